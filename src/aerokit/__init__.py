@@ -1,0 +1,1 @@
+"""Control drones over MAVLink from asyncio."""
