@@ -1,0 +1,363 @@
+"""``StateCell``: the latest value of one thing that a vehicle told, its age and source, and ways to wait."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections import deque
+from collections.abc import AsyncIterator, Callable
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+from aerokit.errors import OperationTimeout, StaleValueError, ValueUnknownError
+
+__all__ = ["Changes", "Source", "StateCell"]
+
+T = TypeVar("T")
+
+_SEEN = 3  # how many of the last distinct values a time-out names
+
+
+@dataclass(frozen=True)
+class Source:
+    """Who said it: system id, component id and the name of the message it came in."""
+
+    system_id: int
+    component_id: int
+    message: str
+
+
+class StateCell(Generic[T]):
+    """The latest value of one thing: read it at once, ask for its age, wait for it, follow it.
+
+    Reading never talks to the vehicle. ``clock`` gives the time in seconds (the event loop's), ``waits_for``
+    names the messages the value comes from, for error texts. A cell belongs to one event loop and its thread.
+    """
+
+    __slots__ = (
+        "_arrivals",
+        "_changes",
+        "_clock",
+        "_closed_by",
+        "_known",
+        "_latest",
+        "_sinks",
+        "_source",
+        "_updated_at",
+        "_waits_for",
+        "name",
+    )
+
+    def __init__(self, name: str, clock: Callable[[], float], waits_for: str) -> None:
+        self.name = name
+        self._clock = clock
+        self._waits_for = waits_for
+        self._known = False
+        self._latest: T | None = None
+        self._source: Source | None = None
+        self._updated_at = -math.inf
+        self._arrivals = 0
+        self._changes = 0
+        self._sinks: list[_Sink[T]] = []
+        self._closed_by: BaseException | None = None
+
+    # ------------------------------------------------------------------------------ reading
+
+    @property
+    def value(self) -> T:
+        """The latest value, however old; :class:`ValueUnknownError` before the first."""
+        if not self._known:
+            raise ValueUnknownError(f"{self.name} is not known yet: no {self._waits_for} has been received")
+        return self._latest  # type: ignore[return-value]
+
+    @property
+    def latest(self) -> T | None:
+        """The latest value, or None before the first."""
+        return self._latest
+
+    @property
+    def is_known(self) -> bool:
+        """Whether a value has come."""
+        return self._known
+
+    @property
+    def updated_at(self) -> float:
+        """When the latest value came, in seconds of the cell's clock; −inf before the first."""
+        return self._updated_at
+
+    @property
+    def age(self) -> float:
+        """Seconds since the latest value came; inf before the first."""
+        return self._clock() - self._updated_at
+
+    @property
+    def source(self) -> Source | None:
+        """Who sent the latest value, and in which message; None before the first."""
+        return self._source
+
+    def fresh(self, within: float) -> T:
+        """The latest value if it is at most ``within`` seconds old.
+
+        Raises :class:`StaleValueError` when it is older, :class:`ValueUnknownError` when there is none.
+        """
+        value = self.value
+        if self.age > within:
+            raise StaleValueError(
+                f"{self.name} is {self.age:.1f} s old, older than the {within:g} s asked for:"
+                f" no {self._waits_for} since"
+            )
+        return value
+
+    # ------------------------------------------------------------------------------ waiting
+
+    async def wait_until(
+        self,
+        predicate: Callable[[T], object],
+        *,
+        held_for: float = 0.0,
+        timeout: float | None = None,
+        description: str = "",
+    ) -> T:
+        """Wait until ``predicate(value)`` is true, ``held_for`` seconds on end, and return the value.
+
+        The predicate is tried on the present value and on every value that comes, so one that lasted a single
+        message is not missed; an exception of it is raised here. After ``timeout`` seconds
+        :class:`OperationTimeout` says what was waited for (``description``) and what was seen meanwhile.
+        """
+        self._raise_if_closed()
+        waiter = _Waiter(self, predicate, held_for)
+        self._sinks.append(waiter)
+        if self._known:
+            waiter.receive(self._latest)  # type: ignore[arg-type]
+        return await waiter.wait(timeout, description)
+
+    def changes(self) -> Changes[T]:
+        """Follow the values that differ from the one before; a slow reader gets the latest only.
+
+        The present value, when there is one, comes first. Nothing is left behind when the loop is left early.
+        """
+        return Changes(self, every_arrival=False)
+
+    def updates(self) -> Changes[T]:
+        """Like :meth:`changes`, but each value that comes counts, also when it equals the one before."""
+        return Changes(self, every_arrival=True)
+
+    def observe(self, callback: Callable[[T | None, T], None]) -> Callable[[], None]:
+        """Call ``callback(previous, value)`` at every change, inside :meth:`set`; returns what ends that.
+
+        The callback must be quick and must not raise.
+        """
+        observer = _Observer(self, callback)
+        self._sinks.append(observer)
+        return observer.close
+
+    # ------------------------------------------------------------------------------ writing
+
+    def set(self, value: T, source: Source) -> None:
+        """Take ``value`` as the latest, and wake whoever waits for it."""
+        self._updated_at = self._clock()
+        self._source = source
+        self._arrivals += 1
+        if not self._known or value != self._latest:
+            self._changes += 1
+            self._known = True
+        self._latest = value
+        if self._sinks:
+            for sink in tuple(self._sinks):
+                sink.receive(value)
+
+    def forget(self) -> None:
+        """Make the value unknown again, as after a reboot; whoever waits goes on waiting."""
+        self._known = False
+        self._latest = None
+        self._source = None
+        self._updated_at = -math.inf
+        for sink in tuple(self._sinks):
+            sink.forget()
+
+    def close(self, error: BaseException) -> None:
+        """No value will come any more: whoever waits, now or later, gets ``error``. Reading still works."""
+        if self._closed_by is None:
+            self._closed_by = error
+            for sink in tuple(self._sinks):
+                sink.fail(error)
+
+    def _raise_if_closed(self) -> None:
+        if self._closed_by is not None:
+            raise self._closed_by
+
+    def _describe(self) -> str:
+        if not self._known:
+            return f"{self.name} is not known yet, no {self._waits_for} has been received"
+        return f"{self.name} is {self._latest!r}, {self.age:.1f} s old"
+
+    def __repr__(self) -> str:
+        return f"<StateCell {self._describe()}>"
+
+
+class Changes(AsyncIterator[T]):
+    """An endless asynchronous iterator over a cell; the latest value wins.
+
+    Raises the error that the cell was closed with. It is registered at the cell only while it waits.
+    """
+
+    def __init__(self, cell: StateCell[T], *, every_arrival: bool) -> None:
+        self._cell = cell
+        self._every_arrival = every_arrival
+        self._read_at = self._count() - (1 if cell.is_known else 0)
+        self._missed = 0
+
+    @property
+    def missed(self) -> int:
+        """How many values were overwritten before this reader came to them."""
+        return self._missed
+
+    def __aiter__(self) -> Changes[T]:
+        return self
+
+    async def __anext__(self) -> T:
+        while self._count() == self._read_at or not self._cell.is_known:
+            await self._next_arrival()
+        count = self._count()
+        self._missed += count - self._read_at - 1
+        self._read_at = count
+        return self._cell.value
+
+    def _count(self) -> int:
+        return self._cell._arrivals if self._every_arrival else self._cell._changes
+
+    async def _next_arrival(self) -> None:
+        self._cell._raise_if_closed()
+        waiter: _Waiter[T] = _Waiter(self._cell, lambda _: True, 0.0)
+        self._cell._sinks.append(waiter)
+        await waiter.wait(None, "")
+
+
+class _Sink(Generic[T]):
+    """What a cell tells when something happens to it."""
+
+    __slots__ = ()
+
+    def receive(self, value: T) -> None:
+        raise NotImplementedError
+
+    def forget(self) -> None:
+        """The value became unknown."""
+
+    def fail(self, error: BaseException) -> None:
+        """The cell was closed."""
+
+
+class _Waiter(_Sink[T]):
+    """One call of ``wait_until``: a future, and at most one timer for ``held_for``."""
+
+    __slots__ = (
+        "_cell",
+        "_error",
+        "_future",
+        "_held_for",
+        "_hold_timer",
+        "_loop",
+        "_predicate",
+        "_seen",
+        "_seen_count",
+    )
+
+    def __init__(self, cell: StateCell[T], predicate: Callable[[T], object], held_for: float) -> None:
+        self._cell = cell
+        self._predicate = predicate
+        self._held_for = held_for
+        self._loop = asyncio.get_running_loop()
+        self._future: asyncio.Future[T | None] = self._loop.create_future()
+        self._error: BaseException | None = None
+        self._hold_timer: asyncio.TimerHandle | None = None
+        self._seen: deque[T] = deque(maxlen=_SEEN)
+        self._seen_count = 0
+
+    async def wait(self, timeout: float | None, description: str) -> T:
+        timer = (
+            None if timeout is None else self._loop.call_later(timeout, self._expire, timeout, description)
+        )
+        try:
+            value = await self._future
+        finally:
+            self._cell._sinks.remove(self)
+            self._stop_hold()
+            if timer is not None:
+                timer.cancel()
+        if self._error is not None:
+            raise self._error
+        return value  # type: ignore[return-value]
+
+    def receive(self, value: T) -> None:
+        if self._future.done():
+            return
+        self._note(value)
+        try:
+            holds = bool(self._predicate(value))
+        except Exception as error:  # the predicate belongs to the one who waits, so does its error
+            self.fail(error)
+            return
+        if not holds:
+            self._stop_hold()
+        elif self._held_for <= 0:
+            self._future.set_result(value)
+        elif self._hold_timer is None:
+            self._hold_timer = self._loop.call_later(self._held_for, self._finish_hold)
+
+    def forget(self) -> None:
+        self._stop_hold()
+
+    def fail(self, error: BaseException) -> None:
+        # Not set_exception: a caller cancelled just now would leave it unread, and the loop complains of that.
+        if not self._future.done():
+            self._error = error
+            self._future.set_result(None)
+
+    def _finish_hold(self) -> None:
+        if not self._future.done():
+            self._future.set_result(self._cell.value)
+
+    def _stop_hold(self) -> None:
+        if self._hold_timer is not None:
+            self._hold_timer.cancel()
+            self._hold_timer = None
+
+    def _expire(self, timeout: float, description: str) -> None:
+        self.fail(OperationTimeout(self._timeout_text(timeout, description)))
+
+    def _note(self, value: T) -> None:
+        self._seen_count += 1
+        if not self._seen or self._seen[-1] != value:
+            self._seen.append(value)
+
+    def _timeout_text(self, timeout: float, description: str) -> str:
+        text = f"{description or self._cell.name}: not reached within {timeout:g} s; {self._cell._describe()}"
+        if self._held_for > 0:
+            text += f"; it had to hold for {self._held_for:g} s"
+        if self._seen_count > 1:
+            text += f"; {self._seen_count} values seen, last " + ", ".join(map(repr, self._seen))
+        return text
+
+
+class _Observer(_Sink[T]):
+    """A callback for every change."""
+
+    __slots__ = ("_callback", "_cell", "_previous")
+
+    def __init__(self, cell: StateCell[T], callback: Callable[[T | None, T], None]) -> None:
+        self._cell = cell
+        self._callback = callback
+        self._previous = cell.latest
+
+    def receive(self, value: T) -> None:
+        previous, self._previous = self._previous, value
+        if previous is None or previous != value:
+            self._callback(previous, value)
+
+    def forget(self) -> None:
+        self._previous = None
+
+    def close(self) -> None:
+        if self in self._cell._sinks:
+            self._cell._sinks.remove(self)
