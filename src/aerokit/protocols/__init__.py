@@ -1,0 +1,1 @@
+"""MAVLink microservices without IO: messages and ``now`` in, messages and results out."""

@@ -1,0 +1,217 @@
+"""The command protocol (https://mavlink.io/en/services/command.html): COMMAND_LONG or COMMAND_INT until COMMAND_ACK."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from aerokit.errors import CommandRejected, CommandTimeout, LocalProtocolError
+from aerokit.mavlink.messages import CommandAck, CommandInt, CommandLong
+from aerokit.protocols.exchange import Exchange
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from aerokit.mavlink.message import Message
+
+__all__ = ["CommandExchange", "command_int", "command_long", "command_name", "result_name"]
+
+ACCEPTED, IN_PROGRESS = 0, 5
+BROADCAST = 0
+FLOAT32_MAX = 3.4028234663852886e38
+
+
+def command_long(
+    target_system: int, target_component: int, command: int, params: tuple[float, ...] = ()
+) -> CommandLong:
+    """Build a COMMAND_LONG; ``params`` are param1 to param7, missing ones are 0, NaN is allowed.
+
+    Raises:
+        LocalProtocolError: more than seven parameters, not a number, infinite, or no target system.
+    """
+    _check_target(target_system, command)
+    if len(params) > 7:
+        raise LocalProtocolError(f"{command_name(command)} takes at most 7 parameters, {len(params)} were given")
+    values = [_check_param(command, f"param{i}", value) for i, value in enumerate(params, 1)]
+    values += [0.0] * (7 - len(values))
+    return CommandLong(target_system, target_component, command, 0, *values)
+
+
+def command_int(
+    target_system: int,
+    target_component: int,
+    command: int,
+    params: tuple[float, ...] = (),
+    *,
+    frame: int,
+    x: int,
+    y: int,
+    z: float,
+) -> CommandInt:
+    """Build a COMMAND_INT; ``params`` are param1 to param4, ``x`` and ``y`` latitude and longitude in 1e-7 degrees
+    (or 1e-4 m in local frames), ``z`` the altitude in metres in ``frame`` (MAV_FRAME).
+
+    Raises:
+        LocalProtocolError: more than four parameters, a value outside its type, or no target system.
+    """
+    _check_target(target_system, command)
+    if len(params) > 4:
+        raise LocalProtocolError(f"{command_name(command)} as COMMAND_INT takes at most 4 parameters beside x, y, z")
+    for field, value in (("x", x), ("y", y)):
+        if not isinstance(value, int) or not -(2**31) <= value < 2**31:
+            raise LocalProtocolError(f"{command_name(command)}: {field} = {value!r} is not an integer of 32 bits")
+    values = [_check_param(command, f"param{i}", value) for i, value in enumerate(params, 1)]
+    values += [0.0] * (4 - len(values))
+    return CommandInt(
+        target_system, target_component, frame, command, 0, 0, *values, x, y, _check_param(command, "z", z)
+    )
+
+
+class CommandExchange(Exchange[CommandAck]):
+    """Send one command until its result is known; ends with the COMMAND_ACK whose result is ACCEPTED.
+
+    ``confirmation`` rises with each resend. IN_PROGRESS is no result: it extends the deadline by ``progress_timeout``
+    and is reported to ``on_progress`` (0–100, None when the vehicle does not say). An ack for another ground station
+    is not ours.
+
+    Raises from ``result()``:
+        CommandRejected: any other result; the vehicle's reasons are added by those who see its status texts.
+        CommandTimeout: ``attempts`` times ``attempt_timeout`` seconds without an ack.
+    """
+
+    expects = (CommandAck,)
+
+    def __init__(
+        self,
+        message: CommandLong | CommandInt,
+        *,
+        own_system: int,
+        own_component: int,
+        attempts: int = 4,
+        attempt_timeout: float = 1.0,
+        progress_timeout: float = 10.0,
+        on_progress: Callable[[int | None], None] | None = None,
+    ) -> None:
+        super().__init__()
+        if attempts < 1:
+            raise LocalProtocolError(f"attempts = {attempts} is not allowed: at least 1")
+        self._message = message
+        self._own = (own_system, own_component)
+        self._attempts, self._attempt_timeout = attempts, attempt_timeout
+        self._progress_timeout, self._on_progress = progress_timeout, on_progress
+        self._sent = 0
+        self._started = 0.0
+        self._in_progress = False
+
+    def start(self, now: float) -> None:
+        """Send the command for the first time."""
+        self._started = now
+        self._send(now)
+
+    def receive(self, message: Message, now: float) -> None:
+        """Take a COMMAND_ACK of the target; others are ignored."""
+        if self.done or not isinstance(message, CommandAck) or not self._is_ours(message):
+            return
+        if message.result == IN_PROGRESS:
+            self._report_progress(message, now)
+        elif message.result == ACCEPTED:
+            self._finish(message)
+        else:
+            self._fail(rejection(message.command, message.result))
+
+    def expire(self, now: float) -> None:
+        """Send again, or give up after the last attempt or when a command in progress has gone silent."""
+        if self.done or self.deadline is None or now < self.deadline:
+            return
+        if self._in_progress or self._sent >= self._attempts:
+            self._fail(CommandTimeout(self._timeout_text(now)))
+        else:
+            self._send(now)
+
+    def _send(self, now: float) -> None:
+        self._outbox.append(self._numbered(self._sent))
+        self._sent += 1
+        self.deadline = now + self._attempt_timeout
+
+    def _numbered(self, confirmation: int) -> Message:
+        """COMMAND_LONG counts its resends; COMMAND_INT has no field for it."""
+        message = self._message
+        if confirmation == 0 or not isinstance(message, CommandLong):
+            return message
+        fields = message.to_dict() | {"confirmation": min(confirmation, 255)}
+        return CommandLong(**fields)
+
+    def _is_ours(self, ack: CommandAck) -> bool:
+        """Is it for this command and for us? Targets are 0 in acks of MAVLink 1 and of old firmwares."""
+        own_system, own_component = self._own
+        return (
+            ack.command == self._message.command
+            and ack.target_system in (BROADCAST, own_system)
+            and ack.target_component in (BROADCAST, own_component)
+        )
+
+    def _report_progress(self, ack: CommandAck, now: float) -> None:
+        self._in_progress = True
+        self.deadline = now + self._progress_timeout
+        if self._on_progress is not None:
+            self._on_progress(ack.progress if 0 < ack.progress <= 100 else None)
+
+    def _timeout_text(self, now: float) -> str:
+        name, seconds = command_name(self._message.command), now - self._started
+        if self._in_progress:
+            return f"{name} was in progress, then nothing came for {self._progress_timeout:g} s"
+        times = "once" if self._sent == 1 else f"{self._sent} times"
+        return f"no COMMAND_ACK for {name}, sent {times} within {seconds:.1f} s"
+
+
+def rejection(command: int, result: int) -> CommandRejected:
+    """The error that stands for this result."""
+    text = f"{command_name(command)} was refused: {result_name(result)}{_HINTS.get(result, '')}"
+    return CommandRejected(text, command=command, result=result)
+
+
+def command_name(command: int) -> str:
+    """``MAV_CMD_NAV_TAKEOFF`` for 22; ``MAV_CMD 12345`` for what the dialects do not know."""
+    from aerokit.mavlink.enums import MavCmd
+
+    try:
+        return f"MAV_CMD_{MavCmd(command).name}"
+    except ValueError:
+        return f"MAV_CMD {command}"
+
+
+def result_name(result: int) -> str:
+    """``DENIED`` for 2; ``MAV_RESULT 99`` for what the dialects do not know."""
+    from aerokit.mavlink.enums import MavResult
+
+    try:
+        return MavResult(result).name
+    except ValueError:
+        return f"MAV_RESULT {result}"
+
+
+_HINTS = {
+    1: " (the vehicle says: not now, later perhaps)",
+    2: " (the vehicle says: never with these parameters)",
+    3: " (this firmware does not know the command)",
+    7: " (it has to be sent as COMMAND_LONG)",
+    8: " (it has to be sent as COMMAND_INT)",
+}
+
+
+def _check_target(target_system: int, command: int) -> None:
+    if not 1 <= target_system <= 255:
+        raise LocalProtocolError(
+            f"{command_name(command)}: target_system = {target_system} is not allowed: 1 to 255"
+            " (0 would command every vehicle on the link)"
+        )
+
+
+def _check_param(command: int, field: str, value: float) -> float:
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        raise LocalProtocolError(f"{command_name(command)}: {field} = {value!r} is not a number") from None
+    if math.isinf(number) or abs(number) > FLOAT32_MAX:
+        raise LocalProtocolError(f"{command_name(command)}: {field} = {value!r} does not fit into 32 bits")
+    return number

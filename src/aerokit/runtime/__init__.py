@@ -1,0 +1,1 @@
+"""Where sans-IO protocols meet the event loop."""

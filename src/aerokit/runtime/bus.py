@@ -1,0 +1,116 @@
+"""Who wants which message: the bus decodes a frame once, when someone wants it, and never otherwise."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from aerokit.mavlink.dialect import STANDARD
+from aerokit.mavlink.message import Message
+from aerokit.runtime.events import Event
+
+if TYPE_CHECKING:
+    from aerokit.mavlink.dialect import Dialect
+    from aerokit.mavlink.frame import Frame
+
+__all__ = ["Bus", "Detach", "Sink"]
+
+logger = logging.getLogger("aerokit")
+
+Detach = Callable[[], None]
+"""Calling it ends an attachment; calling it again does nothing."""
+
+Sink = Callable[[Any], None]
+"""Takes one message or event; it must be quick and must not await."""
+
+EventT = TypeVar("EventT", bound=Event)
+EVERY_SYSTEM = 0
+
+
+class Bus:
+    """Brings messages and events to those who asked for them, in the order in which they attached.
+
+    ``wanted`` is the live set of message ids somebody wants: a framer that holds it builds no frame for the others.
+    """
+
+    def __init__(self, dialect: Dialect = STANDARD) -> None:
+        self.dialect = dialect
+        self.wanted: dict[int, int] = {}
+        self._sinks: dict[tuple[int, int], tuple[Sink, ...]] = {}
+        self._event_sinks: dict[type[Event], tuple[Sink, ...]] = {}
+
+    def attach(self, message_type: type[Message], sink: Sink, *, system_id: int = EVERY_SYSTEM) -> Detach:
+        """Have every ``message_type`` of ``system_id`` (0: of every system) delivered to ``sink``."""
+        key = (system_id, message_type.ID)
+        self._sinks[key] = (*self._sinks.get(key, ()), sink)
+        self.wanted[message_type.ID] = self.wanted.get(message_type.ID, 0) + 1
+        return _once(lambda: self._detach(key, sink))
+
+    def attach_event(self, event_type: type[EventT], sink: Callable[[EventT], None]) -> Detach:
+        """Have every event of this class and of its subclasses delivered to ``sink``."""
+        self._event_sinks[event_type] = (*self._event_sinks.get(event_type, ()), sink)
+        return _once(lambda: self._detach_event(event_type, sink))
+
+    def deliver(self, frame: Frame) -> None:
+        """Decode the frame if anyone wants it and hand it over; a sink that raises is logged, the others go on."""
+        message_id = frame.message_id
+        everyone = self._sinks.get((EVERY_SYSTEM, message_id), ())
+        own = self._sinks.get((frame.system_id, message_id), ())
+        if not everyone and not own:
+            return
+        message = self.dialect.decode(frame)
+        for sink in own:
+            try:
+                sink(message)
+            except Exception:
+                _report(sink)
+        for sink in everyone:
+            try:
+                sink(message)
+            except Exception:
+                _report(sink)
+
+    def publish(self, event: Event) -> None:
+        """Hand an event to those who want its class."""
+        for event_type in type(event).__mro__[:-1]:
+            for sink in self._event_sinks.get(event_type, ()):
+                try:
+                    sink(event)
+                except Exception:
+                    _report(sink)
+
+    def _detach(self, key: tuple[int, int], sink: Sink) -> None:
+        _drop(self._sinks, key, sink)
+        left = self.wanted[key[1]] - 1
+        if left:
+            self.wanted[key[1]] = left
+        else:
+            del self.wanted[key[1]]
+
+    def _detach_event(self, event_type: type[Event], sink: Sink) -> None:
+        _drop(self._event_sinks, event_type, sink)
+
+
+def _drop(table: dict[Any, tuple[Sink, ...]], key: object, sink: Sink) -> None:
+    """Take one occurrence of the sink out; deliveries under way keep the tuple they began with."""
+    left = list(table[key])
+    left.remove(sink)
+    if left:
+        table[key] = tuple(left)
+    else:
+        del table[key]
+
+
+def _once(action: Callable[[], None]) -> Detach:
+    pending = [action]
+
+    def detach() -> None:
+        if pending:
+            pending.pop()()
+
+    return detach
+
+
+def _report(sink: Sink) -> None:
+    logger.exception("a subscriber (%r) raised; the message was delivered to the others", sink)

@@ -1,0 +1,116 @@
+"""Sends any MAV_CMD to one vehicle and awaits its result; one command of a kind at a time."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING
+
+from aerokit.errors import CommandTimeout
+from aerokit.protocols.command import CommandExchange, command_int, command_long
+from aerokit.runtime.driver import run_exchange
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+
+    from aerokit.mavlink.messages import CommandAck, CommandInt, CommandLong
+    from aerokit.runtime.connection import Connection
+
+__all__ = ["CommandSender"]
+
+
+class CommandSender:
+    """The command protocol with one vehicle (https://mavlink.io/en/services/command.html).
+
+    COMMAND_ACK carries no request id, so two equal commands to one component follow each other; different
+    commands never wait for each other.
+    """
+
+    def __init__(
+        self,
+        connection: Connection,
+        system_id: int,
+        component_id: int,
+        describe: Callable[[], str],
+    ) -> None:
+        self._connection = connection
+        self._system_id, self._component_id = system_id, component_id
+        self._describe = describe
+        self._locks: dict[tuple[int, int], _SharedLock] = {}
+
+    async def send_long(
+        self,
+        command: int,
+        *params: float,
+        component_id: int | None = None,
+        attempts: int = 4,
+        attempt_timeout: float = 1.0,
+        on_progress: Callable[[int | None], None] | None = None,
+    ) -> CommandAck:
+        """Send a COMMAND_LONG with param1 to param7 and return its ACCEPTED ack; see :meth:`Vehicle.command`."""
+        message = command_long(self._system_id, component_id or self._component_id, command, params)
+        return await self._run(message, attempts, attempt_timeout, on_progress)
+
+    async def send_int(
+        self,
+        command: int,
+        *params: float,
+        frame: int,
+        x: int = 0,
+        y: int = 0,
+        z: float = 0.0,
+        component_id: int | None = None,
+        attempts: int = 4,
+        attempt_timeout: float = 1.0,
+        on_progress: Callable[[int | None], None] | None = None,
+    ) -> CommandAck:
+        """Send a COMMAND_INT with param1 to param4, x, y, z and return its ACCEPTED ack."""
+        target = component_id or self._component_id
+        message = command_int(self._system_id, target, command, params, frame=frame, x=x, y=y, z=z)
+        return await self._run(message, attempts, attempt_timeout, on_progress)
+
+    def send_unconfirmed(self, command: int, *params: float) -> None:
+        """Send a COMMAND_LONG once and do not wait: for ends of blocks, which must not await."""
+        self._connection.send(command_long(self._system_id, self._component_id, command, params))
+
+    async def _run(
+        self,
+        message: CommandLong | CommandInt,
+        attempts: int,
+        attempt_timeout: float,
+        on_progress: Callable[[int | None], None] | None,
+    ) -> CommandAck:
+        exchange = CommandExchange(
+            message,
+            own_system=self._connection.source_system,
+            own_component=self._connection.source_component,
+            attempts=attempts,
+            attempt_timeout=attempt_timeout,
+            on_progress=on_progress,
+        )
+        async with self._alone(message.target_component, message.command):
+            try:
+                return await run_exchange(self._connection, self._system_id, exchange)
+            except CommandTimeout as error:
+                raise CommandTimeout(f"{error}; {self._describe()}") from None
+
+    @asynccontextmanager
+    async def _alone(self, component_id: int, command: int) -> AsyncIterator[None]:
+        key = (component_id, command)
+        shared = self._locks.setdefault(key, _SharedLock())
+        shared.users += 1
+        try:
+            async with shared.lock:
+                yield
+        finally:
+            shared.users -= 1
+            if not shared.users:
+                del self._locks[key]
+
+
+class _SharedLock:
+    """A lock that is forgotten when nobody uses it."""
+
+    def __init__(self) -> None:
+        self.lock = asyncio.Lock()
+        self.users = 0
