@@ -1,0 +1,73 @@
+"""The contract of every link: bytes in by callback, bytes out without waiting."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Hashable
+from typing import Protocol
+
+from aerokit.errors import LinkLost
+
+__all__ = ["Link", "Peer", "Receiver"]
+
+Peer = Hashable
+"""Who sent the bytes, to be handed back to `Link.write`; None where there is only one. Opaque."""
+
+
+class Receiver(Protocol):
+    """What a link calls, always on the loop it was opened on and never from inside `Link.write`.
+
+    Calls may come before `Link.open` has returned to its caller, and none comes after `Link.close`. They must
+    not raise: what they raise goes to the loop's exception handler, and a stream link may end by it.
+    """
+
+    def bytes_received(self, data: bytes, peer: Peer) -> None:
+        """Bytes came in: a datagram, or any piece of a stream."""
+
+    def link_lost(self, error: LinkLost) -> None:
+        """The link has gone by itself; called at most once, and the last call there is."""
+
+
+class Link(ABC):
+    """Moves bytes between this program and one or several peers; knows nothing of what they mean.
+
+    A link belongs to the event loop it was opened on and is opened once; when `open` has failed or was
+    cancelled it may be tried again.
+    """
+
+    address: str
+    """How to name it to a human, mostly as `create_link` takes it; a listening port 0 becomes the real one."""
+
+    dropped_writes: int = 0
+    """Writes (datagrams, whole calls of `write`) that were thrown away: no room, no route, nobody there."""
+
+    @abstractmethod
+    async def open(self, receiver: Receiver) -> None:
+        """Opens the link; from now on the receiver is called.
+
+        Raises LinkOpenError with the address, the system's reason and a hint, BusyError when it is open
+        already, and ConnectionClosed after `close`. A cancelled or failed `open` leaves nothing behind.
+        """
+
+    @abstractmethod
+    def write(self, data: bytes, peer: Peer = None) -> None:
+        """Sends bytes to one peer, or to every known one (None).
+
+        Never blocks and never raises: what cannot be sent is dropped whole and counted in `dropped_writes`;
+        before `open` and after the end it does nothing.
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """Closes the link: at once to the eye, no callback comes any more. Never blocks, idempotent.
+
+        What was written is still handed to the system, for up to `LINGER_S` seconds.
+        """
+
+    @abstractmethod
+    async def wait_closed(self) -> None:
+        """Returns when nothing of a closed or lost link is left; at most about `LINGER_S` seconds later."""
+
+
+LINGER_S = 1.0
+"""Seconds that a closed link may spend on sending what was written before."""
