@@ -29,8 +29,7 @@ LOOPS: list[Any] = [
 
 def each_loop(test: AsyncTest) -> AsyncTest:
     """Runs an async test on stock asyncio and on uvloop."""
-    return pytest.mark.anyio(pytest.mark.parametrize("anyio_backend", LOOPS)(test))  # type:
-    ignore[no-any-return]
+    return pytest.mark.anyio(pytest.mark.parametrize("anyio_backend", LOOPS)(test))  # type: ignore[no-any-return]
 
 
 TRAFFIC: list[list[bytes]] = [

@@ -36,7 +36,7 @@ class Link(ABC):
     """
 
     address: str
-    """How to name it to a human, mostly as `create_link` takes it; a listening port 0 becomes the real one."""
+    """What to call it: mostly a form that `create_link` takes; a listening port 0 becomes the real one."""
 
     dropped_writes: int = 0
     """Writes (datagrams, whole calls of `write`) that were thrown away: no room, no route, nobody there."""

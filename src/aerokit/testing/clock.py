@@ -73,8 +73,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         """Virtual seconds since this loop was made."""
         return self._now
 
-    def run_in_executor(self, executor: Any, func: Callable[..., T], *args: Any) -> asyncio.Future[T]:  #
-    type: ignore[override]
+    def run_in_executor(self, executor: Any, func: Callable[..., T], *args: Any) -> asyncio.Future[T]:  # type: ignore[override]
         """Runs ``func`` on a thread; the clock stands still until it has returned."""
         future = super().run_in_executor(executor, func, *args)
         self._outside_calls += 1
