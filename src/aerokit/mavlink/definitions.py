@@ -1,0 +1,361 @@
+"""MAVLink XML read into plain definitions, for the generator and for dialects that are loaded at run time.
+
+The rules are the standard's: https://mavlink.io/en/guide/xml_schema.html and, for the order of fields on the wire and
+for CRC_EXTRA, https://mavlink.io/en/guide/serialization.html.
+"""
+
+from __future__ import annotations
+
+import keyword
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+from aerokit.errors import LocalProtocolError
+from aerokit.mavlink.checksum import x25
+
+__all__ = [
+    "DialectDefinition",
+    "EntryDefinition",
+    "EnumDefinition",
+    "FieldDefinition",
+    "MessageDefinition",
+    "merged_enums",
+    "read_dialect",
+    "read_xml",
+]
+
+SIZES = {
+    "char": 1,
+    "int8_t": 1,
+    "uint8_t": 1,
+    "int16_t": 2,
+    "uint16_t": 2,
+    "int32_t": 4,
+    "uint32_t": 4,
+    "int64_t": 8,
+    "uint64_t": 8,
+    "float": 4,
+    "double": 8,
+}
+"""Bytes on the wire of each type the standard knows."""
+
+# Names that a message class needs for itself; a private dialect's field of that name gets a trailing underscore.
+_RESERVED = frozenset(
+    "ID NAME CRC_EXTRA FIELDS LENGTH BASE_LENGTH received_frame decode encode to_dict self cls".split()
+)
+_IDENTIFIER = re.compile(r"[A-Za-z][A-Za-z0-9_]*\Z")
+_FIELD_TYPE = re.compile(r"(\w+?)(?:_mavlink_version)?(?:\[(\d+)\])?\Z")
+
+
+@dataclass(frozen=True)
+class FieldDefinition:
+    """One field of a message, as the XML has it."""
+
+    name: str
+    type: str  # without the array brackets
+    array_length: int = 0  # 0: not an array
+    units: str = ""
+    enum: str = ""
+    invalid: str = ""  # the value which means "not known"
+    description: str = ""
+    extension: bool = False
+    default: int | None = None  # only mavlink_version, which the standard fills in
+
+    @property
+    def attribute(self) -> str:
+        """The name in Python: the standard's, with an underscore behind a keyword."""
+        reserved = keyword.iskeyword(self.name) or self.name in _RESERVED
+        return self.name + "_" if reserved else self.name
+
+    @property
+    def length(self) -> int:
+        """Bytes on the wire."""
+        return SIZES[self.type] * (self.array_length or 1)
+
+
+@dataclass(frozen=True)
+class MessageDefinition:
+    """One message; ``fields`` are in the standard's order, extensions last."""
+
+    id: int
+    name: str
+    fields: tuple[FieldDefinition, ...]
+    description: str = ""
+    origin: str = ""  # the XML file's name without its ending
+    remarks: tuple[str, ...] = ()  # deprecated, superseded, work in progress
+
+    @property
+    def class_name(self) -> str:
+        """The name of its class: ``GPS2_RAW`` is ``Gps2Raw``."""
+        return cap_words(self.name)
+
+    @property
+    def wire_fields(self) -> tuple[FieldDefinition, ...]:
+        """The fields in wire order: largest type first, extensions untouched at the end."""
+        base = sorted((f for f in self.fields if not f.extension), key=lambda f: -SIZES[f.type])
+        return (*base, *(f for f in self.fields if f.extension))
+
+    @property
+    def base_length(self) -> int:
+        """Bytes of the payload without extensions: the only length MAVLink 1 knows."""
+        return sum(f.length for f in self.fields if not f.extension)
+
+    @property
+    def length(self) -> int:
+        """Bytes of the payload with extensions."""
+        return sum(f.length for f in self.fields)
+
+    @property
+    def crc_extra(self) -> int:
+        """The byte which makes frames of another definition fail their checksum."""
+        text = self.name + " "
+        for f in self.wire_fields:
+            if not f.extension:
+                text += f"{f.type} {f.name} " + (chr(f.array_length) if f.array_length else "")
+        crc = x25(text.encode("latin-1"))
+        return (crc & 0xFF) ^ (crc >> 8)
+
+
+@dataclass(frozen=True)
+class EntryDefinition:
+    """One entry of an enum; ``params`` are filled for MAV_CMD only: (index, label, units, description)."""
+
+    name: str
+    value: int
+    description: str = ""
+    params: tuple[tuple[int, str, str, str], ...] = ()
+    remarks: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class EnumDefinition:
+    """One enum of one file, or of all files after `merged_enums`."""
+
+    name: str
+    entries: tuple[EntryDefinition, ...]
+    bitmask: bool = False
+    description: str = ""
+    origin: str = ""
+    remarks: tuple[str, ...] = ()
+
+    @property
+    def class_name(self) -> str:
+        """The name of its class: ``MAV_CMD`` is ``MavCmd``."""
+        return cap_words(self.name)
+
+    def members(self) -> list[tuple[str, EntryDefinition]]:
+        """The entries with their Python names: what all of them begin with is taken off."""
+        prefix = _common_prefix(self.name, [entry.name for entry in self.entries])
+        return [(_member_name(self.name, prefix, entry.name), entry) for entry in self.entries]
+
+
+@dataclass(frozen=True)
+class DialectDefinition:
+    """What one XML file defines itself; ``includes`` are the files it builds on."""
+
+    name: str
+    messages: tuple[MessageDefinition, ...] = ()
+    enums: tuple[EnumDefinition, ...] = ()
+    includes: tuple[str, ...] = field(default=())
+
+
+def cap_words(name: str) -> str:
+    """``GLOBAL_POSITION_INT`` → ``GlobalPositionInt``."""
+    return "".join(part.capitalize() for part in name.split("_"))
+
+
+def read_dialect(path: Path, search: Sequence[Path] = ()) -> list[DialectDefinition]:
+    """Read a file and everything it includes, the included first.
+
+    Includes are looked for beside the file, then in the folders of ``search``.
+    Raises LocalProtocolError when a file is missing or is no MAVLink XML.
+    """
+    found: dict[str, DialectDefinition] = {}
+    pending: set[str] = set()
+
+    def visit(file: Path) -> None:
+        if file.name in found or file.name in pending:
+            return
+        pending.add(file.name)
+        dialect = read_xml(file)
+        for include in dialect.includes:
+            visit(_find_include(include, file, search))
+        found[file.name] = dialect
+
+    visit(path)
+    return list(found.values())
+
+
+def read_xml(path: Path) -> DialectDefinition:
+    """Read one file, without what it includes; LocalProtocolError when it is no MAVLink XML."""
+    try:
+        root = ElementTree.parse(path).getroot()
+        return DialectDefinition(
+            name=path.stem,
+            messages=tuple(_message(node, path.stem) for node in root.findall("messages/message")),
+            enums=tuple(_enum(node, path.stem) for node in root.findall("enums/enum")),
+            includes=tuple((node.text or "").strip() for node in root.findall("include")),
+        )
+    except FileNotFoundError:
+        raise LocalProtocolError(f"no dialect file {path}") from None
+    except (ElementTree.ParseError, KeyError, ValueError) as error:
+        raise LocalProtocolError(f"{path} is not a MAVLink dialect: {error!r}") from error
+
+
+def merged_enums(dialects: Iterable[DialectDefinition]) -> list[EnumDefinition]:
+    """All enums, each once: a later file's entries are added to the enum of the first file that defines it."""
+    merged: dict[str, EnumDefinition] = {}
+    for dialect in dialects:
+        for enum in dialect.enums:
+            first = merged.get(enum.name)
+            if first is None:
+                merged[enum.name] = enum
+                continue
+            entries = {entry.name: entry for entry in (*first.entries, *enum.entries)}
+            ordered = sorted(entries.values(), key=lambda entry: entry.value)
+            merged[enum.name] = replace(first, entries=tuple(ordered))
+    return list(merged.values())
+
+
+# ------------------------------------------------------------------------------------------ XML
+
+
+def _find_include(include: str, file: Path, search: Sequence[Path]) -> Path:
+    folders = [file.parent, *search]
+    for folder in folders:
+        if (folder / include).is_file():
+            return folder / include
+    looked = ", ".join(str(folder) for folder in folders)
+    raise LocalProtocolError(f"{file.name} includes {include}, which is in none of: {looked}")
+
+
+def _message(node: ElementTree.Element, origin: str) -> MessageDefinition:
+    fields: list[FieldDefinition] = []
+    extension = False
+    for child in node:
+        if child.tag == "extensions":
+            extension = True
+        elif child.tag == "field":
+            fields.append(_field(child, extension))
+    message = MessageDefinition(
+        id=int(node.attrib["id"], 0),
+        name=_identifier(node.attrib["name"]),
+        fields=tuple(fields),
+        description=_text(node.find("description")),
+        origin=origin,
+        remarks=_remarks(node),
+    )
+    if not 0 <= message.id < 1 << 24:
+        raise ValueError(f"{message.name}: message id {message.id} is not in 0..16777215")
+    if message.length > 255:
+        raise ValueError(f"{message.name}: a payload of {message.length} bytes, at most 255 fit in a frame")
+    return message
+
+
+def _field(node: ElementTree.Element, extension: bool) -> FieldDefinition:
+    found = _FIELD_TYPE.match(node.attrib["type"])
+    if found is None or found[1] not in SIZES:
+        raise ValueError(f"unknown field type {node.attrib['type']!r}")
+    return FieldDefinition(
+        name=_identifier(node.attrib["name"]),
+        type=found[1],
+        array_length=int(found[2] or 0),
+        units=node.get("units", ""),
+        enum=node.get("enum", ""),
+        invalid=node.get("invalid", ""),
+        description=_text(node),
+        extension=extension,
+        default=3 if node.attrib["type"].endswith("_mavlink_version") else None,
+    )
+
+
+def _enum(node: ElementTree.Element, origin: str) -> EnumDefinition:
+    entries: list[EntryDefinition] = []
+    highest = 0
+    for child in node.findall("entry"):
+        value = _integer(child.attrib["value"]) if "value" in child.attrib else highest + 1
+        highest = max(highest, value)
+        entries.append(
+            EntryDefinition(
+                name=_identifier(child.attrib["name"]),
+                value=value,
+                description=_text(child.find("description")),
+                params=tuple(_param(param) for param in child.findall("param")),
+                remarks=_remarks(child),
+            )
+        )
+    return EnumDefinition(
+        name=_identifier(node.attrib["name"]),
+        entries=tuple(entries),
+        bitmask=node.get("bitmask") == "true",
+        description=_text(node.find("description")),
+        origin=origin,
+        remarks=_remarks(node),
+    )
+
+
+def _param(node: ElementTree.Element) -> tuple[int, str, str, str]:
+    return int(node.attrib["index"]), node.get("label", ""), node.get("units", ""), _text(node)
+
+
+def _integer(text: str) -> int:
+    """``16``, ``0x10``, ``0b10000``, ``1<<4`` or ``2**4``."""
+    for operator in ("<<", "**"):
+        if operator in text:
+            left, right = (int(part.strip(), 0) for part in text.split(operator))
+            return left << right if operator == "<<" else int(left**right)
+    return int(text.strip(), 0)
+
+
+def _identifier(name: str) -> str:
+    if not _IDENTIFIER.match(name):
+        raise ValueError(f"{name!r} is not a name")
+    return name
+
+
+def _text(node: ElementTree.Element | None) -> str:
+    return "" if node is None else " ".join("".join(node.itertext()).split())
+
+
+def _remarks(node: ElementTree.Element) -> tuple[str, ...]:
+    remarks: list[str] = []
+    for child in node:
+        if child.tag in ("deprecated", "superseded"):
+            since, by, why = child.get("since", ""), child.get("replaced_by", ""), _text(child)
+            remark = child.tag.capitalize() + (f" since {since}" if since else "")
+            remark += f", replaced by {by}." if by else "."
+            remarks.append(f"{remark} {why}".strip())
+        elif child.tag == "wip":
+            remarks.append("Work in progress: may change.")
+    return tuple(remarks)
+
+
+# --------------------------------------------------------------------------------------- member names
+
+
+def _common_prefix(enum: str, names: list[str]) -> str:
+    own = enum + "_"
+    if sum(name.startswith(own) for name in names) * 2 > len(names):
+        return own
+    split = [name.split("_")[:-1] for name in names] if len(names) > 1 else [enum.split("_")]
+    split.append(names[0].split("_")[:-1])
+    common: list[str] = []
+    for words in zip(*split):  # noqa: B905 - the shortest ends it
+        if len(set(words)) > 1:
+            break
+        common.append(words[0])
+    return "".join(word + "_" for word in common)
+
+
+def _member_name(enum: str, prefix: str, name: str) -> str:
+    if not name.startswith(prefix):  # an entry that forgot the first words of its enum's name
+        words = enum.split("_")
+        tails = ("_".join(words[i:]) + "_" for i in range(1, len(words)))
+        prefix = next((tail for tail in tails if name.startswith(tail)), "")
+    rest = name[len(prefix) :]
+    if rest[:1].isdigit():
+        rest = prefix.rstrip("_").rpartition("_")[2] + "_" + rest
+    return rest + "_" if keyword.iskeyword(rest) or rest == "mro" else rest

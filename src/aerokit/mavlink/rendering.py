@@ -1,0 +1,288 @@
+"""Python source for message classes and enums, out of definitions; pure text in, text out.
+
+`generator` writes it to the committed modules, `dialect` compiles it for dialects that are loaded at run time, so both
+kinds of classes are the same.
+"""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterable
+
+from aerokit.mavlink.definitions import EntryDefinition, EnumDefinition, FieldDefinition, MessageDefinition
+
+__all__ = ["render_enum_row", "render_enum_stub", "render_message"]
+
+_WIDTH = 110
+_CODES = {
+    "int8_t": "b",
+    "uint8_t": "B",
+    "int16_t": "h",
+    "uint16_t": "H",
+    "int32_t": "i",
+    "uint32_t": "I",
+    "int64_t": "q",
+    "uint64_t": "Q",
+    "float": "f",
+    "double": "d",
+}
+_UNPACKED_ONE_BY_ONE = 4  # arrays up to this length are unpacked into names of their own, longer ones are sliced
+
+
+def render_message(message: MessageDefinition, *, docs: bool = True) -> str:
+    """The class of one message, with its Struct; ``docs=False`` leaves all texts out but the first line."""
+    lines = [f"_S{message.id} = Struct({_format(message)!r})", "", "", f"class {message.class_name}(Message):"]
+    lines += _docstring(_message_doc(message) if docs else [f"{message.name} ({message.id})."], "    ")
+    names = [f.attribute for f in message.fields]
+    lines += ["", *_tuple("__slots__", names), *_tuple("__match_args__", names)]
+    lines += [
+        f"    ID = {message.id}",
+        f"    NAME = {_quoted(message.name)}",
+        f"    CRC_EXTRA = {message.crc_extra}",
+        f"    LENGTH = {message.length}",
+        f"    BASE_LENGTH = {message.base_length}",
+        "    _FIELDS = (",
+        *(f"        {_field_row(f)}," for f in message.fields),
+        "    )",
+    ]
+    for f in message.fields:
+        lines += ["", f"    {f.attribute}: {_annotation(f)}"]
+        lines += _docstring([_field_doc(f)], "    ") if docs else []
+    lines += ["", *_init(message), "", *_decode(message), "", *_encode(message)]
+    return "\n".join(lines) + "\n"
+
+
+def render_enum_row(enum: EnumDefinition) -> str:
+    """One entry of the table an enum module makes its enums of: name → (bitmask, docstring, members)."""
+    members = "".join(f"            ({_quoted(name)}, {entry.value}),\n" for name, entry in enum.members())
+    doc = "\n\n".join(_enum_doc(enum))
+    return f"    {_quoted(enum.class_name)}: (\n        {enum.bitmask},\n        {doc!r},\n        (\n{members}        ),\n    ),\n"
+
+
+def render_enum_stub(enum: EnumDefinition) -> str:
+    """The class of one enum for type checkers and editors, with the standard's text on every member."""
+    lines = [f"class {enum.class_name}({'IntFlag' if enum.bitmask else 'IntEnum'}):"]
+    lines += _docstring(_enum_doc(enum), "    ")
+    for name, entry in enum.members():
+        lines.append(f"    {name} = {entry.value}")
+        doc = _entry_doc(entry)
+        lines += _docstring(doc, "    ") if doc else []
+    return "\n".join(lines) + "\n"
+
+
+# ------------------------------------------------------------------------------------------ texts
+
+
+def _page(origin: str, name: str) -> str:
+    return f"https://mavlink.io/en/messages/{origin}.html#{name}"
+
+
+def _message_doc(message: MessageDefinition) -> list[str]:
+    first = f"{message.name} ({message.id}): {message.description or 'no description in the standard.'}"
+    return [first, *message.remarks, _page(message.origin, message.name)]
+
+
+def _enum_doc(enum: EnumDefinition) -> list[str]:
+    first = f"{enum.name}: {enum.description or 'no description in the standard.'}"
+    return [first, *enum.remarks, _page(enum.origin, enum.name)]
+
+
+def _field_doc(f: FieldDefinition) -> str:
+    parts = [_sentence(f.description)] if f.description else []
+    if f.array_length:
+        parts.append(f"Type: {f.type}[{f.array_length}].")
+    else:
+        parts.append(f"Type: {f.type}.")
+    if f.units:
+        parts.append(f"Unit: {f.units}.")
+    if f.enum:
+        parts.append(f"Values: {f.enum}.")
+    if f.invalid:
+        parts.append(f"Unknown: {f.invalid}.")
+    if f.extension:
+        parts.append("Extension, absent in MAVLink 1.")
+    return " ".join(parts)
+
+
+def _entry_doc(entry: EntryDefinition) -> list[str]:
+    paragraphs = [_sentence(entry.description)] if entry.description else []
+    paragraphs += entry.remarks
+    for index, label, units, text in entry.params:
+        unit = f" [{units}]" if units else ""
+        title = f"param{index}{' ' + label if label else ''}{unit}: {text}".rstrip(": ")
+        paragraphs.append(title)
+    return paragraphs
+
+
+def _sentence(text: str) -> str:
+    return text if text[-1:] in ".!?:)" else text + "."
+
+
+def _docstring(paragraphs: Iterable[str], indent: str) -> list[str]:
+    texts = [text.replace("\\", "\\\\").replace('"""', "'''") for text in paragraphs if text]
+    if texts and texts[-1].endswith('"'):
+        texts[-1] += " "
+    wrapped: list[str] = []
+    for number, text in enumerate(texts):
+        wrapped += [""] if number else []
+        wrapped += textwrap.wrap(
+            text, _WIDTH - len(indent) - 6, break_long_words=False, break_on_hyphens=False
+        )
+    if len(wrapped) == 1:
+        return [f'{indent}"""{wrapped[0]}"""']
+    body = [f"{indent}{line}" if line else "" for line in wrapped[1:]]
+    return [f'{indent}"""{wrapped[0]}', *body, f'{indent}"""']
+
+
+# ------------------------------------------------------------------------------------------- code
+
+
+def _quoted(text: str) -> str:
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
+
+
+def _tuple(name: str, items: list[str]) -> list[str]:
+    return _filled(f"    {name} = (", [_quoted(item) for item in items], ")", "    ")
+
+
+def _filled(head: str, items: list[str], tail: str, indent: str) -> list[str]:
+    """Items between brackets: on one line when they fit, else as many to a line as fit."""
+    single = f"{head}{', '.join(items)}{',' if len(items) == 1 else ''}{tail}"
+    if len(single) <= _WIDTH:
+        return [single]
+    lines = [""]
+    for item in items:
+        if lines[-1] and len(indent) + 4 + len(lines[-1]) + len(item) + 2 > _WIDTH:
+            lines.append("")
+        lines[-1] += f" {item}," if lines[-1] else f"{item},"
+    return [head, *(f"{indent}    {line}" for line in lines), f"{indent}{tail}"]
+
+
+def _field_row(f: FieldDefinition) -> str:
+    texts = ", ".join(_quoted(text) for text in (f.units, f.enum, f.invalid, f.description))
+    return f'({_quoted(f.attribute)}, "{f.type}", {f.array_length}, {texts}, {f.extension})'
+
+
+def _code(f: FieldDefinition) -> str:
+    if f.type == "char" or (f.type == "uint8_t" and f.array_length):
+        return f"{f.array_length or 1}s"
+    return f"{f.array_length or ''}{_CODES[f.type]}"
+
+
+def _format(message: MessageDefinition) -> str:
+    return "<" + "".join(_code(f) for f in message.wire_fields)
+
+
+def _is_tuple(f: FieldDefinition) -> bool:
+    return bool(f.array_length) and f.type not in ("char", "uint8_t")
+
+
+def _annotation(f: FieldDefinition, *, argument: bool = False) -> str:
+    if f.type == "char":
+        return "str"
+    if f.type == "uint8_t" and f.array_length:
+        return "bytes"
+    number = "float" if f.type in ("float", "double") else "int"
+    if not f.array_length:
+        return number
+    return f"Sequence[{number}]" if argument else f"tuple[{number}, ...]"
+
+
+def _default(f: FieldDefinition) -> str:
+    if f.default is not None:
+        return f" = {f.default}"
+    if not f.extension:
+        return ""
+    if f.type == "char":
+        return ' = ""'
+    if f.array_length:
+        return ' = b""' if f.type == "uint8_t" else f" = (0,) * {f.array_length}"
+    return " = 0"
+
+
+def _init(message: MessageDefinition) -> list[str]:
+    # A field with a default may stand before one without: then those behind it must be given by name.
+    arguments: list[str] = []
+    optional = False
+    for f in message.fields:
+        default = _default(f)
+        if optional and not default and "*" not in arguments:
+            arguments.append("*")
+        optional = optional or bool(default)
+        arguments.append(f"{f.attribute}: {_annotation(f, argument=True)}{default}")
+    lines = _filled("    def __init__(", ["self", *arguments], ") -> None:", "    ")
+    for f in message.fields:
+        value = f"tuple({f.attribute})" if _is_tuple(f) else f.attribute
+        lines.append(f"        self.{f.attribute} = {value}")
+    return [*lines, "        self.received_frame = None"]
+
+
+def _decode(message: MessageDefinition) -> list[str]:
+    struct, length = f"_S{message.id}", message.length
+    lines = [
+        "    @classmethod",
+        f"    def decode(cls, payload: bytes, frame: Frame | None = None) -> {message.class_name}:",
+    ]
+    if length:
+        lines += [
+            f"        if len(payload) != {length}:",
+            f'            payload = payload.ljust({length}, b"\\0")[:{length}]',
+        ]
+    lines += ["        self = _new(cls)", "        self.received_frame = frame"]
+    if not message.fields:
+        return [*lines, "        return self"]
+    fields = message.wire_fields
+    if any(_is_tuple(f) and f.array_length > _UNPACKED_ONE_BY_ONE for f in fields):
+        return [*lines, *_decode_by_index(fields, struct), "        return self"]
+    targets: list[str] = []
+    after: list[str] = []
+    for number, f in enumerate(fields):
+        if _is_tuple(f):
+            parts = [f"v{number}_{i}" for i in range(f.array_length)]
+            targets += parts
+            comma = "," if len(parts) == 1 else ""
+            after.append(f"        self.{f.attribute} = ({', '.join(parts)}{comma})")
+        elif f.type == "char":
+            targets.append(f"v{number}")
+            after.append(f"        self.{f.attribute} = {_text(f'v{number}')}")
+        else:
+            targets.append(f"self.{f.attribute}")
+    lines += _filled("        (", targets, f") = {struct}.unpack(payload)", "        ")
+    return [*lines, *after, "        return self"]
+
+
+def _decode_by_index(fields: Iterable[FieldDefinition], struct: str) -> list[str]:
+    lines = [f"        values = {struct}.unpack(payload)"]
+    index = 0
+    for f in fields:
+        if _is_tuple(f):
+            value, count = f"values[{index}:{index + f.array_length}]", f.array_length
+        else:
+            value, count = f"values[{index}]", 1
+        lines.append(f"        self.{f.attribute} = {_text(value) if f.type == 'char' else value}")
+        index += count
+    return lines
+
+
+def _text(value: str) -> str:
+    return f'{value}.partition(b"\\0")[0].decode("utf-8", "replace")'
+
+
+def _encode(message: MessageDefinition) -> list[str]:
+    arguments: list[str] = []
+    for f in message.wire_fields:
+        value = f"self.{f.attribute}"
+        if f.type == "char":
+            value = f"pack_text({value}, {f.array_length or 1})"
+        elif f.type == "uint8_t" and f.array_length:
+            value = f"pack_bytes({value}, {f.array_length})"
+        elif f.array_length:
+            value = f"*pack_items({value}, {f.array_length})"
+        arguments.append(value)
+    return [
+        "    def encode(self) -> bytes:",
+        "        try:",
+        *_filled(f"            return _S{message.id}.pack(", arguments, ")", "            "),
+        "        except PACK_ERRORS:",
+        "            raise self._encode_error() from None",
+    ]
