@@ -309,7 +309,7 @@ class _Waiter(_Sink[T]):
         self._stop_hold()
 
     def fail(self, error: BaseException) -> None:
-        # Not set_exception: a caller cancelled just now would leave it unread, and the loop complains of that.
+        # Not set_exception: a caller cancelled just now would leave it unread, and the loop complains.
         if not self._future.done():
             self._error = error
             self._future.set_result(None)

@@ -1,0 +1,63 @@
+"""Everything that differs between autopilots and vehicle types: mode tables and quirks, and nowhere else.
+
+``autopilot_for(heartbeat)`` gives the :class:`Autopilot` that describes a vehicle; it does no IO, has no
+state.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from aerokit.autopilots.ardupilot import (
+    AntennaTracker,
+    ArduCopter,
+    ArduPilot,
+    ArduPlane,
+    ArduRover,
+    ArduSub,
+    Blimp,
+    ardupilot_for,
+)
+from aerokit.autopilots.base import Autopilot, ModeOrder, Purpose, Reposition, SetpointRules, TakeOff
+from aerokit.autopilots.modes import Mode, ModeTable, is_armed
+from aerokit.autopilots.px4 import Px4, px4_custom_mode
+from aerokit.autopilots.streams import DEFAULT_RATES_HZ
+from aerokit.autopilots.version import AutopilotVersion
+
+if TYPE_CHECKING:
+    from aerokit.mavlink.messages import Heartbeat
+
+__all__ = [
+    "DEFAULT_RATES_HZ",
+    "AntennaTracker",
+    "ArduCopter",
+    "ArduPilot",
+    "ArduPlane",
+    "ArduRover",
+    "ArduSub",
+    "Autopilot",
+    "AutopilotVersion",
+    "Blimp",
+    "Mode",
+    "ModeOrder",
+    "ModeTable",
+    "Purpose",
+    "Px4",
+    "Reposition",
+    "SetpointRules",
+    "TakeOff",
+    "autopilot_for",
+    "is_armed",
+    "px4_custom_mode",
+]
+
+MAV_AUTOPILOT_ARDUPILOTMEGA, MAV_AUTOPILOT_PX4 = 3, 12
+
+
+def autopilot_for(heartbeat: Heartbeat) -> Autopilot:
+    """The autopilot and vehicle type that a HEARTBEAT tells; a cautious general one for all others."""
+    if heartbeat.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA:
+        return ardupilot_for(heartbeat.type)
+    if heartbeat.autopilot == MAV_AUTOPILOT_PX4:
+        return Px4(heartbeat.type)
+    return Autopilot(heartbeat.type)

@@ -1,0 +1,261 @@
+"""ArduPilot: one class for each of its vehicles (https://ardupilot.org/dev/docs/mavlink-commands.html)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, ClassVar
+
+from aerokit.autopilots import ardupilot_modes
+from aerokit.autopilots.base import (
+    LANDED_STATE_IN_AIR,
+    LANDED_STATE_ON_GROUND,
+    NAN,
+    NAV_TAKEOFF,
+    Autopilot,
+    Purpose,
+    Reposition,
+    SetpointRules,
+    TakeOff,
+)
+from aerokit.autopilots.health import names_of
+from aerokit.autopilots.streams import ARDUPILOT_GROUPS
+
+if TYPE_CHECKING:
+    from aerokit.mavlink.messages import Heartbeat
+
+__all__ = [
+    "AntennaTracker",
+    "ArduCopter",
+    "ArduPilot",
+    "ArduPlane",
+    "ArduRover",
+    "ArduSub",
+    "Blimp",
+    "ardupilot_for",
+]
+
+MAV_STATE_STANDBY, MAV_STATE_ACTIVE = 3, 4
+EKF_ATTITUDE, EKF_POS_HORIZ_ABS, EKF_POS_VERT_ABS, EKF_PRED_POS_HORIZ_ABS = 1, 16, 32, 512
+EKF_PROBLEMS: Mapping[int, str] = {1024: "initialisation", 32768: "GPS without glitches"}
+FIXED_WING, SURFACE_BOAT, SUBMARINE, GROUND_ROVER, ANTENNA_TRACKER, AIRSHIP = 1, 11, 12, 10, 5, 7
+VTOLS = range(19, 26)
+QUADROTOR, COAXIAL, HELICOPTER, HEXAROTOR, OCTOROTOR, TRICOPTER, DODECAROTOR, DECAROTOR = (
+    2,
+    3,
+    4,
+    13,
+    14,
+    15,
+    29,
+    35,
+)
+COPTERS = (QUADROTOR, COAXIAL, HELICOPTER, HEXAROTOR, OCTOROTOR, TRICOPTER, DODECAROTOR, DECAROTOR)
+
+
+class ArduPilot(Autopilot):
+    """What ArduPilot's vehicles have in common, and all that is said of one whose type is not known."""
+
+    name = "ArduPilot"
+    firmware = "ArduPilot"
+    home_is_item_0 = True
+    runs_prearm_checks = True
+    sends_mission_requests_float = True
+    estimator_message = "EKF_STATUS_REPORT"
+    wind_message = "WIND"
+    stream_groups = ARDUPILOT_GROUPS
+    never_sent = frozenset(("ESTIMATOR_STATUS", "WIND_COV", "ALTITUDE", "CURRENT_MODE")) - {
+        "ATTITUDE_QUATERNION"  # on request
+    }
+
+    def missing_estimates(self, flags: int) -> tuple[str, ...]:
+        """What EKF_STATUS_REPORT lacks; a predicted absolute position is enough to arm."""
+        return (
+            *self._missing_estimates(
+                flags,
+                required=EKF_ATTITUDE | EKF_POS_VERT_ABS,
+                horizontal=EKF_POS_HORIZ_ABS | EKF_PRED_POS_HORIZ_ABS,
+            ),
+            *names_of(flags, EKF_PROBLEMS),
+        )
+
+    def arming_reason(self, text: str) -> str | None:
+        """The reason in ``PreArm: …`` and ``Arm: …`` texts."""
+        return _after(text, "PreArm: ", "Arm: ")
+
+    def is_refusal(self, text: str) -> bool:
+        """Also mode changes that failed say so."""
+        lower = text.lower()
+        return super().is_refusal(text) or ("mode change" in lower and "failed" in lower)
+
+    def _git_hash(self, custom_version: bytes) -> str:
+        return custom_version.split(b"\0")[0].decode("ascii", "replace")
+
+
+class ArduCopter(ArduPilot):
+    """Multicopters and helicopters."""
+
+    firmware = "ArduCopter"
+    modes = ardupilot_modes.COPTER
+    purposes: ClassVar[Mapping[str, str]] = {
+        "hold": "BRAKE",  # LOITER obeys the throttle stick, which is down or missing when a program flies
+        "land": "LAND",
+        "return": "RTL",
+        "setpoint": "GUIDED",
+        "take_off": "GUIDED",
+        "mission": "AUTO",
+    }
+    setpoints = SetpointRules()
+    reposition = Reposition(relative_altitude=True, yaw=False, speed=False, armed_only=False)
+    condition_yaw = True
+    changes_speed = True
+    unarmable_modes = frozenset(
+        (
+            *(
+                "AUTOROTATE",
+                "AUTOTUNE",
+                "AUTO_RTL",
+                "AVOID_ADSB",
+                "BRAKE",
+                "CIRCLE",
+                "FLIP",
+                "FOLLOW",
+                "LAND",
+            ),
+            *("RTL", "SMART_RTL", "SYSTEMID"),
+        )
+    )
+
+    def take_off(
+        self, altitude_relative_m: float, home_altitude_amsl_m: float | None, *, is_vtol: bool = False
+    ) -> TakeOff:
+        """GUIDED, arm, NAV_TAKEOFF with the altitude above home; it stays in GUIDED."""
+        guided = self.modes.find("GUIDED")
+        return TakeOff(guided, NAV_TAKEOFF, (0, 0, 0, NAN, 0, 0, altitude_relative_m), None)
+
+    def landed_state_of(self, heartbeat: Heartbeat) -> int | None:
+        """STANDBY is said on the ground only, ACTIVE in the air only; a failsafe (CRITICAL) hides both."""
+        return _landed_state(heartbeat)
+
+
+class ArduPlane(ArduPilot):
+    """Planes, and the planes with lifting rotors that ArduPilot calls QuadPlanes."""
+
+    firmware = "ArduPlane"
+    modes = ardupilot_modes.PLANE
+    purposes: ClassVar[Mapping[str, str]] = {
+        "hold": "LOITER",
+        "land": "AUTOLAND",
+        "return": "RTL",
+        "setpoint": "GUIDED",
+        "take_off": "TAKEOFF",
+        "mission": "AUTO",
+    }
+    setpoints = SetpointRules(local_position=False, global_position=False, velocity=False, acceleration=False)
+    reposition = Reposition(relative_altitude=True, yaw=False, speed=False, armed_only=False)
+    changes_speed = True
+
+    def _purpose_name(self, purpose: Purpose, is_vtol: bool) -> str | None:
+        if self._can_hover(is_vtol) and purpose in _QUADPLANE:
+            return _QUADPLANE[purpose]
+        return super()._purpose_name(purpose, is_vtol)
+
+    def take_off(
+        self, altitude_relative_m: float, home_altitude_amsl_m: float | None, *, is_vtol: bool = False
+    ) -> TakeOff:
+        """A QuadPlane rises in GUIDED; a plane armed in TAKEOFF climbs to its parameter TKOFF_ALT."""
+        if self._can_hover(is_vtol):
+            params = (0, 0, 0, NAN, 0, 0, altitude_relative_m)
+            return TakeOff(self.modes.find("GUIDED"), NAV_TAKEOFF, params, None)
+        return TakeOff(self.modes.find("TAKEOFF"), None, (), None, sets_altitude=False)
+
+    def landed_state_of(self, heartbeat: Heartbeat) -> int | None:
+        """STANDBY is said on the ground only, ACTIVE while flying."""
+        return _landed_state(heartbeat)
+
+    def _can_hover(self, is_vtol: bool) -> bool:
+        return is_vtol or self.vehicle_type in VTOLS
+
+
+_QUADPLANE: Mapping[str, str] = {"land": "QLAND", "return": "QRTL", "take_off": "GUIDED"}
+
+
+class ArduRover(ArduPilot):
+    """Rovers and boats."""
+
+    firmware = "Rover"
+    modes = ardupilot_modes.ROVER
+    purposes: ClassVar[Mapping[str, str]] = {
+        "hold": "HOLD",
+        "return": "RTL",
+        "setpoint": "GUIDED",
+        "mission": "AUTO",
+    }
+    setpoints = SetpointRules(acceleration=False)
+    reposition = Reposition(relative_altitude=True, yaw=False, speed=False, armed_only=False)
+    changes_speed = True
+    unarmable_modes = frozenset(("RTL", "SMART_RTL", "INITIALISING"))
+
+    def _purpose_name(self, purpose: Purpose, is_vtol: bool) -> str | None:
+        if purpose == "hold" and self.vehicle_type == SURFACE_BOAT:
+            return "LOITER"  # in HOLD the motors are off and a boat drifts away
+        return super()._purpose_name(purpose, is_vtol)
+
+
+class ArduSub(ArduPilot):
+    """Remotely operated and autonomous underwater vehicles."""
+
+    firmware = "ArduSub"
+    modes = ardupilot_modes.SUB
+    purposes: ClassVar[Mapping[str, str]] = {
+        "hold": "POSHOLD",
+        "land": "SURFACE",
+        "setpoint": "GUIDED",
+        "mission": "AUTO",
+    }
+    setpoints = SetpointRules(acceleration=False)
+    reposition = Reposition(relative_altitude=True, yaw=False, speed=False, armed_only=False)
+    condition_yaw = True
+    changes_speed = True
+
+
+class Blimp(ArduPilot):
+    """Airships."""
+
+    firmware = "Blimp"
+    modes = ardupilot_modes.BLIMP
+    purposes: ClassVar[Mapping[str, str]] = {"hold": "LOITER", "land": "LAND", "return": "RTL"}
+
+
+class AntennaTracker(ArduPilot):
+    """Antenna trackers."""
+
+    firmware = "AntennaTracker"
+    modes = ardupilot_modes.TRACKER
+    purposes: ClassVar[Mapping[str, str]] = {"hold": "STOP", "setpoint": "GUIDED"}
+
+
+_BY_TYPE: Mapping[int, type[ArduPilot]] = {
+    FIXED_WING: ArduPlane,
+    GROUND_ROVER: ArduRover,
+    SURFACE_BOAT: ArduRover,
+    SUBMARINE: ArduSub,
+    ANTENNA_TRACKER: AntennaTracker,
+    AIRSHIP: Blimp,
+    **dict.fromkeys(VTOLS, ArduPlane),
+    **dict.fromkeys(COPTERS, ArduCopter),
+}
+
+
+def ardupilot_for(vehicle_type: int) -> ArduPilot:
+    """ArduPilot's firmware for a MAV_TYPE."""
+    return _BY_TYPE.get(vehicle_type, ArduPilot)(vehicle_type)
+
+
+def _landed_state(heartbeat: Heartbeat) -> int | None:
+    if heartbeat.system_status == MAV_STATE_STANDBY:
+        return LANDED_STATE_ON_GROUND
+    return LANDED_STATE_IN_AIR if heartbeat.system_status == MAV_STATE_ACTIVE else None
+
+
+def _after(text: str, *prefixes: str) -> str | None:
+    return next((text[len(prefix) :].strip() for prefix in prefixes if text.startswith(prefix)), None)

@@ -1,0 +1,259 @@
+"""``Autopilot``: the interface by which vehicle code asks for everything that differs between autopilots."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+from aerokit.autopilots.health import ESTIMATES, PREARM_CHECK, SENSORS, names_of
+from aerokit.autopilots.modes import CUSTOM_MODE_ENABLED, NO_MODES, Mode, ModeTable, base_mode_name
+from aerokit.autopilots.version import AutopilotVersion, version_text
+from aerokit.mavlink.messages import AutopilotVersion as AutopilotVersionMessage
+from aerokit.mavlink.messages import SetMode
+
+if TYPE_CHECKING:
+    from aerokit.mavlink.message import Message
+    from aerokit.mavlink.messages import Heartbeat
+
+__all__ = ["Autopilot", "ModeOrder", "Purpose", "Reposition", "SetpointRules", "TakeOff"]
+
+NAN = math.nan
+NAV_TAKEOFF = 22
+PARAM_ENCODE_C_CAST, PARAM_ENCODE_BYTEWISE = 0x2_0000, 0x10
+LANDED_STATE_ON_GROUND, LANDED_STATE_IN_AIR = 1, 2
+
+Purpose = Literal["hold", "land", "return", "setpoint", "take_off", "mission"]
+"""What a program wants a mode for."""
+
+
+@dataclass(frozen=True)
+class TakeOff:
+    """How this vehicle takes off.
+
+    Go to ``mode`` (None: stay), arm, then send the command ``command`` (None: arming in ``mode`` is all) with
+    ``params``. ``mode_after`` is where it ends up by itself, None when it stays. ``sets_altitude`` is False
+    when the vehicle climbs to an altitude of its own (a parameter) whatever is asked for.
+    """
+
+    mode: Mode | None
+    command: int | None
+    params: tuple[float, ...]
+    mode_after: Mode | None
+    sets_altitude: bool = True
+
+
+@dataclass(frozen=True)
+class SetpointRules:
+    """Which guided set-points are obeyed, and what the autopilot expects of the stream.
+
+    ``before_mode``: the stream must run before the mode is asked for. ``minimum_hz`` is the slowest stream
+    the autopilot puts up with, ``timeout_s`` how long it goes on without a new set-point by default.
+    """
+
+    local_position: bool = True
+    global_position: bool = True
+    velocity: bool = True
+    acceleration: bool = True
+    attitude: bool = True
+    before_mode: bool = False
+    minimum_hz: float = 1.0
+    timeout_s: float = 3.0
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The kinds that are obeyed, in words."""
+        kinds = ("local_position", "global_position", "velocity", "acceleration", "attitude")
+        return tuple(kind.replace("_", " ") for kind in kinds if getattr(self, kind))
+
+
+@dataclass(frozen=True)
+class Reposition:
+    """How MAV_CMD_DO_REPOSITION (192) is understood here.
+
+    ``relative_altitude``: frames relative to home are obeyed; else the altitude must be AMSL. ``yaw``: param4
+    turns the vehicle, in radians. ``speed``: param1 sets the ground speed. ``armed_only``: it is ignored
+    while disarmed.
+    """
+
+    relative_altitude: bool
+    yaw: bool
+    speed: bool
+    armed_only: bool
+
+
+@dataclass(frozen=True)
+class ModeOrder:
+    """The parameters of MAV_CMD_DO_SET_MODE (176), and the fields of the older SET_MODE message (11)."""
+
+    params: tuple[float, float, float]
+    base_mode: int
+    custom_mode: int
+
+    def legacy(self, target_system: int) -> SetMode:
+        """The same order as a SET_MODE message, which has no acknowledgement of its own."""
+        return SetMode(target_system, self.base_mode, self.custom_mode)
+
+
+class Autopilot:
+    """Everything that differs between autopilots and vehicle types; this base answers for unknown ones.
+
+    One object describes one vehicle as its HEARTBEAT introduced it. It holds no state, does no IO and sends
+    nothing.
+    """
+
+    name = "unknown autopilot"
+    """The autopilot's name."""
+    firmware = "unknown"
+    """The firmware for this vehicle type, ``"ArduCopter"``."""
+    modes = ModeTable({})
+    purposes: ClassVar[Mapping[str, str]] = {}
+    """Purpose → name of the mode that serves it."""
+    setpoints = SetpointRules(*[False] * 5)
+    reposition: Reposition | None = None
+    """None: DO_REPOSITION is not known to work."""
+    home_is_item_0 = False
+    """Whether a mission's item 0 is home."""
+    runs_prearm_checks = False
+    """Whether MAV_CMD_RUN_PREARM_CHECKS (401) repeats the failing checks as status texts."""
+    condition_yaw = False
+    """Whether MAV_CMD_CONDITION_YAW (115) turns the vehicle in its mode for set-points."""
+    changes_speed = False
+    """Whether MAV_CMD_DO_CHANGE_SPEED (178) is obeyed outside missions."""
+    relative_altitude_needs_home = False
+    """Whether GLOBAL_POSITION_INT.relative_alt is the altitude above the sea until home is known."""
+    sends_mission_requests_float = False
+    """Whether it asks for mission items by MISSION_REQUEST instead of MISSION_REQUEST_INT."""
+    estimator_message = "ESTIMATOR_STATUS"
+    wind_message = "WIND_COV"
+    stream_groups: ClassVar[Mapping[int, int]] = {}
+    """Message id → MAV_DATA_STREAM, for firmware that knows no MAV_CMD_SET_MESSAGE_INTERVAL."""
+    unarmable_modes: frozenset[str] = frozenset()
+    """Modes in which the autopilot refuses to arm."""
+
+    def __init__(self, vehicle_type: int) -> None:
+        self.vehicle_type = vehicle_type
+        """MAV_TYPE, as HEARTBEAT says it."""
+
+    def __repr__(self) -> str:
+        return f"<{self.name}: {self.firmware}>"
+
+    # --------------------------------------------------------------------------------- modes
+
+    def mode_of(self, heartbeat: Heartbeat, extra: Mapping[int, str] = NO_MODES) -> Mode:
+        """The mode that a HEARTBEAT tells; ``extra`` are names the vehicle told by AVAILABLE_MODES."""
+        return self.mode(heartbeat.custom_mode, heartbeat.base_mode, extra)
+
+    def mode(self, custom_mode: int, base_mode: int, extra: Mapping[int, str] = NO_MODES) -> Mode:
+        """The mode of these numbers; without the flag for custom modes, base_mode gives the name."""
+        if base_mode & CUSTOM_MODE_ENABLED:
+            return Mode(self.modes.name_of(custom_mode, extra), custom_mode, base_mode)
+        return Mode(base_mode_name(base_mode), custom_mode, base_mode)
+
+    def find_mode(self, mode: str | int | Mode, extra: Mapping[int, str] = NO_MODES) -> Mode:
+        """The mode of this name (any case, with or without spaces and underscores) or number.
+
+        Raises :class:`LocalProtocolError`, which lists the known names.
+        """
+        return self.modes.find(mode, extra)
+
+    def mode_for(self, purpose: Purpose, *, is_vtol: bool = False) -> Mode | None:
+        """The mode in which this vehicle holds its place, lands, returns, obeys set-points …; None: none.
+
+        ``is_vtol`` says that a vehicle which calls itself a plane can hover.
+        """
+        name = self._purpose_name(purpose, is_vtol)
+        return None if name is None else self.modes.find(name)
+
+    def mode_order(self, mode: Mode) -> ModeOrder:
+        """How to ask for a mode."""
+        return ModeOrder((CUSTOM_MODE_ENABLED, mode.custom_mode, 0), CUSTOM_MODE_ENABLED, mode.custom_mode)
+
+    def learn_mode_name(self, custom_mode: int, name: str) -> str | None:
+        """The name to remember for an entry of AVAILABLE_MODES; None when it tells nothing new."""
+        return name if name and custom_mode not in self.modes.numbers else None
+
+    def _purpose_name(self, purpose: Purpose, is_vtol: bool) -> str | None:
+        return self.purposes.get(purpose)
+
+    # ------------------------------------------------------------------------------ take-off
+
+    def take_off(
+        self, altitude_relative_m: float, home_altitude_amsl_m: float | None, *, is_vtol: bool = False
+    ) -> TakeOff | None:
+        """How to take off to this altitude above home; None: this vehicle cannot."""
+        return None
+
+    def take_off_needs_home(self) -> bool:
+        """Whether :meth:`take_off` must be told the altitude of home above the sea."""
+        return False
+
+    def landed_state_of(self, heartbeat: Heartbeat) -> int | None:
+        """MAV_LANDED_STATE as far as HEARTBEAT.system_status alone tells it; None when it does not."""
+        return None
+
+    # -------------------------------------------------------------------------------- health
+
+    def failing_sensors(self, present: int, enabled: int, health: int) -> tuple[str, ...]:
+        """What SYS_STATUS calls failing, in words (https://mavlink.io/en/messages/common.html#SYS_STATUS)."""
+        return names_of(enabled & present & ~health & ~PREARM_CHECK, SENSORS)
+
+    def prearm_checks_pass(self, present: int, enabled: int, health: int) -> bool | None:
+        """Whether SYS_STATUS says that it could be armed; None when it does not say."""
+        return bool(health & PREARM_CHECK) if present & enabled & PREARM_CHECK else None
+
+    def missing_estimates(self, flags: int) -> tuple[str, ...]:
+        """What the estimator lacks for arming in a mode that needs a position; empty when it is good enough.
+
+        ``flags`` are those of the message named in ``estimator_message``.
+        """
+        return self._missing_estimates(flags, required=0x01 | 0x20, horizontal=0x10)
+
+    def arming_reason(self, text: str) -> str | None:
+        """The reason in a status text about why the vehicle cannot be armed, or None for any other text."""
+        return None
+
+    def is_refusal(self, text: str) -> bool:
+        """Whether a status text explains why something was refused."""
+        return self.arming_reason(text) is not None or "denied" in text.lower() or "reject" in text.lower()
+
+    @staticmethod
+    def _missing_estimates(flags: int, *, required: int, horizontal: int) -> tuple[str, ...]:
+        missing = names_of(required & ~flags, ESTIMATES)
+        return missing if flags & horizontal else (*missing, ESTIMATES[0x10])
+
+    # ------------------------------------------------------------------------------- version
+
+    def version_of(self, message: AutopilotVersionMessage) -> AutopilotVersion:
+        """What AUTOPILOT_VERSION says, in words."""
+        text, number = version_text(message.flight_sw_version)
+        return AutopilotVersion(
+            text,
+            number,
+            self._git_hash(bytes(message.flight_custom_version)),
+            message.capabilities,
+            message.vendor_id,
+            message.product_id,
+            message.board_version,
+            message.uid,
+        )
+
+    def encodes_parameters_bytewise(self, capabilities: int | None) -> bool:
+        """Whether integer parameters travel as their bytes instead of as a number in a float."""
+        if capabilities is not None and capabilities & (PARAM_ENCODE_BYTEWISE | PARAM_ENCODE_C_CAST):
+            return bool(capabilities & PARAM_ENCODE_BYTEWISE)
+        return self._bytewise_by_default
+
+    _bytewise_by_default = False
+
+    def _git_hash(self, custom_version: bytes) -> str:
+        return custom_version.hex().rstrip("0")
+
+    # ------------------------------------------------------------------------------- streams
+
+    def sends(self, message: type[Message]) -> bool:
+        """Whether this autopilot is known to have the message; True when in doubt."""
+        return message.NAME not in self.never_sent
+
+    never_sent: frozenset[str] = frozenset()

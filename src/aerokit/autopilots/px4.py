@@ -1,0 +1,186 @@
+"""PX4 (https://docs.px4.io/main/en/mavlink/): main and sub modes, and what it does its own way."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+from aerokit.autopilots.base import (
+    NAN,
+    NAV_TAKEOFF,
+    Autopilot,
+    ModeOrder,
+    Purpose,
+    Reposition,
+    SetpointRules,
+    TakeOff,
+)
+from aerokit.autopilots.health import PREARM_CHECK, SENSORS, names_of
+from aerokit.autopilots.modes import CUSTOM_MODE_ENABLED, NO_MODES, Mode, ModeTable
+from aerokit.errors import LocalProtocolError
+
+__all__ = ["Px4", "px4_custom_mode"]
+
+MAIN_POSCTL, MAIN_AUTO = 3, 4
+GROUND_ROVER, SURFACE_BOAT, SUBMARINE = 10, 11, 12
+ESTIMATES_REQUIRED, POS_HORIZ_ABS = 0x01 | 0x02 | 0x04 | 0x20, 0x10
+ESTIMATOR_PROBLEMS: Mapping[int, str] = {1024: "GPS without glitches", 2048: "accelerometer without errors"}
+
+
+def px4_custom_mode(main: int, sub: int = 0) -> int:
+    """PX4's custom_mode: main mode in the third byte, sub mode in the fourth."""
+    return main << 16 | sub << 24
+
+
+def _auto(sub: int) -> int:
+    return px4_custom_mode(MAIN_AUTO, sub)
+
+
+MODES = ModeTable(
+    {
+        px4_custom_mode(1): "MANUAL",
+        px4_custom_mode(2): "ALTCTL",
+        px4_custom_mode(MAIN_POSCTL): "POSCTL",
+        px4_custom_mode(MAIN_POSCTL, 1): "ORBIT",
+        px4_custom_mode(MAIN_POSCTL, 2): "POSITION_SLOW",
+        _auto(1): "READY",
+        _auto(2): "TAKEOFF",
+        _auto(3): "LOITER",
+        _auto(4): "MISSION",
+        _auto(5): "RTL",
+        _auto(6): "LAND",
+        _auto(7): "RTGS",  # until 1.10
+        _auto(8): "FOLLOWME",
+        _auto(9): "PRECLAND",
+        _auto(10): "VTOL_TAKEOFF",
+        **{_auto(10 + number): f"EXTERNAL{number}" for number in range(1, 9)},
+        px4_custom_mode(5): "ACRO",
+        px4_custom_mode(6): "OFFBOARD",
+        px4_custom_mode(7): "STABILIZED",
+        px4_custom_mode(8): "RATTITUDE",  # until 1.12
+        px4_custom_mode(9): "SIMPLE",
+        px4_custom_mode(10): "TERMINATION",
+        px4_custom_mode(11): "ALTITUDE_CRUISE",
+    },
+    {
+        **{
+            f"AUTO.{name}": name
+            for name in ("READY", "TAKEOFF", "LOITER", "MISSION", "RTL", "LAND", "PRECLAND")
+        },
+        "AUTO.FOLLOW_TARGET": "FOLLOWME",
+        "FOLLOW_TARGET": "FOLLOWME",
+        "ALTITUDE": "ALTCTL",
+        "POSITION": "POSCTL",
+        "HOLD": "LOITER",
+        "RETURN": "RTL",
+        "STABILIZE": "STABILIZED",
+        "PRECISION_LANDING": "PRECLAND",
+        "DESCEND": "LAND",
+    },
+)
+"""From px4_custom_mode.h; names as in pymavlink, those of QGroundControl are aliases."""
+
+_EXTERNAL = range(_auto(11), _auto(19))
+
+
+class Px4(Autopilot):
+    """PX4, any vehicle type."""
+
+    name = "PX4"
+    firmware = "PX4"
+    modes = MODES
+    setpoints = SetpointRules(before_mode=True, minimum_hz=2.0, timeout_s=0.5)
+    reposition = Reposition(relative_altitude=False, yaw=True, speed=True, armed_only=True)
+    changes_speed = True
+    relative_altitude_needs_home = True
+    _bytewise_by_default = True
+    purposes: ClassVar[Mapping[str, str]] = {
+        "hold": "LOITER",
+        "land": "LAND",
+        "return": "RTL",
+        "setpoint": "OFFBOARD",
+        "take_off": "TAKEOFF",
+        "mission": "MISSION",
+    }
+    never_sent = frozenset(
+        ("EKF_STATUS_REPORT", "WIND", "RANGEFINDER", "AHRS", "AHRS2", "MEMINFO", "POWER_STATUS", "RAW_IMU")
+    )
+
+    def mode(self, custom_mode: int, base_mode: int, extra: Mapping[int, str] = NO_MODES) -> Mode:
+        """The mode of these numbers; what an external mode calls itself goes before EXTERNAL1 and so on."""
+        if custom_mode in _EXTERNAL and custom_mode in extra:
+            return Mode(extra[custom_mode], custom_mode, base_mode)
+        return super().mode(custom_mode, base_mode, extra)
+
+    def find_mode(self, mode: str | int | Mode, extra: Mapping[int, str] = NO_MODES) -> Mode:
+        """The mode of this name or number; external modes are found by their own names too."""
+        found = super().find_mode(mode, extra)
+        return Mode(extra.get(found.custom_mode, found.name), found.custom_mode)
+
+    def mode_order(self, mode: Mode) -> ModeOrder:
+        """DO_SET_MODE takes main and sub mode in param2 and param3."""
+        main, sub = mode.custom_mode >> 16 & 0xFF, mode.custom_mode >> 24
+        return ModeOrder((CUSTOM_MODE_ENABLED, main, sub), CUSTOM_MODE_ENABLED, mode.custom_mode)
+
+    def learn_mode_name(self, custom_mode: int, name: str) -> str | None:
+        """Names of external modes; places without a registered mode say "(Mode not available)"."""
+        if name.startswith("("):
+            return None
+        if custom_mode in _EXTERNAL:
+            return name or None
+        return super().learn_mode_name(custom_mode, name)
+
+    def take_off(
+        self, altitude_relative_m: float, home_altitude_amsl_m: float | None, *, is_vtol: bool = False
+    ) -> TakeOff | None:
+        """NAV_TAKEOFF with the altitude above the sea, here, with the present heading; then LOITER.
+
+        Raises :class:`LocalProtocolError` when the altitude of home is not given.
+        """
+        if self._stays_down:
+            return None
+        if home_altitude_amsl_m is None:
+            raise LocalProtocolError("take-off on PX4 needs the altitude of home: it counts from the sea")
+        params = (NAN, 0, 0, NAN, NAN, NAN, home_altitude_amsl_m + altitude_relative_m)
+        return TakeOff(None, NAV_TAKEOFF, params, self.modes.find("LOITER"))
+
+    def take_off_needs_home(self) -> bool:
+        """True: param7 of NAV_TAKEOFF is above the sea."""
+        return not self._stays_down
+
+    def failing_sensors(self, present: int, enabled: int, health: int) -> tuple[str, ...]:
+        """A part that is required but missing is enabled without being present."""
+        missing = names_of(enabled & ~present & ~health & ~PREARM_CHECK, SENSORS)
+        return (
+            *super().failing_sensors(present, enabled, health),
+            *(f"{name} (missing)" for name in missing),
+        )
+
+    def prearm_checks_pass(self, present: int, enabled: int, health: int) -> bool:
+        """PX4 sets the bit in ``health`` alone, when it could be armed in its present mode."""
+        return bool(health & PREARM_CHECK)
+
+    def missing_estimates(self, flags: int) -> tuple[str, ...]:
+        """What ESTIMATOR_STATUS lacks for modes that need a global position."""
+        missing = self._missing_estimates(flags, required=ESTIMATES_REQUIRED, horizontal=POS_HORIZ_ABS)
+        return (*missing, *names_of(flags, ESTIMATOR_PROBLEMS))
+
+    def arming_reason(self, text: str) -> str | None:
+        """The reason in ``Preflight Fail: …`` and ``Arming denied: …`` texts."""
+        for prefix in ("Preflight Fail: ", "Preflight: ", "Arming denied: ", "Arming denied! "):
+            if text.startswith(prefix):
+                return text[len(prefix) :].strip()
+        return None
+
+    def _purpose_name(self, purpose: Purpose, is_vtol: bool) -> str | None:
+        if self._stays_down and purpose in ("take_off", "land"):
+            return None
+        return super()._purpose_name(purpose, is_vtol)
+
+    @property
+    def _stays_down(self) -> bool:
+        return self.vehicle_type in (GROUND_ROVER, SURFACE_BOAT, SUBMARINE)
+
+    def _git_hash(self, custom_version: bytes) -> str:
+        """The commit stands backwards, behind three bytes for the vendor's own version."""
+        return custom_version[3:8][::-1].hex() if any(custom_version[3:8]) else ""
