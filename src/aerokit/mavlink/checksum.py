@@ -7,41 +7,37 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-__all__ = ["TABLE", "x25"]
+__all__ = ["fast_x25", "x25"]
 
 
-def _table() -> tuple[int, ...]:
+def _in_python() -> Callable[[bytes, int], int]:
     table: list[int] = []
-    for crc in range(256):
+    for byte in range(256):
         for _ in range(8):
-            crc = (crc >> 1) ^ 0x8408 if crc & 1 else crc >> 1
-        table.append(crc)
-    return tuple(table)
+            byte = (byte >> 1) ^ 0x8408 if byte & 1 else byte >> 1
+        table.append(byte)
 
+    def x25_in_python(data: bytes, initial: int) -> int:
+        crc = initial
+        for byte in data:
+            crc = (crc >> 8) ^ table[(crc ^ byte) & 0xFF]
+        return crc
 
-TABLE = _table()
-"""``crc = (crc >> 8) ^ TABLE[(crc ^ byte) & 0xFF]`` adds one byte."""
-
-
-def x25_in_python(data: bytes, initial: int = 0xFFFF) -> int:
-    """The checksum without any library, about fifty times slower."""
-    crc = initial
-    for byte in data:
-        crc = (crc >> 8) ^ TABLE[(crc ^ byte) & 0xFF]
-    return crc
+    return x25_in_python
 
 
 def _fastest() -> Callable[[bytes, int], int]:
     try:
-        from fastcrc.crc16 import mcrf4xx  # noqa: PLC0415 - pymavlink brings it, but not on every platform
+        from fastcrc.crc16 import mcrf4xx
     except ImportError:
-        return x25_in_python
+        return _in_python()
     return mcrf4xx
 
 
-_fast = _fastest()
+fast_x25 = _fastest()
+"""The same as `x25` without its default: always ``(data, 0xFFFF)``, for places that run per frame."""
 
 
 def x25(data: bytes, initial: int = 0xFFFF) -> int:
     """The checksum of ``data``, 0..65535; ``initial`` goes on from an earlier one."""
-    return _fast(data, initial)
+    return fast_x25(data, initial)

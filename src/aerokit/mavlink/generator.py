@@ -70,7 +70,7 @@ _TABLE: dict[str, tuple[bool, str, tuple[tuple[str, int], ...]]] = {{
 '''
 _ENUMS_TAIL = """}
 
-__all__ = list(_TABLE)
+__all__ = [*_TABLE]
 
 
 def __getattr__(name: str) -> type[int]:
@@ -96,7 +96,7 @@ from importlib import import_module
 _MODULES = {{
 {rows}}}
 
-__all__ = list(_MODULES)
+__all__ = [*_MODULES]
 
 
 def __getattr__(name: str) -> object:
@@ -109,10 +109,35 @@ def __getattr__(name: str) -> object:
 def __dir__() -> list[str]:
     return [*globals(), *_MODULES]
 '''
-_MESSAGES_DOC = '''"""Messages of the standard, one class each: ``GLOBAL_POSITION_INT`` is `GlobalPositionInt`.
+_MESSAGES_INIT = '''"""Messages of the standard, one class each: ``GLOBAL_POSITION_INT`` is `GlobalPositionInt`.
 
 Names of fields, order and raw units are the standard's: https://mavlink.io/en/messages/
+
+A module is imported when the first of its messages is asked for. `INDEX` is what checking a frame takes, without the
+class: message id → (class, module, CRC_EXTRA, base length, length).
 """
+
+from __future__ import annotations
+
+from importlib import import_module
+
+INDEX: dict[int, tuple[str, str, int, int, int]] = {{
+{rows}}}
+
+_MODULES = {{row[0]: row[1] for row in INDEX.values()}}
+
+__all__ = [*_MODULES]
+
+
+def __getattr__(name: str) -> object:
+    if name not in _MODULES:
+        raise AttributeError(f"module {{__name__!r}} has no attribute {{name!r}}")
+    value = globals()[name] = getattr(import_module(f"{{__name__}}.{{_MODULES[name]}}"), name)
+    return value
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *_MODULES]
 '''
 
 
@@ -135,7 +160,9 @@ def fingerprint(folder: Path | None = None) -> str:
 
 def generated_fingerprint() -> str:
     """The fingerprint of the XML that the committed modules were made from."""
-    found = re.search(_MARK + "([0-9a-f]+)", (FOLDER / "messages" / "__init__.py").read_text(encoding="utf-8"))
+    found = re.search(
+        _MARK + "([0-9a-f]+)", (FOLDER / "messages" / "__init__.py").read_text(encoding="utf-8")
+    )
     return found[1] if found else ""
 
 
@@ -146,7 +173,8 @@ def generate(folder: Path | None = None) -> dict[str, str]:
     enums = merged_enums(dialects.values())
     _refuse_doubles(m.class_name for dialect in dialects.values() for m in dialect.messages)
     _refuse_doubles(enum.class_name for enum in enums)
-    files: dict[str, str] = {"messages/__init__.py": _messages_init(dialects)}
+    files: dict[str, str] = {}
+    files["messages/__init__.py"], files["messages/__init__.pyi"] = _messages_init(dialects)
     files["enums/__init__.py"], files["enums/__init__.pyi"] = _enums_init(enums)
     for module, stems in MODULES.items():
         own = [enum for enum in enums if enum.origin in stems]
@@ -171,8 +199,12 @@ def differences(folder: Path | None = None) -> list[str]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m aerokit.mavlink.generator", description=__doc__.splitlines()[0])
-    parser.add_argument("--check", action="store_true", help="compare with the committed modules, write nothing")
+    parser = argparse.ArgumentParser(
+        prog="python -m aerokit.mavlink.generator", description=__doc__.splitlines()[0]
+    )
+    parser.add_argument(
+        "--check", action="store_true", help="compare with the committed modules, write nothing"
+    )
     options = parser.parse_args(arguments)
     if not options.check:
         for path, text in generate().items():
@@ -180,10 +212,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
             (FOLDER / path).write_text(text, encoding="utf-8", newline="\n")
         return 0
     if fingerprint() != generated_fingerprint():
-        sys.stdout.write("skipped: the installed pymavlink carries other XML than the modules were made from\n")
+        sys.stdout.write(
+            "skipped: the installed pymavlink carries other XML than the modules were made from\n"
+        )
         return 3
     wrong = differences()
-    sys.stdout.write("".join(f"differs: {path}\n" for path in wrong) or "the committed modules are up to date\n")
+    sys.stdout.write(
+        "".join(f"differs: {path}\n" for path in wrong) or "the committed modules are up to date\n"
+    )
     return 1 if wrong else 0
 
 
@@ -212,16 +248,15 @@ def _messages_module(module: str, dialects: Sequence[DialectDefinition]) -> str:
     return head + _all(message.class_name for message in messages) + "\n" + text
 
 
-def _messages_init(dialects: dict[str, DialectDefinition]) -> str:
-    names = {
-        module: sorted(m.class_name for stem in stems for m in dialects[stem].messages)
-        for module, stems in MODULES.items()
-    }
-    text = _MESSAGES_DOC + "\nfrom __future__ import annotations\n\n"
-    for module, classes in sorted(names.items()):
-        rows = "".join(f"    {name},\n" for name in classes)
-        text += f"from aerokit.mavlink.messages.{module} import (\n{rows})\n"
-    return text + "\n" + _all(sorted(name for classes in names.values() for name in classes))
+def _messages_init(dialects: dict[str, DialectDefinition]) -> tuple[str, str]:
+    modules = {stem: module for module, stems in MODULES.items() for stem in stems}
+    rows = ""
+    for message in sorted((m for d in dialects.values() for m in d.messages), key=lambda m: m.id):
+        numbers = f"{message.crc_extra}, {message.base_length}, {message.length}"
+        rows += f'    {message.id}: ("{message.class_name}", "{modules[message.origin]}", {numbers}),\n'
+    names = {m.class_name: modules[m.origin] for d in dialects.values() for m in d.messages}
+    stub = _reexports("messages", names) + "\nINDEX: dict[int, tuple[str, str, int, int, int]]\n"
+    return _MESSAGES_INIT.format(rows=rows), stub
 
 
 def _enums_module(module: str, stems: Sequence[str], enums: Sequence[EnumDefinition]) -> str:
@@ -239,11 +274,15 @@ def _enums_init(enums: Sequence[EnumDefinition]) -> tuple[str, str]:
     modules = {stem: module for module, stems in MODULES.items() for stem in stems}
     names = {enum.class_name: modules[enum.origin] for enum in enums}
     rows = "".join(f'    "{name}": "{module}",\n' for name, module in sorted(names.items()))
+    return _ENUMS_INIT.format(rows=rows), _reexports("enums", names)
+
+
+def _reexports(package: str, names: dict[str, str]) -> str:
     stub = ""
     for module in sorted(set(names.values())):
         imports = "".join(f"    {name} as {name},\n" for name in sorted(names) if names[name] == module)
-        stub += f"from aerokit.mavlink.enums.{module} import (\n{imports})\n"
-    return _ENUMS_INIT.format(rows=rows), stub + "\n" + _all(sorted(names))
+        stub += f"from aerokit.mavlink.{package}.{module} import (\n{imports})\n"
+    return stub + "\n" + _all(sorted(names))
 
 
 def _all(names: Iterable[str]) -> str:

@@ -26,12 +26,19 @@ _CODES = {
     "float": "f",
     "double": "d",
 }
-_UNPACKED_ONE_BY_ONE = 4  # arrays up to this length are unpacked into names of their own, longer ones are sliced
+_UNPACKED_ONE_BY_ONE = (
+    4  # arrays up to this length are unpacked into names of their own, longer ones are sliced
+)
 
 
 def render_message(message: MessageDefinition, *, docs: bool = True) -> str:
     """The class of one message, with its Struct; ``docs=False`` leaves all texts out but the first line."""
-    lines = [f"_S{message.id} = Struct({_format(message)!r})", "", "", f"class {message.class_name}(Message):"]
+    lines = [
+        f"_S{message.id} = Struct({_format(message)!r})",
+        "",
+        "",
+        f"class {message.class_name}(Message):",
+    ]
     lines += _docstring(_message_doc(message) if docs else [f"{message.name} ({message.id})."], "    ")
     names = [f.attribute for f in message.fields]
     lines += ["", *_tuple("__slots__", names), *_tuple("__match_args__", names)]

@@ -229,7 +229,7 @@ _MODULES = {
     "WinchActions": "common",
 }
 
-__all__ = list(_MODULES)
+__all__ = [*_MODULES]
 
 
 def __getattr__(name: str) -> object:

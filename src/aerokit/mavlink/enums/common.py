@@ -2135,7 +2135,7 @@ _TABLE: dict[str, tuple[bool, str, tuple[tuple[str, int], ...]]] = {
     ),
 }
 
-__all__ = list(_TABLE)
+__all__ = [*_TABLE]
 
 
 def __getattr__(name: str) -> type[int]:

@@ -1,0 +1,55 @@
+"""`FrameEncoder`: messages in, frames out, with one sequence counter."""
+
+from __future__ import annotations
+
+from aerokit.errors import LocalProtocolError
+from aerokit.mavlink.checksum import fast_x25
+from aerokit.mavlink.frame import MAGIC_V1, MAGIC_V2
+from aerokit.mavlink.message import Message
+
+__all__ = ["FrameEncoder"]
+
+
+class FrameEncoder:
+    """We, as one component: puts our ids, the sequence number and the checksum around messages.
+
+    Use one for each link, so that the peer can count what was lost on it.
+    """
+
+    def __init__(self, system_id: int, component_id: int, *, version: int = 2) -> None:
+        """Ids are 1..255, ``version`` is that of the frames, 1 or 2; LocalProtocolError otherwise."""
+        for name, value in (("system_id", system_id), ("component_id", component_id)):
+            if not 1 <= value <= 255:
+                raise LocalProtocolError(
+                    f"{name} = {value!r} must be in 1..255 (0 addresses everyone, and is nobody)"
+                )
+        if version not in (1, 2):
+            raise LocalProtocolError(f"version = {version!r} must be 1 or 2")
+        self.system_id = int(system_id)
+        self.component_id = int(component_id)
+        self.version = version
+        self.sequence = 0
+        """The sequence number of the next frame, 0..255."""
+
+    def encode(self, message: Message) -> bytes:
+        """The whole frame. LocalProtocolError names a field that does not fit; the sequence number is not used then.
+
+        MAVLink 2 drops zeros from the end of the payload, MAVLink 1 all extension fields; it has no ids above 255.
+        """
+        payload = message.encode()
+        if self.version == 2:
+            payload = payload.rstrip(b"\0") or payload[:1]  # the standard never cuts the first byte
+            header = bytes((len(payload), 0, 0, self.sequence, self.system_id, self.component_id))
+            body = header + message.ID.to_bytes(3, "little") + payload
+            magic = MAGIC_V2
+        else:
+            if message.ID > 255:
+                raise LocalProtocolError(f"{message.NAME} has id {message.ID}, MAVLink 1 has none above 255")
+            payload = payload[: message.BASE_LENGTH]
+            body = (
+                bytes((len(payload), self.sequence, self.system_id, self.component_id, message.ID)) + payload
+            )
+            magic = MAGIC_V1
+        self.sequence = (self.sequence + 1) & 0xFF
+        crc = fast_x25(body + bytes((message.CRC_EXTRA,)), 0xFFFF)
+        return bytes((magic,)) + body + crc.to_bytes(2, "little")

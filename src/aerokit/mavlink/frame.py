@@ -1,0 +1,83 @@
+"""`Frame`: one checked frame off the wire, payload not decoded.
+
+https://mavlink.io/en/guide/serialization.html#packet_format
+"""
+
+from __future__ import annotations
+
+__all__ = ["MAGIC_V1", "MAGIC_V2", "SIGNED", "Frame"]
+
+MAGIC_V1 = 0xFE
+"""First byte of a MAVLink 1 frame."""
+MAGIC_V2 = 0xFD
+"""First byte of a MAVLink 2 frame."""
+SIGNED = 0x01
+"""The one incompatibility flag that exists: the frame ends with 13 bytes of signature."""
+
+SIGNATURE_LENGTH = 13
+
+
+class Frame:
+    """One frame whose checksum was right. Treat it as immutable: it is shared by everyone who listens."""
+
+    __slots__ = (
+        "component_id",
+        "message_id",
+        "payload",
+        "raw",
+        "received_at",
+        "sequence",
+        "system_id",
+    )
+
+    raw: bytes
+    """The whole frame, from the magic byte to the end of checksum or signature."""
+    payload: bytes
+    """The payload as on the wire: MAVLink 2 cuts zeros off its end."""
+    message_id: int
+    """The standard's number of the message, 0..16777215."""
+    system_id: int
+    """Who sent it: the system, 0..255 (0 is nobody's)."""
+    component_id: int
+    """Who sent it: the component, 0..255."""
+    sequence: int
+    """The sender's counter, 0..255, then from 0 again."""
+    received_at: float
+    """The ``now`` that the framer was given with its bytes, in seconds."""
+
+    def __init__(self, raw: bytes, received_at: float = 0.0) -> None:
+        """Take a frame that is known to be whole and right, out of a log for example, apart."""
+        self.raw = raw
+        self.received_at = received_at
+        length = raw[1]
+        if raw[0] == MAGIC_V1:
+            self.sequence, self.system_id, self.component_id, self.message_id = raw[2:6]
+            self.payload = raw[6 : 6 + length]
+        else:
+            self.sequence, self.system_id, self.component_id = raw[4:7]
+            self.message_id = int.from_bytes(raw[7:10], "little")
+            self.payload = raw[10 : 10 + length]
+
+    @property
+    def version(self) -> int:
+        """1 or 2."""
+        return 1 if self.raw[0] == MAGIC_V1 else 2
+
+    @property
+    def incompat_flags(self) -> int:
+        """What a receiver must understand to read it: 0, or `SIGNED`."""
+        return 0 if self.raw[0] == MAGIC_V1 else self.raw[2]
+
+    @property
+    def compat_flags(self) -> int:
+        """What a receiver may ignore."""
+        return 0 if self.raw[0] == MAGIC_V1 else self.raw[3]
+
+    @property
+    def signature(self) -> bytes:
+        """Link id, time stamp and signature, 13 bytes, not verified; empty when it is not signed."""
+        return self.raw[-SIGNATURE_LENGTH:] if self.incompat_flags & SIGNED else b""
+
+    def __repr__(self) -> str:
+        source = f"{self.system_id}/{self.component_id}"
+        return f"<Frame v{self.version} id={self.message_id} from={source} seq={self.sequence}>"

@@ -1,0 +1,193 @@
+"""`Framer`: any bytes in, checked frames out.
+
+It is fed whatever a link delivers, datagrams or a stream cut anywhere, with noise and text in between, and never
+raises. What it does with each byte that could start a frame is decided in `_Verdict`'s order: a good checksum wins, a
+plausible header is worth waiting for, anything else is passed over one byte at a time, so that a good frame behind
+noise is found. https://mavlink.io/en/guide/serialization.html
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Container
+from struct import Struct
+
+from aerokit.mavlink.checksum import fast_x25
+from aerokit.mavlink.dialect import STANDARD, Dialect
+from aerokit.mavlink.frame import MAGIC_V1, MAGIC_V2, SIGNATURE_LENGTH, SIGNED, Frame
+from aerokit.mavlink.statistics import FramerStatistics, SourceStatistics
+
+__all__ = ["Framer"]
+
+_HEADER_V2 = Struct("<BBxBHHB").unpack_from  # length, flags, sequence, source, id (low 16 bits, high 8 bits)
+_HEADER_V1 = Struct("<BBHB").unpack_from  # length, sequence, source, id
+_SHORTEST_V2 = 12
+_SHORTEST_V1 = 8
+_MAGICS = (MAGIC_V1, MAGIC_V2)
+_next_magic = re.compile(b"[\xfd\xfe]").search
+_new = object.__new__
+
+# What a place in the bytes may be.
+_GOOD = 0  # a whole frame with the right checksum
+_WAIT = 1  # the beginning of a likely frame
+_DOUBTFUL = 2  # the beginning of an unlikely frame: wait, but look behind it meanwhile
+_UNKNOWN = 3  # a whole frame of an unknown message, if it is one
+_BAD_CRC = 4
+_NOISE = 5
+
+_Found = tuple[
+    int, int, int, int, int, int, int
+]  # begin, message id, sequence, source, payload from, to, end
+
+
+class Framer:
+    """Turns bytes of one link and one peer into frames; keeps at most two unfinished frames, about 600 bytes."""
+
+    def __init__(self, dialect: Dialect = STANDARD) -> None:
+        self.dialect = dialect
+        """Knows the messages; ids it does not know cannot be checked and are only counted."""
+        self.wanted: Container[int] | None = None
+        """Ids of the messages that are returned, None for all; the others are checked and counted, nothing more."""
+        self.statistics = FramerStatistics()
+        """Counters since the beginning."""
+        self._rest = b""
+        self._rows = dialect.rows
+        self._extras = {message_id: bytes((row[0],)) for message_id, row in dialect.rows.items()}
+        self._sources: dict[int, SourceStatistics] = {}
+
+    def receive(self, data: bytes, now: float = 0.0) -> list[Frame]:
+        """The wanted frames that are complete with ``data``, in order; ``now`` becomes their ``received_at``.
+
+        Never raises, whatever the bytes.
+        """
+        # The loop is long and repeats itself on purpose: it runs for every frame on the air.
+        if type(data) is not bytes:
+            data = bytes(data)
+        statistics, sources, extras, wanted = self.statistics, self._sources, self._extras, self.wanted
+        statistics.bytes += len(data)
+        if self._rest:
+            data, self._rest = self._rest + data, b""
+        frames: list[Frame] = []
+        begin, size, count = 0, len(data), 0
+        while begin < size:
+            good = False
+            if size - begin >= 12 and data[begin] == 0xFD:
+                length, flags, sequence, key, low, high = _HEADER_V2(data, begin + 1)
+                message_id = low | high << 16
+                extra = extras.get(message_id)
+                upto = begin + 10 + length
+                end = upto + 2
+                if extra is not None and end <= size and not flags:
+                    good = (
+                        fast_x25(data[begin + 1 : upto] + extra, 0xFFFF) == data[upto] | data[upto + 1] << 8
+                    )
+                    body = begin + 10
+            if not good:
+                found = self._search(data, begin)
+                if found is None:
+                    break
+                begin, message_id, sequence, key, body, upto, end = found
+            count += 1
+            source = sources.get(key)
+            if source is None:
+                source = self._add_source(key, sequence)
+            elif source.expected == sequence:
+                source.received += 1
+                source.expected = (sequence + 1) & 0xFF
+            else:
+                source.out_of_order(sequence)
+            if wanted is None or message_id in wanted:
+                frame = _new(Frame)
+                frame.raw = data[begin:end]
+                frame.payload = data[body:upto]
+                frame.message_id = message_id
+                frame.system_id = source.system_id
+                frame.component_id = source.component_id
+                frame.sequence = sequence
+                frame.received_at = now
+                frames.append(frame)
+            begin = end
+        statistics.frames += count
+        return frames
+
+    def _add_source(self, key: int, sequence: int) -> SourceStatistics:
+        source = SourceStatistics(key & 0xFF, key >> 8, sequence)
+        self._sources[key] = self.statistics.sources[key & 0xFF, key >> 8] = source
+        return source
+
+    # ------------------------------------------------------------------------------ the slow path
+
+    def _search(self, data: bytes, begin: int) -> _Found | None:
+        """The next good frame from ``begin`` on; or None, with what may yet become one kept in ``_rest``."""
+        size = len(data)
+        hold = -1  # from here on the bytes are kept
+        unknown = unknown_end = -1  # a whole frame of an unknown message, unless a good one is found inside
+        bad_crcs: list[int] = []
+        here = begin
+        while True:
+            magic = _next_magic(data, here)
+            here = magic.start() if magic else size
+            if unknown >= 0 and here >= unknown_end:
+                if unknown_end == size or data[unknown_end] in _MAGICS:
+                    self._pass(begin, unknown, bad_crcs)
+                    self.statistics.unknown_ids += 1
+                    begin = here = unknown_end
+                    hold, bad_crcs = -1, []
+                unknown = -1
+                continue
+            if here >= size:
+                break
+            verdict, end, found = self._examine(data, here)
+            if verdict == _GOOD:
+                self._pass(begin, here, bad_crcs)
+                return found
+            if verdict == _WAIT:
+                hold = min(place for place in (hold, unknown, here) if place >= 0)
+                break
+            if verdict == _DOUBTFUL and hold < 0:
+                hold = here
+            elif verdict == _UNKNOWN and hold < 0 and unknown < 0:
+                unknown, unknown_end = here, end
+            elif verdict == _BAD_CRC:
+                bad_crcs.append(here)
+            here += 1
+        keep = size if hold < 0 else hold
+        self._pass(begin, keep, bad_crcs)
+        self._rest = data[keep:]
+        return None
+
+    def _pass(self, begin: int, end: int, bad_crcs: list[int]) -> None:
+        """Bytes that are in no frame are behind us; those that are kept will be looked at, and counted, again."""
+        self.statistics.bad_bytes += end - begin
+        self.statistics.bad_crcs += sum(place < end for place in bad_crcs)
+
+    def _examine(self, data: bytes, begin: int) -> tuple[int, int, _Found | None]:
+        """(verdict, end, frame when good) of the place ``begin``, where a magic byte is."""
+        size = len(data)
+        if data[begin] == MAGIC_V2:
+            if size - begin < _SHORTEST_V2:
+                whole = size - begin < 3 or data[begin + 2] <= SIGNED
+                return (_WAIT if whole else _NOISE), size, None
+            length, flags, sequence, key, low, high = _HEADER_V2(data, begin + 1)
+            if flags & ~SIGNED:
+                return _NOISE, size, None
+            message_id, body = low | high << 16, begin + 10
+            end = body + length + 2 + (SIGNATURE_LENGTH if flags else 0)
+        else:
+            if size - begin < _SHORTEST_V1:
+                return _WAIT, size, None
+            length, sequence, key, message_id = _HEADER_V1(data, begin + 1)
+            body, flags = begin + 6, 0
+            end = body + length + 2
+        row = self._rows.get(message_id)
+        if row is None:
+            return (_UNKNOWN if end <= size else _DOUBTFUL), end, None
+        extra, base_length, full_length = row
+        if end > size:
+            usual = length <= full_length if body - begin == 10 else length in (base_length, full_length)
+            return (_WAIT if usual else _DOUBTFUL), end, None
+        upto = body + length
+        crc = fast_x25(data[begin + 1 : upto] + bytes((extra,)), 0xFFFF)
+        if crc != data[upto] | data[upto + 1] << 8:
+            return _BAD_CRC, end, None
+        return _GOOD, end, (begin, message_id, sequence, key, body, upto, end)

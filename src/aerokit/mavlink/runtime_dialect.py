@@ -1,0 +1,160 @@
+"""Dialects that are not committed: read from XML or from a pymavlink module, compiled to the same kind of classes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from importlib import import_module
+from pathlib import Path
+from struct import Struct
+from types import ModuleType
+from typing import Any
+
+from aerokit.errors import LocalProtocolError
+from aerokit.mavlink import message as message_module
+from aerokit.mavlink.definitions import (
+    EntryDefinition,
+    EnumDefinition,
+    FieldDefinition,
+    MessageDefinition,
+    merged_enums,
+    read_dialect,
+)
+from aerokit.mavlink.dialect import STANDARD, Dialect
+from aerokit.mavlink.enumeration import make_enum
+from aerokit.mavlink.generator import xml_folder
+from aerokit.mavlink.message import Message
+from aerokit.mavlink.rendering import render_message
+
+__all__ = ["compile_message", "dialect_from_pymavlink", "dialect_from_xml"]
+
+
+def dialect_from_xml(path: str | Path) -> Dialect:
+    """See `Dialect.from_xml`."""
+    path = Path(path)
+    dialects = read_dialect(path, [xml_folder()])
+    definitions = [message for dialect in dialects for message in dialect.messages]
+    return _dialect(path.stem, definitions, merged_enums(dialects))
+
+
+def dialect_from_pymavlink(module: str | ModuleType) -> Dialect:
+    """See `Dialect.from_pymavlink`."""
+    if isinstance(module, str):
+        module = _import(module)
+    known: dict[int, Any] | None = getattr(module, "mavlink_map", None)
+    if known is None:
+        raise LocalProtocolError(f"{module.__name__} is no pymavlink dialect: it has no mavlink_map")
+    definitions = [_message(cls) for _, cls in sorted(known.items()) if cls.id >= 0]
+    enums = [_enum(name, entries) for name, entries in getattr(module, "enums", {}).items()]
+    return _dialect(module.__name__.rpartition(".")[2], definitions, [enum for enum in enums if enum.entries])
+
+
+def compile_message(definition: MessageDefinition) -> type[Message]:
+    """A class like the generated ones; it cannot be pickled, because no module holds it."""
+    source = "from __future__ import annotations\n" + render_message(definition, docs=False)
+    namespace: dict[str, Any] = {
+        "__name__": f"{__name__}.{definition.origin}",
+        "Struct": Struct,
+        "Message": Message,
+        "PACK_ERRORS": message_module.PACK_ERRORS,
+        "pack_bytes": message_module.pack_bytes,
+        "pack_items": message_module.pack_items,
+        "pack_text": message_module.pack_text,
+        "_new": object.__new__,
+    }
+    exec(compile(source, f"<{definition.origin} {definition.name}>", "exec"), namespace)
+    message_class: type[Message] = namespace[definition.class_name]
+    message_class.__doc__ = f"{definition.name} ({definition.id}): {definition.description}"
+    return message_class
+
+
+def _dialect(name: str, definitions: Iterable[MessageDefinition], enums: Iterable[EnumDefinition]) -> Dialect:
+    by_id: dict[int, MessageDefinition] = {}
+    for definition in definitions:
+        other = by_id.setdefault(definition.id, definition)
+        if other != definition and (other.name, other.crc_extra) != (definition.name, definition.crc_extra):
+            raise LocalProtocolError(
+                f"message id {definition.id} is defined twice in {name}: {other.name} in {other.origin},"
+                f" {definition.name} in {definition.origin}"
+            )
+    classes = [_standard_class(definition) or compile_message(definition) for definition in by_id.values()]
+    enum_types = {
+        enum.name: make_enum(
+            f"{__name__}.{name}",
+            enum.class_name,
+            enum.bitmask,
+            enum.description,
+            [(member, entry.value) for member, entry in enum.members()],
+        )
+        for enum in enums
+    }
+    return Dialect(name, classes, enum_types)
+
+
+def _standard_class(definition: MessageDefinition) -> type[Message] | None:
+    """The committed class, when it says the same about the bytes."""
+    row = (definition.crc_extra, definition.base_length, definition.length)
+    if STANDARD.rows.get(definition.id) != row:
+        return None
+    standard = STANDARD[definition.id]
+    same_fields = standard.__match_args__ == tuple(f.attribute for f in definition.fields)
+    return standard if definition.name == standard.NAME and same_fields else None
+
+
+# -------------------------------------------------------------------------------- pymavlink modules
+
+
+def _import(name: str) -> ModuleType:
+    candidates = [name] if "." in name else [f"pymavlink.dialects.v20.{name}", name]
+    for candidate in candidates:
+        try:
+            return import_module(candidate)
+        except ModuleNotFoundError as error:
+            if error.name is None or not candidate.startswith(error.name):
+                raise
+    raise LocalProtocolError(f"no pymavlink dialect {name!r}: tried {', '.join(candidates)}")
+
+
+def _message(cls: Any) -> MessageDefinition:
+    order = list(cls.ordered_fieldnames)
+    fields = []
+    for name, kind in zip(cls.fieldnames, cls.fieldtypes):  # noqa: B905 - of one length
+        array_length = int(cls.array_lengths[order.index(name)])
+        units = getattr(cls, "fieldunits_by_name", {}).get(name, "")
+        enum = getattr(cls, "fieldenums_by_name", {}).get(name, "")
+        default = 3 if cls.id == 0 and name == "mavlink_version" else None
+        fields.append(FieldDefinition(name, kind, array_length, units, enum, default=default))
+    name = getattr(cls, "msgname", None) or cls.name
+    description = " ".join((cls.__doc__ or "").split())
+    definition = MessageDefinition(
+        int(cls.id), name, tuple(fields), description, cls.__module__.rpartition(".")[2]
+    )
+    return _with_extensions(definition, order, int(cls.crc_extra))
+
+
+def _with_extensions(definition: MessageDefinition, order: list[str], crc_extra: int) -> MessageDefinition:
+    """Pymavlink's classes do not say where the extensions begin; CRC_EXTRA and the order on the wire do."""
+    fields = definition.fields
+    for base in range(len(fields), -1, -1):
+        guess = MessageDefinition(
+            definition.id,
+            definition.name,
+            tuple(
+                FieldDefinition(
+                    f.name, f.type, f.array_length, f.units, f.enum, extension=i >= base, default=f.default
+                )
+                for i, f in enumerate(fields)
+            ),
+            definition.description,
+            definition.origin,
+        )
+        if guess.crc_extra == crc_extra and [f.name for f in guess.wire_fields] == order:
+            return guess
+    raise LocalProtocolError(f"{definition.name}: CRC_EXTRA {crc_extra} fits none of its field orders")
+
+
+def _enum(name: str, entries: dict[int, Any]) -> EnumDefinition:
+    end_marker = f"{name}_ENUM_END"
+    kept = [
+        EntryDefinition(e.name, value, e.description) for value, e in entries.items() if e.name != end_marker
+    ]
+    return EnumDefinition(name, tuple(kept))
