@@ -1,0 +1,368 @@
+"""`SimulatedCopter`: an ArduCopter 4.7 quadrotor without sockets, threads or a clock of its own."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable
+from typing import TYPE_CHECKING, ClassVar
+
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import CopterMode, MavFrame, MavMissionResult, MavModeFlag, MavResult, MavSeverity
+from aerokit.sim.ardupilot.arming import Arming
+from aerokit.sim.ardupilot.boot import BootTimeline
+from aerokit.sim.ardupilot.copter_commands import copter_commands
+from aerokit.sim.ardupilot.copter_parameters import COPTER_PARAMETERS
+from aerokit.sim.ardupilot.failsafes import Failsafes
+from aerokit.sim.ardupilot.guided import Guided
+from aerokit.sim.ardupilot.modes import AltHold, Auto, Brake, Circle, Loiter, Mode, PosHold, Stabilize
+from aerokit.sim.ardupilot.motors import Motors
+from aerokit.sim.ardupilot.navigation import Navigation
+from aerokit.sim.ardupilot.requests import Requests
+from aerokit.sim.ardupilot.returning import Land, Rtl, SmartRtl
+from aerokit.sim.ardupilot.setpoints import Setpoints
+from aerokit.sim.ardupilot.telemetry import BUILDERS, global_origin, heartbeat, home_position
+from aerokit.sim.ardupilot.yaw import AutoYaw
+from aerokit.sim.battery import Battery
+from aerokit.sim.commands import CommandServer
+from aerokit.sim.local_frame import GlobalPoint, LocalFrame
+from aerokit.sim.motion import Motion, Wind
+from aerokit.sim.parameters import Parameters, ParameterServer
+from aerokit.sim.vehicle import ExtraComponent, SimulatedVehicle
+
+if TYPE_CHECKING:
+    from aerokit.mavlink.message import Message
+    from aerokit.sim.ardupilot.navigation import Ned
+    from aerokit.sim.channel import Channel
+
+__all__ = ["SimulatedCopter"]
+
+_MODES: tuple[type[Mode], ...] = (
+    Auto, Stabilize, AltHold, Circle, Loiter, Guided, Land, Rtl, PosHold, Brake, SmartRtl,
+)  # fmt: skip
+_REBOOT_SILENCE_S = 1.5
+_LAND_DETECTOR_S = 1.0
+_TIMESYNC_S = 10.0
+_BEFORE_READY = frozenset({m.Heartbeat.ID, m.AutopilotVersion.ID})
+_RC_AT_REST = (1500, 1500, 1000, 1500, 1800, 1000, 1000, 1800)
+_RELATIVE = frozenset({MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT})
+_TERRAIN = frozenset({MavFrame.GLOBAL_TERRAIN_ALT, MavFrame.GLOBAL_TERRAIN_ALT_INT})
+_ABSOLUTE = frozenset({MavFrame.GLOBAL, MavFrame.GLOBAL_INT})
+_RELEASES = {"dev": 0, "alpha": 64, "beta": 128, "rc": 192, "official": 255}
+
+
+class SimulatedCopter(SimulatedVehicle):
+    """Speaks and behaves as ArduCopter does where a client can see it; flies as `Motion` does.
+
+    home                where it stands when it is switched on: latitude and longitude in degrees, altitude AMSL in m
+    heading_deg         where its nose points then
+    boot_time_s         seconds until the estimator has a position; the real one needs 41.5, 0 is ready at once
+    boot_text           the plain text that a serial or TCP port gives before the first frame
+    version             "4.7.0-dev": goes into AUTOPILOT_VERSION and the banner
+    battery_percent     charge at the start; ``battery_capacity_mah`` its size
+    wind                constant wind and gusts
+    rangefinder_reach_m 0 means that there is no range finder
+    unsupported_commands  MAV_CMDs that this firmware does not know (SET_MESSAGE_INTERVAL, DO_SET_MODE of old ones)
+    stream_groups       False for a firmware that does not know REQUEST_DATA_STREAM
+    components          other components on its links (gimbal, camera): heartbeats only
+    unix_time_at_boot   what its GPS clock says at power on, in seconds
+
+    Not simulated yet: missions, fence, rally, files, logs, a gimbal, radio failsafe.
+    """
+
+    CAPABILITIES: ClassVar[int] = 0xFBEF
+    GIT_HASH: ClassVar[bytes] = b"5ae20c17"
+
+    def __init__(
+        self,
+        *,
+        system_id: int = 1,
+        home: tuple[float, float, float] = (-35.3632610, 149.1652299, 584.09),
+        heading_deg: float = 353.0,
+        seed: int = 0,
+        boot_time_s: float = 5.0,
+        boot_text: bool = False,
+        version: str = "4.7.0-dev",
+        parameters: dict[str, float] | None = None,
+        battery_percent: float = 100.0,
+        battery_capacity_mah: float = 3300.0,
+        wind: Wind | None = None,
+        rangefinder_reach_m: float = 0.0,
+        unsupported_commands: Collection[int] = (),
+        stream_groups: bool = True,
+        components: Iterable[ExtraComponent] = (),
+        unix_time_at_boot: float = 1_790_000_000.0,
+    ) -> None:
+        self.parameters = Parameters.from_text(COPTER_PARAMETERS)
+        """By name; change them as a test needs it. They survive a reboot."""
+        self.parameters["MAV_SYSID"] = system_id
+        for name, value in (parameters or {}).items():
+            self.parameters[name] = value
+        super().__init__(system_id=system_id, component_id=1, seed=seed, components=components)
+        self.timeline = BootTimeline.scaled(boot_time_s)
+        self.version = version
+        self.uid = bytes([0xA0, system_id]) + bytes(16)
+        self.battery = Battery(battery_capacity_mah, percent=battery_percent)
+        self.motion = Motion(self.rng, wind=wind)
+        self.motion.yaw = math.remainder(math.radians(heading_deg), 2 * math.pi)
+        self.rangefinder_reach_m = rangefinder_reach_m
+        self.unsupported_commands = frozenset(unsupported_commands)
+        self.rc = list(_RC_AT_REST)
+        """What the sticks and switches send, 8 channels; the throttle (index 2) rests at 1000."""
+        self._boot_text = boot_text
+        self._stream_groups = stream_groups
+        self._unix_time_at_start = unix_time_at_boot
+        self._frame = LocalFrame(GlobalPoint(round(home[0] * 1e7), round(home[1] * 1e7), home[2]))
+        self._reset()
+        self._listen()
+
+    def _reset(self) -> None:
+        """What a power cycle makes new."""
+        self.is_initialised = self.has_left_boot = False
+        self.is_landed = self.motion.is_on_ground
+        self.motors = Motors()
+        self.navigation = Navigation(self, self._frame)
+        self.arming = Arming(self)
+        self.failsafes = Failsafes(self)
+        self.yaw = AutoYaw(self)
+        self._modes = {mode.number: mode(self) for mode in _MODES}
+        guided = self._modes[CopterMode.GUIDED]
+        assert isinstance(guided, Guided)
+        self.guided = guided
+        self.mode: Mode = self._modes[int(self.parameters["INITIAL_MODE"])]
+        self._still_since = math.nan
+
+    def _listen(self) -> None:
+        self.requests = Requests(self, stream_groups=self._stream_groups)
+        ParameterServer(self, self.parameters)
+        CommandServer(self, copter_commands(self))
+        Setpoints(self)
+        self.on(m.Heartbeat, self._on_heartbeat)
+        self.on(m.SetMode, self._on_set_mode)
+        self.on(m.Timesync, self._on_timesync)
+        self.on(m.Ping, self._on_ping)
+        self.on(m.RcChannelsOverride, self._on_rc_override)
+        self.on(m.MissionRequestList, self._on_mission_request_list)
+        self.on(m.MissionCount, self._on_mission_count)
+        self.on(m.MissionClearAll, self._on_mission_clear)
+
+    # ---------------------------------------------------------------------------------------- state
+
+    @property
+    def is_armed(self) -> bool:
+        """Whether the motors are armed."""
+        return self.motors.is_armed
+
+    @property
+    def altitude_m(self) -> float:
+        """Metres above home."""
+        return self.navigation.altitude_above_home
+
+    @property
+    def unix_time(self) -> float:
+        """What the GPS says the time is."""
+        return self._unix_time_at_start + self.now
+
+    @property
+    def version_number(self) -> int:
+        """As AUTOPILOT_VERSION packs it."""
+        numbers, _, release = self.version.partition("-")
+        major, minor, patch = (int(part) for part in (*numbers.split("."), "0", "0")[:3])
+        return major << 24 | minor << 16 | patch << 8 | _RELEASES.get(release or "official", 0)
+
+    # ------------------------------------------------------------------------------ boot and reboot
+
+    def boot(self) -> None:
+        """Say what a booting ArduCopter says, when it says it."""
+        line, later = self.timeline, self.call_later
+        if self._boot_text:
+            for channel in self.channels:
+                channel.write(
+                    f"\r\n\r\nInit ArduCopter V{self.version} ({self.GIT_HASH.decode()})\r\n".encode()
+                )
+                channel.write(b"\r\nFree RAM: 524288\r\nBooting 0/0\r\n")
+        later(line.first_text, lambda: self.info("Calibrating barometer"))
+        later(line.heartbeat, self.send_banner)
+        later(line.barometers, lambda: self.info("Barometer 1 calibration complete"))
+        later(line.barometers, lambda: self.info("Barometer 2 calibration complete"))
+        later(line.ready, self._become_ready)
+        self.navigation.start()
+
+    def _become_ready(self) -> None:
+        self.is_initialised = True
+        self.info("ArduPilot Ready")
+        self.info("AHRS: DCM active")
+        self.arming.start()
+        self.failsafes.start()
+        self.call_later(0.25 * self.timeline.ready, self._leave_boot)
+
+    def _leave_boot(self) -> None:
+        self.has_left_boot = True
+
+    def start_channel(self, channel: Channel) -> None:
+        """Heartbeats and time synchronisation; everything else waits to be asked."""
+        first = self.booted_at + self.timeline.heartbeat
+        channel.streams.set_interval(m.Heartbeat.ID, 1.0, max(self.now, first))
+        channel.streams.set_interval(m.Timesync.ID, _TIMESYNC_S, max(self.now, self.booted_at + _TIMESYNC_S))
+
+    def send_banner(self) -> None:
+        """Firmware, hash and frame as texts."""
+        self.info(f"ArduCopter V{self.version} ({self.GIT_HASH.decode()})")
+        self.info(self.uid.hex()[:32])
+        self.info("Frame: QUAD/PLUS")
+
+    def restart(self) -> None:
+        """Reboot now: silence, then the whole boot again; stream rates and estimates are forgotten."""
+        self.parameters["STAT_BOOTCNT"] += 1
+        if not self.motion.is_on_ground:
+            self.motion.down = self.motion.ground_down
+        self.motion.settle()
+        self._reset()
+        self.reboot(_REBOOT_SILENCE_S)
+
+    def send_text(self, severity: int, text: str) -> None:
+        """Queue a text: as in the firmware, what explains a refusal leaves after the acknowledgement."""
+        if self.is_initialised:
+            self.call_later(0.0, lambda: super(SimulatedCopter, self).send_text(severity, text))
+        else:
+            super().send_text(severity, text)
+
+    # ---------------------------------------------------------------------------------------- modes
+
+    def set_mode(self, number: int) -> bool:
+        """Change the mode if the vehicle may; says why not. A change is told by a heartbeat at once."""
+        if number == self.mode.number:
+            return True
+        mode = self._modes.get(number)
+        if mode is None:
+            self.send_text(MavSeverity.WARNING, f"No such mode {number}")
+            return False
+        armed = self.motors.is_armed
+        reason = None
+        if (
+            armed
+            and mode.needs_position
+            and not (self.navigation.has_position and not self.failsafes.estimator)
+        ):
+            reason = "requires position"
+        elif not mode.enter(force=not armed):
+            reason = "init failed"
+        if reason is not None:
+            self.send_text(MavSeverity.WARNING, f"Mode change to {mode.name} failed: {reason}")
+            return False
+        self.mode.leave()
+        self.mode = mode
+        self.call_later(0.0, lambda: self.send(heartbeat(self)))
+        return True
+
+    def set_mode_from(self, base_mode: int, custom_mode: int) -> int:
+        """DO_SET_MODE and SET_MODE: only custom modes; the MAV_RESULT. SET_MODE does not tell it."""
+        if not base_mode & MavModeFlag.CUSTOM_MODE_ENABLED:
+            return MavResult.DENIED
+        return MavResult.ACCEPTED if self.set_mode(custom_mode) else MavResult.FAILED
+
+    def available_modes(self) -> list[m.AvailableModes]:
+        """AVAILABLE_MODES, as ArduPilot numbers and names them."""
+        modes = list(self._modes.values())
+        return [
+            m.AvailableModes(len(modes), index, 0, mode.number, 0, mode.name)
+            for index, mode in enumerate(modes, start=1)
+        ]
+
+    def point(self, latitude_e7: int, longitude_e7: int, altitude: float, frame: int) -> Ned | None:
+        """A place on the globe in the world's frame; None when it is none, or the frame is unknown."""
+        valid = abs(latitude_e7) <= 900_000_000 and abs(longitude_e7) <= 1_800_000_000
+        if not valid or not math.isfinite(altitude):
+            return None
+        north, east = self._frame.to_local(latitude_e7, longitude_e7)
+        if frame in _RELATIVE:
+            home = self.navigation.home
+            return (north, east, (self.motion.ground_down if home is None else home[2]) - altitude)
+        if frame in _TERRAIN:
+            return (north, east, self.motion.ground_down - altitude)
+        return (north, east, self._frame.origin.altitude_m - altitude) if frame in _ABSOLUTE else None
+
+    def send_home(self, channel: Channel | None = None) -> None:
+        """GPS_GLOBAL_ORIGIN and HOME_POSITION, as far as they are known."""
+        for message in (global_origin(self), home_position(self)):
+            if message is not None:
+                self.send(message, channel)
+
+    # --------------------------------------------------------------------------------------- flying
+
+    def build(self, message_id: int) -> Message | None:
+        """What is to be streamed now."""
+        if message_id == m.Timesync.ID:
+            return m.Timesync(0, int(self.uptime * 1e9) + self.system_id)
+        if message_id == m.AvailableModesMonitor.ID:
+            return m.AvailableModesMonitor(0)
+        if not self.is_initialised and message_id not in _BEFORE_READY:
+            return None
+        builder = BUILDERS.get(message_id)
+        return None if builder is None else builder(self)
+
+    def tick(self, dt: float) -> None:
+        """Mode, motors, motion, land detector, battery."""
+        if self.motors.is_armed:
+            self.mode.update(dt)
+        self.motors.update(self.now, dt, self.motion, landed=self.is_landed)
+        if not self.is_landed:
+            self._fly(dt)
+        self.battery.drain(self.motors.current_a, dt)
+        if not self.motors.is_armed and self.is_landed and self.motors.is_idle:
+            self.set_ticking(False)
+
+    def _fly(self, dt: float) -> None:
+        motion = self.motion
+        was_on_ground = motion.is_on_ground
+        motion.step(dt, powered=self.motors.is_armed and not self.faults.motor_failed)
+        if motion.is_on_ground and not was_on_ground:
+            self.info(f"SIM Hit ground at {motion.impact_speed_m_s:f} m/s")
+        if not motion.is_on_ground or self.mode.is_taking_off:
+            self._still_since = math.nan
+        elif math.isnan(self._still_since):
+            self._still_since = self.now
+        elif self.now - self._still_since >= _LAND_DETECTOR_S or not self.motors.is_armed:
+            self.is_landed, self._still_since = True, math.nan
+            motion.settle()
+
+    # -------------------------------------------------------------------------------- other messages
+
+    def _on_set_mode(self, request: m.SetMode, _: Channel) -> None:
+        self.set_mode_from(request.base_mode, request.custom_mode)
+
+    def _on_heartbeat(self, message: m.Heartbeat, _: Channel) -> None:
+        frame = message.received_frame
+        if frame is not None and frame.system_id == self.parameters["MAV_GCS_SYSID"]:
+            self.failsafes.ground_station_seen_at = self.now
+
+    def _on_timesync(self, request: m.Timesync, channel: Channel) -> None:
+        if request.tc1 == 0:
+            self.send(m.Timesync(int(self.uptime * 1e9), request.ts1), channel)
+
+    def _on_ping(self, ping: m.Ping, channel: Channel) -> None:
+        frame = ping.received_frame
+        if frame is not None and ping.target_system == 0:
+            self.send(m.Ping(ping.time_usec, ping.seq, frame.system_id, frame.component_id), channel)
+
+    def _on_rc_override(self, override: m.RcChannelsOverride, _: Channel) -> None:
+        for index in range(len(self.rc)):
+            value = getattr(override, f"chan{index + 1}_raw")
+            if value == 0:
+                self.rc[index] = _RC_AT_REST[index]
+            elif value != 0xFFFF:
+                self.rc[index] = value
+
+    def _on_mission_request_list(self, request: m.MissionRequestList, channel: Channel) -> None:
+        self.send(m.MissionCount(*_sender(request), 0, request.mission_type), channel)
+
+    def _on_mission_count(self, count: m.MissionCount, channel: Channel) -> None:
+        self.send_text(MavSeverity.WARNING, "Only 0 items are supported")
+        self.send(m.MissionAck(*_sender(count), MavMissionResult.NO_SPACE, count.mission_type), channel)
+
+    def _on_mission_clear(self, clear: m.MissionClearAll, channel: Channel) -> None:
+        self.send(m.MissionAck(*_sender(clear), MavMissionResult.ACCEPTED, clear.mission_type), channel)
+
+
+def _sender(message: Message) -> tuple[int, int]:
+    frame = message.received_frame
+    return (0, 0) if frame is None else (frame.system_id, frame.component_id)

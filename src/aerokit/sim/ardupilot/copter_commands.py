@@ -1,0 +1,237 @@
+"""The commands (MAV_CMD) that a simulated ArduCopter knows, with the real one's conditions and results."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from aerokit.mavlink.enums import CopterMode, MavCmd, MavFrame, MavResult, MavSeverity, SpeedType
+from aerokit.mavlink.messages import AutopilotVersion
+from aerokit.sim.ardupilot.guided import Guided
+from aerokit.sim.commands import Command, CommandHandler, Progress
+
+if TYPE_CHECKING:
+    from aerokit.sim.ardupilot.copter import SimulatedCopter
+
+__all__ = ["copter_commands"]
+
+_FORCE_ARM_OR_DISARM, _FORCE_ARM = 21196.0, 2989.0
+_FORCE_REBOOT = 20190226
+_CHANGE_MODE = 1
+_GYRO_CALIBRATION_S = 1.0
+
+
+def copter_commands(copter: SimulatedCopter) -> dict[int, CommandHandler]:
+    """MAV_CMD → handler."""
+    flight, setup = _Flight(copter), _Setup(copter)
+    handlers: dict[int, CommandHandler] = {
+        MavCmd.COMPONENT_ARM_DISARM: flight.arm_or_disarm,
+        MavCmd.DO_SET_MODE: flight.set_mode,
+        MavCmd.NAV_TAKEOFF: flight.take_off,
+        MavCmd.NAV_LAND: lambda _: flight.change_to(CopterMode.LAND),
+        MavCmd.NAV_RETURN_TO_LAUNCH: lambda _: flight.change_to(CopterMode.RTL),
+        MavCmd.NAV_LOITER_UNLIM: lambda _: flight.change_to(CopterMode.LOITER),
+        MavCmd.MISSION_START: flight.start_mission,
+        MavCmd.DO_REPOSITION: flight.reposition,
+        MavCmd.DO_CHANGE_SPEED: flight.change_speed,
+        MavCmd.CONDITION_YAW: flight.turn,
+        MavCmd.DO_PAUSE_CONTINUE: flight.pause_or_continue,
+        MavCmd.DO_SET_ROI: flight.look_at,
+        MavCmd.DO_SET_ROI_LOCATION: flight.look_at,
+        MavCmd.DO_SET_ROI_NONE: flight.look_ahead,
+        MavCmd.DO_FLIGHTTERMINATION: flight.terminate,
+        MavCmd.DO_SET_HOME: setup.set_home,
+        MavCmd.GET_HOME_POSITION: setup.get_home,
+        MavCmd.REQUEST_AUTOPILOT_CAPABILITIES: setup.request_capabilities,
+        MavCmd.REQUEST_MESSAGE: copter.requests.request_message,
+        MavCmd.SET_MESSAGE_INTERVAL: copter.requests.set_interval,
+        MavCmd.GET_MESSAGE_INTERVAL: copter.requests.get_interval,
+        MavCmd.RUN_PREARM_CHECKS: setup.run_prearm_checks,
+        MavCmd.PREFLIGHT_CALIBRATION: setup.calibrate,
+        MavCmd.PREFLIGHT_REBOOT_SHUTDOWN: setup.reboot,
+        MavCmd.DO_SEND_BANNER: setup.send_banner,
+    }
+    for command in copter.unsupported_commands:
+        handlers.pop(command, None)
+    return handlers
+
+
+class _Flight:
+    """Commands that move the vehicle."""
+
+    def __init__(self, copter: SimulatedCopter) -> None:
+        self._copter = copter
+
+    def arm_or_disarm(self, command: Command) -> int:
+        if command.param1 == 1.0:
+            if self._copter.motors.is_armed:
+                return MavResult.ACCEPTED
+            done = self._copter.arming.arm(force=command.param2 in (_FORCE_ARM, _FORCE_ARM_OR_DISARM))
+        elif command.param1 == 0.0:
+            done = self._copter.arming.disarm(force=command.param2 == _FORCE_ARM_OR_DISARM)
+        else:
+            return MavResult.UNSUPPORTED
+        return MavResult.ACCEPTED if done else MavResult.FAILED
+
+    def set_mode(self, command: Command) -> int:
+        return self._copter.set_mode_from(int(command.param1), int(command.param2))
+
+    def change_to(self, mode: int) -> int:
+        return MavResult.ACCEPTED if self._copter.set_mode(mode) else MavResult.FAILED
+
+    def take_off(self, command: Command) -> int:
+        copter = self._copter
+        if command.altitude_frame != MavFrame.GLOBAL_RELATIVE_ALT:
+            return MavResult.DENIED
+        upwards = command.z > copter.navigation.altitude_above_home
+        if not (copter.motors.is_armed and copter.is_landed and upwards):
+            return MavResult.FAILED
+        done = copter.mode.take_off(command.z, must_navigate=command.param3 == 0.0)
+        return MavResult.ACCEPTED if done else MavResult.FAILED
+
+    def start_mission(self, command: Command) -> int:
+        if command.param1 or command.param2:
+            return MavResult.DENIED
+        return self.change_to(CopterMode.AUTO)
+
+    def reposition(self, command: Command) -> int:
+        """Only as COMMAND_INT: ArduPilot knows no frame for it in COMMAND_LONG."""
+        copter = self._copter
+        if command.is_long:
+            return MavResult.UNSUPPORTED
+        may_change_mode = int(command.param2) & _CHANGE_MODE
+        if copter.mode is not copter.guided and not may_change_mode:
+            return MavResult.DENIED
+        point = copter.point(*command.place(), command.z, command.altitude_frame)
+        if point is None:
+            return MavResult.DENIED
+        if copter.mode is not copter.guided and not copter.set_mode(CopterMode.GUIDED):
+            return MavResult.FAILED
+        copter.guided.go_to(point)
+        copter.yaw.default()
+        return MavResult.ACCEPTED
+
+    def change_speed(self, command: Command) -> int:
+        mode, speed = self._copter.mode, command.param2
+        if not speed > 0:
+            return MavResult.DENIED
+        if not mode.can_change_speed:
+            return MavResult.FAILED
+        if command.param1 in (SpeedType.AIRSPEED, SpeedType.GROUNDSPEED):
+            mode.speed = speed  # type: ignore[attr-defined]
+            return MavResult.ACCEPTED
+        if not isinstance(mode, Guided):
+            return MavResult.FAILED
+        if command.param1 == SpeedType.CLIMB_SPEED:
+            mode.climb = speed
+        elif command.param1 == SpeedType.DESCENT_SPEED:
+            mode.descent = speed
+        else:
+            return MavResult.FAILED
+        return MavResult.ACCEPTED
+
+    def turn(self, command: Command) -> int:
+        angle, rate, direction, relative = command.param1, command.param2, command.param3, command.param4
+        if not 0.0 <= angle <= 360.0 or relative not in (0.0, 1.0):
+            return MavResult.FAILED
+        heading = math.radians(angle)
+        if relative:
+            heading = self._copter.motion.yaw + math.copysign(heading, direction or 1.0)
+        self._copter.yaw.fixed(heading, math.radians(rate), int(direction) if not relative else 0)
+        return MavResult.ACCEPTED
+
+    def pause_or_continue(self, command: Command) -> int:
+        copter = self._copter
+        if command.param1 not in (0.0, 1.0):
+            return MavResult.DENIED
+        pause = command.param1 == 0.0
+        if copter.mode.pause() if pause else copter.mode.resume():
+            return MavResult.ACCEPTED
+        copter.info("Failed to pause" if pause else "Failed to resume")
+        return MavResult.FAILED
+
+    def look_at(self, command: Command) -> int:
+        point = self._copter.point(*command.place(), command.z, command.altitude_frame)
+        if point is None:
+            return MavResult.DENIED
+        nowhere = command.place() == (0, 0) and command.z == 0
+        self._copter.yaw.region_of_interest(None if nowhere else point[:2])
+        return MavResult.ACCEPTED
+
+    def look_ahead(self, _: Command) -> int:
+        self._copter.yaw.region_of_interest(None)
+        return MavResult.ACCEPTED
+
+    def terminate(self, command: Command) -> int:
+        if command.param1 <= 0.5:
+            return MavResult.FAILED
+        self._copter.arming.disarm()
+        return MavResult.ACCEPTED
+
+
+class _Setup:
+    """Commands that ask for or change settings."""
+
+    def __init__(self, copter: SimulatedCopter) -> None:
+        self._copter = copter
+
+    def set_home(self, command: Command) -> int:
+        nav, motion = self._copter.navigation, self._copter.motion
+        if command.param1 == 1.0 or command.place() == (0, 0):
+            if not nav.has_position:
+                return MavResult.FAILED
+            nav.set_home((motion.north, motion.east, motion.down), lock=True)
+            return MavResult.ACCEPTED
+        if command.param1 != 0.0 or nav.origin is None:
+            return MavResult.FAILED
+        frame = MavFrame.GLOBAL if command.is_long else command.altitude_frame
+        point = self._copter.point(*command.place(), command.z, frame)
+        if point is None:
+            return MavResult.DENIED
+        nav.set_home(point, lock=True)
+        return MavResult.ACCEPTED
+
+    def get_home(self, command: Command) -> int:
+        if self._copter.navigation.home is None:
+            return MavResult.FAILED
+        self._copter.send_home(command.channel)
+        return MavResult.ACCEPTED
+
+    def request_capabilities(self, command: Command) -> int:
+        if command.param1 != 1.0:
+            return MavResult.FAILED
+        self._copter.requests.send_soon(AutopilotVersion.ID, command.channel)
+        return MavResult.ACCEPTED
+
+    def run_prearm_checks(self, _: Command) -> int:
+        if self._copter.motors.is_armed:
+            return MavResult.TEMPORARILY_REJECTED
+        self._copter.arming.report()
+        return MavResult.ACCEPTED
+
+    def calibrate(self, command: Command) -> int | Progress:
+        """Gyroscopes and level take a second; the rest is answered at once with what 4.7-dev answers."""
+        copter = self._copter
+        if copter.motors.is_armed:
+            copter.send_text(MavSeverity.NOTICE, "Disarm to allow calibration")
+            return MavResult.FAILED
+        if command.param1 == 1.0 or command.x == 2:
+            return Progress((), _GYRO_CALIBRATION_S)
+        if command.param3 == 1.0:
+            copter.info("Barometer calibration complete")
+            return MavResult.ACCEPTED
+        if command.x == 4:
+            return MavResult.TEMPORARILY_REJECTED
+        return MavResult.ACCEPTED if command.x in (1, 76) or command.param2 == 76.0 else MavResult.UNSUPPORTED
+
+    def reboot(self, command: Command) -> int:
+        if self._copter.motors.is_armed and command.y != _FORCE_REBOOT:
+            return MavResult.FAILED
+        if command.param1 not in (1.0, 3.0):
+            return MavResult.UNSUPPORTED
+        self._copter.call_later(0.1, self._copter.restart)  # the answer still goes out
+        return MavResult.ACCEPTED
+
+    def send_banner(self, _: Command) -> int:
+        self._copter.send_banner()
+        return MavResult.ACCEPTED

@@ -1,0 +1,69 @@
+"""Arming delay, spool-up and what the motors draw, as ArduCopter's clients see it."""
+
+from __future__ import annotations
+
+import math
+
+from aerokit.sim.motion import GRAVITY_M_S2, Motion
+
+__all__ = ["Motors"]
+
+_ARMING_DELAY_S = 2.0
+_SPOOL_UP_S = 1.3
+_SPOOL_DOWN_S = 1.1
+_HOVER_THROTTLE = 0.36
+_AMPERES_AT_FULL = 78.0
+_STOPPED_PWM, _IDLE_PWM, _FULL_PWM = 1000, 1100, 2000
+
+
+class Motors:
+    """``spool`` is 0 while the motors idle or stand and 1 when they can lift; `wanted` is what the mode asks for."""
+
+    def __init__(self) -> None:
+        self.is_armed = False
+        self.armed_at = -math.inf
+        self.wanted = False
+        self.spool = 0.0
+        self.throttle = 0.0
+        """0 to 1, as VFR_HUD says it in percent."""
+
+    @property
+    def can_lift(self) -> bool:
+        """Whether the propellers turn fast enough to fly."""
+        return self.is_armed and self.spool >= 1.0
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether they turn at their lowest speed, or not at all."""
+        return self.spool <= 0.0
+
+    @property
+    def current_a(self) -> float:
+        """What the battery gives to all of them and the electronics."""
+        return 0.08 * self.is_armed + self.throttle * _AMPERES_AT_FULL
+
+    @property
+    def pwm(self) -> int:
+        """What SERVO_OUTPUT_RAW shows for each."""
+        if not self.is_armed:
+            return _STOPPED_PWM
+        return round(_IDLE_PWM + 20 * self.spool + self.throttle * (_FULL_PWM - _IDLE_PWM) * 1.3)
+
+    def set_armed(self, armed: bool, now: float) -> None:
+        """Arm or stop them."""
+        self.is_armed, self.armed_at = armed, now
+        self.spool = self.throttle = 0.0
+        self.wanted = False
+
+    def update(self, now: float, dt: float, motion: Motion, *, landed: bool) -> None:
+        """Follow what is wanted."""
+        if self.is_armed and self.wanted and now - self.armed_at >= _ARMING_DELAY_S:
+            self.spool = min(1.0, self.spool + dt / _SPOOL_UP_S)
+        else:
+            self.spool = max(0.0, self.spool - dt / _SPOOL_DOWN_S)
+        if landed or not self.is_armed:
+            self.throttle = 0.05 * self.spool
+            return
+        lean = math.cos(motion.roll) * math.cos(motion.pitch)
+        lift = max(0.0, 1.0 - motion.acceleration_down / GRAVITY_M_S2)
+        self.throttle = min(1.0, _HOVER_THROTTLE * lift / max(0.5, lean))

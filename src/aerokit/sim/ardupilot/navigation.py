@@ -1,0 +1,179 @@
+"""What a simulated ArduPilot knows of where it is: GPS, estimator, origin and home."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from aerokit.mavlink.enums import EkfStatusFlags as Ekf
+from aerokit.mavlink.enums import GpsFixType
+from aerokit.sim.local_frame import GlobalPoint, LocalFrame
+
+if TYPE_CHECKING:
+    from aerokit.sim.ardupilot.copter import SimulatedCopter
+
+__all__ = ["Navigation"]
+
+_ATTITUDE_ONLY = Ekf.ATTITUDE | Ekf.VELOCITY_HORIZ | Ekf.VELOCITY_VERT | Ekf.POS_VERT_ABS | Ekf.CONST_POS_MODE
+_WITH_POSITION = (
+    Ekf.ATTITUDE
+    | Ekf.VELOCITY_HORIZ
+    | Ekf.VELOCITY_VERT
+    | Ekf.POS_HORIZ_REL
+    | Ekf.POS_HORIZ_ABS
+    | Ekf.POS_VERT_ABS
+    | Ekf.PRED_POS_HORIZ_REL
+    | Ekf.PRED_POS_HORIZ_ABS
+)
+_GIVE_UP_S = 10.0
+_CHECK_S = 0.1
+
+Ned = tuple[float, float, float]
+
+
+class Navigation:
+    """Grows with the boot, suffers under ``faults.gps_lost``.
+
+    Positions are kept in the world's frame (`frame`, around the place where the vehicle was created);
+    ``origin`` and
+    ``home`` are points of it, None until they are known.
+    """
+
+    def __init__(self, copter: SimulatedCopter, frame: LocalFrame) -> None:
+        self._copter = copter
+        self.frame = frame
+        self.flags: int | None = None
+        """EKF_STATUS_FLAGS; None while there is no estimator to ask."""
+        self.fix_type: int = GpsFixType.NO_GPS
+        self.is_gps_detected = False
+        self.is_healthy = False
+        self.origin: Ned | None = None
+        self.home: Ned | None = None
+        self.home_is_locked = False
+        self._lost_at = math.nan
+
+    def start(self) -> None:
+        """Follow the boot timeline from now on."""
+        copter, line = self._copter, self._copter.timeline
+        later = copter.call_later
+        later(
+            line.ready + 0.5 * (line.estimator_active - line.ready),
+            lambda: self._set_flags(Ekf.UNINITIALIZED),
+        )
+        later(line.estimator_active, self._activate)
+        later(line.tilt_aligned, lambda: self._say_cores("tilt alignment complete"))
+        later(line.yaw_aligned, self._align)
+        later(line.gps_detected, self._detect_gps)
+        later(line.gps_fix, self._get_fix)
+        later(line.origin_set, self._set_origin)
+        later(line.healthy, self._become_healthy)
+        later(line.position_good, self._use_gps)
+
+    # -------------------------------------------------------------------------------------- answers
+
+    @property
+    def has_position(self) -> bool:
+        """Whether the estimator has a position that is good enough to fly by."""
+        return self.flags is not None and bool(self.flags & Ekf.POS_HORIZ_ABS)
+
+    @property
+    def has_attitude(self) -> bool:
+        """Whether the estimator knows up from down."""
+        return self.flags is not None and bool(self.flags & Ekf.ATTITUDE)
+
+    @property
+    def has_altitude(self) -> bool:
+        """Whether the estimator has a height."""
+        return self.flags is not None and bool(self.flags & Ekf.POS_VERT_ABS)
+
+    @property
+    def position(self) -> GlobalPoint | None:
+        """Where the vehicle believes to be; None before the first fix."""
+        if self.fix_type < GpsFixType.TYPE_3D_FIX and self.origin is None:
+            return None
+        motion = self._copter.motion
+        return self.frame.to_global(motion.north, motion.east, motion.down)
+
+    @property
+    def altitude_above_home(self) -> float:
+        """Metres above home, or above the ground it was switched on while home is unknown."""
+        reference = self._copter.motion.ground_down if self.home is None else self.home[2]
+        return reference - self._copter.motion.down
+
+    def local(self, point: Ned) -> Ned:
+        """A point of the world, relative to the estimator's origin."""
+        north, east, down = (0.0, 0.0, 0.0) if self.origin is None else self.origin
+        return (point[0] - north, point[1] - east, point[2] - down)
+
+    def world(self, local: Ned) -> Ned:
+        """A point relative to the estimator's origin, in the world."""
+        north, east, down = (0.0, 0.0, 0.0) if self.origin is None else self.origin
+        return (local[0] + north, local[1] + east, local[2] + down)
+
+    def set_home(self, point: Ned, *, lock: bool) -> None:
+        """Make a point home and tell everybody."""
+        self.home, self.home_is_locked = point, self.home_is_locked or lock
+        self._copter.call_later(0.0, self._copter.send_home)
+
+    # ------------------------------------------------------------------------------------- timeline
+
+    def _set_flags(self, flags: int) -> None:
+        self.flags = flags
+
+    def _say_cores(self, text: str) -> None:
+        for core in (0, 1):
+            self._copter.info(f"EKF3 IMU{core} {text}")
+
+    def _activate(self) -> None:
+        self.flags = 0
+        self._say_cores("initialised")
+        self._copter.info("AHRS: EKF3 active")
+
+    def _align(self) -> None:
+        self.flags = _ATTITUDE_ONLY
+        self._say_cores("MAG0 initial yaw alignment complete")
+
+    def _detect_gps(self) -> None:
+        self.is_gps_detected, self.fix_type = True, GpsFixType.NO_FIX
+        self._copter.info("GPS 1: probing for u-blox at 230400 baud")
+        self._copter.info("GPS 1: detected u-blox")
+
+    def _get_fix(self) -> None:
+        if not self._copter.faults.gps_lost:
+            self.fix_type = GpsFixType.RTK_FIXED
+        self._copter.every(_CHECK_S, self._watch_gps)
+
+    def _set_origin(self) -> None:
+        if self.fix_type < GpsFixType.TYPE_3D_FIX:
+            self._copter.call_later(1.0, self._set_origin)
+            return
+        motion = self._copter.motion
+        self.origin = (motion.north, motion.east, motion.down)
+        self.home = self.origin
+        self._copter.send_home()
+        self._say_cores("origin set")
+        self._copter.info(f"Field Elevation Set: {self.frame.origin.altitude_m - motion.down:.0f}m")
+
+    def _become_healthy(self) -> None:
+        self.is_healthy = True
+
+    def _use_gps(self) -> None:
+        if self.origin is None or self.fix_type < GpsFixType.TYPE_3D_FIX:
+            self._copter.call_later(1.0, self._use_gps)
+            return
+        self.flags = _WITH_POSITION
+        self._say_cores("is using GPS")
+
+    # ----------------------------------------------------------------------------------- losing GPS
+
+    def _watch_gps(self) -> None:
+        now, lost = self._copter.now, self._copter.faults.gps_lost
+        if lost and math.isnan(self._lost_at):
+            self._lost_at, self.fix_type = now, GpsFixType.NO_FIX
+        elif lost and self.has_position and now - self._lost_at >= _GIVE_UP_S:
+            self.flags = _ATTITUDE_ONLY
+            self._say_cores("stopped aiding")
+        elif not lost and self.fix_type < GpsFixType.TYPE_3D_FIX:
+            self._lost_at, self.fix_type = math.nan, GpsFixType.RTK_FIXED
+            if self.origin is not None and not self.has_position:
+                self._use_gps()

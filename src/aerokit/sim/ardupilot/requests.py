@@ -1,0 +1,108 @@
+"""How a client asks a simulated ArduPilot for messages: by id and interval, by stream group, or once."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from aerokit.mavlink.enums import MavDataStream, MavResult
+from aerokit.mavlink.messages import (
+    AvailableModes,
+    AvailableModesMonitor,
+    Heartbeat,
+    MessageInterval,
+    RequestDataStream,
+)
+from aerokit.sim.ardupilot.stream_groups import COPTER_GROUPS, KNOWN_MESSAGES
+
+if TYPE_CHECKING:
+    from aerokit.sim.ardupilot.copter import SimulatedCopter
+    from aerokit.sim.channel import Channel
+    from aerokit.sim.commands import Command
+
+__all__ = ["Requests"]
+
+_SHORTEST_S, _LONGEST_S = 0.0025 / 0.8, 60.0
+_LARGEST_IN_MESSAGE_INTERVAL = 1 << 16
+
+
+class Requests:
+    """SET_MESSAGE_INTERVAL, GET_MESSAGE_INTERVAL, REQUEST_MESSAGE and REQUEST_DATA_STREAM."""
+
+    def __init__(self, copter: SimulatedCopter, *, stream_groups: bool = True) -> None:
+        self._copter = copter
+        if stream_groups:
+            copter.on(RequestDataStream, self._on_group)
+
+    def set_interval(self, command: Command) -> int:
+        """Interval in microseconds; -1 is off, 0 the default (off, but for the heartbeat)."""
+        message_id, interval_us = int(command.param1), int(command.param2)
+        if command.param3 != 0.0:
+            return MavResult.DENIED
+        if message_id not in KNOWN_MESSAGES:
+            self._copter.info(f"No ap_message for mavlink id ({message_id})")
+            return MavResult.DENIED
+        if interval_us < -1:
+            return MavResult.DENIED
+        interval = max(0, interval_us) / 1e6
+        if interval_us == 0 and message_id == Heartbeat.ID:
+            interval = 1.0
+        if 0.0 < interval < _SHORTEST_S:
+            text = f"Requested rate for message ID {message_id} too fast. Increase SCHED_LOOP_RATE"
+            self._copter.info(text)
+            return MavResult.DENIED
+        command.channel.streams.set_interval(message_id, min(interval, _LONGEST_S), self._copter.now)
+        return MavResult.ACCEPTED
+
+    def get_interval(self, command: Command) -> int:
+        """Answers MESSAGE_INTERVAL before the acknowledgement."""
+        return self._send_interval(int(command.param1), command.channel)
+
+    def _send_interval(self, message_id: int, channel: Channel) -> int:
+        known = message_id in KNOWN_MESSAGES
+        interval_us = round(channel.streams.interval(message_id) * 1e6) or -1
+        if message_id < _LARGEST_IN_MESSAGE_INTERVAL:
+            self._copter.send(MessageInterval(message_id, interval_us if known else 0), channel)
+        return MavResult.ACCEPTED if known else MavResult.FAILED
+
+    def request_message(self, command: Command) -> int:
+        """Send a message once, right after the acknowledgement."""
+        message_id = int(command.param1)
+        if message_id == MessageInterval.ID:
+            return self._send_interval(int(command.param2), command.channel)
+        if message_id not in KNOWN_MESSAGES:
+            return MavResult.FAILED
+        if message_id == AvailableModes.ID:
+            self._send_modes(int(command.param2), command.channel)
+        else:
+            self.send_soon(message_id, command.channel)
+        return MavResult.ACCEPTED
+
+    def send_soon(self, message_id: int, channel: Channel) -> None:
+        """Send it after what is being answered now."""
+
+        def send() -> None:
+            message = self._copter.build(message_id)
+            if message is not None:
+                self._copter.send(message, channel)
+
+        self._copter.call_later(0.0, send)
+
+    def _send_modes(self, index: int, channel: Channel) -> None:
+        """One mode by its index from 1, or all for 0; from then on AVAILABLE_MODES_MONITOR every 5 s."""
+        copter = self._copter
+        modes = copter.available_modes()
+        wanted = modes if index == 0 else modes[index - 1 : index]
+        for message in wanted:
+            copter.call_later(0.0, lambda message=message: copter.send(message, channel))  # type: ignore[misc]
+        channel.streams.set_interval(AvailableModesMonitor.ID, 5.0, copter.now)
+
+    def _on_group(self, request: RequestDataStream, channel: Channel) -> None:
+        if request.start_stop not in (0, 1):
+            return
+        rate = request.req_message_rate if request.start_stop else 0
+        wanted = request.req_stream_id
+        groups = COPTER_GROUPS if wanted == MavDataStream.ALL else {wanted: COPTER_GROUPS.get(wanted, ())}
+        for messages in groups.values():
+            for message_id in messages:
+                interval = max(1.0 / rate, _SHORTEST_S) if rate > 0 else 0.0
+                channel.streams.set_interval(message_id, interval, self._copter.now)

@@ -1,0 +1,60 @@
+"""The three bit masks of SYS_STATUS as ArduCopter fills them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from aerokit.mavlink.enums import MavSysStatusSensor as Sensor
+
+if TYPE_CHECKING:
+    from aerokit.sim.ardupilot.copter import SimulatedCopter
+
+__all__ = ["sensor_status"]
+
+_PREARM = Sensor.MAV_SYS_STATUS_PREARM_CHECK
+_AHRS = Sensor.MAV_SYS_STATUS_AHRS
+_LOGGING = Sensor.MAV_SYS_STATUS_LOGGING
+_ALWAYS = (
+    Sensor.SENSOR_3D_GYRO
+    | Sensor.SENSOR_3D_ACCEL
+    | Sensor.SENSOR_3D_MAG
+    | Sensor.ABSOLUTE_PRESSURE
+    | Sensor.ANGULAR_RATE_CONTROL
+    | Sensor.ATTITUDE_STABILIZATION
+    | Sensor.YAW_POSITION
+    | Sensor.MOTOR_OUTPUTS
+    | Sensor.RC_RECEIVER
+    | Sensor.MAV_SYS_STATUS_TERRAIN
+    | Sensor.BATTERY
+    | Sensor.PROPULSION
+)
+_CONTROL = Sensor.Z_ALTITUDE_CONTROL | Sensor.XY_POSITION_CONTROL
+_PRESENT = _ALWAYS | _CONTROL | _PREARM | _AHRS | _LOGGING | Sensor.MAV_SYS_STATUS_GEOFENCE
+_QUIETLY_HEALTHY = Sensor.MAV_SYS_STATUS_GEOFENCE | Sensor.PROXIMITY | _LOGGING
+
+
+def sensor_status(copter: SimulatedCopter) -> tuple[int, int, int]:
+    """Present, enabled and healthy, as integers."""
+    nav = copter.navigation
+    present, enabled, health = int(_PRESENT), int(_ALWAYS | _PREARM), int(_ALWAYS | _QUIETLY_HEALTHY)
+    if nav.is_gps_detected:
+        present |= Sensor.GPS
+        enabled |= Sensor.GPS
+        if not copter.faults.gps_lost:
+            health |= Sensor.GPS
+    if nav.is_healthy:
+        enabled |= _AHRS
+        health |= _AHRS
+    if copter.motors.is_armed:
+        enabled |= _LOGGING
+    if not copter.mode.has_manual_throttle and (copter.motors.is_armed or copter.mode.name == "GUIDED"):
+        enabled |= _CONTROL
+        health |= _CONTROL
+    if copter.arming.passes:
+        health |= _PREARM
+    if copter.faults.motor_failed:
+        health &= ~Sensor.PROPULSION
+    if copter.rangefinder_reach_m > 0.0:
+        for_it = Sensor.LASER_POSITION
+        present, enabled, health = present | for_it, enabled | for_it, health | for_it
+    return int(present), int(enabled), int(health)

@@ -1,0 +1,68 @@
+"""One port of a simulated vehicle: its own frames in, its own stream rates and its own bytes out."""
+
+from __future__ import annotations
+
+from collections.abc import Container, Hashable
+from typing import TYPE_CHECKING
+
+from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.framer import Framer
+from aerokit.sim.streams import Streams
+
+if TYPE_CHECKING:
+    from aerokit.mavlink.frame import Frame
+    from aerokit.mavlink.message import Message
+
+__all__ = ["Channel"]
+
+
+class Channel:
+    """As on a flight controller, rates belong to the port: all who listen to it share them."""
+
+    def __init__(
+        self, system_id: int, component_id: int, wanted: Container[int], *, version: int = 2
+    ) -> None:
+        self.version = version
+        self.streams = Streams()
+        self._wanted = wanted
+        self._own = (system_id, component_id)
+        self._framers: dict[Hashable, Framer] = {}
+        self._encoders: dict[tuple[int, int], FrameEncoder] = {}
+        self._outbox = bytearray()
+
+    def frames(self, data: bytes, now: float, peer: Hashable = None) -> list[Frame]:
+        """What the bytes of one peer hold that the vehicle understands."""
+        framer = self._framers.get(peer)
+        if framer is None:
+            framer = self._framers[peer] = Framer()
+            framer.wanted = self._wanted
+        return framer.receive(data, now)
+
+    def encode(self, message: Message, sender: tuple[int, int] | None = None) -> bytes:
+        """A frame with the next sequence number of the sending component; empty when this version has none."""
+        if self.version == 1 and message.ID > 255:
+            return b""
+        sender = self._own if sender is None else sender
+        encoder = self._encoders.get(sender)
+        if encoder is None:
+            encoder = self._encoders[sender] = FrameEncoder(*sender, version=self.version)
+        return encoder.encode(message)
+
+    def write(self, data: bytes) -> None:
+        """Put bytes into the outbox."""
+        self._outbox += data
+
+    def take_outbox(self) -> bytes:
+        """Everything that waits to be sent, in order; whole frames only."""
+        if not self._outbox:
+            return b""
+        data = bytes(self._outbox)
+        self._outbox.clear()
+        return data
+
+    def reset(self) -> None:
+        """Forget rates, half frames and what was not sent yet, as a reboot does."""
+        self.streams = Streams()
+        self._framers.clear()
+        self._encoders.clear()
+        self._outbox.clear()

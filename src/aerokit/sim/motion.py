@@ -1,0 +1,244 @@
+"""How a simulated multicopter moves: a point mass with a heading that leans as its acceleration needs.
+
+What it does: limits of speed, acceleration and turn rate; the slowing down before a target that ArduPilot's
+and PX4's square-root controllers show; drag, which makes it lean into its airspeed; a constant wind with
+gusts; ground. What it does not: propeller dynamics, attitude control loops, ground effect, being blown off
+its track.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from dataclasses import dataclass
+
+__all__ = ["GRAVITY_M_S2", "Motion", "MotionLimits", "Wind", "approach_speed", "wrap_pi"]
+
+GRAVITY_M_S2 = 9.80665
+_DRAG_PER_S = 0.33  # deceleration per airspeed: a 450 mm quadrotor leans 20 degrees at 10 m/s
+_VELOCITY_TIME_CONSTANT_S = 0.3
+_LEAN_TIME_CONSTANT_S = 0.15
+_TURN_GAIN_PER_S = 2.0
+_TERMINAL_SPEED_M_S = 25.0
+
+
+def wrap_pi(angle: float) -> float:
+    """The same direction between -pi and pi."""
+    return (angle + math.pi) % (2 * math.pi) - math.pi
+
+
+def approach_speed(distance: float, gain: float, deceleration: float) -> float:
+    """How fast to go towards something ``distance`` metres away and stop there without overshoot."""
+    linear = deceleration / (gain * gain)
+    if distance <= linear:
+        return distance * gain
+    return math.sqrt(2.0 * deceleration * (distance - linear / 2.0))
+
+
+@dataclass
+class MotionLimits:
+    """What the airframe and its controller settings allow."""
+
+    acceleration_m_s2: float = 2.5
+    vertical_acceleration_m_s2: float = 1.5
+    turn_rate_rad_s: float = math.radians(60.0)
+    lean_rad: float = math.radians(30.0)
+
+
+@dataclass
+class Wind:
+    """Where the air goes, in m/s; ``gusts_m_s`` is the standard deviation of its changes."""
+
+    north_m_s: float = 0.0
+    east_m_s: float = 0.0
+    gusts_m_s: float = 0.0
+
+
+class Motion:
+    """Position (metres north, east, down of the origin), velocity (m/s) and attitude (radians) of one multicopter.
+
+    One of the ``seek_…`` methods says what to do next; ``step`` does it. The ground is level at
+    ``ground_down``.
+    """
+
+    def __init__(
+        self, rng: random.Random, limits: MotionLimits | None = None, wind: Wind | None = None
+    ) -> None:
+        self.limits = limits if limits is not None else MotionLimits()
+        self.wind = wind if wind is not None else Wind()
+        self._rng = rng
+        self.ground_down = 0.0
+        self.north = self.east = self.down = 0.0
+        self.velocity_north = self.velocity_east = self.velocity_down = 0.0
+        self.acceleration_north = self.acceleration_east = self.acceleration_down = 0.0
+        self.roll = self.pitch = self.yaw = 0.0
+        self.roll_rate = self.pitch_rate = self.yaw_rate = 0.0
+        self.impact_speed_m_s = 0.0
+        """Vertical speed at the last touch of the ground."""
+        self._gust_north = self._gust_east = 0.0
+        self._wanted = (0.0, 0.0, 0.0)
+        self._leaning: tuple[float, float] | None = None
+        self._accelerating = False
+        self._wanted_yaw: float | None = None
+        self._wanted_yaw_rate = 0.0
+
+    # ------------------------------------------------------------------------------------ what to do
+
+    def seek_velocity(self, north: float, east: float, down: float) -> None:
+        """Fly at this velocity."""
+        self._wanted, self._leaning, self._accelerating = (north, east, down), None, False
+
+    def seek_acceleration(self, north: float, east: float, down: float) -> None:
+        """Accelerate like this for as long as it is asked."""
+        self._wanted, self._leaning, self._accelerating = (north, east, down), None, True
+
+    def seek_attitude(self, roll: float, pitch: float, velocity_down: float) -> None:
+        """Lean like this and keep this vertical speed."""
+        self._wanted, self._leaning, self._accelerating = (0.0, 0.0, velocity_down), (roll, pitch), False
+
+    def seek_position(
+        self, north: float, east: float, down: float, *, speed: float, climb: float, descent: float
+    ) -> None:
+        """Fly towards a point and stop there, with these speed limits in m/s."""
+        offset_north, offset_east, offset_down = north - self.north, east - self.east, down - self.down
+        distance = math.hypot(offset_north, offset_east)
+        scale = 0.0
+        if distance > 1e-6:
+            deceleration = 0.7 * self.limits.acceleration_m_s2
+            scale = min(speed, approach_speed(distance, 1.0, deceleration)) / distance
+        vertical = approach_speed(abs(offset_down), 1.0, 0.7 * self.limits.vertical_acceleration_m_s2)
+        vertical = min(vertical, descent if offset_down > 0 else climb)
+        self.seek_velocity(offset_north * scale, offset_east * scale, math.copysign(vertical, offset_down))
+
+    def face(self, yaw: float) -> None:
+        """Turn to this heading."""
+        self._wanted_yaw = yaw
+
+    def turn(self, rate: float) -> None:
+        """Keep turning at this rate, in radians per second."""
+        self._wanted_yaw, self._wanted_yaw_rate = None, rate
+
+    # ------------------------------------------------------------------------------------- and do it
+
+    @property
+    def is_on_ground(self) -> bool:
+        """Whether the skids touch."""
+        return self.down >= self.ground_down
+
+    @property
+    def airspeed_m_s(self) -> float:
+        """Horizontal speed through the air."""
+        return math.hypot(
+            self.velocity_north - self.wind.north_m_s - self._gust_north,
+            self.velocity_east - self.wind.east_m_s - self._gust_east,
+        )
+
+    @property
+    def ground_speed_m_s(self) -> float:
+        """Horizontal speed over the ground."""
+        return math.hypot(self.velocity_north, self.velocity_east)
+
+    def step(self, dt: float, *, powered: bool = True) -> None:
+        """Move on by ``dt`` seconds; without power it falls."""
+        self._blow(dt)
+        if powered:
+            north, east, down = self._commanded_acceleration()
+        else:
+            drag = GRAVITY_M_S2 / _TERMINAL_SPEED_M_S
+            north, east = -drag * self.velocity_north, -drag * self.velocity_east
+            down = GRAVITY_M_S2 - drag * self.velocity_down
+        self._integrate(north, east, down, dt)
+        self._lean(north, east, dt, powered=powered)
+        self._turn(dt, powered=powered)
+
+    def settle(self) -> None:
+        """Stand still and level on the ground."""
+        self.down = self.ground_down
+        self.velocity_north = self.velocity_east = self.velocity_down = 0.0
+        self.acceleration_north = self.acceleration_east = self.acceleration_down = 0.0
+        self.roll = self.pitch = self.roll_rate = self.pitch_rate = self.yaw_rate = 0.0
+        self._wanted, self._leaning, self._accelerating = (0.0, 0.0, 0.0), None, False
+        self._wanted_yaw, self._wanted_yaw_rate = None, 0.0
+
+    def _blow(self, dt: float) -> None:
+        if self.wind.gusts_m_s <= 0.0:
+            return
+        decay, kick = 1.0 - dt / 2.0, self.wind.gusts_m_s * math.sqrt(dt)
+        self._gust_north = self._gust_north * decay + self._rng.gauss(0.0, kick)
+        self._gust_east = self._gust_east * decay + self._rng.gauss(0.0, kick)
+
+    def _commanded_acceleration(self) -> tuple[float, float, float]:
+        limits = self.limits
+        wanted_north, wanted_east, wanted_down = self._wanted
+        down = wanted_down
+        if not self._accelerating:
+            down = (wanted_down - self.velocity_down) / _VELOCITY_TIME_CONSTANT_S
+        down = max(-limits.vertical_acceleration_m_s2, min(limits.vertical_acceleration_m_s2, down))
+        if self._leaning is not None:
+            north, east = self._acceleration_from_lean(*self._leaning)
+            return north, east, down
+        north, east = wanted_north, wanted_east
+        if not self._accelerating:
+            north = (wanted_north - self.velocity_north) / _VELOCITY_TIME_CONSTANT_S
+            east = (wanted_east - self.velocity_east) / _VELOCITY_TIME_CONSTANT_S
+        size = math.hypot(north, east)
+        if size > limits.acceleration_m_s2:
+            north, east = north * limits.acceleration_m_s2 / size, east * limits.acceleration_m_s2 / size
+        return north, east, down
+
+    def _acceleration_from_lean(self, roll: float, pitch: float) -> tuple[float, float]:
+        lean = self.limits.lean_rad
+        forward = -GRAVITY_M_S2 * math.tan(max(-lean, min(lean, pitch)))
+        right = GRAVITY_M_S2 * math.tan(max(-lean, min(lean, roll)))
+        cos_yaw, sin_yaw = math.cos(self.yaw), math.sin(self.yaw)
+        drag_north, drag_east = self._drag()
+        return (
+            forward * cos_yaw - right * sin_yaw - drag_north,
+            forward * sin_yaw + right * cos_yaw - drag_east,
+        )
+
+    def _drag(self) -> tuple[float, float]:
+        return (
+            _DRAG_PER_S * (self.velocity_north - self.wind.north_m_s - self._gust_north),
+            _DRAG_PER_S * (self.velocity_east - self.wind.east_m_s - self._gust_east),
+        )
+
+    def _integrate(self, north: float, east: float, down: float, dt: float) -> None:
+        self.acceleration_north, self.acceleration_east, self.acceleration_down = north, east, down
+        was_on_ground = self.is_on_ground
+        self.north += (self.velocity_north + 0.5 * north * dt) * dt
+        self.east += (self.velocity_east + 0.5 * east * dt) * dt
+        self.down += (self.velocity_down + 0.5 * down * dt) * dt
+        self.velocity_north += north * dt
+        self.velocity_east += east * dt
+        self.velocity_down += down * dt
+        if self.is_on_ground and self.velocity_down >= 0.0:
+            if not was_on_ground:
+                self.impact_speed_m_s = self.velocity_down
+            self.down = self.ground_down
+            self.velocity_north = self.velocity_east = self.velocity_down = 0.0
+
+    def _lean(self, north: float, east: float, dt: float, *, powered: bool) -> None:
+        roll = pitch = 0.0
+        if powered and not self.is_on_ground:
+            drag_north, drag_east = self._drag()
+            north, east = north + drag_north, east + drag_east
+            cos_yaw, sin_yaw = math.cos(self.yaw), math.sin(self.yaw)
+            limit = self.limits.lean_rad
+            pitch = max(-limit, min(limit, -math.atan2(north * cos_yaw + east * sin_yaw, GRAVITY_M_S2)))
+            roll = max(-limit, min(limit, math.atan2(east * cos_yaw - north * sin_yaw, GRAVITY_M_S2)))
+        share = min(1.0, dt / _LEAN_TIME_CONSTANT_S)
+        roll_step, pitch_step = (roll - self.roll) * share, (pitch - self.pitch) * share
+        self.roll += roll_step
+        self.pitch += pitch_step
+        self.roll_rate, self.pitch_rate = roll_step / dt, pitch_step / dt
+
+    def _turn(self, dt: float, *, powered: bool) -> None:
+        rate = 0.0
+        if powered and not self.is_on_ground:
+            rate = self._wanted_yaw_rate
+            if self._wanted_yaw is not None:
+                rate = _TURN_GAIN_PER_S * wrap_pi(self._wanted_yaw - self.yaw)
+            rate = max(-self.limits.turn_rate_rad_s, min(self.limits.turn_rate_rad_s, rate))
+        self.yaw_rate = rate
+        self.yaw = wrap_pi(self.yaw + rate * dt)

@@ -1,0 +1,58 @@
+"""Which message goes out how often on one channel of a simulated vehicle."""
+
+from __future__ import annotations
+
+import math
+from heapq import heappop, heappush
+
+__all__ = ["Streams"]
+
+
+class Streams:
+    """Intervals per message id, and what is due. A stream that fell behind skips; it never bursts."""
+
+    __slots__ = ("_heap", "_intervals", "_token")
+
+    def __init__(self) -> None:
+        self._intervals: dict[int, tuple[float, int]] = {}
+        self._heap: list[tuple[float, int, int]] = []
+        self._token = 0
+
+    def set_interval(self, message_id: int, interval_s: float, now: float) -> None:
+        """Send a message every ``interval_s`` seconds, for the first time now; 0 stops it."""
+        self._token += 1
+        if interval_s <= 0.0:
+            self._intervals.pop(message_id, None)
+            return
+        self._intervals[message_id] = (interval_s, self._token)
+        heappush(self._heap, (now, self._token, message_id))
+
+    def interval(self, message_id: int) -> float:
+        """Seconds between two of these messages; 0 when it is not streamed."""
+        return self._intervals.get(message_id, (0.0, 0))[0]
+
+    def ids(self) -> frozenset[int]:
+        """What is streamed at present."""
+        return frozenset(self._intervals)
+
+    @property
+    def next_due(self) -> float:
+        """When something is due; infinity when nothing is streamed."""
+        heap = self._heap
+        while heap:
+            due, token, message_id = heap[0]
+            if self._intervals.get(message_id, (0.0, 0))[1] == token:
+                return due
+            heappop(heap)
+        return math.inf
+
+    def take_due(self, now: float) -> list[int]:
+        """The message ids that are due, each scheduled anew."""
+        ids: list[int] = []
+        while self.next_due <= now:
+            due, token, message_id = heappop(self._heap)
+            interval = self._intervals[message_id][0]
+            following = due + interval
+            heappush(self._heap, (following if following > now else now + interval, token, message_id))
+            ids.append(message_id)
+        return ids

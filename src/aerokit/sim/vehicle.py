@@ -1,0 +1,293 @@
+"""What every simulated vehicle is made of: a clock that is fed, channels, timers, status texts, faults.
+
+Nothing here knows an event loop. ``now`` is simulated seconds, given by the caller, never going back.
+Whatever happens in between happens at its own instant and in the same order however large the steps are, so
+the same calls with the same seed always give the same bytes.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Callable, Hashable, Iterable
+from dataclasses import dataclass
+from heapq import heappop, heappush
+from typing import Any
+
+from aerokit.mavlink.dialect import STANDARD
+from aerokit.mavlink.enums import MavAutopilot, MavModeFlag, MavSeverity, MavState, MavType
+from aerokit.mavlink.message import Message
+from aerokit.mavlink.messages import Heartbeat, Statustext
+from aerokit.sim.channel import Channel
+from aerokit.sim.faults import Faults
+
+__all__ = ["ExtraComponent", "SimulatedVehicle"]
+
+TICK_S = 0.02
+"""Motion, modes and failsafes run at 50 Hz while anything moves."""
+
+_TEXT_SIZE = 50
+Handler = Callable[[Any, Channel], None]
+
+
+@dataclass(frozen=True)
+class ExtraComponent:
+    """Another MAVLink component that shows up on this vehicle's links with a heartbeat once a second."""
+
+    component_id: int
+    type: int = MavType.GIMBAL
+    autopilot: int = MavAutopilot.INVALID
+    system_id: int | None = None
+    """None: of the vehicle's own system."""
+    base_mode: int = MavModeFlag(0)
+    custom_mode: int = 0
+    system_status: int = MavState.ACTIVE
+
+
+class SimulatedVehicle:
+    """The sans-IO frame of a vehicle; a subclass says what it hears, what it streams and how it moves.
+
+    ``receive`` and ``step`` take the time, ``take_outbox`` gives the bytes; ``next_due`` says when ``step`` has
+    something to do. These three speak for the first channel; ``open_channel`` gives more (one for each link).
+    """
+
+    def __init__(
+        self, *, system_id: int, component_id: int, seed: int, components: Iterable[ExtraComponent]
+    ) -> None:
+        self.system_id = system_id
+        self.component_id = component_id
+        self.faults = Faults()
+        self.rng = random.Random(seed)
+        self.now = 0.0
+        """Simulated seconds of the latest thing that happened."""
+        self.booted_at = math.nan
+        """When it was switched on or last rebooted."""
+        self.components = tuple(components)
+        self.handlers: dict[int, Handler] = {}
+        """Message id → what is done with such a message."""
+        self._timers: list[tuple[float, int, Callable[[], None]]] = []
+        self._timer_count = 0
+        self._ticks_from = math.inf
+        self._ticks_done = 0
+        self._text_id = 0
+        self._is_on = False
+        self.channels: list[Channel] = []
+        self._channel = self.open_channel()
+
+    # ---------------------------------------------------------------------------- bytes, time, bytes
+
+    def open_channel(self, *, version: int = 2) -> Channel:
+        """Another port with its own stream rates; ``version`` is the MAVLink version it speaks."""
+        channel = Channel(self.system_id, self.component_id, self.handlers, version=version)
+        self.channels.append(channel)
+        if self._is_on:
+            self.start_channel(channel)
+        return channel
+
+    def receive(self, data: bytes, now: float, peer: Hashable = None, channel: Channel | None = None) -> None:
+        """Hear bytes from somebody. What they cause is in the outbox afterwards."""
+        self.step(now)
+        channel = self._channel if channel is None else channel
+        if self.faults.frozen or self.faults.silent or not self._is_on:
+            return
+        for frame in channel.frames(data, now, peer):
+            if frame.system_id == self.system_id and frame.component_id == self.component_id:
+                continue
+            self._handle(frame.message_id, frame, channel)
+        self.step(now)
+
+    def step(self, now: float) -> None:
+        """Let everything happen that is due up to ``now``."""
+        if not self._is_on and math.isnan(self.booted_at):
+            self.now = now
+            self.power_on()
+        if self.faults.frozen:
+            self._skip_to(now)
+            return
+        while (due := self.next_due) <= now:
+            self.now = max(self.now, due)
+            self._happen(due)
+        self.now = max(self.now, now)
+
+    @property
+    def next_due(self) -> float:
+        """The time at which ``step`` has something to do; infinity while nothing is planned."""
+        if not self._is_on and math.isnan(self.booted_at):
+            return self.now
+        due = self._ticks_from + self._ticks_done * TICK_S
+        if self._timers and self._timers[0][0] < due:
+            due = self._timers[0][0]
+        for channel in self.channels:
+            if (stream := channel.streams.next_due) < due:
+                due = stream
+        return due
+
+    def take_outbox(self) -> bytes:
+        """Everything the first channel wants to send, in order."""
+        return self._channel.take_outbox()
+
+    @property
+    def uptime(self) -> float:
+        """Seconds since it was switched on or rebooted, as ``time_boot_ms`` counts them."""
+        return self.now - self.booted_at
+
+    @property
+    def time_boot_ms(self) -> int:
+        """For the messages."""
+        return int((self.now - self.booted_at) * 1000.0) & 0xFFFFFFFF
+
+    # ----------------------------------------------------------------------------- power and reboot
+
+    def power_on(self) -> None:
+        """Start booting now."""
+        self.booted_at, self._is_on = self.now, True
+        for component in self.components:
+            self.every(1.0, lambda component=component: self._send_component(component))  # type: ignore[misc]
+        self.boot()
+        for channel in self.channels:
+            self.start_channel(channel)
+
+    def reboot(self, silence_s: float) -> None:
+        """Go silent at once, forget rates and timers, and boot anew after ``silence_s`` seconds."""
+        self._is_on = False
+        self._timers.clear()
+        self.set_ticking(False)
+        for channel in self.channels:
+            channel.reset()
+        self.call_at(self.now + silence_s, self.power_on)
+
+    def boot(self) -> None:
+        """What this kind of vehicle does when it is switched on."""
+        raise NotImplementedError
+
+    def start_channel(self, channel: Channel) -> None:
+        """What a port sends without being asked."""
+        raise NotImplementedError
+
+    def build(self, message_id: int) -> Message | None:
+        """The message to be streamed now; None when the vehicle has nothing to say."""
+        raise NotImplementedError
+
+    def tick(self, dt: float) -> None:
+        """Move on by one tick."""
+        raise NotImplementedError
+
+    # ----------------------------------------------------------------------------------------- time
+
+    def call_at(self, when: float, action: Callable[[], None]) -> None:
+        """Do something at a time; a reboot forgets it."""
+        self._timer_count += 1
+        heappush(self._timers, (when, self._timer_count, action))
+
+    def call_later(self, delay: float, action: Callable[[], None]) -> None:
+        """Do something after ``delay`` seconds; a reboot forgets it."""
+        self.call_at(self.now + delay, action)
+
+    def every(self, interval: float, action: Callable[[], None], *, first: float | None = None) -> None:
+        """Do something again and again, until a reboot."""
+        start = self.now + (interval if first is None else first)
+        boot = self.booted_at
+        count = 0
+
+        def again() -> None:
+            nonlocal count
+            count += 1
+            if boot == self.booted_at:
+                self.call_at(start + count * interval, again)
+            action()
+
+        self.call_at(start, again)
+
+    def set_ticking(self, ticking: bool) -> None:
+        """Run ``tick`` at 50 Hz from now on, or not."""
+        if ticking == (self._ticks_from != math.inf):
+            return
+        self._ticks_from, self._ticks_done = (self.now, 1) if ticking else (math.inf, 0)
+
+    def _happen(self, due: float) -> None:
+        if self._ticks_from + self._ticks_done * TICK_S <= due:
+            self._ticks_done += 1
+            self.tick(TICK_S)
+        while self._timers and self._timers[0][0] <= due:
+            heappop(self._timers)[2]()
+        for channel in self.channels:
+            if channel.streams.next_due <= due:
+                for message_id in channel.streams.take_due(due):
+                    message = self.build(message_id)
+                    if message is not None:
+                        self.send(message, channel)
+
+    def _skip_to(self, now: float) -> None:
+        """Frozen: whatever was due is late, as in a program that hung."""
+        late = now - self.now
+        if late <= 0:
+            return
+        self.now = now
+        self._timers = [(when + late, count, action) for when, count, action in self._timers]
+        self._ticks_from += late
+
+    # ------------------------------------------------------------------------------- hearing, saying
+
+    def on(self, message_class: type[Message], handler: Handler) -> None:
+        """Hear such messages from now on, when they are for this vehicle."""
+        self.handlers[message_class.ID] = handler
+
+    def is_for_me(self, message: Message) -> bool:
+        """Whether a message is addressed to this component or to everybody."""
+        system, component = getattr(message, "target_system", 0), getattr(message, "target_component", 0)
+        return system in (0, self.system_id) and component in (0, self.component_id)
+
+    def send(
+        self, message: Message, channel: Channel | None = None, sender: tuple[int, int] | None = None
+    ) -> None:
+        """Send on one channel, or on all; faults may stop it after it got its sequence number."""
+        for port in self.channels if channel is None else (channel,):
+            data = port.encode(message, sender)
+            if not self._is_lost(message):
+                port.write(data)
+
+    def send_text(self, severity: int, text: str) -> None:
+        """Send a STATUSTEXT on every channel; a text of more than 50 characters goes out in chunks."""
+        text = text.encode("ascii", "replace").decode()
+        if len(text) <= _TEXT_SIZE:
+            self.send(Statustext(severity, text, 0, 0))
+            return
+        self._text_id = self._text_id % 0xFFFF + 1
+        for number in range(len(text) // _TEXT_SIZE + 1):  # only a chunk that is not full ends the text
+            chunk = text[number * _TEXT_SIZE : (number + 1) * _TEXT_SIZE]
+            self.send(Statustext(severity, chunk, self._text_id, number))
+
+    def info(self, text: str) -> None:
+        """Send a text of severity INFO."""
+        self.send_text(MavSeverity.INFO, text)
+
+    def _handle(self, message_id: int, frame: Any, channel: Channel) -> None:
+        handler = self.handlers.get(message_id)
+        message = STANDARD.decode(frame)
+        if handler is None or not self.is_for_me(message):
+            return
+        if self.faults.drop_incoming > 0:
+            self.faults.drop_incoming -= 1
+            return
+        handler(message, channel)
+
+    def _is_lost(self, message: Message) -> bool:
+        faults = self.faults
+        if faults.silent or (faults.heartbeats_stopped and message.ID == Heartbeat.ID):
+            return True
+        if faults.drop_outgoing > 0:
+            faults.drop_outgoing -= 1
+            return True
+        return faults.loss > 0.0 and self.rng.random() < faults.loss
+
+    def _send_component(self, component: ExtraComponent) -> None:
+        heartbeat = Heartbeat(
+            component.type,
+            component.autopilot,
+            component.base_mode,
+            component.custom_mode,
+            component.system_status,
+            3,
+        )
+        system_id = self.system_id if component.system_id is None else component.system_id
+        self.send(heartbeat, sender=(system_id, component.component_id))
