@@ -1,6 +1,14 @@
 """Simulated vehicles: they speak MAVLink and fly, without hardware, firmware builds or waiting.
 
-`SimulatedCopter` is the vehicle, without any IO: bytes and the time go in, bytes come out.
+`SimulatedCopter` is the vehicle, without any IO: bytes and the time go in, bytes come out. `SimulatorServer` puts
+vehicles on links, `simulated_link` gives the client's end of a link in memory, `open_simulator` serves an address:
+
+```python
+copter = SimulatedCopter(boot_time_s=1.0)
+async with simulated_link(copter) as link, aerokit.connect(link) as vehicle:
+    ...
+    copter.faults.refuse(MavCmd.NAV_TAKEOFF, MavResult.DENIED, "No")
+```
 """
 
 from __future__ import annotations
@@ -8,6 +16,7 @@ from __future__ import annotations
 from aerokit.sim.ardupilot import BootTimeline, SimulatedCopter
 from aerokit.sim.faults import CommandFault, Faults
 from aerokit.sim.motion import Wind
+from aerokit.sim.server import SimulatorServer, open_simulator, simulated_link
 from aerokit.sim.vehicle import ExtraComponent, SimulatedVehicle
 
 __all__ = [
@@ -17,5 +26,8 @@ __all__ = [
     "Faults",
     "SimulatedCopter",
     "SimulatedVehicle",
+    "SimulatorServer",
     "Wind",
+    "open_simulator",
+    "simulated_link",
 ]

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Channel"]
 
+_DATAGRAM_SIZE = 1200
+
 
 class Channel:
     """As on a flight controller, rates belong to the port: all who listen to it share them."""
@@ -28,7 +30,7 @@ class Channel:
         self._own = (system_id, component_id)
         self._framers: dict[Hashable, Framer] = {}
         self._encoders: dict[tuple[int, int], FrameEncoder] = {}
-        self._outbox = bytearray()
+        self._outbox: list[bytes] = []
 
     def frames(self, data: bytes, now: float, peer: Hashable = None) -> list[Frame]:
         """What the bytes of one peer hold that the vehicle understands."""
@@ -49,16 +51,34 @@ class Channel:
         return encoder.encode(message)
 
     def write(self, data: bytes) -> None:
-        """Put bytes into the outbox."""
-        self._outbox += data
+        """Put a frame, or other bytes that belong together, into the outbox."""
+        if data:
+            self._outbox.append(data)
 
     def take_outbox(self) -> bytes:
         """Everything that waits to be sent, in order; whole frames only."""
         if not self._outbox:
             return b""
-        data = bytes(self._outbox)
+        data = b"".join(self._outbox)
         self._outbox.clear()
         return data
+
+    def take_datagrams(self) -> list[bytes]:
+        """The same in pieces that fit into a datagram each."""
+        datagrams: list[bytes] = []
+        size = _DATAGRAM_SIZE
+        pieces: list[bytes] = []
+        for data in self._outbox:
+            if size + len(data) > _DATAGRAM_SIZE:
+                if pieces:
+                    datagrams.append(b"".join(pieces))
+                pieces, size = [], 0
+            pieces.append(data)
+            size += len(data)
+        if pieces:
+            datagrams.append(b"".join(pieces))
+        self._outbox.clear()
+        return datagrams
 
     def reset(self) -> None:
         """Forget rates, half frames and what was not sent yet, as a reboot does."""

@@ -1,0 +1,190 @@
+"""Simulated vehicles on links, in real time or faster, inside the running event loop."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Iterable, Sequence
+from contextlib import AsyncExitStack, asynccontextmanager
+from types import TracebackType
+from typing import TYPE_CHECKING
+
+from aerokit.errors import BusyError, LinkLost, LocalProtocolError
+from aerokit.links import Link, MemoryLink, Peer, memory_link_pair
+from aerokit.sim.vehicle import SimulatedVehicle
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+    from aerokit.sim.channel import Channel
+
+__all__ = ["SimulatorServer", "open_simulator", "simulated_link"]
+
+_SHORTEST_WAIT_S = 0.001
+"""Of real time, when the simulation runs faster than it: several ticks are then done in one go."""
+
+
+class SimulatorServer:
+    """Vehicles that live as long as an ``async with`` block; every vehicle is on every link.
+
+    It runs on the loop's own clock by timers alone: no task, no thread. ``speedup`` 10 makes ten simulated seconds of
+    a real one. What the loop missed because something blocked it is caught up. Leaving the block closes the links.
+
+    Raises LinkOpenError when a link cannot be opened; nothing is left behind then.
+    """
+
+    def __init__(
+        self,
+        vehicles: SimulatedVehicle | Iterable[SimulatedVehicle],
+        links: Link | Iterable[Link],
+        *,
+        speedup: float = 1.0,
+    ) -> None:
+        if not speedup > 0:
+            raise LocalProtocolError(f"speedup = {speedup!r} must be above 0")
+        self.vehicles = (vehicles,) if isinstance(vehicles, SimulatedVehicle) else tuple(vehicles)
+        self._links = (links,) if isinstance(links, Link) else tuple(links)
+        self._speedup = speedup
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._started_at = 0.0
+        self._now_at_start = max((vehicle.now for vehicle in self.vehicles), default=0.0)
+        self._ports: list[_Port] = []
+        self._timer: asyncio.TimerHandle | None = None
+        self._timer_due = 0.0
+        self._exit = AsyncExitStack()
+
+    @property
+    def addresses(self) -> tuple[str, ...]:
+        """The addresses of its links, as they are once they are open."""
+        return tuple(link.address for link in self._links)
+
+    @property
+    def now(self) -> float:
+        """Simulated seconds."""
+        if self._loop is None:
+            return self._now_at_start
+        return self._now_at_start + (self._loop.time() - self._started_at) * self._speedup
+
+    async def __aenter__(self) -> Self:
+        if self._loop is not None:
+            raise BusyError("this SimulatorServer was started before")
+        self._loop = asyncio.get_running_loop()
+        self._started_at = self._loop.time()
+        async with AsyncExitStack() as opening:
+            for number, link in enumerate(self._links):
+                port = _Port(self, link, _channels(self.vehicles, number))
+                opening.push_async_callback(port.close)
+                await link.open(port)
+                self._ports.append(port)
+            self._exit = opening.pop_all()
+        self._run(self.now)
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer = None
+        self._loop = None
+        self._ports.clear()
+        await self._exit.aclose()
+
+    # -------------------------------------------------------------------------------------- running
+
+    def wake(self) -> None:
+        """Let everything happen that is due; call it after a fault or a value was changed by hand."""
+        if self._loop is not None:
+            self._run(self.now)
+
+    def _on_timer(self) -> None:
+        self._timer = None
+        self._run(max(self.now, self._timer_due))  # a timer may fire a hair early
+
+    def _run(self, now: float) -> None:
+        for vehicle in self.vehicles:
+            vehicle.step(now)
+        self._flush()
+        self._schedule()
+
+    def hear(self, data: bytes, peer: Peer, channels: Sequence[Channel]) -> None:
+        """Bytes came in on a link."""
+        if self._loop is None:
+            return
+        now = self.now
+        for vehicle, channel in zip(self.vehicles, channels, strict=True):
+            vehicle.receive(data, max(now, vehicle.now), peer, channel)
+        self._flush()
+        self._schedule()
+
+    def _flush(self) -> None:
+        for port in self._ports:
+            for channel in port.channels:
+                for datagram in channel.take_datagrams():
+                    port.link.write(datagram)
+
+    def _schedule(self) -> None:
+        loop = self._loop
+        due = min((vehicle.next_due for vehicle in self.vehicles), default=float("inf"))
+        if loop is None or due == float("inf"):
+            return
+        if self._timer is not None:
+            if self._timer_due == due:
+                return
+            self._timer.cancel()
+        when = self._started_at + (due - self._now_at_start) / self._speedup
+        if self._speedup != 1.0:
+            when = max(when, loop.time() + _SHORTEST_WAIT_S)
+        self._timer_due, self._timer = due, loop.call_at(when, self._on_timer)
+
+
+class _Port:
+    """One link and the vehicles' channels on it."""
+
+    def __init__(self, server: SimulatorServer, link: Link, channels: Sequence[Channel]) -> None:
+        self._server = server
+        self.link = link
+        self.channels = channels
+
+    def bytes_received(self, data: bytes, peer: Peer) -> None:
+        """See `Receiver`."""
+        self._server.hear(data, peer, self.channels)
+
+    def link_lost(self, error: LinkLost) -> None:
+        """The client has gone; the vehicles fly on, as vehicles do."""
+
+    async def close(self) -> None:
+        """Close the link and wait until it is gone."""
+        self.link.close()
+        await self.link.wait_closed()
+
+
+def _channels(vehicles: Iterable[SimulatedVehicle], number: int) -> list[Channel]:
+    return [vehicle.channels[0] if number == 0 else vehicle.open_channel() for vehicle in vehicles]
+
+
+@asynccontextmanager
+async def simulated_link(
+    vehicles: SimulatedVehicle | Iterable[SimulatedVehicle], *, speedup: float = 1.0, latency_s: float = 0.0
+) -> AsyncIterator[MemoryLink]:
+    """Vehicles in memory: gives the client's end of the link, to be opened by the caller.
+
+    ``latency_s`` seconds, by the loop's clock, pass between sending and receiving in both directions.
+    """
+    near, far = memory_link_pair(latency_s=latency_s)
+    async with SimulatorServer(vehicles, far, speedup=speedup):
+        yield near
+
+
+@asynccontextmanager
+async def open_simulator(
+    vehicles: SimulatedVehicle | Iterable[SimulatedVehicle], *addresses: str, speedup: float = 1.0
+) -> AsyncIterator[SimulatorServer]:
+    """Serve vehicles on connection strings ("tcpin:0.0.0.0:5760", "udpout:127.0.0.1:14550") for other programs.
+
+    Raises LocalProtocolError for a wrong address, LinkOpenError for one that cannot be opened.
+    """
+    from aerokit.links import create_link  # type: ignore[attr-defined,unused-ignore]
+
+    links = [create_link(address) for address in addresses]
+    async with SimulatorServer(vehicles, links, speedup=speedup) as server:
+        yield server
