@@ -9,7 +9,6 @@ from aerokit.autopilots import ardupilot_modes
 from aerokit.autopilots.base import (
     LANDED_STATE_IN_AIR,
     LANDED_STATE_ON_GROUND,
-    NAN,
     NAV_TAKEOFF,
     Autopilot,
     Purpose,
@@ -108,6 +107,7 @@ class ArduCopter(ArduPilot):
     reposition = Reposition(relative_altitude=True, yaw=False, speed=False, armed_only=False)
     condition_yaw = True
     changes_speed = True
+    lands_after_return = True
     unarmable_modes = frozenset(
         (
             *(
@@ -130,7 +130,7 @@ class ArduCopter(ArduPilot):
     ) -> TakeOff:
         """GUIDED, arm, NAV_TAKEOFF with the altitude above home; it stays in GUIDED."""
         guided = self.modes.find("GUIDED")
-        return TakeOff(guided, NAV_TAKEOFF, (0, 0, 0, NAN, 0, 0, altitude_relative_m), None)
+        return TakeOff(guided, NAV_TAKEOFF, (0, 0, 0, 0, 0, 0, altitude_relative_m), None)
 
     def landed_state_of(self, heartbeat: Heartbeat) -> int | None:
         """STANDBY is said on the ground only, ACTIVE in the air only; a failsafe (CRITICAL) hides both."""
@@ -153,6 +153,7 @@ class ArduPlane(ArduPilot):
     setpoints = SetpointRules(local_position=False, global_position=False, velocity=False, acceleration=False)
     reposition = Reposition(relative_altitude=True, yaw=False, speed=False, armed_only=False)
     changes_speed = True
+    arrival_radius_m = 90.0  # it circles at WP_LOITER_RAD, 60 m by default
 
     def _purpose_name(self, purpose: Purpose, is_vtol: bool) -> str | None:
         if self._can_hover(is_vtol) and purpose in _QUADPLANE:
@@ -164,7 +165,7 @@ class ArduPlane(ArduPilot):
     ) -> TakeOff:
         """A QuadPlane rises in GUIDED; a plane armed in TAKEOFF climbs to its parameter TKOFF_ALT."""
         if self._can_hover(is_vtol):
-            params = (0, 0, 0, NAN, 0, 0, altitude_relative_m)
+            params = (0, 0, 0, 0, 0, 0, altitude_relative_m)
             return TakeOff(self.modes.find("GUIDED"), NAV_TAKEOFF, params, None)
         return TakeOff(self.modes.find("TAKEOFF"), None, (), None, sets_altitude=False)
 
@@ -193,6 +194,7 @@ class ArduRover(ArduPilot):
     setpoints = SetpointRules(acceleration=False)
     reposition = Reposition(relative_altitude=True, yaw=False, speed=False, armed_only=False)
     changes_speed = True
+    arrival_radius_m = 4.0
     unarmable_modes = frozenset(("RTL", "SMART_RTL", "INITIALISING"))
 
     def _purpose_name(self, purpose: Purpose, is_vtol: bool) -> str | None:

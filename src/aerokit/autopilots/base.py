@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from aerokit.autopilots.health import ESTIMATES, PREARM_CHECK, SENSORS, names_of
 from aerokit.autopilots.modes import CUSTOM_MODE_ENABLED, NO_MODES, Mode, ModeTable, base_mode_name
 from aerokit.autopilots.version import AutopilotVersion, version_text
-from aerokit.mavlink.messages import AutopilotVersion as AutopilotVersionMessage
-from aerokit.mavlink.messages import SetMode
+from aerokit.mavlink import messages
+from aerokit.snapshot import Snapshot
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
-    from aerokit.mavlink.messages import Heartbeat
 
 __all__ = ["Autopilot", "ModeOrder", "Purpose", "Reposition", "SetpointRules", "TakeOff"]
 
@@ -28,8 +26,7 @@ Purpose = Literal["hold", "land", "return", "setpoint", "take_off", "mission"]
 """What a program wants a mode for."""
 
 
-@dataclass(frozen=True)
-class TakeOff:
+class TakeOff(Snapshot):
     """How this vehicle takes off.
 
     Go to ``mode`` (None: stay), arm, then send the command ``command`` (None: arming in ``mode`` is all) with
@@ -44,8 +41,7 @@ class TakeOff:
     sets_altitude: bool = True
 
 
-@dataclass(frozen=True)
-class SetpointRules:
+class SetpointRules(Snapshot):
     """Which guided set-points are obeyed, and what the autopilot expects of the stream.
 
     ``before_mode``: the stream must run before the mode is asked for. ``minimum_hz`` is the slowest stream
@@ -68,8 +64,7 @@ class SetpointRules:
         return tuple(kind.replace("_", " ") for kind in kinds if getattr(self, kind))
 
 
-@dataclass(frozen=True)
-class Reposition:
+class Reposition(Snapshot):
     """How MAV_CMD_DO_REPOSITION (192) is understood here.
 
     ``relative_altitude``: frames relative to home are obeyed; else the altitude must be AMSL. ``yaw``: param4
@@ -83,17 +78,16 @@ class Reposition:
     armed_only: bool
 
 
-@dataclass(frozen=True)
-class ModeOrder:
+class ModeOrder(Snapshot):
     """The parameters of MAV_CMD_DO_SET_MODE (176), and the fields of the older SET_MODE message (11)."""
 
     params: tuple[float, float, float]
     base_mode: int
     custom_mode: int
 
-    def legacy(self, target_system: int) -> SetMode:
+    def legacy(self, target_system: int) -> messages.SetMode:
         """The same order as a SET_MODE message, which has no acknowledgement of its own."""
-        return SetMode(target_system, self.base_mode, self.custom_mode)
+        return messages.SetMode(target_system, self.base_mode, self.custom_mode)
 
 
 class Autopilot:
@@ -121,10 +115,18 @@ class Autopilot:
     """Whether MAV_CMD_CONDITION_YAW (115) turns the vehicle in its mode for set-points."""
     changes_speed = False
     """Whether MAV_CMD_DO_CHANGE_SPEED (178) is obeyed outside missions."""
+    reposition_purpose: Purpose = "setpoint"
+    """Which mode DO_REPOSITION puts the vehicle into."""
+    lands_after_return = False
+    """Whether the mode for returning ends on the ground."""
+    arrival_radius_m = 2.0
+    """How near it comes to a place that it was sent to, or circles it, by default."""
     relative_altitude_needs_home = False
     """Whether GLOBAL_POSITION_INT.relative_alt is the altitude above the sea until home is known."""
     sends_mission_requests_float = False
     """Whether it asks for mission items by MISSION_REQUEST instead of MISSION_REQUEST_INT."""
+    unknown_currents_ca: frozenset[int] = frozenset((-1,))
+    """What a battery's current in 0.01 A says when it is not known; the standard says −1."""
     estimator_message = "ESTIMATOR_STATUS"
     wind_message = "WIND_COV"
     stream_groups: ClassVar[Mapping[int, int]] = {}
@@ -141,7 +143,7 @@ class Autopilot:
 
     # --------------------------------------------------------------------------------- modes
 
-    def mode_of(self, heartbeat: Heartbeat, extra: Mapping[int, str] = NO_MODES) -> Mode:
+    def mode_of(self, heartbeat: messages.Heartbeat, extra: Mapping[int, str] = NO_MODES) -> Mode:
         """The mode that a HEARTBEAT tells; ``extra`` are names the vehicle told by AVAILABLE_MODES."""
         return self.mode(heartbeat.custom_mode, heartbeat.base_mode, extra)
 
@@ -189,7 +191,7 @@ class Autopilot:
         """Whether :meth:`take_off` must be told the altitude of home above the sea."""
         return False
 
-    def landed_state_of(self, heartbeat: Heartbeat) -> int | None:
+    def landed_state_of(self, heartbeat: messages.Heartbeat) -> int | None:
         """MAV_LANDED_STATE as far as HEARTBEAT.system_status alone tells it; None when it does not."""
         return None
 
@@ -225,7 +227,7 @@ class Autopilot:
 
     # ------------------------------------------------------------------------------- version
 
-    def version_of(self, message: AutopilotVersionMessage) -> AutopilotVersion:
+    def version_of(self, message: messages.AutopilotVersion) -> AutopilotVersion:
         """What AUTOPILOT_VERSION says, in words."""
         text, number = version_text(message.flight_sw_version)
         return AutopilotVersion(

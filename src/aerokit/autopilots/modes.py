@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 
 from aerokit.errors import LocalProtocolError
+from aerokit.snapshot import Snapshot
 
 __all__ = ["CUSTOM_MODE_ENABLED", "Mode", "ModeTable", "base_mode_name", "is_armed"]
 
@@ -21,8 +21,7 @@ _UNKNOWN = "MODE"
 _MAX_CUSTOM_MODE = 0xFFFF_FFFF
 
 
-@dataclass(frozen=True)
-class Mode:
+class Mode(Snapshot):
     """A flight mode, as HEARTBEAT tells it (https://mavlink.io/en/messages/minimal.html#HEARTBEAT).
 
     ``name`` is the autopilot's own name for it (``"GUIDED"``, ``"POSCTL"``), ``"MODE 42"`` for a number that
@@ -32,7 +31,15 @@ class Mode:
 
     name: str
     custom_mode: int
-    base_mode: int = field(default=CUSTOM_MODE_ENABLED, compare=False)
+    base_mode: int = CUSTOM_MODE_ENABLED
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Mode):
+            return NotImplemented
+        return self.custom_mode == other.custom_mode and self.name == other.name
+
+    def __hash__(self) -> int:
+        return hash((self.name, self.custom_mode))
 
     def __str__(self) -> str:
         return self.name

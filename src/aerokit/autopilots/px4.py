@@ -22,7 +22,7 @@ from aerokit.errors import LocalProtocolError
 __all__ = ["Px4", "px4_custom_mode"]
 
 MAIN_POSCTL, MAIN_AUTO = 3, 4
-GROUND_ROVER, SURFACE_BOAT, SUBMARINE = 10, 11, 12
+FIXED_WING, GROUND_ROVER, SURFACE_BOAT, SUBMARINE = 1, 10, 11, 12
 ESTIMATES_REQUIRED, POS_HORIZ_ABS = 0x01 | 0x02 | 0x04 | 0x20, 0x10
 ESTIMATOR_PROBLEMS: Mapping[int, str] = {1024: "GPS without glitches", 2048: "accelerometer without errors"}
 
@@ -94,6 +94,8 @@ class Px4(Autopilot):
     changes_speed = True
     relative_altitude_needs_home = True
     _bytewise_by_default = True
+    unknown_currents_ca = frozenset((-1, -100))  # inside PX4, −1 A is "unknown"
+    reposition_purpose = "hold"
     purposes: ClassVar[Mapping[str, str]] = {
         "hold": "LOITER",
         "land": "LAND",
@@ -105,6 +107,12 @@ class Px4(Autopilot):
     never_sent = frozenset(
         ("EKF_STATUS_REPORT", "WIND", "RANGEFINDER", "AHRS", "AHRS2", "MEMINFO", "POWER_STATUS", "RAW_IMU")
     )
+
+    def __init__(self, vehicle_type: int) -> None:
+        super().__init__(vehicle_type)
+        self.lands_after_return = not self._stays_down and vehicle_type != FIXED_WING
+        if vehicle_type == FIXED_WING:
+            self.arrival_radius_m = 120.0  # it circles at NAV_LOITER_RAD, 80 m by default
 
     def mode(self, custom_mode: int, base_mode: int, extra: Mapping[int, str] = NO_MODES) -> Mode:
         """The mode of these numbers; what an external mode calls itself goes before EXTERNAL1 and so on."""

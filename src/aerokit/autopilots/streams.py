@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from aerokit.mavlink import messages as m
-from aerokit.mavlink.message import Message
+from aerokit.mavlink.messages import INDEX
 
 __all__ = ["ARDUPILOT_GROUPS", "DEFAULT_RATES_HZ"]
 
@@ -20,80 +19,80 @@ RAW_SENSORS, EXTENDED_STATUS, RC_CHANNELS, RAW_CONTROLLER, POSITION, EXTRA1, EXT
     12,
 )
 
-_GROUPS: Mapping[int, tuple[type[Message], ...]] = {
+_GROUPS: Mapping[int, tuple[str, ...]] = {
     RAW_SENSORS: (
-        m.RawImu,
-        m.ScaledImu2,
-        m.ScaledImu3,
-        m.ScaledPressure,
-        m.ScaledPressure2,
-        m.ScaledPressure3,
-        m.Airspeed,
+        "RawImu",
+        "ScaledImu2",
+        "ScaledImu3",
+        "ScaledPressure",
+        "ScaledPressure2",
+        "ScaledPressure3",
+        "Airspeed",
     ),
     EXTENDED_STATUS: (
-        m.SysStatus,
-        m.PowerStatus,
-        m.McuStatus,
-        m.Meminfo,
-        m.MissionCurrent,
-        m.GpsRawInt,
-        m.GpsRtk,
-        m.Gps2Raw,
-        m.Gps2Rtk,
-        m.NavControllerOutput,
-        m.FenceStatus,
-        m.PositionTargetGlobalInt,
+        "SysStatus",
+        "PowerStatus",
+        "McuStatus",
+        "Meminfo",
+        "MissionCurrent",
+        "GpsRawInt",
+        "GpsRtk",
+        "Gps2Raw",
+        "Gps2Rtk",
+        "NavControllerOutput",
+        "FenceStatus",
+        "PositionTargetGlobalInt",
     ),
-    POSITION: (m.GlobalPositionInt, m.LocalPositionNed),
-    RAW_CONTROLLER: (m.RcChannelsScaled,),
-    RC_CHANNELS: (m.ServoOutputRaw, m.RcChannels, m.RcChannelsRaw),
-    EXTRA1: (m.Attitude, m.Simstate, m.Ahrs2, m.Rpm, m.AoaSsa, m.PidTuning, m.EscTelemetry1To4),
-    EXTRA2: (m.VfrHud,),
+    POSITION: ("GlobalPositionInt", "LocalPositionNed"),
+    RAW_CONTROLLER: ("RcChannelsScaled",),
+    RC_CHANNELS: ("ServoOutputRaw", "RcChannels", "RcChannelsRaw"),
+    EXTRA1: ("Attitude", "Simstate", "Ahrs2", "Rpm", "AoaSsa", "PidTuning", "EscTelemetry1To4"),
+    EXTRA2: ("VfrHud",),
     EXTRA3: (
-        m.Ahrs,
-        m.Wind,
-        m.Rangefinder,
-        m.DistanceSensor,
-        m.SystemTime,
-        m.TerrainReport,
-        m.BatteryStatus,
-        m.OpticalFlow,
-        m.MagCalReport,
-        m.MagCalProgress,
-        m.EkfStatusReport,
-        m.Vibration,
+        "Ahrs",
+        "Wind",
+        "Rangefinder",
+        "DistanceSensor",
+        "SystemTime",
+        "TerrainReport",
+        "BatteryStatus",
+        "OpticalFlow",
+        "MagCalReport",
+        "MagCalProgress",
+        "EkfStatusReport",
+        "Vibration",
     ),
 }
 
+_IDS: Mapping[str, int] = {row[0]: message_id for message_id, row in INDEX.items()}
+
 ARDUPILOT_GROUPS: Mapping[int, int] = {
-    message.ID: group for group, messages in _GROUPS.items() for message in messages
+    _IDS[name]: group for group, names in _GROUPS.items() for name in names
 }
 """Message id → MAV_DATA_STREAM, from ArduPilot's GCS_MAVLink_Parameters.cpp."""
 
-DEFAULT_RATES_HZ: Mapping[type[Message], float] = {
-    m.Attitude: 10.0,
-    m.AttitudeQuaternion: 10.0,
-    m.GlobalPositionInt: 10.0,
-    m.LocalPositionNed: 10.0,
-    m.VfrHud: 5.0,
-    m.ExtendedSysState: 5.0,
-    m.SysStatus: 2.0,
-    m.GpsRawInt: 2.0,
-    m.Gps2Raw: 2.0,
-    m.EkfStatusReport: 2.0,
-    m.EstimatorStatus: 2.0,
-    m.RcChannels: 2.0,
-    m.ServoOutputRaw: 2.0,
-    m.DistanceSensor: 5.0,
-    m.Rangefinder: 5.0,
-    m.BatteryStatus: 1.0,
-    m.MissionCurrent: 1.0,
-    m.SystemTime: 1.0,
-    m.Vibration: 1.0,
-    m.Wind: 1.0,
-    m.WindCov: 1.0,
-    m.HomePosition: 0.5,
-    m.GpsGlobalOrigin: 0.5,
-    m.CurrentMode: 1.0,
+DEFAULT_RATES_HZ: Mapping[str, float] = {
+    "Attitude": 10.0,
+    "GlobalPositionInt": 10.0,
+    "LocalPositionNed": 10.0,
+    "VfrHud": 5.0,
+    "ExtendedSysState": 5.0,
+    "SysStatus": 2.0,
+    "GpsRawInt": 2.0,
+    "EkfStatusReport": 2.0,
+    "EstimatorStatus": 2.0,
+    "RcChannels": 2.0,
+    "ServoOutputRaw": 2.0,
+    "DistanceSensor": 5.0,
+    "BatteryStatus": 1.0,
+    "MissionCurrent": 1.0,
+    "SystemTime": 1.0,
+    "Vibration": 1.0,
+    "Wind": 1.0,
+    "WindCov": 1.0,
+    "CurrentMode": 1.0,
 }
-"""How fast the values of a vehicle should come when nobody asks for another rate."""
+"""Class name of a message → how fast it should come when nobody asks for another rate.
+
+Names, so that this module does not have all messages imported.
+"""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from aerokit.snapshot import Snapshot
 
 __all__ = ["AutopilotVersion", "version_text"]
 
@@ -10,8 +10,7 @@ _KINDS = ((255, ""), (192, "-rc"), (128, "-beta"), (64, "-alpha"), (0, "-dev"))
 """FIRMWARE_VERSION_TYPE: each kind begins at its number."""
 
 
-@dataclass(frozen=True)
-class AutopilotVersion:
+class AutopilotVersion(Snapshot):
     """Firmware and hardware of an autopilot.
 
     ``firmware`` is ``"4.7.0-dev"``, ``number`` its (major, minor, patch) for comparisons, ``git_hash`` the

@@ -44,14 +44,15 @@ class StateCell(Generic[T]):
         "_sinks",
         "_source",
         "_updated_at",
-        "_waits_for",
         "name",
+        "waits_for",
     )
 
     def __init__(self, name: str, clock: Callable[[], float], waits_for: str) -> None:
         self.name = name
         self._clock = clock
-        self._waits_for = waits_for
+        self.waits_for = waits_for
+        """The messages that the value comes from."""
         self._known = False
         self._latest: T | None = None
         self._source: Source | None = None
@@ -67,7 +68,7 @@ class StateCell(Generic[T]):
     def value(self) -> T:
         """The latest value, however old; :class:`ValueUnknownError` before the first."""
         if not self._known:
-            raise ValueUnknownError(f"{self.name} is not known yet: no {self._waits_for} has been received")
+            raise ValueUnknownError(f"{self.name} is not known yet: no {self.waits_for} has been received")
         return self._latest  # type: ignore[return-value]
 
     @property
@@ -104,7 +105,7 @@ class StateCell(Generic[T]):
         if self.age > within:
             raise StaleValueError(
                 f"{self.name} is {self.age:.1f} s old, older than the {within:g} s asked for:"
-                f" no {self._waits_for} since"
+                f" no {self.waits_for} since"
             )
         return value
 
@@ -142,12 +143,16 @@ class StateCell(Generic[T]):
         """Like :meth:`changes`, but each value that comes counts, also when it equals the one before."""
         return Changes(self, every_arrival=True)
 
-    def observe(self, callback: Callable[[T | None, T], None]) -> Callable[[], None]:
+    def observe(
+        self, callback: Callable[[T | None, T], None], *, every_arrival: bool = False
+    ) -> Callable[[], None]:
         """Call ``callback(previous, value)`` at every change, inside :meth:`set`; returns what ends that.
+
+        With ``every_arrival`` also when a value equals the one before.
 
         The callback must be quick and must not raise.
         """
-        observer = _Observer(self, callback)
+        observer = _Observer(self, callback, every_arrival)
         self._sinks.append(observer)
         return observer.close
 
@@ -188,7 +193,7 @@ class StateCell(Generic[T]):
 
     def _describe(self) -> str:
         if not self._known:
-            return f"{self.name} is not known yet, no {self._waits_for} has been received"
+            return f"{self.name} is not known yet, no {self.waits_for} has been received"
         return f"{self.name} is {self._latest!r}, {self.age:.1f} s old"
 
     def __repr__(self) -> str:
@@ -343,16 +348,19 @@ class _Waiter(_Sink[T]):
 class _Observer(_Sink[T]):
     """A callback for every change."""
 
-    __slots__ = ("_callback", "_cell", "_previous")
+    __slots__ = ("_callback", "_cell", "_every_arrival", "_previous")
 
-    def __init__(self, cell: StateCell[T], callback: Callable[[T | None, T], None]) -> None:
+    def __init__(
+        self, cell: StateCell[T], callback: Callable[[T | None, T], None], every_arrival: bool
+    ) -> None:
         self._cell = cell
+        self._every_arrival = every_arrival
         self._callback = callback
         self._previous = cell.latest
 
     def receive(self, value: T) -> None:
         previous, self._previous = self._previous, value
-        if previous is None or previous != value:
+        if self._every_arrival or previous is None or previous != value:
             self._callback(previous, value)
 
     def forget(self) -> None:

@@ -1,0 +1,91 @@
+"""``Snapshot``: an immutable value with named fields, like a dataclass, but quick to define and to make.
+
+Thirty frozen, slotted dataclasses cost more to import than the rest of the package. This writes the one
+method that must be written, ``__init__``, and shares the others.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, ClassVar
+
+if TYPE_CHECKING:
+    from typing_extensions import Self, dataclass_transform
+else:  # importing typing_extensions would cost more than everything else here
+
+    def dataclass_transform(**_: object) -> Any:
+        """Only the type checker cares."""
+        return lambda cls: cls
+
+
+__all__ = ["Snapshot"]
+
+
+@dataclass_transform(frozen_default=True)
+class _SnapshotType(type):
+    """Turns annotated names into slots and writes ``__init__``; the module must postpone annotations."""
+
+    def __new__(mcs, name: str, bases: tuple[type, ...], namespace: dict[str, Any]) -> _SnapshotType:
+        annotations: dict[str, str] = namespace.get("__annotations__", {})
+        fields = tuple(field for field, kind in annotations.items() if not kind.startswith("ClassVar"))
+        defaults = {field: namespace.pop(field) for field in fields if field in namespace}
+        cls = super().__new__(mcs, name, bases, {**namespace, "__slots__": fields, "__match_args__": fields})
+        if fields:
+            _write_init(cls, fields, defaults)
+        return cls
+
+
+def _write_init(cls: type, fields: tuple[str, ...], defaults: dict[str, Any]) -> None:
+    """``def __init__(self, a, b=default)``, which sets the slots directly, behind __setattr__'s back."""
+    scope: dict[str, Any] = {f"_set_{field}": cls.__dict__[field].__set__ for field in fields}
+    scope.update({f"_default_{field}": value for field, value in defaults.items()})
+    arguments = [f"{field}=_default_{field}" if field in defaults else field for field in fields]
+    lines = [f"def __init__(self, {', '.join(arguments)}):", *(f" _set_{f}(self, {f})" for f in fields)]
+    if hasattr(cls, "_check"):
+        lines.append(" self._check()")
+    exec("\n".join(lines), scope)
+    init = scope["__init__"]
+    init.__qualname__ = f"{cls.__qualname__}.__init__"
+    type.__setattr__(cls, "__init__", init)
+
+
+class Snapshot(metaclass=_SnapshotType):
+    """Base of the values that programs read: immutable, comparable, printable.
+
+    A subclass may have a method ``_check(self)``, which raises when the fields make no sense together.
+    """
+
+    __match_args__: ClassVar[tuple[str, ...]]
+
+    def replace(self, **changes: Any) -> Self:
+        """A copy with these fields changed."""
+        return type(self)(**{**self.to_dict(), **changes})
+
+    def to_dict(self) -> dict[str, Any]:
+        """Field names and values, in the order of the fields."""
+        return {field: getattr(self, field) for field in self.__match_args__}
+
+    def __setattr__(self, name: str, value: object) -> None:
+        raise AttributeError(f"{type(self).__name__} is immutable: use replace({name}=…)")
+
+    def __delattr__(self, name: str) -> None:
+        raise AttributeError(f"{type(self).__name__} is immutable")
+
+    def __eq__(self, other: object) -> bool:
+        if type(self) is not type(other):
+            return NotImplemented
+        return all(getattr(self, field) == getattr(other, field) for field in self.__match_args__)
+
+    def __hash__(self) -> int:
+        return hash(tuple(self.to_dict().values()))
+
+    def __repr__(self) -> str:
+        fields = ", ".join(f"{field}={_short(getattr(self, field))}" for field in self.__match_args__)
+        return f"{type(self).__name__}({fields})"
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), tuple(self.to_dict().values())
+
+
+def _short(value: object) -> str:
+    """Seven digits behind the point are a centimetre on the globe."""
+    return repr(round(value, 7) if isinstance(value, float) else value)
