@@ -1,7 +1,8 @@
 """Simulated vehicles: they speak MAVLink and fly, without hardware, firmware builds or waiting.
 
-`SimulatedCopter` is the vehicle, without any IO: bytes and the time go in, bytes come out. `SimulatorServer` puts
-vehicles on links, `simulated_link` gives the client's end of a link in memory, `open_simulator` serves an address:
+`SimulatedCopter` is the vehicle, without any IO: bytes and the time go in, bytes come out. `SimulatorServer`
+puts vehicles on links, `simulated_link` gives the client's end of a link in memory, `open_simulator` serves
+addresses:
 
 ```python
 copter = SimulatedCopter(boot_time_s=1.0)

@@ -41,7 +41,7 @@ class Channel:
         return framer.receive(data, now)
 
     def encode(self, message: Message, sender: tuple[int, int] | None = None) -> bytes:
-        """A frame with the next sequence number of the sending component; empty when this version has none."""
+        """A frame with the sending component's next sequence number; empty when MAVLink 1 has none."""
         if self.version == 1 and message.ID > 255:
             return b""
         sender = self._own if sender is None else sender

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING
 from aerokit.mavlink.enums import MavFrame, MavResult, MavSeverity
 from aerokit.mavlink.messages import CommandAck, CommandInt, CommandLong
 from aerokit.sim.faults import CommandFault
+from aerokit.sim.vehicle import SimulatedVehicle, sender_of
 
 if TYPE_CHECKING:
     from aerokit.sim.channel import Channel
-    from aerokit.sim.vehicle import SimulatedVehicle
 
 __all__ = ["Command", "CommandServer", "Progress"]
 
@@ -86,12 +86,12 @@ class CommandServer:
     def _on_long(self, message: CommandLong, channel: Channel) -> None:
         numbers = (message.param1, message.param2, message.param3, message.param4)
         place = (message.param5, message.param6, message.param7)
-        self.execute(Command(message.command, *numbers, *place, None, channel, _sender(message)))
+        self.execute(Command(message.command, *numbers, *place, None, channel, sender_of(message)))
 
     def _on_int(self, message: CommandInt, channel: Channel) -> None:
         numbers = (message.param1, message.param2, message.param3, message.param4)
         place = (message.x, message.y, message.z)
-        self.execute(Command(message.command, *numbers, *place, message.frame, channel, _sender(message)))
+        self.execute(Command(message.command, *numbers, *place, message.frame, channel, sender_of(message)))
 
     def execute(self, command: Command) -> None:
         """Do it and answer."""
@@ -141,11 +141,6 @@ class CommandServer:
         system, component = command.sender
         ack = CommandAck(command.command, result, progress, 0, system, component)
         self._vehicle.send(ack, command.channel)
-
-
-def _sender(message: CommandLong | CommandInt) -> tuple[int, int]:
-    frame = message.received_frame
-    return (0, 0) if frame is None else (frame.system_id, frame.component_id)
 
 
 def _whole(value: float) -> int:

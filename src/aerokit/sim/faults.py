@@ -33,15 +33,14 @@ class CommandFault:
 class Faults:
     """Everything is off at first. Change attributes at any time; they act from the next message or step on.
 
-    ``gps_lost``             no GPS fix any more; after ten seconds the estimator gives its position up
-    ``heartbeats_stopped``   every stream goes on, heartbeats do not
-    ``frozen``               the autopilot hangs: it neither hears, moves nor sends until it is False again
-    ``silent``               the radio is out: nothing gets through in either direction, the vehicle flies on
-    ``prearm_failures``      reasons that the arming checks give on top of the real ones ("Compass not healthy")
-    ``drop_outgoing``        this many of the next frames are lost on their way out (counts down)
-    ``drop_incoming``        this many of the next messages for the vehicle are lost (counts down)
-    ``loss``                 share of the outgoing frames that is lost at random, 0 to 1, the same for the same seed
-    ``motor_failed``         a motor stands still: the vehicle cannot hold its height and comes down
+    - ``gps_lost``: no GPS fix any more; after ten seconds the estimator gives its position up
+    - ``heartbeats_stopped``: every stream goes on, heartbeats do not
+    - ``frozen``: the autopilot hangs; it neither hears, moves nor sends until it is False again
+    - ``silent``: the radio is out; nothing gets through in either direction, the vehicle flies on
+    - ``prearm_failures``: reasons that the arming checks give besides the real ones ("Compass not healthy")
+    - ``drop_outgoing``, ``drop_incoming``: this many of the next frames are lost (they count down)
+    - ``loss``: share of the outgoing frames that is lost at random, 0 to 1, the same for the same seed
+    - ``motor_failed``: a motor stands still; the vehicle cannot hold its height and comes down
     """
 
     gps_lost: bool = False

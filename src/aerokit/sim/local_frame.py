@@ -22,7 +22,7 @@ class GlobalPoint:
 
 
 class LocalFrame:
-    """North, east, down in metres around an origin; good for a few kilometres, as in the autopilots themselves."""
+    """North, east, down in metres around an origin; good for some kilometres, as the autopilots' own."""
 
     __slots__ = ("_east_scale", "origin")
 

@@ -55,7 +55,7 @@ class Wind:
 
 
 class Motion:
-    """Position (metres north, east, down of the origin), velocity (m/s) and attitude (radians) of one multicopter.
+    """Position (metres north, east, down of an origin), velocity (m/s) and attitude (rad) of a multicopter.
 
     One of the ``seek_…`` methods says what to do next; ``step`` does it. The ground is level at
     ``ground_down``.

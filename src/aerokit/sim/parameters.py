@@ -83,8 +83,8 @@ class Parameters:
 class ParameterServer:
     """Answers PARAM_REQUEST_LIST, PARAM_REQUEST_READ and PARAM_SET.
 
-    ``bytewise``: integers travel as their bytes (PX4); otherwise as numbers (ArduPilot). An unknown name is met with
-    silence, as both do (PX4 "main" sends PARAM_ERROR).
+    With ``bytewise`` integers travel as their bytes (PX4), otherwise as numbers (ArduPilot). An unknown name
+    is met with silence, as both do (PX4 "main" sends PARAM_ERROR).
     """
 
     def __init__(self, vehicle: SimulatedVehicle, parameters: Parameters, *, bytewise: bool = False) -> None:

@@ -26,8 +26,9 @@ _SHORTEST_WAIT_S = 0.001
 class SimulatorServer:
     """Vehicles that live as long as an ``async with`` block; every vehicle is on every link.
 
-    It runs on the loop's own clock by timers alone: no task, no thread. ``speedup`` 10 makes ten simulated seconds of
-    a real one. What the loop missed because something blocked it is caught up. Leaving the block closes the links.
+    It runs on the loop's own clock by timers alone: no task, no thread. ``speedup`` 10 makes ten simulated
+    seconds of a real one. What the loop missed because something blocked it is caught up. Leaving the block
+    closes the links.
 
     Raises LinkOpenError when a link cannot be opened; nothing is left behind then.
     """
@@ -179,7 +180,7 @@ async def simulated_link(
 async def open_simulator(
     vehicles: SimulatedVehicle | Iterable[SimulatedVehicle], *addresses: str, speedup: float = 1.0
 ) -> AsyncIterator[SimulatorServer]:
-    """Serve vehicles on connection strings ("tcpin:0.0.0.0:5760", "udpout:127.0.0.1:14550") for other programs.
+    """Serve vehicles on addresses ("tcpin:0.0.0.0:5760", "udpout:127.0.0.1:14550") for other programs.
 
     Raises LocalProtocolError for a wrong address, LinkOpenError for one that cannot be opened.
     """

@@ -21,7 +21,7 @@ from aerokit.mavlink.messages import Heartbeat, Statustext
 from aerokit.sim.channel import Channel
 from aerokit.sim.faults import Faults
 
-__all__ = ["ExtraComponent", "SimulatedVehicle"]
+__all__ = ["ExtraComponent", "SimulatedVehicle", "sender_of"]
 
 TICK_S = 0.02
 """Motion, modes and failsafes run at 50 Hz while anything moves."""
@@ -47,8 +47,8 @@ class ExtraComponent:
 class SimulatedVehicle:
     """The sans-IO frame of a vehicle; a subclass says what it hears, what it streams and how it moves.
 
-    ``receive`` and ``step`` take the time, ``take_outbox`` gives the bytes; ``next_due`` says when ``step`` has
-    something to do. These three speak for the first channel; ``open_channel`` gives more (one for each link).
+    `receive` and `step` take the time, `take_outbox` gives the bytes; `next_due` says when `step` has
+    something to do. They speak for the first channel; `open_channel` gives more, one for each link.
     """
 
     def __init__(
@@ -135,6 +135,11 @@ class SimulatedVehicle:
     def time_boot_ms(self) -> int:
         """For the messages."""
         return int((self.now - self.booted_at) * 1000.0) & 0xFFFFFFFF
+
+    @property
+    def time_boot_us(self) -> int:
+        """For the messages."""
+        return int((self.now - self.booted_at) * 1e6)
 
     # ----------------------------------------------------------------------------- power and reboot
 
@@ -291,3 +296,9 @@ class SimulatedVehicle:
         )
         system_id = self.system_id if component.system_id is None else component.system_id
         self.send(heartbeat, sender=(system_id, component.component_id))
+
+
+def sender_of(message: Message) -> tuple[int, int]:
+    """System and component id of who sent a received message; zeros for one that was not received."""
+    frame = message.received_frame
+    return (0, 0) if frame is None else (frame.system_id, frame.component_id)

@@ -20,14 +20,16 @@ from aerokit.sim.ardupilot.navigation import Navigation
 from aerokit.sim.ardupilot.requests import Requests
 from aerokit.sim.ardupilot.returning import Land, Rtl, SmartRtl
 from aerokit.sim.ardupilot.setpoints import Setpoints
-from aerokit.sim.ardupilot.telemetry import BUILDERS, global_origin, heartbeat, home_position
+from aerokit.sim.ardupilot.telemetry import BUILDERS
+from aerokit.sim.ardupilot.telemetry_position import global_origin, home_position
+from aerokit.sim.ardupilot.telemetry_state import heartbeat
 from aerokit.sim.ardupilot.yaw import AutoYaw
 from aerokit.sim.battery import Battery
 from aerokit.sim.commands import CommandServer
 from aerokit.sim.local_frame import GlobalPoint, LocalFrame
 from aerokit.sim.motion import Motion, Wind
 from aerokit.sim.parameters import Parameters, ParameterServer
-from aerokit.sim.vehicle import ExtraComponent, SimulatedVehicle
+from aerokit.sim.vehicle import ExtraComponent, SimulatedVehicle, sender_of
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
@@ -53,18 +55,17 @@ _RELEASES = {"dev": 0, "alpha": 64, "beta": 128, "rc": 192, "official": 255}
 class SimulatedCopter(SimulatedVehicle):
     """Speaks and behaves as ArduCopter does where a client can see it; flies as `Motion` does.
 
-    home                where it stands when it is switched on: latitude and longitude in degrees, altitude AMSL in m
-    heading_deg         where its nose points then
-    boot_time_s         seconds until the estimator has a position; the real one needs 41.5, 0 is ready at once
-    boot_text           the plain text that a serial or TCP port gives before the first frame
-    version             "4.7.0-dev": goes into AUTOPILOT_VERSION and the banner
-    battery_percent     charge at the start; ``battery_capacity_mah`` its size
-    wind                constant wind and gusts
-    rangefinder_reach_m 0 means that there is no range finder
-    unsupported_commands  MAV_CMDs that this firmware does not know (SET_MESSAGE_INTERVAL, DO_SET_MODE of old ones)
-    stream_groups       False for a firmware that does not know REQUEST_DATA_STREAM
-    components          other components on its links (gimbal, camera): heartbeats only
-    unix_time_at_boot   what its GPS clock says at power on, in seconds
+    - ``home``: where it is switched on: latitude, longitude (degrees), altitude AMSL (m);
+      ``heading_deg``: where its nose points then
+    - ``boot_time_s``: seconds until the estimator has a position; the real one needs 41.5, 0 is ready at once
+    - ``boot_text``: the plain text that a serial or TCP port gives before the first frame
+    - ``version``: goes into AUTOPILOT_VERSION and the banner; ``parameters``: values other than the defaults
+    - ``battery_percent``: charge at the start; ``battery_capacity_mah``: the size of the pack
+    - ``wind``: constant wind and gusts; ``rangefinder_reach_m``: 0 means that there is no range finder
+    - ``unsupported_commands``: MAV_CMDs that this firmware does not know (SET_MESSAGE_INTERVAL if it is old);
+      ``stream_groups`` False: it does not know REQUEST_DATA_STREAM
+    - ``components``: other components on its links (gimbal, camera), heartbeats only
+    - ``unix_time_at_boot``: what its GPS clock says at simulated second 0
 
     Not simulated yet: missions, fence, rally, files, logs, a gimbal, radio failsafe.
     """
@@ -331,8 +332,7 @@ class SimulatedCopter(SimulatedVehicle):
         self.set_mode_from(request.base_mode, request.custom_mode)
 
     def _on_heartbeat(self, message: m.Heartbeat, _: Channel) -> None:
-        frame = message.received_frame
-        if frame is not None and frame.system_id == self.parameters["MAV_GCS_SYSID"]:
+        if sender_of(message)[0] == self.parameters["MAV_GCS_SYSID"]:
             self.failsafes.ground_station_seen_at = self.now
 
     def _on_timesync(self, request: m.Timesync, channel: Channel) -> None:
@@ -340,9 +340,8 @@ class SimulatedCopter(SimulatedVehicle):
             self.send(m.Timesync(int(self.uptime * 1e9), request.ts1), channel)
 
     def _on_ping(self, ping: m.Ping, channel: Channel) -> None:
-        frame = ping.received_frame
-        if frame is not None and ping.target_system == 0:
-            self.send(m.Ping(ping.time_usec, ping.seq, frame.system_id, frame.component_id), channel)
+        if ping.target_system == 0:
+            self.send(m.Ping(ping.time_usec, ping.seq, *sender_of(ping)), channel)
 
     def _on_rc_override(self, override: m.RcChannelsOverride, _: Channel) -> None:
         for index in range(len(self.rc)):
@@ -353,16 +352,11 @@ class SimulatedCopter(SimulatedVehicle):
                 self.rc[index] = value
 
     def _on_mission_request_list(self, request: m.MissionRequestList, channel: Channel) -> None:
-        self.send(m.MissionCount(*_sender(request), 0, request.mission_type), channel)
+        self.send(m.MissionCount(*sender_of(request), 0, request.mission_type), channel)
 
     def _on_mission_count(self, count: m.MissionCount, channel: Channel) -> None:
         self.send_text(MavSeverity.WARNING, "Only 0 items are supported")
-        self.send(m.MissionAck(*_sender(count), MavMissionResult.NO_SPACE, count.mission_type), channel)
+        self.send(m.MissionAck(*sender_of(count), MavMissionResult.NO_SPACE, count.mission_type), channel)
 
     def _on_mission_clear(self, clear: m.MissionClearAll, channel: Channel) -> None:
-        self.send(m.MissionAck(*_sender(clear), MavMissionResult.ACCEPTED, clear.mission_type), channel)
-
-
-def _sender(message: Message) -> tuple[int, int]:
-    frame = message.received_frame
-    return (0, 0) if frame is None else (frame.system_id, frame.component_id)
+        self.send(m.MissionAck(*sender_of(clear), MavMissionResult.ACCEPTED, clear.mission_type), channel)

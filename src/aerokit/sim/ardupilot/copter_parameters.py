@@ -1,4 +1,4 @@
-"""Parameters of a simulated ArduCopter: names, defaults and types of 4.7-dev, those that something here reads or shows."""
+"""Parameters of a simulated ArduCopter: names, defaults and types of 4.7-dev; those that something reads."""
 
 from __future__ import annotations
 

@@ -19,8 +19,9 @@ _LAND_ON_BATTERY, _RTL_ON_BATTERY = 1, 2
 
 
 class Failsafes:
-    """Checked ten times a second. Each acts once when it starts and says so; only the actions below are simulated:
-    nothing, LAND, RTL, and SMART_RTL as RTL.
+    """Checked ten times a second; each acts once when it starts and says so.
+
+    Of the actions that can be configured these are simulated: nothing, LAND, RTL, and SMART_RTL as RTL.
     """
 
     def __init__(self, copter: SimulatedCopter) -> None:

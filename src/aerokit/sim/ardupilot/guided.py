@@ -30,7 +30,7 @@ class Submode(Enum):
 
 
 class Guided(Mode):
-    """Holds still at first. A position target stays; every other set-point ends GUID_TIMEOUT seconds after its last.
+    """Still at first. A position target stays, other set-points end GUID_TIMEOUT seconds after the last.
 
     A change from one kind of set-point to another resets the speed limits to WPNAV_SPEED and its siblings, as
     ArduCopter does: DO_CHANGE_SPEED is for the flight to the present kind of target.

@@ -99,7 +99,7 @@ class TakeOff:
 
 
 class PilotedMode(Mode):
-    """Modes that the sticks fly. Nobody touches them here: they stay where RC_CHANNELS_OVERRIDE or the test put them."""
+    """Modes that the sticks fly; the sticks stay where RC_CHANNELS_OVERRIDE or the test put them."""
 
     def __init__(self, copter: SimulatedCopter) -> None:
         super().__init__(copter)

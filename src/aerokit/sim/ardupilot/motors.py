@@ -17,7 +17,7 @@ _STOPPED_PWM, _IDLE_PWM, _FULL_PWM = 1000, 1100, 2000
 
 
 class Motors:
-    """``spool`` is 0 while the motors idle or stand and 1 when they can lift; `wanted` is what the mode asks for."""
+    """``spool`` is 0 while the motors idle or stand, 1 when they can lift; ``wanted`` asks for that."""
 
     def __init__(self) -> None:
         self.is_armed = False

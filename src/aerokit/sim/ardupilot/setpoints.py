@@ -133,7 +133,7 @@ class Setpoints:
         copter.guided.lean(roll, pitch, self._climb(target.thrust))
 
     def _climb(self, thrust: float) -> float:
-        """Thrust 0.5 holds the height; it is a climb rate unless GUID_OPTIONS says otherwise (not simulated)."""
+        """Thrust is a climb rate, 0.5 holds the height; the meaning by GUID_OPTIONS is not simulated."""
         share = (max(0.0, min(1.0, thrust)) - 0.5) * 2.0
         parameters = self._copter.parameters
         return share * parameters["WPNAV_SPEED_UP" if share > 0 else "WPNAV_SPEED_DN"] / 100.0

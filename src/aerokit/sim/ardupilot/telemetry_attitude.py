@@ -1,0 +1,182 @@
+"""What a simulated ArduCopter says of its attitude, speed and inertial sensors."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from aerokit.mavlink import messages as m
+from aerokit.sim.motion import GRAVITY_M_S2
+
+if TYPE_CHECKING:
+    from aerokit.mavlink.message import Message
+    from aerokit.sim.ardupilot.copter import SimulatedCopter
+
+__all__ = ["ATTITUDE_BUILDERS"]
+
+
+def _attitude(copter: SimulatedCopter) -> m.Attitude:
+    motion = copter.motion
+    return m.Attitude(
+        copter.time_boot_ms,
+        motion.roll,
+        motion.pitch,
+        motion.yaw,
+        motion.roll_rate,
+        motion.pitch_rate,
+        motion.yaw_rate,
+    )
+
+
+def _attitude_quaternion(copter: SimulatedCopter) -> m.AttitudeQuaternion | None:
+    if not copter.navigation.has_attitude:
+        return None
+    motion = copter.motion
+    q = _quaternion(motion.roll, motion.pitch, motion.yaw)
+    return m.AttitudeQuaternion(copter.time_boot_ms, *q, motion.roll_rate, motion.pitch_rate, motion.yaw_rate)
+
+
+def _quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
+    """Euler angles as w, x, y, z."""
+    cr, sr = math.cos(roll / 2), math.sin(roll / 2)
+    cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
+    cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
+    return (
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    )
+
+
+def _attitude_target(copter: SimulatedCopter) -> m.AttitudeTarget:
+    motion = copter.motion
+    q = _quaternion(motion.roll, motion.pitch, motion.yaw)
+    return m.AttitudeTarget(copter.time_boot_ms, 0, q, 0.0, 0.0, motion.yaw_rate, copter.motors.throttle)
+
+
+def _ahrs(copter: SimulatedCopter) -> m.Ahrs:
+    error = 0.01 if copter.navigation.has_attitude else 1.0
+    return m.Ahrs(0.0, 0.0, 0.0, 0.0, 0.0, error, error)
+
+
+def _ahrs2(copter: SimulatedCopter) -> m.Ahrs2:
+    motion, place = copter.motion, copter.navigation.position
+    lat, lon, alt = (
+        (0, 0, 0.0) if place is None else (place.latitude_e7, place.longitude_e7, place.altitude_m)
+    )
+    return m.Ahrs2(motion.roll, motion.pitch, motion.yaw, alt, lat, lon)
+
+
+def _simstate(copter: SimulatedCopter) -> m.Simstate:
+    motion = copter.motion
+    place = copter.navigation.frame.to_global(motion.north, motion.east, motion.down)
+    return m.Simstate(
+        motion.roll,
+        motion.pitch,
+        motion.yaw,
+        0.0,
+        0.0,
+        -GRAVITY_M_S2,
+        motion.roll_rate,
+        motion.pitch_rate,
+        motion.yaw_rate,
+        place.latitude_e7,
+        place.longitude_e7,
+    )
+
+
+def _vfr_hud(copter: SimulatedCopter) -> m.VfrHud:
+    motion, place = copter.motion, copter.navigation.position
+    return m.VfrHud(
+        motion.airspeed_m_s if copter.navigation.has_position else 0.0,
+        motion.ground_speed_m_s,
+        int(math.degrees(motion.yaw) % 360.0),
+        round(copter.motors.throttle * 100),
+        0.0 if place is None else place.altitude_m,
+        -motion.velocity_down,
+    )
+
+
+Three = tuple[int, int, int]
+
+
+def _acceleration(copter: SimulatedCopter) -> Three:
+    """In mG."""
+    motion = copter.motion
+    lift = -GRAVITY_M_S2 + (0.0 if copter.is_landed else motion.acceleration_down)
+    x, y = 1000 * math.sin(motion.pitch), -1000 * math.sin(motion.roll)
+    return (_int16(x), _int16(y), _int16(lift / GRAVITY_M_S2 * 1000))
+
+
+def _rates(copter: SimulatedCopter) -> Three:
+    """In mrad/s."""
+    motion = copter.motion
+    return (
+        _int16(motion.roll_rate * 1000),
+        _int16(motion.pitch_rate * 1000),
+        _int16(motion.yaw_rate * 1000),
+    )
+
+
+def _field(copter: SimulatedCopter) -> Three:
+    """In mG (milligauss)."""
+    yaw = copter.motion.yaw
+    return (_int16(230 * math.cos(yaw)), _int16(-230 * math.sin(yaw)), -530)
+
+
+def _int16(value: float) -> int:
+    return max(-32768, min(32767, round(value)))
+
+
+def _raw_imu(copter: SimulatedCopter) -> m.RawImu:
+    return m.RawImu(copter.time_boot_us, *_acceleration(copter), *_rates(copter), *_field(copter), 0, 3500)
+
+
+def _scaled_imu2(copter: SimulatedCopter) -> m.ScaledImu2:
+    return m.ScaledImu2(copter.time_boot_ms, *_acceleration(copter), *_rates(copter), *_field(copter), 3500)
+
+
+def _scaled_imu3(copter: SimulatedCopter) -> m.ScaledImu3:
+    return m.ScaledImu3(copter.time_boot_ms, 0, 0, 0, 0, 0, 0, *_field(copter))
+
+
+def _pressure_hpa(copter: SimulatedCopter) -> float:
+    altitude = copter.navigation.frame.origin.altitude_m - copter.motion.down
+    return float(1013.25 * (1 - 2.25577e-5 * altitude) ** 5.25588)
+
+
+def _scaled_pressure(copter: SimulatedCopter) -> m.ScaledPressure:
+    return m.ScaledPressure(copter.time_boot_ms, _pressure_hpa(copter), 0.0, 2800, 0)
+
+
+def _scaled_pressure2(copter: SimulatedCopter) -> m.ScaledPressure2:
+    return m.ScaledPressure2(copter.time_boot_ms, _pressure_hpa(copter), 0.0, 2800, 0)
+
+
+def _wind(copter: SimulatedCopter) -> m.Wind | None:
+    if not copter.navigation.has_position:
+        return None
+    wind = copter.motion.wind
+    speed = math.hypot(wind.north_m_s, wind.east_m_s)
+    comes_from = math.degrees(math.atan2(-wind.east_m_s, -wind.north_m_s))
+    return m.Wind(comes_from, speed, 0.0)
+
+
+ATTITUDE_BUILDERS: dict[int, Callable[[SimulatedCopter], Message | None]] = {
+    m.Attitude.ID: _attitude,
+    m.AttitudeQuaternion.ID: _attitude_quaternion,
+    m.AttitudeTarget.ID: _attitude_target,
+    m.Ahrs.ID: _ahrs,
+    m.Ahrs2.ID: _ahrs2,
+    m.Simstate.ID: _simstate,
+    m.VfrHud.ID: _vfr_hud,
+    m.RawImu.ID: _raw_imu,
+    m.ScaledImu2.ID: _scaled_imu2,
+    m.ScaledImu3.ID: _scaled_imu3,
+    m.ScaledPressure.ID: _scaled_pressure,
+    m.ScaledPressure2.ID: _scaled_pressure2,
+    m.Wind.ID: _wind,
+}
+"""Message id → what to send now, or None."""

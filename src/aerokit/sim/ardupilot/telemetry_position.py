@@ -1,0 +1,229 @@
+"""What a simulated ArduCopter says of where it is and where it goes.
+
+Unknown values look as they do on the real vehicle: latitude and longitude 0 before the first fix, no
+LOCAL_POSITION_NED before the estimator uses GPS, no HOME_POSITION without a home.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import EkfStatusFlags, GpsFixType
+from aerokit.mavlink.enums import PositionTargetTypemask as Mask
+
+if TYPE_CHECKING:
+    from aerokit.mavlink.message import Message
+    from aerokit.sim.ardupilot.copter import SimulatedCopter
+    from aerokit.sim.ardupilot.navigation import Ned
+
+__all__ = ["POSITION_BUILDERS", "global_origin", "home_position"]
+
+_NAN4 = (math.nan,) * 4
+_POSITION_ONLY = (
+    Mask.VX_IGNORE | Mask.VY_IGNORE | Mask.VZ_IGNORE | Mask.AX_IGNORE | Mask.AY_IGNORE | Mask.AZ_IGNORE
+) | (Mask.YAW_IGNORE | Mask.YAW_RATE_IGNORE)
+
+
+def _global_position(copter: SimulatedCopter) -> m.GlobalPositionInt:
+    motion, nav = copter.motion, copter.navigation
+    place = nav.position
+    relative = round(nav.altitude_above_home * 1000)
+    heading = round(math.degrees(motion.yaw) % 360.0 * 100) % 36000 if nav.has_attitude else 0
+    if place is None:
+        return m.GlobalPositionInt(copter.time_boot_ms, 0, 0, 0, relative, 0, 0, 0, heading)
+    return m.GlobalPositionInt(
+        copter.time_boot_ms,
+        place.latitude_e7,
+        place.longitude_e7,
+        round(place.altitude_m * 1000),
+        relative,
+        round(motion.velocity_north * 100),
+        round(motion.velocity_east * 100),
+        round(motion.velocity_down * 100),
+        heading,
+    )
+
+
+def _local_position(copter: SimulatedCopter) -> m.LocalPositionNed | None:
+    motion, nav = copter.motion, copter.navigation
+    if not nav.has_position:
+        return None
+    north, east, down = nav.local((motion.north, motion.east, motion.down))
+    return m.LocalPositionNed(
+        copter.time_boot_ms,
+        north,
+        east,
+        down,
+        motion.velocity_north,
+        motion.velocity_east,
+        motion.velocity_down,
+    )
+
+
+def _gps_raw(copter: SimulatedCopter) -> m.GpsRawInt:
+    motion, nav = copter.motion, copter.navigation
+    if not nav.is_gps_detected:
+        return m.GpsRawInt(0, GpsFixType.NO_GPS, 0, 0, 0, 65535, 65535, 0, 0, 0)
+    if nav.fix_type < GpsFixType.TYPE_3D_FIX:
+        return m.GpsRawInt(0, GpsFixType.NO_FIX, 0, 0, 0, 9999, 9999, 0, 0, 3)
+    place = nav.frame.to_global(motion.north, motion.east, motion.down)
+    altitude = round(place.altitude_m * 1000)
+    course = (
+        round(math.degrees(math.atan2(motion.velocity_east, motion.velocity_north)) % 360.0 * 100) % 36000
+    )
+    return m.GpsRawInt(
+        copter.time_boot_us,
+        nav.fix_type,
+        place.latitude_e7,
+        place.longitude_e7,
+        altitude,
+        121,
+        200,
+        round(motion.ground_speed_m_s * 100),
+        course,
+        10,
+        altitude,
+        300,
+        300,
+    )
+
+
+def _ekf_status(copter: SimulatedCopter) -> m.EkfStatusReport | None:
+    flags = copter.navigation.flags
+    if flags is None:
+        return None
+    size = 0.02 if flags & EkfStatusFlags.POS_HORIZ_ABS else 0.0
+    return m.EkfStatusReport(flags, size, size, size / 2, size, 0.0, 0.0)
+
+
+def home_position(copter: SimulatedCopter) -> m.HomePosition | None:
+    """HOME_POSITION; None without a home. ArduPilot's quaternion is NaN."""
+    home = copter.navigation.home
+    if home is None:
+        return None
+    place = copter.navigation.frame.to_global(*home)
+    local = copter.navigation.local(home)
+    return m.HomePosition(
+        place.latitude_e7,
+        place.longitude_e7,
+        round(place.altitude_m * 1000),
+        *local,
+        _NAN4,
+        0.0,
+        0.0,
+        0.0,
+        copter.time_boot_us,
+    )
+
+
+def global_origin(copter: SimulatedCopter) -> m.GpsGlobalOrigin | None:
+    """GPS_GLOBAL_ORIGIN; None before the estimator has one."""
+    origin = copter.navigation.origin
+    if origin is None:
+        return None
+    place = copter.navigation.frame.to_global(*origin)
+    return m.GpsGlobalOrigin(
+        place.latitude_e7, place.longitude_e7, round(place.altitude_m * 1000), copter.time_boot_us
+    )
+
+
+def _target_global(copter: SimulatedCopter) -> m.PositionTargetGlobalInt | None:
+    target = copter.mode.destination
+    if target is None or not copter.motors.is_armed:
+        return None
+    place = copter.navigation.frame.to_global(*target)
+    return m.PositionTargetGlobalInt(
+        copter.time_boot_ms,
+        0,
+        _POSITION_ONLY | 0xF000,
+        place.latitude_e7,
+        place.longitude_e7,
+        place.altitude_m,
+        *(0.0,) * 8,
+    )
+
+
+def _target_local(copter: SimulatedCopter) -> m.PositionTargetLocalNed | None:
+    if copter.mode is not copter.guided:
+        return None
+    target = copter.guided.destination
+    if target is None:
+        mask = Mask.X_IGNORE | Mask.Y_IGNORE | Mask.Z_IGNORE | Mask.YAW_IGNORE | Mask.YAW_RATE_IGNORE
+        velocity, acceleration = copter.guided.velocity, copter.guided.acceleration
+        return m.PositionTargetLocalNed(
+            copter.time_boot_ms, 1, mask, 0.0, 0.0, 0.0, *velocity, *acceleration, 0.0, 0.0
+        )
+    local = copter.navigation.local(target)
+    return m.PositionTargetLocalNed(copter.time_boot_ms, 1, _POSITION_ONLY, *local, *(0.0,) * 8)
+
+
+def _nav_controller(copter: SimulatedCopter) -> m.NavControllerOutput:
+    motion, target = copter.motion, copter.mode.destination
+    roll, pitch, yaw = (math.degrees(angle) for angle in (motion.roll, motion.pitch, motion.yaw))
+    bearing, distance, altitude_error = _to_target(copter, target)
+    return m.NavControllerOutput(roll, pitch, round(yaw), bearing, distance, altitude_error, 0.0, 0.0)
+
+
+def _to_target(copter: SimulatedCopter, target: Ned | None) -> tuple[int, int, float]:
+    if target is None:
+        return 0, 0, 0.0
+    motion = copter.motion
+    north, east = target[0] - motion.north, target[1] - motion.east
+    bearing = round(math.degrees(math.atan2(east, north)) % 360.0) % 360
+    return bearing, min(65535, int(math.hypot(north, east))), motion.down - target[2]
+
+
+def _terrain_report(copter: SimulatedCopter) -> m.TerrainReport:
+    place = copter.navigation.position
+    if place is None:
+        return m.TerrainReport(0, 0, 100, 0.0, 0.0, 56, 0)
+    return m.TerrainReport(place.latitude_e7, place.longitude_e7, 0, 0.0, place.altitude_m, 504, 0)
+
+
+def _rangefinder(copter: SimulatedCopter) -> m.Rangefinder | None:
+    distance = _height_below(copter)
+    return None if distance is None else m.Rangefinder(distance, 0.0)
+
+
+def _distance_sensor(copter: SimulatedCopter) -> m.DistanceSensor | None:
+    distance = _height_below(copter)
+    if distance is None:
+        return None
+    reach = round(copter.rangefinder_reach_m * 100)
+    return m.DistanceSensor(
+        copter.time_boot_ms,
+        20,
+        reach,
+        min(reach + 10, round(distance * 100)),
+        0,
+        0,
+        25,
+        0,
+        signal_quality=100,
+    )
+
+
+def _height_below(copter: SimulatedCopter) -> float | None:
+    if copter.rangefinder_reach_m <= 0.0:
+        return None
+    return copter.motion.ground_down - copter.motion.down + 0.2
+
+
+POSITION_BUILDERS: dict[int, Callable[[SimulatedCopter], Message | None]] = {
+    m.GlobalPositionInt.ID: _global_position,
+    m.LocalPositionNed.ID: _local_position,
+    m.GpsRawInt.ID: _gps_raw,
+    m.EkfStatusReport.ID: _ekf_status,
+    m.HomePosition.ID: home_position,
+    m.GpsGlobalOrigin.ID: global_origin,
+    m.PositionTargetGlobalInt.ID: _target_global,
+    m.PositionTargetLocalNed.ID: _target_local,
+    m.NavControllerOutput.ID: _nav_controller,
+    m.TerrainReport.ID: _terrain_report,
+    m.Rangefinder.ID: _rangefinder,
+    m.DistanceSensor.ID: _distance_sensor,
+}
+"""Message id → what to send now, or None."""
