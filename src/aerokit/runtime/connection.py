@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import time
-from collections import Counter
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import anyio
 
-from aerokit.errors import ConnectionClosed, LinkLost, LocalProtocolError
+from aerokit.errors import AerokitError, ConnectionClosed, LinkLost, LocalProtocolError
 from aerokit.links import create_link
 from aerokit.links.link import Link
 from aerokit.mavlink.dialect import STANDARD
@@ -21,11 +21,12 @@ from aerokit.mavlink.messages import Heartbeat
 from aerokit.mavlink.tlog import TlogWriter
 from aerokit.runtime.bus import Bus
 from aerokit.runtime.events import Event, LinkClosed
+from aerokit.runtime.loop_watch import watch_loop
 from aerokit.runtime.subscription import Overflow, Subscription
 
 if TYPE_CHECKING:
     import os
-    from collections.abc import AsyncIterator, Callable, Iterator
+    from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
 
     from anyio.abc import TaskGroup
 
@@ -36,6 +37,8 @@ if TYPE_CHECKING:
     from aerokit.runtime.bus import Detach, Sink
 
 __all__ = ["Connection", "open_connection"]
+
+logger = logging.getLogger("aerokit")
 
 ItemT = TypeVar("ItemT", bound="Message | Event")
 
@@ -134,6 +137,8 @@ class Connection:
         self.source_system, self.source_component = source_system, source_component
         self.heard: dict[tuple[int, int], Heartbeat] = {}
         """The last HEARTBEAT of every (system id, component id) on the link."""
+        self.attached: set[int] = set()
+        """System ids that have a vehicle object on this connection."""
         self._clock = asyncio.get_running_loop().time
         self._encoder = FrameEncoder(source_system, source_component, version=mavlink_version)
         self._framers: dict[Peer, Framer] = {}
@@ -146,19 +151,20 @@ class Connection:
 
     # ------------------------------------------------------------------------------- sending
 
-    def send(self, message: Message) -> None:
+    def send(self, message: Message, *, to: int | None = None) -> None:
         """Number, frame and write a message; never blocks.
 
-        It goes where the system in its ``target_system`` was last heard, or to every peer when it names none.
+        It goes to where the system ``to`` (None: the one in its ``target_system``) was last heard, and to every peer
+        when there is none.
 
         Raises:
             LocalProtocolError: a field is out of range; nothing was sent.
             ConnectionClosed, LinkLost: the connection has ended.
         """
-        if self._error is not None:
-            raise self._error
+        self.raise_if_ended()
         data = self._encoder.encode(message)
-        self.link.write(data, self._routes.get(getattr(message, "target_system", 0)))
+        target = getattr(message, "target_system", 0) if to is None else to
+        self.link.write(data, self._routes.get(target))
         if self._recorder is not None:
             self._recorder.write(data, time.time())
 
@@ -177,11 +183,14 @@ class Connection:
         self.check_types(types)
 
         def attach(sink: Sink) -> list[Detach]:
-            ended = self.on_end(subscription.close)
-            return [ended, *(self._attach(item, sink, system_id) for item in types)]
+            return [self.on_end(subscription.close), *self.attach(types, sink, system_id=system_id)]
 
         subscription: Subscription[ItemT] = Subscription(attach, capacity=capacity, overflow=overflow)
         return subscription
+
+    def attach(self, types: Sequence[type[Any]], sink: Sink, *, system_id: int = 0) -> list[Detach]:
+        """Have these messages and events, of one system or of all (0), delivered to ``sink``."""
+        return [self._attach(item, sink, system_id) for item in types]
 
     def check_types(self, types: tuple[type[Any], ...]) -> None:
         """Raise LocalProtocolError unless each of these can be subscribed to."""
@@ -213,6 +222,11 @@ class Connection:
         """Whether messages can still be sent and received."""
         return self._error is None
 
+    def raise_if_ended(self) -> None:
+        """Raise what ended the connection (ConnectionClosed, LinkLost), if it has ended."""
+        if self._error is not None:
+            raise self._error
+
     def now(self) -> float:
         """Seconds on the event loop's clock, the one that all ages and deadlines are measured on."""
         return self._clock()
@@ -223,18 +237,17 @@ class Connection:
 
     def counts(self, system_id: int) -> tuple[int, int]:
         """Frames of this system that were received, and frames that its sequence numbers say were lost."""
-        received: Counter[str] = Counter()
-        for statistics in self.statistics():
-            for (system, _), count in statistics.received.items():
-                received["received"] += count if system == system_id else 0
-            for (system, _), count in statistics.lost.items():
-                received["lost"] += count if system == system_id else 0
-        return received["received"], received["lost"]
+        sources = [
+            source
+            for statistics in self.statistics()
+            for source in statistics.sources.values()
+            if source.system_id == system_id
+        ]
+        return sum(source.received for source in sources), sum(source.lost for source in sources)
 
     def close(self, error: Exception | None = None) -> None:
         """End it: what waits gets ``error``, the link closes, tasks are cancelled. Never blocks; idempotent."""
-        if self._error is None:
-            self._end(error or ConnectionClosed("the connection was closed"))
+        self._end(error or ConnectionClosed("the connection was closed"))
         self.link.close()
         if self._recorder is not None:
             self._recorder.close()
@@ -266,7 +279,24 @@ class Connection:
 
     def _start(self, tasks: TaskGroup) -> None:
         self._tasks = tasks
-        tasks.start_soon(self._send_heartbeats, name="aerokit heartbeat")
+        tasks.start_soon(self.guarded, self._send_heartbeats, name="aerokit heartbeat")
+        tasks.start_soon(self.guarded, self._watch_loop, name="aerokit loop watch")
+
+    async def guarded(self, function: Callable[[], Awaitable[None]]) -> None:
+        """Run a background task of ours: a mistake in it ends the connection, and never surfaces as a group."""
+        try:
+            await function()
+        except AerokitError as error:
+            if self.is_open:
+                self._end(error)
+        except Exception as error:
+            logger.exception("a background task of aerokit failed")
+            closed = ConnectionClosed(f"a background task of aerokit failed: {error!r}")
+            closed.__cause__ = error
+            self._end(closed)
+
+    async def _watch_loop(self) -> None:
+        await watch_loop(self)
 
     async def _send_heartbeats(self) -> None:
         heartbeat = Heartbeat(MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID, 0, 0, MAV_STATE_ACTIVE, 3)
@@ -275,6 +305,8 @@ class Connection:
             await anyio.sleep(HEARTBEAT_PERIOD_S)
 
     def _end(self, error: Exception) -> None:
+        if self._error is not None:
+            return
         self._error = error
         enders, self._enders = self._enders, []
         for ender in enders:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -35,9 +34,7 @@ class _Diagnosis:
         self._bytes = sum(each.bytes for each in statistics)
         self._frames = sum(each.frames for each in statistics)
         self._bad_crcs = sum(each.bad_crcs for each in statistics)
-        self._unknown: Counter[int] = Counter()
-        for each in statistics:
-            self._unknown.update(each.unknown_ids)
+        self._unknown = sum(each.unknown_ids for each in statistics)
 
     def text(self) -> str:
         if not self._bytes:
@@ -50,8 +47,10 @@ class _Diagnosis:
 
     def _without_frames(self) -> str:
         if self._unknown:
-            ids = ", ".join(str(each) for each, _ in self._unknown.most_common(5))
-            return f"{self._bytes} bytes were heard with messages of an unknown dialect (message ids {ids})"
+            return (
+                f"{self._bytes} bytes were heard with {self._unknown} frames of an unknown dialect and none of this"
+                " one: pass dialect=Dialect.from_xml(...)"
+            )
         if self._bad_crcs:
             return (
                 f"{self._bytes} bytes were heard with {self._bad_crcs} damaged frames and no good one:"

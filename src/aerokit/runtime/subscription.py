@@ -122,7 +122,9 @@ class Subscription(Generic[ItemT]):
             self._queue.popleft()
             self._queue.append(item)
         elif self._overflow == "error":
-            self.close(SubscriptionOverflow(f"{self._capacity} items were waiting and were not read fast enough"))
+            self.close(
+                SubscriptionOverflow(f"{self._capacity} items were waiting and were not read fast enough")
+            )
 
     async def _wait(self) -> None:
         if self._waiter is not None:

@@ -106,7 +106,9 @@ class MessageRates:
     def want(self, message_type: type[Message], hz: float) -> Detach:
         """Ask for ``message_type`` at ``hz`` (above 0, at most 1000) or faster until the returned function is called."""
         if not 0 < hz <= 1000:
-            raise LocalProtocolError(f"rate_hz = {hz!r} of {message_type.NAME} is not allowed: above 0, at most 1000")
+            raise LocalProtocolError(
+                f"rate_hz = {hz!r} of {message_type.NAME} is not allowed: above 0, at most 1000"
+            )
         stream = self._streams.get(message_type.ID)
         if stream is None:
             stream = self._streams[message_type.ID] = self._new_stream(message_type)
@@ -151,7 +153,9 @@ class MessageRates:
 
     def _new_stream(self, message_type: type[Message]) -> _Stream:
         stream = _Stream(message_type)
-        stream.detach = self._connection.bus.attach(message_type, stream.on_message, system_id=self._system_id)
+        stream.detach = self._connection.bus.attach(
+            message_type, stream.on_message, system_id=self._system_id
+        )
         return stream
 
     async def _ask_for_all_due(self) -> None:

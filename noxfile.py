@@ -1,0 +1,59 @@
+"""Sessions: tests (each Python that is there), lint, types, docs, bench, demo. `nox -l` lists them."""
+
+from __future__ import annotations
+
+import shutil
+
+import nox
+
+nox.options.sessions = ["tests", "lint", "types"]
+nox.options.error_on_missing_interpreters = False
+nox.options.default_venv_backend = "venv"
+
+PYTHONS = [f"3.{minor}" for minor in range(10, 15)]
+
+
+@nox.session(python=[version for version in PYTHONS if shutil.which(f"python{version}")] or None)
+def tests(session: nox.Session) -> None:
+    """Run the tests; on Python with the extras of `fast`, so that uvloop is tested too."""
+    session.install("-e", ".[test,fast]")
+    session.run("pytest", *session.posargs)
+
+
+@nox.session
+def lint(session: nox.Session) -> None:
+    """Style, format, import direction, and generated code that is what the generator makes."""
+    session.install("-e", ".[dev]")
+    session.run("ruff", "check", ".")
+    session.run("ruff", "format", "--check", ".")
+    session.run("pytest", "-q", "tests/test_layers.py")
+    session.run("python", "-m", "aerokit.mavlink.generator", "--check")
+
+
+@nox.session
+def types(session: nox.Session) -> None:
+    """mypy --strict and pyright, over sources, tests, examples and benchmarks."""
+    session.install("-e", ".[dev]")
+    session.run("mypy")
+    session.run("pyright")
+
+
+@nox.session
+def docs(session: nox.Session) -> None:
+    """Build the API reference into `site/`."""
+    session.install("-e", ".[dev]")
+    session.run("pdoc", "aerokit", "-o", "site")
+
+
+@nox.session
+def bench(session: nox.Session) -> None:
+    """Measure beside pymavlink and MAVSDK, print the table, write bench.json."""
+    session.install("-e", ".[fast]", "mavsdk>=4")
+    session.run("python", "benchmarks/run.py", *session.posargs)
+
+
+@nox.session
+def demo(session: nox.Session) -> None:
+    """Fly the demonstration; `nox -s demo -- --connect ADDRESS` flies any vehicle."""
+    session.install("-e", ".")
+    session.run("aerokit", "demo", *session.posargs)

@@ -1,0 +1,307 @@
+"""What everything about one vehicle rests on: its address, its commands, its telemetry, its texts."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import anyio
+
+from aerokit.autopilots import autopilot_for
+from aerokit.errors import CommandRejected
+from aerokit.mavlink.message import Message
+from aerokit.mavlink.messages import CommandAck, Heartbeat
+from aerokit.runtime.cells import Source, StateCell
+from aerokit.runtime.events import (
+    ArmedChanged,
+    LandedStateChanged,
+    LinkReport,
+    ModeChanged,
+    StatusTextReceived,
+)
+from aerokit.runtime.subscription import Overflow, Subscription
+from aerokit.vehicle.commands import CommandSender
+from aerokit.vehicle.rates import MessageRates
+from aerokit.vehicle.telemetry import Telemetry
+from aerokit.vehicle.watch import LinkWatch, VehicleWatch
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Iterator
+
+    from anyio.abc import TaskGroup
+
+    from aerokit.runtime.bus import Detach, Sink
+    from aerokit.runtime.connection import Connection
+    from aerokit.runtime.events import Event
+
+__all__ = ["VehicleCore"]
+
+ItemT = TypeVar("ItemT", bound="Message | Event")
+
+SETTLE_S = 0.3
+"""How long after a refusal the vehicle's texts about it are waited for."""
+RESULTS_OF_REFUSAL = (1, 2, 3, 4)
+
+
+class VehicleCore:
+    """One remote system: system id, autopilot component, and what was heard of it."""
+
+    def __init__(
+        self, connection: Connection, system_id: int, component_id: int, heartbeat: Heartbeat
+    ) -> None:
+        self.connection = connection
+        """The connection it is reached by."""
+        self.system_id = system_id
+        """MAVLink system id, 1–255."""
+        self.component_id = component_id
+        """Component id of its autopilot, usually 1."""
+        self.vehicle_type = heartbeat.type
+        """MAV_TYPE of the first heartbeat (https://mavlink.io/en/messages/minimal.html#MAV_TYPE)."""
+        self.autopilot = autopilot_for(heartbeat)
+        """What differs between ArduPilot, PX4 and others."""
+        self.telemetry = Telemetry(
+            connection.now, system_id=system_id, component_id=component_id, autopilot=self.autopilot
+        )
+        """The state cells; most are properties of the vehicle too."""
+        self.link_quality: StateCell[LinkReport] = StateCell(
+            "link_quality", connection.now, "second of traffic"
+        )
+        """Loss, delay and rates of the last second."""
+        self._commands = CommandSender(connection, system_id, component_id, self.describe_link)
+        self._rates = MessageRates(
+            connection, self._commands, system_id, component_id, self.autopilot.stream_groups
+        )
+        self._watch = VehicleWatch(connection, system_id, component_id, self._on_reboot)
+        self._link_watch = LinkWatch(connection, system_id, component_id, self._on_link_report)
+        self._tasks: TaskGroup | None = None
+        self._detach: list[Detach] = []
+        self._attach_telemetry()
+
+    # ---------------------------------------------------------------------------- commands
+
+    async def command(
+        self,
+        command: int,
+        *params: float,
+        component_id: int | None = None,
+        attempts: int = 4,
+        attempt_timeout: float = 1.0,
+        on_progress: Callable[[int | None], None] | None = None,
+    ) -> CommandAck:
+        """Send any MAV_CMD as COMMAND_LONG and return its ACCEPTED ack.
+
+        Args:
+            command: the number, or a member of ``enums.MavCmd``.
+            params: param1 to param7; missing ones are 0, NaN where the command says so.
+            component_id: to another component than the autopilot.
+            attempts: how often it is sent at most; ``confirmation`` rises with each.
+            attempt_timeout: seconds to wait for an ack after each. IN_PROGRESS extends it.
+            on_progress: called with 0–100, or None, for each IN_PROGRESS.
+
+        See https://mavlink.io/en/services/command.html.
+
+        Raises:
+            LocalProtocolError: a parameter is no number or does not fit. Nothing was sent.
+            CommandRejected: any other result; ``reasons`` has the status texts seen meanwhile.
+            CommandTimeout: no ack; the text names attempts, seconds, the last heartbeat and the loss.
+        """
+        started = self.connection.now()
+        try:
+            return await self._commands.send_long(
+                command,
+                *params,
+                component_id=component_id,
+                attempts=attempts,
+                attempt_timeout=attempt_timeout,
+                on_progress=on_progress,
+            )
+        except CommandRejected as error:
+            raise self._explained(error, started) from None
+
+    async def command_int(
+        self,
+        command: int,
+        *params: float,
+        frame: int,
+        x: int = 0,
+        y: int = 0,
+        z: float = 0.0,
+        component_id: int | None = None,
+        attempts: int = 4,
+        attempt_timeout: float = 1.0,
+        on_progress: Callable[[int | None], None] | None = None,
+    ) -> CommandAck:
+        """Send any MAV_CMD as COMMAND_INT: param1 to param4, ``x``, ``y``, ``z`` in ``frame`` (MAV_FRAME).
+
+        ``x`` and ``y`` are latitude and longitude in 1e-7 degrees, or 1e-4 m in local frames; ``z`` metres. The rest
+        is as for :meth:`command`.
+        """
+        started = self.connection.now()
+        try:
+            return await self._commands.send_int(
+                command,
+                *params,
+                frame=frame,
+                x=x,
+                y=y,
+                z=z,
+                component_id=component_id,
+                attempts=attempts,
+                attempt_timeout=attempt_timeout,
+                on_progress=on_progress,
+            )
+        except CommandRejected as error:
+            raise self._explained(error, started) from None
+
+    def send(self, message: Message) -> None:
+        """Send one message as it is, once; never blocks. Its ``target_system`` is yours to set."""
+        self.connection.send(message)
+
+    # ----------------------------------------------------------------------- subscriptions
+
+    def subscribe(
+        self,
+        *types: type[ItemT],
+        capacity: int = 1,
+        overflow: Overflow = "drop_oldest",
+        rate_hz: float | None = None,
+    ) -> Subscription[ItemT]:
+        """Return a stream of messages or events of this vehicle, for use in a ``with`` block.
+
+        ``capacity=1`` gives the latest only, ``missed`` counts the others. ``rate_hz`` asks the vehicle to send these
+        messages that often (or faster, if others want it) while the block lasts; None takes them as they come.
+
+        Raises:
+            LocalProtocolError: no type, a rate out of range, or a message that the dialect does not hold.
+        """
+        self.connection.check_types(types)
+        messages: list[type[Message]] = [each for each in types if issubclass(each, Message)]
+
+        def attach(sink: Sink) -> list[Detach]:
+            detach = self.connection.attach(types, sink, system_id=self.system_id)
+            detach.append(self.connection.on_end(subscription.close))
+            if rate_hz is not None:
+                detach += [self._rates.want(each, rate_hz) for each in messages]
+            return detach
+
+        subscription: Subscription[ItemT] = Subscription(attach, capacity=capacity, overflow=overflow)
+        return subscription
+
+    @contextmanager
+    def rate(self, message_type: type[Message], rate_hz: float) -> Iterator[None]:
+        """Have the vehicle send ``message_type`` at ``rate_hz`` or faster for the time of the ``with`` block."""
+        release = self._rates.want(message_type, rate_hz)
+        try:
+            yield
+        finally:
+            release()
+
+    # ------------------------------------------------------------------------------- state
+
+    @property
+    def heartbeat_age(self) -> float:
+        """Seconds since the last heartbeat of the autopilot."""
+        return self.connection.now() - self._watch.last_heartbeat_at
+
+    @property
+    def is_silent(self) -> bool:
+        """Whether no heartbeat has come for more than 3.5 seconds."""
+        return self._watch.is_silent
+
+    def describe_link(self) -> str:
+        """One line on how well the vehicle is heard, for error texts."""
+        received, lost = self.connection.counts(self.system_id)
+        loss = (
+            f"{100 * lost / (received + lost):.0f} % of its frames lost"
+            if received + lost
+            else "nothing heard"
+        )
+        texts = self.texts_since(self.connection.now() - 10.0)
+        said = f", it said: {'; '.join(texts[-3:])}" if texts else ""
+        return f"last heartbeat {self.heartbeat_age:.1f} s ago, {loss}{said}"
+
+    def texts_since(self, at: float) -> tuple[str, ...]:
+        """What the vehicle said (STATUSTEXT) since this time on the loop's clock, oldest first."""
+        return tuple(each.text for each in self.telemetry.texts_since(at))
+
+    # ------------------------------------------------------------------------------ inside
+
+    def _attach_telemetry(self) -> None:
+        for message_id, handler in self.telemetry.handles.items():
+            message_type = self.connection.bus.dialect.get(message_id)
+            if message_type is not None:
+                self._detach.append(
+                    self.connection.bus.attach(message_type, handler, system_id=self.system_id)
+                )
+        self._detach += [
+            self.telemetry.mode.observe(self._on_mode),
+            self.telemetry.armed.observe(self._on_armed),
+            self.telemetry.landed_state.observe(self._on_landed_state),
+            self.telemetry.status_text.observe(self._on_status_text, every_arrival=True),
+        ]
+        self._detach.append(self.connection.on_end(self._on_end))
+
+    def _close(self) -> None:
+        for detach in self._detach:
+            detach()
+        self._watch.close()
+        self._link_watch.close()
+        self._rates.close()
+
+    def _in_background(self, function: Callable[[], Awaitable[None]]) -> None:
+        if self._tasks is not None and self.connection.is_open:
+            self._tasks.start_soon(self.connection.guarded, function)
+
+    @contextmanager
+    def _refusals_of(self, command: int) -> Iterator[list[CommandAck]]:
+        """Collect later acks of a command that refuse what an earlier one accepted (PX4 acks some twice)."""
+        refusals: list[CommandAck] = []
+
+        def note(ack: CommandAck) -> None:
+            if ack.command == command and ack.result in RESULTS_OF_REFUSAL:
+                refusals.append(ack)
+
+        detach = self.connection.bus.attach(CommandAck, note, system_id=self.system_id)
+        try:
+            yield refusals
+        finally:
+            detach()
+
+    async def _settle(self) -> None:
+        await anyio.sleep(SETTLE_S)
+
+    def _explained(
+        self, error: CommandRejected, since: float, reasons: tuple[str, ...] = ()
+    ) -> CommandRejected:
+        texts = tuple(text for text in self.texts_since(since) if text not in reasons)
+        return CommandRejected(
+            str(error), command=error.command, result=error.result, reasons=(*texts, *reasons)
+        )
+
+    # ------------------------------------------------------------------------------ events
+
+    def _on_mode(self, before: Any, after: Any) -> None:
+        self._publish(ModeChanged, None if before is None else before.name, after.name)
+
+    def _on_armed(self, before: bool | None, after: bool) -> None:
+        self._publish(ArmedChanged, after)
+
+    def _on_landed_state(self, before: int | None, after: int) -> None:
+        self._publish(LandedStateChanged, before, after)
+
+    def _on_status_text(self, before: Any, after: Any) -> None:
+        self._publish(StatusTextReceived, after.severity, after.text)
+
+    def _publish(self, event_type: type[Event], *fields: Any) -> None:
+        self.connection.bus.publish(event_type(self.connection.now(), self.system_id, *fields))
+
+    def _on_link_report(self, report: LinkReport) -> None:
+        self.link_quality.set(report, Source(self.system_id, self.component_id, "link"))
+
+    def _on_reboot(self) -> None:
+        self.telemetry.forget()
+        self._rates.ask_again()
+
+    def _on_end(self, error: Exception) -> None:
+        self.telemetry.close(error)
+        self.link_quality.close(error)

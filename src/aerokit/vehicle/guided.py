@@ -1,0 +1,473 @@
+"""Guided set-points, streamed at a rate and bound to the life of the code that feeds them.
+
+An autopilot stops by itself when set-points stop coming (ArduCopter after 3 s, PX4 after 0.5 s). A library that
+resends the last set-point for ever defeats that. Here the stream ends, and the vehicle is told to hold, when the code
+that feeds it ends, raises, is cancelled, goes silent or blocks the event loop.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Generic, TypeVar
+
+import anyio
+
+from aerokit.errors import AerokitError, LocalProtocolError, SetpointStreamStopped
+from aerokit.mavlink.messages import (
+    SetAttitudeTarget,
+    SetPositionTargetGlobalInt,
+    SetPositionTargetLocalNed,
+)
+from aerokit.vehicle.values import Position
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from types import TracebackType
+
+    from typing_extensions import Self
+
+    from aerokit.autopilots import Mode
+    from aerokit.mavlink.message import Message
+    from aerokit.vehicle.vehicle import Vehicle
+
+__all__ = [
+    "AccelerationSetpoint",
+    "AttitudeSetpoint",
+    "BodyVelocitySetpoint",
+    "Guided",
+    "LocalPositionSetpoint",
+    "PositionSetpoint",
+    "SetpointStream",
+    "VelocitySetpoint",
+]
+
+SetpointT = TypeVar("SetpointT")
+
+MAV_FRAME_LOCAL_NED = 1
+MAV_FRAME_GLOBAL_INT = 5
+MAV_FRAME_GLOBAL_RELATIVE_ALT_INT = 6
+MAV_FRAME_BODY_NED = 8
+IGNORE_POSITION, IGNORE_VELOCITY, IGNORE_ACCELERATION = 0x007, 0x038, 0x1C0
+IGNORE_YAW, IGNORE_YAW_RATE = 0x400, 0x800
+IGNORE_BODY_RATES = 0x07
+ENTRY_S = 1.0
+"""How long the initial set-point is streamed before PX4 is asked for OFFBOARD: it wants to see a stream first."""
+
+
+@dataclass(frozen=True)
+class VelocitySetpoint:
+    """Velocity over ground in m/s, north, east, down; with a heading (degrees) or a turn rate (degrees/s, clockwise)."""
+
+    north_m_s: float = 0.0
+    east_m_s: float = 0.0
+    down_m_s: float = 0.0
+    yaw_deg: float | None = None
+    yaw_rate_deg_s: float | None = None
+
+
+@dataclass(frozen=True)
+class BodyVelocitySetpoint:
+    """Velocity in m/s as seen from the vehicle: forward, right, down; with a heading or a turn rate."""
+
+    forward_m_s: float = 0.0
+    right_m_s: float = 0.0
+    down_m_s: float = 0.0
+    yaw_deg: float | None = None
+    yaw_rate_deg_s: float | None = None
+
+
+@dataclass(frozen=True)
+class AccelerationSetpoint:
+    """Acceleration in m/s², north, east, down; with a heading or a turn rate."""
+
+    north_m_s2: float = 0.0
+    east_m_s2: float = 0.0
+    down_m_s2: float = 0.0
+    yaw_deg: float | None = None
+    yaw_rate_deg_s: float | None = None
+
+
+@dataclass(frozen=True)
+class LocalPositionSetpoint:
+    """A place in metres north, east and down of the estimator's origin (``vehicle.origin``)."""
+
+    north_m: float
+    east_m: float
+    down_m: float
+    yaw_deg: float | None = None
+    yaw_rate_deg_s: float | None = None
+
+
+@dataclass(frozen=True)
+class PositionSetpoint:
+    """A place on the globe; ``position`` with ``altitude_relative_m`` or ``altitude_amsl_m``."""
+
+    position: Position
+    yaw_deg: float | None = None
+    yaw_rate_deg_s: float | None = None
+
+
+@dataclass(frozen=True)
+class AttitudeSetpoint:
+    """Attitude in degrees and ``thrust`` from 0 to 1.
+
+    ArduCopter reads ``thrust`` as climb rate in GUIDED unless GUID_OPTIONS says otherwise: 0.5 holds the altitude.
+    PX4 reads it as collective thrust.
+    """
+
+    roll_deg: float
+    pitch_deg: float
+    yaw_deg: float
+    thrust: float
+
+
+class Guided:
+    """Opens set-point streams: ``async with vehicle.guided.velocity() as stream: stream.set(...)``.
+
+    Every stream takes ``rate_hz`` (how often the latest set-point is sent, 2 to 100), ``valid_for_s`` (how long a
+    set-point may be resent without a new one) and ``max_lag_s`` (how late the event loop may be).
+    """
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        self._vehicle = vehicle
+
+    def velocity(
+        self,
+        initial: VelocitySetpoint = VelocitySetpoint(),
+        *,
+        rate_hz: float = 10.0,
+        valid_for_s: float = 1.0,
+        max_lag_s: float = 0.5,
+    ) -> SetpointStream[VelocitySetpoint]:
+        """Stream velocities over ground (SET_POSITION_TARGET_LOCAL_NED)."""
+        return SetpointStream(self._vehicle, self._velocity, initial, rate_hz, valid_for_s, max_lag_s)
+
+    def body_velocity(
+        self,
+        initial: BodyVelocitySetpoint = BodyVelocitySetpoint(),
+        *,
+        rate_hz: float = 10.0,
+        valid_for_s: float = 1.0,
+        max_lag_s: float = 0.5,
+    ) -> SetpointStream[BodyVelocitySetpoint]:
+        """Stream velocities as seen from the vehicle (SET_POSITION_TARGET_LOCAL_NED in MAV_FRAME_BODY_NED)."""
+        return SetpointStream(self._vehicle, self._body_velocity, initial, rate_hz, valid_for_s, max_lag_s)
+
+    def acceleration(
+        self,
+        initial: AccelerationSetpoint = AccelerationSetpoint(),
+        *,
+        rate_hz: float = 20.0,
+        valid_for_s: float = 0.5,
+        max_lag_s: float = 0.5,
+    ) -> SetpointStream[AccelerationSetpoint]:
+        """Stream accelerations (SET_POSITION_TARGET_LOCAL_NED)."""
+        return SetpointStream(self._vehicle, self._acceleration, initial, rate_hz, valid_for_s, max_lag_s)
+
+    def local_position(
+        self,
+        initial: LocalPositionSetpoint,
+        *,
+        rate_hz: float = 10.0,
+        valid_for_s: float = 1.0,
+        max_lag_s: float = 0.5,
+    ) -> SetpointStream[LocalPositionSetpoint]:
+        """Stream places in the local frame (SET_POSITION_TARGET_LOCAL_NED)."""
+        return SetpointStream(self._vehicle, self._local_position, initial, rate_hz, valid_for_s, max_lag_s)
+
+    def position(
+        self,
+        initial: PositionSetpoint,
+        *,
+        rate_hz: float = 10.0,
+        valid_for_s: float = 1.0,
+        max_lag_s: float = 0.5,
+    ) -> SetpointStream[PositionSetpoint]:
+        """Stream places on the globe (SET_POSITION_TARGET_GLOBAL_INT)."""
+        return SetpointStream(self._vehicle, self._position, initial, rate_hz, valid_for_s, max_lag_s)
+
+    def attitude(
+        self,
+        initial: AttitudeSetpoint,
+        *,
+        rate_hz: float = 50.0,
+        valid_for_s: float = 0.3,
+        max_lag_s: float = 0.3,
+    ) -> SetpointStream[AttitudeSetpoint]:
+        """Stream attitudes with thrust (SET_ATTITUDE_TARGET)."""
+        return SetpointStream(self._vehicle, self._attitude, initial, rate_hz, valid_for_s, max_lag_s)
+
+    # ------------------------------------------------------------------------------ messages
+
+    def _velocity(self, s: VelocitySetpoint) -> Message:
+        vector = (s.north_m_s, s.east_m_s, s.down_m_s)
+        return self._local(MAV_FRAME_LOCAL_NED, IGNORE_VELOCITY, vector, s.yaw_deg, s.yaw_rate_deg_s)
+
+    def _body_velocity(self, s: BodyVelocitySetpoint) -> Message:
+        vector = (s.forward_m_s, s.right_m_s, s.down_m_s)
+        return self._local(MAV_FRAME_BODY_NED, IGNORE_VELOCITY, vector, s.yaw_deg, s.yaw_rate_deg_s)
+
+    def _acceleration(self, s: AccelerationSetpoint) -> Message:
+        vector = (s.north_m_s2, s.east_m_s2, s.down_m_s2)
+        return self._local(MAV_FRAME_LOCAL_NED, IGNORE_ACCELERATION, vector, s.yaw_deg, s.yaw_rate_deg_s)
+
+    def _local_position(self, s: LocalPositionSetpoint) -> Message:
+        vector = (s.north_m, s.east_m, s.down_m)
+        return self._local(MAV_FRAME_LOCAL_NED, IGNORE_POSITION, vector, s.yaw_deg, s.yaw_rate_deg_s)
+
+    def _local(
+        self,
+        frame: int,
+        group: int,
+        vector: tuple[float, float, float],
+        yaw_deg: float | None,
+        yaw_rate_deg_s: float | None,
+    ) -> Message:
+        """One SET_POSITION_TARGET_LOCAL_NED whose only vector is the one of ``group``."""
+        _check_finite("set-point", *vector)
+        everything = IGNORE_POSITION | IGNORE_VELOCITY | IGNORE_ACCELERATION
+        mask, yaw, yaw_rate = _yaw(yaw_deg, yaw_rate_deg_s)
+        none = (0.0, 0.0, 0.0)
+        vectors = [vector if group == each else none for each in _GROUPS]
+        return SetPositionTargetLocalNed(
+            self._time_ms(),
+            self._vehicle.system_id,
+            self._vehicle.component_id,
+            frame,
+            (everything & ~group) | mask,
+            *vectors[0],
+            *vectors[1],
+            *vectors[2],
+            yaw,
+            yaw_rate,
+        )
+
+    def _position(self, s: PositionSetpoint) -> Message:
+        mask, yaw, yaw_rate = _yaw(s.yaw_deg, s.yaw_rate_deg_s)
+        latitude, longitude, altitude, is_relative = self._vehicle._global_target(s.position)
+        return SetPositionTargetGlobalInt(
+            self._time_ms(),
+            self._vehicle.system_id,
+            self._vehicle.component_id,
+            MAV_FRAME_GLOBAL_RELATIVE_ALT_INT if is_relative else MAV_FRAME_GLOBAL_INT,
+            IGNORE_VELOCITY | IGNORE_ACCELERATION | mask,
+            latitude,
+            longitude,
+            altitude,
+            *(0.0, 0.0, 0.0),
+            *(0.0, 0.0, 0.0),
+            yaw,
+            yaw_rate,
+        )
+
+    def _attitude(self, s: AttitudeSetpoint) -> Message:
+        _check_finite("attitude", s.roll_deg, s.pitch_deg, s.yaw_deg, s.thrust)
+        if not 0 <= s.thrust <= 1:
+            raise LocalProtocolError(f"thrust = {s.thrust} is not allowed: 0 to 1")
+        return SetAttitudeTarget(
+            self._time_ms(),
+            self._vehicle.system_id,
+            self._vehicle.component_id,
+            IGNORE_BODY_RATES,
+            _quaternion(math.radians(s.roll_deg), math.radians(s.pitch_deg), math.radians(s.yaw_deg)),
+            0.0,
+            0.0,
+            0.0,
+            s.thrust,
+        )
+
+    def _time_ms(self) -> int:
+        return int(self._vehicle.connection.now() * 1000) & 0xFFFFFFFF
+
+
+class SetpointStream(Generic[SetpointT]):
+    """Sends the latest set-point at a rate for as long as the ``async with`` block feeds it.
+
+    Entering puts the vehicle into its mode for set-points (GUIDED, OFFBOARD) with the initial set-point. Leaving, in
+    any way, tells it to hold. When the stream has stopped by itself, ``set`` and leaving the block raise
+    :class:`SetpointStreamStopped`; when it stopped because the mode changed (a pilot, a failsafe), the vehicle is
+    left to whoever changed it.
+    """
+
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        encode: Callable[[SetpointT], Message],
+        initial: SetpointT,
+        rate_hz: float,
+        valid_for_s: float,
+        max_lag_s: float,
+    ) -> None:
+        if not 2 <= rate_hz <= 100:
+            raise LocalProtocolError(f"rate_hz = {rate_hz!r} is not allowed: 2 to 100")
+        for name, value in (("valid_for_s", valid_for_s), ("max_lag_s", max_lag_s)):
+            if not 0 < value <= 60:
+                raise LocalProtocolError(f"{name} = {value!r} is not allowed: above 0, at most 60")
+        self._vehicle, self._encode = vehicle, encode
+        self._period_s, self._valid_for_s, self._max_lag_s = 1 / rate_hz, valid_for_s, max_lag_s
+        self._setpoint = initial
+        self._set_at = -math.inf
+        self._mode: Mode | None = None
+        self._timer: asyncio.TimerHandle | None = None
+        self._stopped: SetpointStreamStopped | None = None
+        self._was_told = False
+
+    @property
+    def is_running(self) -> bool:
+        """Whether set-points are being sent."""
+        return self._timer is not None
+
+    def set(self, setpoint: SetpointT) -> None:
+        """Take a new set-point; it is sent at the next tick, and resent until ``valid_for_s`` has passed.
+
+        Raises:
+            LocalProtocolError: a value is out of range; the one before stays in force until it is too old.
+            SetpointStreamStopped: the stream has ended by itself, or the block was left.
+        """
+        self._raise_if_stopped()
+        if self._timer is None:
+            raise SetpointStreamStopped(
+                "this set-point stream is not running: use it inside its `async with`"
+            )
+        self._encode(setpoint)
+        self._setpoint, self._set_at = setpoint, self._now()
+
+    async def fly(self, setpoint: SetpointT, duration_s: float) -> None:
+        """Feed one set-point for ``duration_s`` seconds.
+
+        Raises:
+            SetpointStreamStopped: the stream ended meanwhile.
+        """
+        until = self._now() + duration_s
+        while (left := until - self._now()) > 0:
+            self.set(setpoint)
+            await anyio.sleep(min(left, self._valid_for_s / 3))
+        self._raise_if_stopped()
+
+    async def __aenter__(self) -> Self:
+        self._encode(self._setpoint)  # refuse nonsense before anything is sent
+        try:
+            await self._enter()
+        except BaseException:
+            self._cancel_timer()
+            self._vehicle._hold_soon()
+            raise
+        return self
+
+    async def __aexit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        if self._stopped is None:
+            self._stop("the block that fed it was left", hold=True)
+            if exc is None:
+                await self._vehicle.hold()
+        elif exc is None and not self._was_told:
+            raise self._stopped
+
+    async def _enter(self) -> None:
+        """ArduPilot takes set-points once it is in GUIDED; PX4 goes to OFFBOARD once it sees set-points."""
+        self._vehicle._supersede_hold()
+        mode = self._vehicle._mode_for("a set-point stream", "setpoint")
+        if self._vehicle.autopilot.setpoints.before_mode:
+            self._begin()
+            await self.fly(self._setpoint, ENTRY_S)
+            await self._feeding_initial(mode)
+        else:
+            await self._vehicle._ensure_mode(mode)
+            self._begin()
+        self._mode = mode
+
+    async def _feeding_initial(self, mode: Mode) -> None:
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(self.fly, self._setpoint, math.inf)
+            await self._vehicle._ensure_mode(mode)
+            tasks.cancel_scope.cancel()
+
+    # ---------------------------------------------------------------------------- the stream
+
+    def _begin(self) -> None:
+        self._set_at = self._now()
+        self._tick(self._now())
+
+    def _tick(self, due: float) -> None:
+        """Send once more, unless something says that nobody steers any more."""
+        self._timer = None
+        reason = self._why_stop(self._now() - due)
+        if reason:
+            self._stop(reason, hold=self._mode is None or self._vehicle.mode.latest == self._mode)
+            return
+        try:
+            self._vehicle.connection.send(self._encode(self._setpoint))
+        except AerokitError as error:
+            self._stop(str(error), hold=False)
+            return
+        due = max(due + self._period_s, self._now())
+        self._timer = asyncio.get_running_loop().call_at(due, self._tick, due)
+
+    def _why_stop(self, lag: float) -> str | None:
+        age = self._now() - self._set_at
+        if lag > self._max_lag_s:
+            return f"the event loop was blocked for {lag:.1f} s"
+        if age > self._valid_for_s:
+            return f"no new set-point came for {age:.1f} s (valid_for_s = {self._valid_for_s:g})"
+        mode = self._vehicle.mode.latest
+        if self._mode is not None and mode != self._mode:
+            return f"the vehicle left {self._mode} for {mode}"
+        return None
+
+    def _stop(self, reason: str, *, hold: bool) -> None:
+        self._cancel_timer()
+        self._stopped = SetpointStreamStopped(
+            f"the set-point stream has stopped: {reason}" + ("; the vehicle was told to hold" if hold else "")
+        )
+        if hold:
+            self._vehicle._hold_soon()
+
+    def _cancel_timer(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+
+    def _raise_if_stopped(self) -> None:
+        if self._stopped is not None:
+            self._was_told = True
+            raise self._stopped
+
+    def _now(self) -> float:
+        return self._vehicle.connection.now()
+
+
+_GROUPS = (IGNORE_POSITION, IGNORE_VELOCITY, IGNORE_ACCELERATION)
+
+
+def _yaw(yaw_deg: float | None, yaw_rate_deg_s: float | None) -> tuple[int, float, float]:
+    """Type-mask bits, yaw in radians and yaw rate in radians per second."""
+    if yaw_deg is not None and yaw_rate_deg_s is not None:
+        raise LocalProtocolError("give yaw_deg or yaw_rate_deg_s, not both")
+    _check_finite("yaw", yaw_deg or 0.0, yaw_rate_deg_s or 0.0)
+    mask = (IGNORE_YAW if yaw_deg is None else 0) | (IGNORE_YAW_RATE if yaw_rate_deg_s is None else 0)
+    return mask, math.radians(yaw_deg or 0.0), math.radians(yaw_rate_deg_s or 0.0)
+
+
+def _quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
+    """Roll, pitch, yaw in radians as w, x, y, z."""
+    cr, sr = math.cos(roll / 2), math.sin(roll / 2)
+    cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
+    cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
+    return (
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    )
+
+
+def _check_finite(what: str, *values: float) -> None:
+    for value in values:
+        if not math.isfinite(value):
+            raise LocalProtocolError(f"{what}: {value!r} is not a finite number")

@@ -1,0 +1,76 @@
+"""What keeps a vehicle from flying, in words: beforehand, and after it has refused."""
+
+from __future__ import annotations
+
+import anyio
+
+from aerokit.errors import CommandRejected, CommandTimeout
+from aerokit.vehicle.core import VehicleCore
+
+__all__ = ["VehicleHealth"]
+
+RUN_PREARM_CHECKS = 401
+TEXTS_S = 1.0
+"""How long texts are collected after the vehicle was asked to run its checks."""
+FRESH_S = 5.0
+
+
+class VehicleHealth(VehicleCore):
+    """Pre-arm checks, failing sensors and what the estimator lacks."""
+
+    def missing_for_flight(self) -> list[str]:
+        """What is still missing before the vehicle can fly, as far as it is known already; talks to nobody."""
+        telemetry = self.telemetry
+        missing = [] if not self.is_silent else [f"heartbeats (the last one {self.heartbeat_age:.1f} s ago)"]
+        missing += [
+            f"{cell.name} ({cell.waits_for} has not come)"
+            for cell in (telemetry.sensors, telemetry.estimator, telemetry.position, telemetry.home)
+            if not cell.is_known
+        ]
+        return missing + self._failing()
+
+    async def why_not_armable(self) -> list[str]:
+        """Return the reasons why arming would be refused now; an empty list means that none is known.
+
+        Asks the vehicle to run its checks (MAV_CMD_RUN_PREARM_CHECKS) where it can do so on request and listens to
+        what it says; reads SYS_STATUS and the estimator's flags (ArduPilot EKF_STATUS_REPORT, PX4 ESTIMATOR_STATUS).
+        Takes about a second. The vehicle is not armed by it.
+        """
+        if self.is_armed:
+            return []
+        return list(await self._arming_reasons(self.connection.now()))
+
+    async def _arming_reasons(self, since: float) -> tuple[str, ...]:
+        """Texts about arming since then; those asked for again where there are none; then failing bits and flags."""
+        await self._settle()
+        if not self._arming_texts(since) and self.autopilot.runs_prearm_checks:
+            await self._run_prearm_checks()
+        reasons = dict.fromkeys([*self._arming_texts(since), *self._failing()])
+        return tuple(reasons)
+
+    async def _run_prearm_checks(self) -> None:
+        try:
+            await self._commands.send_long(RUN_PREARM_CHECKS, attempts=2)
+        except (CommandRejected, CommandTimeout):
+            return
+        await anyio.sleep(TEXTS_S)
+
+    def _arming_texts(self, since: float) -> list[str]:
+        return [text for text in self.texts_since(since) if self.autopilot.arming_reason(text) is not None]
+
+    def _failing(self) -> list[str]:
+        """Failing sensors, failing pre-arm checks, missing estimates."""
+        failing: list[str] = []
+        sensors, estimator = self.telemetry.sensors.latest, self.telemetry.estimator.latest
+        if sensors is not None:
+            failing += [f"{name} is not healthy (SYS_STATUS)" for name in sensors.failing]
+            if sensors.prearm_checks_pass is False:
+                failing.append("the vehicle's pre-arm checks do not pass (SYS_STATUS)")
+        if estimator is not None:
+            failing += [f"the estimator has no {name} ({estimator.message})" for name in estimator.missing]
+        return failing
+
+    @property
+    def is_armed(self) -> bool:
+        """Whether the last heartbeat says armed; False before the first."""
+        return self.telemetry.armed.latest is True

@@ -1,0 +1,85 @@
+"""``Vehicle``: one drone, rover, boat or submarine, as its program sees it."""
+
+from __future__ import annotations
+
+import contextlib
+from typing import TYPE_CHECKING
+
+import anyio
+
+from aerokit.errors import CommandRejected, CommandTimeout
+from aerokit.vehicle.flight import FlightActions
+from aerokit.vehicle.guided import Guided
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from anyio.abc import TaskGroup
+
+    from aerokit.mavlink.message import Message
+    from aerokit.mavlink.messages import Heartbeat
+    from aerokit.runtime.connection import Connection
+
+__all__ = ["Vehicle"]
+
+REQUEST_MESSAGE = 512
+AUTOPILOT_VERSION, HOME_POSITION, GPS_GLOBAL_ORIGIN, AVAILABLE_MODES = 148, 242, 49, 435
+ASK_AGAIN_S = 3.0
+
+
+class Vehicle(FlightActions):
+    """One vehicle. Coroutines talk to it, properties never do; everything has a deadline and can be cancelled.
+
+    Made by :func:`aerokit.connect`. State is in cells (``vehicle.position.value``, ``.age``, ``.fresh(within=1)``,
+    ``await vehicle.mode.wait_until(...)``), SI units and degrees, the unit in the name.
+    """
+
+    def __init__(
+        self, connection: Connection, system_id: int, component_id: int, heartbeat: Heartbeat
+    ) -> None:
+        super().__init__(connection, system_id, component_id, heartbeat)
+        self.guided = Guided(self)
+        """Set-point streams: velocity, position, acceleration, attitude."""
+
+    def __repr__(self) -> str:
+        return f"<Vehicle {self.system_id}/{self.component_id} {self.autopilot.firmware}, {self.describe_link()}>"
+
+    # ------------------------------------------------------------------------------ inside
+
+    def _start(
+        self, tasks: TaskGroup, heartbeat: Heartbeat, rates: Mapping[type[Message], float] | None
+    ) -> None:
+        self._tasks = tasks
+        self.telemetry.receive(heartbeat)
+        for message_type, hz in (self.telemetry.default_rates if rates is None else rates).items():
+            self._rates.want(message_type, hz)
+        for function in (self._rates.run, self._run_link_watch, self._learn_constants):
+            tasks.start_soon(self.connection.guarded, function, name=f"aerokit {function.__qualname__}")
+
+    async def _run_link_watch(self) -> None:
+        await self._link_watch.run(self._on_second)
+
+    def _on_second(self) -> None:
+        self._watch.check()
+        self.telemetry.expire(self.connection.now())
+
+    async def _learn_constants(self) -> None:
+        """Ask for what is not streamed, until it is known; a reboot makes it unknown again."""
+        asked_for_modes = False
+        while self.connection.is_open:
+            for message_id, cell in (
+                (AUTOPILOT_VERSION, self.telemetry.version),
+                (HOME_POSITION, self.telemetry.home),
+                (GPS_GLOBAL_ORIGIN, self.telemetry.origin),
+            ):
+                if not cell.is_known:
+                    await self._request(message_id)
+            if not asked_for_modes:
+                asked_for_modes = True
+                await self._request(AVAILABLE_MODES)
+            await anyio.sleep(ASK_AGAIN_S)
+
+    async def _request(self, message_id: int) -> None:
+        """Ask for one message once; a vehicle that does not have it says so, and that is all right."""
+        with contextlib.suppress(CommandRejected, CommandTimeout):
+            await self._commands.send_long(REQUEST_MESSAGE, message_id, attempts=2)

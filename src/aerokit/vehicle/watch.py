@@ -1,0 +1,147 @@
+"""Watches one vehicle and its link: silence, reboots, loss, delay and rate, told as events."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import anyio
+
+from aerokit.mavlink.messages import Attitude, GlobalPositionInt, Heartbeat, SystemTime, Timesync
+from aerokit.runtime.events import LinkReport, VehicleBack, VehicleRebooted, VehicleSilent
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from aerokit.runtime.bus import Detach
+    from aerokit.runtime.connection import Connection
+
+__all__ = ["LinkWatch", "VehicleWatch"]
+
+SILENT_AFTER_S = 3.5
+"""Three missed heartbeats and a half."""
+REBOOT_STEP_MS = 3000
+"""Reordered messages go back in time by less than this, a reboot by more, unless it had just booted."""
+REPORT_PERIOD_S = 1.0
+TIMESYNC_PERIOD_S = 2.0
+
+
+class VehicleWatch:
+    """Tells when the heartbeats of one vehicle stop and come back, and when it has rebooted."""
+
+    def __init__(
+        self,
+        connection: Connection,
+        system_id: int,
+        component_id: int,
+        on_reboot: Callable[[], None],
+    ) -> None:
+        self._connection, self._system_id, self._component_id = connection, system_id, component_id
+        self._on_reboot = on_reboot
+        self.last_heartbeat_at = connection.now()
+        self.is_silent = False
+        self.reboots = 0
+        self._boot_ms: int | None = None
+        attach = connection.bus.attach
+        self._detach: list[Detach] = [attach(Heartbeat, self._on_heartbeat, system_id=system_id)]
+        for message_type in (SystemTime, Attitude, GlobalPositionInt):
+            self._detach.append(attach(message_type, self._on_boot_time, system_id=system_id))
+
+    def close(self) -> None:
+        """Stop watching."""
+        for detach in self._detach:
+            detach()
+
+    def check(self) -> None:
+        """Publish VehicleSilent when heartbeats have stopped; called once a second."""
+        now = self._connection.now()
+        silent_for = now - self.last_heartbeat_at
+        if silent_for > SILENT_AFTER_S and not self.is_silent:
+            self.is_silent = True
+            self._connection.bus.publish(VehicleSilent(now, self._system_id, silent_for))
+
+    def _on_heartbeat(self, heartbeat: Heartbeat) -> None:
+        frame = heartbeat.received_frame
+        if frame is None or frame.component_id != self._component_id:
+            return
+        now = self._connection.now()
+        silent_for, self.last_heartbeat_at = now - self.last_heartbeat_at, now
+        if self.is_silent:
+            self.is_silent = False
+            self._connection.bus.publish(VehicleBack(now, self._system_id, silent_for))
+
+    def _on_boot_time(self, message: SystemTime | Attitude | GlobalPositionInt) -> None:
+        frame = message.received_frame
+        if frame is None or frame.component_id != self._component_id:
+            return
+        before, self._boot_ms = self._boot_ms, message.time_boot_ms
+        if before is not None and message.time_boot_ms + REBOOT_STEP_MS < before:
+            self.reboots += 1
+            self._on_reboot()
+            self._connection.bus.publish(VehicleRebooted(self._connection.now(), self._system_id))
+
+
+class LinkWatch:
+    """Measures the link to one vehicle once a second: loss by sequence numbers, delay by TIMESYNC, rates by counting.
+
+    See https://mavlink.io/en/services/timesync.html; ArduPilot and PX4 both answer.
+    """
+
+    def __init__(
+        self,
+        connection: Connection,
+        system_id: int,
+        component_id: int,
+        on_report: Callable[[LinkReport], None],
+    ) -> None:
+        self._connection, self._system_id, self._component_id = connection, system_id, component_id
+        self._on_report = on_report
+        self._round_trip_s: float | None = None
+        self._ask_at = connection.now()
+        self._before = self._count()
+        self._detach = connection.bus.attach(Timesync, self._on_timesync, system_id=system_id)
+
+    def close(self) -> None:
+        """Stop measuring."""
+        self._detach()
+
+    async def run(self, on_tick: Callable[[], None]) -> None:
+        """Report once a second until cancelled or the connection ends; ``on_tick`` is called as often."""
+        while self._connection.is_open:
+            await anyio.sleep(REPORT_PERIOD_S)
+            if self._connection.is_open:
+                self._ask()
+                self._report()
+                on_tick()
+
+    def _ask(self) -> None:
+        now = self._connection.now()
+        if now >= self._ask_at:
+            self._ask_at = now + TIMESYNC_PERIOD_S
+            self._connection.send(Timesync(0, int(now * 1e9)), to=self._system_id)
+
+    def _on_timesync(self, message: Timesync) -> None:
+        """Take the answer to our question; questions of the vehicle and answers to others are not ours."""
+        round_trip_s = self._connection.now() - message.ts1 / 1e9
+        if message.tc1 != 0 and 0 <= round_trip_s < 60:
+            self._round_trip_s = round_trip_s
+
+    def _report(self) -> None:
+        at, (received, lost), total = count = self._count()
+        then, (received_before, lost_before), total_before = self._before
+        self._before = count
+        seconds = max(at - then, 1e-9)
+        frames, missing = received - received_before, lost - lost_before
+        report = LinkReport(
+            at,
+            self._system_id,
+            100 * missing / (frames + missing) if frames + missing else None,
+            self._round_trip_s,
+            frames / seconds,
+            (total - total_before) / seconds,
+        )
+        self._on_report(report)
+        self._connection.bus.publish(report)
+
+    def _count(self) -> tuple[float, tuple[int, int], int]:
+        total = sum(each.bytes for each in self._connection.statistics())
+        return self._connection.now(), self._connection.counts(self._system_id), total

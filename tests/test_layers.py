@@ -1,0 +1,85 @@
+"""The picture in docs/design.md is true: a file imports only from floors below its own."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+SOURCE = Path(__file__).parent.parent / "src" / "aerokit"
+
+FLOORS = [
+    {"errors", "snapshot"},
+    {"geo"},
+    {"mavlink"},
+    {"protocols", "links", "autopilots"},
+    {"runtime", "sim"},
+    {"vehicle"},
+    {"sync", "testing"},
+    {"dronekit"},
+    {"cli"},
+]
+ALLOWED_BESIDE = {("sim", "autopilots"), ("sim", "links")}
+SANS_IO = ("mavlink", "protocols", "autopilots")
+NO_IO = {"asyncio", "anyio", "socket", "threading", "time", "logging", "select", "selectors", "subprocess"}
+SOCKETS = {"socket", "serial", "serial_asyncio", "serial_asyncio_fast"}
+
+
+def floor_of(package: str) -> int:
+    return next(i for i, floor in enumerate(FLOORS) if package in floor)
+
+
+def package_of(path: Path) -> str:
+    return path.relative_to(SOURCE).with_suffix("").parts[0]
+
+
+def imports_of(path: Path) -> list[str]:
+    """Absolute names of everything the file imports, type-checking imports included."""
+    found: list[str] = []
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                parts = ("aerokit", *path.relative_to(SOURCE).parts)[: -node.level]
+                base = ".".join((*parts, *([base] if base else [])))
+            if base == "aerokit":
+                found += [f"aerokit.{alias.name}" for alias in node.names]
+            else:
+                found.append(base)
+    return found
+
+
+FILES = sorted(
+    path
+    for path in SOURCE.rglob("*.py")
+    if path.parent != SOURCE or path.stem not in ("__init__", "__main__", "messages", "enums", "events")
+)
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(SOURCE)))
+def test_imports_only_from_floors_below(path: Path) -> None:
+    own = package_of(path)
+    for name in imports_of(path):
+        if not name.startswith("aerokit."):
+            continue
+        other = name.split(".")[1]
+        if other == own or (own, other) in ALLOWED_BESIDE:
+            continue
+        if other in ("messages", "enums"):
+            other = "mavlink"
+        assert floor_of(other) < floor_of(own), f"{own} may not import {name}"
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(SOURCE)))
+def test_only_the_right_floors_touch_the_world(path: Path) -> None:
+    own, tops = package_of(path), {name.split(".")[0] for name in imports_of(path)}
+    if own in SANS_IO:
+        assert not tops & NO_IO
+    if own != "links":
+        assert not tops & SOCKETS
+    assert own == "testing" or "testing" not in {
+        name.split(".")[1] for name in imports_of(path) if name.startswith("aerokit.")
+    }
