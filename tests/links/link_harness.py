@@ -27,10 +27,17 @@ LOOPS: list[Any] = [
 ]
 
 
-def each_loop(test: AsyncTest) -> AsyncTest:
-    """Runs an async test on stock asyncio and on uvloop."""
-    return pytest.mark.anyio(pytest.mark.parametrize("anyio_backend", LOOPS)(test))  # type: ignore[no-any-return]
+def each_of(loops: list[Any]) -> Callable[[AsyncTest], AsyncTest]:
+    """A decorator that runs an async test on each of these loops."""
 
+    def decorate(test: AsyncTest) -> AsyncTest:
+        return pytest.mark.anyio(pytest.mark.parametrize("anyio_backend", loops)(test))  # type: ignore[no-any-return]
+
+    return decorate
+
+
+each_loop = each_of(LOOPS)
+"""Runs an async test on stock asyncio and on uvloop."""
 
 TRAFFIC: list[list[bytes]] = [
     [b"\xfd\x09\x00\x00\x00\x01\x01\x00\x00\x00"],
@@ -83,3 +90,10 @@ class Recorder:
     async def until_lost(self) -> LinkLost:
         await self.until(lambda: bool(self.losses))
         return self.losses[0]
+
+
+async def eventually(condition: Callable[[], bool]) -> None:
+    """Lets the loop turn until a condition holds that nobody signals; 20 s are for hung tests only."""
+    with anyio.fail_after(20.0):
+        while not condition():  # noqa: ASYNC110
+            await asyncio.sleep(0)

@@ -45,7 +45,7 @@ class BaseLink(Link):
             if isinstance(error, OSError) and not isinstance(error, LinkError):
                 raise link_open_error(self.address, error) from error
             raise
-        if self._state is _State.CLOSED:
+        if self._is_closed:
             self._release()
             raise ConnectionClosed(f"{self.address} was closed while it was being opened")
         if self._state is _State.OPENING:
@@ -60,6 +60,10 @@ class BaseLink(Link):
     async def wait_closed(self) -> None:
         """See `Link.wait_closed`."""
         await self._released.wait()
+
+    @property
+    def _is_closed(self) -> bool:
+        return self._state is _State.CLOSED
 
     @abstractmethod
     async def _connect(self) -> None:
@@ -113,6 +117,8 @@ def _hint(address: str, cause: OSError) -> str:
         return (
             "this machine has no such address; listen on 0.0.0.0, or reach another machine by udpout: or tcp:"
         )
+    if cause.errno == errno.EACCES and address.startswith("udpout"):
+        return "to reach a broadcast address write udpbcast:"
     return _HINTS.get(cause.errno or 0, "")
 
 
@@ -122,6 +128,6 @@ _HINTS = {
     errno.EHOSTUNREACH: "no route to this host; is the network or radio up?",
     errno.ENETUNREACH: "no route to this network; is the network or radio up?",
     errno.ETIMEDOUT: "the host does not answer; is it on, and does a firewall drop the port?",
-    errno.EACCES: "ports below 1024 and broadcast addresses need rights or the right kind of link",
+    errno.EACCES: "ports below 1024 need the rights of an administrator",
     errno.EAFNOSUPPORT: "this machine has no such address family, for instance no IPv6",
 }

@@ -1,0 +1,293 @@
+"""Connection strings: DroneKit's and pymavlink's spellings and URLs, read into one form."""
+
+from __future__ import annotations
+
+import ipaddress
+import math
+import re
+from dataclasses import dataclass
+from typing import Literal, NoReturn
+from urllib.parse import quote, unquote
+
+from aerokit.errors import LocalProtocolError
+
+__all__ = ["ACCEPTED_FORMS", "LinkAddress", "LinkKind", "host_and_port", "parse_address"]
+
+LinkKind = Literal["udpin", "udpout", "udpbcast", "tcp", "tcpin", "serial", "replay"]
+
+ACCEPTED_FORMS = """\
+  127.0.0.1:14550  udp:0.0.0.0:14550  udpin:0.0.0.0:14550  udp://:14550   listen for UDP
+  udpout:192.168.1.12:14550  udpout://192.168.1.12:14550                  send UDP to one host
+  udpbcast:192.168.1.255:14550                                            broadcast, then talk to who answers
+  tcp:127.0.0.1:5760  tcp://127.0.0.1:5760  tcpout:127.0.0.1:5760         connect by TCP
+  tcpin:0.0.0.0:5760                                                      wait for TCP clients
+  /dev/ttyACM0  /dev/ttyUSB0,57600  COM14  COM14,115200                   serial port, with its baud rate
+  serial:///dev/ttyUSB0:57600  serial://COM3:57600?rtscts=1               the same, with flow control
+  flight.tlog  replay:flight.tlog?speed=2  file:///logs/flight.tlog       replay a recording
+  an IPv6 address stands in brackets: udpin:[::1]:14550"""
+"""What an address may look like, for error messages and help texts."""
+
+
+@dataclass(frozen=True)
+class LinkAddress:
+    """A connection string, taken apart; ``str()`` gives the canonical one, which parses back to the same."""
+
+    kind: LinkKind
+    host: str = ""
+    """Name or IP address without brackets; "0.0.0.0" where none was given to listen on."""
+    port: int = 0
+    """0 to 65535; 0 only for listening: the system chooses."""
+    device: str = ""
+    """Serial port, e.g. "/dev/ttyACM0" or "COM14"."""
+    baud: int | None = None
+    """Bits per second; None when the string does not say."""
+    path: str = ""
+    """File of a recording."""
+    options: tuple[tuple[str, str], ...] = ()
+    """The rest, sorted.
+
+    ``rtscts`` is "1"; ``speed`` a factor, "inf" as fast as it goes; ``timeout`` is in seconds.
+    """
+
+    def __str__(self) -> str:
+        query = "&".join(f"{key}={value}" for key, value in self.options)
+        return self._without_options() + (f"?{query}" if query else "")
+
+    def option(self, name: str) -> str | None:
+        """The value of one option, None when it was not given."""
+        return dict(self.options).get(name)
+
+    def _without_options(self) -> str:
+        if self.kind == "serial":
+            baud = "" if self.baud is None else f":{self.baud}"
+            return f"serial://{_quote_device(self.device)}{baud}"
+        if self.kind == "replay":
+            return f"replay:{'//' if self.path.startswith('//') else ''}{_quote(self.path)}"
+        return f"{self.kind}:{host_and_port(self.host, self.port)}"
+
+
+def parse_address(text: str) -> LinkAddress:
+    """Reads a connection string.
+
+    A bare ``host:port`` and ``udp:`` listen, as with DroneKit and pymavlink. In the forms with a scheme,
+    ``%20`` and its like in devices and paths are decoded, as in any URL. Raises LocalProtocolError that says
+    what is wrong and lists the accepted forms.
+    """
+    return _Parser(text).parse()
+
+
+def host_and_port(host: str, port: int) -> str:
+    """``host:port`` with brackets where the host is an IPv6 address."""
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+
+_SCHEMES: dict[str, LinkKind] = {
+    "udp": "udpin",
+    "udpin": "udpin",
+    "udpout": "udpout",
+    "udpbcast": "udpbcast",
+    "tcp": "tcp",
+    "tcpout": "tcp",
+    "tcpin": "tcpin",
+    "serial": "serial",
+    "replay": "replay",
+    "file": "replay",
+}
+_OPTIONS: dict[LinkKind, tuple[str, ...]] = {
+    "tcp": ("timeout",),
+    "serial": ("baud", "rtscts"),
+    "replay": ("speed",),
+}
+_LISTENING = ("udpin", "tcpin")
+_NOT_HERE = ("uds", "unix", "mcast", "ws", "wss", "wsserver", "csv")  # pymavlink knows these
+_SCHEME = re.compile(r"([a-z][a-z0-9_+.-]+):(.*)", re.IGNORECASE | re.DOTALL)  # one letter is a drive
+_URL = re.compile(r"([a-z][a-z0-9_+.-]*)://(.*)", re.IGNORECASE | re.DOTALL)
+_RECORDING = re.compile(r".*\.tlog(\?[^/\\]*)?", re.IGNORECASE | re.DOTALL)
+_DATAFLASH = re.compile(r".*\.(bin|log|px4log|ulg)", re.IGNORECASE | re.DOTALL)
+_COM_PORT = re.compile(r"com\d+([,:].*)?", re.IGNORECASE)
+_COM_COLON_BAUD = re.compile(r"(com\d+):(.*)", re.IGNORECASE)
+_COLON_BAUD = re.compile(r"(.*):(\d+)", re.DOTALL | re.ASCII)
+_HOST = re.compile(r"[^\s\[\]/\\?#:,@]+")
+_YES_AND_NO = {
+    "1": True,
+    "true": True,
+    "yes": True,
+    "on": True,
+    "0": False,
+    "false": False,
+    "no": False,
+    "off": False,
+}
+
+
+class _Parser:
+    """One run over one string; keeps it for the error messages."""
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+
+    def parse(self) -> LinkAddress:
+        text = self.text.strip()
+        if not text:
+            self.fail("it is empty")
+        if "\0" in text:
+            self.fail("it has a NUL character in it")
+        scheme, rest = self.split_scheme(text)
+        if scheme in _SCHEMES:
+            return self.with_scheme(scheme, rest)
+        if scheme:
+            self.fail_scheme(scheme)
+        return self.bare(text)
+
+    def split_scheme(self, text: str) -> tuple[str, str]:
+        """The scheme in lower case and what follows it; "" when the string has none."""
+        if match := _URL.fullmatch(text):
+            return match[1].lower(), match[2]
+        match = _SCHEME.fullmatch(text)
+        if match and match[1].lower() in (*_SCHEMES, *_NOT_HERE, "http", "https", "ftp"):
+            return match[1].lower(), match[2]
+        return "", text
+
+    def with_scheme(self, scheme: str, rest: str) -> LinkAddress:
+        kind = _SCHEMES[scheme]
+        rest, _, query = rest.partition("?")
+        options = self.options(kind, query)
+        if kind == "serial":
+            return self.serial(rest, options, decode=True)
+        if kind == "replay":
+            drive = scheme == "file" and re.match(r"/[a-z]:[/\\]", rest, re.IGNORECASE)
+            return self.replay(unquote(rest[1:] if drive else rest), options)
+        return self.network(kind, rest.removesuffix("/"), options)
+
+    def bare(self, text: str) -> LinkAddress:
+        if _RECORDING.fullmatch(text):
+            end = text.lower().rindex(".tlog") + len(".tlog")
+            return self.replay(text[:end], self.options("replay", text[end + 1 :]))
+        if _DATAFLASH.fullmatch(text):
+            self.fail("this is a log of the autopilot's own format, not a recording of MAVLink (.tlog)")
+        if _COM_PORT.fullmatch(text) or "\\" in text or "/" in text:
+            return self.serial(text, {}, decode=False)
+        if ":" not in text:
+            self.fail("it is neither host:port nor the path of a serial port or of a .tlog file")
+        if not text.startswith("[") and text.count(":") > 1 and not _is_ipv6(text.rpartition(":")[0]):
+            self.fail_scheme(text.partition(":")[0])
+        return self.network("udpin", text, {})
+
+    def network(self, kind: LinkKind, text: str, options: dict[str, str]) -> LinkAddress:
+        if text.startswith("["):
+            host, bracket, tail = text[1:].partition("]")
+            if not bracket or not _is_ipv6(host):
+                self.fail(f"{text!r} does not begin with an IPv6 address in brackets")
+        else:
+            host, colon, tail = text.rpartition(":")
+            if not colon:
+                host, tail = tail, ""
+            tail = colon + tail
+            if _is_ipv6(host):
+                self.fail("an IPv6 address must stand in brackets, as in [::1]:14550")
+            if host.isdigit() and not tail:
+                self.fail(f"the host is missing, as in {kind}:127.0.0.1:{host}")
+        if not host and kind in _LISTENING:
+            host = "0.0.0.0"
+        if not host:
+            self.fail("the host is missing")
+        if kind == "udpbcast" and _is_ipv6(host):
+            self.fail("broadcast exists in IPv4 only")
+        if not _is_ipv6(host) and not _HOST.fullmatch(host):
+            self.fail(f"{host!r} is not a host")
+        return LinkAddress(
+            kind, host=host, port=self.port(kind, tail), options=tuple(sorted(options.items()))
+        )
+
+    def port(self, kind: LinkKind, tail: str) -> int:
+        if not tail.startswith(":") or tail == ":":
+            self.fail("the port is missing" if tail in ("", ":") else f"{tail!r} follows the host, not :port")
+        port, lowest = self.whole_number("the port", tail[1:]), 0 if kind in _LISTENING else 1
+        if not lowest <= port <= 65535:
+            self.fail(f"the port {port} is out of range ({lowest} to 65535)")
+        return port
+
+    def serial(self, text: str, options: dict[str, str], *, decode: bool) -> LinkAddress:
+        rate: str | None
+        if "," in text:
+            device, _, rate = text.partition(",")
+        elif match := (_COLON_BAUD if decode else _COM_COLON_BAUD).fullmatch(text):
+            device, rate = match[1], match[2]
+        else:
+            device, rate = text, None
+        given = options.pop("baud", rate)
+        device = unquote(device) if decode else device
+        if not device.strip("/"):
+            self.fail("the serial port is missing")
+        baud = None if given is None else self.whole_number("the baud rate", given)
+        if baud == 0:
+            self.fail("the baud rate is 0")
+        return LinkAddress("serial", device=device, baud=baud, options=tuple(sorted(options.items())))
+
+    def replay(self, path: str, options: dict[str, str]) -> LinkAddress:
+        if not path.strip():
+            self.fail("the path of the recording is missing")
+        return LinkAddress("replay", path=path, options=tuple(sorted(options.items())))
+
+    def options(self, kind: LinkKind, query: str) -> dict[str, str]:
+        found: dict[str, str] = {}
+        for item in filter(None, query.split("&")):
+            key, _, value = item.partition("=")
+            key = key.strip().lower()
+            if key not in _OPTIONS.get(kind, ()):
+                known = ", ".join(_OPTIONS.get(kind, ())) or "none"
+                self.fail(f"{key!r} is not an option of {kind} links (they have: {known})")
+            found[key] = self.option_value(key, value.strip().lower())
+        return {
+            key: value
+            for key, value in found.items()
+            if (key, value) not in (("rtscts", "0"), ("speed", "1"))
+        }
+
+    def option_value(self, key: str, value: str) -> str:
+        if key == "baud":
+            return value
+        if key == "rtscts":
+            if value not in _YES_AND_NO:
+                self.fail(f"rtscts={value} is neither yes (1) nor no (0)")
+            return str(int(_YES_AND_NO[value]))
+        try:
+            number = float("inf" if value == "max" else value)
+        except ValueError:
+            number = math.nan
+        if not number > 0 or (key == "timeout" and math.isinf(number)):
+            self.fail(f"{key}={value} is not a number above 0")
+        return repr(number).removesuffix(".0")
+
+    def whole_number(self, what: str, text: str) -> int:
+        if not (text.isascii() and text.isdigit() and len(text) <= 9):
+            self.fail(f"{what} {text!r} is not a whole number")
+        return int(text)
+
+    def fail_scheme(self, scheme: str) -> NoReturn:
+        known = (
+            "pymavlink has it, aerokit does not" if scheme in _NOT_HERE else "there is no such kind of link"
+        )
+        self.fail(f"{scheme}: {known}")
+
+    def fail(self, reason: str) -> NoReturn:
+        raise LocalProtocolError(
+            f"{self.text!r} is not a link address: {reason}. Accepted:\n{ACCEPTED_FORMS}"
+        )
+
+
+def _is_ipv6(text: str) -> bool:
+    try:
+        ipaddress.IPv6Address(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _quote(text: str) -> str:
+    """Percent-encodes only what would be misread: ``%``, ``?`` and white space."""
+    return re.sub(r"[%?\s]", lambda match: quote(match[0], safe=""), text)
+
+
+def _quote_device(device: str) -> str:
+    return re.sub(r":(?=[0-9]+$)", "%3A", _quote(device).replace(",", "%2C"))

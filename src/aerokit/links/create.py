@@ -1,0 +1,33 @@
+"""From a connection string to a link that is ready to be opened."""
+
+from __future__ import annotations
+
+from .address import LinkAddress, parse_address
+from .link import Link
+from .replay import Replay
+from .serial import SerialLink
+from .tcp import CONNECT_TIMEOUT_S, TcpConnect, TcpListen
+from .udp import UdpBroadcast, UdpConnect, UdpListen
+
+__all__ = ["create_link"]
+
+
+def create_link(address: str | LinkAddress, *, baud: int = 57600) -> Link:
+    """The link that a connection string describes; nothing is opened yet.
+
+    ``baud`` is for serial ports whose string does not say one. Raises LocalProtocolError for a wrong address,
+    with the reason and the accepted forms.
+    """
+    where = address if isinstance(address, LinkAddress) else parse_address(address)
+    if where.kind == "serial":
+        return SerialLink(where.device, where.baud or baud, rtscts=where.option("rtscts") == "1")
+    if where.kind == "replay":
+        return Replay(where.path, float(where.option("speed") or 1.0))
+    if where.kind == "tcp":
+        timeout = float(where.option("timeout") or CONNECT_TIMEOUT_S)
+        return TcpConnect(where.host, where.port, connect_timeout_s=timeout)
+    if where.kind == "tcpin":
+        return TcpListen(where.host, where.port)
+    if where.kind == "udpin":
+        return UdpListen(where.host, where.port)
+    return (UdpConnect if where.kind == "udpout" else UdpBroadcast)(where.host, where.port)

@@ -1,0 +1,198 @@
+"""Serial ports, by pyserial-asyncio-fast where it is installed and pyserial-asyncio where not.
+
+Both are used for their transport alone, with the port's own calls replaced (on POSIX), because of what was
+seen:
+
+* they wait in ``tcdrain`` when they close, 0.6 on the event loop itself: a port that is held up blocks the
+program; * pyserial's non-blocking ``write`` spins while the device takes nothing, ``read`` fails above
+descriptor 1023; * an unplugged device is reported to the loop's exception handler instead of the protocol, or
+not before what is left
+  to write has gone.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import importlib
+import os
+from functools import partial
+from types import ModuleType
+from typing import Any
+
+from .address import LinkAddress
+from .base import BaseLink, link_open_error
+from .link import LINGER_S, Peer
+
+__all__ = ["SerialLink"]
+
+_READ_SIZE = 4096
+_LINGER_STEP_S = 0.005
+_SECONDS_HELD_BACK = 2.0  # more would only be stale when it arrives
+
+
+class SerialLink(BaseLink):
+    """A serial port, 8N1, not shared with other programs; unplugging it is a lost link.
+
+    ``baud`` is in bits per second and matters to real UARTs, not to USB ports such as /dev/ttyACM0;
+    ``rtscts`` turns hardware flow control on. About two seconds' worth of bytes may wait to be sent, at least
+    4096.
+    """
+
+    def __init__(self, device: str, baud: int = 57600, *, rtscts: bool = False) -> None:
+        options = (("rtscts", "1"),) if rtscts else ()
+        super().__init__(str(LinkAddress("serial", device=device, baud=baud, options=options)))
+        self._device, self._baud, self._rtscts = device, baud, rtscts
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._port: Any = None
+        self._transport: Any = None
+        self._paused = False
+
+    def write(self, data: bytes, peer: Peer = None) -> None:
+        """See `Link.write`; drops while more waits than the line carries in two seconds."""
+        if self._transport is None or not data:
+            return
+        if self._paused:
+            self.dropped_writes += 1
+        else:
+            self._transport.write(data)
+
+    async def _connect(self) -> None:
+        """Without an await in it: there is no half-way at which it could be cancelled."""
+        self._loop = asyncio.get_running_loop()
+        transports = _transports()
+        self._port = port = self._open_port()
+        self._released.clear()
+        _replace_calls(port, self._device_failed)
+        self._transport = transports.SerialTransport(self._loop, _SerialProtocol(self), port)
+        limit = max(4096, int(self._baud / 10 * _SECONDS_HELD_BACK))
+        self._transport.set_write_buffer_limits(high=limit, low=limit // 2)
+
+    def _open_port(self) -> Any:
+        serial = importlib.import_module("serial")
+        try:
+            return serial.Serial(
+                self._device, self._baud, rtscts=self._rtscts, exclusive=True, timeout=0, write_timeout=0
+            )
+        except (OSError, ValueError, OverflowError) as error:
+            raise _open_error(self.address, error) from error
+
+    def _device_failed(self, error: OSError) -> None:
+        """Reading or writing failed; said on a later turn, for it may be inside `write`."""
+        if self._loop is not None and self._transport is not None:
+            self._transport.pause_reading()
+            self._loop.call_soon(self._lose, f"the device is gone: {error.strerror or error}", error)
+
+    def _release(self) -> None:
+        transport, self._transport = self._transport, None
+        if transport is None or self._loop is None:
+            return
+        transport.pause_reading()
+        if self._loop.is_running():
+            until = self._loop.time() + (LINGER_S if self._is_closed else 0.0)
+            self._loop.call_soon(self._finish, transport, until)
+        else:
+            self._close_port(transport)
+
+    def _finish(self, transport: Any, until: float) -> None:
+        """Closes the port when what was written has left the machine, or has had its time."""
+        assert self._loop is not None
+        if self._waiting_to_be_sent(transport) and self._loop.time() < until:
+            self._loop.call_later(_LINGER_STEP_S, self._finish, transport, until)
+        else:
+            self._close_port(transport)
+
+    def _waiting_to_be_sent(self, transport: Any) -> int:
+        with contextlib.suppress(OSError):
+            return int(transport.get_write_buffer_size() + self._port.out_waiting)
+        return 0
+
+    def _close_port(self, transport: Any) -> None:
+        with contextlib.suppress(RuntimeError):  # the loop is closed
+            transport.pause_reading()  # again: before its first turn there was nothing to pause
+            transport.flush()
+        with contextlib.suppress(Exception):
+            self._port.reset_output_buffer()  # else the system's close waits for it, up to 30 s
+        self._port.close()
+        self._released.set()
+
+
+class _SerialProtocol(asyncio.Protocol):
+    def __init__(self, link: SerialLink) -> None:
+        self._link = link
+
+    def data_received(self, data: bytes) -> None:
+        self._link._deliver(data)
+
+    def pause_writing(self) -> None:
+        self._link._paused = True
+
+    def resume_writing(self) -> None:
+        self._link._paused = False
+
+    def connection_lost(self, exc: Exception | None) -> None:  # only where the port's own calls are in use
+        self._link._lose(f"the device is gone: {exc}", exc)
+
+
+def _transports() -> ModuleType:
+    try:
+        return importlib.import_module("serial_asyncio_fast")
+    except ImportError:
+        return importlib.import_module("serial_asyncio")
+
+
+def _replace_calls(port: Any, failed: Any) -> None:
+    """Gives a port calls that never wait and report a lost device to ``failed``."""
+    port.flush = lambda: None
+    if os.name == "posix":
+        port.read = partial(_read, port.fileno(), failed)
+        port.write = partial(_write, port.fileno(), failed)
+
+
+def _read(fd: int, failed: Any, _size: int) -> bytes:
+    try:
+        data = os.read(fd, _READ_SIZE)
+    except (BlockingIOError, InterruptedError):
+        return b""
+    except OSError as error:
+        failed(error)
+        return b""
+    if not data:  # ready to be read, and nothing there
+        failed(OSError(errno.ENODEV, "unplugged"))
+    return data
+
+
+def _write(fd: int, failed: Any, data: bytes) -> int:
+    try:
+        return os.write(fd, data)
+    except (BlockingIOError, InterruptedError):
+        raise  # the transport keeps it for later
+    except OSError as error:
+        failed(error)
+        return len(data)
+
+
+def _open_error(address: str, error: Exception) -> OSError:
+    number = error.errno if isinstance(error, OSError) else None
+    if number is None and str(errno.ENOTTY) in str(error):
+        number = errno.ENOTTY
+    cause = OSError(number, os.strerror(number)) if number else OSError(str(error))
+    missing = number in (errno.ENOENT, errno.ENXIO, errno.ENODEV)
+    return link_open_error(address, cause, _ports_here() if missing else _HINTS.get(number or 0, ""))
+
+
+def _ports_here() -> str:
+    comports = importlib.import_module("serial.tools.list_ports").comports
+    names = ", ".join(sorted(port.device for port in comports()))
+    return f"serial ports here: {names}" if names else "there is no serial port here; is it plugged in?"
+
+
+_HINTS = {
+    errno.EACCES: "on Linux: sudo usermod -a -G dialout $USER, then log in again",
+    errno.EPERM: "on Linux: sudo usermod -a -G dialout $USER, then log in again",
+    errno.EAGAIN: "another program uses this port",
+    errno.EBUSY: "another program uses this port",
+    errno.ENOTTY: "this is no serial port; to replay a recording write replay:PATH",
+    errno.EISDIR: "this is a directory",
+}

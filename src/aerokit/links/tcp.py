@@ -1,0 +1,252 @@
+"""TCP: connect to one server, or serve several clients."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import socket
+from abc import abstractmethod
+from typing import Any
+
+import anyio
+
+from .address import host_and_port
+from .base import BaseLink
+from .link import LINGER_S, Peer
+from .sockets import Endpoint, bound_socket, resolve
+
+__all__ = ["CONNECT_TIMEOUT_S", "MAX_CLIENTS", "MAX_PENDING_BYTES", "TcpConnect", "TcpListen"]
+
+CONNECT_TIMEOUT_S = 10.0
+"""Seconds that `TcpConnect.open` waits for the other side by default."""
+
+MAX_PENDING_BYTES = 256 * 1024
+"""With more than this written and not taken by the other side, whole writes are dropped."""
+
+MAX_CLIENTS = 64
+"""Further clients of a listening link are turned away."""
+
+
+class _TcpLink(BaseLink):
+    """What both ends have in common: streams that outlive the link by `LINGER_S` at most."""
+
+    def __init__(self, scheme: str, host: str, port: int) -> None:
+        super().__init__(f"{scheme}:{host_and_port(host, port)}")
+        self._host, self._port = host, port
+        self._streams: set[_Stream] = set()  # all that are not quite gone
+
+    @abstractmethod
+    def _stream_made(self, stream: _Stream) -> None: ...
+
+    @abstractmethod
+    def _stream_lost(self, stream: _Stream, error: Exception | None) -> None: ...
+
+    def _stream_begins(self, stream: _Stream) -> None:
+        self._streams.add(stream)
+        self._released.clear()
+        if self._receiver is None:
+            stream.close()
+        else:
+            self._stream_made(stream)
+
+    def _stream_ends(self, stream: _Stream, error: Exception | None) -> None:
+        self._streams.discard(stream)
+        if not self._streams:
+            self._released.set()
+        self._stream_lost(stream, error)
+
+    def _release(self) -> None:
+        for stream in tuple(self._streams):
+            stream.close()
+
+
+class TcpConnect(_TcpLink):
+    """``tcp:`` connects to a server; the server's end of stream is a lost link."""
+
+    def __init__(self, host: str, port: int, *, connect_timeout_s: float = CONNECT_TIMEOUT_S) -> None:
+        super().__init__("tcp", host, port)
+        self._connect_timeout_s = connect_timeout_s
+        self._stream: _Stream | None = None
+
+    @property
+    def local_address(self) -> tuple[str, int]:
+        """Our own host and port; ("", 0) when it is not open."""
+        return self._stream.own_address if self._stream is not None else ("", 0)
+
+    def write(self, data: bytes, peer: Peer = None) -> None:
+        """See `Link.write`; drops while more than `MAX_PENDING_BYTES` wait for the other side."""
+        if self._stream is not None:
+            self.dropped_writes += not self._stream.write(data)
+
+    async def _connect(self) -> None:
+        with anyio.move_on_after(self._connect_timeout_s):
+            return await self._connect_to_any(await resolve(self._host, self._port, socket.SOCK_STREAM))
+        raise OSError(errno.ETIMEDOUT, f"no answer within {self._connect_timeout_s:g} s")
+
+    async def _connect_to_any(self, endpoints: list[Endpoint]) -> None:
+        first_error: OSError | None = None
+        for endpoint in endpoints:
+            try:
+                return await self._connect_to(endpoint)
+            except OSError as error:
+                first_error = first_error or error
+        raise first_error or OSError(errno.EADDRNOTAVAIL, "the host has no address")
+
+    async def _connect_to(self, endpoint: Endpoint) -> None:
+        loop = asyncio.get_running_loop()
+        sock = socket.socket(endpoint.family, socket.SOCK_STREAM)
+        try:
+            sock.setblocking(False)
+            await loop.sock_connect(sock, endpoint.address)
+        except BaseException:
+            sock.close()
+            raise
+        await loop.create_connection(lambda: _Stream(self), sock=sock)  # closes the socket when it fails
+
+    def _stream_made(self, stream: _Stream) -> None:
+        self._stream = stream
+
+    def _stream_lost(self, stream: _Stream, error: Exception | None) -> None:
+        if stream is self._stream:
+            self._lose(_why_lost(error), error)
+
+    def _release(self) -> None:
+        self._stream = None
+        super()._release()
+
+
+class TcpListen(_TcpLink):
+    """``tcpin:`` serves clients; each is a peer, and losing one, or all of them, does not lose the link.
+
+    Port 0 lets the system choose one; `address` and `local_address` say which once the link is open.
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        super().__init__("tcpin", host, port)
+        self._socket: socket.socket | None = None  # until the server has it
+        self._server: asyncio.AbstractServer | None = None
+        self._local_address = ("", 0)
+        self._clients: dict[Peer, _Stream] = {}
+
+    @property
+    def local_address(self) -> tuple[str, int]:
+        """Host and port this link listens on; ("", 0) before it is open."""
+        return self._local_address
+
+    @property
+    def peers(self) -> tuple[Peer, ...]:
+        """The clients that are connected now."""
+        return tuple(self._clients)
+
+    def write(self, data: bytes, peer: Peer = None) -> None:
+        """See `Link.write`; drops for a client that has more than `MAX_PENDING_BYTES` waiting."""
+        if peer is None:
+            for client in tuple(self._clients.values()):
+                self.dropped_writes += not client.write(data)
+        elif client_of_peer := self._clients.get(peer):
+            self.dropped_writes += not client_of_peer.write(data)
+        else:
+            self.dropped_writes += 1
+
+    async def wait_closed(self) -> None:
+        """See `Link.wait_closed`."""
+        await super().wait_closed()
+        if self._server is not None and self._receiver is None:
+            with anyio.move_on_after(LINGER_S):
+                await self._server.wait_closed()
+
+    async def _connect(self) -> None:
+        self._socket = sock = await bound_socket(self._host, self._port, socket.SOCK_STREAM)
+        self._local_address = sock.getsockname()[:2]
+        self.address = f"tcpin:{host_and_port(self._host, self._local_address[1])}"
+        loop = asyncio.get_running_loop()
+        self._server = await loop.create_server(
+            lambda: _Stream(self), sock=sock, backlog=16, start_serving=False
+        )
+        self._socket = None
+        await self._server.start_serving()
+
+    def _stream_made(self, stream: _Stream) -> None:
+        if len(self._clients) < MAX_CLIENTS:
+            self._clients[stream.peer] = stream
+        else:
+            stream.close()
+
+    def _stream_lost(self, stream: _Stream, error: Exception | None) -> None:
+        if self._clients.get(stream.peer) is stream:
+            del self._clients[stream.peer]
+
+    def _release(self) -> None:
+        self._clients.clear()
+        if self._server is not None:
+            with contextlib.suppress(RuntimeError):  # the loop is closed, and its sockets with it
+                self._server.close()
+        if self._socket is not None:
+            self._socket.close()
+        self._socket = None
+        super()._release()
+
+
+class _Stream(asyncio.Protocol):
+    """One TCP connection: bounded in what it holds back, and in how long it lingers."""
+
+    def __init__(self, link: _TcpLink) -> None:
+        self._link = link
+        self._transport: asyncio.Transport | None = None
+        self._paused = False
+        self._loop = asyncio.get_running_loop()
+        self._linger: asyncio.TimerHandle | None = None
+        self.peer: Peer = None
+
+    @property
+    def own_address(self) -> tuple[str, int]:
+        name: Any = self._transport and self._transport.get_extra_info("sockname")
+        return name[:2] if name else ("", 0)
+
+    def write(self, data: bytes) -> bool:
+        """False when it was dropped."""
+        if self._paused or self._transport is None or self._transport.is_closing():
+            return False
+        self._transport.write(data)
+        return True
+
+    def close(self) -> None:
+        """Sends what was written, for up to `LINGER_S`, and closes."""
+        if self._transport is None or self._transport.is_closing():
+            return
+        with contextlib.suppress(RuntimeError):  # the loop is closed
+            self._transport.close()
+            if self._transport.get_write_buffer_size():
+                self._linger = self._loop.call_later(LINGER_S, self._transport.abort)
+
+    def connection_made(self, transport: Any) -> None:  # not every loop's is a Transport by its class
+        self._transport = transport
+        self.peer = transport.get_extra_info("peername") or f"client {id(self):#x}"  # it may be gone already
+        transport.set_write_buffer_limits(high=MAX_PENDING_BYTES, low=MAX_PENDING_BYTES // 2)
+        sock = transport.get_extra_info("socket")
+        with contextlib.suppress(OSError):
+            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        self._link._stream_begins(self)
+
+    def data_received(self, data: bytes) -> None:
+        peer = self.peer if isinstance(self._link, TcpListen) else None
+        self._link._deliver(data, peer)
+
+    def pause_writing(self) -> None:
+        self._paused = True
+
+    def resume_writing(self) -> None:
+        self._paused = False
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        if self._linger is not None:
+            self._linger.cancel()
+        self._link._stream_ends(self, exc)
+
+
+def _why_lost(error: Exception | None) -> str:
+    if error is None:
+        return "the other side closed the connection"
+    return (error.strerror if isinstance(error, OSError) else None) or str(error) or type(error).__name__

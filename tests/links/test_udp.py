@@ -1,0 +1,299 @@
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import socket
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from link_harness import LOOPS, Recorder, each_loop, each_of, each_traffic
+
+from aerokit.errors import BusyError, ConnectionClosed, LinkOpenError
+from aerokit.links import UdpBroadcast, UdpConnect, UdpListen, udp
+
+HOSTS = pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
+
+
+class LoopWithoutReaders(asyncio.SelectorEventLoop):
+    """Like the Proactor loop of Windows: it has datagram transports, but no add_reader."""
+
+    def add_reader(self, fd: Any, callback: Any, *args: Any) -> None:  # type: ignore[override]
+        raise NotImplementedError
+
+    def remove_reader(self, fd: Any) -> bool:
+        raise NotImplementedError
+
+
+WITHOUT_READERS = pytest.param(("asyncio", {"loop_factory": LoopWithoutReaders}), id="no add_reader")
+
+
+each_loop_and_the_fallback = each_of([*LOOPS, WITHOUT_READERS])
+
+
+@contextlib.contextmanager
+def plain_socket(host: str = "127.0.0.1") -> Iterator[socket.socket]:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.socket(family, socket.SOCK_DGRAM) as sock:
+        sock.bind((host, 0))
+        sock.settimeout(20.0)
+        yield sock
+
+
+@each_loop_and_the_fallback
+@each_traffic
+@HOSTS
+async def test_datagrams_go_both_ways(host: str, pieces: list[bytes]) -> None:
+    listener, caller = UdpListen(host, 0), UdpConnect(host, 0)
+    heard, answered = Recorder(), Recorder()
+    await listener.open(heard)
+    caller = UdpConnect(host, listener.local_address[1])
+    await caller.open(answered)
+    for piece in pieces:
+        caller.write(piece)
+    await heard.until_data(b"".join(pieces))
+    assert [data for data, _ in heard.pieces] == pieces
+    assert heard.peers == list(listener.peers)
+    for piece in pieces:
+        listener.write(piece, heard.peers[0])
+    await answered.until_data(b"".join(pieces))
+    assert answered.peers == [None]
+    for link in (listener, caller):
+        link.close()
+        await link.wait_closed()
+    assert heard.losses == answered.losses == []
+    assert listener.dropped_writes == caller.dropped_writes == 0
+
+
+@each_loop_and_the_fallback
+async def test_a_listener_talks_to_everybody_it_heard() -> None:
+    listener, heard = UdpListen("127.0.0.1", 0), Recorder()
+    await listener.open(heard)
+    listener.write(b"nobody is there yet")
+    with plain_socket() as first, plain_socket() as second:
+        for sock in (first, second, first):
+            sock.sendto(b"hello", listener.local_address)
+        await heard.until_data(b"hello" * 3)
+        assert listener.peers == (first.getsockname(), second.getsockname())
+        listener.write(b"to both")
+        listener.write(b"to the second", second.getsockname())
+        assert first.recv(100) == b"to both"
+        assert [second.recv(100), second.recv(100)] == [b"to both", b"to the second"]
+    listener.close()
+    await listener.wait_closed()
+    assert listener.dropped_writes == 0
+
+
+@each_loop
+async def test_the_peer_unheard_for_longest_is_forgotten_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(udp, "MAX_PEERS", 2)
+    listener, heard = UdpListen("127.0.0.1", 0), Recorder()
+    await listener.open(heard)
+    with plain_socket() as first, plain_socket() as second, plain_socket() as third:
+        for sock in (first, second, first, third):
+            sock.sendto(b"x", listener.local_address)
+        await heard.until_data(b"xxxx")
+        assert listener.peers == (third.getsockname(), first.getsockname())
+        listener.write(b"?", second.getsockname())
+    assert listener.dropped_writes == 1
+    listener.close()
+
+
+@each_loop
+async def test_a_burst_is_read_in_bounded_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(udp, "DATAGRAMS_PER_WAKE_UP", 4)
+    listener, heard = UdpListen("127.0.0.1", 0), Recorder()
+    await listener.open(heard)
+    loop = asyncio.get_running_loop()
+    seen_between_turns: list[int] = []
+
+    def count() -> None:
+        seen_between_turns.append(len(heard.pieces))
+        if len(heard.pieces) < 10:
+            loop.call_soon(count)
+
+    with plain_socket() as sock:
+        for n in range(10):
+            sock.sendto(bytes([n]), listener.local_address)
+        loop.call_soon(count)
+        await heard.until_data(bytes(range(10)))
+    assert 4 in seen_between_turns
+    assert 8 in seen_between_turns
+    listener.close()
+
+
+@each_loop_and_the_fallback
+async def test_a_closed_remote_port_does_not_lose_the_link() -> None:
+    with plain_socket() as sock:
+        port = sock.getsockname()[1]
+    caller, answered = UdpConnect("127.0.0.1", port), Recorder()
+    await caller.open(answered)
+    for _ in range(5):
+        caller.write(b"is anybody there?")
+        await asyncio.sleep(0)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle:
+        vehicle.bind(("127.0.0.1", port))
+        vehicle.settimeout(20.0)
+        caller.write(b"now")
+        data, source = vehicle.recvfrom(100)
+        assert data == b"now"
+        vehicle.sendto(b"yes", source)
+        await answered.until_data(b"yes")
+    assert answered.losses == []
+    caller.close()
+    await caller.wait_closed()
+
+
+@each_loop_and_the_fallback
+async def test_only_the_one_that_is_called_is_heard() -> None:
+    with plain_socket() as vehicle, plain_socket() as stranger:
+        caller, answered = UdpConnect("0.0.0.0", vehicle.getsockname()[1]), Recorder()
+        await caller.open(answered)
+        caller.write(b"hello")
+        data, source = vehicle.recvfrom(100)
+        assert data == b"hello"
+        stranger.sendto(b"psst", source)
+        vehicle.sendto(b"here", source)
+        await answered.until_data(b"here")
+    caller.close()
+    await caller.wait_closed()
+
+
+@each_loop
+async def test_what_the_system_will_not_take_is_dropped_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    with plain_socket() as remote:
+        caller = UdpConnect(*remote.getsockname())
+        await caller.open(Recorder())
+        caller.write(b"x" * 70_000)
+        assert caller.dropped_writes == 1
+        assert caller._socket is not None
+        real, caller._socket = caller._socket, FullSocket()  # type: ignore[assignment]
+        caller.write(b"no room")
+        caller._socket = real
+        assert caller.dropped_writes == 2
+        caller.write(b"room")
+        assert remote.recv(100) == b"room"
+    caller.close()
+
+
+class FullSocket:
+    def sendto(self, data: bytes, address: object) -> int:
+        raise BlockingIOError(errno.EAGAIN, "no room")
+
+
+@each_loop_and_the_fallback
+async def test_broadcast_talks_only_to_the_one_that_answers() -> None:
+    broadcast, heard = UdpBroadcast("127.255.255.255", 14550), Recorder()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle, plain_socket() as other:
+        vehicle.bind(("0.0.0.0", 0))
+        vehicle.settimeout(20.0)
+        broadcast = UdpBroadcast("127.255.255.255", vehicle.getsockname()[1])
+        await broadcast.open(heard)
+        broadcast.write(b"who is there?")
+        data, source = vehicle.recvfrom(100)
+        assert data == b"who is there?"
+        vehicle.sendto(b"me", source)
+        await heard.until_data(b"me")
+        other.sendto(b"me too", source)
+        broadcast.write(b"hello you")
+        assert vehicle.recvfrom(100) == (b"hello you", source)
+        vehicle.sendto(b"!", source)
+        await heard.until_data(b"me!")
+        assert heard.peers == [None]
+    broadcast.close()
+    await broadcast.wait_closed()
+
+
+@each_loop_and_the_fallback
+async def test_close_inside_a_callback_ends_all_callbacks() -> None:
+    listener, heard = UdpListen("127.0.0.1", 0), Recorder()
+    await listener.open(heard)
+    address = listener.local_address
+    heard.at_each_piece = lambda data, peer: listener.close()
+    with plain_socket() as sock:
+        for piece in (b"first", b"second", b"third"):
+            sock.sendto(piece, address)
+        await heard.until_data(b"first")
+        await listener.wait_closed()
+        for _ in range(3):
+            await asyncio.sleep(0)
+    assert heard.data == b"first"
+    listener.write(b"after the end")
+    listener.close()
+    assert heard.losses == []
+
+
+@each_loop_and_the_fallback
+async def test_a_taken_port_is_an_error_with_a_hint_and_can_be_tried_again() -> None:
+    with plain_socket() as sock:
+        listener = UdpListen(*sock.getsockname())
+        with pytest.raises(
+            LinkOpenError, match=r"udpin:127\.0\.0\.1:\d+: .*another program has this port"
+        ) as caught:
+            await listener.open(Recorder())
+        assert caught.value.errno == errno.EADDRINUSE
+        await listener.wait_closed()
+    await listener.open(Recorder())
+    with pytest.raises(BusyError):
+        await listener.open(Recorder())
+    listener.close()
+    await listener.wait_closed()
+    with pytest.raises(ConnectionClosed):
+        await listener.open(Recorder())
+
+
+@each_loop
+@pytest.mark.parametrize(
+    ("link", "hint"),
+    [
+        (UdpListen("192.0.2.1", 14550), "this machine has no such address"),
+        (UdpConnect("no-such-host.invalid", 14550), "the host name is not known"),
+        (UdpConnect("255.255.255.255", 14550), "udpbcast:"),
+    ],
+    ids=["foreign address", "unknown name", "broadcast"],
+)
+async def test_errors_of_opening_help(link: UdpListen | UdpConnect, hint: str) -> None:
+    link = type(link)(link._host, link._port)
+    with pytest.raises(LinkOpenError, match=hint):
+        await link.open(Recorder())
+    link.close()
+
+
+@each_loop_and_the_fallback
+async def test_a_cancelled_open_leaves_nothing_behind() -> None:
+    for turns in range(12):
+        listener = UdpListen("localhost", 0)
+        task = asyncio.ensure_future(listener.open(Recorder()))
+        for _ in range(turns):
+            await asyncio.sleep(0)
+        if task.cancel():
+            with pytest.raises(asyncio.CancelledError):
+                await task
+            await listener.wait_closed()
+            assert listener.local_address == ("", 0)
+        listener.close()
+        await listener.wait_closed()
+
+
+@each_loop_and_the_fallback
+async def test_closed_while_opening() -> None:
+    listener = UdpListen("localhost", 0)
+    task = asyncio.ensure_future(listener.open(Recorder()))
+    await asyncio.sleep(0)
+    listener.close()
+    with pytest.raises(ConnectionClosed):
+        await task
+    await listener.wait_closed()
+    assert listener.local_address == ("", 0)
+
+
+def test_close_works_when_the_loop_is_not_running_or_gone() -> None:
+    loop = asyncio.new_event_loop()
+    stopped, gone = UdpListen("127.0.0.1", 0), UdpListen("127.0.0.1", 0)
+    loop.run_until_complete(stopped.open(Recorder()))
+    loop.run_until_complete(gone.open(Recorder()))
+    stopped.close()
+    loop.close()
+    gone.close()
+    UdpListen("127.0.0.1", 0).close()
