@@ -59,10 +59,13 @@ class VehicleHealth(VehicleCore):
         return [text for text in self.texts_since(since) if self.autopilot.arming_reason(text) is not None]
 
     def _failing(self) -> list[str]:
-        """Failing sensors, failing pre-arm checks, missing estimates."""
+        """Failing sensors, failing pre-arm checks, missing estimates.
+
+        When the vehicle says that it could be armed, a failing sensor is one it can do without (PX4: no RC receiver).
+        """
         failing: list[str] = []
         sensors, estimator = self.telemetry.sensors.latest, self.telemetry.estimator.latest
-        if sensors is not None:
+        if sensors is not None and sensors.prearm_checks_pass is not True:
             failing += [f"{name} is not healthy (SYS_STATUS)" for name in sensors.failing]
             if sensors.prearm_checks_pass is False:
                 failing.append("the vehicle's pre-arm checks do not pass (SYS_STATUS)")

@@ -45,6 +45,7 @@ class _Stream:
     def __init__(self, message_type: type[Message]) -> None:
         self.message_type = message_type
         self.wishes: dict[object, float] = {}
+        self.is_optional = True
         self.asked_hz: float | None = None
         self.refused = False
         self.is_slow = False
@@ -103,8 +104,11 @@ class MessageRates:
         """Whether the vehicle turned out not to know MAV_CMD_SET_MESSAGE_INTERVAL."""
         return self._legacy
 
-    def want(self, message_type: type[Message], hz: float) -> Detach:
-        """Ask for ``message_type`` at ``hz`` (above 0, at most 1000) or faster until the returned function is called."""
+    def want(self, message_type: type[Message], hz: float, *, is_optional: bool = False) -> Detach:
+        """Ask for ``message_type`` at ``hz`` (above 0, at most 1000) or faster until the returned function is called.
+
+        What is optional may never come (a sensor that is not there): that is no event.
+        """
         if not 0 < hz <= 1000:
             raise LocalProtocolError(
                 f"rate_hz = {hz!r} of {message_type.NAME} is not allowed: above 0, at most 1000"
@@ -112,6 +116,7 @@ class MessageRates:
         stream = self._streams.get(message_type.ID)
         if stream is None:
             stream = self._streams[message_type.ID] = self._new_stream(message_type)
+        stream.is_optional = stream.is_optional and is_optional
         token = object()
         stream.wishes[token] = hz
         self._dirty.set()
@@ -209,6 +214,8 @@ class MessageRates:
         return max((stream.wanted_hz for stream in members), default=AUTOPILOT_DEFAULT)
 
     def _publish_unavailable(self, stream: _Stream, reason: str) -> None:
+        if stream.is_optional:
+            return
         name = stream.message_type.NAME
         self._connection.bus.publish(StreamUnavailable(self._connection.now(), self._system_id, name, reason))
 
@@ -242,6 +249,8 @@ class MessageRates:
         achieved = stream.achieved_hz()
         expected = SLOW_FACTOR * stream.asked_hz * WATCH_WINDOW * WATCH_PERIOD_S
         was_slow, stream.is_slow = stream.is_slow, achieved * WATCH_WINDOW * WATCH_PERIOD_S < expected - 1
+        if achieved == 0 and stream.is_optional:
+            return
         if stream.is_slow and not was_slow:
             self._connection.bus.publish(
                 StreamSlow(
