@@ -67,6 +67,7 @@ class _Flight:
         await vehicle.wait_ready()
         home = vehicle.home.value
         self._say(f"ready at {home.latitude_deg:.6f}, {home.longitude_deg:.6f}; arming")
+        await self._leave_unarmable_mode()
         await vehicle.arm()
         self._say(f"armed; taking off to {altitude_m:g} m")
         await vehicle.take_off(altitude_m)
@@ -80,6 +81,13 @@ class _Flight:
         self._say("on the ground; waiting for the motors to stop")
         await vehicle.armed.wait_until(lambda armed: not armed, timeout=30)
         self._say("disarmed")
+
+    async def _leave_unarmable_mode(self) -> None:
+        """ArduPilot refuses to arm in LAND, where the flight before has left it."""
+        vehicle = self._vehicle
+        mode = vehicle.autopilot.mode_for("take_off")
+        if mode is not None and vehicle.mode_name in vehicle.autopilot.unarmable_modes:
+            await vehicle.set_mode(mode.name)
 
     @asynccontextmanager
     async def reporting(self) -> AsyncIterator[None]:
