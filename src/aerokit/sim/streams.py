@@ -46,6 +46,10 @@ class Streams:
             heappop(heap)
         return math.inf
 
+    def postpone(self, seconds: float) -> None:
+        """Make everything this much later."""
+        self._heap = [(due + seconds, token, message_id) for due, token, message_id in self._heap]
+
     def take_due(self, now: float) -> list[int]:
         """The message ids that are due, each scheduled anew."""
         ids: list[int] = []

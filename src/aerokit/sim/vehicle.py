@@ -230,6 +230,8 @@ class SimulatedVehicle:
         self.now = now
         self._timers = [(when + late, count, action) for when, count, action in self._timers]
         self._ticks_from += late
+        for channel in self.channels:
+            channel.streams.postpone(late)
 
     # ------------------------------------------------------------------------------- hearing, saying
 

@@ -1,0 +1,107 @@
+"""A client for tests of simulated vehicles: no loop, no sockets, simulated time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeVar
+
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.dialect import STANDARD
+from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.enums import CopterMode, MavCmd, MavModeFlag
+from aerokit.mavlink.framer import Framer
+from aerokit.mavlink.message import Message
+from aerokit.sim import SimulatedCopter, SimulatedVehicle
+
+M = TypeVar("M", bound=Message)
+STEP_S = 0.05
+
+
+class Client:
+    def __init__(self, vehicle: SimulatedVehicle, *, system_id: int = 255, component_id: int = 190) -> None:
+        self.vehicle = vehicle
+        self.target = (vehicle.system_id, vehicle.component_id)
+        self.now = 0.0
+        self.heard: list[tuple[float, Message]] = []
+        self.framer = Framer()
+        self._encoder = FrameEncoder(system_id, component_id)
+        vehicle.step(0.0)
+
+    def send(self, message: Message) -> None:
+        self.vehicle.receive(self._encoder.encode(message), self.now)
+        self.listen()
+
+    def command(self, command: int, *params: float) -> int | None:
+        """The result; None when there is no answer at once."""
+        first = len(self.heard)
+        numbers = [*params, *(0.0,) * (7 - len(params))]
+        self.send(m.CommandLong(*self.target, command, 0, *numbers))
+        return self.ack_since(first, command)
+
+    def command_int(self, command: int, frame: int, *params: float, x: int = 0, y: int = 0, z: float = 0.0) -> int | None:
+        first = len(self.heard)
+        numbers = [*params, *(0.0,) * (4 - len(params))]
+        self.send(m.CommandInt(*self.target, frame, command, 0, 0, *numbers, x, y, z))
+        return self.ack_since(first, command)
+
+    def ack_since(self, first: int, command: int) -> int | None:
+        for _, message in self.heard[first:]:
+            if isinstance(message, m.CommandAck) and message.command == command:
+                return message.result
+        return None
+
+    def listen(self) -> None:
+        for frame in self.framer.receive(self.vehicle.take_outbox(), self.now):
+            self.heard.append((self.now, STANDARD.decode(frame)))
+
+    def run(self, seconds: float) -> None:
+        end = self.now + seconds
+        while self.now < end - 1e-9:
+            self.now = min(end, self.now + STEP_S)
+            self.vehicle.step(self.now)
+            self.listen()
+
+    def run_until(self, condition: Callable[[], bool], timeout: float = 120.0) -> float:
+        """Simulated seconds it took."""
+        start = self.now
+        while not condition():
+            assert self.now - start < timeout, f"not within {timeout} s; texts: {self.texts}"
+            self.run(STEP_S)
+        return self.now - start
+
+    def all(self, kind: type[M]) -> list[M]:
+        return [message for _, message in self.heard if isinstance(message, kind)]
+
+    def last(self, kind: type[M]) -> M:
+        return self.all(kind)[-1]
+
+    @property
+    def texts(self) -> list[str]:
+        return [message.text for message in self.all(m.Statustext)]
+
+    def forget(self) -> None:
+        self.heard.clear()
+
+
+def ready_copter(**options: object) -> tuple[SimulatedCopter, Client]:
+    """Booted, disarmed, with a position."""
+    copter = SimulatedCopter(boot_time_s=0.0, **options)  # type: ignore[arg-type]
+    client = Client(copter)
+    client.run(3.0)
+    client.forget()
+    return copter, client
+
+
+def flying_copter(altitude_m: float = 10.0, **options: object) -> tuple[SimulatedCopter, Client]:
+    """Hovering in GUIDED."""
+    copter, client = ready_copter(**options)
+    assert set_mode(client, CopterMode.GUIDED) == 0
+    assert client.command(MavCmd.COMPONENT_ARM_DISARM, 1) == 0
+    assert client.command(MavCmd.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude_m) == 0
+    client.run_until(lambda: not copter.is_landed and not copter.mode.is_taking_off, 60.0)
+    client.forget()
+    return copter, client
+
+
+def set_mode(client: Client, mode: int) -> int | None:
+    return client.command(MavCmd.DO_SET_MODE, MavModeFlag.CUSTOM_MODE_ENABLED, mode)

@@ -1,0 +1,145 @@
+from __future__ import annotations
+
+from simulated_client import Client, flying_copter, ready_copter, set_mode
+
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import CopterMode, MavCmd, MavModeFlag, MavResult, MavSysStatusSensor
+from aerokit.sim import SimulatedCopter
+
+ARM = MavCmd.COMPONENT_ARM_DISARM
+FORCE = 21196.0
+
+
+def test_arms_in_guided_and_says_so() -> None:
+    copter, client = ready_copter()
+    assert set_mode(client, CopterMode.GUIDED) == MavResult.ACCEPTED
+    assert client.command(ARM, 1) == MavResult.ACCEPTED
+    assert copter.is_armed
+    assert client.texts == ["Arming motors"]
+    assert client.all(m.HomePosition), "home moves to where it is armed"
+    client.run(1.0)
+    assert client.last(m.Heartbeat).base_mode & MavModeFlag.SAFETY_ARMED
+    assert client.command(ARM, 1) == MavResult.ACCEPTED, "twice is no error"
+
+
+def test_the_reason_leaves_after_the_refusal() -> None:
+    copter, client = ready_copter()
+    copter.faults.prearm_failures = ["Compass not healthy", "Hardware safety switch"]
+    assert client.command(ARM, 1) == MavResult.FAILED
+    assert client.texts == ["Arm: Compass not healthy", "Arm: Hardware safety switch"]
+    kinds = [type(message) for _, message in client.heard]
+    assert kinds[0] is m.CommandAck
+
+
+def test_guided_needs_a_position_and_stabilize_does_not() -> None:
+    client = Client(SimulatedCopter())  # its boot takes five seconds
+    client.run(4.0)
+    set_mode(client, CopterMode.GUIDED)
+    assert client.command(ARM, 1) == MavResult.FAILED
+    assert client.texts[-1] == "Arm: Need Position Estimate"
+    assert client.command(ARM, 1, FORCE) == MavResult.FAILED, "mandatory even by force"
+    set_mode(client, CopterMode.STABILIZE)
+    assert client.command(ARM, 1) == MavResult.ACCEPTED
+
+
+def test_reasons_change_while_it_boots() -> None:
+    copter = SimulatedCopter(boot_time_s=41.5)
+    client = Client(copter)
+    seen = []
+    while copter.uptime < 42.0:
+        copter.mode = copter.guided
+        seen += copter.arming.reasons()[:1] or ["none"]
+        client.run(0.05)
+    assert list(dict.fromkeys(seen)) == [
+        "System not initialised",
+        "GPS 1: not healthy",
+        "GPS 1: Bad fix",
+        "AHRS: waiting for home",
+        "AHRS: Not healthy",
+        "Need Position Estimate",
+        "none",
+    ]
+
+
+def test_modes_that_come_home_cannot_be_armed() -> None:
+    _, client = ready_copter()
+    for mode, name in ((CopterMode.RTL, "RTL"), (CopterMode.LAND, "LAND"), (CopterMode.BRAKE, "BRAKE")):
+        set_mode(client, mode)
+        assert client.command(ARM, 1) == MavResult.FAILED
+        assert client.texts[-1] == f"Arm: {name} mode not armable"
+    set_mode(client, CopterMode.AUTO)
+    assert client.command(ARM, 1) == MavResult.FAILED
+    assert client.texts[-1] == "Arm: Mode requires mission"
+    assert client.command(ARM, 1, FORCE) == MavResult.ACCEPTED, "force passes over it"
+
+
+def test_raised_throttle_keeps_a_stick_mode_from_arming() -> None:
+    copter, client = ready_copter()
+    copter.rc[2] = 1700
+    assert client.command(ARM, 1) == MavResult.FAILED
+    assert client.texts == ["Arm: Throttle too high"]
+    set_mode(client, CopterMode.GUIDED)
+    assert client.command(ARM, 1) == MavResult.ACCEPTED
+
+
+def test_checks_on_request_and_every_half_minute() -> None:
+    copter, client = ready_copter()
+    assert client.command(MavCmd.RUN_PREARM_CHECKS) == MavResult.ACCEPTED
+    assert client.texts == []
+    copter.faults.prearm_failures = ["Compass not healthy"]
+    assert client.command(MavCmd.RUN_PREARM_CHECKS) == MavResult.ACCEPTED
+    assert client.texts == ["PreArm: Compass not healthy"]
+    client.run(61.0)
+    assert len(client.texts) == 3
+    copter.faults.prearm_failures = []
+    client.command(ARM, 1)
+    assert client.command(MavCmd.RUN_PREARM_CHECKS) == MavResult.TEMPORARILY_REJECTED
+
+
+def test_prearm_bit_follows_the_checks_within_a_second() -> None:
+    copter, client = ready_copter()
+    bit = MavSysStatusSensor.MAV_SYS_STATUS_PREARM_CHECK
+    client.command(MavCmd.SET_MESSAGE_INTERVAL, m.SysStatus.ID, 100_000)
+    client.run(1.5)
+    assert client.last(m.SysStatus).onboard_control_sensors_health & bit
+    copter.faults.prearm_failures = ["Compass not healthy"]
+    client.run(1.5)
+    assert not client.last(m.SysStatus).onboard_control_sensors_health & bit
+
+
+def test_disarming_in_the_air_needs_force_and_ends_on_the_ground() -> None:
+    copter, client = flying_copter(5.0)
+    assert client.command(ARM, 0) == MavResult.FAILED
+    assert client.texts == []
+    assert client.command(ARM, 0, FORCE) == MavResult.ACCEPTED
+    client.run(3.0)
+    assert not copter.is_armed
+    assert copter.altitude_m == 0.0
+    assert copter.is_landed
+    hit = next(text for text in client.texts if text.startswith("SIM Hit ground at"))
+    assert 7.0 < float(hit.split()[4]) < 10.0
+
+
+def test_an_idle_vehicle_is_disarmed_after_disarm_delay() -> None:
+    copter, client = ready_copter()
+    set_mode(client, CopterMode.GUIDED)
+    client.command(ARM, 1)
+    assert 9.9 < client.run_until(lambda: not copter.is_armed) < 10.3
+    assert client.texts[-1] == "Disarming motors"
+    copter.parameters["DISARM_DELAY"] = 0
+    client.command(ARM, 1)
+    client.run(60.0)
+    assert copter.is_armed
+
+
+def test_too_early_is_refused_with_a_text() -> None:
+    client = Client(SimulatedCopter())
+    client.run(0.2)
+    assert client.command(ARM, 1) == MavResult.FAILED
+    assert client.texts[-1] == "Arm: System not initialised"
+
+
+def test_a_low_battery_is_not_armed() -> None:
+    _, client = ready_copter(battery_percent=3.0, parameters={"BATT_ARM_VOLT": 10.5})
+    assert client.command(ARM, 1) == MavResult.FAILED
+    assert client.texts == ["Arm: Battery 1 below minimum arming voltage"]

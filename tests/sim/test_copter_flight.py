@@ -1,0 +1,464 @@
+"""Flights in simulated time; durations are compared with the recorded flight of a real ArduCopter."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from simulated_client import Client, flying_copter, ready_copter, set_mode
+
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import (
+    CopterMode,
+    MavCmd,
+    MavFrame,
+    MavLandedState,
+    MavResult,
+    MavState,
+    PositionTargetTypemask,
+)
+from aerokit.sim import SimulatedCopter
+
+T = PositionTargetTypemask
+POSITION = T.VX_IGNORE | T.VY_IGNORE | T.VZ_IGNORE | T.AX_IGNORE | T.AY_IGNORE | T.AZ_IGNORE
+VELOCITY = T.X_IGNORE | T.Y_IGNORE | T.Z_IGNORE | T.AX_IGNORE | T.AY_IGNORE | T.AZ_IGNORE
+ACCELERATION = T.X_IGNORE | T.Y_IGNORE | T.Z_IGNORE | T.VX_IGNORE | T.VY_IGNORE | T.VZ_IGNORE
+NO_YAW = T.YAW_IGNORE | T.YAW_RATE_IGNORE
+RELATIVE = MavFrame.GLOBAL_RELATIVE_ALT_INT
+
+
+def local_target(
+    client: Client,
+    mask: int,
+    position: tuple[float, float, float] = (0, 0, 0),
+    velocity: tuple[float, float, float] = (0, 0, 0),
+    acceleration: tuple[float, float, float] = (0, 0, 0),
+    *,
+    yaw: float = 0.0,
+    rate: float = 0.0,
+    frame: int = MavFrame.LOCAL_NED,
+) -> None:
+    values = (*position, *velocity, *acceleration)
+    client.send(m.SetPositionTargetLocalNed(0, 1, 1, frame, mask, *values, yaw, rate))
+
+
+def speed(copter: SimulatedCopter) -> tuple[float, float, float]:
+    motion = copter.motion
+    return (motion.velocity_north, motion.velocity_east, motion.velocity_down)
+
+
+def place(copter: SimulatedCopter) -> tuple[float, float, float]:
+    return (copter.motion.north, copter.motion.east, copter.motion.down)
+
+
+# ---------------------------------------------------------------------------------------- take-off
+
+
+def test_take_off_takes_as_long_as_the_real_one() -> None:
+    copter, client = ready_copter()
+    set_mode(client, CopterMode.GUIDED)
+    client.command(MavCmd.COMPONENT_ARM_DISARM, 1)
+    client.run(0.4)
+    assert client.command(MavCmd.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 10.0) == MavResult.ACCEPTED
+    lifted = client.run_until(lambda: not copter.is_landed)
+    assert lifted == pytest.approx(3.0, abs=0.4)
+    risen = client.run_until(lambda: copter.altitude_m > 9.9)
+    assert lifted + risen == pytest.approx(10.1, rel=0.15)
+    client.run(10.0)
+    assert copter.altitude_m == pytest.approx(10.0, abs=0.05)
+
+
+def test_landed_state_goes_through_take_off_to_in_air() -> None:
+    copter, client = ready_copter()
+    client.command(MavCmd.SET_MESSAGE_INTERVAL, m.ExtendedSysState.ID, 100_000)
+    set_mode(client, CopterMode.GUIDED)
+    client.command(MavCmd.COMPONENT_ARM_DISARM, 1)
+    client.command(MavCmd.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 5.0)
+    client.run(20.0)
+    set_mode(client, CopterMode.LAND)
+    client.run(25.0)
+    states = [message.landed_state for message in client.all(m.ExtendedSysState)]
+    assert list(dict.fromkeys(states)) == [
+        MavLandedState.ON_GROUND,
+        MavLandedState.TAKEOFF,
+        MavLandedState.IN_AIR,
+        MavLandedState.LANDING,
+    ]
+    assert states[-1] == MavLandedState.ON_GROUND
+    assert not copter.is_armed
+
+
+@pytest.mark.parametrize(("armed", "altitude"), [(False, 10.0), (True, 0.0), (True, -5.0)])
+def test_take_off_is_refused(armed: bool, altitude: float) -> None:
+    _, client = ready_copter()
+    set_mode(client, CopterMode.GUIDED)
+    if armed:
+        client.command(MavCmd.COMPONENT_ARM_DISARM, 1)
+    assert client.command(MavCmd.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude) == MavResult.FAILED
+
+
+def test_take_off_needs_a_mode_that_can_and_happens_once() -> None:
+    _, client = ready_copter()
+    client.command(MavCmd.COMPONENT_ARM_DISARM, 1)
+    assert client.command(MavCmd.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 10.0) == MavResult.FAILED
+    set_mode(client, CopterMode.ALT_HOLD)
+    assert client.command(MavCmd.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 10.0) == MavResult.FAILED
+    _, client = flying_copter()
+    assert client.command(MavCmd.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 20.0) == MavResult.FAILED
+    assert client.command_int(MavCmd.NAV_TAKEOFF, MavFrame.GLOBAL, z=20.0) == MavResult.DENIED
+
+
+# ----------------------------------------------------------------------------------------- targets
+
+
+def test_flies_fifty_metres_north_like_the_real_one() -> None:
+    copter, client = flying_copter()
+    client.send(
+        m.SetPositionTargetGlobalInt(
+            0, 1, 1, RELATIVE, POSITION | NO_YAW, -353628118, 1491652300, 10, 0, 0, 0, 0, 0, 0, 0, 0
+        )
+    )
+    took = client.run_until(lambda: copter.motion.north > 49.5)
+    assert took == pytest.approx(9.7, rel=0.15)
+    client.run(5.0)
+    assert copter.motion.north == pytest.approx(50.0, abs=0.1)
+    assert abs(copter.motion.yaw) < 0.05, "looks where it flies"
+    client.command(MavCmd.REQUEST_MESSAGE, m.PositionTargetGlobalInt.ID)
+    target = client.last(m.PositionTargetGlobalInt)
+    assert (target.lat_int, target.alt) == (-353628118, pytest.approx(594.09, abs=0.02))
+    assert target.type_mask == 65016
+
+
+def test_reposition_is_known_as_command_int_only() -> None:
+    copter, client = flying_copter()
+    north = copter.navigation.frame.to_global(30.0, 0.0, 0.0)
+    x, y = north.latitude_e7, north.longitude_e7
+    assert client.command(MavCmd.DO_REPOSITION, -1, 1, 0, 0, x * 1e-7, y * 1e-7, 15) == MavResult.UNSUPPORTED
+    assert client.command_int(MavCmd.DO_REPOSITION, RELATIVE, -1, 0, x=x, y=y, z=15.0) == MavResult.ACCEPTED
+    client.run(15.0)
+    assert place(copter) == pytest.approx((30.0, 0.0, -15.0), abs=0.2)
+    set_mode(client, CopterMode.BRAKE)
+    assert client.command_int(MavCmd.DO_REPOSITION, RELATIVE, -1, 0, x=x, y=y, z=20.0) == MavResult.DENIED
+    assert client.command_int(MavCmd.DO_REPOSITION, RELATIVE, -1, 1, x=x, y=y, z=20.0) == MavResult.ACCEPTED
+    assert copter.mode.number == CopterMode.GUIDED
+    bad = client.command_int(MavCmd.DO_REPOSITION, MavFrame.BODY_FRD, -1, 1, x=x, y=y, z=20.0)
+    assert bad == MavResult.DENIED
+
+
+def test_position_targets_in_all_local_frames() -> None:
+    copter, client = flying_copter()
+    local_target(client, POSITION | NO_YAW, (10, 5, -12))
+    client.run(15.0)
+    assert place(copter) == pytest.approx((10, 5, -12), abs=0.1)
+    local_target(client, POSITION | NO_YAW, (-10, 0, 2), frame=MavFrame.LOCAL_OFFSET_NED)
+    client.run(15.0)
+    assert place(copter) == pytest.approx((0, 5, -10), abs=0.2)
+    heading = copter.motion.yaw
+    local_target(client, POSITION | NO_YAW, (10, 0, 0), frame=MavFrame.BODY_OFFSET_NED)
+    client.run(15.0)
+    wanted = (10 * math.cos(heading), 5 + 10 * math.sin(heading), -10)
+    assert place(copter) == pytest.approx(wanted, abs=0.3)
+
+
+def test_velocity_is_flown_and_ends_three_seconds_after_the_last_setpoint() -> None:
+    copter, client = flying_copter()
+    for _ in range(8):
+        local_target(client, VELOCITY | NO_YAW, velocity=(3.0, -2.0, -0.5))
+        client.run(0.5)
+    assert speed(copter) == pytest.approx((3.0, -2.0, -0.5), abs=0.1)
+    client.run(2.0)
+    assert speed(copter) == pytest.approx((3.0, -2.0, -0.5), abs=0.1)
+    client.run(4.0)
+    assert speed(copter) == pytest.approx((0.0, 0.0, 0.0), abs=0.05)
+
+
+def test_body_velocity_follows_the_nose() -> None:
+    copter, client = flying_copter(heading_deg=90.0)
+    local_target(client, VELOCITY | T.YAW_IGNORE, velocity=(4.0, 0.0, 0.0), frame=MavFrame.BODY_NED)
+    client.run(2.5)
+    assert speed(copter) == pytest.approx((0.0, 4.0, 0.0), abs=0.1)
+
+
+def test_acceleration_setpoints_accelerate_and_then_stop() -> None:
+    copter, client = flying_copter()
+    local_target(client, ACCELERATION | NO_YAW, acceleration=(1.0, 0.0, 0.0))
+    client.run(2.0)
+    assert speed(copter)[0] == pytest.approx(2.0, abs=0.1)
+    client.run(6.0)
+    assert speed(copter)[0] == pytest.approx(0.0, abs=0.05)
+
+
+def test_position_with_velocity_tracks_a_moving_target() -> None:
+    copter, client = flying_copter()
+    for step in range(40):
+        time = step * 0.25
+        local_target(client, NO_YAW, (2.0 * time, 0.0, -10.0), (2.0, 0.0, 0.0))
+        client.run(0.25)
+    assert copter.motion.north == pytest.approx(20.0, abs=1.0)
+    assert speed(copter)[0] == pytest.approx(2.0, abs=0.2)
+
+
+def test_attitude_setpoints_lean_and_climb_and_time_out() -> None:
+    copter, client = flying_copter()
+    pitch = math.radians(-10)
+    q = (math.cos(pitch / 2), 0.0, math.sin(pitch / 2), 0.0)
+    client.send(m.SetAttitudeTarget(0, 1, 1, 0b111, q, 0, 0, 0, 0.75))
+    client.run(2.0)
+    assert math.degrees(copter.motion.pitch) == pytest.approx(-10, abs=1)
+    assert speed(copter)[2] == pytest.approx(-1.25, abs=0.05)
+    client.run(6.0)
+    assert speed(copter)[2] == pytest.approx(0.0, abs=0.05)
+    assert abs(math.degrees(copter.motion.pitch)) < 3
+
+
+def test_nonsense_stops_the_vehicle() -> None:
+    copter, client = flying_copter()
+    local_target(client, VELOCITY | NO_YAW, velocity=(5.0, 0.0, 0.0))
+    client.run(2.0)
+    local_target(client, VELOCITY | NO_YAW, velocity=(math.nan, 0.0, 0.0))
+    client.run(4.0)
+    assert speed(copter) == pytest.approx((0.0, 0.0, 0.0), abs=0.05)
+
+
+def test_setpoints_are_ignored_on_the_ground_and_in_other_modes() -> None:
+    copter, client = ready_copter()
+    set_mode(client, CopterMode.GUIDED)
+    client.command(MavCmd.COMPONENT_ARM_DISARM, 1)
+    local_target(client, POSITION | NO_YAW, (0, 0, -10))
+    client.run(5.0)
+    assert copter.altitude_m == 0.0
+    copter, client = flying_copter()
+    set_mode(client, CopterMode.BRAKE)
+    local_target(client, POSITION | NO_YAW, (50, 0, -10))
+    client.run(5.0)
+    assert copter.motion.north == pytest.approx(0.0, abs=0.1)
+
+
+# --------------------------------------------------------------------------- speed, heading, pause
+
+
+def test_speed_can_be_changed_for_the_present_kind_of_target() -> None:
+    copter, client = flying_copter()
+    local_target(client, POSITION | NO_YAW, (200, 0, -10))
+    assert client.command(MavCmd.DO_CHANGE_SPEED, 1, 3.0) == MavResult.ACCEPTED
+    client.run(10.0)
+    assert speed(copter)[0] == pytest.approx(3.0, abs=0.05)
+    local_target(client, POSITION | NO_YAW, (400, 0, -10))
+    client.run(5.0)
+    assert speed(copter)[0] == pytest.approx(3.0, abs=0.05)
+    assert client.command(MavCmd.DO_CHANGE_SPEED, 1, 0.0) == MavResult.DENIED
+    set_mode(client, CopterMode.LAND)
+    assert client.command(MavCmd.DO_CHANGE_SPEED, 1, 3.0) == MavResult.FAILED
+
+
+def test_heading_commands_and_region_of_interest() -> None:
+    copter, client = flying_copter(heading_deg=0.0)
+    assert client.command(MavCmd.CONDITION_YAW, 90, 0, 1, 0) == MavResult.ACCEPTED
+    local_target(client, VELOCITY | T.YAW_IGNORE | T.YAW_RATE_IGNORE)  # resets it, as in the firmware
+    assert client.command(MavCmd.CONDITION_YAW, 90, 0, 1, 0) == MavResult.ACCEPTED
+    client.run(6.0)
+    assert math.degrees(copter.motion.yaw) == pytest.approx(90, abs=1)
+    assert client.command(MavCmd.CONDITION_YAW, 45, 0, -1, 1) == MavResult.ACCEPTED
+    client.run(6.0)
+    assert math.degrees(copter.motion.yaw) == pytest.approx(45, abs=1)
+    assert client.command(MavCmd.CONDITION_YAW, 400, 0, 1, 0) == MavResult.FAILED
+    south = copter.navigation.frame.to_global(-100.0, 0.0, 0.0)
+    x, y = south.latitude_e7, south.longitude_e7
+    assert client.command_int(MavCmd.DO_SET_ROI_LOCATION, RELATIVE, x=x, y=y) == MavResult.ACCEPTED
+    client.run(8.0)
+    assert abs(math.degrees(copter.motion.yaw)) == pytest.approx(180, abs=1)
+    assert client.command(MavCmd.DO_SET_ROI_NONE) == MavResult.ACCEPTED
+
+
+def test_the_long_way_round_when_the_direction_says_so() -> None:
+    copter, client = flying_copter(heading_deg=0.0)
+    local_target(client, VELOCITY | NO_YAW)
+    client.command(MavCmd.CONDITION_YAW, 90, 30, -1, 0)
+    client.run(1.0)
+    assert copter.motion.yaw_rate < -0.3
+    client.run(15.0)
+    assert math.degrees(copter.motion.yaw) == pytest.approx(90, abs=1)
+
+
+def test_yaw_rate_setpoint_turns_and_stops_with_its_stream() -> None:
+    copter, client = flying_copter()
+    local_target(client, VELOCITY | T.YAW_IGNORE, rate=0.5)
+    client.run(2.0)
+    assert copter.motion.yaw_rate == pytest.approx(0.5)
+    client.run(3.0)
+    assert copter.motion.yaw_rate == 0.0
+
+
+def test_pause_and_continue() -> None:
+    copter, client = flying_copter()
+    local_target(client, POSITION | NO_YAW, (100, 0, -10))
+    client.run(4.0)
+    assert client.command(MavCmd.DO_PAUSE_CONTINUE, 0) == MavResult.ACCEPTED
+    client.run(6.0)
+    paused = copter.motion.north
+    assert paused < 60
+    client.run(5.0)
+    assert copter.motion.north == pytest.approx(paused, abs=0.1)
+    assert client.command(MavCmd.DO_PAUSE_CONTINUE, 1) == MavResult.ACCEPTED
+    client.run(20.0)
+    assert copter.motion.north == pytest.approx(100, abs=0.2)
+    set_mode(client, CopterMode.BRAKE)
+    assert client.command(MavCmd.DO_PAUSE_CONTINUE, 0) == MavResult.FAILED
+    assert client.texts[-1] == "Failed to pause"
+
+
+# -------------------------------------------------------------------------------------- coming home
+
+
+def test_rtl_climbs_comes_home_waits_lands_and_disarms_like_the_real_one() -> None:
+    copter, client = flying_copter()
+    local_target(client, POSITION | NO_YAW, (50, 0, -10))
+    client.run(15.0)
+    heading = copter.motion.yaw
+    assert client.command(MavCmd.NAV_RETURN_TO_LAUNCH) == MavResult.ACCEPTED
+    highest = 0.0
+
+    def has_hit_the_ground() -> bool:
+        nonlocal highest
+        highest = max(highest, copter.altitude_m)
+        return any("SIM Hit ground" in text for text in client.texts)
+
+    assert client.run_until(has_hit_the_ground) == pytest.approx(46.3, rel=0.15)
+    assert highest == pytest.approx(15.0, abs=0.1)
+    assert copter.motion.yaw == pytest.approx(heading, abs=0.05), "keeps its heading on the way home"
+    assert client.run_until(lambda: not copter.is_armed) == pytest.approx(2.1, abs=0.3)
+    assert math.hypot(copter.motion.north, copter.motion.east) < 0.5
+    assert client.texts[-1] == "Disarming motors"
+    client.run(1.0)
+    assert client.last(m.Heartbeat).system_status == MavState.STANDBY
+
+
+def test_smart_rtl_and_landing_elsewhere() -> None:
+    copter, client = flying_copter()
+    local_target(client, POSITION | NO_YAW, (0, 30, -8))
+    client.run(10.0)
+    assert set_mode(client, CopterMode.SMART_RTL) == MavResult.ACCEPTED
+    client.run(8.0)
+    assert copter.altitude_m == pytest.approx(8.0, abs=0.1)
+    assert client.command(MavCmd.NAV_LAND) == MavResult.ACCEPTED
+    client.run_until(lambda: not copter.is_armed)
+    assert copter.altitude_m == 0.0
+
+
+def test_home_can_be_set_and_is_kept_when_it_was_set_by_hand() -> None:
+    copter, client = ready_copter()
+    spot = copter.navigation.frame.to_global(20.0, -10.0, 0.0)
+    x, y = spot.latitude_e7, spot.longitude_e7
+    assert client.command_int(MavCmd.DO_SET_HOME, MavFrame.GLOBAL, 0, x=x, y=y, z=584.09) == MavResult.ACCEPTED
+    assert client.last(m.HomePosition).latitude == x
+    set_mode(client, CopterMode.GUIDED)
+    client.command(MavCmd.COMPONENT_ARM_DISARM, 1)
+    assert copter.navigation.home == pytest.approx((20.0, -10.0, 0.0), abs=0.02)
+    assert client.command(MavCmd.DO_SET_HOME, 1) == MavResult.ACCEPTED
+    assert copter.navigation.home == pytest.approx((0.0, 0.0, 0.0))
+
+
+# ------------------------------------------------------------------------------------- other modes
+
+
+def test_brake_stops_and_stays_and_loiter_needs_the_throttle_in_the_middle() -> None:
+    copter, client = flying_copter(20.0)
+    local_target(client, VELOCITY | NO_YAW, velocity=(5.0, 0.0, 0.0))
+    client.run(3.0)
+    set_mode(client, CopterMode.BRAKE)
+    client.run(5.0)
+    assert speed(copter) == pytest.approx((0.0, 0.0, 0.0), abs=0.02)
+    client.send(m.RcChannelsOverride(1, 1, 0xFFFF, 0xFFFF, 1500, 0xFFFF, 0xFFFF, 0xFFFF, 0xFFFF, 0xFFFF))
+    set_mode(client, CopterMode.LOITER)
+    client.run(5.0)
+    assert copter.altitude_m == pytest.approx(20.0, abs=0.2)
+    client.send(m.RcChannelsOverride(1, 1, 1500, 1250, 0, 1500, 0, 0, 0, 0))  # forward, throttle released
+    client.run(3.0)
+    assert copter.motion.ground_speed_m_s > 3.0
+    assert speed(copter)[2] > 1.0, "the released throttle is low: it descends"
+
+
+def test_stabilize_with_a_low_throttle_comes_down() -> None:
+    copter, client = flying_copter(20.0)
+    set_mode(client, CopterMode.STABILIZE)
+    client.run(10.0)
+    assert copter.is_landed
+    client.run_until(lambda: not copter.is_armed, 15.0)
+
+
+def test_unknown_modes_and_modes_without_position_are_refused_with_a_reason() -> None:
+    copter, client = ready_copter()
+    assert set_mode(client, 99) == MavResult.FAILED
+    assert client.texts[-1] == "No such mode 99"
+    assert client.command(MavCmd.DO_SET_MODE, 0, 4) == MavResult.DENIED
+    copter.faults.gps_lost = True
+    client.run(11.0)
+    client.command(MavCmd.COMPONENT_ARM_DISARM, 1)
+    assert copter.is_armed
+    assert set_mode(client, CopterMode.GUIDED) == MavResult.FAILED
+    assert client.texts[-1] == "Mode change to GUIDED failed: requires position"
+    assert client.command(MavCmd.MISSION_START) == MavResult.FAILED
+
+
+def test_the_old_set_mode_message_changes_the_mode_without_an_answer() -> None:
+    copter, client = ready_copter()
+    client.send(m.SetMode(1, 1, CopterMode.GUIDED))
+    assert copter.mode.number == CopterMode.GUIDED
+    assert client.all(m.CommandAck) == []
+    assert client.last(m.Heartbeat).custom_mode == CopterMode.GUIDED, "told at once"
+
+
+# --------------------------------------------------------------------------------------- failsafes
+
+
+def test_losing_gps_in_flight_ends_in_land() -> None:
+    copter, client = flying_copter()
+    copter.faults.gps_lost = True
+    client.run(12.0)
+    assert copter.mode.number == CopterMode.LAND
+    assert "EKF Failsafe: changed to LAND Mode" in client.texts
+    client.run(1.0)
+    assert client.last(m.Heartbeat).system_status == MavState.CRITICAL
+
+
+def test_ground_station_failsafe_is_off_until_it_is_switched_on() -> None:
+    copter, client = flying_copter()
+    client.send(m.Heartbeat(6, 8, 0, 0, 4))
+    client.run(8.0)
+    assert copter.mode.number == CopterMode.GUIDED
+    copter.parameters["FS_GCS_ENABLE"] = 1
+    client.send(m.Heartbeat(6, 8, 0, 0, 4))
+    client.run(4.5)
+    assert copter.mode.number == CopterMode.GUIDED
+    client.run(1.0)
+    assert copter.mode.number == CopterMode.RTL
+    assert "GCS Failsafe" in client.texts
+    client.send(m.Heartbeat(6, 8, 0, 0, 4))
+    client.run(0.2)
+    assert client.texts[-1] == "GCS Failsafe Cleared"
+
+
+def test_a_battery_that_runs_low_warns_and_acts() -> None:
+    copter, client = flying_copter(battery_percent=100.0, parameters={"BATT_FS_LOW_ACT": 2})
+    before = copter.battery.percent
+    client.run(10.0)
+    assert 1.0 < before - copter.battery.percent < 4.0
+    copter.battery.percent = 8.0
+    client.run(12.0)
+    assert any(text.startswith("Battery 1 is low") for text in client.texts)
+    assert copter.mode.number == CopterMode.RTL
+
+
+def test_a_failed_motor_brings_it_down() -> None:
+    copter, client = flying_copter(20.0)
+    copter.faults.motor_failed = True
+    client.run(4.0)
+    assert copter.altitude_m == 0.0
+    assert any("SIM Hit ground" in text for text in client.texts)
+
+
+def test_termination_stops_the_motors() -> None:
+    copter, client = flying_copter(5.0)
+    assert client.command(MavCmd.DO_FLIGHTTERMINATION, 0) == MavResult.FAILED
+    assert client.command(MavCmd.DO_FLIGHTTERMINATION, 1) == MavResult.ACCEPTED
+    assert not copter.is_armed

@@ -1,0 +1,260 @@
+"""What all simulated vehicles share, tried on the copter."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from simulated_client import Client, flying_copter, ready_copter
+
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.dialect import STANDARD
+from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.enums import MavCmd, MavDataStream, MavType
+from aerokit.mavlink.framer import Framer
+from aerokit.sim import ExtraComponent, SimulatedCopter, Wind
+
+
+def recorded(steps: list[float]) -> bytes:
+    """Everything a copter sends while it is told to take off at fixed times, stepped as given in between."""
+    copter = SimulatedCopter(boot_time_s=1.0, seed=7, wind=Wind(3.0, 1.0, gusts_m_s=1.0))
+    encoder = FrameEncoder(255, 190)
+    commands = [
+        (1.5, m.RequestDataStream(1, 1, MavDataStream.ALL, 4, 1)),
+        (1.5, m.CommandLong(1, 1, MavCmd.DO_SET_MODE, 0, 1, 4, 0, 0, 0, 0, 0)),
+        (2.0, m.CommandLong(1, 1, MavCmd.COMPONENT_ARM_DISARM, 0, 1, 0, 0, 0, 0, 0, 0)),
+        (2.5, m.CommandLong(1, 1, MavCmd.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 0, 5)),
+    ]
+    sent = b""
+    moments = sorted({sum(steps[: i + 1]) for i in range(len(steps))} | {0.0, 8.0})
+    for now, message in sorted([(t, None) for t in moments if t <= 8.0] + commands, key=lambda pair: pair[0]):
+        if message is None:
+            copter.step(now)
+        else:
+            copter.receive(encoder.encode(message), now)
+        sent += copter.take_outbox()
+    return sent
+
+
+@settings(max_examples=10)
+@given(st.lists(st.floats(0.001, 3.0), max_size=10))
+def test_the_size_of_the_steps_changes_nothing(steps: list[float]) -> None:
+    assert recorded(steps) == recorded([0.013] * 620)
+
+
+def test_next_due_is_never_in_the_past() -> None:
+    copter, client = flying_copter()
+    client.send(m.RequestDataStream(1, 1, MavDataStream.ALL, 10, 1))
+    for _ in range(200):
+        due = copter.next_due
+        assert due > copter.now
+        copter.step(due)
+
+
+def test_a_disarmed_vehicle_sleeps_between_its_heartbeats() -> None:
+    copter, client = ready_copter()
+    wakes = 0
+    while copter.now < client.now + 10.0:
+        copter.step(copter.next_due)
+        wakes += 1
+    assert wakes < 350  # failsafes at 10 Hz, GPS at 10 Hz, heartbeat and arming checks at 1 Hz
+
+
+def test_only_hears_what_is_addressed_to_it() -> None:
+    _, client = ready_copter()
+    for target in ((2, 1), (1, 154), (2, 0)):
+        client.send(m.CommandLong(*target, MavCmd.DO_SEND_BANNER, 0, 0, 0, 0, 0, 0, 0, 0))
+    assert client.all(m.CommandAck) == []
+    for target in ((1, 1), (1, 0), (0, 0)):
+        client.send(m.CommandLong(*target, MavCmd.DO_SEND_BANNER, 0, 0, 0, 0, 0, 0, 0, 0))
+    assert len(client.all(m.CommandAck)) == 3
+
+
+def test_answers_go_to_who_asked() -> None:
+    copter, client = ready_copter()
+    other = Client(copter, system_id=42, component_id=191)
+    other.now = client.now
+    other.command(MavCmd.DO_SEND_BANNER)
+    ack = other.last(m.CommandAck)
+    assert (ack.target_system, ack.target_component) == (42, 191)
+
+
+def test_long_texts_come_in_chunks_the_last_of_which_is_not_full() -> None:
+    copter, client = ready_copter()
+    copter.send_text(4, "a" * 100)
+    copter.send_text(4, "b" * 60)
+    copter.send_text(4, "c" * 50)
+    client.run(0.1)
+    texts = [(t.text, t.id, t.chunk_seq) for t in client.all(m.Statustext)]
+    assert texts[:3] == [("a" * 50, 1, 0), ("a" * 50, 1, 1), ("", 1, 2)]
+    assert texts[3:5] == [("b" * 50, 2, 0), ("b" * 10, 2, 1)]
+    assert texts[5:] == [("c" * 50, 0, 0)]
+
+
+def test_channels_have_rates_of_their_own() -> None:
+    copter, client = ready_copter()
+    second = copter.open_channel(version=1)
+    client.send(m.RequestDataStream(1, 1, MavDataStream.EXTRA1, 10, 1))
+    client.run(2.5)
+    heard = [STANDARD.decode(frame) for frame in Framer().receive(second.take_outbox())]
+    assert len(client.all(m.Attitude)) >= 24
+    assert {type(message) for message in heard} == {m.Heartbeat}
+    assert all(message.received_frame and message.received_frame.version == 1 for message in heard)
+
+
+def test_datagrams_hold_whole_frames() -> None:
+    copter, _ = ready_copter()
+    channel = copter.channels[0]
+    for _ in range(100):
+        copter.send_text(6, "x" * 45)
+    copter.step(copter.now)
+    datagrams = channel.take_datagrams()
+    assert len(datagrams) > 3
+    assert all(len(data) <= 1200 for data in datagrams)
+    assert sum(len(Framer().receive(data)) for data in datagrams) == 100
+
+
+def test_other_components_and_systems_show_up() -> None:
+    gimbal = ExtraComponent(154)
+    tracker = ExtraComponent(1, type=MavType.ANTENNA_TRACKER, system_id=7)
+    _, client = ready_copter(components=(gimbal, tracker))
+    client.run(3.0)
+    senders = {(f.system_id, f.component_id) for h in client.all(m.Heartbeat) if (f := h.received_frame)}
+    assert senders == {(1, 1), (1, 154), (7, 1)}
+
+
+# ------------------------------------------------------------------------------------------ faults
+
+
+def test_lost_frames_leave_gaps_in_the_sequence() -> None:
+    copter, client = ready_copter()
+    client.framer = Framer()
+    client.run(1.0)
+    copter.faults.drop_outgoing = 3
+    client.run(5.0)
+    statistics = client.framer.statistics
+    assert copter.faults.drop_outgoing == 0
+    assert sum(source.lost for source in statistics.sources.values()) == 3
+
+
+def test_random_loss_is_the_same_for_the_same_seed() -> None:
+    counts = []
+    for _ in range(2):
+        copter, client = ready_copter(seed=3)
+        client.send(m.RequestDataStream(1, 1, MavDataStream.ALL, 10, 1))
+        copter.faults.loss = 0.3
+        client.run(10.0)
+        counts.append(len(client.heard))
+    assert counts[0] == counts[1]
+    assert 0.6 < counts[0] / (10 * 10 * 27) < 0.8
+
+
+def test_silence_and_freezing() -> None:
+    copter, client = flying_copter()
+    copter.faults.silent = True
+    client.run(3.0)
+    assert client.command(MavCmd.DO_SEND_BANNER) is None
+    assert client.heard == []
+    copter.faults.silent, copter.faults.frozen = False, True
+    uptime = copter.uptime
+    client.run(3.0)
+    assert client.heard == []
+    assert copter.uptime > uptime
+    copter.faults.frozen = False
+    client.run(1.5)
+    assert 1 <= len(client.all(m.Heartbeat)) <= 2
+    assert client.command(MavCmd.DO_SEND_BANNER) == 0
+
+
+def test_heartbeats_stop_alone() -> None:
+    copter, client = ready_copter()
+    client.send(m.RequestDataStream(1, 1, MavDataStream.EXTRA1, 4, 1))
+    copter.faults.heartbeats_stopped = True
+    client.run(3.0)
+    assert client.all(m.Heartbeat) == []
+    assert len(client.all(m.Attitude)) >= 12
+
+
+def test_a_command_can_be_mistreated_in_every_way() -> None:
+    copter, client = ready_copter()
+    banner = MavCmd.DO_SEND_BANNER
+    copter.faults.refuse(banner, 1, "PreArm: not today", times=1)
+    assert client.command(banner) == 1
+    assert client.texts == ["PreArm: not today"]
+    assert client.command(banner) == 0
+    copter.faults.ignore(banner, times=1)
+    assert client.command(banner) is None
+    client.forget()
+    copter.faults.lose_ack(banner)
+    assert client.command(banner) is None
+    assert len(client.texts) == 3, "it was done all the same"
+    copter.faults.repeat_ack(banner, 2, times=1)
+    client.forget()
+    client.command(banner)
+    assert len(client.all(m.CommandAck)) == 2
+
+
+def test_answers_can_be_late_and_report_progress() -> None:
+    copter, client = ready_copter()
+    banner = MavCmd.DO_SEND_BANNER
+    copter.faults.delay_ack(banner, 2.0, times=1)
+    assert client.command(banner) is None
+    client.run(1.9)
+    assert client.all(m.CommandAck) == []
+    client.run(0.2)
+    assert client.last(m.CommandAck).result == 0
+    client.forget()
+    copter.faults.report_progress(banner, (10, 90), interval_s=0.5)
+    client.command(banner)
+    client.run(2.0)
+    assert [(a.result, a.progress) for a in client.all(m.CommandAck)] == [(5, 10), (5, 90), (0, 0)]
+    copter.faults.clear()
+    assert client.command(banner) == 0
+
+
+# -------------------------------------------------------------------------------------- robustness
+
+
+@settings(max_examples=30)
+@given(st.binary(max_size=400))
+def test_any_bytes_are_survived(data: bytes) -> None:
+    copter = SimulatedCopter(boot_time_s=0.0)
+    copter.receive(data, 1.0)
+    copter.receive(data, 2.0, peer="other")
+    copter.step(3.0)
+
+
+FLOATS = st.floats(width=32)
+
+
+@settings(max_examples=60)
+@given(
+    command=st.sampled_from([int(c) for c in MavCmd]),
+    numbers=st.tuples(*(FLOATS,) * 7),
+    flying=st.booleans(),
+)
+def test_any_command_is_answered_once(command: int, numbers: tuple[float, ...], flying: bool) -> None:
+    copter, client = flying_copter() if flying else ready_copter()
+    client.command(command, *numbers)
+    client.run(2.0)
+    assert len(client.all(m.CommandAck)) == 1
+    client.run(3.0)
+    assert client.framer.statistics.bad_crcs == 0
+    assert abs(copter.motion.down) < 100
+
+
+@settings(max_examples=40)
+@given(
+    mask=st.integers(0, 0xFFF),
+    frame=st.integers(0, 21),
+    numbers=st.tuples(*(FLOATS,) * 11),
+)
+def test_any_setpoint_is_survived(mask: int, frame: int, numbers: tuple[float, ...]) -> None:
+    copter, client = flying_copter()
+    client.send(m.SetPositionTargetLocalNed(0, 1, 1, frame, mask, *numbers))
+    client.send(m.SetAttitudeTarget(0, 1, 1, mask & 0xFF, numbers[:4], *numbers[4:8]))
+    client.send(m.SetPositionTargetGlobalInt(0, 1, 1, frame, mask, 473_000_000, 85_000_000, *numbers[2:]))
+    client.send(m.RequestDataStream(1, 1, MavDataStream.ALL, 4, 1))
+    client.run(2.0)
+    assert copter.motion.north == pytest.approx(copter.motion.north)  # no NaN
+    assert client.all(m.GlobalPositionInt)

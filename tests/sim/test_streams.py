@@ -1,0 +1,55 @@
+from __future__ import annotations
+
+import math
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from aerokit.sim.streams import Streams
+
+
+def test_nothing_is_streamed_at_first() -> None:
+    streams = Streams()
+    assert streams.next_due == math.inf
+    assert streams.take_due(100.0) == []
+    assert streams.interval(30) == 0.0
+
+
+def test_starts_now_and_repeats() -> None:
+    streams = Streams()
+    streams.set_interval(30, 0.25, 10.0)
+    assert streams.next_due == 10.0
+    assert streams.take_due(10.0) == [30]
+    assert streams.next_due == 10.25
+    assert streams.take_due(10.2) == []
+    assert streams.take_due(10.25) == [30]
+
+
+def test_a_new_interval_replaces_the_old_one() -> None:
+    streams = Streams()
+    streams.set_interval(30, 1.0, 0.0)
+    streams.set_interval(30, 0.5, 0.0)
+    assert streams.take_due(0.0) == [30]
+    assert streams.next_due == 0.5
+    streams.set_interval(30, 0.0, 0.6)
+    assert streams.next_due == math.inf
+    assert streams.ids() == frozenset()
+
+
+def test_falling_behind_skips_instead_of_bursting() -> None:
+    streams = Streams()
+    streams.set_interval(30, 0.1, 0.0)
+    assert streams.take_due(5.0) == [30]
+    assert streams.next_due == 5.1
+
+
+@given(st.lists(st.tuples(st.integers(0, 5), st.sampled_from([0.1, 0.25, 1.0])), min_size=1, max_size=6))
+def test_each_comes_at_its_rate(requests: list[tuple[int, float]]) -> None:
+    streams = Streams()
+    for message_id, interval in requests:
+        streams.set_interval(message_id, interval, 0.0)
+    sent: list[int] = []
+    while streams.next_due < 10.0:
+        sent += streams.take_due(streams.next_due)
+    for message_id, interval in dict(requests).items():
+        assert abs(sent.count(message_id) - 10.0 / interval) <= 1
