@@ -31,7 +31,8 @@ class StateCell(Generic[T]):
     """The latest value of one thing: read it at once, ask for its age, wait for it, follow it.
 
     Reading never talks to the vehicle. ``clock`` gives the time in seconds (the event loop's), ``waits_for``
-    names the messages the value comes from, for error texts. A cell belongs to one event loop and its thread.
+    names the messages the value comes from, for error texts. A cell belongs to one event loop and its thread; other
+    threads may read it (never a torn value, and never one called younger than it is), but not wait or write.
     """
 
     __slots__ = (
@@ -74,7 +75,7 @@ class StateCell(Generic[T]):
     @property
     def latest(self) -> T | None:
         """The latest value, or None before the first."""
-        return self._latest
+        return self._latest if self._known else None
 
     @property
     def is_known(self) -> bool:
@@ -101,10 +102,11 @@ class StateCell(Generic[T]):
 
         Raises :class:`StaleValueError` when it is older, :class:`ValueUnknownError` when there is none.
         """
+        age = self.age  # before the value: read from another thread, it is never younger than the value is
         value = self.value
-        if self.age > within:
+        if age > within:
             raise StaleValueError(
-                f"{self.name} is {self.age:.1f} s old, older than the {within:g} s asked for:"
+                f"{self.name} is {age:.1f} s old, older than the {within:g} s asked for:"
                 f" no {self.waits_for} since"
             )
         return value
@@ -160,21 +162,20 @@ class StateCell(Generic[T]):
 
     def set(self, value: T, source: Source) -> None:
         """Take ``value`` as the latest, and wake whoever waits for it."""
-        self._updated_at = self._clock()
-        self._source = source
-        self._arrivals += 1
         if not self._known or value != self._latest:
             self._changes += 1
-            self._known = True
         self._latest = value
+        self._known = True
+        self._source = source
+        self._updated_at = self._clock()
+        self._arrivals += 1
         if self._sinks:
             for sink in tuple(self._sinks):
                 sink.receive(value)
 
     def forget(self) -> None:
         """Make the value unknown again, as after a reboot; whoever waits goes on waiting."""
-        self._known = False
-        self._latest = None
+        self._known = False  # the value itself stays for a thread that has just seen that it is known
         self._source = None
         self._updated_at = -math.inf
         for sink in tuple(self._sinks):
