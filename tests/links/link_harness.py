@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import importlib.util
+import math
 from collections.abc import Awaitable, Callable
 from typing import Any, TypeVar
 
@@ -12,6 +13,7 @@ import pytest
 
 from aerokit.errors import LinkLost
 from aerokit.links import Peer
+from aerokit.testing import VirtualClockLoop
 
 AsyncTest = TypeVar("AsyncTest", bound=Callable[..., Awaitable[None]])
 
@@ -77,8 +79,9 @@ class Recorder:
         return list(dict.fromkeys(peer for _, peer in self.pieces))
 
     async def until(self, condition: Callable[[], bool]) -> None:
-        """Waits until something that arrived has made the condition true; 20 s are for hung tests only."""
-        with anyio.fail_after(20.0):
+        """Waits until something that arrived has made the condition true; bounded for hung tests only."""
+        virtual = isinstance(asyncio.get_running_loop(), VirtualClockLoop)
+        with anyio.fail_after(math.inf if virtual else 20.0):
             while not condition():
                 self._changed.clear()
                 await self._changed.wait()

@@ -262,12 +262,14 @@ async def test_cancelled_at_any_turn_nothing_is_left_behind() -> None:
     async with listening() as (listener, _):
         for turns in range(10):
             for link in (TcpConnect(*listener.local_address), TcpListen("127.0.0.1", 0)):
-                task = asyncio.ensure_future(link.open(Recorder()))
+                heard = Recorder()
+                task = asyncio.ensure_future(link.open(heard))
                 for _ in range(turns):
                     await asyncio.sleep(0)
                 if task.cancel():
                     with pytest.raises(asyncio.CancelledError):
                         await task
+                assert heard.losses == []
                 link.close()
                 with anyio.fail_after(20.0):
                     await link.wait_closed()

@@ -1,13 +1,13 @@
-"""Serial ports, by pyserial-asyncio-fast where it is installed and pyserial-asyncio where not.
+"""Serial ports, by pyserial-asyncio-fast where it is installed and by pyserial-asyncio where not.
 
-Both are used for their transport alone, with the port's own calls replaced (on POSIX), because of what was
-seen:
+Either is used for its transport alone, with the port's own calls replaced, because of what was seen:
 
-* they wait in ``tcdrain`` when they close, 0.6 on the event loop itself: a port that is held up blocks the
-program; * pyserial's non-blocking ``write`` spins while the device takes nothing, ``read`` fails above
-descriptor 1023; * an unplugged device is reported to the loop's exception handler instead of the protocol, or
-not before what is left
-  to write has gone.
+* They wait in ``tcdrain`` when they close, 0.6 on the loop itself: a port that is held up blocks everything.
+* pyserial's ``write`` spins while the device takes nothing; its ``read`` fails above file descriptor 1023.
+* A write to an unplugged device goes to the loop's exception handler too; a read from one is told only when
+  what is left to write has gone.
+* pyserial-asyncio-fast 0.16 keeps its writer on the loop when a partial write has been completed, and fails
+  an assertion at every turn from then on.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import contextlib
 import errno
 import importlib
 import os
+from collections.abc import Callable
 from functools import partial
 from types import ModuleType
 from typing import Any
@@ -27,6 +28,7 @@ from .link import LINGER_S, Peer
 
 __all__ = ["SerialLink"]
 
+_Failed = Callable[[OSError], None]
 _READ_SIZE = 4096
 _LINGER_STEP_S = 0.005
 _SECONDS_HELD_BACK = 2.0  # more would only be stale when it arrives
@@ -64,8 +66,8 @@ class SerialLink(BaseLink):
         transports = _transports()
         self._port = port = self._open_port()
         self._released.clear()
-        _replace_calls(port, self._device_failed)
         self._transport = transports.SerialTransport(self._loop, _SerialProtocol(self), port)
+        _replace_calls(port, self._transport, self._device_failed)
         limit = max(4096, int(self._baud / 10 * _SECONDS_HELD_BACK))
         self._transport.set_write_buffer_limits(high=limit, low=limit // 2)
 
@@ -109,11 +111,13 @@ class SerialLink(BaseLink):
         return 0
 
     def _close_port(self, transport: Any) -> None:
+        unsent = self._waiting_to_be_sent(transport)
         with contextlib.suppress(RuntimeError):  # the loop is closed
             transport.pause_reading()  # again: before its first turn there was nothing to pause
             transport.flush()
-        with contextlib.suppress(Exception):
-            self._port.reset_output_buffer()  # else the system's close waits for it, up to 30 s
+        if unsent:
+            with contextlib.suppress(Exception):
+                self._port.reset_output_buffer()  # else the system's close waits for it, up to 30 s
         self._port.close()
         self._released.set()
 
@@ -142,15 +146,17 @@ def _transports() -> ModuleType:
         return importlib.import_module("serial_asyncio")
 
 
-def _replace_calls(port: Any, failed: Any) -> None:
+def _replace_calls(port: Any, transport: Any, failed: _Failed) -> None:
     """Gives a port calls that never wait and report a lost device to ``failed``."""
     port.flush = lambda: None
     if os.name == "posix":
         port.read = partial(_read, port.fileno(), failed)
-        port.write = partial(_write, port.fileno(), failed)
+        port.write = partial(_write, partial(os.write, port.fileno()), transport, failed)
+    else:
+        port.write = partial(_write, port.write, transport, failed)
 
 
-def _read(fd: int, failed: Any, _size: int) -> bytes:
+def _read(fd: int, failed: _Failed, _size: int) -> bytes:
     try:
         data = os.read(fd, _READ_SIZE)
     except (BlockingIOError, InterruptedError):
@@ -163,14 +169,17 @@ def _read(fd: int, failed: Any, _size: int) -> bytes:
     return data
 
 
-def _write(fd: int, failed: Any, data: bytes) -> int:
+def _write(write: Callable[[bytes], int], transport: Any, failed: _Failed, data: bytes) -> int:
     try:
-        return os.write(fd, data)
+        written = write(data)
     except (BlockingIOError, InterruptedError):
         raise  # the transport keeps it for later
     except OSError as error:
         failed(error)
-        return len(data)
+        written = len(data)
+    if written == len(data):
+        transport.flush()  # takes back its wish to write
+    return written
 
 
 def _open_error(address: str, error: Exception) -> OSError:

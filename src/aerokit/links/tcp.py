@@ -102,7 +102,14 @@ class TcpConnect(_TcpLink):
         except BaseException:
             sock.close()
             raise
-        await loop.create_connection(lambda: _Stream(self), sock=sock)  # closes the socket when it fails
+        stream = _Stream(self)
+        try:
+            await loop.create_connection(lambda: stream, sock=sock)
+        except BaseException:
+            self._stream = None  # it was never open: not a loss
+            stream.close()
+            self._stream_ends(stream, None)  # uvloop closes it without a word
+            raise
 
     def _stream_made(self, stream: _Stream) -> None:
         self._stream = stream

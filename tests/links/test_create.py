@@ -1,0 +1,45 @@
+from __future__ import annotations
+
+import pytest
+
+from aerokit.errors import LocalProtocolError
+from aerokit.links import (
+    Link,
+    Replay,
+    SerialLink,
+    TcpConnect,
+    TcpListen,
+    UdpBroadcast,
+    UdpConnect,
+    UdpListen,
+    create_link,
+    parse_address,
+)
+
+LINKS: list[tuple[str, type[Link], str]] = [
+    ("127.0.0.1:14550", UdpListen, "udpin:127.0.0.1:14550"),
+    ("udp://:14540", UdpListen, "udpin:0.0.0.0:14540"),
+    ("udpout:[::1]:14550", UdpConnect, "udpout:[::1]:14550"),
+    ("udpbcast:10.0.0.255:14550", UdpBroadcast, "udpbcast:10.0.0.255:14550"),
+    ("tcpout://127.0.0.1:5760?timeout=3", TcpConnect, "tcp:127.0.0.1:5760"),
+    ("tcpin::5760", TcpListen, "tcpin:0.0.0.0:5760"),
+    ("/dev/ttyACM0", SerialLink, "serial:///dev/ttyACM0:921600"),
+    ("/dev/ttyACM0,57600", SerialLink, "serial:///dev/ttyACM0:57600"),
+    ("serial://COM3?rtscts=1", SerialLink, "serial://COM3:921600?rtscts=1"),
+    ("flight.tlog", Replay, "replay:flight.tlog"),
+    ("replay:flight.tlog?speed=max", Replay, "replay:flight.tlog?speed=inf"),
+]
+
+
+@pytest.mark.parametrize(("address", "kind", "named"), LINKS, ids=[address for address, _, _ in LINKS])
+def test_each_address_makes_its_link(address: str, kind: type[Link], named: str) -> None:
+    link = create_link(address, baud=921600)
+    assert type(link) is kind
+    assert link.address == named
+    assert create_link(parse_address(address), baud=921600).address == named
+    link.close()
+
+
+def test_a_wrong_address_shows_the_accepted_forms() -> None:
+    with pytest.raises(LocalProtocolError, match="Accepted:"):
+        create_link("udpin:0.0.0.0")
