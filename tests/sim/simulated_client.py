@@ -38,10 +38,12 @@ class Client:
         self.send(m.CommandLong(*self.target, command, 0, *numbers))
         return self.ack_since(first, command)
 
-    def command_int(self, command: int, frame: int, *params: float, x: int = 0, y: int = 0, z: float = 0.0) -> int | None:
+    def command_int(
+        self, command: int, frame: int, *params: float, x: int = 0, y: int = 0, z: float = 0.0
+    ) -> int | None:
         first = len(self.heard)
-        numbers = [*params, *(0.0,) * (4 - len(params))]
-        self.send(m.CommandInt(*self.target, frame, command, 0, 0, *numbers, x, y, z))
+        one, two, three, four = (*params, *(0.0,) * (4 - len(params)))
+        self.send(m.CommandInt(*self.target, frame, command, 0, 0, one, two, three, four, x, y, z))
         return self.ack_since(first, command)
 
     def ack_since(self, first: int, command: int) -> int | None:

@@ -12,6 +12,7 @@ from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavCmd, MavDataStream, MavType
 from aerokit.mavlink.framer import Framer
+from aerokit.mavlink.message import Message
 from aerokit.sim import ExtraComponent, SimulatedCopter, Wind
 
 
@@ -27,7 +28,8 @@ def recorded(steps: list[float]) -> bytes:
     ]
     sent = b""
     moments = sorted({sum(steps[: i + 1]) for i in range(len(steps))} | {0.0, 8.0})
-    for now, message in sorted([(t, None) for t in moments if t <= 8.0] + commands, key=lambda pair: pair[0]):
+    events: list[tuple[float, Message | None]] = [(t, None) for t in moments if t <= 8.0]
+    for now, message in sorted([*events, *commands], key=lambda pair: pair[0]):
         if message is None:
             copter.step(now)
         else:

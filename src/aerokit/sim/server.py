@@ -9,7 +9,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING
 
 from aerokit.errors import BusyError, LinkLost, LocalProtocolError
-from aerokit.links import Link, MemoryLink, Peer, memory_link_pair
+from aerokit.links import Link, MemoryLink, Peer, create_link, memory_link_pair
 from aerokit.sim.vehicle import SimulatedVehicle
 
 if TYPE_CHECKING:
@@ -184,8 +184,6 @@ async def open_simulator(
 
     Raises LocalProtocolError for a wrong address, LinkOpenError for one that cannot be opened.
     """
-    from aerokit.links import create_link  # type: ignore[attr-defined,unused-ignore]
-
     links = [create_link(address) for address in addresses]
     async with SimulatorServer(vehicles, links, speedup=speedup) as server:
         yield server
