@@ -9,13 +9,13 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavDataStream, MavResult
 
 STREAMED_BY_A_REAL_COPTER = {
-    "AHRS", "AHRS2", "ATTITUDE", "BATTERY_STATUS", "EKF_STATUS_REPORT", "ESC_TELEMETRY_1_TO_4", "GLOBAL_POSITION_INT",
-    "GPS_RAW_INT", "HEARTBEAT", "LOCAL_POSITION_NED", "MEMINFO", "MISSION_CURRENT", "NAV_CONTROLLER_OUTPUT",
+    "AHRS", "AHRS2", "ATTITUDE", "BATTERY_STATUS", "EKF_STATUS_REPORT", "ESC_TELEMETRY_1_TO_4",
+    "GLOBAL_POSITION_INT", "GPS_RAW_INT", "HEARTBEAT", "LOCAL_POSITION_NED", "MEMINFO", "MISSION_CURRENT", "NAV_CONTROLLER_OUTPUT",
     "POSITION_TARGET_GLOBAL_INT", "POWER_STATUS", "RAW_IMU", "RC_CHANNELS", "SCALED_IMU2", "SCALED_IMU3",
     "SCALED_PRESSURE", "SCALED_PRESSURE2", "SERVO_OUTPUT_RAW", "SIMSTATE", "SYSTEM_TIME", "SYS_STATUS",
     "TERRAIN_REPORT", "VFR_HUD", "VIBRATION", "WIND",
 }  # fmt: skip
-"""With REQUEST_DATA_STREAM ALL, in GUIDED with a target; TERRAIN_REQUEST, which needs a ground station, left out."""
+"""With REQUEST_DATA_STREAM ALL, in GUIDED with a target; but for TERRAIN_REQUEST, which is not simulated."""
 
 
 def interval(client: Client, message_id: int, microseconds: float) -> int | None:

@@ -107,7 +107,7 @@ class SimulatedCopter(SimulatedVehicle):
         self.motion.yaw = math.remainder(math.radians(heading_deg), 2 * math.pi)
         self.rangefinder_reach_m = rangefinder_reach_m
         self.unsupported_commands = frozenset(unsupported_commands)
-        self.rc = list(_RC_AT_REST)
+        self.rc: list[int] = list(_RC_AT_REST)
         """What the sticks and switches send, 8 channels; the throttle (index 2) rests at 1000."""
         self._boot_text = boot_text
         self._stream_groups = stream_groups
