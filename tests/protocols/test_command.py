@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.errors import CommandRejected, CommandTimeout, ConnectionClosed, LocalProtocolError
+from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.mavlink.messages import CommandAck, CommandInt, CommandLong, Heartbeat
 from aerokit.protocols.command import CommandExchange, command_int, command_long
 

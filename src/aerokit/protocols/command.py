@@ -31,7 +31,9 @@ def command_long(
     """
     _check_target(target_system, command)
     if len(params) > 7:
-        raise LocalProtocolError(f"{command_name(command)} takes at most 7 parameters, {len(params)} were given")
+        raise LocalProtocolError(
+            f"{command_name(command)} takes at most 7 parameters, {len(params)} were given"
+        )
     values = [_check_param(command, f"param{i}", value) for i, value in enumerate(params, 1)]
     values += [0.0] * (7 - len(values))
     return CommandLong(target_system, target_component, command, 0, *values)
@@ -56,14 +58,19 @@ def command_int(
     """
     _check_target(target_system, command)
     if len(params) > 4:
-        raise LocalProtocolError(f"{command_name(command)} as COMMAND_INT takes at most 4 parameters beside x, y, z")
+        raise LocalProtocolError(
+            f"{command_name(command)} as COMMAND_INT takes at most 4 parameters beside x, y, z"
+        )
     for field, value in (("x", x), ("y", y)):
         if not isinstance(value, int) or not -(2**31) <= value < 2**31:
-            raise LocalProtocolError(f"{command_name(command)}: {field} = {value!r} is not an integer of 32 bits")
+            raise LocalProtocolError(
+                f"{command_name(command)}: {field} = {value!r} is not an integer of 32 bits"
+            )
     values = [_check_param(command, f"param{i}", value) for i, value in enumerate(params, 1)]
-    values += [0.0] * (4 - len(values))
+    param1, param2, param3, param4 = values + [0.0] * (4 - len(values))
+    z = _check_param(command, "z", z)
     return CommandInt(
-        target_system, target_component, frame, command, 0, 0, *values, x, y, _check_param(command, "z", z)
+        target_system, target_component, frame, command, 0, 0, param1, param2, param3, param4, x, y, z
     )
 
 

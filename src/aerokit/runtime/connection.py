@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from aerokit.links.link import Peer
     from aerokit.mavlink.dialect import Dialect
     from aerokit.mavlink.frame import Frame
-    from aerokit.mavlink.framer import FramerStatistics
+    from aerokit.mavlink.statistics import FramerStatistics
     from aerokit.runtime.bus import Detach, Sink
 
 __all__ = ["Connection", "open_connection"]

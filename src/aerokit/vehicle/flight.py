@@ -12,6 +12,7 @@ from aerokit import geo
 from aerokit.errors import (
     AerokitError,
     CommandRejected,
+    CommandTimeout,
     LocalProtocolError,
     NotSupported,
     OperationRejected,
@@ -55,6 +56,7 @@ class FlightActions(VehicleState):
     """Arming, modes, take-off, flying somewhere, landing."""
 
     _hold_scope: anyio.CancelScope | None = None
+    _resend: SetPositionTargetGlobalInt | None = None
 
     # --------------------------------------------------------------------------- readiness
 
@@ -142,7 +144,7 @@ class FlightActions(VehicleState):
     # ------------------------------------------------------------------------------ arming
 
     async def arm(self, *, force: bool = False, timeout: float = 10.0) -> None:
-        """Arm the motors and wait until HEARTBEAT says armed. **Propellers may start to turn.**
+        """Arm the motors and wait until HEARTBEAT says armed: **propellers may start to turn**.
 
         Args:
             force: skip the vehicle's own arming checks. Dangerous.
@@ -284,37 +286,44 @@ class FlightActions(VehicleState):
         if not self.is_armed:
             raise OperationRejected("go_to: the vehicle is not armed; nothing was sent")
         if speed_m_s is not None:
-            await self.set_speed(speed_m_s)
-        resend: SetPositionTargetGlobalInt | None = None
+            _check_speed(speed_m_s)
+        yaw = self._reposition_yaw(heading_deg)
+        await self._send_there(latitude, longitude, altitude, is_relative, yaw, speed_m_s)
         try:
-            resend = await self._send_there(latitude, longitude, altitude, is_relative, heading_deg)
-            await self._await_arrival(target, near_m, timeout, resend)
-        except anyio.get_cancelled_exc_class():
+            if speed_m_s is not None and not self._speeds_by_reposition:
+                await self.set_speed(speed_m_s)  # ArduPilot obeys it only once it is under way
+            if heading_deg is not None and math.isnan(yaw):
+                await self.set_heading(heading_deg)
+            await self._await_arrival(target, near_m, timeout)
+        except (anyio.get_cancelled_exc_class(), CommandRejected, CommandTimeout):
             self._hold_soon()
             raise
 
     async def _send_there(
-        self, latitude: int, longitude: int, altitude: float, is_relative: bool, heading_deg: float | None
-    ) -> SetPositionTargetGlobalInt | None:
-        """Tell the vehicle where to go; returns what has to be resent where there is no acknowledged command."""
+        self,
+        latitude: int,
+        longitude: int,
+        altitude: float,
+        is_relative: bool,
+        yaw: float,
+        speed_m_s: float | None,
+    ) -> None:
         started = self.connection.now()
         frame = MAV_FRAME_GLOBAL_RELATIVE_ALT_INT if is_relative else MAV_FRAME_GLOBAL_INT
-        yaw = self._reposition_yaw(heading_deg)
-        resend: SetPositionTargetGlobalInt | None = None
+        speed = speed_m_s if speed_m_s is not None and self._speeds_by_reposition else -1
+        params = (speed, CHANGE_MODE, 0, yaw)
+        self._resend = None
         try:
             await self._commands.send_int(
-                DO_REPOSITION, -1, CHANGE_MODE, 0, yaw, frame=frame, x=latitude, y=longitude, z=altitude
+                DO_REPOSITION, *params, frame=frame, x=latitude, y=longitude, z=altitude
             )
         except CommandRejected as error:
             if error.result != RESULT_UNSUPPORTED:
                 await self._settle()
                 raise self._explained(error, started) from None
             await self._ensure_mode(self._mode_for("go_to", "setpoint"))
-            resend = self._position_target(latitude, longitude, altitude, frame)
-            self.connection.send(resend)
-        if heading_deg is not None and math.isnan(yaw):
-            await self.set_heading(heading_deg)
-        return resend
+            self._resend = self._position_target(latitude, longitude, altitude, frame)
+            self.connection.send(self._resend)
 
     def _position_target(
         self, latitude: int, longitude: int, altitude: float, frame: int
@@ -329,9 +338,9 @@ class FlightActions(VehicleState):
         target: Position,
         near_m: float,
         timeout: float | None,
-        resend: SetPositionTargetGlobalInt | None,
     ) -> None:
-        sent_at = self.connection.now()
+        """Wait for it. The older message has no answer, so it is repeated for as long as this call lasts."""
+        sent_at, resend = self.connection.now(), self._resend
 
         def is_there() -> bool:
             nonlocal sent_at
@@ -440,9 +449,15 @@ class FlightActions(VehicleState):
     # ------------------------------------------------------------------------------ on the way
 
     async def set_speed(self, speed_m_s: float) -> None:
-        """Change the ground speed for flying somewhere, in m/s, above 0 (MAV_CMD_DO_CHANGE_SPEED)."""
-        if not 0 < speed_m_s <= 1000:
-            raise LocalProtocolError(f"speed_m_s = {speed_m_s!r} is not allowed: above 0, at most 1000")
+        """Change the ground speed for flying somewhere, in m/s, above 0 (MAV_CMD_DO_CHANGE_SPEED).
+
+        ArduPilot takes it only while it is under way in GUIDED or AUTO; ``go_to(speed_m_s=...)`` sees to that.
+
+        Raises:
+            LocalProtocolError: out of range. Nothing was sent.
+            CommandRejected: the vehicle refused.
+        """
+        _check_speed(speed_m_s)
         await self._explained_command(DO_CHANGE_SPEED, 1, speed_m_s, -1)
 
     async def set_heading(
@@ -542,6 +557,10 @@ class FlightActions(VehicleState):
         return trouble
 
     @property
+    def _speeds_by_reposition(self) -> bool:
+        return self.autopilot.reposition is not None and self.autopilot.reposition.speed
+
+    @property
     def _turns_by_reposition(self) -> bool:
         return self.autopilot.reposition is not None and self.autopilot.reposition.yaw
 
@@ -600,3 +619,8 @@ class FlightActions(VehicleState):
         if is_relative and not self._takes_relative_altitude:
             altitude, is_relative = altitude + self._home_altitude(), False
         return round(target.latitude_deg * 1e7), round(target.longitude_deg * 1e7), altitude, is_relative
+
+
+def _check_speed(speed_m_s: float) -> None:
+    if not 0 < speed_m_s <= 1000:
+        raise LocalProtocolError(f"speed_m_s = {speed_m_s!r} is not allowed: above 0, at most 1000")

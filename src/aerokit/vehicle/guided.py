@@ -2,7 +2,7 @@
 
 An autopilot stops by itself when set-points stop coming (ArduCopter after 3 s, PX4 after 0.5 s). A library that
 resends the last set-point for ever defeats that. Here the stream ends, and the vehicle is told to hold, when the code
-that feeds it ends, raises, is cancelled, goes silent or blocks the event loop.
+that feeds it ends, raises, is cancelled, goes silent or blocks the event loop, and when the vehicle falls silent.
 """
 
 from __future__ import annotations
@@ -313,6 +313,7 @@ class SetpointStream(Generic[SetpointT]):
         self._timer: asyncio.TimerHandle | None = None
         self._stopped: SetpointStreamStopped | None = None
         self._was_told = False
+        self._was_armed = False
 
     @property
     def is_running(self) -> bool:
@@ -418,6 +419,11 @@ class SetpointStream(Generic[SetpointT]):
         mode = self._vehicle.mode.latest
         if self._mode is not None and mode != self._mode:
             return f"the vehicle left {self._mode} for {mode}"
+        if self._was_armed and not self._vehicle.is_armed:
+            return "the vehicle disarmed"
+        if self._vehicle.is_silent:
+            return f"the vehicle has been silent for {self._vehicle.heartbeat_age:.1f} s"
+        self._was_armed = self._vehicle.is_armed
         return None
 
     def _stop(self, reason: str, *, hold: bool) -> None:
