@@ -1,8 +1,8 @@
 """UDP: listen for any number of peers, talk to one, or broadcast until somebody answers.
 
-A non-blocking socket is drained in bounded bursts by ``loop.add_reader``, which costs a tenth of what
-asyncio's datagram transport does (one datagram per turn of the loop); that one is kept for loops without
-``add_reader`` (Proactor on Windows).
+A non-blocking socket is drained in bounded bursts by ``loop.add_reader``, which costs a third of what
+stock asyncio's datagram transport does (one datagram per turn of the loop); that one is kept for loops
+without ``add_reader`` (Proactor on Windows).
 """
 
 from __future__ import annotations
