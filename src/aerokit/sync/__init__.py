@@ -1,0 +1,40 @@
+"""The blocking twin of aerokit: the same names and arguments, for programs without ``async``.
+
+```python
+import aerokit.sync
+
+with aerokit.sync.connect("udpin:0.0.0.0:14550") as vehicle:
+    vehicle.wait_ready()
+    vehicle.arm()
+    vehicle.take_off(altitude_m=10)
+    print(vehicle.position.value, vehicle.position.age)
+    vehicle.land()
+```
+
+One event loop runs on a thread of its own for each connection and ends with it: heartbeats go out and
+messages come in whatever the program does meanwhile. Reading a value (``.value``, ``.latest``, ``.age``,
+``.fresh(within=1)``) takes a snapshot and never crosses a thread. Everything that waits does so on the loop,
+and Ctrl-C ends it there: a take-off or a flight somewhere that is interrupted leaves the vehicle holding its
+place. Exceptions come through as they are. Any thread may call; functions that are handed in (predicates,
+``on_progress``) run on the loop's thread, so they must be quick and cannot call anything that blocks
+(:class:`aerokit.errors.BusyError`).
+"""
+
+from __future__ import annotations
+
+from aerokit.sync.cells import StateCell
+from aerokit.sync.connection import Connection, open_connection
+from aerokit.sync.guided import Guided, SetpointStream
+from aerokit.sync.subscription import Subscription
+from aerokit.sync.vehicle import Vehicle, connect
+
+__all__ = [
+    "Connection",
+    "Guided",
+    "SetpointStream",
+    "StateCell",
+    "Subscription",
+    "Vehicle",
+    "connect",
+    "open_connection",
+]

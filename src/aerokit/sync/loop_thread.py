@@ -1,0 +1,165 @@
+"""An event loop on a thread of its own, and blocking calls into it that Ctrl-C can end."""
+
+from __future__ import annotations
+
+import asyncio
+import atexit
+import concurrent.futures
+import contextlib
+import threading
+from typing import TYPE_CHECKING, Any, Generic, ParamSpec, TypeVar
+
+import anyio
+from anyio.from_thread import BlockingPortal
+
+from aerokit.errors import BusyError, ConnectionClosed
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+    from contextlib import AbstractAsyncContextManager
+
+__all__ = ["Held", "LoopThread"]
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+WAKE_S = 0.2
+"""On Windows, Ctrl-C is noticed only between waits."""
+INTERRUPTED_CALL_ENDS_S = 2.0
+CLOSE_S = 5.0
+"""The longest that closing waits; every single step of it is bounded by itself."""
+
+
+class LoopThread:
+    """One asyncio loop on one thread. The thread does not keep the interpreter alive; at its exit it is closed."""
+
+    def __init__(self) -> None:
+        started: concurrent.futures.Future[BlockingPortal] = concurrent.futures.Future()
+        self._thread = threading.Thread(target=_run, args=(started,), name="aerokit loop", daemon=True)
+        self._thread.start()
+        self._portal = started.result()
+        self._is_closed = False
+        self._lock = threading.Lock()
+        atexit.register(self.close)
+
+    def run(self, function: Callable[P, Awaitable[T]], *args: P.args, **kwargs: P.kwargs) -> T:
+        """Await ``function(*args, **kwargs)`` on the loop and return its result or raise its exception, as it is.
+
+        Ctrl-C cancels it there, waits until it has cleaned up, and goes on as KeyboardInterrupt.
+
+        Raises:
+            BusyError: called on the loop's own thread, which would wait for itself.
+            ConnectionClosed: the loop was closed, before or meanwhile.
+        """
+        ended = threading.Event()
+
+        async def call() -> T:
+            try:
+                return await function(*args, **kwargs)
+            finally:
+                ended.set()
+
+        future = self._start(call)
+        try:
+            self.wait_for(future)
+        except BaseException:
+            future.cancel()
+            ended.wait(INTERRUPTED_CALL_ENDS_S)
+            raise
+        try:
+            return future.result()
+        except concurrent.futures.CancelledError:
+            raise ConnectionClosed("the connection was closed while this call waited") from None
+
+    def call(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """Call a function that does not wait on the loop's thread; else as :meth:`run`."""
+
+        async def call() -> T:
+            return function(*args, **kwargs)
+
+        return self.run(call)
+
+    def hold_open(self, context: AbstractAsyncContextManager[T]) -> Held[T]:
+        """Enter an asynchronous context manager on the loop; it is left, in the same task, when it is closed."""
+        return Held(self, context)
+
+    def close(self) -> None:
+        """End whatever still runs on the loop, the loop and the thread; idempotent, and bounded in time."""
+        with self._lock:
+            if self._is_closed:
+                return
+            self._is_closed = True
+        atexit.unregister(self.close)
+        with contextlib.suppress(RuntimeError):  # it has stopped by itself
+            self._portal.start_task_soon(self._portal.stop, True)
+        if not self.is_current:
+            self._thread.join(CLOSE_S)
+
+    @property
+    def is_current(self) -> bool:
+        """Whether the caller is on the loop's thread."""
+        return threading.current_thread() is self._thread
+
+    def wait_for(self, *futures: concurrent.futures.Future[Any]) -> None:
+        """Wait until one of them is done, open to Ctrl-C on every system; ConnectionClosed when the loop ends first."""
+        while not concurrent.futures.wait(futures, WAKE_S, concurrent.futures.FIRST_COMPLETED).done:
+            if not self._thread.is_alive() and not any(future.done() for future in futures):
+                raise ConnectionClosed("the connection was closed while this call waited")
+
+    def _start(self, function: Callable[[], Awaitable[T]]) -> concurrent.futures.Future[T]:
+        if self.is_current:
+            raise BusyError(
+                "a blocking call on the loop's own thread would wait for itself: predicates and callbacks run there;"
+                " call it from another thread"
+            )
+        with self._lock:
+            if self._is_closed:
+                raise ConnectionClosed("the connection was closed")
+            return self._portal.start_task_soon(function)
+
+
+class Held(Generic[T]):
+    """An asynchronous context manager that is open on a :class:`LoopThread`, in a task of its own."""
+
+    def __init__(self, loop: LoopThread, context: AbstractAsyncContextManager[T]) -> None:
+        self._loop, self._context = loop, context
+        self._opened: concurrent.futures.Future[T] = concurrent.futures.Future()
+        self._leave = asyncio.Event()
+        self._task = loop._start(self._live)
+        self.value = self._wait_until_open()
+        """What the context manager gave."""
+
+    def close(self) -> None:
+        """Leave the context manager and wait until that is done; idempotent."""
+        if self._loop.is_current:
+            self._leave.set()
+        elif not self._task.done():
+            with contextlib.suppress(ConnectionClosed):
+                self._loop.call(self._leave.set)
+                concurrent.futures.wait([self._task], CLOSE_S)
+
+    async def _live(self) -> None:
+        async with self._context as value:
+            self._opened.set_result(value)
+            await self._leave.wait()
+
+    def _wait_until_open(self) -> T:
+        try:
+            self._loop.wait_for(self._opened, self._task)
+        except BaseException:
+            self._task.cancel()
+            raise
+        if not self._opened.done():
+            self._task.result()  # raises what entering it raised
+        return self._opened.result()
+
+
+def _run(started: concurrent.futures.Future[BlockingPortal]) -> None:
+    """What the thread does."""
+
+    async def main() -> None:
+        async with BlockingPortal() as portal:
+            started.set_result(portal)
+            await portal.sleep_until_stopped()
+
+    anyio.run(main)
