@@ -113,7 +113,17 @@ SUB = ModeTable(
     {"DEPTH_HOLD": "ALT_HOLD"},
 )
 
-BLIMP = ModeTable({0: "LAND", 1: "MANUAL", 2: "VELOCITY", 3: "LOITER", 4: "RTL"})
+BLIMP = ModeTable(
+    {
+        0: "LAND",
+        1: "MANUAL",
+        2: "VELOCITY",
+        3: "LOITER",
+        4: "RTL",
+        5: "AUTO",
+        6: "HOLD",
+    }  # 5, 6: pymavlink only
+)
 
 TRACKER = ModeTable(
     {0: "MANUAL", 1: "STOP", 2: "SCAN", 3: "SERVOTEST", 4: "GUIDED", 10: "AUTO", 16: "INITIALISING"}

@@ -121,8 +121,6 @@ class Autopilot:
     """Whether the mode for returning ends on the ground."""
     arrival_radius_m = 2.0
     """How near it comes to a place that it was sent to, or circles it, by default."""
-    relative_altitude_needs_home = False
-    """Whether GLOBAL_POSITION_INT.relative_alt is the altitude above the sea until home is known."""
     sends_mission_requests_float = False
     """Whether it asks for mission items by MISSION_REQUEST instead of MISSION_REQUEST_INT."""
     unknown_currents_ca: frozenset[int] = frozenset((-1,))

@@ -92,7 +92,6 @@ class Px4(Autopilot):
     setpoints = SetpointRules(before_mode=True, minimum_hz=2.0, timeout_s=0.5)
     reposition = Reposition(relative_altitude=False, yaw=True, speed=True, armed_only=True)
     changes_speed = True
-    relative_altitude_needs_home = True
     _bytewise_by_default = True
     unknown_currents_ca = frozenset((-1, -100))  # inside PX4, −1 A is "unknown"
     reposition_purpose = "hold"

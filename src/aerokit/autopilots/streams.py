@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from aerokit.mavlink.messages import INDEX
 
-__all__ = ["ARDUPILOT_GROUPS", "DEFAULT_RATES_HZ"]
+__all__ = ["ARDUPILOT_GROUPS", "DEFAULT_RATES_HZ", "subscription_rate_hz"]
 
 RAW_SENSORS, EXTENDED_STATUS, RC_CHANNELS, RAW_CONTROLLER, POSITION, EXTRA1, EXTRA2, EXTRA3 = (
     1,
@@ -96,3 +96,26 @@ DEFAULT_RATES_HZ: Mapping[str, float] = {
 
 Names, so that this module does not have all messages imported.
 """
+
+SUBSCRIPTION_HZ = 4.0
+"""How fast a streamed message without a default rate is asked for by a subscription that names no rate."""
+
+_ALSO_STREAMED = (
+    *("ActuatorControlTarget", "ActuatorOutputStatus", "Ahrs2", "Ahrs3", "Altitude", "AttitudeQuaternion"),
+    *("AttitudeTarget", "Battery2", "CameraTriggerStatus", "DeepStall", "EfiStatus", "EscInfo", "EscStatus"),
+    *("GimbalDeviceAttitudeStatus", "GimbalManagerStatus", "GlobalPositionIntCov", "GpsStatus", "Gps2Raw"),
+    *("HighLatency2", "HighresImu", "HilActuatorControls", "HygrometerSensor", "LocalPositionNedCov"),
+    *("LocalPositionNedSystemGlobalOffset", "ManualControl", "NavControllerOutput", "ObstacleDistance"),
+    *("Odometry", "OpticalFlowRad", "OrbitExecutionStatus", "PositionTargetGlobalInt"),
+    *("PositionTargetLocalNed", "RawRpm", "ScaledImu", "UtmGlobalPosition", "WaterDepth", "WheelDistance"),
+)
+
+
+def subscription_rate_hz(class_name: str) -> float | None:
+    """The rate that a subscription asks for when it names none; None: the message is sent when there is need for it."""
+    if class_name in DEFAULT_RATES_HZ:
+        return DEFAULT_RATES_HZ[class_name]
+    return SUBSCRIPTION_HZ if class_name in _STREAMED else None
+
+
+_STREAMED = frozenset((*(name for names in _GROUPS.values() for name in names), *_ALSO_STREAMED))

@@ -31,8 +31,9 @@ class StateCell(Generic[T]):
     """The latest value of one thing: read it at once, ask for its age, wait for it, follow it.
 
     Reading never talks to the vehicle. ``clock`` gives the time in seconds (the event loop's), ``waits_for``
-    names the messages the value comes from, for error texts. A cell belongs to one event loop and its thread; other
-    threads may read it (never a torn value, and never one called younger than it is), but not wait or write.
+    names the messages the value comes from, for error texts. A cell belongs to one event loop and its thread;
+    other threads may read it (never a torn value, and never one called younger than it is), but not wait or
+    write.
     """
 
     __slots__ = (

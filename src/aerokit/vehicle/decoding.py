@@ -33,6 +33,8 @@ U8, U16 = 0xFF, 0xFFFF
 I16 = 0x7FFF
 NORTH_CDEG = 36000
 LOOKING_DOWN = 25
+NOWHERE = 100_000
+"""Within 0.01 degrees of 0°N 0°E nothing is believed."""
 FULL_CELL = 0xFFFE
 """The most a cell can say; a pack of more than 65.5 V fills several "cells" with it."""
 EARLIEST_UNIX_S = 1_000_000_000
@@ -48,8 +50,13 @@ def member(enum: type[int], value: int) -> int:
 
 
 def place(latitude: int, longitude: int) -> tuple[float, float] | None:
-    """Degrees from 1e-7 degrees; None for 0, 0 (there is no fix yet) and for what is no place on earth."""
-    if latitude == longitude == 0 or abs(latitude) > 900_000_000 or abs(longitude) > 1_800_000_000:
+    """Degrees from 1e-7 degrees; None where there is no fix yet, and for what is no place on earth.
+
+    Without a fix, autopilots say 0, 0, or a place near it: ArduPlane was seen to reckon its way from there.
+    """
+    if abs(latitude) < NOWHERE and abs(longitude) < NOWHERE:
+        return None
+    if abs(latitude) > 900_000_000 or abs(longitude) > 1_800_000_000:
         return None
     return latitude / 1e7, longitude / 1e7
 

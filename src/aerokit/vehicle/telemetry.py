@@ -45,6 +45,7 @@ __all__ = ["Telemetry"]
 BETTER_SOURCE_S = 2.0
 """For so long the second-best source of a value keeps quiet after the best one."""
 OUTPUTS_PER_PORT = 16
+SAME_ALTITUDE_MM = 100
 
 Handler = Callable[[Any, Source], None]
 
@@ -294,8 +295,8 @@ class Telemetry:
             self.velocity.set(decoding.global_velocity(message), source)
 
     def _relative_is_known(self, message: messages.GlobalPositionInt) -> bool:
-        is_absolute = message.relative_alt == message.alt and not self.home.is_known
-        return not (is_absolute and self.autopilot.relative_altitude_needs_home)
+        """Until home is set, ``relative_alt`` is no more than the altitude above the sea once again."""
+        return self.home.is_known or abs(message.relative_alt - message.alt) > SAME_ALTITUDE_MM
 
     def _on_local_position(self, message: messages.LocalPositionNed, source: Source) -> None:
         self.local_position.set(decoding.local_position(message), source)

@@ -1,0 +1,189 @@
+"""Mode names and numbers: lookups, and parity with pymavlink's tables where those are right."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import get_args
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pymavlink import mavutil
+
+from aerokit.autopilots import Autopilot, Mode, ModeOrder, Purpose, autopilot_for, px4_custom_mode
+from aerokit.errors import LocalProtocolError
+from aerokit.mavlink.messages import Heartbeat
+
+ARDUPILOT, PX4 = 3, 12
+TYPES = {
+    "copter": 2,
+    "heli": 4,
+    "plane": 1,
+    "quadplane": 20,
+    "rover": 10,
+    "boat": 11,
+    "sub": 12,
+    "blimp": 7,
+    "tracker": 5,
+}
+
+
+def ardupilot(kind: str) -> Autopilot:
+    return autopilot_for(heartbeat(TYPES[kind]))
+
+
+def heartbeat(
+    vehicle_type: int, autopilot: int = ARDUPILOT, base_mode: int = 81, custom_mode: int = 0
+) -> Heartbeat:
+    return Heartbeat(vehicle_type, autopilot, base_mode, custom_mode, 3)
+
+
+px4 = autopilot_for(heartbeat(2, PX4))
+EVERY_AUTOPILOT = [*(ardupilot(kind) for kind in TYPES), px4]
+
+
+@pytest.mark.parametrize("kind", TYPES)
+def test_names_are_those_of_pymavlink(kind: str) -> None:
+    theirs: Mapping[int, str] = mavutil.AP_MAV_TYPE_MODE_MAP_DEFAULT[TYPES[kind]]
+    ours = ardupilot(kind).modes.numbers
+    assert {number: ours.get(number) for number in theirs} == theirs
+
+
+NEWER = {"sub": {20: "MOTOR_DETECT", 21: "SURFTRAK"}, "tracker": {3: "SERVOTEST"}}
+"""What mode.h of ArduPilot 4.7 has beyond pymavlink's tables."""
+
+
+@pytest.mark.parametrize("kind", TYPES)
+def test_names_beyond_pymavlinks_are_the_firmwares(kind: str) -> None:
+    theirs = mavutil.AP_MAV_TYPE_MODE_MAP_DEFAULT[TYPES[kind]]
+    ours = ardupilot(kind).modes.numbers
+    assert {n: name for n, name in ours.items() if n not in theirs} == NEWER.get(kind, {})
+
+
+@pytest.mark.parametrize("name", mavutil.px4_map)
+def test_px4_names_and_numbers_are_those_of_pymavlink(name: str) -> None:
+    _, main, sub = mavutil.px4_map[name]
+    assert px4.find_mode(name).custom_mode == px4_custom_mode(main, sub)
+
+
+def test_px4_modes_as_the_firmware_was_seen_to_send_them() -> None:
+    assert px4.find_mode("LOITER").custom_mode == 50593792
+    assert px4.mode(50593792, 157) == Mode("LOITER", 50593792)
+    assert px4.mode(px4_custom_mode(6), 157).name == "OFFBOARD"
+
+
+@pytest.mark.parametrize("autopilot", EVERY_AUTOPILOT, ids=repr)
+def test_every_name_is_found_again(autopilot: Autopilot) -> None:
+    for number, name in autopilot.modes.numbers.items():
+        for spelling in (name, name.lower(), name.replace("_", " ").title(), f" {name} "):
+            assert autopilot.find_mode(spelling) == Mode(name, number)
+        assert autopilot.find_mode(number).name == autopilot.mode(number, 1).name == name
+
+
+@pytest.mark.parametrize("autopilot", EVERY_AUTOPILOT, ids=repr)
+def test_every_purpose_names_a_mode_that_exists(autopilot: Autopilot) -> None:
+    for purpose in get_args(Purpose):
+        for is_vtol in (False, True):
+            mode = autopilot.mode_for(purpose, is_vtol=is_vtol)
+            assert mode is None or mode.name in autopilot.modes.names
+    assert autopilot.unarmable_modes <= set(autopilot.modes.names)
+
+
+@pytest.mark.parametrize(
+    ("kind", "purpose", "is_vtol", "name"),
+    [
+        ("copter", "hold", False, "BRAKE"),
+        ("copter", "land", False, "LAND"),
+        ("copter", "setpoint", False, "GUIDED"),
+        ("plane", "hold", False, "LOITER"),
+        ("plane", "land", False, "AUTOLAND"),
+        ("plane", "land", True, "QLAND"),
+        ("quadplane", "return", False, "QRTL"),
+        ("rover", "hold", False, "HOLD"),
+        ("boat", "hold", False, "LOITER"),
+        ("rover", "land", False, None),
+        ("sub", "hold", False, "POSHOLD"),
+        ("sub", "land", False, "SURFACE"),
+        ("blimp", "setpoint", False, None),
+    ],
+)
+def test_modes_by_purpose(kind: str, purpose: Purpose, is_vtol: bool, name: str | None) -> None:
+    mode = ardupilot(kind).mode_for(purpose, is_vtol=is_vtol)
+    assert (mode.name if mode else None) == name
+
+
+@pytest.mark.parametrize("alias", ["AUTO.LOITER", "hold", "Auto Loiter"])
+def test_px4_aliases(alias: str) -> None:
+    assert px4.find_mode(alias).name == "LOITER"
+
+
+@given(st.integers(0, 0xFFFF_FFFF))
+def test_an_unknown_number_has_a_name_that_parses(number: int) -> None:
+    for autopilot in EVERY_AUTOPILOT:
+        mode = autopilot.mode(number, 1)
+        assert autopilot.find_mode(mode.name).custom_mode == number
+
+
+def test_an_unknown_name_raises_with_the_known_ones() -> None:
+    with pytest.raises(
+        LocalProtocolError, match=r"'guidde' is not known \(did you mean 'GUIDED'\?\).*RTL, CIRCLE"
+    ):
+        ardupilot("copter").find_mode("guidde")
+    with pytest.raises(LocalProtocolError, match="0 to 4294967295"):
+        ardupilot("copter").find_mode(-1)
+    with pytest.raises(LocalProtocolError):
+        ardupilot("copter").find_mode("")
+
+
+def test_modes_the_vehicle_told_are_found_by_their_names() -> None:
+    copter = ardupilot("copter")
+    assert copter.learn_mode_name(127, "Drone show") == "Drone show"
+    assert copter.learn_mode_name(21, "SMARTRTL") is None  # known by another spelling already
+    extra = {127: "Drone show"}
+    assert copter.find_mode("drone_show", extra) == Mode("Drone show", 127)
+    assert copter.mode(127, 81, extra).name == "Drone show"
+    with pytest.raises(LocalProtocolError, match="Drone show"):
+        copter.find_mode("nonsense", extra)
+
+
+def test_px4_external_modes_have_the_names_they_registered() -> None:
+    number = px4_custom_mode(4, 11)
+    assert px4.mode(number, 1).name == "EXTERNAL1"
+    assert px4.learn_mode_name(number, "(Mode not available)") is None
+    assert px4.learn_mode_name(px4_custom_mode(4, 3), "") is None  # standard modes come without a name
+    extra = {number: px4.learn_mode_name(number, "Precise landing") or ""}
+    assert px4.mode(number, 1, extra).name == "Precise landing"
+    assert px4.find_mode("precise landing", extra) == px4.find_mode("EXTERNAL1", extra)
+    assert px4.find_mode("EXTERNAL1", extra).name == "Precise landing"
+
+
+def test_mode_orders() -> None:
+    copter = ardupilot("copter")
+    order = copter.mode_order(copter.find_mode("GUIDED"))
+    assert order == ModeOrder((1, 4, 0), 1, 4)
+    px4_order = px4.mode_order(px4.find_mode("RTL"))
+    assert px4_order == ModeOrder((1, 4, 5), 1, px4_custom_mode(4, 5))
+    message = px4_order.legacy(target_system=7)
+    assert (message.target_system, message.base_mode, message.custom_mode) == (7, 1, px4_custom_mode(4, 5))
+
+
+def test_a_mode_does_not_change_with_arming() -> None:
+    copter = ardupilot("copter")
+    assert copter.mode(4, 81) == copter.mode(4, 209)
+    assert len({copter.mode(4, 81), copter.mode(4, 209)}) == 1
+    assert str(copter.mode(4, 81)) == "GUIDED"
+
+
+def test_an_unknown_autopilot_is_described_by_its_base_mode() -> None:
+    other = autopilot_for(heartbeat(2, autopilot=0))
+    names = {other.mode_of(heartbeat(2, 0, base_mode)).name for base_mode in (0, 4, 8, 16, 64)}
+    assert names == {"PREFLIGHT", "AUTO", "GUIDED", "STABILIZE", "MANUAL"}
+    assert other.mode(5, 1).name == "MODE 5"
+    assert other.mode_for("hold") is None
+    assert other.take_off(10, None) is None
+
+
+def test_an_ardupilot_of_unknown_type_still_is_ardupilot() -> None:
+    other = autopilot_for(heartbeat(200))
+    assert other.home_is_item_0
+    assert other.mode(5, 1).name == "MODE 5"

@@ -1,0 +1,268 @@
+"""State cells: reading, ages, waiting, following; all on virtual time."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import math
+from collections.abc import Callable
+
+import pytest
+
+from aerokit.errors import OperationTimeout, StaleValueError, ValueUnknownError
+from aerokit.runtime.cells import Source, StateCell
+
+HEARTBEAT = Source(1, 1, "HEARTBEAT")
+
+pytestmark = pytest.mark.anyio
+
+
+def make_cell(name: str = "altitude") -> StateCell[int]:
+    return StateCell(name, asyncio.get_running_loop().time, "HEARTBEAT")
+
+
+def later(delay: float, callback: Callable[..., object], *args: object) -> None:
+    asyncio.get_running_loop().call_later(delay, callback, *args)
+
+
+async def test_unknown_value_names_what_it_waits_for() -> None:
+    cell = make_cell()
+    with pytest.raises(ValueUnknownError, match="altitude is not known yet: no HEARTBEAT has been received"):
+        _ = cell.value
+    assert (cell.latest, cell.source, cell.is_known, cell.age) == (None, None, False, math.inf)
+
+
+async def test_value_age_and_source() -> None:
+    cell = make_cell()
+    await asyncio.sleep(1.5)
+    cell.set(7, HEARTBEAT)
+    await asyncio.sleep(2)
+    assert (cell.value, cell.latest, cell.age, cell.updated_at) == (7, 7, 2.0, 1.5)
+    assert cell.source == Source(1, 1, "HEARTBEAT")
+
+
+async def test_setting_an_equal_value_makes_it_young_again() -> None:
+    cell = make_cell()
+    cell.set(7, HEARTBEAT)
+    await asyncio.sleep(2)
+    cell.set(7, HEARTBEAT)
+    assert cell.age == 0.0
+
+
+async def test_fresh_raises_instead_of_returning_yesterdays_value() -> None:
+    cell = make_cell()
+    with pytest.raises(ValueUnknownError):
+        cell.fresh(within=1)
+    cell.set(7, HEARTBEAT)
+    await asyncio.sleep(1)
+    assert cell.fresh(within=1) == 7
+    await asyncio.sleep(4.2)
+    with pytest.raises(
+        StaleValueError, match=r"altitude is 5\.2 s old, older than the 1 s asked for: no HEARTBEAT"
+    ):
+        cell.fresh(within=1)
+
+
+async def test_wait_until_returns_at_once_when_it_is_true_already() -> None:
+    cell = make_cell()
+    cell.set(7, HEARTBEAT)
+    assert await cell.wait_until(lambda value: value == 7) == 7
+
+
+async def test_a_value_that_lasted_one_message_is_not_missed() -> None:
+    cell = make_cell()
+
+    def flicker() -> None:
+        for value in (1, 99, 2):
+            cell.set(value, HEARTBEAT)
+
+    later(1, flicker)
+    assert await cell.wait_until(lambda value: value == 99) == 99
+    assert cell.value == 2
+
+
+async def test_held_for_starts_again_when_the_value_leaves() -> None:
+    cell = make_cell()
+    for at, value in ((0, 5), (1, 0), (2, 5), (3, 6)):
+        later(at, cell.set, value, HEARTBEAT)
+    assert await cell.wait_until(lambda value: value >= 5, held_for=2) == 6
+    assert asyncio.get_running_loop().time() == pytest.approx(4)
+
+
+async def test_held_for_is_over_between_two_messages() -> None:
+    cell = make_cell()
+    cell.set(5, HEARTBEAT)
+    await cell.wait_until(lambda value: value == 5, held_for=0.5)
+    assert asyncio.get_running_loop().time() == pytest.approx(0.5)
+
+
+async def test_forgetting_breaks_the_hold() -> None:
+    cell = make_cell()
+    cell.set(5, HEARTBEAT)
+    later(1, cell.forget)
+    later(5, cell.set, 5, HEARTBEAT)
+    await cell.wait_until(lambda value: value == 5, held_for=2)
+    assert asyncio.get_running_loop().time() == pytest.approx(7)
+
+
+async def test_timeout_says_what_was_seen() -> None:
+    cell = make_cell("mode")
+    for at, value in enumerate((3, 3, 4, 5, 6)):
+        later(at / 4, cell.set, value, HEARTBEAT)
+    with pytest.raises(OperationTimeout) as caught:
+        await cell.wait_until(lambda value: value == 99, timeout=2, description="mode GUIDED")
+    assert str(caught.value) == (
+        "mode GUIDED: not reached within 2 s; mode is 6, 1.0 s old; 5 values seen, last 4, 5, 6"
+    )
+
+
+async def test_timeout_of_an_unknown_value_says_so() -> None:
+    with pytest.raises(OperationTimeout, match="not known yet, no HEARTBEAT has been received"):
+        await make_cell().wait_until(lambda _: True, timeout=1)
+
+
+async def test_timeout_names_the_time_it_had_to_hold() -> None:
+    cell = make_cell()
+    cell.set(1, HEARTBEAT)
+    with pytest.raises(OperationTimeout, match="it had to hold for 5 s"):
+        await cell.wait_until(lambda value: value == 1, held_for=5, timeout=1)
+
+
+async def test_an_error_in_the_predicate_goes_to_the_one_who_waits() -> None:
+    cell = make_cell()
+    waiting = asyncio.create_task(cell.wait_until(lambda value: 1 // value > 0))
+    other = asyncio.create_task(cell.wait_until(lambda value: value == 0))
+    await asyncio.sleep(0)
+    cell.set(0, HEARTBEAT)
+    with pytest.raises(ZeroDivisionError):
+        await waiting
+    assert await other == 0
+
+
+async def test_close_reaches_everyone_who_waits_now_or_later() -> None:
+    cell = make_cell()
+    cell.set(1, HEARTBEAT)
+    waiting = asyncio.create_task(cell.wait_until(lambda value: value == 2, held_for=1, timeout=5))
+    changes = cell.changes()
+    assert await anext(changes) == 1
+    following = asyncio.create_task(_next(changes))
+    await asyncio.sleep(0)
+    cell.close(ConnectionError("gone"))
+    for task in (waiting, following):
+        with pytest.raises(ConnectionError, match="gone"):
+            await task
+    with pytest.raises(ConnectionError):
+        await cell.wait_until(lambda _: True)
+    assert cell.value == 1
+
+
+async def test_cancelling_leaves_nothing_behind() -> None:
+    cell = make_cell()
+    cell.set(1, HEARTBEAT)
+    tasks = [
+        asyncio.create_task(cell.wait_until(lambda value: value == 1, held_for=100, timeout=200)),
+        asyncio.create_task(_next(cell.changes(), skip=1)),
+    ]
+    await asyncio.sleep(0.1)
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
+    assert cell._sinks == []
+    handles = [handle for handle in _timers() if not handle.cancelled()]
+    assert handles == []
+
+
+async def test_cancelled_at_the_moment_of_failure_complains_to_nobody() -> None:
+    complaints: list[object] = []
+    asyncio.get_running_loop().set_exception_handler(lambda _, context: complaints.append(context))
+    cell = make_cell()
+    task = asyncio.create_task(cell.wait_until(lambda _: False))
+    await asyncio.sleep(0)
+    cell.close(ConnectionError("gone"))
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task
+    del task
+    gc.collect()
+    assert complaints == []
+
+
+async def test_a_slow_reader_gets_the_latest_value_and_sees_how_many_it_missed() -> None:
+    cell = make_cell()
+    cell.set(0, HEARTBEAT)
+    changes = cell.changes()
+    assert await anext(changes) == 0
+    for value in range(1, 6):
+        cell.set(value, HEARTBEAT)
+    assert await anext(changes) == 5
+    assert changes.missed == 4
+
+
+async def test_changes_skip_equal_values_and_updates_do_not() -> None:
+    cell = make_cell()
+    cell.set(1, HEARTBEAT)
+    changes, updates = cell.changes(), cell.updates()
+    assert (await anext(changes), await anext(updates)) == (1, 1)
+    later(1, cell.set, 1, HEARTBEAT)
+    later(2, cell.set, 2, HEARTBEAT)
+    assert await anext(updates) == 1
+    assert asyncio.get_running_loop().time() == pytest.approx(1)
+    assert await anext(changes) == 2
+    assert asyncio.get_running_loop().time() == pytest.approx(2)
+
+
+async def test_changes_of_an_unknown_cell_begin_with_the_first_value() -> None:
+    cell = make_cell()
+    later(1, cell.set, 4, HEARTBEAT)
+    assert await anext(cell.changes()) == 4
+
+
+async def test_a_loop_left_early_leaves_nothing_behind() -> None:
+    cell = make_cell()
+    cell.set(1, HEARTBEAT)
+    async for value in cell.changes():
+        assert value == 1
+        break
+    assert cell._sinks == []
+
+
+async def test_after_forgetting_the_same_value_is_news() -> None:
+    cell = make_cell()
+    cell.set(1, HEARTBEAT)
+    changes = cell.changes()
+    await anext(changes)
+    cell.forget()
+    with pytest.raises(ValueUnknownError):
+        _ = cell.value
+    later(1, cell.set, 1, HEARTBEAT)
+    assert await anext(changes) == 1
+
+
+async def test_observers_see_every_change_with_what_was_before() -> None:
+    cell = make_cell()
+    seen: list[tuple[int | None, int]] = []
+    stop = cell.observe(lambda before, after: seen.append((before, after)))
+    for value in (1, 1, 2):
+        cell.set(value, HEARTBEAT)
+    stop()
+    stop()
+    cell.set(3, HEARTBEAT)
+    assert seen == [(None, 1), (1, 2)]
+
+
+async def test_repr_is_readable() -> None:
+    cell = make_cell()
+    assert repr(cell) == "<StateCell altitude is not known yet, no HEARTBEAT has been received>"
+    cell.set(3, HEARTBEAT)
+    assert repr(cell) == "<StateCell altitude is 3, 0.0 s old>"
+
+
+async def _next(changes: object, skip: int = 0) -> object:
+    for _ in range(skip):
+        await anext(changes)  # type: ignore[call-overload]
+    return await anext(changes)  # type: ignore[call-overload]
+
+
+def _timers() -> list[asyncio.TimerHandle]:
+    loop = asyncio.get_running_loop()
+    return list(loop._scheduled)  # type: ignore[attr-defined]

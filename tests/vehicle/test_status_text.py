@@ -1,0 +1,158 @@
+"""STATUSTEXT: chunks in and out of order, padding, losses, garbage."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from aerokit.mavlink import STANDARD, Frame
+from aerokit.mavlink.messages import Statustext
+from aerokit.vehicle.status_text import MOST_OPEN, StatusTextAssembler
+from aerokit.vehicle.values import StatusText
+
+LONG = (
+    "A text much longer than the fifty characters which fit into one STATUSTEXT message, and then some more."
+)
+
+
+def chunks(text: str, number: int = 1, severity: int = 4) -> list[Statustext]:
+    data = text.encode()
+    parts = [data[begin : begin + 50] for begin in range(0, len(data), 50)] or [b""]
+    if len(parts[-1]) == 50:
+        parts.append(b"")
+    return [_received(Statustext(severity, "", number, seq), part) for seq, part in enumerate(parts)]
+
+
+def _received(message: Statustext, text: bytes) -> Statustext:
+    """A message off the wire, whose text may be any bytes."""
+    payload = bytearray(message.encode())
+    payload[1:51] = text.ljust(50, b"\0")
+    header = bytes((0xFD, len(payload), 0, 0, 0, 1, 1, 253, 0, 0))
+    return Statustext.decode(bytes(payload), Frame(header + bytes(payload)))
+
+
+def test_single_text_with_trailing_tabs() -> None:
+    texts = StatusTextAssembler()
+    assert texts.receive(Statustext(6, "Armed by external command\t"), 3.0) == [
+        StatusText(6, "Armed by external command", 3.0)
+    ]
+
+
+def test_chunks_are_joined() -> None:
+    texts = StatusTextAssembler()
+    told = [text for each in chunks(LONG) for text in texts.receive(each, 1.0)]
+    assert told == [StatusText(4, LONG, 1.0)]
+
+
+def test_a_text_that_fills_its_chunks_ends_with_an_empty_one() -> None:
+    texts = StatusTextAssembler()
+    told = [text.text for each in chunks("x" * 100) for text in texts.receive(each, 1.0)]
+    assert told == ["x" * 100]
+
+
+@given(st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=300))
+def test_every_text_survives_its_chunks(text: str) -> None:
+    texts = StatusTextAssembler()
+    told = [each.text for chunk in chunks(text) for each in texts.receive(chunk, 0.0)]
+    assert told == [text.rstrip()]
+
+
+def test_texts_of_two_components_and_ids_do_not_mix() -> None:
+    texts = StatusTextAssembler()
+    first, second = chunks(LONG, 1), chunks(LONG.upper(), 2)
+    told = [
+        text.text
+        for pair in zip(first, second, strict=True)
+        for each in pair
+        for text in texts.receive(each, 0.0)
+    ]
+    assert told == [LONG, LONG.upper()]
+
+
+def test_a_missing_chunk_is_marked() -> None:
+    texts = StatusTextAssembler()
+    first, _, last = chunks(LONG)
+    assert texts.receive(first, 0.0) == []
+    (text,) = texts.receive(last, 0.1)
+    assert text.text == LONG[:50] + "…" + LONG[100:]
+
+
+def test_a_missing_beginning_is_marked() -> None:
+    texts = StatusTextAssembler()
+    (text,) = texts.receive(chunks(LONG)[2], 0.1)
+    assert text.text == "…" + LONG[100:]
+
+
+def test_a_missing_end_is_told_after_two_seconds() -> None:
+    texts = StatusTextAssembler()
+    texts.receive(chunks(LONG)[0], 0.0)
+    assert texts.expire(1.9) == []
+    assert texts.expire(2.1) == [StatusText(4, LONG[:50].rstrip() + "…", 2.1)]
+    assert texts.expire(9) == []
+
+
+def test_a_new_text_with_the_same_id_cuts_the_old_one_off() -> None:
+    texts = StatusTextAssembler()
+    texts.receive(chunks(LONG)[0], 0.0)
+    texts.receive(chunks(LONG)[1], 0.0)
+    told = [text.text for each in chunks("Another " + LONG) for text in texts.receive(each, 0.5)]
+    assert told == [LONG[:100].rstrip() + "…", "Another " + LONG]
+
+
+def test_a_repeated_chunk_is_taken_once() -> None:
+    texts = StatusTextAssembler()
+    told = [text.text for each in chunks(LONG) for _ in range(2) for text in texts.receive(each, 0.0)]
+    assert told[0] == LONG
+
+
+def test_recent_texts_by_time() -> None:
+    texts = StatusTextAssembler()
+    for at in range(100):
+        texts.receive(Statustext(6, f"text {at}"), float(at))
+    assert [text.text for text in texts.recent(since=98.0)] == ["text 98", "text 99"]
+    assert len(texts.recent()) == 64
+    texts.clear()
+    assert texts.recent() == ()
+
+
+def test_garbage_does_not_pile_up() -> None:
+    texts = StatusTextAssembler()
+    for number in range(1, 1000):
+        texts.receive(chunks("y" * 120, number)[0], 0.0)
+    assert len(texts._open) == MOST_OPEN
+    for seq in range(100):
+        texts.receive(_received(Statustext(6, "", 7, seq), b"z" * 50), 0.0)
+    assert len(texts._open) <= MOST_OPEN
+
+
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 3), st.integers(0, 5), st.binary(max_size=50), st.floats(0, 1)), max_size=40
+    )
+)
+def test_any_sequence_of_chunks_is_taken(sequence: list[tuple[int, int, bytes, float]]) -> None:
+    texts = StatusTextAssembler()
+    now = 0.0
+    for number, seq, data, step in sequence:
+        now += step
+        for text in texts.receive(_received(Statustext(6, "", number, seq), data), now):
+            assert "\0" not in text.text
+    texts.expire(now + 3)
+    assert not texts._open
+
+
+def test_severity_in_words() -> None:
+    assert str(StatusText(2, "Preflight Fail: Yaw")) == "CRITICAL: Preflight Fail: Yaw"
+    assert StatusText(3, "").is_error
+    assert not StatusText(4, "").is_error
+    assert str(StatusText(9, "?")) == "9: ?"
+
+
+@pytest.mark.parametrize("text", ["", "\t", "   "])
+def test_empty_texts(text: str) -> None:
+    assert [each.text for each in StatusTextAssembler().receive(Statustext(6, text), 0.0)] == [""]
+
+
+def test_the_standard_dialect_knows_the_message() -> None:
+    assert STANDARD[253] is Statustext
