@@ -102,7 +102,11 @@ SUBSCRIPTION_HZ = 4.0
 
 _ALSO_STREAMED = (
     *("ActuatorControlTarget", "ActuatorOutputStatus", "Ahrs2", "Ahrs3", "Altitude", "AttitudeQuaternion"),
-    *("AttitudeTarget", "Battery2", "CameraTriggerStatus", "DeepStall", "EfiStatus", "EscInfo", "EscStatus"),
+    *(
+        "AttitudeTarget",
+        "Battery2",
+        "EfiStatus",
+    ),
     *("GimbalDeviceAttitudeStatus", "GimbalManagerStatus", "GlobalPositionIntCov", "GpsStatus", "Gps2Raw"),
     *("HighLatency2", "HighresImu", "HilActuatorControls", "HygrometerSensor", "LocalPositionNedCov"),
     *("LocalPositionNedSystemGlobalOffset", "ManualControl", "NavControllerOutput", "ObstacleDistance"),

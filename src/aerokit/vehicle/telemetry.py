@@ -11,6 +11,7 @@ from aerokit.mavlink import messages
 from aerokit.mavlink.enums import MavLandedState, MavProtocolCapability, MavState, MavVtolState
 from aerokit.runtime.cells import Source, StateCell
 from aerokit.vehicle import decoding
+from aerokit.vehicle.feeds import FEEDS, MESSAGE_IDS, message_type
 from aerokit.vehicle.status_text import StatusTextAssembler
 from aerokit.vehicle.values import (
     Attitude,
@@ -77,7 +78,7 @@ class Telemetry:
         self._make_cells()
         self._handlers = {messages.Heartbeat.ID: self._entry("Heartbeat", self._on_heartbeat)}
         self._handlers.update(
-            {_ID[name]: self._entry(name, handler) for name, handler in self._table().items()}
+            {MESSAGE_IDS[name]: self._entry(name, handler) for name, handler in self._table().items()}
         )
 
     def _make_cells(self) -> None:
@@ -195,12 +196,12 @@ class Telemetry:
     @property
     def default_rates(self) -> Mapping[type[Message], float]:
         """Message class → Hz, for a program that asks for nothing special."""
-        known = {_message_type(name): hz for name, hz in DEFAULT_RATES_HZ.items()}
+        known = {message_type(name): hz for name, hz in DEFAULT_RATES_HZ.items()}
         return {message: hz for message, hz in known.items() if self.autopilot.sends(message)}
 
     def required_messages(self, name: str) -> tuple[type[Message], ...]:
         """The messages to ask for when a program wants the cell of this name."""
-        types = (_message_type(feed) for feed in _FEEDS[name])
+        types = (message_type(feed) for feed in FEEDS[name])
         return tuple(message for message in types if self.autopilot.sends(message))
 
     def texts_since(self, at: float) -> tuple[StatusText, ...]:
@@ -214,7 +215,7 @@ class Telemetry:
         return cell
 
     def _source(self, class_name: str) -> Source:
-        return Source(self.system_id, self.component_id, _message_type(class_name).NAME)
+        return Source(self.system_id, self.component_id, message_type(class_name).NAME)
 
     def _entry(self, class_name: str, handler: Handler) -> Callable[[Any], None]:
         source = self._source(class_name)
@@ -359,39 +360,6 @@ class Telemetry:
     def _tell(self, texts: Iterable[StatusText], source: Source) -> None:
         for text in texts:
             self.status_text.set(text, source)
-
-
-_ID: Mapping[str, int] = {row[0]: message_id for message_id, row in messages.INDEX.items()}
-
-_FEEDS: Mapping[str, tuple[str, ...]] = {
-    **dict.fromkeys(("mode", "armed", "system_status"), ("Heartbeat",)),
-    **dict.fromkeys(("landed_state", "vtol_state"), ("ExtendedSysState",)),
-    **dict.fromkeys(("position", "velocity", "heading_deg"), ("GlobalPositionInt",)),
-    **dict.fromkeys(("ground_speed_m_s", "air_speed_m_s", "climb_m_s", "throttle_percent"), ("VfrHud",)),
-    **dict.fromkeys(("version", "capabilities"), ("AutopilotVersion",)),
-    "attitude": ("Attitude",),
-    "local_position": ("LocalPositionNed",),
-    "gps": ("GpsRawInt",),
-    "batteries": ("BatteryStatus",),
-    "estimator": ("EkfStatusReport", "EstimatorStatus"),
-    "sensors": ("SysStatus",),
-    "home": ("HomePosition",),
-    "origin": ("GpsGlobalOrigin",),
-    "rc_channels": ("RcChannels",),
-    "servo_outputs": ("ServoOutputRaw",),
-    "wind": ("Wind", "WindCov"),
-    "range_finders": ("DistanceSensor",),
-    "vibration": ("Vibration",),
-    "system_time": ("SystemTime",),
-    "mission_current": ("MissionCurrent",),
-    "mission_reached": ("MissionItemReached",),
-    "status_text": ("Statustext",),
-}
-
-
-def _message_type(class_name: str) -> type[Message]:
-    message_type: type[Message] = getattr(messages, class_name)
-    return message_type
 
 
 def _with(items: tuple[Any, ...] | None, item: Any, key: Callable[[Any], int]) -> tuple[Any, ...]:
