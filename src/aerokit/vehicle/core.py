@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import anyio
 
 from aerokit.autopilots import autopilot_for
+from aerokit.autopilots.streams import subscription_rate_hz
 from aerokit.errors import CommandRejected
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import CommandAck, Heartbeat
@@ -168,8 +169,11 @@ class VehicleCore:
     ) -> Subscription[ItemT]:
         """Return a stream of messages or events of this vehicle, for use in a ``with`` block.
 
-        ``capacity=1`` gives the latest only, ``missed`` counts the others. ``rate_hz`` asks the vehicle to send these
-        messages that often (or faster, if others want it) while the block lasts; None takes them as they come.
+        ``capacity=1`` gives the latest only, ``missed`` counts the others.
+
+        Subscribing is the rate request: while the block lasts, the vehicle is asked to send these messages at
+        ``rate_hz`` (above 0, at most 1000), or faster if others want it. None means the default rate of a message that
+        comes in a stream; one that is sent when there is need (HEARTBEAT, STATUSTEXT, acks) is not asked for.
 
         Raises:
             LocalProtocolError: no type, a rate out of range, or a message that the dialect does not hold.
@@ -180,8 +184,10 @@ class VehicleCore:
         def attach(sink: Sink) -> list[Detach]:
             detach = self.connection.attach(types, sink, system_id=self.system_id)
             detach.append(self.connection.on_end(subscription.close))
-            if rate_hz is not None:
-                detach += [self._rates.want(each, rate_hz) for each in messages]
+            for each in messages:
+                hz = subscription_rate_hz(each.__name__) if rate_hz is None else rate_hz
+                if hz is not None:
+                    detach.append(self._rates.want(each, hz))
             return detach
 
         subscription: Subscription[ItemT] = Subscription(attach, capacity=capacity, overflow=overflow)

@@ -50,6 +50,8 @@ LANDED_ON_GROUND = 1
 MODE_GRACE_S = 3.0
 """How long HEARTBEAT, at 1 Hz, may lag behind an accepted command that changes the mode."""
 RESEND_S = 1.0
+STOP_HERE = (DO_REPOSITION, -1, CHANGE_MODE, 0, *(math.nan,) * 4)
+"""A place that is no number means: here, with the way it takes to brake."""
 
 
 class FlightActions(VehicleState):
@@ -415,9 +417,20 @@ class FlightActions(VehicleState):
     async def hold(self) -> None:
         """Stop and stay (a fixed wing circles); returns when HEARTBEAT tells the autopilot's mode for that.
 
-        Copter BRAKE, Plane LOITER, Rover HOLD, Sub POSHOLD, PX4 LOITER.
+        Copter BRAKE, Plane LOITER, Rover HOLD (a boat LOITER), Sub POSHOLD; PX4 LOITER where it comes to a stop.
+
+        Raises as :meth:`set_mode`; NotSupported when this vehicle has no mode for it.
         """
-        await self._ensure_mode(self._mode_for("hold", "hold"))
+        mode = self._mode_for("hold", "hold")
+        self._supersede_hold()
+        await self._stop_in(mode)
+
+    async def _stop_in(self, mode: Mode) -> None:
+        """PX4 in LOITER may be on its way somewhere: asking for the mode again would not stop it."""
+        if self._holds_by_reposition:
+            await self._explained_command(*STOP_HERE)
+        if not self._is_in(mode):
+            await self._change_mode(mode)
 
     def _hold_soon(self) -> None:
         """Tell the vehicle to hold without waiting: for the ends of blocks and for cancelled calls.
@@ -427,14 +440,17 @@ class FlightActions(VehicleState):
         mode = self.autopilot.mode_for("hold", is_vtol=self.is_vtol)
         if mode is None or not self.connection.is_open or not self.is_armed:
             return
-        self._commands.send_unconfirmed(DO_SET_MODE, *self.autopilot.mode_order(mode).params)
+        if self._holds_by_reposition:
+            self._commands.send_unconfirmed(*STOP_HERE)
+        else:
+            self._commands.send_unconfirmed(DO_SET_MODE, *self.autopilot.mode_order(mode).params)
         self._supersede_hold()
         scope = self._hold_scope = anyio.CancelScope()
 
         async def confirm() -> None:
             with scope:
                 try:
-                    await self._change_mode(mode)
+                    await self._stop_in(mode)
                 except AerokitError as error:
                     logger.warning("the vehicle was told to hold and did not confirm it: %s", error)
 
@@ -555,6 +571,10 @@ class FlightActions(VehicleState):
             return None
 
         return trouble
+
+    @property
+    def _holds_by_reposition(self) -> bool:
+        return self.autopilot.reposition is not None and self.autopilot.reposition_purpose == "hold"
 
     @property
     def _speeds_by_reposition(self) -> bool:
