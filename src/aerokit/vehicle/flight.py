@@ -46,7 +46,7 @@ RESULT_UNSUPPORTED = 3
 MAV_FRAME_GLOBAL_INT = 5
 MAV_FRAME_GLOBAL_RELATIVE_ALT_INT = 6
 POSITION_ONLY = 0x0FF8
-LANDED_ON_GROUND = 1
+LANDED_ON_GROUND, LANDED_IN_AIR = 1, 2
 MODE_GRACE_S = 3.0
 """How long HEARTBEAT, at 1 Hz, may lag behind an accepted command that changes the mode."""
 RESEND_S = 1.0
@@ -209,7 +209,7 @@ class FlightActions(VehicleState):
         Raises:
             LocalProtocolError: the altitude is out of range. Nothing was sent.
             NotSupported: this type of vehicle cannot take off.
-            OperationRejected: it is not armed; it refused; or its mode changed or it disarmed on the way.
+            OperationRejected: it is not armed, or flies already; it refused; or its mode changed or it disarmed on the way.
             OperationTimeout: it did not get there in time.
         """
         if not 0 < altitude_m <= 10_000:
@@ -218,6 +218,8 @@ class FlightActions(VehicleState):
         self._supersede_hold()
         if not self.is_armed:
             raise OperationRejected("take_off: the vehicle is not armed: await arm() first; nothing was sent")
+        if self.telemetry.landed_state.latest == LANDED_IN_AIR:
+            raise OperationRejected("take_off: the vehicle flies already: go_to() climbs too; nothing was sent")
         try:
             await self._begin_take_off(plan)
             await self._await_altitude(altitude_m, plan, timeout)
@@ -295,7 +297,7 @@ class FlightActions(VehicleState):
             if speed_m_s is not None and not self._speeds_by_reposition:
                 await self.set_speed(speed_m_s)  # ArduPilot obeys it only once it is under way
             if heading_deg is not None and math.isnan(yaw):
-                await self.set_heading(heading_deg)
+                await self._explained_command(CONDITION_YAW, heading_deg % 360)
             await self._await_arrival(target, near_m, timeout)
         except (anyio.get_cancelled_exc_class(), CommandRejected, CommandTimeout):
             self._hold_soon()
@@ -477,25 +479,58 @@ class FlightActions(VehicleState):
         await self._explained_command(DO_CHANGE_SPEED, 1, speed_m_s, -1)
 
     async def set_heading(
-        self, heading_deg: float, *, relative: bool = False, rate_deg_s: float = 0.0
+        self,
+        heading_deg: float,
+        *,
+        relative: bool = False,
+        rate_deg_s: float = 0.0,
+        tolerance_deg: float = 5.0,
+        timeout: float = 60.0,
     ) -> None:
-        """Turn to a heading in degrees clockwise from north; ``relative``: by so many degrees, left is negative.
+        """Turn on the spot and return when the nose points there.
 
-        ArduPilot: MAV_CMD_CONDITION_YAW, in GUIDED. PX4 has no such command: MAV_CMD_DO_REPOSITION on the spot.
-        Returns when the vehicle has accepted; follow ``vehicle.heading_deg`` for the turn itself.
+        ArduPilot: MAV_CMD_CONDITION_YAW, in GUIDED, which it is put into. PX4 has no such command and stops where it
+        is to turn: MAV_CMD_DO_REPOSITION.
+
+        Args:
+            heading_deg: −360 to 360, clockwise from north; ``relative``: by so many degrees, left is negative.
+            relative: count from the present heading.
+            rate_deg_s: how fast, degrees per second; 0 leaves it to the autopilot. PX4 does not look at it.
+            tolerance_deg: how near is there.
+            timeout: seconds until it is there.
+
+        Raises:
+            LocalProtocolError: out of range. Nothing was sent.
+            CommandRejected: the vehicle refused.
+            OperationRejected: the mode changed or it disarmed on the way.
+            OperationTimeout: it did not get there in time.
         """
         if not -360 <= heading_deg <= 360:
             raise LocalProtocolError(f"heading_deg = {heading_deg!r} is not allowed: −360 to 360")
+        start = self.telemetry.heading_deg.value
+        goal = (start + heading_deg if relative else heading_deg) % 360
         if self._turns_by_reposition:
-            absolute = heading_deg + (self.telemetry.heading_deg.value if relative else 0.0)
-            yaw = math.remainder(math.radians(absolute), 2 * math.pi)
-            await self._explained_command(
-                DO_REPOSITION, -1, CHANGE_MODE, 0, yaw, *(math.nan, math.nan, math.nan)
-            )
-            return
-        angle = abs(heading_deg) if relative else heading_deg % 360
-        direction = (1 if heading_deg >= 0 else -1) if relative else 0
-        await self._explained_command(CONDITION_YAW, angle, rate_deg_s, direction, 1 if relative else 0)
+            yaw = math.remainder(math.radians(goal), 2 * math.pi)
+            await self._explained_command(DO_REPOSITION, -1, CHANGE_MODE, 0, yaw, *(math.nan,) * 3)
+        else:
+            await self._ensure_mode(self._mode_for("set_heading", "setpoint"))
+            direction = (1 if heading_deg >= 0 else -1) if relative else 0
+            angle = abs(heading_deg) if relative else goal
+            await self._explained_command(CONDITION_YAW, angle, rate_deg_s, direction, 1 if relative else 0)
+        await self._await_heading(goal, tolerance_deg, timeout)
+
+    async def _await_heading(self, goal: float, tolerance_deg: float, timeout: float) -> None:
+        def off() -> float:
+            return abs(math.remainder(self.telemetry.heading_deg.value - goal, 360))
+
+        await await_progress(
+            self,
+            f"set_heading({goal:g}°)",
+            is_done=lambda: off() <= tolerance_deg,
+            trouble=self._stays_in(self._mode_for("set_heading", self.autopilot.reposition_purpose)),
+            describe=lambda: f"it is {off():.0f}° off",
+            timeout=timeout,
+        )
 
     async def look_at(self, target: Position) -> None:
         """Make nose or gimbal point at a place (MAV_CMD_DO_SET_ROI_LOCATION), until :meth:`stop_looking`."""

@@ -45,8 +45,14 @@ class VehicleHealth(VehicleCore):
         await self._settle()
         if not self._arming_texts(since) and self.autopilot.runs_prearm_checks:
             await self._run_prearm_checks()
-        reasons = dict.fromkeys([*self._arming_texts(since), *self._failing()])
+        reasons = dict.fromkeys([*self._arming_texts(since), *self._unarmable_mode(), *self._failing()])
         return tuple(reasons)
+
+    def _unarmable_mode(self) -> list[str]:
+        mode = self.telemetry.mode.latest
+        if mode is None or mode.name not in self.autopilot.unarmable_modes:
+            return []
+        return [f"{self.autopilot.firmware} does not arm in {mode.name}: set another mode first"]
 
     async def _run_prearm_checks(self) -> None:
         try:
