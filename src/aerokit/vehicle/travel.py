@@ -1,0 +1,291 @@
+"""Flying, driving or diving somewhere: places, speed, heading."""
+
+from __future__ import annotations
+
+import math
+
+import anyio
+
+from aerokit import geo
+from aerokit.errors import CommandRejected, CommandTimeout, LocalProtocolError, OperationRejected
+from aerokit.mavlink.messages import SetPositionTargetGlobalInt
+from aerokit.vehicle.arming import ArmingActions
+from aerokit.vehicle.modes import CHANGE_MODE, DO_REPOSITION, RESULT_UNSUPPORTED
+from aerokit.vehicle.progress import await_progress
+from aerokit.vehicle.values import Position
+
+__all__ = ["TravelActions"]
+
+CONDITION_YAW = 115
+DO_CHANGE_SPEED = 178
+DO_SET_ROI_LOCATION = 195
+DO_SET_ROI_NONE = 197
+MAV_FRAME_GLOBAL_INT = 5
+MAV_FRAME_GLOBAL_RELATIVE_ALT_INT = 6
+POSITION_ONLY = 0x0FF8
+RESEND_S = 1.0
+
+
+class TravelActions(ArmingActions):
+    """Going to a place, turning, looking."""
+
+    _resend: SetPositionTargetGlobalInt | None = None
+
+    async def go_to(
+        self,
+        target: Position,
+        *,
+        speed_m_s: float | None = None,
+        heading_deg: float | None = None,
+        tolerance_m: float | None = None,
+        timeout: float | None = None,
+    ) -> None:
+        """Fly to a place and return on arrival. Cancelled half-way, the vehicle is told to hold where it is.
+
+        Args:
+            target: latitude and longitude, and an altitude above home or above mean sea level; without an altitude
+                the present one is kept.
+            speed_m_s: ground speed from now on, above 0; None leaves it.
+            heading_deg: where to look on arrival, 0–360 clockwise from north; None leaves it to the autopilot.
+            tolerance_m: how near is there, in metres; None: what suits the type of vehicle.
+            timeout: seconds; None: as long as it takes, provided that heartbeats come and the mode stays.
+
+        Sends MAV_CMD_DO_REPOSITION (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_REPOSITION), and
+        SET_POSITION_TARGET_GLOBAL_INT to a vehicle that does not know it.
+
+        Raises:
+            LocalProtocolError: the target is no place on earth. Nothing was sent.
+            ValueUnknownError: position or home is not known and is needed here.
+            CommandRejected: the vehicle refused (outside its fence, no position, …).
+            OperationRejected: on the way the mode changed (a pilot, a failsafe) or the vehicle disarmed.
+            OperationTimeout: it did not arrive in time.
+        """
+        latitude, longitude, altitude, is_relative = self._global_target(target)
+        near_m = self.autopilot.arrival_radius_m if tolerance_m is None else tolerance_m
+        self._supersede_hold()
+        if not self.is_armed:
+            raise OperationRejected("go_to: the vehicle is not armed; nothing was sent")
+        if speed_m_s is not None:
+            _check_speed(speed_m_s)
+        yaw = self._reposition_yaw(heading_deg)
+        await self._send_there(latitude, longitude, altitude, is_relative, yaw, speed_m_s)
+        try:
+            if speed_m_s is not None and not self._speeds_by_reposition:
+                await self.set_speed(speed_m_s)  # ArduPilot obeys it only once it is under way
+            if heading_deg is not None and math.isnan(yaw):
+                await self._explained_command(CONDITION_YAW, heading_deg % 360)
+            await self._await_arrival(target, near_m, timeout)
+        except (anyio.get_cancelled_exc_class(), CommandRejected, CommandTimeout):
+            self._hold_soon()
+            raise
+
+    async def _send_there(
+        self,
+        latitude: int,
+        longitude: int,
+        altitude: float,
+        is_relative: bool,
+        yaw: float,
+        speed_m_s: float | None,
+    ) -> None:
+        started = self.connection.now()
+        frame = MAV_FRAME_GLOBAL_RELATIVE_ALT_INT if is_relative else MAV_FRAME_GLOBAL_INT
+        speed = speed_m_s if speed_m_s is not None and self._speeds_by_reposition else -1
+        params = (speed, CHANGE_MODE, 0, yaw)
+        self._resend = None
+        try:
+            await self._commands.send_int(
+                DO_REPOSITION, *params, frame=frame, x=latitude, y=longitude, z=altitude
+            )
+        except CommandRejected as error:
+            if error.result != RESULT_UNSUPPORTED:
+                await self._settle()
+                raise self._explained(error, started) from None
+            await self._ensure_mode(self._mode_for("go_to", "setpoint"))
+            self._resend = self._position_target(latitude, longitude, altitude, frame)
+            self.connection.send(self._resend)
+
+    def _position_target(
+        self, latitude: int, longitude: int, altitude: float, frame: int
+    ) -> SetPositionTargetGlobalInt:
+        zeros = (0.0,) * 8
+        return SetPositionTargetGlobalInt(
+            0, self.system_id, self.component_id, frame, POSITION_ONLY, latitude, longitude, altitude, *zeros
+        )
+
+    async def _await_arrival(
+        self,
+        target: Position,
+        near_m: float,
+        timeout: float | None,
+    ) -> None:
+        """Wait for it. The older message has no answer, so it is repeated for as long as this call lasts."""
+        sent_at, resend = self.connection.now(), self._resend
+
+        def is_there() -> bool:
+            nonlocal sent_at
+            if resend is not None and self.connection.now() - sent_at >= RESEND_S:
+                sent_at = self.connection.now()
+                self.connection.send(resend)
+            return self.distance_to(target) <= near_m
+
+        await await_progress(
+            self,
+            f"go_to({target.latitude_deg:.7f}, {target.longitude_deg:.7f})",
+            is_done=is_there,
+            trouble=self._stays_in(self._mode_for("go_to", self.autopilot.reposition_purpose)),
+            describe=lambda: f"it is {self.distance_to(target):.1f} m away",
+            timeout=timeout,
+            held_for=0.5,
+        )
+
+    async def set_speed(self, speed_m_s: float) -> None:
+        """Change the ground speed for flying somewhere, in m/s, above 0 (MAV_CMD_DO_CHANGE_SPEED).
+
+        ArduPilot takes it only while it is under way in GUIDED or AUTO; ``go_to(speed_m_s=...)`` sees to that.
+
+        Raises:
+            LocalProtocolError: out of range. Nothing was sent.
+            CommandRejected: the vehicle refused.
+        """
+        _check_speed(speed_m_s)
+        await self._explained_command(DO_CHANGE_SPEED, 1, speed_m_s, -1)
+
+    async def set_heading(
+        self,
+        heading_deg: float,
+        *,
+        relative: bool = False,
+        rate_deg_s: float = 0.0,
+        tolerance_deg: float = 5.0,
+        timeout: float = 60.0,
+    ) -> None:
+        """Turn on the spot and return when the nose points there.
+
+        ArduPilot: MAV_CMD_CONDITION_YAW, in GUIDED, which it is put into. PX4 has no such command and stops where it
+        is to turn: MAV_CMD_DO_REPOSITION.
+
+        Args:
+            heading_deg: −360 to 360, clockwise from north; ``relative``: by so many degrees, left is negative.
+            relative: count from the present heading.
+            rate_deg_s: how fast, degrees per second; 0 leaves it to the autopilot. PX4 does not look at it.
+            tolerance_deg: how near is there.
+            timeout: seconds until it is there.
+
+        Raises:
+            LocalProtocolError: out of range. Nothing was sent.
+            CommandRejected: the vehicle refused.
+            OperationRejected: the mode changed or it disarmed on the way.
+            OperationTimeout: it did not get there in time.
+        """
+        if not -360 <= heading_deg <= 360:
+            raise LocalProtocolError(f"heading_deg = {heading_deg!r} is not allowed: −360 to 360")
+        start = self.telemetry.heading_deg.value
+        goal = (start + heading_deg if relative else heading_deg) % 360
+        if self._turns_by_reposition:
+            yaw = math.remainder(math.radians(goal), 2 * math.pi)
+            await self._explained_command(DO_REPOSITION, -1, CHANGE_MODE, 0, yaw, *(math.nan,) * 3)
+        else:
+            await self._ensure_mode(self._mode_for("set_heading", "setpoint"))
+            direction = (1 if heading_deg >= 0 else -1) if relative else 0
+            angle = abs(heading_deg) if relative else goal
+            await self._explained_command(CONDITION_YAW, angle, rate_deg_s, direction, 1 if relative else 0)
+        await self._await_heading(goal, tolerance_deg, timeout)
+
+    async def _await_heading(self, goal: float, tolerance_deg: float, timeout: float) -> None:
+        def off() -> float:
+            return abs(math.remainder(self.telemetry.heading_deg.value - goal, 360))
+
+        await await_progress(
+            self,
+            f"set_heading({goal:g}°)",
+            is_done=lambda: off() <= tolerance_deg,
+            trouble=self._stays_in(self._mode_for("set_heading", self.autopilot.reposition_purpose)),
+            describe=lambda: f"it is {off():.0f}° off",
+            timeout=timeout,
+        )
+
+    async def look_at(self, target: Position) -> None:
+        """Make nose or gimbal point at a place (MAV_CMD_DO_SET_ROI_LOCATION), until :meth:`stop_looking`."""
+        latitude, longitude, altitude, is_relative = self._global_target(target)
+        frame = MAV_FRAME_GLOBAL_RELATIVE_ALT_INT if is_relative else MAV_FRAME_GLOBAL_INT
+        started = self.connection.now()
+        try:
+            await self._commands.send_int(
+                DO_SET_ROI_LOCATION, frame=frame, x=latitude, y=longitude, z=altitude
+            )
+        except CommandRejected as error:
+            raise self._explained(error, started) from None
+
+    async def stop_looking(self) -> None:
+        """End :meth:`look_at` (MAV_CMD_DO_SET_ROI_NONE)."""
+        await self._explained_command(DO_SET_ROI_NONE)
+
+    def distance_to(self, target: Position) -> float:
+        """Metres from where the vehicle is to ``target``; in three dimensions when ``target`` has an altitude.
+
+        Infinite while the position is unknown.
+        """
+        here = self.telemetry.position.latest
+        if here is None:
+            return math.inf
+        along = geo.distance_m(
+            here.latitude_deg, here.longitude_deg, target.latitude_deg, target.longitude_deg
+        )
+        return math.hypot(along, self._altitude_difference(here, target))
+
+    @staticmethod
+    def _altitude_difference(here: Position, target: Position) -> float:
+        for mine, its in (
+            (here.altitude_relative_m, target.altitude_relative_m),
+            (here.altitude_amsl_m, target.altitude_amsl_m),
+        ):
+            if mine is not None and its is not None:
+                return mine - its
+        return 0.0
+
+    def _altitude_relative(self) -> float:
+        here = self.telemetry.position.latest
+        altitude = None if here is None else here.altitude_relative_m
+        return -math.inf if altitude is None else altitude
+
+    def _home_altitude(self) -> float:
+        return self.telemetry.home.value.altitude_amsl_m
+
+    def _global_target(self, target: Position) -> tuple[int, int, float, bool]:
+        """Latitude and longitude in 1e-7 degrees, altitude in metres, and whether it is above home.
+
+        PX4 reads altitudes above mean sea level only, so home must be known there for one above home.
+        """
+        relative, amsl = target.altitude_relative_m, target.altitude_amsl_m
+        if relative is None and amsl is None:
+            relative = self.telemetry.position.value.altitude_relative_m
+        is_relative = relative is not None
+        altitude = relative if relative is not None else amsl
+        if altitude is None:
+            raise LocalProtocolError("the target has no altitude, and the vehicle's own is not known")
+        if is_relative and not self._takes_relative_altitude:
+            altitude, is_relative = altitude + self._home_altitude(), False
+        return round(target.latitude_deg * 1e7), round(target.longitude_deg * 1e7), altitude, is_relative
+
+    @property
+    def _speeds_by_reposition(self) -> bool:
+        return self.autopilot.reposition is not None and self.autopilot.reposition.speed
+
+    @property
+    def _turns_by_reposition(self) -> bool:
+        return self.autopilot.reposition is not None and self.autopilot.reposition.yaw
+
+    @property
+    def _takes_relative_altitude(self) -> bool:
+        return self.autopilot.reposition is None or self.autopilot.reposition.relative_altitude
+
+    def _reposition_yaw(self, heading_deg: float | None) -> float:
+        if heading_deg is None or not self._turns_by_reposition:
+            return math.nan
+        return math.remainder(math.radians(heading_deg), 2 * math.pi)
+
+
+def _check_speed(speed_m_s: float) -> None:
+    if not 0 < speed_m_s <= 1000:
+        raise LocalProtocolError(f"speed_m_s = {speed_m_s!r} is not allowed: above 0, at most 1000")
