@@ -30,7 +30,9 @@ def served(copters: Sequence[SimulatedCopter], *addresses: str, speedup: float =
 
     @asynccontextmanager
     async def serve() -> AsyncIterator[str]:
-        async with open_simulator(copters, *(addresses or ["tcpin:127.0.0.1:0"]), speedup=speedup) as simulator:
+        async with open_simulator(
+            copters, *(addresses or ["tcpin:127.0.0.1:0"]), speedup=speedup
+        ) as simulator:
             yield simulator.addresses[0].replace("tcpin:", "tcp:")
 
     with start_blocking_portal() as portal, portal.wrap_async_context_manager(serve()) as address:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Generic, TypeVar
 
-from aerokit.vehicle.guided import (
+from aerokit.vehicle.setpoints import (
     AccelerationSetpoint,
     AttitudeSetpoint,
     BodyVelocitySetpoint,

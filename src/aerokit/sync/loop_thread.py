@@ -40,6 +40,7 @@ class LoopThread:
         self._portal = started.result()
         self._is_closed = False
         self._lock = threading.Lock()
+        self._stopping: asyncio.Task[None] | None = None
         atexit.register(self.close)
 
     def run(self, function: Callable[P, Awaitable[T]], *args: P.args, **kwargs: P.kwargs) -> T:
@@ -90,10 +91,12 @@ class LoopThread:
                 return
             self._is_closed = True
         atexit.unregister(self.close)
+        if self.is_current:
+            self._stopping = asyncio.get_running_loop().create_task(self._portal.stop(True))
+            return
         with contextlib.suppress(RuntimeError):  # it has stopped by itself
             self._portal.start_task_soon(self._portal.stop, True)
-        if not self.is_current:
-            self._thread.join(CLOSE_S)
+        self._thread.join(CLOSE_S)
 
     @property
     def is_current(self) -> bool:

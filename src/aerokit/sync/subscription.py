@@ -50,9 +50,9 @@ class Subscription(Generic[ItemT]):
         """Return the next item if there is one."""
         return self._loop.call(self._subscription.get_nowait)
 
-    def close(self) -> None:
-        """Take no more items; a waiting reader comes to its end."""
-        self._loop.call(self._subscription.close)
+    def close(self, error: Exception | None = None) -> None:
+        """Take no more items; a waiting reader gets ``error``, or the end of the iteration without one."""
+        self._loop.call(self._subscription.close, error)
 
     def __enter__(self) -> Self:
         self._loop.call(self._subscription.__enter__)

@@ -181,9 +181,24 @@ class Vehicle(VehicleState):
         """Change the ground speed for flying somewhere, m/s; see :meth:`aerokit.Vehicle.set_speed`."""
         self._loop.run(self.aio.set_speed, speed_m_s)
 
-    def set_heading(self, heading_deg: float, *, relative: bool = False, rate_deg_s: float = 0.0) -> None:
-        """Turn to a heading in degrees; see :meth:`aerokit.Vehicle.set_heading`."""
-        self._loop.run(self.aio.set_heading, heading_deg, relative=relative, rate_deg_s=rate_deg_s)
+    def set_heading(
+        self,
+        heading_deg: float,
+        *,
+        relative: bool = False,
+        rate_deg_s: float = 0.0,
+        tolerance_deg: float = 5.0,
+        timeout: float = 60.0,
+    ) -> None:
+        """Turn on the spot and return when the nose points there; see :meth:`aerokit.Vehicle.set_heading`."""
+        self._loop.run(
+            self.aio.set_heading,
+            heading_deg,
+            relative=relative,
+            rate_deg_s=rate_deg_s,
+            tolerance_deg=tolerance_deg,
+            timeout=timeout,
+        )
 
     def look_at(self, target: Position) -> None:
         """Make nose or gimbal point at a place; see :meth:`aerokit.Vehicle.look_at`."""
