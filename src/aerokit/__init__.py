@@ -19,16 +19,30 @@ from aerokit.mavlink import enums, messages
 from aerokit.mavlink.dialect import Dialect
 from aerokit.runtime.connection import Connection, open_connection
 from aerokit.vehicle.connect import connect
+from aerokit.vehicle.setpoints import (
+    AccelerationSetpoint,
+    AttitudeSetpoint,
+    BodyVelocitySetpoint,
+    LocalPositionSetpoint,
+    PositionSetpoint,
+    VelocitySetpoint,
+)
 from aerokit.vehicle.values import Position
 from aerokit.vehicle.vehicle import Vehicle
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "AccelerationSetpoint",
+    "AttitudeSetpoint",
+    "BodyVelocitySetpoint",
     "Connection",
     "Dialect",
+    "LocalPositionSetpoint",
     "Position",
+    "PositionSetpoint",
     "Vehicle",
+    "VelocitySetpoint",
     "connect",
     "enums",
     "errors",

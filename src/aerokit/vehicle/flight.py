@@ -35,7 +35,8 @@ class FlightActions(TravelActions):
         Raises:
             LocalProtocolError: the altitude is out of range. Nothing was sent.
             NotSupported: this type of vehicle cannot take off.
-            OperationRejected: it is not armed, or flies already; it refused; or its mode changed or it disarmed on the way.
+            OperationRejected: it is not armed or flies already, it refused, or its mode changed or it disarmed on the
+                way.
             OperationTimeout: it did not get there in time.
         """
         if not 0 < altitude_m <= 10_000:

@@ -9,18 +9,20 @@ from __future__ import annotations
 
 import asyncio
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Generic, TypeVar
 
 import anyio
 
 from aerokit.errors import AerokitError, LocalProtocolError, SetpointStreamStopped
-from aerokit.mavlink.messages import (
-    SetAttitudeTarget,
-    SetPositionTargetGlobalInt,
-    SetPositionTargetLocalNed,
+from aerokit.vehicle.setpoints import (
+    AccelerationSetpoint,
+    AttitudeSetpoint,
+    BodyVelocitySetpoint,
+    LocalPositionSetpoint,
+    PositionSetpoint,
+    SetpointEncoder,
+    VelocitySetpoint,
 )
-from aerokit.vehicle.values import Position
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -32,95 +34,12 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.vehicle.vehicle import Vehicle
 
-__all__ = [
-    "AccelerationSetpoint",
-    "AttitudeSetpoint",
-    "BodyVelocitySetpoint",
-    "Guided",
-    "LocalPositionSetpoint",
-    "PositionSetpoint",
-    "SetpointStream",
-    "VelocitySetpoint",
-]
+__all__ = ["Guided", "SetpointStream"]
 
 SetpointT = TypeVar("SetpointT")
 
-MAV_FRAME_LOCAL_NED = 1
-MAV_FRAME_GLOBAL_INT = 5
-MAV_FRAME_GLOBAL_RELATIVE_ALT_INT = 6
-MAV_FRAME_BODY_NED = 8
-IGNORE_POSITION, IGNORE_VELOCITY, IGNORE_ACCELERATION = 0x007, 0x038, 0x1C0
-IGNORE_YAW, IGNORE_YAW_RATE = 0x400, 0x800
-IGNORE_BODY_RATES = 0x07
 ENTRY_S = 1.0
 """How long the initial set-point is streamed before PX4 is asked for OFFBOARD: it wants to see a stream first."""
-
-
-@dataclass(frozen=True)
-class VelocitySetpoint:
-    """Velocity over ground in m/s, north, east, down; with a heading (degrees) or a turn rate (degrees/s, clockwise)."""
-
-    north_m_s: float = 0.0
-    east_m_s: float = 0.0
-    down_m_s: float = 0.0
-    yaw_deg: float | None = None
-    yaw_rate_deg_s: float | None = None
-
-
-@dataclass(frozen=True)
-class BodyVelocitySetpoint:
-    """Velocity in m/s as seen from the vehicle: forward, right, down; with a heading or a turn rate."""
-
-    forward_m_s: float = 0.0
-    right_m_s: float = 0.0
-    down_m_s: float = 0.0
-    yaw_deg: float | None = None
-    yaw_rate_deg_s: float | None = None
-
-
-@dataclass(frozen=True)
-class AccelerationSetpoint:
-    """Acceleration in m/s², north, east, down; with a heading or a turn rate."""
-
-    north_m_s2: float = 0.0
-    east_m_s2: float = 0.0
-    down_m_s2: float = 0.0
-    yaw_deg: float | None = None
-    yaw_rate_deg_s: float | None = None
-
-
-@dataclass(frozen=True)
-class LocalPositionSetpoint:
-    """A place in metres north, east and down of the estimator's origin (``vehicle.origin``)."""
-
-    north_m: float
-    east_m: float
-    down_m: float
-    yaw_deg: float | None = None
-    yaw_rate_deg_s: float | None = None
-
-
-@dataclass(frozen=True)
-class PositionSetpoint:
-    """A place on the globe; ``position`` with ``altitude_relative_m`` or ``altitude_amsl_m``."""
-
-    position: Position
-    yaw_deg: float | None = None
-    yaw_rate_deg_s: float | None = None
-
-
-@dataclass(frozen=True)
-class AttitudeSetpoint:
-    """Attitude in degrees and ``thrust`` from 0 to 1.
-
-    ArduCopter reads ``thrust`` as climb rate in GUIDED unless GUID_OPTIONS says otherwise: 0.5 holds the altitude.
-    PX4 reads it as collective thrust.
-    """
-
-    roll_deg: float
-    pitch_deg: float
-    yaw_deg: float
-    thrust: float
 
 
 class Guided:
@@ -132,6 +51,7 @@ class Guided:
 
     def __init__(self, vehicle: Vehicle) -> None:
         self._vehicle = vehicle
+        self._encode = SetpointEncoder(vehicle)
 
     def velocity(
         self,
@@ -142,7 +62,7 @@ class Guided:
         max_lag_s: float = 0.5,
     ) -> SetpointStream[VelocitySetpoint]:
         """Stream velocities over ground (SET_POSITION_TARGET_LOCAL_NED)."""
-        return SetpointStream(self._vehicle, self._velocity, initial, rate_hz, valid_for_s, max_lag_s)
+        return SetpointStream(self._vehicle, self._encode.velocity, initial, rate_hz, valid_for_s, max_lag_s)
 
     def body_velocity(
         self,
@@ -153,7 +73,9 @@ class Guided:
         max_lag_s: float = 0.5,
     ) -> SetpointStream[BodyVelocitySetpoint]:
         """Stream velocities as seen from the vehicle (SET_POSITION_TARGET_LOCAL_NED in MAV_FRAME_BODY_NED)."""
-        return SetpointStream(self._vehicle, self._body_velocity, initial, rate_hz, valid_for_s, max_lag_s)
+        return SetpointStream(
+            self._vehicle, self._encode.body_velocity, initial, rate_hz, valid_for_s, max_lag_s
+        )
 
     def acceleration(
         self,
@@ -164,7 +86,9 @@ class Guided:
         max_lag_s: float = 0.5,
     ) -> SetpointStream[AccelerationSetpoint]:
         """Stream accelerations (SET_POSITION_TARGET_LOCAL_NED)."""
-        return SetpointStream(self._vehicle, self._acceleration, initial, rate_hz, valid_for_s, max_lag_s)
+        return SetpointStream(
+            self._vehicle, self._encode.acceleration, initial, rate_hz, valid_for_s, max_lag_s
+        )
 
     def local_position(
         self,
@@ -175,7 +99,9 @@ class Guided:
         max_lag_s: float = 0.5,
     ) -> SetpointStream[LocalPositionSetpoint]:
         """Stream places in the local frame (SET_POSITION_TARGET_LOCAL_NED)."""
-        return SetpointStream(self._vehicle, self._local_position, initial, rate_hz, valid_for_s, max_lag_s)
+        return SetpointStream(
+            self._vehicle, self._encode.local_position, initial, rate_hz, valid_for_s, max_lag_s
+        )
 
     def position(
         self,
@@ -186,7 +112,7 @@ class Guided:
         max_lag_s: float = 0.5,
     ) -> SetpointStream[PositionSetpoint]:
         """Stream places on the globe (SET_POSITION_TARGET_GLOBAL_INT)."""
-        return SetpointStream(self._vehicle, self._position, initial, rate_hz, valid_for_s, max_lag_s)
+        return SetpointStream(self._vehicle, self._encode.position, initial, rate_hz, valid_for_s, max_lag_s)
 
     def attitude(
         self,
@@ -197,89 +123,7 @@ class Guided:
         max_lag_s: float = 0.3,
     ) -> SetpointStream[AttitudeSetpoint]:
         """Stream attitudes with thrust (SET_ATTITUDE_TARGET)."""
-        return SetpointStream(self._vehicle, self._attitude, initial, rate_hz, valid_for_s, max_lag_s)
-
-    # ------------------------------------------------------------------------------ messages
-
-    def _velocity(self, s: VelocitySetpoint) -> Message:
-        vector = (s.north_m_s, s.east_m_s, s.down_m_s)
-        return self._local(MAV_FRAME_LOCAL_NED, IGNORE_VELOCITY, vector, s.yaw_deg, s.yaw_rate_deg_s)
-
-    def _body_velocity(self, s: BodyVelocitySetpoint) -> Message:
-        vector = (s.forward_m_s, s.right_m_s, s.down_m_s)
-        return self._local(MAV_FRAME_BODY_NED, IGNORE_VELOCITY, vector, s.yaw_deg, s.yaw_rate_deg_s)
-
-    def _acceleration(self, s: AccelerationSetpoint) -> Message:
-        vector = (s.north_m_s2, s.east_m_s2, s.down_m_s2)
-        return self._local(MAV_FRAME_LOCAL_NED, IGNORE_ACCELERATION, vector, s.yaw_deg, s.yaw_rate_deg_s)
-
-    def _local_position(self, s: LocalPositionSetpoint) -> Message:
-        vector = (s.north_m, s.east_m, s.down_m)
-        return self._local(MAV_FRAME_LOCAL_NED, IGNORE_POSITION, vector, s.yaw_deg, s.yaw_rate_deg_s)
-
-    def _local(
-        self,
-        frame: int,
-        group: int,
-        vector: tuple[float, float, float],
-        yaw_deg: float | None,
-        yaw_rate_deg_s: float | None,
-    ) -> Message:
-        """One SET_POSITION_TARGET_LOCAL_NED whose only vector is the one of ``group``."""
-        _check_finite("set-point", *vector)
-        everything = IGNORE_POSITION | IGNORE_VELOCITY | IGNORE_ACCELERATION
-        mask, yaw, yaw_rate = _yaw(yaw_deg, yaw_rate_deg_s)
-        none = (0.0, 0.0, 0.0)
-        vectors = [vector if group == each else none for each in _GROUPS]
-        return SetPositionTargetLocalNed(
-            self._time_ms(),
-            self._vehicle.system_id,
-            self._vehicle.component_id,
-            frame,
-            (everything & ~group) | mask,
-            *vectors[0],
-            *vectors[1],
-            *vectors[2],
-            yaw,
-            yaw_rate,
-        )
-
-    def _position(self, s: PositionSetpoint) -> Message:
-        mask, yaw, yaw_rate = _yaw(s.yaw_deg, s.yaw_rate_deg_s)
-        latitude, longitude, altitude, is_relative = self._vehicle._global_target(s.position)
-        return SetPositionTargetGlobalInt(
-            self._time_ms(),
-            self._vehicle.system_id,
-            self._vehicle.component_id,
-            MAV_FRAME_GLOBAL_RELATIVE_ALT_INT if is_relative else MAV_FRAME_GLOBAL_INT,
-            IGNORE_VELOCITY | IGNORE_ACCELERATION | mask,
-            latitude,
-            longitude,
-            altitude,
-            *(0.0, 0.0, 0.0),
-            *(0.0, 0.0, 0.0),
-            yaw,
-            yaw_rate,
-        )
-
-    def _attitude(self, s: AttitudeSetpoint) -> Message:
-        _check_finite("attitude", s.roll_deg, s.pitch_deg, s.yaw_deg, s.thrust)
-        if not 0 <= s.thrust <= 1:
-            raise LocalProtocolError(f"thrust = {s.thrust} is not allowed: 0 to 1")
-        return SetAttitudeTarget(
-            self._time_ms(),
-            self._vehicle.system_id,
-            self._vehicle.component_id,
-            IGNORE_BODY_RATES,
-            _quaternion(math.radians(s.roll_deg), math.radians(s.pitch_deg), math.radians(s.yaw_deg)),
-            0.0,
-            0.0,
-            0.0,
-            s.thrust,
-        )
-
-    def _time_ms(self) -> int:
-        return int(self._vehicle.connection.now() * 1000) & 0xFFFFFFFF
+        return SetpointStream(self._vehicle, self._encode.attitude, initial, rate_hz, valid_for_s, max_lag_s)
 
 
 class SetpointStream(Generic[SetpointT]):
@@ -446,34 +290,3 @@ class SetpointStream(Generic[SetpointT]):
 
     def _now(self) -> float:
         return self._vehicle.connection.now()
-
-
-_GROUPS = (IGNORE_POSITION, IGNORE_VELOCITY, IGNORE_ACCELERATION)
-
-
-def _yaw(yaw_deg: float | None, yaw_rate_deg_s: float | None) -> tuple[int, float, float]:
-    """Type-mask bits, yaw in radians and yaw rate in radians per second."""
-    if yaw_deg is not None and yaw_rate_deg_s is not None:
-        raise LocalProtocolError("give yaw_deg or yaw_rate_deg_s, not both")
-    _check_finite("yaw", yaw_deg or 0.0, yaw_rate_deg_s or 0.0)
-    mask = (IGNORE_YAW if yaw_deg is None else 0) | (IGNORE_YAW_RATE if yaw_rate_deg_s is None else 0)
-    return mask, math.radians(yaw_deg or 0.0), math.radians(yaw_rate_deg_s or 0.0)
-
-
-def _quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
-    """Roll, pitch, yaw in radians as w, x, y, z."""
-    cr, sr = math.cos(roll / 2), math.sin(roll / 2)
-    cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
-    cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
-    return (
-        cr * cp * cy + sr * sp * sy,
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-    )
-
-
-def _check_finite(what: str, *values: float) -> None:
-    for value in values:
-        if not math.isfinite(value):
-            raise LocalProtocolError(f"{what}: {value!r} is not a finite number")
