@@ -17,6 +17,7 @@ from __future__ import annotations
 from aerokit.sim.ardupilot import BootTimeline, SimulatedCopter
 from aerokit.sim.faults import CommandFault, Faults
 from aerokit.sim.motion import Wind
+from aerokit.sim.px4 import SimulatedPx4
 from aerokit.sim.server import SimulatorServer, open_simulator, simulated_link
 from aerokit.sim.vehicle import ExtraComponent, SimulatedVehicle
 
@@ -26,6 +27,7 @@ __all__ = [
     "ExtraComponent",
     "Faults",
     "SimulatedCopter",
+    "SimulatedPx4",
     "SimulatedVehicle",
     "SimulatorServer",
     "Wind",

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import struct
+import zlib
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
 __all__ = ["ParameterServer", "Parameters"]
 
 _UNCOUNTED = 0xFFFF
+_HASH_NAME = "_HASH_CHECK"
+_NO_NAN = 0xFEFFFFFF
 _LIST_BURST = 10
 _LIST_PERIOD_S = 0.005
 
@@ -83,45 +86,79 @@ class Parameters:
 class ParameterServer:
     """Answers PARAM_REQUEST_LIST, PARAM_REQUEST_READ and PARAM_SET.
 
-    With ``bytewise`` integers travel as their bytes (PX4), otherwise as numbers (ArduPilot). An unknown name
-    is met with silence, as both do (PX4 "main" sends PARAM_ERROR).
+    With ``bytewise`` integers travel as their bytes (PX4), otherwise as numbers (ArduPilot). With ``hash_check`` a
+    list begins with PX4's uncounted _HASH_CHECK, and setting that ends a running list. ``echoes`` PARAM_VALUEs
+    follow a PARAM_SET. An unknown name is met with silence (but PX4 "main" sends PARAM_ERROR).
     """
 
-    def __init__(self, vehicle: SimulatedVehicle, parameters: Parameters, *, bytewise: bool = False) -> None:
+    def __init__(
+        self,
+        vehicle: SimulatedVehicle,
+        parameters: Parameters,
+        *,
+        bytewise: bool = False,
+        hash_check: bool = False,
+        echoes: int = 1,
+    ) -> None:
         self._vehicle = vehicle
         self._parameters = parameters
         self._bytewise = bytewise
+        self._hash_check = hash_check
+        self._echoes = echoes
+        self._list_number = 0
         vehicle.on(ParamRequestList, self._on_list)
         vehicle.on(ParamRequestRead, self._on_read)
         vehicle.on(ParamSet, self._on_set)
 
     def _on_list(self, _: ParamRequestList, channel: Channel) -> None:
-        self._send_from(0, channel)
+        self._list_number += 1
+        if self._hash_check:
+            self._send_hash(channel)
+        self._send_from(0, channel, self._list_number)
 
-    def _send_from(self, index: int, channel: Channel) -> None:
+    def _send_from(self, index: int, channel: Channel, list_number: int) -> None:
         names = self._parameters.names
+        if list_number != self._list_number:
+            return
         for position in range(index, min(index + _LIST_BURST, len(names))):
             self._send(names[position], position, channel)
         if index + _LIST_BURST < len(names):
-            self._vehicle.call_later(_LIST_PERIOD_S, lambda: self._send_from(index + _LIST_BURST, channel))
+            self._vehicle.call_later(
+                _LIST_PERIOD_S, lambda: self._send_from(index + _LIST_BURST, channel, list_number)
+            )
 
     def _on_read(self, request: ParamRequestRead, channel: Channel) -> None:
         names = self._parameters.names
         if request.param_index >= 0:
             if request.param_index < len(names):
                 self._send(names[request.param_index], request.param_index, channel)
+        elif request.param_id == _HASH_NAME and self._hash_check:
+            self._send_hash(channel)
         elif request.param_id in self._parameters:
             self._send(request.param_id, names.index(request.param_id), channel)
 
     def _on_set(self, request: ParamSet, channel: Channel) -> None:
         name = request.param_id
+        if name == _HASH_NAME and self._hash_check:
+            self._list_number += 1
         if name not in self._parameters:
             return
         value = self._from_wire(request.param_value, self._parameters.type(name))
         if not math.isfinite(value):
             return
         self._parameters[name] = value
-        self._send(name, _UNCOUNTED, None)
+        for _ in range(self._echoes):
+            self._send(name, _UNCOUNTED, None)
+
+    def _send_hash(self, channel: Channel) -> None:
+        """A checksum over names and values, so that a client can keep its list when nothing has changed."""
+        parameters = self._parameters
+        crc = 0
+        for name in parameters.names:
+            crc = zlib.crc32(name.encode() + struct.pack("<f", parameters[name]), crc)
+        value = float(struct.unpack("<f", struct.pack("<I", crc & _NO_NAN))[0])
+        count = len(parameters)
+        self._vehicle.send(ParamValue(_HASH_NAME, value, MavParamType.UINT32, count, _UNCOUNTED), channel)
 
     def _send(self, name: str, index: int, channel: Channel | None) -> None:
         type_ = self._parameters.type(name)

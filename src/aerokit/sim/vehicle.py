@@ -260,9 +260,13 @@ class SimulatedVehicle:
             self.send(Statustext(severity, text, 0, 0))
             return
         self._text_id = self._text_id % 0xFFFF + 1
-        for number in range(len(text) // _TEXT_SIZE + 1):  # only a chunk that is not full ends the text
+        self.send_chunks(severity, text, self._text_id)
+
+    def send_chunks(self, severity: int, text: str, text_id: int) -> None:
+        """Send STATUSTEXTs of one id; only a chunk that is not full ends the text."""
+        for number in range(len(text) // _TEXT_SIZE + 1):
             chunk = text[number * _TEXT_SIZE : (number + 1) * _TEXT_SIZE]
-            self.send(Statustext(severity, chunk, self._text_id, number))
+            self.send(Statustext(severity, chunk, text_id, number))
 
     def info(self, text: str) -> None:
         """Send a text of severity INFO."""

@@ -13,6 +13,7 @@ from aerokit.mavlink.enums import AttitudeTargetTypemask as AttitudeMask
 from aerokit.mavlink.enums import MavFrame
 from aerokit.mavlink.enums import PositionTargetTypemask as Mask
 from aerokit.mavlink.messages import SetAttitudeTarget, SetPositionTargetGlobalInt, SetPositionTargetLocalNed
+from aerokit.sim.rotations import euler_from_quaternion
 
 if TYPE_CHECKING:
     from aerokit.sim.ardupilot.copter import SimulatedCopter
@@ -126,7 +127,7 @@ class Setpoints:
             return
         roll = pitch = 0.0
         if not mask & AttitudeMask.ATTITUDE_IGNORE:
-            roll, pitch, yaw = _euler(*target.q)
+            roll, pitch, yaw = euler_from_quaternion(*target.q)
             copter.motion.face(yaw)
         elif not rates_ignored:
             copter.motion.turn(target.body_yaw_rate)
@@ -145,11 +146,3 @@ def _is_sane(vector: Ned) -> bool:
 
 def _is_number(vector: Ned) -> bool:
     return all(math.isfinite(part) for part in vector)
-
-
-def _euler(w: float, x: float, y: float, z: float) -> tuple[float, float, float]:
-    return (
-        math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
-        math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x)))),
-        math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
-    )

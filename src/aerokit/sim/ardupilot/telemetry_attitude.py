@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
 from aerokit.sim.motion import GRAVITY_M_S2
+from aerokit.sim.rotations import quaternion_from_euler
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
@@ -33,26 +34,13 @@ def _attitude_quaternion(copter: SimulatedCopter) -> m.AttitudeQuaternion | None
     if not copter.navigation.has_attitude:
         return None
     motion = copter.motion
-    q = _quaternion(motion.roll, motion.pitch, motion.yaw)
+    q = quaternion_from_euler(motion.roll, motion.pitch, motion.yaw)
     return m.AttitudeQuaternion(copter.time_boot_ms, *q, motion.roll_rate, motion.pitch_rate, motion.yaw_rate)
-
-
-def _quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
-    """Euler angles as w, x, y, z."""
-    cr, sr = math.cos(roll / 2), math.sin(roll / 2)
-    cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
-    cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
-    return (
-        cr * cp * cy + sr * sp * sy,
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-    )
 
 
 def _attitude_target(copter: SimulatedCopter) -> m.AttitudeTarget:
     motion = copter.motion
-    q = _quaternion(motion.roll, motion.pitch, motion.yaw)
+    q = quaternion_from_euler(motion.roll, motion.pitch, motion.yaw)
     return m.AttitudeTarget(copter.time_boot_ms, 0, q, 0.0, 0.0, motion.yaw_rate, copter.motors.throttle)
 
 

@@ -1,0 +1,138 @@
+"""How a simulated PX4 flies in each of its modes."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from aerokit.sim.motion import approach_speed
+from aerokit.sim.px4.modes import HOLD, LAND, MISSION, OFFBOARD, RTL, TAKEOFF, Px4Mode
+
+if TYPE_CHECKING:
+    from aerokit.sim.px4.vehicle import SimulatedPx4
+
+__all__ = ["Flight"]
+
+Ned = tuple[float, float, float]
+
+_SPOOL_UP_S = 1.8
+_ARRIVED_M = 0.5
+_YAW_FROM_M_S = 0.5
+
+
+class Flight:
+    """The navigator: a target, speeds, and the phase of a mode that has several."""
+
+    def __init__(self, vehicle: SimulatedPx4) -> None:
+        self._vehicle = vehicle
+        self.target: Ned = (0.0, 0.0, 0.0)
+        """Where HOLD stays, TAKEOFF and RTL go: north, east, down in the world's frame."""
+        self.heading: float | None = None
+        self.speed_m_s = 0.0
+        self.lifts_off = False
+        """Whether the mode wants to leave the ground."""
+        self._phase = ""
+        self._ramp_from = 0.0
+
+    def enter(self, mode: Px4Mode) -> None:
+        """A mode begins."""
+        self.speed_m_s = self._vehicle.parameters["MPC_XY_CRUISE"]
+        self.heading = None
+        self._phase = "climb"
+        self.stay_here()
+        if mode == RTL:
+            self._plan_return()
+
+    def stay_here(self) -> None:
+        """Make the present place the target."""
+        motion = self._vehicle.motion
+        self.target = (motion.north, motion.east, motion.down)
+
+    def update(self) -> None:
+        """Tell the motion what to do until the next tick."""
+        vehicle = self._vehicle
+        mode = vehicle.mode
+        self.lifts_off = mode == TAKEOFF or (mode == OFFBOARD and vehicle.offboard.wants_up)
+        if vehicle.is_landed:
+            self._lift_off()
+            return
+        if mode == TAKEOFF:
+            self._take_off()
+        elif mode == LAND:
+            self._descend()
+        elif mode == RTL:
+            self._return()
+        elif mode == OFFBOARD:
+            vehicle.offboard.fly()
+        elif mode in (HOLD, MISSION):
+            self._go()
+        else:
+            vehicle.motion.seek_velocity(0.0, 0.0, 0.0)
+
+    def _lift_off(self) -> None:
+        vehicle = self._vehicle
+        if self.lifts_off and vehicle.now - vehicle.armed_at >= _SPOOL_UP_S:
+            self._ramp_from = vehicle.now
+            vehicle.leave_ground()
+
+    def _take_off(self) -> None:
+        vehicle = self._vehicle
+        ramp = (vehicle.now - self._ramp_from) / max(0.1, vehicle.parameters["MPC_TKO_RAMP_T"])
+        climb = vehicle.parameters["MPC_TKO_SPEED"] * max(0.05, min(1.0, ramp))
+        vehicle.motion.seek_position(*self.target, speed=self.speed_m_s, climb=climb, descent=1.0)
+        if abs(vehicle.motion.down - self.target[2]) < _ARRIVED_M:
+            target = self.target
+            vehicle.switch_to(HOLD)
+            self.target = target
+
+    def _go(self) -> None:
+        vehicle, limits = self._vehicle, self._vehicle.parameters
+        up, down = limits["MPC_Z_V_AUTO_UP"], limits["MPC_Z_V_AUTO_DN"]
+        vehicle.motion.seek_position(*self.target, speed=self.speed_m_s, climb=up, descent=down)
+        self._point()
+
+    def _point(self) -> None:
+        motion = self._vehicle.motion
+        if self.heading is not None:
+            motion.face(self.heading)
+        elif motion.ground_speed_m_s > _YAW_FROM_M_S:
+            motion.face(math.atan2(motion.velocity_east, motion.velocity_north))
+
+    def _descend(self) -> None:
+        """MPC_Z_V_AUTO_DN above MPC_LAND_ALT1, MPC_LAND_SPEED below MPC_LAND_ALT2, in between in between."""
+        vehicle, limits = self._vehicle, self._vehicle.parameters
+        fast, slow = limits["MPC_Z_V_AUTO_DN"], limits["MPC_LAND_SPEED"]
+        high, low = limits["MPC_LAND_ALT1"], limits["MPC_LAND_ALT2"]
+        share = min(1.0, max(0.0, (vehicle.altitude_m - low) / max(0.1, high - low)))
+        vehicle.motion.seek_velocity(0.0, 0.0, slow + (fast - slow) * share)
+
+    def _plan_return(self) -> None:
+        vehicle = self._vehicle
+        north, east, down = vehicle.motion.north, vehicle.motion.east, vehicle.motion.down
+        height = max(vehicle.parameters["RTL_RETURN_ALT"], vehicle.altitude_m)
+        away = math.hypot(north - vehicle.home[0], east - vehicle.home[1])
+        if away < vehicle.parameters["RTL_MIN_DIST"]:
+            height = max(vehicle.parameters["RTL_DESCEND_ALT"], vehicle.altitude_m)
+        self.target = (north, east, min(down, vehicle.home[2] - height))
+        amsl = vehicle.frame.origin.altitude_m - self.target[2]
+        vehicle.info(f"RTL: start return at {amsl:.0f} m ({height:.0f} m above destination)")
+
+    def _return(self) -> None:
+        vehicle, motion = self._vehicle, self._vehicle.motion
+        if self._phase == "land":
+            self._descend()
+            return
+        self._go()
+        if math.dist(self.target, (motion.north, motion.east, motion.down)) > _ARRIVED_M:
+            return
+        if self._phase == "climb":
+            self._phase = "return"
+            self.target = (*vehicle.home[:2], self.target[2])
+        else:
+            self._phase = "land"
+            vehicle.info("RTL: land at destination")
+
+
+def velocity_towards(offset: float, limit: float, acceleration: float) -> float:
+    """A signed speed along one axis towards something ``offset`` metres away."""
+    return math.copysign(min(limit, approach_speed(abs(offset), 1.0, 0.7 * acceleration)), offset)

@@ -1,0 +1,148 @@
+"""OFFBOARD: set-points that have to keep coming, each axis by position, velocity or acceleration.
+
+https://docs.px4.io/main/en/flight_modes/offboard.html
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from aerokit.mavlink.enums import AttitudeTargetTypemask, MavFrame
+from aerokit.mavlink.enums import PositionTargetTypemask as Mask
+from aerokit.mavlink.messages import SetAttitudeTarget, SetPositionTargetGlobalInt, SetPositionTargetLocalNed
+from aerokit.sim.px4.flight import velocity_towards
+from aerokit.sim.rotations import euler_from_quaternion
+
+if TYPE_CHECKING:
+    from aerokit.sim.channel import Channel
+    from aerokit.sim.px4.vehicle import SimulatedPx4
+
+__all__ = ["Offboard"]
+
+Ned = tuple[float, float, float]
+_NAN3: Ned = (math.nan, math.nan, math.nan)
+_POSITION = (Mask.X_IGNORE, Mask.Y_IGNORE, Mask.Z_IGNORE)
+_VELOCITY = (Mask.VX_IGNORE, Mask.VY_IGNORE, Mask.VZ_IGNORE)
+_ACCELERATION = (Mask.AX_IGNORE, Mask.AY_IGNORE, Mask.AZ_IGNORE)
+_RELATIVE = (MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT)
+_CLIMB_AT_FULL_THRUST_M_S = 5.0
+
+
+class Offboard:
+    """The latest set-point; it is heard in every mode and flown in OFFBOARD."""
+
+    def __init__(self, vehicle: SimulatedPx4) -> None:
+        self._vehicle = vehicle
+        self.updated_at = -math.inf
+        self._position, self._velocity, self._acceleration = _NAN3, _NAN3, _NAN3
+        self._yaw = self._yaw_rate = math.nan
+        self._attitude: tuple[float, float, float] | None = None
+        self._thrust = 0.0
+        vehicle.on(SetPositionTargetLocalNed, self._on_local)
+        vehicle.on(SetPositionTargetGlobalInt, self._on_global)
+        vehicle.on(SetAttitudeTarget, self._on_attitude)
+
+    @property
+    def is_fresh(self) -> bool:
+        """Whether set-points keep coming; COM_OF_LOSS_T is the patience."""
+        return self._vehicle.now - self.updated_at <= self._vehicle.parameters["COM_OF_LOSS_T"]
+
+    @property
+    def wants_up(self) -> bool:
+        """Whether the set-point leaves the ground."""
+        if self._attitude is not None:
+            return self._thrust > 0.5
+        down = self._position[2] - self._vehicle.motion.down
+        return down < -0.1 or self._velocity[2] < -0.1 or self._acceleration[2] < -0.1
+
+    # --------------------------------------------------------------------------------------- hearing
+
+    def _on_local(self, target: SetPositionTargetLocalNed, _: Channel) -> None:
+        if target.coordinate_frame not in (MavFrame.LOCAL_NED, MavFrame.BODY_NED):
+            return
+        body = target.coordinate_frame == MavFrame.BODY_NED
+        position = _NAN3 if body else (target.x, target.y, target.z)
+        self._take(target, position, body=body)
+
+    def _on_global(self, target: SetPositionTargetGlobalInt, _: Channel) -> None:
+        frame = self._vehicle.frame
+        north, east = frame.to_local(target.lat_int, target.lon_int)
+        down = frame.origin.altitude_m - target.alt
+        if target.coordinate_frame in _RELATIVE:
+            down = self._vehicle.home[2] - target.alt
+        self._take(target, (north, east, down), body=False)
+
+    def _take(
+        self, target: SetPositionTargetLocalNed | SetPositionTargetGlobalInt, position: Ned, *, body: bool
+    ) -> None:
+        mask = target.type_mask
+        self._position = _masked(position, mask, _POSITION)
+        self._velocity = self._rotated(_masked((target.vx, target.vy, target.vz), mask, _VELOCITY), body)
+        acceleration = _masked((target.afx, target.afy, target.afz), mask, _ACCELERATION)
+        self._acceleration = self._rotated(acceleration, body)
+        self._yaw = math.nan if mask & Mask.YAW_IGNORE else target.yaw
+        self._yaw_rate = math.nan if mask & Mask.YAW_RATE_IGNORE else target.yaw_rate
+        self._attitude, self.updated_at = None, self._vehicle.now
+
+    def _rotated(self, vector: Ned, body: bool) -> Ned:
+        if not body:
+            return vector
+        yaw = self._vehicle.motion.yaw
+        forward, right, down = vector
+        return (
+            forward * math.cos(yaw) - right * math.sin(yaw),
+            forward * math.sin(yaw) + right * math.cos(yaw),
+            down,
+        )
+
+    def _on_attitude(self, target: SetAttitudeTarget, _: Channel) -> None:
+        if target.type_mask & AttitudeTargetTypemask.ATTITUDE_IGNORE:
+            self._attitude = (0.0, 0.0, self._vehicle.motion.yaw)
+        elif all(math.isfinite(part) for part in target.q):
+            self._attitude = euler_from_quaternion(*target.q)
+        if math.isfinite(target.thrust):
+            self._thrust = target.thrust
+        self.updated_at = self._vehicle.now
+
+    # ---------------------------------------------------------------------------------------- flying
+
+    def fly(self) -> None:
+        """Follow the set-point."""
+        motion = self._vehicle.motion
+        if self._attitude is not None:
+            roll, pitch, yaw = self._attitude
+            climb = (max(0.0, min(1.0, self._thrust)) - 0.5) * 2.0 * _CLIMB_AT_FULL_THRUST_M_S
+            motion.seek_attitude(roll, pitch, -climb)
+            motion.face(yaw)
+            return
+        if all(math.isnan(part) for part in (*self._position, *self._velocity)):
+            motion.seek_acceleration(*(0.0 if math.isnan(part) else part for part in self._acceleration))
+        else:
+            motion.seek_velocity(*self._wanted_velocity())
+        if math.isfinite(self._yaw):
+            motion.face(self._yaw)
+        else:
+            motion.turn(self._yaw_rate if math.isfinite(self._yaw_rate) else 0.0)
+
+    def _wanted_velocity(self) -> Ned:
+        motion, limits = self._vehicle.motion, self._vehicle.parameters
+        place = (motion.north, motion.east, motion.down)
+        fastest = (limits["MPC_XY_VEL_MAX"],) * 2 + (limits["MPC_Z_V_AUTO_UP"],)
+        accelerations = (motion.limits.acceleration_m_s2,) * 2 + (motion.limits.vertical_acceleration_m_s2,)
+        wanted = []
+        for axis in range(3):
+            speed = 0.0 if math.isnan(self._velocity[axis]) else self._velocity[axis]
+            if math.isfinite(self._position[axis]):
+                offset = self._position[axis] - place[axis]
+                speed += velocity_towards(offset, fastest[axis], accelerations[axis])
+            wanted.append(max(-fastest[axis], min(fastest[axis], speed)))
+        return (wanted[0], wanted[1], wanted[2])
+
+
+def _masked(vector: Ned, mask: int, bits: tuple[int, int, int]) -> Ned:
+    one, two, three = (
+        math.nan if mask & bit or not math.isfinite(value) else value
+        for value, bit in zip(vector, bits, strict=True)
+    )
+    return (one, two, three)

@@ -1,0 +1,311 @@
+"""What a simulated PX4 streams, and how often: the default set of its ground-station link in simulation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import (
+    EstimatorStatusFlags,
+    GpsFixType,
+    MavAutopilot,
+    MavBatteryChargeState,
+    MavBatteryFunction,
+    MavBatteryType,
+    MavLandedState,
+    MavModeFlag,
+    MavState,
+    MavType,
+    MissionState,
+)
+from aerokit.sim.px4.modes import KNOWN, LAND, OFFBOARD, TAKEOFF, custom_mode
+from aerokit.sim.rotations import quaternion_from_euler
+
+if TYPE_CHECKING:
+    from aerokit.mavlink.message import Message
+    from aerokit.sim.px4.vehicle import SimulatedPx4
+
+__all__ = ["BUILDERS", "DEFAULT_RATES_HZ", "FAST_MESSAGES", "available_modes"]
+
+_PRESENT, _ENABLED = 0x0300402F, 0x0301402F
+_HEALTHY, _BOOTING = 0x1320C83F, 0x0320883F
+_GPS_BIT, _PREARM_BIT = 0x20, 0x10000000
+_AUTO = MavModeFlag.AUTO_ENABLED | MavModeFlag.STABILIZE_ENABLED | MavModeFlag.GUIDED_ENABLED
+_F = EstimatorStatusFlags
+_ALL_BUT_STILL = (
+    _F.ATTITUDE | _F.VELOCITY_HORIZ | _F.VELOCITY_VERT | _F.POS_HORIZ_REL | _F.POS_HORIZ_ABS | _F.POS_VERT_ABS
+) | (_F.POS_VERT_AGL | _F.PRED_POS_HORIZ_REL | _F.PRED_POS_HORIZ_ABS)
+_BOOT_FLAGS = _F.ATTITUDE | _F.VELOCITY_VERT | _F.POS_VERT_ABS | _F.POS_VERT_AGL | _F.CONST_POS_MODE
+_POSITION_FLAGS = _F.VELOCITY_HORIZ | _F.POS_HORIZ_REL | _F.POS_HORIZ_ABS | _F.PRED_POS_HORIZ_ABS
+
+
+def _heartbeat(px4: SimulatedPx4) -> m.Heartbeat:
+    base = MavModeFlag.CUSTOM_MODE_ENABLED
+    if px4.is_armed:
+        base |= MavModeFlag.SAFETY_ARMED
+    if px4.mode[0] == 4:
+        base |= _AUTO
+    elif px4.mode != OFFBOARD:
+        base |= MavModeFlag.MANUAL_INPUT_ENABLED | MavModeFlag.STABILIZE_ENABLED
+    state = MavState.ACTIVE if px4.is_armed else MavState.STANDBY
+    if px4.is_in_failsafe:
+        state = MavState.CRITICAL
+    if not px4.is_ready:
+        state = MavState.UNINIT
+    return m.Heartbeat(MavType.QUADROTOR, MavAutopilot.PX4, base, custom_mode(px4.mode), state, 3)
+
+
+def _sys_status(px4: SimulatedPx4) -> m.SysStatus:
+    health = _HEALTHY if px4.is_ready else _BOOTING
+    if px4.reasons():
+        health &= ~_PREARM_BIT
+    if px4.faults.gps_lost:
+        health &= ~_GPS_BIT
+    voltage = round(px4.battery.voltage_v * 1000)
+    percent = int(px4.battery.percent)
+    return m.SysStatus(_PRESENT, _ENABLED, health, 120, voltage, -100, percent, 0, 0, 0, 0, 0, 0)
+
+
+def _estimator_status(px4: SimulatedPx4) -> m.EstimatorStatus:
+    flags = _ALL_BUT_STILL
+    if not px4.is_armed:
+        flags |= _F.CONST_POS_MODE
+    if not px4.has_position:
+        flags &= ~_POSITION_FLAGS
+    if not px4.is_ready:
+        flags = _BOOT_FLAGS
+    size = 0.02 if px4.is_ready else math.nan
+    return m.EstimatorStatus(px4.time_boot_us, flags, size, size, 0.003, size, 0.002, math.nan, 0.3, 0.3)
+
+
+def _extended_sys_state(px4: SimulatedPx4) -> m.ExtendedSysState:
+    state = MavLandedState.IN_AIR
+    if px4.is_landed:
+        state = MavLandedState.ON_GROUND
+    elif px4.mode == TAKEOFF:
+        state = MavLandedState.TAKEOFF
+    elif px4.mode == LAND:
+        state = MavLandedState.LANDING
+    return m.ExtendedSysState(0, state)
+
+
+def _battery_status(px4: SimulatedPx4) -> m.BatteryStatus:
+    battery = px4.battery
+    voltages = (round(battery.voltage_v * 1000), *(0xFFFF,) * 9)
+    return m.BatteryStatus(
+        0,
+        MavBatteryFunction.ALL,
+        MavBatteryType.LIPO,
+        32767,
+        voltages,
+        -100,
+        -1,
+        -1,
+        int(battery.percent),
+        0,
+        MavBatteryChargeState.OK,
+    )
+
+
+def _attitude(px4: SimulatedPx4) -> m.Attitude:
+    o = px4.motion
+    return m.Attitude(px4.time_boot_ms, o.roll, o.pitch, o.yaw, o.roll_rate, o.pitch_rate, o.yaw_rate)
+
+
+def _attitude_quaternion(px4: SimulatedPx4) -> m.AttitudeQuaternion:
+    o = px4.motion
+    q = quaternion_from_euler(o.roll, o.pitch, o.yaw)
+    return m.AttitudeQuaternion(px4.time_boot_ms, *q, o.roll_rate, o.pitch_rate, o.yaw_rate)
+
+
+def _attitude_target(px4: SimulatedPx4) -> m.AttitudeTarget:
+    o = px4.motion
+    q = quaternion_from_euler(o.roll, o.pitch, o.yaw)
+    return m.AttitudeTarget(px4.time_boot_ms, 0, q, 0.0, 0.0, o.yaw_rate, px4.throttle)
+
+
+def _global_position(px4: SimulatedPx4) -> m.GlobalPositionInt | None:
+    """Absent without a position, not zero as with ArduPilot."""
+    if not px4.has_position:
+        return None
+    o = px4.motion
+    place = px4.frame.to_global(o.north, o.east, o.down)
+    return m.GlobalPositionInt(
+        px4.time_boot_ms,
+        place.latitude_e7,
+        place.longitude_e7,
+        round(place.altitude_m * 1000),
+        round(px4.altitude_m * 1000),
+        round(o.velocity_north * 100),
+        round(o.velocity_east * 100),
+        round(o.velocity_down * 100),
+        round(math.degrees(o.yaw) % 360.0 * 100) % 36000,
+    )
+
+
+def _local_position(px4: SimulatedPx4) -> m.LocalPositionNed:
+    o = px4.motion
+    velocity = (o.velocity_north, o.velocity_east, o.velocity_down)
+    return m.LocalPositionNed(px4.time_boot_ms, o.north, o.east, o.down, *velocity)
+
+
+def _altitude(px4: SimulatedPx4) -> m.Altitude:
+    amsl = px4.frame.origin.altitude_m - px4.motion.down
+    above, ground = px4.altitude_m, px4.motion.ground_down
+    return m.Altitude(
+        px4.time_boot_us, amsl, amsl, -px4.motion.down, above, -ground, ground - px4.motion.down
+    )
+
+
+def _vfr_hud(px4: SimulatedPx4) -> m.VfrHud:
+    o = px4.motion
+    heading = int(math.degrees(o.yaw) % 360.0)
+    amsl = px4.frame.origin.altitude_m - o.down
+    return m.VfrHud(math.nan, o.ground_speed_m_s, heading, round(px4.throttle * 100), amsl, -o.velocity_down)
+
+
+def _gps_raw(px4: SimulatedPx4) -> m.GpsRawInt:
+    o = px4.motion
+    if px4.faults.gps_lost:
+        return m.GpsRawInt(0, GpsFixType.NO_FIX, 0, 0, 0, 9999, 9999, 65535, 65535, 0)
+    place = px4.frame.to_global(o.north, o.east, o.down)
+    altitude = round(place.altitude_m * 1000)
+    course = round(math.degrees(math.atan2(o.velocity_east, o.velocity_north)) % 360.0 * 100) % 36000
+    return m.GpsRawInt(
+        px4.time_boot_us,
+        GpsFixType.TYPE_3D_FIX,
+        place.latitude_e7,
+        place.longitude_e7,
+        altitude,
+        70,
+        110,
+        round(o.ground_speed_m_s * 100),
+        course,
+        10,
+        altitude,
+        900,
+        1780,
+        400,
+    )
+
+
+def _home_position(px4: SimulatedPx4) -> m.HomePosition | None:
+    if not px4.is_ready:
+        return None
+    place = px4.frame.to_global(*px4.home)
+    altitude = round(place.altitude_m * 1000)
+    q = (math.nan,) * 4 if px4.home_is_set_by_hand else (1.0, 0.0, 0.0, 0.0)
+    return m.HomePosition(
+        place.latitude_e7, place.longitude_e7, altitude, *px4.home, q, 0.0, 0.0, 0.0, px4.time_boot_us
+    )
+
+
+def _global_origin(px4: SimulatedPx4) -> m.GpsGlobalOrigin:
+    origin = px4.frame.origin
+    altitude = round(origin.altitude_m * 1000)
+    return m.GpsGlobalOrigin(origin.latitude_e7, origin.longitude_e7, altitude, px4.time_boot_us)
+
+
+def _target_local(px4: SimulatedPx4) -> m.PositionTargetLocalNed:
+    return m.PositionTargetLocalNed(px4.time_boot_ms, 1, 0, *px4.flight.target, *(0.0,) * 8)
+
+
+def _servo_output(px4: SimulatedPx4) -> m.ServoOutputRaw:
+    pwm = 900 if not px4.is_armed else round(1000 + 1000 * px4.throttle)
+    return m.ServoOutputRaw(px4.time_boot_us, 0, pwm, pwm, pwm, pwm, 900, 900, 900, 900)
+
+
+def _mission_current(px4: SimulatedPx4) -> m.MissionCurrent:
+    return m.MissionCurrent(0, 65535, MissionState.NO_MISSION, 2)
+
+
+def _vibration(px4: SimulatedPx4) -> m.Vibration:
+    return m.Vibration(px4.time_boot_us, 0.0, 0.1, 1.4 if px4.is_armed else 0.1, 0, 0, 0)
+
+
+def _system_time(px4: SimulatedPx4) -> m.SystemTime:
+    return m.SystemTime(round(px4.unix_time * 1e6), px4.time_boot_ms)
+
+
+def _current_mode(px4: SimulatedPx4) -> m.CurrentMode:
+    return m.CurrentMode(0, custom_mode(px4.mode), custom_mode(px4.intended_mode))
+
+
+def _ping(px4: SimulatedPx4) -> m.Ping:
+    return m.Ping(px4.time_boot_us, px4.next_ping(), 0, 0)
+
+
+def _autopilot_version(px4: SimulatedPx4) -> m.AutopilotVersion:
+    number, commit = px4.version_number, b"\0\0\0\xfd\xaf\xd6\xde\x59"
+    return m.AutopilotVersion(
+        px4.CAPABILITIES, number, number, 101854463, 1, commit, commit, bytes(8), 0, 0, 5283920058631409231
+    )
+
+
+def available_modes(px4: SimulatedPx4) -> list[m.AvailableModes]:
+    """AVAILABLE_MODES: PX4 gives no name to a mode that the standard names (HOLD, RETURN, LAND …)."""
+    standard = {(3, 0): 1, (2, 0): 3, (4, 5): 4, (4, 4): 6, (4, 6): 7, (4, 2): 8}
+    messages = []
+    for index, (mode, name) in enumerate(KNOWN.items(), start=1):
+        number = standard.get(mode, 0)
+        text = "" if number else name
+        messages.append(m.AvailableModes(len(KNOWN), index, number, custom_mode(mode), 0, text))
+    return messages
+
+
+BUILDERS: dict[int, Callable[[SimulatedPx4], Message | None]] = {
+    m.Heartbeat.ID: _heartbeat,
+    m.SysStatus.ID: _sys_status,
+    m.EstimatorStatus.ID: _estimator_status,
+    m.ExtendedSysState.ID: _extended_sys_state,
+    m.BatteryStatus.ID: _battery_status,
+    m.Attitude.ID: _attitude,
+    m.AttitudeQuaternion.ID: _attitude_quaternion,
+    m.AttitudeTarget.ID: _attitude_target,
+    m.GlobalPositionInt.ID: _global_position,
+    m.LocalPositionNed.ID: _local_position,
+    m.Altitude.ID: _altitude,
+    m.VfrHud.ID: _vfr_hud,
+    m.GpsRawInt.ID: _gps_raw,
+    m.HomePosition.ID: _home_position,
+    m.GpsGlobalOrigin.ID: _global_origin,
+    m.PositionTargetLocalNed.ID: _target_local,
+    m.ServoOutputRaw.ID: _servo_output,
+    m.MissionCurrent.ID: _mission_current,
+    m.Vibration.ID: _vibration,
+    m.SystemTime.ID: _system_time,
+    m.CurrentMode.ID: _current_mode,
+    m.Ping.ID: _ping,
+    m.AutopilotVersion.ID: _autopilot_version,
+}
+"""Message id → what to send now, or None."""
+
+DEFAULT_RATES_HZ: dict[int, float] = {
+    m.Heartbeat.ID: 1.0,
+    m.Altitude.ID: 1.0,
+    m.BatteryStatus.ID: 0.5,
+    m.CurrentMode.ID: 0.5,
+    m.EstimatorStatus.ID: 0.5,
+    m.ExtendedSysState.ID: 1.0,
+    m.GpsRawInt.ID: 5.0,
+    m.GpsGlobalOrigin.ID: 1.0,
+    m.HomePosition.ID: 0.5,
+    m.MissionCurrent.ID: 1.0,
+    m.Ping.ID: 0.1,
+    m.SysStatus.ID: 1.0,
+    m.VfrHud.ID: 4.0,
+    m.Vibration.ID: 0.1,
+}
+
+FAST_MESSAGES = (
+    m.Attitude.ID,
+    m.AttitudeQuaternion.ID,
+    m.AttitudeTarget.ID,
+    m.GlobalPositionInt.ID,
+    m.LocalPositionNed.ID,
+    m.PositionTargetLocalNed.ID,
+    m.ServoOutputRaw.ID,
+)
+"""Sent at 50 Hz in simulation."""
