@@ -449,7 +449,7 @@ def test_a_reboot_starts_over() -> None:
     assert client.all(m.Statustext)[0].id == 0
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(
     command=st.sampled_from([int(c) for c in MavCmd]),
     numbers=st.tuples(*(st.floats(width=32),) * 7),
@@ -464,7 +464,7 @@ def test_any_command_is_answered(command: int, numbers: tuple[float, ...], flyin
     assert client.framer.statistics.bad_crcs == 0
 
 
-@settings(max_examples=30)
+@settings(max_examples=15)
 @given(mask=st.integers(0, 0xFFF), frame=st.integers(0, 21), numbers=st.tuples(*(st.floats(width=32),) * 11))
 def test_any_setpoint_is_survived(mask: int, frame: int, numbers: tuple[float, ...]) -> None:
     px4, client = flying_px4(3.0)
