@@ -21,7 +21,7 @@ FLOORS = [
     {"cli"},
 ]
 ALLOWED_BESIDE = {("sim", "autopilots"), ("sim", "links")}
-REEXPORTED = {"messages": "mavlink", "enums": "mavlink", "events": "runtime"}
+REEXPORTED = {"messages": "mavlink", "enums": "mavlink", "events": "runtime", "__version__": "errors"}
 SANS_IO = ("mavlink", "protocols", "autopilots")
 NO_IO = {"asyncio", "anyio", "socket", "threading", "time", "logging", "select", "selectors", "subprocess"}
 SOCKETS = {"socket", "serial", "serial_asyncio", "serial_asyncio_fast"}
