@@ -97,8 +97,9 @@ class Dialect:
 
     def decode(self, frame: Frame) -> Message:
         """The message of a frame, its ``received_frame`` set; KeyError when the dialect does not know the id."""
-        decoder = self._decoders.get(frame.message_id)
-        if decoder is None:
+        try:
+            decoder = self._decoders[frame.message_id]
+        except KeyError:
             decoder = self._decoders[frame.message_id] = self[frame.message_id].decode
         return decoder(frame.payload, frame)
 

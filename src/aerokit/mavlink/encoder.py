@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from aerokit.errors import LocalProtocolError
-from aerokit.mavlink.checksum import fast_x25
+from aerokit.mavlink.checksum import x25
 from aerokit.mavlink.frame import MAGIC_V1, MAGIC_V2
 from aerokit.mavlink.message import Message
 
@@ -51,5 +51,5 @@ class FrameEncoder:
             )
             magic = MAGIC_V1
         self.sequence = (self.sequence + 1) & 0xFF
-        crc = fast_x25(body + bytes((message.CRC_EXTRA,)), 0xFFFF)
+        crc = x25(body + bytes((message.CRC_EXTRA,)))
         return bytes((magic,)) + body + crc.to_bytes(2, "little")

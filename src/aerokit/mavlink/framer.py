@@ -11,16 +11,18 @@ from __future__ import annotations
 import re
 from collections.abc import Container
 from struct import Struct
+from struct import error as StructError  # noqa: N812
 
-from aerokit.mavlink.checksum import fast_x25
+from aerokit.mavlink.checksum import x25
 from aerokit.mavlink.dialect import STANDARD, Dialect
 from aerokit.mavlink.frame import MAGIC_V1, MAGIC_V2, SIGNATURE_LENGTH, SIGNED, Frame
 from aerokit.mavlink.statistics import FramerStatistics, SourceStatistics
 
 __all__ = ["Framer"]
 
-_HEADER_V2 = Struct("<BBxBHHB").unpack_from  # length, flags, sequence, source, id (low 16 bits, high 8 bits)
-_HEADER_V1 = Struct("<BBHB").unpack_from  # length, sequence, source, id
+# The last of version 2 is the id in its lower three bytes; the byte above them belongs to what follows.
+_HEADER_V2 = Struct("<BBBxBHI").unpack_from  # magic, length, flags, sequence, source, id
+_HEADER_V1 = Struct("<xBBHB").unpack_from  # length, sequence, source, id
 _SHORTEST_V2 = 12
 _SHORTEST_V1 = 8
 _MAGICS = (MAGIC_V1, MAGIC_V2)
@@ -60,38 +62,40 @@ class Framer:
 
         Never raises, whatever the bytes.
         """
-        # The loop is long and repeats itself on purpose: it runs for every frame on the air.
+        # The loop is long and repeats `_examine` on purpose: it runs for every frame on the air.
         if type(data) is not bytes:
             data = bytes(data)
-        statistics, sources, extras, wanted = self.statistics, self._sources, self._extras, self.wanted
-        statistics.bytes += len(data)
+        self.statistics.bytes += len(data)
         if self._rest:
             data, self._rest = self._rest + data, b""
+        extras, sources, wanted = self._extras, self._sources, self.wanted
         frames: list[Frame] = []
-        begin, size, count = 0, len(data), 0
+        begin, size = 0, len(data)
         while begin < size:
-            good = False
-            if size - begin >= 12 and data[begin] == 0xFD:
-                length, flags, sequence, key, low, high = _HEADER_V2(data, begin + 1)
-                message_id = low | high << 16
-                extra = extras.get(message_id)
-                upto = begin + 10 + length
+            try:
+                magic, length, flags, sequence, key, message_id = _HEADER_V2(data, begin)
+                message_id &= 0xFFFFFF
+                body = begin + 10
+                upto = body + length
                 end = upto + 2
-                if extra is not None and end <= size and not flags:
-                    good = (
-                        fast_x25(data[begin + 1 : upto] + extra, 0xFFFF) == data[upto] | data[upto + 1] << 8
-                    )
-                    body = begin + 10
+                good = (
+                    magic == 0xFD
+                    and not flags
+                    and end <= size
+                    and x25(data[begin + 1 : upto] + extras[message_id]) == data[upto] | data[upto + 1] << 8
+                )
+            except (StructError, KeyError):
+                good = False
             if not good:
                 found = self._search(data, begin)
                 if found is None:
                     break
                 begin, message_id, sequence, key, body, upto, end = found
-            count += 1
-            source = sources.get(key)
-            if source is None:
+            try:
+                source = sources[key]
+            except KeyError:
                 source = self._add_source(key, sequence)
-            elif source.expected == sequence:
+            if source.expected == sequence:
                 source.received += 1
                 source.expected = (sequence + 1) & 0xFF
             else:
@@ -107,7 +111,6 @@ class Framer:
                 frame.received_at = now
                 frames.append(frame)
             begin = end
-        statistics.frames += count
         return frames
 
     def _add_source(self, key: int, sequence: int) -> SourceStatistics:
@@ -130,7 +133,7 @@ class Framer:
             if unknown >= 0 and here >= unknown_end:
                 if unknown_end == size or data[unknown_end] in _MAGICS:
                     self._pass(begin, unknown, bad_crcs)
-                    self.statistics.unknown_ids += 1
+                    self._unknown_passed(data, unknown)
                     begin = here = unknown_end
                     hold, bad_crcs = -1, []
                 unknown = -1
@@ -156,6 +159,17 @@ class Framer:
         self._rest = data[keep:]
         return None
 
+    def _unknown_passed(self, data: bytes, begin: int) -> None:
+        """A frame of an unknown message was here: its sender, if we know it, has not lost it."""
+        self.statistics.unknown_ids += 1
+        if data[begin] == MAGIC_V2:
+            _, _, _, sequence, key, _ = _HEADER_V2(data, begin)
+        else:
+            _, sequence, key, _ = _HEADER_V1(data, begin)
+        source = self._sources.get(key)
+        if source is not None and source.expected == sequence:
+            source.expected = (sequence + 1) & 0xFF
+
     def _pass(self, begin: int, end: int, bad_crcs: list[int]) -> None:
         """Bytes that are in no frame are behind us; those that are kept will be looked at, and counted, again."""
         self.statistics.bad_bytes += end - begin
@@ -168,15 +182,15 @@ class Framer:
             if size - begin < _SHORTEST_V2:
                 whole = size - begin < 3 or data[begin + 2] <= SIGNED
                 return (_WAIT if whole else _NOISE), size, None
-            length, flags, sequence, key, low, high = _HEADER_V2(data, begin + 1)
+            _, length, flags, sequence, key, message_id = _HEADER_V2(data, begin)
             if flags & ~SIGNED:
                 return _NOISE, size, None
-            message_id, body = low | high << 16, begin + 10
+            message_id, body = message_id & 0xFFFFFF, begin + 10
             end = body + length + 2 + (SIGNATURE_LENGTH if flags else 0)
         else:
             if size - begin < _SHORTEST_V1:
                 return _WAIT, size, None
-            length, sequence, key, message_id = _HEADER_V1(data, begin + 1)
+            length, sequence, key, message_id = _HEADER_V1(data, begin)
             body, flags = begin + 6, 0
             end = body + length + 2
         row = self._rows.get(message_id)
@@ -187,7 +201,7 @@ class Framer:
             usual = length <= full_length if body - begin == 10 else length in (base_length, full_length)
             return (_WAIT if usual else _DOUBTFUL), end, None
         upto = body + length
-        crc = fast_x25(data[begin + 1 : upto] + bytes((extra,)), 0xFFFF)
+        crc = x25(data[begin + 1 : upto] + bytes((extra,)))
         if crc != data[upto] | data[upto + 1] << 8:
             return _BAD_CRC, end, None
         return _GOOD, end, (begin, message_id, sequence, key, body, upto, end)

@@ -232,8 +232,11 @@ def _decode(message: MessageDefinition) -> list[str]:
     ]
     if length:
         lines += [
-            f"        if len(payload) != {length}:",
-            f'            payload = payload.ljust({length}, b"\\0")[:{length}]',
+            "        size = len(payload)",
+            f"        if size < {length}:",
+            f'            payload = payload.ljust({length}, b"\\0")',
+            f"        elif size > {length}:",
+            f"            payload = payload[:{length}]",
         ]
     lines += ["        self = _new(cls)", "        self.received_frame = frame"]
     if not message.fields:

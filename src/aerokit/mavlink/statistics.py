@@ -24,11 +24,11 @@ class SourceStatistics:
     def __init__(self, system_id: int, component_id: int, sequence: int) -> None:
         self.system_id = system_id
         self.component_id = component_id
-        self.received = 1
+        self.received = 0
         """Frames that came, whether anyone wanted them or not."""
         self.lost = 0
         """Frames missing in the sequence; one that comes late after all is taken off again."""
-        self.expected = (sequence + 1) & 0xFF
+        self.expected = sequence
         """The sequence number of the next frame."""
         self._missing: dict[int, int] = {}  # sequence number → value of `received` when it was missed
         self._late_sequence = self._late_at = -1
@@ -72,13 +72,11 @@ class SourceStatistics:
 class FramerStatistics:
     """Counters of one framer since it was made; every byte is in a frame, in an unknown one, bad, or still waiting."""
 
-    __slots__ = ("bad_bytes", "bad_crcs", "bytes", "frames", "sources", "unknown_ids")
+    __slots__ = ("bad_bytes", "bad_crcs", "bytes", "sources", "unknown_ids")
 
     def __init__(self) -> None:
         self.bytes = 0
         """Bytes taken in."""
-        self.frames = 0
-        """Frames whose checksum was right, wanted or not."""
         self.bad_bytes = 0
         """Bytes that belong to no frame: text, noise, damaged frames."""
         self.bad_crcs = 0
@@ -87,6 +85,11 @@ class FramerStatistics:
         """Frames, as far as one can tell, of messages this dialect does not know; their checksum cannot be checked."""
         self.sources: dict[tuple[int, int], SourceStatistics] = {}
         """(system id, component id) → what came from there."""
+
+    @property
+    def frames(self) -> int:
+        """Frames whose checksum was right, wanted or not."""
+        return sum(source.received for source in self.sources.values())
 
     def __repr__(self) -> str:
         names = ("bytes", "frames", "bad_bytes", "bad_crcs", "unknown_ids")

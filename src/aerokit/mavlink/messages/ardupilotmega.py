@@ -211,8 +211,11 @@ class SensorOffsets(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> SensorOffsets:
-        if len(payload) != 42:
-            payload = payload.ljust(42, b"\0")[:42]
+        size = len(payload)
+        if size < 42:
+            payload = payload.ljust(42, b"\0")
+        elif size > 42:
+            payload = payload[:42]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -286,8 +289,11 @@ class SetMagOffsets(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> SetMagOffsets:
-        if len(payload) != 8:
-            payload = payload.ljust(8, b"\0")[:8]
+        size = len(payload)
+        if size < 8:
+            payload = payload.ljust(8, b"\0")
+        elif size > 8:
+            payload = payload[:8]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -343,8 +349,11 @@ class Meminfo(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> Meminfo:
-        if len(payload) != 8:
-            payload = payload.ljust(8, b"\0")[:8]
+        size = len(payload)
+        if size < 8:
+            payload = payload.ljust(8, b"\0")
+        elif size > 8:
+            payload = payload[:8]
         self = _new(cls)
         self.received_frame = frame
         (self.brkval, self.freemem, self.freemem32) = _S152.unpack(payload)
@@ -411,8 +420,11 @@ class ApAdc(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> ApAdc:
-        if len(payload) != 12:
-            payload = payload.ljust(12, b"\0")[:12]
+        size = len(payload)
+        if size < 12:
+            payload = payload.ljust(12, b"\0")
+        elif size > 12:
+            payload = payload[:12]
         self = _new(cls)
         self.received_frame = frame
         (self.adc1, self.adc2, self.adc3, self.adc4, self.adc5, self.adc6) = _S153.unpack(payload)
@@ -516,8 +528,11 @@ class DigicamConfigure(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> DigicamConfigure:
-        if len(payload) != 15:
-            payload = payload.ljust(15, b"\0")[:15]
+        size = len(payload)
+        if size < 15:
+            payload = payload.ljust(15, b"\0")
+        elif size > 15:
+            payload = payload[:15]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -623,8 +638,11 @@ class DigicamControl(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> DigicamControl:
-        if len(payload) != 13:
-            payload = payload.ljust(13, b"\0")[:13]
+        size = len(payload)
+        if size < 13:
+            payload = payload.ljust(13, b"\0")
+        elif size > 13:
+            payload = payload[:13]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -702,8 +720,11 @@ class MountConfigure(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> MountConfigure:
-        if len(payload) != 6:
-            payload = payload.ljust(6, b"\0")[:6]
+        size = len(payload)
+        if size < 6:
+            payload = payload.ljust(6, b"\0")
+        elif size > 6:
+            payload = payload[:6]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -781,8 +802,11 @@ class MountControl(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> MountControl:
-        if len(payload) != 15:
-            payload = payload.ljust(15, b"\0")[:15]
+        size = len(payload)
+        if size < 15:
+            payload = payload.ljust(15, b"\0")
+        elif size > 15:
+            payload = payload[:15]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -860,8 +884,11 @@ class MountStatus(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> MountStatus:
-        if len(payload) != 15:
-            payload = payload.ljust(15, b"\0")[:15]
+        size = len(payload)
+        if size < 15:
+            payload = payload.ljust(15, b"\0")
+        elif size > 15:
+            payload = payload[:15]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -937,8 +964,11 @@ class FencePoint(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> FencePoint:
-        if len(payload) != 12:
-            payload = payload.ljust(12, b"\0")[:12]
+        size = len(payload)
+        if size < 12:
+            payload = payload.ljust(12, b"\0")
+        elif size > 12:
+            payload = payload[:12]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -994,8 +1024,11 @@ class FenceFetchPoint(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> FenceFetchPoint:
-        if len(payload) != 3:
-            payload = payload.ljust(3, b"\0")[:3]
+        size = len(payload)
+        if size < 3:
+            payload = payload.ljust(3, b"\0")
+        elif size > 3:
+            payload = payload[:3]
         self = _new(cls)
         self.received_frame = frame
         (self.target_system, self.target_component, self.idx) = _S161.unpack(payload)
@@ -1070,8 +1103,11 @@ class Ahrs(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> Ahrs:
-        if len(payload) != 28:
-            payload = payload.ljust(28, b"\0")[:28]
+        size = len(payload)
+        if size < 28:
+            payload = payload.ljust(28, b"\0")
+        elif size > 28:
+            payload = payload[:28]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -1172,8 +1208,11 @@ class Simstate(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> Simstate:
-        if len(payload) != 44:
-            payload = payload.ljust(44, b"\0")[:44]
+        size = len(payload)
+        if size < 44:
+            payload = payload.ljust(44, b"\0")
+        elif size > 44:
+            payload = payload[:44]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -1229,8 +1268,11 @@ class Hwstatus(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> Hwstatus:
-        if len(payload) != 3:
-            payload = payload.ljust(3, b"\0")[:3]
+        size = len(payload)
+        if size < 3:
+            payload = payload.ljust(3, b"\0")
+        elif size > 3:
+            payload = payload[:3]
         self = _new(cls)
         self.received_frame = frame
         (self.Vcc, self.I2Cerr) = _S165.unpack(payload)
@@ -1306,8 +1348,11 @@ class Radio(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> Radio:
-        if len(payload) != 9:
-            payload = payload.ljust(9, b"\0")[:9]
+        size = len(payload)
+        if size < 9:
+            payload = payload.ljust(9, b"\0")
+        elif size > 9:
+            payload = payload[:9]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -1402,8 +1447,11 @@ class LimitsStatus(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> LimitsStatus:
-        if len(payload) != 22:
-            payload = payload.ljust(22, b"\0")[:22]
+        size = len(payload)
+        if size < 22:
+            payload = payload.ljust(22, b"\0")
+        elif size > 22:
+            payload = payload[:22]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -1461,8 +1509,11 @@ class Wind(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> Wind:
-        if len(payload) != 12:
-            payload = payload.ljust(12, b"\0")[:12]
+        size = len(payload)
+        if size < 12:
+            payload = payload.ljust(12, b"\0")
+        elif size > 12:
+            payload = payload[:12]
         self = _new(cls)
         self.received_frame = frame
         (self.direction, self.speed, self.speed_z) = _S168.unpack(payload)
@@ -1514,8 +1565,11 @@ class Data16(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> Data16:
-        if len(payload) != 18:
-            payload = payload.ljust(18, b"\0")[:18]
+        size = len(payload)
+        if size < 18:
+            payload = payload.ljust(18, b"\0")
+        elif size > 18:
+            payload = payload[:18]
         self = _new(cls)
         self.received_frame = frame
         (self.type, self.len, self.data) = _S169.unpack(payload)
@@ -1567,8 +1621,11 @@ class Data32(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> Data32:
-        if len(payload) != 34:
-            payload = payload.ljust(34, b"\0")[:34]
+        size = len(payload)
+        if size < 34:
+            payload = payload.ljust(34, b"\0")
+        elif size > 34:
+            payload = payload[:34]
         self = _new(cls)
         self.received_frame = frame
         (self.type, self.len, self.data) = _S170.unpack(payload)
@@ -1620,8 +1677,11 @@ class Data64(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> Data64:
-        if len(payload) != 66:
-            payload = payload.ljust(66, b"\0")[:66]
+        size = len(payload)
+        if size < 66:
+            payload = payload.ljust(66, b"\0")
+        elif size > 66:
+            payload = payload[:66]
         self = _new(cls)
         self.received_frame = frame
         (self.type, self.len, self.data) = _S171.unpack(payload)
@@ -1673,8 +1733,11 @@ class Data96(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> Data96:
-        if len(payload) != 98:
-            payload = payload.ljust(98, b"\0")[:98]
+        size = len(payload)
+        if size < 98:
+            payload = payload.ljust(98, b"\0")
+        elif size > 98:
+            payload = payload[:98]
         self = _new(cls)
         self.received_frame = frame
         (self.type, self.len, self.data) = _S172.unpack(payload)
@@ -1721,8 +1784,11 @@ class Rangefinder(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> Rangefinder:
-        if len(payload) != 8:
-            payload = payload.ljust(8, b"\0")[:8]
+        size = len(payload)
+        if size < 8:
+            payload = payload.ljust(8, b"\0")
+        elif size > 8:
+            payload = payload[:8]
         self = _new(cls)
         self.received_frame = frame
         (self.distance, self.voltage) = _S173.unpack(payload)
@@ -1828,8 +1894,11 @@ class AirspeedAutocal(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> AirspeedAutocal:
-        if len(payload) != 48:
-            payload = payload.ljust(48, b"\0")[:48]
+        size = len(payload)
+        if size < 48:
+            payload = payload.ljust(48, b"\0")
+        elif size > 48:
+            payload = payload[:48]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -1932,8 +2001,11 @@ class RallyPoint(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> RallyPoint:
-        if len(payload) != 19:
-            payload = payload.ljust(19, b"\0")[:19]
+        size = len(payload)
+        if size < 19:
+            payload = payload.ljust(19, b"\0")
+        elif size > 19:
+            payload = payload[:19]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -1992,8 +2064,11 @@ class RallyFetchPoint(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> RallyFetchPoint:
-        if len(payload) != 3:
-            payload = payload.ljust(3, b"\0")[:3]
+        size = len(payload)
+        if size < 3:
+            payload = payload.ljust(3, b"\0")
+        elif size > 3:
+            payload = payload[:3]
         self = _new(cls)
         self.received_frame = frame
         (self.target_system, self.target_component, self.idx) = _S176.unpack(payload)
@@ -2065,8 +2140,11 @@ class CompassmotStatus(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> CompassmotStatus:
-        if len(payload) != 20:
-            payload = payload.ljust(20, b"\0")[:20]
+        size = len(payload)
+        if size < 20:
+            payload = payload.ljust(20, b"\0")
+        elif size > 20:
+            payload = payload[:20]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -2139,8 +2217,11 @@ class Ahrs2(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> Ahrs2:
-        if len(payload) != 24:
-            payload = payload.ljust(24, b"\0")[:24]
+        size = len(payload)
+        if size < 24:
+            payload = payload.ljust(24, b"\0")
+        elif size > 24:
+            payload = payload[:24]
         self = _new(cls)
         self.received_frame = frame
         (self.roll, self.pitch, self.yaw, self.altitude, self.lat, self.lng) = _S178.unpack(payload)
@@ -2225,8 +2306,11 @@ class CameraStatus(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> CameraStatus:
-        if len(payload) != 29:
-            payload = payload.ljust(29, b"\0")[:29]
+        size = len(payload)
+        if size < 29:
+            payload = payload.ljust(29, b"\0")
+        elif size > 29:
+            payload = payload[:29]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -2351,8 +2435,11 @@ class CameraFeedback(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> CameraFeedback:
-        if len(payload) != 47:
-            payload = payload.ljust(47, b"\0")[:47]
+        size = len(payload)
+        if size < 47:
+            payload = payload.ljust(47, b"\0")
+        elif size > 47:
+            payload = payload[:47]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -2408,8 +2495,11 @@ class Battery2(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> Battery2:
-        if len(payload) != 4:
-            payload = payload.ljust(4, b"\0")[:4]
+        size = len(payload)
+        if size < 4:
+            payload = payload.ljust(4, b"\0")
+        elif size > 4:
+            payload = payload[:4]
         self = _new(cls)
         self.received_frame = frame
         (self.voltage, self.current_battery) = _S181.unpack(payload)
@@ -2500,8 +2590,11 @@ class Ahrs3(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> Ahrs3:
-        if len(payload) != 40:
-            payload = payload.ljust(40, b"\0")[:40]
+        size = len(payload)
+        if size < 40:
+            payload = payload.ljust(40, b"\0")
+        elif size > 40:
+            payload = payload[:40]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -2554,8 +2647,11 @@ class AutopilotVersionRequest(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> AutopilotVersionRequest:
-        if len(payload) != 2:
-            payload = payload.ljust(2, b"\0")[:2]
+        size = len(payload)
+        if size < 2:
+            payload = payload.ljust(2, b"\0")
+        elif size > 2:
+            payload = payload[:2]
         self = _new(cls)
         self.received_frame = frame
         (self.target_system, self.target_component) = _S183.unpack(payload)
@@ -2612,8 +2708,11 @@ class RemoteLogDataBlock(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> RemoteLogDataBlock:
-        if len(payload) != 206:
-            payload = payload.ljust(206, b"\0")[:206]
+        size = len(payload)
+        if size < 206:
+            payload = payload.ljust(206, b"\0")
+        elif size > 206:
+            payload = payload[:206]
         self = _new(cls)
         self.received_frame = frame
         (self.seqno, self.target_system, self.target_component, self.data) = _S184.unpack(payload)
@@ -2672,8 +2771,11 @@ class RemoteLogBlockStatus(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> RemoteLogBlockStatus:
-        if len(payload) != 7:
-            payload = payload.ljust(7, b"\0")[:7]
+        size = len(payload)
+        if size < 7:
+            payload = payload.ljust(7, b"\0")
+        elif size > 7:
+            payload = payload[:7]
         self = _new(cls)
         self.received_frame = frame
         (self.seqno, self.target_system, self.target_component, self.status) = _S185.unpack(payload)
@@ -2745,8 +2847,11 @@ class LedControl(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> LedControl:
-        if len(payload) != 29:
-            payload = payload.ljust(29, b"\0")[:29]
+        size = len(payload)
+        if size < 29:
+            payload = payload.ljust(29, b"\0")
+        elif size > 29:
+            payload = payload[:29]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -2843,8 +2948,11 @@ class MagCalProgress(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> MagCalProgress:
-        if len(payload) != 27:
-            payload = payload.ljust(27, b"\0")[:27]
+        size = len(payload)
+        if size < 27:
+            payload = payload.ljust(27, b"\0")
+        elif size > 27:
+            payload = payload[:27]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -2931,8 +3039,11 @@ class EkfStatusReport(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> EkfStatusReport:
-        if len(payload) != 26:
-            payload = payload.ljust(26, b"\0")[:26]
+        size = len(payload)
+        if size < 26:
+            payload = payload.ljust(26, b"\0")
+        elif size > 26:
+            payload = payload[:26]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -3023,8 +3134,11 @@ class PidTuning(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> PidTuning:
-        if len(payload) != 33:
-            payload = payload.ljust(33, b"\0")[:33]
+        size = len(payload)
+        if size < 33:
+            payload = payload.ljust(33, b"\0")
+        elif size > 33:
+            payload = payload[:33]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -3126,8 +3240,11 @@ class Deepstall(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> Deepstall:
-        if len(payload) != 37:
-            payload = payload.ljust(37, b"\0")[:37]
+        size = len(payload)
+        if size < 37:
+            payload = payload.ljust(37, b"\0")
+        elif size > 37:
+            payload = payload[:37]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -3242,8 +3359,11 @@ class GimbalReport(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> GimbalReport:
-        if len(payload) != 42:
-            payload = payload.ljust(42, b"\0")[:42]
+        size = len(payload)
+        if size < 42:
+            payload = payload.ljust(42, b"\0")
+        elif size > 42:
+            payload = payload[:42]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -3318,8 +3438,11 @@ class GimbalControl(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> GimbalControl:
-        if len(payload) != 14:
-            payload = payload.ljust(14, b"\0")[:14]
+        size = len(payload)
+        if size < 14:
+            payload = payload.ljust(14, b"\0")
+        elif size > 14:
+            payload = payload[:14]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -3390,8 +3513,11 @@ class GimbalTorqueCmdReport(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> GimbalTorqueCmdReport:
-        if len(payload) != 8:
-            payload = payload.ljust(8, b"\0")[:8]
+        size = len(payload)
+        if size < 8:
+            payload = payload.ljust(8, b"\0")
+        elif size > 8:
+            payload = payload[:8]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -3449,8 +3575,11 @@ class GoproHeartbeat(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> GoproHeartbeat:
-        if len(payload) != 3:
-            payload = payload.ljust(3, b"\0")[:3]
+        size = len(payload)
+        if size < 3:
+            payload = payload.ljust(3, b"\0")
+        elif size > 3:
+            payload = payload[:3]
         self = _new(cls)
         self.received_frame = frame
         (self.status, self.capture_mode, self.flags) = _S215.unpack(payload)
@@ -3502,8 +3631,11 @@ class GoproGetRequest(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> GoproGetRequest:
-        if len(payload) != 3:
-            payload = payload.ljust(3, b"\0")[:3]
+        size = len(payload)
+        if size < 3:
+            payload = payload.ljust(3, b"\0")
+        elif size > 3:
+            payload = payload[:3]
         self = _new(cls)
         self.received_frame = frame
         (self.target_system, self.target_component, self.cmd_id) = _S216.unpack(payload)
@@ -3555,8 +3687,11 @@ class GoproGetResponse(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> GoproGetResponse:
-        if len(payload) != 6:
-            payload = payload.ljust(6, b"\0")[:6]
+        size = len(payload)
+        if size < 6:
+            payload = payload.ljust(6, b"\0")
+        elif size > 6:
+            payload = payload[:6]
         self = _new(cls)
         self.received_frame = frame
         (self.cmd_id, self.status, self.value) = _S217.unpack(payload)
@@ -3613,8 +3748,11 @@ class GoproSetRequest(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> GoproSetRequest:
-        if len(payload) != 7:
-            payload = payload.ljust(7, b"\0")[:7]
+        size = len(payload)
+        if size < 7:
+            payload = payload.ljust(7, b"\0")
+        elif size > 7:
+            payload = payload[:7]
         self = _new(cls)
         self.received_frame = frame
         (self.target_system, self.target_component, self.cmd_id, self.value) = _S218.unpack(payload)
@@ -3663,8 +3801,11 @@ class GoproSetResponse(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> GoproSetResponse:
-        if len(payload) != 2:
-            payload = payload.ljust(2, b"\0")[:2]
+        size = len(payload)
+        if size < 2:
+            payload = payload.ljust(2, b"\0")
+        elif size > 2:
+            payload = payload[:2]
         self = _new(cls)
         self.received_frame = frame
         (self.cmd_id, self.status) = _S219.unpack(payload)
@@ -3711,8 +3852,11 @@ class Rpm(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> Rpm:
-        if len(payload) != 8:
-            payload = payload.ljust(8, b"\0")[:8]
+        size = len(payload)
+        if size < 8:
+            payload = payload.ljust(8, b"\0")
+        elif size > 8:
+            payload = payload[:8]
         self = _new(cls)
         self.received_frame = frame
         (self.rpm1, self.rpm2) = _S226.unpack(payload)
@@ -3808,8 +3952,11 @@ class DeviceOpRead(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> DeviceOpRead:
-        if len(payload) != 52:
-            payload = payload.ljust(52, b"\0")[:52]
+        size = len(payload)
+        if size < 52:
+            payload = payload.ljust(52, b"\0")
+        elif size > 52:
+            payload = payload[:52]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -3885,8 +4032,11 @@ class DeviceOpReadReply(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> DeviceOpReadReply:
-        if len(payload) != 136:
-            payload = payload.ljust(136, b"\0")[:136]
+        size = len(payload)
+        if size < 136:
+            payload = payload.ljust(136, b"\0")
+        elif size > 136:
+            payload = payload[:136]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -3992,8 +4142,11 @@ class DeviceOpWrite(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> DeviceOpWrite:
-        if len(payload) != 180:
-            payload = payload.ljust(180, b"\0")[:180]
+        size = len(payload)
+        if size < 180:
+            payload = payload.ljust(180, b"\0")
+        elif size > 180:
+            payload = payload[:180]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -4048,8 +4201,11 @@ class DeviceOpWriteReply(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> DeviceOpWriteReply:
-        if len(payload) != 5:
-            payload = payload.ljust(5, b"\0")[:5]
+        size = len(payload)
+        if size < 5:
+            payload = payload.ljust(5, b"\0")
+        elif size > 5:
+            payload = payload[:5]
         self = _new(cls)
         self.received_frame = frame
         (self.request_id, self.result) = _S11003.unpack(payload)
@@ -4133,8 +4289,11 @@ class SecureCommand(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> SecureCommand:
-        if len(payload) != 232:
-            payload = payload.ljust(232, b"\0")[:232]
+        size = len(payload)
+        if size < 232:
+            payload = payload.ljust(232, b"\0")
+        elif size > 232:
+            payload = payload[:232]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -4202,8 +4361,11 @@ class SecureCommandReply(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> SecureCommandReply:
-        if len(payload) != 230:
-            payload = payload.ljust(230, b"\0")[:230]
+        size = len(payload)
+        if size < 230:
+            payload = payload.ljust(230, b"\0")
+        elif size > 230:
+            payload = payload[:230]
         self = _new(cls)
         self.received_frame = frame
         (self.sequence, self.operation, self.result, self.data_length, self.data) = _S11005.unpack(payload)
@@ -4316,8 +4478,11 @@ class AdapTuning(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> AdapTuning:
-        if len(payload) != 49:
-            payload = payload.ljust(49, b"\0")[:49]
+        size = len(payload)
+        if size < 49:
+            payload = payload.ljust(49, b"\0")
+        elif size > 49:
+            payload = payload[:49]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -4392,8 +4557,11 @@ class VisionPositionDelta(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> VisionPositionDelta:
-        if len(payload) != 44:
-            payload = payload.ljust(44, b"\0")[:44]
+        size = len(payload)
+        if size < 44:
+            payload = payload.ljust(44, b"\0")
+        elif size > 44:
+            payload = payload[:44]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -4452,8 +4620,11 @@ class AoaSsa(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> AoaSsa:
-        if len(payload) != 16:
-            payload = payload.ljust(16, b"\0")[:16]
+        size = len(payload)
+        if size < 16:
+            payload = payload.ljust(16, b"\0")
+        elif size > 16:
+            payload = payload[:16]
         self = _new(cls)
         self.received_frame = frame
         (self.time_usec, self.AOA, self.SSA) = _S11020.unpack(payload)
@@ -4523,8 +4694,11 @@ class EscTelemetry1To4(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> EscTelemetry1To4:
-        if len(payload) != 44:
-            payload = payload.ljust(44, b"\0")[:44]
+        size = len(payload)
+        if size < 44:
+            payload = payload.ljust(44, b"\0")
+        elif size > 44:
+            payload = payload[:44]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -4605,8 +4779,11 @@ class EscTelemetry5To8(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> EscTelemetry5To8:
-        if len(payload) != 44:
-            payload = payload.ljust(44, b"\0")[:44]
+        size = len(payload)
+        if size < 44:
+            payload = payload.ljust(44, b"\0")
+        elif size > 44:
+            payload = payload[:44]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -4688,8 +4865,11 @@ class EscTelemetry9To12(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> EscTelemetry9To12:
-        if len(payload) != 44:
-            payload = payload.ljust(44, b"\0")[:44]
+        size = len(payload)
+        if size < 44:
+            payload = payload.ljust(44, b"\0")
+        elif size > 44:
+            payload = payload[:44]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -4799,8 +4979,11 @@ class OsdParamConfig(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> OsdParamConfig:
-        if len(payload) != 37:
-            payload = payload.ljust(37, b"\0")[:37]
+        size = len(payload)
+        if size < 37:
+            payload = payload.ljust(37, b"\0")
+        elif size > 37:
+            payload = payload[:37]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -4855,8 +5038,11 @@ class OsdParamConfigReply(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> OsdParamConfigReply:
-        if len(payload) != 5:
-            payload = payload.ljust(5, b"\0")[:5]
+        size = len(payload)
+        if size < 5:
+            payload = payload.ljust(5, b"\0")
+        elif size > 5:
+            payload = payload[:5]
         self = _new(cls)
         self.received_frame = frame
         (self.request_id, self.result) = _S11034.unpack(payload)
@@ -4920,8 +5106,11 @@ class OsdParamShowConfig(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> OsdParamShowConfig:
-        if len(payload) != 8:
-            payload = payload.ljust(8, b"\0")[:8]
+        size = len(payload)
+        if size < 8:
+            payload = payload.ljust(8, b"\0")
+        elif size > 8:
+            payload = payload[:8]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -5005,8 +5194,11 @@ class OsdParamShowConfigReply(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> OsdParamShowConfigReply:
-        if len(payload) != 34:
-            payload = payload.ljust(34, b"\0")[:34]
+        size = len(payload)
+        if size < 34:
+            payload = payload.ljust(34, b"\0")
+        elif size > 34:
+            payload = payload[:34]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -5104,8 +5296,11 @@ class ObstacleDistance3d(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> ObstacleDistance3d:
-        if len(payload) != 28:
-            payload = payload.ljust(28, b"\0")[:28]
+        size = len(payload)
+        if size < 28:
+            payload = payload.ljust(28, b"\0")
+        elif size > 28:
+            payload = payload[:28]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -5212,8 +5407,11 @@ class WaterDepth(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> WaterDepth:
-        if len(payload) != 38:
-            payload = payload.ljust(38, b"\0")[:38]
+        size = len(payload)
+        if size < 38:
+            payload = payload.ljust(38, b"\0")
+        elif size > 38:
+            payload = payload[:38]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -5284,8 +5482,11 @@ class McuStatus(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> McuStatus:
-        if len(payload) != 9:
-            payload = payload.ljust(9, b"\0")[:9]
+        size = len(payload)
+        if size < 9:
+            payload = payload.ljust(9, b"\0")
+        elif size > 9:
+            payload = payload[:9]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -5360,8 +5561,11 @@ class EscTelemetry13To16(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> EscTelemetry13To16:
-        if len(payload) != 44:
-            payload = payload.ljust(44, b"\0")[:44]
+        size = len(payload)
+        if size < 44:
+            payload = payload.ljust(44, b"\0")
+        elif size > 44:
+            payload = payload[:44]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -5443,8 +5647,11 @@ class EscTelemetry17To20(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> EscTelemetry17To20:
-        if len(payload) != 44:
-            payload = payload.ljust(44, b"\0")[:44]
+        size = len(payload)
+        if size < 44:
+            payload = payload.ljust(44, b"\0")
+        elif size > 44:
+            payload = payload[:44]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -5526,8 +5733,11 @@ class EscTelemetry21To24(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> EscTelemetry21To24:
-        if len(payload) != 44:
-            payload = payload.ljust(44, b"\0")[:44]
+        size = len(payload)
+        if size < 44:
+            payload = payload.ljust(44, b"\0")
+        elif size > 44:
+            payload = payload[:44]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -5609,8 +5819,11 @@ class EscTelemetry25To28(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> EscTelemetry25To28:
-        if len(payload) != 44:
-            payload = payload.ljust(44, b"\0")[:44]
+        size = len(payload)
+        if size < 44:
+            payload = payload.ljust(44, b"\0")
+        elif size > 44:
+            payload = payload[:44]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -5692,8 +5905,11 @@ class EscTelemetry29To32(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> EscTelemetry29To32:
-        if len(payload) != 44:
-            payload = payload.ljust(44, b"\0")[:44]
+        size = len(payload)
+        if size < 44:
+            payload = payload.ljust(44, b"\0")
+        elif size > 44:
+            payload = payload[:44]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -5758,8 +5974,11 @@ class NamedValueString(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> NamedValueString:
-        if len(payload) != 78:
-            payload = payload.ljust(78, b"\0")[:78]
+        size = len(payload)
+        if size < 78:
+            payload = payload.ljust(78, b"\0")
+        elif size > 78:
+            payload = payload[:78]
         self = _new(cls)
         self.received_frame = frame
         (self.time_boot_ms, v1, v2) = _S11060.unpack(payload)
@@ -5858,8 +6077,11 @@ class UavionixAdsbOutCfg(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> UavionixAdsbOutCfg:
-        if len(payload) != 20:
-            payload = payload.ljust(20, b"\0")[:20]
+        size = len(payload)
+        if size < 20:
+            payload = payload.ljust(20, b"\0")
+        elif size > 20:
+            payload = payload[:20]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -6006,8 +6228,11 @@ class UavionixAdsbOutDynamic(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> UavionixAdsbOutDynamic:
-        if len(payload) != 41:
-            payload = payload.ljust(41, b"\0")[:41]
+        size = len(payload)
+        if size < 41:
+            payload = payload.ljust(41, b"\0")
+        elif size > 41:
+            payload = payload[:41]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -6058,8 +6283,11 @@ class UavionixAdsbTransceiverHealthReport(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> UavionixAdsbTransceiverHealthReport:
-        if len(payload) != 1:
-            payload = payload.ljust(1, b"\0")[:1]
+        size = len(payload)
+        if size < 1:
+            payload = payload.ljust(1, b"\0")
+        elif size > 1:
+            payload = payload[:1]
         self = _new(cls)
         self.received_frame = frame
         (self.rfHealth,) = _S10003.unpack(payload)
@@ -6103,8 +6331,11 @@ class UavionixAdsbOutCfgRegistration(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> UavionixAdsbOutCfgRegistration:
-        if len(payload) != 9:
-            payload = payload.ljust(9, b"\0")[:9]
+        size = len(payload)
+        if size < 9:
+            payload = payload.ljust(9, b"\0")
+        elif size > 9:
+            payload = payload[:9]
         self = _new(cls)
         self.received_frame = frame
         (v0,) = _S10004.unpack(payload)
@@ -6150,8 +6381,11 @@ class UavionixAdsbOutCfgFlightid(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> UavionixAdsbOutCfgFlightid:
-        if len(payload) != 9:
-            payload = payload.ljust(9, b"\0")[:9]
+        size = len(payload)
+        if size < 9:
+            payload = payload.ljust(9, b"\0")
+        elif size > 9:
+            payload = payload[:9]
         self = _new(cls)
         self.received_frame = frame
         (v0,) = _S10005.unpack(payload)
@@ -6194,8 +6428,11 @@ class UavionixAdsbGet(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> UavionixAdsbGet:
-        if len(payload) != 4:
-            payload = payload.ljust(4, b"\0")[:4]
+        size = len(payload)
+        if size < 4:
+            payload = payload.ljust(4, b"\0")
+        elif size > 4:
+            payload = payload[:4]
         self = _new(cls)
         self.received_frame = frame
         (self.ReqMessageId,) = _S10006.unpack(payload)
@@ -6268,8 +6505,11 @@ class UavionixAdsbOutControl(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> UavionixAdsbOutControl:
-        if len(payload) != 17:
-            payload = payload.ljust(17, b"\0")[:17]
+        size = len(payload)
+        if size < 17:
+            payload = payload.ljust(17, b"\0")
+        elif size > 17:
+            payload = payload[:17]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -6350,8 +6590,11 @@ class UavionixAdsbOutStatus(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> UavionixAdsbOutStatus:
-        if len(payload) != 14:
-            payload = payload.ljust(14, b"\0")[:14]
+        size = len(payload)
+        if size < 14:
+            payload = payload.ljust(14, b"\0")
+        elif size > 14:
+            payload = payload[:14]
         self = _new(cls)
         self.received_frame = frame
         (self.squawk, self.state, self.NIC_NACp, self.boardTemp, self.fault, v5) = _S10008.unpack(payload)
@@ -6397,8 +6640,11 @@ class IcarousHeartbeat(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> IcarousHeartbeat:
-        if len(payload) != 1:
-            payload = payload.ljust(1, b"\0")[:1]
+        size = len(payload)
+        if size < 1:
+            payload = payload.ljust(1, b"\0")
+        elif size > 1:
+            payload = payload[:1]
         self = _new(cls)
         self.received_frame = frame
         (self.status,) = _S42000.unpack(payload)
@@ -6525,8 +6771,11 @@ class IcarousKinematicBands(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> IcarousKinematicBands:
-        if len(payload) != 46:
-            payload = payload.ljust(46, b"\0")[:46]
+        size = len(payload)
+        if size < 46:
+            payload = payload.ljust(46, b"\0")
+        elif size > 46:
+            payload = payload[:46]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -6705,8 +6954,11 @@ class LoweheiserGovEfi(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> LoweheiserGovEfi:
-        if len(payload) != 85:
-            payload = payload.ljust(85, b"\0")[:85]
+        size = len(payload)
+        if size < 85:
+            payload = payload.ljust(85, b"\0")
+        elif size > 85:
+            payload = payload[:85]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -6760,8 +7012,11 @@ class CubepilotRawRc(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> CubepilotRawRc:
-        if len(payload) != 32:
-            payload = payload.ljust(32, b"\0")[:32]
+        size = len(payload)
+        if size < 32:
+            payload = payload.ljust(32, b"\0")
+        elif size > 32:
+            payload = payload[:32]
         self = _new(cls)
         self.received_frame = frame
         (self.rc_raw,) = _S50001.unpack(payload)
@@ -6847,8 +7102,11 @@ class HerelinkVideoStreamInformation(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> HerelinkVideoStreamInformation:
-        if len(payload) != 246:
-            payload = payload.ljust(246, b"\0")[:246]
+        size = len(payload)
+        if size < 246:
+            payload = payload.ljust(246, b"\0")
+        elif size > 246:
+            payload = payload[:246]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -6929,8 +7187,11 @@ class HerelinkTelem(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> HerelinkTelem:
-        if len(payload) != 19:
-            payload = payload.ljust(19, b"\0")[:19]
+        size = len(payload)
+        if size < 19:
+            payload = payload.ljust(19, b"\0")
+        elif size > 19:
+            payload = payload[:19]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -6992,8 +7253,11 @@ class CubepilotFirmwareUpdateStart(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> CubepilotFirmwareUpdateStart:
-        if len(payload) != 10:
-            payload = payload.ljust(10, b"\0")[:10]
+        size = len(payload)
+        if size < 10:
+            payload = payload.ljust(10, b"\0")
+        elif size > 10:
+            payload = payload[:10]
         self = _new(cls)
         self.received_frame = frame
         (self.size, self.crc, self.target_system, self.target_component) = _S50004.unpack(payload)
@@ -7045,8 +7309,11 @@ class CubepilotFirmwareUpdateResp(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> CubepilotFirmwareUpdateResp:
-        if len(payload) != 6:
-            payload = payload.ljust(6, b"\0")[:6]
+        size = len(payload)
+        if size < 6:
+            payload = payload.ljust(6, b"\0")
+        elif size > 6:
+            payload = payload[:6]
         self = _new(cls)
         self.received_frame = frame
         (self.offset, self.target_system, self.target_component) = _S50005.unpack(payload)
@@ -7093,8 +7360,11 @@ class AirlinkAuth(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> AirlinkAuth:
-        if len(payload) != 100:
-            payload = payload.ljust(100, b"\0")[:100]
+        size = len(payload)
+        if size < 100:
+            payload = payload.ljust(100, b"\0")
+        elif size > 100:
+            payload = payload[:100]
         self = _new(cls)
         self.received_frame = frame
         (v0, v1) = _S52000.unpack(payload)
@@ -7138,8 +7408,11 @@ class AirlinkAuthResponse(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> AirlinkAuthResponse:
-        if len(payload) != 1:
-            payload = payload.ljust(1, b"\0")[:1]
+        size = len(payload)
+        if size < 1:
+            payload = payload.ljust(1, b"\0")
+        elif size > 1:
+            payload = payload[:1]
         self = _new(cls)
         self.received_frame = frame
         (self.resp_type,) = _S52001.unpack(payload)

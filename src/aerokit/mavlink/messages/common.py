@@ -380,8 +380,11 @@ class SysStatus(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> SysStatus:
-        if len(payload) != 43:
-            payload = payload.ljust(43, b"\0")[:43]
+        size = len(payload)
+        if size < 43:
+            payload = payload.ljust(43, b"\0")
+        elif size > 43:
+            payload = payload[:43]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -446,8 +449,11 @@ class SystemTime(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> SystemTime:
-        if len(payload) != 12:
-            payload = payload.ljust(12, b"\0")[:12]
+        size = len(payload)
+        if size < 12:
+            payload = payload.ljust(12, b"\0")
+        elif size > 12:
+            payload = payload[:12]
         self = _new(cls)
         self.received_frame = frame
         (self.time_unix_usec, self.time_boot_ms) = _S2.unpack(payload)
@@ -515,8 +521,11 @@ class Ping(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> Ping:
-        if len(payload) != 14:
-            payload = payload.ljust(14, b"\0")[:14]
+        size = len(payload)
+        if size < 14:
+            payload = payload.ljust(14, b"\0")
+        elif size > 14:
+            payload = payload[:14]
         self = _new(cls)
         self.received_frame = frame
         (self.time_usec, self.seq, self.target_system, self.target_component) = _S4.unpack(payload)
@@ -578,8 +587,11 @@ class ChangeOperatorControl(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> ChangeOperatorControl:
-        if len(payload) != 28:
-            payload = payload.ljust(28, b"\0")[:28]
+        size = len(payload)
+        if size < 28:
+            payload = payload.ljust(28, b"\0")
+        elif size > 28:
+            payload = payload[:28]
         self = _new(cls)
         self.received_frame = frame
         (self.target_system, self.control_request, self.version, v3) = _S5.unpack(payload)
@@ -636,8 +648,11 @@ class ChangeOperatorControlAck(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> ChangeOperatorControlAck:
-        if len(payload) != 3:
-            payload = payload.ljust(3, b"\0")[:3]
+        size = len(payload)
+        if size < 3:
+            payload = payload.ljust(3, b"\0")
+        elif size > 3:
+            payload = payload[:3]
         self = _new(cls)
         self.received_frame = frame
         (self.gcs_system_id, self.control_request, self.ack) = _S6.unpack(payload)
@@ -680,8 +695,11 @@ class AuthKey(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> AuthKey:
-        if len(payload) != 32:
-            payload = payload.ljust(32, b"\0")[:32]
+        size = len(payload)
+        if size < 32:
+            payload = payload.ljust(32, b"\0")
+        elif size > 32:
+            payload = payload[:32]
         self = _new(cls)
         self.received_frame = frame
         (v0,) = _S7.unpack(payload)
@@ -738,8 +756,11 @@ class SetMode(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> SetMode:
-        if len(payload) != 6:
-            payload = payload.ljust(6, b"\0")[:6]
+        size = len(payload)
+        if size < 6:
+            payload = payload.ljust(6, b"\0")
+        elif size > 6:
+            payload = payload[:6]
         self = _new(cls)
         self.received_frame = frame
         (self.custom_mode, self.target_system, self.base_mode) = _S11.unpack(payload)
@@ -806,8 +827,11 @@ class ParamRequestRead(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> ParamRequestRead:
-        if len(payload) != 20:
-            payload = payload.ljust(20, b"\0")[:20]
+        size = len(payload)
+        if size < 20:
+            payload = payload.ljust(20, b"\0")
+        elif size > 20:
+            payload = payload[:20]
         self = _new(cls)
         self.received_frame = frame
         (self.param_index, self.target_system, self.target_component, v3) = _S20.unpack(payload)
@@ -859,8 +883,11 @@ class ParamRequestList(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> ParamRequestList:
-        if len(payload) != 2:
-            payload = payload.ljust(2, b"\0")[:2]
+        size = len(payload)
+        if size < 2:
+            payload = payload.ljust(2, b"\0")
+        elif size > 2:
+            payload = payload[:2]
         self = _new(cls)
         self.received_frame = frame
         (self.target_system, self.target_component) = _S21.unpack(payload)
@@ -930,8 +957,11 @@ class ParamValue(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> ParamValue:
-        if len(payload) != 25:
-            payload = payload.ljust(25, b"\0")[:25]
+        size = len(payload)
+        if size < 25:
+            payload = payload.ljust(25, b"\0")
+        elif size > 25:
+            payload = payload[:25]
         self = _new(cls)
         self.received_frame = frame
         (self.param_value, self.param_count, self.param_index, v3, self.param_type) = _S22.unpack(payload)
@@ -1006,8 +1036,11 @@ class ParamSet(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> ParamSet:
-        if len(payload) != 23:
-            payload = payload.ljust(23, b"\0")[:23]
+        size = len(payload)
+        if size < 23:
+            payload = payload.ljust(23, b"\0")
+        elif size > 23:
+            payload = payload[:23]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -1158,8 +1191,11 @@ class GpsRawInt(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> GpsRawInt:
-        if len(payload) != 52:
-            payload = payload.ljust(52, b"\0")[:52]
+        size = len(payload)
+        if size < 52:
+            payload = payload.ljust(52, b"\0")
+        elif size > 52:
+            payload = payload[:52]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -1247,8 +1283,11 @@ class GpsStatus(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> GpsStatus:
-        if len(payload) != 101:
-            payload = payload.ljust(101, b"\0")[:101]
+        size = len(payload)
+        if size < 101:
+            payload = payload.ljust(101, b"\0")
+        elif size > 101:
+            payload = payload[:101]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -1359,8 +1398,11 @@ class ScaledImu(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> ScaledImu:
-        if len(payload) != 24:
-            payload = payload.ljust(24, b"\0")[:24]
+        size = len(payload)
+        if size < 24:
+            payload = payload.ljust(24, b"\0")
+        elif size > 24:
+            payload = payload[:24]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -1482,8 +1524,11 @@ class RawImu(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> RawImu:
-        if len(payload) != 29:
-            payload = payload.ljust(29, b"\0")[:29]
+        size = len(payload)
+        if size < 29:
+            payload = payload.ljust(29, b"\0")
+        elif size > 29:
+            payload = payload[:29]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -1557,8 +1602,11 @@ class RawPressure(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> RawPressure:
-        if len(payload) != 16:
-            payload = payload.ljust(16, b"\0")[:16]
+        size = len(payload)
+        if size < 16:
+            payload = payload.ljust(16, b"\0")
+        elif size > 16:
+            payload = payload[:16]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -1630,8 +1678,11 @@ class ScaledPressure(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> ScaledPressure:
-        if len(payload) != 16:
-            payload = payload.ljust(16, b"\0")[:16]
+        size = len(payload)
+        if size < 16:
+            payload = payload.ljust(16, b"\0")
+        elif size > 16:
+            payload = payload[:16]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -1712,8 +1763,11 @@ class Attitude(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> Attitude:
-        if len(payload) != 28:
-            payload = payload.ljust(28, b"\0")[:28]
+        size = len(payload)
+        if size < 28:
+            payload = payload.ljust(28, b"\0")
+        elif size > 28:
+            payload = payload[:28]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -1817,8 +1871,11 @@ class AttitudeQuaternion(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> AttitudeQuaternion:
-        if len(payload) != 48:
-            payload = payload.ljust(48, b"\0")[:48]
+        size = len(payload)
+        if size < 48:
+            payload = payload.ljust(48, b"\0")
+        elif size > 48:
+            payload = payload[:48]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -1901,8 +1958,11 @@ class LocalPositionNed(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> LocalPositionNed:
-        if len(payload) != 28:
-            payload = payload.ljust(28, b"\0")[:28]
+        size = len(payload)
+        if size < 28:
+            payload = payload.ljust(28, b"\0")
+        elif size > 28:
+            payload = payload[:28]
         self = _new(cls)
         self.received_frame = frame
         (self.time_boot_ms, self.x, self.y, self.z, self.vx, self.vy, self.vz) = _S32.unpack(payload)
@@ -2009,8 +2069,11 @@ class RcChannelsScaled(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> RcChannelsScaled:
-        if len(payload) != 22:
-            payload = payload.ljust(22, b"\0")[:22]
+        size = len(payload)
+        if size < 22:
+            payload = payload.ljust(22, b"\0")
+        elif size > 22:
+            payload = payload[:22]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -2124,8 +2187,11 @@ class RcChannelsRaw(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> RcChannelsRaw:
-        if len(payload) != 22:
-            payload = payload.ljust(22, b"\0")[:22]
+        size = len(payload)
+        if size < 22:
+            payload = payload.ljust(22, b"\0")
+        elif size > 22:
+            payload = payload[:22]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -2278,8 +2344,11 @@ class ServoOutputRaw(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> ServoOutputRaw:
-        if len(payload) != 37:
-            payload = payload.ljust(37, b"\0")[:37]
+        size = len(payload)
+        if size < 37:
+            payload = payload.ljust(37, b"\0")
+        elif size > 37:
+            payload = payload[:37]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -2356,8 +2425,11 @@ class MissionRequestPartialList(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> MissionRequestPartialList:
-        if len(payload) != 7:
-            payload = payload.ljust(7, b"\0")[:7]
+        size = len(payload)
+        if size < 7:
+            payload = payload.ljust(7, b"\0")
+        elif size > 7:
+            payload = payload[:7]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -2431,8 +2503,11 @@ class MissionWritePartialList(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> MissionWritePartialList:
-        if len(payload) != 7:
-            payload = payload.ljust(7, b"\0")[:7]
+        size = len(payload)
+        if size < 7:
+            payload = payload.ljust(7, b"\0")
+        elif size > 7:
+            payload = payload[:7]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -2570,8 +2645,11 @@ class MissionItem(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> MissionItem:
-        if len(payload) != 38:
-            payload = payload.ljust(38, b"\0")[:38]
+        size = len(payload)
+        if size < 38:
+            payload = payload.ljust(38, b"\0")
+        elif size > 38:
+            payload = payload[:38]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -2641,8 +2719,11 @@ class MissionRequest(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> MissionRequest:
-        if len(payload) != 5:
-            payload = payload.ljust(5, b"\0")[:5]
+        size = len(payload)
+        if size < 5:
+            payload = payload.ljust(5, b"\0")
+        elif size > 5:
+            payload = payload[:5]
         self = _new(cls)
         self.received_frame = frame
         (self.seq, self.target_system, self.target_component, self.mission_type) = _S40.unpack(payload)
@@ -2704,8 +2785,11 @@ class MissionSetCurrent(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> MissionSetCurrent:
-        if len(payload) != 4:
-            payload = payload.ljust(4, b"\0")[:4]
+        size = len(payload)
+        if size < 4:
+            payload = payload.ljust(4, b"\0")
+        elif size > 4:
+            payload = payload[:4]
         self = _new(cls)
         self.received_frame = frame
         (self.seq, self.target_system, self.target_component) = _S41.unpack(payload)
@@ -2773,8 +2857,11 @@ class MissionCurrent(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> MissionCurrent:
-        if len(payload) != 6:
-            payload = payload.ljust(6, b"\0")[:6]
+        size = len(payload)
+        if size < 6:
+            payload = payload.ljust(6, b"\0")
+        elif size > 6:
+            payload = payload[:6]
         self = _new(cls)
         self.received_frame = frame
         (self.seq, self.total, self.mission_state, self.mission_mode) = _S42.unpack(payload)
@@ -2826,8 +2913,11 @@ class MissionRequestList(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> MissionRequestList:
-        if len(payload) != 3:
-            payload = payload.ljust(3, b"\0")[:3]
+        size = len(payload)
+        if size < 3:
+            payload = payload.ljust(3, b"\0")
+        elif size > 3:
+            payload = payload[:3]
         self = _new(cls)
         self.received_frame = frame
         (self.target_system, self.target_component, self.mission_type) = _S43.unpack(payload)
@@ -2886,8 +2976,11 @@ class MissionCount(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> MissionCount:
-        if len(payload) != 5:
-            payload = payload.ljust(5, b"\0")[:5]
+        size = len(payload)
+        if size < 5:
+            payload = payload.ljust(5, b"\0")
+        elif size > 5:
+            payload = payload[:5]
         self = _new(cls)
         self.received_frame = frame
         (self.count, self.target_system, self.target_component, self.mission_type) = _S44.unpack(payload)
@@ -2939,8 +3032,11 @@ class MissionClearAll(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> MissionClearAll:
-        if len(payload) != 3:
-            payload = payload.ljust(3, b"\0")[:3]
+        size = len(payload)
+        if size < 3:
+            payload = payload.ljust(3, b"\0")
+        elif size > 3:
+            payload = payload[:3]
         self = _new(cls)
         self.received_frame = frame
         (self.target_system, self.target_component, self.mission_type) = _S45.unpack(payload)
@@ -2984,8 +3080,11 @@ class MissionItemReached(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> MissionItemReached:
-        if len(payload) != 2:
-            payload = payload.ljust(2, b"\0")[:2]
+        size = len(payload)
+        if size < 2:
+            payload = payload.ljust(2, b"\0")
+        elif size > 2:
+            payload = payload[:2]
         self = _new(cls)
         self.received_frame = frame
         (self.seq,) = _S46.unpack(payload)
@@ -3043,8 +3142,11 @@ class MissionAck(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> MissionAck:
-        if len(payload) != 4:
-            payload = payload.ljust(4, b"\0")[:4]
+        size = len(payload)
+        if size < 4:
+            payload = payload.ljust(4, b"\0")
+        elif size > 4:
+            payload = payload[:4]
         self = _new(cls)
         self.received_frame = frame
         (self.target_system, self.target_component, self.type, self.mission_type) = _S47.unpack(payload)
@@ -3117,8 +3219,11 @@ class SetGpsGlobalOrigin(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> SetGpsGlobalOrigin:
-        if len(payload) != 21:
-            payload = payload.ljust(21, b"\0")[:21]
+        size = len(payload)
+        if size < 21:
+            payload = payload.ljust(21, b"\0")
+        elif size > 21:
+            payload = payload[:21]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -3182,8 +3287,11 @@ class GpsGlobalOrigin(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> GpsGlobalOrigin:
-        if len(payload) != 20:
-            payload = payload.ljust(20, b"\0")[:20]
+        size = len(payload)
+        if size < 20:
+            payload = payload.ljust(20, b"\0")
+        elif size > 20:
+            payload = payload[:20]
         self = _new(cls)
         self.received_frame = frame
         (self.latitude, self.longitude, self.altitude, self.time_usec) = _S49.unpack(payload)
@@ -3287,8 +3395,11 @@ class ParamMapRc(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> ParamMapRc:
-        if len(payload) != 37:
-            payload = payload.ljust(37, b"\0")[:37]
+        size = len(payload)
+        if size < 37:
+            payload = payload.ljust(37, b"\0")
+        elif size > 37:
+            payload = payload[:37]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -3355,8 +3466,11 @@ class MissionRequestInt(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> MissionRequestInt:
-        if len(payload) != 5:
-            payload = payload.ljust(5, b"\0")[:5]
+        size = len(payload)
+        if size < 5:
+            payload = payload.ljust(5, b"\0")
+        elif size > 5:
+            payload = payload[:5]
         self = _new(cls)
         self.received_frame = frame
         (self.seq, self.target_system, self.target_component, self.mission_type) = _S51.unpack(payload)
@@ -3445,8 +3559,11 @@ class SafetySetAllowedArea(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> SafetySetAllowedArea:
-        if len(payload) != 27:
-            payload = payload.ljust(27, b"\0")[:27]
+        size = len(payload)
+        if size < 27:
+            payload = payload.ljust(27, b"\0")
+        elif size > 27:
+            payload = payload[:27]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -3528,8 +3645,11 @@ class SafetyAllowedArea(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> SafetyAllowedArea:
-        if len(payload) != 25:
-            payload = payload.ljust(25, b"\0")[:25]
+        size = len(payload)
+        if size < 25:
+            payload = payload.ljust(25, b"\0")
+        elif size > 25:
+            payload = payload[:25]
         self = _new(cls)
         self.received_frame = frame
         (self.p1x, self.p1y, self.p1z, self.p2x, self.p2y, self.p2z, self.frame) = _S55.unpack(payload)
@@ -3607,8 +3727,11 @@ class AttitudeQuaternionCov(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> AttitudeQuaternionCov:
-        if len(payload) != 72:
-            payload = payload.ljust(72, b"\0")[:72]
+        size = len(payload)
+        if size < 72:
+            payload = payload.ljust(72, b"\0")
+        elif size > 72:
+            payload = payload[:72]
         self = _new(cls)
         self.received_frame = frame
         values = _S61.unpack(payload)
@@ -3703,8 +3826,11 @@ class NavControllerOutput(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> NavControllerOutput:
-        if len(payload) != 26:
-            payload = payload.ljust(26, b"\0")[:26]
+        size = len(payload)
+        if size < 26:
+            payload = payload.ljust(26, b"\0")
+        elif size > 26:
+            payload = payload[:26]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -3814,8 +3940,11 @@ class GlobalPositionIntCov(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> GlobalPositionIntCov:
-        if len(payload) != 181:
-            payload = payload.ljust(181, b"\0")[:181]
+        size = len(payload)
+        if size < 181:
+            payload = payload.ljust(181, b"\0")
+        elif size > 181:
+            payload = payload[:181]
         self = _new(cls)
         self.received_frame = frame
         values = _S63.unpack(payload)
@@ -3941,8 +4070,11 @@ class LocalPositionNedCov(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> LocalPositionNedCov:
-        if len(payload) != 225:
-            payload = payload.ljust(225, b"\0")[:225]
+        size = len(payload)
+        if size < 225:
+            payload = payload.ljust(225, b"\0")
+        elif size > 225:
+            payload = payload[:225]
         self = _new(cls)
         self.received_frame = frame
         values = _S64.unpack(payload)
@@ -4119,8 +4251,11 @@ class RcChannels(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> RcChannels:
-        if len(payload) != 42:
-            payload = payload.ljust(42, b"\0")[:42]
+        size = len(payload)
+        if size < 42:
+            payload = payload.ljust(42, b"\0")
+        elif size > 42:
+            payload = payload[:42]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -4195,8 +4330,11 @@ class RequestDataStream(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> RequestDataStream:
-        if len(payload) != 6:
-            payload = payload.ljust(6, b"\0")[:6]
+        size = len(payload)
+        if size < 6:
+            payload = payload.ljust(6, b"\0")
+        elif size > 6:
+            payload = payload[:6]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -4254,8 +4392,11 @@ class DataStream(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> DataStream:
-        if len(payload) != 4:
-            payload = payload.ljust(4, b"\0")[:4]
+        size = len(payload)
+        if size < 4:
+            payload = payload.ljust(4, b"\0")
+        elif size > 4:
+            payload = payload[:4]
         self = _new(cls)
         self.received_frame = frame
         (self.message_rate, self.stream_id, self.on_off) = _S67.unpack(payload)
@@ -4428,8 +4569,11 @@ class ManualControl(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> ManualControl:
-        if len(payload) != 30:
-            payload = payload.ljust(30, b"\0")[:30]
+        size = len(payload)
+        if size < 30:
+            payload = payload.ljust(30, b"\0")
+        elif size > 30:
+            payload = payload[:30]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -4636,8 +4780,11 @@ class RcChannelsOverride(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> RcChannelsOverride:
-        if len(payload) != 38:
-            payload = payload.ljust(38, b"\0")[:38]
+        size = len(payload)
+        if size < 38:
+            payload = payload.ljust(38, b"\0")
+        elif size > 38:
+            payload = payload[:38]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -4782,8 +4929,11 @@ class MissionItemInt(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> MissionItemInt:
-        if len(payload) != 38:
-            payload = payload.ljust(38, b"\0")[:38]
+        size = len(payload)
+        if size < 38:
+            payload = payload.ljust(38, b"\0")
+        elif size > 38:
+            payload = payload[:38]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -4863,8 +5013,11 @@ class VfrHud(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> VfrHud:
-        if len(payload) != 20:
-            payload = payload.ljust(20, b"\0")[:20]
+        size = len(payload)
+        if size < 20:
+            payload = payload.ljust(20, b"\0")
+        elif size > 20:
+            payload = payload[:20]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -4984,8 +5137,11 @@ class CommandInt(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> CommandInt:
-        if len(payload) != 35:
-            payload = payload.ljust(35, b"\0")[:35]
+        size = len(payload)
+        if size < 35:
+            payload = payload.ljust(35, b"\0")
+        elif size > 35:
+            payload = payload[:35]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -5097,8 +5253,11 @@ class CommandLong(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> CommandLong:
-        if len(payload) != 33:
-            payload = payload.ljust(33, b"\0")[:33]
+        size = len(payload)
+        if size < 33:
+            payload = payload.ljust(33, b"\0")
+        elif size > 33:
+            payload = payload[:33]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -5180,8 +5339,11 @@ class CommandAck(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> CommandAck:
-        if len(payload) != 10:
-            payload = payload.ljust(10, b"\0")[:10]
+        size = len(payload)
+        if size < 10:
+            payload = payload.ljust(10, b"\0")
+        elif size > 10:
+            payload = payload[:10]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -5264,8 +5426,11 @@ class ManualSetpoint(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> ManualSetpoint:
-        if len(payload) != 22:
-            payload = payload.ljust(22, b"\0")[:22]
+        size = len(payload)
+        if size < 22:
+            payload = payload.ljust(22, b"\0")
+        elif size > 22:
+            payload = payload[:22]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -5368,8 +5533,11 @@ class SetAttitudeTarget(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> SetAttitudeTarget:
-        if len(payload) != 39:
-            payload = payload.ljust(39, b"\0")[:39]
+        size = len(payload)
+        if size < 39:
+            payload = payload.ljust(39, b"\0")
+        elif size > 39:
+            payload = payload[:39]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -5461,8 +5629,11 @@ class AttitudeTarget(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> AttitudeTarget:
-        if len(payload) != 37:
-            payload = payload.ljust(37, b"\0")[:37]
+        size = len(payload)
+        if size < 37:
+            payload = payload.ljust(37, b"\0")
+        elif size > 37:
+            payload = payload[:37]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -5608,8 +5779,11 @@ class SetPositionTargetLocalNed(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> SetPositionTargetLocalNed:
-        if len(payload) != 53:
-            payload = payload.ljust(53, b"\0")[:53]
+        size = len(payload)
+        if size < 53:
+            payload = payload.ljust(53, b"\0")
+        elif size > 53:
+            payload = payload[:53]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -5745,8 +5919,11 @@ class PositionTargetLocalNed(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> PositionTargetLocalNed:
-        if len(payload) != 51:
-            payload = payload.ljust(51, b"\0")[:51]
+        size = len(payload)
+        if size < 51:
+            payload = payload.ljust(51, b"\0")
+        elif size > 51:
+            payload = payload[:51]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -5896,8 +6073,11 @@ class SetPositionTargetGlobalInt(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> SetPositionTargetGlobalInt:
-        if len(payload) != 53:
-            payload = payload.ljust(53, b"\0")[:53]
+        size = len(payload)
+        if size < 53:
+            payload = payload.ljust(53, b"\0")
+        elif size > 53:
+            payload = payload[:53]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -6039,8 +6219,11 @@ class PositionTargetGlobalInt(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> PositionTargetGlobalInt:
-        if len(payload) != 51:
-            payload = payload.ljust(51, b"\0")[:51]
+        size = len(payload)
+        if size < 51:
+            payload = payload.ljust(51, b"\0")
+        elif size > 51:
+            payload = payload[:51]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -6122,8 +6305,11 @@ class LocalPositionNedSystemGlobalOffset(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> LocalPositionNedSystemGlobalOffset:
-        if len(payload) != 28:
-            payload = payload.ljust(28, b"\0")[:28]
+        size = len(payload)
+        if size < 28:
+            payload = payload.ljust(28, b"\0")
+        elif size > 28:
+            payload = payload[:28]
         self = _new(cls)
         self.received_frame = frame
         (self.time_boot_ms, self.x, self.y, self.z, self.roll, self.pitch, self.yaw) = _S89.unpack(payload)
@@ -6257,8 +6443,11 @@ class HilState(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> HilState:
-        if len(payload) != 56:
-            payload = payload.ljust(56, b"\0")[:56]
+        size = len(payload)
+        if size < 56:
+            payload = payload.ljust(56, b"\0")
+        elif size > 56:
+            payload = payload[:56]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -6370,8 +6559,11 @@ class HilControls(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> HilControls:
-        if len(payload) != 42:
-            payload = payload.ljust(42, b"\0")[:42]
+        size = len(payload)
+        if size < 42:
+            payload = payload.ljust(42, b"\0")
+        elif size > 42:
+            payload = payload[:42]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -6501,8 +6693,11 @@ class HilRcInputsRaw(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> HilRcInputsRaw:
-        if len(payload) != 33:
-            payload = payload.ljust(33, b"\0")[:33]
+        size = len(payload)
+        if size < 33:
+            payload = payload.ljust(33, b"\0")
+        elif size > 33:
+            payload = payload[:33]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -6571,8 +6766,11 @@ class HilActuatorControls(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> HilActuatorControls:
-        if len(payload) != 81:
-            payload = payload.ljust(81, b"\0")[:81]
+        size = len(payload)
+        if size < 81:
+            payload = payload.ljust(81, b"\0")
+        elif size > 81:
+            payload = payload[:81]
         self = _new(cls)
         self.received_frame = frame
         values = _S93.unpack(payload)
@@ -6678,8 +6876,11 @@ class OpticalFlow(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> OpticalFlow:
-        if len(payload) != 34:
-            payload = payload.ljust(34, b"\0")[:34]
+        size = len(payload)
+        if size < 34:
+            payload = payload.ljust(34, b"\0")
+        elif size > 34:
+            payload = payload[:34]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -6777,8 +6978,11 @@ class GlobalVisionPositionEstimate(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> GlobalVisionPositionEstimate:
-        if len(payload) != 117:
-            payload = payload.ljust(117, b"\0")[:117]
+        size = len(payload)
+        if size < 117:
+            payload = payload.ljust(117, b"\0")
+        elif size > 117:
+            payload = payload[:117]
         self = _new(cls)
         self.received_frame = frame
         values = _S101.unpack(payload)
@@ -6882,8 +7086,11 @@ class VisionPositionEstimate(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> VisionPositionEstimate:
-        if len(payload) != 117:
-            payload = payload.ljust(117, b"\0")[:117]
+        size = len(payload)
+        if size < 117:
+            payload = payload.ljust(117, b"\0")
+        elif size > 117:
+            payload = payload[:117]
         self = _new(cls)
         self.received_frame = frame
         values = _S102.unpack(payload)
@@ -6971,8 +7178,11 @@ class VisionSpeedEstimate(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> VisionSpeedEstimate:
-        if len(payload) != 57:
-            payload = payload.ljust(57, b"\0")[:57]
+        size = len(payload)
+        if size < 57:
+            payload = payload.ljust(57, b"\0")
+        elif size > 57:
+            payload = payload[:57]
         self = _new(cls)
         self.received_frame = frame
         values = _S103.unpack(payload)
@@ -7064,8 +7274,11 @@ class ViconPositionEstimate(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> ViconPositionEstimate:
-        if len(payload) != 116:
-            payload = payload.ljust(116, b"\0")[:116]
+        size = len(payload)
+        if size < 116:
+            payload = payload.ljust(116, b"\0")
+        elif size > 116:
+            payload = payload[:116]
         self = _new(cls)
         self.received_frame = frame
         values = _S104.unpack(payload)
@@ -7210,8 +7423,11 @@ class HighresImu(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> HighresImu:
-        if len(payload) != 63:
-            payload = payload.ljust(63, b"\0")[:63]
+        size = len(payload)
+        if size < 63:
+            payload = payload.ljust(63, b"\0")
+        elif size > 63:
+            payload = payload[:63]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -7339,8 +7555,11 @@ class OpticalFlowRad(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> OpticalFlowRad:
-        if len(payload) != 44:
-            payload = payload.ljust(44, b"\0")[:44]
+        size = len(payload)
+        if size < 44:
+            payload = payload.ljust(44, b"\0")
+        elif size > 44:
+            payload = payload[:44]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -7482,8 +7701,11 @@ class HilSensor(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> HilSensor:
-        if len(payload) != 65:
-            payload = payload.ljust(65, b"\0")[:65]
+        size = len(payload)
+        if size < 65:
+            payload = payload.ljust(65, b"\0")
+        elif size > 65:
+            payload = payload[:65]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -7664,8 +7886,11 @@ class SimState(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> SimState:
-        if len(payload) != 92:
-            payload = payload.ljust(92, b"\0")[:92]
+        size = len(payload)
+        if size < 92:
+            payload = payload.ljust(92, b"\0")
+        elif size > 92:
+            payload = payload[:92]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -7755,8 +7980,11 @@ class RadioStatus(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> RadioStatus:
-        if len(payload) != 9:
-            payload = payload.ljust(9, b"\0")[:9]
+        size = len(payload)
+        if size < 9:
+            payload = payload.ljust(9, b"\0")
+        elif size > 9:
+            payload = payload[:9]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -7823,8 +8051,11 @@ class FileTransferProtocol(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> FileTransferProtocol:
-        if len(payload) != 254:
-            payload = payload.ljust(254, b"\0")[:254]
+        size = len(payload)
+        if size < 254:
+            payload = payload.ljust(254, b"\0")
+        elif size > 254:
+            payload = payload[:254]
         self = _new(cls)
         self.received_frame = frame
         (self.target_network, self.target_system, self.target_component, self.payload) = _S110.unpack(payload)
@@ -7888,8 +8119,11 @@ class Timesync(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> Timesync:
-        if len(payload) != 16:
-            payload = payload.ljust(16, b"\0")[:16]
+        size = len(payload)
+        if size < 16:
+            payload = payload.ljust(16, b"\0")
+        elif size > 16:
+            payload = payload[:16]
         self = _new(cls)
         self.received_frame = frame
         (self.tc1, self.ts1) = _S111.unpack(payload)
@@ -7939,8 +8173,11 @@ class CameraTrigger(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> CameraTrigger:
-        if len(payload) != 12:
-            payload = payload.ljust(12, b"\0")[:12]
+        size = len(payload)
+        if size < 12:
+            payload = payload.ljust(12, b"\0")
+        elif size > 12:
+            payload = payload[:12]
         self = _new(cls)
         self.received_frame = frame
         (self.time_usec, self.seq) = _S112.unpack(payload)
@@ -8076,8 +8313,11 @@ class HilGps(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> HilGps:
-        if len(payload) != 39:
-            payload = payload.ljust(39, b"\0")[:39]
+        size = len(payload)
+        if size < 39:
+            payload = payload.ljust(39, b"\0")
+        elif size > 39:
+            payload = payload[:39]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -8204,8 +8444,11 @@ class HilOpticalFlow(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> HilOpticalFlow:
-        if len(payload) != 44:
-            payload = payload.ljust(44, b"\0")[:44]
+        size = len(payload)
+        if size < 44:
+            payload = payload.ljust(44, b"\0")
+        elif size > 44:
+            payload = payload[:44]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -8347,8 +8590,11 @@ class HilStateQuaternion(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> HilStateQuaternion:
-        if len(payload) != 64:
-            payload = payload.ljust(64, b"\0")[:64]
+        size = len(payload)
+        if size < 64:
+            payload = payload.ljust(64, b"\0")
+        elif size > 64:
+            payload = payload[:64]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -8461,8 +8707,11 @@ class ScaledImu2(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> ScaledImu2:
-        if len(payload) != 24:
-            payload = payload.ljust(24, b"\0")[:24]
+        size = len(payload)
+        if size < 24:
+            payload = payload.ljust(24, b"\0")
+        elif size > 24:
+            payload = payload[:24]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -8528,8 +8777,11 @@ class LogRequestList(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> LogRequestList:
-        if len(payload) != 6:
-            payload = payload.ljust(6, b"\0")[:6]
+        size = len(payload)
+        if size < 6:
+            payload = payload.ljust(6, b"\0")
+        elif size > 6:
+            payload = payload[:6]
         self = _new(cls)
         self.received_frame = frame
         (self.start, self.end, self.target_system, self.target_component) = _S117.unpack(payload)
@@ -8591,8 +8843,11 @@ class LogEntry(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> LogEntry:
-        if len(payload) != 14:
-            payload = payload.ljust(14, b"\0")[:14]
+        size = len(payload)
+        if size < 14:
+            payload = payload.ljust(14, b"\0")
+        elif size > 14:
+            payload = payload[:14]
         self = _new(cls)
         self.received_frame = frame
         (self.time_utc, self.size, self.id, self.num_logs, self.last_log_num) = _S118.unpack(payload)
@@ -8654,8 +8909,11 @@ class LogRequestData(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> LogRequestData:
-        if len(payload) != 12:
-            payload = payload.ljust(12, b"\0")[:12]
+        size = len(payload)
+        if size < 12:
+            payload = payload.ljust(12, b"\0")
+        elif size > 12:
+            payload = payload[:12]
         self = _new(cls)
         self.received_frame = frame
         (self.ofs, self.count, self.id, self.target_system, self.target_component) = _S119.unpack(payload)
@@ -8712,8 +8970,11 @@ class LogData(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> LogData:
-        if len(payload) != 97:
-            payload = payload.ljust(97, b"\0")[:97]
+        size = len(payload)
+        if size < 97:
+            payload = payload.ljust(97, b"\0")
+        elif size > 97:
+            payload = payload[:97]
         self = _new(cls)
         self.received_frame = frame
         (self.ofs, self.id, self.count, self.data) = _S120.unpack(payload)
@@ -8760,8 +9021,11 @@ class LogErase(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> LogErase:
-        if len(payload) != 2:
-            payload = payload.ljust(2, b"\0")[:2]
+        size = len(payload)
+        if size < 2:
+            payload = payload.ljust(2, b"\0")
+        elif size > 2:
+            payload = payload[:2]
         self = _new(cls)
         self.received_frame = frame
         (self.target_system, self.target_component) = _S121.unpack(payload)
@@ -8808,8 +9072,11 @@ class LogRequestEnd(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> LogRequestEnd:
-        if len(payload) != 2:
-            payload = payload.ljust(2, b"\0")[:2]
+        size = len(payload)
+        if size < 2:
+            payload = payload.ljust(2, b"\0")
+        elif size > 2:
+            payload = payload[:2]
         self = _new(cls)
         self.received_frame = frame
         (self.target_system, self.target_component) = _S122.unpack(payload)
@@ -8866,8 +9133,11 @@ class GpsInjectData(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> GpsInjectData:
-        if len(payload) != 113:
-            payload = payload.ljust(113, b"\0")[:113]
+        size = len(payload)
+        if size < 113:
+            payload = payload.ljust(113, b"\0")
+        elif size > 113:
+            payload = payload[:113]
         self = _new(cls)
         self.received_frame = frame
         (self.target_system, self.target_component, self.len, self.data) = _S123.unpack(payload)
@@ -9018,8 +9288,11 @@ class Gps2Raw(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> Gps2Raw:
-        if len(payload) != 57:
-            payload = payload.ljust(57, b"\0")[:57]
+        size = len(payload)
+        if size < 57:
+            payload = payload.ljust(57, b"\0")
+        elif size > 57:
+            payload = payload[:57]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -9079,8 +9352,11 @@ class PowerStatus(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> PowerStatus:
-        if len(payload) != 6:
-            payload = payload.ljust(6, b"\0")[:6]
+        size = len(payload)
+        if size < 6:
+            payload = payload.ljust(6, b"\0")
+        elif size > 6:
+            payload = payload[:6]
         self = _new(cls)
         self.received_frame = frame
         (self.Vcc, self.Vservo, self.flags) = _S125.unpack(payload)
@@ -9150,8 +9426,11 @@ class SerialControl(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> SerialControl:
-        if len(payload) != 79:
-            payload = payload.ljust(79, b"\0")[:79]
+        size = len(payload)
+        if size < 79:
+            payload = payload.ljust(79, b"\0")
+        elif size > 79:
+            payload = payload[:79]
         self = _new(cls)
         self.received_frame = frame
         (self.baudrate, self.timeout, self.device, self.flags, self.count, self.data) = _S126.unpack(payload)
@@ -9268,8 +9547,11 @@ class GpsRtk(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> GpsRtk:
-        if len(payload) != 35:
-            payload = payload.ljust(35, b"\0")[:35]
+        size = len(payload)
+        if size < 35:
+            payload = payload.ljust(35, b"\0")
+        elif size > 35:
+            payload = payload[:35]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -9392,8 +9674,11 @@ class Gps2Rtk(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> Gps2Rtk:
-        if len(payload) != 35:
-            payload = payload.ljust(35, b"\0")[:35]
+        size = len(payload)
+        if size < 35:
+            payload = payload.ljust(35, b"\0")
+        elif size > 35:
+            payload = payload[:35]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -9505,8 +9790,11 @@ class ScaledImu3(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> ScaledImu3:
-        if len(payload) != 24:
-            payload = payload.ljust(24, b"\0")[:24]
+        size = len(payload)
+        if size < 24:
+            payload = payload.ljust(24, b"\0")
+        elif size > 24:
+            payload = payload[:24]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -9589,8 +9877,11 @@ class DataTransmissionHandshake(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> DataTransmissionHandshake:
-        if len(payload) != 13:
-            payload = payload.ljust(13, b"\0")[:13]
+        size = len(payload)
+        if size < 13:
+            payload = payload.ljust(13, b"\0")
+        elif size > 13:
+            payload = payload[:13]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -9642,8 +9933,11 @@ class EncapsulatedData(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> EncapsulatedData:
-        if len(payload) != 255:
-            payload = payload.ljust(255, b"\0")[:255]
+        size = len(payload)
+        if size < 255:
+            payload = payload.ljust(255, b"\0")
+        elif size > 255:
+            payload = payload[:255]
         self = _new(cls)
         self.received_frame = frame
         (self.seqnr, self.data) = _S131.unpack(payload)
@@ -9769,8 +10063,11 @@ class DistanceSensor(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> DistanceSensor:
-        if len(payload) != 39:
-            payload = payload.ljust(39, b"\0")[:39]
+        size = len(payload)
+        if size < 39:
+            payload = payload.ljust(39, b"\0")
+        elif size > 39:
+            payload = payload[:39]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -9837,8 +10134,11 @@ class TerrainRequest(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> TerrainRequest:
-        if len(payload) != 18:
-            payload = payload.ljust(18, b"\0")[:18]
+        size = len(payload)
+        if size < 18:
+            payload = payload.ljust(18, b"\0")
+        elif size > 18:
+            payload = payload[:18]
         self = _new(cls)
         self.received_frame = frame
         (self.mask, self.lat, self.lon, self.grid_spacing) = _S133.unpack(payload)
@@ -9902,8 +10202,11 @@ class TerrainData(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> TerrainData:
-        if len(payload) != 43:
-            payload = payload.ljust(43, b"\0")[:43]
+        size = len(payload)
+        if size < 43:
+            payload = payload.ljust(43, b"\0")
+        elif size > 43:
+            payload = payload[:43]
         self = _new(cls)
         self.received_frame = frame
         values = _S134.unpack(payload)
@@ -9957,8 +10260,11 @@ class TerrainCheck(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> TerrainCheck:
-        if len(payload) != 8:
-            payload = payload.ljust(8, b"\0")[:8]
+        size = len(payload)
+        if size < 8:
+            payload = payload.ljust(8, b"\0")
+        elif size > 8:
+            payload = payload[:8]
         self = _new(cls)
         self.received_frame = frame
         (self.lat, self.lon) = _S135.unpack(payload)
@@ -10035,8 +10341,11 @@ class TerrainReport(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> TerrainReport:
-        if len(payload) != 22:
-            payload = payload.ljust(22, b"\0")[:22]
+        size = len(payload)
+        if size < 22:
+            payload = payload.ljust(22, b"\0")
+        elif size > 22:
+            payload = payload[:22]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -10109,8 +10418,11 @@ class ScaledPressure2(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> ScaledPressure2:
-        if len(payload) != 16:
-            payload = payload.ljust(16, b"\0")[:16]
+        size = len(payload)
+        if size < 16:
+            payload = payload.ljust(16, b"\0")
+        elif size > 16:
+            payload = payload[:16]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -10192,8 +10504,11 @@ class AttPosMocap(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> AttPosMocap:
-        if len(payload) != 120:
-            payload = payload.ljust(120, b"\0")[:120]
+        size = len(payload)
+        if size < 120:
+            payload = payload.ljust(120, b"\0")
+        elif size > 120:
+            payload = payload[:120]
         self = _new(cls)
         self.received_frame = frame
         values = _S138.unpack(payload)
@@ -10276,8 +10591,11 @@ class SetActuatorControlTarget(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> SetActuatorControlTarget:
-        if len(payload) != 43:
-            payload = payload.ljust(43, b"\0")[:43]
+        size = len(payload)
+        if size < 43:
+            payload = payload.ljust(43, b"\0")
+        elif size > 43:
+            payload = payload[:43]
         self = _new(cls)
         self.received_frame = frame
         values = _S139.unpack(payload)
@@ -10346,8 +10664,11 @@ class ActuatorControlTarget(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> ActuatorControlTarget:
-        if len(payload) != 41:
-            payload = payload.ljust(41, b"\0")[:41]
+        size = len(payload)
+        if size < 41:
+            payload = payload.ljust(41, b"\0")
+        elif size > 41:
+            payload = payload[:41]
         self = _new(cls)
         self.received_frame = frame
         values = _S140.unpack(payload)
@@ -10452,8 +10773,11 @@ class Altitude(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> Altitude:
-        if len(payload) != 32:
-            payload = payload.ljust(32, b"\0")[:32]
+        size = len(payload)
+        if size < 32:
+            payload = payload.ljust(32, b"\0")
+        elif size > 32:
+            payload = payload[:32]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -10527,8 +10851,11 @@ class ResourceRequest(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> ResourceRequest:
-        if len(payload) != 243:
-            payload = payload.ljust(243, b"\0")[:243]
+        size = len(payload)
+        if size < 243:
+            payload = payload.ljust(243, b"\0")
+        elif size > 243:
+            payload = payload[:243]
         self = _new(cls)
         self.received_frame = frame
         (self.request_id, self.uri_type, self.uri, self.transfer_type, self.storage) = _S142.unpack(payload)
@@ -10598,8 +10925,11 @@ class ScaledPressure3(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> ScaledPressure3:
-        if len(payload) != 16:
-            payload = payload.ljust(16, b"\0")[:16]
+        size = len(payload)
+        if size < 16:
+            payload = payload.ljust(16, b"\0")
+        elif size > 16:
+            payload = payload[:16]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -10708,8 +11038,11 @@ class FollowTarget(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> FollowTarget:
-        if len(payload) != 93:
-            payload = payload.ljust(93, b"\0")[:93]
+        size = len(payload)
+        if size < 93:
+            payload = payload.ljust(93, b"\0")
+        elif size > 93:
+            payload = payload[:93]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -10858,8 +11191,11 @@ class ControlSystemState(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> ControlSystemState:
-        if len(payload) != 100:
-            payload = payload.ljust(100, b"\0")[:100]
+        size = len(payload)
+        if size < 100:
+            payload = payload.ljust(100, b"\0")
+        elif size > 100:
+            payload = payload[:100]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -11021,8 +11357,11 @@ class BatteryStatus(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> BatteryStatus:
-        if len(payload) != 54:
-            payload = payload.ljust(54, b"\0")[:54]
+        size = len(payload)
+        if size < 54:
+            payload = payload.ljust(54, b"\0")
+        elif size > 54:
+            payload = payload[:54]
         self = _new(cls)
         self.received_frame = frame
         values = _S147.unpack(payload)
@@ -11167,8 +11506,11 @@ class LandingTarget(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> LandingTarget:
-        if len(payload) != 60:
-            payload = payload.ljust(60, b"\0")[:60]
+        size = len(payload)
+        if size < 60:
+            payload = payload.ljust(60, b"\0")
+        elif size > 60:
+            payload = payload[:60]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -11244,8 +11586,11 @@ class FenceStatus(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> FenceStatus:
-        if len(payload) != 9:
-            payload = payload.ljust(9, b"\0")[:9]
+        size = len(payload)
+        if size < 9:
+            payload = payload.ljust(9, b"\0")
+        elif size > 9:
+            payload = payload[:9]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -11395,8 +11740,11 @@ class MagCalReport(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> MagCalReport:
-        if len(payload) != 54:
-            payload = payload.ljust(54, b"\0")[:54]
+        size = len(payload)
+        if size < 54:
+            payload = payload.ljust(54, b"\0")
+        elif size > 54:
+            payload = payload[:54]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -11558,8 +11906,11 @@ class EfiStatus(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> EfiStatus:
-        if len(payload) != 73:
-            payload = payload.ljust(73, b"\0")[:73]
+        size = len(payload)
+        if size < 73:
+            payload = payload.ljust(73, b"\0")
+        elif size > 73:
+            payload = payload[:73]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -11680,8 +12031,11 @@ class EstimatorStatus(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> EstimatorStatus:
-        if len(payload) != 42:
-            payload = payload.ljust(42, b"\0")[:42]
+        size = len(payload)
+        if size < 42:
+            payload = payload.ljust(42, b"\0")
+        elif size > 42:
+            payload = payload[:42]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -11789,8 +12143,11 @@ class WindCov(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> WindCov:
-        if len(payload) != 40:
-            payload = payload.ljust(40, b"\0")[:40]
+        size = len(payload)
+        if size < 40:
+            payload = payload.ljust(40, b"\0")
+        elif size > 40:
+            payload = payload[:40]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -11953,8 +12310,11 @@ class GpsInput(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> GpsInput:
-        if len(payload) != 65:
-            payload = payload.ljust(65, b"\0")[:65]
+        size = len(payload)
+        if size < 65:
+            payload = payload.ljust(65, b"\0")
+        elif size > 65:
+            payload = payload[:65]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -12023,8 +12383,11 @@ class GpsRtcmData(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> GpsRtcmData:
-        if len(payload) != 182:
-            payload = payload.ljust(182, b"\0")[:182]
+        size = len(payload)
+        if size < 182:
+            payload = payload.ljust(182, b"\0")
+        elif size > 182:
+            payload = payload[:182]
         self = _new(cls)
         self.received_frame = frame
         (self.flags, self.len, self.data) = _S233.unpack(payload)
@@ -12203,8 +12566,11 @@ class HighLatency(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> HighLatency:
-        if len(payload) != 40:
-            payload = payload.ljust(40, b"\0")[:40]
+        size = len(payload)
+        if size < 40:
+            payload = payload.ljust(40, b"\0")
+        elif size > 40:
+            payload = payload[:40]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -12406,8 +12772,11 @@ class HighLatency2(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> HighLatency2:
-        if len(payload) != 42:
-            payload = payload.ljust(42, b"\0")[:42]
+        size = len(payload)
+        if size < 42:
+            payload = payload.ljust(42, b"\0")
+        elif size > 42:
+            payload = payload[:42]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -12501,8 +12870,11 @@ class Vibration(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> Vibration:
-        if len(payload) != 32:
-            payload = payload.ljust(32, b"\0")[:32]
+        size = len(payload)
+        if size < 32:
+            payload = payload.ljust(32, b"\0")
+        elif size > 32:
+            payload = payload[:32]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -12633,8 +13005,11 @@ class HomePosition(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> HomePosition:
-        if len(payload) != 60:
-            payload = payload.ljust(60, b"\0")[:60]
+        size = len(payload)
+        if size < 60:
+            payload = payload.ljust(60, b"\0")
+        elif size > 60:
+            payload = payload[:60]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -12777,8 +13152,11 @@ class SetHomePosition(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> SetHomePosition:
-        if len(payload) != 61:
-            payload = payload.ljust(61, b"\0")[:61]
+        size = len(payload)
+        if size < 61:
+            payload = payload.ljust(61, b"\0")
+        elif size > 61:
+            payload = payload[:61]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -12837,8 +13215,11 @@ class MessageInterval(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> MessageInterval:
-        if len(payload) != 6:
-            payload = payload.ljust(6, b"\0")[:6]
+        size = len(payload)
+        if size < 6:
+            payload = payload.ljust(6, b"\0")
+        elif size > 6:
+            payload = payload[:6]
         self = _new(cls)
         self.received_frame = frame
         (self.interval_us, self.message_id) = _S244.unpack(payload)
@@ -12889,8 +13270,11 @@ class ExtendedSysState(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> ExtendedSysState:
-        if len(payload) != 2:
-            payload = payload.ljust(2, b"\0")[:2]
+        size = len(payload)
+        if size < 2:
+            payload = payload.ljust(2, b"\0")
+        elif size > 2:
+            payload = payload[:2]
         self = _new(cls)
         self.received_frame = frame
         (self.vtol_state, self.landed_state) = _S245.unpack(payload)
@@ -13004,8 +13388,11 @@ class AdsbVehicle(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> AdsbVehicle:
-        if len(payload) != 38:
-            payload = payload.ljust(38, b"\0")[:38]
+        size = len(payload)
+        if size < 38:
+            payload = payload.ljust(38, b"\0")
+        elif size > 38:
+            payload = payload[:38]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -13096,8 +13483,11 @@ class Collision(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> Collision:
-        if len(payload) != 19:
-            payload = payload.ljust(19, b"\0")[:19]
+        size = len(payload)
+        if size < 19:
+            payload = payload.ljust(19, b"\0")
+        elif size > 19:
+            payload = payload[:19]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -13183,8 +13573,11 @@ class V2Extension(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> V2Extension:
-        if len(payload) != 254:
-            payload = payload.ljust(254, b"\0")[:254]
+        size = len(payload)
+        if size < 254:
+            payload = payload.ljust(254, b"\0")
+        elif size > 254:
+            payload = payload[:254]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -13251,8 +13644,11 @@ class MemoryVect(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> MemoryVect:
-        if len(payload) != 36:
-            payload = payload.ljust(36, b"\0")[:36]
+        size = len(payload)
+        if size < 36:
+            payload = payload.ljust(36, b"\0")
+        elif size > 36:
+            payload = payload[:36]
         self = _new(cls)
         self.received_frame = frame
         values = _S249.unpack(payload)
@@ -13321,8 +13717,11 @@ class DebugVect(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> DebugVect:
-        if len(payload) != 30:
-            payload = payload.ljust(30, b"\0")[:30]
+        size = len(payload)
+        if size < 30:
+            payload = payload.ljust(30, b"\0")
+        elif size > 30:
+            payload = payload[:30]
         self = _new(cls)
         self.received_frame = frame
         (self.time_usec, self.x, self.y, self.z, v4) = _S250.unpack(payload)
@@ -13377,8 +13776,11 @@ class NamedValueFloat(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> NamedValueFloat:
-        if len(payload) != 18:
-            payload = payload.ljust(18, b"\0")[:18]
+        size = len(payload)
+        if size < 18:
+            payload = payload.ljust(18, b"\0")
+        elif size > 18:
+            payload = payload[:18]
         self = _new(cls)
         self.received_frame = frame
         (self.time_boot_ms, self.value, v2) = _S251.unpack(payload)
@@ -13433,8 +13835,11 @@ class NamedValueInt(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> NamedValueInt:
-        if len(payload) != 18:
-            payload = payload.ljust(18, b"\0")[:18]
+        size = len(payload)
+        if size < 18:
+            payload = payload.ljust(18, b"\0")
+        elif size > 18:
+            payload = payload[:18]
         self = _new(cls)
         self.received_frame = frame
         (self.time_boot_ms, self.value, v2) = _S252.unpack(payload)
@@ -13501,8 +13906,11 @@ class Statustext(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> Statustext:
-        if len(payload) != 54:
-            payload = payload.ljust(54, b"\0")[:54]
+        size = len(payload)
+        if size < 54:
+            payload = payload.ljust(54, b"\0")
+        elif size > 54:
+            payload = payload[:54]
         self = _new(cls)
         self.received_frame = frame
         (self.severity, v1, self.id, self.chunk_seq) = _S253.unpack(payload)
@@ -13556,8 +13964,11 @@ class Debug(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> Debug:
-        if len(payload) != 9:
-            payload = payload.ljust(9, b"\0")[:9]
+        size = len(payload)
+        if size < 9:
+            payload = payload.ljust(9, b"\0")
+        elif size > 9:
+            payload = payload[:9]
         self = _new(cls)
         self.received_frame = frame
         (self.time_boot_ms, self.value, self.ind) = _S254.unpack(payload)
@@ -13617,8 +14028,11 @@ class SetupSigning(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> SetupSigning:
-        if len(payload) != 42:
-            payload = payload.ljust(42, b"\0")[:42]
+        size = len(payload)
+        if size < 42:
+            payload = payload.ljust(42, b"\0")
+        elif size > 42:
+            payload = payload[:42]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -13675,8 +14089,11 @@ class ButtonChange(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> ButtonChange:
-        if len(payload) != 9:
-            payload = payload.ljust(9, b"\0")[:9]
+        size = len(payload)
+        if size < 9:
+            payload = payload.ljust(9, b"\0")
+        elif size > 9:
+            payload = payload[:9]
         self = _new(cls)
         self.received_frame = frame
         (self.time_boot_ms, self.last_change_ms, self.state) = _S257.unpack(payload)
@@ -13733,8 +14150,11 @@ class PlayTune(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> PlayTune:
-        if len(payload) != 232:
-            payload = payload.ljust(232, b"\0")[:232]
+        size = len(payload)
+        if size < 232:
+            payload = payload.ljust(232, b"\0")
+        elif size > 232:
+            payload = payload[:232]
         self = _new(cls)
         self.received_frame = frame
         (self.target_system, self.target_component, v2, v3) = _S258.unpack(payload)
@@ -13878,8 +14298,11 @@ class CameraInformation(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> CameraInformation:
-        if len(payload) != 237:
-            payload = payload.ljust(237, b"\0")[:237]
+        size = len(payload)
+        if size < 237:
+            payload = payload.ljust(237, b"\0")
+        elif size > 237:
+            payload = payload[:237]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -13963,8 +14386,11 @@ class CameraSettings(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> CameraSettings:
-        if len(payload) != 14:
-            payload = payload.ljust(14, b"\0")[:14]
+        size = len(payload)
+        if size < 14:
+            payload = payload.ljust(14, b"\0")
+        elif size > 14:
+            payload = payload[:14]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -14092,8 +14518,11 @@ class StorageInformation(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> StorageInformation:
-        if len(payload) != 61:
-            payload = payload.ljust(61, b"\0")[:61]
+        size = len(payload)
+        if size < 61:
+            payload = payload.ljust(61, b"\0")
+        elif size > 61:
+            payload = payload[:61]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -14197,8 +14626,11 @@ class CameraCaptureStatus(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> CameraCaptureStatus:
-        if len(payload) != 23:
-            payload = payload.ljust(23, b"\0")[:23]
+        size = len(payload)
+        if size < 23:
+            payload = payload.ljust(23, b"\0")
+        elif size > 23:
+            payload = payload[:23]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -14320,8 +14752,11 @@ class CameraImageCaptured(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> CameraImageCaptured:
-        if len(payload) != 255:
-            payload = payload.ljust(255, b"\0")[:255]
+        size = len(payload)
+        if size < 255:
+            payload = payload.ljust(255, b"\0")
+        elif size > 255:
+            payload = payload[:255]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -14404,8 +14839,11 @@ class FlightInformation(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> FlightInformation:
-        if len(payload) != 32:
-            payload = payload.ljust(32, b"\0")[:32]
+        size = len(payload)
+        if size < 32:
+            payload = payload.ljust(32, b"\0")
+        elif size > 32:
+            payload = payload[:32]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -14481,8 +14919,11 @@ class MountOrientation(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> MountOrientation:
-        if len(payload) != 20:
-            payload = payload.ljust(20, b"\0")[:20]
+        size = len(payload)
+        if size < 20:
+            payload = payload.ljust(20, b"\0")
+        elif size > 20:
+            payload = payload[:20]
         self = _new(cls)
         self.received_frame = frame
         (self.time_boot_ms, self.roll, self.pitch, self.yaw, self.yaw_absolute) = _S265.unpack(payload)
@@ -14556,8 +14997,11 @@ class LoggingData(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> LoggingData:
-        if len(payload) != 255:
-            payload = payload.ljust(255, b"\0")[:255]
+        size = len(payload)
+        if size < 255:
+            payload = payload.ljust(255, b"\0")
+        elif size > 255:
+            payload = payload[:255]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -14638,8 +15082,11 @@ class LoggingDataAcked(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> LoggingDataAcked:
-        if len(payload) != 255:
-            payload = payload.ljust(255, b"\0")[:255]
+        size = len(payload)
+        if size < 255:
+            payload = payload.ljust(255, b"\0")
+        elif size > 255:
+            payload = payload[:255]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -14697,8 +15144,11 @@ class LoggingAck(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> LoggingAck:
-        if len(payload) != 4:
-            payload = payload.ljust(4, b"\0")[:4]
+        size = len(payload)
+        if size < 4:
+            payload = payload.ljust(4, b"\0")
+        elif size > 4:
+            payload = payload[:4]
         self = _new(cls)
         self.received_frame = frame
         (self.sequence, self.target_system, self.target_component) = _S268.unpack(payload)
@@ -14821,8 +15271,11 @@ class VideoStreamInformation(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> VideoStreamInformation:
-        if len(payload) != 215:
-            payload = payload.ljust(215, b"\0")[:215]
+        size = len(payload)
+        if size < 215:
+            payload = payload.ljust(215, b"\0")
+        elif size > 215:
+            payload = payload[:215]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -14925,8 +15378,11 @@ class VideoStreamStatus(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> VideoStreamStatus:
-        if len(payload) != 20:
-            payload = payload.ljust(20, b"\0")[:20]
+        size = len(payload)
+        if size < 20:
+            payload = payload.ljust(20, b"\0")
+        elif size > 20:
+            payload = payload[:20]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -15043,8 +15499,11 @@ class CameraFovStatus(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> CameraFovStatus:
-        if len(payload) != 53:
-            payload = payload.ljust(53, b"\0")[:53]
+        size = len(payload)
+        if size < 53:
+            payload = payload.ljust(53, b"\0")
+        elif size > 53:
+            payload = payload[:53]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -15172,8 +15631,11 @@ class CameraTrackingImageStatus(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> CameraTrackingImageStatus:
-        if len(payload) != 32:
-            payload = payload.ljust(32, b"\0")[:32]
+        size = len(payload)
+        if size < 32:
+            payload = payload.ljust(32, b"\0")
+        elif size > 32:
+            payload = payload[:32]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -15301,8 +15763,11 @@ class CameraTrackingGeoStatus(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> CameraTrackingGeoStatus:
-        if len(payload) != 50:
-            payload = payload.ljust(50, b"\0")[:50]
+        size = len(payload)
+        if size < 50:
+            payload = payload.ljust(50, b"\0")
+        elif size > 50:
+            payload = payload[:50]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -15414,8 +15879,11 @@ class CameraThermalRange(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> CameraThermalRange:
-        if len(payload) != 30:
-            payload = payload.ljust(30, b"\0")[:30]
+        size = len(payload)
+        if size < 30:
+            payload = payload.ljust(30, b"\0")
+        elif size > 30:
+            payload = payload[:30]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -15519,8 +15987,11 @@ class GimbalManagerInformation(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> GimbalManagerInformation:
-        if len(payload) != 33:
-            payload = payload.ljust(33, b"\0")[:33]
+        size = len(payload)
+        if size < 33:
+            payload = payload.ljust(33, b"\0")
+        elif size > 33:
+            payload = payload[:33]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -15610,8 +16081,11 @@ class GimbalManagerStatus(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> GimbalManagerStatus:
-        if len(payload) != 13:
-            payload = payload.ljust(13, b"\0")[:13]
+        size = len(payload)
+        if size < 13:
+            payload = payload.ljust(13, b"\0")
+        elif size > 13:
+            payload = payload[:13]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -15716,8 +16190,11 @@ class GimbalManagerSetAttitude(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> GimbalManagerSetAttitude:
-        if len(payload) != 35:
-            payload = payload.ljust(35, b"\0")[:35]
+        size = len(payload)
+        if size < 35:
+            payload = payload.ljust(35, b"\0")
+        elif size > 35:
+            payload = payload[:35]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -15885,8 +16362,11 @@ class GimbalDeviceInformation(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> GimbalDeviceInformation:
-        if len(payload) != 149:
-            payload = payload.ljust(149, b"\0")[:149]
+        size = len(payload)
+        if size < 149:
+            payload = payload.ljust(149, b"\0")
+        elif size > 149:
+            payload = payload[:149]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -15998,8 +16478,11 @@ class GimbalDeviceSetAttitude(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> GimbalDeviceSetAttitude:
-        if len(payload) != 32:
-            payload = payload.ljust(32, b"\0")[:32]
+        size = len(payload)
+        if size < 32:
+            payload = payload.ljust(32, b"\0")
+        elif size > 32:
+            payload = payload[:32]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -16147,8 +16630,11 @@ class GimbalDeviceAttitudeStatus(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> GimbalDeviceAttitudeStatus:
-        if len(payload) != 49:
-            payload = payload.ljust(49, b"\0")[:49]
+        size = len(payload)
+        if size < 49:
+            payload = payload.ljust(49, b"\0")
+        elif size > 49:
+            payload = payload[:49]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -16284,8 +16770,11 @@ class AutopilotStateForGimbalDevice(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> AutopilotStateForGimbalDevice:
-        if len(payload) != 57:
-            payload = payload.ljust(57, b"\0")[:57]
+        size = len(payload)
+        if size < 57:
+            payload = payload.ljust(57, b"\0")
+        elif size > 57:
+            payload = payload[:57]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -16393,8 +16882,11 @@ class GimbalManagerSetPitchyaw(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> GimbalManagerSetPitchyaw:
-        if len(payload) != 23:
-            payload = payload.ljust(23, b"\0")[:23]
+        size = len(payload)
+        if size < 23:
+            payload = payload.ljust(23, b"\0")
+        elif size > 23:
+            payload = payload[:23]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -16500,8 +16992,11 @@ class GimbalManagerSetManualControl(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> GimbalManagerSetManualControl:
-        if len(payload) != 23:
-            payload = payload.ljust(23, b"\0")[:23]
+        size = len(payload)
+        if size < 23:
+            payload = payload.ljust(23, b"\0")
+        elif size > 23:
+            payload = payload[:23]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -16569,8 +17064,11 @@ class Airspeed(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> Airspeed:
-        if len(payload) != 12:
-            payload = payload.ljust(12, b"\0")[:12]
+        size = len(payload)
+        if size < 12:
+            payload = payload.ljust(12, b"\0")
+        elif size > 12:
+            payload = payload[:12]
         self = _new(cls)
         self.received_frame = frame
         (self.airspeed, self.raw_press, self.temperature, self.id, self.flags) = _S295.unpack(payload)
@@ -16692,8 +17190,11 @@ class GlobalPositionSensor(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> GlobalPositionSensor:
-        if len(payload) != 41:
-            payload = payload.ljust(41, b"\0")[:41]
+        size = len(payload)
+        if size < 41:
+            payload = payload.ljust(41, b"\0")
+        elif size > 41:
+            payload = payload[:41]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -16751,8 +17252,11 @@ class WifiConfigAp(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> WifiConfigAp:
-        if len(payload) != 96:
-            payload = payload.ljust(96, b"\0")[:96]
+        size = len(payload)
+        if size < 96:
+            payload = payload.ljust(96, b"\0")
+        elif size > 96:
+            payload = payload[:96]
         self = _new(cls)
         self.received_frame = frame
         (v0, v1) = _S299.unpack(payload)
@@ -16888,8 +17392,11 @@ class AisVessel(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> AisVessel:
-        if len(payload) != 58:
-            payload = payload.ljust(58, b"\0")[:58]
+        size = len(payload)
+        if size < 58:
+            payload = payload.ljust(58, b"\0")
+        elif size > 58:
+            payload = payload[:58]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -16975,8 +17482,11 @@ class UavcanNodeStatus(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> UavcanNodeStatus:
-        if len(payload) != 17:
-            payload = payload.ljust(17, b"\0")[:17]
+        size = len(payload)
+        if size < 17:
+            payload = payload.ljust(17, b"\0")
+        elif size > 17:
+            payload = payload[:17]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -17083,8 +17593,11 @@ class UavcanNodeInfo(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> UavcanNodeInfo:
-        if len(payload) != 116:
-            payload = payload.ljust(116, b"\0")[:116]
+        size = len(payload)
+        if size < 116:
+            payload = payload.ljust(116, b"\0")
+        elif size > 116:
+            payload = payload[:116]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -17155,8 +17668,11 @@ class ParamExtRequestRead(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> ParamExtRequestRead:
-        if len(payload) != 20:
-            payload = payload.ljust(20, b"\0")[:20]
+        size = len(payload)
+        if size < 20:
+            payload = payload.ljust(20, b"\0")
+        elif size > 20:
+            payload = payload[:20]
         self = _new(cls)
         self.received_frame = frame
         (self.param_index, self.target_system, self.target_component, v3) = _S320.unpack(payload)
@@ -17207,8 +17723,11 @@ class ParamExtRequestList(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> ParamExtRequestList:
-        if len(payload) != 2:
-            payload = payload.ljust(2, b"\0")[:2]
+        size = len(payload)
+        if size < 2:
+            payload = payload.ljust(2, b"\0")
+        elif size > 2:
+            payload = payload[:2]
         self = _new(cls)
         self.received_frame = frame
         (self.target_system, self.target_component) = _S321.unpack(payload)
@@ -17277,8 +17796,11 @@ class ParamExtValue(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> ParamExtValue:
-        if len(payload) != 149:
-            payload = payload.ljust(149, b"\0")[:149]
+        size = len(payload)
+        if size < 149:
+            payload = payload.ljust(149, b"\0")
+        elif size > 149:
+            payload = payload[:149]
         self = _new(cls)
         self.received_frame = frame
         (self.param_count, self.param_index, v2, v3, self.param_type) = _S322.unpack(payload)
@@ -17353,8 +17875,11 @@ class ParamExtSet(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> ParamExtSet:
-        if len(payload) != 147:
-            payload = payload.ljust(147, b"\0")[:147]
+        size = len(payload)
+        if size < 147:
+            payload = payload.ljust(147, b"\0")
+        elif size > 147:
+            payload = payload[:147]
         self = _new(cls)
         self.received_frame = frame
         (self.target_system, self.target_component, v2, v3, self.param_type) = _S323.unpack(payload)
@@ -17419,8 +17944,11 @@ class ParamExtAck(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> ParamExtAck:
-        if len(payload) != 146:
-            payload = payload.ljust(146, b"\0")[:146]
+        size = len(payload)
+        if size < 146:
+            payload = payload.ljust(146, b"\0")
+        elif size > 146:
+            payload = payload[:146]
         self = _new(cls)
         self.received_frame = frame
         (v0, v1, self.param_type, self.param_result) = _S324.unpack(payload)
@@ -17536,8 +18064,11 @@ class ObstacleDistance(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> ObstacleDistance:
-        if len(payload) != 167:
-            payload = payload.ljust(167, b"\0")[:167]
+        size = len(payload)
+        if size < 167:
+            payload = payload.ljust(167, b"\0")
+        elif size > 167:
+            payload = payload[:167]
         self = _new(cls)
         self.received_frame = frame
         values = _S330.unpack(payload)
@@ -17710,8 +18241,11 @@ class Odometry(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> Odometry:
-        if len(payload) != 233:
-            payload = payload.ljust(233, b"\0")[:233]
+        size = len(payload)
+        if size < 233:
+            payload = payload.ljust(233, b"\0")
+        elif size > 233:
+            payload = payload[:233]
         self = _new(cls)
         self.received_frame = frame
         values = _S331.unpack(payload)
@@ -17867,8 +18401,11 @@ class TrajectoryRepresentationWaypoints(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> TrajectoryRepresentationWaypoints:
-        if len(payload) != 239:
-            payload = payload.ljust(239, b"\0")[:239]
+        size = len(payload)
+        if size < 239:
+            payload = payload.ljust(239, b"\0")
+        elif size > 239:
+            payload = payload[:239]
         self = _new(cls)
         self.received_frame = frame
         values = _S332.unpack(payload)
@@ -17978,8 +18515,11 @@ class TrajectoryRepresentationBezier(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> TrajectoryRepresentationBezier:
-        if len(payload) != 109:
-            payload = payload.ljust(109, b"\0")[:109]
+        size = len(payload)
+        if size < 109:
+            payload = payload.ljust(109, b"\0")
+        elif size > 109:
+            payload = payload[:109]
         self = _new(cls)
         self.received_frame = frame
         values = _S333.unpack(payload)
@@ -18084,8 +18624,11 @@ class IsbdLinkStatus(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> IsbdLinkStatus:
-        if len(payload) != 24:
-            payload = payload.ljust(24, b"\0")[:24]
+        size = len(payload)
+        if size < 24:
+            payload = payload.ljust(24, b"\0")
+        elif size > 24:
+            payload = payload[:24]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -18138,8 +18681,11 @@ class RawRpm(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> RawRpm:
-        if len(payload) != 5:
-            payload = payload.ljust(5, b"\0")[:5]
+        size = len(payload)
+        if size < 5:
+            payload = payload.ljust(5, b"\0")
+        elif size > 5:
+            payload = payload[:5]
         self = _new(cls)
         self.received_frame = frame
         (self.frequency, self.index) = _S339.unpack(payload)
@@ -18278,8 +18824,11 @@ class UtmGlobalPosition(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> UtmGlobalPosition:
-        if len(payload) != 70:
-            payload = payload.ljust(70, b"\0")[:70]
+        size = len(payload)
+        if size < 70:
+            payload = payload.ljust(70, b"\0")
+        elif size > 70:
+            payload = payload[:70]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -18359,8 +18908,11 @@ class ParamError(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> ParamError:
-        if len(payload) != 21:
-            payload = payload.ljust(21, b"\0")[:21]
+        size = len(payload)
+        if size < 21:
+            payload = payload.ljust(21, b"\0")
+        elif size > 21:
+            payload = payload[:21]
         self = _new(cls)
         self.received_frame = frame
         (self.param_index, self.target_system, self.target_component, v3, self.error) = _S345.unpack(payload)
@@ -18426,8 +18978,11 @@ class DebugFloatArray(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> DebugFloatArray:
-        if len(payload) != 252:
-            payload = payload.ljust(252, b"\0")[:252]
+        size = len(payload)
+        if size < 252:
+            payload = payload.ljust(252, b"\0")
+        elif size > 252:
+            payload = payload[:252]
         self = _new(cls)
         self.received_frame = frame
         values = _S350.unpack(payload)
@@ -18510,8 +19065,11 @@ class OrbitExecutionStatus(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> OrbitExecutionStatus:
-        if len(payload) != 25:
-            payload = payload.ljust(25, b"\0")[:25]
+        size = len(payload)
+        if size < 25:
+            payload = payload.ljust(25, b"\0")
+        elif size > 25:
+            payload = payload[:25]
         self = _new(cls)
         self.received_frame = frame
         (self.time_usec, self.radius, self.x, self.y, self.z, self.frame) = _S360.unpack(payload)
@@ -18671,8 +19229,11 @@ class SmartBatteryInfo(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> SmartBatteryInfo:
-        if len(payload) != 109:
-            payload = payload.ljust(109, b"\0")[:109]
+        size = len(payload)
+        if size < 109:
+            payload = payload.ljust(109, b"\0")
+        elif size > 109:
+            payload = payload[:109]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -18809,8 +19370,11 @@ class GeneratorStatus(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> GeneratorStatus:
-        if len(payload) != 42:
-            payload = payload.ljust(42, b"\0")[:42]
+        size = len(payload)
+        if size < 42:
+            payload = payload.ljust(42, b"\0")
+        elif size > 42:
+            payload = payload[:42]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -18871,8 +19435,11 @@ class ActuatorOutputStatus(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> ActuatorOutputStatus:
-        if len(payload) != 140:
-            payload = payload.ljust(140, b"\0")[:140]
+        size = len(payload)
+        if size < 140:
+            payload = payload.ljust(140, b"\0")
+        elif size > 140:
+            payload = payload[:140]
         self = _new(cls)
         self.received_frame = frame
         values = _S375.unpack(payload)
@@ -18933,8 +19500,11 @@ class RelayStatus(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> RelayStatus:
-        if len(payload) != 8:
-            payload = payload.ljust(8, b"\0")[:8]
+        size = len(payload)
+        if size < 8:
+            payload = payload.ljust(8, b"\0")
+        elif size > 8:
+            payload = payload[:8]
         self = _new(cls)
         self.received_frame = frame
         (self.time_boot_ms, self.on, self.present) = _S376.unpack(payload)
@@ -19009,8 +19579,11 @@ class Tunnel(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> Tunnel:
-        if len(payload) != 133:
-            payload = payload.ljust(133, b"\0")[:133]
+        size = len(payload)
+        if size < 133:
+            payload = payload.ljust(133, b"\0")
+        elif size > 133:
+            payload = payload[:133]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -19084,8 +19657,11 @@ class CanFrame(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> CanFrame:
-        if len(payload) != 16:
-            payload = payload.ljust(16, b"\0")[:16]
+        size = len(payload)
+        if size < 16:
+            payload = payload.ljust(16, b"\0")
+        elif size > 16:
+            payload = payload[:16]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -19160,8 +19736,11 @@ class CanfdFrame(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> CanfdFrame:
-        if len(payload) != 72:
-            payload = payload.ljust(72, b"\0")[:72]
+        size = len(payload)
+        if size < 72:
+            payload = payload.ljust(72, b"\0")
+        elif size > 72:
+            payload = payload[:72]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -19242,8 +19821,11 @@ class CanFilterModify(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> CanFilterModify:
-        if len(payload) != 37:
-            payload = payload.ljust(37, b"\0")[:37]
+        size = len(payload)
+        if size < 37:
+            payload = payload.ljust(37, b"\0")
+        elif size > 37:
+            payload = payload[:37]
         self = _new(cls)
         self.received_frame = frame
         values = _S388.unpack(payload)
@@ -19454,8 +20036,11 @@ class OnboardComputerStatus(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> OnboardComputerStatus:
-        if len(payload) != 240:
-            payload = payload.ljust(240, b"\0")[:240]
+        size = len(payload)
+        if size < 240:
+            payload = payload.ljust(240, b"\0")
+        elif size > 240:
+            payload = payload[:240]
         self = _new(cls)
         self.received_frame = frame
         values = _S390.unpack(payload)
@@ -19541,8 +20126,11 @@ class WheelDistance(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> WheelDistance:
-        if len(payload) != 137:
-            payload = payload.ljust(137, b"\0")[:137]
+        size = len(payload)
+        if size < 137:
+            payload = payload.ljust(137, b"\0")
+        elif size > 137:
+            payload = payload[:137]
         self = _new(cls)
         self.received_frame = frame
         values = _S9000.unpack(payload)
@@ -19631,8 +20219,11 @@ class WinchStatus(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> WinchStatus:
-        if len(payload) != 34:
-            payload = payload.ljust(34, b"\0")[:34]
+        size = len(payload)
+        if size < 34:
+            payload = payload.ljust(34, b"\0")
+        elif size > 34:
+            payload = payload[:34]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -19716,8 +20307,11 @@ class OpenDroneIdBasicId(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> OpenDroneIdBasicId:
-        if len(payload) != 44:
-            payload = payload.ljust(44, b"\0")[:44]
+        size = len(payload)
+        if size < 44:
+            payload = payload.ljust(44, b"\0")
+        elif size > 44:
+            payload = payload[:44]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -19896,8 +20490,11 @@ class OpenDroneIdLocation(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> OpenDroneIdLocation:
-        if len(payload) != 59:
-            payload = payload.ljust(59, b"\0")[:59]
+        size = len(payload)
+        if size < 59:
+            payload = payload.ljust(59, b"\0")
+        elif size > 59:
+            payload = payload[:59]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -20019,8 +20616,11 @@ class OpenDroneIdAuthentication(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> OpenDroneIdAuthentication:
-        if len(payload) != 53:
-            payload = payload.ljust(53, b"\0")[:53]
+        size = len(payload)
+        if size < 53:
+            payload = payload.ljust(53, b"\0")
+        elif size > 53:
+            payload = payload[:53]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -20101,8 +20701,11 @@ class OpenDroneIdSelfId(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> OpenDroneIdSelfId:
-        if len(payload) != 46:
-            payload = payload.ljust(46, b"\0")[:46]
+        size = len(payload)
+        if size < 46:
+            payload = payload.ljust(46, b"\0")
+        elif size > 46:
+            payload = payload[:46]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -20251,8 +20854,11 @@ class OpenDroneIdSystem(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> OpenDroneIdSystem:
-        if len(payload) != 54:
-            payload = payload.ljust(54, b"\0")[:54]
+        size = len(payload)
+        if size < 54:
+            payload = payload.ljust(54, b"\0")
+        elif size > 54:
+            payload = payload[:54]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -20332,8 +20938,11 @@ class OpenDroneIdOperatorId(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> OpenDroneIdOperatorId:
-        if len(payload) != 43:
-            payload = payload.ljust(43, b"\0")[:43]
+        size = len(payload)
+        if size < 43:
+            payload = payload.ljust(43, b"\0")
+        elif size > 43:
+            payload = payload[:43]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -20424,8 +21033,11 @@ class OpenDroneIdMessagePack(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> OpenDroneIdMessagePack:
-        if len(payload) != 249:
-            payload = payload.ljust(249, b"\0")[:249]
+        size = len(payload)
+        if size < 249:
+            payload = payload.ljust(249, b"\0")
+        elif size > 249:
+            payload = payload[:249]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -20482,8 +21094,11 @@ class OpenDroneIdArmStatus(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> OpenDroneIdArmStatus:
-        if len(payload) != 51:
-            payload = payload.ljust(51, b"\0")[:51]
+        size = len(payload)
+        if size < 51:
+            payload = payload.ljust(51, b"\0")
+        elif size > 51:
+            payload = payload[:51]
         self = _new(cls)
         self.received_frame = frame
         (self.status, v1) = _S12918.unpack(payload)
@@ -20566,8 +21181,11 @@ class OpenDroneIdSystemUpdate(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> OpenDroneIdSystemUpdate:
-        if len(payload) != 18:
-            payload = payload.ljust(18, b"\0")[:18]
+        size = len(payload)
+        if size < 18:
+            payload = payload.ljust(18, b"\0")
+        elif size > 18:
+            payload = payload[:18]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -20625,8 +21243,11 @@ class HygrometerSensor(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> HygrometerSensor:
-        if len(payload) != 5:
-            payload = payload.ljust(5, b"\0")[:5]
+        size = len(payload)
+        if size < 5:
+            payload = payload.ljust(5, b"\0")
+        elif size > 5:
+            payload = payload[:5]
         self = _new(cls)
         self.received_frame = frame
         (self.temperature, self.humidity, self.id) = _S12920.unpack(payload)

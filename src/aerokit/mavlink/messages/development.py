@@ -76,8 +76,11 @@ class MissionChecksum(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> MissionChecksum:
-        if len(payload) != 5:
-            payload = payload.ljust(5, b"\0")[:5]
+        size = len(payload)
+        if size < 5:
+            payload = payload.ljust(5, b"\0")
+        elif size > 5:
+            payload = payload[:5]
         self = _new(cls)
         self.received_frame = frame
         (self.checksum, self.mission_type) = _S53.unpack(payload)
@@ -175,8 +178,11 @@ class RadioRcChannels(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> RadioRcChannels:
-        if len(payload) != 73:
-            payload = payload.ljust(73, b"\0")[:73]
+        size = len(payload)
+        if size < 73:
+            payload = payload.ljust(73, b"\0")
+        elif size > 73:
+            payload = payload[:73]
         self = _new(cls)
         self.received_frame = frame
         values = _S420.unpack(payload)
@@ -261,8 +267,11 @@ class AvailableModes(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> AvailableModes:
-        if len(payload) != 46:
-            payload = payload.ljust(46, b"\0")[:46]
+        size = len(payload)
+        if size < 46:
+            payload = payload.ljust(46, b"\0")
+        elif size > 46:
+            payload = payload[:46]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -326,8 +335,11 @@ class CurrentMode(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> CurrentMode:
-        if len(payload) != 9:
-            payload = payload.ljust(9, b"\0")[:9]
+        size = len(payload)
+        if size < 9:
+            payload = payload.ljust(9, b"\0")
+        elif size > 9:
+            payload = payload[:9]
         self = _new(cls)
         self.received_frame = frame
         (self.custom_mode, self.intended_custom_mode, self.standard_mode) = _S436.unpack(payload)
@@ -374,8 +386,11 @@ class AvailableModesMonitor(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> AvailableModesMonitor:
-        if len(payload) != 1:
-            payload = payload.ljust(1, b"\0")[:1]
+        size = len(payload)
+        if size < 1:
+            payload = payload.ljust(1, b"\0")
+        elif size > 1:
+            payload = payload[:1]
         self = _new(cls)
         self.received_frame = frame
         (self.seq,) = _S437.unpack(payload)
@@ -497,8 +512,11 @@ class GnssIntegrity(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> GnssIntegrity:
-        if len(payload) != 17:
-            payload = payload.ljust(17, b"\0")[:17]
+        size = len(payload)
+        if size < 17:
+            payload = payload.ljust(17, b"\0")
+        elif size > 17:
+            payload = payload[:17]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -637,8 +655,11 @@ class RangingBeacon(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> RangingBeacon:
-        if len(payload) != 45:
-            payload = payload.ljust(45, b"\0")[:45]
+        size = len(payload)
+        if size < 45:
+            payload = payload.ljust(45, b"\0")
+        elif size > 45:
+            payload = payload[:45]
         self = _new(cls)
         self.received_frame = frame
         (

@@ -90,8 +90,11 @@ class Heartbeat(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> Heartbeat:
-        if len(payload) != 9:
-            payload = payload.ljust(9, b"\0")[:9]
+        size = len(payload)
+        if size < 9:
+            payload = payload.ljust(9, b"\0")
+        elif size > 9:
+            payload = payload[:9]
         self = _new(cls)
         self.received_frame = frame
         (

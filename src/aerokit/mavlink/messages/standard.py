@@ -101,8 +101,11 @@ class GlobalPositionInt(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> GlobalPositionInt:
-        if len(payload) != 28:
-            payload = payload.ljust(28, b"\0")[:28]
+        size = len(payload)
+        if size < 28:
+            payload = payload.ljust(28, b"\0")
+        elif size > 28:
+            payload = payload[:28]
         self = _new(cls)
         self.received_frame = frame
         (
@@ -236,8 +239,11 @@ class AutopilotVersion(Message):
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> AutopilotVersion:
-        if len(payload) != 78:
-            payload = payload.ljust(78, b"\0")[:78]
+        size = len(payload)
+        if size < 78:
+            payload = payload.ljust(78, b"\0")
+        elif size > 78:
+            payload = payload[:78]
         self = _new(cls)
         self.received_frame = frame
         (
