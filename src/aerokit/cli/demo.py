@@ -2,39 +2,53 @@
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING
 
-from aerokit import events
+import anyio
+
+from aerokit.cli.interrupt import on_interrupt
+from aerokit.cli.report import FlightReport
+from aerokit.errors import AerokitError
 from aerokit.vehicle.connect import connect
-from aerokit.vehicle.values import Position
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Awaitable, Callable
 
     from aerokit.vehicle.vehicle import Vehicle
 
 __all__ = ["run_demo"]
 
-CORNERS = (("north", 1, 0), ("east", 1, 1), ("south", 0, 1), ("west", 0, 0))
-WARNING = 4
+DONE, FAILED, INTERRUPTED = 0, 1, 130
+CORNERS = (("north-west", 1, 0), ("north-east", 1, 1), ("south-east", 0, 1), ("south-west", 0, 0))
+"""Of the square: its name, and how many sides north and east of the start it is."""
+READY_TIMEOUT_S = 120.0
+ON_GROUND = 1
 
 
 async def run_demo(options: argparse.Namespace) -> int:
     """Fly the demonstration; 0 when the vehicle is back on the ground."""
+    interruptible = _Interruptible()
+    with on_interrupt(interruptible.interrupt):
+        code = await interruptible.run(lambda: _connect_and_fly(options, interruptible))
+    if code is None:
+        print("interrupted")
+        return INTERRUPTED
+    return code
+
+
+async def _connect_and_fly(options: argparse.Namespace, interruptible: _Interruptible) -> int:
     async with _address(options) as address:
-        print(f"connecting to {address}")
+        print(f"connecting to {address}", flush=True)
         async with connect(
             address, system_id=options.system_id, baud=options.baud, record=options.record
         ) as vehicle:
-            flight = _Flight(vehicle)
-            async with flight.reporting():
-                await flight.fly(options.altitude, options.side)
-            flight.print_summary(options.record)
-    return 0
+            report = FlightReport(vehicle)
+            async with report.running():
+                code = await _Flight(vehicle, report, interruptible).fly(options.altitude, options.side)
+            report.print_summary(options.record)
+    return code
 
 
 @asynccontextmanager
@@ -46,41 +60,75 @@ async def _address(options: argparse.Namespace) -> AsyncIterator[str]:
     from aerokit.sim import SimulatedCopter, open_simulator
 
     async with open_simulator(SimulatedCopter(), "tcpin:127.0.0.1:0", speedup=options.speedup) as simulator:
-        print(f"simulated copter, {options.speedup:g} times real time, on {simulator.addresses[0]}")
-        yield simulator.addresses[0].replace("tcpin", "tcp")
+        address = simulator.addresses[0].replace("tcpin", "tcp")
+        print(f"simulated copter, {options.speedup:g} times real time, on {address}", flush=True)
+        yield address
+
+
+class _Interruptible:
+    """Runs functions that Ctrl-C ends; each Ctrl-C ends the innermost one only."""
+
+    def __init__(self) -> None:
+        self._scopes: list[anyio.CancelScope] = []
+
+    def interrupt(self) -> None:
+        if self._scopes:
+            self._scopes[-1].cancel()
+
+    async def run(self, function: Callable[[], Awaitable[int]]) -> int | None:
+        """What the function gives, None when it was interrupted."""
+        scope = anyio.CancelScope()
+        with scope:
+            self._scopes.append(scope)
+            try:
+                return await function()
+            finally:
+                self._scopes.remove(scope)
+        return None
 
 
 class _Flight:
-    """One flight with what is told of it."""
+    """The square, and what is done when it is interrupted or fails."""
 
-    def __init__(self, vehicle: Vehicle) -> None:
-        self._vehicle = vehicle
-        self._started = vehicle.connection.now()
-        self._highest_m = self._fastest_m_s = self._flown_m = 0.0
-        self._before: Position | None = None
+    def __init__(self, vehicle: Vehicle, report: FlightReport, interruptible: _Interruptible) -> None:
+        self._vehicle, self._say, self._interruptible = vehicle, report.say, interruptible
 
-    async def fly(self, altitude_m: float, side_m: float) -> None:
+    async def fly(self, altitude_m: float, side_m: float) -> int:
+        """Fly it, come down whatever happens, and return the exit code."""
+        try:
+            code = await self._interruptible.run(lambda: self._fly_square(altitude_m, side_m))
+        except AerokitError as error:
+            self._say(f"failed: {error}")
+            await self._come_down_after_failure()
+            return FAILED
+        if code is None:
+            self._say("interrupted")
+            await self._come_down()
+            return INTERRUPTED
+        return code
+
+    async def _fly_square(self, altitude_m: float, side_m: float) -> int:
+        await self._take_off(altitude_m)
+        start = self._vehicle.position.value.replace(altitude_relative_m=altitude_m, altitude_amsl_m=None)
+        for name, north, east in CORNERS:
+            await self._vehicle.go_to(start.offset(north_m=north * side_m, east_m=east * side_m))
+            self._say(f"at the {name} corner")
+        await self._land()
+        return DONE
+
+    async def _take_off(self, altitude_m: float) -> None:
         vehicle = self._vehicle
         self._say(
             f"found {vehicle.autopilot.firmware}, system {vehicle.system_id}; waiting until it is ready"
         )
-        await vehicle.wait_ready()
+        await vehicle.wait_ready(timeout=READY_TIMEOUT_S)
         home = vehicle.home.value
-        self._say(f"ready at {home.latitude_deg:.6f}, {home.longitude_deg:.6f}; arming")
+        self._say(f"ready, home is {home.latitude_deg:.6f}, {home.longitude_deg:.6f}; arming")
         await self._leave_unarmable_mode()
         await vehicle.arm()
         self._say(f"armed; taking off to {altitude_m:g} m")
         await vehicle.take_off(altitude_m)
-        start = vehicle.position.value.replace(altitude_relative_m=altitude_m, altitude_amsl_m=None)
         self._say("at altitude; flying the square")
-        for name, north, east in CORNERS:
-            await vehicle.go_to(start.offset(north_m=north * side_m, east_m=east * side_m))
-            self._say(f"arrived at the corner {name}")
-        self._say("landing")
-        await vehicle.land()
-        self._say("on the ground; waiting for the motors to stop")
-        await vehicle.armed.wait_until(lambda armed: not armed, timeout=30)
-        self._say("disarmed")
 
     async def _leave_unarmable_mode(self) -> None:
         """ArduPilot refuses to arm in LAND, where the flight before has left it."""
@@ -89,54 +137,40 @@ class _Flight:
         if mode is not None and vehicle.mode_name in vehicle.autopilot.unarmable_modes:
             await vehicle.set_mode(mode.name)
 
-    @asynccontextmanager
-    async def reporting(self) -> AsyncIterator[None]:
-        """Print what the vehicle says, and follow where it is."""
-        detach = self._vehicle.position.observe(self._on_position)
-        task = asyncio.create_task(self._print_events())
+    async def _land(self) -> int:
+        self._say("landing")
+        await self._vehicle.land()
+        self._say("on the ground; waiting for the motors to stop")
+        await self._vehicle.armed.wait_until(lambda armed: not armed, timeout=30)
+        self._say("disarmed")
+        return DONE
+
+    # ---------------------------------------------------------------------- when it went wrong
+
+    async def _come_down_after_failure(self) -> None:
+        """Whoever changed the mode, a pilot or a failsafe, keeps the vehicle."""
+        vehicle, autopilot = self._vehicle, self._vehicle.autopilot
+        ours = [autopilot.mode_for(purpose) for purpose in ("take_off", "setpoint", "hold", "land")]
+        if vehicle.is_armed and vehicle.mode_name not in [mode.name for mode in ours if mode is not None]:
+            self._say(f"left to whoever put it into {vehicle.mode_name}")
+            return
+        await self._come_down()
+
+    async def _come_down(self) -> None:
+        """Land, or switch off what stands on the ground; a second Ctrl-C leaves it to itself."""
         try:
-            yield
-        finally:
-            detach()
-            task.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await task
+            if await self._interruptible.run(self._end_flight) is None:
+                self._say(f"interrupted again: left in {self._vehicle.mode_name}")
+        except AerokitError as error:
+            self._say(f"it could not be landed: {error}")
 
-    async def _print_events(self) -> None:
-        with self._vehicle.subscribe(events.StatusTextReceived, events.ModeChanged, capacity=100) as news:
-            async for event in news:
-                if isinstance(event, events.ModeChanged):
-                    self._say(f"  mode {event.after}")
-                else:
-                    self._say(f"  {'! ' if event.severity <= WARNING else ''}{event.text}")
-
-    def _on_position(self, before: Position | None, position: Position) -> None:
-        if self._before is not None:
-            self._flown_m += position.distance_to(self._before)
-        self._before = position
-        self._highest_m = max(self._highest_m, position.altitude_relative_m or 0.0)
-        self._fastest_m_s = max(self._fastest_m_s, self._vehicle.ground_speed_m_s.latest or 0.0)
-
-    def _say(self, text: str) -> None:
+    async def _end_flight(self) -> int:
         vehicle = self._vehicle
-        here = vehicle.position.latest
-        altitude = here.altitude_relative_m if here is not None else None
-        height = "     -" if altitude is None else f"{altitude:6.1f}"
-        print(f"{vehicle.connection.now() - self._started:6.1f} s {height} m  {text}", flush=True)
-
-    def print_summary(self, record: str) -> None:
-        vehicle = self._vehicle
-        received, lost = vehicle.connection.counts(vehicle.system_id)
-        batteries = vehicle.batteries.latest or ()
-        print(
-            f"\nflown {self._flown_m:.0f} m, up to {self._highest_m:.1f} m high and {self._fastest_m_s:.1f} m/s fast"
-            f"\n{received} frames received, {lost} lost; recorded in {record}"
-        )
-        for battery in batteries:
-            print(
-                f"battery {battery.id}: {_number(battery.voltage_v, 'V')}, {_number(battery.remaining_percent, '%')}"
-            )
-
-
-def _number(value: float | None, unit: str) -> str:
-    return "unknown" if value is None else f"{value:.4g} {unit}"
+        if not vehicle.is_armed:
+            return DONE
+        if vehicle.landed_state.latest == ON_GROUND:
+            self._say("on the ground and armed; disarming")
+            await vehicle.disarm()
+            return DONE
+        self._say("landing here; Ctrl-C again to leave it to itself")
+        return await self._land()

@@ -1,38 +1,56 @@
-"""Arguments, exit codes, and nothing else."""
+"""The commands, their arguments and exit codes."""
 
 from __future__ import annotations
 
 import argparse
 import asyncio
+import os
 import sys
 from typing import TYPE_CHECKING
 
-from aerokit.errors import AerokitError
+from aerokit.cli.arguments import address, home, number, system_id, writable_file
+from aerokit.errors import AerokitError, LocalProtocolError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
 __all__ = ["main"]
 
-FAILED, INTERRUPTED = 1, 130
+FAILED, WRONG_ARGUMENTS, INTERRUPTED = 1, 2, 130
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code: 0 done, 1 failed, 2 wrong arguments, 130 interrupted."""
     options = _parser().parse_args(arguments)
     try:
-        return asyncio.run(options.run(options))
+        code: int = asyncio.run(options.run(options))
     except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        return INTERRUPTED
-    except AerokitError as error:
-        print(f"{type(error).__name__}: {error}", file=sys.stderr)
+        return _failed("interrupted", INTERRUPTED)
+    except LocalProtocolError as error:
+        return _failed(str(error), WRONG_ARGUMENTS)
+    except BrokenPipeError:
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - else the interpreter complains at its exit
         return FAILED
+    except (AerokitError, OSError) as error:
+        return _failed(str(error), FAILED)
+    return code
+
+
+def _failed(text: str, code: int) -> int:
+    print(f"aerokit: {text}", file=sys.stderr)
+    return code
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="aerokit", description="Control drones over MAVLink.")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    from aerokit import __version__
+
+    parser = argparse.ArgumentParser(
+        prog="aerokit",
+        description="Control drones over MAVLink.",
+        epilog="Exit codes: 0 done, 1 failed, 2 wrong arguments, 130 interrupted.",
+    )
+    parser.add_argument("--version", action="version", version=f"aerokit {__version__}")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND", title="commands")
     _add_demo(commands)
     _add_sim(commands)
     return parser
@@ -44,20 +62,40 @@ def _add_demo(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
 
         return await run_demo(options)
 
-    text = "Fly a square: on a simulated copter, or on any vehicle with --connect."
+    text = (
+        "Take off, fly a square, come back and land: on a simulated copter, or on any vehicle with --connect."
+        " Ctrl-C lands it where it is, a second Ctrl-C leaves it to itself."
+    )
     demo = commands.add_parser("demo", help="fly a square", description=text)
     demo.set_defaults(run=run)
     demo.add_argument(
-        "--connect", metavar="ADDRESS", help="a vehicle, e.g. udpin:0.0.0.0:14550 or /dev/ttyACM0,57600"
+        "--connect",
+        type=address,
+        metavar="ADDRESS",
+        help="a vehicle: udpin:0.0.0.0:14550, tcp:127.0.0.1:5760, /dev/ttyACM0,57600 …",
     )
-    demo.add_argument("--altitude", type=float, default=10.0, metavar="M", help="metres above home (10)")
     demo.add_argument(
-        "--side", type=float, default=20.0, metavar="M", help="side of the square in metres (20)"
+        "--altitude", type=number(1, 500), default=10.0, metavar="M", help="metres above home (10)"
     )
-    demo.add_argument("--record", default="flight.tlog", metavar="FILE", help="telemetry log (flight.tlog)")
-    demo.add_argument("--speedup", type=float, default=5.0, metavar="X", help="of the simulated copter (5)")
-    demo.add_argument("--system-id", type=int, metavar="ID", help="of the vehicle (the first that is heard)")
-    demo.add_argument("--baud", type=int, default=57600, help="of a serial port (57600)")
+    demo.add_argument(
+        "--side", type=number(1, 5000), default=20.0, metavar="M", help="side of the square in metres (20)"
+    )
+    demo.add_argument(
+        "--record",
+        type=writable_file,
+        default="flight.tlog",
+        metavar="FILE",
+        help="telemetry log; one that is there is replaced (flight.tlog)",
+    )
+    demo.add_argument(
+        "--speedup", type=number(0.1, 100), default=5.0, metavar="X", help="of the simulated copter (5)"
+    )
+    demo.add_argument(
+        "--system-id", type=system_id, metavar="ID", help="of the vehicle (the first that is heard)"
+    )
+    demo.add_argument(
+        "--baud", type=int, default=57600, help="of a serial port whose address says none (57600)"
+    )
 
 
 def _add_sim(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -66,19 +104,25 @@ def _add_sim(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
 
         return await run_sim(options)
 
-    text = "Simulate a copter for other programs, until interrupted."
+    text = "Simulate an ArduCopter for other programs, until interrupted."
     sim = commands.add_parser("sim", help="simulate a copter", description=text)
     sim.set_defaults(run=run)
     sim.add_argument(
         "addresses",
         nargs="*",
+        type=address,
         default=["tcpin:127.0.0.1:5760"],
         metavar="ADDRESS",
-        help="where to serve it: tcpin:HOST:PORT (tcpin:127.0.0.1:5760), udpout:HOST:PORT, udpin:HOST:PORT, a port",
+        help="where to serve it, one or several: tcpin:127.0.0.1:5760 (the default), udpout:127.0.0.1:14550,"
+        " udpin:0.0.0.0:14550, /dev/ttyUSB0,57600",
     )
-    sim.add_argument("--speedup", type=float, default=1.0, metavar="X", help="times real time (1)")
-    sim.add_argument("--system-id", type=int, default=1, metavar="ID", help="MAVLink system id (1)")
+    sim.add_argument("--speedup", type=number(0.1, 100), default=1.0, metavar="X", help="times real time (1)")
+    sim.add_argument("--system-id", type=system_id, default=1, metavar="ID", help="MAVLink system id (1)")
     sim.add_argument(
-        "--home", default="47.397742,8.545594,488", metavar="LAT,LON,ALT", help="degrees and metres"
+        "--home",
+        type=home,
+        default=(47.397742, 8.545594, 488.0),
+        metavar="LAT,LON,ALT",
+        help="degrees and metres above the sea (47.397742,8.545594,488)",
     )
     sim.add_argument("--seed", type=int, default=0, help="of its noise (0)")

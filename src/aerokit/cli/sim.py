@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING
 
-from aerokit.errors import LocalProtocolError
+from aerokit.cli.interrupt import on_interrupt
 from aerokit.sim import SimulatedCopter, open_simulator
 
 if TYPE_CHECKING:
@@ -13,24 +13,29 @@ if TYPE_CHECKING:
 
 __all__ = ["run_sim"]
 
+CLIENTS_USE = {"tcpin": "tcp", "udpout": "udpin", "udpbcast": "udpin", "udpin": "udpout"}
+"""What a client writes where the simulator writes this."""
+
 
 async def run_sim(options: argparse.Namespace) -> int:
     """Serve it until interrupted."""
     copter = SimulatedCopter(
-        system_id=options.system_id, home=_home(options.home), seed=options.seed, boot_text=True
+        system_id=options.system_id, home=options.home, seed=options.seed, boot_text=True
     )
-    async with open_simulator(copter, *options.addresses, speedup=options.speedup) as simulator:
-        for address in simulator.addresses:
-            print(f"system {options.system_id} on {address}, {options.speedup:g} times real time", flush=True)
-        await asyncio.Event().wait()
+    stop = asyncio.Event()
+    with on_interrupt(stop.set):
+        async with open_simulator(copter, *options.addresses, speedup=options.speedup) as simulator:
+            for address in simulator.addresses:
+                print(f"system {options.system_id} on {address}, {options.speedup:g} times real time")
+            print(f"try: aerokit demo --connect {_client_address(simulator.addresses[0])}", flush=True)
+            await stop.wait()
+    print("stopped")
     return 0
 
 
-def _home(text: str) -> tuple[float, float, float]:
-    try:
-        latitude, longitude, altitude = (float(part) for part in text.split(","))
-    except ValueError:
-        raise LocalProtocolError(
-            f"--home {text!r}: latitude,longitude,altitude in degrees and metres"
-        ) from None
-    return latitude, longitude, altitude
+def _client_address(address: str) -> str:
+    """How a client on this machine reaches it; serial ports have another end."""
+    scheme, _, place = address.partition(":")
+    if scheme not in CLIENTS_USE:
+        return "the other end of the serial line"
+    return f"{CLIENTS_USE[scheme]}:{place.replace('0.0.0.0', '127.0.0.1')}"
