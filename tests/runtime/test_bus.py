@@ -75,7 +75,12 @@ def test_a_subscriber_that_raises_is_logged_and_the_others_go_on(caplog: pytest.
 
 def test_detaching_while_a_message_is_delivered() -> None:
     bus, seen = Bus(), list[str]()
-    detach = bus.attach(Heartbeat, lambda message: (seen.append("first"), detach()))
+
+    def first(message: Heartbeat) -> None:
+        seen.append("first")
+        detach()
+
+    detach = bus.attach(Heartbeat, first)
     bus.attach(Heartbeat, lambda message: seen.append("second"))
     bus.deliver(frame(HEARTBEAT))
     bus.deliver(frame(HEARTBEAT))

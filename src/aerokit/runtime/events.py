@@ -31,7 +31,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Event:
-    """Something happened at ``at`` (seconds on the event loop's clock), to ``system_id`` (0: to the link as a whole)."""
+    """Something happened at ``at`` (seconds on the event loop's clock) to ``system_id`` (0: to the link as a whole)."""
 
     at: float
     system_id: int

@@ -9,7 +9,7 @@ import anyio
 
 from aerokit.autopilots import autopilot_for
 from aerokit.autopilots.streams import subscription_rate_hz
-from aerokit.errors import CommandRejected
+from aerokit.errors import CommandRejected, ConnectionClosed
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import CommandAck, Heartbeat
 from aerokit.runtime.cells import Source, StateCell
@@ -38,9 +38,12 @@ if TYPE_CHECKING:
 __all__ = ["VehicleCore"]
 
 ItemT = TypeVar("ItemT", bound="Message | Event")
+MessageT = TypeVar("MessageT", bound=Message)
 
 SETTLE_S = 0.3
 """How long after a refusal the vehicle's texts about it are waited for."""
+ACTION_HZ = 4.0
+"""How fast an action wants to be told what it waits for."""
 RESULTS_OF_REFUSAL = (1, 2, 3, 4)
 
 
@@ -76,6 +79,7 @@ class VehicleCore:
         self._link_watch = LinkWatch(connection, system_id, component_id, self._on_link_report)
         self._tasks: TaskGroup | None = None
         self._detach: list[Detach] = []
+        self._messages: dict[type[Message], StateCell[Any]] = {}
         self._attach_telemetry()
 
     # ---------------------------------------------------------------------------- commands
@@ -117,6 +121,7 @@ class VehicleCore:
                 on_progress=on_progress,
             )
         except CommandRejected as error:
+            await self._settle()
             raise self._explained(error, started) from None
 
     async def command_int(
@@ -152,6 +157,7 @@ class VehicleCore:
                 on_progress=on_progress,
             )
         except CommandRejected as error:
+            await self._settle()
             raise self._explained(error, started) from None
 
     def send(self, message: Message) -> None:
@@ -202,7 +208,52 @@ class VehicleCore:
         finally:
             release()
 
+    @contextmanager
+    def _streaming(self, *names: str) -> Iterator[None]:
+        """Have what feeds these cells sent, also when the program asked for no rates of its own."""
+        releases = [
+            self._rates.want(message_type, ACTION_HZ, is_optional=True)
+            for name in names
+            for message_type in self.telemetry.required_messages(name)
+        ]
+        try:
+            yield
+        finally:
+            for release in releases:
+                release()
+
     # ------------------------------------------------------------------------------- state
+
+    def message(self, message_type: type[MessageT], *, rate_hz: float | None = None) -> StateCell[MessageT]:
+        """The latest message of a kind as it came, in a cell: ``vehicle.message(messages.RawImu).value.xacc``.
+
+        The first call registers it, and has the vehicle send it at ``rate_hz`` (None: the default rate of a message
+        that comes in a stream) for as long as the vehicle object lives; later calls give the same cell. Only messages
+        of the autopilot count.
+
+        Raises:
+            LocalProtocolError: the rate is out of range, or the dialect does not hold the message.
+        """
+        cell = self._messages.get(message_type)
+        if cell is None:
+            self.connection.check_types((message_type,))
+            cell = self._messages[message_type] = self._message_cell(message_type)
+            rate_hz = subscription_rate_hz(message_type.__name__) if rate_hz is None else rate_hz
+        if rate_hz is not None:
+            self._detach.append(self._rates.want(message_type, rate_hz))
+        return cell
+
+    def _message_cell(self, message_type: type[Message]) -> StateCell[Any]:
+        cell: StateCell[Any] = StateCell(message_type.NAME, self.connection.now, message_type.NAME)
+        source = Source(self.system_id, self.component_id, message_type.NAME)
+
+        def take(message: Message) -> None:
+            frame = message.received_frame
+            if frame is not None and self.telemetry.accepts(frame):
+                cell.set(message, source)
+
+        self._detach.append(self.connection.bus.attach(message_type, take, system_id=self.system_id))
+        return cell
 
     @property
     def heartbeat_age(self) -> float:
@@ -248,8 +299,10 @@ class VehicleCore:
         self._detach.append(self.connection.on_end(self._on_end))
 
     def _close(self) -> None:
+        self._on_end(ConnectionClosed("the block of this vehicle was left"))
         for detach in self._detach:
             detach()
+        self._commands.close()
         self._watch.close()
         self._link_watch.close()
         self._rates.close()
@@ -311,3 +364,5 @@ class VehicleCore:
     def _on_end(self, error: Exception) -> None:
         self.telemetry.close(error)
         self.link_quality.close(error)
+        for cell in self._messages.values():
+            cell.close(error)
