@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, TypeVar
 from aerokit.errors import ConnectionClosed
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.runtime.connection import MAV_COMP_ID_MISSIONPLANNER
+from aerokit.sync.cells import StateCell
 from aerokit.sync.connection import Connection
 from aerokit.sync.guided import Guided
 from aerokit.sync.loop_thread import LoopThread
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
 __all__ = ["Vehicle", "connect"]
 
 ItemT = TypeVar("ItemT", bound="Message | Event")
+MessageT = TypeVar("MessageT", bound="Message")
 
 
 def connect(
@@ -277,6 +279,11 @@ class Vehicle(VehicleState):
         return Subscription(
             self._loop, self.aio.subscribe(*types, capacity=capacity, overflow=overflow, rate_hz=rate_hz)
         )
+
+    def message(self, message_type: type[MessageT], *, rate_hz: float | None = None) -> StateCell[MessageT]:
+        """The latest message of a kind as it came, in a cell; see :meth:`aerokit.Vehicle.message`."""
+        cell = self._loop.call(self.aio.message, message_type, rate_hz=rate_hz)
+        return StateCell(self._loop, cell)
 
     @contextmanager
     def rate(self, message_type: type[Message], rate_hz: float) -> Iterator[None]:
