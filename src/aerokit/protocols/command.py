@@ -79,7 +79,9 @@ class CommandExchange(Exchange[CommandAck]):
 
     ``confirmation`` rises with each resend. IN_PROGRESS is no result: it extends the deadline by ``progress_timeout``
     and is reported to ``on_progress`` (0–100, None when the vehicle does not say). An ack for another ground station
-    is not ours.
+    is not ours, nor is one of another component than the target; nor are the first ``answers_before_ours``: those to
+    an earlier command of the same number that was abandoned. If they do not come after all, the command is sent
+    again, and then every ack counts.
 
     Raises from ``result()``:
         CommandRejected: any other result; the vehicle's reasons are added by those who see its status texts.
@@ -98,6 +100,7 @@ class CommandExchange(Exchange[CommandAck]):
         attempt_timeout: float = 1.0,
         progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
+        answers_before_ours: int = 0,
     ) -> None:
         super().__init__()
         if attempts < 1:
@@ -106,7 +109,9 @@ class CommandExchange(Exchange[CommandAck]):
         self._own = (own_system, own_component)
         self._attempts, self._attempt_timeout = attempts, attempt_timeout
         self._progress_timeout, self._on_progress = progress_timeout, on_progress
+        self._answers_before_ours = answers_before_ours
         self._sent = 0
+        self._answers = 0
         self._started = 0.0
         self._in_progress = False
 
@@ -119,12 +124,22 @@ class CommandExchange(Exchange[CommandAck]):
         """Take a COMMAND_ACK of the target; others are ignored."""
         if self.done or not isinstance(message, CommandAck) or not self._is_ours(message):
             return
+        is_earlier = self._sent == 1 < self._attempts and self._answers < self._answers_before_ours
+        self._answers += message.result != IN_PROGRESS
+        if is_earlier:
+            return
         if message.result == IN_PROGRESS:
             self._report_progress(message, now)
         elif message.result == ACCEPTED:
             self._finish(message)
         else:
             self._fail(rejection(message.command, message.result))
+
+    @property
+    def answers_to_come(self) -> int:
+        """How many answers may still be under way when it is abandoned now; after a resend, the others were lost."""
+        before_ours = self._answers_before_ours - self._answers if self._sent == 1 else 0
+        return max(0, before_ours) + 1
 
     def expire(self, now: float) -> None:
         """Send again, or give up after the last attempt or when a command in progress has gone silent."""
@@ -151,8 +166,10 @@ class CommandExchange(Exchange[CommandAck]):
     def _is_ours(self, ack: CommandAck) -> bool:
         """Is it for this command and for us? Targets are 0 in acks of MAVLink 1 and of old firmwares."""
         own_system, own_component = self._own
+        frame, component = ack.received_frame, self._message.target_component
         return (
             ack.command == self._message.command
+            and (frame is None or component in (BROADCAST, frame.component_id))
             and ack.target_system in (BROADCAST, own_system)
             and ack.target_component in (BROADCAST, own_component)
         )

@@ -13,6 +13,7 @@ __all__ = ["ArmingActions"]
 PREFLIGHT_REBOOT_SHUTDOWN = 246
 COMPONENT_ARM_DISARM = 400
 FORCE = 21196
+FORCE_REBOOT = 20190226
 
 
 class ArmingActions(ModeActions):
@@ -24,7 +25,7 @@ class ArmingActions(ModeActions):
         Raises:
             OperationTimeout: not within ``timeout`` seconds; the text says what is still missing.
         """
-        with anyio.move_on_after(timeout):
+        with self._streaming("sensors", "estimator", "position"), anyio.move_on_after(timeout):
             while self.missing_for_flight():
                 self.connection.raise_if_ended()
                 await anyio.sleep(0.2)
@@ -99,7 +100,7 @@ class ArmingActions(ModeActions):
         if self.is_armed and not force:
             raise OperationRejected("reboot: the vehicle is armed; nothing was sent")
         reboots = self._watch.reboots
-        await self._explained_command(PREFLIGHT_REBOOT_SHUTDOWN, 1, *(0.0,) * 4, FORCE if force else 0)
+        await self._explained_command(PREFLIGHT_REBOOT_SHUTDOWN, 1, *(0.0,) * 4, FORCE_REBOOT if force else 0)
         with anyio.move_on_after(timeout):
             while self._watch.reboots == reboots:
                 self.connection.raise_if_ended()

@@ -7,23 +7,32 @@ from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING
 
 from aerokit.errors import CommandTimeout
+from aerokit.mavlink.messages import CommandAck
 from aerokit.protocols.command import CommandExchange, command_int, command_long
 from aerokit.runtime.driver import run_exchange
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
-    from aerokit.mavlink.messages import CommandAck, CommandInt, CommandLong
+    from aerokit.mavlink.messages import CommandInt, CommandLong
     from aerokit.runtime.connection import Connection
 
 __all__ = ["CommandSender"]
+
+IN_PROGRESS = 5
+UNDER_WAY_S = 2.0
+"""An answer that has not come by then was lost."""
+
+_Key = tuple[int, int]
+"""Component id, command."""
 
 
 class CommandSender:
     """The command protocol with one vehicle (https://mavlink.io/en/services/command.html).
 
     COMMAND_ACK carries no request id, so two equal commands to one component follow each other; different
-    commands never wait for each other.
+    commands never wait for each other. What a cancelled or unconfirmed command left under way is not taken for the
+    answer to the next one.
     """
 
     def __init__(
@@ -36,7 +45,13 @@ class CommandSender:
         self._connection = connection
         self._system_id, self._component_id = system_id, component_id
         self._describe = describe
-        self._locks: dict[tuple[int, int], _SharedLock] = {}
+        self._locks: dict[_Key, _SharedLock] = {}
+        self._under_way: dict[_Key, list[float]] = {}
+        self._detach = connection.bus.attach(CommandAck, self._on_ack, system_id=system_id)
+
+    def close(self) -> None:
+        """Stop listening to answers."""
+        self._detach()
 
     async def send_long(
         self,
@@ -72,6 +87,7 @@ class CommandSender:
     def send_unconfirmed(self, command: int, *params: float) -> None:
         """Send a COMMAND_LONG once and do not wait: for ends of blocks, which must not await."""
         self._connection.send(command_long(self._system_id, self._component_id, command, params))
+        self._expect_answers((self._component_id, command), 1)
 
     async def _run(
         self,
@@ -80,23 +96,44 @@ class CommandSender:
         attempt_timeout: float,
         on_progress: Callable[[int | None], None] | None,
     ) -> CommandAck:
-        exchange = CommandExchange(
-            message,
-            own_system=self._connection.source_system,
-            own_component=self._connection.source_component,
-            attempts=attempts,
-            attempt_timeout=attempt_timeout,
-            on_progress=on_progress,
-        )
-        async with self._alone(message.target_component, message.command):
+        key = (message.target_component, message.command)
+        async with self._alone(key):
+            exchange = CommandExchange(
+                message,
+                own_system=self._connection.source_system,
+                own_component=self._connection.source_component,
+                attempts=attempts,
+                attempt_timeout=attempt_timeout,
+                on_progress=on_progress,
+                answers_before_ours=self._take_answers_under_way(key),
+            )
             try:
                 return await run_exchange(self._connection, self._system_id, exchange)
             except CommandTimeout as error:
                 raise CommandTimeout(f"{error}; {self._describe()}") from None
+            except asyncio.CancelledError:
+                self._expect_answers(key, exchange.answers_to_come)
+                raise
+
+    def _expect_answers(self, key: _Key, count: int) -> None:
+        """Remember that answers may come which nobody waits for."""
+        self._under_way.setdefault(key, []).extend([self._connection.now()] * count)
+
+    def _take_answers_under_way(self, key: _Key) -> int:
+        oldest = self._connection.now() - UNDER_WAY_S
+        return sum(at >= oldest for at in self._under_way.pop(key, ()))
+
+    def _on_ack(self, ack: CommandAck) -> None:
+        """An answer that no exchange waits for was one of those under way."""
+        frame = ack.received_frame
+        key = (0 if frame is None else frame.component_id, ack.command)
+        if key in self._under_way and key not in self._locks and ack.result != IN_PROGRESS:
+            self._under_way[key].pop(0)
+            if not self._under_way[key]:
+                del self._under_way[key]
 
     @asynccontextmanager
-    async def _alone(self, component_id: int, command: int) -> AsyncIterator[None]:
-        key = (component_id, command)
+    async def _alone(self, key: _Key) -> AsyncIterator[None]:
         shared = self._locks.setdefault(key, _SharedLock())
         shared.users += 1
         try:

@@ -44,7 +44,8 @@ SETTLE_S = 0.3
 """How long after a refusal the vehicle's texts about it are waited for."""
 ACTION_HZ = 4.0
 """How fast an action wants to be told what it waits for."""
-RESULTS_OF_REFUSAL = (1, 2, 3, 4)
+RESULT_ACCEPTED = 0
+RESULTS_OF_REFUSAL = (1, 2, 4)
 
 
 class VehicleCore:
@@ -317,7 +318,9 @@ class VehicleCore:
         refusals: list[CommandAck] = []
 
         def note(ack: CommandAck) -> None:
-            if ack.command == command and ack.result in RESULTS_OF_REFUSAL:
+            if ack.command == command and ack.result == RESULT_ACCEPTED:
+                refusals.clear()
+            elif ack.command == command and ack.result in RESULTS_OF_REFUSAL:
                 refusals.append(ack)
 
         detach = self.connection.bus.attach(CommandAck, note, system_id=self.system_id)

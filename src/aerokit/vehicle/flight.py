@@ -71,16 +71,18 @@ class FlightActions(TravelActions):
 
     async def _await_altitude(self, altitude_m: float, plan: TakeOff, timeout: float) -> None:
         """The mode may become the take-off's own and the one after it; any other one is somebody else's doing."""
-        tolerance = max(0.5, 0.05 * altitude_m)
+        enough_m = altitude_m - max(0.5, 0.05 * altitude_m)
+        started = self.connection.now()
         modes = [plan.mode, plan.mode_after, self.autopilot.mode_for("take_off", is_vtol=self.is_vtol)]
-        await await_progress(
-            self,
-            f"take_off({altitude_m:g} m)",
-            is_done=lambda: self._altitude_relative() >= altitude_m - tolerance,
-            trouble=self._stays_in(*(mode for mode in modes if mode is not None)),
-            describe=lambda: f"it is at {self._altitude_relative():.1f} m",
-            timeout=timeout,
-        )
+        with self._streaming("position"):
+            await await_progress(
+                self,
+                f"take_off({altitude_m:g} m)",
+                is_done=lambda: self._knows_position_since(started) and self._altitude_relative() >= enough_m,
+                trouble=self._stays_in(*(mode for mode in modes if mode is not None)),
+                describe=lambda: f"it is at {self._altitude_relative():.1f} m",
+                timeout=timeout,
+            )
 
     async def land(self, *, timeout: float | None = 300.0) -> None:
         """Land where the vehicle is; returns on the ground.
@@ -124,11 +126,13 @@ class FlightActions(TravelActions):
         home = self.telemetry.home.value
         place = Position(home.latitude_deg, home.longitude_deg)
         near_m = self.autopilot.arrival_radius_m
-        await await_progress(
-            self,
-            "return_to_launch",
-            is_done=lambda: self.distance_to(place) <= near_m,
-            trouble=self._stays_in(mode),
-            describe=lambda: f"it is {self.distance_to(place):.1f} m from home",
-            timeout=timeout,
-        )
+        started = self.connection.now()
+        with self._streaming("position"):
+            await await_progress(
+                self,
+                "return_to_launch",
+                is_done=lambda: self._knows_position_since(started) and self.distance_to(place) <= near_m,
+                trouble=self._stays_in(mode),
+                describe=lambda: f"it is {self.distance_to(place):.1f} m from home",
+                timeout=timeout,
+            )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import anyio
@@ -13,7 +14,7 @@ from aerokit.vehicle.progress import await_progress
 from aerokit.vehicle.state import VehicleState
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     from aerokit.autopilots import Mode, Purpose
     from aerokit.mavlink.messages import CommandAck
@@ -28,6 +29,8 @@ CHANGE_MODE = 1
 RESULT_UNSUPPORTED = 3
 MODE_GRACE_S = 3.0
 """How long HEARTBEAT, at 1 Hz, may lag behind an accepted command that changes the mode."""
+HOLD_AGAIN_S = 0.4
+"""When HEARTBEAT does not tell it by then, an order to hold is given again."""
 STOP_HERE = (DO_REPOSITION, -1, CHANGE_MODE, 0, *(math.nan,) * 4)
 """A place that is no number means: here, with the way it takes to brake."""
 
@@ -36,6 +39,10 @@ class ModeActions(VehicleState):
     """Changing the flight mode, holding."""
 
     _hold_scope: anyio.CancelScope | None = None
+    _mode_is_in_doubt = False
+    """An order that changes the mode is out and its end is not known: the mode in HEARTBEAT may be about to change."""
+    _mode_settles_at = -math.inf
+    """Until then HEARTBEAT may tell the mode of an order that was given up."""
 
     async def set_mode(self, mode: str | int, *, timeout: float = 6.0) -> None:
         """Change the flight mode and wait until HEARTBEAT tells it.
@@ -69,11 +76,31 @@ class ModeActions(VehicleState):
 
     async def _change_mode(self, wanted: Mode, timeout: float = 6.0) -> None:
         started = self.connection.now()
-        with self._refusals_of(DO_SET_MODE) as refusals:
+        was_in_doubt = self._mode_is_in_doubt
+        with self._refusals_of(DO_SET_MODE) as refusals, self._changing_mode():
             await self._request_mode(wanted)
-            if self._is_in(wanted):
-                return
-            await self._await_mode(wanted, refusals, started, timeout)
+            told_since = self.connection.now() if was_in_doubt else -math.inf
+            await self._await_mode(wanted, refusals, started, timeout, told_since)
+            self._mode_settles_at = -math.inf
+
+    @contextmanager
+    def _changing_mode(self) -> Iterator[None]:
+        """Until the vehicle's answer is known, which it is not when this is cancelled or times out, trust no mode."""
+        self._mode_is_in_doubt = True
+        try:
+            yield
+        except CommandRejected:
+            self._mode_is_in_doubt = False
+            raise
+        except BaseException:
+            self._doubt_mode()
+            raise
+        self._mode_is_in_doubt = False
+
+    def _doubt_mode(self) -> None:
+        """An order that changes the mode is out and nobody waits for what comes of it."""
+        self._mode_is_in_doubt = True
+        self._mode_settles_at = self.connection.now() + MODE_GRACE_S
 
     async def _request_mode(self, wanted: Mode) -> None:
         started = self.connection.now()
@@ -86,7 +113,12 @@ class ModeActions(VehicleState):
             self.connection.send(self.autopilot.mode_order(wanted).legacy(self.system_id))
 
     async def _await_mode(
-        self, wanted: Mode, refusals: list[CommandAck], started: float, timeout: float
+        self,
+        wanted: Mode,
+        refusals: list[CommandAck],
+        started: float,
+        timeout: float,
+        told_since: float,
     ) -> None:
         """PX4 acks twice: the first ack is always ACCEPTED, the second one may take it back."""
 
@@ -96,7 +128,7 @@ class ModeActions(VehicleState):
         await await_progress(
             self,
             f"set_mode({wanted.name})",
-            is_done=lambda: self._is_in(wanted),
+            is_done=lambda: self._is_in(wanted) and self.telemetry.mode.updated_at > told_since,
             trouble=trouble,
             describe=lambda: f"the vehicle is in {self.mode_name}",
             timeout=max(0.1, timeout - (self.connection.now() - started)),
@@ -108,14 +140,14 @@ class ModeActions(VehicleState):
 
     async def _ensure_mode(self, mode: Mode) -> None:
         self._supersede_hold()
-        if not self._is_in(mode):
+        if self._mode_is_in_doubt or not self._is_in(mode):
             await self._change_mode(mode)
 
     async def _stop_in(self, mode: Mode) -> None:
         """PX4 in LOITER may be on its way somewhere: asking for the mode again would not stop it."""
         if self._holds_by_reposition:
             await self._explained_command(*STOP_HERE)
-        if not self._is_in(mode):
+        if self._mode_is_in_doubt or not self._is_in(mode):
             await self._change_mode(mode)
 
     def _hold_soon(self) -> None:
@@ -131,10 +163,15 @@ class ModeActions(VehicleState):
         else:
             self._commands.send_unconfirmed(DO_SET_MODE, *self.autopilot.mode_order(mode).params)
         self._supersede_hold()
-        scope = self._hold_scope = anyio.CancelScope()
+        self._doubt_mode()
+        ordered_at, scope = self.connection.now(), anyio.CancelScope()
+        self._hold_scope = scope
 
         async def confirm() -> None:
             with scope:
+                await anyio.sleep(HOLD_AGAIN_S)
+                if self._is_in(mode) and self.telemetry.mode.updated_at > ordered_at:
+                    return
                 try:
                     await self._stop_in(mode)
                 except AerokitError as error:
@@ -156,13 +193,15 @@ class ModeActions(VehicleState):
 
     def _stays_in(self, *modes: Mode) -> Callable[[], str | None]:
         """What can go wrong on the way: it disarms, or its mode becomes another one than these."""
-        grace_until = self.connection.now() + MODE_GRACE_S
+        grace_until, settles_at = self.connection.now() + MODE_GRACE_S, self._mode_settles_at
         arrived = False
 
         def trouble() -> str | None:
             nonlocal arrived
             if not self.is_armed:
                 return "the vehicle disarmed"
+            if self.connection.now() < settles_at:
+                return None
             mode = self.telemetry.mode.latest
             arrived = arrived or mode in modes
             if mode not in modes and (arrived or self.connection.now() > grace_until):

@@ -22,8 +22,9 @@ DO_SET_ROI_LOCATION = 195
 DO_SET_ROI_NONE = 197
 MAV_FRAME_GLOBAL_INT = 5
 MAV_FRAME_GLOBAL_RELATIVE_ALT_INT = 6
-POSITION_ONLY = 0x0FF8
+POSITION_ONLY = 0x0DF8
 RESEND_S = 1.0
+OLD_POSITION_S = 2.0
 
 
 class TravelActions(ArmingActions):
@@ -54,29 +55,34 @@ class TravelActions(ArmingActions):
         SET_POSITION_TARGET_GLOBAL_INT to a vehicle that does not know it.
 
         Raises:
-            LocalProtocolError: the target is no place on earth. Nothing was sent.
+            LocalProtocolError: the target is no place on earth, or another argument is out of range. Nothing was sent.
             ValueUnknownError: position or home is not known and is needed here.
             CommandRejected: the vehicle refused (outside its fence, no position, …).
             OperationRejected: on the way the mode changed (a pilot, a failsafe) or the vehicle disarmed.
             OperationTimeout: it did not arrive in time.
         """
         latitude, longitude, altitude, is_relative = self._global_target(target)
+        _check_travel(speed_m_s, heading_deg, tolerance_m, timeout)
         near_m = self.autopilot.arrival_radius_m if tolerance_m is None else tolerance_m
         self._supersede_hold()
         if not self.is_armed:
             raise OperationRejected("go_to: the vehicle is not armed; nothing was sent")
-        if speed_m_s is not None:
-            _check_speed(speed_m_s)
         yaw = self._reposition_yaw(heading_deg)
-        await self._send_there(latitude, longitude, altitude, is_relative, yaw, speed_m_s)
+        under_way = False
         try:
+            await self._send_there(latitude, longitude, altitude, is_relative, yaw, speed_m_s)
+            under_way = True
             if speed_m_s is not None and not self._speeds_by_reposition:
                 await self.set_speed(speed_m_s)  # ArduPilot obeys it only once it is under way
             if heading_deg is not None and math.isnan(yaw):
                 await self._explained_command(CONDITION_YAW, heading_deg % 360)
             await self._await_arrival(target, near_m, timeout)
-        except (anyio.get_cancelled_exc_class(), CommandRejected, CommandTimeout):
+        except (anyio.get_cancelled_exc_class(), CommandTimeout):  # it may have heard the order
             self._hold_soon()
+            raise
+        except CommandRejected:
+            if under_way:
+                self._hold_soon()
             raise
 
     async def _send_there(
@@ -94,9 +100,10 @@ class TravelActions(ArmingActions):
         params = (speed, CHANGE_MODE, 0, yaw)
         self._resend = None
         try:
-            await self._commands.send_int(
-                DO_REPOSITION, *params, frame=frame, x=latitude, y=longitude, z=altitude
-            )
+            with self._changing_mode():
+                await self._commands.send_int(
+                    DO_REPOSITION, *params, frame=frame, x=latitude, y=longitude, z=altitude
+                )
         except CommandRejected as error:
             if error.result != RESULT_UNSUPPORTED:
                 await self._settle()
@@ -120,24 +127,26 @@ class TravelActions(ArmingActions):
         timeout: float | None,
     ) -> None:
         """Wait for it. The older message has no answer, so it is repeated for as long as this call lasts."""
-        sent_at, resend = self.connection.now(), self._resend
+        started = sent_at = self.connection.now()
+        resend = self._resend
 
         def is_there() -> bool:
             nonlocal sent_at
             if resend is not None and self.connection.now() - sent_at >= RESEND_S:
                 sent_at = self.connection.now()
                 self.connection.send(resend)
-            return self.distance_to(target) <= near_m
+            return self._knows_position_since(started) and self.distance_to(target) <= near_m
 
-        await await_progress(
-            self,
-            f"go_to({target.latitude_deg:.7f}, {target.longitude_deg:.7f})",
-            is_done=is_there,
-            trouble=self._stays_in(self._mode_for("go_to", self.autopilot.reposition_purpose)),
-            describe=lambda: f"it is {self.distance_to(target):.1f} m away",
-            timeout=timeout,
-            held_for=0.5,
-        )
+        with self._streaming("position"):
+            await await_progress(
+                self,
+                f"go_to({target.latitude_deg:.7f}, {target.longitude_deg:.7f})",
+                is_done=is_there,
+                trouble=self._stays_in(self._mode_for("go_to", self.autopilot.reposition_purpose)),
+                describe=lambda: f"it is {self.distance_to(target):.1f} m away",
+                timeout=timeout,
+                held_for=0.5,
+            )
 
     async def set_speed(self, speed_m_s: float) -> None:
         """Change the ground speed for flying somewhere, in m/s, above 0 (MAV_CMD_DO_CHANGE_SPEED).
@@ -180,8 +189,7 @@ class TravelActions(ArmingActions):
         """
         if not -360 <= heading_deg <= 360:
             raise LocalProtocolError(f"heading_deg = {heading_deg!r} is not allowed: −360 to 360")
-        start = self.telemetry.heading_deg.value
-        goal = (start + heading_deg if relative else heading_deg) % 360
+        goal = (heading_deg + (self.telemetry.heading_deg.value if relative else 0)) % 360
         if self._turns_by_reposition:
             yaw = math.remainder(math.radians(goal), 2 * math.pi)
             await self._explained_command(DO_REPOSITION, -1, CHANGE_MODE, 0, yaw, *(math.nan,) * 3)
@@ -193,17 +201,21 @@ class TravelActions(ArmingActions):
         await self._await_heading(goal, tolerance_deg, timeout)
 
     async def _await_heading(self, goal: float, tolerance_deg: float, timeout: float) -> None:
-        def off() -> float:
-            return abs(math.remainder(self.telemetry.heading_deg.value - goal, 360))
+        started = self.connection.now()
+        heading = self.telemetry.heading_deg
 
-        await await_progress(
-            self,
-            f"set_heading({goal:g}°)",
-            is_done=lambda: off() <= tolerance_deg,
-            trouble=self._stays_in(self._mode_for("set_heading", self.autopilot.reposition_purpose)),
-            describe=lambda: f"it is {off():.0f}° off",
-            timeout=timeout,
-        )
+        def off() -> float:
+            return abs(math.remainder(heading.value - goal, 360)) if heading.is_known else math.inf
+
+        with self._streaming("heading_deg"):
+            await await_progress(
+                self,
+                f"set_heading({goal:g}°)",
+                is_done=lambda: heading.updated_at >= started and off() <= tolerance_deg,
+                trouble=self._stays_in(self._mode_for("set_heading", self.autopilot.reposition_purpose)),
+                describe=lambda: f"it is {off():.0f}° off",
+                timeout=timeout,
+            )
 
     async def look_at(self, target: Position) -> None:
         """Make nose or gimbal point at a place (MAV_CMD_DO_SET_ROI_LOCATION), until :meth:`stop_looking`."""
@@ -215,6 +227,7 @@ class TravelActions(ArmingActions):
                 DO_SET_ROI_LOCATION, frame=frame, x=latitude, y=longitude, z=altitude
             )
         except CommandRejected as error:
+            await self._settle()
             raise self._explained(error, started) from None
 
     async def stop_looking(self) -> None:
@@ -243,6 +256,11 @@ class TravelActions(ArmingActions):
             if mine is not None and its is not None:
                 return mine - its
         return 0.0
+
+    def _knows_position_since(self, started: float) -> bool:
+        """Whether a position has come since then and is not old: nobody arrives by an old one."""
+        position = self.telemetry.position
+        return position.updated_at >= started and position.age <= OLD_POSITION_S
 
     def _altitude_relative(self) -> float:
         here = self.telemetry.position.latest
@@ -284,6 +302,18 @@ class TravelActions(ArmingActions):
         if heading_deg is None or not self._turns_by_reposition:
             return math.nan
         return math.remainder(math.radians(heading_deg), 2 * math.pi)
+
+
+def _check_travel(
+    speed_m_s: float | None, heading_deg: float | None, tolerance_m: float | None, timeout: float | None
+) -> None:
+    if speed_m_s is not None:
+        _check_speed(speed_m_s)
+    if heading_deg is not None and not 0 <= heading_deg <= 360:
+        raise LocalProtocolError(f"heading_deg = {heading_deg!r} is not allowed: 0 to 360")
+    for name, value in (("tolerance_m", tolerance_m), ("timeout", timeout)):
+        if value is not None and not value > 0:
+            raise LocalProtocolError(f"{name} = {value!r} is not allowed: above 0, or None")
 
 
 def _check_speed(speed_m_s: float) -> None:

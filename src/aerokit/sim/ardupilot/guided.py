@@ -156,6 +156,7 @@ class Guided(Mode):
         assert self._take_off is not None
         self._take_off.update(self.copter.parameters["WPNAV_SPEED_UP"] / 100.0)
         self.is_taking_off = not self._take_off.is_complete
+        self.copter.yaw.update()
 
     def _run_attitude(self) -> None:
         copter = self.copter

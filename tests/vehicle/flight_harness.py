@@ -1,0 +1,169 @@
+"""A simulated copter in memory, a vehicle object on it, and a tap on what the program wrote: on virtual time."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import AsyncIterator, Iterable
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import anyio
+
+import aerokit
+from aerokit import messages as m
+from aerokit.errors import LinkLost
+from aerokit.links.link import Link, Peer, Receiver
+from aerokit.mavlink.dialect import STANDARD
+from aerokit.mavlink.enums import CopterMode, MavCmd
+from aerokit.mavlink.framer import Framer
+from aerokit.mavlink.message import Message
+from aerokit.runtime.connection import Connection
+from aerokit.sim import SimulatedCopter, SimulatedVehicle, simulated_link
+from aerokit.testing.clock import VirtualClockLoop
+
+M = TypeVar("M", bound=Message)
+
+SETPOINTS = (m.SetPositionTargetLocalNed, m.SetPositionTargetGlobalInt, m.SetAttitudeTarget)
+
+
+class Wire(Link):
+    """The program's end of a link. ``sent`` is what the program wrote: (loop time, message)."""
+
+    def __init__(self, link: Link) -> None:
+        self.address = link.address
+        self.sent: list[tuple[float, Message]] = []
+        self._link = link
+        self._framer = Framer()
+        self._receiver: Receiver | None = None
+
+    async def open(self, receiver: Receiver) -> None:
+        self._receiver = receiver
+        await self._link.open(receiver)
+
+    def write(self, data: bytes, peer: Peer = None) -> None:
+        now = asyncio.get_running_loop().time()
+        self.sent += [(now, STANDARD.decode(frame)) for frame in self._framer.receive(data, now)]
+        self._link.write(data, peer)
+
+    def close(self) -> None:
+        self._link.close()
+
+    async def wait_closed(self) -> None:
+        await self._link.wait_closed()
+
+    def lose(self) -> None:
+        """As when the cable is pulled out."""
+        assert self._receiver is not None
+        self._link.close()
+        self._receiver.link_lost(LinkLost("the cable was pulled out"))
+
+    def deliver(self, data: bytes) -> None:
+        """Let the program hear these bytes."""
+        assert self._receiver is not None
+        self._receiver.bytes_received(data, None)
+
+    def forget(self) -> None:
+        self.sent.clear()
+
+    def all(self, kind: type[M]) -> list[M]:
+        return [message for _, message in self.sent if isinstance(message, kind)]
+
+    def last(self, kind: type[M]) -> M:
+        return self.all(kind)[-1]
+
+    def times(self, kind: type[Message]) -> list[float]:
+        return [at for at, message in self.sent if isinstance(message, kind)]
+
+    def commands(self, command: int) -> list[m.CommandLong | m.CommandInt]:
+        return [
+            message
+            for _, message in self.sent
+            if isinstance(message, (m.CommandLong, m.CommandInt)) and message.command == command
+        ]
+
+    def mode_orders(self) -> list[int]:
+        """The custom modes that were asked for by MAV_CMD_DO_SET_MODE (as ArduPilot wants it)."""
+        return [
+            int(each.param2) for each in self.commands(MavCmd.DO_SET_MODE) if isinstance(each, m.CommandLong)
+        ]
+
+    def setpoints(self) -> list[tuple[float, Message]]:
+        return [(at, message) for at, message in self.sent if isinstance(message, SETPOINTS)]
+
+
+@dataclass
+class Flight:
+    """One simulated copter and the vehicle object that a program has of it."""
+
+    copter: SimulatedCopter
+    vehicle: aerokit.Vehicle
+    wire: Wire
+
+    async def take_off(self, altitude_m: float = 10.0) -> None:
+        """Ready, armed, in GUIDED, at this altitude; what was sent for it is forgotten."""
+        await self.vehicle.wait_ready()
+        await self.vehicle.set_mode("GUIDED")
+        await self.vehicle.arm()
+        await self.vehicle.take_off(altitude_m)
+        await anyio.sleep(3.0)
+        self.wire.forget()
+
+    def pilot_takes_over(self, mode: int = CopterMode.LOITER) -> None:
+        """Somebody turns the mode switch; the throttle stick is in the middle."""
+        self.copter.rc[2] = 1500
+        assert self.copter.set_mode(mode)
+
+
+@asynccontextmanager
+async def open_flight(
+    copter: SimulatedCopter | None = None,
+    *,
+    latency_s: float = 0.0,
+    others: Iterable[SimulatedVehicle] = (),
+    **options: Any,
+) -> AsyncIterator[Flight]:
+    """A copter that is ready when it is switched on, and a vehicle on it; ``options`` are those of `connect`."""
+    copter = SimulatedCopter(boot_time_s=0.0) if copter is None else copter
+    options.setdefault("system_id", copter.system_id)
+    async with simulated_link([copter, *others], latency_s=latency_s) as link:
+        wire = Wire(link)
+        async with aerokit.connect(wire, **options) as vehicle:
+            yield Flight(copter, vehicle, wire)
+
+
+@asynccontextmanager
+async def in_the_air(altitude_m: float = 10.0, **options: Any) -> AsyncIterator[Flight]:
+    """The same, hovering in GUIDED."""
+    async with open_flight(**options) as flight:
+        await flight.take_off(altitude_m)
+        yield flight
+
+
+def now() -> float:
+    return asyncio.get_running_loop().time()
+
+
+def block_loop(seconds: float) -> None:
+    """What a program does that calls time.sleep: the clock goes on, the loop does not."""
+    loop = asyncio.get_running_loop()
+    assert isinstance(loop, VirtualClockLoop)
+    loop._now += seconds
+
+
+def speed_of(copter: SimulatedCopter) -> float:
+    motion = copter.motion
+    return math.hypot(motion.velocity_north, motion.velocity_east, motion.velocity_down)
+
+
+def attached_sinks(connection: Connection) -> int:
+    """How many callbacks hang on a connection: sinks of messages and events, and what ends with it."""
+    bus = connection.bus
+    tables = (*bus._sinks.values(), *bus._event_sinks.values())
+    return sum(len(sinks) for sinks in tables) + len(connection._enders)
+
+
+def waiting_on_cells(vehicle: aerokit.Vehicle) -> int:
+    """How many waiters and observers hang on the state cells of a vehicle."""
+    return sum(len(cell._sinks) for cell in (*vehicle.telemetry.cells.values(), vehicle.link_quality))

@@ -1,0 +1,561 @@
+"""Taking off, going somewhere, coming back: each action ends when the vehicle has done it."""
+
+from __future__ import annotations
+
+import math
+
+import anyio
+import pytest
+from flight_harness import Flight, in_the_air, now, open_flight, speed_of
+
+from aerokit import Position, geo
+from aerokit import messages as m
+from aerokit.errors import (
+    CommandRejected,
+    HeartbeatTimeout,
+    LocalProtocolError,
+    OperationRejected,
+    OperationTimeout,
+)
+from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult
+from aerokit.sim import SimulatedCopter
+from aerokit.vehicle.setpoints import VelocitySetpoint
+
+pytestmark = pytest.mark.anyio
+
+GUIDED, BRAKE, LOITER, LAND, RTL = (
+    CopterMode.GUIDED,
+    CopterMode.BRAKE,
+    CopterMode.LOITER,
+    CopterMode.LAND,
+    CopterMode.RTL,
+)
+
+
+def north_of_home(flight: Flight, north_m: float, altitude_m: float = 10.0) -> Position:
+    home = flight.vehicle.home.value
+    latitude, longitude = geo.offset(home.latitude_deg, home.longitude_deg, north_m, 0.0)
+    return Position(latitude, longitude, altitude_relative_m=altitude_m)
+
+
+async def cancelled_after(seconds: float, action: object) -> None:
+    """Run a coroutine and cancel it half-way; it must have been under way still."""
+    with anyio.move_on_after(seconds) as scope:
+        await action  # type: ignore[misc]
+    assert scope.cancelled_caught
+
+
+# ------------------------------------------------------------------------------------ readiness
+
+
+async def test_wait_ready_says_what_is_missing() -> None:
+    async with open_flight(SimulatedCopter(boot_time_s=40.0)) as flight:
+        with pytest.raises(OperationTimeout) as caught:
+            await flight.vehicle.wait_ready(timeout=6.0)
+    text = str(caught.value)
+    assert "not ready within 6 s" in text
+    assert "home (HOME_POSITION has not come)" in text
+    assert "position (GLOBAL_POSITION_INT with a fix has not come)" in text
+    assert "absolute horizontal position" in text
+    assert "last heartbeat 0." in text
+
+
+async def test_wait_ready_returns_when_the_vehicle_can_be_armed() -> None:
+    async with open_flight(SimulatedCopter(boot_time_s=20.0)) as flight:
+        await flight.vehicle.wait_ready()
+        assert flight.vehicle.missing_for_flight() == []
+        assert flight.copter.navigation.has_position
+        await flight.vehicle.set_mode("GUIDED")
+        await flight.vehicle.arm()
+
+
+async def test_wait_ready_asks_for_the_streams_it_needs() -> None:
+    async with open_flight(rates={}) as flight:
+        await flight.vehicle.wait_ready(timeout=10.0)
+
+
+async def test_wait_ready_names_a_failing_check_and_a_silent_vehicle(grounded: Flight) -> None:
+    grounded.copter.faults.prearm_failures.append("Compass not healthy")
+    await anyio.sleep(3.0)
+    with pytest.raises(OperationTimeout, match="pre-arm checks do not pass"):
+        await grounded.vehicle.wait_ready(timeout=2.0)
+    grounded.copter.faults.silent = True
+    with pytest.raises(OperationTimeout, match="heartbeats \\(the last one"):
+        await grounded.vehicle.wait_ready(timeout=6.0)
+
+
+# ------------------------------------------------------------------------------------- take-off
+
+
+async def test_take_off_disarmed_sends_nothing(grounded: Flight) -> None:
+    await grounded.vehicle.set_mode("GUIDED")
+    grounded.wire.forget()
+    with pytest.raises(OperationRejected, match="not armed"):
+        await grounded.vehicle.take_off(10.0)
+    assert not grounded.wire.mode_orders()
+    assert not grounded.wire.commands(MavCmd.NAV_TAKEOFF)
+
+
+@pytest.mark.parametrize("altitude_m", [0.0, -3.0, 10_001.0, math.nan, math.inf])
+async def test_take_off_to_nonsense_sends_nothing(grounded: Flight, altitude_m: float) -> None:
+    await grounded.vehicle.set_mode("GUIDED")
+    await grounded.vehicle.arm()
+    with pytest.raises(LocalProtocolError, match="altitude_m"):
+        await grounded.vehicle.take_off(altitude_m)
+    assert not grounded.wire.commands(MavCmd.NAV_TAKEOFF)
+
+
+async def test_take_off_changes_to_guided_and_returns_at_altitude(grounded: Flight) -> None:
+    await grounded.vehicle.arm()
+    await grounded.vehicle.take_off(15.0)
+    assert grounded.copter.mode.number == GUIDED
+    assert grounded.copter.altitude_m >= 14.2
+    (command,) = grounded.wire.commands(MavCmd.NAV_TAKEOFF)
+    assert isinstance(command, m.CommandLong)
+    assert (command.target_system, command.target_component, command.param7) == (1, 1, 15.0)
+
+
+async def test_take_off_works_without_default_streams() -> None:
+    async with open_flight(rates={}) as flight:
+        await anyio.sleep(3.0)
+        await flight.vehicle.set_mode("GUIDED")
+        await flight.vehicle.arm()
+        await flight.vehicle.take_off(8.0)
+        assert flight.copter.altitude_m >= 7.4
+
+
+async def test_take_off_refused_says_why(grounded: Flight) -> None:
+    grounded.copter.faults.refuse(MavCmd.NAV_TAKEOFF, MavResult.FAILED, "Takeoff: not today")
+    await grounded.vehicle.set_mode("GUIDED")
+    await grounded.vehicle.arm()
+    with pytest.raises(CommandRejected) as caught:
+        await grounded.vehicle.take_off(10.0)
+    assert caught.value.command == MavCmd.NAV_TAKEOFF
+    assert caught.value.result == MavResult.FAILED
+    assert "Takeoff: not today" in caught.value.reasons
+    assert "Takeoff: not today" in str(caught.value)
+
+
+async def test_take_off_cancelled_half_way_holds(grounded: Flight) -> None:
+    await grounded.vehicle.set_mode("GUIDED")
+    await grounded.vehicle.arm()
+    await cancelled_after(7.0, grounded.vehicle.take_off(30.0))
+    await anyio.sleep(5.0)
+    assert grounded.copter.mode.number == BRAKE
+    assert 2.0 < grounded.copter.altitude_m < 28.0
+    assert speed_of(grounded.copter) < 0.1
+
+
+async def test_take_off_ends_when_a_pilot_takes_over(grounded: Flight) -> None:
+    await grounded.vehicle.set_mode("GUIDED")
+    await grounded.vehicle.arm()
+    async with anyio.create_task_group() as tasks:
+
+        async def pilot() -> None:
+            await anyio.sleep(6.0)
+            grounded.pilot_takes_over()
+
+        tasks.start_soon(pilot)
+        with pytest.raises(OperationRejected, match="mode changed to LOITER"):
+            await grounded.vehicle.take_off(30.0)
+    await anyio.sleep(3.0)
+    assert grounded.copter.mode.number == LOITER  # it is the pilot's now
+
+
+async def test_take_off_that_does_not_come_off_times_out(grounded: Flight) -> None:
+    grounded.copter.faults.motor_failed = True
+    await grounded.vehicle.set_mode("GUIDED")
+    await grounded.vehicle.arm()
+    started = now()
+    with pytest.raises(OperationTimeout, match=r"take_off\(10 m\): not done within 8 s; it is at -?0\.0 m"):
+        await grounded.vehicle.take_off(10.0, timeout=8.0)
+    assert 8.0 <= now() - started < 10.0
+
+
+async def test_take_off_ends_when_it_is_disarmed(grounded: Flight) -> None:
+    await grounded.vehicle.set_mode("GUIDED")
+    await grounded.vehicle.arm()
+    grounded.copter.faults.motor_failed = True
+    async with anyio.create_task_group() as tasks:
+
+        async def disarm() -> None:
+            await anyio.sleep(2.0)
+            await grounded.vehicle.disarm(force=True)
+
+        tasks.start_soon(disarm)
+        with pytest.raises(OperationRejected, match="disarmed"):
+            await grounded.vehicle.take_off(10.0)
+
+
+async def test_take_off_after_a_cancelled_one_goes_on(grounded: Flight) -> None:
+    """The hold that the first one left behind must not come after the second one's order."""
+    vehicle = grounded.vehicle
+    await vehicle.set_mode("GUIDED")
+    await vehicle.arm()
+    await cancelled_after(1.0, vehicle.take_off(20.0))
+    await vehicle.take_off(10.0)
+    assert grounded.copter.mode.number == GUIDED
+    assert grounded.copter.altitude_m > 9.0
+
+
+# ---------------------------------------------------------------------------------------- go_to
+
+
+async def test_go_to_returns_on_arrival(flying: Flight) -> None:
+    target = north_of_home(flying, 40.0, 15.0)
+    await flying.vehicle.go_to(target)
+    assert flying.vehicle.distance_to(target) <= flying.vehicle.autopilot.arrival_radius_m
+    assert flying.copter.motion.north == pytest.approx(40.0, abs=2.5)
+    assert flying.copter.altitude_m == pytest.approx(15.0, abs=2.0)
+    (command,) = flying.wire.commands(MavCmd.DO_REPOSITION)
+    assert isinstance(command, m.CommandInt)
+    assert (command.target_system, command.frame, command.z) == (1, 6, 15.0)
+    assert (command.x, command.y) == (round(target.latitude_deg * 1e7), round(target.longitude_deg * 1e7))
+    assert math.isnan(command.param4)
+
+
+async def test_go_to_takes_tolerance(flying: Flight) -> None:
+    target = north_of_home(flying, 60.0)
+    await flying.vehicle.go_to(target, tolerance_m=30.0)
+    assert 5.0 < flying.vehicle.distance_to(target) <= 30.0
+    await flying.vehicle.go_to(target, tolerance_m=0.5)
+    assert flying.vehicle.distance_to(target) <= 0.5
+
+
+async def test_go_to_keeps_the_altitude_when_none_is_given(flying: Flight) -> None:
+    home = flying.vehicle.home.value
+    latitude, longitude = geo.offset(home.latitude_deg, home.longitude_deg, 0.0, 20.0)
+    await flying.vehicle.go_to(Position(latitude, longitude))
+    assert flying.copter.altitude_m == pytest.approx(10.0, abs=0.3)
+    assert flying.copter.motion.east == pytest.approx(20.0, abs=2.5)
+
+
+async def test_go_to_understands_altitudes_above_the_sea(flying: Flight) -> None:
+    home = flying.vehicle.home.value
+    target = Position(home.latitude_deg, home.longitude_deg, altitude_amsl_m=home.altitude_amsl_m + 25.0)
+    await flying.vehicle.go_to(target, tolerance_m=1.0)
+    assert flying.copter.altitude_m == pytest.approx(25.0, abs=1.0)
+    (command,) = flying.wire.commands(MavCmd.DO_REPOSITION)
+    assert isinstance(command, m.CommandInt)
+    assert command.frame == 5
+
+
+async def test_go_to_at_a_speed(flying: Flight) -> None:
+    fastest = 0.0
+
+    async def watch() -> None:
+        nonlocal fastest
+        while True:
+            fastest = max(fastest, speed_of(flying.copter))
+            await anyio.sleep(0.1)
+
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(watch)
+        await flying.vehicle.go_to(north_of_home(flying, 40.0), speed_m_s=3.0)
+        tasks.cancel_scope.cancel()
+    assert fastest == pytest.approx(3.0, abs=0.5)
+
+
+async def test_go_to_with_a_heading(flying: Flight) -> None:
+    await flying.vehicle.go_to(north_of_home(flying, 40.0), heading_deg=270.0)
+    heading = await flying.vehicle.heading_deg.wait_until(lambda deg: abs(deg - 270.0) < 5.0, timeout=10.0)
+    assert heading == pytest.approx(270.0, abs=5.0)
+
+
+@pytest.mark.parametrize("after_s", [0.0, 0.001, 1.0, 3.0])
+async def test_go_to_cancelled_half_way_holds(after_s: float) -> None:
+    async with in_the_air(latency_s=0.05) as flying:
+        await cancelled_after(after_s, flying.vehicle.go_to(north_of_home(flying, 200.0)))
+        await anyio.sleep(6.0)
+        where = flying.copter.motion.north
+        await anyio.sleep(3.0)
+        assert flying.copter.motion.north == pytest.approx(where, abs=0.1)
+        assert flying.copter.motion.north < 60.0
+        assert flying.copter.mode.number == BRAKE
+
+
+async def test_an_order_after_a_cancelled_go_to_stays_in_force(flying: Flight) -> None:
+    await cancelled_after(2.0, flying.vehicle.go_to(north_of_home(flying, 200.0)))
+    await flying.vehicle.go_to(north_of_home(flying, 0.0))
+    await anyio.sleep(3.0)
+    assert flying.copter.mode.number == GUIDED
+    assert flying.copter.motion.north == pytest.approx(0.0, abs=2.5)
+
+
+async def test_a_stream_after_a_cancelled_go_to_is_not_stopped() -> None:
+    async with in_the_air(latency_s=0.2) as flying:
+        await cancelled_after(2.0, flying.vehicle.go_to(north_of_home(flying, 200.0)))
+        async with flying.vehicle.guided.velocity() as stream:
+            await stream.fly(VelocitySetpoint(east_m_s=2.0), 5.0)
+            assert flying.copter.motion.velocity_east == pytest.approx(2.0, abs=0.2)
+        assert flying.copter.mode.number == BRAKE
+
+
+async def test_landing_after_a_cancelled_go_to_is_not_stopped() -> None:
+    async with in_the_air(latency_s=0.2) as flying:
+        await cancelled_after(2.0, flying.vehicle.go_to(north_of_home(flying, 200.0)))
+        await flying.vehicle.land()
+        assert flying.copter.is_landed
+
+
+@pytest.mark.parametrize("order", ["hold", "land", "set_mode", "stream"])
+async def test_a_refused_hold_of_a_cancelled_call_is_not_taken_for_the_next_answer(order: str) -> None:
+    """COMMAND_ACK carries no request id: the answer to what was left behind must not fail what comes after."""
+    async with in_the_air(latency_s=0.2) as flying:
+        vehicle = flying.vehicle
+        await cancelled_after(2.0, vehicle.go_to(north_of_home(flying, 200.0)))
+        flying.copter.faults.refuse(MavCmd.DO_SET_MODE, MavResult.FAILED, "Mode change failed", times=1)
+        if order == "hold":
+            await vehicle.hold()
+            assert flying.copter.mode.number == BRAKE
+        elif order == "land":
+            await vehicle.land()
+            assert flying.copter.is_landed
+        elif order == "set_mode":
+            await vehicle.set_mode("RTL")
+            assert flying.copter.mode.number == RTL
+        else:
+            async with vehicle.guided.velocity() as stream:
+                await anyio.sleep(0.9)
+                assert stream.is_running
+                assert flying.copter.mode.number == GUIDED
+
+
+async def test_go_to_without_do_reposition_sends_the_older_message() -> None:
+    copter = SimulatedCopter(boot_time_s=0.0, unsupported_commands=[MavCmd.DO_REPOSITION])
+    async with in_the_air(copter=copter) as flight:
+        flight.pilot_takes_over(LOITER)
+        await anyio.sleep(1.0)
+        target = north_of_home(flight, 40.0)
+        await flight.vehicle.go_to(target)
+        assert flight.copter.motion.north == pytest.approx(40.0, abs=2.5)
+        sent = flight.wire.all(m.SetPositionTargetGlobalInt)
+        assert {each.type_mask for each in sent} == {
+            0x0DF8
+        }  # velocity, acceleration, yaw and yaw rate ignored
+        assert {each.coordinate_frame for each in sent} == {6}
+        assert sent[0].lat_int == round(target.latitude_deg * 1e7)
+        flight.wire.forget()
+        await anyio.sleep(5.0)
+        assert not flight.wire.setpoints()  # nothing is resent once the call has ended
+
+
+async def test_the_older_message_is_not_resent_after_cancellation() -> None:
+    copter = SimulatedCopter(boot_time_s=0.0, unsupported_commands=[MavCmd.DO_REPOSITION])
+    async with in_the_air(copter=copter) as flight:
+        await cancelled_after(3.0, flight.vehicle.go_to(north_of_home(flight, 200.0)))
+        flight.wire.forget()
+        await anyio.sleep(5.0)
+        assert not flight.wire.setpoints()
+        assert flight.copter.mode.number == BRAKE
+
+
+async def test_go_to_nowhere_sends_nothing(flying: Flight) -> None:
+    with pytest.raises(LocalProtocolError, match="latitude"):
+        await flying.vehicle.go_to(Position(91.0, 8.0, altitude_relative_m=10.0))
+    assert not flying.wire.commands(MavCmd.DO_REPOSITION)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *(("speed_m_s", value) for value in (0.0, -1.0, math.nan, math.inf)),
+        *(("heading_deg", value) for value in (-1.0, 361.0, math.nan)),
+        *(("tolerance_m", value) for value in (0.0, -1.0, math.nan)),
+        ("timeout", -1.0),
+    ],
+)
+async def test_go_to_with_nonsense_sends_nothing(flying: Flight, name: str, value: float) -> None:
+    with pytest.raises(LocalProtocolError, match=name):
+        await flying.vehicle.go_to(north_of_home(flying, 10.0), **{name: value})
+    await anyio.sleep(1.0)
+    assert not flying.wire.commands(MavCmd.DO_REPOSITION)
+    assert not flying.wire.mode_orders()
+
+
+async def test_go_to_disarmed_sends_nothing(grounded: Flight) -> None:
+    with pytest.raises(OperationRejected, match="not armed"):
+        await grounded.vehicle.go_to(north_of_home(grounded, 10.0))
+    assert not grounded.wire.commands(MavCmd.DO_REPOSITION)
+
+
+async def test_go_to_refused_says_why(flying: Flight) -> None:
+    flying.copter.faults.refuse(MavCmd.DO_REPOSITION, MavResult.DENIED, "Target is outside the fence")
+    with pytest.raises(CommandRejected) as caught:
+        await flying.vehicle.go_to(north_of_home(flying, 10.0))
+    assert caught.value.result == MavResult.DENIED
+    assert caught.value.reasons == ("Target is outside the fence",)
+    assert flying.copter.mode.number == GUIDED
+
+
+async def test_go_to_ends_when_a_pilot_takes_over(flying: Flight) -> None:
+    async with anyio.create_task_group() as tasks:
+
+        async def pilot() -> None:
+            await anyio.sleep(3.0)
+            flying.pilot_takes_over()
+
+        tasks.start_soon(pilot)
+        with pytest.raises(OperationRejected, match="mode changed to LOITER"):
+            await flying.vehicle.go_to(north_of_home(flying, 200.0))
+    await anyio.sleep(2.0)
+    assert flying.copter.mode.number == LOITER
+    assert not flying.wire.mode_orders()
+
+
+async def test_go_to_notices_that_the_vehicle_has_fallen_silent(flying: Flight) -> None:
+    flying.copter.faults.silent = False
+    async with anyio.create_task_group() as tasks:
+
+        async def radio_fails() -> None:
+            await anyio.sleep(2.0)
+            flying.copter.faults.silent = True
+
+        tasks.start_soon(radio_fails)
+        started = now()
+        with pytest.raises(HeartbeatTimeout, match="last heartbeat 1"):
+            await flying.vehicle.go_to(north_of_home(flying, 500.0))
+        assert now() - started < 15.0
+
+
+async def test_go_to_times_out_and_says_how_far_it_is(flying: Flight) -> None:
+    with pytest.raises(OperationTimeout, match=r"not done within 5 s; it is 1\d\d\.\d m away"):
+        await flying.vehicle.go_to(north_of_home(flying, 200.0), timeout=5.0)
+
+
+async def test_go_to_works_without_default_streams() -> None:
+    async with open_flight(rates={}) as flight:
+        vehicle = flight.vehicle
+        await vehicle.wait_ready()
+        await vehicle.set_mode("GUIDED")
+        await vehicle.arm()
+        await vehicle.take_off(10.0)
+        await vehicle.go_to(north_of_home(flight, 20.0), timeout=60.0)
+        assert flight.copter.motion.north == pytest.approx(20.0, abs=2.5)
+
+
+# ---------------------------------------------------------------------------------- coming back
+
+
+async def test_land_returns_on_the_ground(flying: Flight) -> None:
+    await flying.vehicle.land()
+    assert flying.copter.is_landed
+    await flying.vehicle.armed.wait_until(lambda armed: not armed, timeout=5.0)
+
+
+async def test_land_ends_when_a_pilot_takes_over(flying: Flight) -> None:
+    async with anyio.create_task_group() as tasks:
+
+        async def pilot() -> None:
+            await anyio.sleep(2.0)
+            flying.pilot_takes_over()
+
+        tasks.start_soon(pilot)
+        with pytest.raises(OperationRejected, match="land: the mode changed to LOITER"):
+            await flying.vehicle.land()
+
+
+async def test_land_refused_says_why(flying: Flight) -> None:
+    flying.copter.faults.refuse(MavCmd.DO_SET_MODE, MavResult.FAILED, "Mode change to LAND failed: no")
+    with pytest.raises(CommandRejected, match="Mode change to LAND failed: no"):
+        await flying.vehicle.land()
+
+
+async def test_return_to_launch_ends_on_the_ground_at_home(flying: Flight) -> None:
+    await flying.vehicle.go_to(north_of_home(flying, 30.0))
+    await flying.vehicle.return_to_launch()
+    assert flying.copter.is_landed
+    assert flying.copter.motion.north == pytest.approx(0.0, abs=1.0)
+
+
+async def test_return_to_launch_times_out(flying: Flight) -> None:
+    await flying.vehicle.go_to(north_of_home(flying, 50.0))
+    with pytest.raises(OperationTimeout, match="return_to_launch: not done within 3 s; it is at"):
+        await flying.vehicle.return_to_launch(timeout=3.0)
+    assert flying.copter.mode.number == RTL
+
+
+async def test_hold_stops(flying: Flight) -> None:
+    async with anyio.create_task_group() as tasks:
+
+        async def fly_on() -> None:
+            with pytest.raises(OperationRejected, match="mode changed to BRAKE"):
+                await flying.vehicle.go_to(north_of_home(flying, 500.0))
+
+        tasks.start_soon(fly_on)
+        await anyio.sleep(5.0)
+        assert speed_of(flying.copter) > 3.0
+        await flying.vehicle.hold()
+        assert flying.vehicle.mode_name == "BRAKE"
+    await anyio.sleep(5.0)
+    assert speed_of(flying.copter) < 0.1
+
+
+# ----------------------------------------------------------------------------------- on the way
+
+
+async def test_set_speed(flying: Flight) -> None:
+    async with anyio.create_task_group() as tasks:
+
+        async def fly_on() -> None:
+            await flying.vehicle.go_to(north_of_home(flying, 200.0))
+
+        tasks.start_soon(fly_on)
+        await anyio.sleep(1.0)
+        await flying.vehicle.set_speed(2.0)
+        await anyio.sleep(5.0)
+        assert speed_of(flying.copter) == pytest.approx(2.0, abs=0.3)
+        tasks.cancel_scope.cancel()
+
+
+@pytest.mark.parametrize("speed", [0.0, -1.0, 1001.0, math.nan])
+async def test_set_speed_out_of_range_sends_nothing(flying: Flight, speed: float) -> None:
+    with pytest.raises(LocalProtocolError, match="speed_m_s"):
+        await flying.vehicle.set_speed(speed)
+    assert not flying.wire.commands(MavCmd.DO_CHANGE_SPEED)
+
+
+async def test_set_heading_absolute_and_relative(flying: Flight) -> None:
+    vehicle = flying.vehicle
+    await vehicle.set_heading(90.0, tolerance_deg=1.0)
+    assert math.degrees(flying.copter.motion.yaw) == pytest.approx(90.0, abs=1.5)
+    await vehicle.set_heading(-30.0, relative=True, tolerance_deg=1.0)
+    assert math.degrees(flying.copter.motion.yaw) == pytest.approx(60.0, abs=3.0)
+    await vehicle.set_heading(40.0, relative=True, rate_deg_s=20.0, tolerance_deg=1.0)
+    assert math.degrees(flying.copter.motion.yaw) == pytest.approx(100.0, abs=4.0)
+    absolute, left, right = (each for each in flying.wire.commands(MavCmd.CONDITION_YAW))
+    assert (absolute.param1, absolute.param3, absolute.param4) == (90.0, 0.0, 0.0)
+    assert (left.param1, left.param3, left.param4) == (30.0, -1.0, 1.0)
+    assert (right.param1, right.param2, right.param3, right.param4) == (40.0, 20.0, 1.0, 1.0)
+
+
+async def test_set_heading_that_does_not_come_off_times_out(flying: Flight) -> None:
+    flying.copter.faults.lose_ack(MavCmd.CONDITION_YAW)
+    flying.copter.yaw.fixed = lambda *_, **__: None  # type: ignore[method-assign]
+    with pytest.raises(OperationTimeout, match=r"set_heading\(90°\): not done within 3 s; it is \d+° off"):
+        await flying.vehicle.set_heading(90.0, timeout=3.0)
+
+
+@pytest.mark.parametrize("heading", [-361.0, 400.0, math.nan])
+async def test_set_heading_out_of_range_sends_nothing(flying: Flight, heading: float) -> None:
+    with pytest.raises(LocalProtocolError, match="heading_deg"):
+        await flying.vehicle.set_heading(heading)
+    assert not flying.wire.commands(MavCmd.CONDITION_YAW)
+
+
+async def test_look_at_and_stop_looking(flying: Flight) -> None:
+    home = flying.vehicle.home.value
+    latitude, longitude = geo.offset(home.latitude_deg, home.longitude_deg, 0.0, 50.0)
+    await flying.vehicle.look_at(Position(latitude, longitude, altitude_relative_m=0.0))
+    await flying.vehicle.heading_deg.wait_until(lambda deg: abs(deg - 90.0) < 2.0, timeout=20.0)
+    (command,) = flying.wire.commands(MavCmd.DO_SET_ROI_LOCATION)
+    assert isinstance(command, m.CommandInt)
+    assert (command.frame, command.x) == (6, round(latitude * 1e7))
+    await flying.vehicle.stop_looking()
+    assert len(flying.wire.commands(MavCmd.DO_SET_ROI_NONE)) == 1
+
+
+async def test_look_at_refused(flying: Flight) -> None:
+    flying.copter.faults.refuse(MavCmd.DO_SET_ROI_LOCATION, MavResult.DENIED, "No mount")
+    with pytest.raises(CommandRejected, match="No mount"):
+        await flying.vehicle.look_at(north_of_home(flying, 50.0))
