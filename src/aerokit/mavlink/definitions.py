@@ -44,7 +44,10 @@ SIZES = {
 
 # Names that a message class needs for itself; a private dialect's field of that name gets a trailing underscore.
 _RESERVED = frozenset(
-    ["ID", "NAME", "CRC_EXTRA", "FIELDS", "LENGTH", "BASE_LENGTH", "received_frame", "decode", "encode", "to_dict", "self", "cls"]
+    (
+        *("ID", "NAME", "CRC_EXTRA", "FIELDS", "LENGTH", "BASE_LENGTH", "received_frame"),
+        *("decode", "encode", "to_dict", "self", "cls"),
+    )
 )
 _IDENTIFIER = re.compile(r"[A-Za-z][A-Za-z0-9_]*\Z")
 _FIELD_TYPE = re.compile(r"(\w+?)(?:_mavlink_version)?(?:\[(\d+)\])?\Z")

@@ -153,7 +153,11 @@ class _Extended(Dialect):
                 found.append(part.enum(name))
             except LocalProtocolError:
                 continue
-        return max(found, key=len) if found else super().enum(name)
+        return max(found, key=_size) if found else super().enum(name)
+
+
+def _size(enum: Any) -> int:
+    return len(enum)
 
 
 def _cap_words(name: str) -> str:

@@ -85,7 +85,8 @@ class Framer:
                     and x25(data[begin + 1 : upto] + extras[message_id]) == data[upto] | data[upto + 1] << 8
                 )
             except (StructError, KeyError):
-                good = False
+                good, message_id = False, 0
+                body = upto = end = sequence = key = 0
             if not good:
                 found = self._search(data, begin)
                 if found is None:

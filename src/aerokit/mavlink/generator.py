@@ -56,7 +56,8 @@ if TYPE_CHECKING:
 _new = object.__new__
 
 '''
-_ENUMS_HEAD = '''"""Enums of ``{name}.xml``{more}: https://mavlink.io/en/messages/{name}.html.
+_ENUMS_HEAD = '''# pyright: reportUnsupportedDunderAll=false
+"""Enums of ``{name}.xml``{more}: https://mavlink.io/en/messages/{name}.html.
 
 Each is made when it is first asked for: two thousand members at once would double the time an import takes.
 What type checkers and editors read is the stub file beside this one.
@@ -83,7 +84,8 @@ def __getattr__(name: str) -> type[int]:
 def __dir__() -> list[str]:
     return [*globals(), *_TABLE]
 """
-_ENUMS_INIT = '''"""Enums of the standard: ``MAV_CMD`` is `MavCmd`, ``MAV_CMD_NAV_TAKEOFF`` is ``MavCmd.NAV_TAKEOFF``.
+_ENUMS_INIT = '''# pyright: reportUnsupportedDunderAll=false
+"""Enums of the standard: ``MAV_CMD`` is `MavCmd`, ``MAV_CMD_NAV_TAKEOFF`` is ``MavCmd.NAV_TAKEOFF``.
 
 Each is an ``IntEnum``, or an ``IntFlag`` when the standard calls it a bitmask. Fields of messages are plain ``int``;
 members compare equal to them. https://mavlink.io/en/messages/
@@ -109,7 +111,8 @@ def __getattr__(name: str) -> object:
 def __dir__() -> list[str]:
     return [*globals(), *_MODULES]
 '''
-_MESSAGES_INIT = '''"""Messages of the standard, one class each: ``GLOBAL_POSITION_INT`` is `GlobalPositionInt`.
+_MESSAGES_INIT = '''# pyright: reportUnsupportedDunderAll=false
+"""Messages of the standard, one class each: ``GLOBAL_POSITION_INT`` is `GlobalPositionInt`.
 
 Names of fields, order and raw units are the standard's: https://mavlink.io/en/messages/
 
@@ -200,7 +203,7 @@ def differences(folder: Path | None = None) -> list[str]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line; returns the exit code."""
     parser = argparse.ArgumentParser(
-        prog="python -m aerokit.mavlink.generator", description=__doc__.splitlines()[0]
+        prog="python -m aerokit.mavlink.generator", description=(__doc__ or "").partition("\n")[0]
     )
     parser.add_argument(
         "--check", action="store_true", help="compare with the committed modules, write nothing"

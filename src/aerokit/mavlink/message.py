@@ -108,7 +108,8 @@ class Message:
     Messages are equal when they are of one class and their fields are equal (NaN counts as equal to NaN).
     """
 
-    __slots__ = ("received_frame",)
+    if not TYPE_CHECKING:  # a type checker would take the slot for a class attribute of the same name
+        __slots__ = ("received_frame",)
     __match_args__: ClassVar[tuple[str, ...]] = ()
     __hash__ = None  # type: ignore[assignment]
 
@@ -129,18 +130,19 @@ class Message:
         FIELDS = _Fields()
     _FIELDS: ClassVar[tuple[tuple[Any, ...], ...]] = ()
 
-    if TYPE_CHECKING:
+    received_frame: Frame | None
+    """The frame this was decoded from: who sent it and when it came. None when the program built it."""
 
-        @property
-        def received_frame(self) -> Frame | None:
-            """The frame this was decoded from: who sent it and when it came. None when the program built it."""
+    if TYPE_CHECKING:
 
         @classmethod
         def decode(cls, payload: bytes, frame: Frame | None = None) -> Self:
             """Make a message of a payload off the wire; trimmed zeros are restored, unknown extensions ignored."""
+            raise NotImplementedError
 
         def encode(self) -> bytes:
             """The whole payload; LocalProtocolError names the field, the value and the allowed range."""
+            raise NotImplementedError
 
     def to_dict(self) -> dict[str, Any]:
         """Field names and values, in the standard's order."""

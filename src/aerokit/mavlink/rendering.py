@@ -63,7 +63,8 @@ def render_enum_row(enum: EnumDefinition) -> str:
     """One entry of the table an enum module makes its enums of: name → (bitmask, docstring, members)."""
     members = "".join(f"            ({_quoted(name)}, {entry.value}),\n" for name, entry in enum.members())
     doc = "\n\n".join(_enum_doc(enum))
-    return f"    {_quoted(enum.class_name)}: (\n        {enum.bitmask},\n        {doc!r},\n        (\n{members}        ),\n    ),\n"
+    head = f"    {_quoted(enum.class_name)}: (\n        {enum.bitmask},\n        {doc!r},\n"
+    return f"{head}        (\n{members}        ),\n    ),\n"
 
 
 def render_enum_stub(enum: EnumDefinition) -> str:
