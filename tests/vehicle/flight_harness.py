@@ -20,7 +20,7 @@ from aerokit.mavlink.enums import CopterMode, MavCmd
 from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.message import Message
 from aerokit.runtime.connection import Connection
-from aerokit.sim import SimulatedCopter, SimulatedVehicle, simulated_link
+from aerokit.sim import SimulatedCopter, SimulatedPx4, SimulatedVehicle, simulated_link
 from aerokit.testing.clock import VirtualClockLoop
 
 M = TypeVar("M", bound=Message)
@@ -167,3 +167,30 @@ def attached_sinks(connection: Connection) -> int:
 def waiting_on_cells(vehicle: aerokit.Vehicle) -> int:
     """How many waiters and observers hang on the state cells of a vehicle."""
     return sum(len(cell._sinks) for cell in (*vehicle.telemetry.cells.values(), vehicle.link_quality))
+
+
+@dataclass
+class Px4Flight:
+    """One simulated PX4 and the vehicle object that a program has of it."""
+
+    px4: SimulatedPx4
+    vehicle: aerokit.Vehicle
+    wire: Wire
+
+    async def take_off(self, altitude_m: float = 10.0) -> None:
+        """Ready, armed, at this altitude, in LOITER; what was sent for it is forgotten."""
+        await self.vehicle.wait_ready()
+        await self.vehicle.arm()
+        await self.vehicle.take_off(altitude_m)
+        await anyio.sleep(3.0)
+        self.wire.forget()
+
+
+@asynccontextmanager
+async def open_px4(px4: SimulatedPx4 | None = None, **options: Any) -> AsyncIterator[Px4Flight]:
+    """A PX4 that is ready soon, and a vehicle on it; ``options`` are those of `connect`."""
+    px4 = SimulatedPx4(boot_time_s=1.0) if px4 is None else px4
+    async with simulated_link(px4) as link:
+        wire = Wire(link)
+        async with aerokit.connect(wire, **options) as vehicle:
+            yield Px4Flight(px4, vehicle, wire)

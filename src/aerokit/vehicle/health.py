@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import anyio
 
 from aerokit.errors import CommandRejected, CommandTimeout
@@ -13,6 +15,7 @@ RUN_PREARM_CHECKS = 401
 TEXTS_S = 1.0
 """How long texts are collected after the vehicle was asked to run its checks."""
 FRESH_S = 5.0
+"""What is older says nothing about now."""
 
 
 class VehicleHealth(VehicleCore):
@@ -26,6 +29,11 @@ class VehicleHealth(VehicleCore):
             f"{cell.name} ({cell.waits_for} has not come)"
             for cell in (telemetry.sensors, telemetry.estimator, telemetry.position, telemetry.home)
             if not cell.is_known
+        ]
+        missing += [
+            f"{cell.name} (no {cell.waits_for} for {cell.age:.0f} s)"
+            for cell in (telemetry.sensors, telemetry.estimator, telemetry.position)
+            if FRESH_S < cell.age < math.inf
         ]
         return missing + self._failing()
 
@@ -42,9 +50,11 @@ class VehicleHealth(VehicleCore):
 
     async def _arming_reasons(self, since: float) -> tuple[str, ...]:
         """Texts about arming since then; those asked for again where there are none; then failing bits and flags."""
-        await self._settle()
-        if not self._arming_texts(since) and self.autopilot.runs_prearm_checks:
-            await self._run_prearm_checks()
+        with self._streaming("sensors", "estimator"):
+            await self._settle()
+            if not self._arming_texts(since) and self.autopilot.runs_prearm_checks:
+                await self._run_prearm_checks()
+            await self._hear_of_health()
         reasons = dict.fromkeys([*self._arming_texts(since), *self._unarmable_mode(), *self._failing()])
         return tuple(reasons)
 
@@ -53,6 +63,13 @@ class VehicleHealth(VehicleCore):
         if mode is None or mode.name not in self.autopilot.unarmable_modes:
             return []
         return [f"{self.autopilot.firmware} does not arm in {mode.name}: set another mode first"]
+
+    async def _hear_of_health(self) -> None:
+        """Give the vehicle a moment to tell what it has not told lately."""
+        cells = (self.telemetry.sensors, self.telemetry.estimator)
+        with anyio.move_on_after(TEXTS_S):
+            while any(cell.age > FRESH_S for cell in cells):
+                await anyio.sleep(0.1)
 
     async def _run_prearm_checks(self) -> None:
         try:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from typing import TYPE_CHECKING
 
 import anyio
@@ -75,11 +74,15 @@ class Vehicle(FlightActions):
                 if not cell.is_known:
                     await self._request(message_id)
             if not asked_for_modes:
-                asked_for_modes = True
-                await self._request(AVAILABLE_MODES)
+                asked_for_modes = await self._request(AVAILABLE_MODES)
             await anyio.sleep(ASK_AGAIN_S)
 
-    async def _request(self, message_id: int) -> None:
-        """Ask for one message once; a vehicle that does not have it says so, and that is all right."""
-        with contextlib.suppress(CommandRejected, CommandTimeout):
+    async def _request(self, message_id: int) -> bool:
+        """Ask for one message once; whether there was an answer, also that the vehicle does not have it."""
+        try:
             await self._commands.send_long(REQUEST_MESSAGE, message_id, attempts=2)
+        except CommandTimeout:
+            return False
+        except CommandRejected:
+            pass
+        return True

@@ -1,0 +1,207 @@
+"""Arming and disarming, and why it is refused: what the vehicle says, what its sensors and its estimator say."""
+
+from __future__ import annotations
+
+import anyio
+import pytest
+from flight_harness import Flight, now, open_flight, open_px4
+
+from aerokit.errors import CommandRejected, CommandTimeout, OperationTimeout
+from aerokit.mavlink.enums import MavCmd, MavResult
+from aerokit.sim import SimulatedCopter, SimulatedPx4
+
+pytestmark = pytest.mark.anyio
+
+ARM = MavCmd.COMPONENT_ARM_DISARM
+
+
+async def test_arm_and_disarm_end_when_heartbeat_says_so(grounded: Flight) -> None:
+    vehicle = grounded.vehicle
+    await vehicle.arm()
+    assert vehicle.is_armed
+    assert vehicle.armed.value
+    assert grounded.copter.is_armed
+    await vehicle.disarm()
+    assert not vehicle.is_armed
+    assert not grounded.copter.is_armed
+    arm, disarm = grounded.wire.commands(ARM)
+    assert (arm.param1, arm.param2) == (1.0, 0.0)
+    assert (disarm.param1, disarm.param2) == (0.0, 0.0)
+
+
+async def test_arming_an_armed_vehicle_is_no_error(grounded: Flight) -> None:
+    await grounded.vehicle.arm()
+    await grounded.vehicle.arm()
+    assert grounded.vehicle.is_armed
+
+
+async def test_a_lost_answer_is_asked_for_again(grounded: Flight) -> None:
+    grounded.copter.faults.lose_ack(ARM)
+    await grounded.vehicle.arm()
+    first, second = grounded.wire.commands(ARM)
+    assert (first.confirmation, second.confirmation) == (0, 1)  # type: ignore[union-attr]
+
+
+async def test_refused_with_the_vehicles_own_words(grounded: Flight) -> None:
+    grounded.copter.faults.prearm_failures += ["Compass not healthy", "Gyros inconsistent"]
+    with pytest.raises(CommandRejected) as caught:
+        await grounded.vehicle.arm()
+    assert caught.value.result == MavResult.FAILED
+    assert "Arm: Compass not healthy" in caught.value.reasons
+    assert "Arm: Gyros inconsistent" in caught.value.reasons
+    assert "\n  - Arm: Compass not healthy" in str(caught.value)
+    assert not grounded.wire.commands(MavCmd.RUN_PREARM_CHECKS)  # it has spoken already
+
+
+async def test_refused_in_silence_asks_the_vehicle_to_run_its_checks(grounded: Flight) -> None:
+    grounded.copter.faults.refuse(ARM, MavResult.FAILED)
+    grounded.copter.faults.prearm_failures.append("Compass not healthy")
+    with pytest.raises(CommandRejected) as caught:
+        await grounded.vehicle.arm()
+    assert "PreArm: Compass not healthy" in caught.value.reasons
+    assert len(grounded.wire.commands(MavCmd.RUN_PREARM_CHECKS)) == 1
+
+
+async def test_each_reason_is_told_once(grounded: Flight) -> None:
+    grounded.copter.faults.prearm_failures.append("Compass not healthy")
+    with pytest.raises(CommandRejected) as caught:
+        await grounded.vehicle.arm()
+    assert len(set(caught.value.reasons)) == len(caught.value.reasons)
+
+
+async def test_too_early_names_the_estimator_and_the_failing_bits() -> None:
+    async with open_flight(SimulatedCopter(boot_time_s=60.0)) as flight:
+        await anyio.sleep(12.0)
+        await flight.vehicle.set_mode("GUIDED")
+        with pytest.raises(CommandRejected) as caught:
+            await flight.vehicle.arm()
+        reasons = "; ".join(caught.value.reasons)
+        assert "the estimator has no absolute horizontal position (EKF_STATUS_REPORT)" in reasons
+        assert "pre-arm checks do not pass (SYS_STATUS)" in reasons
+        assert "Arm: " in reasons
+
+
+async def test_force_skips_the_checks(grounded: Flight) -> None:
+    grounded.copter.faults.prearm_failures.append("Compass not healthy")
+    await grounded.vehicle.arm(force=True)
+    assert grounded.vehicle.is_armed
+    assert grounded.wire.commands(ARM)[0].param2 == 21196.0
+
+
+async def test_accepted_but_not_armed_is_a_timeout(grounded: Flight) -> None:
+    grounded.copter.arming.arm = lambda **_: True  # type: ignore[method-assign, assignment]
+    started = now()
+    with pytest.raises(
+        OperationTimeout, match=r"arm\(\): not done within 3 s; the vehicle said nothing about it"
+    ):
+        await grounded.vehicle.arm(timeout=3.0)
+    assert 3.0 <= now() - started < 4.0
+
+
+async def test_a_silent_vehicle_is_a_timeout(grounded: Flight) -> None:
+    grounded.copter.faults.silent = True
+    with pytest.raises(
+        CommandTimeout, match=r"COMPONENT_ARM_DISARM, sent 4 times within 4\.0 s; last heartbeat 4"
+    ):
+        await grounded.vehicle.arm()
+
+
+async def test_disarm_in_the_air_is_refused_and_forced(flying: Flight) -> None:
+    with pytest.raises(CommandRejected):
+        await flying.vehicle.disarm()
+    assert flying.copter.is_armed
+    await flying.vehicle.disarm(force=True)
+    assert not flying.copter.is_armed
+    assert [each.param2 for each in flying.wire.commands(ARM)] == [0.0, 21196.0]
+
+
+async def test_an_answer_that_was_left_behind_is_not_the_next_ones() -> None:
+    """arm() is cancelled while its refusal is under way; disarm() must not take that for its own answer."""
+    async with open_flight(latency_s=0.2) as flight:
+        await flight.vehicle.wait_ready()
+        flight.copter.faults.refuse(ARM, MavResult.FAILED, times=1)
+        with anyio.move_on_after(0.1):
+            await flight.vehicle.arm()
+        await flight.vehicle.disarm()
+
+
+# ---------------------------------------------------------------------------- beforehand
+
+
+async def test_nothing_keeps_it_from_arming(grounded: Flight) -> None:
+    assert await grounded.vehicle.why_not_armable() == []
+    await grounded.vehicle.arm()
+    assert await grounded.vehicle.why_not_armable() == []
+    assert len(grounded.wire.commands(MavCmd.RUN_PREARM_CHECKS)) == 1
+
+
+async def test_why_not_armable_names_failing_checks_without_arming(grounded: Flight) -> None:
+    grounded.copter.faults.prearm_failures.append("Compass not healthy")
+    reasons = await grounded.vehicle.why_not_armable()
+    assert "PreArm: Compass not healthy" in reasons
+    assert not grounded.wire.commands(ARM)
+    assert not grounded.copter.is_armed
+
+
+async def test_why_not_armable_names_a_mode_that_cannot_be_armed_in(grounded: Flight) -> None:
+    await grounded.vehicle.set_mode("LAND")
+    assert any("does not arm in LAND" in reason for reason in await grounded.vehicle.why_not_armable())
+
+
+async def test_why_not_armable_works_when_the_vehicle_cannot_run_its_checks(grounded: Flight) -> None:
+    grounded.copter.faults.refuse(MavCmd.RUN_PREARM_CHECKS, MavResult.UNSUPPORTED)
+    grounded.copter.faults.prearm_failures.append("Compass not healthy")
+    await anyio.sleep(3.0)
+    assert await grounded.vehicle.why_not_armable() == [
+        "the vehicle's pre-arm checks do not pass (SYS_STATUS)"
+    ]
+
+
+async def test_why_not_armable_works_without_default_streams() -> None:
+    copter = SimulatedCopter(boot_time_s=0.0)
+    copter.faults.refuse(MavCmd.RUN_PREARM_CHECKS, MavResult.UNSUPPORTED)
+    copter.faults.prearm_failures.append("Compass not healthy")
+    async with open_flight(copter, rates={}) as flight:
+        await anyio.sleep(3.0)
+        assert await flight.vehicle.why_not_armable() == [
+            "the vehicle's pre-arm checks do not pass (SYS_STATUS)"
+        ]
+
+
+async def test_what_was_said_long_ago_is_no_reason(grounded: Flight) -> None:
+    grounded.copter.faults.prearm_failures.append("Compass not healthy")
+    assert await grounded.vehicle.why_not_armable()
+    grounded.copter.faults.prearm_failures.clear()
+    await anyio.sleep(3.0)
+    assert await grounded.vehicle.why_not_armable() == []
+
+
+# ------------------------------------------------------------------------------------------ PX4
+
+
+async def test_px4_says_why_not() -> None:
+    async with open_px4(SimulatedPx4(boot_time_s=30.0)) as flight:
+        await anyio.sleep(3.0)
+        reasons = await flight.vehicle.why_not_armable()
+        assert reasons
+        with pytest.raises(CommandRejected) as caught:
+            await flight.vehicle.arm()
+        assert caught.value.result == MavResult.TEMPORARILY_REJECTED
+        assert caught.value.reasons
+
+
+async def test_px4_arms_when_ready_and_disarms() -> None:
+    async with open_px4() as flight:
+        await flight.vehicle.wait_ready()
+        assert await flight.vehicle.why_not_armable() == []
+        await flight.vehicle.arm()
+        await flight.vehicle.disarm()
+        assert not flight.px4.is_armed
+
+
+async def test_px4_disarm_in_the_air_says_why_not() -> None:
+    async with open_px4() as flight:
+        await flight.take_off()
+        with pytest.raises(CommandRejected, match="(?i)disarming denied|not landed"):
+            await flight.vehicle.disarm()
+        assert flight.px4.is_armed

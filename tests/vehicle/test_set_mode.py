@@ -1,0 +1,158 @@
+"""Changing the flight mode: by name and number, refused, taken back, not done, and on firmware that knows it not."""
+
+from __future__ import annotations
+
+import anyio
+import pytest
+from flight_harness import Flight, now, open_flight, open_px4
+
+from aerokit import messages as m
+from aerokit.errors import (
+    CommandRejected,
+    CommandTimeout,
+    LocalProtocolError,
+    OperationRejected,
+    OperationTimeout,
+)
+from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult
+from aerokit.sim import SimulatedCopter
+
+pytestmark = pytest.mark.anyio
+
+
+@pytest.mark.parametrize("mode", ["GUIDED", "guided", "Alt Hold", "ALT_HOLD", "althold", 4, CopterMode.LAND])
+async def test_by_name_and_by_number(grounded: Flight, mode: str | int) -> None:
+    await grounded.vehicle.set_mode(mode)
+    wanted = grounded.vehicle.autopilot.find_mode(mode)
+    assert grounded.copter.mode.number == wanted.custom_mode
+    assert grounded.vehicle.mode.value == wanted
+    (command,) = grounded.wire.commands(MavCmd.DO_SET_MODE)
+    assert isinstance(command, m.CommandLong)
+    assert (command.target_system, command.param1, command.param2) == (1, 1.0, wanted.custom_mode)
+
+
+async def test_an_unknown_name_lists_the_modes_and_sends_nothing(grounded: Flight) -> None:
+    with pytest.raises(LocalProtocolError) as caught:
+        await grounded.vehicle.set_mode("GIUDED")
+    text = str(caught.value)
+    assert "'GIUDED' is not known (did you mean 'GUIDED'?)" in text
+    assert all(name in text for name in ("STABILIZE", "LOITER", "RTL", "SMART_RTL", "BRAKE"))
+    assert not grounded.wire.commands(MavCmd.DO_SET_MODE)
+
+
+async def test_a_refused_mode_says_why(flying: Flight) -> None:
+    with pytest.raises(CommandRejected) as caught:
+        await flying.vehicle.set_mode("AUTO")
+    assert caught.value.result == MavResult.FAILED
+    assert caught.value.command == MavCmd.DO_SET_MODE
+    assert caught.value.reasons == ("Mode change to AUTO failed: init failed",)
+    assert flying.vehicle.mode_name == "GUIDED"
+
+
+async def test_firmware_without_the_command_gets_the_older_message() -> None:
+    copter = SimulatedCopter(boot_time_s=0.0, unsupported_commands=[MavCmd.DO_SET_MODE])
+    async with open_flight(copter) as flight:
+        await flight.vehicle.set_mode("GUIDED")
+        assert copter.mode.number == CopterMode.GUIDED
+        assert flight.wire.all(m.SetMode) == [m.SetMode(1, 1, CopterMode.GUIDED)]
+
+
+async def test_a_silent_vehicle_is_a_timeout_that_says_how_often_it_was_asked(grounded: Flight) -> None:
+    grounded.copter.faults.silent = True
+    with pytest.raises(
+        CommandTimeout, match=r"MAV_CMD_DO_SET_MODE, sent 4 times within 4\.0 s; last heartbeat"
+    ):
+        await grounded.vehicle.set_mode("GUIDED")
+
+
+async def test_accepted_but_not_changed_is_a_timeout(grounded: Flight) -> None:
+    grounded.copter.set_mode_from = lambda *_: MavResult.ACCEPTED  # type: ignore[method-assign]
+    started = now()
+    with pytest.raises(
+        OperationTimeout, match=r"set_mode\(GUIDED\): not done within \d.* s; the vehicle is in STABILIZE"
+    ):
+        await grounded.vehicle.set_mode("GUIDED", timeout=4.0)
+    assert now() - started == pytest.approx(4.0, abs=0.6)
+
+
+async def test_a_number_that_no_table_knows_is_sent_all_the_same(grounded: Flight) -> None:
+    with pytest.raises(CommandRejected, match="No such mode 99"):
+        await grounded.vehicle.set_mode(99)
+
+
+class CopterWithAScript(SimulatedCopter):
+    """Tells of one more mode than the tables know, as a Lua script may add one."""
+
+    def available_modes(self) -> list[m.AvailableModes]:
+        return [*super().available_modes(), m.AvailableModes(12, 12, 0, 118, 0, "Follow Boat")]
+
+
+async def test_a_mode_that_the_vehicle_tells_is_known_by_its_name() -> None:
+    async with open_flight(CopterWithAScript(boot_time_s=0.0)) as flight:
+        await anyio.sleep(3.0)
+        assert (
+            flight.vehicle.autopilot.find_mode("follow boat", flight.vehicle.telemetry.mode_names).custom_mode
+            == 118
+        )
+        with pytest.raises(CommandRejected, match="No such mode 118"):
+            await flight.vehicle.set_mode("FOLLOW_BOAT")
+        with pytest.raises(LocalProtocolError, match="Follow Boat"):
+            await flight.vehicle.set_mode("FOLLOW_TRAIN")
+
+
+async def test_modes_are_asked_for_until_they_are_told() -> None:
+    """The link is bad when the vehicle connects: its own modes are asked for again."""
+    copter = CopterWithAScript(boot_time_s=0.0)
+    copter.faults.ignore(MavCmd.REQUEST_MESSAGE)
+    async with open_flight(copter) as flight:
+        await anyio.sleep(20.0)
+        copter.faults.clear()
+        await anyio.sleep(20.0)
+        assert flight.vehicle.telemetry.mode_names == {118: "Follow Boat"}
+
+
+async def test_an_ack_to_another_ground_station_is_not_ours(grounded: Flight) -> None:
+    grounded.copter.faults.ignore(MavCmd.DO_SET_MODE, times=1)
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(grounded.vehicle.set_mode, "GUIDED")
+        await anyio.sleep(0.1)
+        grounded.copter.send(m.CommandAck(MavCmd.DO_SET_MODE, MavResult.DENIED, 0, 0, 254, 190))
+    assert len(grounded.wire.commands(MavCmd.DO_SET_MODE)) == 2
+
+
+# ------------------------------------------------------------------------------------------ PX4
+
+
+@pytest.mark.parametrize(
+    ("mode", "params"),
+    [("POSCTL", (1, 3, 0)), ("LOITER", (1, 4, 3)), ("Hold", (1, 4, 3)), (3 << 16, (1, 3, 0))],
+)
+async def test_px4_main_and_sub_mode(mode: str | int, params: tuple[float, ...]) -> None:
+    async with open_px4() as flight:
+        await flight.vehicle.wait_ready()
+        await flight.vehicle.set_mode("ALTCTL")
+        flight.wire.forget()
+        await flight.vehicle.set_mode(mode)
+        (command,) = flight.wire.commands(MavCmd.DO_SET_MODE)
+        assert (command.param1, command.param2, command.param3) == params
+
+
+async def test_px4_takes_its_acceptance_back() -> None:
+    async with open_px4() as flight:
+        await flight.take_off()
+        before = flight.px4.mode
+        started = now()
+        with pytest.raises(
+            OperationRejected, match=r"set_mode\(OFFBOARD\): the vehicle took its acceptance back"
+        ):
+            await flight.vehicle.set_mode("OFFBOARD")
+        assert now() - started < 2.0
+        assert flight.px4.mode == before
+
+
+async def test_px4_heartbeats_lag_behind() -> None:
+    async with open_px4() as flight:
+        await flight.vehicle.wait_ready()
+        for mode in ("POSCTL", "ALTCTL", "LOITER"):
+            await flight.vehicle.set_mode(mode)
+            assert flight.vehicle.mode_name == mode
