@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 from hypothesis import settings
+from recorded import headline
 
 from aerokit.testing.clock import VirtualClockLoop
 
@@ -16,3 +17,7 @@ settings.load_profile("aerokit")
 @pytest.fixture
 def anyio_backend() -> tuple[str, dict[str, Any]]:
     return "asyncio", {"loop_factory": VirtualClockLoop}
+
+
+def pytest_report_header() -> str:
+    return headline()

@@ -1,7 +1,7 @@
 """Flights of real firmwares: what the cells said is believable, and agrees with pymavlink at the end.
 
-The recordings are those beside the project (``../shared/traces``) when they are there, else the project's
-own, shorter ones; a flight that is in neither is skipped.
+The recordings are those beside the project (``../shared/traces``) when they are there, else the project's own, which
+hold the telling parts of two of these flights; a flight that is in neither is skipped.
 """
 
 from __future__ import annotations
@@ -9,18 +9,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega
+from recorded import recording
 
 from aerokit.mavlink import STANDARD, Framer, read_tlog
 from aerokit.vehicle.telemetry import Telemetry
 from aerokit.vehicle.values import Position
 
-ROOT = Path(__file__).parents[2]
-SHARED, OWN = ROOT.parent / "shared" / "traces", ROOT / "tests" / "recordings"
 SYSTEM_IDS = {"ardupilot-copter": 1, "ardupilot-plane": 2, "ardupilot-rover": 3, "px4-quad": 1}
 
 
@@ -29,7 +27,6 @@ class Flight:
     """A recorded flight, played into cells."""
 
     telemetry: Telemetry
-    is_complete: bool
     modes: list[str] = field(default_factory=list)
     armed: list[bool] = field(default_factory=list)
     landed: list[int] = field(default_factory=list)
@@ -51,14 +48,6 @@ class Flight:
         return [text.text for text in self.telemetry.texts_since(-math.inf)]
 
 
-def recording(name: str) -> Path:
-    """The longer one if it is there."""
-    for folder in (SHARED, OWN):
-        if (folder / f"{name}.tlog").exists():
-            return folder / f"{name}.tlog"
-    pytest.skip(f"no recording of {name}: neither in {SHARED} nor in {OWN}")
-
-
 @pytest.fixture(scope="module")
 def flights() -> Callable[[str], Flight]:
     """Plays each recording once."""
@@ -73,9 +62,9 @@ def flights() -> Callable[[str], Flight]:
 
 
 def play(name: str) -> Flight:
-    path, now = recording(name), [0.0]
+    path, now = recording(f"{name}.tlog"), [0.0]
     telemetry = Telemetry(lambda: now[0], system_id=SYSTEM_IDS[name])
-    flight = Flight(telemetry, is_complete=path.parent == SHARED)
+    flight = Flight(telemetry)
     watch(flight)
     framer = Framer()
     framer.wanted = telemetry.handles
@@ -106,18 +95,11 @@ def note(items: list[Any], item: Any) -> None:
 Flights = Callable[[str], Flight]
 
 
-def complete(flights: Flights, name: str) -> Flight:
-    flight = flights(name)
-    if not flight.is_complete:
-        pytest.skip(f"the project's own recording of {name} has not the whole flight")
-    return flight
-
-
 # ------------------------------------------------------------------------- what happened on the way
 
 
 def test_copter(flights: Flights) -> None:
-    flight = complete(flights, "ardupilot-copter")
+    flight = flights("ardupilot-copter")
     assert flight.modes == ["STABILIZE", "GUIDED", "RTL"]
     assert flight.armed == [False, True, False]
     assert flight.landed == [1, 2, 1]
@@ -131,7 +113,7 @@ def test_copter(flights: Flights) -> None:
 
 
 def test_plane(flights: Flights) -> None:
-    flight = complete(flights, "ardupilot-plane")
+    flight = flights("ardupilot-plane")
     assert flight.modes == ["INITIALISING", "MANUAL", "AUTO"]
     assert flight.armed == [False, True, False]
     assert flight.landed == [1, 2, 1]
@@ -141,7 +123,7 @@ def test_plane(flights: Flights) -> None:
 
 
 def test_rover(flights: Flights) -> None:
-    flight = complete(flights, "ardupilot-rover")
+    flight = flights("ardupilot-rover")
     assert flight.modes == ["INITIALISING", "MANUAL", "GUIDED", "HOLD"]
     assert flight.armed == [False, True, False]
     assert not flight.telemetry.landed_state.is_known
@@ -149,7 +131,7 @@ def test_rover(flights: Flights) -> None:
 
 
 def test_px4(flights: Flights) -> None:
-    flight = complete(flights, "px4-quad")
+    flight = flights("px4-quad")
     assert flight.modes == ["LOITER", "TAKEOFF", "LOITER", "MISSION", "RTL", "LOITER"]
     assert flight.armed == [False, True, False]
     assert flight.landed == [1, 3, 2, 4, 1]
