@@ -157,6 +157,7 @@ class SetpointStream(Generic[SetpointT]):
         self._timer: asyncio.TimerHandle | None = None
         self._stopped: SetpointStreamStopped | None = None
         self._was_told = False
+        self._is_entering = False
         self._was_armed = False
 
     @property
@@ -228,10 +229,14 @@ class SetpointStream(Generic[SetpointT]):
         self._mode = mode
 
     async def _feeding_initial(self, mode: Mode) -> None:
-        async with anyio.create_task_group() as tasks:
-            tasks.start_soon(self.fly, self._setpoint, math.inf)
+        """Not in a task group: what is raised here reaches the user as it is."""
+        self._is_entering = True
+        try:
             await self._vehicle._ensure_mode(mode)
-            tasks.cancel_scope.cancel()
+        finally:
+            self._is_entering = False
+            self._set_at = self._now()
+        self._raise_if_stopped()
 
     # ---------------------------------------------------------------------------- the stream
 
@@ -255,7 +260,7 @@ class SetpointStream(Generic[SetpointT]):
         self._timer = asyncio.get_running_loop().call_at(due, self._tick, due)
 
     def _why_stop(self, lag: float) -> str | None:
-        age = self._now() - self._set_at
+        age = 0.0 if self._is_entering else self._now() - self._set_at
         if lag > self._max_lag_s:
             return f"the event loop was blocked for {lag:.1f} s"
         if age > self._valid_for_s:

@@ -139,13 +139,18 @@ class MessageRates:
         self._dirty.set()
 
     async def run(self) -> None:
-        """Ask and watch until cancelled."""
-        async with anyio.create_task_group() as tasks:
-            tasks.start_soon(self._watch_forever, name="aerokit rate watch")
-            while True:
-                await self._dirty.wait()
-                self._dirty.clear()
-                await self._ask_for_all_due()
+        """Ask for what is wanted until cancelled; :meth:`watch` must run beside it."""
+        while True:
+            await self._dirty.wait()
+            self._dirty.clear()
+            await self._ask_for_all_due()
+
+    async def watch(self) -> None:
+        """Count what comes and judge it once a second, until cancelled."""
+        while True:
+            await anyio.sleep(WATCH_PERIOD_S)
+            for stream in self._streams.values():
+                self._watch(stream)
 
     def close(self) -> None:
         """Stop counting."""
@@ -220,12 +225,6 @@ class MessageRates:
         self._connection.bus.publish(StreamUnavailable(self._connection.now(), self._system_id, name, reason))
 
     # ------------------------------------------------------------------------------ watching
-
-    async def _watch_forever(self) -> None:
-        while True:
-            await anyio.sleep(WATCH_PERIOD_S)
-            for stream in self._streams.values():
-                self._watch(stream)
 
     def _watch(self, stream: _Stream) -> None:
         stream.counts.append(stream.count)

@@ -52,7 +52,7 @@ class Vehicle(FlightActions):
         self.telemetry.receive(heartbeat)
         for message_type, hz in (self.telemetry.default_rates if rates is None else rates).items():
             self._rates.want(message_type, hz, is_optional=rates is None)
-        for function in (self._rates.run, self._run_link_watch, self._learn_constants):
+        for function in (self._rates.run, self._rates.watch, self._run_link_watch, self._learn_constants):
             tasks.start_soon(self.connection.guarded, function, name=f"aerokit {function.__qualname__}")
 
     async def _run_link_watch(self) -> None:
