@@ -40,7 +40,7 @@ class FlightReport:
         """Print a line with the time and the altitude; a reader who has gone does not end the flight."""
         here = self._vehicle.position.latest
         altitude = None if here is None else here.altitude_relative_m
-        height = "     -" if altitude is None else f"{altitude + 0.0:6.1f}"
+        height = "     -" if altitude is None else f"{round(altitude, 1) + 0.0:6.1f}"
         self._last_line = self._vehicle.connection.now()
         self._print(f"{self._last_line - self._started:6.1f} s {height} m  {text}")
 
