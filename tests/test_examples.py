@@ -1,0 +1,104 @@
+"""Every example runs against a simulated copter: most in virtual time, some as programs on a real socket."""
+
+from __future__ import annotations
+
+import json
+import os
+import runpy
+import signal
+import subprocess
+import sys
+import urllib.request
+from pathlib import Path
+from typing import Any
+
+import pytest
+from served_copter import served_copter
+
+from aerokit.sim import SimulatedCopter, simulated_link
+from aerokit.testing import run_virtual
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+
+IN_VIRTUAL_TIME: dict[str, tuple[list[Any], list[str]]] = {
+    "fly_square": ([], ["at Position(", "landed"]),
+    "watch_state": ([5.0], ["s old", "rad, 0 missed", "LinkReport(", "enough"]),
+    "guided_velocity": ([], ["holding in BRAKE", "landed"]),
+    "custom_mode_and_command": ([], ["mode BRAKE", "'FASTER'", "AutopilotVersion(", "result 4: "]),
+    "land_on_low_battery": ([95.0], ["landing with 94 %"]),
+    "two_vehicles": ([], ["system 1 is at", "system 2 is at", "both landed"]),
+}
+"""Example: what its ``main`` takes behind the address, and what it must print."""
+AS_PROGRAMS: dict[str, list[str]] = {
+    "hello": ["ArduCopter 4.7.0", "disarmed", "could be armed"],
+    "blocking_hello": ["ArduCopter 4.7.0", "landed"],
+    "blocking_messages": ["m/s at", "holding in BRAKE"],
+}
+"""Example: what it must print, given an address."""
+ON_THEIR_OWN = {"record_and_replay", "web_server"}
+
+
+def test_every_example_is_run() -> None:
+    assert {path.stem for path in EXAMPLES.glob("*.py")} == {*IN_VIRTUAL_TIME, *AS_PROGRAMS, *ON_THEIR_OWN}
+
+
+def run_in_virtual_time(name: str, *arguments: Any) -> None:
+    """Run the example's ``main``, with a link in memory in the place of the address."""
+    example = runpy.run_path(str(EXAMPLES / f"{name}.py"))
+
+    async def main() -> None:
+        copters = [SimulatedCopter(system_id=number, boot_time_s=0.0) for number in (1, 2)]
+        async with simulated_link(copters if name == "two_vehicles" else copters[0]) as link:
+            await example["main"](link, *arguments)
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize("name", IN_VIRTUAL_TIME)
+def test_example_in_virtual_time(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments, expected = IN_VIRTUAL_TIME[name]
+    run_in_virtual_time(name, *arguments)
+    told = capsys.readouterr().out
+    for text in expected:
+        assert text in told
+
+
+def test_record_and_replay(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    record = str(tmp_path / "flight.tlog")
+    run_in_virtual_time("record_and_replay", record)
+    live, recorded, replayed = capsys.readouterr().out.splitlines()
+    assert recorded == f"recorded in {record}"
+    assert live.endswith("attitudes, 0 missed")
+    assert 0 < int(replayed.split()[0]) <= int(live.split()[0])
+
+
+def command(name: str, *arguments: str) -> list[str]:
+    return [sys.executable, "-W", "error", str(EXAMPLES / f"{name}.py"), *arguments]
+
+
+@pytest.mark.parametrize("name", AS_PROGRAMS)
+def test_example_as_a_program(name: str) -> None:
+    with served_copter() as address:
+        done = subprocess.run(command(name, address), capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stderr) == (0, ""), done.stdout
+    for text in AS_PROGRAMS[name]:
+        assert text in done.stdout
+
+
+@pytest.mark.skipif(os.name == "nt", reason="sends POSIX signals")
+def test_web_server() -> None:
+    with (
+        served_copter() as address,
+        subprocess.Popen(command("web_server", address, "0"), stdout=subprocess.PIPE, text=True) as server,
+    ):
+        try:
+            assert server.stdout is not None
+            url = server.stdout.readline().strip()
+            with urllib.request.urlopen(url, timeout=30) as answer:
+                state = json.load(answer)
+            server.send_signal(signal.SIGTERM)
+            server.wait(30)
+        finally:
+            server.kill()
+    assert state["armed"] is False
+    assert state["mode"] == "STABILIZE"
