@@ -18,12 +18,9 @@ ARM = MavCmd.COMPONENT_ARM_DISARM
 async def test_arm_and_disarm_end_when_heartbeat_says_so(grounded: Flight) -> None:
     vehicle = grounded.vehicle
     await vehicle.arm()
-    assert vehicle.is_armed
-    assert vehicle.armed.value
-    assert grounded.copter.is_armed
+    assert (vehicle.is_armed, vehicle.armed.value, grounded.copter.is_armed) == (True, True, True)
     await vehicle.disarm()
-    assert not vehicle.is_armed
-    assert not grounded.copter.is_armed
+    assert (vehicle.is_armed, vehicle.armed.value, grounded.copter.is_armed) == (False, False, False)
     arm, disarm = grounded.wire.commands(ARM)
     assert (arm.param1, arm.param2) == (1.0, 0.0)
     assert (disarm.param1, disarm.param2) == (0.0, 0.0)
@@ -89,7 +86,7 @@ async def test_force_skips_the_checks(grounded: Flight) -> None:
 
 
 async def test_accepted_but_not_armed_is_a_timeout(grounded: Flight) -> None:
-    grounded.copter.arming.arm = lambda **_: True  # type: ignore[method-assign, assignment]
+    grounded.copter.arming.arm = lambda **_: True  # type: ignore[method-assign]
     started = now()
     with pytest.raises(
         OperationTimeout, match=r"arm\(\): not done within 3 s; the vehicle said nothing about it"
@@ -109,7 +106,7 @@ async def test_a_silent_vehicle_is_a_timeout(grounded: Flight) -> None:
 async def test_disarm_in_the_air_is_refused_and_forced(flying: Flight) -> None:
     with pytest.raises(CommandRejected):
         await flying.vehicle.disarm()
-    assert flying.copter.is_armed
+    assert flying.vehicle.is_armed
     await flying.vehicle.disarm(force=True)
     assert not flying.copter.is_armed
     assert [each.param2 for each in flying.wire.commands(ARM)] == [0.0, 21196.0]
@@ -202,6 +199,6 @@ async def test_px4_arms_when_ready_and_disarms() -> None:
 async def test_px4_disarm_in_the_air_says_why_not() -> None:
     async with open_px4() as flight:
         await flight.take_off()
-        with pytest.raises(CommandRejected, match="(?i)disarming denied|not landed"):
+        with pytest.raises(CommandRejected, match=r"(?i)disarming denied|not landed"):
             await flight.vehicle.disarm()
         assert flight.px4.is_armed

@@ -66,10 +66,9 @@ class VehicleHealth(VehicleCore):
 
     async def _hear_of_health(self) -> None:
         """Give the vehicle a moment to tell what it has not told lately."""
-        cells = (self.telemetry.sensors, self.telemetry.estimator)
         with anyio.move_on_after(TEXTS_S):
-            while any(cell.age > FRESH_S for cell in cells):
-                await anyio.sleep(0.1)
+            await self.telemetry.sensors.wait_until(lambda _: self.telemetry.sensors.age <= FRESH_S)
+            await self.telemetry.estimator.wait_until(lambda _: self.telemetry.estimator.age <= FRESH_S)
 
     async def _run_prearm_checks(self) -> None:
         try:
