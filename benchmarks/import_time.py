@@ -1,0 +1,57 @@
+"""Import time, each import in a process of its own, in turns.
+
+    python benchmarks/import_time.py
+
+What is measured is the time inside the process, in milliseconds, without the start of the interpreter; byte code is
+on disk, as it is for everyone from the second run on.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from tempfile import TemporaryDirectory
+
+from table import Row, faster_is_better
+
+__all__ = ["rows"]
+
+AEROKIT = "import aerokit"
+AEROKIT_READY = "import aerokit; aerokit.connect"
+DIALECT = "import pymavlink.dialects.v20.ardupilotmega"
+MAVUTIL = "import pymavlink.mavutil"
+STATEMENTS = (AEROKIT, DIALECT, AEROKIT_READY, MAVUTIL)
+
+
+def rows(rounds: int = 25) -> list[Row]:
+    """``import``, and ``import_ready``: with everything that is needed to connect to a vehicle."""
+    with TemporaryDirectory() as byte_code:
+        for statement in STATEMENTS:
+            _import_ms(statement, byte_code)
+        taken: dict[str, list[float]] = {statement: [] for statement in STATEMENTS}
+        for _ in range(rounds):
+            for statement, series in taken.items():
+                series.append(_import_ms(statement, byte_code))
+    return [
+        _row("import", taken[AEROKIT], taken[DIALECT], DIALECT),
+        _row("import_ready", taken[AEROKIT_READY], taken[MAVUTIL], MAVUTIL),
+    ]
+
+
+def _row(name: str, own: list[float], peer: list[float], statement: str) -> Row:
+    return faster_is_better(name, own, peer, statement, unit="ms", aim=1 / 1.5)
+
+
+def _import_ms(statement: str, byte_code: str) -> float:
+    program = f"from time import perf_counter as now; began = now(); {statement}; print(now() - began)"
+    environment = {**os.environ, "PYTHONPYCACHEPREFIX": byte_code}
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)
+    run = [sys.executable, "-c", program]
+    done = subprocess.run(run, env=environment, capture_output=True, text=True, check=True)
+    return float(done.stdout) * 1000
+
+
+if __name__ == "__main__":
+    sys.stdout.write(json.dumps(rows(), indent=2) + "\n")

@@ -1,0 +1,102 @@
+"""A vehicle that does nothing but answer commands, in a process of its own, so that it is not what is measured.
+
+    python benchmarks/responder.py PORT ...
+
+It sends a heartbeat to each of these UDP ports of this machine four times a second, and answers each COMMAND_LONG
+with an ACCEPTED COMMAND_ACK whose bytes were made beforehand. Asked for a message that connecting programs want to
+know (MAV_CMD_REQUEST_MESSAGE), it sends that one too. It ends when it is terminated.
+"""
+
+from __future__ import annotations
+
+import socket
+import struct
+import sys
+import time
+from collections.abc import Callable, Hashable
+from functools import partial
+
+from aerokit.mavlink import FrameEncoder, Message, messages
+
+MAGIC_V2 = 0xFD
+COMMAND_LONG, REQUEST_MESSAGE = 76, 512
+HEARTBEAT_PERIOD_S = 0.25
+SYSTEM_ID, COMPONENT_ID = 1, 1
+
+Address = tuple[str, int]
+
+TOLD_ON_REQUEST: dict[int, Callable[[], Message]] = {
+    148: lambda: messages.AutopilotVersion(0, 0x04070000, 0, 0, 0, bytes(8), bytes(8), bytes(8), 0, 0, 1),
+    242: lambda: messages.HomePosition(0, 0, 0, 0.0, 0.0, 0.0, (1.0, 0.0, 0.0, 0.0), 0.0, 0.0, 0.0),
+    49: lambda: messages.GpsGlobalOrigin(0, 0, 0),
+}
+
+
+class Peer:
+    """One program at the other end; the sequence numbers it sees have no gaps."""
+
+    def __init__(self) -> None:
+        self._sequence = -1
+        self._made: dict[Hashable, list[bytes]] = {}
+
+    def next_frame(self, key: Hashable, make: Callable[[], Message]) -> bytes:
+        """A message with the next sequence number; its 256 frames are made when it is first needed."""
+        self._sequence = (self._sequence + 1) & 0xFF
+        if key not in self._made:
+            encoder, message = FrameEncoder(SYSTEM_ID, COMPONENT_ID), make()
+            self._made[key] = [encoder.encode(message) for _ in range(256)]
+        return self._made[key][self._sequence]
+
+
+class Responder:
+    """Heartbeats and acks on one blocking socket."""
+
+    def __init__(self, ports: list[int]) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind(("127.0.0.1", 0))
+        self._socket.settimeout(HEARTBEAT_PERIOD_S)
+        self._peers: dict[Address, Peer] = {("127.0.0.1", port): Peer() for port in ports}
+
+    def run(self) -> None:
+        """Answer until the process is ended; a line on standard output says that it has begun."""
+        print("ready", flush=True)
+        due = time.monotonic()
+        while True:
+            if time.monotonic() >= due:
+                due = time.monotonic() + HEARTBEAT_PERIOD_S
+                self._send_heartbeats()
+            try:
+                data, address = self._socket.recvfrom(4096)
+            except (TimeoutError, ConnectionError):  # nobody asks, or nobody listens yet
+                continue
+            self._answer(data, address)
+
+    def _send_heartbeats(self) -> None:
+        for address, peer in self._peers.items():
+            self._socket.sendto(peer.next_frame("heartbeat", _heartbeat), address)
+
+    def _answer(self, data: bytes, address: Address) -> None:
+        if data[0] != MAGIC_V2 or int.from_bytes(data[7:10], "little") != COMMAND_LONG:
+            return
+        peer = self._peers.get(address)
+        if peer is None:
+            return
+        (command,) = struct.unpack_from("<H", data, 10 + 28)
+        sender = (data[5], data[6])
+        ack = partial(messages.CommandAck, command, 0, 0, 0, *sender)
+        self._socket.sendto(peer.next_frame((command, *sender), ack), address)
+        if command == REQUEST_MESSAGE:
+            self._tell(int(struct.unpack_from("<f", data, 10)[0]), peer, address)
+
+    def _tell(self, message_id: int, peer: Peer, address: Address) -> None:
+        make = TOLD_ON_REQUEST.get(message_id)
+        if make is not None:
+            self._socket.sendto(peer.next_frame(("told", message_id), make), address)
+
+
+def _heartbeat() -> Message:
+    return messages.Heartbeat(type=2, autopilot=3, base_mode=81, custom_mode=4, system_status=4)
+
+
+if __name__ == "__main__":
+    Responder([int(port) for port in sys.argv[1:]]).run()

@@ -1,0 +1,74 @@
+"""The whole table, side by side with pymavlink and MAVSDK; writes it to ``bench.json``.
+
+    python benchmarks/run.py                          # everything, about a minute
+    python benchmarks/run.py import decode_skip       # these rows only
+    python benchmarks/run.py --quick                  # a few rounds: does it run? The figures mean little
+
+Figures are medians of interleaved rounds; only the ratios mean something on another machine. What is missed is said
+loudly, but is no failure: the exit code is 0.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import command_rtt
+import decode
+import deliver
+import import_time
+import table
+from table import Row
+
+Measure = Callable[[bool], list[Row]]
+"""Gives rows; with True in few rounds."""
+
+MEASURES: dict[tuple[str, ...], Measure] = {
+    ("decode_skip", "decode_typed"): lambda quick: decode.rows(1 if quick else 7),
+    ("deliver_telemetry",): lambda quick: deliver.rows(1 if quick else 7),
+    ("command_rtt_pymavlink", "command_rtt_mavsdk"): lambda quick: (
+        command_rtt.rows(1, 20) if quick else command_rtt.rows()
+    ),
+    ("import", "import_ready"): lambda quick: import_time.rows(1 if quick else 25),
+}
+NAMES = tuple(name for names in MEASURES for name in names)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure what was asked for, print it, write it."""
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    wanted = options.names or NAMES
+    if not set(wanted) <= set(NAMES):
+        parser.error(f"the names are {', '.join(NAMES)}")
+    rows = [each for each in _measured(wanted, options.quick) if each["name"] in wanted]
+    print(table.printed(rows))
+    for name in sorted(set(wanted) - {each["name"] for each in rows}):
+        print(f"{name}: left out, its peer is not installed")
+    missed = [each["name"] for each in rows if table.is_missed(each)]
+    print(f"MISSED: {', '.join(missed)}" if missed else "every aim is met")
+    table.write(rows, options.output)
+    return 0
+
+
+def _measured(wanted: Sequence[str], quick: bool) -> list[Row]:
+    rows: list[Row] = []
+    for names, measure in MEASURES.items():
+        if not set(names).isdisjoint(wanted):
+            print(f"measuring {', '.join(names)} …", file=sys.stderr, flush=True)
+            rows += measure(quick)
+    return rows
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(NAMES))
+    parser.add_argument("--quick", action="store_true", help="few rounds: does it run?")
+    parser.add_argument("--output", type=Path, default=Path("bench.json"), help="default: bench.json")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

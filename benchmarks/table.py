@@ -1,0 +1,69 @@
+"""Rows of the table, and how figures become one: side by side in one process, in turns, by their medians."""
+
+from __future__ import annotations
+
+import json
+import statistics
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+__all__ = ["Row", "faster_is_better", "is_missed", "printed", "row", "write"]
+
+Row = dict[str, Any]
+"""``name``, ``aerokit`` and ``peer`` (in ``unit``), ``peer_name``, ``ratio`` (above 1: aerokit is ahead), ``aim``."""
+
+HEADINGS = ("name", "aerokit", "peer", "unit", "ratio", "aim", "", "against")
+
+
+def faster_is_better(
+    name: str, aerokit: Sequence[float], peer: Sequence[float], peer_name: str, *, unit: str, aim: float
+) -> Row:
+    """A row of two series of durations: the medians, and how many times as long the peer takes."""
+    own, other = statistics.median(aerokit), statistics.median(peer)
+    return row(name, own, other, peer_name, unit=unit, ratio=other / own, aim=aim)
+
+
+def row(
+    name: str, aerokit: float, peer: float, peer_name: str, *, unit: str, ratio: float, aim: float
+) -> Row:
+    """One row, rounded for people."""
+    return {
+        "name": name,
+        "aerokit": _rounded(aerokit),
+        "peer": _rounded(peer),
+        "peer_name": peer_name,
+        "unit": unit,
+        "ratio": round(ratio, 3),
+        "aim": round(aim, 3),
+    }
+
+
+def is_missed(row: Row) -> bool:
+    """Whether the ratio is below what was aimed at."""
+    return bool(row["ratio"] < row["aim"])
+
+
+def printed(rows: Sequence[Row]) -> str:
+    """The table as text."""
+    lines = [HEADINGS, *(_cells(each) for each in rows)]
+    widths = [max(len(line[i]) for line in lines) for i in range(len(HEADINGS))]
+    return "\n".join(
+        "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip()
+        for line in lines
+    )
+
+
+def write(rows: Sequence[Row], path: Path) -> None:
+    """The rows as JSON."""
+    path.write_text(json.dumps(list(rows), indent=2) + "\n")
+
+
+def _cells(row: Row) -> tuple[str, ...]:
+    verdict = "MISSED" if is_missed(row) else "ok"
+    figures = (f"{row['aerokit']:,}", f"{row['peer']:,}", row.get("unit", ""), f"{row['ratio']:.2f}")
+    return (row["name"], *figures, f"{row['aim']:.2f}", verdict, row["peer_name"])
+
+
+def _rounded(value: float) -> float:
+    return round(value) if value >= 1000 else round(value, 1)
