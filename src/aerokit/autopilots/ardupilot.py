@@ -103,7 +103,7 @@ class ArduCopter(ArduPilot):
         "take_off": "GUIDED",
         "mission": "AUTO",
     }
-    setpoints = SetpointRules()
+    setpoints = SetpointRules(body_yaw_is_relative=True)
     reposition = Reposition(relative_altitude=True, yaw=False, speed=False, armed_only=False)
     condition_yaw = True
     changes_speed = True
@@ -191,7 +191,7 @@ class ArduRover(ArduPilot):
         "setpoint": "GUIDED",
         "mission": "AUTO",
     }
-    setpoints = SetpointRules(acceleration=False)
+    setpoints = SetpointRules(acceleration=False, body_yaw_is_relative=True)
     reposition = Reposition(relative_altitude=True, yaw=False, speed=False, armed_only=False)
     changes_speed = True
     arrival_radius_m = 4.0

@@ -46,6 +46,7 @@ class SetpointRules(Snapshot):
 
     ``before_mode``: the stream must run before the mode is asked for. ``minimum_hz`` is the slowest stream
     the autopilot puts up with, ``timeout_s`` how long it goes on without a new set-point by default.
+    ``body_yaw_is_relative``: in MAV_FRAME_BODY_NED yaw counts from where the nose points, not from north.
     """
 
     local_position: bool = True
@@ -56,6 +57,7 @@ class SetpointRules(Snapshot):
     before_mode: bool = False
     minimum_hz: float = 1.0
     timeout_s: float = 3.0
+    body_yaw_is_relative: bool = False
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -13,7 +13,13 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 
 import anyio
 
-from aerokit.errors import AerokitError, LocalProtocolError, SetpointStreamStopped
+from aerokit.errors import (
+    AerokitError,
+    LocalProtocolError,
+    NotSupported,
+    OperationRejected,
+    SetpointStreamStopped,
+)
 from aerokit.vehicle.setpoints import (
     AccelerationSetpoint,
     AttitudeSetpoint,
@@ -46,7 +52,8 @@ class Guided:
     """Opens set-point streams: ``async with vehicle.guided.velocity() as stream: stream.set(...)``.
 
     Every stream takes ``rate_hz`` (how often the latest set-point is sent, 2 to 100), ``valid_for_s`` (how long a
-    set-point may be resent without a new one) and ``max_lag_s`` (how late the event loop may be).
+    set-point may be resent without a new one) and ``max_lag_s`` (how late the event loop may be). NotSupported is
+    raised for a kind that this type of vehicle does not obey.
     """
 
     def __init__(self, vehicle: Vehicle) -> None:
@@ -62,7 +69,7 @@ class Guided:
         max_lag_s: float = 0.5,
     ) -> SetpointStream[VelocitySetpoint]:
         """Stream velocities over ground (SET_POSITION_TARGET_LOCAL_NED)."""
-        return SetpointStream(self._vehicle, self._encode.velocity, initial, rate_hz, valid_for_s, max_lag_s)
+        return self._stream("velocity", self._encode.velocity, initial, rate_hz, valid_for_s, max_lag_s)
 
     def body_velocity(
         self,
@@ -73,9 +80,7 @@ class Guided:
         max_lag_s: float = 0.5,
     ) -> SetpointStream[BodyVelocitySetpoint]:
         """Stream velocities as seen from the vehicle (SET_POSITION_TARGET_LOCAL_NED in MAV_FRAME_BODY_NED)."""
-        return SetpointStream(
-            self._vehicle, self._encode.body_velocity, initial, rate_hz, valid_for_s, max_lag_s
-        )
+        return self._stream("velocity", self._encode.body_velocity, initial, rate_hz, valid_for_s, max_lag_s)
 
     def acceleration(
         self,
@@ -86,8 +91,8 @@ class Guided:
         max_lag_s: float = 0.5,
     ) -> SetpointStream[AccelerationSetpoint]:
         """Stream accelerations (SET_POSITION_TARGET_LOCAL_NED)."""
-        return SetpointStream(
-            self._vehicle, self._encode.acceleration, initial, rate_hz, valid_for_s, max_lag_s
+        return self._stream(
+            "acceleration", self._encode.acceleration, initial, rate_hz, valid_for_s, max_lag_s
         )
 
     def local_position(
@@ -99,8 +104,8 @@ class Guided:
         max_lag_s: float = 0.5,
     ) -> SetpointStream[LocalPositionSetpoint]:
         """Stream places in the local frame (SET_POSITION_TARGET_LOCAL_NED)."""
-        return SetpointStream(
-            self._vehicle, self._encode.local_position, initial, rate_hz, valid_for_s, max_lag_s
+        return self._stream(
+            "local position", self._encode.local_position, initial, rate_hz, valid_for_s, max_lag_s
         )
 
     def position(
@@ -112,7 +117,9 @@ class Guided:
         max_lag_s: float = 0.5,
     ) -> SetpointStream[PositionSetpoint]:
         """Stream places on the globe (SET_POSITION_TARGET_GLOBAL_INT)."""
-        return SetpointStream(self._vehicle, self._encode.position, initial, rate_hz, valid_for_s, max_lag_s)
+        return self._stream(
+            "global position", self._encode.position, initial, rate_hz, valid_for_s, max_lag_s
+        )
 
     def attitude(
         self,
@@ -123,7 +130,18 @@ class Guided:
         max_lag_s: float = 0.3,
     ) -> SetpointStream[AttitudeSetpoint]:
         """Stream attitudes with thrust (SET_ATTITUDE_TARGET)."""
-        return SetpointStream(self._vehicle, self._encode.attitude, initial, rate_hz, valid_for_s, max_lag_s)
+        return self._stream("attitude", self._encode.attitude, initial, rate_hz, valid_for_s, max_lag_s)
+
+    def _stream(
+        self, kind: str, encode: Callable[[SetpointT], Message], initial: SetpointT, *limits: float
+    ) -> SetpointStream[SetpointT]:
+        autopilot = self._vehicle.autopilot
+        if kind not in autopilot.setpoints.names:
+            obeyed = ", ".join(autopilot.setpoints.names) or "none"
+            raise NotSupported(
+                f"{autopilot.firmware} does not obey {kind} set-points; those it obeys: {obeyed}"
+            )
+        return SetpointStream(self._vehicle, encode, initial, *limits)
 
 
 class SetpointStream(Generic[SetpointT]):
@@ -156,7 +174,7 @@ class SetpointStream(Generic[SetpointT]):
         self._mode: Mode | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._stopped: SetpointStreamStopped | None = None
-        self._was_told = False
+        self._was_told = self._was_entered = False
         self._is_entering = False
         self._was_armed = False
 
@@ -193,9 +211,15 @@ class SetpointStream(Generic[SetpointT]):
         self._raise_if_stopped()
 
     async def __aenter__(self) -> Self:
+        if self._was_entered:
+            raise SetpointStreamStopped("a set-point stream is entered once: open another one")
+        self._was_entered = True
         self._encode(self._setpoint)  # refuse nonsense before anything is sent
         try:
             await self._enter()
+        except OperationRejected:  # the vehicle stays with whoever steers it
+            self._cancel_timer()
+            raise
         except BaseException:
             self._cancel_timer()
             self._vehicle._hold_soon()
@@ -208,6 +232,8 @@ class SetpointStream(Generic[SetpointT]):
         exc: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
+        if self._stopped is None and (reason := self._why_leave_alone()):
+            self._stop(reason, hold=False)
         if self._stopped is None:
             self._stop("the block that fed it was left", hold=True)
             if exc is None:
@@ -265,13 +291,17 @@ class SetpointStream(Generic[SetpointT]):
             return f"the event loop was blocked for {lag:.1f} s"
         if age > self._valid_for_s:
             return f"no new set-point came for {age:.1f} s (valid_for_s = {self._valid_for_s:g})"
+        if self._vehicle.is_silent:
+            return f"the vehicle has been silent for {self._vehicle.heartbeat_age:.1f} s"
+        return self._why_leave_alone()
+
+    def _why_leave_alone(self) -> str | None:
+        """Somebody else has taken over: a pilot, a failsafe, another program."""
         mode = self._vehicle.mode.latest
         if self._mode is not None and mode != self._mode:
             return f"the vehicle left {self._mode} for {mode}"
         if self._was_armed and not self._vehicle.is_armed:
             return "the vehicle disarmed"
-        if self._vehicle.is_silent:
-            return f"the vehicle has been silent for {self._vehicle.heartbeat_age:.1f} s"
         self._was_armed = self._vehicle.is_armed
         return None
 

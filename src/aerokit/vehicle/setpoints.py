@@ -51,7 +51,7 @@ class VelocitySetpoint(Snapshot):
 
 
 class BodyVelocitySetpoint(Snapshot):
-    """Velocity in m/s as seen from the vehicle: forward, right, down; with a heading or a turn rate."""
+    """Velocity in m/s as seen from the vehicle: forward, right, down; with a heading (from north) or a turn rate."""
 
     forward_m_s: float = 0.0
     right_m_s: float = 0.0
@@ -114,8 +114,10 @@ class SetpointEncoder:
 
     def body_velocity(self, s: BodyVelocitySetpoint) -> Message:
         """SET_POSITION_TARGET_LOCAL_NED with a velocity in MAV_FRAME_BODY_NED."""
-        vector = (s.forward_m_s, s.right_m_s, s.down_m_s)
-        return self._local(MAV_FRAME_BODY_NED, IGNORE_VELOCITY, vector, s.yaw_deg, s.yaw_rate_deg_s)
+        vector, yaw_deg = (s.forward_m_s, s.right_m_s, s.down_m_s), s.yaw_deg
+        if yaw_deg is not None and self._vehicle.autopilot.setpoints.body_yaw_is_relative:
+            yaw_deg = math.remainder(yaw_deg - self._vehicle.heading_deg.value, 360)
+        return self._local(MAV_FRAME_BODY_NED, IGNORE_VELOCITY, vector, yaw_deg, s.yaw_rate_deg_s)
 
     def acceleration(self, s: AccelerationSetpoint) -> Message:
         """SET_POSITION_TARGET_LOCAL_NED with an acceleration in MAV_FRAME_LOCAL_NED."""

@@ -1,0 +1,510 @@
+"""Set-point streams: what goes over the wire, and that nothing goes over it once nobody feeds them."""
+
+# ruff: noqa: PT012  (an `async with` inside `pytest.raises` is what these tests are about)
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from typing import Any
+
+import anyio
+import pytest
+from flight_harness import Flight, Px4Flight, block_loop, in_the_air, now, open_flight, open_px4, speed_of
+
+from aerokit import Position
+from aerokit import messages as m
+from aerokit.errors import (
+    CommandRejected,
+    CommandTimeout,
+    LocalProtocolError,
+    NotSupported,
+    SetpointStreamStopped,
+)
+from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult
+from aerokit.vehicle.guided import SetpointStream
+from aerokit.vehicle.setpoints import (
+    AccelerationSetpoint,
+    AttitudeSetpoint,
+    BodyVelocitySetpoint,
+    LocalPositionSetpoint,
+    PositionSetpoint,
+    VelocitySetpoint,
+)
+
+pytestmark = pytest.mark.anyio
+
+BRAKE, GUIDED, LOITER = CopterMode.BRAKE, CopterMode.GUIDED, CopterMode.LOITER
+NORTH = VelocitySetpoint(north_m_s=3.0)
+
+
+async def stays_quiet(flight: Flight, seconds: float = 6.0) -> None:
+    """Nothing is sent any more, and the vehicle stands still in the mode for it."""
+    flight.wire.forget()
+    await anyio.sleep(seconds)
+    assert flight.wire.setpoints() == []
+
+
+# ---------------------------------------------------------------------------- bytes on the wire
+
+
+async def first_sent(flight: Flight, stream: SetpointStream[Any], setpoint: object = None) -> Any:
+    async with stream:
+        flight.wire.forget()
+        if setpoint is not None:
+            stream.set(setpoint)
+        await anyio.sleep(0.25)
+        return flight.wire.setpoints()[-1][1]
+
+
+@pytest.mark.parametrize(
+    ("setpoint", "mask", "yaw", "yaw_rate"),
+    [
+        (VelocitySetpoint(1.0, -2.0, 0.5), 0xDC7, 0.0, 0.0),
+        (VelocitySetpoint(1.0, -2.0, 0.5, yaw_deg=90.0), 0x9C7, math.pi / 2, 0.0),
+        (VelocitySetpoint(1.0, -2.0, 0.5, yaw_rate_deg_s=18.0), 0x5C7, 0.0, math.pi / 10),
+    ],
+)
+async def test_velocity(
+    flying: Flight, setpoint: VelocitySetpoint, mask: int, yaw: float, yaw_rate: float
+) -> None:
+    sent = await first_sent(flying, flying.vehicle.guided.velocity(), setpoint)
+    assert isinstance(sent, m.SetPositionTargetLocalNed)
+    assert (sent.target_system, sent.target_component, sent.coordinate_frame) == (1, 1, 1)
+    assert sent.type_mask == mask
+    assert (sent.vx, sent.vy, sent.vz) == (1.0, -2.0, 0.5)
+    assert (sent.x, sent.y, sent.z, sent.afx, sent.afy, sent.afz) == (0,) * 6
+    assert (sent.yaw, sent.yaw_rate) == pytest.approx((yaw, yaw_rate))
+
+
+async def test_body_velocity(flying: Flight) -> None:
+    sent = await first_sent(
+        flying, flying.vehicle.guided.body_velocity(), BodyVelocitySetpoint(2.0, 1.0, -0.5)
+    )
+    assert isinstance(sent, m.SetPositionTargetLocalNed)
+    assert (sent.coordinate_frame, sent.type_mask) == (8, 0xDC7)
+    assert (sent.vx, sent.vy, sent.vz) == (2.0, 1.0, -0.5)
+
+
+async def test_acceleration(flying: Flight) -> None:
+    sent = await first_sent(
+        flying, flying.vehicle.guided.acceleration(), AccelerationSetpoint(0.5, 0.25, -0.125)
+    )
+    assert isinstance(sent, m.SetPositionTargetLocalNed)
+    assert (sent.coordinate_frame, sent.type_mask) == (1, 0xC3F)
+    assert (sent.afx, sent.afy, sent.afz) == (0.5, 0.25, -0.125)
+    assert (sent.x, sent.y, sent.z, sent.vx, sent.vy, sent.vz) == (0,) * 6
+
+
+async def test_local_position(flying: Flight) -> None:
+    sent = await first_sent(
+        flying, flying.vehicle.guided.local_position(LocalPositionSetpoint(5.0, 6.0, -12.0))
+    )
+    assert isinstance(sent, m.SetPositionTargetLocalNed)
+    assert (sent.coordinate_frame, sent.type_mask) == (1, 0xDF8)
+    assert (sent.x, sent.y, sent.z) == (5.0, 6.0, -12.0)
+
+
+@pytest.mark.parametrize("above_sea", [False, True])
+async def test_global_position(flying: Flight, above_sea: bool) -> None:
+    altitude = {"altitude_amsl_m": 600.0} if above_sea else {"altitude_relative_m": 12.0}
+    place = Position(-35.3630000, 149.1652000, **altitude)
+    sent = await first_sent(flying, flying.vehicle.guided.position(PositionSetpoint(place, yaw_deg=180.0)))
+    assert isinstance(sent, m.SetPositionTargetGlobalInt)
+    assert (sent.coordinate_frame, sent.type_mask) == (5 if above_sea else 6, 0x9F8)
+    assert (sent.lat_int, sent.lon_int, sent.alt) == (-353630000, 1491652000, 600.0 if above_sea else 12.0)
+    assert sent.yaw == pytest.approx(math.pi)
+
+
+async def test_attitude(flying: Flight) -> None:
+    sent = await first_sent(flying, flying.vehicle.guided.attitude(AttitudeSetpoint(0.0, -10.0, 90.0, 0.5)))
+    assert isinstance(sent, m.SetAttitudeTarget)
+    assert (sent.target_system, sent.type_mask, sent.thrust) == (1, 0x07, 0.5)
+    cos, sin, root = math.cos(math.radians(5.0)), math.sin(math.radians(5.0)), math.sqrt(0.5)
+    assert sent.q == pytest.approx((cos * root, sin * root, -sin * root, cos * root), abs=1e-6)
+    assert (sent.body_roll_rate, sent.body_pitch_rate, sent.body_yaw_rate) == (0, 0, 0)
+
+
+@pytest.mark.parametrize("rate_hz", [2.0, 10.0, 40.0])
+async def test_the_rate_is_kept(flying: Flight, rate_hz: float) -> None:
+    async with flying.vehicle.guided.velocity(rate_hz=rate_hz) as stream:
+        flying.wire.forget()
+        await stream.fly(NORTH, 5.0)
+        times = [at for at, _ in flying.wire.setpoints()]
+    gaps = [later - earlier for earlier, later in itertools.pairwise(times)]
+    assert gaps == pytest.approx([1 / rate_hz] * len(gaps), abs=1e-6)
+    assert len(times) == pytest.approx(5.0 * rate_hz, abs=1)
+
+
+# ------------------------------------------------------------------------------- what it does
+
+
+async def test_the_vehicle_flies_it(flying: Flight) -> None:
+    async with flying.vehicle.guided.velocity() as stream:
+        await stream.fly(NORTH, 6.0)
+        assert flying.copter.motion.velocity_north == pytest.approx(3.0, abs=0.1)
+        await stream.fly(VelocitySetpoint(east_m_s=-2.0), 6.0)
+        assert flying.copter.motion.velocity_east == pytest.approx(-2.0, abs=0.1)
+    assert flying.vehicle.mode_name == "BRAKE"
+
+
+async def test_body_velocity_is_seen_from_the_nose(flying: Flight) -> None:
+    await flying.vehicle.set_heading(90.0, tolerance_deg=0.5)
+    async with flying.vehicle.guided.body_velocity() as stream:
+        await stream.fly(BodyVelocitySetpoint(forward_m_s=2.0), 6.0)
+        assert flying.copter.motion.velocity_east == pytest.approx(2.0, abs=0.2)
+
+
+async def test_a_heading_with_a_body_velocity_is_a_heading(flying: Flight) -> None:
+    """In MAV_FRAME_BODY_NED ArduPilot counts yaw from where the nose points; users give degrees from north."""
+    await flying.vehicle.set_heading(40.0)
+    async with flying.vehicle.guided.body_velocity() as stream:
+        await stream.fly(BodyVelocitySetpoint(yaw_deg=120.0), 20.0)
+        assert math.degrees(flying.copter.motion.yaw) == pytest.approx(120.0, abs=3.0)
+
+
+async def test_entering_changes_to_guided(flying: Flight) -> None:
+    flying.pilot_takes_over()
+    await anyio.sleep(1.0)
+    async with flying.vehicle.guided.local_position(LocalPositionSetpoint(10.0, 0.0, -10.0)) as stream:
+        assert flying.vehicle.mode_name == "GUIDED"
+        await stream.fly(LocalPositionSetpoint(10.0, 0.0, -10.0), 12.0)
+        assert flying.copter.motion.north == pytest.approx(10.0, abs=0.5)
+
+
+# ------------------------------------------------------------------------------ how it ends
+
+
+async def test_left_in_peace_the_vehicle_holds(flying: Flight) -> None:
+    async with flying.vehicle.guided.velocity() as stream:
+        await stream.fly(NORTH, 3.0)
+    assert not stream.is_running
+    assert flying.vehicle.mode_name == "BRAKE"
+    await stays_quiet(flying)
+    assert speed_of(flying.copter) < 0.1
+
+
+async def test_the_body_raises(flying: Flight) -> None:
+    with pytest.raises(ZeroDivisionError):
+        async with flying.vehicle.guided.velocity() as stream:
+            await stream.fly(NORTH, 3.0)
+            _ = 1 / 0
+    assert flying.wire.mode_orders()[-1] == BRAKE  # it went out before the error left the block
+    await stays_quiet(flying)
+    assert flying.copter.mode.number == BRAKE
+    assert speed_of(flying.copter) < 0.1
+
+
+async def test_cancelled(flying: Flight) -> None:
+    async def fly_on() -> None:
+        async with flying.vehicle.guided.velocity() as stream:
+            await stream.fly(NORTH, math.inf)
+
+    with anyio.move_on_after(4.0):
+        await fly_on()
+    assert flying.wire.mode_orders()[-1] == BRAKE
+    await stays_quiet(flying)
+    assert flying.copter.mode.number == BRAKE
+
+
+async def test_cancelled_while_entering() -> None:
+    async with in_the_air(latency_s=0.5) as flying:
+        flying.pilot_takes_over()
+        await anyio.sleep(2.0)
+        with anyio.move_on_after(0.7) as scope:
+            async with flying.vehicle.guided.velocity():
+                raise AssertionError("entered too early")
+        assert scope.cancelled_caught
+        await anyio.sleep(3.0)
+        assert flying.copter.mode.number == BRAKE
+        await stays_quiet(flying)
+
+
+async def test_the_whole_program_is_cancelled() -> None:
+    """The order to hold goes out although connection and loop are about to end."""
+    flight: Flight | None = None
+    with anyio.move_on_after(30.0):
+        async with in_the_air() as flight, flight.vehicle.guided.velocity() as stream:
+            await stream.fly(NORTH, math.inf)
+    assert flight is not None
+    assert flight.wire.mode_orders() == [GUIDED, BRAKE] or flight.wire.mode_orders() == [BRAKE]
+
+
+async def test_no_new_setpoint_for_too_long(flying: Flight) -> None:
+    with pytest.raises(SetpointStreamStopped, match=r"no new set-point came for 1\.\d s \(valid_for_s = 1\)"):
+        async with flying.vehicle.guided.velocity(valid_for_s=1.0) as stream:
+            stream.set(NORTH)
+            fed_at = now()
+            await anyio.sleep(5.0)
+            assert not stream.is_running
+            last = flying.wire.setpoints()[-1][0]
+            assert fed_at + 0.8 <= last <= fed_at + 1.01
+            assert flying.copter.mode.number == BRAKE
+    await stays_quiet(flying)
+
+
+async def test_set_after_the_stop_raises_and_leaving_does_not_again(flying: Flight) -> None:
+    async with flying.vehicle.guided.velocity(valid_for_s=0.5) as stream:
+        await anyio.sleep(2.0)
+        with pytest.raises(SetpointStreamStopped, match="told to hold"):
+            stream.set(NORTH)
+    await stays_quiet(flying)
+
+
+async def test_leaving_by_an_error_of_ones_own_keeps_that_error(flying: Flight) -> None:
+    with pytest.raises(ZeroDivisionError):
+        async with flying.vehicle.guided.velocity(valid_for_s=0.5):
+            await anyio.sleep(2.0)
+            _ = 1 / 0
+
+
+async def test_fly_tells_that_it_stopped(flying: Flight) -> None:
+    async with flying.vehicle.guided.velocity() as stream, anyio.create_task_group() as tasks:
+
+        async def pilot() -> None:
+            await anyio.sleep(2.0)
+            flying.pilot_takes_over()
+
+        tasks.start_soon(pilot)
+        with pytest.raises(SetpointStreamStopped, match="left GUIDED for LOITER"):
+            await stream.fly(NORTH, 60.0)
+
+
+async def test_the_event_loop_is_blocked(flying: Flight) -> None:
+    with pytest.raises(SetpointStreamStopped, match=r"event loop was blocked for 1\.\d s; .* told to hold"):
+        async with flying.vehicle.guided.velocity(valid_for_s=60.0, max_lag_s=0.5) as stream:
+            stream.set(NORTH)
+            await anyio.sleep(2.0)
+            flying.wire.forget()
+            block_loop(2.0)
+            await anyio.sleep(1.0)
+            assert not stream.is_running
+            assert not flying.wire.setpoints()  # no stale one after the blockade
+            assert flying.wire.mode_orders()[0] == BRAKE
+    await stays_quiet(flying)
+    assert flying.copter.mode.number == BRAKE
+
+
+async def test_a_short_hiccup_of_the_loop_is_put_up_with(flying: Flight) -> None:
+    async with flying.vehicle.guided.velocity(max_lag_s=0.5) as stream:
+        await stream.fly(NORTH, 1.0)
+        flying.wire.forget()
+        block_loop(0.4)
+        await stream.fly(NORTH, 1.0)
+        assert stream.is_running
+        assert len(flying.wire.setpoints()) <= 12  # what was missed is not sent in a burst
+
+
+async def test_a_pilot_takes_over(flying: Flight) -> None:
+    with pytest.raises(SetpointStreamStopped, match="left GUIDED for LOITER") as caught:
+        async with flying.vehicle.guided.velocity() as stream:
+            await stream.fly(NORTH, 3.0)
+            flying.pilot_takes_over()
+            await anyio.sleep(1.0)
+    assert "told to hold" not in str(caught.value)
+    assert BRAKE not in flying.wire.mode_orders()
+    await stays_quiet(flying)
+    assert flying.copter.mode.number == LOITER
+
+
+async def test_a_pilot_takes_over_right_before_the_block_is_left() -> None:
+    """The stream has not noticed yet; the vehicle is the pilot's all the same."""
+    async with in_the_air() as flying:
+        with pytest.raises(SetpointStreamStopped, match="left GUIDED for LOITER"):
+            async with flying.vehicle.guided.velocity(rate_hz=2.0) as stream:
+                await stream.fly(NORTH, 3.05)
+                flying.pilot_takes_over()
+                await flying.vehicle.mode.wait_until(lambda mode: mode.name == "LOITER")
+                assert stream.is_running
+        await anyio.sleep(2.0)
+        assert BRAKE not in flying.wire.mode_orders()
+        assert flying.copter.mode.number == LOITER
+
+
+async def test_the_vehicle_lands_and_disarms(flying: Flight) -> None:
+    with pytest.raises(SetpointStreamStopped, match="disarmed"):
+        async with flying.vehicle.guided.velocity() as stream:
+            await stream.fly(NORTH, 1.0)
+            flying.copter.arming.disarm()
+            await stream.fly(NORTH, 3.0)
+    await stays_quiet(flying)
+
+
+async def test_the_connection_is_lost(flying: Flight) -> None:
+    with pytest.raises(SetpointStreamStopped, match="cable was pulled out"):
+        async with flying.vehicle.guided.velocity() as stream:
+            await stream.fly(NORTH, 1.0)
+            flying.wire.lose()
+            await anyio.sleep(1.0)
+            assert not stream.is_running
+
+
+async def test_the_vehicle_falls_silent(flying: Flight) -> None:
+    with pytest.raises(SetpointStreamStopped, match=r"silent for \d"):
+        async with flying.vehicle.guided.velocity() as stream:
+            await stream.fly(NORTH, 1.0)
+            flying.copter.faults.silent = True
+            await stream.fly(NORTH, 30.0)
+
+
+# --------------------------------------------------------------------------------- entering
+
+
+async def test_a_refused_mode_is_told_and_the_vehicle_is_left_alone(flying: Flight) -> None:
+    flying.pilot_takes_over()
+    await anyio.sleep(1.0)
+    flying.copter.faults.refuse(MavCmd.DO_SET_MODE, MavResult.FAILED, "Mode change to GUIDED failed: no")
+    with pytest.raises(CommandRejected, match="Mode change to GUIDED failed: no"):
+        async with flying.vehicle.guided.velocity():
+            raise AssertionError("entered")
+    await anyio.sleep(3.0)
+    assert flying.wire.mode_orders() == [GUIDED]
+    assert flying.wire.setpoints() == []
+
+
+async def test_a_silent_vehicle_is_a_timeout(flying: Flight) -> None:
+    flying.pilot_takes_over()
+    await anyio.sleep(1.0)
+    flying.copter.faults.silent = True
+    with pytest.raises(CommandTimeout):
+        async with flying.vehicle.guided.velocity():
+            raise AssertionError("entered")
+
+
+async def test_a_stream_is_used_inside_its_block_and_once(flying: Flight) -> None:
+    stream = flying.vehicle.guided.velocity()
+    with pytest.raises(SetpointStreamStopped, match="not running"):
+        stream.set(NORTH)
+    async with stream:
+        pass
+    with pytest.raises(SetpointStreamStopped):
+        stream.set(NORTH)
+    with pytest.raises(SetpointStreamStopped):
+        async with stream:
+            raise AssertionError("entered twice")
+    await stays_quiet(flying)
+
+
+BAD: list[Callable[[Any], object]] = [
+    lambda guided: guided.velocity(rate_hz=1.0),
+    lambda guided: guided.velocity(rate_hz=101.0),
+    lambda guided: guided.velocity(rate_hz=math.nan),
+    lambda guided: guided.velocity(valid_for_s=0.0),
+    lambda guided: guided.velocity(valid_for_s=math.inf),
+    lambda guided: guided.velocity(max_lag_s=-1.0),
+]
+
+
+@pytest.mark.parametrize("make", BAD)
+async def test_wrong_arguments(grounded: Flight, make: Callable[[Any], object]) -> None:
+    with pytest.raises(LocalProtocolError, match="is not allowed"):
+        make(grounded.vehicle.guided)
+
+
+async def test_wrong_setpoints_are_refused_before_anything_is_sent(flying: Flight) -> None:
+    guided = flying.vehicle.guided
+    for stream in (
+        guided.velocity(VelocitySetpoint(math.nan)),
+        guided.velocity(VelocitySetpoint(1.0, yaw_deg=1.0, yaw_rate_deg_s=1.0)),
+        guided.acceleration(AccelerationSetpoint(math.inf)),
+        guided.local_position(LocalPositionSetpoint(0.0, math.nan, 0.0)),
+        guided.attitude(AttitudeSetpoint(0.0, 0.0, 0.0, 1.1)),
+        guided.attitude(AttitudeSetpoint(math.nan, 0.0, 0.0, 0.5)),
+    ):
+        with pytest.raises(LocalProtocolError):
+            async with stream:  # type: ignore[attr-defined]
+                raise AssertionError("entered")
+    await anyio.sleep(1.0)
+    assert not flying.wire.mode_orders()
+    assert not flying.wire.setpoints()
+
+
+async def test_a_wrong_setpoint_leaves_the_one_before_in_force(flying: Flight) -> None:
+    async with flying.vehicle.guided.velocity(valid_for_s=5.0) as stream:
+        stream.set(NORTH)
+        with pytest.raises(LocalProtocolError):
+            stream.set(VelocitySetpoint(math.nan))
+        flying.wire.forget()
+        await anyio.sleep(1.0)
+        assert {each.vx for each in flying.wire.all(m.SetPositionTargetLocalNed)} == {3.0}  # type: ignore[attr-defined]
+
+
+async def test_kinds_that_the_autopilot_ignores_are_not_offered() -> None:
+    """ArduPlane obeys attitudes only; a velocity would be sent to nobody."""
+    from aerokit.autopilots import ArduPlane
+
+    async with open_flight() as flight:
+        flight.vehicle.autopilot = ArduPlane(1)
+        with pytest.raises(NotSupported, match=r"velocity.*attitude"):
+            async with flight.vehicle.guided.velocity():
+                raise AssertionError("entered")
+        assert not flight.wire.mode_orders()
+
+
+# -------------------------------------------------------------------------------------- PX4
+
+
+async def px4_in_the_air(flight: Px4Flight) -> None:
+    await flight.take_off()
+
+
+async def test_px4_sees_the_stream_before_it_is_asked_for_offboard() -> None:
+    async with open_px4() as flight:
+        await flight.take_off()
+        async with flight.vehicle.guided.velocity(rate_hz=20.0) as stream:
+            first = flight.wire.setpoints()[0][0]
+            asked = next(
+                at
+                for at, each in flight.wire.sent
+                if isinstance(each, m.CommandLong) and each.command == MavCmd.DO_SET_MODE
+            )
+            assert asked - first >= 0.9
+            await stream.fly(NORTH, 6.0)
+            assert flight.px4.motion.velocity_north == pytest.approx(3.0, abs=0.3)
+        assert flight.vehicle.mode_name == "LOITER"
+        flight.wire.forget()
+        await anyio.sleep(5.0)
+        assert not flight.wire.setpoints()
+
+
+async def test_px4_refuses_offboard() -> None:
+    async with open_px4() as flight:
+        await flight.take_off()
+        flight.px4.faults.refuse(MavCmd.DO_SET_MODE, MavResult.DENIED, "Offboard denied")
+        with pytest.raises(CommandRejected, match="Offboard denied"):
+            async with flight.vehicle.guided.velocity():
+                raise AssertionError("entered")
+        flight.wire.forget()
+        await anyio.sleep(5.0)
+        assert not flight.wire.setpoints()
+        assert flight.vehicle.mode_name == "LOITER"
+
+
+async def test_px4_block_left_by_an_error() -> None:
+    async with open_px4() as flight:
+        await flight.take_off()
+        with pytest.raises(ZeroDivisionError):
+            async with flight.vehicle.guided.velocity() as stream:
+                await stream.fly(NORTH, 3.0)
+                _ = 1 / 0
+        await anyio.sleep(5.0)
+        assert flight.vehicle.mode_name == "LOITER"
+        flight.wire.forget()
+        await anyio.sleep(5.0)
+        assert not flight.wire.setpoints()
+        assert math.hypot(flight.px4.motion.velocity_north, flight.px4.motion.velocity_east) < 0.2
+
+
+async def test_px4_cancelled_while_entering() -> None:
+    async with open_px4() as flight:
+        await flight.take_off()
+        for seconds in (0.5, 1.01, 1.3):
+            with anyio.move_on_after(seconds):
+                async with flight.vehicle.guided.velocity(NORTH):
+                    await anyio.sleep(0.05)
+            await anyio.sleep(6.0)
+            assert flight.vehicle.mode_name == "LOITER"
+            flight.wire.forget()
+            await anyio.sleep(3.0)
+            assert not flight.wire.setpoints()
