@@ -204,7 +204,7 @@ def _default(f: FieldDefinition) -> str:
     if f.type == "char":
         return ' = ""'
     if f.array_length:
-        return ' = b""' if f.type == "uint8_t" else f" = (0,) * {f.array_length}"
+        return f" = bytes({f.array_length})" if f.type == "uint8_t" else f" = (0,) * {f.array_length}"
     return " = 0"
 
 

@@ -221,7 +221,7 @@ class AutopilotVersion(Message):
     def __init__(
         self, capabilities: int, flight_sw_version: int, middleware_sw_version: int, os_sw_version: int,
         board_version: int, flight_custom_version: bytes, middleware_custom_version: bytes,
-        os_custom_version: bytes, vendor_id: int, product_id: int, uid: int, uid2: bytes = b"",
+        os_custom_version: bytes, vendor_id: int, product_id: int, uid: int, uid2: bytes = bytes(18),
     ) -> None:
         self.capabilities = capabilities
         self.flight_sw_version = flight_sw_version

@@ -1,0 +1,106 @@
+"""Every recorded frame that pymavlink accepts is accepted here, with the same fields."""
+
+from __future__ import annotations
+
+import random
+from functools import cache
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega, development
+from recorded import LONG, recording
+from wire_samples import peer_fields, same
+
+from aerokit.mavlink import STANDARD, Frame, Framer, read_tlog
+
+FLIGHTS = ("ardupilot-copter", "ardupilot-plane", "ardupilot-rover", "px4-quad")
+COUNTS = {
+    "ardupilot-copter": 33_910,
+    "ardupilot-plane": 50_669,
+    "ardupilot-rover": 17_446,
+    "px4-quad": 35_528,
+}
+"""Frames in the whole flights, by their README."""
+SHORT_COUNTS = {"ardupilot-copter": 2_820, "px4-quad": 2_388}
+KINDS = {"ardupilot-copter": 48, "ardupilot-plane": 50, "ardupilot-rover": 45, "px4-quad": 44}
+BOOT = "ardupilot-copter-serial-boot.raw"
+
+
+# PX4's LINK_NODE_STATUS, TIME_ESTIMATE_TO_TARGET, EVENT, CURRENT_EVENT_SEQUENCE are in none of pymavlink's XML.
+UNKNOWN = {8, 380, 410, 411}
+
+
+@cache
+def records(flight: str) -> tuple[bytes, ...]:
+    return tuple(raw for _, raw in read_tlog(recording(f"{flight}.tlog")))
+
+
+def is_whole(flight: str) -> bool:
+    return recording(f"{flight}.tlog").parent == LONG
+
+
+def message_id(raw: bytes) -> int:
+    return int.from_bytes(raw[7:10], "little")
+
+
+@pytest.mark.parametrize("flight", FLIGHTS)
+def test_frames_one_by_one_are_what_pymavlink_reads(flight: str) -> None:
+    framer, peers = Framer(), [ardupilotmega.MAVLink(None), development.MAVLink(None)]
+    for raw in records(flight):
+        theirs: Any = next(filter(is_known, (peer.parse_buffer(raw)[0] for peer in peers)), None)
+        frames = framer.receive(raw)
+        assert len(frames) == (theirs is not None)
+        for frame in frames:
+            assert frame.raw == raw
+            assert (frame.system_id, frame.component_id) == (
+                theirs.get_srcSystem(),
+                theirs.get_srcComponent(),
+            )
+            assert (frame.message_id, frame.sequence) == (theirs.get_msgId(), theirs.get_seq())
+            assert same(STANDARD.decode(frame).to_dict(), peer_fields(theirs))
+
+
+def is_known(theirs: Any) -> bool:
+    return not isinstance(theirs, (ardupilotmega.MAVLink_unknown, development.MAVLink_unknown))
+
+
+@pytest.mark.parametrize("flight", FLIGHTS)
+def test_counts(flight: str) -> None:
+    raws = records(flight)
+    framer = Framer()
+    seen = sum(len(framer.receive(raw)) for raw in raws)
+    statistics = framer.statistics
+    assert len(raws) == (COUNTS if is_whole(flight) else SHORT_COUNTS)[flight]
+    assert len({message_id(raw) for raw in raws}) == KINDS[flight]
+    assert statistics.frames == seen == len(raws) - statistics.unknown_ids
+    assert (statistics.bad_bytes, statistics.bad_crcs) == (0, 0)
+    assert statistics.unknown_ids == sum(message_id(raw) in UNKNOWN for raw in raws)
+    if is_whole(flight):
+        assert [source.lost for source in statistics.sources.values()] == [0, 0]
+
+
+@pytest.mark.parametrize("flight", FLIGHTS)
+def test_as_one_stream_in_pieces_of_any_size(flight: str) -> None:
+    raws = records(flight)
+    stream, framer, chance = b"".join(raws), Framer(), random.Random(flight)
+    found: list[Frame] = []
+    place = 0
+    while place < len(stream):
+        size = chance.choice((1, 2, 7, 30, 300, 3000))
+        found += framer.receive(stream[place : place + size])
+        place += size
+    assert [frame.raw for frame in found] == [raw for raw in raws if message_id(raw) not in UNKNOWN]
+    assert framer.statistics.bad_bytes == 0
+
+
+@pytest.mark.parametrize("size", [1, 13, 64, 4096])
+def test_a_serial_port_at_boot_begins_with_text(size: int) -> None:
+    path = recording(BOOT)
+    stream = path.read_bytes() if size > 1 else path.read_bytes()[:4096]
+    framer = Framer()
+    frames = [frame for i in range(0, len(stream), size) for frame in framer.receive(stream[i : i + size])]
+    assert len(frames) == (33_760 if len(stream) > 4096 else 106)
+    assert [frame.sequence for frame in frames[:100]] == list(range(100))
+    assert STANDARD.decode(frames[0]).to_dict()["text"] == "RCInput: decoding UDP (Pulses)"
+    assert framer.statistics.bad_bytes >= 152  # the text before the first frame
+    assert framer.statistics.bad_crcs == 0

@@ -1,0 +1,134 @@
+"""Random messages of every kind, ours and pymavlink's of the same fields, and how to compare the two."""
+
+from __future__ import annotations
+
+import math
+import random
+import struct
+from collections.abc import Iterator
+from importlib import import_module
+from typing import Any
+
+from aerokit.mavlink import STANDARD, Field, Message
+
+__all__ = ["PEERS", "peer_class", "peer_fields", "peer_message", "random_message", "same", "samples"]
+
+PEERS = ("ardupilotmega", "development")
+"""Pymavlink's dialects which together know every message of `STANDARD`."""
+
+_BITS = {"int8_t": 7, "uint8_t": 8, "int16_t": 15, "uint16_t": 16, "int32_t": 31, "uint32_t": 32} | {
+    "int64_t": 63,
+    "uint64_t": 64,
+}
+_ODD_FLOATS = (0.0, -0.0, 1.0, -1.5, math.inf, -math.inf, math.nan, 3.4028234e38, 1e-45, 0.1)
+_LETTERS = "abcXYZ019 _-%µß→"
+
+
+def samples(message_class: type[Message], count: int = 6) -> Iterator[Message]:
+    """Messages with random fields, always the same ones; the first has nothing but zeros, the second the extremes."""
+    chance = random.Random(message_class.ID)
+    for number in range(count):
+        yield random_message(message_class, chance, ("zeros", "extremes")[number] if number < 2 else "random")
+
+
+def random_message(message_class: type[Message], chance: random.Random, kind: str = "random") -> Message:
+    """A message whose fields are zeros, at their extremes, or random."""
+    return message_class(**{field.name: _value(field, chance, kind) for field in message_class.FIELDS})
+
+
+def _value(field: Field, chance: random.Random, kind: str) -> Any:
+    if field.type == "char":
+        return _text(field.array_length or 1, chance, kind)
+    if not field.array_length:
+        return _number(field.type, chance, kind)
+    if field.type == "uint8_t":
+        return bytes(_number("uint8_t", chance, kind) for _ in range(field.array_length))
+    return tuple(_number(field.type, chance, kind) for _ in range(field.array_length))
+
+
+def _number(kind: str, chance: random.Random, how: str) -> Any:
+    if how == "zeros":
+        return 0
+    if kind in ("float", "double"):
+        value = (
+            chance.choice(_ODD_FLOATS) if how == "extremes" or chance.random() < 0.3 else chance.gauss(0, 1e3)
+        )
+        return _rounded(value) if kind == "float" else value
+    bits = _BITS[kind]
+    low, high = (0 if kind.startswith("u") else -(1 << bits)), (1 << bits) - 1
+    if how == "extremes":
+        return chance.choice((low, high))
+    return 0 if chance.random() < 0.2 else chance.randint(low, high)
+
+
+def _rounded(value: float) -> float:
+    """The nearest value that a float of four bytes can have, so that a round trip gives it back."""
+    return float(struct.unpack("<f", struct.pack("<f", value))[0])
+
+
+def _text(size: int, chance: random.Random, how: str) -> str:
+    if how == "zeros":
+        return ""
+    text = "".join(
+        chance.choice(_LETTERS) for _ in range(size if how == "extremes" else chance.randint(0, size))
+    )
+    return text.encode()[:size].decode(errors="ignore")
+
+
+# -------------------------------------------------------------------------------------- pymavlink
+
+
+def dialect_module(name: str, version: int) -> Any:
+    """Pymavlink's module for a dialect and a version of the protocol."""
+    return import_module(f"pymavlink.dialects.v{version}0.{name}")
+
+
+def peer_class(message_class: type[Message], version: int) -> tuple[Any, Any]:
+    """Pymavlink's (module, class) for one of our classes; MAVLink 1 has none above 255."""
+    for name in PEERS:
+        module = dialect_module(name, version)
+        if message_class.ID in module.mavlink_map:
+            return module, module.mavlink_map[message_class.ID]
+    raise LookupError(f"no dialect of pymavlink knows {message_class.NAME} in version {version}")
+
+
+def peer_message(message: Message, version: int) -> tuple[Any, Any]:
+    """Pymavlink's (module, message) with the same fields."""
+    module, cls = peer_class(type(message), version)
+    fields = [field for field in message.FIELDS if field.name in cls.fieldnames]
+    return module, cls(**{field.name: _for_peer(field, getattr(message, field.name)) for field in fields})
+
+
+def _for_peer(field: Field, value: Any) -> Any:
+    if field.type == "char":
+        return value.encode()
+    return list(value) if field.array_length else value
+
+
+def peer_fields(message: Any) -> dict[str, Any]:
+    """What pymavlink decoded, in our types; its text goes on behind the first NUL, ours ends there."""
+    fields = [field for field in STANDARD[message.get_msgId()].FIELDS if field.name in message.fieldnames]
+    return {field.name: _from_peer(field, message) for field in fields}
+
+
+def _from_peer(field: Field, message: Any) -> Any:
+    if field.type == "char":
+        raw = getattr(message, f"_{field.name}_raw")
+        return raw.partition(b"\0")[0].decode(errors="replace")
+    value = getattr(message, field.name)
+    if field.array_length:
+        return bytes(value) if field.type == "uint8_t" else tuple(value)
+    return value
+
+
+def same(ours: dict[str, Any], theirs: dict[str, Any]) -> bool:
+    """Whether all fields are equal, NaN being equal to NaN."""
+    return ours == theirs or (
+        ours.keys() == theirs.keys() and all(_equal(ours[name], theirs[name]) for name in ours)
+    )
+
+
+def _equal(one: Any, other: Any) -> bool:
+    if isinstance(one, tuple) and isinstance(other, tuple) and len(one) == len(other):
+        return all(map(_equal, one, other))
+    return bool(one == other or (one != one and other != other))
