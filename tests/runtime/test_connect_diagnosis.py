@@ -1,0 +1,151 @@
+"""A connect that fails says what it heard, and what it was waiting for."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+
+import anyio
+import pytest
+from pymavlink.dialects.v20 import minimal as pymavlink
+
+from aerokit import connect
+from aerokit.errors import ConnectFailed, LinkLost, LocalProtocolError
+from aerokit.links import MemoryLink, Peer, memory_link_pair
+from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.messages import Attitude, Heartbeat
+
+pytestmark = pytest.mark.anyio
+
+GCS = Heartbeat(6, 8, 0, 0, 4)
+GIMBAL = Heartbeat(26, 8, 0, 0, 4)
+COPTER = Heartbeat(2, 3, 81, 0, 3)
+ATTITUDE = Attitude(0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+UNKNOWN_FRAME = bytes.fromhex("fd0100000001018888880011f0")
+
+
+class FarEnd:
+    """Whoever is at the other end of the link: sends the same bytes again and again."""
+
+    def __init__(self) -> None:
+        self.heard = b""
+
+    def bytes_received(self, data: bytes, peer: Peer) -> None:
+        self.heard += data
+
+    def link_lost(self, error: LinkLost) -> None:
+        """Nothing to do."""
+
+
+@asynccontextmanager
+async def link_that_says(speak: Callable[[], bytes]) -> AsyncIterator[MemoryLink]:
+    near, far = memory_link_pair()
+    await far.open(FarEnd())
+
+    async def go_on() -> None:
+        while True:
+            far.write(speak())
+            await anyio.sleep(0.5)
+
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(go_on)
+        yield near
+        tasks.cancel_scope.cancel()
+    far.close()
+
+
+def saying(system_id: int, component_id: int, *messages: Heartbeat | Attitude) -> Callable[[], bytes]:
+    encoder = FrameEncoder(system_id, component_id)
+    return lambda: b"".join(encoder.encode(message) for message in messages)
+
+
+def heartbeat_of_system_0() -> bytes:
+    """Our own encoder refuses to be nobody."""
+    nobody = pymavlink.MAVLink(None, srcSystem=0, srcComponent=1)
+    return bytes(pymavlink.MAVLink_heartbeat_message(2, 3, 81, 0, 3, 3).pack(nobody))
+
+
+def damaged(speak: Callable[[], bytes]) -> Callable[[], bytes]:
+    return lambda: speak()[:-1] + b"\xaa"
+
+
+@pytest.mark.parametrize(
+    ("speak", "system_id", "text"),
+    [
+        (lambda: b"", None, "not a single byte was heard"),
+        (lambda: b"Init ArduCopter V4.7\n", None, "no MAVLink frame: wrong baud rate, or another protocol"),
+        (lambda: b"\x00\xff\x13" * 20, None, "no MAVLink frame"),
+        (damaged(saying(1, 1, ATTITUDE)), None, "damaged frames and no good one"),
+        (lambda: UNKNOWN_FRAME, None, "unknown dialect"),
+        (saying(1, 1, ATTITUDE), None, "no HEARTBEAT among them"),
+        (saying(255, 190, GCS), None, r"only ground stations were heard \(255/190\)"),
+        (saying(1, 154, GIMBAL), None, r"no autopilot were heard \(1/154\)"),
+        (saying(7, 1, COPTER), 3, r"other system ids were heard: 7 \(wanted: 3\)"),
+        (heartbeat_of_system_0, None, "no HEARTBEAT among them"),
+    ],
+    ids=[
+        *("nothing", "text", "noise", "damaged", "dialect", "no heartbeat", "ground stations", "gimbal"),
+        *("other vehicle", "system id 0"),
+    ],
+)
+async def test_it_says_what_was_heard(speak: Callable[[], bytes], system_id: int | None, text: str) -> None:
+    async with link_that_says(speak) as link:
+        with pytest.raises(ConnectFailed, match=text) as caught:
+            async with connect(link, system_id=system_id, timeout=5):
+                pytest.fail("there is no vehicle")
+    assert "within 5 s on memory:near" in str(caught.value)
+    assert "no heartbeat of" in str(caught.value)
+
+
+async def test_there_is_a_deadline_by_default() -> None:
+    started = anyio.current_time()
+    async with link_that_says(lambda: b"") as link:
+        with pytest.raises(ConnectFailed, match="within 30 s"):
+            async with connect(link):
+                pytest.fail("there is no vehicle")
+    assert 30 <= anyio.current_time() - started < 31
+
+
+async def test_a_link_that_goes_while_waiting_is_told_at_once() -> None:
+    near, far = memory_link_pair()
+    await far.open(FarEnd())
+
+    async def unplug() -> None:
+        await anyio.sleep(2)
+        far.close()
+
+    started = anyio.current_time()
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(unplug)
+        with pytest.raises(LinkLost):
+            async with connect(near):
+                pytest.fail("there is no vehicle")
+    assert anyio.current_time() - started < 3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        ({"system_id": 0}, "system_id = 0"),
+        ({"system_id": 256}, "system_id = 256"),
+        ({"timeout": 0}, "timeout = 0"),
+        ({"source_system": 0}, "source_system = 0"),
+        ({"source_component": 256}, "source_component = 256"),
+        ({"mavlink_version": 3}, "mavlink_version = 3"),
+    ],
+)
+async def test_wrong_arguments_are_refused_before_anything_is_opened(
+    arguments: dict[str, int], text: str
+) -> None:
+    near, _ = memory_link_pair()
+    with pytest.raises(LocalProtocolError, match=text):
+        async with connect(near, **arguments):  # type: ignore[arg-type]
+            pytest.fail("nothing is opened")
+    await near.open(FarEnd())  # it was not opened before
+    near.close()
+
+
+async def test_a_wrong_address_shows_the_accepted_forms() -> None:
+    with pytest.raises(LocalProtocolError, match="udpin"):
+        async with connect("carrier pigeon"):
+            pytest.fail("there is no such link")

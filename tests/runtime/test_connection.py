@@ -1,0 +1,311 @@
+"""The connection as an async context manager: what comes out of it, how it ends, and that nothing is left behind."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import threading
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+
+import anyio
+import anyio.lowlevel
+import pytest
+
+from aerokit import Vehicle, VelocitySetpoint, connect, open_connection
+from aerokit.errors import BusyError, ConnectFailed, ConnectionClosed, LinkLost, LinkOpenError
+from aerokit.links import MemoryLink, Peer, memory_link_pair
+from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.framer import Framer
+from aerokit.mavlink.messages import Attitude, CommandLong, Heartbeat
+from aerokit.runtime.connection import Connection
+from aerokit.runtime.events import LinkClosed
+from aerokit.sim import SimulatedCopter, simulated_link
+
+pytestmark = pytest.mark.anyio
+
+COPTER = Heartbeat(2, 3, 81, 0, 3)
+
+
+class Ear:
+    """The far end of a link: keeps what it hears."""
+
+    def __init__(self) -> None:
+        self.data = b""
+        self.times: list[float] = []
+
+    def bytes_received(self, data: bytes, peer: Peer) -> None:
+        self.data += data
+        self.times.append(anyio.current_time())
+
+    def link_lost(self, error: LinkLost) -> None:
+        """Nothing to do."""
+
+
+@asynccontextmanager
+async def far_end() -> AsyncIterator[tuple[MemoryLink, MemoryLink, Ear]]:
+    near, far = memory_link_pair()
+    ear = Ear()
+    await far.open(ear)
+    yield near, far, ear
+    far.close()
+
+
+# ------------------------------------------------------------------------------------ what goes out
+
+
+async def test_our_heartbeat_goes_out_at_1_hz_from_the_start() -> None:
+    async with far_end() as (near, _, ear), open_connection(near, source_system=254, source_component=191):
+        await anyio.sleep(5.5)
+        frames = Framer().receive(ear.data)
+        assert {(frame.system_id, frame.component_id, frame.message_id) for frame in frames} == {
+            (254, 191, 0)
+        }
+        assert len(frames) == 6
+        gaps = [later - earlier for earlier, later in zip(ear.times, ear.times[1:], strict=False)]
+        assert gaps == pytest.approx([1.0] * 5)
+        assert ear.times[0] < 0.1
+
+
+async def test_a_message_out_of_range_is_not_sent() -> None:
+    async with far_end() as (near, _, ear), open_connection(near) as connection:
+        await anyio.sleep(0.1)
+        before = ear.data
+        with pytest.raises(ValueError, match="target_system"):
+            connection.send(CommandLong(300, 1, 400, 0, *(0.0,) * 7))
+        await anyio.sleep(0.1)
+        assert ear.data == before
+
+
+# --------------------------------------------------------------------------- what comes out of the block
+
+
+class Mine(BaseException):
+    """An exception of the program's own, and no Exception."""
+
+
+@pytest.mark.parametrize(
+    "error",
+    [ValueError("mine"), KeyboardInterrupt(), SystemExit(3), Mine()],
+    ids=lambda error: type(error).__name__,
+)
+async def test_exceptions_of_the_body_come_out_as_they_are(error: BaseException) -> None:
+    async with simulated_link(SimulatedCopter(boot_time_s=0)) as link:
+        with pytest.raises(type(error)) as caught:
+            async with connect(link):
+                raise error
+        assert caught.value is error
+
+
+async def test_cancellation_of_the_body_is_no_error() -> None:
+    async with simulated_link(SimulatedCopter(boot_time_s=0)) as link:
+        with anyio.move_on_after(2) as scope:
+            async with connect(link):
+                await anyio.sleep_forever()
+        assert scope.cancelled_caught
+
+
+async def test_a_return_out_of_the_block() -> None:
+    async def mode() -> str:
+        async with simulated_link(SimulatedCopter(boot_time_s=0)) as link, connect(link) as vehicle:
+            return vehicle.mode_name
+
+    assert await mode() == "STABILIZE"
+
+
+async def test_a_mistake_of_ours_ends_the_connection_and_is_no_group(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with simulated_link(SimulatedCopter(boot_time_s=0)) as link, connect(link) as vehicle:
+
+        def broken(*_: object) -> None:
+            raise ZeroDivisionError("ours")
+
+        monkeypatch.setattr(vehicle.telemetry, "expire", broken)
+        with pytest.raises(ConnectionClosed, match="ZeroDivisionError"):
+            await vehicle.mode.wait_until(lambda mode: mode.name == "NEVER", timeout=10)
+        assert not vehicle.connection.is_open
+
+
+# ----------------------------------------------------------------------------------- how it ends
+
+
+async def test_close_is_idempotent_and_ends_what_waits() -> None:
+    async with simulated_link(SimulatedCopter(boot_time_s=0)) as link, connect(link) as vehicle:
+
+        async def close() -> None:
+            await anyio.sleep(1)
+            vehicle.connection.close()
+            vehicle.connection.close()
+
+        closing = asyncio.ensure_future(close())
+        with pytest.raises(ConnectionClosed, match="was closed"):
+            await vehicle.mode.wait_until(lambda mode: mode.name == "NEVER", timeout=10)
+        await closing
+        for use in (
+            lambda: vehicle.connection.send(COPTER),
+            lambda: vehicle.send(COPTER),
+        ):
+            with pytest.raises(ConnectionClosed):
+                use()
+
+
+async def test_a_lost_link_ends_everything_that_waits() -> None:
+    closed: list[LinkClosed] = []
+    errors: list[type[BaseException]] = []
+    async with far_end() as (near, far, _):
+        encoder = FrameEncoder(1, 1)
+        far.write(encoder.encode(COPTER))
+
+        async def note(wait: Callable[[], Awaitable[object]]) -> None:
+            try:
+                await wait()
+            except LinkLost as error:
+                errors.append(type(error))
+
+        async with open_connection(near) as connection:
+            far.write(encoder.encode(COPTER))
+            async with connect(connection, rates={}) as vehicle:
+                connection.bus.attach_event(LinkClosed, closed.append)
+
+                async def read() -> None:
+                    with vehicle.subscribe(Attitude) as attitudes:
+                        await attitudes.get()
+
+                async with anyio.create_task_group() as tasks:
+                    tasks.start_soon(note, read)
+                    tasks.start_soon(note, vehicle.arm)
+                    tasks.start_soon(note, vehicle.wait_ready)
+                    tasks.start_soon(note, lambda: vehicle.position.wait_until(lambda _: True))
+                    await anyio.sleep(0.5)
+                    far.close()
+    assert len(closed) == 1
+    assert errors == [LinkLost] * 4
+
+
+async def test_closing_is_bounded_when_the_link_hangs(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with simulated_link(SimulatedCopter(boot_time_s=0)) as link:
+
+        async def hang() -> None:
+            await anyio.sleep_forever()
+
+        monkeypatch.setattr(link, "wait_closed", hang)
+        async with open_connection(link):
+            await anyio.sleep(1)
+            started = anyio.current_time()
+        assert anyio.current_time() - started <= 3
+
+
+async def test_an_error_on_opening_leaves_nothing_open(monkeypatch: pytest.MonkeyPatch) -> None:
+    near, _ = memory_link_pair()
+
+    async def refuse(receiver: object) -> None:
+        raise LinkOpenError("no")
+
+    monkeypatch.setattr(near, "open", refuse)
+    with pytest.raises(LinkOpenError, match="no"):
+        async with open_connection(near):
+            pytest.fail("not open")
+
+
+# ------------------------------------------------------------------------------- several vehicles, one link
+
+
+async def test_a_vehicle_has_one_object_on_a_connection() -> None:
+    copter = SimulatedCopter(boot_time_s=0)
+    async with simulated_link(copter) as link, open_connection(link) as connection:
+        async with connect(connection) as vehicle:
+            with pytest.raises(BusyError, match="system 1"):
+                async with connect(connection):
+                    pytest.fail("there is one already")
+        assert vehicle.connection.is_open
+        async with connect(connection) as again:
+            assert again.is_armed is False
+
+
+async def test_what_names_its_target_goes_only_where_that_was_heard() -> None:
+    """Three peers on one listening link; a command to system 2 reaches its peer alone, heartbeats reach all."""
+    link = SeveralPeers()
+    async with open_connection(link) as connection:
+        for system_id, peer in ((1, "one"), (2, "two"), (3, "three")):
+            link.receive(FrameEncoder(system_id, 1).encode(COPTER), peer)
+        connection.send(CommandLong(2, 1, 400, 0, *(0.0,) * 7))
+        assert link.sent_to(76) == ["two"]
+        link.receive(FrameEncoder(2, 1).encode(COPTER), "elsewhere")  # the vehicle's port has changed
+        connection.send(CommandLong(2, 1, 400, 0, *(0.0,) * 7))
+        assert link.sent_to(76) == ["two", "elsewhere"]
+        connection.send(Heartbeat(6, 8, 0, 0, 4))
+        assert link.sent_to(0)[-1] is None
+
+
+class SeveralPeers(MemoryLink):
+    """A link with peers by name."""
+
+    def __init__(self) -> None:
+        super().__init__("memory:several")
+        self.sent: list[tuple[int, Peer]] = []
+        self.connection: Connection | None = None
+
+    async def open(self, receiver: object) -> None:
+        assert isinstance(receiver, Connection)
+        self.connection = receiver
+
+    def write(self, data: bytes, peer: Peer = None) -> None:
+        self.sent += [(frame.message_id, peer) for frame in Framer().receive(data)]
+
+    def receive(self, data: bytes, peer: Peer) -> None:
+        assert self.connection is not None
+        self.connection.bytes_received(data, peer)
+
+    def sent_to(self, message_id: int) -> list[Peer]:
+        return [peer for sent_id, peer in self.sent if sent_id == message_id]
+
+
+# -------------------------------------------------------------------------- nothing is left behind
+
+
+def scheduled_timers() -> list[asyncio.TimerHandle]:
+    loop = asyncio.get_running_loop()
+    timers: list[asyncio.TimerHandle] = loop._scheduled  # type: ignore[attr-defined]
+    return [timer for timer in timers if not timer.cancelled()]
+
+
+async def use(vehicle: Vehicle) -> None:
+    """A program that does a little of everything and never ends by itself."""
+    await vehicle.wait_ready()
+    await vehicle.set_mode("GUIDED")
+    await vehicle.arm()
+    await vehicle.take_off(5)
+    with vehicle.subscribe(Attitude, rate_hz=20) as attitudes:
+        await attitudes.get()
+    async with vehicle.guided.velocity() as stream:
+        await stream.fly(VelocitySetpoint(1, 0, 0), 3)
+    await anyio.sleep_forever()
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.0005, 0.3, 1.0, 1.06, 1.2, 2.0, 3.3, 5.0, 8.0, 12.0])
+async def test_cancelled_at_any_time_it_leaves_nothing_behind(seconds: float) -> None:
+    tasks_before, threads_before = asyncio.all_tasks(), threading.active_count()
+    connection: Connection | None = None
+    async with simulated_link(SimulatedCopter(boot_time_s=1)) as link:
+        with anyio.move_on_after(seconds):
+            async with connect(link) as vehicle:
+                connection = vehicle.connection
+                await use(vehicle)
+    await anyio.lowlevel.checkpoint()
+    assert asyncio.all_tasks() == tasks_before
+    assert threading.active_count() == threads_before
+    gc.collect()
+    assert not [t for t in scheduled_timers() if "aerokit" in repr(t)]
+    if connection is not None:
+        assert set(connection.bus.wanted) == {Heartbeat.ID}
+        assert not connection.bus._event_sinks
+        assert connection._enders == []
+
+
+async def test_a_connect_that_fails_leaves_nothing_behind() -> None:
+    tasks_before = asyncio.all_tasks()
+    async with far_end() as (near, _, _ear):
+        with pytest.raises(ConnectFailed):
+            async with connect(near, timeout=2):
+                pytest.fail("nobody is there")
+        assert asyncio.all_tasks() == tasks_before
+        assert not scheduled_timers()
