@@ -17,6 +17,23 @@ class Point(Snapshot):
     y: float = 2.0
 
 
+class Seen(Snapshot):
+    """Something at a time."""
+
+    at: float
+
+
+class Heard(Seen):
+    """More of it."""
+
+    text: str
+    loudness: float = 1.0
+
+
+class HeardAgain(Heard):
+    """The same with another name."""
+
+
 class Positive(Snapshot):
     """A number above zero."""
 
@@ -57,6 +74,18 @@ def test_repr_and_matching() -> None:
     match Point(1, 7):
         case Point(x, y):
             assert (x, y) == (1, 7)
+
+
+def test_fields_of_the_base_class_come_first() -> None:
+    heard = Heard(1.5, "ping")
+    assert heard.to_dict() == {"at": 1.5, "text": "ping", "loudness": 1.0}
+    assert (Seen(1.5) == heard, heard == Heard(1.5, "ping", 1.0)) == (False, True)
+    assert not hasattr(heard, "__dict__")
+
+
+def test_a_subclass_without_fields_of_its_own_is_made_the_same_way() -> None:
+    assert repr(HeardAgain(1, "ping")) == "HeardAgain(at=1, text='ping', loudness=1.0)"
+    assert HeardAgain(1, "ping") != Heard(1, "ping")
 
 
 def test_a_check_refuses_nonsense() -> None:

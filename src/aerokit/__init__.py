@@ -14,21 +14,27 @@ asyncio.run(main())
 ```
 """
 
-from aerokit import errors, events
-from aerokit.mavlink import enums, messages
-from aerokit.mavlink.dialect import Dialect
-from aerokit.runtime.connection import Connection, open_connection
-from aerokit.vehicle.connect import connect
-from aerokit.vehicle.setpoints import (
-    AccelerationSetpoint,
-    AttitudeSetpoint,
-    BodyVelocitySetpoint,
-    LocalPositionSetpoint,
-    PositionSetpoint,
-    VelocitySetpoint,
-)
-from aerokit.vehicle.values import Position
-from aerokit.vehicle.vehicle import Vehicle
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from aerokit import errors, events
+    from aerokit.mavlink import enums, messages
+    from aerokit.mavlink.dialect import Dialect
+    from aerokit.runtime.connection import Connection, open_connection
+    from aerokit.vehicle.connect import connect
+    from aerokit.vehicle.setpoints import (
+        AccelerationSetpoint,
+        AttitudeSetpoint,
+        BodyVelocitySetpoint,
+        LocalPositionSetpoint,
+        PositionSetpoint,
+        VelocitySetpoint,
+    )
+    from aerokit.vehicle.values import Position
+    from aerokit.vehicle.vehicle import Vehicle
 
 __version__ = "0.1.0"
 
@@ -50,3 +56,35 @@ __all__ = [
     "messages",
     "open_connection",
 ]
+
+# Imported when first asked for: whoever wants `aerokit.messages` does not pay for asyncio.
+_HOMES = {
+    "AccelerationSetpoint": "aerokit.vehicle.setpoints",
+    "AttitudeSetpoint": "aerokit.vehicle.setpoints",
+    "BodyVelocitySetpoint": "aerokit.vehicle.setpoints",
+    "Connection": "aerokit.runtime.connection",
+    "Dialect": "aerokit.mavlink.dialect",
+    "LocalPositionSetpoint": "aerokit.vehicle.setpoints",
+    "Position": "aerokit.vehicle.values",
+    "PositionSetpoint": "aerokit.vehicle.setpoints",
+    "Vehicle": "aerokit.vehicle.vehicle",
+    "VelocitySetpoint": "aerokit.vehicle.setpoints",
+    "connect": "aerokit.vehicle.connect",
+    "enums": "aerokit.mavlink.enums",
+    "errors": "aerokit.errors",
+    "events": "aerokit.events",
+    "messages": "aerokit.mavlink.messages",
+    "open_connection": "aerokit.runtime.connection",
+}
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    home = import_module(_HOMES[name])
+    value = globals()[name] = getattr(home, name, home)  # the name in its module, or the module
+    return value
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *__all__]

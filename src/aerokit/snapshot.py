@@ -26,17 +26,18 @@ class _SnapshotType(type):
 
     def __new__(mcs, name: str, bases: tuple[type, ...], namespace: dict[str, Any]) -> _SnapshotType:
         annotations: dict[str, str] = namespace.get("__annotations__", {})
-        fields = tuple(field for field, kind in annotations.items() if not kind.startswith("ClassVar"))
-        defaults = {field: namespace.pop(field) for field in fields if field in namespace}
-        cls = super().__new__(mcs, name, bases, {**namespace, "__slots__": fields, "__match_args__": fields})
-        if fields:
+        own = tuple(field for field, kind in annotations.items() if not kind.startswith("ClassVar"))
+        defaults = {field: namespace.pop(field) for field in own if field in namespace}
+        fields = (*(field for base in bases for field in getattr(base, "__match_args__", ())), *own)
+        cls = super().__new__(mcs, name, bases, {**namespace, "__slots__": own, "__match_args__": fields})
+        if own:
             _write_init(cls, fields, defaults)
         return cls
 
 
 def _write_init(cls: type, fields: tuple[str, ...], defaults: dict[str, Any]) -> None:
     """``def __init__(self, a, b=default)``, which sets the slots directly, behind __setattr__'s back."""
-    scope: dict[str, Any] = {f"_set_{field}": cls.__dict__[field].__set__ for field in fields}
+    scope: dict[str, Any] = {f"_set_{field}": getattr(cls, field).__set__ for field in fields}
     scope.update({f"_default_{field}": value for field, value in defaults.items()})
     arguments = [f"{field}=_default_{field}" if field in defaults else field for field in fields]
     lines = [f"def __init__(self, {', '.join(arguments)}):", *(f" _set_{f}(self, {f})" for f in fields)]
@@ -51,7 +52,8 @@ def _write_init(cls: type, fields: tuple[str, ...], defaults: dict[str, Any]) ->
 class Snapshot(metaclass=_SnapshotType):
     """Base of the values that programs read: immutable, comparable, printable.
 
-    A subclass may have a method ``_check(self)``, which raises when the fields make no sense together.
+    A subclass may have a method ``_check(self)``, which raises when the fields make no sense together. The fields of
+    a base class come first, and must have no defaults.
     """
 
     __match_args__: ClassVar[tuple[str, ...]]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping
 
 from aerokit.errors import LocalProtocolError
@@ -98,6 +97,8 @@ class ModeTable:
         return int(number)
 
     def _unknown(self, name: str, extra: Mapping[int, str]) -> str:
+        import difflib  # only now: it is needed for this text alone
+
         known = [*self.names, *(extra[n] for n in sorted(extra) if n not in self._names)]
         close = difflib.get_close_matches(name.upper(), known, n=1)
         hint = f" (did you mean {close[0]!r}?)" if close else ""

@@ -5,11 +5,11 @@ from __future__ import annotations
 import ipaddress
 import math
 import re
-from dataclasses import dataclass
 from typing import Literal, NoReturn
 from urllib.parse import quote, unquote
 
 from aerokit.errors import LocalProtocolError
+from aerokit.snapshot import Snapshot
 
 __all__ = ["ACCEPTED_FORMS", "LinkAddress", "LinkKind", "host_and_port", "parse_address"]
 
@@ -28,8 +28,7 @@ ACCEPTED_FORMS = """\
 """What an address may look like, for error messages and help texts."""
 
 
-@dataclass(frozen=True)
-class LinkAddress:
+class LinkAddress(Snapshot):
     """A connection string, taken apart; ``str()`` gives the canonical one, which parses back to the same."""
 
     kind: LinkKind

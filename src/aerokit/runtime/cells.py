@@ -6,10 +6,10 @@ import asyncio
 import math
 from collections import deque
 from collections.abc import AsyncIterator, Callable
-from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 from aerokit.errors import OperationTimeout, StaleValueError, ValueUnknownError
+from aerokit.snapshot import Snapshot
 
 __all__ = ["Changes", "Source", "StateCell"]
 
@@ -18,8 +18,7 @@ T = TypeVar("T")
 _SEEN = 3  # how many of the last distinct values a time-out names
 
 
-@dataclass(frozen=True)
-class Source:
+class Source(Snapshot):
     """Who said it: system id, component id and the name of the message it came in."""
 
     system_id: int
