@@ -140,12 +140,9 @@ async def test_close_is_idempotent_and_ends_what_waits() -> None:
         with pytest.raises(ConnectionClosed, match="was closed"):
             await vehicle.mode.wait_until(lambda mode: mode.name == "NEVER", timeout=10)
         await closing
-        for use in (
-            lambda: vehicle.connection.send(COPTER),
-            lambda: vehicle.send(COPTER),
-        ):
+        for send in (vehicle.connection.send, vehicle.send):
             with pytest.raises(ConnectionClosed):
-                use()
+                send(COPTER)
 
 
 async def test_a_lost_link_ends_everything_that_waits() -> None:

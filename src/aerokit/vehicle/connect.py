@@ -57,7 +57,7 @@ async def connect(
         baud: of a serial link whose address names none.
         dialect: the messages that are understood.
         mavlink_version: of what we send, 1 or 2.
-        record: a ``.tlog`` file for everything received and sent.
+        record: a ``.tlog`` file for everything received and sent; an existing file is replaced.
 
     Raises:
         LocalProtocolError: an argument is wrong. Nothing was opened.
