@@ -1,0 +1,54 @@
+"""The README tells the truth: its programs fly, its commands are complete, its links lead somewhere."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from served_copter import served_copter
+
+ROOT = Path(__file__).parent.parent
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+ADDRESS = "udpin:0.0.0.0:14550"
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```$", README, flags=re.DOTALL | re.MULTILINE)
+
+
+@pytest.mark.parametrize("number", [0, 1], ids=["async", "blocking"])
+def test_the_programs_fly(number: int) -> None:
+    program = blocks("python")[number]
+    assert program.count(ADDRESS) == 1
+    assert len([line for line in program.splitlines() if line.strip()]) <= 10
+    with served_copter(speedup=40.0) as address:
+        exec(compile(program.replace(ADDRESS, address), "README.md", "exec"), {"__name__": "__main__"})
+
+
+def test_there_are_no_other_programs() -> None:
+    assert len(blocks("python")) == 2
+
+
+def test_the_commands_stand_on_one_line_each_in_blocks_of_their_own() -> None:
+    commands = [block.strip() for block in blocks("sh")]
+    assert len(commands) == 2
+    for command, last in zip(commands, ("aerokit demo", "pytest"), strict=True):
+        assert "\n" not in command
+        assert command.startswith("python3 -m venv .venv && .venv/bin/pip install ")
+        assert command.endswith(f"&& .venv/bin/{last}")
+
+
+def test_ci_runs_the_readmes_test_command() -> None:
+    found = next(line for line in README.splitlines() if line.endswith("pytest"))
+    assert found == blocks("sh")[1].strip()
+
+
+DOCUMENTS = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
+def test_links_lead_somewhere(path: Path) -> None:
+    for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", path.read_text(encoding="utf-8")):
+        if "://" not in target and not (path.name == "README.md" and target == "docs/benchmarks.md"):
+            assert (path.parent / target).exists(), f"{path.name} links to {target}"
