@@ -1,7 +1,5 @@
 """Set-point streams: what goes over the wire, and that nothing goes over it once nobody feeds them."""
 
-# ruff: noqa: PT012  (an `async with` inside `pytest.raises` is what these tests are about)
-
 from __future__ import annotations
 
 import itertools
@@ -413,7 +411,7 @@ async def test_wrong_setpoints_are_refused_before_anything_is_sent(flying: Fligh
         guided.attitude(AttitudeSetpoint(math.nan, 0.0, 0.0, 0.5)),
     ):
         with pytest.raises(LocalProtocolError):
-            async with stream:  # type: ignore[attr-defined]
+            async with stream:
                 raise AssertionError("entered")
     await anyio.sleep(1.0)
     assert not flying.wire.mode_orders()
@@ -427,7 +425,7 @@ async def test_a_wrong_setpoint_leaves_the_one_before_in_force(flying: Flight) -
             stream.set(VelocitySetpoint(math.nan))
         flying.wire.forget()
         await anyio.sleep(1.0)
-        assert {each.vx for each in flying.wire.all(m.SetPositionTargetLocalNed)} == {3.0}  # type: ignore[attr-defined]
+        assert {each.vx for each in flying.wire.all(m.SetPositionTargetLocalNed)} == {3.0}
 
 
 async def test_kinds_that_the_autopilot_ignores_are_not_offered() -> None:

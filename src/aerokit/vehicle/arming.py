@@ -101,6 +101,7 @@ class ArmingActions(ModeActions):
             raise OperationRejected("reboot: the vehicle is armed; nothing was sent")
         reboots = self._watch.reboots
         await self._explained_command(PREFLIGHT_REBOOT_SHUTDOWN, 1, *(0.0,) * 4, FORCE_REBOOT if force else 0)
+        self._watch.expect_reboot()
         with anyio.move_on_after(timeout):
             while self._watch.reboots == reboots:
                 self.connection.raise_if_ended()

@@ -117,6 +117,8 @@ class MessageRates:
         if stream is None:
             stream = self._streams[message_type.ID] = self._new_stream(message_type)
         stream.is_optional = stream.is_optional and is_optional
+        if stream.refused:  # perhaps not at this rate
+            stream.refused, stream.asked_hz = False, None
         token = object()
         stream.wishes[token] = hz
         self._dirty.set()
@@ -181,17 +183,20 @@ class MessageRates:
         try:
             await self._commands.send_long(SET_MESSAGE_INTERVAL, stream.message_type.ID, interval_us)
         except CommandRejected as error:
+            if error.result == RESULT_UNSUPPORTED:
+                self._ask_by_group_from_now_on()
+                return
             self._was_refused(stream, error)
         except CommandTimeout:
             logger.debug("no answer to SET_MESSAGE_INTERVAL for %s", stream.message_type.NAME)
         stream.was_asked(self._connection.now(), hz)
 
+    def _ask_by_group_from_now_on(self) -> None:
+        self._legacy = True
+        for stream in self._streams.values():
+            stream.asked_hz = None
+
     def _was_refused(self, stream: _Stream, error: CommandRejected) -> None:
-        if error.result == RESULT_UNSUPPORTED:
-            self._legacy = True
-            for each in self._streams.values():
-                each.asked_hz = None
-            return
         stream.refused = True
         self._publish_unavailable(stream, result_name(error.result))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from typing import TYPE_CHECKING
 
 import anyio
@@ -12,6 +13,7 @@ from aerokit.runtime.events import LinkReport, VehicleBack, VehicleRebooted, Veh
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from aerokit.mavlink.message import Message
     from aerokit.runtime.bus import Detach
     from aerokit.runtime.connection import Connection
 
@@ -21,8 +23,12 @@ SILENT_AFTER_S = 3.5
 """Three missed heartbeats and a half."""
 REBOOT_STEP_MS = 3000
 """Reordered messages go back in time by less than this, a reboot by more, unless it had just booted."""
+LATE_MS = 2000
+"""Once the vehicle has accepted to reboot: it boots for longer than this, and no message is so late."""
 REPORT_PERIOD_S = 1.0
 TIMESYNC_PERIOD_S = 2.0
+QUESTIONS = 16
+"""So many questions may be under way; what is older is taken for lost."""
 
 
 class VehicleWatch:
@@ -40,16 +46,22 @@ class VehicleWatch:
         self.last_heartbeat_at = connection.now()
         self.is_silent = False
         self.reboots = 0
-        self._boot_ms: int | None = None
+        self._times: dict[str, tuple[int, float]] = {}
+        self._expects_reboot = False
         attach = connection.bus.attach
         self._detach: list[Detach] = [attach(Heartbeat, self._on_heartbeat, system_id=system_id)]
         for message_type in (SystemTime, Attitude, GlobalPositionInt):
             self._detach.append(attach(message_type, self._on_boot_time, system_id=system_id))
+        self._detach.append(attach(Timesync, self._on_timesync, system_id=system_id))
 
     def close(self) -> None:
         """Stop watching."""
         for detach in self._detach:
             detach()
+
+    def expect_reboot(self) -> None:
+        """The vehicle has accepted to reboot; it is noticed even if it had just booted before."""
+        self._expects_reboot = True
 
     def check(self) -> None:
         """Publish VehicleSilent when heartbeats have stopped; called once a second."""
@@ -70,14 +82,27 @@ class VehicleWatch:
             self._connection.bus.publish(VehicleBack(now, self._system_id, silent_for))
 
     def _on_boot_time(self, message: SystemTime | Attitude | GlobalPositionInt) -> None:
+        self._note_time(message, "time_boot_ms", message.time_boot_ms)
+
+    def _on_timesync(self, message: Timesync) -> None:
+        """Answers to our own questions come also from a vehicle that streams nothing (yet)."""
+        if message.tc1 != 0:
+            self._note_time(message, "TIMESYNC", message.tc1 // 1_000_000)
+
+    def _note_time(self, message: Message, clock: str, milliseconds: int) -> None:
         frame = message.received_frame
         if frame is None or frame.component_id != self._component_id:
             return
-        before, self._boot_ms = self._boot_ms, message.time_boot_ms
-        if before is not None and message.time_boot_ms + REBOOT_STEP_MS < before:
+        now = self._connection.now()
+        before, then = self._times.get(clock, (milliseconds, now))
+        self._times[clock] = (milliseconds, now)
+        late = 1000 * (now - then) - (milliseconds - before)
+        if milliseconds + REBOOT_STEP_MS < before or (self._expects_reboot and late > LATE_MS):
+            self._times = {clock: (milliseconds, now)}
+            self._expects_reboot = False
             self.reboots += 1
             self._on_reboot()
-            self._connection.bus.publish(VehicleRebooted(self._connection.now(), self._system_id))
+            self._connection.bus.publish(VehicleRebooted(now, self._system_id))
 
 
 class LinkWatch:
@@ -96,6 +121,7 @@ class LinkWatch:
         self._connection, self._system_id, self._component_id = connection, system_id, component_id
         self._on_report = on_report
         self._round_trip_s: float | None = None
+        self._asked: deque[int] = deque(maxlen=QUESTIONS)
         self._ask_at = connection.now()
         self._before = self._count()
         self._detach = connection.bus.attach(Timesync, self._on_timesync, system_id=system_id)
@@ -117,13 +143,14 @@ class LinkWatch:
         now = self._connection.now()
         if now >= self._ask_at:
             self._ask_at = now + TIMESYNC_PERIOD_S
-            self._connection.send(Timesync(0, int(now * 1e9)), to=self._system_id)
+            self._asked.append(int(now * 1e9))
+            self._connection.send(Timesync(0, self._asked[-1]), to=self._system_id)
 
     def _on_timesync(self, message: Timesync) -> None:
         """Take the answer to our question; questions of the vehicle and answers to others are not ours."""
-        round_trip_s = self._connection.now() - message.ts1 / 1e9
-        if message.tc1 != 0 and 0 <= round_trip_s < 60:
-            self._round_trip_s = round_trip_s
+        if message.tc1 != 0 and message.ts1 in self._asked:
+            self._asked.remove(message.ts1)
+            self._round_trip_s = self._connection.now() - message.ts1 / 1e9
 
     def _report(self) -> None:
         at, (received, lost), total = count = self._count()

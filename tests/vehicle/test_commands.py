@@ -1,0 +1,316 @@
+"""Any command by number, rebooting, and what two commands at once have to do with each other."""
+
+from __future__ import annotations
+
+import math
+
+import anyio
+import pytest
+from flight_harness import Flight, now, open_flight
+
+from aerokit import messages as m
+from aerokit.errors import (
+    CommandRejected,
+    CommandTimeout,
+    ConnectionClosed,
+    LinkLost,
+    LocalProtocolError,
+    OperationRejected,
+    OperationTimeout,
+)
+from aerokit.mavlink.enums import MavCmd, MavResult
+from aerokit.runtime.events import VehicleRebooted
+from aerokit.sim import ExtraComponent, SimulatedCopter
+
+pytestmark = pytest.mark.anyio
+
+REBOOT = MavCmd.PREFLIGHT_REBOOT_SHUTDOWN
+BANNER = MavCmd.DO_SEND_BANNER
+
+
+# -------------------------------------------------------------------------------- LONG and INT
+
+
+async def test_a_long_command_and_its_ack(grounded: Flight) -> None:
+    ack = await grounded.vehicle.command(MavCmd.GET_MESSAGE_INTERVAL, m.Attitude.ID)
+    assert ack.result == MavResult.ACCEPTED
+    assert (ack.target_system, ack.target_component) == (255, 190)
+    (sent,) = grounded.wire.commands(MavCmd.GET_MESSAGE_INTERVAL)
+    assert isinstance(sent, m.CommandLong)
+    assert (sent.target_system, sent.target_component, sent.confirmation) == (1, 1, 0)
+    assert (sent.param1, sent.param2, sent.param7) == (m.Attitude.ID, 0.0, 0.0)
+
+
+async def test_an_int_command_and_its_ack(flying: Flight) -> None:
+    ack = await flying.vehicle.command_int(
+        MavCmd.DO_REPOSITION, -1, 1, 0, math.nan, frame=6, x=-353632610, y=1491652299, z=12.5
+    )
+    assert ack.result == MavResult.ACCEPTED
+    (sent,) = flying.wire.commands(MavCmd.DO_REPOSITION)
+    assert isinstance(sent, m.CommandInt)
+    assert (sent.frame, sent.x, sent.y, sent.z) == (6, -353632610, 1491652299, 12.5)
+    assert (sent.param1, sent.param2) == (-1.0, 1.0)
+    assert math.isnan(sent.param4)
+
+
+@pytest.mark.parametrize(
+    "result",
+    [
+        MavResult.TEMPORARILY_REJECTED,
+        MavResult.DENIED,
+        MavResult.UNSUPPORTED,
+        MavResult.FAILED,
+    ],
+)
+async def test_every_other_result_is_a_typed_error(grounded: Flight, result: MavResult) -> None:
+    grounded.copter.faults.refuse(BANNER, result, "Because I say so")
+    with pytest.raises(CommandRejected) as caught:
+        await grounded.vehicle.command(BANNER)
+    assert (caught.value.command, caught.value.result) == (BANNER, result)
+    assert caught.value.reasons == ("Because I say so",)
+    assert f"MAV_CMD_DO_SEND_BANNER was refused: {result.name}" in str(caught.value)
+
+
+async def test_unsupported_on_this_firmware(grounded: Flight) -> None:
+    with pytest.raises(CommandRejected, match="does not know the command"):
+        await grounded.vehicle.command(31_000)
+
+
+async def test_nonsense_is_not_sent(grounded: Flight) -> None:
+    vehicle = grounded.vehicle
+    with pytest.raises(LocalProtocolError, match="at most 7"):
+        await vehicle.command(BANNER, *range(8))
+    with pytest.raises(LocalProtocolError, match="param2"):
+        await vehicle.command(BANNER, 0, math.inf)
+    with pytest.raises(LocalProtocolError, match="x = "):
+        await vehicle.command_int(MavCmd.DO_REPOSITION, frame=6, x=2**31)
+    with pytest.raises(LocalProtocolError, match="attempts"):
+        await vehicle.command(BANNER, attempts=0)
+    assert not grounded.wire.commands(BANNER)
+    assert not grounded.wire.commands(MavCmd.DO_REPOSITION)
+
+
+# ------------------------------------------------------------------------- retries and progress
+
+
+async def test_retries_count_their_confirmation(grounded: Flight) -> None:
+    grounded.copter.faults.ignore(BANNER, times=2)
+    started = now()
+    await grounded.vehicle.command(BANNER)
+    assert [each.confirmation for each in grounded.wire.commands(BANNER)] == [0, 1, 2]  # type: ignore[union-attr]
+    assert now() - started == pytest.approx(2.0, abs=0.01)
+
+
+async def test_no_answer_at_all_says_what_was_seen_meanwhile(grounded: Flight) -> None:
+    grounded.copter.faults.ignore(BANNER)
+    started = now()
+
+    async def talk() -> None:
+        await anyio.sleep(0.5)
+        grounded.copter.send_text(4, "Terrain data missing")
+
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(talk)
+        with pytest.raises(CommandTimeout) as caught:
+            await grounded.vehicle.command(BANNER, attempts=3, attempt_timeout=0.5)
+    assert now() - started == pytest.approx(1.5, abs=0.01)
+    text = str(caught.value)
+    assert "no COMMAND_ACK for MAV_CMD_DO_SEND_BANNER, sent 3 times within 1.5 s" in text
+    assert "last heartbeat 0." in text
+    assert "0 % of its frames lost" in text
+    assert "it said: Terrain data missing" in text
+
+
+async def test_progress_extends_the_deadline_and_is_reported(grounded: Flight) -> None:
+    grounded.copter.faults.report_progress(BANNER, (10, 50, 90), interval_s=4.0)
+    seen: list[int | None] = []
+    started = now()
+    await grounded.vehicle.command(BANNER, on_progress=seen.append)
+    assert seen == [10, 50, 90]
+    assert now() - started == pytest.approx(12.0, abs=0.1)
+    assert len(grounded.wire.commands(BANNER)) == 1
+
+
+async def test_progress_that_stops_is_a_timeout(grounded: Flight) -> None:
+    grounded.copter.faults.report_progress(BANNER, (10, 50), interval_s=1.0)
+    async with anyio.create_task_group() as tasks:
+
+        async def radio_fails() -> None:
+            await anyio.sleep(1.5)
+            grounded.copter.faults.silent = True
+
+        tasks.start_soon(radio_fails)
+        with pytest.raises(CommandTimeout, match="was in progress, then nothing came for 10 s"):
+            await grounded.vehicle.command(BANNER)
+
+
+async def test_a_callback_that_raises_does_not_stop_the_command(grounded: Flight) -> None:
+    grounded.copter.faults.report_progress(BANNER, (10,), interval_s=0.5)
+
+    def fail(percent: int | None) -> None:
+        raise ZeroDivisionError
+
+    await grounded.vehicle.command(BANNER, on_progress=fail)
+
+
+# ----------------------------------------------------------------------------- two at a time
+
+
+async def test_equal_commands_follow_each_other_and_each_gets_its_own_answer(grounded: Flight) -> None:
+    grounded.copter.faults.delay_ack(MavCmd.GET_MESSAGE_INTERVAL, 0.5)
+    finished: list[float] = []
+
+    async def ask() -> None:
+        await grounded.vehicle.command(MavCmd.GET_MESSAGE_INTERVAL, m.Attitude.ID)
+        finished.append(now())
+
+    started = now()
+    async with anyio.create_task_group() as tasks:
+        for _ in range(3):
+            tasks.start_soon(ask)
+    assert [at - started for at in finished] == pytest.approx([0.5, 1.0, 1.5], abs=0.01)
+    assert len(grounded.wire.commands(MavCmd.GET_MESSAGE_INTERVAL)) == 3
+
+
+async def test_the_same_command_to_two_components_does_not_mix_its_answers() -> None:
+    """A camera does not answer; the autopilot's answer to the same command is not the camera's."""
+    camera = ExtraComponent(100, type=30)
+    async with open_flight(SimulatedCopter(boot_time_s=0.0, components=[camera])) as flight:
+        vehicle = flight.vehicle
+        await vehicle.wait_ready()
+        async with anyio.create_task_group() as tasks:
+
+            async def ask_the_autopilot() -> None:
+                await anyio.sleep(0.2)
+                await vehicle.command(MavCmd.REQUEST_MESSAGE, m.AutopilotVersion.ID)
+
+            tasks.start_soon(ask_the_autopilot)
+            with pytest.raises(CommandTimeout):
+                await vehicle.command(
+                    MavCmd.REQUEST_MESSAGE, m.CameraInformation.ID, component_id=100, attempts=2
+                )
+
+
+async def test_a_cancelled_command_leaves_the_lock_and_its_answer_behind(grounded: Flight) -> None:
+    grounded.copter.faults.ignore(BANNER, times=1)
+    with anyio.move_on_after(0.3):
+        await grounded.vehicle.command(BANNER)
+    started = now()
+    await grounded.vehicle.command(BANNER)
+    assert now() - started < 1.1
+
+
+async def test_the_connection_ends_while_a_command_waits(grounded: Flight) -> None:
+    grounded.copter.faults.ignore(BANNER)
+    async with anyio.create_task_group() as tasks:
+
+        async def pull_the_cable() -> None:
+            await anyio.sleep(0.5)
+            grounded.wire.lose()
+
+        tasks.start_soon(pull_the_cable)
+        with pytest.raises(LinkLost, match="cable"):
+            await grounded.vehicle.command(BANNER)
+    with pytest.raises(LinkLost):
+        await grounded.vehicle.command(BANNER)
+
+
+async def test_a_vehicle_that_was_left_is_closed() -> None:
+    async with open_flight() as flight:
+        vehicle = flight.vehicle
+    with pytest.raises(ConnectionClosed):
+        await vehicle.command(BANNER)
+    with pytest.raises(ConnectionClosed):
+        await vehicle.set_mode("GUIDED")
+
+
+# -------------------------------------------------------------------------------------- reboot
+
+
+async def test_reboot_waits_until_it_is_back_and_forgets_what_was(grounded: Flight) -> None:
+    vehicle = grounded.vehicle
+    with vehicle.subscribe(VehicleRebooted, capacity=10) as events:
+        started = now()
+        await vehicle.reboot()
+        assert now() - started < 10.0
+        assert vehicle.position.latest is None or vehicle.position.age < 3.0
+        event = await events.get(timeout=1.0)
+        assert event.system_id == 1
+        assert events.get_nowait() is None
+    assert grounded.copter.uptime < 10.0
+    await vehicle.wait_ready(timeout=30.0)
+    assert vehicle.version.is_known
+    rates = [
+        each for each in grounded.wire.commands(MavCmd.SET_MESSAGE_INTERVAL) if each.param1 == m.Attitude.ID
+    ]
+    assert len(rates) >= 1  # streams are asked for again
+    assert vehicle.attitude.fresh(within=0.5)
+
+
+async def test_reboot_is_noticed_without_any_stream() -> None:
+    async with open_flight(rates={}) as flight:
+        await anyio.sleep(3.5)
+        await flight.vehicle.reboot(timeout=10.0)
+        assert flight.copter.uptime < 10.0
+
+
+async def test_state_of_before_the_reboot_is_unknown_after_it() -> None:
+    async with open_flight(SimulatedCopter(boot_time_s=0.0)) as flight:
+        await flight.vehicle.wait_ready()
+        flight.copter.timeline = flight.copter.timeline.scaled(60.0)
+        await anyio.sleep(5.0)
+        vehicle = flight.vehicle
+        assert (vehicle.position.is_known, vehicle.home.is_known, vehicle.armed.is_known) == (
+            True,
+            True,
+            True,
+        )
+        await vehicle.reboot()
+        await anyio.sleep(2.0)
+        assert (vehicle.position.is_known, vehicle.home.is_known, vehicle.armed.is_known) == (
+            False,
+            False,
+            True,
+        )
+        assert flight.vehicle.missing_for_flight()
+
+
+async def test_reboot_of_an_armed_vehicle_sends_nothing(flying: Flight) -> None:
+    with pytest.raises(OperationRejected, match="armed"):
+        await flying.vehicle.reboot()
+    assert not flying.wire.commands(REBOOT)
+
+
+async def test_a_forced_reboot_is_one(flying: Flight) -> None:
+    await flying.vehicle.reboot(force=True)
+    assert flying.copter.motion.is_on_ground
+
+
+async def test_reboot_refused(grounded: Flight) -> None:
+    grounded.copter.faults.refuse(REBOOT, MavResult.DENIED, "Logging")
+    with pytest.raises(CommandRejected, match="Logging"):
+        await grounded.vehicle.reboot()
+
+
+async def test_a_vehicle_that_does_not_come_back(grounded: Flight) -> None:
+    async with anyio.create_task_group() as tasks:
+
+        async def dies() -> None:
+            await anyio.sleep(0.05)
+            grounded.copter.faults.silent = True
+
+        tasks.start_soon(dies)
+        with pytest.raises(OperationTimeout, match=r"reboot: not back within 8 s; last heartbeat \d"):
+            await grounded.vehicle.reboot(timeout=8.0)
+
+
+async def test_the_link_goes_down_with_the_vehicle(grounded: Flight) -> None:
+    async with anyio.create_task_group() as tasks:
+
+        async def unplug() -> None:
+            await anyio.sleep(0.3)
+            grounded.wire.lose()
+
+        tasks.start_soon(unplug)
+        with pytest.raises(LinkLost):
+            await grounded.vehicle.reboot()

@@ -1,0 +1,265 @@
+"""Subscribing is the rate request: asked, kept, released, asked again, and told when it does not come."""
+
+from __future__ import annotations
+
+import anyio
+import pytest
+from flight_harness import Flight, open_flight, open_px4
+
+from aerokit import messages as m
+from aerokit.errors import LocalProtocolError
+from aerokit.mavlink.enums import MavCmd, MavDataStream, MavResult
+from aerokit.mavlink.message import Message
+from aerokit.runtime.events import StreamSlow, StreamUnavailable
+from aerokit.sim import SimulatedCopter
+
+pytestmark = pytest.mark.anyio
+
+SET_INTERVAL = MavCmd.SET_MESSAGE_INTERVAL
+
+
+def asked(flight: Flight, kind: type[Message]) -> list[float]:
+    """The intervals in seconds that this message was asked for."""
+    return [each.param2 / 1e6 for each in flight.wire.commands(SET_INTERVAL) if each.param1 == kind.ID]
+
+
+def interval(flight: Flight, kind: type[Message]) -> float:
+    """Seconds between two of these messages, as the vehicle has it."""
+    return flight.copter.channels[0].streams.interval(kind.ID)
+
+
+def group_requests(flight: Flight) -> dict[int, list[tuple[int, int]]]:
+    requests: dict[int, list[tuple[int, int]]] = {}
+    for each in flight.wire.all(m.RequestDataStream):
+        assert (each.target_system, each.target_component) == (1, 1)
+        requests.setdefault(each.req_stream_id, []).append((each.req_message_rate, each.start_stop))
+    return requests
+
+
+async def test_the_default_rates_are_asked_for_at_once() -> None:
+    async with open_flight() as flight:
+        await anyio.sleep(1.0)
+        for kind, hz in flight.vehicle.telemetry.default_rates.items():
+            assert asked(flight, kind) == pytest.approx([1 / hz], rel=1e-5), kind
+        assert interval(flight, m.Attitude) == pytest.approx(0.1)
+        assert interval(flight, m.GlobalPositionInt) == pytest.approx(0.1)
+
+
+async def test_rates_of_ones_own_and_none_at_all() -> None:
+    async with open_flight(rates={m.Attitude: 25.0}) as flight:
+        await anyio.sleep(2.0)
+        assert asked(flight, m.Attitude) == [0.04]
+        assert len(flight.wire.commands(SET_INTERVAL)) == 1
+    async with open_flight(rates={}) as flight:
+        await anyio.sleep(10.0)
+        assert not flight.wire.commands(SET_INTERVAL)
+        assert not flight.wire.all(m.RequestDataStream)
+
+
+async def test_a_subscription_asks_for_its_rate_and_gives_it_back(grounded: Flight) -> None:
+    vehicle = grounded.vehicle
+    with vehicle.subscribe(m.Attitude, rate_hz=50.0, capacity=200) as attitudes:
+        await anyio.sleep(1.0)
+        assert interval(grounded, m.Attitude) == pytest.approx(0.02)
+        while attitudes.get_nowait():
+            pass
+        await anyio.sleep(2.0)
+        assert len(list(iter(attitudes.get_nowait, None))) == pytest.approx(100, abs=2)
+    await anyio.sleep(1.0)
+    assert interval(grounded, m.Attitude) == pytest.approx(0.1)  # the default rate again
+
+
+async def test_a_message_without_a_default_rate_goes_back_to_the_autopilots_own(grounded: Flight) -> None:
+    with grounded.vehicle.subscribe(m.RawImu, rate_hz=20.0):
+        await anyio.sleep(1.0)
+        assert interval(grounded, m.RawImu) == pytest.approx(0.05)
+    await anyio.sleep(1.0)
+    assert asked(grounded, m.RawImu) == [0.05, 0.0]
+    assert interval(grounded, m.RawImu) == 0.0
+
+
+async def test_the_fastest_of_several_wishes(grounded: Flight) -> None:
+    vehicle = grounded.vehicle
+    with vehicle.rate(m.RawImu, 5.0):
+        await anyio.sleep(1.0)
+        assert interval(grounded, m.RawImu) == pytest.approx(0.2)
+        with vehicle.rate(m.RawImu, 20.0):
+            with vehicle.rate(m.RawImu, 10.0):
+                await anyio.sleep(1.0)
+                assert interval(grounded, m.RawImu) == pytest.approx(0.05)
+            await anyio.sleep(1.0)
+            assert interval(grounded, m.RawImu) == pytest.approx(0.05)
+        await anyio.sleep(1.0)
+        assert interval(grounded, m.RawImu) == pytest.approx(0.2)
+
+
+async def test_a_slower_wish_asks_for_nothing(grounded: Flight) -> None:
+    with grounded.vehicle.rate(m.Attitude, 2.0):
+        await anyio.sleep(2.0)
+    await anyio.sleep(2.0)
+    assert not asked(grounded, m.Attitude)
+
+
+@pytest.mark.parametrize("hz", [0.0, -1.0, 1001.0, float("nan")])
+async def test_rates_out_of_range(grounded: Flight, hz: float) -> None:
+    with pytest.raises(LocalProtocolError, match="rate_hz"), grounded.vehicle.rate(m.Attitude, hz):
+        raise AssertionError
+    with (
+        pytest.raises(LocalProtocolError, match="rate_hz"),
+        grounded.vehicle.subscribe(m.Attitude, rate_hz=hz),
+    ):
+        raise AssertionError
+    assert not asked(grounded, m.Attitude)
+
+
+async def test_a_lost_request_is_sent_again() -> None:
+    copter = SimulatedCopter(boot_time_s=0.0)
+    copter.faults.ignore(SET_INTERVAL, times=7)
+    async with open_flight(copter) as flight:
+        await anyio.sleep(30.0)
+        for kind, hz in flight.vehicle.telemetry.default_rates.items():
+            if kind not in (m.DistanceSensor,):
+                assert interval(flight, kind) == pytest.approx(1 / hz, rel=1e-5), kind
+
+
+async def test_after_a_reboot_everything_is_asked_for_again(grounded: Flight) -> None:
+    with grounded.vehicle.rate(m.RawImu, 20.0):
+        await anyio.sleep(10.0)
+        grounded.wire.forget()
+        grounded.copter.restart()
+        await anyio.sleep(10.0)
+        assert asked(grounded, m.Attitude) == pytest.approx([0.1])
+        assert asked(grounded, m.RawImu) == pytest.approx([0.05])
+        assert interval(grounded, m.RawImu) == pytest.approx(0.05)
+
+
+async def test_a_stream_that_somebody_else_switched_off_is_asked_for_again(grounded: Flight) -> None:
+    grounded.copter.channels[0].streams.set_interval(m.Attitude.ID, 0.0, grounded.copter.now)
+    await anyio.sleep(12.0)
+    assert asked(grounded, m.Attitude) == pytest.approx([0.1])
+    assert grounded.vehicle.attitude.fresh(within=0.5)
+
+
+async def test_a_sensor_that_is_not_there_is_not_asked_for_all_the_time() -> None:
+    async with open_flight() as flight:
+        await anyio.sleep(300.0)
+        assert 2 <= len(asked(flight, m.DistanceSensor)) <= 12
+
+
+# ------------------------------------------------------------------------------------- events
+
+
+async def test_a_stream_that_comes_too_slowly_is_an_event(grounded: Flight) -> None:
+    with grounded.vehicle.subscribe(StreamSlow, capacity=20) as events:
+        grounded.copter.channels[0].streams.set_interval(m.Attitude.ID, 0.5, grounded.copter.now)
+        event = await events.get(timeout=10.0)
+        assert (event.message, event.asked_hz) == ("ATTITUDE", 10.0)
+        assert event.achieved_hz < 5.0
+        await anyio.sleep(20.0)
+        assert events.get_nowait() is None  # told once, not every second
+
+
+async def test_a_wanted_stream_that_does_not_come_at_all_is_an_event() -> None:
+    async with open_flight() as flight:
+        await flight.vehicle.wait_ready()
+        with (
+            flight.vehicle.subscribe(StreamSlow, capacity=20) as events,
+            flight.vehicle.rate(m.DistanceSensor, 5.0),
+        ):
+            event = await events.get(timeout=30.0)
+            assert (event.message, event.achieved_hz) == ("DISTANCE_SENSOR", 0.0)
+
+
+async def test_an_optional_stream_that_does_not_come_is_none() -> None:
+    async with open_flight() as flight:
+        with flight.vehicle.subscribe(StreamSlow, StreamUnavailable, capacity=20) as events:
+            await anyio.sleep(60.0)
+            assert events.get_nowait() is None
+
+
+async def test_a_message_that_the_vehicle_does_not_have_is_an_event(grounded: Flight) -> None:
+    with (
+        grounded.vehicle.subscribe(StreamUnavailable, capacity=5) as events,
+        grounded.vehicle.rate(m.Odometry, 10.0),
+    ):
+        event = await events.get(timeout=5.0)
+        assert (event.system_id, event.message, event.reason) == (1, "ODOMETRY", "DENIED")
+        await anyio.sleep(30.0)
+        assert events.get_nowait() is None
+        assert len(asked(grounded, m.Odometry)) == 1
+
+
+async def test_a_rate_that_was_refused_is_asked_for_again_by_the_next_one_who_wants_it(
+    grounded: Flight,
+) -> None:
+    grounded.copter.faults.refuse(SET_INTERVAL, MavResult.DENIED, times=1)
+    with grounded.vehicle.rate(m.RawImu, 500.0):
+        await anyio.sleep(1.0)
+    with grounded.vehicle.rate(m.RawImu, 20.0):
+        await anyio.sleep(1.0)
+        assert interval(grounded, m.RawImu) == pytest.approx(0.05)
+
+
+# ----------------------------------------------------------------- firmware without the command
+
+
+def old_copter() -> SimulatedCopter:
+    return SimulatedCopter(boot_time_s=0.0, unsupported_commands=[SET_INTERVAL])
+
+
+async def test_old_firmware_gets_stream_requests() -> None:
+    async with open_flight(old_copter()) as flight:
+        await anyio.sleep(2.0)
+        assert len(flight.wire.commands(SET_INTERVAL)) == 1
+        requests = group_requests(flight)
+        assert requests[MavDataStream.EXTRA1] == [(10, 1)]
+        assert requests[MavDataStream.POSITION] == [(10, 1)]
+        assert requests[MavDataStream.EXTRA2] == [(5, 1)]
+        assert interval(flight, m.Attitude) == pytest.approx(0.1)
+        await flight.vehicle.wait_ready(timeout=10.0)
+
+
+async def test_old_firmware_takes_the_fastest_wish_of_a_group_and_gives_it_back() -> None:
+    async with open_flight(old_copter()) as flight:
+        await anyio.sleep(2.0)
+        flight.wire.forget()
+        with flight.vehicle.rate(m.Ahrs2, 30.0):
+            await anyio.sleep(2.0)
+            assert group_requests(flight) == {MavDataStream.EXTRA1: [(30, 1)]}
+        await anyio.sleep(2.0)
+        assert group_requests(flight) == {MavDataStream.EXTRA1: [(30, 1), (10, 1)]}
+
+
+async def test_old_firmware_is_asked_again_after_a_reboot() -> None:
+    async with open_flight(old_copter()) as flight:
+        await anyio.sleep(10.0)
+        flight.wire.forget()
+        flight.copter.restart()
+        await anyio.sleep(10.0)
+        assert group_requests(flight)[MavDataStream.EXTRA1]
+        assert interval(flight, m.Attitude) == pytest.approx(0.1)
+
+
+async def test_old_firmware_has_no_group_for_some_messages() -> None:
+    async with open_flight(old_copter()) as flight:
+        await anyio.sleep(2.0)
+        with (
+            flight.vehicle.subscribe(StreamUnavailable, capacity=5) as events,
+            flight.vehicle.rate(m.AttitudeQuaternion, 10.0),
+        ):
+            event = await events.get(timeout=5.0)
+            assert event.message == "ATTITUDE_QUATERNION"
+
+
+# ------------------------------------------------------------------------------------------ PX4
+
+
+async def test_px4_streams_are_set_by_interval() -> None:
+    async with open_px4() as flight:
+        await flight.vehicle.wait_ready()
+        with flight.vehicle.subscribe(m.Attitude, rate_hz=20.0, capacity=200) as attitudes:
+            await anyio.sleep(1.0)
+            while attitudes.get_nowait():
+                pass
+            await anyio.sleep(2.0)
+            assert len(list(iter(attitudes.get_nowait, None))) == pytest.approx(40, abs=2)
