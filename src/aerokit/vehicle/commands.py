@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from contextlib import asynccontextmanager
+from collections import defaultdict
 from typing import TYPE_CHECKING
 
 from aerokit.errors import CommandTimeout
@@ -12,7 +12,7 @@ from aerokit.protocols.command import CommandExchange, command_int, command_long
 from aerokit.runtime.driver import run_exchange
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
+    from collections.abc import Callable
 
     from aerokit.mavlink.messages import CommandInt, CommandLong
     from aerokit.runtime.connection import Connection
@@ -45,7 +45,7 @@ class CommandSender:
         self._connection = connection
         self._system_id, self._component_id = system_id, component_id
         self._describe = describe
-        self._locks: dict[_Key, _SharedLock] = {}
+        self._locks: defaultdict[_Key, asyncio.Lock] = defaultdict(asyncio.Lock)
         self._under_way: dict[_Key, list[float]] = {}
         self._detach = connection.bus.attach(CommandAck, self._on_ack, system_id=system_id)
 
@@ -97,7 +97,7 @@ class CommandSender:
         on_progress: Callable[[int | None], None] | None,
     ) -> CommandAck:
         key = (message.target_component, message.command)
-        async with self._alone(key):
+        async with self._locks[key]:
             exchange = CommandExchange(
                 message,
                 own_system=self._connection.source_system,
@@ -120,34 +120,18 @@ class CommandSender:
         self._under_way.setdefault(key, []).extend([self._connection.now()] * count)
 
     def _take_answers_under_way(self, key: _Key) -> int:
+        if key not in self._under_way:
+            return 0
         oldest = self._connection.now() - UNDER_WAY_S
-        return sum(at >= oldest for at in self._under_way.pop(key, ()))
+        return sum(at >= oldest for at in self._under_way.pop(key))
 
     def _on_ack(self, ack: CommandAck) -> None:
         """An answer that no exchange waits for was one of those under way."""
+        if not self._under_way:
+            return
         frame = ack.received_frame
         key = (0 if frame is None else frame.component_id, ack.command)
-        if key in self._under_way and key not in self._locks and ack.result != IN_PROGRESS:
+        if key in self._under_way and not self._locks[key].locked() and ack.result != IN_PROGRESS:
             self._under_way[key].pop(0)
             if not self._under_way[key]:
                 del self._under_way[key]
-
-    @asynccontextmanager
-    async def _alone(self, key: _Key) -> AsyncIterator[None]:
-        shared = self._locks.setdefault(key, _SharedLock())
-        shared.users += 1
-        try:
-            async with shared.lock:
-                yield
-        finally:
-            shared.users -= 1
-            if not shared.users:
-                del self._locks[key]
-
-
-class _SharedLock:
-    """A lock that is forgotten when nobody uses it."""
-
-    def __init__(self) -> None:
-        self.lock = asyncio.Lock()
-        self.users = 0
