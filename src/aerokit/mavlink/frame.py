@@ -20,15 +20,8 @@ SIGNATURE_LENGTH = 13
 class Frame:
     """One frame whose checksum was right. Treat it as immutable: it is shared by everyone who listens."""
 
-    __slots__ = (
-        "component_id",
-        "message_id",
-        "payload",
-        "raw",
-        "received_at",
-        "sequence",
-        "system_id",
-    )
+    # No constructor: the framer fills in what it has read already, and making an object without one is faster.
+    __slots__ = ("component_id", "message_id", "payload", "raw", "received_at", "system_id")
 
     raw: bytes
     """The whole frame, from the magic byte to the end of checksum or signature."""
@@ -40,23 +33,28 @@ class Frame:
     """Who sent it: the system, 0..255 (0 is nobody's)."""
     component_id: int
     """Who sent it: the component, 0..255."""
-    sequence: int
-    """The sender's counter, 0..255, then from 0 again."""
     received_at: float
     """The ``now`` that the framer was given with its bytes, in seconds."""
 
-    def __init__(self, raw: bytes, received_at: float = 0.0) -> None:
+    @classmethod
+    def parse(cls, raw: bytes, received_at: float = 0.0) -> Frame:
         """Take a frame that is known to be whole and right, out of a log for example, apart."""
-        self.raw = raw
-        self.received_at = received_at
-        length = raw[1]
+        frame = cls()
+        frame.raw = raw
+        frame.received_at = received_at
         if raw[0] == MAGIC_V1:
-            self.sequence, self.system_id, self.component_id, self.message_id = raw[2:6]
-            self.payload = raw[6 : 6 + length]
+            frame.system_id, frame.component_id, frame.message_id = raw[3:6]
+            frame.payload = raw[6 : 6 + raw[1]]
         else:
-            self.sequence, self.system_id, self.component_id = raw[4:7]
-            self.message_id = int.from_bytes(raw[7:10], "little")
-            self.payload = raw[10 : 10 + length]
+            frame.system_id, frame.component_id = raw[5:7]
+            frame.message_id = int.from_bytes(raw[7:10], "little")
+            frame.payload = raw[10 : 10 + raw[1]]
+        return frame
+
+    @property
+    def sequence(self) -> int:
+        """The sender's counter, 0..255, then from 0 again."""
+        return self.raw[2] if self.raw[0] == MAGIC_V1 else self.raw[4]
 
     @property
     def version(self) -> int:

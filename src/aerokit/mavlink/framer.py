@@ -27,7 +27,6 @@ _SHORTEST_V2 = 12
 _SHORTEST_V1 = 8
 _MAGICS = (MAGIC_V1, MAGIC_V2)
 _next_magic = re.compile(b"[\xfd\xfe]").search
-_new = object.__new__
 
 # What a place in the bytes may be.
 _GOOD = 0  # a whole frame with the right checksum
@@ -37,9 +36,8 @@ _UNKNOWN = 3  # a whole frame of an unknown message, if it is one
 _BAD_CRC = 4
 _NOISE = 5
 
-_Found = tuple[
-    int, int, int, int, int, int, int
-]  # begin, message id, sequence, source, payload from, to, end
+_Found = tuple[int, int, int, int, int, int, int]
+"""Begin, message id, sequence, source, payload from and to, end."""
 
 
 class Framer:
@@ -50,9 +48,13 @@ class Framer:
         """Knows the messages; ids it does not know cannot be checked and are only counted."""
         self.wanted: Container[int] | None = None
         """Ids of the messages that are returned, None for all; the others are checked and counted, nothing more."""
+        self.keep_unknown = False
+        """Whether frames of messages that the dialect does not know are returned too, whatever is wanted: for a
+        recording. Their checksums cannot be checked."""
         self.statistics = FramerStatistics()
         """Counters since the beginning."""
         self._rest = b""
+        self._unknown: list[bytes] = []
         self._rows = dialect.rows
         self._extras = {message_id: bytes((row[0],)) for message_id, row in dialect.rows.items()}
         self._sources: dict[int, SourceStatistics] = {}
@@ -89,6 +91,9 @@ class Framer:
                 body = upto = end = sequence = key = 0
             if not good:
                 found = self._search(data, begin)
+                if self._unknown:
+                    frames += [Frame.parse(raw, now) for raw in self._unknown]
+                    self._unknown.clear()
                 if found is None:
                     break
                 begin, message_id, sequence, key, body, upto, end = found
@@ -102,13 +107,12 @@ class Framer:
             else:
                 source.out_of_order(sequence)
             if wanted is None or message_id in wanted:
-                frame = _new(Frame)
+                frame = Frame()
                 frame.raw = data[begin:end]
                 frame.payload = data[body:upto]
                 frame.message_id = message_id
                 frame.system_id = source.system_id
                 frame.component_id = source.component_id
-                frame.sequence = sequence
                 frame.received_at = now
                 frames.append(frame)
             begin = end
@@ -134,7 +138,7 @@ class Framer:
             if unknown >= 0 and here >= unknown_end:
                 if unknown_end == size or data[unknown_end] in _MAGICS:
                     self._pass(begin, unknown, bad_crcs)
-                    self._unknown_passed(data, unknown)
+                    self._unknown_passed(data, unknown, unknown_end)
                     begin = here = unknown_end
                     hold, bad_crcs = -1, []
                 unknown = -1
@@ -160,9 +164,11 @@ class Framer:
         self._rest = data[keep:]
         return None
 
-    def _unknown_passed(self, data: bytes, begin: int) -> None:
+    def _unknown_passed(self, data: bytes, begin: int, end: int) -> None:
         """A frame of an unknown message was here: its sender, if we know it, has not lost it."""
         self.statistics.unknown_ids += 1
+        if self.keep_unknown:
+            self._unknown.append(data[begin:end])
         if data[begin] == MAGIC_V2:
             _, _, _, sequence, key, _ = _HEADER_V2(data, begin)
         else:
