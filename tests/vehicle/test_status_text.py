@@ -29,7 +29,7 @@ def _received(message: Statustext, text: bytes) -> Statustext:
     payload = bytearray(message.encode())
     payload[1:51] = text.ljust(50, b"\0")
     header = bytes((0xFD, len(payload), 0, 0, 0, 1, 1, 253, 0, 0))
-    return Statustext.decode(bytes(payload), Frame(header + bytes(payload)))
+    return Statustext.decode(bytes(payload), Frame.parse(header + bytes(payload)))
 
 
 def test_single_text_with_trailing_tabs() -> None:
