@@ -1,7 +1,7 @@
 """`Framer`: any bytes in, checked frames out.
 
 It is fed whatever a link delivers, datagrams or a stream cut anywhere, with noise and text in between, and never
-raises. What it does with each byte that could start a frame is decided in `_Verdict`'s order: a good checksum wins, a
+raises. What it does with each byte that could start a frame follows one order: a good checksum wins, a
 plausible header is worth waiting for, anything else is passed over one byte at a time, so that a good frame behind
 noise is found. https://mavlink.io/en/guide/serialization.html
 """
@@ -67,12 +67,14 @@ class Framer:
         # The loop is long and repeats `_examine` on purpose: it runs for every frame on the air.
         if type(data) is not bytes:
             data = bytes(data)
-        self.statistics.bytes += len(data)
+        size = len(data)
+        self.statistics.bytes += size
         if self._rest:
             data, self._rest = self._rest + data, b""
+            size = len(data)
         extras, sources, wanted = self._extras, self._sources, self.wanted
         frames: list[Frame] = []
-        begin, size = 0, len(data)
+        begin = 0
         while begin < size:
             try:
                 magic, length, flags, sequence, key, message_id = _HEADER_V2(data, begin)
