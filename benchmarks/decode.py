@@ -27,7 +27,7 @@ RECORDINGS = (
 CHUNK = 1024
 
 
-def rows(rounds: int = 7) -> list[dict[str, Any]]:
+def rows(rounds: int = 7, path: Path | None = None) -> list[dict[str, Any]]:
     """What nobody wants (``decode_skip``), and what is delivered as its typed message (``decode_typed``).
 
     These are fed frame by frame, as the recording has them and UDP brings them; ``…_stream`` are fed the same bytes in

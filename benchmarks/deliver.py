@@ -14,6 +14,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import anyio
@@ -30,9 +31,9 @@ __all__ = ["rows"]
 AUTOPILOT = (1, 1)
 
 
-def rows(rounds: int = 7) -> list[Row]:
-    """``deliver_telemetry``."""
-    frames = [raw for _, raw in read_tlog(recording())]
+def rows(rounds: int = 7, path: Path | None = None) -> list[Row]:
+    """``deliver_telemetry``; ``path`` is another recording than the copter's flight."""
+    frames = [raw for _, raw in read_tlog(path or recording())]
     own, peer = anyio.run(_in_turns, frames, rounds)
     return [
         row(

@@ -25,6 +25,8 @@ from table import Row
 Measure = Callable[[bool], list[Row]]
 """Gives rows; with True in few rounds."""
 
+SHORT = decode.RECORDINGS[-1]
+
 MEASURES: dict[tuple[str, ...], Measure] = {
     ("decode_skip", "decode_typed", "decode_skip_stream", "decode_typed_stream"): lambda quick: decode.rows(
         1 if quick else 7
@@ -33,7 +35,9 @@ MEASURES: dict[tuple[str, ...], Measure] = {
     ("command_rtt_pymavlink", "command_rtt_mavsdk"): lambda quick: (
         command_rtt.rows(1, 20) if quick else command_rtt.rows()
     ),
-    ("import", "import_ready"): lambda quick: import_time.rows(1 if quick else 25),
+    ("import", "import_ready"): lambda quick: (
+        import_time.rows(1, fresh_byte_code=False) if quick else import_time.rows()
+    ),
 }
 NAMES = tuple(name for names in MEASURES for name in names)
 
