@@ -31,9 +31,9 @@ def rows(rounds: int = 7, path: Path | None = None) -> list[dict[str, Any]]:
     """What nobody wants (``decode_skip``), and what is delivered as its typed message (``decode_typed``).
 
     These are fed frame by frame, as the recording has them and UDP brings them; ``…_stream`` are fed the same bytes in
-    pieces of 1 kB, as TCP and serial ports bring them.
+    pieces of 1 kB, as TCP and serial ports bring them. ``path`` is another recording than the copter's flight.
     """
-    frames = [raw for _, raw in read_tlog(recording())]
+    frames = [raw for _, raw in read_tlog(path or recording())]
     stream = b"".join(frames)
     feeds = {"": frames, "_stream": [stream[i : i + CHUNK] for i in range(0, len(stream), CHUNK)]}
     table: list[dict[str, Any]] = []

@@ -28,10 +28,10 @@ Measure = Callable[[bool], list[Row]]
 SHORT = decode.RECORDINGS[-1]
 
 MEASURES: dict[tuple[str, ...], Measure] = {
-    ("decode_skip", "decode_typed", "decode_skip_stream", "decode_typed_stream"): lambda quick: decode.rows(
-        1 if quick else 7
+    ("decode_skip", "decode_typed", "decode_skip_stream", "decode_typed_stream"): lambda quick: (
+        decode.rows(1, SHORT) if quick else decode.rows()
     ),
-    ("deliver_telemetry",): lambda quick: deliver.rows(1 if quick else 7),
+    ("deliver_telemetry",): lambda quick: deliver.rows(1, SHORT) if quick else deliver.rows(),
     ("command_rtt_pymavlink", "command_rtt_mavsdk"): lambda quick: (
         command_rtt.rows(1, 20) if quick else command_rtt.rows()
     ),
