@@ -38,12 +38,14 @@ class Bus:
         self.dialect = dialect
         self.wanted: dict[int, int] = {}
         self._sinks: dict[tuple[int, int], tuple[Sink, ...]] = {}
+        self._plans: dict[int, tuple[Sink, ...]] = {}  # system and message id → all sinks, when needed
         self._event_sinks: dict[type[Event], tuple[Sink, ...]] = {}
 
     def attach(self, message_type: type[Message], sink: Sink, *, system_id: int = EVERY_SYSTEM) -> Detach:
         """Have every ``message_type`` of ``system_id`` (0: of every system) delivered to ``sink``."""
         key = (system_id, message_type.ID)
         self._sinks[key] = (*self._sinks.get(key, ()), sink)
+        self._plans.clear()
         self.wanted[message_type.ID] = self.wanted.get(message_type.ID, 0) + 1
         return _once(lambda: self._detach(key, sink))
 
@@ -54,18 +56,14 @@ class Bus:
 
     def deliver(self, frame: Frame) -> None:
         """Decode the frame if anyone wants it and hand it over; a sink that raises is logged, the others go on."""
-        message_id = frame.message_id
-        everyone = self._sinks.get((EVERY_SYSTEM, message_id), ())
-        own = self._sinks.get((frame.system_id, message_id), ())
-        if not everyone and not own:
-            return
+        try:
+            sinks = self._plans[frame.system_id << 24 | frame.message_id]
+        except KeyError:
+            sinks = self._plan(frame)
+            if not sinks:
+                return
         message = self.dialect.decode(frame)
-        for sink in own:
-            try:
-                sink(message)
-            except Exception:
-                _report(sink)
-        for sink in everyone:
+        for sink in sinks:
             try:
                 sink(message)
             except Exception:
@@ -80,8 +78,19 @@ class Bus:
                 except Exception:
                     _report(sink)
 
+    def _plan(self, frame: Frame) -> tuple[Sink, ...]:
+        """Who gets such a frame: those of its system before those of every system; nobody if it cannot be decoded."""
+        system_id, message_id = frame.system_id, frame.message_id
+        sinks = self._sinks.get((system_id, message_id), ()) if system_id != EVERY_SYSTEM else ()
+        sinks += self._sinks.get((EVERY_SYSTEM, message_id), ())
+        if not sinks or self.dialect.get(message_id) is None:
+            return ()
+        self._plans[system_id << 24 | message_id] = sinks
+        return sinks
+
     def _detach(self, key: tuple[int, int], sink: Sink) -> None:
         _drop(self._sinks, key, sink)
+        self._plans.clear()
         left = self.wanted[key[1]] - 1
         if left:
             self.wanted[key[1]] = left

@@ -9,6 +9,7 @@ from collections.abc import AsyncIterator, Callable
 from typing import Generic, TypeVar
 
 from aerokit.errors import OperationTimeout, StaleValueError, ValueUnknownError
+from aerokit.runtime.endings import raisable
 from aerokit.snapshot import Snapshot
 
 __all__ = ["Changes", "Source", "StateCell"]
@@ -186,11 +187,11 @@ class StateCell(Generic[T]):
         if self._closed_by is None:
             self._closed_by = error
             for sink in tuple(self._sinks):
-                sink.fail(error)
+                sink.fail(raisable(error))
 
     def _raise_if_closed(self) -> None:
         if self._closed_by is not None:
-            raise self._closed_by
+            raise raisable(self._closed_by)
 
     def _describe(self) -> str:
         if not self._known:

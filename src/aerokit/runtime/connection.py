@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import time
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import anyio
 
-from aerokit.errors import AerokitError, ConnectionClosed, LinkLost, LocalProtocolError
+from aerokit.errors import AerokitError, BusyError, ConnectionClosed, LinkLost, LocalProtocolError
 from aerokit.links import create_link
 from aerokit.links.link import Link
 from aerokit.mavlink.dialect import STANDARD
@@ -18,15 +17,16 @@ from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import Heartbeat
-from aerokit.mavlink.tlog import TlogWriter
 from aerokit.runtime.bus import Bus
+from aerokit.runtime.endings import raisable
 from aerokit.runtime.events import Event, LinkClosed
 from aerokit.runtime.loop_watch import watch_loop
+from aerokit.runtime.recording import Recording
 from aerokit.runtime.subscription import Overflow, Subscription
 
 if TYPE_CHECKING:
     import os
-    from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
+    from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Iterator, Sequence
 
     from anyio.abc import TaskGroup
 
@@ -49,6 +49,7 @@ MAV_COMP_ID_MISSIONPLANNER = 190
 HEARTBEAT_PERIOD_S = 1.0
 CLOSE_TIMEOUT_S = 2.0
 MOST_PEERS = 256
+EVERY_PEER: tuple[Peer, ...] = (None,)
 
 
 @asynccontextmanager
@@ -71,15 +72,19 @@ async def open_connection(
         address: a connection string (``"udpin:0.0.0.0:14550"``, ``"/dev/ttyACM0,57600"``, …) or a link not yet open.
         source_system: our own system id, 1–255; ground stations take 255.
         source_component: our own component id, 1–255.
-        baud: of a serial link whose address names none.
+        baud: of a serial link whose address names none, bits per second, above 0.
         dialect: the messages that are understood.
         mavlink_version: of what we send, 1 or 2; both are understood.
-        record: a ``.tlog`` file for everything received and sent; an existing file is appended to.
+        record: a ``.tlog`` file for everything received and sent, messages of unknown dialects too; an existing file
+            is replaced. A disk that is full ends the recording, not the connection.
 
     Raises:
         LocalProtocolError: an argument is wrong; nothing was opened.
-        LinkOpenError: the link could not be opened.
+        LinkOpenError: the link or the file for the recording could not be opened.
+        ConnectionClosed, BusyError: the link given was used before.
     """
+    if not baud > 0:
+        raise LocalProtocolError(f"baud = {baud} is not allowed: above 0")
     link = create_link(address, baud=baud) if isinstance(address, str) else address
     connection = Connection(
         link,
@@ -87,10 +92,11 @@ async def open_connection(
         source_component=source_component,
         dialect=dialect,
         mavlink_version=mavlink_version,
-        recorder=None if record is None else TlogWriter(record),
     )
     failure: BaseException | None = None
     try:
+        if record is not None:
+            connection.record(record)
         await link.open(connection)
         async with anyio.create_task_group() as tasks:
             connection._start(tasks)
@@ -102,12 +108,16 @@ async def open_connection(
                 failure = error  # raised below: a task group would wrap it in an exception group
             finally:
                 connection.close()
+                tasks.cancel_scope.cancel()
     finally:
         connection.close()
         with anyio.CancelScope(shield=True), anyio.move_on_after(CLOSE_TIMEOUT_S):
             await link.wait_closed()
-    if failure is not None:
-        raise failure
+    try:
+        if failure is not None:
+            raise failure
+    finally:
+        failure = None  # its traceback holds this frame: no circle
 
 
 class Connection:
@@ -125,13 +135,16 @@ class Connection:
         source_component: int = MAV_COMP_ID_MISSIONPLANNER,
         dialect: Dialect = STANDARD,
         mavlink_version: int = 2,
-        recorder: TlogWriter | None = None,
     ) -> None:
         for field, value in (("source_system", source_system), ("source_component", source_component)):
             if not 1 <= value <= 255:
                 raise LocalProtocolError(f"{field} = {value} is not allowed: 1 to 255")
         if mavlink_version not in (1, 2):
             raise LocalProtocolError(f"mavlink_version = {mavlink_version} is not allowed: 1 or 2")
+        if dialect.get(Heartbeat.ID) is not Heartbeat:
+            raise LocalProtocolError(
+                f"dialect {dialect.name!r} has no HEARTBEAT: pass Dialect.extended_by of the standard one"
+            )
         self.link = link
         self.bus = Bus(dialect)
         self.source_system, self.source_component = source_system, source_component
@@ -142,10 +155,10 @@ class Connection:
         self._clock = asyncio.get_running_loop().time
         self._encoder = FrameEncoder(source_system, source_component, version=mavlink_version)
         self._framers: dict[Peer, Framer] = {}
-        self._routes: dict[int, Peer] = {}
-        self._recorder = recorder
+        self._routes: dict[tuple[int, int], Peer] = {}  # system, component → where its heartbeat came from
+        self._recording: Recording | None = None
         self._enders: list[Callable[[Exception], None]] = []
-        self._tasks: TaskGroup | None = None
+        self._background: set[anyio.CancelScope] = set()
         self._error: Exception | None = None
         self.bus.attach(Heartbeat, _ignore)  # routes and diagnosis need every heartbeat
 
@@ -154,8 +167,9 @@ class Connection:
     def send(self, message: Message, *, to: int | None = None) -> None:
         """Number, frame and write a message; never blocks.
 
-        It goes to where the system ``to`` (None: the one in its ``target_system``) was last heard, and to every peer
-        when there is none.
+        It goes to where its ``target_component`` of the system ``to`` (None: its ``target_system``) was last heard;
+        to every peer with components of that system when it names none of them; and to every peer when it is for all
+        or for one that was never heard.
 
         Raises:
             LocalProtocolError: a field is out of range; nothing was sent.
@@ -163,10 +177,11 @@ class Connection:
         """
         self.raise_if_ended()
         data = self._encoder.encode(message)
-        target = getattr(message, "target_system", 0) if to is None else to
-        self.link.write(data, self._routes.get(target))
-        if self._recorder is not None:
-            self._recorder.write(data, time.time())
+        system_id = getattr(message, "target_system", 0) if to is None else to
+        for peer in self._peers_of(system_id, getattr(message, "target_component", 0)):
+            self.link.write(data, peer)
+        if self._recording is not None:
+            self._recording.write(data)
 
     def subscribe(
         self,
@@ -225,7 +240,7 @@ class Connection:
     def raise_if_ended(self) -> None:
         """Raise what ended the connection (ConnectionClosed, LinkLost), if it has ended."""
         if self._error is not None:
-            raise self._error
+            raise raisable(self._error)
 
     def now(self) -> float:
         """Seconds on the event loop's clock, the one that all ages and deadlines are measured on."""
@@ -246,54 +261,72 @@ class Connection:
         return sum(source.received for source in sources), sum(source.lost for source in sources)
 
     def close(self, error: Exception | None = None) -> None:
-        """End it: what waits gets ``error``, the link closes, tasks are cancelled. Never blocks; idempotent."""
+        """End it: what waits gets ``error``, the link closes, our tasks are cancelled. Never blocks; idempotent.
+
+        Inside the connection's block as well: the block goes on, and whatever it asks of the connection raises.
+        """
         self._end(error or ConnectionClosed("the connection was closed"))
         self.link.close()
-        if self._recorder is not None:
-            self._recorder.close()
-            self._recorder = None
-        if self._tasks is not None:
-            self._tasks.cancel_scope.cancel()
+        if self._recording is not None:
+            self._recording.close()
+            self._recording = None
+
+    def record(self, path: str | os.PathLike[str]) -> None:
+        """Write everything sent and received from now on to a ``.tlog`` file, until the connection is closed.
+
+        Raises:
+            LinkOpenError: the file cannot be written.
+            BusyError: a recording is under way.
+            ConnectionClosed, LinkLost: the connection has ended.
+        """
+        self.raise_if_ended()
+        if self._recording is not None:
+            raise BusyError("this connection is being recorded already")
+        self._recording = Recording(path)
+        for framer in self._framers.values():
+            self._let_through(framer)
 
     # -------------------------------------------------------------------- what the link calls
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
-        """Take bytes off the link (called by the link)."""
-        framer = self._framers.get(peer)
-        if framer is None:
-            framer = self._new_framer(peer)
-        for frame in framer.receive(data, self._clock()):
-            if frame.message_id == Heartbeat.ID:
-                self._note_heartbeat(frame, peer)
-            if self._recorder is not None:
-                self._recorder.write(frame.raw, time.time())
-            self.bus.deliver(frame)
+        """Take bytes off the link (called by the link); never raises."""
+        try:
+            framer = self._framers.get(peer)
+            if framer is None:
+                framer = self._new_framer(peer)
+            for frame in framer.receive(data, self._clock()):
+                if self._error is not None:  # a sink has closed it
+                    return
+                if self._recording is not None:
+                    self._recording.write(frame.raw)
+                if frame.message_id == Heartbeat.ID:
+                    self._note_heartbeat(frame, peer)
+                self.bus.deliver(frame)
+        except Exception as error:
+            self._fail(error)
 
     def link_lost(self, error: LinkLost) -> None:
         """The link has gone (called by the link): whatever waits ends with this error."""
-        if self._error is None:
-            self._end(error)
-            self.bus.publish(LinkClosed(self._clock(), 0, error))
+        self._end(error)
 
     # ------------------------------------------------------------------------------- inside
 
     def _start(self, tasks: TaskGroup) -> None:
-        self._tasks = tasks
         tasks.start_soon(self.guarded, self._send_heartbeats, name="aerokit heartbeat")
         tasks.start_soon(self.guarded, self._watch_loop, name="aerokit loop watch")
 
     async def guarded(self, function: Callable[[], Awaitable[None]]) -> None:
-        """Run a background task of ours: a mistake in it ends the connection, and never surfaces as a group."""
-        try:
-            await function()
-        except AerokitError as error:
-            if self.is_open:
-                self._end(error)
-        except Exception as error:
-            logger.exception("a background task of aerokit failed")
-            closed = ConnectionClosed(f"a background task of aerokit failed: {error!r}")
-            closed.__cause__ = error
-            self._end(closed)
+        """Run a background task of ours until the connection ends; a mistake in it ends the connection."""
+        if not self.is_open:
+            return
+        with anyio.CancelScope() as scope:
+            self._background.add(scope)
+            try:
+                await function()
+            except Exception as error:
+                self._fail(error)
+            finally:
+                self._background.discard(scope)
 
     async def _watch_loop(self) -> None:
         await watch_loop(self)
@@ -302,15 +335,42 @@ class Connection:
         heartbeat = Heartbeat(MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID, 0, 0, MAV_STATE_ACTIVE, 3)
         while self.is_open:
             self.send(heartbeat)
+            if self._recording is not None:
+                self._recording.flush()
             await anyio.sleep(HEARTBEAT_PERIOD_S)
+
+    def _fail(self, error: Exception) -> None:
+        """A mistake of ours: whoever waits is told, and it never surfaces where the program did not ask."""
+        if self._error is not None and isinstance(error, AerokitError):
+            return  # a task of ours was told of the end
+        logger.error("a mistake inside aerokit closes the connection", exc_info=error)
+        closed = ConnectionClosed(f"a mistake inside aerokit closed the connection: {error!r}")
+        closed.__cause__ = error
+        self.close(closed)
 
     def _end(self, error: Exception) -> None:
         if self._error is not None:
             return
         self._error = error
+        if isinstance(error, LinkLost):
+            self.bus.publish(LinkClosed(self._clock(), 0, error))
         enders, self._enders = self._enders, []
         for ender in enders:
-            ender(error)
+            try:
+                ender(error)
+            except Exception:
+                logger.exception("a mistake at the end of a connection; the others are told all the same")
+        for scope in tuple(self._background):
+            scope.cancel()
+
+    def _peers_of(self, system_id: int, component_id: int) -> Collection[Peer]:
+        """Where to send what is for this component, or for this system if the component is 0 or was never heard."""
+        if system_id == 0:
+            return EVERY_PEER
+        try:
+            return (self._routes[system_id, component_id],)
+        except KeyError:
+            return {peer for (system, _), peer in self._routes.items() if system == system_id} or EVERY_PEER
 
     def _attach(self, item: type[Any], sink: Sink, system_id: int) -> Detach:
         if issubclass(item, Message):
@@ -318,17 +378,27 @@ class Connection:
         return self.bus.attach_event(item, _only(system_id, sink) if system_id else sink)
 
     def _new_framer(self, peer: Peer) -> Framer:
-        while len(self._framers) >= MOST_PEERS:
-            self._framers.pop(next(iter(self._framers)))
+        if len(self._framers) >= MOST_PEERS:
+            del self._framers[self._peer_to_forget()]
         framer = self._framers[peer] = Framer(self.bus.dialect)
-        framer.wanted = None if self._recorder is not None else self.bus.wanted
+        self._let_through(framer)
         return framer
+
+    def _peer_to_forget(self) -> Peer:
+        """The oldest that no heartbeat came from, else the oldest."""
+        routes = set(self._routes.values())
+        return next((peer for peer in self._framers if peer not in routes), next(iter(self._framers)))
+
+    def _let_through(self, framer: Framer) -> None:
+        """A recording holds everything, also what nobody wants and what the dialect does not know."""
+        framer.keep_unknown = self._recording is not None
+        framer.wanted = None if framer.keep_unknown else self.bus.wanted
 
     def _note_heartbeat(self, frame: Frame, peer: Peer) -> None:
         heartbeat = self.bus.dialect.decode(frame)
         if frame.system_id != 0 and isinstance(heartbeat, Heartbeat):
-            self.heard[frame.system_id, frame.component_id] = heartbeat
-            self._routes[frame.system_id] = peer
+            source = frame.system_id, frame.component_id
+            self.heard[source], self._routes[source] = heartbeat, peer
 
 
 def _only(system_id: int, sink: Sink) -> Sink:

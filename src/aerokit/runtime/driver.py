@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from aerokit.runtime.endings import raisable
+
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.protocols.exchange import Exchange
@@ -18,7 +20,8 @@ ResultT = TypeVar("ResultT")
 async def run_exchange(connection: Connection, system_id: int, exchange: Exchange[ResultT]) -> ResultT:
     """Run ``exchange`` with the vehicle ``system_id`` to its end and return its result.
 
-    Cancellation ends it at once. When the connection ends, the exchange ends with the connection's error.
+    Cancellation ends it at once. When the connection ends, the exchange ends with the connection's error; what goes
+    wrong in sending is raised here.
     """
     runner = _Runner(connection, exchange)
     detachments = [
@@ -50,12 +53,14 @@ class _Runner:
         self._after_step()
 
     def receive(self, message: Message) -> None:
-        self._exchange.receive(message, self._loop.time())
-        self._after_step()
+        try:
+            self._exchange.receive(message, self._loop.time())
+        finally:  # what a callback of the program raised is for the bus to report; the exchange goes on
+            self._after_step()
 
     def abort(self, error: Exception) -> None:
-        self._exchange.abort(error)
-        self._after_step()
+        self._exchange.abort(raisable(error))
+        self._finish()
 
     def stop(self) -> None:
         if self._timer is not None:
@@ -64,17 +69,29 @@ class _Runner:
 
     def _expire(self) -> None:
         self._timer = None
-        self._exchange.expire(self._loop.time())
+        try:
+            self._exchange.expire(self._loop.time())
+        except Exception as error:
+            self._exchange.abort(error)
         self._after_step()
 
     def _after_step(self) -> None:
-        for message in self._exchange.take_outbox():
-            self._connection.send(message)
-        deadline = self._exchange.deadline
+        try:
+            for message in self._exchange.take_outbox():
+                self._connection.send(message)
+        except Exception as error:  # nobody else would tell the one who waits
+            self._exchange.abort(error)
         if self._exchange.done:
-            self.stop()
-            if not self.future.done():
-                self.future.set_result(None)
-        elif deadline is not None and (self._timer is None or self._timer.when() != deadline):
+            self._finish()
+        else:
+            self._set_timer(self._exchange.deadline)
+
+    def _set_timer(self, deadline: float | None) -> None:
+        if deadline is not None and (self._timer is None or self._timer.when() != deadline):
             self.stop()
             self._timer = self._loop.call_at(deadline, self._expire)
+
+    def _finish(self) -> None:
+        self.stop()
+        if not self.future.done():
+            self.future.set_result(None)

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Generic, Literal, TypeVar
 
 import anyio
 
-from aerokit.errors import LocalProtocolError, OperationTimeout, SubscriptionOverflow
+from aerokit.errors import BusyError, LocalProtocolError, OperationTimeout, SubscriptionOverflow
+from aerokit.runtime.endings import raisable
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -58,6 +59,8 @@ class Subscription(Generic[ItemT]):
         self._closed = False
 
     def __enter__(self) -> Self:
+        if self._closed or self._detach:
+            raise BusyError("a subscription is entered once; make a new one")
         self._detach = list(self._attach(self._push))
         return self
 
@@ -75,7 +78,7 @@ class Subscription(Generic[ItemT]):
     async def __anext__(self) -> ItemT:
         while not self._queue:
             if self._error is not None:
-                raise self._error
+                raise raisable(self._error)
             if self._closed:
                 raise StopAsyncIteration
             await self._wait()
@@ -110,6 +113,8 @@ class Subscription(Generic[ItemT]):
         self._wake()
 
     def _push(self, item: ItemT) -> None:
+        if self._closed:  # in the middle of a delivery that had begun
+            return
         if len(self._queue) < self._capacity:
             self._queue.append(item)
         else:

@@ -14,7 +14,9 @@ from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.messages import Heartbeat
 from aerokit.runtime.connection import MAV_COMP_ID_MISSIONPLANNER, Connection, open_connection
 from aerokit.runtime.diagnosis import is_autopilot, no_vehicle_reason
+from aerokit.runtime.endings import raisable
 from aerokit.runtime.events import VehicleFound
+from aerokit.vehicle.rates import check_rate
 from aerokit.vehicle.vehicle import Vehicle
 
 if TYPE_CHECKING:
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Mapping
 
     from aerokit.mavlink.dialect import Dialect
+    from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.message import Message
 
 __all__ = ["connect"]
@@ -48,10 +51,12 @@ async def connect(
 
     Args:
         address: ``"udpin:0.0.0.0:14550"``, ``"tcp:127.0.0.1:5760"``, ``"/dev/ttyACM0,57600"``, a ``.tlog`` file …;
-            a link; or a connection that is open already, for several vehicles on one link.
+            a link; or a connection that is open already, for several vehicles on one link: what follows ``rates`` here
+            is then said where it is opened.
         system_id: the vehicle's MAVLink system id, 1–255; None takes the first autopilot that is heard.
         timeout: seconds to wait for its first heartbeat, above 0.
-        rates: message class → Hz, asked for instead of the default rates; ``{}`` asks for nothing.
+        rates: message class → Hz (above 0, at most 1000), asked for instead of the default rates; ``{}`` asks for
+            nothing.
         source_system: our own system id.
         source_component: our own component id.
         baud: of a serial link whose address names none.
@@ -61,17 +66,17 @@ async def connect(
 
     Raises:
         LocalProtocolError: an argument is wrong. Nothing was opened.
-        LinkOpenError: the link could not be opened.
-        LinkLost: the link went down while waiting.
+        BusyError: this system has a vehicle object on this connection already.
+        LinkOpenError: the link, or the file to record to, could not be opened.
+        LinkLost, ConnectionClosed: the link went down while waiting, or the connection was closed.
         ConnectFailed: no heartbeat of such a vehicle came in time; the text says what was heard instead.
     """
-    if system_id is not None and not 1 <= system_id <= 255:
-        raise LocalProtocolError(
-            f"system_id = {system_id} is not allowed: 1 to 255, or None for the first heard"
-        )
-    if not timeout > 0:
-        raise LocalProtocolError(f"timeout = {timeout} is not allowed: above 0")
+    _check(system_id, timeout, rates, address.bus.dialect if isinstance(address, Connection) else dialect)
     if isinstance(address, Connection):
+        if record is not None:
+            raise LocalProtocolError(
+                "record = … is not allowed here: the connection is open; use its record()"
+            )
         async with _attached(address, system_id, timeout, rates) as vehicle:
             yield vehicle
         return
@@ -90,6 +95,21 @@ async def connect(
         yield vehicle
 
 
+def _check(
+    system_id: int | None, timeout: float, rates: Mapping[type[Message], float] | None, dialect: Dialect
+) -> None:
+    if system_id is not None and not 1 <= system_id <= 255:
+        raise LocalProtocolError(
+            f"system_id = {system_id} is not allowed: 1 to 255, or None for the first heard"
+        )
+    if not timeout > 0:
+        raise LocalProtocolError(f"timeout = {timeout} is not allowed: above 0")
+    for message_type, hz in (rates or {}).items():
+        check_rate(message_type, hz)
+        if dialect.get(message_type.ID) is not message_type:
+            raise LocalProtocolError(f"{message_type.NAME} is not in the dialect {dialect.name!r}")
+
+
 @asynccontextmanager
 async def _attached(
     connection: Connection,
@@ -98,19 +118,15 @@ async def _attached(
     rates: Mapping[type[Message], float] | None,
 ) -> AsyncIterator[Vehicle]:
     """Find a vehicle on an open connection and keep it for the time of the block."""
-    heartbeat = await _first_heartbeat(connection, system_id, timeout)
-    frame = heartbeat.received_frame
-    assert frame is not None
-    if frame.system_id in connection.attached:
-        raise BusyError(f"system {frame.system_id} has a vehicle object on this connection already")
-    vehicle = Vehicle(connection, frame.system_id, frame.component_id, heartbeat)
+    vehicle, heartbeat = await _find_vehicle(connection, system_id, timeout)
     failure: BaseException | None = None
-    connection.attached.add(frame.system_id)
     try:
         async with anyio.create_task_group() as tasks:
-            vehicle._start(tasks, heartbeat, rates)
-            connection.bus.publish(VehicleFound(connection.now(), frame.system_id, frame.component_id))
             try:
+                vehicle._start(tasks, heartbeat, rates)
+                connection.bus.publish(
+                    VehicleFound(connection.now(), vehicle.system_id, vehicle.component_id)
+                )
                 yield vehicle
             except asyncio.CancelledError:
                 raise
@@ -120,33 +136,89 @@ async def _attached(
                 tasks.cancel_scope.cancel()
     finally:
         vehicle._close()
-        connection.attached.discard(frame.system_id)
-    if failure is not None:
-        raise failure
+        connection.attached.discard(vehicle.system_id)
+    try:
+        if failure is not None:
+            raise failure
+    finally:
+        failure = None  # its traceback holds this frame: no circle
 
 
-async def _first_heartbeat(connection: Connection, system_id: int | None, timeout: float) -> Heartbeat:
-    def is_wanted(heartbeat: Heartbeat) -> bool:
-        frame = heartbeat.received_frame
-        return (
-            frame is not None
-            and frame.system_id != 0
-            and system_id in (None, frame.system_id)
-            and is_autopilot(heartbeat)
-        )
-
+async def _find_vehicle(
+    connection: Connection, system_id: int | None, timeout: float
+) -> tuple[Vehicle, Heartbeat]:
+    """The vehicle of the first heartbeat that will do, listening from the instant it came."""
+    connection.raise_if_ended()
+    search = _Search(connection, system_id)
     for known in connection.heard.values():
-        if is_wanted(known):
-            return known
-    with (
-        connection.subscribe(Heartbeat, capacity=64) as heartbeats,
-        anyio.move_on_after(timeout),
-    ):
-        async for heartbeat in heartbeats:
-            if is_wanted(heartbeat):
-                return heartbeat
-    wanted = "an autopilot" if system_id is None else f"the autopilot of system {system_id}"
+        search.take(known)
+    detachments = [
+        connection.bus.attach(Heartbeat, search.take, system_id=system_id or 0),
+        connection.on_end(search.abort),
+    ]
+    try:
+        with anyio.move_on_after(timeout):
+            return await search.result()
+    finally:
+        for detach in detachments:
+            detach()
+        search.forget()
     raise ConnectFailed(
-        f"no heartbeat of {wanted} within {timeout:g} s on {connection.link.address}:"
+        f"no heartbeat of {search.wanted} within {timeout:g} s on {connection.link.address}:"
         f" {no_vehicle_reason(connection, system_id)}"
     )
+
+
+class _Search:
+    """Makes the vehicle as soon as it is heard, inside the delivery of its heartbeat: what follows is not missed.
+
+    A recording that is replayed as fast as it goes brings many frames in one turn of the loop.
+    """
+
+    def __init__(self, connection: Connection, system_id: int | None) -> None:
+        self._connection, self._system_id = connection, system_id
+        self._vehicle: Vehicle | None = None
+        self._heartbeat: Heartbeat | None = None
+        self._error: Exception | None = None
+        self._ended = asyncio.Event()
+        self.wanted = "an autopilot" if system_id is None else f"the autopilot of system {system_id}"
+
+    def take(self, heartbeat: Heartbeat) -> None:
+        """One heartbeat off the link."""
+        frame = heartbeat.received_frame
+        if frame is None or self._ended.is_set() or not self._is_wanted(frame, heartbeat):
+            return
+        try:
+            if frame.system_id in self._connection.attached:
+                raise BusyError(f"system {frame.system_id} has a vehicle object on this connection already")
+            self._vehicle = Vehicle(self._connection, frame.system_id, frame.component_id, heartbeat)
+            self._heartbeat = heartbeat
+            self._connection.attached.add(frame.system_id)
+        except Exception as error:
+            self._error = error
+        self._ended.set()
+
+    def abort(self, error: Exception) -> None:
+        """The connection has ended."""
+        if not self._ended.is_set():
+            self._error = raisable(error)
+            self._ended.set()
+
+    async def result(self) -> tuple[Vehicle, Heartbeat]:
+        """The vehicle, now its finder's to close, and its first heartbeat."""
+        await self._ended.wait()
+        if self._vehicle is None or self._heartbeat is None:
+            assert self._error is not None
+            raise self._error
+        vehicle, self._vehicle = self._vehicle, None
+        return vehicle, self._heartbeat
+
+    def forget(self) -> None:
+        """Close the vehicle if nobody took it: the wait was cancelled just then."""
+        self._ended.set()
+        if self._vehicle is not None:
+            self._vehicle._close()
+            self._connection.attached.discard(self._vehicle.system_id)
+
+    def _is_wanted(self, frame: Frame, heartbeat: Heartbeat) -> bool:
+        return frame.system_id != 0 and self._system_id in (None, frame.system_id) and is_autopilot(heartbeat)

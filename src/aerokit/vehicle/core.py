@@ -22,7 +22,7 @@ from aerokit.runtime.events import (
 )
 from aerokit.runtime.subscription import Overflow, Subscription
 from aerokit.vehicle.commands import CommandSender
-from aerokit.vehicle.rates import MessageRates
+from aerokit.vehicle.rates import MessageRates, check_rate
 from aerokit.vehicle.telemetry import Telemetry
 from aerokit.vehicle.watch import LinkWatch, VehicleWatch
 
@@ -187,6 +187,8 @@ class VehicleCore:
         """
         self.connection.check_types(types)
         messages: list[type[Message]] = [each for each in types if issubclass(each, Message)]
+        for message in messages if rate_hz is not None else ():
+            check_rate(message, rate_hz)
 
         def attach(sink: Sink) -> list[Detach]:
             detach = self.connection.attach(types, sink, system_id=self.system_id)

@@ -44,6 +44,7 @@ async def await_progress(
     reasons_from = started
     cells = (vehicle.telemetry.mode, vehicle.telemetry.armed, vehicle.telemetry.position)
     ends = [cell.observe(lambda *_: changed.set()) for cell in (*cells, vehicle.telemetry.landed_state)]
+    ends.append(vehicle.connection.on_end(lambda _: changed.set()))
     done_since: float | None = None
     try:
         while True:

@@ -39,6 +39,14 @@ ASK_AGAIN_LONGEST_S = 60.0
 AUTOPILOT_DEFAULT = 0.0
 
 
+def check_rate(message_type: type[Message], hz: float) -> None:
+    """Raise LocalProtocolError unless such a message can be asked for at ``hz``: above 0, at most 1000."""
+    if not 0 < hz <= 1000:
+        raise LocalProtocolError(
+            f"rate_hz = {hz!r} of {message_type.NAME} is not allowed: above 0, at most 1000"
+        )
+
+
 class _Stream:
     """What is wanted of one message, what was asked and what came."""
 
@@ -109,10 +117,7 @@ class MessageRates:
 
         What is optional may never come (a sensor that is not there): that is no event.
         """
-        if not 0 < hz <= 1000:
-            raise LocalProtocolError(
-                f"rate_hz = {hz!r} of {message_type.NAME} is not allowed: above 0, at most 1000"
-            )
+        check_rate(message_type, hz)
         stream = self._streams.get(message_type.ID)
         if stream is None:
             stream = self._streams[message_type.ID] = self._new_stream(message_type)

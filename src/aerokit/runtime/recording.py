@@ -1,0 +1,67 @@
+"""Writes everything sent and received into a ``.tlog`` file; a disk that is full ends the recording, not the flight."""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+
+from aerokit.errors import LinkOpenError
+from aerokit.mavlink.tlog import TlogWriter
+
+__all__ = ["Recording"]
+
+logger = logging.getLogger("aerokit")
+
+
+class Recording:
+    """A ``.tlog`` of one connection, begun anew: a file of that name is overwritten. Stamped with the wall clock.
+
+    Raises:
+        LinkOpenError: the file cannot be written.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self._path = os.fspath(path)
+        self._writer: TlogWriter | None = None
+        try:
+            self._writer = TlogWriter(path)
+        except OSError as error:
+            raise LinkOpenError(f"cannot record to {self._path}: {error.strerror or error}") from error
+
+    def write(self, raw: bytes) -> None:
+        """Add one frame; never raises."""
+        if self._writer is not None:
+            try:
+                self._writer.write(raw, time.time())
+            except OSError as error:
+                self._give_up(error)
+
+    def flush(self) -> None:
+        """Hand everything to the system, so that a crash of the program loses nothing; never raises."""
+        if self._writer is not None:
+            try:
+                self._writer.flush()
+            except OSError as error:
+                self._give_up(error)
+
+    def close(self) -> None:
+        """End the file; never raises, idempotent."""
+        writer, self._writer = self._writer, None
+        if writer is not None:
+            try:
+                writer.close()
+            except OSError as error:
+                self._report(error)
+
+    def _give_up(self, error: OSError) -> None:
+        self._report(error)
+        writer, self._writer = self._writer, None
+        if writer is not None:
+            try:
+                writer.close()
+            except OSError:
+                logger.debug("the end of %s was lost too", self._path)
+
+    def _report(self, error: OSError) -> None:
+        logger.error("recording to %s has ended: %s", self._path, error.strerror or error)
