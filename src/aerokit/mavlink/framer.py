@@ -23,6 +23,7 @@ __all__ = ["Framer"]
 # The last of version 2 is the id in its lower three bytes; the byte above them belongs to what follows.
 _HEADER_V2 = Struct("<BBBxBHI").unpack_from  # magic, length, flags, sequence, source, id
 _HEADER_V1 = Struct("<xBBHB").unpack_from  # length, sequence, source, id
+_CHECKSUM = Struct("<H").unpack_from
 _SHORTEST_V2 = 12
 _SHORTEST_V1 = 8
 _MAGICS = (MAGIC_V1, MAGIC_V2)
@@ -81,12 +82,12 @@ class Framer:
                 message_id &= 0xFFFFFF
                 body = begin + 10
                 upto = body + length
-                end = upto + 2
+                end = upto + 15 if flags else upto + 2
                 good = (
                     magic == 0xFD
-                    and not flags
+                    and flags <= 1
                     and end <= size
-                    and x25(data[begin + 1 : upto] + extras[message_id]) == data[upto] | data[upto + 1] << 8
+                    and x25(data[begin + 1 : upto] + extras[message_id]) == _CHECKSUM(data, upto)[0]
                 )
             except (StructError, KeyError):
                 good, message_id = False, 0
@@ -120,6 +121,11 @@ class Framer:
             begin = end
         return frames
 
+    @property
+    def waiting(self) -> int:
+        """Bytes kept because they may become a frame, a few hundred at most."""
+        return len(self._rest)
+
     def _add_source(self, key: int, sequence: int) -> SourceStatistics:
         source = SourceStatistics(key & 0xFF, key >> 8, sequence)
         self._sources[key] = self.statistics.sources[key & 0xFF, key >> 8] = source
@@ -152,7 +158,10 @@ class Framer:
                 self._pass(begin, here, bad_crcs)
                 return found
             if verdict == _WAIT:
-                hold = min(place for place in (hold, unknown, here) if place >= 0)
+                if unknown >= 0 and (hold < 0 or unknown < hold):
+                    hold = unknown
+                elif hold < 0:
+                    hold = here
                 break
             if verdict == _DOUBTFUL and hold < 0:
                 hold = here
@@ -168,13 +177,13 @@ class Framer:
 
     def _unknown_passed(self, data: bytes, begin: int, end: int) -> None:
         """A frame of an unknown message was here: its sender, if we know it, has not lost it."""
-        self.statistics.unknown_ids += 1
         if self.keep_unknown:
             self._unknown.append(data[begin:end])
         if data[begin] == MAGIC_V2:
-            _, _, _, sequence, key, _ = _HEADER_V2(data, begin)
+            _, _, _, sequence, key, message_id = _HEADER_V2(data, begin)
         else:
-            _, sequence, key, _ = _HEADER_V1(data, begin)
+            _, sequence, key, message_id = _HEADER_V1(data, begin)
+        self.statistics.unknown(message_id & 0xFFFFFF)
         source = self._sources.get(key)
         if source is not None and source.expected == sequence:
             source.expected = (sequence + 1) & 0xFF
@@ -182,7 +191,8 @@ class Framer:
     def _pass(self, begin: int, end: int, bad_crcs: list[int]) -> None:
         """Bytes that are in no frame are behind us; those that are kept will be looked at, and counted, again."""
         self.statistics.bad_bytes += end - begin
-        self.statistics.bad_crcs += sum(place < end for place in bad_crcs)
+        if bad_crcs:
+            self.statistics.bad_crcs += sum(place < end for place in bad_crcs)
 
     def _examine(self, data: bytes, begin: int) -> tuple[int, int, _Found | None]:
         """(verdict, end, frame when good) of the place ``begin``, where a magic byte is."""
@@ -206,11 +216,11 @@ class Framer:
         if row is None:
             return (_UNKNOWN if end <= size else _DOUBTFUL), end, None
         extra, base_length, full_length = row
+        if body - begin == 6 and not base_length <= length <= full_length:
+            return _NOISE, size, None  # version 1 neither trims nor knows extensions that are newer than ours
         if end > size:
-            usual = length <= full_length if body - begin == 10 else length in (base_length, full_length)
-            return (_WAIT if usual else _DOUBTFUL), end, None
+            return (_WAIT if length <= full_length else _DOUBTFUL), end, None
         upto = body + length
-        crc = x25(data[begin + 1 : upto] + bytes((extra,)))
-        if crc != data[upto] | data[upto + 1] << 8:
+        if x25(data[begin + 1 : upto] + bytes((extra,))) != _CHECKSUM(data, upto)[0]:
             return _BAD_CRC, end, None
         return _GOOD, end, (begin, message_id, sequence, key, body, upto, end)

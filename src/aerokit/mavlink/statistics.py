@@ -4,6 +4,7 @@ from __future__ import annotations
 
 __all__ = ["FramerStatistics", "SourceStatistics"]
 
+_MOST_UNKNOWN = 64
 _HALF = 128  # a counter that is more than this behind is late, not lost
 
 
@@ -72,7 +73,7 @@ class SourceStatistics:
 class FramerStatistics:
     """Counters of one framer since it was made; every byte is in a frame, in an unknown one, bad, or still waiting."""
 
-    __slots__ = ("bad_bytes", "bad_crcs", "bytes", "sources", "unknown_ids")
+    __slots__ = ("bad_bytes", "bad_crcs", "bytes", "sources", "unknown_ids", "unknown_messages")
 
     def __init__(self) -> None:
         self.bytes = 0
@@ -83,6 +84,8 @@ class FramerStatistics:
         """Places that looked like a frame of a known message, but for the checksum."""
         self.unknown_ids = 0
         """Frames, as far as one can tell, of messages this dialect does not know; their checksum cannot be checked."""
+        self.unknown_messages: dict[int, int] = {}
+        """Message id → how many of these frames; of the first 64 ids, because noise could name any number."""
         self.sources: dict[tuple[int, int], SourceStatistics] = {}
         """(system id, component id) → what came from there."""
 
@@ -90,6 +93,13 @@ class FramerStatistics:
     def frames(self) -> int:
         """Frames whose checksum was right, wanted or not."""
         return sum(source.received for source in self.sources.values())
+
+    def unknown(self, message_id: int) -> None:
+        """Count a frame of an unknown message."""
+        self.unknown_ids += 1
+        seen = self.unknown_messages
+        if message_id in seen or len(seen) < _MOST_UNKNOWN:
+            seen[message_id] = seen.get(message_id, 0) + 1
 
     def __repr__(self) -> str:
         names = ("bytes", "frames", "bad_bytes", "bad_crcs", "unknown_ids")
