@@ -1,0 +1,389 @@
+"""The framer: whatever comes, it never raises, never gives a wrong frame and finds the good ones."""
+
+from __future__ import annotations
+
+import random
+from itertools import chain
+
+import pytest
+from framer_harness import (
+    LONGEST,
+    cut,
+    cuts,
+    feed,
+    framed,
+    good_frames,
+    noise,
+    raws,
+    signed,
+    some_frames,
+    unknown,
+)
+from hypothesis import given
+from hypothesis import strategies as st
+
+from aerokit.mavlink import STANDARD, Dialect, FrameEncoder, Framer, Message, messages
+
+HEARTBEAT = messages.Heartbeat(2, 3, 81, 4, 3)
+ATTITUDE = messages.Attitude(1000, 0.25, 0.5, 0.75, -1.25, -1.5, -1.75)
+
+
+def frame_of(message: Message, *, sequence: int = 0, system_id: int = 1, version: int = 2) -> bytes:
+    encoder = FrameEncoder(system_id, 1, version=version)
+    encoder.sequence = sequence
+    return encoder.encode(message)
+
+
+# ------------------------------------------------------------------------------------- good streams
+
+
+@given(good_frames, cuts)
+def test_a_clean_stream_cut_anywhere_gives_every_frame(frames: list[bytes], places: list[int]) -> None:
+    framer = Framer()
+    assert raws(feed(framer, cut(b"".join(frames), places))) == frames
+    statistics = framer.statistics
+    assert statistics.bytes == sum(map(len, frames))
+    assert statistics.frames == len(frames)
+    assert (statistics.bad_bytes, statistics.bad_crcs, statistics.unknown_ids, framer.waiting) == (0, 0, 0, 0)
+    (source,) = statistics.sources.values()
+    assert (source.system_id, source.component_id, source.received, source.lost) == (1, 1, len(frames), 0)
+
+
+def test_every_single_cut_of_a_short_stream() -> None:
+    frames = some_frames(6)
+    stream = b"".join(frames)
+    for place in range(len(stream)):
+        assert raws(feed(Framer(), cut(stream, [place]))) == frames
+    assert raws(feed(Framer(), (stream[i : i + 1] for i in range(len(stream))))) == frames
+
+
+def test_the_header_is_told() -> None:
+    raw = frame_of(ATTITUDE, sequence=200, system_id=9)
+    (frame,) = Framer().receive(raw, 12.5)
+    assert (frame.version, frame.sequence, frame.system_id, frame.component_id) == (2, 200, 9, 1)
+    assert (frame.message_id, frame.payload, frame.raw) == (30, raw[10:-2], raw)
+    assert (frame.incompat_flags, frame.compat_flags, frame.signature) == (0, 0, b"")
+    assert frame.received_at == 12.5
+    assert repr(frame) == "<Frame v2 id=30 from=9/1 seq=200>"
+
+
+def test_version_1_is_told() -> None:
+    raw = frame_of(ATTITUDE, sequence=3, version=1)
+    (frame,) = Framer().receive(raw)
+    assert (frame.version, frame.sequence, frame.message_id, frame.payload) == (1, 3, 30, raw[6:-2])
+    assert (frame.incompat_flags, frame.compat_flags, frame.signature) == (0, 0, b"")
+
+
+def test_compatibility_flags_are_ignored_and_told() -> None:
+    body = bytes.fromhex("0900 80 00 0101 000000") + HEARTBEAT.encode()
+    raw = framed(body, HEARTBEAT.CRC_EXTRA)
+    (frame,) = Framer().receive(raw)
+    assert (frame.compat_flags, STANDARD.decode(frame)) == (0x80, HEARTBEAT)
+
+
+def test_unknown_incompatibility_flags_are_refused() -> None:
+    body = bytes.fromhex("0902 00 00 0101 000000") + HEARTBEAT.encode()
+    raw = framed(body, HEARTBEAT.CRC_EXTRA)
+    framer = Framer()
+    assert raws(framer.receive(raw + frame_of(ATTITUDE))) == [frame_of(ATTITUDE)]
+    assert framer.statistics.bad_bytes == len(raw)
+
+
+@pytest.mark.parametrize("kind", [bytearray, memoryview])
+def test_any_bytes_like_data(kind: type) -> None:
+    frames = some_frames(3)
+    assert raws(Framer().receive(kind(b"".join(frames)))) == frames
+
+
+def test_nothing_gives_nothing() -> None:
+    assert Framer().receive(b"") == []
+
+
+def test_payloads_longer_than_known_are_accepted() -> None:
+    """A sender with a newer standard has extensions that we do not know; the checksum is the same."""
+    payload = ATTITUDE.encode() + b"\x01\x02\x03"
+    body = bytes((len(payload), 0, 0, 0, 1, 1, 30, 0, 0)) + payload
+    raw = framed(body, ATTITUDE.CRC_EXTRA)
+    for pieces in ([raw], [raw[:20], raw[20:]], [raw[:41], raw[41:]]):
+        (frame,) = feed(Framer(), pieces)
+        assert STANDARD.decode(frame) == ATTITUDE
+
+
+# ------------------------------------------------------------------------------------------ signing
+
+
+@given(cuts)
+def test_signed_frames(places: list[int]) -> None:
+    plain = some_frames(4, versions=(2,))
+    extras = [STANDARD[int.from_bytes(raw[7:10], "little")].CRC_EXTRA for raw in plain]
+    frames = [signed(raw, extra) for raw, extra in zip(plain, extras, strict=True)]
+    mixed = list(chain.from_iterable(zip(frames, plain, strict=True)))
+    found = feed(Framer(), cut(b"".join(mixed), places))
+    assert raws(found) == mixed
+    assert [frame.signature for frame in found] == [bytes(range(100, 113)), b""] * 4
+    assert [frame.payload for frame in found[::2]] == [frame.payload for frame in found[1::2]]
+
+
+# -------------------------------------------------------------------------------------------- noise
+
+
+@given(st.lists(st.tuples(noise, good_frames), min_size=1, max_size=4), cuts)
+def test_good_frames_between_noise_are_found(
+    parts: list[tuple[bytes, list[bytes]]], places: list[int]
+) -> None:
+    frames = [raw for _, group in parts for raw in group]
+    stream = b"".join(bad + b"".join(group) for bad, group in parts)
+    trailer = some_frames(20, seed=77, system_id=200)  # as long as a false frame may claim to be
+    framer = Framer()
+    found = raws(feed(framer, cut(stream + b"".join(trailer), places)))
+    assert [raw for raw in found if raw in set(frames)] == frames
+    assert set(found) <= {*frames, *trailer}
+
+
+@given(st.lists(noise, max_size=30), cuts)
+def test_noise_alone_gives_nothing(parts: list[bytes], places: list[int]) -> None:
+    stream = b"".join(parts)
+    framer = Framer()
+    assert feed(framer, cut(stream, places)) == []
+    assert framer.statistics.bytes == len(stream)
+    assert framer.statistics.bad_bytes + framer.waiting <= len(stream)
+    if not framer.statistics.unknown_ids:
+        assert framer.statistics.bad_bytes + framer.waiting == len(stream)
+
+
+@given(
+    good_frames, st.lists(st.tuples(st.integers(0, 4000), st.integers(1, 255)), min_size=1, max_size=6), cuts
+)
+def test_damage_never_gives_a_wrong_frame(
+    frames: list[bytes], damage: list[tuple[int, int]], places: list[int]
+) -> None:
+    stream = bytearray(b"".join(frames))
+    for place, change in damage:
+        stream[place % len(stream)] ^= change
+    trailer = some_frames(20, seed=77, system_id=200)
+    found = raws(feed(Framer(), cut(bytes(stream) + b"".join(trailer), places)))
+    whole = [raw for raw in frames if raw in bytes(stream)]
+    assert set(found) <= {*frames, *trailer}
+    assert [raw for raw in found if raw in set(whole)] == whole
+
+
+@given(good_frames, st.integers(0, 4000), st.integers(1, 60))
+def test_bytes_left_out_cost_only_the_frames_they_are_of(frames: list[bytes], place: int, count: int) -> None:
+    stream = b"".join(frames)
+    place %= len(stream)
+    stream = stream[:place] + stream[place + count :]
+    trailer = some_frames(20, seed=77, system_id=200)
+    found = raws(Framer().receive(stream + b"".join(trailer)))
+    whole = [raw for raw in frames if raw in stream]
+    assert [raw for raw in found if raw in set(whole)] == whole
+    assert set(found) <= {*frames, *trailer}
+
+
+@pytest.mark.parametrize(
+    "claim",
+    [
+        b"\xfe\xff",
+        b"\xfd\xff\x00\x00",
+        b"\xfe\xff\x00\x01\x01\x0c",  # an unknown message of version 1
+        b"\xfd\xff\x00\x00\x00\x01\x01\x1e\x00\x00",  # longer than an ATTITUDE can be
+        b"\xfd\xff\x01\x00\x00\x01\x01\x99\x99\x99",  # unknown, signed
+    ],
+    ids=bytes.hex,
+)
+def test_a_false_beginning_that_claims_a_long_frame_holds_nothing_back(claim: bytes) -> None:
+    framer, frames = Framer(), some_frames(3, versions=(2,))
+    assert framer.receive(claim) == []
+    found = [raw for raw in frames for raw in raws(framer.receive(raw))]
+    assert found == frames
+    assert framer.statistics.bad_bytes == len(claim)
+
+
+def test_a_likely_false_beginning_is_waited_for_but_nothing_behind_it_is_lost() -> None:
+    claim = b"\xfd\x1c\x00\x00\x00\x01\x01\x1e\x00\x00"  # the header of a true ATTITUDE
+    framer, frames = Framer(), some_frames(10)
+    found = [raw for raw in frames for raw in raws(framer.receive(raw))]
+    framer = Framer()
+    framer.receive(claim)
+    assert raws(feed(framer, frames)) == found == frames
+    assert framer.statistics.bad_crcs == 1
+    assert framer.statistics.bad_bytes == len(claim)
+
+
+def test_text_before_the_first_frame() -> None:
+    text = b"\n\nInit ArduCopter V4.7.0-dev (21910f24)\n\nFree RAM: 524288\nBooting 0/0\n"
+    framer = Framer()
+    assert framer.receive(text) == []
+    assert raws(framer.receive(frame_of(HEARTBEAT))) == [frame_of(HEARTBEAT)]
+    assert (framer.statistics.bad_bytes, framer.statistics.bad_crcs) == (len(text), 0)
+
+
+def test_a_frame_with_a_wrong_checksum_is_counted_once() -> None:
+    raw = bytearray(frame_of(ATTITUDE))
+    raw[-1] ^= 0x40
+    framer = Framer()
+    assert raws(framer.receive(bytes(raw) + frame_of(HEARTBEAT))) == [frame_of(HEARTBEAT)]
+    assert (framer.statistics.bad_crcs, framer.statistics.bad_bytes) == (1, len(raw))
+
+
+@given(st.lists(noise, min_size=1, max_size=60), good_frames)
+def test_memory_is_bounded(parts: list[bytes], frames: list[bytes]) -> None:
+    framer = Framer()
+    for part in (*parts, *frames, *parts):
+        framer.receive(part)
+        assert framer.waiting <= 2 * LONGEST
+
+
+def test_memory_is_bounded_under_random_bytes() -> None:
+    chance = random.Random(5)
+    framer = Framer()
+    for _ in range(400):
+        framer.receive(chance.randbytes(chance.randint(0, 500)).replace(b"\x00", b"\xfd"))
+        assert framer.waiting <= 2 * LONGEST
+    assert framer.statistics.frames == 0
+
+
+# ----------------------------------------------------------------------------------- unknown messages
+
+
+@given(good_frames, st.integers(0, 200), cuts)
+def test_unknown_frames_are_passed_over_and_counted(
+    frames: list[bytes], length: int, places: list[int]
+) -> None:
+    stream = b"".join(unknown(length) + raw for raw in frames)
+    framer = Framer()
+    assert raws(feed(framer, cut(stream, places))) == frames
+    assert framer.statistics.unknown_ids == len(frames)
+    assert framer.statistics.unknown_messages == {16_000_000: len(frames)}
+    assert framer.statistics.bad_bytes == 0
+
+
+def test_a_good_frame_inside_a_seeming_unknown_one_is_found() -> None:
+    """The length of an unknown frame proves nothing: its checksum cannot be checked."""
+    raw = frame_of(HEARTBEAT)
+    seeming = bytearray(unknown(80))
+    seeming[30 : 30 + len(raw)] = raw
+    framer = Framer()
+    assert raws(framer.receive(bytes(seeming) + raw)) == [raw, raw]
+    assert framer.statistics.unknown_ids == 0
+
+
+def test_unknown_frames_of_a_known_sender_are_not_lost_ones() -> None:
+    framer = Framer()
+    framer.receive(frame_of(HEARTBEAT, sequence=0))
+    framer.receive(unknown(sequence=1))
+    framer.receive(frame_of(HEARTBEAT, sequence=2))
+    assert [source.lost for source in framer.statistics.sources.values()] == [0]
+
+
+def test_the_table_of_unknown_ids_is_bounded() -> None:
+    framer = Framer()
+    for number in range(200):
+        framer.receive(unknown(message_id=1_000_000 + number % 100))
+    assert framer.statistics.unknown_ids == 200
+    assert len(framer.statistics.unknown_messages) == 64
+
+
+def test_unknown_frames_are_returned_on_demand() -> None:
+    framer = Framer()
+    framer.keep_unknown = True
+    framer.wanted = frozenset()
+    stream = frame_of(HEARTBEAT) + unknown(sequence=1) + frame_of(HEARTBEAT, sequence=2) + unknown(sequence=3)
+    found = framer.receive(stream, 4.0)
+    assert raws(found) == [unknown(sequence=1), unknown(sequence=3)]
+    assert [(frame.message_id, frame.sequence, frame.received_at) for frame in found] == [
+        (16_000_000, 1, 4.0),
+        (16_000_000, 3, 4.0),
+    ]
+
+
+def test_a_dialect_of_few_messages_knows_no_others() -> None:
+    framer = Framer(Dialect("heartbeats", [messages.Heartbeat]))
+    assert raws(framer.receive(frame_of(ATTITUDE) + frame_of(HEARTBEAT))) == [frame_of(HEARTBEAT)]
+    assert framer.statistics.unknown_messages == {30: 1}
+
+
+# -------------------------------------------------------------------------------------------- wanted
+
+
+def test_wanted_ids_are_returned_and_the_others_counted() -> None:
+    framer = Framer()
+    framer.wanted = {0}
+    stream = b"".join(frame_of(m, sequence=i) for i, m in enumerate([HEARTBEAT, ATTITUDE, HEARTBEAT]))
+    assert [frame.message_id for frame in framer.receive(stream)] == [0, 0]
+    (source,) = framer.statistics.sources.values()
+    assert (source.received, source.lost) == (3, 0)
+
+
+def test_wanted_may_change_while_frames_come() -> None:
+    framer, wanted = Framer(), set[int]()
+    framer.wanted = wanted
+    assert framer.receive(frame_of(HEARTBEAT)) == []
+    wanted.add(0)
+    assert len(framer.receive(frame_of(HEARTBEAT, sequence=1))) == 1
+
+
+# ----------------------------------------------------------------------------------------- sequences
+
+
+def lost_after(sequences: list[int]) -> tuple[int, int]:
+    framer = Framer()
+    feed(framer, (frame_of(HEARTBEAT, sequence=sequence) for sequence in sequences))
+    (source,) = framer.statistics.sources.values()
+    return source.received, source.lost
+
+
+@pytest.mark.parametrize(
+    ("sequences", "lost"),
+    [
+        ([0, 1, 2], 0),
+        ([200, 201], 0),
+        ([254, 255, 0, 1], 0),
+        ([0, 2], 1),
+        ([250, 4], 9),
+        ([255, 1], 1),
+        ([0, 100], 99),
+        ([0, 2, 1, 3], 0),
+        ([0, 3, 2, 1, 4], 0),
+        ([255, 1, 0, 2], 0),
+        ([0, 1, 1, 2], 0),
+        ([0, 1, 0, 2], 0),
+        ([0, 2, 2, 3], 1),
+        ([0, 2, 1, 1, 3], 0),
+        ([200, 201, 0, 1, 2], 54),
+        ([100, 101, 0, 1, 2, 3], 0),
+        ([100, 101, 50, 51, 52, 54], 1),
+    ],
+)
+def test_lost_frames(sequences: list[int], lost: int) -> None:
+    assert lost_after(sequences) == (len(sequences), lost)
+
+
+@given(st.integers(0, 255), st.lists(st.booleans(), min_size=1, max_size=600))
+def test_every_gap_is_counted(first: int, came: list[bool]) -> None:
+    numbers = [first] + [(first + i) & 0xFF for i, here in enumerate(came, start=1) if here or i % 50 == 0]
+    inside = 0
+    last = 0
+    for i, here in enumerate(came, start=1):
+        if here or i % 50 == 0:
+            inside += i - last - 1
+            last = i
+    assert lost_after(numbers) == (len(numbers), inside)
+
+
+@given(st.permutations(range(8)))
+def test_reordering_loses_nothing(order: list[int]) -> None:
+    """The last of a batch that came in any order: all eight came, none is missing."""
+    received, lost = lost_after([100, *(101 + number for number in order), 109, 110])
+    assert (received, lost) == (11, 0)
+
+
+def test_senders_are_counted_apart() -> None:
+    framer = Framer()
+    stream = [frame_of(HEARTBEAT, sequence=i, system_id=s) for i in (0, 1, 3) for s in (1, 2)]
+    feed(framer, stream)
+    counted = {key: (source.received, source.lost) for key, source in framer.statistics.sources.items()}
+    assert counted == {(1, 1): (3, 1), (2, 1): (3, 1)}
+    assert framer.statistics.frames == 6
+    assert framer.statistics.sources[1, 1].loss == pytest.approx(0.25)
+    assert repr(framer.statistics.sources[2, 1]) == "<2/1: 3 received, 1 lost>"
+    assert "frames=6" in repr(framer.statistics)
