@@ -104,9 +104,8 @@ class Framer:
                 source = sources[key]
             except KeyError:
                 source = self._add_source(key, sequence)
-            if source.expected == sequence:
-                source.received += 1
-                source.expected = (sequence + 1) & 0xFF
+            if source.expected & 0xFF == sequence:
+                source.expected += 1
             else:
                 source.out_of_order(sequence)
             if wanted is None or message_id in wanted:
@@ -185,8 +184,8 @@ class Framer:
             _, sequence, key, message_id = _HEADER_V1(data, begin)
         self.statistics.unknown(message_id & 0xFFFFFF)
         source = self._sources.get(key)
-        if source is not None and source.expected == sequence:
-            source.expected = (sequence + 1) & 0xFF
+        if source is not None and source.expected & 0xFF == sequence:
+            source.skip(1)
 
     def _pass(self, begin: int, end: int, bad_crcs: list[int]) -> None:
         """Bytes that are in no frame are behind us; those that are kept will be looked at, and counted, again."""

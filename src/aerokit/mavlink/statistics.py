@@ -15,24 +15,28 @@ class SourceStatistics:
         "_late_at",
         "_late_sequence",
         "_missing",
+        "_without",
         "component_id",
         "expected",
         "lost",
-        "received",
         "system_id",
     )
 
     def __init__(self, system_id: int, component_id: int, sequence: int) -> None:
         self.system_id = system_id
         self.component_id = component_id
-        self.received = 0
-        """Frames that came, whether anyone wanted them or not."""
         self.lost = 0
         """Frames missing in the sequence; one that comes late after all is taken off again."""
         self.expected = sequence
-        """The sequence number of the next frame."""
+        """The sequence number of the next frame; its low byte is what is on the wire, it counts on beyond 255."""
+        self._without = sequence  # how far `expected` has come without a frame: then a frame costs one addition
         self._missing: dict[int, int] = {}  # sequence number → value of `received` when it was missed
         self._late_sequence = self._late_at = -1
+
+    @property
+    def received(self) -> int:
+        """Frames that came, whether anyone wanted them or not."""
+        return self.expected - self._without
 
     @property
     def loss(self) -> float:
@@ -42,25 +46,30 @@ class SourceStatistics:
 
     def out_of_order(self, sequence: int) -> None:
         """A frame came whose sequence number is not `expected`: a gap, a late one, a double or a reboot."""
-        self.received += 1
         ahead = (sequence - self.expected) & 0xFF
         if ahead < _HALF:
-            self._gap(sequence, ahead)
-        elif self._was_missing(sequence):
+            self._gap(ahead)
+            return
+        self._without -= 1
+        if self._was_missing(sequence):
             self.lost -= 1
         elif sequence == (self._late_sequence + 1) & 0xFF and self._late_at == self.received - 1:
-            self.expected = (
-                sequence + 1
-            ) & 0xFF  # two in a row from elsewhere: it counts anew after a reboot
+            self.skip((sequence + 1 - self.expected) & 0xFF)  # two in a row: it counts anew after a reboot
             self._missing.clear()
         else:
             self._late_sequence, self._late_at = sequence, self.received
 
-    def _gap(self, sequence: int, ahead: int) -> None:
+    def skip(self, count: int) -> None:
+        """Let ``count`` numbers pass that are neither received nor lost: of messages that cannot be checked."""
+        self.expected += count
+        self._without += count
+
+    def _gap(self, ahead: int) -> None:
         self.lost += ahead
         for missed in range(self.expected, self.expected + ahead):
             self._missing[missed & 0xFF] = self.received
-        self.expected = (sequence + 1) & 0xFF
+        self.skip(ahead)
+        self.expected += 1
 
     def _was_missing(self, sequence: int) -> bool:
         missed_at = self._missing.pop(sequence, None)
