@@ -1,0 +1,163 @@
+"""What cannot be sent is refused with the field, the value and the range; what can is numbered."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from aerokit.errors import LocalProtocolError
+from aerokit.mavlink import FrameEncoder, Framer, Message, enums, messages
+from aerokit.mavlink.checksum import x25, x25_in_python
+
+
+def attitude(**changes: Any) -> Message:
+    fields = {
+        "time_boot_ms": 0,
+        "roll": 0,
+        "pitch": 0,
+        "yaw": 0,
+        "rollspeed": 0,
+        "pitchspeed": 0,
+        "yawspeed": 0,
+    }
+    return messages.Attitude(**{**fields, **changes})
+
+
+def battery(voltages: Any) -> Message:
+    return messages.BatteryStatus(0, 0, 0, 0, voltages, 0, 0, 0, 0)
+
+
+def text(value: Any) -> Message:
+    return messages.Statustext(6, value)
+
+
+def injected(value: Any) -> Message:
+    return messages.GpsInjectData(1, 1, 2, value)
+
+
+WRONG: list[tuple[Callable[[], Message], str]] = [
+    (
+        lambda: attitude(time_boot_ms=-1),
+        "ATTITUDE.time_boot_ms = -1 cannot be sent: must be in 0..4294967295",
+    ),
+    (
+        lambda: attitude(time_boot_ms=1 << 32),
+        "= 4294967296 cannot be sent: must be in 0..4294967295 (uint32_t)",
+    ),
+    (
+        lambda: attitude(time_boot_ms=1.5),
+        "= 1.5 cannot be sent: must be an integer in 0..4294967295 (uint32_t)",
+    ),
+    (
+        lambda: attitude(time_boot_ms="1"),
+        "= '1' cannot be sent: must be an integer in 0..4294967295 (uint32_t)",
+    ),
+    (lambda: attitude(roll="up"), "ATTITUDE.roll = 'up' cannot be sent: must be a number"),
+    (lambda: attitude(roll=None), "ATTITUDE.roll = None cannot be sent: must be a number"),
+    (lambda: attitude(roll=1e39), "ATTITUDE.roll = 1e+39 cannot be sent: does not fit into a float"),
+    (
+        lambda: messages.Heartbeat(256, 0, 0, 0, 0),
+        "HEARTBEAT.type = 256 cannot be sent: must be in 0..255 (uint8_t)",
+    ),
+    (
+        lambda: messages.ManualControl(1, 40000, 0, 0, 0, 0),
+        "MANUAL_CONTROL.x = 40000 cannot be sent: must be in -32768",
+    ),
+    (lambda: messages.Timesync(1 << 63, 0), "must be in -9223372036854775808..9223372036854775807 (int64_t)"),
+    (lambda: messages.SystemTime(-1, 0), "must be in 0..18446744073709551615 (uint64_t)"),
+    (lambda: text("x" * 51), "cannot be sent: has 51 bytes, at most 50 fit"),
+    (lambda: text("µ" * 26), "cannot be sent: has 52 bytes, at most 50 fit"),
+    (lambda: text(b"bytes"), "STATUSTEXT.text = b'bytes' cannot be sent: must be a str of at most 50 bytes"),
+    (lambda: text("\ud800"), "cannot be sent: has characters that cannot be encoded"),
+    (lambda: injected(b"x" * 111), "cannot be sent: has 111 elements, at most 110 fit"),
+    (lambda: injected("text"), "GPS_INJECT_DATA.data = 'text' cannot be sent: must be bytes, at most 110"),
+    (lambda: injected([1, 2]), "GPS_INJECT_DATA.data = [1, 2] cannot be sent: must be bytes, at most 110"),
+    (lambda: battery((1,) * 11), "cannot be sent: has 11 elements, at most 10 fit"),
+    (
+        lambda: battery((1, 70000)),
+        "voltages = (1, 70000) cannot be sent: must be in 0..65535 (uint16_t)",
+    ),
+    (lambda: battery((1.5,)), "cannot be sent: must be an integer in 0..65535 (uint16_t)"),
+]
+
+
+@pytest.mark.parametrize(("make", "complaint"), WRONG, ids=[complaint for _, complaint in WRONG])
+def test_what_does_not_fit_is_named(make: Callable[[], Message], complaint: str) -> None:
+    encoder = FrameEncoder(1, 1)
+    with pytest.raises(LocalProtocolError) as caught:
+        encoder.encode(make())
+    assert complaint in str(caught.value)
+    assert encoder.sequence == 0, "no number is used up"
+    assert caught.value.__cause__ is None
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        attitude(roll=3),
+        attitude(time_boot_ms=True),
+        messages.Heartbeat(
+            enums.MavType.QUADROTOR, enums.MavAutopilot.PX4, enums.MavModeFlag.SAFETY_ARMED, 0, 0
+        ),
+        battery([1]),
+        battery(()),
+        injected(bytearray(b"ab")),
+        text(""),
+        text("x" * 50),
+    ],
+    ids=repr,
+)
+def test_what_fits_in_spite_of_its_type(message: Message) -> None:
+    assert len(message.encode()) == message.LENGTH
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        ((0, 1), "system_id = 0 must be in 1..255"),
+        ((256, 1), "system_id = 256 must be in 1..255"),
+        ((1, 0), "component_id = 0 must be in 1..255"),
+        ((1, -1), "component_id = -1 must be in 1..255"),
+    ],
+)
+def test_wrong_ids(arguments: tuple[int, int], complaint: str) -> None:
+    with pytest.raises(LocalProtocolError, match=complaint):
+        FrameEncoder(*arguments)
+
+
+def test_wrong_version() -> None:
+    with pytest.raises(LocalProtocolError, match="version = 3 must be 1 or 2"):
+        FrameEncoder(1, 1, version=3)
+
+
+def test_version_1_has_no_ids_above_255() -> None:
+    encoder = FrameEncoder(1, 1, version=1)
+    with pytest.raises(LocalProtocolError, match="PLAY_TUNE has id 258, MAVLink 1 has none above 255"):
+        encoder.encode(messages.PlayTune(1, 1, "A"))
+    assert encoder.sequence == 0
+
+
+def test_sequence_numbers_wrap() -> None:
+    encoder = FrameEncoder(1, 1)
+    raws = [encoder.encode(messages.Heartbeat(6, 8, 0, 0, 4)) for _ in range(300)]
+    assert [raw[4] for raw in raws] == [number % 256 for number in range(300)]
+    framer = Framer()
+    framer.receive(b"".join(raws))
+    assert framer.statistics.sources[1, 1].lost == 0
+
+
+def test_trailing_zeros_are_trimmed_but_for_the_first_byte() -> None:
+    encoder = FrameEncoder(1, 1)
+    assert encoder.encode(messages.CommandAck(0, 0))[1] == 1
+    assert encoder.encode(messages.CommandAck(400, 0))[1] == 2
+    assert encoder.encode(messages.CommandAck(400, 0, target_component=7))[1] == 10
+
+
+def test_checksums_without_the_library_are_the_same() -> None:
+    slow = x25_in_python()
+    for size in (0, 1, 2, 9, 50, 280):
+        data = bytes((number * 37 + size) & 0xFF for number in range(size))
+        assert slow(data) == x25(data)
+    assert slow(b"123456789") == 0x6F91  # the check value of CRC-16/MCRF4XX
