@@ -81,7 +81,7 @@ def damaged(speak: Callable[[], bytes]) -> Callable[[], bytes]:
         (saying(255, 190, GCS), None, r"only ground stations were heard \(255/190\)"),
         (saying(1, 154, GIMBAL), None, r"no autopilot were heard \(1/154\)"),
         (saying(7, 1, COPTER), 3, r"other system ids were heard: 7 \(wanted: 3\)"),
-        (heartbeat_of_system_0, None, "no HEARTBEAT among them"),
+        (heartbeat_of_system_0, None, "all of system id 0, which is nobody"),
     ],
     ids=[
         *("nothing", "text", "noise", "damaged", "dialect", "no heartbeat", "ground stations", "gimbal"),

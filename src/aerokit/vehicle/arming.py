@@ -5,6 +5,7 @@ from __future__ import annotations
 import anyio
 
 from aerokit.errors import CommandRejected, OperationRejected, OperationTimeout
+from aerokit.vehicle.checks import check_seconds
 from aerokit.vehicle.modes import ModeActions
 from aerokit.vehicle.progress import await_progress
 
@@ -25,6 +26,7 @@ class ArmingActions(ModeActions):
         Raises:
             OperationTimeout: not within ``timeout`` seconds; the text says what is still missing.
         """
+        check_seconds("timeout", timeout)
         with self._streaming("sensors", "estimator", "position"), anyio.move_on_after(timeout):
             while self.missing_for_flight():
                 self.connection.raise_if_ended()
@@ -38,6 +40,8 @@ class ArmingActions(ModeActions):
     async def arm(self, *, force: bool = False, timeout: float = 10.0) -> None:
         """Arm the motors and wait until HEARTBEAT says armed: **propellers may start to turn**.
 
+        Cancelled, the vehicle may arm all the same: the order is out.
+
         Args:
             force: skip the vehicle's own arming checks. Dangerous.
             timeout: seconds for HEARTBEAT to say so after the command was accepted.
@@ -47,6 +51,7 @@ class ArmingActions(ModeActions):
                 estimator lacks. They are asked for again where the vehicle can run its checks on request.
             OperationTimeout: it accepted and did not arm.
         """
+        check_seconds("timeout", timeout)
         started = self.connection.now()
         try:
             await self._commands.send_long(COMPONENT_ARM_DISARM, 1, FORCE if force else 0)
@@ -66,6 +71,7 @@ class ArmingActions(ModeActions):
             CommandRejected: the vehicle refused, usually because it flies.
             OperationTimeout: it accepted and did not disarm.
         """
+        check_seconds("timeout", timeout)
         started = self.connection.now()
         try:
             await self._commands.send_long(COMPONENT_ARM_DISARM, 0, FORCE if force else 0)
@@ -75,10 +81,11 @@ class ArmingActions(ModeActions):
         await self._await_armed(False, started, timeout)
 
     async def _await_armed(self, armed: bool, started: float, timeout: float) -> None:
+        cell = self.telemetry.armed
         await await_progress(
             self,
             "arm()" if armed else "disarm()",
-            is_done=lambda: self.is_armed is armed,
+            is_done=lambda: cell.latest is armed and cell.updated_at > started,
             trouble=lambda: None,
             describe=lambda: "; ".join(self.texts_since(started)) or "the vehicle said nothing about it",
             timeout=timeout,
@@ -92,13 +99,15 @@ class ArmingActions(ModeActions):
             timeout: seconds until it is back.
 
         Raises:
-            OperationRejected: it is armed. Nothing was sent.
+            OperationRejected: it is armed, or not known to be disarmed. Nothing was sent.
             CommandRejected: it refused.
             LinkLost: the link goes down with the vehicle (USB, TCP); connect again.
             OperationTimeout: it did not come back.
         """
-        if self.is_armed and not force:
-            raise OperationRejected("reboot: the vehicle is armed; nothing was sent")
+        check_seconds("timeout", timeout)
+        if not force and not self.is_surely_disarmed:
+            state = "armed" if self.is_armed else "not known to be disarmed"
+            raise OperationRejected(f"reboot: the vehicle is {state}; nothing was sent")
         reboots = self._watch.reboots
         await self._explained_command(PREFLIGHT_REBOOT_SHUTDOWN, 1, *(0.0,) * 4, FORCE_REBOOT if force else 0)
         self._watch.expect_reboot()

@@ -89,6 +89,11 @@ class CommandSender:
         self._connection.send(command_long(self._system_id, self._component_id, command, params))
         self._expect_answers((self._component_id, command), 1)
 
+    def awaits_answer(self, command: int) -> bool:
+        """Whether an answer of the autopilot to what was sent unconfirmed may still come."""
+        oldest = self._connection.now() - UNDER_WAY_S
+        return any(at >= oldest for at in self._under_way.get((self._component_id, command), ()))
+
     async def _run(
         self,
         message: CommandLong | CommandInt,

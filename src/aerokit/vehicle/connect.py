@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 
 __all__ = ["connect"]
 
+FRESH_HEARTBEAT_S = 2.0
+"""A heartbeat heard longer ago says nothing about now: the next one is waited for."""
+
 
 @asynccontextmanager
 async def connect(
@@ -133,6 +136,8 @@ async def _attached(
             except BaseException as error:
                 failure = error  # raised below: a task group would wrap it in an exception group
             finally:
+                vehicle._end_stream()
+                await vehicle._finish_hold()
                 tasks.cancel_scope.cancel()
     finally:
         vehicle._close()
@@ -151,7 +156,9 @@ async def _find_vehicle(
     connection.raise_if_ended()
     search = _Search(connection, system_id)
     for known in connection.heard.values():
-        search.take(known)
+        frame = known.received_frame
+        if frame is not None and connection.now() - frame.received_at <= FRESH_HEARTBEAT_S:
+            search.take(known)
     detachments = [
         connection.bus.attach(Heartbeat, search.take, system_id=system_id or 0),
         connection.on_end(search.abort),

@@ -6,13 +6,15 @@ from typing import TYPE_CHECKING
 
 import anyio
 
-from aerokit.errors import LocalProtocolError, NotSupported, OperationRejected
+from aerokit.errors import NotSupported, OperationRejected, OperationTimeout
+from aerokit.vehicle.checks import check_range, check_seconds
 from aerokit.vehicle.progress import await_progress
 from aerokit.vehicle.travel import TravelActions
 from aerokit.vehicle.values import Position
 
 if TYPE_CHECKING:
-    from aerokit.autopilots import Mode, TakeOff
+    from aerokit.autopilots import TakeOff
+    from aerokit.vehicle.orders import Order
 
 __all__ = ["FlightActions"]
 
@@ -26,7 +28,7 @@ class FlightActions(TravelActions):
         """Take off and climb to ``altitude_m`` above home; returns at that altitude.
 
         The vehicle must be armed. Where the autopilot needs its guided mode for this, it is put into it. Cancelled
-        half-way, the vehicle is told to hold where it is.
+        half-way, or when it does not get there in time, the vehicle is told to hold where it is.
 
         Args:
             altitude_m: metres above home, above 0, at most 10,000.
@@ -38,22 +40,24 @@ class FlightActions(TravelActions):
             OperationRejected: it is not armed or flies already, it refused, or its mode changed or it disarmed on the
                 way.
             OperationTimeout: it did not get there in time.
+            ValueUnknownError: home is not known, and PX4 needs its altitude.
         """
-        if not 0 < altitude_m <= 10_000:
-            raise LocalProtocolError(f"altitude_m = {altitude_m!r} is not allowed: above 0, at most 10,000")
+        check_range("altitude_m", altitude_m, 0, 10_000, above=True)
+        check_seconds("timeout", timeout)
         plan = self._take_off_plan(altitude_m)
-        self._supersede_hold()
         if not self.is_armed:
             raise OperationRejected("take_off: the vehicle is not armed: await arm() first; nothing was sent")
         if self.telemetry.landed_state.latest == LANDED_IN_AIR:
             raise OperationRejected(
                 "take_off: the vehicle flies already: go_to() climbs too; nothing was sent"
             )
+        modes = (plan.mode, plan.mode_after, self.autopilot.mode_for("take_off", is_vtol=self.is_vtol))
+        order = self._new_order(*(mode for mode in modes if mode is not None))
         try:
             await self._begin_take_off(plan)
-            await self._await_altitude(altitude_m, plan, timeout)
-        except anyio.get_cancelled_exc_class():
-            self._hold_soon()
+            await self._await_altitude(altitude_m, timeout, order)
+        except (anyio.get_cancelled_exc_class(), OperationTimeout):  # it may have heard the order
+            self._hold_soon(order)
             raise
 
     def _take_off_plan(self, altitude_m: float) -> TakeOff:
@@ -69,23 +73,24 @@ class FlightActions(TravelActions):
         if plan.command is not None:
             await self._explained_command(plan.command, *plan.params)
 
-    async def _await_altitude(self, altitude_m: float, plan: TakeOff, timeout: float) -> None:
+    async def _await_altitude(self, altitude_m: float, timeout: float, order: Order) -> None:
         """The mode may become the take-off's own and the one after it; any other one is somebody else's doing."""
         enough_m = altitude_m - max(0.5, 0.05 * altitude_m)
         started = self.connection.now()
-        modes = [plan.mode, plan.mode_after, self.autopilot.mode_for("take_off", is_vtol=self.is_vtol)]
         with self._streaming("position"):
             await await_progress(
                 self,
                 f"take_off({altitude_m:g} m)",
                 is_done=lambda: self._knows_position_since(started) and self._altitude_relative() >= enough_m,
-                trouble=self._stays_in(*(mode for mode in modes if mode is not None)),
+                trouble=self._stays_in(order, *order.modes),
                 describe=lambda: f"it is at {self._altitude_relative():.1f} m",
                 timeout=timeout,
             )
 
     async def land(self, *, timeout: float | None = 300.0) -> None:
-        """Land where the vehicle is; returns on the ground.
+        """Land where the vehicle is; returns on the ground, where the motors may still be turning.
+
+        Follow ``vehicle.armed`` for the motors. Cancelled, the vehicle goes on landing.
 
         Raises:
             NotSupported: this type of vehicle has no mode for it. Nothing was sent.
@@ -93,36 +98,45 @@ class FlightActions(TravelActions):
             OperationRejected: the mode changed on the way.
             OperationTimeout: not on the ground in time.
         """
+        check_seconds("timeout", timeout, none_is_allowed=True)
         mode = self._mode_for("land", "land")
-        await self._ensure_mode(mode)
-        await self._await_ground("land", mode, timeout)
+        order = self._new_order(mode)
+        await self._change_mode(mode, told_since=order.given_at)
+        await self._await_ground("land", order, timeout)
 
     async def return_to_launch(self, *, timeout: float | None = 600.0) -> None:
         """Return to the launch place; returns on the ground, or above it where the vehicle does not land by itself.
 
         Raises as :meth:`land`.
         """
+        check_seconds("timeout", timeout, none_is_allowed=True)
         mode = self._mode_for("return_to_launch", "return")
-        await self._ensure_mode(mode)
+        order = self._new_order(mode)
+        await self._change_mode(mode, told_since=order.given_at)
         if self.autopilot.lands_after_return:
-            await self._await_ground("return_to_launch", mode, timeout)
+            await self._await_ground("return_to_launch", order, timeout)
         else:
-            await self._await_home(mode, timeout)
+            await self._await_home(order, timeout)
 
-    async def _await_ground(self, what: str, mode: Mode, timeout: float | None) -> None:
+    async def _await_ground(self, what: str, order: Order, timeout: float | None) -> None:
+        """Only what was told after the order counts: a state that had gone stale would end a landing in the air."""
+        armed, landed = self.telemetry.armed, self.telemetry.landed_state
+
         def is_down() -> bool:
-            return not self.is_armed or self.telemetry.landed_state.latest == LANDED_ON_GROUND
+            is_disarmed = self.is_surely_disarmed and armed.updated_at > order.given_at
+            return is_disarmed or (landed.latest == LANDED_ON_GROUND and landed.updated_at > order.given_at)
 
-        await await_progress(
-            self,
-            what,
-            is_done=is_down,
-            trouble=self._stays_in(mode),
-            describe=lambda: f"it is at {self._altitude_relative():.1f} m",
-            timeout=timeout,
-        )
+        with self._streaming("landed_state"):
+            await await_progress(
+                self,
+                what,
+                is_done=is_down,
+                trouble=self._stays_in(order, *order.modes),
+                describe=lambda: f"it is at {self._altitude_relative():.1f} m",
+                timeout=timeout,
+            )
 
-    async def _await_home(self, mode: Mode, timeout: float | None) -> None:
+    async def _await_home(self, order: Order, timeout: float | None) -> None:
         home = self.telemetry.home.value
         place = Position(home.latitude_deg, home.longitude_deg)
         near_m = self.autopilot.arrival_radius_m
@@ -132,7 +146,7 @@ class FlightActions(TravelActions):
                 self,
                 "return_to_launch",
                 is_done=lambda: self._knows_position_since(started) and self.distance_to(place) <= near_m,
-                trouble=self._stays_in(mode),
+                trouble=self._stays_in(order, *order.modes),
                 describe=lambda: f"it is {self.distance_to(place):.1f} m from home",
                 timeout=timeout,
             )

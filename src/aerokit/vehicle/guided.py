@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 import anyio
 
 from aerokit.errors import (
-    AerokitError,
+    BusyError,
     LocalProtocolError,
     NotSupported,
     OperationRejected,
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 
     from aerokit.autopilots import Mode
     from aerokit.mavlink.message import Message
+    from aerokit.vehicle.orders import Order
     from aerokit.vehicle.vehicle import Vehicle
 
 __all__ = ["Guided", "SetpointStream"]
@@ -170,6 +171,8 @@ class SetpointStream(Generic[SetpointT]):
         self._vehicle, self._encode = vehicle, encode
         self._period_s, self._valid_for_s, self._max_lag_s = 1 / rate_hz, valid_for_s, max_lag_s
         self._setpoint = initial
+        self._message: Message | None = None
+        self._order: Order | None = None
         self._set_at = -math.inf
         self._mode: Mode | None = None
         self._timer: asyncio.TimerHandle | None = None
@@ -195,8 +198,7 @@ class SetpointStream(Generic[SetpointT]):
             raise SetpointStreamStopped(
                 "this set-point stream is not running: use it inside its `async with`"
             )
-        self._encode(setpoint)
-        self._setpoint, self._set_at = setpoint, self._now()
+        self._take(setpoint)
 
     async def fly(self, setpoint: SetpointT, duration_s: float) -> None:
         """Feed one set-point for ``duration_s`` seconds.
@@ -213,16 +215,21 @@ class SetpointStream(Generic[SetpointT]):
     async def __aenter__(self) -> Self:
         if self._was_entered:
             raise SetpointStreamStopped("a set-point stream is entered once: open another one")
+        self._take(self._setpoint)  # refuse nonsense before anything is sent
+        if self._vehicle._stream is not None:
+            raise BusyError("another set-point stream is open: leave it first; nothing was sent")
+        mode = self._vehicle._mode_for("a set-point stream", "setpoint")
         self._was_entered = True
-        self._encode(self._setpoint)  # refuse nonsense before anything is sent
+        self._vehicle._stream = self
+        order = self._order = self._vehicle._new_order(mode)
         try:
-            await self._enter()
+            await self._enter(mode)
         except OperationRejected:  # the vehicle stays with whoever steers it
-            self._cancel_timer()
+            self._end()
             raise
         except BaseException:
-            self._cancel_timer()
-            self._vehicle._hold_soon()
+            self._end()
+            self._vehicle._hold_soon(order)
             raise
         return self
 
@@ -235,16 +242,17 @@ class SetpointStream(Generic[SetpointT]):
         if self._stopped is None and (reason := self._why_leave_alone()):
             self._stop(reason, hold=False)
         if self._stopped is None:
-            self._stop("the block that fed it was left", hold=True)
-            if exc is None:
+            self._end()
+            self._stopped = SetpointStreamStopped("the block of this set-point stream was left")
+            if exc is not None:
+                self._hold()
+            elif not self._vehicle.is_surely_disarmed:
                 await self._vehicle.hold()
         elif exc is None and not self._was_told:
             raise self._stopped
 
-    async def _enter(self) -> None:
+    async def _enter(self, mode: Mode) -> None:
         """ArduPilot takes set-points once it is in GUIDED; PX4 goes to OFFBOARD once it sees set-points."""
-        self._vehicle._supersede_hold()
-        mode = self._vehicle._mode_for("a set-point stream", "setpoint")
         if self._vehicle.autopilot.setpoints.before_mode:
             self._begin()
             await self.fly(self._setpoint, ENTRY_S)
@@ -266,21 +274,30 @@ class SetpointStream(Generic[SetpointT]):
 
     # ---------------------------------------------------------------------------- the stream
 
+    def _take(self, setpoint: SetpointT) -> None:
+        """Turn it into the message to send, whole: what cannot be sent is refused here."""
+        message = self._encode(setpoint)
+        message.encode()
+        self._setpoint, self._message, self._set_at = setpoint, message, self._now()
+
     def _begin(self) -> None:
-        self._set_at = self._now()
+        self._take(self._setpoint)
         self._tick(self._now())
 
     def _tick(self, due: float) -> None:
         """Send once more, unless something says that nobody steers any more."""
         self._timer = None
-        reason = self._why_stop(self._now() - due)
-        if reason:
-            self._stop(reason, hold=self._mode is None or self._vehicle.mode.latest == self._mode)
+        if reason := self._why_leave_alone():
+            self._stop(reason, hold=False)
             return
+        if reason := self._why_stop(self._now() - due):
+            self._stop(reason)
+            return
+        assert self._message is not None
         try:
-            self._vehicle.connection.send(self._encode(self._setpoint))
-        except AerokitError as error:
-            self._stop(str(error), hold=False)
+            self._vehicle.connection.send(self._message)
+        except Exception as error:
+            self._stop(str(error))
             return
         due = max(due + self._period_s, self._now())
         self._timer = asyncio.get_running_loop().call_at(due, self._tick, due)
@@ -293,25 +310,36 @@ class SetpointStream(Generic[SetpointT]):
             return f"no new set-point came for {age:.1f} s (valid_for_s = {self._valid_for_s:g})"
         if self._vehicle.is_silent:
             return f"the vehicle has been silent for {self._vehicle.heartbeat_age:.1f} s"
-        return self._why_leave_alone()
+        return None
 
     def _why_leave_alone(self) -> str | None:
         """Somebody else has taken over: a pilot, a failsafe, another program."""
         mode = self._vehicle.mode.latest
-        if self._mode is not None and mode != self._mode:
+        if self._order is not self._vehicle._order and self._mode is not None:
+            return "another order was given"
+        if self._mode is not None and mode is not None and mode != self._mode:
             return f"the vehicle left {self._mode} for {mode}"
-        if self._was_armed and not self._vehicle.is_armed:
+        if self._was_armed and self._vehicle.is_surely_disarmed:
             return "the vehicle disarmed"
-        self._was_armed = self._vehicle.is_armed
+        self._was_armed = self._was_armed or self._vehicle.is_armed
         return None
 
-    def _stop(self, reason: str, *, hold: bool) -> None:
-        self._cancel_timer()
+    def _stop(self, reason: str, *, hold: bool = True) -> None:
+        """End it by itself. The vehicle is told to hold, unless somebody else steers it by now."""
+        self._end()
+        is_told = hold and self._hold()
         self._stopped = SetpointStreamStopped(
-            f"the set-point stream has stopped: {reason}" + ("; the vehicle was told to hold" if hold else "")
+            f"the set-point stream has stopped: {reason}"
+            + ("; the vehicle was told to hold" if is_told else "")
         )
-        if hold:
-            self._vehicle._hold_soon()
+
+    def _hold(self) -> bool:
+        return self._order is not None and self._vehicle._hold_soon(self._order)
+
+    def _end(self) -> None:
+        self._cancel_timer()
+        if self._vehicle._stream is self:
+            self._vehicle._stream = None
 
     def _cancel_timer(self) -> None:
         if self._timer is not None:

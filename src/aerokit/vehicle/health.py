@@ -97,5 +97,10 @@ class VehicleHealth(VehicleCore):
 
     @property
     def is_armed(self) -> bool:
-        """Whether the last heartbeat says armed; False before the first."""
+        """Whether the last heartbeat says armed; False before the first, and after a reboot until the next one."""
         return self.telemetry.armed.latest is True
+
+    @property
+    def is_surely_disarmed(self) -> bool:
+        """Whether the last heartbeat says disarmed; False while it is not known."""
+        return self.telemetry.armed.latest is False

@@ -3,16 +3,27 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import anyio
 
 from aerokit import geo
-from aerokit.errors import CommandRejected, CommandTimeout, LocalProtocolError, OperationRejected
+from aerokit.errors import (
+    CommandRejected,
+    LocalProtocolError,
+    NotSupported,
+    OperationRejected,
+    OperationTimeout,
+)
 from aerokit.mavlink.messages import SetPositionTargetGlobalInt
 from aerokit.vehicle.arming import ArmingActions
+from aerokit.vehicle.checks import check_range, check_seconds
 from aerokit.vehicle.modes import CHANGE_MODE, DO_REPOSITION, RESULT_UNSUPPORTED
 from aerokit.vehicle.progress import await_progress
 from aerokit.vehicle.values import Position
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 __all__ = ["TravelActions"]
 
@@ -23,6 +34,7 @@ DO_SET_ROI_NONE = 197
 MAV_FRAME_GLOBAL_INT = 5
 MAV_FRAME_GLOBAL_RELATIVE_ALT_INT = 6
 POSITION_ONLY = 0x0DF8
+LANDED_ON_GROUND = 1
 RESEND_S = 1.0
 OLD_POSITION_S = 2.0
 
@@ -41,7 +53,10 @@ class TravelActions(ArmingActions):
         tolerance_m: float | None = None,
         timeout: float | None = None,
     ) -> None:
-        """Fly to a place and return on arrival. Cancelled half-way, the vehicle is told to hold where it is.
+        """Fly to a place and return on arrival.
+
+        Cancelled half-way, or when it does not arrive in time or falls silent, the vehicle is told to hold where it
+        is; unless another order was given meanwhile or somebody else has changed the mode.
 
         Args:
             target: latitude and longitude, and an altitude above home or above mean sea level; without an altitude
@@ -64,9 +79,13 @@ class TravelActions(ArmingActions):
         latitude, longitude, altitude, is_relative = self._global_target(target)
         _check_travel(speed_m_s, heading_deg, tolerance_m, timeout)
         near_m = self.autopilot.arrival_radius_m if tolerance_m is None else tolerance_m
-        self._supersede_hold()
+        self._check_can_turn(heading_deg)
         if not self.is_armed:
             raise OperationRejected("go_to: the vehicle is not armed; nothing was sent")
+        if self._stands_on_the_ground():
+            raise OperationRejected("go_to: the vehicle is on the ground: take_off() first; nothing was sent")
+        mode = self._mode_for("go_to", self.autopilot.reposition_purpose)
+        order = self._new_order(mode, self._mode_for("go_to", "setpoint"))
         yaw = self._reposition_yaw(heading_deg)
         under_way = False
         try:
@@ -76,13 +95,13 @@ class TravelActions(ArmingActions):
                 await self.set_speed(speed_m_s)  # ArduPilot obeys it only once it is under way
             if heading_deg is not None and math.isnan(yaw):
                 await self._explained_command(CONDITION_YAW, heading_deg % 360)
-            await self._await_arrival(target, near_m, timeout)
-        except (anyio.get_cancelled_exc_class(), CommandTimeout):  # it may have heard the order
-            self._hold_soon()
+            await self._await_arrival(target, near_m, timeout, self._stays_in(order, mode))
+        except (anyio.get_cancelled_exc_class(), OperationTimeout):  # it may have heard the order
+            self._hold_soon(order)
             raise
         except CommandRejected:
             if under_way:
-                self._hold_soon()
+                self._hold_soon(order)
             raise
 
     async def _send_there(
@@ -125,6 +144,7 @@ class TravelActions(ArmingActions):
         target: Position,
         near_m: float,
         timeout: float | None,
+        trouble: Callable[[], str | None],
     ) -> None:
         """Wait for it. The older message has no answer, so it is repeated for as long as this call lasts."""
         started = sent_at = self.connection.now()
@@ -142,7 +162,7 @@ class TravelActions(ArmingActions):
                 self,
                 f"go_to({target.latitude_deg:.7f}, {target.longitude_deg:.7f})",
                 is_done=is_there,
-                trouble=self._stays_in(self._mode_for("go_to", self.autopilot.reposition_purpose)),
+                trouble=trouble,
                 describe=lambda: f"it is {self.distance_to(target):.1f} m away",
                 timeout=timeout,
                 held_for=0.5,
@@ -157,7 +177,7 @@ class TravelActions(ArmingActions):
             LocalProtocolError: out of range. Nothing was sent.
             CommandRejected: the vehicle refused.
         """
-        _check_speed(speed_m_s)
+        check_range("speed_m_s", speed_m_s, 0, 1000, above=True)
         await self._explained_command(DO_CHANGE_SPEED, 1, speed_m_s, -1)
 
     async def set_heading(
@@ -187,20 +207,27 @@ class TravelActions(ArmingActions):
             OperationRejected: the mode changed or it disarmed on the way.
             OperationTimeout: it did not get there in time.
         """
-        if not -360 <= heading_deg <= 360:
-            raise LocalProtocolError(f"heading_deg = {heading_deg!r} is not allowed: −360 to 360")
+        check_range("heading_deg", heading_deg, -360, 360)
+        check_range("rate_deg_s", rate_deg_s, 0, 360)
+        check_range("tolerance_deg", tolerance_deg, 0, 180, above=True)
+        check_seconds("timeout", timeout)
+        self._check_can_turn(heading_deg)
+        mode = self._mode_for("set_heading", self.autopilot.reposition_purpose)
+        order = self._new_order(mode)
         goal = (heading_deg + (self.telemetry.heading_deg.value if relative else 0)) % 360
         if self._turns_by_reposition:
             yaw = math.remainder(math.radians(goal), 2 * math.pi)
             await self._explained_command(DO_REPOSITION, -1, CHANGE_MODE, 0, yaw, *(math.nan,) * 3)
         else:
-            await self._ensure_mode(self._mode_for("set_heading", "setpoint"))
+            await self._ensure_mode(mode)
             direction = (1 if heading_deg >= 0 else -1) if relative else 0
             angle = abs(heading_deg) if relative else goal
             await self._explained_command(CONDITION_YAW, angle, rate_deg_s, direction, 1 if relative else 0)
-        await self._await_heading(goal, tolerance_deg, timeout)
+        await self._await_heading(goal, tolerance_deg, timeout, self._stays_in(order, mode))
 
-    async def _await_heading(self, goal: float, tolerance_deg: float, timeout: float) -> None:
+    async def _await_heading(
+        self, goal: float, tolerance_deg: float, timeout: float, trouble: Callable[[], str | None]
+    ) -> None:
         started = self.connection.now()
         heading = self.telemetry.heading_deg
 
@@ -212,7 +239,7 @@ class TravelActions(ArmingActions):
                 self,
                 f"set_heading({goal:g}°)",
                 is_done=lambda: heading.updated_at >= started and off() <= tolerance_deg,
-                trouble=self._stays_in(self._mode_for("set_heading", self.autopilot.reposition_purpose)),
+                trouble=trouble,
                 describe=lambda: f"it is {off():.0f}° off",
                 timeout=timeout,
             )
@@ -277,14 +304,25 @@ class TravelActions(ArmingActions):
         """
         relative, amsl = target.altitude_relative_m, target.altitude_amsl_m
         if relative is None and amsl is None:
-            relative = self.telemetry.position.value.altitude_relative_m
+            relative = self.telemetry.position.fresh(OLD_POSITION_S).altitude_relative_m
         is_relative = relative is not None
         altitude = relative if relative is not None else amsl
         if altitude is None:
             raise LocalProtocolError("the target has no altitude, and the vehicle's own is not known")
+        check_range("altitude", altitude, -12_000, 100_000)
         if is_relative and not self._takes_relative_altitude:
             altitude, is_relative = altitude + self._home_altitude(), False
         return round(target.latitude_deg * 1e7), round(target.longitude_deg * 1e7), altitude, is_relative
+
+    def _check_can_turn(self, heading_deg: float | None) -> None:
+        if heading_deg is not None and not self._turns_by_reposition and not self.autopilot.condition_yaw:
+            raise NotSupported(f"{self.autopilot.firmware} cannot be told where to look; nothing was sent")
+
+    def _stands_on_the_ground(self) -> bool:
+        """Whether it was told just now that a vehicle which flies is on the ground."""
+        landed = self.telemetry.landed_state
+        flies = self.autopilot.mode_for("take_off", is_vtol=self.is_vtol) is not None
+        return flies and landed.latest == LANDED_ON_GROUND and landed.age <= OLD_POSITION_S
 
     @property
     def _speeds_by_reposition(self) -> bool:
@@ -308,14 +346,9 @@ def _check_travel(
     speed_m_s: float | None, heading_deg: float | None, tolerance_m: float | None, timeout: float | None
 ) -> None:
     if speed_m_s is not None:
-        _check_speed(speed_m_s)
-    if heading_deg is not None and not 0 <= heading_deg <= 360:
-        raise LocalProtocolError(f"heading_deg = {heading_deg!r} is not allowed: 0 to 360")
-    for name, value in (("tolerance_m", tolerance_m), ("timeout", timeout)):
-        if value is not None and not value > 0:
-            raise LocalProtocolError(f"{name} = {value!r} is not allowed: above 0, or None")
-
-
-def _check_speed(speed_m_s: float) -> None:
-    if not 0 < speed_m_s <= 1000:
-        raise LocalProtocolError(f"speed_m_s = {speed_m_s!r} is not allowed: above 0, at most 1000")
+        check_range("speed_m_s", speed_m_s, 0, 1000, above=True)
+    if heading_deg is not None:
+        check_range("heading_deg", heading_deg, 0, 360)
+    if tolerance_m is not None:
+        check_range("tolerance_m", tolerance_m, 0, 100_000, above=True)
+    check_seconds("timeout", timeout, none_is_allowed=True)

@@ -1,0 +1,29 @@
+"""Checks of arguments, before anything is sent."""
+
+from __future__ import annotations
+
+import math
+
+from aerokit.errors import LocalProtocolError
+
+__all__ = ["check_range", "check_seconds"]
+
+
+def check_range(name: str, value: float, lowest: float, highest: float, *, above: bool = False) -> None:
+    """Raise LocalProtocolError unless ``value`` is from ``lowest`` (with ``above``: above it) to ``highest``."""
+    try:
+        is_allowed = lowest <= value <= highest and not (above and value == lowest)
+    except TypeError:
+        is_allowed = False
+    if not is_allowed:
+        begin = f"above {lowest:g}" if above else f"{lowest:g}"
+        raise LocalProtocolError(f"{name} = {value!r} is not allowed: {begin} to {highest:g}")
+
+
+def check_seconds(name: str, value: float | None, *, none_is_allowed: bool = False) -> None:
+    """Raise LocalProtocolError unless ``value`` is a number of seconds above 0, inf allowed."""
+    if value is None and none_is_allowed:
+        return
+    if value is None or math.isnan(value) or value <= 0:
+        allowed = "above 0, or None" if none_is_allowed else "above 0"
+        raise LocalProtocolError(f"{name} = {value!r} is not allowed: seconds {allowed}")
