@@ -82,7 +82,7 @@ def __getattr__(name: str) -> type[int]:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_TABLE})
+    return sorted(set(globals()) | set(_TABLE))
 """
 _ENUMS_INIT = '''# pyright: reportUnsupportedDunderAll=false
 """Enums of the standard: ``MAV_CMD`` is `MavCmd`, ``MAV_CMD_NAV_TAKEOFF`` is ``MavCmd.NAV_TAKEOFF``.
@@ -109,7 +109,7 @@ def __getattr__(name: str) -> object:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_MODULES})
+    return sorted(set(globals()) | set(_MODULES))
 '''
 _MESSAGES_INIT = '''# pyright: reportUnsupportedDunderAll=false
 """Messages of the standard, one class each: ``GLOBAL_POSITION_INT`` is `GlobalPositionInt`.
@@ -140,7 +140,7 @@ def __getattr__(name: str) -> object:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_MODULES})
+    return sorted(set(globals()) | set(_MODULES))
 '''
 
 

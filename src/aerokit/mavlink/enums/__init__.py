@@ -241,4 +241,4 @@ def __getattr__(name: str) -> object:
 
 
 def __dir__() -> list[str]:
-    return [*globals(), *_MODULES]
+    return sorted(set(globals()) | set(_MODULES))

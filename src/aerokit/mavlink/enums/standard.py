@@ -71,4 +71,4 @@ def __getattr__(name: str) -> type[int]:
 
 
 def __dir__() -> list[str]:
-    return [*globals(), *_TABLE]
+    return sorted(set(globals()) | set(_TABLE))
