@@ -12,11 +12,20 @@ __all__ = ["is_autopilot", "no_vehicle_reason"]
 
 MAV_TYPE_GCS = 6
 MAV_AUTOPILOT_INVALID = 8
+NO_AUTOPILOTS = frozenset((MAV_TYPE_GCS, 18, 26, 27, *range(30, 35), *range(36, 43), 44, 48))
+"""Types of other components: onboard controller, gimbal, ADS-B, camera, servo, battery, … (MAV_TYPE)."""
+
+NOISE_BYTES = 500
+"""In so many bytes of noise there is about a tenth of a place that looks like a damaged frame."""
+SOME = 5
 
 
 def is_autopilot(heartbeat: Heartbeat) -> bool:
-    """Whether it comes from an autopilot: not from a ground station, a gimbal, a camera or an ADS-B receiver."""
-    return heartbeat.autopilot != MAV_AUTOPILOT_INVALID and heartbeat.type != MAV_TYPE_GCS
+    """Whether it comes from an autopilot: not from a ground station, a gimbal, a camera or an ADS-B receiver.
+
+    Some of those call their autopilot GENERIC instead of INVALID, so their type counts too.
+    """
+    return heartbeat.autopilot != MAV_AUTOPILOT_INVALID and heartbeat.type not in NO_AUTOPILOTS
 
 
 def no_vehicle_reason(connection: Connection, wanted_system: int | None) -> str:
@@ -34,7 +43,10 @@ class _Diagnosis:
         self._bytes = sum(each.bytes for each in statistics)
         self._frames = sum(each.frames for each in statistics)
         self._bad_crcs = sum(each.bad_crcs for each in statistics)
+        self._bad_bytes = sum(each.bad_bytes for each in statistics)
         self._unknown = sum(each.unknown_ids for each in statistics)
+        self._unknown_messages = {number for each in statistics for number in each.unknown_messages}
+        self._systems = {system for each in statistics for system, _ in each.sources}
 
     def text(self) -> str:
         if not self._bytes:
@@ -42,21 +54,29 @@ class _Diagnosis:
         if not self._frames:
             return self._without_frames()
         if not self._heard:
-            return f"{self._frames} frames were heard, but no HEARTBEAT among them"
+            return self._without_heartbeats()
         return self._without_vehicle()
 
     def _without_frames(self) -> str:
-        if self._unknown:
+        """Noise has a few places that look like frames: what is said rests on most of the bytes."""
+        heard = f"{self._bytes} bytes were heard"
+        if self._unknown and 2 * self._bad_bytes < self._bytes:
+            numbers = ", ".join(map(str, sorted(self._unknown_messages)[:SOME]))
             return (
-                f"{self._bytes} bytes were heard with {self._unknown} frames of an unknown dialect and none of this"
-                " one: pass dialect=Dialect.from_xml(...)"
+                f"{heard} with {self._unknown} frames of an unknown dialect (messages {numbers}) and none of this one:"
+                " pass dialect=Dialect.from_xml(...)"
             )
-        if self._bad_crcs:
+        if self._bad_crcs * NOISE_BYTES > self._bytes:
             return (
-                f"{self._bytes} bytes were heard with {self._bad_crcs} damaged frames and no good one:"
-                " a noisy link, or another dialect?"
+                f"{heard} with {self._bad_crcs} damaged frames and no good one: a noisy link, or another dialect?"
             )
-        return f"{self._bytes} bytes were heard, but no MAVLink frame: wrong baud rate, or another protocol?"
+        return f"{heard}, but no MAVLink frame: wrong baud rate, or another protocol?"
+
+    def _without_heartbeats(self) -> str:
+        heard = f"{self._frames} frames were heard"
+        if not any(self._systems):
+            return f"{heard}, all of system id 0, which is nobody's: give the vehicle an id of 1 to 255"
+        return f"{heard}, but no HEARTBEAT among them"
 
     def _without_vehicle(self) -> str:
         autopilots = sorted({system for (system, _), beat in self._heard.items() if is_autopilot(beat)})

@@ -114,6 +114,8 @@ class SimulatedVehicle:
         """The time at which ``step`` has something to do; infinity while nothing is planned."""
         if not self._is_on and math.isnan(self.booted_at):
             return self.now
+        if self.faults.frozen:
+            return self.now + TICK_S  # nothing happens, but time is to be followed
         due = self._ticks_from + self._ticks_done * TICK_S
         if self._timers and self._timers[0][0] < due:
             due = self._timers[0][0]
