@@ -215,11 +215,14 @@ CAMERA = ExtraComponent(
 ADSB = ExtraComponent(156, type=MavType.ADSB, base_mode=0xFF)
 COMPANION = ExtraComponent(191, type=MavType.ONBOARD_CONTROLLER, custom_mode=6)
 GROUND_STATION = ExtraComponent(190, type=MavType.GCS, system_id=254, base_mode=0xD9, custom_mode=4)
+SECOND_AUTOPILOT = ExtraComponent(
+    2, type=MavType.QUADROTOR, autopilot=MavAutopilot.ARDUPILOTMEGA, base_mode=0xD9, custom_mode=6
+)
 
 
 @pytest.mark.parametrize(
     "component",
-    [GIMBAL, CAMERA, ADSB, COMPANION, GROUND_STATION],
+    [GIMBAL, CAMERA, ADSB, COMPANION, GROUND_STATION, SECOND_AUTOPILOT],
     ids=lambda c: str(c.component_id),
 )
 async def test_heartbeats_of_others_change_nothing(component: ExtraComponent) -> None:
@@ -233,6 +236,24 @@ async def test_heartbeats_of_others_change_nothing(component: ExtraComponent) ->
         assert (vehicle.mode_name, vehicle.is_armed, vehicle.system_status.value) == ("STABILIZE", False, 3)
         copter.faults.heartbeats_stopped = True
         await anyio.sleep(6.0)
+
+
+async def test_an_autopilot_that_is_not_component_1() -> None:
+    """Nobody else is there: after its third heartbeat it is the vehicle."""
+    async with simulated_link([]) as link:
+        wire = Wire(link)
+        odd = FrameEncoder(5, 7)
+        async with anyio.create_task_group() as tasks:
+
+            async def beat() -> None:
+                while True:
+                    await anyio.sleep(1.0)
+                    wire.deliver(odd.encode(m.Heartbeat(MavType.QUADROTOR, MavAutopilot.PX4, 1, 0, 3, 3)))
+
+            tasks.start_soon(beat)
+            async with aerokit.connect(wire, timeout=5.0, rates={}) as vehicle:
+                assert (vehicle.system_id, vehicle.component_id) == (5, 7)
+                tasks.cancel_scope.cancel()
 
 
 async def test_the_gimbal_goes_on_while_the_autopilot_is_silent() -> None:

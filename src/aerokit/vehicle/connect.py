@@ -31,6 +31,9 @@ __all__ = ["connect"]
 
 FRESH_HEARTBEAT_S = 2.0
 """A heartbeat heard longer ago says nothing about now: the next one is waited for."""
+MAV_COMP_ID_AUTOPILOT1 = 1
+HEARTBEATS_ALONE = 3
+"""So many heartbeats of another component and none of component 1 make it the vehicle's autopilot."""
 
 
 @asynccontextmanager
@@ -188,12 +191,15 @@ class _Search:
         self._heartbeat: Heartbeat | None = None
         self._error: Exception | None = None
         self._ended = asyncio.Event()
+        self._others: dict[tuple[int, int], int] = {}
         self.wanted = "an autopilot" if system_id is None else f"the autopilot of system {system_id}"
 
     def take(self, heartbeat: Heartbeat) -> None:
         """One heartbeat off the link."""
         frame = heartbeat.received_frame
         if frame is None or self._ended.is_set() or not self._is_wanted(frame, heartbeat):
+            return
+        if frame.component_id != MAV_COMP_ID_AUTOPILOT1 and not self._is_alone(frame):
             return
         try:
             if frame.system_id in self._connection.attached:
@@ -204,6 +210,12 @@ class _Search:
         except Exception as error:
             self._error = error
         self._ended.set()
+
+    def _is_alone(self, frame: Frame) -> bool:
+        """A component that says it is an autopilot gives the system's first autopilot the time to be heard."""
+        source = (frame.system_id, frame.component_id)
+        self._others[source] = self._others.get(source, 0) + 1
+        return self._others[source] >= HEARTBEATS_ALONE
 
     def abort(self, error: Exception) -> None:
         """The connection has ended."""
