@@ -8,6 +8,7 @@ standard's are the same classes, so that ``isinstance(message, messages.Heartbea
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from aerokit.errors import LocalProtocolError
@@ -35,12 +36,19 @@ class Dialect:
         self.name = name
         """Its name, the XML file's for example."""
         self._classes = {cls.ID: cls for cls in classes}
-        self._decoders: dict[int, Callable[[bytes, Frame | None], Message]] = {}
         self._enums = dict(enum_types or {})
-        self.rows: dict[int, Row] = {
-            cls.ID: (cls.CRC_EXTRA, cls.BASE_LENGTH, cls.LENGTH) for cls in self._classes.values()
-        }
+        self._take(
+            {cls.ID: (cls.CRC_EXTRA, cls.BASE_LENGTH, cls.LENGTH) for cls in self._classes.values()},
+        )
+
+    def _take(self, rows: dict[int, Row]) -> None:
+        self.rows = rows
         """Message id → (CRC_EXTRA, length of the payload without extensions, and with them)."""
+        self.extras: dict[int, bytes] = {message_id: bytes((row[0],)) for message_id, row in rows.items()}
+        """Message id → CRC_EXTRA as the byte that goes behind the payload into the checksum."""
+        self._decoders: dict[int, Callable[[bytes, Frame | None], Message]] = {
+            message_id: partial(self._decode_first, message_id) for message_id in rows
+        }
 
     @classmethod
     def from_xml(cls, path: str | Path) -> Dialect:
@@ -97,11 +105,12 @@ class Dialect:
 
     def decode(self, frame: Frame) -> Message:
         """The message of a frame, its ``received_frame`` set; KeyError when the dialect does not know the id."""
-        try:
-            decoder = self._decoders[frame.message_id]
-        except KeyError:
-            decoder = self._decoders[frame.message_id] = self[frame.message_id].decode
-        return decoder(frame.payload, frame)
+        return self._decoders[frame.message_id](frame.payload, frame)
+
+    def _decode_first(self, message_id: int, payload: bytes, frame: Frame | None) -> Message:
+        """Stands in for a class that is not loaded yet, so that `decode` need not ask each time."""
+        decoder = self._decoders[message_id] = self[message_id].decode
+        return decoder(payload, frame)
 
     def extended_by(self, other: Dialect) -> Dialect:
         """Both together. LocalProtocolError when an id means one message here and another there."""
@@ -120,7 +129,7 @@ class _Standard(Dialect):
 
     def __init__(self) -> None:
         super().__init__("standard", ())
-        self.rows = {message_id: row[2:] for message_id, row in messages.INDEX.items()}
+        self._take({message_id: row[2:] for message_id, row in messages.INDEX.items()})
 
     def __getitem__(self, message_id: int) -> type[Message]:
         message_class: type[Message] = getattr(messages, messages.INDEX[message_id][0])
@@ -138,8 +147,8 @@ class _Standard(Dialect):
 class _Extended(Dialect):
     def __init__(self, first: Dialect, second: Dialect) -> None:
         super().__init__(f"{first.name}+{second.name}", ())
-        self.rows = {**second.rows, **first.rows}
         self._parts = (first, second)
+        self._take({**second.rows, **first.rows})
 
     def __getitem__(self, message_id: int) -> type[Message]:
         first, second = self._parts

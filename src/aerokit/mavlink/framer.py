@@ -57,7 +57,7 @@ class Framer:
         self._rest = b""
         self._unknown: list[bytes] = []
         self._rows = dialect.rows
-        self._extras = {message_id: bytes((row[0],)) for message_id, row in dialect.rows.items()}
+        self._extras = dialect.extras
         self._sources: dict[int, SourceStatistics] = {}
 
     def receive(self, data: bytes, now: float = 0.0) -> list[Frame]:
