@@ -19,7 +19,7 @@ from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.messages import Attitude, CommandLong, Heartbeat
 from aerokit.runtime.connection import Connection
-from aerokit.runtime.events import LinkClosed
+from aerokit.runtime.events import HeardTwice, LinkClosed
 from aerokit.sim import SimulatedCopter, simulated_link
 
 pytestmark = pytest.mark.anyio
@@ -226,9 +226,16 @@ async def test_what_names_its_target_goes_only_where_that_was_heard() -> None:
             link.receive(FrameEncoder(system_id, 1).encode(COPTER), peer)
         connection.send(CommandLong(2, 1, 400, 0, *(0.0,) * 7))
         assert link.sent_to(76) == ["two"]
+        heard: list[HeardTwice] = []
+        connection.bus.attach_event(HeardTwice, heard.append)
+        link.receive(FrameEncoder(2, 1).encode(COPTER), "elsewhere")  # a second vehicle with the same ids?
+        connection.send(CommandLong(2, 1, 400, 0, *(0.0,) * 7))
+        assert link.sent_to(76) == ["two", "two"]
+        assert [(event.system_id, event.component_id) for event in heard] == [(2, 1)]
+        await anyio.sleep(4)
         link.receive(FrameEncoder(2, 1).encode(COPTER), "elsewhere")  # the vehicle's port has changed
         connection.send(CommandLong(2, 1, 400, 0, *(0.0,) * 7))
-        assert link.sent_to(76) == ["two", "elsewhere"]
+        assert link.sent_to(76) == ["two", "two", "elsewhere"]
         connection.send(Heartbeat(6, 8, 0, 0, 4))
         assert link.sent_to(0)[-1] is None
 

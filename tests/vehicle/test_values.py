@@ -47,7 +47,8 @@ def test_offsets_keep_and_raise_the_altitude() -> None:
 
 
 def test_home_as_a_target() -> None:
-    assert Home(47.0, 8.0, 488.0).position == Position(47.0, 8.0, 488.0, 0.0)
+    """Without an altitude: going home must not mean flying into the ground."""
+    assert Home(47.0, 8.0, 488.0).position == Position(47.0, 8.0)
 
 
 def test_velocity_as_speed_and_course() -> None:

@@ -34,9 +34,7 @@ def command_long(
         raise LocalProtocolError(
             f"{command_name(command)} takes at most 7 parameters, {len(params)} were given"
         )
-    values = [_check_param(command, f"param{i}", value) for i, value in enumerate(params, 1)]
-    values += [0.0] * (7 - len(values))
-    return CommandLong(target_system, target_component, command, 0, *values)
+    return CommandLong(target_system, target_component, command, 0, *_checked_params(command, params, 7))
 
 
 def command_int(
@@ -66,9 +64,8 @@ def command_int(
             raise LocalProtocolError(
                 f"{command_name(command)}: {field} = {value!r} is not an integer of 32 bits"
             )
-    values = [_check_param(command, f"param{i}", value) for i, value in enumerate(params, 1)]
-    param1, param2, param3, param4 = values + [0.0] * (4 - len(values))
-    z = _check_param(command, "z", z)
+    param1, param2, param3, param4 = _checked_params(command, params, 4)
+    z = _checked_number(command, "z", z)
     return CommandInt(
         target_system, target_component, frame, command, 0, 0, param1, param2, param3, param4, x, y, z
     )
@@ -137,9 +134,9 @@ class CommandExchange(Exchange[CommandAck]):
 
     @property
     def answers_to_come(self) -> int:
-        """How many answers may still be under way when it is abandoned now; after a resend, the others were lost."""
-        before_ours = self._answers_before_ours - self._answers if self._sent == 1 else 0
-        return max(0, before_ours) + 1
+        """How many answers may still be under way, to be ignored by the next command of the same number."""
+        before_ours = self._answers_before_ours if self._sent == 1 else 0
+        return max(0, before_ours + self._sent - self._answers)
 
     def expire(self, now: float) -> None:
         """Send again, or give up after the last attempt or when a command in progress has gone silent."""
@@ -231,7 +228,18 @@ def _check_target(target_system: int, command: int) -> None:
         )
 
 
-def _check_param(command: int, field: str, value: float) -> float:
+def _checked_params(command: int, params: tuple[float, ...], count: int) -> list[float]:
+    """The parameters as numbers, with zeros for the missing ones."""
+    numbers = [0.0] * count
+    for index, value in enumerate(params):
+        if isinstance(value, (int, float)) and -FLOAT32_MAX <= value <= FLOAT32_MAX:
+            numbers[index] = float(value)  # nearly always
+        else:
+            numbers[index] = _checked_number(command, f"param{index + 1}", value)
+    return numbers
+
+
+def _checked_number(command: int, field: str, value: float) -> float:
     try:
         number = float(value)
     except (TypeError, ValueError):

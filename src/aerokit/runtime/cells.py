@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import math
 from collections import deque
 from collections.abc import AsyncIterator, Callable
@@ -15,6 +16,8 @@ from aerokit.snapshot import Snapshot
 __all__ = ["Changes", "Source", "StateCell"]
 
 T = TypeVar("T")
+
+logger = logging.getLogger("aerokit")
 
 _SEEN = 3  # how many of the last distinct values a time-out names
 
@@ -153,7 +156,7 @@ class StateCell(Generic[T]):
 
         With ``every_arrival`` also when a value equals the one before.
 
-        The callback must be quick and must not raise.
+        The callback must be quick; what it raises is logged.
         """
         observer = _Observer(self, callback, every_arrival)
         self._sinks.append(observer)
@@ -363,7 +366,10 @@ class _Observer(_Sink[T]):
     def receive(self, value: T) -> None:
         previous, self._previous = self._previous, value
         if self._every_arrival or previous is None or previous != value:
-            self._callback(previous, value)
+            try:
+                self._callback(previous, value)
+            except Exception:  # what one observer does wrong must not keep the state from the others
+                logger.exception("an observer of %s raised", self._cell.name)
 
     def forget(self) -> None:
         self._previous = None

@@ -18,8 +18,9 @@ from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import Heartbeat
 from aerokit.runtime.bus import Bus
+from aerokit.runtime.deadlines import Deadlines
 from aerokit.runtime.endings import raisable
-from aerokit.runtime.events import Event, LinkClosed
+from aerokit.runtime.events import Event, HeardTwice, LinkClosed
 from aerokit.runtime.loop_watch import watch_loop
 from aerokit.runtime.recording import Recording
 from aerokit.runtime.subscription import Overflow, Subscription
@@ -49,6 +50,8 @@ MAV_COMP_ID_MISSIONPLANNER = 190
 HEARTBEAT_PERIOD_S = 1.0
 CLOSE_TIMEOUT_S = 2.0
 MOST_PEERS = 256
+MOVES_AFTER_S = 3.5
+"""A component that was silent for so long may come from another peer: its port has changed, or the link."""
 EVERY_PEER: tuple[Peer, ...] = (None,)
 
 
@@ -152,13 +155,17 @@ class Connection:
         """The last HEARTBEAT of every (system id, component id) on the link."""
         self.attached: set[int] = set()
         """System ids that have a vehicle object on this connection."""
+        self.deadlines = Deadlines()
+        """What has to happen at a time, as long as the connection is open."""
         self._clock = asyncio.get_running_loop().time
         self._encoder = FrameEncoder(source_system, source_component, version=mavlink_version)
         self._framers: dict[Peer, Framer] = {}
         self._routes: dict[tuple[int, int], Peer] = {}  # system, component → where its heartbeat came from
+        self._routed_at: dict[tuple[int, int], float] = {}
+        self._doubles: set[tuple[int, int, Peer]] = set()
         self._recording: Recording | None = None
         self._enders: list[Callable[[Exception], None]] = []
-        self._background: set[anyio.CancelScope] = set()
+        self._background: set[asyncio.Task[None]] = set()
         self._error: Exception | None = None
         self.bus.attach(Heartbeat, _ignore)  # routes and diagnosis need every heartbeat
 
@@ -299,6 +306,8 @@ class Connection:
                     return
                 if self._recording is not None:
                     self._recording.write(frame.raw)
+                if len(self._framers) > 1 and self._is_of_another(frame, peer):
+                    continue
                 if frame.message_id == Heartbeat.ID:
                     self._note_heartbeat(frame, peer)
                 self.bus.deliver(frame)
@@ -316,17 +325,25 @@ class Connection:
         tasks.start_soon(self.guarded, self._watch_loop, name="aerokit loop watch")
 
     async def guarded(self, function: Callable[[], Awaitable[None]]) -> None:
-        """Run a background task of ours until the connection ends; a mistake in it ends the connection."""
-        if not self.is_open:
+        """Run a background task of ours until the connection ends; a mistake in it ends the connection.
+
+        It is cancelled as a task, not by a scope: where a scope and the scope around it are cancelled together, anyio
+        up to 4.16 lets the outer one's task forget a cancellation of its own.
+        """
+        task = asyncio.current_task()
+        if task is None or not self.is_open:
             return
-        with anyio.CancelScope() as scope:
-            self._background.add(scope)
-            try:
-                await function()
-            except Exception as error:
-                self._fail(error)
-            finally:
-                self._background.discard(scope)
+        self._background.add(task)
+        try:
+            await function()
+        except asyncio.CancelledError:
+            if self.is_open:
+                raise
+        except Exception as error:
+            self._background.discard(task)
+            self._fail(error)
+        finally:
+            self._background.discard(task)
 
     async def _watch_loop(self) -> None:
         await watch_loop(self)
@@ -360,8 +377,9 @@ class Connection:
                 ender(error)
             except Exception:
                 logger.exception("a mistake at the end of a connection; the others are told all the same")
-        for scope in tuple(self._background):
-            scope.cancel()
+        self.deadlines.close()
+        for task in tuple(self._background):
+            task.cancel()
 
     def _peers_of(self, system_id: int, component_id: int) -> Collection[Peer]:
         """Where to send what is for this component, or for this system if the component is 0 or was never heard."""
@@ -399,6 +417,22 @@ class Connection:
         if frame.system_id != 0 and isinstance(heartbeat, Heartbeat):
             source = frame.system_id, frame.component_id
             self.heard[source], self._routes[source] = heartbeat, peer
+            self._routed_at[source] = frame.received_at
+
+    def _is_of_another(self, frame: Frame, peer: Peer) -> bool:
+        """Whether it is heard from another peer already: two vehicles with the same ids, or two ways to one.
+
+        The first one stays; another takes its place when it has been silent for ``MOVES_AFTER_S``.
+        """
+        source = frame.system_id, frame.component_id
+        if self._routes.get(source, peer) == peer:
+            return False
+        if frame.received_at - self._routed_at[source] > MOVES_AFTER_S:
+            return False
+        if (*source, peer) not in self._doubles:
+            self._doubles.add((*source, peer))
+            self.bus.publish(HeardTwice(frame.received_at, *source))
+        return True
 
 
 def _only(system_id: int, sink: Sink) -> Sink:

@@ -1,9 +1,9 @@
-"""Runs a sans-IO exchange on the event loop: one future, one timer, and nothing left of either afterwards."""
+"""Runs a sans-IO exchange on the event loop: one future, one deadline, and nothing left of either afterwards."""
 
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 from aerokit.runtime.endings import raisable
 
@@ -12,86 +12,78 @@ if TYPE_CHECKING:
     from aerokit.protocols.exchange import Exchange
     from aerokit.runtime.connection import Connection
 
-__all__ = ["run_exchange"]
+__all__ = ["ExchangeRun", "run_exchange"]
 
 ResultT = TypeVar("ResultT")
 
 
 async def run_exchange(connection: Connection, system_id: int, exchange: Exchange[ResultT]) -> ResultT:
-    """Run ``exchange`` with the vehicle ``system_id`` to its end and return its result.
-
-    Cancellation ends it at once. When the connection ends, the exchange ends with the connection's error; what goes
-    wrong in sending is raised here.
-    """
-    runner = _Runner(connection, exchange)
+    """Run ``exchange`` with the vehicle ``system_id`` to its end and return its result; see `ExchangeRun.result`."""
+    run = ExchangeRun(connection, exchange)
     detachments = [
-        connection.bus.attach(message_type, runner.receive, system_id=system_id)
+        connection.bus.attach(message_type, run.receive, system_id=system_id)
         for message_type in exchange.expects
     ]
-    detachments.append(connection.on_end(runner.abort))
     try:
-        runner.start()
-        await runner.future
+        return await run.result()
     finally:
-        runner.stop()
         for detach in detachments:
             detach()
-    return exchange.result()
 
 
-class _Runner:
-    """Feeds one exchange with messages and time, and sends what it wants sent."""
+class ExchangeRun(Generic[ResultT]):
+    """Gives one exchange its time and sends what it wants sent; its owner gives it the messages of its target."""
 
-    def __init__(self, connection: Connection, exchange: Exchange[Any]) -> None:
+    def __init__(self, connection: Connection, exchange: Exchange[ResultT]) -> None:
         self._connection, self._exchange = connection, exchange
-        self._loop = asyncio.get_running_loop()
-        self._timer: asyncio.TimerHandle | None = None
-        self.future: asyncio.Future[None] = self._loop.create_future()
+        self._deadline: float | None = None
+        self._ended: asyncio.Future[None] = asyncio.get_running_loop().create_future()
 
-    def start(self) -> None:
-        self._exchange.start(self._loop.time())
-        self._after_step()
+    async def result(self) -> ResultT:
+        """Start it, await its end and return its result; once.
+
+        Cancellation ends it at once. When the connection ends, the exchange ends with the connection's error; what
+        goes wrong in sending is raised here.
+        """
+        detach = self._connection.on_end(self._abort)
+        try:
+            self._exchange.start(self._connection.now())
+            self._after_step()
+            await self._ended
+        finally:
+            self._connection.deadlines.take_back(self._expire)
+            detach()
+        return self._exchange.result()
 
     def receive(self, message: Message) -> None:
+        """Take a message of the target."""
         try:
-            self._exchange.receive(message, self._loop.time())
+            self._exchange.receive(message, self._connection.now())
         finally:  # what a callback of the program raised is for the bus to report; the exchange goes on
             self._after_step()
 
-    def abort(self, error: Exception) -> None:
+    def _abort(self, error: Exception) -> None:
         self._exchange.abort(raisable(error))
-        self._finish()
-
-    def stop(self) -> None:
-        if self._timer is not None:
-            self._timer.cancel()
-            self._timer = None
+        self._after_step()
 
     def _expire(self) -> None:
-        self._timer = None
+        self._deadline = None
         try:
-            self._exchange.expire(self._loop.time())
+            self._exchange.expire(self._connection.now())
         except Exception as error:
             self._exchange.abort(error)
         self._after_step()
 
     def _after_step(self) -> None:
+        exchange = self._exchange
         try:
-            for message in self._exchange.take_outbox():
+            for message in exchange.take_outbox():
                 self._connection.send(message)
         except Exception as error:  # nobody else would tell the one who waits
-            self._exchange.abort(error)
-        if self._exchange.done:
-            self._finish()
-        else:
-            self._set_timer(self._exchange.deadline)
-
-    def _set_timer(self, deadline: float | None) -> None:
-        if deadline is not None and (self._timer is None or self._timer.when() != deadline):
-            self.stop()
-            self._timer = self._loop.call_at(deadline, self._expire)
-
-    def _finish(self) -> None:
-        self.stop()
-        if not self.future.done():
-            self.future.set_result(None)
+            exchange.abort(error)
+        if exchange.done:
+            if not self._ended.done():
+                self._ended.set_result(None)
+        elif exchange.deadline is not None and exchange.deadline != self._deadline:
+            self._deadline = exchange.deadline
+            self._connection.deadlines.set(self._expire, self._deadline)

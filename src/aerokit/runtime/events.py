@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 __all__ = [
     "ArmedChanged",
     "Event",
+    "HeardTwice",
     "LandedStateChanged",
     "LinkClosed",
     "LinkReport",
@@ -57,6 +58,15 @@ class VehicleBack(Event):
 
 class VehicleRebooted(Event):
     """The autopilot's time since boot went backwards: it has started anew. Message rates are asked for again."""
+
+
+class HeardTwice(Event):
+    """The same system and component id came from a second peer of the link; what it says is not listened to.
+
+    Two vehicles with the same ids, or two ways to the same one. Told once for each such peer.
+    """
+
+    component_id: int
 
 
 class ModeChanged(Event):

@@ -88,6 +88,11 @@ class VehicleState:
         return self._cell(self.aio.landed_state)
 
     @cached_property
+    def vtol_state(self) -> StateCell[int]:
+        """MAV_VTOL_STATE: 1 to fixed wing, 2 to multicopter, 3 multicopter, 4 fixed wing (EXTENDED_SYS_STATE)."""
+        return self._cell(self.aio.vtol_state)
+
+    @cached_property
     def system_status(self) -> StateCell[int]:
         """MAV_STATE by HEARTBEAT: 3 standby, 4 active, 5 critical, 6 emergency."""
         return self._cell(self.aio.system_status)
@@ -213,6 +218,11 @@ class VehicleState:
         return self._cell(self.aio.mission_current)
 
     @cached_property
+    def mission_reached(self) -> StateCell[int]:
+        """The mission item that was reached last (MISSION_ITEM_REACHED)."""
+        return self._cell(self.aio.mission_reached)
+
+    @cached_property
     def status_text(self) -> StateCell[StatusText]:
         """The last thing it said (STATUSTEXT, chunks joined)."""
         return self._cell(self.aio.status_text)
@@ -234,8 +244,13 @@ class VehicleState:
 
     @property
     def is_armed(self) -> bool:
-        """Whether the last heartbeat says armed; False before the first."""
+        """Whether the last heartbeat says armed; False before the first, and after a reboot until the next one."""
         return self.aio.is_armed
+
+    @property
+    def is_surely_disarmed(self) -> bool:
+        """Whether the last heartbeat says disarmed; False while it is not known."""
+        return self.aio.is_surely_disarmed
 
     @property
     def heartbeat_age(self) -> float:

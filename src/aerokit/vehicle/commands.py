@@ -6,10 +6,10 @@ import asyncio
 from collections import defaultdict
 from typing import TYPE_CHECKING
 
-from aerokit.errors import CommandTimeout
+from aerokit.errors import CommandTimeout, ConnectionClosed
 from aerokit.mavlink.messages import CommandAck
 from aerokit.protocols.command import CommandExchange, command_int, command_long
-from aerokit.runtime.driver import run_exchange
+from aerokit.runtime.driver import ExchangeRun
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 __all__ = ["CommandSender"]
 
 IN_PROGRESS = 5
+EVERY_COMPONENT = 0
 UNDER_WAY_S = 2.0
 """An answer that has not come by then was lost."""
 
@@ -46,12 +47,15 @@ class CommandSender:
         self._system_id, self._component_id = system_id, component_id
         self._describe = describe
         self._locks: defaultdict[_Key, asyncio.Lock] = defaultdict(asyncio.Lock)
+        self._runs: dict[_Key, ExchangeRun[CommandAck]] = {}
         self._under_way: dict[_Key, list[float]] = {}
+        self._is_closed = False
         self._detach = connection.bus.attach(CommandAck, self._on_ack, system_id=system_id)
 
     def close(self) -> None:
-        """Stop listening to answers."""
+        """Stop listening to answers; what is asked for from now on raises."""
         self._detach()
+        self._is_closed = True
 
     async def send_long(
         self,
@@ -89,6 +93,13 @@ class CommandSender:
         self._connection.send(command_long(self._system_id, self._component_id, command, params))
         self._expect_answers((self._component_id, command), 1)
 
+    def is_for_us(self, ack: CommandAck) -> bool:
+        """Whether it answers us, and not another ground station; targets are 0 in MAVLink 1 and old firmwares."""
+        return ack.target_system in (0, self._connection.source_system) and ack.target_component in (
+            0,
+            self._connection.source_component,
+        )
+
     def awaits_answer(self, command: int) -> bool:
         """Whether an answer of the autopilot to what was sent unconfirmed may still come."""
         oldest = self._connection.now() - UNDER_WAY_S
@@ -101,6 +112,8 @@ class CommandSender:
         attempt_timeout: float,
         on_progress: Callable[[int | None], None] | None,
     ) -> CommandAck:
+        if self._is_closed:
+            raise ConnectionClosed("the block of this vehicle was left; nothing was sent")
         key = (message.target_component, message.command)
         async with self._locks[key]:
             exchange = CommandExchange(
@@ -112,17 +125,19 @@ class CommandSender:
                 on_progress=on_progress,
                 answers_before_ours=self._take_answers_under_way(key),
             )
+            run = self._runs[key] = ExchangeRun(self._connection, exchange)
             try:
-                return await run_exchange(self._connection, self._system_id, exchange)
+                return await run.result()
             except CommandTimeout as error:
                 raise CommandTimeout(f"{error}; {self._describe()}") from None
-            except asyncio.CancelledError:
+            finally:
+                del self._runs[key]
                 self._expect_answers(key, exchange.answers_to_come)
-                raise
 
     def _expect_answers(self, key: _Key, count: int) -> None:
         """Remember that answers may come which nobody waits for."""
-        self._under_way.setdefault(key, []).extend([self._connection.now()] * count)
+        if count:
+            self._under_way.setdefault(key, []).extend([self._connection.now()] * count)
 
     def _take_answers_under_way(self, key: _Key) -> int:
         if key not in self._under_way:
@@ -131,12 +146,13 @@ class CommandSender:
         return sum(at >= oldest for at in self._under_way.pop(key))
 
     def _on_ack(self, ack: CommandAck) -> None:
-        """An answer that no exchange waits for was one of those under way."""
-        if not self._under_way:
-            return
+        """Give an answer to the exchange that waits for it; without one, it was one of those under way."""
         frame = ack.received_frame
         key = (0 if frame is None else frame.component_id, ack.command)
-        if key in self._under_way and not self._locks[key].locked() and ack.result != IN_PROGRESS:
+        run = self._runs.get(key) or self._runs.get((EVERY_COMPONENT, ack.command))
+        if run is not None:
+            run.receive(ack)
+        elif key in self._under_way and ack.result != IN_PROGRESS:
             self._under_way[key].pop(0)
             if not self._under_way[key]:
                 del self._under_way[key]

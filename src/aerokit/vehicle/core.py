@@ -79,8 +79,10 @@ class VehicleCore:
         self._watch = VehicleWatch(connection, system_id, component_id, self._on_reboot)
         self._link_watch = LinkWatch(connection, system_id, component_id, self._on_link_report)
         self._tasks: TaskGroup | None = None
+        self._is_closed = False
         self._detach: list[Detach] = []
         self._messages: dict[type[Message], StateCell[Any]] = {}
+        self._message_rates: dict[type[Message], Detach] = {}
         self._attach_telemetry()
 
     # ---------------------------------------------------------------------------- commands
@@ -111,6 +113,7 @@ class VehicleCore:
             CommandRejected: any other result; ``reasons`` has the status texts seen meanwhile.
             CommandTimeout: no ack; the text names attempts, seconds, the last heartbeat and the loss.
         """
+        self._before_command(command)
         started = self.connection.now()
         try:
             return await self._commands.send_long(
@@ -143,6 +146,7 @@ class VehicleCore:
         ``x`` and ``y`` are latitude and longitude in 1e-7 degrees, or 1e-4 m in local frames; ``z`` metres. The rest
         is as for :meth:`command`.
         """
+        self._before_command(command)
         started = self.connection.now()
         try:
             return await self._commands.send_int(
@@ -162,7 +166,14 @@ class VehicleCore:
             raise self._explained(error, started) from None
 
     def send(self, message: Message) -> None:
-        """Send one message as it is, once; never blocks. Its ``target_system`` is yours to set."""
+        """Send one message as it is, once; never blocks. Its ``target_system`` is yours to set.
+
+        Raises:
+            LocalProtocolError: a field is out of range; nothing was sent.
+            ConnectionClosed, LinkLost: the connection has ended, or the block of this vehicle was left.
+        """
+        if self._is_closed:
+            raise ConnectionClosed("the block of this vehicle was left; nothing was sent")
         self.connection.send(message)
 
     # ----------------------------------------------------------------------- subscriptions
@@ -187,8 +198,9 @@ class VehicleCore:
         """
         self.connection.check_types(types)
         messages: list[type[Message]] = [each for each in types if issubclass(each, Message)]
-        for message in messages if rate_hz is not None else ():
-            check_rate(message, rate_hz)
+        if rate_hz is not None:
+            for message in messages:
+                check_rate(message, rate_hz)
 
         def attach(sink: Sink) -> list[Detach]:
             detach = self.connection.attach(types, sink, system_id=self.system_id)
@@ -231,8 +243,8 @@ class VehicleCore:
         """The latest message of a kind as it came, in a cell: ``vehicle.message(messages.RawImu).value.xacc``.
 
         The first call registers it, and has the vehicle send it at ``rate_hz`` (None: the default rate of a message
-        that comes in a stream) for as long as the vehicle object lives; later calls give the same cell. Only messages
-        of the autopilot count.
+        that comes in a stream) for as long as the vehicle object lives; later calls give the same cell, and may change
+        the rate. Only messages of the autopilot count.
 
         Raises:
             LocalProtocolError: the rate is out of range, or the dialect does not hold the message.
@@ -243,7 +255,10 @@ class VehicleCore:
             cell = self._messages[message_type] = self._message_cell(message_type)
             rate_hz = subscription_rate_hz(message_type.__name__) if rate_hz is None else rate_hz
         if rate_hz is not None:
-            self._detach.append(self._rates.want(message_type, rate_hz))
+            release = self._message_rates.pop(message_type, None)
+            self._message_rates[message_type] = self._rates.want(message_type, rate_hz)
+            if release is not None:
+                release()
         return cell
 
     def _message_cell(self, message_type: type[Message]) -> StateCell[Any]:
@@ -301,7 +316,11 @@ class VehicleCore:
         ]
         self._detach.append(self.connection.on_end(self._on_end))
 
+    def _before_command(self, command: int) -> None:
+        """Any command is about to be sent by the program itself."""
+
     def _close(self) -> None:
+        self._is_closed = True
         self._on_end(ConnectionClosed("the block of this vehicle was left"))
         for detach in self._detach:
             detach()
@@ -320,9 +339,13 @@ class VehicleCore:
         refusals: list[CommandAck] = []
 
         def note(ack: CommandAck) -> None:
-            if ack.command == command and ack.result == RESULT_ACCEPTED:
+            frame = ack.received_frame
+            is_its = frame is not None and frame.component_id == self.component_id
+            if ack.command != command or not is_its or not self._commands.is_for_us(ack):
+                return
+            if ack.result == RESULT_ACCEPTED:
                 refusals.clear()
-            elif ack.command == command and ack.result in RESULTS_OF_REFUSAL:
+            elif ack.result in RESULTS_OF_REFUSAL:
                 refusals.append(ack)
 
         detach = self.connection.bus.attach(CommandAck, note, system_id=self.system_id)
@@ -364,6 +387,8 @@ class VehicleCore:
 
     def _on_reboot(self) -> None:
         self.telemetry.forget()
+        for cell in self._messages.values():
+            cell.forget()
         self._rates.ask_again()
 
     def _on_end(self, error: Exception) -> None:

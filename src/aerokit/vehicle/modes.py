@@ -11,7 +11,7 @@ import anyio
 
 from aerokit.errors import AerokitError, CommandRejected, NotSupported
 from aerokit.vehicle.checks import check_seconds
-from aerokit.vehicle.orders import Order
+from aerokit.vehicle.orders import MOVING_COMMANDS, Order
 from aerokit.vehicle.progress import await_progress
 from aerokit.vehicle.state import VehicleState
 
@@ -176,6 +176,11 @@ class ModeActions(VehicleState):
             self._hold_scope = None
         self._order = Order(self.connection.now(), self.telemetry.mode.latest, modes)
         return self._order
+
+    def _before_command(self, command: int) -> None:
+        """A program that steers past the actions gives a new order too."""
+        if command in MOVING_COMMANDS:
+            self._new_order()
 
     def _on_mode(self, before: Mode | None, after: Mode) -> None:
         """Once the vehicle is in a mode of the order, the mode before would be somebody else's doing too."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 import math
 from collections import deque
 from typing import TYPE_CHECKING
@@ -24,8 +23,6 @@ if TYPE_CHECKING:
     from aerokit.vehicle.commands import CommandSender
 
 __all__ = ["MessageRates"]
-
-logger = logging.getLogger("aerokit")
 
 SET_MESSAGE_INTERVAL = 511
 RESULT_UNSUPPORTED = 3
@@ -61,6 +58,8 @@ class _Stream:
         self.counts: deque[int] = deque([0], maxlen=WATCH_WINDOW + 1)
         self.patience_s = ASK_AGAIN_S
         self.ask_again_at = math.inf
+        self.failures = 0
+        self.not_before = -math.inf
         self.detach: Detach | None = None
 
     @property
@@ -143,6 +142,7 @@ class MessageRates:
         """Forget what was asked, as after a reboot, and ask for everything again."""
         for stream in self._streams.values():
             stream.asked_hz, stream.refused, stream.patience_s = None, False, ASK_AGAIN_S
+            stream.failures, stream.not_before = 0, -math.inf
         self._dirty.set()
 
     async def run(self) -> None:
@@ -158,6 +158,8 @@ class MessageRates:
             await anyio.sleep(WATCH_PERIOD_S)
             for stream in self._streams.values():
                 self._watch(stream)
+            if self._most_urgent() is not None:
+                self._dirty.set()
 
     def close(self) -> None:
         """Stop counting."""
@@ -176,24 +178,34 @@ class MessageRates:
         return stream
 
     async def _ask_for_all_due(self) -> None:
-        for stream in list(self._streams.values()):
-            if stream.is_due and not self._legacy:
-                await self._ask_by_command(stream)
+        """One after the other, the most urgent next: a new wish does not wait for those that are not answered."""
+        while not self._legacy and (stream := self._most_urgent()) is not None:
+            await self._ask_by_command(stream)
         if self._legacy:
             self._ask_by_group()
+
+    def _most_urgent(self) -> _Stream | None:
+        now = self._connection.now()
+        due = (each for each in self._streams.values() if each.is_due and now >= each.not_before)
+        return min(due, key=lambda each: (each.failures, each.is_optional), default=None)
 
     async def _ask_by_command(self, stream: _Stream) -> None:
         hz = stream.wanted_hz
         interval_us = 0.0 if hz == AUTOPILOT_DEFAULT else 1e6 / hz
         try:
-            await self._commands.send_long(SET_MESSAGE_INTERVAL, stream.message_type.ID, interval_us)
+            await self._commands.send_long(
+                SET_MESSAGE_INTERVAL, stream.message_type.ID, interval_us, attempts=1
+            )
         except CommandRejected as error:
             if error.result == RESULT_UNSUPPORTED:
                 self._ask_by_group_from_now_on()
                 return
             self._was_refused(stream, error)
         except CommandTimeout:
-            logger.debug("no answer to SET_MESSAGE_INTERVAL for %s", stream.message_type.NAME)
+            stream.failures += 1
+            stream.not_before = self._connection.now() + min(2.0**stream.failures, ASK_AGAIN_LONGEST_S)
+            return
+        stream.failures = 0
         stream.was_asked(self._connection.now(), hz)
 
     def _ask_by_group_from_now_on(self) -> None:
@@ -219,10 +231,9 @@ class MessageRates:
                 wanted[group] = self._fastest_of(group)
             stream.was_asked(self._connection.now(), stream.wanted_hz)
         for group, hz in wanted.items():
-            rate = max(1, min(math.ceil(hz), 0xFFFF))
-            self._connection.send(
-                RequestDataStream(self._system_id, self._component_id, group, rate, 1 if hz > 0 else 0)
-            )
+            if hz > 0:  # what nobody here wants any more may have been running before, for somebody else
+                rate = min(math.ceil(hz), 0xFFFF)
+                self._connection.send(RequestDataStream(self._system_id, self._component_id, group, rate, 1))
 
     def _fastest_of(self, group: int) -> float:
         members = (s for s in self._streams.values() if self._groups.get(s.message_type.ID) == group)

@@ -54,6 +54,11 @@ class VehicleState(VehicleHealth):
         return self.telemetry.landed_state
 
     @property
+    def vtol_state(self) -> StateCell[int]:
+        """MAV_VTOL_STATE: 1 to fixed wing, 2 to multicopter, 3 multicopter, 4 fixed wing (EXTENDED_SYS_STATE)."""
+        return self.telemetry.vtol_state
+
+    @property
     def system_status(self) -> StateCell[int]:
         """MAV_STATE by HEARTBEAT: 3 standby, 4 active, 5 critical, 6 emergency."""
         return self.telemetry.system_status
@@ -177,6 +182,11 @@ class VehicleState(VehicleHealth):
     def mission_current(self) -> StateCell[MissionProgress]:
         """Current mission item (MISSION_CURRENT)."""
         return self.telemetry.mission_current
+
+    @property
+    def mission_reached(self) -> StateCell[int]:
+        """The mission item that was reached last (MISSION_ITEM_REACHED)."""
+        return self.telemetry.mission_reached
 
     @property
     def status_text(self) -> StateCell[StatusText]:

@@ -96,8 +96,8 @@ class Home(Snapshot):
 
     @property
     def position(self) -> Position:
-        """The place as a target, at the altitude of home."""
-        return Position(self.latitude_deg, self.longitude_deg, self.altitude_amsl_m, 0.0)
+        """The place as a target without an altitude, so that going there keeps the present one."""
+        return Position(self.latitude_deg, self.longitude_deg)
 
 
 class LocalPosition(Snapshot):

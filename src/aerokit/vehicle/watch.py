@@ -23,6 +23,8 @@ SILENT_AFTER_S = 3.5
 """Three missed heartbeats and a half."""
 REBOOT_STEP_MS = 3000
 """Reordered messages go back in time by less than this, a reboot by more, unless it had just booted."""
+REBOOT_SEEN_S = 0.2
+"""So long, and in at least two messages, must the new time run before it is believed: one late message is no reboot."""
 LATE_MS = 2000
 """Once the vehicle has accepted to reboot: it boots for longer than this, and no message is so late."""
 REPORT_PERIOD_S = 1.0
@@ -47,6 +49,7 @@ class VehicleWatch:
         self.is_silent = False
         self.reboots = 0
         self._times: dict[str, tuple[int, float]] = {}
+        self._candidates: dict[str, tuple[int, float]] = {}
         self._expects_reboot = False
         attach = connection.bus.attach
         self._detach: list[Detach] = [attach(Heartbeat, self._on_heartbeat, system_id=system_id)]
@@ -95,14 +98,31 @@ class VehicleWatch:
             return
         now = self._connection.now()
         before, then = self._times.get(clock, (milliseconds, now))
-        self._times[clock] = (milliseconds, now)
         late = 1000 * (now - then) - (milliseconds - before)
-        if milliseconds + REBOOT_STEP_MS < before or (self._expects_reboot and late > LATE_MS):
-            self._times = {clock: (milliseconds, now)}
-            self._expects_reboot = False
-            self.reboots += 1
-            self._on_reboot()
-            self._connection.bus.publish(VehicleRebooted(now, self._system_id))
+        if self._expects_reboot and late > LATE_MS:
+            self._has_rebooted(clock, milliseconds)
+        elif milliseconds + REBOOT_STEP_MS >= before:
+            self._times[clock] = (milliseconds, now)
+            self._candidates.pop(clock, None)
+        elif self._is_confirmed(clock, milliseconds):
+            self._has_rebooted(clock, milliseconds)
+
+    def _is_confirmed(self, clock: str, milliseconds: int) -> bool:
+        """Whether the earlier time has been running for a while, with nothing of the later time in between."""
+        now = self._connection.now()
+        first, since = self._candidates.setdefault(clock, (milliseconds, now))
+        if milliseconds < first:
+            self._candidates[clock] = (milliseconds, now)
+            return False
+        return milliseconds > first and now - since >= REBOOT_SEEN_S
+
+    def _has_rebooted(self, clock: str, milliseconds: int) -> None:
+        now = self._connection.now()
+        self._times, self._candidates = {clock: (milliseconds, now)}, {}
+        self._expects_reboot = False
+        self.reboots += 1
+        self._on_reboot()
+        self._connection.bus.publish(VehicleRebooted(now, self._system_id))
 
 
 class LinkWatch:
