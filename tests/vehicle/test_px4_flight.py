@@ -1,0 +1,179 @@
+"""The same actions on a PX4: altitudes above the sea, a mode for everything, heartbeats once a second only."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import AsyncIterator
+
+import anyio
+import pytest
+from flight_harness import Px4Flight, now, open_px4
+
+from aerokit import Position, geo
+from aerokit import messages as m
+from aerokit.errors import CommandRejected, OperationRejected
+from aerokit.mavlink.enums import MavCmd, MavResult
+from aerokit.sim.px4.modes import POSITION
+
+pytestmark = pytest.mark.anyio
+
+
+@pytest.fixture
+async def flying(anyio_backend: object) -> AsyncIterator[Px4Flight]:
+    async with open_px4() as flight:
+        await flight.take_off()
+        yield flight
+
+
+def north_of_home(flight: Px4Flight, north_m: float, altitude_m: float = 10.0) -> Position:
+    home = flight.vehicle.home.value
+    latitude, longitude = geo.offset(home.latitude_deg, home.longitude_deg, north_m, 0.0)
+    return Position(latitude, longitude, altitude_relative_m=altitude_m)
+
+
+def speed(flight: Px4Flight) -> float:
+    return math.hypot(flight.px4.motion.velocity_north, flight.px4.motion.velocity_east)
+
+
+async def test_take_off_gives_the_altitude_above_the_sea_and_ends_in_loiter() -> None:
+    async with open_px4() as flight:
+        await flight.vehicle.wait_ready()
+        await flight.vehicle.arm()
+        flight.wire.forget()
+        await flight.vehicle.take_off(12.0)
+        (command,) = flight.wire.commands(MavCmd.NAV_TAKEOFF)
+        assert isinstance(command, m.CommandLong)
+        assert command.param7 == pytest.approx(flight.vehicle.home.value.altitude_amsl_m + 12.0, abs=0.01)
+        assert math.isnan(command.param5)
+        assert not flight.wire.commands(MavCmd.DO_SET_MODE)
+        assert flight.vehicle.position.value.altitude_relative_m == pytest.approx(12.0, abs=0.7)
+        await flight.vehicle.mode.wait_until(lambda mode: mode.name == "LOITER", timeout=10.0)
+
+
+async def test_take_off_refused_says_why() -> None:
+    async with open_px4() as flight:
+        await flight.vehicle.wait_ready()
+        await flight.vehicle.arm()
+        flight.px4.faults.refuse(
+            MavCmd.NAV_TAKEOFF, MavResult.TEMPORARILY_REJECTED, "Takeoff denied: no GPS\t"
+        )
+        with pytest.raises(CommandRejected, match="Takeoff denied: no GPS"):
+            await flight.vehicle.take_off(12.0)
+
+
+async def test_take_off_cancelled_half_way_holds() -> None:
+    async with open_px4() as flight:
+        await flight.vehicle.wait_ready()
+        await flight.vehicle.arm()
+        with anyio.move_on_after(5.0) as scope:
+            await flight.vehicle.take_off(40.0)
+        assert scope.cancelled_caught
+        await anyio.sleep(4.0)
+        altitude = flight.vehicle.position.value.altitude_relative_m
+        assert altitude is not None
+        await anyio.sleep(4.0)
+        assert flight.vehicle.position.value.altitude_relative_m == pytest.approx(altitude, abs=0.3)
+        assert altitude < 30.0
+        assert flight.vehicle.mode_name == "LOITER"
+
+
+async def test_go_to_with_speed_and_heading(flying: Px4Flight) -> None:
+    target = north_of_home(flying, 40.0, 15.0)
+    fastest = 0.0
+
+    async def watch() -> None:
+        nonlocal fastest
+        while True:
+            fastest = max(fastest, speed(flying))
+            await anyio.sleep(0.1)
+
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(watch)
+        await flying.vehicle.go_to(target, speed_m_s=4.0, heading_deg=270.0)
+        tasks.cancel_scope.cancel()
+    assert flying.vehicle.distance_to(target) <= flying.vehicle.autopilot.arrival_radius_m
+    assert fastest == pytest.approx(4.0, abs=0.6)
+    (command,) = flying.wire.commands(MavCmd.DO_REPOSITION)
+    assert isinstance(command, m.CommandInt)
+    assert (command.frame, command.param1, command.param2) == (5, 4.0, 1.0)
+    assert command.param4 == pytest.approx(-math.pi / 2)
+    assert command.z == pytest.approx(flying.vehicle.home.value.altitude_amsl_m + 15.0, abs=0.01)
+
+
+async def test_go_to_cancelled_half_way_stops_on_the_spot(flying: Px4Flight) -> None:
+    """LOITER is the mode of a PX4 that is on its way too: the mode alone would let it fly on."""
+    with anyio.move_on_after(5.0) as scope:
+        await flying.vehicle.go_to(north_of_home(flying, 300.0))
+    assert scope.cancelled_caught
+    await anyio.sleep(6.0)
+    assert speed(flying) < 0.2
+    assert flying.px4.motion.north < 100.0
+    assert flying.vehicle.mode_name == "LOITER"
+
+
+async def test_an_order_after_a_cancelled_go_to_stays_in_force(flying: Px4Flight) -> None:
+    with anyio.move_on_after(4.0):
+        await flying.vehicle.go_to(north_of_home(flying, 300.0))
+    await flying.vehicle.go_to(north_of_home(flying, 5.0))
+    assert flying.px4.motion.north == pytest.approx(5.0, abs=2.5)
+    await anyio.sleep(3.0)
+    assert flying.px4.motion.north == pytest.approx(5.0, abs=2.5)
+
+
+async def test_go_to_ends_when_a_pilot_takes_over(flying: Px4Flight) -> None:
+    async with anyio.create_task_group() as tasks:
+
+        async def pilot() -> None:
+            await anyio.sleep(3.0)
+            flying.px4.switch_to(POSITION)
+
+        tasks.start_soon(pilot)
+        with pytest.raises(OperationRejected, match="mode changed to POSCTL"):
+            await flying.vehicle.go_to(north_of_home(flying, 300.0))
+    await anyio.sleep(2.0)
+    assert flying.px4.mode == POSITION
+
+
+async def test_hold_stops_what_is_on_its_way(flying: Px4Flight) -> None:
+    async with anyio.create_task_group() as tasks:
+
+        async def fly_on() -> None:
+            with pytest.raises(OperationRejected):
+                await flying.vehicle.go_to(north_of_home(flying, 300.0))
+
+        tasks.start_soon(fly_on)
+        await anyio.sleep(5.0)
+        assert speed(flying) > 3.0
+        await flying.vehicle.hold()
+    await anyio.sleep(5.0)
+    assert speed(flying) < 0.2
+
+
+async def test_set_heading_turns_on_the_spot(flying: Px4Flight) -> None:
+    await flying.vehicle.set_heading(120.0)
+    assert math.degrees(flying.px4.motion.yaw) == pytest.approx(120.0, abs=6.0)
+    await flying.vehicle.set_heading(-60.0, relative=True)
+    assert math.degrees(flying.px4.motion.yaw) == pytest.approx(60.0, abs=11.0)
+    assert not flying.wire.commands(MavCmd.CONDITION_YAW)
+
+
+async def test_land_and_return(flying: Px4Flight) -> None:
+    await flying.vehicle.go_to(north_of_home(flying, 20.0))
+    await flying.vehicle.return_to_launch()
+    assert flying.px4.is_landed
+    assert flying.px4.motion.north == pytest.approx(0.0, abs=1.5)
+
+
+async def test_land(flying: Px4Flight) -> None:
+    await flying.vehicle.land()
+    assert flying.px4.is_landed
+
+
+async def test_reboot() -> None:
+    async with open_px4() as flight:
+        await flight.vehicle.wait_ready()
+        started = now()
+        await flight.vehicle.reboot()
+        assert now() - started < 12.0
+        assert flight.px4.uptime < 12.0
+        await flight.vehicle.wait_ready()
