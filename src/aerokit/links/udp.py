@@ -12,12 +12,13 @@ import contextlib
 import errno
 import socket
 from abc import abstractmethod
+from collections.abc import Callable
 from typing import Any
 
 from .address import host_and_port
 from .base import BaseLink
 from .link import Peer
-from .sockets import Endpoint, bind_to, bound_socket, resolve
+from .sockets import Endpoint, bind_to, bound_socket, has_more, resolve
 
 __all__ = ["DATAGRAMS_PER_WAKE_UP", "MAX_PEERS", "UdpBroadcast", "UdpConnect", "UdpListen"]
 
@@ -49,6 +50,7 @@ class _UdpLink(BaseLink):
         self._socket: socket.socket | None = None
         self._transport: asyncio.DatagramTransport | None = None  # only on loops without add_reader
         self._transport_owns_socket = False
+        self._has_more: Callable[[], object] = bool
 
     @property
     def local_address(self) -> tuple[str, int]:
@@ -65,6 +67,7 @@ class _UdpLink(BaseLink):
         self._loop = asyncio.get_running_loop()
         self._transport_owns_socket = False
         self._socket = sock = await self._make_socket()
+        self._has_more = has_more(sock)
         _ask_for_buffers(sock)
         try:
             self._loop.add_reader(sock, self._drain)
@@ -115,6 +118,8 @@ class _UdpLink(BaseLink):
                 self._receive_failed(error)
             else:
                 self._datagram_received(data, source)
+            if not self._has_more():
+                return
 
     def _receive_failed(self, error: OSError) -> None:
         """An earlier datagram of ours met a closed port, or the network is away: neither ends a UDP link."""

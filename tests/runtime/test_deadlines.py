@@ -1,0 +1,101 @@
+"""Deadlines: many on one timer, in virtual time."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+
+from aerokit.runtime.deadlines import Deadlines
+from aerokit.testing import run_virtual
+
+
+class Alarms:
+    """Deadlines whose alarms note their name and the time."""
+
+    def __init__(self) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._began = self._loop.time()
+        self.deadlines = Deadlines()
+        self.rung: list[tuple[str, float]] = []
+
+    def at(self, name: str, seconds: float) -> Callable[[], None]:
+        def alarm() -> None:
+            self.rung.append((name, round(self._loop.time() - self._began, 6)))
+
+        self.move(alarm, seconds)
+        return alarm
+
+    def move(self, alarm: Callable[[], None], seconds: float) -> None:
+        self.deadlines.set(alarm, self._began + seconds)
+
+    def timers(self) -> int:
+        scheduled: list[asyncio.TimerHandle] = self._loop._scheduled  # type: ignore[attr-defined]
+        return sum("_ring" in repr(timer) and not timer.cancelled() for timer in scheduled)
+
+
+def test_each_rings_once_at_its_time_whatever_the_order() -> None:
+    async def program() -> None:
+        alarms = Alarms()
+        for name, seconds in (("third", 3.0), ("first", 1.0), ("second", 2.0), ("second too", 2.0)):
+            alarms.at(name, seconds)
+        assert alarms.timers() == 1
+        await asyncio.sleep(10)
+        assert alarms.rung == [("first", 1.0), ("second", 2.0), ("second too", 2.0), ("third", 3.0)]
+        assert alarms.timers() == 0
+
+    run_virtual(program())
+
+
+def test_taken_back_it_does_not_ring_and_a_later_one_does() -> None:
+    async def program() -> None:
+        alarms = Alarms()
+        first = alarms.at("first", 1.0)
+        alarms.at("second", 2.0)
+        alarms.deadlines.take_back(first)
+        alarms.deadlines.take_back(first)
+        await asyncio.sleep(10)
+        assert alarms.rung == [("second", 2.0)]
+
+    run_virtual(program())
+
+
+def test_set_again_it_rings_at_the_new_time_only() -> None:
+    async def program() -> None:
+        alarms = Alarms()
+        alarms.move(alarms.at("later", 1.0), 4.0)
+        alarms.move(alarms.at("earlier", 3.0), 2.0)
+        await asyncio.sleep(10)
+        assert alarms.rung == [("earlier", 2.0), ("later", 4.0)]
+
+    run_virtual(program())
+
+
+def test_an_alarm_may_set_and_take_back_others() -> None:
+    async def program() -> None:
+        alarms = Alarms()
+        other = alarms.at("other", 2.0)
+
+        def alarm() -> None:
+            alarms.deadlines.take_back(other)
+            alarms.at("next", 1.5)
+
+        alarms.move(alarm, 1.0)
+        await asyncio.sleep(10)
+        assert alarms.rung == [("next", 1.5)]
+
+    run_virtual(program())
+
+
+def test_requests_that_are_answered_cost_one_timer_and_closing_leaves_none() -> None:
+    async def program() -> None:
+        alarms = Alarms()
+        for number in range(100):
+            alarms.deadlines.take_back(alarms.at("answered", 1.0 + number))
+        assert alarms.timers() == 1
+        alarms.at("open", 1.0)
+        alarms.deadlines.close()
+        assert alarms.timers() == 0
+        await asyncio.sleep(10)
+        assert alarms.rung == []
+
+    run_virtual(program())
