@@ -6,12 +6,23 @@ import math
 import random
 import struct
 from collections.abc import Iterator
+from functools import cache
 from importlib import import_module
 from typing import Any
 
 from aerokit.mavlink import STANDARD, Field, Message
 
-__all__ = ["PEERS", "peer_class", "peer_fields", "peer_message", "random_message", "same", "samples"]
+__all__ = [
+    "PEERS",
+    "dialect_module",
+    "for_peer",
+    "peer_class",
+    "peer_fields",
+    "peer_message",
+    "random_message",
+    "same",
+    "samples",
+]
 
 PEERS = ("ardupilotmega", "development")
 """Pymavlink's dialects which together know every message of `STANDARD`."""
@@ -96,19 +107,28 @@ def peer_message(message: Message, version: int) -> tuple[Any, Any]:
     """Pymavlink's (module, message) with the same fields."""
     module, cls = peer_class(type(message), version)
     fields = [field for field in message.FIELDS if field.name in cls.fieldnames]
-    return module, cls(**{field.name: _for_peer(field, getattr(message, field.name)) for field in fields})
+    return module, cls(**{field.name: for_peer(field, getattr(message, field.name)) for field in fields})
 
 
-def _for_peer(field: Field, value: Any) -> Any:
+def for_peer(field: Field, value: Any) -> Any:
+    """A field's value as pymavlink's constructors take it."""
     if field.type == "char":
-        return value.encode()
+        return value.encode() if field.array_length else value.encode().ljust(1, b"\0")
     return list(value) if field.array_length else value
 
 
 def peer_fields(message: Any) -> dict[str, Any]:
     """What pymavlink decoded, in our types; its text goes on behind the first NUL, ours ends there."""
-    fields = [field for field in STANDARD[message.get_msgId()].FIELDS if field.name in message.fieldnames]
-    return {field.name: _from_peer(field, message) for field in fields}
+    fields = {name: getattr(message, name) for name in message.fieldnames}
+    for field in _fields_of_other_types(message.get_msgId()):
+        if field.name in fields:
+            fields[field.name] = _from_peer(field, message)
+    return fields
+
+
+@cache
+def _fields_of_other_types(message_id: int) -> tuple[Field, ...]:
+    return tuple(f for f in STANDARD[message_id].FIELDS if f.array_length or f.type == "char")
 
 
 def _from_peer(field: Field, message: Any) -> Any:
@@ -116,9 +136,7 @@ def _from_peer(field: Field, message: Any) -> Any:
         raw = getattr(message, f"_{field.name}_raw")
         return raw.partition(b"\0")[0].decode(errors="replace")
     value = getattr(message, field.name)
-    if field.array_length:
-        return bytes(value) if field.type == "uint8_t" else tuple(value)
-    return value
+    return bytes(value) if field.type == "uint8_t" else tuple(value)
 
 
 def same(ours: dict[str, Any], theirs: dict[str, Any]) -> bool:

@@ -1,0 +1,371 @@
+"""Dialects loaded at run time from XML and from pymavlink's modules, and the standard one."""
+
+from __future__ import annotations
+
+import enum
+import math
+from functools import cache
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+from wire_samples import for_peer, samples
+
+from aerokit.errors import LocalProtocolError
+from aerokit.mavlink import STANDARD, Dialect, FrameEncoder, Framer, Message, enums, messages
+from aerokit.mavlink.generator import xml_folder
+
+PRIVATE = """<?xml version="1.0"?>
+<mavlink>
+  <include>{include}</include>
+  <enums>
+    <enum name="WINCH_STATE">
+      <description>What the winch does.</description>
+      <entry value="0" name="WINCH_STATE_IDLE"><description>Nothing.</description></entry>
+      <entry value="0x10" name="WINCH_STATE_3_METERS"/>
+      <entry value="1&lt;&lt;5" name="WINCH_STATE_NONE"/>
+      <entry name="WINCH_STATE_NEXT"/>
+    </enum>
+    <enum name="WINCH_FLAGS" bitmask="true">
+      <entry value="0b1" name="WINCH_FLAGS_A"/>
+      <entry value="2**3" name="WINCH_FLAGS_B"/>
+    </enum>
+    <enum name="MAV_CMD">
+      <entry value="60000" name="MAV_CMD_WINCH_DROP"/>
+    </enum>
+  </enums>
+  <messages>
+    <message id="{id}" name="WINCH_REPORT">
+      <description>How the winch is.</description>
+      <field type="uint8_t" name="from" enum="WINCH_STATE">Before.</field>
+      <field type="double" name="length" units="m" invalid="NaN">Rope out.</field>
+      <field type="int16_t[3]" name="forces">Forces.</field>
+      <field type="uint8_t[4]" name="serial">Serial number.</field>
+      <field type="char[5]" name="name">Name.</field>
+      <field type="uint16_t" name="encode">A name that the class needs itself.</field>
+      <extensions/>
+      <field type="float[6]" name="history">History.</field>
+      <field type="char" name="letter">One letter.</field>
+    </message>
+  </messages>
+</mavlink>
+"""
+
+
+def write(folder: Path, name: str = "private.xml", text: str = PRIVATE, **fields: Any) -> Path:
+    path = folder / name
+    path.write_text(text.format(**{"include": "common.xml", "id": 60_001, **fields}))
+    return path
+
+
+# ---------------------------------------------------------------------------------------- from XML
+
+
+def test_a_private_dialect_with_the_standard_included_from_pymavlinks_package(tmp_path: Path) -> None:
+    dialect = Dialect.from_xml(write(tmp_path))
+    assert dialect.name == "private"
+    assert len(dialect) > 200
+    assert 60_001 in dialect
+    assert dialect[0] is messages.Heartbeat, "the standard's messages are the standard's classes"
+    assert repr(dialect) == f"<Dialect 'private': {len(dialect)} messages>"
+
+
+def test_includes_are_looked_for_beside_the_file_first(tmp_path: Path) -> None:
+    text = one_message(7, "OWN", "float")
+    (tmp_path / "common.xml").write_text(text)
+    dialect = Dialect.from_xml(str(write(tmp_path)))
+    assert [cls.NAME for cls in dialect] == ["OWN", "WINCH_REPORT"]
+
+
+def test_circular_includes_end(tmp_path: Path) -> None:
+    write(tmp_path, "a.xml", include="b.xml", id=60_001)
+    text = "<mavlink><include>a.xml</include></mavlink>"
+    (tmp_path / "b.xml").write_text(text)
+    assert [cls.ID for cls in Dialect.from_xml(tmp_path / "a.xml")] == [60_001]
+
+
+@pytest.fixture
+def private(tmp_path: Path) -> Dialect:
+    return Dialect.from_xml(write(tmp_path))
+
+
+def winch(private: Dialect, **changes: Any) -> Any:
+    fields = {
+        "from_": 16,
+        "length": 1.5,
+        "forces": (1, -2, 3),
+        "serial": b"\1\2\3\4",
+        "name": "drum",
+        "encode_": 9,
+    }
+    return private[60_001](**{**fields, **changes})
+
+
+def test_a_private_message_is_like_the_standards(private: Dialect) -> None:
+    message = winch(private)
+    assert private.by_name("WINCH_REPORT") is private[60_001]
+    assert (message.NAME, message.ID, type(message).__name__) == ("WINCH_REPORT", 60_001, "WinchReport")
+    assert (message.LENGTH, message.BASE_LENGTH) == (51, 26)
+    assert message.history == (0,) * 6
+    assert message.letter == ""
+    assert message == winch(private)
+    assert message != winch(private, length=math.nan)
+    assert repr(message).startswith(
+        "WinchReport(from_=16, length=1.5, forces=(1, -2, 3), serial=b'\\x01\\x02\\x03\\x04'"
+    )
+    assert message.to_dict()["encode_"] == 9
+    assert (type(message).__doc__ or "").startswith("WINCH_REPORT (60001): How the winch is.")
+    fields = {field.name: field for field in message.FIELDS}
+    assert (fields["length"].units, fields["length"].invalid, fields["from_"].enum) == (
+        "m",
+        "NaN",
+        "WINCH_STATE",
+    )
+    assert [name for name, field in fields.items() if field.extension] == ["history", "letter"]
+
+
+def test_a_private_message_goes_over_the_wire(private: Dialect) -> None:
+    message = winch(private, history=(0.5,) * 6, letter="x")
+    raw = FrameEncoder(1, 1).encode(message)
+    (frame,) = Framer(private).receive(raw)
+    decoded = private.decode(frame)
+    assert decoded == message
+    assert decoded.received_frame is frame
+    assert Framer().receive(raw) == [], "the standard does not know it"
+
+
+@pytest.mark.parametrize(
+    ("changes", "complaint"),
+    [
+        ({"from_": 256}, "WINCH_REPORT.from_ = 256 cannot be sent: must be in 0..255"),
+        ({"forces": (1, 2, 3, 4)}, "has 4 elements, at most 3 fit"),
+        ({"serial": b"12345"}, "has 5 elements, at most 4 fit"),
+        ({"name": "longer"}, "has 6 bytes, at most 5 fit"),
+        ({"letter": "xy"}, "has 2 bytes, at most 1 fit"),
+        ({"history": ("a",)}, "must be a number"),
+        ({"length": "long"}, "must be a number"),
+    ],
+)
+def test_private_messages_complain_too(private: Dialect, changes: dict[str, Any], complaint: str) -> None:
+    with pytest.raises(LocalProtocolError, match=complaint.replace(".", r"\.")):
+        winch(private, **changes).encode()
+
+
+def test_private_enums(private: Dialect) -> None:
+    state = private.enum("WINCH_STATE")
+    assert issubclass(state, enum.IntEnum)
+    assert {member.name: member.value for member in state} == {
+        "IDLE": 0,
+        "STATE_3_METERS": 16,
+        "NONE": 32,
+        "NEXT": 33,
+    }
+    flags: Any = private.enum("WINCH_FLAGS")
+    assert issubclass(flags, enum.IntFlag)
+    assert [member.value for member in flags] == [1, 8]
+
+
+def test_entries_are_added_to_the_standards_enums(private: Dialect) -> None:
+    commands = private.enum("MAV_CMD")
+    assert commands.WINCH_DROP == 60_000
+    assert commands.NAV_TAKEOFF == enums.MavCmd.NAV_TAKEOFF
+
+
+def one_message(id: object, name: str, type: str) -> str:  # noqa: A002
+    field = f'<field type="{type}" name="a"/>'
+    return f'<mavlink><messages><message id="{id}" name="{name}">{field}</message></messages></mavlink>'
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("<mavlink", "is not a MAVLink dialect"),
+        (
+            '<mavlink><messages><message name="X"/></messages></mavlink>',
+            "is not a MAVLink dialect: KeyError('id')",
+        ),
+        (one_message(1, "X", "int"), "unknown field type 'int'"),
+        (one_message(1, "import os", "float"), "'import os' is not a name"),
+        (one_message(1 << 24, "X", "float"), "message id 16777216 is not in 0..16777215"),
+        (one_message(1, "X", "double[32]"), "a payload of 256 bytes, at most 255 fit in a frame"),
+        ("<mavlink><include>nowhere.xml</include></mavlink>", "includes nowhere.xml, which is in none of"),
+    ],
+)
+def test_wrong_files_are_told(tmp_path: Path, text: str, complaint: str) -> None:
+    path = tmp_path / "wrong.xml"
+    path.write_text(text)
+    with pytest.raises(LocalProtocolError) as caught:
+        Dialect.from_xml(path)
+    assert complaint in str(caught.value)
+    assert "wrong.xml" in str(caught.value)
+
+
+def test_a_missing_file_is_told(tmp_path: Path) -> None:
+    with pytest.raises(LocalProtocolError, match=r"no dialect file .*nowhere\.xml"):
+        Dialect.from_xml(tmp_path / "nowhere.xml")
+
+
+def test_an_id_that_means_two_messages_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(LocalProtocolError) as caught:
+        Dialect.from_xml(write(tmp_path, id=30))
+    text = str(caught.value)
+    assert text == "message id 30 is defined twice in private: ATTITUDE in common, WINCH_REPORT in private"
+
+
+# -------------------------------------------------------------------------------- pymavlink's modules
+
+DIALECTS = ("all", "matrixpilot", "paparazzi")  # the first includes all others that pymavlink has
+
+
+@cache
+def loaded(name: str) -> tuple[ModuleType, Dialect]:
+    module = import_module(f"pymavlink.dialects.v20.{name}")
+    return module, Dialect.from_pymavlink(module)
+
+
+@pytest.mark.parametrize("name", DIALECTS)
+def test_a_pymavlink_dialect_is_the_same_as_its_xml(name: str) -> None:
+    module, dialect = loaded(name)
+    xml = Dialect.from_xml(xml_folder() / f"{name}.xml")
+    assert {cls.ID: cls.CRC_EXTRA for cls in dialect} == {
+        i: cls.crc_extra for i, cls in module.mavlink_map.items()
+    }
+    assert dialect.rows == xml.rows
+    for one, other in zip(dialect, xml, strict=True):
+        assert (one.NAME, one.__match_args__) == (other.NAME, other.__match_args__)
+        assert [field.extension for field in one.FIELDS] == [field.extension for field in other.FIELDS]
+
+
+@pytest.mark.parametrize("name", DIALECTS)
+def test_bytes_of_its_own_messages_are_pymavlinks(name: str) -> None:
+    module, dialect = loaded(name)
+    own = [cls for cls in dialect if cls is not STANDARD.get(cls.ID)]
+    assert own
+    for message_class in own:
+        for message in samples(message_class, 3):
+            raw = FrameEncoder(7, 42).encode(message)
+            assert raw == peer_bytes(module, message)
+            (frame,) = Framer(dialect).receive(raw)
+            assert dialect.decode(frame) == message
+
+
+def peer_bytes(module: ModuleType, message: Message) -> bytes:
+    values = {field.name: for_peer(field, getattr(message, field.name)) for field in message.FIELDS}
+    theirs = module.mavlink_map[message.ID](**values)
+    return bytes(theirs.pack(module.MAVLink(None, 7, 42)))
+
+
+@pytest.mark.parametrize("name", ["storm32", "pymavlink.dialects.v20.storm32"])
+def test_dialects_by_name(name: str) -> None:
+    dialect = Dialect.from_pymavlink(name)
+    assert dialect.name == "storm32"
+    assert dialect.by_name("QSHOT_STATUS").ID == 60020
+    assert dialect.enum("MAV_CMD").QSHOT_DO_CONFIGURE == 60020
+
+
+def test_a_private_module_by_its_own_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "private_dialect.py").write_text(
+        "from pymavlink.dialects.v20.test import *\nfrom pymavlink.dialects.v20.test import mavlink_map, enums\n"
+    )
+    assert [cls.NAME for cls in Dialect.from_pymavlink("private_dialect")] == ["TEST_TYPES"]
+
+
+@pytest.mark.parametrize("name", ["nowhere", "nowhere.at.all", "pymavlink.dialects.v20.nowhere"])
+def test_a_missing_module_is_told(name: str) -> None:
+    with pytest.raises(LocalProtocolError, match=f"no pymavlink dialect '{name}'"):
+        Dialect.from_pymavlink(name)
+
+
+def test_a_module_that_is_no_dialect_is_told() -> None:
+    with pytest.raises(
+        LocalProtocolError, match=r"pymavlink\.mavutil is no pymavlink dialect: it has no mavlink_map"
+    ):
+        Dialect.from_pymavlink("pymavlink.mavutil")
+
+
+def test_a_module_that_cannot_be_imported_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "broken_dialect.py").write_text("import a_module_that_is_not_there\n")
+    with pytest.raises(ModuleNotFoundError, match="a_module_that_is_not_there"):
+        Dialect.from_pymavlink("broken_dialect")
+
+
+# ------------------------------------------------------------------------------------- put together
+
+
+def test_extended_by(tmp_path: Path) -> None:
+    (tmp_path / "empty.xml").write_text("<mavlink/>")
+    private = Dialect.from_xml(write(tmp_path, include="empty.xml"))
+    both = STANDARD.extended_by(private)
+    assert both.name == "standard+private"
+    assert len(both) == len(STANDARD) + 1
+    assert both[0] is messages.Heartbeat
+    assert both[60_001] is private[60_001]
+    assert both.get(60_002) is None
+    assert 60_001 not in STANDARD
+    assert both.by_name("WINCH_REPORT") is private[60_001]
+    assert both.by_name("HEARTBEAT") is messages.Heartbeat
+    assert both.enum("WINCH_STATE") is private.enum("WINCH_STATE")
+    assert both.enum("MAV_CMD") is enums.MavCmd
+    (frame,) = Framer(both).receive(FrameEncoder(1, 1).encode(winch(private)))
+    assert both.decode(frame) == winch(private)
+    assert sorted(cls.ID for cls in both) == sorted([*STANDARD.rows, 60_001])
+
+
+def test_extended_by_takes_the_longer_enum(private: Dialect) -> None:
+    assert STANDARD.extended_by(private).enum("MAV_CMD").NAV_TAKEOFF == 22
+
+
+def test_a_clash_is_told(tmp_path: Path) -> None:
+    (tmp_path / "empty.xml").write_text("<mavlink/>")
+    private = Dialect.from_xml(write(tmp_path, include="empty.xml", id=30))
+    with pytest.raises(LocalProtocolError) as caught:
+        STANDARD.extended_by(private)
+    assert "message id 30 is ATTITUDE (CRC_EXTRA 39) in 'standard', but WINCH_REPORT" in str(caught.value)
+
+
+# ------------------------------------------------------------------------------------- the standard
+
+
+def test_the_standard() -> None:
+    assert STANDARD.name == "standard"
+    assert len(STANDARD) == len(list(STANDARD)) == 308
+    assert [cls.ID for cls in STANDARD] == sorted(STANDARD.rows)
+    assert STANDARD.get(33) is messages.GlobalPositionInt
+    assert STANDARD.get(16_000_000) is None
+    assert 16_000_000 not in STANDARD
+    assert STANDARD.by_name("GLOBAL_POSITION_INT") is messages.GlobalPositionInt
+    assert STANDARD.enum("MAV_CMD") is enums.MavCmd
+    with pytest.raises(KeyError):
+        STANDARD[16_000_000]
+    with pytest.raises(LocalProtocolError, match="dialect 'standard' has no message 'NOPE'"):
+        STANDARD.by_name("NOPE")
+    with pytest.raises(LocalProtocolError, match="dialect 'standard' has no enum 'NOPE'"):
+        STANDARD.enum("NOPE")
+
+
+def test_decoding_a_frame_of_another_dialect_is_a_key_error(private: Dialect) -> None:
+    (frame,) = Framer(private).receive(FrameEncoder(1, 1).encode(winch(private)))
+    with pytest.raises(KeyError):
+        STANDARD.decode(frame)
+
+
+def test_names_of_members() -> None:
+    assert enums.MavCmd.NAV_TAKEOFF.value == 22
+    assert enums.MavResult.ACCEPTED.value == 0
+    assert enums.GpsFixType.TYPE_3D_FIX.value == 3
+    assert issubclass(enums.MavModeFlag, enum.IntFlag)
+    assert enums.MavModeFlag(0x81) == enums.MavModeFlag.SAFETY_ARMED | enums.MavModeFlag.CUSTOM_MODE_ENABLED
+    assert enums.MavCmd.__doc__ is not None
+
+
+@pytest.mark.parametrize("package", [messages, enums])
+def test_lazy_packages(package: ModuleType) -> None:
+    assert set(package.__all__) <= set(dir(package))
+    assert len(dir(package)) == len(set(dir(package)))
+    assert all(getattr(package, name).__name__ == name for name in package.__all__)
+    with pytest.raises(AttributeError, match="has no attribute 'Nope'"):
+        package.Nope  # noqa: B018

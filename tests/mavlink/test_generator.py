@@ -1,0 +1,64 @@
+"""The committed modules are what the generator makes of pymavlink's XML."""
+
+from __future__ import annotations
+
+import importlib
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from aerokit.mavlink import enums, generator, messages
+
+PACKAGES = {"messages": messages, "enums": enums}
+
+
+def test_the_committed_modules_are_up_to_date() -> None:
+    if generator.fingerprint() != generator.generated_fingerprint():
+        pytest.skip("the installed pymavlink carries other XML than the committed modules were made from")
+    assert generator.differences() == []
+
+
+def test_other_xml_has_another_fingerprint(tmp_path: Path) -> None:
+    for stem in ("minimal", "standard", "common", "development", *generator.MODULES["ardupilotmega"]):
+        (tmp_path / f"{stem}.xml").write_bytes((generator.xml_folder() / f"{stem}.xml").read_bytes())
+    assert generator.fingerprint(tmp_path) == generator.fingerprint()
+    (tmp_path / "minimal.xml").write_bytes((tmp_path / "minimal.xml").read_bytes().replace(b"\n", b"\r\n"))
+    assert generator.fingerprint(tmp_path) == generator.fingerprint(), "line ends are no difference"
+    text = (tmp_path / "minimal.xml").read_text(encoding="utf-8").replace("system_status", "system_state")
+    (tmp_path / "minimal.xml").write_text(text, encoding="utf-8")
+    assert generator.fingerprint(tmp_path) != generator.fingerprint()
+    assert set(generator.differences(tmp_path)) >= {"messages/__init__.py", "messages/minimal.py"}
+
+
+@pytest.mark.parametrize("other", [False, True])
+def test_the_check(other: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    if other:
+        monkeypatch.setattr(generator, "fingerprint", lambda folder=None: "other")
+        assert generator.main(["--check"]) == 0
+        assert capsys.readouterr().out.startswith("skipped: the installed pymavlink carries other XML")
+    elif generator.fingerprint() == generator.generated_fingerprint():
+        monkeypatch.setattr(generator, "generate", lambda folder=None: {"messages/minimal.py": "changed"})
+        assert generator.main(["--check"]) == 1
+        assert "differs: messages/minimal.py\n" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+@pytest.mark.parametrize("module", generator.MODULES)
+def test_every_module_says_what_it_exports(package: str, module: str) -> None:
+    loaded = importlib.import_module(f"aerokit.mavlink.{package}.{module}")
+    names = loaded.__all__
+    assert len(names) == len(set(names))
+    assert all(getattr(PACKAGES[package], name) is getattr(loaded, name) for name in names)
+
+
+def test_importing_the_wire_imports_no_message() -> None:
+    """Nine hundred kilobytes of source are read when the first of their messages is needed."""
+    code = (
+        "import sys, aerokit.mavlink\n"
+        "print(*sorted(name for name in sys.modules if name.startswith(('aerokit.mavlink.messages.',"
+        " 'aerokit.mavlink.enums.', 'aerokit.mavlink.generator', 'xml', 'pymavlink', 'asyncio'))))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []

@@ -1,0 +1,161 @@
+"""Telemetry logs: what is written is read again, and damage costs the records it is in."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import pytest
+from framer_harness import good_frames, noise, some_frames, unknown
+from hypothesis import given
+from hypothesis import strategies as st
+from pymavlink import mavutil
+from recorded import recording
+
+from aerokit.errors import LocalProtocolError
+from aerokit.mavlink import Framer, TlogWriter, read_tlog
+
+START = 1_700_000_000.0
+Records = list[tuple[float, bytes]]
+
+
+def written(records: Records) -> bytes:
+    file = io.BytesIO()
+    with TlogWriter(file) as writer:
+        for when, raw in records:
+            writer.write(raw, when)
+    return file.getvalue()
+
+
+def stamped(frames: list[bytes]) -> Records:
+    return [(START + number / 64, raw) for number, raw in enumerate(frames)]
+
+
+def read(data: bytes) -> Records:
+    return list(read_tlog(io.BytesIO(data)))
+
+
+@given(good_frames)
+def test_round_trip(frames: list[bytes]) -> None:
+    assert read(written(stamped(frames))) == stamped(frames)
+
+
+def test_the_bytes() -> None:
+    raw = some_frames(1)[0]
+    assert written([(1.5, raw)]) == (1_500_000).to_bytes(8, "big") + raw
+
+
+def test_microseconds_are_kept() -> None:
+    raw = some_frames(1)[0]
+    assert read(written([(1_700_000_000.123456, raw)])) == [(1_700_000_000.123456, raw)]
+
+
+def test_unknown_and_signed_frames_are_kept() -> None:
+    frames = [unknown(), *some_frames(2)]
+    assert read(written(stamped(frames))) == stamped(frames)
+
+
+def test_an_empty_file() -> None:
+    assert read(b"") == []
+    assert read(b"\0" * 7) == []
+
+
+@given(good_frames, st.integers(0, 4000))
+def test_a_file_that_was_cut_off(frames: list[bytes], left: int) -> None:
+    records = stamped(frames)
+    data = written(records)
+    left %= len(data)
+    whole, size = 0, 0
+    for _, raw in records:
+        size += 8 + len(raw)
+        whole += size <= left
+    assert read(data[:left]) == records[:whole]
+
+
+@given(st.lists(st.tuples(good_frames, noise), min_size=1, max_size=3))
+def test_noise_between_records(parts: list[tuple[list[bytes], bytes]]) -> None:
+    """The recorder was stopped in the middle and began again: the same file goes on."""
+    records: Records = []
+    data = b""
+    for frames, garbage in parts:
+        new = stamped(frames)
+        data += garbage + written(new)
+        records += new
+    found = read(data)
+    framer = Framer()
+    good = [raw for _, raw in found if framer.receive(raw)]
+    assert set(good) <= {raw for _, raw in records}
+    missing = len(records) - sum(record in found for record in records)
+    assert missing <= 2 * len(parts), "noise hides at most its neighbours"
+
+
+def test_files_put_together() -> None:
+    first, second = stamped(some_frames(5)), stamped(some_frames(7, seed=2))
+    assert read(written(first)[:-5] + written(second)) in (first[:-1] + second, first[:-1] + second[1:])
+    assert read(written(first) + written(second)) == first + second
+
+
+def test_appending_to_an_open_file(tmp_path: Path) -> None:
+    path = tmp_path / "flight.tlog"
+    first, second = stamped(some_frames(3)), stamped(some_frames(3, seed=2))
+    path.write_bytes(written(first))
+    with path.open("ab") as file:
+        writer = TlogWriter(file)
+        for when, raw in second:
+            writer.write(raw, when)
+        writer.close()
+        writer.close()
+        assert not file.closed, "it is the caller's"
+    assert list(read_tlog(path)) == first + second
+
+
+def test_a_file_of_its_own_is_begun_anew_and_closed(tmp_path: Path) -> None:
+    path = tmp_path / "flight.tlog"
+    path.write_bytes(b"old")
+    with TlogWriter(str(path)) as writer:
+        writer.write(some_frames(1)[0], START)
+        writer.flush()
+        assert len(path.read_bytes()) > 8
+    assert list(read_tlog(str(path))) == stamped(some_frames(1))
+    with pytest.raises(ValueError, match="closed"):
+        writer.write(b"x", 1.0)
+
+
+def test_a_reader_that_stops_early_closes_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "flight.tlog"
+    path.write_bytes(written(stamped(some_frames(5))))
+    records = read_tlog(path)
+    assert next(records) == stamped(some_frames(1))[0]
+    records.close()  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("when", [-1.0, 1e14])
+def test_time_stamps_must_fit(when: float) -> None:
+    with pytest.raises(LocalProtocolError, match=r"timestamp_s = .* must be seconds since 1970"):
+        TlogWriter(io.BytesIO()).write(b"", when)
+
+
+def test_a_missing_file_is_an_os_error(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError):
+        next(read_tlog(tmp_path / "no.tlog"))
+
+
+@pytest.mark.parametrize("flight", ["ardupilot-copter", "px4-quad"])
+def test_a_recording_written_again_is_the_same_file(flight: str) -> None:
+    path = recording(f"{flight}.tlog")
+    assert written(list(read_tlog(path))) == path.read_bytes()
+
+
+def test_pymavlink_reads_what_we_write(tmp_path: Path) -> None:
+    path = tmp_path / "flight.tlog"
+    frames = some_frames(20, versions=(2,))
+    path.write_bytes(written(stamped(frames)))
+    log = mavutil.mavlink_connection(str(path), dialect="development")
+    found = []
+    while (message := log.recv_match()) is not None:
+        found.append((message._timestamp, bytes(message.get_msgbuf())))
+    log.close()
+    assert [raw for _, raw in found] == [raw for raw in frames if raw in {raw for _, raw in found}]
+    assert len(found) > 10
+    times = {raw: when for when, raw in stamped(frames)}
+    assert [when for when, _ in found] == pytest.approx([times[raw] for _, raw in found])
