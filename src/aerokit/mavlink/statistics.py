@@ -29,7 +29,8 @@ class SourceStatistics:
         """Frames missing in the sequence; one that comes late after all is taken off again."""
         self.expected = sequence
         """The sequence number of the next frame; its low byte is what is on the wire, it counts on beyond 255."""
-        self._without = sequence  # how far `expected` has come without a frame: then a frame costs one addition
+        # How far `expected` has come without a frame: then a frame costs one addition.
+        self._without = sequence
         self._missing: dict[int, int] = {}  # sequence number → value of `received` when it was missed
         self._late_sequence = self._late_at = -1
 
