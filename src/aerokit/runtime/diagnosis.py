@@ -67,9 +67,7 @@ class _Diagnosis:
                 " pass dialect=Dialect.from_xml(...)"
             )
         if self._bad_crcs * NOISE_BYTES > self._bytes:
-            return (
-                f"{heard} with {self._bad_crcs} damaged frames and no good one: a noisy link, or another dialect?"
-            )
+            return f"{heard} with {self._bad_crcs} damaged frames and no good one: a noisy link, or another dialect?"
         return f"{heard}, but no MAVLink frame: wrong baud rate, or another protocol?"
 
     def _without_heartbeats(self) -> str:
