@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from typing import Any
 
 import anyio
 import pytest
@@ -31,7 +32,7 @@ from aerokit.sim import SimulatedCopter
 pytestmark = pytest.mark.anyio
 
 
-def drained(events: Subscription[Event]) -> list[Event]:
+def drained(events: Subscription[Any]) -> list[Event]:
     found: list[Event] = []
     while (event := events.get_nowait()) is not None:
         found.append(event)
