@@ -86,6 +86,25 @@ def test_an_alarm_may_set_and_take_back_others() -> None:
     run_virtual(program())
 
 
+def test_an_alarm_that_sets_itself_for_later_does_not_delay_the_others() -> None:
+    async def program() -> None:
+        alarms = Alarms()
+        times = 0
+
+        def again() -> None:
+            nonlocal times
+            times += 1
+            if times < 3:
+                alarms.move(again, 1.0 + 5 * times)
+
+        alarms.move(again, 1.0)
+        alarms.at("soon", 1.5)
+        await asyncio.sleep(20)
+        assert (times, alarms.rung) == (3, [("soon", 1.5)])
+
+    run_virtual(program())
+
+
 def test_requests_that_are_answered_cost_one_timer_and_closing_leaves_none() -> None:
     async def program() -> None:
         alarms = Alarms()

@@ -397,7 +397,9 @@ class Connection:
 
     def _new_framer(self, peer: Peer) -> Framer:
         if len(self._framers) >= MOST_PEERS:
-            del self._framers[self._peer_to_forget()]
+            forgotten = self._peer_to_forget()
+            del self._framers[forgotten]
+            self._doubles = {double for double in self._doubles if double[2] != forgotten}
         framer = self._framers[peer] = Framer(self.bus.dialect)
         self._let_through(framer)
         return framer

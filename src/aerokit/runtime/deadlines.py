@@ -26,11 +26,7 @@ class Deadlines:
     def set(self, alarm: Alarm, at: float) -> None:
         """Have ``alarm`` called at ``at`` (seconds, the loop's clock), and not at the time it was set to before."""
         self._due[alarm] = at
-        if self._timer is None:
-            self._timer = self._loop.call_at(at, self._ring, at)
-        elif at < self._timer.when():
-            self._timer.cancel()
-            self._timer = self._loop.call_at(at, self._ring, at)
+        self._come_by(at)
 
     def take_back(self, alarm: Alarm) -> None:
         """Have it not called; nothing happens when it is not set."""
@@ -48,6 +44,12 @@ class Deadlines:
         for alarm in [alarm for alarm, at in self._due.items() if at <= now]:
             if self._due.pop(alarm, None) is not None:
                 alarm()
-        if self._due and self._timer is None:
-            at = min(self._due.values())
-            self._timer = self._loop.call_at(at, self._ring, at)
+        if self._due:
+            self._come_by(min(self._due.values()))
+
+    def _come_by(self, at: float) -> None:
+        if self._timer is not None and self._timer.when() <= at:
+            return
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer = self._loop.call_at(at, self._ring, at)
