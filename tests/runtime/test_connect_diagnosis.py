@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from pathlib import Path
+from random import Random
+from typing import Any
 
 import anyio
 import pytest
 from pymavlink.dialects.v20 import minimal as pymavlink
 
-from aerokit import connect
+from aerokit import connect, open_connection
 from aerokit.errors import ConnectFailed, LinkLost, LocalProtocolError
 from aerokit.links import MemoryLink, Peer, memory_link_pair
+from aerokit.mavlink.dialect import Dialect
 from aerokit.mavlink.encoder import FrameEncoder
-from aerokit.mavlink.messages import Attitude, Heartbeat
+from aerokit.mavlink.enums import MavType
+from aerokit.mavlink.messages import Attitude, Heartbeat, RequestDataStream
+from aerokit.sim import ExtraComponent, SimulatedCopter, simulated_link
 
 pytestmark = pytest.mark.anyio
 
@@ -76,12 +83,12 @@ def damaged(speak: Callable[[], bytes]) -> Callable[[], bytes]:
         (lambda: b"Init ArduCopter V4.7\n", None, "no MAVLink frame: wrong baud rate, or another protocol"),
         (lambda: b"\x00\xff\x13" * 20, None, "no MAVLink frame"),
         (damaged(saying(1, 1, ATTITUDE)), None, "damaged frames and no good one"),
-        (lambda: UNKNOWN_FRAME, None, "unknown dialect"),
+        (lambda: UNKNOWN_FRAME, None, r"unknown dialect \(messages 8947848\)"),
         (saying(1, 1, ATTITUDE), None, "no HEARTBEAT among them"),
         (saying(255, 190, GCS), None, r"only ground stations were heard \(255/190\)"),
         (saying(1, 154, GIMBAL), None, r"no autopilot were heard \(1/154\)"),
         (saying(7, 1, COPTER), 3, r"other system ids were heard: 7 \(wanted: 3\)"),
-        (heartbeat_of_system_0, None, "all of system id 0, which is nobody"),
+        (heartbeat_of_system_0, None, "all of system id 0, which is nobody's"),
     ],
     ids=[
         *("nothing", "text", "noise", "damaged", "dialect", "no heartbeat", "ground stations", "gimbal"),
@@ -95,6 +102,36 @@ async def test_it_says_what_was_heard(speak: Callable[[], bytes], system_id: int
                 pytest.fail("there is no vehicle")
     assert "within 5 s on memory:near" in str(caught.value)
     assert "no heartbeat of" in str(caught.value)
+
+
+@pytest.mark.parametrize("seed", range(5))
+async def test_noise_is_not_taken_for_another_dialect_or_for_damaged_frames(seed: int) -> None:
+    """As a serial port gives it at the wrong baud rate; places that look like a frame are in it."""
+    random = Random(seed)
+    async with link_that_says(lambda: random.randbytes(random.randrange(1, 400))) as link:
+        with pytest.raises(ConnectFailed, match="no MAVLink frame: wrong baud rate"):
+            async with connect(link, timeout=50):
+                pytest.fail("there is no vehicle")
+
+
+async def test_a_vehicle_without_heartbeats() -> None:
+    copter = SimulatedCopter(boot_time_s=0)
+    copter.faults.heartbeats_stopped = True
+    async with simulated_link(copter) as link:
+        with pytest.raises(ConnectFailed, match="no HEARTBEAT among them"):
+            async with open_connection(link) as connection:
+                connection.send(RequestDataStream(1, 1, 0, 4, 1))
+                async with connect(connection, timeout=5):
+                    pytest.fail("it has no heartbeat")
+
+
+async def test_a_ground_station_and_a_gimbal_are_no_vehicle() -> None:
+    components = [ExtraComponent(1, type=MavType.GCS, system_id=252), ExtraComponent(154)]
+    copter = SimulatedCopter(boot_time_s=0, components=components)
+    async with simulated_link(copter) as link, connect(link) as vehicle:
+        assert (vehicle.system_id, vehicle.component_id) == (1, 1)
+        await anyio.sleep(3)
+        assert set(vehicle.connection.heard) == {(1, 1), (252, 1), (1, 154)}
 
 
 async def test_there_is_a_deadline_by_default() -> None:
@@ -132,15 +169,25 @@ async def test_a_link_that_goes_while_waiting_is_told_at_once() -> None:
         ({"source_system": 0}, "source_system = 0"),
         ({"source_component": 256}, "source_component = 256"),
         ({"mavlink_version": 3}, "mavlink_version = 3"),
+        ({"timeout": math.nan}, "timeout = nan"),
+        ({"baud": 0}, "baud = 0"),
+        ({"rates": {Attitude: 0}}, "rate_hz = 0 of ATTITUDE"),
+        ({"rates": {Attitude: 1001}}, "rate_hz = 1001 of ATTITUDE"),
+        ({"dialect": Dialect("mine", [Attitude])}, "'mine' has no HEARTBEAT"),
+        ({"dialect": Dialect("mine", [Heartbeat]), "rates": {Attitude: 1}}, "ATTITUDE is not in the dialect"),
     ],
+    ids=lambda value: "" if isinstance(value, dict) else value,
 )
 async def test_wrong_arguments_are_refused_before_anything_is_opened(
-    arguments: dict[str, int], text: str
+    arguments: dict[str, Any], text: str, tmp_path: Path
 ) -> None:
     near, _ = memory_link_pair()
+    record = tmp_path / "flight.tlog"
+    record.write_bytes(b"precious")
     with pytest.raises(LocalProtocolError, match=text):
-        async with connect(near, **arguments):  # type: ignore[arg-type]
+        async with connect(near, record=record, **arguments):
             pytest.fail("nothing is opened")
+    assert record.read_bytes() == b"precious"
     await near.open(FarEnd())  # it was not opened before
     near.close()
 
