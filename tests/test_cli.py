@@ -72,6 +72,7 @@ def read_rest(process: subprocess.Popen[str]) -> str:
         ["demo", "--record", "/there/is/no/such/directory/flight.tlog"],
         ["demo", "--speedup", "0"],
         ["sim", "nonsense"],
+        ["sim", "--vehicle", "balloon"],
         ["sim", "--home", "91,0,0"],
         ["sim", "--home", "47.4,8.5"],
         ["sim", "--home", "47.4,8.5,nan"],
@@ -106,12 +107,33 @@ def test_an_address_that_is_taken(capsys: pytest.CaptureFixture[str]) -> None:
 # --------------------------------------------------------------------------------------- demo
 
 
-def test_demo_on_its_own_copter(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+@pytest.mark.parametrize(("vehicle", "firmware"), [("copter", "ArduCopter"), ("px4", "PX4")])
+def test_demo_on_its_own_vehicle(
+    vehicle: str, firmware: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     record = tmp_path / "flight.tlog"
-    arguments = ["--altitude", "4", "--side", "5", "--speedup", "30", "--record", str(record)]
+    arguments = [
+        "--vehicle",
+        vehicle,
+        "--altitude",
+        "4",
+        "--side",
+        "5",
+        "--speedup",
+        "30",
+        "--record",
+        str(record),
+    ]
     assert main(["demo", *arguments]) == 0
     told = capsys.readouterr().out
-    for text in ("ready, home is", "at the north-east corner", "disarmed", "flown ", f"recorded in {record}"):
+    for text in (
+        f"found {firmware}",
+        "ready, home is",
+        "at the north-east corner",
+        "disarmed",
+        "flown ",
+        f"recorded in {record}",
+    ):
         assert text in told
     assert sum(1 for _ in read_tlog(record)) > 100
 
@@ -174,7 +196,7 @@ def test_a_pilot_who_takes_over_keeps_the_vehicle(tmp_path: Path) -> None:
 @posix_only
 def test_a_reader_who_goes_does_not_end_the_flight(tmp_path: Path) -> None:
     copter = SimulatedCopter(boot_time_s=0.0)
-    with served([copter]) as address, in_the_air(address, tmp_path) as process:
+    with served([copter]) as address, in_the_air(address, tmp_path, side_m=3) as process:
         assert process.stdout is not None
         process.stdout.close()
         process.wait(60)
@@ -182,9 +204,9 @@ def test_a_reader_who_goes_does_not_end_the_flight(tmp_path: Path) -> None:
 
 
 @contextmanager
-def in_the_air(address: str, directory: Path) -> Iterator[subprocess.Popen[str]]:
+def in_the_air(address: str, directory: Path, *, side_m: float = 30) -> Iterator[subprocess.Popen[str]]:
     """The demonstration on its way to the first corner."""
-    arguments = ["--connect", address, "--altitude", "4", "--side", "30"]
+    arguments = ["--connect", address, "--altitude", "4", "--side", str(side_m)]
     with program("demo", *arguments, "--record", str(directory / "flight.tlog")) as process:
         read_until(process, "at altitude")
         yield process

@@ -9,6 +9,7 @@ import anyio
 
 from aerokit.cli.interrupt import on_interrupt
 from aerokit.cli.report import FlightReport
+from aerokit.cli.vehicles import simulated_vehicle
 from aerokit.errors import AerokitError
 from aerokit.vehicle.connect import connect
 
@@ -57,11 +58,12 @@ async def _address(options: argparse.Namespace) -> AsyncIterator[str]:
     if options.connect is not None:
         yield options.connect
         return
-    from aerokit.sim import SimulatedCopter, open_simulator
+    from aerokit.sim import open_simulator
 
-    async with open_simulator(SimulatedCopter(), "tcpin:127.0.0.1:0", speedup=options.speedup) as simulator:
+    vehicle = simulated_vehicle(options.vehicle)
+    async with open_simulator(vehicle, "tcpin:127.0.0.1:0", speedup=options.speedup) as simulator:
         address = simulator.addresses[0].replace("tcpin", "tcp")
-        print(f"simulated copter, {options.speedup:g} times real time, on {address}", flush=True)
+        print(f"simulated {options.vehicle}, {options.speedup:g} times real time, on {address}", flush=True)
         yield address
 
 

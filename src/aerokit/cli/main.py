@@ -9,6 +9,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from aerokit.cli.arguments import address, home, number, system_id, writable_file
+from aerokit.cli.vehicles import HOME, NAMES
 from aerokit.errors import AerokitError, LocalProtocolError
 
 if TYPE_CHECKING:
@@ -63,7 +64,7 @@ def _add_demo(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
         return await run_demo(options)
 
     text = (
-        "Take off, fly a square, come back and land: on a simulated copter, or on any vehicle with --connect."
+        "Take off, fly a square, come back and land: on a simulated vehicle, or on any vehicle with --connect."
         " Ctrl-C lands it where it is, a second Ctrl-C leaves it to itself."
     )
     demo = commands.add_parser("demo", help="fly a square", description=text)
@@ -74,6 +75,7 @@ def _add_demo(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
         metavar="ADDRESS",
         help="a vehicle: udpin:0.0.0.0:14550, tcp:127.0.0.1:5760, /dev/ttyACM0,57600 …",
     )
+    _add_vehicle(demo)
     demo.add_argument(
         "--altitude", type=number(1, 500), default=10.0, metavar="M", help="metres above home (10)"
     )
@@ -88,7 +90,7 @@ def _add_demo(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
         help="telemetry log; one that is there is replaced (flight.tlog)",
     )
     demo.add_argument(
-        "--speedup", type=number(0.1, 100), default=5.0, metavar="X", help="of the simulated copter (5)"
+        "--speedup", type=number(0.1, 100), default=5.0, metavar="X", help="of the simulated vehicle (5)"
     )
     demo.add_argument(
         "--system-id", type=system_id, metavar="ID", help="of the vehicle (the first that is heard)"
@@ -104,9 +106,10 @@ def _add_sim(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
 
         return await run_sim(options)
 
-    text = "Simulate an ArduCopter for other programs, until interrupted."
-    sim = commands.add_parser("sim", help="simulate a copter", description=text)
+    text = "Simulate a vehicle for other programs, until interrupted."
+    sim = commands.add_parser("sim", help="simulate a vehicle", description=text)
     sim.set_defaults(run=run)
+    _add_vehicle(sim)
     sim.add_argument(
         "addresses",
         nargs="*",
@@ -121,8 +124,17 @@ def _add_sim(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     sim.add_argument(
         "--home",
         type=home,
-        default=(47.397742, 8.545594, 488.0),
+        default=HOME,
         metavar="LAT,LON,ALT",
         help="degrees and metres above the sea (47.397742,8.545594,488)",
     )
     sim.add_argument("--seed", type=int, default=0, help="of its noise (0)")
+
+
+def _add_vehicle(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--vehicle",
+        choices=NAMES,
+        default="copter",
+        help="simulated: an ArduCopter (copter) or a PX4 quadrotor (px4)",
+    )

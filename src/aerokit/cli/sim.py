@@ -1,4 +1,4 @@
-"""``aerokit sim``: a simulated copter for other programs."""
+"""``aerokit sim``: a simulated vehicle for other programs."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import asyncio
 from typing import TYPE_CHECKING
 
 from aerokit.cli.interrupt import on_interrupt
-from aerokit.sim import SimulatedCopter, open_simulator
+from aerokit.cli.vehicles import simulated_vehicle
+from aerokit.sim import open_simulator
 
 if TYPE_CHECKING:
     import argparse
@@ -19,12 +20,12 @@ CLIENTS_USE = {"tcpin": "tcp", "udpout": "udpin", "udpbcast": "udpin", "udpin": 
 
 async def run_sim(options: argparse.Namespace) -> int:
     """Serve it until interrupted."""
-    copter = SimulatedCopter(
-        system_id=options.system_id, home=options.home, seed=options.seed, boot_text=True
+    vehicle = simulated_vehicle(
+        options.vehicle, system_id=options.system_id, home=options.home, seed=options.seed, boot_text=True
     )
     stop = asyncio.Event()
     with on_interrupt(stop.set):
-        async with open_simulator(copter, *options.addresses, speedup=options.speedup) as simulator:
+        async with open_simulator(vehicle, *options.addresses, speedup=options.speedup) as simulator:
             for address in simulator.addresses:
                 print(f"system {options.system_id} on {address}, {options.speedup:g} times real time")
             print(f"try: aerokit demo --connect {_client_address(simulator.addresses[0])}", flush=True)
