@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from struct import Struct
+
 from aerokit.errors import LocalProtocolError
 from aerokit.mavlink.checksum import x25
 from aerokit.mavlink.frame import MAGIC_V1, MAGIC_V2
 from aerokit.mavlink.message import Message
 
 __all__ = ["FrameEncoder"]
+
+_HEADER_V2 = Struct("<BBBBBBBHB").pack
 
 
 class FrameEncoder:
@@ -39,17 +43,15 @@ class FrameEncoder:
         payload = message.encode()
         if self.version == 2:
             payload = payload.rstrip(b"\0") or payload[:1]  # the standard never cuts the first byte
-            header = bytes((len(payload), 0, 0, self.sequence, self.system_id, self.component_id))
-            body = header + message.ID.to_bytes(3, "little") + payload
-            magic = MAGIC_V2
+            low, high = message.ID & 0xFFFF, message.ID >> 16
+            source = self.system_id, self.component_id
+            frame = _HEADER_V2(MAGIC_V2, len(payload), 0, 0, self.sequence, *source, low, high) + payload
         else:
             if message.ID > 255:
                 raise LocalProtocolError(f"{message.NAME} has id {message.ID}, MAVLink 1 has none above 255")
             payload = payload[: message.BASE_LENGTH]
-            body = (
-                bytes((len(payload), self.sequence, self.system_id, self.component_id, message.ID)) + payload
-            )
-            magic = MAGIC_V1
+            source = self.system_id, self.component_id
+            frame = bytes((MAGIC_V1, len(payload), self.sequence, *source, message.ID)) + payload
         self.sequence = (self.sequence + 1) & 0xFF
-        crc = x25(body + bytes((message.CRC_EXTRA,)))
-        return bytes((magic,)) + body + crc.to_bytes(2, "little")
+        crc = x25(frame[1:] + bytes((message.CRC_EXTRA,)))
+        return frame + crc.to_bytes(2, "little")

@@ -18,12 +18,17 @@ ResultT = TypeVar("ResultT")
 
 
 async def run_exchange(connection: Connection, system_id: int, exchange: Exchange[ResultT]) -> ResultT:
-    """Run ``exchange`` with the vehicle ``system_id`` to its end and return its result; see `ExchangeRun.result`."""
+    """Run ``exchange`` with the vehicle ``system_id`` to its end and return its result.
+
+    Cancellation ends it at once. When the connection ends, the exchange ends with the connection's error; what goes
+    wrong in sending is raised here.
+    """
     run = ExchangeRun(connection, exchange)
     detachments = [
         connection.bus.attach(message_type, run.receive, system_id=system_id)
         for message_type in exchange.expects
     ]
+    detachments.append(connection.on_end(run.abort))
     try:
         return await run.result()
     finally:
@@ -32,7 +37,10 @@ async def run_exchange(connection: Connection, system_id: int, exchange: Exchang
 
 
 class ExchangeRun(Generic[ResultT]):
-    """Gives one exchange its time and sends what it wants sent; its owner gives it the messages of its target."""
+    """Gives one exchange its time and sends what it wants sent.
+
+    Its owner gives it the messages of its target, and tells it the end of the connection.
+    """
 
     def __init__(self, connection: Connection, exchange: Exchange[ResultT]) -> None:
         self._connection, self._exchange = connection, exchange
@@ -42,17 +50,14 @@ class ExchangeRun(Generic[ResultT]):
     async def result(self) -> ResultT:
         """Start it, await its end and return its result; once.
 
-        Cancellation ends it at once. When the connection ends, the exchange ends with the connection's error; what
-        goes wrong in sending is raised here.
+        Cancellation ends it at once. What goes wrong in sending is raised here.
         """
-        detach = self._connection.on_end(self._abort)
         try:
             self._exchange.start(self._connection.now())
             self._after_step()
             await self._ended
         finally:
             self._connection.deadlines.take_back(self._expire)
-            detach()
         return self._exchange.result()
 
     def receive(self, message: Message) -> None:
@@ -62,7 +67,8 @@ class ExchangeRun(Generic[ResultT]):
         finally:  # what a callback of the program raised is for the bus to report; the exchange goes on
             self._after_step()
 
-    def _abort(self, error: Exception) -> None:
+    def abort(self, error: Exception) -> None:
+        """End it with this error."""
         self._exchange.abort(raisable(error))
         self._after_step()
 

@@ -50,12 +50,17 @@ class CommandSender:
         self._runs: dict[_Key, ExchangeRun[CommandAck]] = {}
         self._under_way: dict[_Key, list[float]] = {}
         self._is_closed = False
-        self._detach = connection.bus.attach(CommandAck, self._on_ack, system_id=system_id)
+        self._detach = (
+            connection.bus.attach(CommandAck, self._on_ack, system_id=system_id),
+            connection.on_end(self._abort),
+        )
 
     def close(self) -> None:
-        """Stop listening to answers; what is asked for from now on raises."""
-        self._detach()
+        """Stop listening to answers: what waits for one, and what is asked for from now on, raises."""
+        for detach in self._detach:
+            detach()
         self._is_closed = True
+        self._abort(ConnectionClosed("the block of this vehicle was left"))
 
     async def send_long(
         self,
@@ -144,6 +149,10 @@ class CommandSender:
             return 0
         oldest = self._connection.now() - UNDER_WAY_S
         return sum(at >= oldest for at in self._under_way.pop(key))
+
+    def _abort(self, error: Exception) -> None:
+        for run in tuple(self._runs.values()):
+            run.abort(error)
 
     def _on_ack(self, ack: CommandAck) -> None:
         """Give an answer to the exchange that waits for it; without one, it was one of those under way."""
