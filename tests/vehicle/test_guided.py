@@ -158,8 +158,9 @@ async def test_a_heading_with_a_body_velocity_is_a_heading(flying: Flight) -> No
     """In MAV_FRAME_BODY_NED ArduPilot counts yaw from where the nose points; users give degrees from north."""
     await flying.vehicle.set_heading(40.0)
     async with flying.vehicle.guided.body_velocity() as stream:
-        await stream.fly(BodyVelocitySetpoint(yaw_deg=120.0), 20.0)
-        assert math.degrees(flying.copter.motion.yaw) == pytest.approx(120.0, abs=3.0)
+        await stream.fly(BodyVelocitySetpoint(forward_m_s=2.0, yaw_deg=180.0), 10.0)
+        assert abs(math.degrees(flying.copter.motion.yaw)) == pytest.approx(180.0, abs=3.0)
+        assert flying.copter.motion.velocity_north == pytest.approx(-2.0, abs=0.2)
 
 
 async def test_entering_changes_to_guided(flying: Flight) -> None:

@@ -113,11 +113,19 @@ class SetpointEncoder:
         return self._local(MAV_FRAME_LOCAL_NED, IGNORE_VELOCITY, vector, s.yaw_deg, s.yaw_rate_deg_s)
 
     def body_velocity(self, s: BodyVelocitySetpoint) -> Message:
-        """SET_POSITION_TARGET_LOCAL_NED with a velocity in MAV_FRAME_BODY_NED."""
-        vector, yaw_deg = (s.forward_m_s, s.right_m_s, s.down_m_s), s.yaw_deg
-        if yaw_deg is not None and self._vehicle.autopilot.setpoints.body_yaw_is_relative:
-            yaw_deg = math.remainder(yaw_deg - self._vehicle.heading_deg.value, 360)
-        return self._local(MAV_FRAME_BODY_NED, IGNORE_VELOCITY, vector, yaw_deg, s.yaw_rate_deg_s)
+        """SET_POSITION_TARGET_LOCAL_NED with a velocity in MAV_FRAME_BODY_NED.
+
+        With a heading for ArduPilot it is turned into MAV_FRAME_LOCAL_NED by the heading of now: in MAV_FRAME_BODY_NED
+        ArduPilot adds each yaw to the one it commanded before, and correcting that by telemetry swings to and fro.
+        """
+        vector = (s.forward_m_s, s.right_m_s, s.down_m_s)
+        if s.yaw_deg is None or not self._vehicle.autopilot.setpoints.body_yaw_is_relative:
+            return self._local(MAV_FRAME_BODY_NED, IGNORE_VELOCITY, vector, s.yaw_deg, s.yaw_rate_deg_s)
+        heading = math.radians(self._vehicle.heading_deg.value)
+        north = s.forward_m_s * math.cos(heading) - s.right_m_s * math.sin(heading)
+        east = s.forward_m_s * math.sin(heading) + s.right_m_s * math.cos(heading)
+        vector = (north, east, s.down_m_s)
+        return self._local(MAV_FRAME_LOCAL_NED, IGNORE_VELOCITY, vector, s.yaw_deg, s.yaw_rate_deg_s)
 
     def acceleration(self, s: AccelerationSetpoint) -> Message:
         """SET_POSITION_TARGET_LOCAL_NED with an acceleration in MAV_FRAME_LOCAL_NED."""
