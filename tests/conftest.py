@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import AsyncIterator
 from typing import Any
 
 import pytest
+from flight_harness import Flight, in_the_air, open_flight
 from hypothesis import settings
 from recorded import headline
 
@@ -21,3 +23,19 @@ def anyio_backend() -> tuple[str, dict[str, Any]]:
 
 def pytest_report_header() -> str:
     return headline()
+
+
+@pytest.fixture
+async def grounded(anyio_backend: object) -> AsyncIterator[Flight]:
+    """Ready, disarmed, in STABILIZE."""
+    async with open_flight() as flight:
+        await flight.vehicle.wait_ready()
+        flight.wire.forget()
+        yield flight
+
+
+@pytest.fixture
+async def flying(anyio_backend: object) -> AsyncIterator[Flight]:
+    """Hovering 10 m above home in GUIDED; nothing but what the test does is in ``wire.sent``."""
+    async with in_the_air() as flight:
+        yield flight
