@@ -38,7 +38,7 @@ def types(session: nox.Session) -> None:
     """mypy --strict and pyright, over sources, tests, examples and benchmarks."""
     session.install("-e", ".[dev]")
     session.run("mypy")
-    session.run("pyright")
+    session.run("pyright", "--pythonpath", f"{session.bin}/python")
 
 
 @nox.session
