@@ -43,7 +43,7 @@ def rows(rounds: int = 7, path: Path | None = None) -> list[Row]:
             "pymavlink parse_buffer + post_message",
             unit="frames/s",
             ratio=own / peer,
-            aim=3.0,
+            aim=2.0,
         )
     ]
 

@@ -6,6 +6,7 @@ method that must be written, ``__init__``, and shares the others.
 
 from __future__ import annotations
 
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, ClassVar
 
 if TYPE_CHECKING:
@@ -32,6 +33,7 @@ class _SnapshotType(type):
         cls = super().__new__(mcs, name, bases, {**namespace, "__slots__": own, "__match_args__": fields})
         if own:
             _write_init(cls, fields, defaults)
+        type.__setattr__(cls, "_values", attrgetter(*(fields or ("__class__",))))
         return cls
 
 
@@ -57,6 +59,7 @@ class Snapshot(metaclass=_SnapshotType):
     """
 
     __match_args__: ClassVar[tuple[str, ...]]
+    _values: ClassVar[attrgetter[Any]]
 
     def replace(self, **changes: Any) -> Self:
         """A copy with these fields changed."""
@@ -75,10 +78,10 @@ class Snapshot(metaclass=_SnapshotType):
     def __eq__(self, other: object) -> bool:
         if type(self) is not type(other):
             return NotImplemented
-        return all(getattr(self, field) == getattr(other, field) for field in self.__match_args__)
+        return bool(self._values(self) == self._values(other))
 
     def __hash__(self) -> int:
-        return hash(tuple(self.to_dict().values()))
+        return hash(self._values(self))
 
     def __repr__(self) -> str:
         fields = ", ".join(f"{field}={_short(getattr(self, field))}" for field in self.__match_args__)

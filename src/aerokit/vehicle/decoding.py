@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from operator import attrgetter
 from typing import TYPE_CHECKING
 
 from aerokit import geo
@@ -28,6 +29,9 @@ from aerokit.vehicle.values import (
 if TYPE_CHECKING:
     from aerokit.autopilots import Autopilot
     from aerokit.mavlink import messages
+
+_CHANNELS = attrgetter(*(f"chan{number}_raw" for number in range(1, 19)))
+_SERVOS = attrgetter(*(f"servo{number}_raw" for number in range(1, 17)))
 
 U8, U16 = 0xFF, 0xFFFF
 I16 = 0x7FFF
@@ -215,15 +219,16 @@ def current(centiampere: int, autopilot: Autopilot) -> float | None:
 def rc_channels(message: messages.RcChannels) -> RcChannels:
     """As many channels as the receiver has."""
     count = min(message.chancount, 18)
-    channels = (getattr(message, f"chan{number}_raw") for number in range(1, count + 1))
-    return RcChannels(tuple(unless(us, U16) for us in channels), unless(message.rssi, U8))
+    channels = _CHANNELS(message)[:count]
+    return RcChannels(tuple([None if us == U16 else us for us in channels]), unless(message.rssi, U8))
 
 
 def servo_outputs(message: messages.ServoOutputRaw) -> tuple[int, ...]:
     """Sixteen outputs, or eight in MAVLink 1."""
     frame = message.received_frame
     count = 8 if frame is not None and frame.version == 1 else 16
-    return tuple(getattr(message, f"servo{number}_raw") for number in range(1, count + 1))
+    outputs: tuple[int, ...] = _SERVOS(message)[:count]
+    return outputs
 
 
 def vibration(message: messages.Vibration) -> Vibration:
