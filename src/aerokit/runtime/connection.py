@@ -17,6 +17,7 @@ from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import Heartbeat
+from aerokit.runtime.background import Background
 from aerokit.runtime.bus import Bus
 from aerokit.runtime.deadlines import Deadlines
 from aerokit.runtime.endings import raisable
@@ -27,9 +28,7 @@ from aerokit.runtime.subscription import Overflow, Subscription
 
 if TYPE_CHECKING:
     import os
-    from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Iterator, Sequence
-
-    from anyio.abc import TaskGroup
+    from collections.abc import AsyncIterator, Callable, Collection, Iterator, Sequence
 
     from aerokit.links.link import Peer
     from aerokit.mavlink.dialect import Dialect
@@ -68,8 +67,8 @@ async def open_connection(
 ) -> AsyncIterator[Connection]:
     """Open a link and be a MAVLink node on it for the time of the ``async with`` block.
 
-    Runs in the asyncio loop that is already running, in one task group; nothing outlives the block. Our HEARTBEAT
-    goes out at 1 Hz from the start (https://mavlink.io/en/services/heartbeat.html).
+    Runs in the asyncio loop that is already running; nothing outlives the block, and what the block raises comes out
+    of it as it is. Our HEARTBEAT goes out at 1 Hz from the start (https://mavlink.io/en/services/heartbeat.html).
 
     Args:
         address: a connection string (``"udpin:0.0.0.0:14550"``, ``"/dev/ttyACM0,57600"``, …) or a link not yet open.
@@ -96,31 +95,19 @@ async def open_connection(
         dialect=dialect,
         mavlink_version=mavlink_version,
     )
-    failure: BaseException | None = None
     try:
         if record is not None:
             connection.record(record)
         await link.open(connection)
-        async with anyio.create_task_group() as tasks:
-            connection._start(tasks)
-            try:
-                yield connection
-            except asyncio.CancelledError:
-                raise
-            except BaseException as error:
-                failure = error  # raised below: a task group would wrap it in an exception group
-            finally:
-                connection.close()
-                tasks.cancel_scope.cancel()
+        connection._start()
+        yield connection
     finally:
         connection.close()
-        with anyio.CancelScope(shield=True), anyio.move_on_after(CLOSE_TIMEOUT_S):
-            await link.wait_closed()
-    try:
-        if failure is not None:
-            raise failure
-    finally:
-        failure = None  # its traceback holds this frame: no circle
+        try:
+            await connection._background.aclose()
+        finally:
+            with anyio.CancelScope(shield=True), anyio.move_on_after(CLOSE_TIMEOUT_S):
+                await link.wait_closed()
 
 
 class Connection:
@@ -165,7 +152,7 @@ class Connection:
         self._doubles: set[tuple[int, int, Peer]] = set()
         self._recording: Recording | None = None
         self._enders: list[Callable[[Exception], None]] = []
-        self._background: set[asyncio.Task[None]] = set()
+        self._background = Background(self.fail)
         self._error: Exception | None = None
         self.bus.attach(Heartbeat, _ignore)  # routes and diagnosis need every heartbeat
 
@@ -278,6 +265,15 @@ class Connection:
             self._recording.close()
             self._recording = None
 
+    def fail(self, error: Exception) -> None:
+        """Close it because of a mistake inside aerokit: whoever waits is told, and it never surfaces elsewhere."""
+        if self._error is not None and isinstance(error, AerokitError):
+            return  # a task of ours was told of the end
+        logger.error("a mistake inside aerokit closes the connection", exc_info=error)
+        closed = ConnectionClosed(f"a mistake inside aerokit closed the connection: {error!r}")
+        closed.__cause__ = error
+        self.close(closed)
+
     def record(self, path: str | os.PathLike[str]) -> None:
         """Write everything sent and received from now on to a ``.tlog`` file, until the connection is closed.
 
@@ -312,7 +308,7 @@ class Connection:
                     self._note_heartbeat(frame, peer)
                 self.bus.deliver(frame)
         except Exception as error:
-            self._fail(error)
+            self.fail(error)
 
     def link_lost(self, error: LinkLost) -> None:
         """The link has gone (called by the link): whatever waits ends with this error."""
@@ -320,30 +316,9 @@ class Connection:
 
     # ------------------------------------------------------------------------------- inside
 
-    def _start(self, tasks: TaskGroup) -> None:
-        tasks.start_soon(self.guarded, self._send_heartbeats, name="aerokit heartbeat")
-        tasks.start_soon(self.guarded, self._watch_loop, name="aerokit loop watch")
-
-    async def guarded(self, function: Callable[[], Awaitable[None]]) -> None:
-        """Run a background task of ours until the connection ends; a mistake in it ends the connection.
-
-        It is cancelled as a task, not by a scope: where a scope and the scope around it are cancelled together, anyio
-        up to 4.16 lets the outer one's task forget a cancellation of its own.
-        """
-        task = asyncio.current_task()
-        if task is None or not self.is_open:
-            return
-        self._background.add(task)
-        try:
-            await function()
-        except asyncio.CancelledError:
-            if self.is_open:
-                raise
-        except Exception as error:
-            self._background.discard(task)
-            self._fail(error)
-        finally:
-            self._background.discard(task)
+    def _start(self) -> None:
+        self._background.start(self._send_heartbeats, "aerokit heartbeat")
+        self._background.start(self._watch_loop, "aerokit loop watch")
 
     async def _watch_loop(self) -> None:
         await watch_loop(self)
@@ -355,15 +330,6 @@ class Connection:
             if self._recording is not None:
                 self._recording.flush()
             await anyio.sleep(HEARTBEAT_PERIOD_S)
-
-    def _fail(self, error: Exception) -> None:
-        """A mistake of ours: whoever waits is told, and it never surfaces where the program did not ask."""
-        if self._error is not None and isinstance(error, AerokitError):
-            return  # a task of ours was told of the end
-        logger.error("a mistake inside aerokit closes the connection", exc_info=error)
-        closed = ConnectionClosed(f"a mistake inside aerokit closed the connection: {error!r}")
-        closed.__cause__ = error
-        self.close(closed)
 
     def _end(self, error: Exception) -> None:
         if self._error is not None:
@@ -378,8 +344,7 @@ class Connection:
             except Exception:
                 logger.exception("a mistake at the end of a connection; the others are told all the same")
         self.deadlines.close()
-        for task in tuple(self._background):
-            task.cancel()
+        self._background.cancel()
 
     def _peers_of(self, system_id: int, component_id: int) -> Collection[Peer]:
         """Where to send what is for this component, or for this system if the component is 0 or was never heard."""

@@ -53,7 +53,7 @@ async def connect(
     """Connect to a vehicle for the time of the ``async with`` block.
 
     Returns at its first heartbeat; ``await vehicle.wait_ready()`` waits until it could fly. Runs inside the asyncio
-    loop that is already running, in one task group: nothing outlives the block.
+    loop that is already running: nothing outlives the block, and what the block raises comes out of it as it is.
 
     Args:
         address: ``"udpin:0.0.0.0:14550"``, ``"tcp:127.0.0.1:5760"``, ``"/dev/ttyACM0,57600"``, a ``.tlog`` file …;
@@ -125,31 +125,18 @@ async def _attached(
 ) -> AsyncIterator[Vehicle]:
     """Find a vehicle on an open connection and keep it for the time of the block."""
     vehicle, heartbeat = await _find_vehicle(connection, system_id, timeout)
-    failure: BaseException | None = None
     try:
-        async with anyio.create_task_group() as tasks:
-            try:
-                vehicle._start(tasks, heartbeat, rates)
-                connection.bus.publish(
-                    VehicleFound(connection.now(), vehicle.system_id, vehicle.component_id)
-                )
-                yield vehicle
-            except asyncio.CancelledError:
-                raise
-            except BaseException as error:
-                failure = error  # raised below: a task group would wrap it in an exception group
-            finally:
-                vehicle._end_stream()
-                await vehicle._finish_hold()
-                tasks.cancel_scope.cancel()
+        vehicle._start(heartbeat, rates)
+        connection.bus.publish(VehicleFound(connection.now(), vehicle.system_id, vehicle.component_id))
+        yield vehicle
     finally:
-        vehicle._close()
-        connection.attached.discard(vehicle.system_id)
-    try:
-        if failure is not None:
-            raise failure
-    finally:
-        failure = None  # its traceback holds this frame: no circle
+        try:
+            vehicle._end_stream()
+            await vehicle._finish_hold()
+        finally:
+            vehicle._close()
+            connection.attached.discard(vehicle.system_id)
+            await vehicle._background.aclose()
 
 
 async def _find_vehicle(

@@ -12,6 +12,7 @@ from aerokit.autopilots.streams import subscription_rate_hz
 from aerokit.errors import CommandRejected, ConnectionClosed
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import CommandAck, Heartbeat
+from aerokit.runtime.background import Background
 from aerokit.runtime.cells import Source, StateCell
 from aerokit.runtime.events import (
     ArmedChanged,
@@ -27,9 +28,7 @@ from aerokit.vehicle.telemetry import Telemetry
 from aerokit.vehicle.watch import LinkWatch, VehicleWatch
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterator
-
-    from anyio.abc import TaskGroup
+    from collections.abc import Callable, Iterator
 
     from aerokit.runtime.bus import Detach, Sink
     from aerokit.runtime.connection import Connection
@@ -72,13 +71,15 @@ class VehicleCore:
             "link_quality", connection.now, "second of traffic"
         )
         """Loss, delay and rates of the last second."""
-        self._commands = CommandSender(connection, system_id, component_id, self.describe_link)
+        self._commands = CommandSender(
+            connection, system_id, component_id, self.describe_link, lambda: self._link_watch.round_trip_s
+        )
         self._rates = MessageRates(
             connection, self._commands, system_id, component_id, self.autopilot.stream_groups
         )
         self._watch = VehicleWatch(connection, system_id, component_id, self._on_reboot)
         self._link_watch = LinkWatch(connection, system_id, component_id, self._on_link_report)
-        self._tasks: TaskGroup | None = None
+        self._background = Background(connection.fail)
         self._is_closed = False
         self._detach: list[Detach] = []
         self._messages: dict[type[Message], StateCell[Any]] = {}
@@ -103,7 +104,8 @@ class VehicleCore:
             params: param1 to param7; missing ones are 0, NaN where the command says so.
             component_id: to another component than the autopilot.
             attempts: how often it is sent at most; ``confirmation`` rises with each.
-            attempt_timeout: seconds to wait for an ack after each. IN_PROGRESS extends it.
+            attempt_timeout: seconds to wait for an ack after each, and at least two measured round trips. IN_PROGRESS
+                extends it.
             on_progress: called with 0–100, or None, for each IN_PROGRESS.
 
         See https://mavlink.io/en/services/command.html.
@@ -329,10 +331,6 @@ class VehicleCore:
         self._link_watch.close()
         self._rates.close()
 
-    def _in_background(self, function: Callable[[], Awaitable[None]]) -> None:
-        if self._tasks is not None and self.connection.is_open:
-            self._tasks.start_soon(self.connection.guarded, function)
-
     @contextmanager
     def _refusals_of(self, command: int) -> Iterator[list[CommandAck]]:
         """Collect later acks of a command that refuse what an earlier one accepted (PX4 acks some twice)."""
@@ -392,6 +390,7 @@ class VehicleCore:
         self._rates.ask_again()
 
     def _on_end(self, error: Exception) -> None:
+        self._background.cancel()
         self.telemetry.close(error)
         self.link_quality.close(error)
         for cell in self._messages.values():

@@ -219,7 +219,7 @@ class ModeActions(VehicleState):
                 await self._confirm_hold(mode, hold)
                 self._hold_scope = None
 
-        self._in_background(confirm)
+        self._background.start(confirm, "aerokit hold")
         return True
 
     async def _confirm_hold(self, mode: Mode, order: Order) -> None:

@@ -13,8 +13,6 @@ from aerokit.vehicle.guided import Guided
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from anyio.abc import TaskGroup
-
     from aerokit.mavlink.message import Message
     from aerokit.mavlink.messages import Heartbeat
     from aerokit.runtime.connection import Connection
@@ -45,15 +43,12 @@ class Vehicle(FlightActions):
 
     # ------------------------------------------------------------------------------ inside
 
-    def _start(
-        self, tasks: TaskGroup, heartbeat: Heartbeat, rates: Mapping[type[Message], float] | None
-    ) -> None:
-        self._tasks = tasks
+    def _start(self, heartbeat: Heartbeat, rates: Mapping[type[Message], float] | None) -> None:
         self.telemetry.receive(heartbeat)
         for message_type, hz in (self.telemetry.default_rates if rates is None else rates).items():
             self._rates.want(message_type, hz, is_optional=rates is None)
         for function in (self._rates.run, self._rates.watch, self._run_link_watch, self._learn_constants):
-            tasks.start_soon(self.connection.guarded, function, name=f"aerokit {function.__qualname__}")
+            self._background.start(function, f"aerokit {function.__qualname__}")
 
     async def _run_link_watch(self) -> None:
         await self._link_watch.run(self._on_second)

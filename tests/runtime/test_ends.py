@@ -1,0 +1,356 @@
+"""However a connection ends: the program's exceptions stay its own, who waits is told, whoever comes later too."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import sys
+from collections.abc import AsyncIterator, Awaitable, Callable
+from typing import Any
+
+import anyio.lowlevel
+import pytest
+
+from aerokit import Vehicle, connect, events, open_connection
+from aerokit.errors import (
+    AerokitError,
+    BusyError,
+    ConnectionClosed,
+    LinkLost,
+    OperationTimeout,
+)
+from aerokit.links import MemoryLink, memory_link_pair
+from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.messages import Attitude, Heartbeat
+from aerokit.runtime.connection import Connection
+from aerokit.sim import SimulatedCopter, simulated_link
+
+pytestmark = pytest.mark.anyio
+
+COPTER = Heartbeat(2, 3, 81, 0, 3)
+
+
+@pytest.fixture
+async def link(anyio_backend: object) -> AsyncIterator[MemoryLink]:
+    async with simulated_link(SimulatedCopter(boot_time_s=0)) as near:
+        yield near
+
+
+@pytest.fixture
+async def vehicle(link: MemoryLink) -> AsyncIterator[Vehicle]:
+    async with connect(link) as vehicle:
+        yield vehicle
+
+
+# ------------------------------------------------------------------ what comes out of the block
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        StopAsyncIteration("mine"),
+        StopIteration("mine"),
+        GeneratorExit("mine"),
+        asyncio.CancelledError("mine"),
+        LinkLost("mine"),
+        TimeoutError("mine"),
+        BaseException("mine"),
+    ],
+    ids=lambda error: type(error).__name__,
+)
+async def test_the_bodys_exception_is_the_one_that_comes_out(link: MemoryLink, error: BaseException) -> None:
+    caught: BaseException | None = None
+    try:
+        async with connect(link):
+            raise error
+    except BaseException as its:
+        caught = its
+    assert caught is error
+
+
+@pytest.mark.skipif(sys.version_info < (3, 11), reason="asyncio.TaskGroup is new in 3.11")
+async def test_an_exception_group_of_the_program_stays_as_it_is(link: MemoryLink) -> None:
+    async def fail() -> None:
+        raise ValueError("mine")
+
+    with pytest.raises(BaseException) as caught:  # noqa: PT011 - the class is new in 3.11
+        async with connect(link), asyncio.TaskGroup() as tasks:  # type: ignore[attr-defined, unused-ignore]
+            tasks.create_task(fail())
+    assert type(caught.value).__name__ == "ExceptionGroup"
+    errors: Any = caught.value
+    assert [repr(error) for error in errors.exceptions] == ["ValueError('mine')"]
+
+
+async def test_an_async_generator_around_it_can_be_closed(link: MemoryLink) -> None:
+    connection: Connection | None = None
+
+    async def altitudes() -> AsyncIterator[float]:
+        nonlocal connection
+        async with connect(link) as vehicle:
+            connection = vehicle.connection
+            async for position in vehicle.position.updates():
+                yield position.altitude_amsl_m or 0.0
+
+    generator: Any = altitudes()
+    assert await generator.__anext__() > 0
+    await generator.aclose()
+    assert connection is not None
+    assert not connection.is_open
+
+
+@pytest.mark.skipif(sys.version_info < (3, 11), reason="asyncio.timeout and TaskGroup are new in 3.11")
+async def test_inside_the_programs_own_groups_and_timeouts() -> None:
+    runner: Any = asyncio
+
+    async def session() -> None:
+        async with simulated_link(SimulatedCopter(boot_time_s=0)) as link, connect(link) as vehicle:
+            await vehicle.mode.wait_until(lambda mode: mode.name == "NEVER")
+
+    async with runner.TaskGroup() as group:
+        with pytest.raises(TimeoutError):
+            async with runner.timeout(2):
+                await session()
+        with pytest.raises(TimeoutError):
+            with anyio.fail_after(2):
+                await session()
+        with pytest.raises(TimeoutError):
+            await asyncio.wait_for(session(), 2)
+        other = group.create_task(session())
+        await asyncio.sleep(2)
+        other.cancel()
+    assert other.cancelled()
+    task: Any = asyncio.current_task()
+    assert task.cancelling() == 0
+
+
+async def test_inside_a_group_of_anyio_beside_other_sessions() -> None:
+    modes: list[str] = []
+
+    async def session(system_id: int) -> None:
+        copter = SimulatedCopter(boot_time_s=0, system_id=system_id)
+        async with simulated_link(copter) as link, connect(link, system_id=system_id) as vehicle:
+            await vehicle.set_mode("GUIDED")
+            modes.append(vehicle.mode_name)
+
+    async with anyio.create_task_group() as tasks:
+        for system_id in (1, 2, 3):
+            tasks.start_soon(session, system_id)
+    assert modes == ["GUIDED"] * 3
+
+
+# ---------------------------------------------------------------------------- mistakes inside
+
+
+def broken(*_: object, **__: object) -> Any:
+    raise ZeroDivisionError("ours")
+
+
+def break_bus(vehicle: Vehicle, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(vehicle.connection.bus, "deliver", broken)
+
+
+def break_encoder(vehicle: Vehicle, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(vehicle.connection, "_encoder", None)
+
+
+def break_framer(vehicle: Vehicle, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(vehicle.connection._framers, None, object())
+
+
+def break_rates(vehicle: Vehicle, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(vehicle._rates, "_watch", broken)
+
+
+def break_link_watch(vehicle: Vehicle, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(vehicle._link_watch, "_report", broken)
+
+
+@pytest.mark.parametrize(
+    "breaks",
+    [break_bus, break_encoder, break_framer, break_rates, break_link_watch],
+    ids=lambda breaks: breaks.__name__,
+)
+async def test_a_mistake_inside_ends_the_connection_and_says_so(
+    link: MemoryLink,
+    breaks: Callable[[Vehicle, pytest.MonkeyPatch], None],
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    async with connect(link) as vehicle:
+        breaks(vehicle, monkeypatch)
+        with caplog.at_level(logging.CRITICAL, "aerokit"), pytest.raises(ConnectionClosed) as caught:
+            await vehicle.mode.wait_until(lambda mode: mode.name == "NEVER", timeout=10)
+        assert caught.value.__cause__ is not None
+        await anyio.sleep(1)  # the block is not cancelled
+        with pytest.raises(ConnectionClosed, match="mistake inside aerokit"):
+            vehicle.send(COPTER)
+
+
+# ---------------------------------------------------------------------------- closing
+
+
+async def test_the_block_goes_on_after_close_inside_it(vehicle: Vehicle) -> None:
+    started = anyio.current_time()
+    vehicle.connection.close()
+    vehicle.connection.close()
+    await anyio.sleep(5)
+    assert anyio.current_time() - started == pytest.approx(5)
+    for use in (vehicle.arm, vehicle.wait_ready, lambda: vehicle.command(511), vehicle.hold, vehicle.land):
+        with pytest.raises(ConnectionClosed, match="was closed"):
+            await use()
+    assert vehicle.mode_name == "STABILIZE"  # what was known can still be read
+
+
+async def test_closing_by_a_sink_in_the_middle_of_a_delivery(link: MemoryLink) -> None:
+    async with open_connection(link) as connection:
+        heard: list[Heartbeat] = []
+
+        def close(heartbeat: Heartbeat) -> None:
+            heard.append(heartbeat)
+            connection.close()
+
+        connection.bus.attach(Heartbeat, close)
+        connection.bytes_received(FrameEncoder(9, 1).encode(COPTER) * 3, None)
+        assert len(heard) == 1
+        await anyio.sleep(3)
+        assert len(heard) == 1
+
+
+async def test_a_call_under_way_ends_at_the_instant_of_closing(vehicle: Vehicle) -> None:
+    waits: list[Callable[[], Awaitable[object]]] = [
+        lambda: vehicle.command(31_000),
+        lambda: vehicle.mode.wait_until(lambda _: False),
+        lambda: read(vehicle),
+        lambda: follow(vehicle),
+        lambda: vehicle.set_mode("GUIDED"),
+    ]
+    vehicle.connection.link._far.close()  # type: ignore[attr-defined]
+    ended: list[tuple[float, BaseException]] = []
+
+    async def note(wait: Callable[[], Awaitable[object]]) -> None:
+        try:
+            await wait()
+        except AerokitError as error:
+            ended.append((anyio.current_time(), error))
+
+    async with anyio.create_task_group() as tasks:
+        for wait in waits:
+            tasks.start_soon(note, wait)
+        await anyio.lowlevel.checkpoint()
+    errors = [error for _, error in ended]
+    assert [type(error) for error in errors] == [LinkLost] * len(waits)
+    assert len(set(map(id, errors))) == len(waits)  # nobody gets another one's traceback
+    assert {at for at, _ in ended} == {anyio.current_time()}
+
+
+async def read(vehicle: Vehicle) -> None:
+    with vehicle.subscribe(Attitude) as attitudes:
+        while True:
+            await attitudes.get()
+
+
+async def follow(vehicle: Vehicle) -> None:
+    async for _ in vehicle.landed_state.changes():
+        pass
+
+
+async def test_an_error_raised_often_does_not_gather_tracebacks(vehicle: Vehicle) -> None:
+    vehicle.connection.close()
+    lengths = []
+    for _ in range(5):
+        with pytest.raises(ConnectionClosed) as caught:
+            vehicle.send(COPTER)
+        lengths.append(len(caught.traceback))
+        assert caught.value.__context__ is None
+    assert len(set(lengths)) == 1
+
+
+async def test_what_was_queued_is_read_before_the_loss(link: MemoryLink) -> None:
+    async with connect(link, rates={Attitude: 10}) as vehicle:
+        with vehicle.subscribe(Attitude, events.LinkClosed, capacity=100) as items:
+            await anyio.sleep(1)
+            link._lose("unplugged")
+            seen = []
+            with pytest.raises(LinkLost, match="unplugged"):
+                async for item in items:
+                    seen.append(type(item))
+    assert len(seen) > 5
+    assert seen[-1] is events.LinkClosed
+    assert set(seen[:-1]) == {Attitude}
+
+
+async def test_enders_that_raise_do_not_keep_the_end_from_others(
+    link: MemoryLink, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with open_connection(link) as connection:
+        told: list[Exception] = []
+        connection.on_end(broken)
+        connection.on_end(told.append)
+        with caplog.at_level(logging.CRITICAL, "aerokit"):
+            connection.close()
+        assert [type(error) for error in told] == [ConnectionClosed]
+        connection.on_end(told.append)
+        assert len(told) == 2  # who comes late is told at once
+
+
+async def test_a_link_is_used_once() -> None:
+    near, far = memory_link_pair()
+    async with open_connection(near):
+        with pytest.raises(BusyError, match="opened once"):
+            async with open_connection(near):
+                pytest.fail("it is open already")
+    with pytest.raises(ConnectionClosed, match="make a new link"):
+        async with open_connection(near):
+            pytest.fail("it was closed")
+    far.close()
+
+
+async def test_a_vehicle_whose_block_was_left_on_a_connection_that_stays(link: MemoryLink) -> None:
+    async with open_connection(link) as connection:
+        async with connect(connection) as vehicle:
+            waiting = asyncio.ensure_future(vehicle.mode.wait_until(lambda _: False))
+            await anyio.sleep(0.1)
+        with pytest.raises(ConnectionClosed, match="block of this vehicle"):
+            await waiting
+        with pytest.raises(ConnectionClosed):
+            await vehicle.arm()
+        with pytest.raises(OperationTimeout), connection.subscribe(events.VehicleSilent) as silence:
+            await silence.get(timeout=10)
+
+
+# ------------------------------------------------------------------------------ reentrancy
+
+
+async def test_a_sink_may_subscribe_send_and_detach(link: MemoryLink) -> None:
+    async with open_connection(link) as connection:
+        heard: list[str] = []
+
+        def first(heartbeat: Heartbeat) -> None:
+            heard.append("first")
+            detach()
+            connection.bus.attach(Heartbeat, lambda _: heard.append("new"))
+            connection.send(COPTER)
+
+        detach = connection.bus.attach(Heartbeat, first)
+        connection.bytes_received(FrameEncoder(9, 1).encode(COPTER), None)
+        assert heard == ["first"]
+        connection.bytes_received(FrameEncoder(9, 1).encode(COPTER), None)
+        assert heard == ["first", "new"]
+
+
+async def test_a_subscription_is_entered_once(link: MemoryLink) -> None:
+    async with open_connection(link) as connection:
+        subscription = connection.subscribe(Heartbeat)
+        with subscription, pytest.raises(BusyError, match="entered once"):
+            subscription.__enter__()
+        with pytest.raises(BusyError, match="entered once"):
+            subscription.__enter__()
+
+
+async def test_an_old_vehicle_speaks_mavlink_1(link: MemoryLink) -> None:
+    async with connect(link, mavlink_version=1) as vehicle:
+        await vehicle.wait_ready()
+        await vehicle.set_mode("GUIDED")
+        await vehicle.arm()
+        await anyio.sleep(5)
+        assert vehicle.connection.is_open
