@@ -46,7 +46,7 @@ SIZES = {
 _RESERVED = frozenset(
     (
         *("ID", "NAME", "CRC_EXTRA", "FIELDS", "LENGTH", "BASE_LENGTH", "received_frame"),
-        *("decode", "encode", "to_dict", "self", "cls"),
+        *("decode", "decode_body", "encode", "to_dict", "self", "cls"),
     )
 )
 _IDENTIFIER = re.compile(r"[A-Za-z][A-Za-z0-9_]*\Z")

@@ -105,12 +105,12 @@ class Dialect:
 
     def decode(self, frame: Frame) -> Message:
         """The message of a frame, its ``received_frame`` set; KeyError when the dialect does not know the id."""
-        return self._decoders[frame.message_id](frame.payload, frame)
+        return self._decoders[frame.message_id](frame.body, frame)
 
-    def _decode_first(self, message_id: int, payload: bytes, frame: Frame | None) -> Message:
+    def _decode_first(self, message_id: int, body: bytes, frame: Frame | None) -> Message:
         """Stands in for a class that is not loaded yet, so that `decode` need not ask each time."""
-        decoder = self._decoders[message_id] = self[message_id].decode
-        return decoder(payload, frame)
+        decoder = self._decoders[message_id] = self[message_id].decode_body
+        return decoder(body, frame)
 
     def extended_by(self, other: Dialect) -> Dialect:
         """Both together. LocalProtocolError when an id means one message here and another there."""

@@ -14,19 +14,20 @@ MAGIC_V2 = 0xFD
 SIGNED = 0x01
 """The one incompatibility flag that exists: the frame ends with 13 bytes of signature."""
 
+HEADER_LENGTH = 9  # without the magic byte
 SIGNATURE_LENGTH = 13
 
 
 class Frame:
     """One frame whose checksum was right. Treat it as immutable: it is shared by everyone who listens."""
 
-    # No constructor: the framer fills in what it has read already, and making an object without one is faster.
-    __slots__ = ("component_id", "message_id", "payload", "raw", "received_at", "system_id")
+    # No constructor: the framer fills in what it has at hand, the rest is worked out when somebody asks.
+    __slots__ = ("_raw", "body", "checksum", "component_id", "message_id", "received_at", "system_id")
 
-    raw: bytes
-    """The whole frame, from the magic byte to the end of checksum or signature."""
-    payload: bytes
-    """The payload as on the wire: MAVLink 2 cuts zeros off its end."""
+    body: bytes
+    """What the checksum covers: nine bytes of header, then the payload; of MAVLink 1 too, as MAVLink 2 has it."""
+    checksum: int
+    """As on the wire, 0..65535."""
     message_id: int
     """The standard's number of the message, 0..16777215."""
     system_id: int
@@ -40,21 +41,35 @@ class Frame:
     def parse(cls, raw: bytes, received_at: float = 0.0) -> Frame:
         """Take a frame that is known to be whole and right, out of a log for example, apart."""
         frame = cls()
-        frame.raw = raw
+        frame._raw = raw
         frame.received_at = received_at
+        upto = raw[1] + (6 if raw[0] == MAGIC_V1 else 10)
+        frame.checksum = int.from_bytes(raw[upto : upto + 2], "little")
         if raw[0] == MAGIC_V1:
-            frame.system_id, frame.component_id, frame.message_id = raw[3:6]
-            frame.payload = raw[6 : 6 + raw[1]]
+            frame.body = bytes((raw[1], 0, 0, *raw[2:6], 0, 0)) + raw[6:upto]
         else:
-            frame.system_id, frame.component_id = raw[5:7]
-            frame.message_id = int.from_bytes(raw[7:10], "little")
-            frame.payload = raw[10 : 10 + raw[1]]
+            frame.body = raw[1:upto]
+        frame.system_id, frame.component_id = frame.body[4:6]
+        frame.message_id = int.from_bytes(frame.body[6:9], "little")
         return frame
+
+    @property
+    def raw(self) -> bytes:
+        """The whole frame, from the magic byte to the end of checksum or signature."""
+        try:
+            return self._raw
+        except AttributeError:
+            return b"\xfd" + self.body + self.checksum.to_bytes(2, "little")
+
+    @property
+    def payload(self) -> bytes:
+        """The payload as on the wire: MAVLink 2 cuts zeros off its end."""
+        return self.body[HEADER_LENGTH:]
 
     @property
     def sequence(self) -> int:
         """The sender's counter, 0..255, then from 0 again."""
-        return self.raw[2] if self.raw[0] == MAGIC_V1 else self.raw[4]
+        return self.body[3]
 
     @property
     def version(self) -> int:
@@ -64,12 +79,12 @@ class Frame:
     @property
     def incompat_flags(self) -> int:
         """What a receiver must understand to read it: 0, or `SIGNED`."""
-        return 0 if self.raw[0] == MAGIC_V1 else self.raw[2]
+        return self.body[1]
 
     @property
     def compat_flags(self) -> int:
         """What a receiver may ignore."""
-        return 0 if self.raw[0] == MAGIC_V1 else self.raw[3]
+        return self.body[2]
 
     @property
     def signature(self) -> bytes:

@@ -37,8 +37,8 @@ _UNKNOWN = 3  # a whole frame of an unknown message, if it is one
 _BAD_CRC = 4
 _NOISE = 5
 
-_Found = tuple[int, int, int, int, int, int, int]
-"""Begin, message id, sequence, source, payload from and to, end."""
+_Found = tuple[int, int, int, int, int]
+"""Begin, end, message id, sequence, source."""
 
 
 class Framer:
@@ -80,18 +80,19 @@ class Framer:
             try:
                 magic, length, flags, sequence, key, message_id = _HEADER_V2(data, begin)
                 message_id &= 0xFFFFFF
-                body = begin + 10
-                upto = body + length
+                upto = begin + 10 + length
                 end = upto + 15 if flags else upto + 2
+                body = data[begin + 1 : upto]
+                (checksum,) = _CHECKSUM(data, upto)
                 good = (
                     magic == 0xFD
                     and flags <= 1
                     and end <= size
-                    and x25(data[begin + 1 : upto] + extras[message_id]) == _CHECKSUM(data, upto)[0]
+                    and x25(body + extras[message_id]) == checksum
                 )
             except (StructError, KeyError):
-                good, message_id = False, 0
-                body = upto = end = sequence = key = 0
+                good, body = False, b""
+                flags = end = sequence = key = message_id = checksum = 0
             if not good:
                 found = self._search(data, begin)
                 if self._unknown:
@@ -99,7 +100,7 @@ class Framer:
                     self._unknown.clear()
                 if found is None:
                     break
-                begin, message_id, sequence, key, body, upto, end = found
+                begin, end, message_id, sequence, key = found
             try:
                 source = sources[key]
             except KeyError:
@@ -109,13 +110,16 @@ class Framer:
             else:
                 source.out_of_order(sequence)
             if wanted is None or message_id in wanted:
-                frame = Frame()
-                frame.raw = data[begin:end]
-                frame.payload = data[body:upto]
-                frame.message_id = message_id
-                frame.system_id = source.system_id
-                frame.component_id = source.component_id
-                frame.received_at = now
+                if good and not flags:
+                    frame = Frame()
+                    frame.body = body
+                    frame.checksum = checksum
+                    frame.message_id = message_id
+                    frame.system_id = source.system_id
+                    frame.component_id = source.component_id
+                    frame.received_at = now
+                else:
+                    frame = Frame.parse(data[begin:end], now)
                 frames.append(frame)
             begin = end
         return frames
@@ -222,4 +226,4 @@ class Framer:
         upto = body + length
         if x25(data[begin + 1 : upto] + bytes((extra,))) != _CHECKSUM(data, upto)[0]:
             return _BAD_CRC, end, None
-        return _GOOD, end, (begin, message_id, sequence, key, body, upto, end)
+        return _GOOD, end, (begin, end, message_id, sequence, key)

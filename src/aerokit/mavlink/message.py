@@ -6,6 +6,7 @@ import struct
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from aerokit.errors import LocalProtocolError
+from aerokit.mavlink.frame import HEADER_LENGTH
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -25,6 +26,7 @@ __all__ = ["Field", "Message"]
 PACK_ERRORS = (struct.error, OverflowError, TypeError, ValueError, AttributeError)
 """What packing a wrong value can raise; the generated classes turn it into LocalProtocolError."""
 
+_ANY_HEADER = bytes(HEADER_LENGTH)
 _RANGES = {
     "int8_t": (-(1 << 7), (1 << 7) - 1),
     "uint8_t": (0, (1 << 8) - 1),
@@ -133,11 +135,16 @@ class Message:
     received_frame: Frame | None
     """The frame this was decoded from: who sent it and when it came. None when the program built it."""
 
+    @classmethod
+    def decode(cls, payload: bytes, frame: Frame | None = None) -> Self:
+        """Make a message of a payload off the wire; trimmed zeros are restored, unknown extensions ignored."""
+        return cls.decode_body(_ANY_HEADER + payload, frame)
+
     if TYPE_CHECKING:
 
         @classmethod
-        def decode(cls, payload: bytes, frame: Frame | None = None) -> Self:
-            """Make a message of a payload off the wire; trimmed zeros are restored, unknown extensions ignored."""
+        def decode_body(cls, body: bytes, frame: Frame | None = None) -> Self:
+            """The same of `Frame.body`, where a header is before the payload; a frame is decoded this way."""
             raise NotImplementedError
 
         def encode(self) -> bytes:

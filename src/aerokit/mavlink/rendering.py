@@ -10,6 +10,7 @@ import textwrap
 from collections.abc import Iterable
 
 from aerokit.mavlink.definitions import EntryDefinition, EnumDefinition, FieldDefinition, MessageDefinition
+from aerokit.mavlink.frame import HEADER_LENGTH
 
 __all__ = ["render_enum_row", "render_enum_stub", "render_message"]
 
@@ -226,25 +227,18 @@ def _init(message: MessageDefinition) -> list[str]:
 
 
 def _decode(message: MessageDefinition) -> list[str]:
-    struct, length = f"_S{message.id}", message.length
+    unpacked = f"_S{message.id}.unpack_from(body, {HEADER_LENGTH})"
     lines = [
         "    @classmethod",
-        f"    def decode(cls, payload: bytes, frame: Frame | None = None) -> {message.class_name}:",
+        f"    def decode_body(cls, body: bytes, frame: Frame | None = None) -> {message.class_name}:",
+        f'        body = body.ljust({HEADER_LENGTH + message.length}, b"\\0")',
     ]
-    if length:
-        lines += [
-            "        size = len(payload)",
-            f"        if size < {length}:",
-            f'            payload = payload.ljust({length}, b"\\0")',
-            f"        elif size > {length}:",
-            f"            payload = payload[:{length}]",
-        ]
     lines += ["        self = _new(cls)", "        self.received_frame = frame"]
     if not message.fields:
         return [*lines, "        return self"]
     fields = message.wire_fields
     if any(_is_tuple(f) and f.array_length > _UNPACKED_ONE_BY_ONE for f in fields):
-        return [*lines, *_decode_by_index(fields, struct), "        return self"]
+        return [*lines, *_decode_by_index(fields, unpacked), "        return self"]
     targets: list[str] = []
     after: list[str] = []
     for number, f in enumerate(fields):
@@ -258,12 +252,12 @@ def _decode(message: MessageDefinition) -> list[str]:
             after.append(f"        self.{f.attribute} = {_text(f'v{number}')}")
         else:
             targets.append(f"self.{f.attribute}")
-    lines += _filled("        (", targets, f") = {struct}.unpack(payload)", "        ")
+    lines += _filled("        (", targets, f") = {unpacked}", "        ")
     return [*lines, *after, "        return self"]
 
 
-def _decode_by_index(fields: Iterable[FieldDefinition], struct: str) -> list[str]:
-    lines = [f"        values = {struct}.unpack(payload)"]
+def _decode_by_index(fields: Iterable[FieldDefinition], unpacked: str) -> list[str]:
+    lines = [f"        values = {unpacked}"]
     index = 0
     for f in fields:
         if _is_tuple(f):

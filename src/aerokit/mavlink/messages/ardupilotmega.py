@@ -210,19 +210,15 @@ class SensorOffsets(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> SensorOffsets:
-        size = len(payload)
-        if size < 42:
-            payload = payload.ljust(42, b"\0")
-        elif size > 42:
-            payload = payload[:42]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> SensorOffsets:
+        body = body.ljust(51, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.mag_declination, self.raw_press, self.raw_temp, self.gyro_cal_x, self.gyro_cal_y,
             self.gyro_cal_z, self.accel_cal_x, self.accel_cal_y, self.accel_cal_z, self.mag_ofs_x,
             self.mag_ofs_y, self.mag_ofs_z,
-        ) = _S150.unpack(payload)
+        ) = _S150.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -288,17 +284,13 @@ class SetMagOffsets(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> SetMagOffsets:
-        size = len(payload)
-        if size < 8:
-            payload = payload.ljust(8, b"\0")
-        elif size > 8:
-            payload = payload[:8]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> SetMagOffsets:
+        body = body.ljust(17, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.mag_ofs_x, self.mag_ofs_y, self.mag_ofs_z, self.target_system, self.target_component,
-        ) = _S151.unpack(payload)
+        ) = _S151.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -348,15 +340,11 @@ class Meminfo(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> Meminfo:
-        size = len(payload)
-        if size < 8:
-            payload = payload.ljust(8, b"\0")
-        elif size > 8:
-            payload = payload[:8]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> Meminfo:
+        body = body.ljust(17, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.brkval, self.freemem, self.freemem32) = _S152.unpack(payload)
+        (self.brkval, self.freemem, self.freemem32) = _S152.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -419,15 +407,11 @@ class ApAdc(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> ApAdc:
-        size = len(payload)
-        if size < 12:
-            payload = payload.ljust(12, b"\0")
-        elif size > 12:
-            payload = payload[:12]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> ApAdc:
+        body = body.ljust(21, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.adc1, self.adc2, self.adc3, self.adc4, self.adc5, self.adc6) = _S153.unpack(payload)
+        (self.adc1, self.adc2, self.adc3, self.adc4, self.adc5, self.adc6) = _S153.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -527,19 +511,15 @@ class DigicamConfigure(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> DigicamConfigure:
-        size = len(payload)
-        if size < 15:
-            payload = payload.ljust(15, b"\0")
-        elif size > 15:
-            payload = payload[:15]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> DigicamConfigure:
+        body = body.ljust(24, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.extra_value, self.shutter_speed, self.target_system, self.target_component, self.mode,
             self.aperture, self.iso, self.exposure_type, self.command_id, self.engine_cut_off,
             self.extra_param,
-        ) = _S154.unpack(payload)
+        ) = _S154.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -637,18 +617,14 @@ class DigicamControl(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> DigicamControl:
-        size = len(payload)
-        if size < 13:
-            payload = payload.ljust(13, b"\0")
-        elif size > 13:
-            payload = payload[:13]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> DigicamControl:
+        body = body.ljust(22, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.extra_value, self.target_system, self.target_component, self.session, self.zoom_pos,
             self.zoom_step, self.focus_lock, self.shot, self.command_id, self.extra_param,
-        ) = _S155.unpack(payload)
+        ) = _S155.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -719,18 +695,14 @@ class MountConfigure(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> MountConfigure:
-        size = len(payload)
-        if size < 6:
-            payload = payload.ljust(6, b"\0")
-        elif size > 6:
-            payload = payload[:6]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> MountConfigure:
+        body = body.ljust(15, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.target_system, self.target_component, self.mount_mode, self.stab_roll, self.stab_pitch,
             self.stab_yaw,
-        ) = _S156.unpack(payload)
+        ) = _S156.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -801,18 +773,14 @@ class MountControl(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> MountControl:
-        size = len(payload)
-        if size < 15:
-            payload = payload.ljust(15, b"\0")
-        elif size > 15:
-            payload = payload[:15]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> MountControl:
+        body = body.ljust(24, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.input_a, self.input_b, self.input_c, self.target_system, self.target_component,
             self.save_position,
-        ) = _S157.unpack(payload)
+        ) = _S157.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -883,18 +851,14 @@ class MountStatus(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> MountStatus:
-        size = len(payload)
-        if size < 15:
-            payload = payload.ljust(15, b"\0")
-        elif size > 15:
-            payload = payload[:15]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> MountStatus:
+        body = body.ljust(24, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.pointing_a, self.pointing_b, self.pointing_c, self.target_system, self.target_component,
             self.mount_mode,
-        ) = _S158.unpack(payload)
+        ) = _S158.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -963,17 +927,13 @@ class FencePoint(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> FencePoint:
-        size = len(payload)
-        if size < 12:
-            payload = payload.ljust(12, b"\0")
-        elif size > 12:
-            payload = payload[:12]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> FencePoint:
+        body = body.ljust(21, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.lat, self.lng, self.target_system, self.target_component, self.idx, self.count,
-        ) = _S160.unpack(payload)
+        ) = _S160.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -1023,15 +983,11 @@ class FenceFetchPoint(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> FenceFetchPoint:
-        size = len(payload)
-        if size < 3:
-            payload = payload.ljust(3, b"\0")
-        elif size > 3:
-            payload = payload[:3]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> FenceFetchPoint:
+        body = body.ljust(12, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.target_system, self.target_component, self.idx) = _S161.unpack(payload)
+        (self.target_system, self.target_component, self.idx) = _S161.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -1102,18 +1058,14 @@ class Ahrs(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> Ahrs:
-        size = len(payload)
-        if size < 28:
-            payload = payload.ljust(28, b"\0")
-        elif size > 28:
-            payload = payload[:28]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> Ahrs:
+        body = body.ljust(37, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.omegaIx, self.omegaIy, self.omegaIz, self.accel_weight, self.renorm_val, self.error_rp,
             self.error_yaw,
-        ) = _S163.unpack(payload)
+        ) = _S163.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -1207,18 +1159,14 @@ class Simstate(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> Simstate:
-        size = len(payload)
-        if size < 44:
-            payload = payload.ljust(44, b"\0")
-        elif size > 44:
-            payload = payload[:44]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> Simstate:
+        body = body.ljust(53, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.roll, self.pitch, self.yaw, self.xacc, self.yacc, self.zacc, self.xgyro, self.ygyro,
             self.zgyro, self.lat, self.lng,
-        ) = _S164.unpack(payload)
+        ) = _S164.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -1267,15 +1215,11 @@ class Hwstatus(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> Hwstatus:
-        size = len(payload)
-        if size < 3:
-            payload = payload.ljust(3, b"\0")
-        elif size > 3:
-            payload = payload[:3]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> Hwstatus:
+        body = body.ljust(12, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.Vcc, self.I2Cerr) = _S165.unpack(payload)
+        (self.Vcc, self.I2Cerr) = _S165.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -1347,17 +1291,13 @@ class Radio(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> Radio:
-        size = len(payload)
-        if size < 9:
-            payload = payload.ljust(9, b"\0")
-        elif size > 9:
-            payload = payload[:9]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> Radio:
+        body = body.ljust(18, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.rxerrors, self.fixed, self.rssi, self.remrssi, self.txbuf, self.noise, self.remnoise,
-        ) = _S166.unpack(payload)
+        ) = _S166.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -1446,18 +1386,14 @@ class LimitsStatus(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> LimitsStatus:
-        size = len(payload)
-        if size < 22:
-            payload = payload.ljust(22, b"\0")
-        elif size > 22:
-            payload = payload[:22]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> LimitsStatus:
+        body = body.ljust(31, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.last_trigger, self.last_action, self.last_recovery, self.last_clear, self.breach_count,
             self.limits_state, self.mods_enabled, self.mods_required, self.mods_triggered,
-        ) = _S167.unpack(payload)
+        ) = _S167.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -1508,15 +1444,11 @@ class Wind(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> Wind:
-        size = len(payload)
-        if size < 12:
-            payload = payload.ljust(12, b"\0")
-        elif size > 12:
-            payload = payload[:12]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> Wind:
+        body = body.ljust(21, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.direction, self.speed, self.speed_z) = _S168.unpack(payload)
+        (self.direction, self.speed, self.speed_z) = _S168.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -1564,15 +1496,11 @@ class Data16(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> Data16:
-        size = len(payload)
-        if size < 18:
-            payload = payload.ljust(18, b"\0")
-        elif size > 18:
-            payload = payload[:18]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> Data16:
+        body = body.ljust(27, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.type, self.len, self.data) = _S169.unpack(payload)
+        (self.type, self.len, self.data) = _S169.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -1620,15 +1548,11 @@ class Data32(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> Data32:
-        size = len(payload)
-        if size < 34:
-            payload = payload.ljust(34, b"\0")
-        elif size > 34:
-            payload = payload[:34]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> Data32:
+        body = body.ljust(43, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.type, self.len, self.data) = _S170.unpack(payload)
+        (self.type, self.len, self.data) = _S170.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -1676,15 +1600,11 @@ class Data64(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> Data64:
-        size = len(payload)
-        if size < 66:
-            payload = payload.ljust(66, b"\0")
-        elif size > 66:
-            payload = payload[:66]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> Data64:
+        body = body.ljust(75, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.type, self.len, self.data) = _S171.unpack(payload)
+        (self.type, self.len, self.data) = _S171.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -1732,15 +1652,11 @@ class Data96(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> Data96:
-        size = len(payload)
-        if size < 98:
-            payload = payload.ljust(98, b"\0")
-        elif size > 98:
-            payload = payload[:98]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> Data96:
+        body = body.ljust(107, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.type, self.len, self.data) = _S172.unpack(payload)
+        (self.type, self.len, self.data) = _S172.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -1783,15 +1699,11 @@ class Rangefinder(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> Rangefinder:
-        size = len(payload)
-        if size < 8:
-            payload = payload.ljust(8, b"\0")
-        elif size > 8:
-            payload = payload[:8]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> Rangefinder:
+        body = body.ljust(17, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.distance, self.voltage) = _S173.unpack(payload)
+        (self.distance, self.voltage) = _S173.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -1893,18 +1805,14 @@ class AirspeedAutocal(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> AirspeedAutocal:
-        size = len(payload)
-        if size < 48:
-            payload = payload.ljust(48, b"\0")
-        elif size > 48:
-            payload = payload[:48]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> AirspeedAutocal:
+        body = body.ljust(57, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.vx, self.vy, self.vz, self.diff_pressure, self.EAS2TAS, self.ratio, self.state_x,
             self.state_y, self.state_z, self.Pax, self.Pby, self.Pcz,
-        ) = _S174.unpack(payload)
+        ) = _S174.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -2000,18 +1908,14 @@ class RallyPoint(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> RallyPoint:
-        size = len(payload)
-        if size < 19:
-            payload = payload.ljust(19, b"\0")
-        elif size > 19:
-            payload = payload[:19]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> RallyPoint:
+        body = body.ljust(28, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.lat, self.lng, self.alt, self.break_alt, self.land_dir, self.target_system,
             self.target_component, self.idx, self.count, self.flags,
-        ) = _S175.unpack(payload)
+        ) = _S175.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -2063,15 +1967,11 @@ class RallyFetchPoint(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> RallyFetchPoint:
-        size = len(payload)
-        if size < 3:
-            payload = payload.ljust(3, b"\0")
-        elif size > 3:
-            payload = payload[:3]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> RallyFetchPoint:
+        body = body.ljust(12, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.target_system, self.target_component, self.idx) = _S176.unpack(payload)
+        (self.target_system, self.target_component, self.idx) = _S176.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -2139,18 +2039,14 @@ class CompassmotStatus(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> CompassmotStatus:
-        size = len(payload)
-        if size < 20:
-            payload = payload.ljust(20, b"\0")
-        elif size > 20:
-            payload = payload[:20]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> CompassmotStatus:
+        body = body.ljust(29, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.current, self.CompensationX, self.CompensationY, self.CompensationZ, self.throttle,
             self.interference,
-        ) = _S177.unpack(payload)
+        ) = _S177.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -2216,15 +2112,11 @@ class Ahrs2(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> Ahrs2:
-        size = len(payload)
-        if size < 24:
-            payload = payload.ljust(24, b"\0")
-        elif size > 24:
-            payload = payload[:24]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> Ahrs2:
+        body = body.ljust(33, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.roll, self.pitch, self.yaw, self.altitude, self.lat, self.lng) = _S178.unpack(payload)
+        (self.roll, self.pitch, self.yaw, self.altitude, self.lat, self.lng) = _S178.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -2305,18 +2197,14 @@ class CameraStatus(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> CameraStatus:
-        size = len(payload)
-        if size < 29:
-            payload = payload.ljust(29, b"\0")
-        elif size > 29:
-            payload = payload[:29]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> CameraStatus:
+        body = body.ljust(38, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_usec, self.p1, self.p2, self.p3, self.p4, self.img_idx, self.target_system,
             self.cam_idx, self.event_id,
-        ) = _S179.unpack(payload)
+        ) = _S179.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -2434,18 +2322,14 @@ class CameraFeedback(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> CameraFeedback:
-        size = len(payload)
-        if size < 47:
-            payload = payload.ljust(47, b"\0")
-        elif size > 47:
-            payload = payload[:47]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> CameraFeedback:
+        body = body.ljust(56, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_usec, self.lat, self.lng, self.alt_msl, self.alt_rel, self.roll, self.pitch, self.yaw,
             self.foc_len, self.img_idx, self.target_system, self.cam_idx, self.flags, self.completed_captures,
-        ) = _S180.unpack(payload)
+        ) = _S180.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -2494,15 +2378,11 @@ class Battery2(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> Battery2:
-        size = len(payload)
-        if size < 4:
-            payload = payload.ljust(4, b"\0")
-        elif size > 4:
-            payload = payload[:4]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> Battery2:
+        body = body.ljust(13, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.voltage, self.current_battery) = _S181.unpack(payload)
+        (self.voltage, self.current_battery) = _S181.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -2589,18 +2469,14 @@ class Ahrs3(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> Ahrs3:
-        size = len(payload)
-        if size < 40:
-            payload = payload.ljust(40, b"\0")
-        elif size > 40:
-            payload = payload[:40]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> Ahrs3:
+        body = body.ljust(49, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.roll, self.pitch, self.yaw, self.altitude, self.lat, self.lng, self.v1, self.v2, self.v3,
             self.v4,
-        ) = _S182.unpack(payload)
+        ) = _S182.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -2646,15 +2522,11 @@ class AutopilotVersionRequest(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> AutopilotVersionRequest:
-        size = len(payload)
-        if size < 2:
-            payload = payload.ljust(2, b"\0")
-        elif size > 2:
-            payload = payload[:2]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> AutopilotVersionRequest:
+        body = body.ljust(11, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.target_system, self.target_component) = _S183.unpack(payload)
+        (self.target_system, self.target_component) = _S183.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -2707,15 +2579,11 @@ class RemoteLogDataBlock(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> RemoteLogDataBlock:
-        size = len(payload)
-        if size < 206:
-            payload = payload.ljust(206, b"\0")
-        elif size > 206:
-            payload = payload[:206]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> RemoteLogDataBlock:
+        body = body.ljust(215, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.seqno, self.target_system, self.target_component, self.data) = _S184.unpack(payload)
+        (self.seqno, self.target_system, self.target_component, self.data) = _S184.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -2770,15 +2638,11 @@ class RemoteLogBlockStatus(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> RemoteLogBlockStatus:
-        size = len(payload)
-        if size < 7:
-            payload = payload.ljust(7, b"\0")
-        elif size > 7:
-            payload = payload[:7]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> RemoteLogBlockStatus:
+        body = body.ljust(16, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.seqno, self.target_system, self.target_component, self.status) = _S185.unpack(payload)
+        (self.seqno, self.target_system, self.target_component, self.status) = _S185.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -2846,18 +2710,14 @@ class LedControl(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> LedControl:
-        size = len(payload)
-        if size < 29:
-            payload = payload.ljust(29, b"\0")
-        elif size > 29:
-            payload = payload[:29]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> LedControl:
+        body = body.ljust(38, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.target_system, self.target_component, self.instance, self.pattern, self.custom_len,
             self.custom_bytes,
-        ) = _S186.unpack(payload)
+        ) = _S186.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -2947,18 +2807,14 @@ class MagCalProgress(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> MagCalProgress:
-        size = len(payload)
-        if size < 27:
-            payload = payload.ljust(27, b"\0")
-        elif size > 27:
-            payload = payload[:27]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> MagCalProgress:
+        body = body.ljust(36, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.direction_x, self.direction_y, self.direction_z, self.compass_id, self.cal_mask,
             self.cal_status, self.attempt, self.completion_pct, self.completion_mask,
-        ) = _S191.unpack(payload)
+        ) = _S191.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -3038,18 +2894,14 @@ class EkfStatusReport(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> EkfStatusReport:
-        size = len(payload)
-        if size < 26:
-            payload = payload.ljust(26, b"\0")
-        elif size > 26:
-            payload = payload[:26]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> EkfStatusReport:
+        body = body.ljust(35, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.velocity_variance, self.pos_horiz_variance, self.pos_vert_variance, self.compass_variance,
             self.terrain_alt_variance, self.flags, self.airspeed_variance,
-        ) = _S193.unpack(payload)
+        ) = _S193.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -3133,17 +2985,13 @@ class PidTuning(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> PidTuning:
-        size = len(payload)
-        if size < 33:
-            payload = payload.ljust(33, b"\0")
-        elif size > 33:
-            payload = payload[:33]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> PidTuning:
+        body = body.ljust(42, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.desired, self.achieved, self.FF, self.P, self.I, self.D, self.axis, self.SRate, self.PDmod,
-        ) = _S194.unpack(payload)
+        ) = _S194.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -3239,19 +3087,15 @@ class Deepstall(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> Deepstall:
-        size = len(payload)
-        if size < 37:
-            payload = payload.ljust(37, b"\0")
-        elif size > 37:
-            payload = payload[:37]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> Deepstall:
+        body = body.ljust(46, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.landing_lat, self.landing_lon, self.path_lat, self.path_lon, self.arc_entry_lat,
             self.arc_entry_lon, self.altitude, self.expected_travel_distance, self.cross_track_error,
             self.stage,
-        ) = _S195.unpack(payload)
+        ) = _S195.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -3358,19 +3202,15 @@ class GimbalReport(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> GimbalReport:
-        size = len(payload)
-        if size < 42:
-            payload = payload.ljust(42, b"\0")
-        elif size > 42:
-            payload = payload[:42]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> GimbalReport:
+        body = body.ljust(51, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.delta_time, self.delta_angle_x, self.delta_angle_y, self.delta_angle_z,
             self.delta_velocity_x, self.delta_velocity_y, self.delta_velocity_z, self.joint_roll,
             self.joint_el, self.joint_az, self.target_system, self.target_component,
-        ) = _S200.unpack(payload)
+        ) = _S200.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -3437,18 +3277,14 @@ class GimbalControl(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> GimbalControl:
-        size = len(payload)
-        if size < 14:
-            payload = payload.ljust(14, b"\0")
-        elif size > 14:
-            payload = payload[:14]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> GimbalControl:
+        body = body.ljust(23, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.demanded_rate_x, self.demanded_rate_y, self.demanded_rate_z, self.target_system,
             self.target_component,
-        ) = _S201.unpack(payload)
+        ) = _S201.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -3512,18 +3348,14 @@ class GimbalTorqueCmdReport(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> GimbalTorqueCmdReport:
-        size = len(payload)
-        if size < 8:
-            payload = payload.ljust(8, b"\0")
-        elif size > 8:
-            payload = payload[:8]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> GimbalTorqueCmdReport:
+        body = body.ljust(17, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.rl_torque_cmd, self.el_torque_cmd, self.az_torque_cmd, self.target_system,
             self.target_component,
-        ) = _S214.unpack(payload)
+        ) = _S214.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -3574,15 +3406,11 @@ class GoproHeartbeat(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> GoproHeartbeat:
-        size = len(payload)
-        if size < 3:
-            payload = payload.ljust(3, b"\0")
-        elif size > 3:
-            payload = payload[:3]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> GoproHeartbeat:
+        body = body.ljust(12, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.status, self.capture_mode, self.flags) = _S215.unpack(payload)
+        (self.status, self.capture_mode, self.flags) = _S215.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -3630,15 +3458,11 @@ class GoproGetRequest(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> GoproGetRequest:
-        size = len(payload)
-        if size < 3:
-            payload = payload.ljust(3, b"\0")
-        elif size > 3:
-            payload = payload[:3]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> GoproGetRequest:
+        body = body.ljust(12, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.target_system, self.target_component, self.cmd_id) = _S216.unpack(payload)
+        (self.target_system, self.target_component, self.cmd_id) = _S216.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -3686,15 +3510,11 @@ class GoproGetResponse(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> GoproGetResponse:
-        size = len(payload)
-        if size < 6:
-            payload = payload.ljust(6, b"\0")
-        elif size > 6:
-            payload = payload[:6]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> GoproGetResponse:
+        body = body.ljust(15, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.cmd_id, self.status, self.value) = _S217.unpack(payload)
+        (self.cmd_id, self.status, self.value) = _S217.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -3747,15 +3567,11 @@ class GoproSetRequest(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> GoproSetRequest:
-        size = len(payload)
-        if size < 7:
-            payload = payload.ljust(7, b"\0")
-        elif size > 7:
-            payload = payload[:7]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> GoproSetRequest:
+        body = body.ljust(16, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.target_system, self.target_component, self.cmd_id, self.value) = _S218.unpack(payload)
+        (self.target_system, self.target_component, self.cmd_id, self.value) = _S218.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -3800,15 +3616,11 @@ class GoproSetResponse(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> GoproSetResponse:
-        size = len(payload)
-        if size < 2:
-            payload = payload.ljust(2, b"\0")
-        elif size > 2:
-            payload = payload[:2]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> GoproSetResponse:
+        body = body.ljust(11, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.cmd_id, self.status) = _S219.unpack(payload)
+        (self.cmd_id, self.status) = _S219.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -3851,15 +3663,11 @@ class Rpm(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> Rpm:
-        size = len(payload)
-        if size < 8:
-            payload = payload.ljust(8, b"\0")
-        elif size > 8:
-            payload = payload[:8]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> Rpm:
+        body = body.ljust(17, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.rpm1, self.rpm2) = _S226.unpack(payload)
+        (self.rpm1, self.rpm2) = _S226.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -3951,18 +3759,14 @@ class DeviceOpRead(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> DeviceOpRead:
-        size = len(payload)
-        if size < 52:
-            payload = payload.ljust(52, b"\0")
-        elif size > 52:
-            payload = payload[:52]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> DeviceOpRead:
+        body = body.ljust(61, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.request_id, self.target_system, self.target_component, self.bustype, self.bus, self.address,
             v6, self.regstart, self.count, self.bank,
-        ) = _S11000.unpack(payload)
+        ) = _S11000.unpack_from(body, 9)
         self.busname = v6.partition(b"\0")[0].decode("utf-8", "replace")
         return self
 
@@ -4031,17 +3835,13 @@ class DeviceOpReadReply(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> DeviceOpReadReply:
-        size = len(payload)
-        if size < 136:
-            payload = payload.ljust(136, b"\0")
-        elif size > 136:
-            payload = payload[:136]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> DeviceOpReadReply:
+        body = body.ljust(145, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.request_id, self.result, self.regstart, self.count, self.data, self.bank,
-        ) = _S11001.unpack(payload)
+        ) = _S11001.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -4141,18 +3941,14 @@ class DeviceOpWrite(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> DeviceOpWrite:
-        size = len(payload)
-        if size < 180:
-            payload = payload.ljust(180, b"\0")
-        elif size > 180:
-            payload = payload[:180]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> DeviceOpWrite:
+        body = body.ljust(189, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.request_id, self.target_system, self.target_component, self.bustype, self.bus, self.address,
             v6, self.regstart, self.count, self.data, self.bank,
-        ) = _S11002.unpack(payload)
+        ) = _S11002.unpack_from(body, 9)
         self.busname = v6.partition(b"\0")[0].decode("utf-8", "replace")
         return self
 
@@ -4200,15 +3996,11 @@ class DeviceOpWriteReply(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> DeviceOpWriteReply:
-        size = len(payload)
-        if size < 5:
-            payload = payload.ljust(5, b"\0")
-        elif size > 5:
-            payload = payload[:5]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> DeviceOpWriteReply:
+        body = body.ljust(14, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.request_id, self.result) = _S11003.unpack(payload)
+        (self.request_id, self.result) = _S11003.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -4288,18 +4080,14 @@ class SecureCommand(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> SecureCommand:
-        size = len(payload)
-        if size < 232:
-            payload = payload.ljust(232, b"\0")
-        elif size > 232:
-            payload = payload[:232]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> SecureCommand:
+        body = body.ljust(241, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.sequence, self.operation, self.target_system, self.target_component, self.data_length,
             self.sig_length, self.data,
-        ) = _S11004.unpack(payload)
+        ) = _S11004.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -4360,15 +4148,13 @@ class SecureCommandReply(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> SecureCommandReply:
-        size = len(payload)
-        if size < 230:
-            payload = payload.ljust(230, b"\0")
-        elif size > 230:
-            payload = payload[:230]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> SecureCommandReply:
+        body = body.ljust(239, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.sequence, self.operation, self.result, self.data_length, self.data) = _S11005.unpack(payload)
+        (
+            self.sequence, self.operation, self.result, self.data_length, self.data,
+        ) = _S11005.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -4477,18 +4263,14 @@ class AdapTuning(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> AdapTuning:
-        size = len(payload)
-        if size < 49:
-            payload = payload.ljust(49, b"\0")
-        elif size > 49:
-            payload = payload[:49]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> AdapTuning:
+        body = body.ljust(58, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.desired, self.achieved, self.error, self.theta, self.omega, self.sigma, self.theta_dot,
             self.omega_dot, self.sigma_dot, self.f, self.f_dot, self.u, self.axis,
-        ) = _S11010.unpack(payload)
+        ) = _S11010.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -4556,17 +4338,13 @@ class VisionPositionDelta(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> VisionPositionDelta:
-        size = len(payload)
-        if size < 44:
-            payload = payload.ljust(44, b"\0")
-        elif size > 44:
-            payload = payload[:44]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> VisionPositionDelta:
+        body = body.ljust(53, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_usec, self.time_delta_usec, v2_0, v2_1, v2_2, v3_0, v3_1, v3_2, self.confidence,
-        ) = _S11011.unpack(payload)
+        ) = _S11011.unpack_from(body, 9)
         self.angle_delta = (v2_0, v2_1, v2_2)
         self.position_delta = (v3_0, v3_1, v3_2)
         return self
@@ -4619,15 +4397,11 @@ class AoaSsa(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> AoaSsa:
-        size = len(payload)
-        if size < 16:
-            payload = payload.ljust(16, b"\0")
-        elif size > 16:
-            payload = payload[:16]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> AoaSsa:
+        body = body.ljust(25, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.time_usec, self.AOA, self.SSA) = _S11020.unpack(payload)
+        (self.time_usec, self.AOA, self.SSA) = _S11020.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -4693,18 +4467,14 @@ class EscTelemetry1To4(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> EscTelemetry1To4:
-        size = len(payload)
-        if size < 44:
-            payload = payload.ljust(44, b"\0")
-        elif size > 44:
-            payload = payload[:44]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> EscTelemetry1To4:
+        body = body.ljust(53, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             v0_0, v0_1, v0_2, v0_3, v1_0, v1_1, v1_2, v1_3, v2_0, v2_1, v2_2, v2_3, v3_0, v3_1, v3_2, v3_3,
             v4_0, v4_1, v4_2, v4_3, self.temperature,
-        ) = _S11030.unpack(payload)
+        ) = _S11030.unpack_from(body, 9)
         self.voltage = (v0_0, v0_1, v0_2, v0_3)
         self.current = (v1_0, v1_1, v1_2, v1_3)
         self.totalcurrent = (v2_0, v2_1, v2_2, v2_3)
@@ -4778,18 +4548,14 @@ class EscTelemetry5To8(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> EscTelemetry5To8:
-        size = len(payload)
-        if size < 44:
-            payload = payload.ljust(44, b"\0")
-        elif size > 44:
-            payload = payload[:44]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> EscTelemetry5To8:
+        body = body.ljust(53, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             v0_0, v0_1, v0_2, v0_3, v1_0, v1_1, v1_2, v1_3, v2_0, v2_1, v2_2, v2_3, v3_0, v3_1, v3_2, v3_3,
             v4_0, v4_1, v4_2, v4_3, self.temperature,
-        ) = _S11031.unpack(payload)
+        ) = _S11031.unpack_from(body, 9)
         self.voltage = (v0_0, v0_1, v0_2, v0_3)
         self.current = (v1_0, v1_1, v1_2, v1_3)
         self.totalcurrent = (v2_0, v2_1, v2_2, v2_3)
@@ -4864,18 +4630,14 @@ class EscTelemetry9To12(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> EscTelemetry9To12:
-        size = len(payload)
-        if size < 44:
-            payload = payload.ljust(44, b"\0")
-        elif size > 44:
-            payload = payload[:44]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> EscTelemetry9To12:
+        body = body.ljust(53, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             v0_0, v0_1, v0_2, v0_3, v1_0, v1_1, v1_2, v1_3, v2_0, v2_1, v2_2, v2_3, v3_0, v3_1, v3_2, v3_3,
             v4_0, v4_1, v4_2, v4_3, self.temperature,
-        ) = _S11032.unpack(payload)
+        ) = _S11032.unpack_from(body, 9)
         self.voltage = (v0_0, v0_1, v0_2, v0_3)
         self.current = (v1_0, v1_1, v1_2, v1_3)
         self.totalcurrent = (v2_0, v2_1, v2_2, v2_3)
@@ -4978,18 +4740,14 @@ class OsdParamConfig(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> OsdParamConfig:
-        size = len(payload)
-        if size < 37:
-            payload = payload.ljust(37, b"\0")
-        elif size > 37:
-            payload = payload[:37]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> OsdParamConfig:
+        body = body.ljust(46, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.request_id, self.min_value, self.max_value, self.increment, self.target_system,
             self.target_component, self.osd_screen, self.osd_index, v8, self.config_type,
-        ) = _S11033.unpack(payload)
+        ) = _S11033.unpack_from(body, 9)
         self.param_id = v8.partition(b"\0")[0].decode("utf-8", "replace")
         return self
 
@@ -5037,15 +4795,11 @@ class OsdParamConfigReply(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> OsdParamConfigReply:
-        size = len(payload)
-        if size < 5:
-            payload = payload.ljust(5, b"\0")
-        elif size > 5:
-            payload = payload[:5]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> OsdParamConfigReply:
+        body = body.ljust(14, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.request_id, self.result) = _S11034.unpack(payload)
+        (self.request_id, self.result) = _S11034.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -5105,17 +4859,13 @@ class OsdParamShowConfig(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> OsdParamShowConfig:
-        size = len(payload)
-        if size < 8:
-            payload = payload.ljust(8, b"\0")
-        elif size > 8:
-            payload = payload[:8]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> OsdParamShowConfig:
+        body = body.ljust(17, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.request_id, self.target_system, self.target_component, self.osd_screen, self.osd_index,
-        ) = _S11035.unpack(payload)
+        ) = _S11035.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -5193,18 +4943,14 @@ class OsdParamShowConfigReply(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> OsdParamShowConfigReply:
-        size = len(payload)
-        if size < 34:
-            payload = payload.ljust(34, b"\0")
-        elif size > 34:
-            payload = payload[:34]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> OsdParamShowConfigReply:
+        body = body.ljust(43, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.request_id, self.min_value, self.max_value, self.increment, self.result, v5,
             self.config_type,
-        ) = _S11036.unpack(payload)
+        ) = _S11036.unpack_from(body, 9)
         self.param_id = v5.partition(b"\0")[0].decode("utf-8", "replace")
         return self
 
@@ -5295,18 +5041,14 @@ class ObstacleDistance3d(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> ObstacleDistance3d:
-        size = len(payload)
-        if size < 28:
-            payload = payload.ljust(28, b"\0")
-        elif size > 28:
-            payload = payload[:28]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> ObstacleDistance3d:
+        body = body.ljust(37, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_boot_ms, self.x, self.y, self.z, self.min_distance, self.max_distance, self.obstacle_id,
             self.sensor_type, self.frame,
-        ) = _S11037.unpack(payload)
+        ) = _S11037.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -5406,18 +5148,14 @@ class WaterDepth(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> WaterDepth:
-        size = len(payload)
-        if size < 38:
-            payload = payload.ljust(38, b"\0")
-        elif size > 38:
-            payload = payload[:38]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> WaterDepth:
+        body = body.ljust(47, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_boot_ms, self.lat, self.lng, self.alt, self.roll, self.pitch, self.yaw, self.distance,
             self.temperature, self.id, self.healthy,
-        ) = _S11038.unpack(payload)
+        ) = _S11038.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -5481,17 +5219,13 @@ class McuStatus(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> McuStatus:
-        size = len(payload)
-        if size < 9:
-            payload = payload.ljust(9, b"\0")
-        elif size > 9:
-            payload = payload[:9]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> McuStatus:
+        body = body.ljust(18, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.MCU_temperature, self.MCU_voltage, self.MCU_voltage_min, self.MCU_voltage_max, self.id,
-        ) = _S11039.unpack(payload)
+        ) = _S11039.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -5560,18 +5294,14 @@ class EscTelemetry13To16(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> EscTelemetry13To16:
-        size = len(payload)
-        if size < 44:
-            payload = payload.ljust(44, b"\0")
-        elif size > 44:
-            payload = payload[:44]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> EscTelemetry13To16:
+        body = body.ljust(53, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             v0_0, v0_1, v0_2, v0_3, v1_0, v1_1, v1_2, v1_3, v2_0, v2_1, v2_2, v2_3, v3_0, v3_1, v3_2, v3_3,
             v4_0, v4_1, v4_2, v4_3, self.temperature,
-        ) = _S11040.unpack(payload)
+        ) = _S11040.unpack_from(body, 9)
         self.voltage = (v0_0, v0_1, v0_2, v0_3)
         self.current = (v1_0, v1_1, v1_2, v1_3)
         self.totalcurrent = (v2_0, v2_1, v2_2, v2_3)
@@ -5646,18 +5376,14 @@ class EscTelemetry17To20(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> EscTelemetry17To20:
-        size = len(payload)
-        if size < 44:
-            payload = payload.ljust(44, b"\0")
-        elif size > 44:
-            payload = payload[:44]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> EscTelemetry17To20:
+        body = body.ljust(53, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             v0_0, v0_1, v0_2, v0_3, v1_0, v1_1, v1_2, v1_3, v2_0, v2_1, v2_2, v2_3, v3_0, v3_1, v3_2, v3_3,
             v4_0, v4_1, v4_2, v4_3, self.temperature,
-        ) = _S11041.unpack(payload)
+        ) = _S11041.unpack_from(body, 9)
         self.voltage = (v0_0, v0_1, v0_2, v0_3)
         self.current = (v1_0, v1_1, v1_2, v1_3)
         self.totalcurrent = (v2_0, v2_1, v2_2, v2_3)
@@ -5732,18 +5458,14 @@ class EscTelemetry21To24(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> EscTelemetry21To24:
-        size = len(payload)
-        if size < 44:
-            payload = payload.ljust(44, b"\0")
-        elif size > 44:
-            payload = payload[:44]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> EscTelemetry21To24:
+        body = body.ljust(53, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             v0_0, v0_1, v0_2, v0_3, v1_0, v1_1, v1_2, v1_3, v2_0, v2_1, v2_2, v2_3, v3_0, v3_1, v3_2, v3_3,
             v4_0, v4_1, v4_2, v4_3, self.temperature,
-        ) = _S11042.unpack(payload)
+        ) = _S11042.unpack_from(body, 9)
         self.voltage = (v0_0, v0_1, v0_2, v0_3)
         self.current = (v1_0, v1_1, v1_2, v1_3)
         self.totalcurrent = (v2_0, v2_1, v2_2, v2_3)
@@ -5818,18 +5540,14 @@ class EscTelemetry25To28(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> EscTelemetry25To28:
-        size = len(payload)
-        if size < 44:
-            payload = payload.ljust(44, b"\0")
-        elif size > 44:
-            payload = payload[:44]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> EscTelemetry25To28:
+        body = body.ljust(53, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             v0_0, v0_1, v0_2, v0_3, v1_0, v1_1, v1_2, v1_3, v2_0, v2_1, v2_2, v2_3, v3_0, v3_1, v3_2, v3_3,
             v4_0, v4_1, v4_2, v4_3, self.temperature,
-        ) = _S11043.unpack(payload)
+        ) = _S11043.unpack_from(body, 9)
         self.voltage = (v0_0, v0_1, v0_2, v0_3)
         self.current = (v1_0, v1_1, v1_2, v1_3)
         self.totalcurrent = (v2_0, v2_1, v2_2, v2_3)
@@ -5904,18 +5622,14 @@ class EscTelemetry29To32(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> EscTelemetry29To32:
-        size = len(payload)
-        if size < 44:
-            payload = payload.ljust(44, b"\0")
-        elif size > 44:
-            payload = payload[:44]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> EscTelemetry29To32:
+        body = body.ljust(53, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             v0_0, v0_1, v0_2, v0_3, v1_0, v1_1, v1_2, v1_3, v2_0, v2_1, v2_2, v2_3, v3_0, v3_1, v3_2, v3_3,
             v4_0, v4_1, v4_2, v4_3, self.temperature,
-        ) = _S11044.unpack(payload)
+        ) = _S11044.unpack_from(body, 9)
         self.voltage = (v0_0, v0_1, v0_2, v0_3)
         self.current = (v1_0, v1_1, v1_2, v1_3)
         self.totalcurrent = (v2_0, v2_1, v2_2, v2_3)
@@ -5973,15 +5687,11 @@ class NamedValueString(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> NamedValueString:
-        size = len(payload)
-        if size < 78:
-            payload = payload.ljust(78, b"\0")
-        elif size > 78:
-            payload = payload[:78]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> NamedValueString:
+        body = body.ljust(87, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.time_boot_ms, v1, v2) = _S11060.unpack(payload)
+        (self.time_boot_ms, v1, v2) = _S11060.unpack_from(body, 9)
         self.name = v1.partition(b"\0")[0].decode("utf-8", "replace")
         self.value = v2.partition(b"\0")[0].decode("utf-8", "replace")
         return self
@@ -6076,18 +5786,14 @@ class UavionixAdsbOutCfg(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> UavionixAdsbOutCfg:
-        size = len(payload)
-        if size < 20:
-            payload = payload.ljust(20, b"\0")
-        elif size > 20:
-            payload = payload[:20]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> UavionixAdsbOutCfg:
+        body = body.ljust(29, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.ICAO, self.stallSpeed, v2, self.emitterType, self.aircraftSize, self.gpsOffsetLat,
             self.gpsOffsetLon, self.rfSelect,
-        ) = _S10001.unpack(payload)
+        ) = _S10001.unpack_from(body, 9)
         self.callsign = v2.partition(b"\0")[0].decode("utf-8", "replace")
         return self
 
@@ -6227,19 +5933,15 @@ class UavionixAdsbOutDynamic(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> UavionixAdsbOutDynamic:
-        size = len(payload)
-        if size < 41:
-            payload = payload.ljust(41, b"\0")
-        elif size > 41:
-            payload = payload[:41]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> UavionixAdsbOutDynamic:
+        body = body.ljust(50, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.utcTime, self.gpsLat, self.gpsLon, self.gpsAlt, self.baroAltMSL, self.accuracyHor,
             self.accuracyVert, self.accuracyVel, self.velVert, self.velNS, self.VelEW, self.state,
             self.squawk, self.gpsFix, self.numSats, self.emergencyStatus,
-        ) = _S10002.unpack(payload)
+        ) = _S10002.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -6282,15 +5984,11 @@ class UavionixAdsbTransceiverHealthReport(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> UavionixAdsbTransceiverHealthReport:
-        size = len(payload)
-        if size < 1:
-            payload = payload.ljust(1, b"\0")
-        elif size > 1:
-            payload = payload[:1]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> UavionixAdsbTransceiverHealthReport:
+        body = body.ljust(10, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.rfHealth,) = _S10003.unpack(payload)
+        (self.rfHealth,) = _S10003.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -6330,15 +6028,11 @@ class UavionixAdsbOutCfgRegistration(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> UavionixAdsbOutCfgRegistration:
-        size = len(payload)
-        if size < 9:
-            payload = payload.ljust(9, b"\0")
-        elif size > 9:
-            payload = payload[:9]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> UavionixAdsbOutCfgRegistration:
+        body = body.ljust(18, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (v0,) = _S10004.unpack(payload)
+        (v0,) = _S10004.unpack_from(body, 9)
         self.registration = v0.partition(b"\0")[0].decode("utf-8", "replace")
         return self
 
@@ -6380,15 +6074,11 @@ class UavionixAdsbOutCfgFlightid(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> UavionixAdsbOutCfgFlightid:
-        size = len(payload)
-        if size < 9:
-            payload = payload.ljust(9, b"\0")
-        elif size > 9:
-            payload = payload[:9]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> UavionixAdsbOutCfgFlightid:
+        body = body.ljust(18, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (v0,) = _S10005.unpack(payload)
+        (v0,) = _S10005.unpack_from(body, 9)
         self.flight_id = v0.partition(b"\0")[0].decode("utf-8", "replace")
         return self
 
@@ -6427,15 +6117,11 @@ class UavionixAdsbGet(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> UavionixAdsbGet:
-        size = len(payload)
-        if size < 4:
-            payload = payload.ljust(4, b"\0")
-        elif size > 4:
-            payload = payload[:4]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> UavionixAdsbGet:
+        body = body.ljust(13, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.ReqMessageId,) = _S10006.unpack(payload)
+        (self.ReqMessageId,) = _S10006.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -6504,17 +6190,13 @@ class UavionixAdsbOutControl(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> UavionixAdsbOutControl:
-        size = len(payload)
-        if size < 17:
-            payload = payload.ljust(17, b"\0")
-        elif size > 17:
-            payload = payload[:17]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> UavionixAdsbOutControl:
+        body = body.ljust(26, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.baroAltMSL, self.squawk, self.state, self.emergencyStatus, v4, self.x_bit,
-        ) = _S10007.unpack(payload)
+        ) = _S10007.unpack_from(body, 9)
         self.flight_id = v4.partition(b"\0")[0].decode("utf-8", "replace")
         return self
 
@@ -6589,15 +6271,13 @@ class UavionixAdsbOutStatus(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> UavionixAdsbOutStatus:
-        size = len(payload)
-        if size < 14:
-            payload = payload.ljust(14, b"\0")
-        elif size > 14:
-            payload = payload[:14]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> UavionixAdsbOutStatus:
+        body = body.ljust(23, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.squawk, self.state, self.NIC_NACp, self.boardTemp, self.fault, v5) = _S10008.unpack(payload)
+        (
+            self.squawk, self.state, self.NIC_NACp, self.boardTemp, self.fault, v5,
+        ) = _S10008.unpack_from(body, 9)
         self.flight_id = v5.partition(b"\0")[0].decode("utf-8", "replace")
         return self
 
@@ -6639,15 +6319,11 @@ class IcarousHeartbeat(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> IcarousHeartbeat:
-        size = len(payload)
-        if size < 1:
-            payload = payload.ljust(1, b"\0")
-        elif size > 1:
-            payload = payload[:1]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> IcarousHeartbeat:
+        body = body.ljust(10, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.status,) = _S42000.unpack(payload)
+        (self.status,) = _S42000.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -6770,18 +6446,14 @@ class IcarousKinematicBands(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> IcarousKinematicBands:
-        size = len(payload)
-        if size < 46:
-            payload = payload.ljust(46, b"\0")
-        elif size > 46:
-            payload = payload[:46]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> IcarousKinematicBands:
+        body = body.ljust(55, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.min1, self.max1, self.min2, self.max2, self.min3, self.max3, self.min4, self.max4, self.min5,
             self.max5, self.numBands, self.type1, self.type2, self.type3, self.type4, self.type5,
-        ) = _S42001.unpack(payload)
+        ) = _S42001.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -6953,12 +6625,8 @@ class LoweheiserGovEfi(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> LoweheiserGovEfi:
-        size = len(payload)
-        if size < 85:
-            payload = payload.ljust(85, b"\0")
-        elif size > 85:
-            payload = payload[:85]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> LoweheiserGovEfi:
+        body = body.ljust(94, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
@@ -6967,7 +6635,7 @@ class LoweheiserGovEfi(Message):
             self.efi_rpm, self.efi_pw, self.efi_fuel_flow, self.efi_fuel_consumed, self.efi_baro,
             self.efi_mat, self.efi_clt, self.efi_tps, self.efi_exhaust_gas_temperature, self.generator_status,
             self.efi_status, self.efi_index,
-        ) = _S10151.unpack(payload)
+        ) = _S10151.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -7011,15 +6679,11 @@ class CubepilotRawRc(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> CubepilotRawRc:
-        size = len(payload)
-        if size < 32:
-            payload = payload.ljust(32, b"\0")
-        elif size > 32:
-            payload = payload[:32]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> CubepilotRawRc:
+        body = body.ljust(41, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.rc_raw,) = _S50001.unpack(payload)
+        (self.rc_raw,) = _S50001.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -7101,18 +6765,14 @@ class HerelinkVideoStreamInformation(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> HerelinkVideoStreamInformation:
-        size = len(payload)
-        if size < 246:
-            payload = payload.ljust(246, b"\0")
-        elif size > 246:
-            payload = payload[:246]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> HerelinkVideoStreamInformation:
+        body = body.ljust(255, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.framerate, self.bitrate, self.resolution_h, self.resolution_v, self.rotation, self.camera_id,
             self.status, v7,
-        ) = _S50002.unpack(payload)
+        ) = _S50002.unpack_from(body, 9)
         self.uri = v7.partition(b"\0")[0].decode("utf-8", "replace")
         return self
 
@@ -7186,17 +6846,13 @@ class HerelinkTelem(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> HerelinkTelem:
-        size = len(payload)
-        if size < 19:
-            payload = payload.ljust(19, b"\0")
-        elif size > 19:
-            payload = payload[:19]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> HerelinkTelem:
+        body = body.ljust(28, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.rf_freq, self.link_bw, self.link_rate, self.snr, self.cpu_temp, self.board_temp, self.rssi,
-        ) = _S50003.unpack(payload)
+        ) = _S50003.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -7252,15 +6908,11 @@ class CubepilotFirmwareUpdateStart(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> CubepilotFirmwareUpdateStart:
-        size = len(payload)
-        if size < 10:
-            payload = payload.ljust(10, b"\0")
-        elif size > 10:
-            payload = payload[:10]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> CubepilotFirmwareUpdateStart:
+        body = body.ljust(19, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.size, self.crc, self.target_system, self.target_component) = _S50004.unpack(payload)
+        (self.size, self.crc, self.target_system, self.target_component) = _S50004.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -7308,15 +6960,11 @@ class CubepilotFirmwareUpdateResp(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> CubepilotFirmwareUpdateResp:
-        size = len(payload)
-        if size < 6:
-            payload = payload.ljust(6, b"\0")
-        elif size > 6:
-            payload = payload[:6]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> CubepilotFirmwareUpdateResp:
+        body = body.ljust(15, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.offset, self.target_system, self.target_component) = _S50005.unpack(payload)
+        (self.offset, self.target_system, self.target_component) = _S50005.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -7359,15 +7007,11 @@ class AirlinkAuth(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> AirlinkAuth:
-        size = len(payload)
-        if size < 100:
-            payload = payload.ljust(100, b"\0")
-        elif size > 100:
-            payload = payload[:100]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> AirlinkAuth:
+        body = body.ljust(109, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (v0, v1) = _S52000.unpack(payload)
+        (v0, v1) = _S52000.unpack_from(body, 9)
         self.login = v0.partition(b"\0")[0].decode("utf-8", "replace")
         self.password = v1.partition(b"\0")[0].decode("utf-8", "replace")
         return self
@@ -7407,15 +7051,11 @@ class AirlinkAuthResponse(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> AirlinkAuthResponse:
-        size = len(payload)
-        if size < 1:
-            payload = payload.ljust(1, b"\0")
-        elif size > 1:
-            payload = payload[:1]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> AirlinkAuthResponse:
+        body = body.ljust(10, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.resp_type,) = _S52001.unpack(payload)
+        (self.resp_type,) = _S52001.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:

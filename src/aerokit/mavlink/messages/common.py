@@ -379,12 +379,8 @@ class SysStatus(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> SysStatus:
-        size = len(payload)
-        if size < 43:
-            payload = payload.ljust(43, b"\0")
-        elif size > 43:
-            payload = payload[:43]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> SysStatus:
+        body = body.ljust(52, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
@@ -393,7 +389,7 @@ class SysStatus(Message):
             self.drop_rate_comm, self.errors_comm, self.errors_count1, self.errors_count2, self.errors_count3,
             self.errors_count4, self.battery_remaining, self.onboard_control_sensors_present_extended,
             self.onboard_control_sensors_enabled_extended, self.onboard_control_sensors_health_extended,
-        ) = _S1.unpack(payload)
+        ) = _S1.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -448,15 +444,11 @@ class SystemTime(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> SystemTime:
-        size = len(payload)
-        if size < 12:
-            payload = payload.ljust(12, b"\0")
-        elif size > 12:
-            payload = payload[:12]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> SystemTime:
+        body = body.ljust(21, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.time_unix_usec, self.time_boot_ms) = _S2.unpack(payload)
+        (self.time_unix_usec, self.time_boot_ms) = _S2.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -520,15 +512,11 @@ class Ping(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> Ping:
-        size = len(payload)
-        if size < 14:
-            payload = payload.ljust(14, b"\0")
-        elif size > 14:
-            payload = payload[:14]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> Ping:
+        body = body.ljust(23, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.time_usec, self.seq, self.target_system, self.target_component) = _S4.unpack(payload)
+        (self.time_usec, self.seq, self.target_system, self.target_component) = _S4.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -586,15 +574,11 @@ class ChangeOperatorControl(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> ChangeOperatorControl:
-        size = len(payload)
-        if size < 28:
-            payload = payload.ljust(28, b"\0")
-        elif size > 28:
-            payload = payload[:28]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> ChangeOperatorControl:
+        body = body.ljust(37, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.target_system, self.control_request, self.version, v3) = _S5.unpack(payload)
+        (self.target_system, self.control_request, self.version, v3) = _S5.unpack_from(body, 9)
         self.passkey = v3.partition(b"\0")[0].decode("utf-8", "replace")
         return self
 
@@ -647,15 +631,11 @@ class ChangeOperatorControlAck(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> ChangeOperatorControlAck:
-        size = len(payload)
-        if size < 3:
-            payload = payload.ljust(3, b"\0")
-        elif size > 3:
-            payload = payload[:3]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> ChangeOperatorControlAck:
+        body = body.ljust(12, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.gcs_system_id, self.control_request, self.ack) = _S6.unpack(payload)
+        (self.gcs_system_id, self.control_request, self.ack) = _S6.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -694,15 +674,11 @@ class AuthKey(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> AuthKey:
-        size = len(payload)
-        if size < 32:
-            payload = payload.ljust(32, b"\0")
-        elif size > 32:
-            payload = payload[:32]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> AuthKey:
+        body = body.ljust(41, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (v0,) = _S7.unpack(payload)
+        (v0,) = _S7.unpack_from(body, 9)
         self.key = v0.partition(b"\0")[0].decode("utf-8", "replace")
         return self
 
@@ -755,15 +731,11 @@ class SetMode(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> SetMode:
-        size = len(payload)
-        if size < 6:
-            payload = payload.ljust(6, b"\0")
-        elif size > 6:
-            payload = payload[:6]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> SetMode:
+        body = body.ljust(15, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.custom_mode, self.target_system, self.base_mode) = _S11.unpack(payload)
+        (self.custom_mode, self.target_system, self.base_mode) = _S11.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -826,15 +798,11 @@ class ParamRequestRead(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> ParamRequestRead:
-        size = len(payload)
-        if size < 20:
-            payload = payload.ljust(20, b"\0")
-        elif size > 20:
-            payload = payload[:20]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> ParamRequestRead:
+        body = body.ljust(29, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.param_index, self.target_system, self.target_component, v3) = _S20.unpack(payload)
+        (self.param_index, self.target_system, self.target_component, v3) = _S20.unpack_from(body, 9)
         self.param_id = v3.partition(b"\0")[0].decode("utf-8", "replace")
         return self
 
@@ -882,15 +850,11 @@ class ParamRequestList(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> ParamRequestList:
-        size = len(payload)
-        if size < 2:
-            payload = payload.ljust(2, b"\0")
-        elif size > 2:
-            payload = payload[:2]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> ParamRequestList:
+        body = body.ljust(11, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.target_system, self.target_component) = _S21.unpack(payload)
+        (self.target_system, self.target_component) = _S21.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -956,15 +920,13 @@ class ParamValue(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> ParamValue:
-        size = len(payload)
-        if size < 25:
-            payload = payload.ljust(25, b"\0")
-        elif size > 25:
-            payload = payload[:25]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> ParamValue:
+        body = body.ljust(34, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.param_value, self.param_count, self.param_index, v3, self.param_type) = _S22.unpack(payload)
+        (
+            self.param_value, self.param_count, self.param_index, v3, self.param_type,
+        ) = _S22.unpack_from(body, 9)
         self.param_id = v3.partition(b"\0")[0].decode("utf-8", "replace")
         return self
 
@@ -1035,17 +997,13 @@ class ParamSet(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> ParamSet:
-        size = len(payload)
-        if size < 23:
-            payload = payload.ljust(23, b"\0")
-        elif size > 23:
-            payload = payload[:23]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> ParamSet:
+        body = body.ljust(32, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.param_value, self.target_system, self.target_component, v3, self.param_type,
-        ) = _S23.unpack(payload)
+        ) = _S23.unpack_from(body, 9)
         self.param_id = v3.partition(b"\0")[0].decode("utf-8", "replace")
         return self
 
@@ -1190,19 +1148,15 @@ class GpsRawInt(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> GpsRawInt:
-        size = len(payload)
-        if size < 52:
-            payload = payload.ljust(52, b"\0")
-        elif size > 52:
-            payload = payload[:52]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> GpsRawInt:
+        body = body.ljust(61, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_usec, self.lat, self.lon, self.alt, self.eph, self.epv, self.vel, self.cog,
             self.fix_type, self.satellites_visible, self.alt_ellipsoid, self.h_acc, self.v_acc, self.vel_acc,
             self.hdg_acc, self.yaw,
-        ) = _S24.unpack(payload)
+        ) = _S24.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -1282,18 +1236,14 @@ class GpsStatus(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> GpsStatus:
-        size = len(payload)
-        if size < 101:
-            payload = payload.ljust(101, b"\0")
-        elif size > 101:
-            payload = payload[:101]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> GpsStatus:
+        body = body.ljust(110, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.satellites_visible, self.satellite_prn, self.satellite_used, self.satellite_elevation,
             self.satellite_azimuth, self.satellite_snr,
-        ) = _S25.unpack(payload)
+        ) = _S25.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -1397,18 +1347,14 @@ class ScaledImu(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> ScaledImu:
-        size = len(payload)
-        if size < 24:
-            payload = payload.ljust(24, b"\0")
-        elif size > 24:
-            payload = payload[:24]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> ScaledImu:
+        body = body.ljust(33, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_boot_ms, self.xacc, self.yacc, self.zacc, self.xgyro, self.ygyro, self.zgyro, self.xmag,
             self.ymag, self.zmag, self.temperature,
-        ) = _S26.unpack(payload)
+        ) = _S26.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -1523,18 +1469,14 @@ class RawImu(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> RawImu:
-        size = len(payload)
-        if size < 29:
-            payload = payload.ljust(29, b"\0")
-        elif size > 29:
-            payload = payload[:29]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> RawImu:
+        body = body.ljust(38, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_usec, self.xacc, self.yacc, self.zacc, self.xgyro, self.ygyro, self.zgyro, self.xmag,
             self.ymag, self.zmag, self.id, self.temperature,
-        ) = _S27.unpack(payload)
+        ) = _S27.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -1601,17 +1543,13 @@ class RawPressure(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> RawPressure:
-        size = len(payload)
-        if size < 16:
-            payload = payload.ljust(16, b"\0")
-        elif size > 16:
-            payload = payload[:16]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> RawPressure:
+        body = body.ljust(25, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_usec, self.press_abs, self.press_diff1, self.press_diff2, self.temperature,
-        ) = _S28.unpack(payload)
+        ) = _S28.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -1677,17 +1615,13 @@ class ScaledPressure(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> ScaledPressure:
-        size = len(payload)
-        if size < 16:
-            payload = payload.ljust(16, b"\0")
-        elif size > 16:
-            payload = payload[:16]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> ScaledPressure:
+        body = body.ljust(25, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_boot_ms, self.press_abs, self.press_diff, self.temperature, self.temperature_press_diff,
-        ) = _S29.unpack(payload)
+        ) = _S29.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -1762,18 +1696,14 @@ class Attitude(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> Attitude:
-        size = len(payload)
-        if size < 28:
-            payload = payload.ljust(28, b"\0")
-        elif size > 28:
-            payload = payload[:28]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> Attitude:
+        body = body.ljust(37, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_boot_ms, self.roll, self.pitch, self.yaw, self.rollspeed, self.pitchspeed,
             self.yawspeed,
-        ) = _S30.unpack(payload)
+        ) = _S30.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -1870,18 +1800,14 @@ class AttitudeQuaternion(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> AttitudeQuaternion:
-        size = len(payload)
-        if size < 48:
-            payload = payload.ljust(48, b"\0")
-        elif size > 48:
-            payload = payload[:48]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> AttitudeQuaternion:
+        body = body.ljust(57, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_boot_ms, self.q1, self.q2, self.q3, self.q4, self.rollspeed, self.pitchspeed,
             self.yawspeed, v8_0, v8_1, v8_2, v8_3,
-        ) = _S31.unpack(payload)
+        ) = _S31.unpack_from(body, 9)
         self.repr_offset_q = (v8_0, v8_1, v8_2, v8_3)
         return self
 
@@ -1957,15 +1883,11 @@ class LocalPositionNed(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> LocalPositionNed:
-        size = len(payload)
-        if size < 28:
-            payload = payload.ljust(28, b"\0")
-        elif size > 28:
-            payload = payload[:28]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> LocalPositionNed:
+        body = body.ljust(37, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.time_boot_ms, self.x, self.y, self.z, self.vx, self.vy, self.vz) = _S32.unpack(payload)
+        (self.time_boot_ms, self.x, self.y, self.z, self.vx, self.vy, self.vz) = _S32.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -2068,18 +1990,14 @@ class RcChannelsScaled(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> RcChannelsScaled:
-        size = len(payload)
-        if size < 22:
-            payload = payload.ljust(22, b"\0")
-        elif size > 22:
-            payload = payload[:22]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> RcChannelsScaled:
+        body = body.ljust(31, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_boot_ms, self.chan1_scaled, self.chan2_scaled, self.chan3_scaled, self.chan4_scaled,
             self.chan5_scaled, self.chan6_scaled, self.chan7_scaled, self.chan8_scaled, self.port, self.rssi,
-        ) = _S34.unpack(payload)
+        ) = _S34.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -2186,18 +2104,14 @@ class RcChannelsRaw(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> RcChannelsRaw:
-        size = len(payload)
-        if size < 22:
-            payload = payload.ljust(22, b"\0")
-        elif size > 22:
-            payload = payload[:22]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> RcChannelsRaw:
+        body = body.ljust(31, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_boot_ms, self.chan1_raw, self.chan2_raw, self.chan3_raw, self.chan4_raw, self.chan5_raw,
             self.chan6_raw, self.chan7_raw, self.chan8_raw, self.port, self.rssi,
-        ) = _S35.unpack(payload)
+        ) = _S35.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -2343,12 +2257,8 @@ class ServoOutputRaw(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> ServoOutputRaw:
-        size = len(payload)
-        if size < 37:
-            payload = payload.ljust(37, b"\0")
-        elif size > 37:
-            payload = payload[:37]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> ServoOutputRaw:
+        body = body.ljust(46, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
@@ -2356,7 +2266,7 @@ class ServoOutputRaw(Message):
             self.servo5_raw, self.servo6_raw, self.servo7_raw, self.servo8_raw, self.port, self.servo9_raw,
             self.servo10_raw, self.servo11_raw, self.servo12_raw, self.servo13_raw, self.servo14_raw,
             self.servo15_raw, self.servo16_raw,
-        ) = _S36.unpack(payload)
+        ) = _S36.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -2424,17 +2334,13 @@ class MissionRequestPartialList(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> MissionRequestPartialList:
-        size = len(payload)
-        if size < 7:
-            payload = payload.ljust(7, b"\0")
-        elif size > 7:
-            payload = payload[:7]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> MissionRequestPartialList:
+        body = body.ljust(16, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.start_index, self.end_index, self.target_system, self.target_component, self.mission_type,
-        ) = _S37.unpack(payload)
+        ) = _S37.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -2502,17 +2408,13 @@ class MissionWritePartialList(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> MissionWritePartialList:
-        size = len(payload)
-        if size < 7:
-            payload = payload.ljust(7, b"\0")
-        elif size > 7:
-            payload = payload[:7]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> MissionWritePartialList:
+        body = body.ljust(16, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.start_index, self.end_index, self.target_system, self.target_component, self.mission_type,
-        ) = _S38.unpack(payload)
+        ) = _S38.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -2644,19 +2546,15 @@ class MissionItem(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> MissionItem:
-        size = len(payload)
-        if size < 38:
-            payload = payload.ljust(38, b"\0")
-        elif size > 38:
-            payload = payload[:38]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> MissionItem:
+        body = body.ljust(47, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.param1, self.param2, self.param3, self.param4, self.x, self.y, self.z, self.seq,
             self.command, self.target_system, self.target_component, self.frame, self.current,
             self.autocontinue, self.mission_type,
-        ) = _S39.unpack(payload)
+        ) = _S39.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -2718,15 +2616,11 @@ class MissionRequest(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> MissionRequest:
-        size = len(payload)
-        if size < 5:
-            payload = payload.ljust(5, b"\0")
-        elif size > 5:
-            payload = payload[:5]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> MissionRequest:
+        body = body.ljust(14, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.seq, self.target_system, self.target_component, self.mission_type) = _S40.unpack(payload)
+        (self.seq, self.target_system, self.target_component, self.mission_type) = _S40.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -2784,15 +2678,11 @@ class MissionSetCurrent(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> MissionSetCurrent:
-        size = len(payload)
-        if size < 4:
-            payload = payload.ljust(4, b"\0")
-        elif size > 4:
-            payload = payload[:4]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> MissionSetCurrent:
+        body = body.ljust(13, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.seq, self.target_system, self.target_component) = _S41.unpack(payload)
+        (self.seq, self.target_system, self.target_component) = _S41.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -2856,15 +2746,11 @@ class MissionCurrent(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> MissionCurrent:
-        size = len(payload)
-        if size < 6:
-            payload = payload.ljust(6, b"\0")
-        elif size > 6:
-            payload = payload[:6]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> MissionCurrent:
+        body = body.ljust(15, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.seq, self.total, self.mission_state, self.mission_mode) = _S42.unpack(payload)
+        (self.seq, self.total, self.mission_state, self.mission_mode) = _S42.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -2912,15 +2798,11 @@ class MissionRequestList(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> MissionRequestList:
-        size = len(payload)
-        if size < 3:
-            payload = payload.ljust(3, b"\0")
-        elif size > 3:
-            payload = payload[:3]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> MissionRequestList:
+        body = body.ljust(12, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.target_system, self.target_component, self.mission_type) = _S43.unpack(payload)
+        (self.target_system, self.target_component, self.mission_type) = _S43.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -2975,15 +2857,11 @@ class MissionCount(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> MissionCount:
-        size = len(payload)
-        if size < 5:
-            payload = payload.ljust(5, b"\0")
-        elif size > 5:
-            payload = payload[:5]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> MissionCount:
+        body = body.ljust(14, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.count, self.target_system, self.target_component, self.mission_type) = _S44.unpack(payload)
+        (self.count, self.target_system, self.target_component, self.mission_type) = _S44.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -3031,15 +2909,11 @@ class MissionClearAll(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> MissionClearAll:
-        size = len(payload)
-        if size < 3:
-            payload = payload.ljust(3, b"\0")
-        elif size > 3:
-            payload = payload[:3]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> MissionClearAll:
+        body = body.ljust(12, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.target_system, self.target_component, self.mission_type) = _S45.unpack(payload)
+        (self.target_system, self.target_component, self.mission_type) = _S45.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -3079,15 +2953,11 @@ class MissionItemReached(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> MissionItemReached:
-        size = len(payload)
-        if size < 2:
-            payload = payload.ljust(2, b"\0")
-        elif size > 2:
-            payload = payload[:2]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> MissionItemReached:
+        body = body.ljust(11, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.seq,) = _S46.unpack(payload)
+        (self.seq,) = _S46.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -3141,15 +3011,11 @@ class MissionAck(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> MissionAck:
-        size = len(payload)
-        if size < 4:
-            payload = payload.ljust(4, b"\0")
-        elif size > 4:
-            payload = payload[:4]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> MissionAck:
+        body = body.ljust(13, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.target_system, self.target_component, self.type, self.mission_type) = _S47.unpack(payload)
+        (self.target_system, self.target_component, self.type, self.mission_type) = _S47.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -3218,17 +3084,13 @@ class SetGpsGlobalOrigin(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> SetGpsGlobalOrigin:
-        size = len(payload)
-        if size < 21:
-            payload = payload.ljust(21, b"\0")
-        elif size > 21:
-            payload = payload[:21]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> SetGpsGlobalOrigin:
+        body = body.ljust(30, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.latitude, self.longitude, self.altitude, self.target_system, self.time_usec,
-        ) = _S48.unpack(payload)
+        ) = _S48.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -3286,15 +3148,11 @@ class GpsGlobalOrigin(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> GpsGlobalOrigin:
-        size = len(payload)
-        if size < 20:
-            payload = payload.ljust(20, b"\0")
-        elif size > 20:
-            payload = payload[:20]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> GpsGlobalOrigin:
+        body = body.ljust(29, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.latitude, self.longitude, self.altitude, self.time_usec) = _S49.unpack(payload)
+        (self.latitude, self.longitude, self.altitude, self.time_usec) = _S49.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -3394,18 +3252,14 @@ class ParamMapRc(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> ParamMapRc:
-        size = len(payload)
-        if size < 37:
-            payload = payload.ljust(37, b"\0")
-        elif size > 37:
-            payload = payload[:37]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> ParamMapRc:
+        body = body.ljust(46, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.param_value0, self.scale, self.param_value_min, self.param_value_max, self.param_index,
             self.target_system, self.target_component, v7, self.parameter_rc_channel_index,
-        ) = _S50.unpack(payload)
+        ) = _S50.unpack_from(body, 9)
         self.param_id = v7.partition(b"\0")[0].decode("utf-8", "replace")
         return self
 
@@ -3465,15 +3319,11 @@ class MissionRequestInt(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> MissionRequestInt:
-        size = len(payload)
-        if size < 5:
-            payload = payload.ljust(5, b"\0")
-        elif size > 5:
-            payload = payload[:5]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> MissionRequestInt:
+        body = body.ljust(14, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.seq, self.target_system, self.target_component, self.mission_type) = _S51.unpack(payload)
+        (self.seq, self.target_system, self.target_component, self.mission_type) = _S51.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -3558,18 +3408,14 @@ class SafetySetAllowedArea(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> SafetySetAllowedArea:
-        size = len(payload)
-        if size < 27:
-            payload = payload.ljust(27, b"\0")
-        elif size > 27:
-            payload = payload[:27]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> SafetySetAllowedArea:
+        body = body.ljust(36, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.p1x, self.p1y, self.p1z, self.p2x, self.p2y, self.p2z, self.target_system,
             self.target_component, self.frame,
-        ) = _S54.unpack(payload)
+        ) = _S54.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -3644,15 +3490,11 @@ class SafetyAllowedArea(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> SafetyAllowedArea:
-        size = len(payload)
-        if size < 25:
-            payload = payload.ljust(25, b"\0")
-        elif size > 25:
-            payload = payload[:25]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> SafetyAllowedArea:
+        body = body.ljust(34, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.p1x, self.p1y, self.p1z, self.p2x, self.p2y, self.p2z, self.frame) = _S55.unpack(payload)
+        (self.p1x, self.p1y, self.p1z, self.p2x, self.p2y, self.p2z, self.frame) = _S55.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -3726,15 +3568,11 @@ class AttitudeQuaternionCov(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> AttitudeQuaternionCov:
-        size = len(payload)
-        if size < 72:
-            payload = payload.ljust(72, b"\0")
-        elif size > 72:
-            payload = payload[:72]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> AttitudeQuaternionCov:
+        body = body.ljust(81, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        values = _S61.unpack(payload)
+        values = _S61.unpack_from(body, 9)
         self.time_usec = values[0]
         self.q = values[1:5]
         self.rollspeed = values[5]
@@ -3825,18 +3663,14 @@ class NavControllerOutput(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> NavControllerOutput:
-        size = len(payload)
-        if size < 26:
-            payload = payload.ljust(26, b"\0")
-        elif size > 26:
-            payload = payload[:26]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> NavControllerOutput:
+        body = body.ljust(35, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.nav_roll, self.nav_pitch, self.alt_error, self.aspd_error, self.xtrack_error,
             self.nav_bearing, self.target_bearing, self.wp_dist,
-        ) = _S62.unpack(payload)
+        ) = _S62.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -3939,15 +3773,11 @@ class GlobalPositionIntCov(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> GlobalPositionIntCov:
-        size = len(payload)
-        if size < 181:
-            payload = payload.ljust(181, b"\0")
-        elif size > 181:
-            payload = payload[:181]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> GlobalPositionIntCov:
+        body = body.ljust(190, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        values = _S63.unpack(payload)
+        values = _S63.unpack_from(body, 9)
         self.time_usec = values[0]
         self.lat = values[1]
         self.lon = values[2]
@@ -4069,15 +3899,11 @@ class LocalPositionNedCov(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> LocalPositionNedCov:
-        size = len(payload)
-        if size < 225:
-            payload = payload.ljust(225, b"\0")
-        elif size > 225:
-            payload = payload[:225]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> LocalPositionNedCov:
+        body = body.ljust(234, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        values = _S64.unpack(payload)
+        values = _S64.unpack_from(body, 9)
         self.time_usec = values[0]
         self.x = values[1]
         self.y = values[2]
@@ -4250,12 +4076,8 @@ class RcChannels(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> RcChannels:
-        size = len(payload)
-        if size < 42:
-            payload = payload.ljust(42, b"\0")
-        elif size > 42:
-            payload = payload[:42]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> RcChannels:
+        body = body.ljust(51, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
@@ -4263,7 +4085,7 @@ class RcChannels(Message):
             self.chan6_raw, self.chan7_raw, self.chan8_raw, self.chan9_raw, self.chan10_raw, self.chan11_raw,
             self.chan12_raw, self.chan13_raw, self.chan14_raw, self.chan15_raw, self.chan16_raw,
             self.chan17_raw, self.chan18_raw, self.chancount, self.rssi,
-        ) = _S65.unpack(payload)
+        ) = _S65.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -4329,18 +4151,14 @@ class RequestDataStream(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> RequestDataStream:
-        size = len(payload)
-        if size < 6:
-            payload = payload.ljust(6, b"\0")
-        elif size > 6:
-            payload = payload[:6]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> RequestDataStream:
+        body = body.ljust(15, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.req_message_rate, self.target_system, self.target_component, self.req_stream_id,
             self.start_stop,
-        ) = _S66.unpack(payload)
+        ) = _S66.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -4391,15 +4209,11 @@ class DataStream(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> DataStream:
-        size = len(payload)
-        if size < 4:
-            payload = payload.ljust(4, b"\0")
-        elif size > 4:
-            payload = payload[:4]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> DataStream:
+        body = body.ljust(13, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.message_rate, self.stream_id, self.on_off) = _S67.unpack(payload)
+        (self.message_rate, self.stream_id, self.on_off) = _S67.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -4568,18 +4382,14 @@ class ManualControl(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> ManualControl:
-        size = len(payload)
-        if size < 30:
-            payload = payload.ljust(30, b"\0")
-        elif size > 30:
-            payload = payload[:30]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> ManualControl:
+        body = body.ljust(39, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.x, self.y, self.z, self.r, self.buttons, self.target, self.buttons2, self.enabled_extensions,
             self.s, self.t, self.aux1, self.aux2, self.aux3, self.aux4, self.aux5, self.aux6,
-        ) = _S69.unpack(payload)
+        ) = _S69.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -4779,12 +4589,8 @@ class RcChannelsOverride(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> RcChannelsOverride:
-        size = len(payload)
-        if size < 38:
-            payload = payload.ljust(38, b"\0")
-        elif size > 38:
-            payload = payload[:38]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> RcChannelsOverride:
+        body = body.ljust(47, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
@@ -4792,7 +4598,7 @@ class RcChannelsOverride(Message):
             self.chan7_raw, self.chan8_raw, self.target_system, self.target_component, self.chan9_raw,
             self.chan10_raw, self.chan11_raw, self.chan12_raw, self.chan13_raw, self.chan14_raw,
             self.chan15_raw, self.chan16_raw, self.chan17_raw, self.chan18_raw,
-        ) = _S70.unpack(payload)
+        ) = _S70.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -4928,19 +4734,15 @@ class MissionItemInt(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> MissionItemInt:
-        size = len(payload)
-        if size < 38:
-            payload = payload.ljust(38, b"\0")
-        elif size > 38:
-            payload = payload[:38]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> MissionItemInt:
+        body = body.ljust(47, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.param1, self.param2, self.param3, self.param4, self.x, self.y, self.z, self.seq,
             self.command, self.target_system, self.target_component, self.frame, self.current,
             self.autocontinue, self.mission_type,
-        ) = _S73.unpack(payload)
+        ) = _S73.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -5012,17 +4814,13 @@ class VfrHud(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> VfrHud:
-        size = len(payload)
-        if size < 20:
-            payload = payload.ljust(20, b"\0")
-        elif size > 20:
-            payload = payload[:20]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> VfrHud:
+        body = body.ljust(29, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.airspeed, self.groundspeed, self.alt, self.climb, self.heading, self.throttle,
-        ) = _S74.unpack(payload)
+        ) = _S74.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -5136,18 +4934,14 @@ class CommandInt(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> CommandInt:
-        size = len(payload)
-        if size < 35:
-            payload = payload.ljust(35, b"\0")
-        elif size > 35:
-            payload = payload[:35]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> CommandInt:
+        body = body.ljust(44, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.param1, self.param2, self.param3, self.param4, self.x, self.y, self.z, self.command,
             self.target_system, self.target_component, self.frame, self.current, self.autocontinue,
-        ) = _S75.unpack(payload)
+        ) = _S75.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -5252,18 +5046,14 @@ class CommandLong(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> CommandLong:
-        size = len(payload)
-        if size < 33:
-            payload = payload.ljust(33, b"\0")
-        elif size > 33:
-            payload = payload[:33]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> CommandLong:
+        body = body.ljust(42, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.param1, self.param2, self.param3, self.param4, self.param5, self.param6, self.param7,
             self.command, self.target_system, self.target_component, self.confirmation,
-        ) = _S76.unpack(payload)
+        ) = _S76.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -5338,18 +5128,14 @@ class CommandAck(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> CommandAck:
-        size = len(payload)
-        if size < 10:
-            payload = payload.ljust(10, b"\0")
-        elif size > 10:
-            payload = payload[:10]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> CommandAck:
+        body = body.ljust(19, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.command, self.result, self.progress, self.result_param2, self.target_system,
             self.target_component,
-        ) = _S77.unpack(payload)
+        ) = _S77.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -5425,18 +5211,14 @@ class ManualSetpoint(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> ManualSetpoint:
-        size = len(payload)
-        if size < 22:
-            payload = payload.ljust(22, b"\0")
-        elif size > 22:
-            payload = payload[:22]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> ManualSetpoint:
+        body = body.ljust(31, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_boot_ms, self.roll, self.pitch, self.yaw, self.thrust, self.mode_switch,
             self.manual_override_switch,
-        ) = _S81.unpack(payload)
+        ) = _S81.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -5532,18 +5314,14 @@ class SetAttitudeTarget(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> SetAttitudeTarget:
-        size = len(payload)
-        if size < 39:
-            payload = payload.ljust(39, b"\0")
-        elif size > 39:
-            payload = payload[:39]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> SetAttitudeTarget:
+        body = body.ljust(48, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_boot_ms, v1_0, v1_1, v1_2, v1_3, self.body_roll_rate, self.body_pitch_rate,
             self.body_yaw_rate, self.thrust, self.target_system, self.target_component, self.type_mask,
-        ) = _S82.unpack(payload)
+        ) = _S82.unpack_from(body, 9)
         self.q = (v1_0, v1_1, v1_2, v1_3)
         return self
 
@@ -5628,18 +5406,14 @@ class AttitudeTarget(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> AttitudeTarget:
-        size = len(payload)
-        if size < 37:
-            payload = payload.ljust(37, b"\0")
-        elif size > 37:
-            payload = payload[:37]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> AttitudeTarget:
+        body = body.ljust(46, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_boot_ms, v1_0, v1_1, v1_2, v1_3, self.body_roll_rate, self.body_pitch_rate,
             self.body_yaw_rate, self.thrust, self.type_mask,
-        ) = _S83.unpack(payload)
+        ) = _S83.unpack_from(body, 9)
         self.q = (v1_0, v1_1, v1_2, v1_3)
         return self
 
@@ -5778,19 +5552,15 @@ class SetPositionTargetLocalNed(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> SetPositionTargetLocalNed:
-        size = len(payload)
-        if size < 53:
-            payload = payload.ljust(53, b"\0")
-        elif size > 53:
-            payload = payload[:53]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> SetPositionTargetLocalNed:
+        body = body.ljust(62, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_boot_ms, self.x, self.y, self.z, self.vx, self.vy, self.vz, self.afx, self.afy,
             self.afz, self.yaw, self.yaw_rate, self.type_mask, self.target_system, self.target_component,
             self.coordinate_frame,
-        ) = _S84.unpack(payload)
+        ) = _S84.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -5918,18 +5688,14 @@ class PositionTargetLocalNed(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> PositionTargetLocalNed:
-        size = len(payload)
-        if size < 51:
-            payload = payload.ljust(51, b"\0")
-        elif size > 51:
-            payload = payload[:51]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> PositionTargetLocalNed:
+        body = body.ljust(60, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_boot_ms, self.x, self.y, self.z, self.vx, self.vy, self.vz, self.afx, self.afy,
             self.afz, self.yaw, self.yaw_rate, self.type_mask, self.coordinate_frame,
-        ) = _S85.unpack(payload)
+        ) = _S85.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -6072,19 +5838,15 @@ class SetPositionTargetGlobalInt(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> SetPositionTargetGlobalInt:
-        size = len(payload)
-        if size < 53:
-            payload = payload.ljust(53, b"\0")
-        elif size > 53:
-            payload = payload[:53]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> SetPositionTargetGlobalInt:
+        body = body.ljust(62, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_boot_ms, self.lat_int, self.lon_int, self.alt, self.vx, self.vy, self.vz, self.afx,
             self.afy, self.afz, self.yaw, self.yaw_rate, self.type_mask, self.target_system,
             self.target_component, self.coordinate_frame,
-        ) = _S86.unpack(payload)
+        ) = _S86.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -6218,18 +5980,14 @@ class PositionTargetGlobalInt(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> PositionTargetGlobalInt:
-        size = len(payload)
-        if size < 51:
-            payload = payload.ljust(51, b"\0")
-        elif size > 51:
-            payload = payload[:51]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> PositionTargetGlobalInt:
+        body = body.ljust(60, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_boot_ms, self.lat_int, self.lon_int, self.alt, self.vx, self.vy, self.vz, self.afx,
             self.afy, self.afz, self.yaw, self.yaw_rate, self.type_mask, self.coordinate_frame,
-        ) = _S87.unpack(payload)
+        ) = _S87.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -6304,15 +6062,13 @@ class LocalPositionNedSystemGlobalOffset(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> LocalPositionNedSystemGlobalOffset:
-        size = len(payload)
-        if size < 28:
-            payload = payload.ljust(28, b"\0")
-        elif size > 28:
-            payload = payload[:28]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> LocalPositionNedSystemGlobalOffset:
+        body = body.ljust(37, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.time_boot_ms, self.x, self.y, self.z, self.roll, self.pitch, self.yaw) = _S89.unpack(payload)
+        (
+            self.time_boot_ms, self.x, self.y, self.z, self.roll, self.pitch, self.yaw,
+        ) = _S89.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -6442,18 +6198,14 @@ class HilState(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> HilState:
-        size = len(payload)
-        if size < 56:
-            payload = payload.ljust(56, b"\0")
-        elif size > 56:
-            payload = payload[:56]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> HilState:
+        body = body.ljust(65, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_usec, self.roll, self.pitch, self.yaw, self.rollspeed, self.pitchspeed, self.yawspeed,
             self.lat, self.lon, self.alt, self.vx, self.vy, self.vz, self.xacc, self.yacc, self.zacc,
-        ) = _S90.unpack(payload)
+        ) = _S90.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -6558,18 +6310,14 @@ class HilControls(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> HilControls:
-        size = len(payload)
-        if size < 42:
-            payload = payload.ljust(42, b"\0")
-        elif size > 42:
-            payload = payload[:42]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> HilControls:
+        body = body.ljust(51, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_usec, self.roll_ailerons, self.pitch_elevator, self.yaw_rudder, self.throttle,
             self.aux1, self.aux2, self.aux3, self.aux4, self.mode, self.nav_mode,
-        ) = _S91.unpack(payload)
+        ) = _S91.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -6692,19 +6440,15 @@ class HilRcInputsRaw(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> HilRcInputsRaw:
-        size = len(payload)
-        if size < 33:
-            payload = payload.ljust(33, b"\0")
-        elif size > 33:
-            payload = payload[:33]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> HilRcInputsRaw:
+        body = body.ljust(42, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_usec, self.chan1_raw, self.chan2_raw, self.chan3_raw, self.chan4_raw, self.chan5_raw,
             self.chan6_raw, self.chan7_raw, self.chan8_raw, self.chan9_raw, self.chan10_raw, self.chan11_raw,
             self.chan12_raw, self.rssi,
-        ) = _S92.unpack(payload)
+        ) = _S92.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -6765,15 +6509,11 @@ class HilActuatorControls(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> HilActuatorControls:
-        size = len(payload)
-        if size < 81:
-            payload = payload.ljust(81, b"\0")
-        elif size > 81:
-            payload = payload[:81]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> HilActuatorControls:
+        body = body.ljust(90, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        values = _S93.unpack(payload)
+        values = _S93.unpack_from(body, 9)
         self.time_usec = values[0]
         self.flags = values[1]
         self.controls = values[2:18]
@@ -6875,18 +6615,14 @@ class OpticalFlow(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> OpticalFlow:
-        size = len(payload)
-        if size < 34:
-            payload = payload.ljust(34, b"\0")
-        elif size > 34:
-            payload = payload[:34]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> OpticalFlow:
+        body = body.ljust(43, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_usec, self.flow_comp_m_x, self.flow_comp_m_y, self.ground_distance, self.flow_x,
             self.flow_y, self.sensor_id, self.quality, self.flow_rate_x, self.flow_rate_y,
-        ) = _S100.unpack(payload)
+        ) = _S100.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -6977,15 +6713,11 @@ class GlobalVisionPositionEstimate(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> GlobalVisionPositionEstimate:
-        size = len(payload)
-        if size < 117:
-            payload = payload.ljust(117, b"\0")
-        elif size > 117:
-            payload = payload[:117]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> GlobalVisionPositionEstimate:
+        body = body.ljust(126, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        values = _S101.unpack(payload)
+        values = _S101.unpack_from(body, 9)
         self.usec = values[0]
         self.x = values[1]
         self.y = values[2]
@@ -7085,15 +6817,11 @@ class VisionPositionEstimate(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> VisionPositionEstimate:
-        size = len(payload)
-        if size < 117:
-            payload = payload.ljust(117, b"\0")
-        elif size > 117:
-            payload = payload[:117]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> VisionPositionEstimate:
+        body = body.ljust(126, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        values = _S102.unpack(payload)
+        values = _S102.unpack_from(body, 9)
         self.usec = values[0]
         self.x = values[1]
         self.y = values[2]
@@ -7177,15 +6905,11 @@ class VisionSpeedEstimate(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> VisionSpeedEstimate:
-        size = len(payload)
-        if size < 57:
-            payload = payload.ljust(57, b"\0")
-        elif size > 57:
-            payload = payload[:57]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> VisionSpeedEstimate:
+        body = body.ljust(66, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        values = _S103.unpack(payload)
+        values = _S103.unpack_from(body, 9)
         self.usec = values[0]
         self.x = values[1]
         self.y = values[2]
@@ -7273,15 +6997,11 @@ class ViconPositionEstimate(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> ViconPositionEstimate:
-        size = len(payload)
-        if size < 116:
-            payload = payload.ljust(116, b"\0")
-        elif size > 116:
-            payload = payload[:116]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> ViconPositionEstimate:
+        body = body.ljust(125, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        values = _S104.unpack(payload)
+        values = _S104.unpack_from(body, 9)
         self.usec = values[0]
         self.x = values[1]
         self.y = values[2]
@@ -7422,19 +7142,15 @@ class HighresImu(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> HighresImu:
-        size = len(payload)
-        if size < 63:
-            payload = payload.ljust(63, b"\0")
-        elif size > 63:
-            payload = payload[:63]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> HighresImu:
+        body = body.ljust(72, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_usec, self.xacc, self.yacc, self.zacc, self.xgyro, self.ygyro, self.zgyro, self.xmag,
             self.ymag, self.zmag, self.abs_pressure, self.diff_pressure, self.pressure_alt, self.temperature,
             self.fields_updated, self.id,
-        ) = _S105.unpack(payload)
+        ) = _S105.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -7554,19 +7270,15 @@ class OpticalFlowRad(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> OpticalFlowRad:
-        size = len(payload)
-        if size < 44:
-            payload = payload.ljust(44, b"\0")
-        elif size > 44:
-            payload = payload[:44]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> OpticalFlowRad:
+        body = body.ljust(53, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_usec, self.integration_time_us, self.integrated_x, self.integrated_y,
             self.integrated_xgyro, self.integrated_ygyro, self.integrated_zgyro, self.time_delta_distance_us,
             self.distance, self.temperature, self.sensor_id, self.quality,
-        ) = _S106.unpack(payload)
+        ) = _S106.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -7700,19 +7412,15 @@ class HilSensor(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> HilSensor:
-        size = len(payload)
-        if size < 65:
-            payload = payload.ljust(65, b"\0")
-        elif size > 65:
-            payload = payload[:65]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> HilSensor:
+        body = body.ljust(74, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_usec, self.xacc, self.yacc, self.zacc, self.xgyro, self.ygyro, self.zgyro, self.xmag,
             self.ymag, self.zmag, self.abs_pressure, self.diff_pressure, self.pressure_alt, self.temperature,
             self.fields_updated, self.id,
-        ) = _S107.unpack(payload)
+        ) = _S107.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -7885,19 +7593,15 @@ class SimState(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> SimState:
-        size = len(payload)
-        if size < 92:
-            payload = payload.ljust(92, b"\0")
-        elif size > 92:
-            payload = payload[:92]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> SimState:
+        body = body.ljust(101, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.q1, self.q2, self.q3, self.q4, self.roll, self.pitch, self.yaw, self.xacc, self.yacc,
             self.zacc, self.xgyro, self.ygyro, self.zgyro, self.lat, self.lon, self.alt, self.std_dev_horz,
             self.std_dev_vert, self.vn, self.ve, self.vd, self.lat_int, self.lon_int,
-        ) = _S108.unpack(payload)
+        ) = _S108.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -7979,17 +7683,13 @@ class RadioStatus(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> RadioStatus:
-        size = len(payload)
-        if size < 9:
-            payload = payload.ljust(9, b"\0")
-        elif size > 9:
-            payload = payload[:9]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> RadioStatus:
+        body = body.ljust(18, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.rxerrors, self.fixed, self.rssi, self.remrssi, self.txbuf, self.noise, self.remnoise,
-        ) = _S109.unpack(payload)
+        ) = _S109.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -8050,15 +7750,13 @@ class FileTransferProtocol(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> FileTransferProtocol:
-        size = len(payload)
-        if size < 254:
-            payload = payload.ljust(254, b"\0")
-        elif size > 254:
-            payload = payload[:254]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> FileTransferProtocol:
+        body = body.ljust(263, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.target_network, self.target_system, self.target_component, self.payload) = _S110.unpack(payload)
+        (
+            self.target_network, self.target_system, self.target_component, self.payload,
+        ) = _S110.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -8118,15 +7816,11 @@ class Timesync(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> Timesync:
-        size = len(payload)
-        if size < 16:
-            payload = payload.ljust(16, b"\0")
-        elif size > 16:
-            payload = payload[:16]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> Timesync:
+        body = body.ljust(25, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.tc1, self.ts1) = _S111.unpack(payload)
+        (self.tc1, self.ts1) = _S111.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -8172,15 +7866,11 @@ class CameraTrigger(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> CameraTrigger:
-        size = len(payload)
-        if size < 12:
-            payload = payload.ljust(12, b"\0")
-        elif size > 12:
-            payload = payload[:12]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> CameraTrigger:
+        body = body.ljust(21, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.time_usec, self.seq) = _S112.unpack(payload)
+        (self.time_usec, self.seq) = _S112.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -8312,18 +8002,14 @@ class HilGps(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> HilGps:
-        size = len(payload)
-        if size < 39:
-            payload = payload.ljust(39, b"\0")
-        elif size > 39:
-            payload = payload[:39]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> HilGps:
+        body = body.ljust(48, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_usec, self.lat, self.lon, self.alt, self.eph, self.epv, self.vel, self.vn, self.ve,
             self.vd, self.cog, self.fix_type, self.satellites_visible, self.id, self.yaw,
-        ) = _S113.unpack(payload)
+        ) = _S113.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -8443,19 +8129,15 @@ class HilOpticalFlow(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> HilOpticalFlow:
-        size = len(payload)
-        if size < 44:
-            payload = payload.ljust(44, b"\0")
-        elif size > 44:
-            payload = payload[:44]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> HilOpticalFlow:
+        body = body.ljust(53, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_usec, self.integration_time_us, self.integrated_x, self.integrated_y,
             self.integrated_xgyro, self.integrated_ygyro, self.integrated_zgyro, self.time_delta_distance_us,
             self.distance, self.temperature, self.sensor_id, self.quality,
-        ) = _S114.unpack(payload)
+        ) = _S114.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -8589,19 +8271,15 @@ class HilStateQuaternion(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> HilStateQuaternion:
-        size = len(payload)
-        if size < 64:
-            payload = payload.ljust(64, b"\0")
-        elif size > 64:
-            payload = payload[:64]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> HilStateQuaternion:
+        body = body.ljust(73, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_usec, v1_0, v1_1, v1_2, v1_3, self.rollspeed, self.pitchspeed, self.yawspeed, self.lat,
             self.lon, self.alt, self.vx, self.vy, self.vz, self.ind_airspeed, self.true_airspeed, self.xacc,
             self.yacc, self.zacc,
-        ) = _S115.unpack(payload)
+        ) = _S115.unpack_from(body, 9)
         self.attitude_quaternion = (v1_0, v1_1, v1_2, v1_3)
         return self
 
@@ -8706,18 +8384,14 @@ class ScaledImu2(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> ScaledImu2:
-        size = len(payload)
-        if size < 24:
-            payload = payload.ljust(24, b"\0")
-        elif size > 24:
-            payload = payload[:24]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> ScaledImu2:
+        body = body.ljust(33, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_boot_ms, self.xacc, self.yacc, self.zacc, self.xgyro, self.ygyro, self.zgyro, self.xmag,
             self.ymag, self.zmag, self.temperature,
-        ) = _S116.unpack(payload)
+        ) = _S116.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -8776,15 +8450,11 @@ class LogRequestList(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> LogRequestList:
-        size = len(payload)
-        if size < 6:
-            payload = payload.ljust(6, b"\0")
-        elif size > 6:
-            payload = payload[:6]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> LogRequestList:
+        body = body.ljust(15, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.start, self.end, self.target_system, self.target_component) = _S117.unpack(payload)
+        (self.start, self.end, self.target_system, self.target_component) = _S117.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -8842,15 +8512,11 @@ class LogEntry(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> LogEntry:
-        size = len(payload)
-        if size < 14:
-            payload = payload.ljust(14, b"\0")
-        elif size > 14:
-            payload = payload[:14]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> LogEntry:
+        body = body.ljust(23, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.time_utc, self.size, self.id, self.num_logs, self.last_log_num) = _S118.unpack(payload)
+        (self.time_utc, self.size, self.id, self.num_logs, self.last_log_num) = _S118.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -8908,15 +8574,13 @@ class LogRequestData(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> LogRequestData:
-        size = len(payload)
-        if size < 12:
-            payload = payload.ljust(12, b"\0")
-        elif size > 12:
-            payload = payload[:12]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> LogRequestData:
+        body = body.ljust(21, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.ofs, self.count, self.id, self.target_system, self.target_component) = _S119.unpack(payload)
+        (
+            self.ofs, self.count, self.id, self.target_system, self.target_component,
+        ) = _S119.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -8969,15 +8633,11 @@ class LogData(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> LogData:
-        size = len(payload)
-        if size < 97:
-            payload = payload.ljust(97, b"\0")
-        elif size > 97:
-            payload = payload[:97]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> LogData:
+        body = body.ljust(106, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.ofs, self.id, self.count, self.data) = _S120.unpack(payload)
+        (self.ofs, self.id, self.count, self.data) = _S120.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -9020,15 +8680,11 @@ class LogErase(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> LogErase:
-        size = len(payload)
-        if size < 2:
-            payload = payload.ljust(2, b"\0")
-        elif size > 2:
-            payload = payload[:2]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> LogErase:
+        body = body.ljust(11, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.target_system, self.target_component) = _S121.unpack(payload)
+        (self.target_system, self.target_component) = _S121.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -9071,15 +8727,11 @@ class LogRequestEnd(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> LogRequestEnd:
-        size = len(payload)
-        if size < 2:
-            payload = payload.ljust(2, b"\0")
-        elif size > 2:
-            payload = payload[:2]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> LogRequestEnd:
+        body = body.ljust(11, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.target_system, self.target_component) = _S122.unpack(payload)
+        (self.target_system, self.target_component) = _S122.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -9132,15 +8784,11 @@ class GpsInjectData(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> GpsInjectData:
-        size = len(payload)
-        if size < 113:
-            payload = payload.ljust(113, b"\0")
-        elif size > 113:
-            payload = payload[:113]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> GpsInjectData:
+        body = body.ljust(122, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.target_system, self.target_component, self.len, self.data) = _S123.unpack(payload)
+        (self.target_system, self.target_component, self.len, self.data) = _S123.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -9287,19 +8935,15 @@ class Gps2Raw(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> Gps2Raw:
-        size = len(payload)
-        if size < 57:
-            payload = payload.ljust(57, b"\0")
-        elif size > 57:
-            payload = payload[:57]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> Gps2Raw:
+        body = body.ljust(66, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_usec, self.lat, self.lon, self.alt, self.dgps_age, self.eph, self.epv, self.vel,
             self.cog, self.fix_type, self.satellites_visible, self.dgps_numch, self.yaw, self.alt_ellipsoid,
             self.h_acc, self.v_acc, self.vel_acc, self.hdg_acc,
-        ) = _S124.unpack(payload)
+        ) = _S124.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -9351,15 +8995,11 @@ class PowerStatus(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> PowerStatus:
-        size = len(payload)
-        if size < 6:
-            payload = payload.ljust(6, b"\0")
-        elif size > 6:
-            payload = payload[:6]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> PowerStatus:
+        body = body.ljust(15, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.Vcc, self.Vservo, self.flags) = _S125.unpack(payload)
+        (self.Vcc, self.Vservo, self.flags) = _S125.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -9425,15 +9065,13 @@ class SerialControl(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> SerialControl:
-        size = len(payload)
-        if size < 79:
-            payload = payload.ljust(79, b"\0")
-        elif size > 79:
-            payload = payload[:79]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> SerialControl:
+        body = body.ljust(88, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.baudrate, self.timeout, self.device, self.flags, self.count, self.data) = _S126.unpack(payload)
+        (
+            self.baudrate, self.timeout, self.device, self.flags, self.count, self.data,
+        ) = _S126.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -9546,19 +9184,15 @@ class GpsRtk(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> GpsRtk:
-        size = len(payload)
-        if size < 35:
-            payload = payload.ljust(35, b"\0")
-        elif size > 35:
-            payload = payload[:35]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> GpsRtk:
+        body = body.ljust(44, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_last_baseline_ms, self.tow, self.baseline_a_mm, self.baseline_b_mm, self.baseline_c_mm,
             self.accuracy, self.iar_num_hypotheses, self.wn, self.rtk_receiver_id, self.rtk_health,
             self.rtk_rate, self.nsats, self.baseline_coords_type,
-        ) = _S127.unpack(payload)
+        ) = _S127.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -9673,19 +9307,15 @@ class Gps2Rtk(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> Gps2Rtk:
-        size = len(payload)
-        if size < 35:
-            payload = payload.ljust(35, b"\0")
-        elif size > 35:
-            payload = payload[:35]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> Gps2Rtk:
+        body = body.ljust(44, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_last_baseline_ms, self.tow, self.baseline_a_mm, self.baseline_b_mm, self.baseline_c_mm,
             self.accuracy, self.iar_num_hypotheses, self.wn, self.rtk_receiver_id, self.rtk_health,
             self.rtk_rate, self.nsats, self.baseline_coords_type,
-        ) = _S128.unpack(payload)
+        ) = _S128.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -9789,18 +9419,14 @@ class ScaledImu3(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> ScaledImu3:
-        size = len(payload)
-        if size < 24:
-            payload = payload.ljust(24, b"\0")
-        elif size > 24:
-            payload = payload[:24]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> ScaledImu3:
+        body = body.ljust(33, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_boot_ms, self.xacc, self.yacc, self.zacc, self.xgyro, self.ygyro, self.zgyro, self.xmag,
             self.ymag, self.zmag, self.temperature,
-        ) = _S129.unpack(payload)
+        ) = _S129.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -9876,17 +9502,13 @@ class DataTransmissionHandshake(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> DataTransmissionHandshake:
-        size = len(payload)
-        if size < 13:
-            payload = payload.ljust(13, b"\0")
-        elif size > 13:
-            payload = payload[:13]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> DataTransmissionHandshake:
+        body = body.ljust(22, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.size, self.width, self.height, self.packets, self.type, self.payload, self.jpg_quality,
-        ) = _S130.unpack(payload)
+        ) = _S130.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -9932,15 +9554,11 @@ class EncapsulatedData(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> EncapsulatedData:
-        size = len(payload)
-        if size < 255:
-            payload = payload.ljust(255, b"\0")
-        elif size > 255:
-            payload = payload[:255]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> EncapsulatedData:
+        body = body.ljust(264, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.seqnr, self.data) = _S131.unpack(payload)
+        (self.seqnr, self.data) = _S131.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -10062,19 +9680,15 @@ class DistanceSensor(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> DistanceSensor:
-        size = len(payload)
-        if size < 39:
-            payload = payload.ljust(39, b"\0")
-        elif size > 39:
-            payload = payload[:39]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> DistanceSensor:
+        body = body.ljust(48, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_boot_ms, self.min_distance, self.max_distance, self.current_distance, self.type,
             self.id, self.orientation, self.covariance, self.horizontal_fov, self.vertical_fov, v10_0, v10_1,
             v10_2, v10_3, self.signal_quality,
-        ) = _S132.unpack(payload)
+        ) = _S132.unpack_from(body, 9)
         self.quaternion = (v10_0, v10_1, v10_2, v10_3)
         return self
 
@@ -10133,15 +9747,11 @@ class TerrainRequest(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> TerrainRequest:
-        size = len(payload)
-        if size < 18:
-            payload = payload.ljust(18, b"\0")
-        elif size > 18:
-            payload = payload[:18]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> TerrainRequest:
+        body = body.ljust(27, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.mask, self.lat, self.lon, self.grid_spacing) = _S133.unpack(payload)
+        (self.mask, self.lat, self.lon, self.grid_spacing) = _S133.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -10201,15 +9811,11 @@ class TerrainData(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> TerrainData:
-        size = len(payload)
-        if size < 43:
-            payload = payload.ljust(43, b"\0")
-        elif size > 43:
-            payload = payload[:43]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> TerrainData:
+        body = body.ljust(52, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        values = _S134.unpack(payload)
+        values = _S134.unpack_from(body, 9)
         self.lat = values[0]
         self.lon = values[1]
         self.grid_spacing = values[2]
@@ -10259,15 +9865,11 @@ class TerrainCheck(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> TerrainCheck:
-        size = len(payload)
-        if size < 8:
-            payload = payload.ljust(8, b"\0")
-        elif size > 8:
-            payload = payload[:8]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> TerrainCheck:
+        body = body.ljust(17, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.lat, self.lon) = _S135.unpack(payload)
+        (self.lat, self.lon) = _S135.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -10340,18 +9942,14 @@ class TerrainReport(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> TerrainReport:
-        size = len(payload)
-        if size < 22:
-            payload = payload.ljust(22, b"\0")
-        elif size > 22:
-            payload = payload[:22]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> TerrainReport:
+        body = body.ljust(31, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.lat, self.lon, self.terrain_height, self.current_height, self.spacing, self.pending,
             self.loaded,
-        ) = _S136.unpack(payload)
+        ) = _S136.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -10417,17 +10015,13 @@ class ScaledPressure2(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> ScaledPressure2:
-        size = len(payload)
-        if size < 16:
-            payload = payload.ljust(16, b"\0")
-        elif size > 16:
-            payload = payload[:16]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> ScaledPressure2:
+        body = body.ljust(25, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_boot_ms, self.press_abs, self.press_diff, self.temperature, self.temperature_press_diff,
-        ) = _S137.unpack(payload)
+        ) = _S137.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -10503,15 +10097,11 @@ class AttPosMocap(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> AttPosMocap:
-        size = len(payload)
-        if size < 120:
-            payload = payload.ljust(120, b"\0")
-        elif size > 120:
-            payload = payload[:120]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> AttPosMocap:
+        body = body.ljust(129, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        values = _S138.unpack(payload)
+        values = _S138.unpack_from(body, 9)
         self.time_usec = values[0]
         self.q = values[1:5]
         self.x = values[5]
@@ -10590,15 +10180,11 @@ class SetActuatorControlTarget(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> SetActuatorControlTarget:
-        size = len(payload)
-        if size < 43:
-            payload = payload.ljust(43, b"\0")
-        elif size > 43:
-            payload = payload[:43]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> SetActuatorControlTarget:
+        body = body.ljust(52, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        values = _S139.unpack(payload)
+        values = _S139.unpack_from(body, 9)
         self.time_usec = values[0]
         self.controls = values[1:9]
         self.group_mlx = values[9]
@@ -10663,15 +10249,11 @@ class ActuatorControlTarget(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> ActuatorControlTarget:
-        size = len(payload)
-        if size < 41:
-            payload = payload.ljust(41, b"\0")
-        elif size > 41:
-            payload = payload[:41]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> ActuatorControlTarget:
+        body = body.ljust(50, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        values = _S140.unpack(payload)
+        values = _S140.unpack_from(body, 9)
         self.time_usec = values[0]
         self.controls = values[1:9]
         self.group_mlx = values[9]
@@ -10772,18 +10354,14 @@ class Altitude(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> Altitude:
-        size = len(payload)
-        if size < 32:
-            payload = payload.ljust(32, b"\0")
-        elif size > 32:
-            payload = payload[:32]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> Altitude:
+        body = body.ljust(41, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_usec, self.altitude_monotonic, self.altitude_amsl, self.altitude_local,
             self.altitude_relative, self.altitude_terrain, self.bottom_clearance,
-        ) = _S141.unpack(payload)
+        ) = _S141.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -10850,15 +10428,13 @@ class ResourceRequest(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> ResourceRequest:
-        size = len(payload)
-        if size < 243:
-            payload = payload.ljust(243, b"\0")
-        elif size > 243:
-            payload = payload[:243]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> ResourceRequest:
+        body = body.ljust(252, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.request_id, self.uri_type, self.uri, self.transfer_type, self.storage) = _S142.unpack(payload)
+        (
+            self.request_id, self.uri_type, self.uri, self.transfer_type, self.storage,
+        ) = _S142.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -10924,17 +10500,13 @@ class ScaledPressure3(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> ScaledPressure3:
-        size = len(payload)
-        if size < 16:
-            payload = payload.ljust(16, b"\0")
-        elif size > 16:
-            payload = payload[:16]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> ScaledPressure3:
+        body = body.ljust(25, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_boot_ms, self.press_abs, self.press_diff, self.temperature, self.temperature_press_diff,
-        ) = _S143.unpack(payload)
+        ) = _S143.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -11037,18 +10609,14 @@ class FollowTarget(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> FollowTarget:
-        size = len(payload)
-        if size < 93:
-            payload = payload.ljust(93, b"\0")
-        elif size > 93:
-            payload = payload[:93]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> FollowTarget:
+        body = body.ljust(102, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.timestamp, self.custom_state, self.lat, self.lon, self.alt, v5_0, v5_1, v5_2, v6_0, v6_1,
             v6_2, v7_0, v7_1, v7_2, v7_3, v8_0, v8_1, v8_2, v9_0, v9_1, v9_2, self.est_capabilities,
-        ) = _S144.unpack(payload)
+        ) = _S144.unpack_from(body, 9)
         self.vel = (v5_0, v5_1, v5_2)
         self.acc = (v6_0, v6_1, v6_2)
         self.attitude_q = (v7_0, v7_1, v7_2, v7_3)
@@ -11190,19 +10758,15 @@ class ControlSystemState(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> ControlSystemState:
-        size = len(payload)
-        if size < 100:
-            payload = payload.ljust(100, b"\0")
-        elif size > 100:
-            payload = payload[:100]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> ControlSystemState:
+        body = body.ljust(109, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_usec, self.x_acc, self.y_acc, self.z_acc, self.x_vel, self.y_vel, self.z_vel,
             self.x_pos, self.y_pos, self.z_pos, self.airspeed, v11_0, v11_1, v11_2, v12_0, v12_1, v12_2,
             v13_0, v13_1, v13_2, v13_3, self.roll_rate, self.pitch_rate, self.yaw_rate,
-        ) = _S146.unpack(payload)
+        ) = _S146.unpack_from(body, 9)
         self.vel_variance = (v11_0, v11_1, v11_2)
         self.pos_variance = (v12_0, v12_1, v12_2)
         self.q = (v13_0, v13_1, v13_2, v13_3)
@@ -11356,15 +10920,11 @@ class BatteryStatus(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> BatteryStatus:
-        size = len(payload)
-        if size < 54:
-            payload = payload.ljust(54, b"\0")
-        elif size > 54:
-            payload = payload[:54]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> BatteryStatus:
+        body = body.ljust(63, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        values = _S147.unpack(payload)
+        values = _S147.unpack_from(body, 9)
         self.current_consumed = values[0]
         self.energy_consumed = values[1]
         self.temperature = values[2]
@@ -11505,19 +11065,15 @@ class LandingTarget(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> LandingTarget:
-        size = len(payload)
-        if size < 60:
-            payload = payload.ljust(60, b"\0")
-        elif size > 60:
-            payload = payload[:60]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> LandingTarget:
+        body = body.ljust(69, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_usec, self.angle_x, self.angle_y, self.distance, self.size_x, self.size_y,
             self.target_num, self.frame, self.x, self.y, self.z, v11_0, v11_1, v11_2, v11_3, self.type,
             self.position_valid,
-        ) = _S149.unpack(payload)
+        ) = _S149.unpack_from(body, 9)
         self.q = (v11_0, v11_1, v11_2, v11_3)
         return self
 
@@ -11585,17 +11141,13 @@ class FenceStatus(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> FenceStatus:
-        size = len(payload)
-        if size < 9:
-            payload = payload.ljust(9, b"\0")
-        elif size > 9:
-            payload = payload[:9]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> FenceStatus:
+        body = body.ljust(18, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.breach_time, self.breach_count, self.breach_status, self.breach_type, self.breach_mitigation,
-        ) = _S162.unpack(payload)
+        ) = _S162.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -11739,12 +11291,8 @@ class MagCalReport(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> MagCalReport:
-        size = len(payload)
-        if size < 54:
-            payload = payload.ljust(54, b"\0")
-        elif size > 54:
-            payload = payload[:54]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> MagCalReport:
+        body = body.ljust(63, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
@@ -11752,7 +11300,7 @@ class MagCalReport(Message):
             self.offdiag_x, self.offdiag_y, self.offdiag_z, self.compass_id, self.cal_mask, self.cal_status,
             self.autosaved, self.orientation_confidence, self.old_orientation, self.new_orientation,
             self.scale_factor,
-        ) = _S192.unpack(payload)
+        ) = _S192.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -11905,12 +11453,8 @@ class EfiStatus(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> EfiStatus:
-        size = len(payload)
-        if size < 73:
-            payload = payload.ljust(73, b"\0")
-        elif size > 73:
-            payload = payload[:73]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> EfiStatus:
+        body = body.ljust(82, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
@@ -11919,7 +11463,7 @@ class EfiStatus(Message):
             self.intake_manifold_pressure, self.intake_manifold_temperature, self.cylinder_head_temperature,
             self.ignition_timing, self.injection_time, self.exhaust_gas_temperature, self.throttle_out,
             self.pt_compensation, self.health, self.ignition_voltage, self.fuel_pressure,
-        ) = _S225.unpack(payload)
+        ) = _S225.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -12030,18 +11574,14 @@ class EstimatorStatus(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> EstimatorStatus:
-        size = len(payload)
-        if size < 42:
-            payload = payload.ljust(42, b"\0")
-        elif size > 42:
-            payload = payload[:42]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> EstimatorStatus:
+        body = body.ljust(51, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_usec, self.vel_ratio, self.pos_horiz_ratio, self.pos_vert_ratio, self.mag_ratio,
             self.hagl_ratio, self.tas_ratio, self.pos_horiz_accuracy, self.pos_vert_accuracy, self.flags,
-        ) = _S230.unpack(payload)
+        ) = _S230.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -12142,18 +11682,14 @@ class WindCov(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> WindCov:
-        size = len(payload)
-        if size < 40:
-            payload = payload.ljust(40, b"\0")
-        elif size > 40:
-            payload = payload[:40]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> WindCov:
+        body = body.ljust(49, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_usec, self.wind_x, self.wind_y, self.wind_z, self.var_horiz, self.var_vert,
             self.wind_alt, self.horiz_accuracy, self.vert_accuracy,
-        ) = _S231.unpack(payload)
+        ) = _S231.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -12309,19 +11845,15 @@ class GpsInput(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> GpsInput:
-        size = len(payload)
-        if size < 65:
-            payload = payload.ljust(65, b"\0")
-        elif size > 65:
-            payload = payload[:65]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> GpsInput:
+        body = body.ljust(74, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_usec, self.time_week_ms, self.lat, self.lon, self.alt, self.hdop, self.vdop, self.vn,
             self.ve, self.vd, self.speed_accuracy, self.horiz_accuracy, self.vert_accuracy, self.ignore_flags,
             self.time_week, self.gps_id, self.fix_type, self.satellites_visible, self.yaw,
-        ) = _S232.unpack(payload)
+        ) = _S232.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -12382,15 +11914,11 @@ class GpsRtcmData(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> GpsRtcmData:
-        size = len(payload)
-        if size < 182:
-            payload = payload.ljust(182, b"\0")
-        elif size > 182:
-            payload = payload[:182]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> GpsRtcmData:
+        body = body.ljust(191, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.flags, self.len, self.data) = _S233.unpack(payload)
+        (self.flags, self.len, self.data) = _S233.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -12565,12 +12093,8 @@ class HighLatency(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> HighLatency:
-        size = len(payload)
-        if size < 40:
-            payload = payload.ljust(40, b"\0")
-        elif size > 40:
-            payload = payload[:40]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> HighLatency:
+        body = body.ljust(49, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
@@ -12579,7 +12103,7 @@ class HighLatency(Message):
             self.landed_state, self.throttle, self.airspeed, self.airspeed_sp, self.groundspeed,
             self.climb_rate, self.gps_nsat, self.gps_fix_type, self.battery_remaining, self.temperature,
             self.temperature_air, self.failsafe, self.wp_num,
-        ) = _S234.unpack(payload)
+        ) = _S234.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -12771,12 +12295,8 @@ class HighLatency2(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> HighLatency2:
-        size = len(payload)
-        if size < 42:
-            payload = payload.ljust(42, b"\0")
-        elif size > 42:
-            payload = payload[:42]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> HighLatency2:
+        body = body.ljust(51, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
@@ -12785,7 +12305,7 @@ class HighLatency2(Message):
             self.autopilot, self.heading, self.target_heading, self.throttle, self.airspeed, self.airspeed_sp,
             self.groundspeed, self.windspeed, self.wind_heading, self.eph, self.epv, self.temperature_air,
             self.climb_rate, self.battery, self.custom0, self.custom1, self.custom2,
-        ) = _S235.unpack(payload)
+        ) = _S235.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -12869,18 +12389,14 @@ class Vibration(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> Vibration:
-        size = len(payload)
-        if size < 32:
-            payload = payload.ljust(32, b"\0")
-        elif size > 32:
-            payload = payload[:32]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> Vibration:
+        body = body.ljust(41, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_usec, self.vibration_x, self.vibration_y, self.vibration_z, self.clipping_0,
             self.clipping_1, self.clipping_2,
-        ) = _S241.unpack(payload)
+        ) = _S241.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -13004,18 +12520,14 @@ class HomePosition(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> HomePosition:
-        size = len(payload)
-        if size < 60:
-            payload = payload.ljust(60, b"\0")
-        elif size > 60:
-            payload = payload[:60]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> HomePosition:
+        body = body.ljust(69, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.latitude, self.longitude, self.altitude, self.x, self.y, self.z, v6_0, v6_1, v6_2, v6_3,
             self.approach_x, self.approach_y, self.approach_z, self.time_usec,
-        ) = _S242.unpack(payload)
+        ) = _S242.unpack_from(body, 9)
         self.q = (v6_0, v6_1, v6_2, v6_3)
         return self
 
@@ -13151,18 +12663,14 @@ class SetHomePosition(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> SetHomePosition:
-        size = len(payload)
-        if size < 61:
-            payload = payload.ljust(61, b"\0")
-        elif size > 61:
-            payload = payload[:61]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> SetHomePosition:
+        body = body.ljust(70, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.latitude, self.longitude, self.altitude, self.x, self.y, self.z, v6_0, v6_1, v6_2, v6_3,
             self.approach_x, self.approach_y, self.approach_z, self.target_system, self.time_usec,
-        ) = _S243.unpack(payload)
+        ) = _S243.unpack_from(body, 9)
         self.q = (v6_0, v6_1, v6_2, v6_3)
         return self
 
@@ -13214,15 +12722,11 @@ class MessageInterval(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> MessageInterval:
-        size = len(payload)
-        if size < 6:
-            payload = payload.ljust(6, b"\0")
-        elif size > 6:
-            payload = payload[:6]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> MessageInterval:
+        body = body.ljust(15, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.interval_us, self.message_id) = _S244.unpack(payload)
+        (self.interval_us, self.message_id) = _S244.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -13269,15 +12773,11 @@ class ExtendedSysState(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> ExtendedSysState:
-        size = len(payload)
-        if size < 2:
-            payload = payload.ljust(2, b"\0")
-        elif size > 2:
-            payload = payload[:2]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> ExtendedSysState:
+        body = body.ljust(11, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.vtol_state, self.landed_state) = _S245.unpack(payload)
+        (self.vtol_state, self.landed_state) = _S245.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -13387,18 +12887,14 @@ class AdsbVehicle(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> AdsbVehicle:
-        size = len(payload)
-        if size < 38:
-            payload = payload.ljust(38, b"\0")
-        elif size > 38:
-            payload = payload[:38]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> AdsbVehicle:
+        body = body.ljust(47, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.ICAO_address, self.lat, self.lon, self.altitude, self.heading, self.hor_velocity,
             self.ver_velocity, self.flags, self.squawk, self.altitude_type, v10, self.emitter_type, self.tslc,
-        ) = _S246.unpack(payload)
+        ) = _S246.unpack_from(body, 9)
         self.callsign = v10.partition(b"\0")[0].decode("utf-8", "replace")
         return self
 
@@ -13482,18 +12978,14 @@ class Collision(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> Collision:
-        size = len(payload)
-        if size < 19:
-            payload = payload.ljust(19, b"\0")
-        elif size > 19:
-            payload = payload[:19]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> Collision:
+        body = body.ljust(28, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.id, self.time_to_minimum_delta, self.altitude_minimum_delta, self.horizontal_minimum_delta,
             self.src, self.action, self.threat_level,
-        ) = _S247.unpack(payload)
+        ) = _S247.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -13572,17 +13064,13 @@ class V2Extension(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> V2Extension:
-        size = len(payload)
-        if size < 254:
-            payload = payload.ljust(254, b"\0")
-        elif size > 254:
-            payload = payload[:254]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> V2Extension:
+        body = body.ljust(263, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.message_type, self.target_network, self.target_system, self.target_component, self.payload,
-        ) = _S248.unpack(payload)
+        ) = _S248.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -13643,15 +13131,11 @@ class MemoryVect(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> MemoryVect:
-        size = len(payload)
-        if size < 36:
-            payload = payload.ljust(36, b"\0")
-        elif size > 36:
-            payload = payload[:36]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> MemoryVect:
+        body = body.ljust(45, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        values = _S249.unpack(payload)
+        values = _S249.unpack_from(body, 9)
         self.address = values[0]
         self.ver = values[1]
         self.type = values[2]
@@ -13716,15 +13200,11 @@ class DebugVect(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> DebugVect:
-        size = len(payload)
-        if size < 30:
-            payload = payload.ljust(30, b"\0")
-        elif size > 30:
-            payload = payload[:30]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> DebugVect:
+        body = body.ljust(39, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.time_usec, self.x, self.y, self.z, v4) = _S250.unpack(payload)
+        (self.time_usec, self.x, self.y, self.z, v4) = _S250.unpack_from(body, 9)
         self.name = v4.partition(b"\0")[0].decode("utf-8", "replace")
         return self
 
@@ -13775,15 +13255,11 @@ class NamedValueFloat(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> NamedValueFloat:
-        size = len(payload)
-        if size < 18:
-            payload = payload.ljust(18, b"\0")
-        elif size > 18:
-            payload = payload[:18]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> NamedValueFloat:
+        body = body.ljust(27, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.time_boot_ms, self.value, v2) = _S251.unpack(payload)
+        (self.time_boot_ms, self.value, v2) = _S251.unpack_from(body, 9)
         self.name = v2.partition(b"\0")[0].decode("utf-8", "replace")
         return self
 
@@ -13834,15 +13310,11 @@ class NamedValueInt(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> NamedValueInt:
-        size = len(payload)
-        if size < 18:
-            payload = payload.ljust(18, b"\0")
-        elif size > 18:
-            payload = payload[:18]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> NamedValueInt:
+        body = body.ljust(27, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.time_boot_ms, self.value, v2) = _S252.unpack(payload)
+        (self.time_boot_ms, self.value, v2) = _S252.unpack_from(body, 9)
         self.name = v2.partition(b"\0")[0].decode("utf-8", "replace")
         return self
 
@@ -13905,15 +13377,11 @@ class Statustext(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> Statustext:
-        size = len(payload)
-        if size < 54:
-            payload = payload.ljust(54, b"\0")
-        elif size > 54:
-            payload = payload[:54]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> Statustext:
+        body = body.ljust(63, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.severity, v1, self.id, self.chunk_seq) = _S253.unpack(payload)
+        (self.severity, v1, self.id, self.chunk_seq) = _S253.unpack_from(body, 9)
         self.text = v1.partition(b"\0")[0].decode("utf-8", "replace")
         return self
 
@@ -13963,15 +13431,11 @@ class Debug(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> Debug:
-        size = len(payload)
-        if size < 9:
-            payload = payload.ljust(9, b"\0")
-        elif size > 9:
-            payload = payload[:9]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> Debug:
+        body = body.ljust(18, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.time_boot_ms, self.value, self.ind) = _S254.unpack(payload)
+        (self.time_boot_ms, self.value, self.ind) = _S254.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -14027,17 +13491,13 @@ class SetupSigning(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> SetupSigning:
-        size = len(payload)
-        if size < 42:
-            payload = payload.ljust(42, b"\0")
-        elif size > 42:
-            payload = payload[:42]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> SetupSigning:
+        body = body.ljust(51, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.initial_timestamp, self.target_system, self.target_component, self.secret_key,
-        ) = _S256.unpack(payload)
+        ) = _S256.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -14088,15 +13548,11 @@ class ButtonChange(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> ButtonChange:
-        size = len(payload)
-        if size < 9:
-            payload = payload.ljust(9, b"\0")
-        elif size > 9:
-            payload = payload[:9]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> ButtonChange:
+        body = body.ljust(18, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.time_boot_ms, self.last_change_ms, self.state) = _S257.unpack(payload)
+        (self.time_boot_ms, self.last_change_ms, self.state) = _S257.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -14149,15 +13605,11 @@ class PlayTune(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> PlayTune:
-        size = len(payload)
-        if size < 232:
-            payload = payload.ljust(232, b"\0")
-        elif size > 232:
-            payload = payload[:232]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> PlayTune:
+        body = body.ljust(241, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.target_system, self.target_component, v2, v3) = _S258.unpack(payload)
+        (self.target_system, self.target_component, v2, v3) = _S258.unpack_from(body, 9)
         self.tune = v2.partition(b"\0")[0].decode("utf-8", "replace")
         self.tune2 = v3.partition(b"\0")[0].decode("utf-8", "replace")
         return self
@@ -14297,12 +13749,8 @@ class CameraInformation(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> CameraInformation:
-        size = len(payload)
-        if size < 237:
-            payload = payload.ljust(237, b"\0")
-        elif size > 237:
-            payload = payload[:237]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> CameraInformation:
+        body = body.ljust(246, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
@@ -14310,7 +13758,7 @@ class CameraInformation(Message):
             self.sensor_size_v, self.flags, self.resolution_h, self.resolution_v, self.cam_definition_version,
             self.vendor_name, self.model_name, self.lens_id, v12, self.gimbal_device_id,
             self.camera_device_id,
-        ) = _S259.unpack(payload)
+        ) = _S259.unpack_from(body, 9)
         self.cam_definition_uri = v12.partition(b"\0")[0].decode("utf-8", "replace")
         return self
 
@@ -14385,17 +13833,13 @@ class CameraSettings(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> CameraSettings:
-        size = len(payload)
-        if size < 14:
-            payload = payload.ljust(14, b"\0")
-        elif size > 14:
-            payload = payload[:14]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> CameraSettings:
+        body = body.ljust(23, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_boot_ms, self.mode_id, self.zoomLevel, self.focusLevel, self.camera_device_id,
-        ) = _S260.unpack(payload)
+        ) = _S260.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -14517,19 +13961,15 @@ class StorageInformation(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> StorageInformation:
-        size = len(payload)
-        if size < 61:
-            payload = payload.ljust(61, b"\0")
-        elif size > 61:
-            payload = payload[:61]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> StorageInformation:
+        body = body.ljust(70, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_boot_ms, self.total_capacity, self.used_capacity, self.available_capacity,
             self.read_speed, self.write_speed, self.storage_id, self.storage_count, self.status, self.type,
             v10, self.storage_usage,
-        ) = _S261.unpack(payload)
+        ) = _S261.unpack_from(body, 9)
         self.name = v10.partition(b"\0")[0].decode("utf-8", "replace")
         return self
 
@@ -14625,18 +14065,14 @@ class CameraCaptureStatus(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> CameraCaptureStatus:
-        size = len(payload)
-        if size < 23:
-            payload = payload.ljust(23, b"\0")
-        elif size > 23:
-            payload = payload[:23]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> CameraCaptureStatus:
+        body = body.ljust(32, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_boot_ms, self.image_interval, self.recording_time_ms, self.available_capacity,
             self.image_status, self.video_status, self.image_count, self.camera_device_id,
-        ) = _S262.unpack(payload)
+        ) = _S262.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -14751,18 +14187,14 @@ class CameraImageCaptured(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> CameraImageCaptured:
-        size = len(payload)
-        if size < 255:
-            payload = payload.ljust(255, b"\0")
-        elif size > 255:
-            payload = payload[:255]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> CameraImageCaptured:
+        body = body.ljust(264, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_utc, self.time_boot_ms, self.lat, self.lon, self.alt, self.relative_alt, v6_0, v6_1,
             v6_2, v6_3, self.image_index, self.camera_id, self.capture_result, v10,
-        ) = _S263.unpack(payload)
+        ) = _S263.unpack_from(body, 9)
         self.q = (v6_0, v6_1, v6_2, v6_3)
         self.file_url = v10.partition(b"\0")[0].decode("utf-8", "replace")
         return self
@@ -14838,18 +14270,14 @@ class FlightInformation(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> FlightInformation:
-        size = len(payload)
-        if size < 32:
-            payload = payload.ljust(32, b"\0")
-        elif size > 32:
-            payload = payload[:32]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> FlightInformation:
+        body = body.ljust(41, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.arming_time_utc, self.takeoff_time_utc, self.flight_uuid, self.time_boot_ms,
             self.landing_time,
-        ) = _S264.unpack(payload)
+        ) = _S264.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -14918,15 +14346,11 @@ class MountOrientation(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> MountOrientation:
-        size = len(payload)
-        if size < 20:
-            payload = payload.ljust(20, b"\0")
-        elif size > 20:
-            payload = payload[:20]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> MountOrientation:
+        body = body.ljust(29, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.time_boot_ms, self.roll, self.pitch, self.yaw, self.yaw_absolute) = _S265.unpack(payload)
+        (self.time_boot_ms, self.roll, self.pitch, self.yaw, self.yaw_absolute) = _S265.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -14996,18 +14420,14 @@ class LoggingData(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> LoggingData:
-        size = len(payload)
-        if size < 255:
-            payload = payload.ljust(255, b"\0")
-        elif size > 255:
-            payload = payload[:255]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> LoggingData:
+        body = body.ljust(264, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.sequence, self.target_system, self.target_component, self.length, self.first_message_offset,
             self.data,
-        ) = _S266.unpack(payload)
+        ) = _S266.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -15081,18 +14501,14 @@ class LoggingDataAcked(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> LoggingDataAcked:
-        size = len(payload)
-        if size < 255:
-            payload = payload.ljust(255, b"\0")
-        elif size > 255:
-            payload = payload[:255]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> LoggingDataAcked:
+        body = body.ljust(264, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.sequence, self.target_system, self.target_component, self.length, self.first_message_offset,
             self.data,
-        ) = _S267.unpack(payload)
+        ) = _S267.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -15143,15 +14559,11 @@ class LoggingAck(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> LoggingAck:
-        size = len(payload)
-        if size < 4:
-            payload = payload.ljust(4, b"\0")
-        elif size > 4:
-            payload = payload[:4]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> LoggingAck:
+        body = body.ljust(13, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.sequence, self.target_system, self.target_component) = _S268.unpack(payload)
+        (self.sequence, self.target_system, self.target_component) = _S268.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -15270,18 +14682,14 @@ class VideoStreamInformation(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> VideoStreamInformation:
-        size = len(payload)
-        if size < 215:
-            payload = payload.ljust(215, b"\0")
-        elif size > 215:
-            payload = payload[:215]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> VideoStreamInformation:
+        body = body.ljust(224, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.framerate, self.bitrate, self.flags, self.resolution_h, self.resolution_v, self.rotation,
             self.hfov, self.stream_id, self.count, self.type, v10, v11, self.encoding, self.camera_device_id,
-        ) = _S269.unpack(payload)
+        ) = _S269.unpack_from(body, 9)
         self.name = v10.partition(b"\0")[0].decode("utf-8", "replace")
         self.uri = v11.partition(b"\0")[0].decode("utf-8", "replace")
         return self
@@ -15377,18 +14785,14 @@ class VideoStreamStatus(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> VideoStreamStatus:
-        size = len(payload)
-        if size < 20:
-            payload = payload.ljust(20, b"\0")
-        elif size > 20:
-            payload = payload[:20]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> VideoStreamStatus:
+        body = body.ljust(29, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.framerate, self.bitrate, self.flags, self.resolution_h, self.resolution_v, self.rotation,
             self.hfov, self.stream_id, self.camera_device_id,
-        ) = _S270.unpack(payload)
+        ) = _S270.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -15498,19 +14902,15 @@ class CameraFovStatus(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> CameraFovStatus:
-        size = len(payload)
-        if size < 53:
-            payload = payload.ljust(53, b"\0")
-        elif size > 53:
-            payload = payload[:53]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> CameraFovStatus:
+        body = body.ljust(62, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_boot_ms, self.lat_camera, self.lon_camera, self.alt_camera, self.lat_image,
             self.lon_image, self.alt_image, v7_0, v7_1, v7_2, v7_3, self.hfov, self.vfov,
             self.camera_device_id,
-        ) = _S271.unpack(payload)
+        ) = _S271.unpack_from(body, 9)
         self.q = (v7_0, v7_1, v7_2, v7_3)
         return self
 
@@ -15630,19 +15030,15 @@ class CameraTrackingImageStatus(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> CameraTrackingImageStatus:
-        size = len(payload)
-        if size < 32:
-            payload = payload.ljust(32, b"\0")
-        elif size > 32:
-            payload = payload[:32]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> CameraTrackingImageStatus:
+        body = body.ljust(41, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.point_x, self.point_y, self.radius, self.rec_top_x, self.rec_top_y, self.rec_bottom_x,
             self.rec_bottom_y, self.tracking_status, self.tracking_mode, self.target_data,
             self.camera_device_id,
-        ) = _S275.unpack(payload)
+        ) = _S275.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -15762,18 +15158,14 @@ class CameraTrackingGeoStatus(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> CameraTrackingGeoStatus:
-        size = len(payload)
-        if size < 50:
-            payload = payload.ljust(50, b"\0")
-        elif size > 50:
-            payload = payload[:50]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> CameraTrackingGeoStatus:
+        body = body.ljust(59, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.lat, self.lon, self.alt, self.h_acc, self.v_acc, self.vel_n, self.vel_e, self.vel_d,
             self.vel_acc, self.dist, self.hdg, self.hdg_acc, self.tracking_status, self.camera_device_id,
-        ) = _S276.unpack(payload)
+        ) = _S276.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -15878,18 +15270,14 @@ class CameraThermalRange(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> CameraThermalRange:
-        size = len(payload)
-        if size < 30:
-            payload = payload.ljust(30, b"\0")
-        elif size > 30:
-            payload = payload[:30]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> CameraThermalRange:
+        body = body.ljust(39, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_boot_ms, self.max, self.max_point_x, self.max_point_y, self.min, self.min_point_x,
             self.min_point_y, self.stream_id, self.camera_device_id,
-        ) = _S277.unpack(payload)
+        ) = _S277.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -15986,18 +15374,14 @@ class GimbalManagerInformation(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> GimbalManagerInformation:
-        size = len(payload)
-        if size < 33:
-            payload = payload.ljust(33, b"\0")
-        elif size > 33:
-            payload = payload[:33]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> GimbalManagerInformation:
+        body = body.ljust(42, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_boot_ms, self.cap_flags, self.roll_min, self.roll_max, self.pitch_min, self.pitch_max,
             self.yaw_min, self.yaw_max, self.gimbal_device_id,
-        ) = _S280.unpack(payload)
+        ) = _S280.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -16080,18 +15464,14 @@ class GimbalManagerStatus(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> GimbalManagerStatus:
-        size = len(payload)
-        if size < 13:
-            payload = payload.ljust(13, b"\0")
-        elif size > 13:
-            payload = payload[:13]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> GimbalManagerStatus:
+        body = body.ljust(22, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_boot_ms, self.flags, self.gimbal_device_id, self.primary_control_sysid,
             self.primary_control_compid, self.secondary_control_sysid, self.secondary_control_compid,
-        ) = _S281.unpack(payload)
+        ) = _S281.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -16189,18 +15569,14 @@ class GimbalManagerSetAttitude(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> GimbalManagerSetAttitude:
-        size = len(payload)
-        if size < 35:
-            payload = payload.ljust(35, b"\0")
-        elif size > 35:
-            payload = payload[:35]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> GimbalManagerSetAttitude:
+        body = body.ljust(44, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.flags, v1_0, v1_1, v1_2, v1_3, self.angular_velocity_x, self.angular_velocity_y,
             self.angular_velocity_z, self.target_system, self.target_component, self.gimbal_device_id,
-        ) = _S282.unpack(payload)
+        ) = _S282.unpack_from(body, 9)
         self.q = (v1_0, v1_1, v1_2, v1_3)
         return self
 
@@ -16361,19 +15737,15 @@ class GimbalDeviceInformation(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> GimbalDeviceInformation:
-        size = len(payload)
-        if size < 149:
-            payload = payload.ljust(149, b"\0")
-        elif size > 149:
-            payload = payload[:149]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> GimbalDeviceInformation:
+        body = body.ljust(158, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.uid, self.time_boot_ms, self.firmware_version, self.hardware_version, self.roll_min,
             self.roll_max, self.pitch_min, self.pitch_max, self.yaw_min, self.yaw_max, self.cap_flags,
             self.custom_cap_flags, v12, v13, v14, self.gimbal_device_id, self.cap_flags2,
-        ) = _S283.unpack(payload)
+        ) = _S283.unpack_from(body, 9)
         self.vendor_name = v12.partition(b"\0")[0].decode("utf-8", "replace")
         self.model_name = v13.partition(b"\0")[0].decode("utf-8", "replace")
         self.custom_name = v14.partition(b"\0")[0].decode("utf-8", "replace")
@@ -16477,18 +15849,14 @@ class GimbalDeviceSetAttitude(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> GimbalDeviceSetAttitude:
-        size = len(payload)
-        if size < 32:
-            payload = payload.ljust(32, b"\0")
-        elif size > 32:
-            payload = payload[:32]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> GimbalDeviceSetAttitude:
+        body = body.ljust(41, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             v0_0, v0_1, v0_2, v0_3, self.angular_velocity_x, self.angular_velocity_y, self.angular_velocity_z,
             self.flags, self.target_system, self.target_component,
-        ) = _S284.unpack(payload)
+        ) = _S284.unpack_from(body, 9)
         self.q = (v0_0, v0_1, v0_2, v0_3)
         return self
 
@@ -16629,19 +15997,15 @@ class GimbalDeviceAttitudeStatus(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> GimbalDeviceAttitudeStatus:
-        size = len(payload)
-        if size < 49:
-            payload = payload.ljust(49, b"\0")
-        elif size > 49:
-            payload = payload[:49]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> GimbalDeviceAttitudeStatus:
+        body = body.ljust(58, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_boot_ms, v1_0, v1_1, v1_2, v1_3, self.angular_velocity_x, self.angular_velocity_y,
             self.angular_velocity_z, self.failure_flags, self.flags, self.target_system,
             self.target_component, self.delta_yaw, self.delta_yaw_velocity, self.gimbal_device_id,
-        ) = _S285.unpack(payload)
+        ) = _S285.unpack_from(body, 9)
         self.q = (v1_0, v1_1, v1_2, v1_3)
         return self
 
@@ -16769,19 +16133,15 @@ class AutopilotStateForGimbalDevice(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> AutopilotStateForGimbalDevice:
-        size = len(payload)
-        if size < 57:
-            payload = payload.ljust(57, b"\0")
-        elif size > 57:
-            payload = payload[:57]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> AutopilotStateForGimbalDevice:
+        body = body.ljust(66, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_boot_us, v1_0, v1_1, v1_2, v1_3, self.q_estimated_delay_us, self.vx, self.vy, self.vz,
             self.v_estimated_delay_us, self.feed_forward_angular_velocity_z, self.estimator_status,
             self.target_system, self.target_component, self.landed_state, self.angular_velocity_z,
-        ) = _S286.unpack(payload)
+        ) = _S286.unpack_from(body, 9)
         self.q = (v1_0, v1_1, v1_2, v1_3)
         return self
 
@@ -16881,18 +16241,14 @@ class GimbalManagerSetPitchyaw(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> GimbalManagerSetPitchyaw:
-        size = len(payload)
-        if size < 23:
-            payload = payload.ljust(23, b"\0")
-        elif size > 23:
-            payload = payload[:23]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> GimbalManagerSetPitchyaw:
+        body = body.ljust(32, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.flags, self.pitch, self.yaw, self.pitch_rate, self.yaw_rate, self.target_system,
             self.target_component, self.gimbal_device_id,
-        ) = _S287.unpack(payload)
+        ) = _S287.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -16991,18 +16347,14 @@ class GimbalManagerSetManualControl(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> GimbalManagerSetManualControl:
-        size = len(payload)
-        if size < 23:
-            payload = payload.ljust(23, b"\0")
-        elif size > 23:
-            payload = payload[:23]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> GimbalManagerSetManualControl:
+        body = body.ljust(32, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.flags, self.pitch, self.yaw, self.pitch_rate, self.yaw_rate, self.target_system,
             self.target_component, self.gimbal_device_id,
-        ) = _S288.unpack(payload)
+        ) = _S288.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -17063,15 +16415,11 @@ class Airspeed(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> Airspeed:
-        size = len(payload)
-        if size < 12:
-            payload = payload.ljust(12, b"\0")
-        elif size > 12:
-            payload = payload[:12]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> Airspeed:
+        body = body.ljust(21, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.airspeed, self.raw_press, self.temperature, self.id, self.flags) = _S295.unpack(payload)
+        (self.airspeed, self.raw_press, self.temperature, self.id, self.flags) = _S295.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -17189,18 +16537,14 @@ class GlobalPositionSensor(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> GlobalPositionSensor:
-        size = len(payload)
-        if size < 41:
-            payload = payload.ljust(41, b"\0")
-        elif size > 41:
-            payload = payload[:41]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> GlobalPositionSensor:
+        body = body.ljust(50, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_usec, self.processing_time, self.lat, self.lon, self.alt_ellipsoid, self.alt, self.eph,
             self.epv, self.target_system, self.target_component, self.id, self.source, self.flags,
-        ) = _S296.unpack(payload)
+        ) = _S296.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -17251,15 +16595,11 @@ class WifiConfigAp(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> WifiConfigAp:
-        size = len(payload)
-        if size < 96:
-            payload = payload.ljust(96, b"\0")
-        elif size > 96:
-            payload = payload[:96]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> WifiConfigAp:
+        body = body.ljust(105, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (v0, v1) = _S299.unpack(payload)
+        (v0, v1) = _S299.unpack_from(body, 9)
         self.ssid = v0.partition(b"\0")[0].decode("utf-8", "replace")
         self.password = v1.partition(b"\0")[0].decode("utf-8", "replace")
         return self
@@ -17391,19 +16731,15 @@ class AisVessel(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> AisVessel:
-        size = len(payload)
-        if size < 58:
-            payload = payload.ljust(58, b"\0")
-        elif size > 58:
-            payload = payload[:58]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> AisVessel:
+        body = body.ljust(67, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.MMSI, self.lat, self.lon, self.COG, self.heading, self.velocity, self.dimension_bow,
             self.dimension_stern, self.tslc, self.flags, self.turn_rate, self.navigational_status, self.type,
             self.dimension_port, self.dimension_starboard, v15, v16,
-        ) = _S301.unpack(payload)
+        ) = _S301.unpack_from(body, 9)
         self.callsign = v15.partition(b"\0")[0].decode("utf-8", "replace")
         self.name = v16.partition(b"\0")[0].decode("utf-8", "replace")
         return self
@@ -17481,18 +16817,14 @@ class UavcanNodeStatus(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> UavcanNodeStatus:
-        size = len(payload)
-        if size < 17:
-            payload = payload.ljust(17, b"\0")
-        elif size > 17:
-            payload = payload[:17]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> UavcanNodeStatus:
+        body = body.ljust(26, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_usec, self.uptime_sec, self.vendor_specific_status_code, self.health, self.mode,
             self.sub_mode,
-        ) = _S310.unpack(payload)
+        ) = _S310.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -17592,18 +16924,14 @@ class UavcanNodeInfo(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> UavcanNodeInfo:
-        size = len(payload)
-        if size < 116:
-            payload = payload.ljust(116, b"\0")
-        elif size > 116:
-            payload = payload[:116]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> UavcanNodeInfo:
+        body = body.ljust(125, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_usec, self.uptime_sec, self.sw_vcs_commit, v3, self.hw_version_major,
             self.hw_version_minor, self.hw_unique_id, self.sw_version_major, self.sw_version_minor,
-        ) = _S311.unpack(payload)
+        ) = _S311.unpack_from(body, 9)
         self.name = v3.partition(b"\0")[0].decode("utf-8", "replace")
         return self
 
@@ -17667,15 +16995,11 @@ class ParamExtRequestRead(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> ParamExtRequestRead:
-        size = len(payload)
-        if size < 20:
-            payload = payload.ljust(20, b"\0")
-        elif size > 20:
-            payload = payload[:20]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> ParamExtRequestRead:
+        body = body.ljust(29, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.param_index, self.target_system, self.target_component, v3) = _S320.unpack(payload)
+        (self.param_index, self.target_system, self.target_component, v3) = _S320.unpack_from(body, 9)
         self.param_id = v3.partition(b"\0")[0].decode("utf-8", "replace")
         return self
 
@@ -17722,15 +17046,11 @@ class ParamExtRequestList(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> ParamExtRequestList:
-        size = len(payload)
-        if size < 2:
-            payload = payload.ljust(2, b"\0")
-        elif size > 2:
-            payload = payload[:2]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> ParamExtRequestList:
+        body = body.ljust(11, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.target_system, self.target_component) = _S321.unpack(payload)
+        (self.target_system, self.target_component) = _S321.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -17795,15 +17115,11 @@ class ParamExtValue(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> ParamExtValue:
-        size = len(payload)
-        if size < 149:
-            payload = payload.ljust(149, b"\0")
-        elif size > 149:
-            payload = payload[:149]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> ParamExtValue:
+        body = body.ljust(158, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.param_count, self.param_index, v2, v3, self.param_type) = _S322.unpack(payload)
+        (self.param_count, self.param_index, v2, v3, self.param_type) = _S322.unpack_from(body, 9)
         self.param_id = v2.partition(b"\0")[0].decode("utf-8", "replace")
         self.param_value = v3.partition(b"\0")[0].decode("utf-8", "replace")
         return self
@@ -17874,15 +17190,11 @@ class ParamExtSet(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> ParamExtSet:
-        size = len(payload)
-        if size < 147:
-            payload = payload.ljust(147, b"\0")
-        elif size > 147:
-            payload = payload[:147]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> ParamExtSet:
+        body = body.ljust(156, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.target_system, self.target_component, v2, v3, self.param_type) = _S323.unpack(payload)
+        (self.target_system, self.target_component, v2, v3, self.param_type) = _S323.unpack_from(body, 9)
         self.param_id = v2.partition(b"\0")[0].decode("utf-8", "replace")
         self.param_value = v3.partition(b"\0")[0].decode("utf-8", "replace")
         return self
@@ -17943,15 +17255,11 @@ class ParamExtAck(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> ParamExtAck:
-        size = len(payload)
-        if size < 146:
-            payload = payload.ljust(146, b"\0")
-        elif size > 146:
-            payload = payload[:146]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> ParamExtAck:
+        body = body.ljust(155, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (v0, v1, self.param_type, self.param_result) = _S324.unpack(payload)
+        (v0, v1, self.param_type, self.param_result) = _S324.unpack_from(body, 9)
         self.param_id = v0.partition(b"\0")[0].decode("utf-8", "replace")
         self.param_value = v1.partition(b"\0")[0].decode("utf-8", "replace")
         return self
@@ -18063,15 +17371,11 @@ class ObstacleDistance(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> ObstacleDistance:
-        size = len(payload)
-        if size < 167:
-            payload = payload.ljust(167, b"\0")
-        elif size > 167:
-            payload = payload[:167]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> ObstacleDistance:
+        body = body.ljust(176, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        values = _S330.unpack(payload)
+        values = _S330.unpack_from(body, 9)
         self.time_usec = values[0]
         self.distances = values[1:73]
         self.min_distance = values[73]
@@ -18240,15 +17544,11 @@ class Odometry(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> Odometry:
-        size = len(payload)
-        if size < 233:
-            payload = payload.ljust(233, b"\0")
-        elif size > 233:
-            payload = payload[:233]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> Odometry:
+        body = body.ljust(242, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        values = _S331.unpack(payload)
+        values = _S331.unpack_from(body, 9)
         self.time_usec = values[0]
         self.x = values[1]
         self.y = values[2]
@@ -18400,15 +17700,11 @@ class TrajectoryRepresentationWaypoints(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> TrajectoryRepresentationWaypoints:
-        size = len(payload)
-        if size < 239:
-            payload = payload.ljust(239, b"\0")
-        elif size > 239:
-            payload = payload[:239]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> TrajectoryRepresentationWaypoints:
+        body = body.ljust(248, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        values = _S332.unpack(payload)
+        values = _S332.unpack_from(body, 9)
         self.time_usec = values[0]
         self.pos_x = values[1:6]
         self.pos_y = values[6:11]
@@ -18514,15 +17810,11 @@ class TrajectoryRepresentationBezier(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> TrajectoryRepresentationBezier:
-        size = len(payload)
-        if size < 109:
-            payload = payload.ljust(109, b"\0")
-        elif size > 109:
-            payload = payload[:109]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> TrajectoryRepresentationBezier:
+        body = body.ljust(118, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        values = _S333.unpack(payload)
+        values = _S333.unpack_from(body, 9)
         self.time_usec = values[0]
         self.pos_x = values[1:6]
         self.pos_y = values[6:11]
@@ -18623,18 +17915,14 @@ class IsbdLinkStatus(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> IsbdLinkStatus:
-        size = len(payload)
-        if size < 24:
-            payload = payload.ljust(24, b"\0")
-        elif size > 24:
-            payload = payload[:24]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> IsbdLinkStatus:
+        body = body.ljust(33, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.timestamp, self.last_heartbeat, self.failed_sessions, self.successful_sessions,
             self.signal_quality, self.ring_pending, self.tx_session_pending, self.rx_session_pending,
-        ) = _S335.unpack(payload)
+        ) = _S335.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -18680,15 +17968,11 @@ class RawRpm(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> RawRpm:
-        size = len(payload)
-        if size < 5:
-            payload = payload.ljust(5, b"\0")
-        elif size > 5:
-            payload = payload[:5]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> RawRpm:
+        body = body.ljust(14, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.frequency, self.index) = _S339.unpack(payload)
+        (self.frequency, self.index) = _S339.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -18823,19 +18107,15 @@ class UtmGlobalPosition(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> UtmGlobalPosition:
-        size = len(payload)
-        if size < 70:
-            payload = payload.ljust(70, b"\0")
-        elif size > 70:
-            payload = payload[:70]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> UtmGlobalPosition:
+        body = body.ljust(79, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time, self.lat, self.lon, self.alt, self.relative_alt, self.next_lat, self.next_lon,
             self.next_alt, self.vx, self.vy, self.vz, self.h_acc, self.v_acc, self.vel_acc, self.update_rate,
             self.uas_id, self.flight_state, self.flags,
-        ) = _S340.unpack(payload)
+        ) = _S340.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -18907,15 +18187,13 @@ class ParamError(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> ParamError:
-        size = len(payload)
-        if size < 21:
-            payload = payload.ljust(21, b"\0")
-        elif size > 21:
-            payload = payload[:21]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> ParamError:
+        body = body.ljust(30, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.param_index, self.target_system, self.target_component, v3, self.error) = _S345.unpack(payload)
+        (
+            self.param_index, self.target_system, self.target_component, v3, self.error,
+        ) = _S345.unpack_from(body, 9)
         self.param_id = v3.partition(b"\0")[0].decode("utf-8", "replace")
         return self
 
@@ -18977,15 +18255,11 @@ class DebugFloatArray(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> DebugFloatArray:
-        size = len(payload)
-        if size < 252:
-            payload = payload.ljust(252, b"\0")
-        elif size > 252:
-            payload = payload[:252]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> DebugFloatArray:
+        body = body.ljust(261, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        values = _S350.unpack(payload)
+        values = _S350.unpack_from(body, 9)
         self.time_usec = values[0]
         self.array_id = values[1]
         self.name = values[2].partition(b"\0")[0].decode("utf-8", "replace")
@@ -19064,15 +18338,11 @@ class OrbitExecutionStatus(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> OrbitExecutionStatus:
-        size = len(payload)
-        if size < 25:
-            payload = payload.ljust(25, b"\0")
-        elif size > 25:
-            payload = payload[:25]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> OrbitExecutionStatus:
+        body = body.ljust(34, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.time_usec, self.radius, self.x, self.y, self.z, self.frame) = _S360.unpack(payload)
+        (self.time_usec, self.radius, self.x, self.y, self.z, self.frame) = _S360.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -19228,12 +18498,8 @@ class SmartBatteryInfo(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> SmartBatteryInfo:
-        size = len(payload)
-        if size < 109:
-            payload = payload.ljust(109, b"\0")
-        elif size > 109:
-            payload = payload[:109]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> SmartBatteryInfo:
+        body = body.ljust(118, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
@@ -19241,7 +18507,7 @@ class SmartBatteryInfo(Message):
             self.discharge_minimum_voltage, self.charging_minimum_voltage, self.resting_minimum_voltage,
             self.id, self.battery_function, self.type, v10, v11, self.charging_maximum_voltage,
             self.cells_in_series, self.discharge_maximum_current, self.discharge_maximum_burst_current, v16,
-        ) = _S370.unpack(payload)
+        ) = _S370.unpack_from(body, 9)
         self.serial_number = v10.partition(b"\0")[0].decode("utf-8", "replace")
         self.device_name = v11.partition(b"\0")[0].decode("utf-8", "replace")
         self.manufacture_date = v16.partition(b"\0")[0].decode("utf-8", "replace")
@@ -19369,19 +18635,15 @@ class GeneratorStatus(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> GeneratorStatus:
-        size = len(payload)
-        if size < 42:
-            payload = payload.ljust(42, b"\0")
-        elif size > 42:
-            payload = payload[:42]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> GeneratorStatus:
+        body = body.ljust(51, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.status, self.battery_current, self.load_current, self.power_generated, self.bus_voltage,
             self.bat_current_setpoint, self.runtime, self.time_until_maintenance, self.generator_speed,
             self.rectifier_temperature, self.generator_temperature,
-        ) = _S373.unpack(payload)
+        ) = _S373.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -19434,15 +18696,11 @@ class ActuatorOutputStatus(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> ActuatorOutputStatus:
-        size = len(payload)
-        if size < 140:
-            payload = payload.ljust(140, b"\0")
-        elif size > 140:
-            payload = payload[:140]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> ActuatorOutputStatus:
+        body = body.ljust(149, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        values = _S375.unpack(payload)
+        values = _S375.unpack_from(body, 9)
         self.time_usec = values[0]
         self.active = values[1]
         self.actuator = values[2:34]
@@ -19499,15 +18757,11 @@ class RelayStatus(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> RelayStatus:
-        size = len(payload)
-        if size < 8:
-            payload = payload.ljust(8, b"\0")
-        elif size > 8:
-            payload = payload[:8]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> RelayStatus:
+        body = body.ljust(17, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.time_boot_ms, self.on, self.present) = _S376.unpack(payload)
+        (self.time_boot_ms, self.on, self.present) = _S376.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -19578,17 +18832,13 @@ class Tunnel(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> Tunnel:
-        size = len(payload)
-        if size < 133:
-            payload = payload.ljust(133, b"\0")
-        elif size > 133:
-            payload = payload[:133]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> Tunnel:
+        body = body.ljust(142, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.payload_type, self.target_system, self.target_component, self.payload_length, self.payload,
-        ) = _S385.unpack(payload)
+        ) = _S385.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -19656,17 +18906,13 @@ class CanFrame(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> CanFrame:
-        size = len(payload)
-        if size < 16:
-            payload = payload.ljust(16, b"\0")
-        elif size > 16:
-            payload = payload[:16]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> CanFrame:
+        body = body.ljust(25, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.id, self.target_system, self.target_component, self.bus, self.len, self.data,
-        ) = _S386.unpack(payload)
+        ) = _S386.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -19735,17 +18981,13 @@ class CanfdFrame(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> CanfdFrame:
-        size = len(payload)
-        if size < 72:
-            payload = payload.ljust(72, b"\0")
-        elif size > 72:
-            payload = payload[:72]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> CanfdFrame:
+        body = body.ljust(81, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.id, self.target_system, self.target_component, self.bus, self.len, self.data,
-        ) = _S387.unpack(payload)
+        ) = _S387.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -19820,15 +19062,11 @@ class CanFilterModify(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> CanFilterModify:
-        size = len(payload)
-        if size < 37:
-            payload = payload.ljust(37, b"\0")
-        elif size > 37:
-            payload = payload[:37]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> CanFilterModify:
+        body = body.ljust(46, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        values = _S388.unpack(payload)
+        values = _S388.unpack_from(body, 9)
         self.ids = values[0:16]
         self.target_system = values[16]
         self.target_component = values[17]
@@ -20035,15 +19273,11 @@ class OnboardComputerStatus(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> OnboardComputerStatus:
-        size = len(payload)
-        if size < 240:
-            payload = payload.ljust(240, b"\0")
-        elif size > 240:
-            payload = payload[:240]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> OnboardComputerStatus:
+        body = body.ljust(249, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        values = _S390.unpack(payload)
+        values = _S390.unpack_from(body, 9)
         self.time_usec = values[0]
         self.uptime = values[1]
         self.ram_usage = values[2]
@@ -20125,15 +19359,11 @@ class WheelDistance(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> WheelDistance:
-        size = len(payload)
-        if size < 137:
-            payload = payload.ljust(137, b"\0")
-        elif size > 137:
-            payload = payload[:137]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> WheelDistance:
+        body = body.ljust(146, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        values = _S9000.unpack(payload)
+        values = _S9000.unpack_from(body, 9)
         self.time_usec = values[0]
         self.distance = values[1:17]
         self.count = values[17]
@@ -20218,18 +19448,14 @@ class WinchStatus(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> WinchStatus:
-        size = len(payload)
-        if size < 34:
-            payload = payload.ljust(34, b"\0")
-        elif size > 34:
-            payload = payload[:34]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> WinchStatus:
+        body = body.ljust(43, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_usec, self.line_length, self.speed, self.tension, self.voltage, self.current,
             self.status, self.temperature,
-        ) = _S9005.unpack(payload)
+        ) = _S9005.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -20306,18 +19532,14 @@ class OpenDroneIdBasicId(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> OpenDroneIdBasicId:
-        size = len(payload)
-        if size < 44:
-            payload = payload.ljust(44, b"\0")
-        elif size > 44:
-            payload = payload[:44]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> OpenDroneIdBasicId:
+        body = body.ljust(53, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.target_system, self.target_component, self.id_or_mac, self.id_type, self.ua_type,
             self.uas_id,
-        ) = _S12900.unpack(payload)
+        ) = _S12900.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -20489,12 +19711,8 @@ class OpenDroneIdLocation(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> OpenDroneIdLocation:
-        size = len(payload)
-        if size < 59:
-            payload = payload.ljust(59, b"\0")
-        elif size > 59:
-            payload = payload[:59]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> OpenDroneIdLocation:
+        body = body.ljust(68, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
@@ -20503,7 +19721,7 @@ class OpenDroneIdLocation(Message):
             self.target_component, self.id_or_mac, self.status, self.height_reference,
             self.horizontal_accuracy, self.vertical_accuracy, self.barometer_accuracy, self.speed_accuracy,
             self.timestamp_accuracy,
-        ) = _S12901.unpack(payload)
+        ) = _S12901.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -20615,19 +19833,15 @@ class OpenDroneIdAuthentication(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> OpenDroneIdAuthentication:
-        size = len(payload)
-        if size < 53:
-            payload = payload.ljust(53, b"\0")
-        elif size > 53:
-            payload = payload[:53]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> OpenDroneIdAuthentication:
+        body = body.ljust(62, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.timestamp, self.target_system, self.target_component, self.id_or_mac,
             self.authentication_type, self.data_page, self.last_page_index, self.length,
             self.authentication_data,
-        ) = _S12902.unpack(payload)
+        ) = _S12902.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -20700,17 +19914,13 @@ class OpenDroneIdSelfId(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> OpenDroneIdSelfId:
-        size = len(payload)
-        if size < 46:
-            payload = payload.ljust(46, b"\0")
-        elif size > 46:
-            payload = payload[:46]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> OpenDroneIdSelfId:
+        body = body.ljust(55, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.target_system, self.target_component, self.id_or_mac, self.description_type, v4,
-        ) = _S12903.unpack(payload)
+        ) = _S12903.unpack_from(body, 9)
         self.description = v4.partition(b"\0")[0].decode("utf-8", "replace")
         return self
 
@@ -20853,12 +20063,8 @@ class OpenDroneIdSystem(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> OpenDroneIdSystem:
-        size = len(payload)
-        if size < 54:
-            payload = payload.ljust(54, b"\0")
-        elif size > 54:
-            payload = payload[:54]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> OpenDroneIdSystem:
+        body = body.ljust(63, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
@@ -20866,7 +20072,7 @@ class OpenDroneIdSystem(Message):
             self.operator_altitude_geo, self.timestamp, self.area_count, self.area_radius, self.target_system,
             self.target_component, self.id_or_mac, self.operator_location_type, self.classification_type,
             self.category_eu, self.class_eu,
-        ) = _S12904.unpack(payload)
+        ) = _S12904.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -20937,17 +20143,13 @@ class OpenDroneIdOperatorId(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> OpenDroneIdOperatorId:
-        size = len(payload)
-        if size < 43:
-            payload = payload.ljust(43, b"\0")
-        elif size > 43:
-            payload = payload[:43]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> OpenDroneIdOperatorId:
+        body = body.ljust(52, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.target_system, self.target_component, self.id_or_mac, self.operator_id_type, v4,
-        ) = _S12905.unpack(payload)
+        ) = _S12905.unpack_from(body, 9)
         self.operator_id = v4.partition(b"\0")[0].decode("utf-8", "replace")
         return self
 
@@ -21032,18 +20234,14 @@ class OpenDroneIdMessagePack(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> OpenDroneIdMessagePack:
-        size = len(payload)
-        if size < 249:
-            payload = payload.ljust(249, b"\0")
-        elif size > 249:
-            payload = payload[:249]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> OpenDroneIdMessagePack:
+        body = body.ljust(258, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.target_system, self.target_component, self.id_or_mac, self.single_message_size,
             self.msg_pack_size, self.messages,
-        ) = _S12915.unpack(payload)
+        ) = _S12915.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -21093,15 +20291,11 @@ class OpenDroneIdArmStatus(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> OpenDroneIdArmStatus:
-        size = len(payload)
-        if size < 51:
-            payload = payload.ljust(51, b"\0")
-        elif size > 51:
-            payload = payload[:51]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> OpenDroneIdArmStatus:
+        body = body.ljust(60, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.status, v1) = _S12918.unpack(payload)
+        (self.status, v1) = _S12918.unpack_from(body, 9)
         self.error = v1.partition(b"\0")[0].decode("utf-8", "replace")
         return self
 
@@ -21180,18 +20374,14 @@ class OpenDroneIdSystemUpdate(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> OpenDroneIdSystemUpdate:
-        size = len(payload)
-        if size < 18:
-            payload = payload.ljust(18, b"\0")
-        elif size > 18:
-            payload = payload[:18]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> OpenDroneIdSystemUpdate:
+        body = body.ljust(27, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.operator_latitude, self.operator_longitude, self.operator_altitude_geo, self.timestamp,
             self.target_system, self.target_component,
-        ) = _S12919.unpack(payload)
+        ) = _S12919.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -21242,15 +20432,11 @@ class HygrometerSensor(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> HygrometerSensor:
-        size = len(payload)
-        if size < 5:
-            payload = payload.ljust(5, b"\0")
-        elif size > 5:
-            payload = payload[:5]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> HygrometerSensor:
+        body = body.ljust(14, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.temperature, self.humidity, self.id) = _S12920.unpack(payload)
+        (self.temperature, self.humidity, self.id) = _S12920.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:

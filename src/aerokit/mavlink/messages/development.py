@@ -75,15 +75,11 @@ class MissionChecksum(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> MissionChecksum:
-        size = len(payload)
-        if size < 5:
-            payload = payload.ljust(5, b"\0")
-        elif size > 5:
-            payload = payload[:5]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> MissionChecksum:
+        body = body.ljust(14, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.checksum, self.mission_type) = _S53.unpack(payload)
+        (self.checksum, self.mission_type) = _S53.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -177,15 +173,11 @@ class RadioRcChannels(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> RadioRcChannels:
-        size = len(payload)
-        if size < 73:
-            payload = payload.ljust(73, b"\0")
-        elif size > 73:
-            payload = payload[:73]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> RadioRcChannels:
+        body = body.ljust(82, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        values = _S420.unpack(payload)
+        values = _S420.unpack_from(body, 9)
         self.time_last_update_ms = values[0]
         self.flags = values[1]
         self.target_system = values[2]
@@ -266,17 +258,13 @@ class AvailableModes(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> AvailableModes:
-        size = len(payload)
-        if size < 46:
-            payload = payload.ljust(46, b"\0")
-        elif size > 46:
-            payload = payload[:46]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> AvailableModes:
+        body = body.ljust(55, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.custom_mode, self.properties, self.number_modes, self.mode_index, self.standard_mode, v5,
-        ) = _S435.unpack(payload)
+        ) = _S435.unpack_from(body, 9)
         self.mode_name = v5.partition(b"\0")[0].decode("utf-8", "replace")
         return self
 
@@ -334,15 +322,11 @@ class CurrentMode(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> CurrentMode:
-        size = len(payload)
-        if size < 9:
-            payload = payload.ljust(9, b"\0")
-        elif size > 9:
-            payload = payload[:9]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> CurrentMode:
+        body = body.ljust(18, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.custom_mode, self.intended_custom_mode, self.standard_mode) = _S436.unpack(payload)
+        (self.custom_mode, self.intended_custom_mode, self.standard_mode) = _S436.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -385,15 +369,11 @@ class AvailableModesMonitor(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> AvailableModesMonitor:
-        size = len(payload)
-        if size < 1:
-            payload = payload.ljust(1, b"\0")
-        elif size > 1:
-            payload = payload[:1]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> AvailableModesMonitor:
+        body = body.ljust(10, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.seq,) = _S437.unpack(payload)
+        (self.seq,) = _S437.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -511,19 +491,15 @@ class GnssIntegrity(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> GnssIntegrity:
-        size = len(payload)
-        if size < 17:
-            payload = payload.ljust(17, b"\0")
-        elif size > 17:
-            payload = payload[:17]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> GnssIntegrity:
+        body = body.ljust(26, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.system_errors, self.raim_hfom, self.raim_vfom, self.id, self.authentication_state,
             self.jamming_state, self.spoofing_state, self.raim_state, self.corrections_quality,
             self.system_status_summary, self.gnss_signal_quality, self.post_processing_quality,
-        ) = _S441.unpack(payload)
+        ) = _S441.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -654,19 +630,15 @@ class RangingBeacon(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> RangingBeacon:
-        size = len(payload)
-        if size < 45:
-            payload = payload.ljust(45, b"\0")
-        elif size > 45:
-            payload = payload[:45]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> RangingBeacon:
+        body = body.ljust(54, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_usec, self.range, self.lat, self.lon, self.alt, self.hacc_est, self.vacc_est,
             self.range_accuracy, self.beacon_id, self.carrier_freq, self.target_system, self.target_component,
             self.alt_type, self.sequence, self.status,
-        ) = _S513.unpack(payload)
+        ) = _S513.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:

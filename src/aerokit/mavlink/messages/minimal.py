@@ -89,18 +89,14 @@ class Heartbeat(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> Heartbeat:
-        size = len(payload)
-        if size < 9:
-            payload = payload.ljust(9, b"\0")
-        elif size > 9:
-            payload = payload[:9]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> Heartbeat:
+        body = body.ljust(18, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.custom_mode, self.type, self.autopilot, self.base_mode, self.system_status,
             self.mavlink_version,
-        ) = _S0.unpack(payload)
+        ) = _S0.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:

@@ -100,18 +100,14 @@ class GlobalPositionInt(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> GlobalPositionInt:
-        size = len(payload)
-        if size < 28:
-            payload = payload.ljust(28, b"\0")
-        elif size > 28:
-            payload = payload[:28]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> GlobalPositionInt:
+        body = body.ljust(37, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.time_boot_ms, self.lat, self.lon, self.alt, self.relative_alt, self.vx, self.vy, self.vz,
             self.hdg,
-        ) = _S33.unpack(payload)
+        ) = _S33.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
@@ -238,19 +234,15 @@ class AutopilotVersion(Message):
         self.received_frame = None
 
     @classmethod
-    def decode(cls, payload: bytes, frame: Frame | None = None) -> AutopilotVersion:
-        size = len(payload)
-        if size < 78:
-            payload = payload.ljust(78, b"\0")
-        elif size > 78:
-            payload = payload[:78]
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> AutopilotVersion:
+        body = body.ljust(87, b"\0")
         self = _new(cls)
         self.received_frame = frame
         (
             self.capabilities, self.uid, self.flight_sw_version, self.middleware_sw_version,
             self.os_sw_version, self.board_version, self.vendor_id, self.product_id,
             self.flight_custom_version, self.middleware_custom_version, self.os_custom_version, self.uid2,
-        ) = _S148.unpack(payload)
+        ) = _S148.unpack_from(body, 9)
         return self
 
     def encode(self) -> bytes:
