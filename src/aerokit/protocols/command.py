@@ -135,8 +135,7 @@ class CommandExchange(Exchange[CommandAck]):
     @property
     def answers_to_come(self) -> int:
         """How many answers may still be under way, to be ignored by the next command of the same number."""
-        before_ours = self._answers_before_ours if self._sent == 1 else 0
-        return max(0, before_ours + self._sent - self._answers)
+        return max(0, self._sent - self._answers)
 
     def expire(self, now: float) -> None:
         """Send again, or give up after the last attempt or when a command in progress has gone silent."""

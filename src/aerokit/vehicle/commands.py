@@ -21,6 +21,8 @@ __all__ = ["CommandSender"]
 
 IN_PROGRESS = 5
 EVERY_COMPONENT = 0
+ROUND_TRIPS = 2
+"""Nothing is sent again before so many measured round trips: the answer is still under way."""
 UNDER_WAY_S = 2.0
 """An answer that has not come by then was lost."""
 
@@ -42,10 +44,11 @@ class CommandSender:
         system_id: int,
         component_id: int,
         describe: Callable[[], str],
+        round_trip_s: Callable[[], float | None] = lambda: None,
     ) -> None:
         self._connection = connection
         self._system_id, self._component_id = system_id, component_id
-        self._describe = describe
+        self._describe, self._round_trip_s = describe, round_trip_s
         self._locks: defaultdict[_Key, asyncio.Lock] = defaultdict(asyncio.Lock)
         self._runs: dict[_Key, ExchangeRun[CommandAck]] = {}
         self._under_way: dict[_Key, list[float]] = {}
@@ -126,7 +129,7 @@ class CommandSender:
                 own_system=self._connection.source_system,
                 own_component=self._connection.source_component,
                 attempts=attempts,
-                attempt_timeout=attempt_timeout,
+                attempt_timeout=max(attempt_timeout, ROUND_TRIPS * (self._round_trip_s() or 0.0)),
                 on_progress=on_progress,
                 answers_before_ours=self._take_answers_under_way(key),
             )

@@ -150,6 +150,11 @@ class LinkWatch:
         """Stop measuring."""
         self._detach()
 
+    @property
+    def round_trip_s(self) -> float | None:
+        """The last round trip in seconds; None before the first answer."""
+        return self._round_trip_s
+
     async def run(self, on_tick: Callable[[], None]) -> None:
         """Report once a second until cancelled or the connection ends; ``on_tick`` is called as often."""
         while self._connection.is_open:
