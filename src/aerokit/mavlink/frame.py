@@ -34,6 +34,7 @@ class Frame:
     """Who sent it: the system, 0..255 (0 is nobody's)."""
     component_id: int
     """Who sent it: the component, 0..255."""
+    _raw: bytes  # only where `raw` cannot be put together again: MAVLink 1, signed, or parsed
     received_at: float
     """The ``now`` that the framer was given with its bytes, in seconds."""
 
