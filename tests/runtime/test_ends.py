@@ -21,6 +21,7 @@ from aerokit.errors import (
 )
 from aerokit.links import MemoryLink, memory_link_pair
 from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.messages import Attitude, Heartbeat
 from aerokit.runtime.connection import Connection
 from aerokit.sim import SimulatedCopter, simulated_link
@@ -136,6 +137,34 @@ async def test_inside_a_group_of_anyio_beside_other_sessions() -> None:
         for system_id in (1, 2, 3):
             tasks.start_soon(session, system_id)
     assert modes == ["GUIDED"] * 3
+
+
+async def test_our_heartbeat_goes_on_while_a_cancelled_program_lands(link: MemoryLink) -> None:
+    """Without it, the vehicle's failsafe would act in the middle of the clean-up."""
+    heartbeats: list[float] = []
+
+    async def land(vehicle: Vehicle) -> None:
+        write = link.write
+
+        def noted(data: bytes, peer: object = None) -> None:
+            heartbeats.extend(
+                anyio.current_time() for frame in Framer().receive(data) if frame.message_id == 0
+            )
+            write(data, peer)
+
+        link.write = noted  # type: ignore[method-assign]
+        await vehicle.arm()
+        await anyio.sleep(5.5)
+
+    with anyio.move_on_after(2) as scope:
+        async with connect(link) as vehicle:
+            try:
+                await anyio.sleep_forever()
+            finally:
+                with anyio.CancelScope(shield=True):
+                    await land(vehicle)
+    assert scope.cancelled_caught
+    assert len(heartbeats) >= 5
 
 
 # ---------------------------------------------------------------------------- mistakes inside

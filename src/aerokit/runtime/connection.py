@@ -175,7 +175,7 @@ class Connection:
         for peer in self._peers_of(system_id, getattr(message, "target_component", 0)):
             self.link.write(data, peer)
         if self._recording is not None:
-            self._recording.write(data)
+            self._recording.write(data, self._clock())
 
     def subscribe(
         self,
@@ -285,7 +285,7 @@ class Connection:
         self.raise_if_ended()
         if self._recording is not None:
             raise BusyError("this connection is being recorded already")
-        self._recording = Recording(path)
+        self._recording = Recording(path, self._clock())
         for framer in self._framers.values():
             self._let_through(framer)
 
@@ -301,7 +301,7 @@ class Connection:
                 if self._error is not None:  # a sink has closed it
                     return
                 if self._recording is not None:
-                    self._recording.write(frame.raw)
+                    self._recording.write(frame.raw, frame.received_at)
                 if len(self._framers) > 1 and self._is_of_another(frame, peer):
                     continue
                 if frame.message_id == Heartbeat.ID:

@@ -15,25 +15,30 @@ logger = logging.getLogger("aerokit")
 
 
 class Recording:
-    """A ``.tlog`` of one connection, begun anew: a file of that name is overwritten. Stamped with the wall clock.
+    """A ``.tlog`` of one connection, begun anew: a file of that name is replaced.
+
+    ``now`` is the time on the clock that :meth:`write` is given times of. The stamps are the wall clock's at the
+    beginning and go on by the other one: setting the clock during a flight, as a companion computer does when it
+    finds a network, makes no step.
 
     Raises:
         LinkOpenError: the file cannot be written.
     """
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
+    def __init__(self, path: str | os.PathLike[str], now: float) -> None:
         self._path = os.fspath(path)
+        self._wall_at_0 = time.time() - now
         self._writer: TlogWriter | None = None
         try:
             self._writer = TlogWriter(path)
         except OSError as error:
             raise LinkOpenError(f"cannot record to {self._path}: {error.strerror or error}") from error
 
-    def write(self, raw: bytes) -> None:
-        """Add one frame; never raises."""
+    def write(self, raw: bytes, at: float) -> None:
+        """Add one frame that was sent or received at this time; never raises."""
         if self._writer is not None:
             try:
-                self._writer.write(raw, time.time())
+                self._writer.write(raw, self._wall_at_0 + at)
             except OSError as error:
                 self._give_up(error)
 

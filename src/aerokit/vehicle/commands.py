@@ -120,10 +120,10 @@ class CommandSender:
         attempt_timeout: float,
         on_progress: Callable[[int | None], None] | None,
     ) -> CommandAck:
-        if self._is_closed:
-            raise ConnectionClosed("the block of this vehicle was left; nothing was sent")
         key = (message.target_component, message.command)
         async with self._locks[key]:
+            if self._is_closed:
+                raise ConnectionClosed("the block of this vehicle was left; nothing was sent")
             exchange = CommandExchange(
                 message,
                 own_system=self._connection.source_system,
