@@ -48,7 +48,7 @@ def _row(name: str, own: list[float], peer: list[float], statement: str, *, aim:
 
 def _import_ms(statement: str, byte_code: str | None) -> float:
     program = f"from time import perf_counter as now; began = now(); {statement}; print(now() - began)"
-    environment = dict(os.environ)
+    environment = {**os.environ, "MAVLINK20": "1"}  # mavutil: the same dialect, not that of MAVLink 1
     if byte_code:
         environment["PYTHONPYCACHEPREFIX"] = byte_code
         environment.pop("PYTHONDONTWRITEBYTECODE", None)
