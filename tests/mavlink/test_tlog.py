@@ -50,6 +50,16 @@ def test_microseconds_are_kept() -> None:
     assert read(written([(1_700_000_000.123456, raw)])) == [(1_700_000_000.123456, raw)]
 
 
+def test_clocks_that_were_never_set() -> None:
+    records = [(number / 8, raw) for number, raw in enumerate(some_frames(5))]
+    assert read(written(records)) == records
+
+
+def test_zeros_in_a_frame_that_was_cut_off_are_no_time_stamp() -> None:
+    (raw,) = some_frames(1, seed=24, versions=(2,))
+    assert read(written(stamped([raw]))[:72]) == []
+
+
 def test_unknown_and_signed_frames_are_kept() -> None:
     frames = [unknown(), *some_frames(2)]
     assert read(written(stamped(frames))) == stamped(frames)

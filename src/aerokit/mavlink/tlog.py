@@ -19,6 +19,9 @@ _TIME = Struct(">Q")
 _MAGICS = (MAGIC_V1, MAGIC_V2)
 _BLOCK = 1 << 16
 _LONGEST = 8 + 280
+# While a record is searched for: a clock that was never set is believed only where a record must be, because the
+# zeros of a frame's header look like one.
+_FIRST_TIME = 946_684_800_000_000  # the year 2000
 _LAST_TIME = 4_102_444_800_000_000  # the year 2100: what claims to be later is no time stamp
 
 
@@ -36,27 +39,27 @@ def read_tlog(source: str | PathLike[str] | BinaryIO) -> Iterator[tuple[float, b
 
 
 def _records(file: BinaryIO) -> Iterator[tuple[float, bytes]]:
-    data, begin, ended = b"", 0, False
+    data, begin, ended, earliest = b"", 0, False, 0
     while True:
         if not ended and len(data) - begin < 2 * _LONGEST:  # a record and the head of the next, to tell both
             block = file.read(_BLOCK)
             ended = not block
             data, begin = data[begin:] + block, 0
             continue
-        end = _record_end(data, begin)
+        end = _record_end(data, begin, earliest)
         if end is None:
             if len(data) - begin <= 8:
                 return
-            begin += 1
+            begin, earliest = begin + 1, _FIRST_TIME
             continue
         yield _TIME.unpack_from(data, begin)[0] / 1e6, data[begin + 8 : end]
-        begin = end
+        begin, earliest = end, 0
 
 
-def _record_end(data: bytes, begin: int) -> int | None:
-    """Where the record at ``begin`` ends; None when there is none, or not all of it."""
+def _record_end(data: bytes, begin: int, earliest: int) -> int | None:
+    """Where the record at ``begin`` ends; None when there is none, or not all of it, or it is too early."""
     end = _frame_end(data, begin)
-    if end is None or end > len(data):
+    if end is None or end > len(data) or _TIME.unpack_from(data, begin)[0] < earliest:
         return None
     if len(data) - end <= 8 or _frame_end(data, end) is not None:
         return end
