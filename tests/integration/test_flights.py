@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import select
+import socket
+import threading
 import tty
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager
-from typing import Any
 
 import pytest
 
@@ -15,24 +17,7 @@ from aerokit.sim import SimulatedCopter, open_simulator
 
 pytestmark = pytest.mark.anyio
 
-SPEEDUP = 20.0
-
-
-def loops() -> list[Any]:
-    try:
-        import uvloop
-    except ImportError:
-        return [pytest.param(("asyncio", {}), id="asyncio")]
-    return [
-        pytest.param(("asyncio", {}), id="asyncio"),
-        pytest.param(("asyncio", {"loop_factory": uvloop.new_event_loop}), id="uvloop"),
-    ]
-
-
-@pytest.fixture(params=loops())
-def anyio_backend(request: pytest.FixtureRequest) -> Any:
-    """Real time and real sockets here."""
-    return request.param
+SPEEDUP = 40.0
 
 
 @contextmanager
@@ -42,13 +27,9 @@ def pseudo_terminals() -> Iterator[tuple[str, str]]:
     for pair in pairs:
         for end in pair:
             tty.setraw(end)
-    import threading
-
     stop_read, stop_write = os.pipe()
 
     def carry() -> None:
-        import select
-
         masters = [pair[0] for pair in pairs]
         while True:
             ready, _, _ = select.select([*masters, stop_read], [], [])
@@ -101,8 +82,6 @@ async def test_a_flight(kind: str) -> None:
 
 async def test_a_vehicle_that_calls_us() -> None:
     """The usual way round: we listen, the vehicle sends."""
-    import socket
-
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
