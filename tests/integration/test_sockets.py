@@ -104,7 +104,7 @@ async def test_a_server_that_goes_is_told_at_once() -> None:
             open_simulator(SimulatedCopter(boot_time_s=0), "tcpin:127.0.0.1:0", speedup=SPEEDUP)
         )
         address = simulator.addresses[0].replace("tcpin", "tcp")
-        with anyio.fail_after(20), pytest.raises(LinkLost, match="other side closed|reset by peer"):
+        with anyio.fail_after(20), pytest.raises(LinkLost, match=r"other side closed|reset by peer"):
             async with connect(address) as vehicle:
                 pending = asyncio.ensure_future(vehicle.command(31_000, attempts=50))
                 await asyncio.sleep(0)
