@@ -8,7 +8,7 @@ import sys
 from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import Any
 
-import anyio.lowlevel
+import anyio
 import pytest
 
 from aerokit import Vehicle, connect, events, open_connection
@@ -17,6 +17,7 @@ from aerokit.errors import (
     BusyError,
     ConnectionClosed,
     LinkLost,
+    LocalProtocolError,
     OperationTimeout,
 )
 from aerokit.links import MemoryLink, memory_link_pair
@@ -32,8 +33,13 @@ COPTER = Heartbeat(2, 3, 81, 0, 3)
 
 
 @pytest.fixture
-async def link(anyio_backend: object) -> AsyncIterator[MemoryLink]:
-    async with simulated_link(SimulatedCopter(boot_time_s=0)) as near:
+def copter() -> SimulatedCopter:
+    return SimulatedCopter(boot_time_s=0)
+
+
+@pytest.fixture
+async def link(anyio_backend: object, copter: SimulatedCopter) -> AsyncIterator[MemoryLink]:
+    async with simulated_link(copter) as near:
         yield near
 
 
@@ -245,7 +251,11 @@ async def test_closing_by_a_sink_in_the_middle_of_a_delivery(link: MemoryLink) -
         assert len(heard) == 1
 
 
-async def test_a_call_under_way_ends_at_the_instant_of_closing(vehicle: Vehicle) -> None:
+@pytest.mark.parametrize("how", ["close", "lose"])
+async def test_whatever_waits_ends_at_that_instant(
+    vehicle: Vehicle, link: MemoryLink, copter: SimulatedCopter, how: str
+) -> None:
+    copter.faults.silent = True
     waits: list[Callable[[], Awaitable[object]]] = [
         lambda: vehicle.command(31_000),
         lambda: vehicle.mode.wait_until(lambda _: False),
@@ -253,7 +263,6 @@ async def test_a_call_under_way_ends_at_the_instant_of_closing(vehicle: Vehicle)
         lambda: follow(vehicle),
         lambda: vehicle.set_mode("GUIDED"),
     ]
-    vehicle.connection.link._far.close()  # type: ignore[attr-defined]
     ended: list[tuple[float, BaseException]] = []
 
     async def note(wait: Callable[[], Awaitable[object]]) -> None:
@@ -265,9 +274,15 @@ async def test_a_call_under_way_ends_at_the_instant_of_closing(vehicle: Vehicle)
     async with anyio.create_task_group() as tasks:
         for wait in waits:
             tasks.start_soon(note, wait)
-        await anyio.lowlevel.checkpoint()
+        await anyio.sleep(0.01)
+        assert not ended
+        if how == "close":
+            vehicle.connection.close()
+        else:
+            link._lose("unplugged")
     errors = [error for _, error in ended]
-    assert [type(error) for error in errors] == [LinkLost] * len(waits)
+    expected = ConnectionClosed if how == "close" else LinkLost
+    assert [type(error) for error in errors] == [expected] * len(waits)
     assert len(set(map(id, errors))) == len(waits)  # nobody gets another one's traceback
     assert {at for at, _ in ended} == {anyio.current_time()}
 
@@ -374,6 +389,14 @@ async def test_a_subscription_is_entered_once(link: MemoryLink) -> None:
             subscription.__enter__()
         with pytest.raises(BusyError, match="entered once"):
             subscription.__enter__()
+
+
+async def test_a_subscription_that_is_refused_leaves_nothing_attached(vehicle: Vehicle) -> None:
+    before = dict(vehicle.connection.bus.wanted)
+    for rate_hz in (0, -1, 1001, float("nan")):
+        with pytest.raises(LocalProtocolError, match="rate_hz"):
+            vehicle.subscribe(Attitude, rate_hz=rate_hz)
+    assert vehicle.connection.bus.wanted == before
 
 
 async def test_an_old_vehicle_speaks_mavlink_1(link: MemoryLink) -> None:

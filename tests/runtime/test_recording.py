@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import anyio
 import pytest
@@ -187,7 +188,7 @@ async def test_a_replay_ends_in_the_state_in_which_the_flight_ended(tmp_path: Pa
     assert len(flown) > 25
 
 
-def state(vehicle: Vehicle) -> dict[str, object]:
+def state(vehicle: Vehicle) -> dict[str, Any]:
     """All that is known; but for the last text's time, on the clock of the program that heard it."""
     known = {name: cell.value for name, cell in vehicle.telemetry.cells.items() if cell.is_known}
     return known | {"status_text": vehicle.status_text.value.text}

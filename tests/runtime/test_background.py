@@ -1,0 +1,84 @@
+"""Tasks beside a block: gone with it, and their mistakes are told."""
+
+from __future__ import annotations
+
+import asyncio
+
+import anyio
+import pytest
+
+from aerokit.runtime.background import Background
+
+pytestmark = pytest.mark.anyio
+
+
+async def test_they_run_until_the_end() -> None:
+    background, ticks = Background(lambda error: pytest.fail(repr(error))), list[float]()
+
+    async def tick() -> None:
+        while True:
+            ticks.append(anyio.current_time())
+            await anyio.sleep(1)
+
+    background.start(tick, "tick")
+    await anyio.sleep(2.5)
+    await background.aclose()
+    await background.aclose()
+    assert len(ticks) == 3
+    assert len(background) == 0
+    background.start(tick)
+    await anyio.sleep(2)
+    assert len(ticks) == 3
+
+
+async def test_a_mistake_is_told_and_the_others_go_on() -> None:
+    mistakes: list[Exception] = []
+    background = Background(mistakes.append)
+
+    async def fail() -> None:
+        raise ZeroDivisionError("ours")
+
+    background.start(anyio.sleep_forever)
+    background.start(fail)
+    await anyio.sleep(1)
+    assert [repr(error) for error in mistakes] == ["ZeroDivisionError('ours')"]
+    assert len(background) == 1
+    await background.aclose()
+
+
+async def test_whoever_ends_them_may_be_cancelled_meanwhile() -> None:
+    """They are gone all the same, and the cancellation is not swallowed."""
+    background, cleaned_up = Background(lambda error: pytest.fail(repr(error))), list[str]()
+
+    async def slow_to_end() -> None:
+        try:
+            await anyio.sleep_forever()
+        finally:
+            with anyio.CancelScope(shield=True):
+                await anyio.sleep(0.5)
+            cleaned_up.append("yes")
+
+    background.start(slow_to_end)
+    await anyio.sleep(0.1)
+    closing = asyncio.ensure_future(background.aclose())
+    await anyio.sleep(0.1)
+    closing.cancel()
+    await anyio.sleep(0.1)
+    closing.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await closing
+    assert cleaned_up == ["yes"]
+    assert len(background) == 0
+
+
+async def test_one_of_them_may_end_them_all() -> None:
+    background = Background(lambda error: pytest.fail(repr(error)))
+
+    async def end_all() -> None:
+        background.cancel()
+        await anyio.sleep_forever()
+
+    background.start(anyio.sleep_forever)
+    background.start(end_all)
+    await anyio.sleep(0.1)
+    assert len(background) == 0
