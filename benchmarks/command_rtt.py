@@ -6,6 +6,8 @@ aerokit's ``vehicle.command``, pymavlink's hand-written blocking loop and MAVSDK
 process, sixty round trips at a time, with the same responder in another process (``responder.py``).
 """
 
+# pyright: reportMissingImports=false
+# MAVSDK is installed by the bench session only.
 from __future__ import annotations
 
 import json
