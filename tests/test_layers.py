@@ -12,8 +12,10 @@ SOURCE = Path(__file__).parent.parent / "src" / "aerokit"
 FLOORS = [
     {"errors", "snapshot"},
     {"geo"},
+    {"position"},
     {"mavlink"},
-    {"protocols", "links", "autopilots"},
+    {"parameters", "missions", "links", "autopilots"},
+    {"protocols"},
     {"runtime", "sim"},
     {"vehicle"},
     {"sync", "testing"},
@@ -22,7 +24,7 @@ FLOORS = [
 ]
 ALLOWED_BESIDE = {("sim", "autopilots"), ("sim", "links")}
 REEXPORTED = {"messages": "mavlink", "enums": "mavlink", "events": "runtime", "__version__": "errors"}
-SANS_IO = ("mavlink", "protocols", "autopilots")
+SANS_IO = ("mavlink", "parameters", "missions", "protocols", "autopilots")
 NO_IO = {"asyncio", "anyio", "socket", "threading", "time", "logging", "select", "selectors", "subprocess"}
 SOCKETS = {"socket", "serial", "serial_asyncio", "serial_asyncio_fast"}
 

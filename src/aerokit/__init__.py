@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from aerokit import errors, events
     from aerokit.mavlink import enums, messages
     from aerokit.mavlink.dialect import Dialect
+    from aerokit.position import Position
     from aerokit.runtime.connection import Connection, open_connection
     from aerokit.vehicle.connect import connect
     from aerokit.vehicle.setpoints import (
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
         PositionSetpoint,
         VelocitySetpoint,
     )
-    from aerokit.vehicle.values import Position
     from aerokit.vehicle.vehicle import Vehicle
 
 __version__ = "0.1.0"
@@ -65,7 +65,7 @@ _HOMES = {
     "Connection": "aerokit.runtime.connection",
     "Dialect": "aerokit.mavlink.dialect",
     "LocalPositionSetpoint": "aerokit.vehicle.setpoints",
-    "Position": "aerokit.vehicle.values",
+    "Position": "aerokit.position",
     "PositionSetpoint": "aerokit.vehicle.setpoints",
     "Vehicle": "aerokit.vehicle.vehicle",
     "VelocitySetpoint": "aerokit.vehicle.setpoints",

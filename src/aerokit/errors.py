@@ -9,19 +9,28 @@ __all__ = [
     "CommandTimeout",
     "ConnectFailed",
     "ConnectionClosed",
+    "FileError",
+    "FileFormatError",
+    "FileTimeout",
     "HeartbeatTimeout",
     "LinkError",
     "LinkLost",
     "LinkOpenError",
     "LocalProtocolError",
+    "MissionRejected",
+    "MissionTimeout",
     "NotSupported",
     "OperationRejected",
     "OperationTimeout",
+    "ParameterRejected",
+    "ParameterTimeout",
     "RemoteProtocolError",
+    "RollbackFailed",
     "SetpointStreamStopped",
     "StaleValueError",
     "SubscriptionOverflow",
     "ValueUnknownError",
+    "VerificationFailed",
 ]
 
 
@@ -67,6 +76,30 @@ class ConnectFailed(HeartbeatTimeout):
     """No vehicle was found; the text says what was heard instead."""
 
 
+class ParameterTimeout(OperationTimeout):
+    """Parameters did not arrive or were not confirmed; ``missing`` are their names, or indices of unknown ones."""
+
+    def __init__(self, message: str, *, missing: tuple[str | int, ...] = ()) -> None:
+        super().__init__(message)
+        self.missing = missing
+
+
+class MissionTimeout(OperationTimeout):
+    """A mission transfer did not end; ``missing`` are the items (counted as the program counts) not transferred."""
+
+    def __init__(self, message: str, *, missing: tuple[int, ...] = ()) -> None:
+        super().__init__(message)
+        self.missing = missing
+
+
+class FileTimeout(OperationTimeout):
+    """A file or log did not arrive whole; ``missing`` are the byte ranges (offset, size) that did not."""
+
+    def __init__(self, message: str, *, missing: tuple[tuple[int, int], ...] = ()) -> None:
+        super().__init__(message)
+        self.missing = missing
+
+
 # ------------------------------------------------------------------------------------- refusals
 
 
@@ -93,6 +126,63 @@ class CommandRejected(OperationRejected):
         self.result = result
 
 
+class ParameterRejected(OperationRejected):
+    """The vehicle refused a parameter: it has none of this name, or does not take the value.
+
+    ``name`` is the parameter, ``code`` the MAV_PARAM_ERROR (https://mavlink.io/en/messages/common.html#PARAM_ERROR),
+    None when the vehicle gave none.
+    """
+
+    def __init__(self, message: str, *, name: str, code: int | None = None) -> None:
+        super().__init__(message)
+        self.name = name
+        self.code = code
+
+
+class RollbackFailed(OperationRejected):
+    """What was to be put back could not be; ``not_restored`` maps the parameters to the values they should have."""
+
+    def __init__(self, message: str, *, not_restored: dict[str, float]) -> None:
+        super().__init__(message)
+        self.not_restored = not_restored
+
+
+class MissionRejected(OperationRejected):
+    """The vehicle refused a mission, a fence or rally points; the ones it had before are still there.
+
+    ``result`` is the MAV_MISSION_RESULT (https://mavlink.io/en/messages/common.html#MAV_MISSION_RESULT), ``item`` the
+    index of the item it was about, None when that is not known.
+    """
+
+    def __init__(
+        self, message: str, *, result: int, item: int | None = None, reasons: tuple[str, ...] = ()
+    ) -> None:
+        super().__init__(message, reasons=reasons)
+        self.result = result
+        self.item = item
+
+
+class VerificationFailed(OperationRejected):
+    """The vehicle confirmed something and then holds something else; ``differences`` says what, one text each."""
+
+    def __init__(self, message: str, *, differences: tuple[str, ...]) -> None:
+        super().__init__(message, reasons=differences)
+        self.differences = differences
+
+
+class FileError(OperationRejected):
+    """The vehicle refused a file operation; ``code`` is the MAV_FTP_ERR, ``errno`` the system's number behind it.
+
+    See https://mavlink.io/en/services/ftp.html#error_codes.
+    """
+
+    def __init__(self, message: str, *, path: str, code: int, errno: int | None = None) -> None:
+        super().__init__(message)
+        self.path = path
+        self.code = code
+        self.errno = errno
+
+
 class NotSupported(OperationRejected):
     """This vehicle cannot do that; nothing was sent."""
 
@@ -106,6 +196,10 @@ class SetpointStreamStopped(OperationRejected):
 
 class LocalProtocolError(AerokitError, ValueError):
     """We were asked to send nonsense; the text says which field, which value and what is allowed. Nothing was sent."""
+
+
+class FileFormatError(LocalProtocolError):
+    """A file on this computer is damaged or of another kind; the text names file, place and what was expected."""
 
 
 class RemoteProtocolError(AerokitError):

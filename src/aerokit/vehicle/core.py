@@ -25,6 +25,7 @@ from aerokit.runtime.subscription import Overflow, Subscription
 from aerokit.vehicle.commands import CommandSender
 from aerokit.vehicle.rates import MessageRates, check_rate
 from aerokit.vehicle.telemetry import Telemetry
+from aerokit.vehicle.transfers import Transfers
 from aerokit.vehicle.watch import LinkWatch, VehicleWatch
 
 if TYPE_CHECKING:
@@ -80,6 +81,15 @@ class VehicleCore:
         self._watch = VehicleWatch(connection, system_id, component_id, self._on_reboot)
         self._link_watch = LinkWatch(connection, system_id, component_id, self._on_link_report)
         self._background = Background(connection.fail)
+        self._transfers = Transfers(
+            connection,
+            system_id,
+            component_id,
+            autopilot=self.autopilot,
+            version=self.telemetry.version,
+            background=self._background,
+            describe=self.describe_link,
+        )
         self._is_closed = False
         self._detach: list[Detach] = []
         self._messages: dict[type[Message], StateCell[Any]] = {}
@@ -322,7 +332,7 @@ class VehicleCore:
         """Any command is about to be sent by the program itself."""
 
     def _close(self) -> None:
-        self._is_closed = True
+        self._is_closed = self._transfers.is_closed = True
         self._on_end(ConnectionClosed("the block of this vehicle was left"))
         for detach in self._detach:
             detach()

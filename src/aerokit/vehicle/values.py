@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from aerokit import geo
 from aerokit.autopilots.modes import Mode
 from aerokit.autopilots.version import AutopilotVersion
-from aerokit.errors import LocalProtocolError
+from aerokit.position import Position
 from aerokit.snapshot import Snapshot
 
 if TYPE_CHECKING:
@@ -48,40 +48,6 @@ SEVERITIES = ("EMERGENCY", "ALERT", "CRITICAL", "ERROR", "WARNING", "NOTICE", "I
 
 
 # --------------------------------------------------------------------------- where and how it moves
-
-
-class Position(Snapshot):
-    """A place: degrees (WGS 84) and metres; ``Position(47.3977, 8.5456, altitude_relative_m=30)``.
-
-    ``altitude_amsl_m`` is above mean sea level, ``altitude_relative_m`` above home; None is not known (as a
-    target: not given). Raises :class:`LocalProtocolError` when it is no place on earth.
-    """
-
-    latitude_deg: float
-    longitude_deg: float
-    altitude_amsl_m: float | None = None
-    altitude_relative_m: float | None = None
-
-    def distance_to(self, other: Position) -> float:
-        """Metres to the other place along the ground; altitudes do not count."""
-        return geo.distance_m(self.latitude_deg, self.longitude_deg, other.latitude_deg, other.longitude_deg)
-
-    def bearing_to(self, other: Position) -> float:
-        """Direction to the other place in degrees, 0 to 360."""
-        return geo.bearing_deg(self.latitude_deg, self.longitude_deg, other.latitude_deg, other.longitude_deg)
-
-    def offset(self, *, north_m: float = 0.0, east_m: float = 0.0, up_m: float = 0.0) -> Self:
-        """The place that many metres north, east and above."""
-        latitude, longitude = geo.offset(self.latitude_deg, self.longitude_deg, north_m, east_m)
-        above, relative = _add(self.altitude_amsl_m, up_m), _add(self.altitude_relative_m, up_m)
-        return type(self)(latitude, longitude, above, relative)
-
-    def _check(self) -> None:
-        geo.check_place(self.latitude_deg, self.longitude_deg)
-        for name in ("altitude_amsl_m", "altitude_relative_m"):
-            altitude = getattr(self, name)
-            if altitude is not None and not math.isfinite(altitude):
-                raise LocalProtocolError(f"{name} = {altitude!r} is not a finite number")
 
 
 class Home(Snapshot):
@@ -368,7 +334,3 @@ class StatusText(Snapshot):
     def __str__(self) -> str:
         name = SEVERITIES[self.severity] if self.severity < len(SEVERITIES) else str(self.severity)
         return f"{name}: {self.text}"
-
-
-def _add(altitude: float | None, up_m: float) -> float | None:
-    return None if altitude is None else altitude + up_m

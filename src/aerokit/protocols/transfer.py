@@ -1,0 +1,89 @@
+"""What all transfers have in common: progress, patience, and a measured round trip."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, TypeVar
+
+from aerokit.errors import LocalProtocolError
+from aerokit.protocols.exchange import Exchange
+from aerokit.protocols.round_trip import RoundTrip
+from aerokit.snapshot import Snapshot
+
+if TYPE_CHECKING:
+    from aerokit.mavlink.message import Message
+
+__all__ = ["PATIENCE_S", "OnProgress", "Progress", "Transfer"]
+
+ResultT = TypeVar("ResultT")
+
+PATIENCE_S = 10.0
+"""How long a transfer goes on asking while nothing comes, unless the caller says otherwise."""
+
+
+class Progress(Snapshot):
+    """How far a transfer is: ``done`` of ``total`` (None: not known yet) parameters, items or bytes."""
+
+    done: int
+    total: int | None
+    elapsed_s: float
+
+    @property
+    def fraction(self) -> float | None:
+        """0 to 1; None while the total is not known."""
+        if self.total is None:
+            return None
+        return self.done / self.total if self.total else 1.0
+
+    @property
+    def rate(self) -> float:
+        """Parameters, items or bytes per second since the start; 0 before any time has passed."""
+        return self.done / self.elapsed_s if self.elapsed_s > 0 else 0.0
+
+
+OnProgress = Callable[[Progress], None]
+
+
+class Transfer(Exchange[ResultT]):
+    """An exchange of many messages with one component. It ends when all is there, or when nothing has come for
+    ``patience_s`` seconds; what did come sets that clock back, so that a long transfer over a bad radio ends well.
+    """
+
+    def __init__(
+        self,
+        target_system: int,
+        target_component: int,
+        *,
+        round_trip: RoundTrip | None = None,
+        patience_s: float = PATIENCE_S,
+        on_progress: OnProgress | None = None,
+    ) -> None:
+        super().__init__()
+        if not patience_s > 0:
+            raise LocalProtocolError(f"patience_s = {patience_s!r} is not allowed: above 0")
+        self.target_system, self.target_component = target_system, target_component
+        self.round_trip = RoundTrip() if round_trip is None else round_trip
+        self._patience_s = patience_s
+        self._on_progress = on_progress
+        self._started_at = 0.0
+        self._moved_at = 0.0
+
+    def _begin(self, now: float) -> None:
+        """Time starts to count."""
+        self._started_at = self._moved_at = now
+
+    def _move(self, now: float, done: int, total: int | None) -> None:
+        """Something new has come: tell the caller, and be patient again."""
+        self._moved_at = now
+        if self._on_progress is not None:
+            self._on_progress(Progress(done, total, now - self._started_at))
+
+    def _is_out_of_patience(self, now: float) -> bool:
+        return now - self._moved_at >= self._patience_s
+
+    def _is_from_target(self, message: Message) -> bool:
+        """Whether the component we talk to sent it; other components of the same vehicle do not count."""
+        frame = message.received_frame
+        return frame is None or (
+            frame.system_id == self.target_system and frame.component_id == self.target_component
+        )

@@ -1,0 +1,87 @@
+"""``Transfers``: what parameters, missions, files and logs of one vehicle share: its timing, its features, its end."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, TypeVar
+
+import anyio
+
+from aerokit.errors import ConnectionClosed, OperationTimeout
+from aerokit.protocols.round_trip import RoundTrip
+from aerokit.runtime.driver import run_exchange
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from aerokit.autopilots.base import Autopilot
+    from aerokit.autopilots.version import AutopilotVersion
+    from aerokit.protocols.exchange import Exchange
+    from aerokit.runtime.background import Background
+    from aerokit.runtime.cells import StateCell
+    from aerokit.runtime.connection import Connection
+
+__all__ = ["Transfers"]
+
+ResultT = TypeVar("ResultT")
+
+VERSION_TIMEOUT_S = 3.0
+
+
+class Transfers:
+    """Runs exchanges with the autopilot of one vehicle, and knows what that autopilot can do."""
+
+    def __init__(
+        self,
+        connection: Connection,
+        system_id: int,
+        component_id: int,
+        *,
+        autopilot: Autopilot,
+        version: StateCell[AutopilotVersion],
+        background: Background,
+        describe: Callable[[], str],
+    ) -> None:
+        self.connection = connection
+        self.system_id, self.component_id = system_id, component_id
+        self.autopilot = autopilot
+        self.background = background
+        self.round_trip = RoundTrip()
+        """Measured by whatever was transferred before."""
+        self.is_closed = False
+        self._version, self._describe = version, describe
+
+    async def run(self, exchange: Exchange[ResultT], *, timeout: float | None = None) -> ResultT:
+        """Run one exchange to its end and return its result.
+
+        A time-out of the exchange comes out with what the link is like added to its text; ``timeout`` seconds for all
+        of it end in :class:`OperationTimeout`. Cancellation ends it at once.
+        """
+        if self.is_closed:
+            raise ConnectionClosed("the block of this vehicle was left; nothing was sent")
+        try:
+            with anyio.fail_after(timeout):
+                return await run_exchange(self.connection, self.system_id, exchange)
+        except OperationTimeout as error:
+            error.args = (f"{error}; {self._describe()}",)
+            raise
+        except TimeoutError:
+            raise OperationTimeout(f"not done within {timeout:g} s; {self._describe()}") from None
+
+    def in_background(self, exchange: Exchange[object], name: str) -> None:
+        """Run an exchange that ends something, with nobody waiting; its failure is nobody's."""
+
+        async def end() -> None:
+            try:
+                await run_exchange(self.connection, self.system_id, exchange)
+            except Exception:
+                return  # the vehicle ends it by itself after its own time-out
+
+        self.background.start(end, f"aerokit {name}")
+
+    async def capabilities(self) -> int | None:
+        """MAV_PROTOCOL_CAPABILITY bits of the autopilot; None when it does not tell within a few seconds."""
+        if not self._version.is_known:
+            with anyio.move_on_after(VERSION_TIMEOUT_S):
+                await self._version.wait_until(lambda _: True)
+        version = self._version.latest
+        return None if version is None else version.capabilities
