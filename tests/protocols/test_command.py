@@ -221,3 +221,17 @@ def test_integers_of_the_int_form_must_fit() -> None:
         command_int(1, 1, MavCmd.DO_REPOSITION, frame=6, x=2**31, y=0, z=0.0)
     with pytest.raises(LocalProtocolError, match="at most 4"):
         command_int(1, 1, MavCmd.DO_REPOSITION, (0,) * 5, frame=6, x=0, y=0, z=0.0)
+
+
+@pytest.mark.parametrize("field", ["attempt_timeout", "progress_timeout"])
+@pytest.mark.parametrize("seconds", [0.0, -1.0, float("nan")])
+def test_a_timeout_that_is_no_time_is_refused(field: str, seconds: float) -> None:
+    arguments: dict[str, float] = {field: seconds}
+    with pytest.raises(LocalProtocolError, match=field):
+        CommandExchange(
+            command_long(1, 1, ARM),
+            own_system=255,
+            own_component=190,
+            attempt_timeout=arguments.get("attempt_timeout", 1.0),
+            progress_timeout=arguments.get("progress_timeout", 1.0),
+        )

@@ -133,6 +133,14 @@ async def test_progress_extends_the_deadline_and_is_reported(grounded: Flight) -
     assert len(grounded.wire.commands(BANNER)) == 1
 
 
+async def test_a_slow_command_may_be_given_longer_between_its_reports(grounded: Flight) -> None:
+    grounded.copter.faults.report_progress(BANNER, (10, 50), interval_s=25.0)
+    with pytest.raises(CommandTimeout, match="nothing came for 10 s"):
+        await grounded.vehicle.command(BANNER)
+    grounded.copter.faults.report_progress(BANNER, (10, 50), interval_s=25.0)
+    assert (await grounded.vehicle.command(BANNER, progress_timeout=30.0)).result == MavResult.ACCEPTED
+
+
 async def test_progress_that_stops_is_a_timeout(grounded: Flight) -> None:
     grounded.copter.faults.report_progress(BANNER, (10, 50), interval_s=1.0)
     async with anyio.create_task_group() as tasks:

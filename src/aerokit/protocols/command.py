@@ -102,6 +102,9 @@ class CommandExchange(Exchange[CommandAck]):
         super().__init__()
         if attempts < 1:
             raise LocalProtocolError(f"attempts = {attempts} is not allowed: at least 1")
+        for name, seconds in (("attempt_timeout", attempt_timeout), ("progress_timeout", progress_timeout)):
+            if not seconds > 0:
+                raise LocalProtocolError(f"{name} = {seconds!r} is not allowed: above 0")
         self._message = message
         self._own = (own_system, own_component)
         self._attempts, self._attempt_timeout = attempts, attempt_timeout

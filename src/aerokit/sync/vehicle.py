@@ -223,6 +223,7 @@ class Vehicle(VehicleState):
         component_id: int | None = None,
         attempts: int = 4,
         attempt_timeout: float = 1.0,
+        progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
     ) -> CommandAck:
         """Send any MAV_CMD as COMMAND_LONG and return its ACCEPTED ack; see :meth:`aerokit.Vehicle.command`."""
@@ -233,6 +234,7 @@ class Vehicle(VehicleState):
             component_id=component_id,
             attempts=attempts,
             attempt_timeout=attempt_timeout,
+            progress_timeout=progress_timeout,
             on_progress=on_progress,
         )
 
@@ -247,6 +249,7 @@ class Vehicle(VehicleState):
         component_id: int | None = None,
         attempts: int = 4,
         attempt_timeout: float = 1.0,
+        progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
     ) -> CommandAck:
         """Send any MAV_CMD as COMMAND_INT; see :meth:`aerokit.Vehicle.command_int`."""
@@ -261,6 +264,7 @@ class Vehicle(VehicleState):
             component_id=component_id,
             attempts=attempts,
             attempt_timeout=attempt_timeout,
+            progress_timeout=progress_timeout,
             on_progress=on_progress,
         )
 

@@ -72,11 +72,12 @@ class CommandSender:
         component_id: int | None = None,
         attempts: int = 4,
         attempt_timeout: float = 1.0,
+        progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
     ) -> CommandAck:
         """Send a COMMAND_LONG with param1 to param7 and return its ACCEPTED ack; see :meth:`Vehicle.command`."""
         message = command_long(self._system_id, component_id or self._component_id, command, params)
-        return await self._run(message, attempts, attempt_timeout, on_progress)
+        return await self._run(message, attempts, attempt_timeout, progress_timeout, on_progress)
 
     async def send_int(
         self,
@@ -89,12 +90,13 @@ class CommandSender:
         component_id: int | None = None,
         attempts: int = 4,
         attempt_timeout: float = 1.0,
+        progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
     ) -> CommandAck:
         """Send a COMMAND_INT with param1 to param4, x, y, z and return its ACCEPTED ack."""
         target = component_id or self._component_id
         message = command_int(self._system_id, target, command, params, frame=frame, x=x, y=y, z=z)
-        return await self._run(message, attempts, attempt_timeout, on_progress)
+        return await self._run(message, attempts, attempt_timeout, progress_timeout, on_progress)
 
     def send_unconfirmed(self, command: int, *params: float) -> None:
         """Send a COMMAND_LONG once and do not wait: for ends of blocks, which must not await."""
@@ -118,6 +120,7 @@ class CommandSender:
         message: CommandLong | CommandInt,
         attempts: int,
         attempt_timeout: float,
+        progress_timeout: float,
         on_progress: Callable[[int | None], None] | None,
     ) -> CommandAck:
         key = (message.target_component, message.command)
@@ -130,6 +133,7 @@ class CommandSender:
                 own_component=self._connection.source_component,
                 attempts=attempts,
                 attempt_timeout=max(attempt_timeout, ROUND_TRIPS * (self._round_trip_s() or 0.0)),
+                progress_timeout=progress_timeout,
                 on_progress=on_progress,
                 answers_before_ours=self._take_answers_under_way(key),
             )

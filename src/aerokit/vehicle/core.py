@@ -105,6 +105,7 @@ class VehicleCore:
         component_id: int | None = None,
         attempts: int = 4,
         attempt_timeout: float = 1.0,
+        progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
     ) -> CommandAck:
         """Send any MAV_CMD as COMMAND_LONG and return its ACCEPTED ack.
@@ -114,8 +115,8 @@ class VehicleCore:
             params: param1 to param7; missing ones are 0, NaN where the command says so.
             component_id: to another component than the autopilot.
             attempts: how often it is sent at most; ``confirmation`` rises with each.
-            attempt_timeout: seconds to wait for an ack after each, and at least two measured round trips. IN_PROGRESS
-                extends it.
+            attempt_timeout: seconds to wait for an ack after each, and at least two measured round trips.
+            progress_timeout: seconds to wait after each IN_PROGRESS for the next answer; calibrations can take long.
             on_progress: called with 0–100, or None, for each IN_PROGRESS.
 
         See https://mavlink.io/en/services/command.html.
@@ -134,6 +135,7 @@ class VehicleCore:
                 component_id=component_id,
                 attempts=attempts,
                 attempt_timeout=attempt_timeout,
+                progress_timeout=progress_timeout,
                 on_progress=on_progress,
             )
         except CommandRejected as error:
@@ -151,6 +153,7 @@ class VehicleCore:
         component_id: int | None = None,
         attempts: int = 4,
         attempt_timeout: float = 1.0,
+        progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
     ) -> CommandAck:
         """Send any MAV_CMD as COMMAND_INT: param1 to param4, ``x``, ``y``, ``z`` in ``frame`` (MAV_FRAME).
@@ -171,6 +174,7 @@ class VehicleCore:
                 component_id=component_id,
                 attempts=attempts,
                 attempt_timeout=attempt_timeout,
+                progress_timeout=progress_timeout,
                 on_progress=on_progress,
             )
         except CommandRejected as error:
