@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from .address import ACCEPTED_FORMS, LinkAddress, parse_address
 from .create import create_link
+from .fault_model import FaultModel
+from .faulty import FaultyLink
 from .link import Link, Peer, Receiver
 from .memory import MemoryLink, memory_link_pair
 from .replay import Replay
@@ -13,6 +15,8 @@ from .udp import UdpBroadcast, UdpConnect, UdpListen
 
 __all__ = [
     "ACCEPTED_FORMS",
+    "FaultModel",
+    "FaultyLink",
     "Link",
     "LinkAddress",
     "MemoryLink",

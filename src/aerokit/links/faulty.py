@@ -1,0 +1,203 @@
+"""``FaultyLink``: a bad radio around any link, for tests, benchmarks and trying out what a program does then.
+
+```python
+radio = FaultyLink(
+    create_link("udpin:0.0.0.0:14550"),
+    incoming=FaultModel(loss=0.2, delay_s=0.05),                # from the vehicle
+    outgoing=FaultModel(loss=0.1, delay_s=0.05, bandwidth=5760),  # to it
+    seed=7,
+)
+async with aerokit.connect(radio) as vehicle:
+    ...
+print(radio.incoming.lost, "of", radio.incoming.frames, "frames of the vehicle were lost")
+```
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from heapq import heappop, heappush
+
+from aerokit.errors import BusyError, ConnectionClosed, LinkLost
+
+from .fault_model import Air, FaultModel, FaultyPath
+from .link import LINGER_S, Link, Peer, Receiver
+
+__all__ = ["FaultyLink"]
+
+
+class FaultyLink(Link):
+    """Loses, repeats, delays and damages what another link brings and takes, as `FaultModel` says.
+
+    ``outgoing`` is what this program writes, ``incoming`` what it receives; ``model`` is for the one of them that is
+    not given. Each direction has its own random numbers, made from ``seed``; on virtual time the same program has the
+    same bad luck each time. ``half_duplex`` lets both directions take turns on one frequency, each with its own
+    ``bandwidth``.
+
+    The wrapped link must not be open yet, and belongs to this one from now on.
+    """
+
+    def __init__(
+        self,
+        link: Link,
+        model: FaultModel | None = None,
+        *,
+        outgoing: FaultModel | None = None,
+        incoming: FaultModel | None = None,
+        seed: int = 0,
+        half_duplex: bool = False,
+    ) -> None:
+        self.link = link
+        """The wrapped link."""
+        model = FaultModel() if model is None else model
+        air = Air() if half_duplex else None
+        self.outgoing = FaultyPath(outgoing or model, (seed, "outgoing"), air)
+        """What happens to what is written, with its counters; its ``model`` may be replaced at any time."""
+        self.incoming = FaultyPath(incoming or model, (seed, "incoming"), air)
+        """What happens to what is received."""
+        self._ears: _Ears | None = None
+        self._on_the_way: _Timetable | None = None
+        self._is_closed = False
+        self._drained = asyncio.Event()
+        self._drained.set()
+
+    @property
+    def address(self) -> str:  # type: ignore[override]
+        """``faulty(udpin:0.0.0.0:14550)``."""
+        return f"faulty({self.link.address})"
+
+    @property
+    def dropped_writes(self) -> int:  # type: ignore[override]
+        """What the wrapped link dropped, and what had no room in the queue; not what was lost on its way."""
+        return self.link.dropped_writes + self.outgoing.overflowed
+
+    async def open(self, receiver: Receiver) -> None:
+        """See `Link.open`."""
+        if self._is_closed:
+            raise ConnectionClosed(f"{self.address} was closed; make a new link to open it again")
+        if self._ears is not None:
+            raise BusyError(f"{self.address} is open; a link is opened once")
+        loop = asyncio.get_running_loop()
+        self._on_the_way = _Timetable(loop)
+        self._ears = _Ears(self.incoming, receiver, self._lost)
+        self.outgoing.start(loop.time())
+        self.incoming.start(loop.time())
+        try:
+            await self.link.open(self._ears)
+        except BaseException:
+            self._ears.close()
+            self._on_the_way.clear()
+            self._ears = self._on_the_way = None
+            raise
+
+    def write(self, data: bytes, peer: Peer = None) -> None:
+        """See `Link.write`; what is lost on its way is no dropped write."""
+        on_the_way = self._on_the_way
+        if on_the_way is None or self._is_closed:
+            return
+        for due, piece in self.outgoing.carry(bytes(data), on_the_way.loop.time()):
+            on_the_way.put(due, lambda piece=piece: self.link.write(piece, peer))  # type: ignore[misc]
+
+    def close(self) -> None:
+        """See `Link.close`; what is on its way still goes out, unless that takes longer than `LINGER_S`."""
+        if self._is_closed:
+            return
+        self._is_closed = True
+        if self._ears is not None:
+            self._ears.close()
+        on_the_way = self._on_the_way
+        if on_the_way is None or on_the_way.loop.is_closed() or not on_the_way:
+            self.link.close()
+            return
+        self._drained.clear()
+        on_the_way.put(min(on_the_way.latest_due, on_the_way.loop.time() + LINGER_S), self._close_link)
+
+    async def wait_closed(self) -> None:
+        """See `Link.wait_closed`."""
+        await self._drained.wait()
+        await self.link.wait_closed()
+
+    def _lost(self) -> None:
+        """What is on its way out meets nobody any more."""
+        if self._on_the_way is not None:
+            self._on_the_way.clear()
+        self._drained.set()
+
+    def _close_link(self) -> None:
+        self._lost()
+        self.link.close()
+
+
+class _Ears:
+    """What the wrapped link calls."""
+
+    def __init__(self, path: FaultyPath, receiver: Receiver, when_lost: Callable[[], None]) -> None:
+        self._path, self._receiver, self._when_lost = path, receiver, when_lost
+        self._on_the_way = _Timetable(asyncio.get_running_loop())
+        self._is_closed = False
+
+    def bytes_received(self, data: bytes, peer: Peer) -> None:
+        """See `Receiver`."""
+        for due, piece in self._path.carry(data, self._on_the_way.loop.time()):
+            if self._is_closed:  # by the receiver
+                return
+            self._on_the_way.put(due, lambda piece=piece: self._receiver.bytes_received(piece, peer))  # type: ignore[misc]
+
+    def link_lost(self, error: LinkLost) -> None:
+        """See `Receiver`; what is on its way is heard before."""
+        self._when_lost()
+        if not self._is_closed:
+            self._on_the_way.put(self._on_the_way.latest_due, lambda: self._receiver.link_lost(error))
+
+    def close(self) -> None:
+        self._is_closed = True
+        self._on_the_way.clear()
+
+
+class _Timetable:
+    """Does things when they are due, in order, those of one instant in the order they were put in; one timer."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self.loop = loop
+        self.latest_due = loop.time()
+        self._waiting: list[tuple[float, int, Callable[[], None]]] = []
+        self._count = 0
+        self._timer: asyncio.TimerHandle | None = None
+
+    def __bool__(self) -> bool:
+        return bool(self._waiting)
+
+    def put(self, due: float, action: Callable[[], None]) -> None:
+        """At once when it is due and nothing waits, so that a radio without faults is no radio at all."""
+        if due <= self.loop.time() and not self._waiting:
+            action()
+            return
+        self.latest_due = max(self.latest_due, due)
+        self._count += 1
+        heappush(self._waiting, (due, self._count, action))
+        self._schedule()
+
+    def clear(self) -> None:
+        self._waiting.clear()
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer = None
+
+    def _schedule(self) -> None:
+        due = self._waiting[0][0]
+        if self._timer is not None:
+            if self._timer.when() <= due:
+                return
+            self._timer.cancel()
+        self._timer = self.loop.call_at(due, self._run)
+
+    def _run(self) -> None:
+        self._timer = None
+        now = max(self.loop.time(), self._waiting[0][0])  # a timer may fire a hair early
+        try:
+            while self._waiting and self._waiting[0][0] <= now:
+                heappop(self._waiting)[2]()
+        finally:  # what an action raised is for the loop to report; the others are done all the same
+            if self._waiting:
+                self._schedule()
