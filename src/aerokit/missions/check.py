@@ -1,0 +1,143 @@
+"""What can be said of items before a vehicle sees them: ranges, frames, NaN, jump targets, how many there are."""
+
+from __future__ import annotations
+
+import math
+import struct
+from typing import TYPE_CHECKING
+
+from aerokit.errors import LocalProtocolError
+from aerokit.mavlink.enums import MavCmd, MavFrame, MavMissionType
+from aerokit.missions.commands import (
+    DEFAULT_XY,
+    DESTINATIONS,
+    FENCE_COMMANDS,
+    GLOBAL_FRAMES,
+    LOCAL_FRAMES,
+    NUMBERS,
+    RALLY_COMMANDS,
+    xy_scale,
+)
+from aerokit.missions.item import MissionItem
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+__all__ = ["MOST_ITEMS", "check_count", "check_item", "check_items", "check_jumps"]
+
+MOST_ITEMS = 65_535
+"""MISSION_COUNT has 16 bits for the number of items."""
+
+_FRAMES = frozenset(int(frame) for frame in MavFrame)
+_FRAME_TEXT = "a global frame (0, 3, 10, or 5, 6, 11) or a local one (1, 4, 7, 20, 21)"
+_GLOBAL_TEXT = "a global frame: 0, 3, 10, or 5, 6, 11"
+
+
+def check_items(items: Sequence[MissionItem], mission_type: int = 0, *, home_is_item_0: bool = False) -> None:
+    """Raise :class:`LocalProtocolError`, which names item, field, value and what is allowed, unless all can be sent.
+
+    ``mission_type`` is the MAV_MISSION_TYPE; with ``home_is_item_0`` (ArduPilot's missions) one item fewer fits.
+    """
+    check_count(len(items), home_is_item_0=home_is_item_0)
+    for index, item in enumerate(items):
+        check_item(item, f"item {index}", mission_type)
+    check_jumps(items)
+
+
+def check_count(count: int, *, home_is_item_0: bool = False) -> None:
+    """Raise :class:`LocalProtocolError` when there are more items than the protocol can count."""
+    most = MOST_ITEMS - home_is_item_0
+    if count > most:
+        raise LocalProtocolError(f"{count} items are too many: at most {most} fit")
+
+
+def check_item(item: MissionItem, where: str = "item", mission_type: int = 0) -> None:
+    """Raise :class:`LocalProtocolError`, which begins with ``where``, unless MISSION_ITEM_INT can carry the item."""
+    if not isinstance(item, MissionItem):
+        raise LocalProtocolError(f"{where} = {item!r} is no MissionItem")
+    _check_integer(where, "command", item.command, 0xFFFF)
+    where = f"{where} ({item.name})"
+    _check_command(where, item.command, mission_type)
+    _check_frame(where, item, mission_type)
+    for number in (1, 2, 3, 4):
+        name = f"param{number}"
+        _check_float(where, name, getattr(item, name), number not in NUMBERS.get(item.command, ()))
+    _check_float(where, "z", item.z, item.command not in DESTINATIONS)
+    _check_place(where, item)
+    if not isinstance(item.autocontinue, bool):
+        raise _wrong(where, "autocontinue", item.autocontinue, "True or False")
+
+
+def check_jumps(items: Sequence[MissionItem]) -> None:
+    """Raise :class:`LocalProtocolError` when a DO_JUMP or DO_JUMP_TAG leads nowhere; items are counted from 0."""
+    tags = {item.param1 for item in items if item.command == MavCmd.JUMP_TAG}
+    for index, item in enumerate(items):
+        where = f"item {index} ({item.name})" if item.command in (MavCmd.DO_JUMP, MavCmd.DO_JUMP_TAG) else ""
+        if item.command == MavCmd.DO_JUMP and not (
+            0 <= item.param1 < len(items) and float(item.param1).is_integer()
+        ):
+            allowed = f"an item of this mission: 0 to {len(items) - 1}, the first item is 0"
+            raise _wrong(where, "param1", item.param1, allowed)
+        if item.command == MavCmd.DO_JUMP_TAG and item.param1 not in tags:
+            allowed = f"the tag of a JUMP_TAG of this mission: {sorted(tags) or 'it has none'}"
+            raise _wrong(where, "param1", item.param1, allowed)
+
+
+def _wrong(where: str, field: str, value: object, allowed: str) -> LocalProtocolError:
+    return LocalProtocolError(f"{where}: {field} = {value!r} is not allowed, but {allowed}")
+
+
+def _check_integer(where: str, field: str, value: object, high: int) -> None:
+    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= high:
+        raise _wrong(where, field, value, f"an integer from 0 to {high}")
+
+
+def _check_command(where: str, command: int, mission_type: int) -> None:
+    kinds = {MavMissionType.FENCE: FENCE_COMMANDS, MavMissionType.RALLY: RALLY_COMMANDS}
+    for kind, commands in kinds.items():
+        if (command in commands) != (mission_type == kind):
+            plan = {1: "a fence", 2: "rally points"}.get(mission_type, "a mission")
+            allowed = {1: "fence commands (5000 to 5004)", 2: "NAV_RALLY_POINT (5100)"}
+            text = allowed.get(mission_type, "commands other than those of fences and rally points")
+            raise _wrong(where, "command", int(command), f"{text}, in {plan}")
+
+
+def _check_frame(where: str, item: MissionItem, mission_type: int) -> None:
+    _check_integer(where, "frame", item.frame, 0xFF)
+    if item.frame not in _FRAMES:
+        raise _wrong(where, "frame", item.frame, "one of MAV_FRAME")
+    if mission_type and item.frame not in GLOBAL_FRAMES:
+        raise _wrong(where, "frame", item.frame, _GLOBAL_TEXT)
+    if item.command in DESTINATIONS and item.frame not in GLOBAL_FRAMES | LOCAL_FRAMES:
+        raise _wrong(where, "frame", item.frame, _FRAME_TEXT)
+
+
+def _check_float(where: str, field: str, value: object, nan_allowed: bool) -> None:
+    if not isinstance(value, (int, float)) or isinstance(value, bool):
+        raise _wrong(where, field, value, "a number")
+    if math.isnan(value) and nan_allowed:
+        return
+    if math.isnan(value) or not _fits_float32(value):
+        raise _wrong(where, field, value, "a finite number that fits into 32 bits" + ", or NaN" * nan_allowed)
+
+
+def _fits_float32(value: float) -> bool:
+    try:
+        return math.isfinite(struct.unpack("<f", struct.pack("<f", value))[0])
+    except (OverflowError, struct.error):
+        return False
+
+
+def _check_place(where: str, item: MissionItem) -> None:
+    scale = xy_scale(item.command, item.frame)
+    for field, limit, name in (("x", 90, "latitude"), ("y", 180, "longitude")):
+        value = getattr(item, field)
+        if not isinstance(value, int) or isinstance(value, bool):
+            raise _wrong(where, field, value, "an integer: MISSION_ITEM_INT has no fraction there")
+        if scale == 10_000_000 and abs(value) > limit * scale and value != DEFAULT_XY:
+            allowed = (
+                f"a {name} from -{limit} to {limit} degrees in 1e-7 degrees, and this is {value / 1e7:g}"
+            )
+            raise _wrong(where, field, value, allowed)
+        if not -0x80000000 <= value <= 0x7FFFFFFF:
+            raise _wrong(where, field, value, "an integer of 32 bits")
