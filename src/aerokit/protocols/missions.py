@@ -1,0 +1,198 @@
+"""What all transfers of missions, fences and rally points share (https://mavlink.io/en/services/mission.html).
+
+The three kinds differ by ``mission_type`` alone. Items are those on the wire: where a mission's item 0 is home, it is
+among them here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import TYPE_CHECKING, TypeVar
+
+from aerokit.errors import MissionRejected, MissionTimeout
+from aerokit.mavlink.enums import MavMissionResult, MavMissionType
+from aerokit.mavlink.messages import MissionAck, MissionClearAll
+from aerokit.protocols.transfer import PATIENCE_S, OnProgress, Transfer
+
+if TYPE_CHECKING:
+    from aerokit.mavlink.message import Message
+    from aerokit.protocols.round_trip import RoundTrip
+
+__all__ = [
+    "BUSY_S",
+    "MissionClear",
+    "MissionExchange",
+    "mission_ids",
+    "opaque_id_of",
+    "ranges",
+]
+
+ResultT = TypeVar("ResultT")
+
+BUSY_S = 9.0
+"""How long a vehicle may be busy with a transfer that nobody goes on with: ArduPilot waits 8 s, PX4 5 s."""
+BUSY_AGAIN_S = 1.0
+"""How often a busy vehicle is asked again."""
+NAMES = {
+    MavMissionType.MISSION: "mission",
+    MavMissionType.FENCE: "fence",
+    MavMissionType.RALLY: "rally points",
+}
+RESULTS = {
+    MavMissionResult.ERROR: "an error it does not explain, or it is busy with another transfer",
+    MavMissionResult.UNSUPPORTED_FRAME: "the coordinate frame is not supported",
+    MavMissionResult.UNSUPPORTED: "the command is not supported",
+    MavMissionResult.NO_SPACE: "there is no space for so many items",
+    MavMissionResult.INVALID: "a parameter has an invalid value",
+    MavMissionResult.INVALID_SEQUENCE: "an item came out of sequence",
+    MavMissionResult.DENIED: "denied: another ground station may be transferring",
+    MavMissionResult.OPERATION_CANCELLED: "it cancelled the transfer",
+    **{
+        result: f"{name} has an invalid value"
+        for result, name in zip(
+            range(MavMissionResult.INVALID_PARAM1, MavMissionResult.INVALID_PARAM7 + 1),
+            ("param1", "param2", "param3", "param4", "x", "y", "z"),
+            strict=True,
+        )
+    },
+}
+
+
+def opaque_id_of(message: Message) -> int:
+    """The ``opaque_id`` of a MISSION_COUNT or MISSION_ACK, 0 when there is none: an extension not yet in the dialect.
+
+    PX4 sends it: a checksum of what is stored. See https://mavlink.io/en/messages/common.html#MISSION_COUNT.
+    """
+    return _number_at(message, 5 if message.NAME == "MISSION_COUNT" else 4)
+
+
+def mission_ids(message: Message) -> tuple[int, int, int]:
+    """``mission_id``, ``fence_id``, ``rally_points_id`` of a MISSION_CURRENT, 0 where there are none.
+
+    See https://mavlink.io/en/messages/common.html#MISSION_CURRENT.
+    """
+    return _number_at(message, 6), _number_at(message, 10), _number_at(message, 14)
+
+
+def _number_at(message: Message, offset: int) -> int:
+    frame = message.received_frame
+    return 0 if frame is None else int.from_bytes(frame.payload[offset : offset + 4], "little")
+
+
+class MissionExchange(Transfer[ResultT]):
+    """One transfer with one component. Only what is addressed to us, or to nobody, counts, and only this kind.
+
+    Errors count items as the program does: ``offset`` is what its numbers are lower than those on the wire.
+    """
+
+    def __init__(
+        self,
+        target_system: int,
+        target_component: int,
+        *,
+        mission_type: int = MavMissionType.MISSION,
+        offset: int = 0,
+        own_system: int = 255,
+        own_component: int = 190,
+        round_trip: RoundTrip | None = None,
+        patience_s: float = PATIENCE_S,
+        on_progress: OnProgress | None = None,
+    ) -> None:
+        super().__init__(
+            target_system,
+            target_component,
+            round_trip=round_trip,
+            patience_s=patience_s,
+            on_progress=on_progress,
+        )
+        self.mission_type = mission_type
+        self.offset = offset
+        self._own = (own_system, own_component)
+        self._attempt = 1
+
+    @property
+    def kind(self) -> str:
+        """``"mission"``, ``"fence"`` or ``"rally points"``, for texts."""
+        return NAMES.get(MavMissionType(self.mission_type), "items")
+
+    def cancellation(self) -> list[Message]:
+        """What tells the vehicle that this transfer is given up; to be sent when it is cancelled from outside."""
+        return [self._ack(MavMissionResult.OPERATION_CANCELLED)]
+
+    def _ack(self, result: int) -> MissionAck:
+        return MissionAck(self.target_system, self.target_component, result, self.mission_type)
+
+    def _is_ours(self, message: Message) -> bool:
+        return (
+            self._is_from_target(message)
+            and getattr(message, "target_system", 0) in (0, self._own[0])
+            and getattr(message, "target_component", 0) in (0, self._own[1])
+            and getattr(message, "mission_type", self.mission_type) == self.mission_type
+        )
+
+    def _wait(self, now: float, seconds: float | None = None) -> None:
+        """Set the deadline: an answer is due by then."""
+        self.deadline = now + (self.round_trip.timeout_s(self._attempt) if seconds is None else seconds)
+
+    def _reject(self, result: int, *, seq: int | None = None) -> None:
+        item = None if seq is None or seq < self.offset else seq - self.offset
+        where = "" if item is None else f" item {item}"
+        meaning = RESULTS.get(MavMissionResult(result), "") if result in RESULTS else f"result {result}"
+        self._fail(
+            MissionRejected(f"{self.kind}: the vehicle refused{where}: {meaning}", result=result, item=item)
+        )
+
+
+class MissionClear(MissionExchange[None]):
+    """MISSION_CLEAR_ALL until it is acknowledged.
+
+    ArduPilot refuses (ERROR) while the mission is being flown. PX4 says nothing while it is busy with a transfer.
+    """
+
+    expects = (MissionAck,)
+
+    def start(self, now: float) -> None:
+        """Send it."""
+        self._begin(now)
+        self._send(now)
+
+    def receive(self, message: Message, now: float) -> None:
+        """Take the MISSION_ACK; one of an upload that ran into its time-out says nothing of this."""
+        if not isinstance(message, MissionAck) or not self._is_ours(message):
+            return
+        if message.type == MavMissionResult.ACCEPTED:
+            if self._attempt == 1:
+                self.round_trip.measured(now - self._sent_at)
+            self._finish(None)
+        elif message.type not in (MavMissionResult.OPERATION_CANCELLED, MavMissionResult.INVALID_SEQUENCE):
+            self._reject(message.type)
+
+    def expire(self, now: float) -> None:
+        """Send it again, or give up."""
+        if self._is_out_of_patience(now):
+            self._fail(self._timeout(now))
+            return
+        self._attempt += 1
+        self._send(now)
+
+    def _send(self, now: float) -> None:
+        self._sent_at = now
+        self._outbox.append(MissionClearAll(self.target_system, self.target_component, self.mission_type))
+        self._wait(now)
+
+    def _timeout(self, now: float) -> MissionTimeout:
+        return MissionTimeout(
+            f"{self.kind}: no answer to MISSION_CLEAR_ALL, sent {self._attempt} times"
+            f" in {now - self._started_at:.1f} s; whether it was cleared is not known"
+        )
+
+
+def ranges(seqs: Collection[int]) -> str:
+    """Numbers as text: ``"0–3, 7"``."""
+    parts: list[tuple[int, int]] = []
+    for seq in sorted(seqs):
+        if parts and seq == parts[-1][1] + 1:
+            parts[-1] = (parts[-1][0], seq)
+        else:
+            parts.append((seq, seq))
+    return ", ".join(str(a) if a == b else f"{a}–{b}" for a, b in parts)
