@@ -1,0 +1,155 @@
+"""How a value travels in the 32-bit float of PARAM_VALUE and PARAM_SET.
+
+ArduPilot casts: 5 becomes 5.0, so an INT32 beyond 2**24 loses its last bits. PX4 puts the bytes of the integer there
+(MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE). Those of -5,000,000 and others are signalling NaNs, which change a bit
+on their way through a Python float: :func:`parameter_of`, :func:`set_message` and :func:`value_message` keep it.
+
+https://mavlink.io/en/services/parameter.html#parameter-encoding
+"""
+
+from __future__ import annotations
+
+import math
+from struct import Struct
+from typing import TypeVar
+
+from aerokit.errors import LocalProtocolError
+from aerokit.mavlink.frame import HEADER_LENGTH
+from aerokit.mavlink.messages import ParamSet, ParamValue
+from aerokit.parameters.parameter import Parameter, ParameterType
+
+__all__ = [
+    "UNKNOWN_INDEX",
+    "from_bits",
+    "from_wire",
+    "parameter_of",
+    "set_message",
+    "to_bits",
+    "to_wire",
+    "value_message",
+    "value_of",
+]
+
+UNKNOWN_INDEX = 0xFFFF
+"""``param_index`` of a PARAM_VALUE that is not part of the list: ArduPilot and PX4 send it after PARAM_SET."""
+
+_FLOAT = Struct("<f")
+_FORMATS = {
+    1: Struct("<B"),
+    2: Struct("<b"),
+    3: Struct("<H"),
+    4: Struct("<h"),
+    5: Struct("<I"),
+    6: Struct("<i"),
+}
+_M = TypeVar("_M", ParamSet, ParamValue)
+
+
+def to_bits(value: float, type: ParameterType, bytewise: bool) -> bytes:  # noqa: A002
+    """The four bytes of ``param_value``. The value is one that :func:`checked_value` has let through."""
+    if not bytewise or type is ParameterType.REAL32:
+        return _FLOAT.pack(value)
+    if type not in _FORMATS:
+        raise LocalProtocolError(f"{value!r}: an {type.name} has eight bytes, the message has room for four")
+    return _FORMATS[type].pack(value).ljust(4, b"\0")
+
+
+def from_bits(bits: bytes, type: ParameterType, bytewise: bool) -> int | float:  # noqa: A002
+    """The value of the four bytes of ``param_value``; an int for integer types.
+
+    Never raises: a fraction or NaN that a vehicle sent for an integer is returned as it is.
+    """
+    if bytewise and type in _FORMATS:
+        return int(_FORMATS[type].unpack_from(bits)[0])
+    return _cast(_FLOAT.unpack(bits)[0], type)
+
+
+def to_wire(value: float, type: ParameterType, bytewise: bool) -> float:  # noqa: A002
+    """``param_value`` for a value; signalling NaNs change, see above."""
+    return float(_FLOAT.unpack(to_bits(value, type, bytewise))[0])
+
+
+def from_wire(param_value: float, type: ParameterType, bytewise: bool) -> int | float:  # noqa: A002
+    """The value of a ``param_value``; signalling NaNs have changed, see above."""
+    if bytewise and type in _FORMATS:
+        return from_bits(_FLOAT.pack(param_value), type, bytewise)
+    return _cast(param_value, type)
+
+
+def value_of(message: ParamSet | ParamValue, bytewise: bool) -> int | float:
+    """The value in a message, exact to the bit when it came off the wire."""
+    type_ = ParameterType.from_wire(message.param_type)
+    if message.param_value == message.param_value or not bytewise:
+        return from_wire(message.param_value, type_, bytewise)
+    return from_bits(_exact_bits(message), type_, bytewise)
+
+
+def parameter_of(message: ParamValue, bytewise: bool) -> Parameter:
+    """What a PARAM_VALUE tells; no default, and no index when it is not part of the list."""
+    index = None if message.param_index == UNKNOWN_INDEX else message.param_index
+    type_ = ParameterType.from_wire(message.param_type)
+    return Parameter(message.param_id, value_of(message, bytewise), type_, None, index)
+
+
+def set_message(
+    target_system: int,
+    target_component: int,
+    name: str,
+    value: float,
+    type: ParameterType,  # noqa: A002
+    bytewise: bool,
+) -> ParamSet:
+    """PARAM_SET for a checked name and value."""
+    bits = to_bits(value, type, bytewise)
+    message = ParamSet(target_system, target_component, name, _FLOAT.unpack(bits)[0], int(type))
+    return _exact(message, _ExactParamSet, bits)
+
+
+def value_message(parameter: Parameter, count: int, bytewise: bool) -> ParamValue:
+    """PARAM_VALUE, as a vehicle with ``count`` parameters sends it."""
+    bits = to_bits(parameter.value, parameter.type, bytewise)
+    index = UNKNOWN_INDEX if parameter.index is None else parameter.index
+    message = ParamValue(parameter.name, _FLOAT.unpack(bits)[0], int(parameter.type), count, index)
+    return _exact(message, _ExactParamValue, bits)
+
+
+# ------------------------------------------------------------------------------------------ bits
+
+
+class _ExactParamSet(ParamSet):
+    """One whose ``param_value`` is a signalling NaN, which no Python float can carry."""
+
+    bits: bytes
+
+    def encode(self) -> bytes:
+        return self.bits + super().encode()[4:]
+
+
+class _ExactParamValue(ParamValue):
+    bits: bytes
+
+    def encode(self) -> bytes:
+        return self.bits + super().encode()[4:]
+
+
+def _exact(message: _M, kind: type[_ExactParamSet] | type[_ExactParamValue], bits: bytes) -> _M:
+    """The same message, of a kind that keeps the bits when its own float does not."""
+    if _FLOAT.pack(message.param_value) == bits:
+        return message
+    exact = kind(**message.to_dict())
+    exact.bits = bits  # type: ignore[misc]
+    return exact  # type: ignore[return-value]
+
+
+def _exact_bits(message: ParamSet | ParamValue) -> bytes:
+    """The first four bytes of the payload: the value comes first in both messages."""
+    if isinstance(message, (_ExactParamSet, _ExactParamValue)):
+        return message.bits
+    if message.received_frame is None:
+        return _FLOAT.pack(message.param_value)
+    return message.received_frame.body[HEADER_LENGTH : HEADER_LENGTH + 4].ljust(4, b"\0")
+
+
+def _cast(number: float, type_: ParameterType) -> int | float:
+    whole = type_.is_integer and math.isfinite(number) and number == int(number)
+    return int(number) if whole else number

@@ -1,0 +1,93 @@
+"""Values in messages: ArduPilot's cast and PX4's bytes, every bit of them."""
+
+from __future__ import annotations
+
+import math
+import struct
+
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from aerokit.errors import LocalProtocolError
+from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.frame import Frame
+from aerokit.mavlink.messages import ParamSet, ParamValue
+from aerokit.parameters import Parameter, ParameterType, checked_value
+from aerokit.parameters.encoding import from_wire, parameter_of, set_message, to_wire, value_message, value_of
+
+SMALL = [ParameterType.UINT8, ParameterType.INT8, ParameterType.UINT16, ParameterType.INT16]
+TYPES = [*SMALL, ParameterType.UINT32, ParameterType.INT32, ParameterType.REAL32]
+
+
+@st.composite
+def parameters(draw: st.DrawFn) -> Parameter:
+    type_ = draw(st.sampled_from(TYPES))
+    value: int | float = (
+        draw(st.integers(int(type_.low), int(type_.high)))
+        if type_.is_integer
+        else draw(st.floats(width=32, allow_nan=False, allow_infinity=False))
+    )
+    return Parameter("SIXTEEN_LETTERS_", value, type_, None, draw(st.none() | st.integers(0, 65534)))
+
+
+def over_the_air(message: ParamValue | ParamSet) -> Frame:
+    return Frame.parse(FrameEncoder(1, 1).encode(message))
+
+
+@settings(max_examples=200)
+@given(parameters())
+@example(Parameter("SIGNALLING", -5_000_000, ParameterType.INT32))
+@example(Parameter("SIGNALLING", 0x7F800001, ParameterType.UINT32))
+@example(Parameter("QUIET", -1, ParameterType.INT32))
+@example(Parameter("ZERO", 0, ParameterType.INT32))
+def test_bytewise_keeps_every_bit(parameter: Parameter) -> None:
+    sent = value_message(parameter, 900, bytewise=True)
+    frame = over_the_air(sent)
+    assert parameter_of(ParamValue.decode_body(frame.body, frame), bytewise=True) == parameter
+    assert parameter_of(sent, bytewise=True) == parameter
+    order = set_message(1, 1, parameter.name, parameter.value, parameter.type, bytewise=True)
+    frame = over_the_air(order)
+    received = ParamSet.decode_body(frame.body, frame)
+    assert value_of(received, bytewise=True) == value_of(order, bytewise=True) == parameter.value
+    assert received.param_type == parameter.type
+
+
+@given(parameters())
+def test_cast_keeps_what_float32_can(parameter: Parameter) -> None:
+    wire = to_wire(parameter.value, parameter.type, bytewise=False)
+    assert wire == struct.unpack("<f", struct.pack("<f", parameter.value))[0]
+    back = from_wire(wire, parameter.type, bytewise=False)
+    assert type(back) is type(parameter.value)
+    if parameter.type in (*SMALL, ParameterType.REAL32):
+        assert back == parameter.value
+
+
+@given(parameters())
+def test_bytes_are_those_of_c(parameter: Parameter) -> None:
+    format_ = dict(zip(TYPES, "BbHhIif", strict=True))[parameter.type]
+    payload = value_message(parameter, 900, bytewise=True).encode()
+    assert struct.unpack_from("<" + format_, payload) == (parameter.value,)
+
+
+def test_a_float_is_enough_but_for_signalling_nans() -> None:
+    for value in (0, 1, -1, 2**31 - 1, -(2**31)):
+        type_ = ParameterType.INT32
+        assert from_wire(to_wire(value, type_, True), type_, True) == value
+    assert type(set_message(1, 1, "A", 5, ParameterType.INT32, True)) is ParamSet
+
+
+def test_nonsense_off_the_air_is_returned_as_it_is() -> None:
+    assert math.isnan(from_wire(math.nan, ParameterType.INT8, False))
+    assert from_wire(1.5, ParameterType.INT8, False) == 1.5
+    assert from_wire(math.inf, ParameterType.REAL32, True) == math.inf
+    message = ParamValue("X", math.nan, 0, 1, 65535)  # no such type
+    assert parameter_of(message, True).type is ParameterType.REAL32
+    assert parameter_of(message, True).index is None
+
+
+def test_eight_bytes_do_not_fit() -> None:
+    value = checked_value("X", 5, ParameterType.INT64)
+    with pytest.raises(LocalProtocolError, match="INT64"):
+        to_wire(value, ParameterType.INT64, bytewise=True)
+    assert to_wire(value, ParameterType.INT64, bytewise=False) == 5.0

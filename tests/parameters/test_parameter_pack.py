@@ -1,0 +1,174 @@
+"""param.pck both ways, against ourselves, pymavlink, and damaged files."""
+
+from __future__ import annotations
+
+import contextlib
+import struct
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pymavlink.mavftp import MAVFTP
+
+from aerokit.errors import LocalProtocolError, RemoteProtocolError
+from aerokit.parameters import Parameter, ParameterTable, ParameterType
+from aerokit.parameters.pack import pack_parameters, pack_served, unpack_parameters, unpack_upload
+
+TYPES = [ParameterType.INT8, ParameterType.INT16, ParameterType.INT32, ParameterType.REAL32]
+
+
+def values_of(type_: ParameterType) -> st.SearchStrategy[int | float]:
+    if type_.is_integer:
+        return st.integers(int(type_.low), int(type_.high))
+    return st.floats(width=32, allow_nan=False, allow_infinity=False)
+
+
+@st.composite
+def tables(draw: st.DrawFn, least: int = 0) -> ParameterTable:
+    names = draw(
+        st.lists(st.text("ABC_1", min_size=1, max_size=16), min_size=least, max_size=40, unique=True)
+    )
+    rows = []
+    for index, name in enumerate(sorted(names) if draw(st.booleans()) else names):
+        type_ = draw(st.sampled_from(TYPES))
+        values = values_of(type_)
+        rows.append(Parameter(name, draw(values), type_, draw(values), index))
+    return ParameterTable(rows)
+
+
+def undefaulted(table: ParameterTable) -> ParameterTable:
+    return ParameterTable(p.replace(default=None) for p in table.values())
+
+
+@settings(max_examples=60)
+@given(tables(least=1), st.integers(6, 239))
+def test_what_is_served_is_read(table: ParameterTable, block_size: int) -> None:
+    assert unpack_parameters(pack_served(table, block_size=block_size)) == undefaulted(table)
+    served = pack_served(table, with_defaults=True, block_size=block_size)
+    assert unpack_parameters(served) == table
+    oracle = MAVFTP.ftp_param_decode(served)
+    assert oracle is not None and oracle.defaults is not None
+    assert [(n.decode(), v) for n, v, _ in oracle.params] == [(p.name, p.value) for p in table.values()]
+    assert [(n.decode(), v) for n, v, _ in oracle.defaults] == [(p.name, p.default) for p in table.values()]
+
+
+@settings(max_examples=40)
+@given(tables())
+def test_what_is_uploaded_is_read(table: ParameterTable) -> None:
+    data = pack_parameters(table)
+    magic, count, length = struct.unpack_from("<HHH", data)
+    assert (magic, count, length) == (0x671B, len(table), len(data))
+    bare = ParameterTable(p.replace(default=None, index=None) for p in table.values())
+    assert unpack_upload(data) == bare
+    served = struct.pack("<HHH", magic, count, count) + data[6:]
+    oracle = MAVFTP.ftp_param_decode(served)
+    assert oracle is not None
+    assert [(n.decode(), v) for n, v, _ in oracle.params] == [(p.name, p.value) for p in table.values()]
+
+
+@settings(max_examples=40)
+@given(tables(least=3), st.data())
+def test_a_part(table: ParameterTable, data: st.DataObject) -> None:
+    start = data.draw(st.integers(0, len(table) - 1))
+    count = data.draw(st.integers(0, len(table)))
+    part = list(undefaulted(table).values())[start : start + count if count else None]
+    served = pack_served(table, start=start, count=count)
+    assert unpack_parameters(served, start=start) == ParameterTable(part)
+
+
+@settings(max_examples=40)
+@given(tables(least=1), st.sampled_from([20, 100, 239]), st.data())
+def test_blocks_of_two_readings_never_give_half_a_value(
+    table: ParameterTable, block_size: int, data: st.DataObject
+) -> None:
+    later = ParameterTable(p.replace(value=data.draw(values_of(p.type))) for p in table.values())
+    one, two = (pack_served(t, block_size=block_size) for t in (table, later))
+    blocks = [
+        data.draw(st.sampled_from((one, two)))[i : i + block_size] for i in range(0, len(one), block_size)
+    ]
+    mixed = unpack_parameters(b"".join(blocks))
+    assert all(p.value in (table[p.name].value, later[p.name].value) for p in mixed.values())
+
+
+@settings(max_examples=100)
+@given(tables(least=2), st.data())
+def test_damage_is_noticed_and_nothing_else_is_raised(table: ParameterTable, data: st.DataObject) -> None:
+    whole = pack_served(table, with_defaults=data.draw(st.booleans()))
+    cut = whole[: data.draw(st.integers(0, len(whole) - 1))]
+    if any(whole[len(cut) :]):
+        with pytest.raises(RemoteProtocolError):
+            unpack_parameters(cut)
+    changed = bytearray(whole)
+    changed[data.draw(st.integers(0, len(whole) - 1))] ^= data.draw(st.integers(1, 255))
+    for read in (unpack_parameters, unpack_upload):
+        with contextlib.suppress(RemoteProtocolError):
+            read(bytes(changed))
+
+
+@given(st.binary(max_size=100))
+def test_noise(data: bytes) -> None:
+    for read in (unpack_parameters, unpack_upload):
+        with contextlib.suppress(RemoteProtocolError):
+            read(struct.pack("<HHH", 0x671B, 1, 1) + data)
+
+
+def test_damage_by_name() -> None:
+    def file(*entries: bytes, count: int | None = None) -> bytes:
+        number = len(entries) if count is None else count
+        return struct.pack("<HHH", 0x671B, number, number) + b"".join(entries)
+
+    good = b"\x01\x00A\x05"
+    assert unpack_parameters(file(b"\0\0\0" + good)).values_by_name() == {"A": 5}
+    for entry, text in (
+        (b"\x05\x00A\x05", "type 5"),
+        (b"\x21\x00A\x05", "flags 2"),
+        (b"\x01\x01A\x05", "1 \\+ 1 characters after"),
+        (b"\x01\x00\x80\x05", "the name"),
+        (b"\x02\x00A\x05", "ends within"),
+        (b"\x01", "ends within"),
+    ):
+        with pytest.raises(RemoteProtocolError, match=f"byte 6: .*{text}"):
+            unpack_parameters(file(entry))
+    with pytest.raises(RemoteProtocolError, match="has 1 parameters, its header says 2"):
+        unpack_parameters(file(good, count=2))
+    with pytest.raises(RemoteProtocolError, match="twice"):
+        unpack_parameters(file(good, good))
+    with pytest.raises(RemoteProtocolError, match="header"):
+        unpack_parameters(b"\x1b\x67")
+    with pytest.raises(RemoteProtocolError, match="this is no"):
+        unpack_parameters(b"<html>")
+
+
+def test_wider_types_carry_unsigned_ones() -> None:
+    rows = [
+        Parameter("A", 200, ParameterType.UINT8),
+        Parameter("B", 60000, ParameterType.UINT16),
+        Parameter("C", 2**31 - 1, ParameterType.UINT32),
+    ]
+    read = unpack_upload(pack_parameters(rows))
+    assert read.values_by_name() == {"A": 200, "B": 60000, "C": 2**31 - 1}
+    assert [p.type for p in read.values()] == [ParameterType.INT16, ParameterType.INT32, ParameterType.INT32]
+
+
+@pytest.mark.parametrize(
+    ("parameter", "text"),
+    [
+        (Parameter("SEVENTEEN_LETTERS", 1, ParameterType.INT8), "17 characters"),
+        (Parameter("X", float("nan"), ParameterType.REAL32), "finite"),
+        (Parameter("X", 300, ParameterType.INT8), "-128..127"),
+        (Parameter("X", 2**31, ParameterType.UINT32), "must be in"),
+        (Parameter("X", 1, ParameterType.INT64), "INT64"),
+    ],
+)
+def test_what_cannot_be_packed(parameter: Parameter, text: str) -> None:
+    with pytest.raises(LocalProtocolError, match=text):
+        pack_parameters([parameter])
+
+
+def test_limits() -> None:
+    rows = [Parameter(f"{i * 7919 % 10000:04}{i:012}", 1, ParameterType.INT32) for i in range(8000)]
+    with pytest.raises(LocalProtocolError, match="at most 65535"):
+        pack_parameters(rows)
+    assert len(pack_parameters(rows[:2000])) < 65536
+    with pytest.raises(LocalProtocolError, match=r"start = 8000 must be in 0\.\.7999"):
+        pack_served(rows, start=8000)
