@@ -47,7 +47,8 @@ def test_what_is_served_is_read(table: ParameterTable, block_size: int) -> None:
     served = pack_served(table, with_defaults=True, block_size=block_size)
     assert unpack_parameters(served) == table
     oracle = MAVFTP.ftp_param_decode(served)
-    assert oracle is not None and oracle.defaults is not None
+    assert oracle is not None
+    assert oracle.defaults is not None
     assert [(n.decode(), v) for n, v, _ in oracle.params] == [(p.name, p.value) for p in table.values()]
     assert [(n.decode(), v) for n, v, _ in oracle.defaults] == [(p.name, p.default) for p in table.values()]
 
