@@ -1,0 +1,59 @@
+"""What all clients of ``transfers.py`` share: one task from the command line, timed, its outcome as JSON.
+
+    python benchmarks/client_….py TASK WAY PORT SIZE FOLDER
+
+``WAY`` chooses among the ways that a library has. What was downloaded is left in FOLDER (``out.json``, ``out.bin``),
+what is to be uploaded is there (``in.bin``).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+__all__ = ["Task", "run"]
+
+
+class Task:
+    """What to do, and how long it took."""
+
+    def __init__(self, name: str, way: str, port: int, size: int, folder: Path) -> None:
+        self.name, self.way, self.port, self.size, self.folder = name, way, port, size, folder
+        self.address = f"udpin:127.0.0.1:{port}"
+        self._began_at = time.perf_counter()
+        self._seconds: float | None = None
+
+    @property
+    def seconds(self) -> float:
+        """From `begin` to `end`; to now while there was no end."""
+        return time.perf_counter() - self._began_at if self._seconds is None else self._seconds
+
+    def begin(self) -> None:
+        """Connected: time counts from here."""
+        self._began_at = time.perf_counter()
+
+    def end(self) -> None:
+        """Transferred; what follows is taking leave."""
+        self._seconds = self.seconds
+
+
+def run(perform: Callable[[Task], Any]) -> None:
+    """Do the task of the command line with one library; the last line of standard output says what came of it."""
+    name, way, port, size, folder = sys.argv[1:]
+    task = Task(name, way, int(port), int(size), Path(folder))
+    outcome: dict[str, Any] = {}
+    try:
+        content = perform(task)
+        task.end()
+        if content is not None:
+            (task.folder / "out.json").write_text(json.dumps(content))
+    except Exception as error:
+        task.end()
+        outcome["error"] = f"{type(error).__name__}: {error}".partition("\n")[0][:200]
+    print("\n" + json.dumps({"seconds": task.seconds, **outcome}), flush=True)
+    os._exit(0)  # some libraries leave threads behind that do not end

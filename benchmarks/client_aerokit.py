@@ -1,0 +1,64 @@
+"""aerokit's side of ``transfers.py``: its public interface.
+
+``auto`` lets it choose MAVFTP, ``list`` and ``items`` do not.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+from client import Task, run
+from content import DOWNLOAD_PATH, UPLOAD_PATH, mission_items
+
+import aerokit
+from aerokit.missions import Mission, MissionItem
+
+
+def perform(task: Task) -> Any:
+    """Connect, then transfer; only the latter is timed."""
+    return asyncio.run(_perform(task))
+
+
+async def _perform(task: Task) -> Any:
+    async with aerokit.connect(task.address, rates={}) as vehicle:
+        work = {
+            "parameters": _parameters,
+            "mission_upload": _mission_upload,
+            "mission_download": _mission_download,
+            "file_download": _file_download,
+            "file_upload": _file_upload,
+        }[task.name]
+        task.begin()
+        content = await work(vehicle, task)
+        task.end()
+        return content
+
+
+async def _parameters(vehicle: Any, task: Task) -> dict[str, float]:
+    return dict((await vehicle.parameters.download(method=task.way)).values_by_name())
+
+
+async def _mission_upload(vehicle: Any, task: Task) -> None:
+    items = [MissionItem(*item) for item in mission_items(task.size)]
+    await vehicle.mission.upload(Mission(items), method=task.way)
+
+
+async def _mission_download(vehicle: Any, task: Task) -> list[Any]:
+    mission = await vehicle.mission.download(method=task.way)
+    return [
+        (item.command, item.frame, item.param1, item.param2, item.param3, item.param4, item.x, item.y, item.z)
+        for item in mission.items
+    ]
+
+
+async def _file_download(vehicle: Any, task: Task) -> None:
+    await vehicle.files.download(DOWNLOAD_PATH, task.folder / "out.bin")
+
+
+async def _file_upload(vehicle: Any, task: Task) -> None:
+    await vehicle.files.upload(task.folder / "in.bin", UPLOAD_PATH)
+
+
+if __name__ == "__main__":
+    run(perform)

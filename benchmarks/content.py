@@ -1,0 +1,54 @@
+"""What is transferred in ``transfers.py``: made by a rule, so that each side knows what it has to be."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import dataclass
+
+__all__ = [
+    "DOWNLOAD_PATH",
+    "FULL",
+    "LIMIT_S",
+    "QUICK",
+    "UPLOAD_PATH",
+    "Item",
+    "Sizes",
+    "file_content",
+    "mission_items",
+]
+
+DOWNLOAD_PATH = "/APM/bench.bin"
+UPLOAD_PATH = "/APM/upload.bin"
+LIMIT_S = 120.0
+"""Who has not finished after so many seconds has failed."""
+
+WAYPOINT, GLOBAL_RELATIVE_ALT = 16, 3
+
+Item = tuple[int, int, float, float, float, float, int, int, float]
+"""command, frame, param1 to param4, latitude and longitude in 1e-7 degrees, altitude."""
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How much is transferred; parameters are those that the simulated vehicle has."""
+
+    items: int = 200
+    file_bytes: int = 1_000_000
+
+
+FULL = Sizes()
+QUICK = Sizes(items=10, file_bytes=20_000)
+
+
+def mission_items(count: int) -> list[Item]:
+    """Waypoints, without a home item."""
+    return [
+        (WAYPOINT, GLOBAL_RELATIVE_ALT, 0.0, 0.0, 0.0, 0.0,
+         -353632610 + 1000 * n, 1491652299 + 700 * n, 20.0 + n % 50)
+        for n in range(count)
+    ]  # fmt: skip
+
+
+def file_content(size: int) -> bytes:
+    """Bytes that cannot be guessed: what a download fills a hole with is not what belongs there."""
+    return random.Random(size).randbytes(size)

@@ -1,0 +1,347 @@
+"""Parameters, missions and files through a bad radio: aerokit, pymavlink, MAVSDK and DroneKit against one vehicle.
+
+    python benchmarks/transfers.py                        # everything, half an hour; writes bench-transfers.json
+    python benchmarks/transfers.py parameters --loss 0.2  # these tasks, this loss
+    python benchmarks/transfers.py --quick                # small and without loss: does it run?
+
+Each transfer has a client process and a vehicle process of its own (``bad_vehicle.py``), so that nobody inherits
+anything; the same seed loses the same frames for everybody, counted from the first. Time counts from the call of an
+already connected client to its return, and what came over is compared with what should have. Medians over the seeds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import socket
+import statistics
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import table
+from content import FULL, LIMIT_S, QUICK, Sizes, file_content, mission_items
+from table import Row
+
+__all__ = ["rows"]
+
+HERE = Path(__file__).resolve().parent
+CONNECT_S = 60.0
+DELAY_S = 0.01
+LOSSES = (0.0, 0.05, 0.2)
+SEEDS = (1, 2, 3)
+DRONEKIT = os.environ.get("AEROKIT_DRONEKIT_PYTHON", sys.executable)
+"""The interpreter that has DroneKit, where it is not this one."""
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A library and one of its ways to do something."""
+
+    name: str
+    library: str
+    way: str = "auto"
+
+    @property
+    def python(self) -> str:
+        return DRONEKIT if self.library == "dronekit" else sys.executable
+
+
+AEROKIT = Contender("aerokit", "aerokit")
+MAVSDK = Contender("MAVSDK", "mavsdk")
+DRONEKIT_ = Contender("DroneKit", "dronekit")
+MAVFTP = Contender("pymavlink mavftp", "pymavlink", "mavftp")
+
+CONTENDERS: dict[str, tuple[Contender, ...]] = {
+    "parameters": (
+        AEROKIT,
+        Contender("aerokit by list", "aerokit", "list"),
+        MAVFTP,
+        Contender("pymavlink by list", "pymavlink", "list"),
+        MAVSDK,
+        DRONEKIT_,
+    ),
+    **dict.fromkeys(
+        ("mission_upload", "mission_download"),
+        (
+            AEROKIT,
+            Contender("aerokit by items", "aerokit", "items"),
+            Contender("pymavlink mavwp", "pymavlink", "items"),
+            MAVSDK,
+            DRONEKIT_,
+        ),
+    ),
+    **dict.fromkeys(("file_download", "file_upload"), (AEROKIT, MAVFTP, MAVSDK)),
+}
+TASKS = tuple(CONTENDERS)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Of one contender, one task and one loss: the seconds of each seed, and what failed."""
+
+    task: str
+    loss: float
+    contender: Contender
+    seconds: tuple[float, ...]
+    failures: tuple[str, ...]
+
+    @property
+    def median(self) -> float:
+        return statistics.median(self.seconds) if self.seconds else LIMIT_S
+
+    def __str__(self) -> str:
+        if not self.failures:
+            return f"{self.median:.2f}"
+        return "failed" if not self.seconds else f"{self.median:.2f}, {len(self.failures)} failed"
+
+
+def rows(quick: bool = False) -> list[Row]:
+    """One row for each task, loss and peer: ``transfer_parameters_loss_5_mavsdk``."""
+    if quick:
+        outcomes = measure(TASKS, (0.0,), (1,), QUICK, libraries=("aerokit", "pymavlink"))
+    else:
+        outcomes = measure(TASKS, LOSSES, SEEDS, FULL)
+    return as_rows(outcomes)
+
+
+def measure(
+    tasks: Sequence[str],
+    losses: Sequence[float],
+    seeds: Sequence[int],
+    sizes: Sizes,
+    *,
+    delay_s: float = DELAY_S,
+    libraries: Sequence[str] | None = None,
+    report: Callable[[str], object] = lambda text: None,
+) -> list[Outcome]:
+    """Everybody does everything, in turns; who is not installed is left out."""
+    installed = [
+        name for name in libraries or ("aerokit", "pymavlink", "mavsdk", "dronekit") if _is_installed(name)
+    ]
+    outcomes = []
+    for task in tasks:
+        for loss in losses:
+            for contender in CONTENDERS[task]:
+                if contender.library in installed:
+                    outcome = _outcome(task, loss, contender, seeds, sizes, delay_s)
+                    outcomes.append(outcome)
+                    report(
+                        f"{task}, {loss:.0%} loss, {contender.name}: {outcome} {'; '.join(outcome.failures)}"
+                    )
+    return outcomes
+
+
+def as_rows(outcomes: Sequence[Outcome]) -> list[Row]:
+    """Aerokit beside each of the others; who failed is taken to have needed all the time there was."""
+    found = []
+    for own in outcomes:
+        if own.contender is not AEROKIT:
+            continue
+        for peer in outcomes:
+            if (peer.task, peer.loss) == (own.task, own.loss) and peer.contender.library != "aerokit":
+                found.append(_row(own, peer))
+    return found
+
+
+def printed(outcomes: Sequence[Outcome]) -> str:
+    """A table in Markdown, one line for each task and loss."""
+    lines = []
+    for task in dict.fromkeys(each.task for each in outcomes):
+        names = [contender.name for contender in CONTENDERS[task]]
+        lines += ["", f"| {task.replace('_', ' ')} | {' | '.join(names)} |", "|---" * (len(names) + 1) + "|"]
+        for loss in dict.fromkeys(each.loss for each in outcomes):
+            cells = {
+                str(each.contender.name): str(each)
+                for each in outcomes
+                if (each.task, each.loss) == (task, loss)
+            }
+            if cells:
+                lines.append(f"| {loss:.0%} loss | {' | '.join(cells.get(name, '–') for name in names)} |")
+    return "\n".join(lines)
+
+
+def _row(own: Outcome, peer: Outcome) -> Row:
+    name = f"transfer_{own.task}_loss_{own.loss * 100:.0f}_{peer.contender.library}"
+    if peer.contender.way != "auto":
+        name += f"_{peer.contender.way}"
+    theirs = max(peer.median, LIMIT_S) if peer.failures else peer.median
+    ratio = 0.0 if own.failures else theirs / own.median
+    found = table.row(name, own.median, theirs, peer.contender.name, unit="s", ratio=ratio, aim=1.0)
+    found["aerokit"], found["peer"] = round(own.median, 3), round(theirs, 3)
+    if own.failures or peer.failures:
+        found["failures"] = {"aerokit": list(own.failures), "peer": list(peer.failures)}
+    return found
+
+
+# ------------------------------------------------------------------------------------- one transfer
+
+
+def _outcome(
+    task: str, loss: float, contender: Contender, seeds: Sequence[int], sizes: Sizes, delay_s: float
+) -> Outcome:
+    seconds, failures = [], []
+    for seed in seeds:
+        with TemporaryDirectory() as name:
+            try:
+                seconds.append(_transfer(task, loss, contender, seed, sizes, delay_s, Path(name)))
+            except _FailedError as error:
+                failures.append(str(error))
+    return Outcome(task, loss, contender, tuple(seconds), tuple(failures))
+
+
+class _FailedError(Exception):
+    """It did not end, or not with what it should have."""
+
+
+def _transfer(
+    task: str, loss: float, contender: Contender, seed: int, sizes: Sizes, delay_s: float, folder: Path
+) -> float:
+    (folder / "in.bin").write_bytes(file_content(sizes.file_bytes))
+    port = _free_port()
+    size = sizes.items if task.startswith("mission") else sizes.file_bytes
+    with _vehicle(task, port, loss, seed, delay_s, size, folder) as vehicle:
+        script = HERE / f"client_{contender.library}.py"
+        command = [contender.python, str(script), task, contender.way, str(port), str(size), str(folder)]
+        seconds = _run_client(command, folder)
+        _dump(vehicle, folder)
+    _check(task, contender, sizes, folder)
+    return seconds
+
+
+def _run_client(command: list[str], folder: Path) -> float:
+    try:
+        done = subprocess.run(
+            command, cwd=folder, capture_output=True, text=True, timeout=LIMIT_S + CONNECT_S
+        )
+    except subprocess.TimeoutExpired:
+        raise _FailedError(f"not finished after {LIMIT_S:.0f} s") from None
+    try:
+        outcome = json.loads(done.stdout.splitlines()[-1])
+    except (IndexError, ValueError):
+        raise _FailedError((done.stderr.strip().splitlines() or ["ended without a word"])[-1][:200]) from None
+    if "error" in outcome:
+        raise _FailedError(f"{outcome['error']} (after {outcome['seconds']:.1f} s)")
+    if outcome["seconds"] > LIMIT_S:
+        raise _FailedError(f"not finished after {LIMIT_S:.0f} s")
+    return float(outcome["seconds"])
+
+
+def _check(task: str, contender: Contender, sizes: Sizes, folder: Path) -> None:
+    """What came over is what it should be."""
+    if task == "parameters":
+        expected = json.loads((folder / "vehicle-parameters.json").read_text())
+        _check_parameters(json.loads((folder / "out.json").read_text()), expected)
+    elif task.startswith("mission"):
+        path = folder / ("vehicle.json" if task == "mission_upload" else "out.json")
+        _check_mission(json.loads(path.read_text()), sizes.items, contender)
+    else:
+        path = folder / ("vehicle.bin" if task == "file_upload" else "out.bin")
+        if not path.exists() or path.read_bytes() != file_content(sizes.file_bytes):
+            raise _FailedError("the file is not what it should be")
+
+
+def _check_parameters(found: dict[str, float], expected: dict[str, float]) -> None:
+    if set(found) != set(expected):
+        raise _FailedError(f"{len(set(expected) - set(found))} of {len(expected)} parameters are missing")
+    wrong = [
+        name
+        for name, value in expected.items()
+        if not math.isclose(found[name], value, rel_tol=1e-6, abs_tol=1e-6)
+    ]
+    if wrong:
+        raise _FailedError(f"{len(wrong)} parameters have wrong values: {wrong[:3]}")
+
+
+def _check_mission(found: list[list[float]], count: int, contender: Contender) -> None:
+    expected = mission_items(count)
+    if len(found) != len(expected):
+        raise _FailedError(f"{len(found)} items instead of {len(expected)}")
+    # DroneKit has the form of the messages with 32-bit floats: half a metre.
+    slack = 100 if contender.library == "dronekit" else 0
+    for number, (one, other) in enumerate(zip(found, expected, strict=True)):
+        same = [one[0], *one[2:6], one[8]] == [other[0], *other[2:6], other[8]]
+        near = all(abs(a - b) <= slack for a, b in zip(one[6:8], other[6:8], strict=True))
+        if not (same and near):
+            raise _FailedError(f"item {number} is {one} instead of {list(other)}")
+
+
+@contextmanager
+def _vehicle(
+    task: str, port: int, loss: float, seed: int, delay_s: float, size: int, folder: Path
+) -> Iterator[subprocess.Popen[str]]:
+    script = str(HERE / "bad_vehicle.py")
+    command = [sys.executable, script, task, str(port), str(loss), str(seed), str(delay_s), str(size)]
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    try:
+        _answer(process, "ready")
+        yield process
+    finally:
+        process.terminate()
+        process.communicate()
+
+
+def _dump(vehicle: subprocess.Popen[str], folder: Path) -> None:
+    assert vehicle.stdin is not None
+    vehicle.stdin.write(f"dump {folder}\n")
+    vehicle.stdin.flush()
+    _answer(vehicle, "dumped")
+
+
+def _answer(vehicle: subprocess.Popen[str], word: str) -> None:
+    if vehicle.stdout is None or vehicle.stdout.readline().strip() != word:
+        raise RuntimeError("the simulated vehicle has failed")
+
+
+def _free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def _is_installed(library: str) -> bool:
+    python = DRONEKIT if library == "dronekit" else sys.executable
+    shim = (
+        "import collections, collections.abc; collections.MutableMapping = collections.abc.MutableMapping; "
+    )
+    return subprocess.run([python, "-c", f"{shim}import {library}"], capture_output=True).returncode == 0
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure what was asked for, print it, write it."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("tasks", nargs="*", metavar="TASK", help=", ".join(TASKS))
+    parser.add_argument("--loss", type=float, action="append", help="share of frames lost each way, 0 to 1")
+    parser.add_argument("--seeds", type=int, default=len(SEEDS), help="so many runs of each")
+    parser.add_argument("--delay", type=float, default=DELAY_S, help="seconds each way")
+    parser.add_argument("--library", action="append", help="only these: aerokit, pymavlink, mavsdk, dronekit")
+    parser.add_argument("--quick", action="store_true", help="small and without loss: does it run?")
+    parser.add_argument("--output", type=Path, default=Path("bench-transfers.json"))
+    options = parser.parse_args(arguments)
+    if not set(options.tasks) <= set(TASKS):
+        parser.error(f"the tasks are {', '.join(TASKS)}")
+    outcomes = measure(
+        options.tasks or TASKS,
+        options.loss or ((0.0,) if options.quick else LOSSES),
+        range(1, (1 if options.quick else options.seeds) + 1),
+        QUICK if options.quick else FULL,
+        delay_s=options.delay,
+        libraries=options.library,
+        report=lambda text: print(text, file=sys.stderr, flush=True),
+    )
+    found = as_rows(outcomes)
+    print(printed(outcomes))
+    missed = [each["name"] for each in found if table.is_missed(each)]
+    print(f"\nMISSED: {', '.join(missed)}" if missed else "\naerokit is the fastest in every row")
+    table.write(found, options.output)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

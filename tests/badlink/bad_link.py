@@ -1,0 +1,160 @@
+"""A simulated vehicle behind a bad radio, a program on it, and what one transfer cost: on virtual time.
+
+`attempt` does one transfer and gives an `Attempt`: how it ended, how long it took, what was sent for it, and what was
+left on either side.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import Counter
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import anyio
+from flight_harness import Wire, attached_sinks, waiting_on_cells
+
+import aerokit
+from aerokit import messages as m
+from aerokit.links import FaultModel, FaultyLink
+from aerokit.sim import SimulatedVehicle, simulated_link
+from aerokit.testing import run_virtual
+
+DELAY_S = 0.05
+PERFECT = FaultModel(delay_s=DELAY_S)
+GRACE_S = 15.0
+"""So long may what a transfer leaves to the background take, when its messages get lost, too."""
+
+OWN_LIFE = (m.Heartbeat, m.CommandLong, m.Timesync, m.Ping)
+"""What a program sends anyway."""
+
+
+@dataclass(frozen=True)
+class Radio:
+    """A kind of radio: both directions alike but for what is said otherwise."""
+
+    name: str
+    model: FaultModel = PERFECT
+    half_duplex: bool = False
+
+    def with_loss(self, share: float) -> Radio:
+        return Radio(f"{self.name}, {share:.0%} loss", self.model.replace(loss=share), self.half_duplex)
+
+
+@dataclass
+class Program:
+    """What a transfer is done with."""
+
+    vehicle: aerokit.Vehicle
+    simulated: Any
+    wire: Wire
+    radio: FaultyLink
+
+    def turn_bad(self, radio: Radio) -> None:
+        self.radio.outgoing.model = self.radio.incoming.model = radio.model
+
+
+@dataclass
+class Attempt:
+    """What came of one transfer."""
+
+    seed: int
+    error: Exception | None
+    value: Any
+    seconds: float
+    sent: Counter[str] = field(default_factory=Counter)
+    heard: int = 0
+    left: list[str] = field(default_factory=list)
+
+    @property
+    def messages(self) -> int:
+        return sum(self.sent.values())
+
+
+Work = Callable[[Program], Awaitable[Any]]
+
+
+def attempt(
+    work: Work,
+    radio: Radio,
+    seed: int,
+    make_vehicle: Callable[[], SimulatedVehicle],
+    *,
+    timeout_s: float = 600.0,
+    leftovers: Callable[[Any], Iterator[str]] = lambda simulated: iter(()),
+) -> Attempt:
+    """One transfer; the radio turns bad when the vehicle is connected, ``leftovers`` names what the vehicle kept."""
+    return run_virtual(_attempt(work, radio, seed, make_vehicle(), timeout_s, leftovers))
+
+
+async def _attempt(
+    work: Work,
+    radio: Radio,
+    seed: int,
+    simulated: SimulatedVehicle,
+    timeout_s: float,
+    leftovers: Callable[[Any], Iterator[str]],
+) -> Attempt:
+    loop = asyncio.get_running_loop()
+    async with open_program(simulated, seed, half_duplex=radio.half_duplex) as program:
+        before = _held(program)
+        program.turn_bad(radio)
+        program.wire.forget()
+        heard, begun = program.radio.incoming.frames, loop.time()
+        outcome = Attempt(seed, None, None, 0.0)
+        try:
+            with anyio.fail_after(timeout_s):
+                outcome.value = await work(program)
+        except Exception as error:
+            outcome.error = error
+        outcome.seconds = loop.time() - begun
+        outcome.heard = program.radio.incoming.frames - heard
+        outcome.left = await _what_is_left(program, before, leftovers)
+        outcome.sent = Counter(
+            type(each).NAME for _, each in program.wire.sent if not isinstance(each, OWN_LIFE)
+        )
+    return outcome
+
+
+@asynccontextmanager
+async def open_program(
+    simulated: SimulatedVehicle, seed: int = 0, *, half_duplex: bool = False
+) -> AsyncIterator[Program]:
+    """Connected, what it is known to be able to do, no streams but the vehicle's own; the radio is still good."""
+    async with simulated_link(simulated) as link:
+        radio = FaultyLink(link, PERFECT, seed=seed, half_duplex=half_duplex)
+        wire = Wire(radio)
+        async with aerokit.connect(wire, rates={}, system_id=simulated.system_id) as vehicle:
+            await vehicle.version.wait_until(lambda _: True)
+            await anyio.sleep(0.5)
+            yield Program(vehicle, simulated, wire, radio)
+
+
+def _held(program: Program) -> tuple[int, int, int, int]:
+    connection = program.vehicle.connection
+    return (
+        attached_sinks(connection),
+        waiting_on_cells(program.vehicle),
+        len(connection.deadlines._due),
+        len(asyncio.all_tasks()),
+    )
+
+
+async def _what_is_left(
+    program: Program, before: tuple[int, ...], leftovers: Callable[[Any], Iterator[str]]
+) -> list[str]:
+    """At once if possible: the radio is still as bad, and closing needs it."""
+    names = ("sinks", "waiters", "deadlines", "tasks")
+    until = asyncio.get_running_loop().time() + GRACE_S
+    while True:
+        left = [
+            f"{now - then} {name}"
+            for name, then, now in zip(names, before, _held(program), strict=True)
+            if now > then
+        ]
+        left += leftovers(program.simulated)
+        if not left or asyncio.get_running_loop().time() >= until:
+            return left
+        await anyio.sleep(0.1)
