@@ -33,14 +33,22 @@ _FRAME_TEXT = "a global frame (0, 3, 10, or 5, 6, 11) or a local one (1, 4, 7, 2
 _GLOBAL_TEXT = "a global frame: 0, 3, 10, or 5, 6, 11"
 
 
-def check_items(items: Sequence[MissionItem], mission_type: int = 0, *, home_is_item_0: bool = False) -> None:
+def check_items(
+    items: Sequence[MissionItem], mission_type: int = 0, *, home_is_item_0: bool | None = None
+) -> None:
     """Raise :class:`LocalProtocolError`, which names item, field, value and what is allowed, unless all can be sent.
 
-    ``mission_type`` is the MAV_MISSION_TYPE; with ``home_is_item_0`` (ArduPilot's missions) one item fewer fits.
+    ``mission_type`` is the MAV_MISSION_TYPE. ``home_is_item_0`` is True for missions of ArduPilot: one item fewer
+    fits; False for those of others: 0°, 0° as "where the vehicle is" is ArduPilot's alone; None: not known.
     """
-    check_count(len(items), home_is_item_0=home_is_item_0)
+    check_count(len(items), home_is_item_0=bool(home_is_item_0))
     for index, item in enumerate(items):
         check_item(item, f"item {index}", mission_type)
+        if home_is_item_0 is False and item.command in DESTINATIONS and item.x == item.y == 0:
+            raise LocalProtocolError(
+                f"item {index} ({item.name}): x, y = 0, 0 is not allowed: only ArduPilot takes it for the place where"
+                " the vehicle is; give a latitude and a longitude"
+            )
     check_jumps(items)
 
 

@@ -73,7 +73,7 @@ class Fence(Snapshot):
     circles: Sequence[FenceCircle] = ()
     return_point: Position | None = None
 
-    def check(self, *, home_is_item_0: bool = False) -> None:
+    def check(self, *, home_is_item_0: bool | None = None) -> None:
         """Raise :class:`LocalProtocolError` unless it can be sent; a fence never has home in it."""
         check_items(self.to_items(), self.MISSION_TYPE)
 

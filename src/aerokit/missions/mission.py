@@ -35,10 +35,12 @@ class Mission(Snapshot):
     items: Sequence[MissionItem] = ()
     home: Position | None = None
 
-    def check(self, *, home_is_item_0: bool = False) -> None:
+    def check(self, *, home_is_item_0: bool | None = None) -> None:
         """Raise :class:`LocalProtocolError`, which names item, field, value and what is allowed, unless it can be sent.
 
-        NaN passes where the standard gives it a meaning ("not given"): headings, reserved parameters.
+        NaN passes where the standard gives it a meaning ("not given"): headings, reserved parameters. With
+        ``home_is_item_0``, which says whether it is for an ArduPilot, more can be said: one item fewer fits there,
+        and elsewhere 0°, 0° is not "where the vehicle is".
         """
         check_items(self.items, self.MISSION_TYPE, home_is_item_0=home_is_item_0)
 

@@ -39,7 +39,7 @@ class RallyPoints(Snapshot):
         """The places; what is no place on earth is left out."""
         return tuple(item.position for item in self.items if item.position is not None)
 
-    def check(self, *, home_is_item_0: bool = False) -> None:
+    def check(self, *, home_is_item_0: bool | None = None) -> None:
         """Raise :class:`LocalProtocolError`, which names item, field and what is allowed, unless it can be sent."""
         check_items(self.items, self.MISSION_TYPE)
 

@@ -1,0 +1,334 @@
+"""Builders for items at a place: waypoints, take-off and landing, loitering, rally points.
+
+Latitudes and longitudes are degrees (WGS 84). Each place has exactly one altitude, in metres: ``altitude_relative_m``
+above home, ``altitude_amsl_m`` above mean sea level, ``altitude_terrain_m`` above the ground below (ArduPilot with
+terrain data; PX4 refuses it). ``yaw_deg`` is a heading in degrees from north, None: as the vehicle likes.
+What cannot be right raises :class:`~aerokit.errors.LocalProtocolError` with the argument and what is allowed.
+https://mavlink.io/en/messages/common.html#mav_commands
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from aerokit.mavlink.enums import MavCmd
+from aerokit.missions.places import action, heading, in_range, place
+
+if TYPE_CHECKING:
+    from aerokit.missions.item import MissionItem
+
+__all__ = [
+    "land",
+    "loiter_time",
+    "loiter_to_altitude",
+    "loiter_turns",
+    "loiter_unlimited",
+    "rally_point",
+    "return_to_launch",
+    "spline_waypoint",
+    "take_off",
+    "vtol_land",
+    "vtol_take_off",
+    "waypoint",
+]
+
+_LONGEST_S = 65_535.0  # ArduPilot has 16 bits for seconds
+_WIDEST_M = 65_535.0  # and for metres
+
+
+def waypoint(
+    latitude_deg: float,
+    longitude_deg: float,
+    *,
+    altitude_relative_m: float | None = None,
+    altitude_amsl_m: float | None = None,
+    altitude_terrain_m: float | None = None,
+    hold_s: float = 0.0,
+    acceptance_radius_m: float = 0.0,
+    pass_by_m: float = 0.0,
+    yaw_deg: float | None = None,
+) -> MissionItem:
+    """Fly to a place and stay there for ``hold_s`` seconds (0 to 65,535; ArduPilot: whole ones, not Plane).
+
+    Within ``acceptance_radius_m`` it counts as reached (0: the vehicle's own; not ArduCopter); ``pass_by_m`` is by how
+    much a plane may pass beside it, negative on the other side (ArduPlane keeps whole metres to 255 of both).
+    https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_WAYPOINT
+    """
+    return place(
+        MavCmd.NAV_WAYPOINT,
+        latitude_deg,
+        longitude_deg,
+        (altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
+        in_range("hold_s", hold_s, 0, _LONGEST_S),
+        in_range("acceptance_radius_m", acceptance_radius_m, 0, _WIDEST_M),
+        in_range("pass_by_m", pass_by_m, -_WIDEST_M, _WIDEST_M),
+        heading("yaw_deg", yaw_deg),
+    )
+
+
+def spline_waypoint(
+    latitude_deg: float,
+    longitude_deg: float,
+    *,
+    altitude_relative_m: float | None = None,
+    altitude_amsl_m: float | None = None,
+    altitude_terrain_m: float | None = None,
+    hold_s: float = 0.0,
+) -> MissionItem:
+    """Fly to a place in a curve (ArduPilot, not Plane), and stay there for ``hold_s`` seconds (0 to 65,535).
+
+    https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_SPLINE_WAYPOINT
+    """
+    return place(
+        MavCmd.NAV_SPLINE_WAYPOINT,
+        latitude_deg,
+        longitude_deg,
+        (altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
+        in_range("hold_s", hold_s, 0, _LONGEST_S),
+    )
+
+
+def take_off(
+    latitude_deg: float | None = None,
+    longitude_deg: float | None = None,
+    *,
+    altitude_relative_m: float | None = None,
+    altitude_amsl_m: float | None = None,
+    altitude_terrain_m: float | None = None,
+    pitch_deg: float = 0.0,
+    yaw_deg: float | None = None,
+) -> MissionItem:
+    """Take off to an altitude; without a place where the vehicle is (ArduPilot; PX4 needs the place).
+
+    ``pitch_deg`` is the least pitch of a plane, 0 to 90 degrees.
+    https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_TAKEOFF
+    """
+    return place(
+        MavCmd.NAV_TAKEOFF,
+        latitude_deg,
+        longitude_deg,
+        (altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
+        in_range("pitch_deg", pitch_deg, 0, 90),
+        0.0,
+        0.0,
+        heading("yaw_deg", yaw_deg),
+    )
+
+
+def vtol_take_off(
+    latitude_deg: float | None = None,
+    longitude_deg: float | None = None,
+    *,
+    altitude_relative_m: float | None = None,
+    altitude_amsl_m: float | None = None,
+    altitude_terrain_m: float | None = None,
+    yaw_deg: float | None = None,
+) -> MissionItem:
+    """Take off like a multicopter (PX4: and go over to forward flight towards the place, which it needs).
+
+    https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_VTOL_TAKEOFF
+    """
+    return place(
+        MavCmd.NAV_VTOL_TAKEOFF,
+        latitude_deg,
+        longitude_deg,
+        (altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
+        0.0,
+        0.0,
+        0.0,
+        heading("yaw_deg", yaw_deg),
+    )
+
+
+def land(
+    latitude_deg: float | None = None,
+    longitude_deg: float | None = None,
+    *,
+    altitude_relative_m: float | None = None,
+    altitude_amsl_m: float | None = None,
+    altitude_terrain_m: float | None = None,
+    abort_altitude_m: float = 0.0,
+    precision: int = 0,
+    yaw_deg: float | None = None,
+) -> MissionItem:
+    """Land at a place, or where the vehicle is (ArduPilot; PX4 needs the place).
+
+    The altitude is that of the ground there, home's when none is given. ``abort_altitude_m`` is where to climb when a
+    plane's landing is given up (0 to 65,535 m, 0: its own); ``precision`` 0, 1 (opportunistic) or 2 (required) asks
+    PX4 for a precision landing. https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_LAND
+    """
+    return place(
+        MavCmd.NAV_LAND,
+        latitude_deg,
+        longitude_deg,
+        _ground(altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
+        in_range("abort_altitude_m", abort_altitude_m, 0, _WIDEST_M),
+        in_range("precision", precision, 0, 2),
+        0.0,
+        heading("yaw_deg", yaw_deg),
+    )
+
+
+def vtol_land(
+    latitude_deg: float | None = None,
+    longitude_deg: float | None = None,
+    *,
+    altitude_relative_m: float | None = None,
+    altitude_amsl_m: float | None = None,
+    altitude_terrain_m: float | None = None,
+    yaw_deg: float | None = None,
+) -> MissionItem:
+    """Land like a multicopter at a place, or where the vehicle is (ArduPilot; PX4 needs the place).
+
+    The altitude is that of the ground there, home's when none is given.
+    https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_VTOL_LAND
+    """
+    return place(
+        MavCmd.NAV_VTOL_LAND,
+        latitude_deg,
+        longitude_deg,
+        _ground(altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
+        0.0,
+        0.0,
+        0.0,
+        heading("yaw_deg", yaw_deg),
+    )
+
+
+def loiter_unlimited(
+    latitude_deg: float | None = None,
+    longitude_deg: float | None = None,
+    *,
+    altitude_relative_m: float | None = None,
+    altitude_amsl_m: float | None = None,
+    altitude_terrain_m: float | None = None,
+    radius_m: float = 0.0,
+    yaw_deg: float | None = None,
+) -> MissionItem:
+    """Stay at a place for good; planes circle with ``radius_m`` (0: their own, negative: counter-clockwise).
+
+    https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_LOITER_UNLIM
+    """
+    return place(
+        MavCmd.NAV_LOITER_UNLIM,
+        latitude_deg,
+        longitude_deg,
+        (altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
+        0.0,
+        0.0,
+        in_range("radius_m", radius_m, -_WIDEST_M, _WIDEST_M),
+        heading("yaw_deg", yaw_deg),
+    )
+
+
+def loiter_time(
+    duration_s: float,
+    latitude_deg: float | None = None,
+    longitude_deg: float | None = None,
+    *,
+    altitude_relative_m: float | None = None,
+    altitude_amsl_m: float | None = None,
+    altitude_terrain_m: float | None = None,
+    radius_m: float = 0.0,
+    leave_tangentially: bool = False,
+) -> MissionItem:
+    """Stay at a place for 0 to 65,535 seconds (ArduPilot: whole ones, and of the radius only its sign).
+
+    ``leave_tangentially`` lets a plane go on to the next place from the circle instead of from its centre.
+    https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_LOITER_TIME
+    """
+    return place(
+        MavCmd.NAV_LOITER_TIME,
+        latitude_deg,
+        longitude_deg,
+        (altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
+        in_range("duration_s", duration_s, 0, _LONGEST_S),
+        0.0,
+        in_range("radius_m", radius_m, -_WIDEST_M, _WIDEST_M),
+        float(leave_tangentially),
+    )
+
+
+def loiter_turns(
+    turns: float,
+    latitude_deg: float | None = None,
+    longitude_deg: float | None = None,
+    *,
+    altitude_relative_m: float | None = None,
+    altitude_amsl_m: float | None = None,
+    altitude_terrain_m: float | None = None,
+    radius_m: float = 0.0,
+    leave_tangentially: bool = False,
+) -> MissionItem:
+    """Circle around a place, 0 to 255 times (ArduPilot; PX4 refuses it), with a radius up to 2,550 m.
+
+    ArduPilot keeps whole turns, or a fraction below 1, and tens of metres above 255 m; negative: counter-clockwise.
+    https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_LOITER_TURNS
+    """
+    return place(
+        MavCmd.NAV_LOITER_TURNS,
+        latitude_deg,
+        longitude_deg,
+        (altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
+        in_range("turns", turns, 0, 255),
+        0.0,
+        in_range("radius_m", radius_m, -2550, 2550),
+        float(leave_tangentially),
+    )
+
+
+def loiter_to_altitude(
+    latitude_deg: float | None = None,
+    longitude_deg: float | None = None,
+    *,
+    altitude_relative_m: float | None = None,
+    altitude_amsl_m: float | None = None,
+    altitude_terrain_m: float | None = None,
+    radius_m: float = 0.0,
+    leave_tangentially: bool = False,
+) -> MissionItem:
+    """Circle at a place until the altitude is reached; ``radius_m`` negative: counter-clockwise.
+
+    https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_LOITER_TO_ALT
+    """
+    return place(
+        MavCmd.NAV_LOITER_TO_ALT,
+        latitude_deg,
+        longitude_deg,
+        (altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
+        0.0,
+        in_range("radius_m", radius_m, -_WIDEST_M, _WIDEST_M),
+        0.0,
+        float(leave_tangentially),
+    )
+
+
+def return_to_launch() -> MissionItem:
+    """Return to home, or to a rally point, as the vehicle is set up.
+
+    https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_RETURN_TO_LAUNCH
+    """
+    return action(MavCmd.NAV_RETURN_TO_LAUNCH)
+
+
+def rally_point(
+    latitude_deg: float,
+    longitude_deg: float,
+    *,
+    altitude_relative_m: float | None = None,
+    altitude_amsl_m: float | None = None,
+    altitude_terrain_m: float | None = None,
+) -> MissionItem:
+    """A place for :class:`RallyPoints`; ArduPilot keeps whole metres of altitude, -32,768 to 32,767.
+
+    https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_RALLY_POINT
+    """
+    altitudes = (altitude_relative_m, altitude_amsl_m, altitude_terrain_m)
+    item = place(MavCmd.NAV_RALLY_POINT, latitude_deg, longitude_deg, altitudes)
+    in_range("altitude", item.z, -32_768, 32_767)
+    return item
+
+
+def _ground(*altitudes: float | None) -> tuple[float | None, float | None, float | None]:
+    relative, amsl, terrain = altitudes
+    return (0.0, None, None) if altitudes == (None, None, None) else (relative, amsl, terrain)
