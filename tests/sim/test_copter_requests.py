@@ -193,18 +193,6 @@ def test_time_synchronisation_and_ping_are_answered() -> None:
     assert (ping.time_usec, ping.seq, ping.target_system, ping.target_component) == (99, 7, 255, 190)
 
 
-def test_mission_messages_get_an_honest_answer() -> None:
-    _, client = ready_copter()
-    client.send(m.MissionRequestList(1, 1, 0))
-    count = client.last(m.MissionCount)
-    assert (count.count, count.target_system, count.target_component) == (0, 255, 190)
-    client.send(m.MissionCount(1, 1, 3, 0))
-    assert client.last(m.MissionAck).type == 4
-    assert client.texts == ["Only 0 items are supported"]
-    client.send(m.MissionClearAll(1, 1, 0))
-    assert client.last(m.MissionAck).type == 0
-
-
 # -------------------------------------------------------------------------------------- parameters
 
 

@@ -43,6 +43,8 @@ class Arming:
             reasons.append("Battery 1 below minimum arming voltage")
         if copter.failsafes.battery_is_low:
             reasons.append("Battery failsafe")
+        if copter.mode.needs_mission and not copter.mission.is_present:
+            reasons.append("Mode requires mission")
         if copter.mode.needs_position and (reason := self._gps_reason()):
             return [*reasons, reason]
         if nav.flags is None or not nav.has_attitude:
@@ -72,8 +74,6 @@ class Arming:
 
     def _final_reasons(self) -> list[str]:
         copter, mode = self._copter, self._copter.mode
-        if mode.name == "AUTO":
-            return ["Mode requires mission"]
         if not mode.can_arm:
             return [f"{mode.name} mode not armable"]
         high = _STICK_LOW if mode.has_manual_throttle else _STICK_CENTRE + _DEADZONE
@@ -132,4 +132,5 @@ class Arming:
             return False
         copter.info("Disarming motors")
         copter.motors.set_armed(False, copter.now)
+        copter.mission.reset()
         return True

@@ -7,14 +7,17 @@ from collections.abc import Collection, Iterable
 from typing import TYPE_CHECKING, ClassVar
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import CopterMode, MavFrame, MavMissionResult, MavModeFlag, MavResult, MavSeverity
+from aerokit.mavlink.enums import CopterMode, MavFrame, MavModeFlag, MavResult, MavSeverity
 from aerokit.sim.ardupilot.arming import Arming
+from aerokit.sim.ardupilot.auto import Auto
 from aerokit.sim.ardupilot.boot import BootTimeline
 from aerokit.sim.ardupilot.copter_commands import copter_commands
 from aerokit.sim.ardupilot.copter_parameters import COPTER_PARAMETERS
 from aerokit.sim.ardupilot.failsafes import Failsafes
 from aerokit.sim.ardupilot.guided import Guided
-from aerokit.sim.ardupilot.modes import AltHold, Auto, Brake, Circle, Loiter, Mode, PosHold, Stabilize
+from aerokit.sim.ardupilot.mission_run import MissionRun
+from aerokit.sim.ardupilot.mission_server import MissionServer
+from aerokit.sim.ardupilot.modes import AltHold, Brake, Circle, Loiter, Mode, PosHold, Stabilize
 from aerokit.sim.ardupilot.motors import Motors
 from aerokit.sim.ardupilot.navigation import Navigation
 from aerokit.sim.ardupilot.requests import Requests
@@ -22,7 +25,7 @@ from aerokit.sim.ardupilot.returning import Land, Rtl, SmartRtl
 from aerokit.sim.ardupilot.setpoints import Setpoints
 from aerokit.sim.ardupilot.telemetry import BUILDERS
 from aerokit.sim.ardupilot.telemetry_position import global_origin, home_position
-from aerokit.sim.ardupilot.telemetry_state import heartbeat
+from aerokit.sim.ardupilot.telemetry_state import heartbeat, mission_current
 from aerokit.sim.ardupilot.yaw import AutoYaw
 from aerokit.sim.battery import Battery
 from aerokit.sim.commands import CommandServer
@@ -67,7 +70,7 @@ class SimulatedCopter(SimulatedVehicle):
     - ``components``: other components on its links (gimbal, camera), heartbeats only
     - ``unix_time_at_boot``: what its GPS clock says at simulated second 0
 
-    Not simulated yet: missions, fence, rally, files, logs, a gimbal, radio failsafe.
+    Not simulated yet: keeping within a fence, flying to rally points, files, logs, a gimbal, radio failsafe.
     """
 
     CAPABILITIES: ClassVar[int] = 0xFBEF
@@ -113,6 +116,8 @@ class SimulatedCopter(SimulatedVehicle):
         self._stream_groups = stream_groups
         self._unix_time_at_start = unix_time_at_boot
         self._frame = LocalFrame(GlobalPoint(round(home[0] * 1e7), round(home[1] * 1e7), home[2]))
+        self.missions = MissionServer(self)
+        """Mission, fence and rally points; they survive a reboot."""
         self._reset()
         self._listen()
 
@@ -129,6 +134,11 @@ class SimulatedCopter(SimulatedVehicle):
         guided = self._modes[CopterMode.GUIDED]
         assert isinstance(guided, Guided)
         self.guided = guided
+        auto = self._modes[CopterMode.AUTO]
+        assert isinstance(auto, Auto)
+        self.auto = auto
+        self.mission = MissionRun(self, auto)
+        self.missions.reset()
         self.mode: Mode = self._modes[int(self.parameters["INITIAL_MODE"])]
         self._still_since = math.nan
 
@@ -142,9 +152,8 @@ class SimulatedCopter(SimulatedVehicle):
         self.on(m.Timesync, self._on_timesync)
         self.on(m.Ping, self._on_ping)
         self.on(m.RcChannelsOverride, self._on_rc_override)
-        self.on(m.MissionRequestList, self._on_mission_request_list)
-        self.on(m.MissionCount, self._on_mission_count)
-        self.on(m.MissionClearAll, self._on_mission_clear)
+        self.on(m.MissionSetCurrent, self._on_mission_set_current)
+        self.missions.listen()
 
     # ---------------------------------------------------------------------------------------- state
 
@@ -351,12 +360,7 @@ class SimulatedCopter(SimulatedVehicle):
             elif value != 0xFFFF:
                 self.rc[index] = value
 
-    def _on_mission_request_list(self, request: m.MissionRequestList, channel: Channel) -> None:
-        self.send(m.MissionCount(*sender_of(request), 0, request.mission_type), channel)
-
-    def _on_mission_count(self, count: m.MissionCount, channel: Channel) -> None:
-        self.send_text(MavSeverity.WARNING, "Only 0 items are supported")
-        self.send(m.MissionAck(*sender_of(count), MavMissionResult.NO_SPACE, count.mission_type), channel)
-
-    def _on_mission_clear(self, clear: m.MissionClearAll, channel: Channel) -> None:
-        self.send(m.MissionAck(*sender_of(clear), MavMissionResult.ACCEPTED, clear.mission_type), channel)
+    def _on_mission_set_current(self, request: m.MissionSetCurrent, channel: Channel) -> None:
+        """Answered with the number that was asked for, also when another one is flown."""
+        if self.mission.set_current(request.seq):
+            self.send(mission_current(self, request.seq), channel)

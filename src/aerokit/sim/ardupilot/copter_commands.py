@@ -6,7 +6,8 @@ import math
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import CopterMode, MavCmd, MavFrame, MavResult, MavSeverity, SpeedType
-from aerokit.mavlink.messages import AutopilotVersion
+from aerokit.mavlink.messages import AutopilotVersion, MissionCurrent
+from aerokit.sim.ardupilot.auto import Auto
 from aerokit.sim.ardupilot.guided import Guided
 from aerokit.sim.commands import Command, CommandHandler, Progress
 
@@ -32,6 +33,7 @@ def copter_commands(copter: SimulatedCopter) -> dict[int, CommandHandler]:
         MavCmd.NAV_RETURN_TO_LAUNCH: lambda _: flight.change_to(CopterMode.RTL),
         MavCmd.NAV_LOITER_UNLIM: lambda _: flight.change_to(CopterMode.LOITER),
         MavCmd.MISSION_START: flight.start_mission,
+        MavCmd.DO_SET_MISSION_CURRENT: flight.set_mission_current,
         MavCmd.DO_REPOSITION: flight.reposition,
         MavCmd.DO_CHANGE_SPEED: flight.change_speed,
         MavCmd.CONDITION_YAW: flight.turn,
@@ -90,9 +92,26 @@ class _Flight:
         return MavResult.ACCEPTED if done else MavResult.FAILED
 
     def start_mission(self, command: Command) -> int:
+        """From the present place in the mission; on the ground this is what lets a take-off begin."""
         if command.param1 or command.param2:
             return MavResult.DENIED
-        return self.change_to(CopterMode.AUTO)
+        result = self.change_to(CopterMode.AUTO)
+        if result == MavResult.ACCEPTED:
+            self._copter.auto.may_lift_off = self._copter.is_armed
+        return result
+
+    def set_mission_current(self, command: Command) -> int:
+        copter, resets = self._copter, command.param2 == 1.0
+        if not 0 <= command.param1 < copter.missions.commands.count:
+            return MavResult.DENIED
+        if resets:
+            copter.mission.reset()
+        if not copter.mission.set_current(int(command.param1)):
+            return MavResult.FAILED
+        if resets:
+            copter.mission.start_or_resume()
+        copter.requests.send_soon(MissionCurrent.ID, command.channel)
+        return MavResult.ACCEPTED
 
     def reposition(self, command: Command) -> int:
         """Only as COMMAND_INT: ArduPilot knows no frame for it in COMMAND_LONG."""
@@ -120,7 +139,7 @@ class _Flight:
         if command.param1 in (SpeedType.AIRSPEED, SpeedType.GROUNDSPEED):
             mode.speed = speed  # type: ignore[attr-defined]
             return MavResult.ACCEPTED
-        if not isinstance(mode, Guided):
+        if not isinstance(mode, Guided | Auto):
             return MavResult.FAILED
         if command.param1 == SpeedType.CLIMB_SPEED:
             mode.climb = speed

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from aerokit.sim.ardupilot.copter import SimulatedCopter
     from aerokit.sim.ardupilot.navigation import Ned
 
-__all__ = ["AltHold", "Auto", "Brake", "Circle", "Loiter", "Mode", "PosHold", "Stabilize", "TakeOff"]
+__all__ = ["AltHold", "Brake", "Circle", "Loiter", "Mode", "PosHold", "Stabilize", "TakeOff"]
 
 _MID_STICK, _STICK_RANGE, _THROTTLE_DEADZONE = 1500, 500, 100
 _FULL_STICK_LEAN_RAD = math.radians(30.0)
@@ -32,8 +32,9 @@ class Mode:
     number: ClassVar[int]
     name: ClassVar[str]
     needs_position: ClassVar[bool] = True
+    needs_mission: ClassVar[bool] = False
     has_manual_throttle: ClassVar[bool] = False
-    can_arm: ClassVar[bool] = True
+    can_arm: bool = True
     arms_with_raised_throttle: ClassVar[bool] = False
     can_change_speed: ClassVar[bool] = False
     is_landing: bool = False
@@ -231,20 +232,4 @@ class Brake(Mode):
 
     def update(self, dt: float) -> None:
         """Stop."""
-        self.stay()
-
-
-class Auto(Mode):
-    """There is no mission storage yet: refused in the air, not armable on the ground."""
-
-    number = CopterMode.AUTO
-    name = "AUTO"
-    arms_with_raised_throttle = True
-
-    def enter(self, *, force: bool) -> bool:
-        """A disarmed vehicle may enter any mode."""
-        return force
-
-    def update(self, dt: float) -> None:
-        """Nothing to do."""
         self.stay()

@@ -113,6 +113,7 @@ class Navigation:
     def set_home(self, point: Ned, *, lock: bool) -> None:
         """Make a point home and tell everybody."""
         self.home, self.home_is_locked = point, self.home_is_locked or lock
+        self._copter.missions.commands.add_home()
         self._copter.call_later(0.0, self._copter.send_home)
 
     # ------------------------------------------------------------------------------------- timeline
@@ -150,6 +151,7 @@ class Navigation:
         motion = self._copter.motion
         self.origin = (motion.north, motion.east, motion.down)
         self.home = self.origin
+        self._copter.missions.commands.add_home()
         self._copter.send_home()
         self._say_cores("origin set")
         self._copter.info(f"Field Elevation Set: {self.frame.origin.altitude_m - motion.down:.0f}m")

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from aerokit.sim.ardupilot.copter import SimulatedCopter
     from aerokit.sim.ardupilot.navigation import Ned
 
-__all__ = ["Land", "Rtl", "SmartRtl"]
+__all__ = ["Land", "Rtl", "SmartRtl", "sink"]
 
 _RTL_LOWEST_M = 2.0
 _ARRIVED_M = 0.5
@@ -39,12 +39,17 @@ class Land(Mode):
 
 def descend(copter: SimulatedCopter) -> None:
     """One step of a landing."""
-    parameters = copter.parameters
-    if copter.is_landed:
-        copter.motors.wanted = False
-        if copter.motors.is_armed and copter.motors.is_idle:
-            copter.arming.disarm()
+    if not copter.is_landed:
+        sink(copter)
         return
+    copter.motors.wanted = False
+    if copter.motors.is_armed and copter.motors.is_idle:
+        copter.arming.disarm()
+
+
+def sink(copter: SimulatedCopter) -> None:
+    """Straight down, slowly at last."""
+    parameters = copter.parameters
     copter.motors.wanted = True
     speed = parameters["LAND_SPEED"] / 100.0
     if copter.navigation.altitude_above_home > parameters["LAND_ALT_LOW"] / 100.0:

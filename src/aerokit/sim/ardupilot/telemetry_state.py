@@ -14,7 +14,6 @@ from aerokit.mavlink.enums import (
     MavModeFlag,
     MavState,
     MavType,
-    MissionState,
 )
 from aerokit.sim.ardupilot.sensor_status import sensor_status
 
@@ -22,7 +21,7 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.sim.ardupilot.copter import SimulatedCopter
 
-__all__ = ["STATE_BUILDERS", "heartbeat"]
+__all__ = ["STATE_BUILDERS", "heartbeat", "mission_current"]
 
 _UNKNOWN_CELL = 0xFFFF
 _GUIDED_MODES = frozenset(
@@ -120,8 +119,11 @@ def _system_time(copter: SimulatedCopter) -> m.SystemTime:
     return m.SystemTime(unix, copter.time_boot_ms)
 
 
-def _mission_current(copter: SimulatedCopter) -> m.MissionCurrent:
-    return m.MissionCurrent(0, 0, MissionState.NO_MISSION, 0)
+def mission_current(copter: SimulatedCopter, seq: int | None = None) -> m.MissionCurrent:
+    """MISSION_CURRENT; ``seq`` says another number than that of the command that is flown."""
+    run = copter.mission
+    seq = run.nav_index if seq is None else seq
+    return m.MissionCurrent(seq, run.count, run.state, int(copter.mode.needs_mission))
 
 
 def _rc_channels(copter: SimulatedCopter) -> m.RcChannels:
@@ -177,7 +179,7 @@ STATE_BUILDERS: dict[int, Callable[[SimulatedCopter], Message | None]] = {
     m.PowerStatus.ID: _power_status,
     m.Meminfo.ID: _meminfo,
     m.SystemTime.ID: _system_time,
-    m.MissionCurrent.ID: _mission_current,
+    m.MissionCurrent.ID: mission_current,
     m.RcChannels.ID: _rc_channels,
     m.ServoOutputRaw.ID: _servo_output,
     m.Vibration.ID: _vibration,

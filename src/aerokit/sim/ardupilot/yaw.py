@@ -51,6 +51,16 @@ class AutoYaw:
         if direction and math.copysign(1, offset) != direction and abs(offset) > 0.02:
             self._rate = direction * (rate or self._copter.motion.limits.turn_rate_rad_s)
 
+    def keep_fixed(self, tolerance: float) -> bool:
+        """Go back to the heading of `fixed`, whatever came since; whether it is reached, within radians."""
+        self._apply = self._go_to_heading
+        return abs(wrap_pi(self._heading - self._copter.motion.yaw)) <= tolerance
+
+    @property
+    def has_region_of_interest(self) -> bool:
+        """Whether it looks at a place."""
+        return self._apply == self._look_at_roi
+
     def turn(self, rate: float) -> None:
         """Keep turning, in radians per second."""
         self._rate, self._apply = rate, self._turn
