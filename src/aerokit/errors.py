@@ -148,7 +148,7 @@ class RollbackFailed(OperationRejected):
 
 
 class MissionRejected(OperationRejected):
-    """The vehicle refused a mission, a fence or rally points; the ones it had before are still there.
+    """The vehicle refused a mission, a fence or rally points; the text says whether it still has those from before.
 
     ``result`` is the MAV_MISSION_RESULT (https://mavlink.io/en/messages/common.html#MAV_MISSION_RESULT), ``item`` the
     index of the item it was about, None when that is not known.

@@ -59,6 +59,16 @@ class ArduPilot(Autopilot):
     home_is_item_0 = True
     runs_prearm_checks = True
     sends_mission_requests_float = True
+    mission_storage = "ardupilot"
+    mission_upload_window = 6
+    mission_download_window = 10
+    writes_partial_missions = True
+    replaced_as_they_come = frozenset((0, 2))
+    mission_starts_by_command = True
+    sets_current_by_command = True
+    takes_file_sessions = True
+    log_directories = ("/APM/LOGS", "/logs")
+    first_log_id = 1
     estimator_message = "EKF_STATUS_REPORT"
     wind_message = "WIND"
     stream_groups = ARDUPILOT_GROUPS

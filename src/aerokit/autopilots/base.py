@@ -125,6 +125,28 @@ class Autopilot:
     """How near it comes to a place that it was sent to, or circles it, by default."""
     sends_mission_requests_float = False
     """Whether it asks for mission items by MISSION_REQUEST instead of MISSION_REQUEST_INT."""
+    mission_storage = "any"
+    """What it keeps of a mission item: a value of :class:`aerokit.missions.Storage`."""
+    mission_upload_window = 1
+    """How many mission items may be sent before they are asked for: 1 is the standard."""
+    mission_download_window = 1
+    """How many mission items may be asked for before they come, in any order: 1 is the standard."""
+    writes_partial_missions = False
+    """Whether MISSION_WRITE_PARTIAL_LIST (38) works."""
+    replaced_as_they_come: frozenset[int] = frozenset((0, 1, 2))
+    """MAV_MISSION_TYPEs whose old items are overwritten while new ones come; the others keep theirs until the end."""
+    mission_starts_by_command = False
+    """Whether MAV_CMD_MISSION_START (300) starts the mission, also on the ground, and arms nothing."""
+    sets_current_by_command = False
+    """Whether MAV_CMD_DO_SET_MISSION_CURRENT (224) is known."""
+    repeats_item_reached = False
+    """Whether MISSION_ITEM_REACHED is sent again and again for one item."""
+    takes_file_sessions = False
+    """Whether a MAVFTP session has the number that the client gave it, not one that the vehicle answers."""
+    log_directories: ClassVar[tuple[str, ...]] = ()
+    """Where MAVFTP finds the flight logs, or the directories with them: the first of these that exists."""
+    first_log_id = 0
+    """The id of the oldest log in LOG_ENTRY."""
     unknown_currents_ca: frozenset[int] = frozenset((-1,))
     """What a battery's current in 0.01 A says when it is not known; the standard says −1."""
     estimator_message = "ESTIMATOR_STATUS"
@@ -248,6 +270,8 @@ class Autopilot:
         return self._bytewise_by_default
 
     _bytewise_by_default = False
+    has_parameter_hash = False
+    """Whether the parameter ``_HASH_CHECK`` is a checksum over all others."""
 
     def _git_hash(self, custom_version: bytes) -> str:
         return custom_version.hex().rstrip("0")

@@ -93,6 +93,7 @@ class Px4(Autopilot):
     reposition = Reposition(relative_altitude=False, yaw=True, speed=True, armed_only=True)
     changes_speed = True
     _bytewise_by_default = True
+    has_parameter_hash = True
     unknown_currents_ca = frozenset((-1, -100))  # inside PX4, −1 A is "unknown"
     reposition_purpose = "hold"
     purposes: ClassVar[Mapping[str, str]] = {
@@ -103,6 +104,10 @@ class Px4(Autopilot):
         "take_off": "TAKEOFF",
         "mission": "MISSION",
     }
+    mission_storage = "px4"
+    mission_upload_window = 6
+    replaced_as_they_come = frozenset()  # the new items go into a second place
+    repeats_item_reached = True
     never_sent = frozenset(
         ("EKF_STATUS_REPORT", "WIND", "RANGEFINDER", "AHRS", "AHRS2", "MEMINFO", "POWER_STATUS", "RAW_IMU")
     )

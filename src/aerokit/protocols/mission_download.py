@@ -20,6 +20,8 @@ from aerokit.protocols.missions import BUSY_AGAIN_S, BUSY_S, MissionExchange, op
 from aerokit.snapshot import Snapshot
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from aerokit.mavlink.message import Message
     from aerokit.missions.item import MissionItem as Item
 
@@ -31,9 +33,10 @@ MAX_RESTARTS = 8
 
 
 class Downloaded(Snapshot):
-    """All items as they came, and what the vehicle calls them (0 where it gives no ``opaque_id``)."""
+    """The items as they came, how many there are in all, what the vehicle calls them (0: it gives no ``opaque_id``)."""
 
     items: tuple[Item, ...]
+    count: int
     opaque_id: int
 
 
@@ -42,7 +45,7 @@ class MissionDownload(MissionExchange[Downloaded]):
 
     ``window`` is how many requests are under way: 1 for PX4, which gives up (ERROR) when an item is asked for that is
     neither the next one nor the one before; ArduPilot answers any request, so that only what is missing is asked for
-    again.
+    again. With ``only``, no others than these are asked for.
     """
 
     expects = (MissionCount, MissionItemInt, MissionItem, MissionAck)
@@ -53,11 +56,14 @@ class MissionDownload(MissionExchange[Downloaded]):
         target_component: int,
         *,
         window: int = 1,
+        only: Sequence[int] | None = None,
         gives_int: bool = True,
         **options: Any,
     ) -> None:
         super().__init__(target_system, target_component, **options)
         self._window, self._gives_int = window, gives_int
+        self._only = only
+        self._wanted: Sequence[int] = ()
         self._items: dict[int, Item] = {}
         self._count: int | None = None
         self._opaque_id = 0
@@ -118,8 +124,11 @@ class MissionDownload(MissionExchange[Downloaded]):
             self._items.clear()
             self._forget_requests()
         self._count, self._opaque_id, self._busy_until = message.count, opaque_id, None
-        self._most = min(self._most, self._count)
-        self._move(now, len(self._items), self._count)
+        self._wanted = (
+            range(self._count) if self._only is None else [n for n in self._only if n < message.count]
+        )
+        self._most = min(self._most, len(self._wanted))
+        self._move(now, len(self._items), len(self._wanted))
         self._go_on(now)
 
     def _take_item(self, item: MissionItemInt | MissionItem, now: float) -> None:
@@ -131,7 +140,7 @@ class MissionDownload(MissionExchange[Downloaded]):
         self._items[item.seq] = from_wire(item)
         if len(self._items) > self._most:
             self._most = len(self._items)
-            self._move(now, self._most, self._count)
+            self._move(now, self._most, len(self._wanted))
         self._go_on(now)
 
     def _take_ack(self, result: int, now: float) -> None:
@@ -176,12 +185,13 @@ class MissionDownload(MissionExchange[Downloaded]):
     # -------------------------------------------------------------------------------- requests
 
     def _go_on(self, now: float) -> None:
-        if self._count is not None and len(self._items) >= self._count:
+        if len(self._items) >= len(self._wanted):
             self._end()
             return
-        while self._count is not None and self._next < self._count and len(self._asked_at) < self._window:
-            if self._window == 1 or self._next not in self._items:
-                self._ask(self._next, now)
+        while self._next < len(self._wanted) and len(self._asked_at) < self._window:
+            seq = self._wanted[self._next]
+            if self._window == 1 or seq not in self._items:
+                self._ask(seq, now)
             self._next += 1
         self._wait_for_items(now)
 
@@ -208,12 +218,12 @@ class MissionDownload(MissionExchange[Downloaded]):
     def _end(self) -> None:
         # twice: PX4 takes no upload before it has heard one of them, or 5 s have passed
         self._outbox += [self._ack(MavMissionResult.ACCEPTED)] * (2 if self._window == 1 else 1)
-        count = self._count or 0
-        self._finish(Downloaded(tuple(self._items[seq] for seq in range(count)), self._opaque_id))
+        items = tuple(self._items[seq] for seq in self._wanted)
+        self._finish(Downloaded(items, self._count or 0, self._opaque_id))
 
     def _give_up(self, now: float) -> None:
         self._outbox += self.cancellation()
-        missing = [seq for seq in range(self._count or 0) if seq not in self._items]
+        missing = [seq for seq in self._wanted if seq not in self._items]
         what = "it did not say how many there are" if self._count is None else f"missing: {ranges(missing)}"
         self._fail(
             MissionTimeout(

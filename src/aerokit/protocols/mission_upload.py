@@ -76,6 +76,8 @@ class MissionUpload(MissionExchange[UploadEnd]):
         self._as_float = False
         self.was_vague = False
         """Whether a refusal may mean any of several items that were under way: then send one at a time to find out."""
+        self.was_begun = False
+        """Whether the vehicle has asked for an item: then it may have overwritten some."""
         self._restarts = 0
         self._busy_until: float | None = None
         self._announced_at = 0.0
@@ -136,7 +138,8 @@ class MissionUpload(MissionExchange[UploadEnd]):
         ):  # left over from another transfer: nobody needs an item before he has the one before it
             return
         if not self._is_asked:
-            self._is_asked, self._busy_until = True, None
+            self._is_asked = self.was_begun = True
+            self._busy_until = None
             if self._attempt == 1:
                 self.round_trip.measured(now - self._announced_at)
             self._move(now, 0, len(self._items))

@@ -22,7 +22,6 @@ __all__ = [
     "BUSY_S",
     "MissionClear",
     "MissionExchange",
-    "mission_ids",
     "opaque_id_of",
     "ranges",
 ]
@@ -64,14 +63,6 @@ def opaque_id_of(message: Message) -> int:
     PX4 sends it: a checksum of what is stored. See https://mavlink.io/en/messages/common.html#MISSION_COUNT.
     """
     return _number_at(message, 5 if message.NAME == "MISSION_COUNT" else 4)
-
-
-def mission_ids(message: Message) -> tuple[int, int, int]:
-    """``mission_id``, ``fence_id``, ``rally_points_id`` of a MISSION_CURRENT, 0 where there are none.
-
-    See https://mavlink.io/en/messages/common.html#MISSION_CURRENT.
-    """
-    return _number_at(message, 6), _number_at(message, 10), _number_at(message, 14)
 
 
 def _number_at(message: Message, offset: int) -> int:

@@ -20,7 +20,11 @@ __all__ = [
     "LinkClosed",
     "LinkReport",
     "LoopBlocked",
+    "MissionCurrentChanged",
+    "MissionFinished",
+    "MissionItemReached",
     "ModeChanged",
+    "ParameterChanged",
     "StatusTextReceived",
     "StreamSlow",
     "StreamUnavailable",
@@ -89,6 +93,26 @@ class LandedStateChanged(Event):
     after: int
 
 
+class MissionItemReached(Event):
+    """The vehicle has reached item ``item`` of its mission (counted from 0, home never counts).
+
+    An autopilot may leave items out that it flies past without stopping.
+    """
+
+    item: int
+
+
+class MissionCurrentChanged(Event):
+    """The vehicle goes for another item of its mission; None: for none, because it has not begun or has no mission."""
+
+    before: int | None
+    after: int | None
+
+
+class MissionFinished(Event):
+    """The vehicle has flown its mission to the end."""
+
+
 class StatusTextReceived(Event):
     """The vehicle said something (STATUSTEXT, chunks joined); ``severity`` is a MAV_SEVERITY, 0 the worst, 7 debug."""
 
@@ -109,6 +133,14 @@ class StreamUnavailable(Event):
 
     message: str
     reason: str
+
+
+class ParameterChanged(Event):
+    """A parameter whose value was known has another one now, whoever changed it (the autopilot's own, not a camera's)."""
+
+    name: str
+    before: int | float
+    after: int | float
 
 
 class LinkReport(Event):

@@ -7,8 +7,12 @@ from typing import TYPE_CHECKING
 import anyio
 
 from aerokit.errors import CommandRejected, CommandTimeout
+from aerokit.vehicle.fence import FenceControl
 from aerokit.vehicle.flight import FlightActions
 from aerokit.vehicle.guided import Guided
+from aerokit.vehicle.mission import MissionControl
+from aerokit.vehicle.plans import PlanContext
+from aerokit.vehicle.rally import RallyControl
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -37,11 +41,22 @@ class Vehicle(FlightActions):
         super().__init__(connection, system_id, component_id, heartbeat)
         self.guided = Guided(self)
         """Set-point streams: velocity, position, acceleration, attitude."""
+        plans = PlanContext(self, getattr(self, "files", None))
+        self.mission = MissionControl(plans)
+        """The mission it holds: upload, download, start, pause, wait until it is finished."""
+        self.fence = FenceControl(plans)
+        """The fence it holds."""
+        self.rally = RallyControl(plans)
+        """The rally points it holds."""
 
     def __repr__(self) -> str:
         return f"<Vehicle {self.system_id}/{self.component_id} {self.autopilot.firmware}, {self.describe_link()}>"
 
     # ------------------------------------------------------------------------------ inside
+
+    def _on_reboot(self) -> None:
+        super()._on_reboot()
+        self.mission._forget()
 
     def _start(self, heartbeat: Heartbeat, rates: Mapping[type[Message], float] | None) -> None:
         self.telemetry.receive(heartbeat)

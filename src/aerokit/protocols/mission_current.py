@@ -1,0 +1,63 @@
+"""MISSION_SET_CURRENT until MISSION_CURRENT confirms it (https://mavlink.io/en/services/mission.html)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from aerokit.errors import OperationTimeout
+from aerokit.mavlink.messages import MissionCurrent
+from aerokit.mavlink.messages import MissionSetCurrent as SetCurrentMessage
+from aerokit.protocols.transfer import Transfer
+
+if TYPE_CHECKING:
+    from aerokit.mavlink.message import Message
+
+__all__ = ["MissionSetCurrent"]
+
+TOLD_EVERY_S = 1.0
+"""MISSION_CURRENT is streamed at 1 Hz, and sent when it changes."""
+
+
+class MissionSetCurrent(Transfer[None]):
+    """There is no acknowledgement: PX4 sends MISSION_CURRENT when the item has changed, else at its next turn."""
+
+    expects = (MissionCurrent,)
+
+    def __init__(self, target_system: int, target_component: int, seq: int, **options: Any) -> None:
+        super().__init__(target_system, target_component, **options)
+        self._seq = seq
+        self._told: int | None = None
+        self._attempts = 0
+
+    def start(self, now: float) -> None:
+        """Send it."""
+        self._begin(now)
+        self._send(now)
+
+    def receive(self, message: Message, now: float) -> None:
+        """Take a MISSION_CURRENT; one that was under way may come first."""
+        if not isinstance(message, MissionCurrent) or not self._is_from_target(message):
+            return
+        moved_on = self._told is not None and message.seq != self._told and message.seq > self._seq
+        self._told = message.seq
+        if message.seq == self._seq or moved_on:
+            self._finish(None)
+
+    def expire(self, now: float) -> None:
+        """Send it again, or give up."""
+        if self._is_out_of_patience(now):
+            told = "nothing" if self._told is None else f"item {self._told}"
+            self._fail(
+                OperationTimeout(
+                    f"MISSION_SET_CURRENT {self._seq} was not confirmed in {now - self._started_at:.1f} s"
+                    f" ({self._attempts} attempts); MISSION_CURRENT told {told} (numbers on the wire)"
+                )
+            )
+            return
+        self._send(now)
+
+    def _send(self, now: float) -> None:
+        self._attempts += 1
+        self._outbox.append(SetCurrentMessage(self.target_system, self.target_component, self._seq))
+        left = self._started_at + self._patience_s - now
+        self.deadline = now + min(max(self.round_trip.timeout_s(), TOLD_EVERY_S), max(left, 0.01))

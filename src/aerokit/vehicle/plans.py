@@ -1,0 +1,240 @@
+"""What missions, fences and rally points of one vehicle share: one transfer at a time, what was sent or read last."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from typing import TYPE_CHECKING, Generic, Literal, Protocol, TypeVar
+
+import anyio
+
+from aerokit.errors import LocalProtocolError, OperationTimeout
+from aerokit.mavlink.messages import MissionCurrent
+from aerokit.vehicle.checks import check_seconds
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Sequence
+
+    from aerokit.missions.item import MissionItem
+    from aerokit.position import Position
+    from aerokit.protocols.transfer import OnProgress
+    from aerokit.vehicle.plan_transfer import Plan, PlanTransfer
+    from aerokit.vehicle.vehicle import Vehicle
+
+__all__ = ["HeldPlan", "PlanContext", "PlanFiles", "PlanMemory", "PlanMethod"]
+
+PlanT = TypeVar("PlanT", bound="Plan")
+ResultT = TypeVar("ResultT")
+PlanMethod = Literal["auto", "ftp", "items"]
+METHODS = ("auto", "ftp", "items")
+FRESH_IDS_S = 2.5
+"""MISSION_CURRENT comes at 1 Hz."""
+
+
+class HeldPlan(Generic[PlanT]):
+    """A mission, a fence or rally points that a vehicle holds.
+
+    There is one transfer of them at a time with one vehicle; another one waits for its turn. Each can be cancelled at
+    any moment, and the vehicle is told.
+    """
+
+    def __init__(self, context: PlanContext) -> None:
+        self._context = context
+
+    async def upload(
+        self,
+        plan: PlanT,
+        *,
+        method: PlanMethod = "auto",
+        only_changes: bool = True,
+        verify: bool = True,
+        patience_s: float = 10.0,
+        timeout: float | None = None,
+        on_progress: OnProgress | None = None,
+    ) -> None:
+        """Have the vehicle hold this plan instead of the one it holds; an empty one clears it.
+
+        Args:
+            plan: it is checked before anything is sent.
+            method: ``"ftp"`` (ArduPilot's ``@MISSION/…`` files), ``"items"`` (the mission protocol), or what the
+                vehicle has.
+            only_changes: when it is known what the vehicle holds, from an upload or a download and confirmed by the
+                vehicle, send nothing if it is the same, and only the items that differ if the vehicle takes them alone.
+            verify: read it back and compare. What was sent as a file is always read back.
+            patience_s: give up after so many seconds without progress.
+            timeout: seconds for all of it.
+            on_progress: called with how far it is, in items, or in bytes of a file.
+
+        See https://mavlink.io/en/services/mission.html. PX4 keeps the old items until it has all of the new ones.
+        ArduPilot overwrites a mission and rally points one by one (a fence at the end), so that after a failure it
+        holds a part of both: the error says so.
+
+        Raises:
+            LocalProtocolError: the plan cannot be right; nothing was sent.
+            MissionRejected: the vehicle refused; ``item``, ``result`` and ``reasons`` tell what and why.
+            MissionTimeout: it fell silent; ``missing`` are the items it did not confirm.
+            VerificationFailed: it confirmed, and holds something else.
+            NotSupported: ``"ftp"`` was asked for, and it has none.
+            FileError, FileTimeout: the same for a file, with ``"ftp"``.
+            OperationTimeout: not done within ``timeout``.
+        """
+        plan = self._checked(plan)
+
+        async def work(transfer: PlanTransfer[PlanT]) -> None:
+            await transfer.upload(plan, method, only_changes=only_changes, verify=verify)
+            self._counted(len(plan.to_items()))
+
+        await self._transfer(work, method, patience_s, timeout, on_progress)
+
+    async def download(
+        self,
+        *,
+        method: PlanMethod = "auto",
+        patience_s: float = 10.0,
+        timeout: float | None = None,
+        on_progress: OnProgress | None = None,
+    ) -> PlanT:
+        """Read what the vehicle holds; arguments and errors as for :meth:`upload`.
+
+        Raises MissionTimeout when items are missing in the end, RemoteProtocolError when they make no sense together.
+        """
+
+        async def work(transfer: PlanTransfer[PlanT]) -> PlanT:
+            plan = await transfer.download(method)
+            self._counted(len(plan.to_items()))
+            return plan
+
+        return await self._transfer(work, method, patience_s, timeout, on_progress)
+
+    async def clear(self, *, patience_s: float = 10.0, timeout: float | None = None) -> None:
+        """Have the vehicle forget it, and see that it has; errors as for :meth:`upload`.
+
+        ArduPilot refuses to forget a mission that it is flying.
+        """
+
+        async def work(transfer: PlanTransfer[PlanT]) -> None:
+            await transfer.clear()
+            self._counted(0)
+
+        await self._transfer(work, "items", patience_s, timeout, None)
+
+    # ------------------------------------------------------------------------------------ inside
+
+    def _plan_type(self) -> type[PlanT]:
+        """The class of the plan, imported when needed."""
+        raise NotImplementedError
+
+    def _counted(self, count: int) -> None:
+        """So many items are known to be held."""
+
+    def _checked(self, plan: PlanT) -> PlanT:
+        plan_type = self._plan_type()
+        if not isinstance(plan, plan_type):
+            raise LocalProtocolError(f"plan = {plan!r} is not allowed: a {plan_type.__name__}")
+        plan.check(home_is_item_0=bool(self._context.offset_of(plan_type.MISSION_TYPE)))
+        return plan
+
+    async def _transfer(
+        self,
+        work: Callable[[PlanTransfer[PlanT]], Awaitable[ResultT]],
+        method: str,
+        patience_s: float,
+        timeout: float | None,
+        on_progress: OnProgress | None,
+    ) -> ResultT:
+        from aerokit.vehicle.plan_transfer import PlanTransfer
+
+        if method not in METHODS:
+            raise LocalProtocolError(f"method = {method!r} is not allowed: {', '.join(METHODS)}")
+        check_seconds("patience_s", patience_s)
+        check_seconds("timeout", timeout, none_is_allowed=True)
+        context = self._context
+        transfer = PlanTransfer(context, self._plan_type(), patience_s=patience_s, on_progress=on_progress)
+        try:
+            with anyio.fail_after(timeout):
+                async with context.lock:
+                    return await work(transfer)
+        except OperationTimeout:
+            raise
+        except TimeoutError:
+            link = context.vehicle.describe_link()
+            raise OperationTimeout(f"not done within {timeout:g} s; {link}") from None
+
+
+class PlanFiles(Protocol):
+    """What transfers of plans ask of the vehicle's files."""
+
+    async def read(self, path: str, *, patience_s: float, on_progress: OnProgress | None) -> bytes:
+        """Return the whole file."""
+
+    async def write(
+        self, path: str, data: bytes, *, patience_s: float, on_progress: OnProgress | None
+    ) -> None:
+        """Write the whole file."""
+
+
+class PlanMemory:
+    """What one kind of plan was when it was last sent or read, counted as the vehicle counts, and by which way."""
+
+    def __init__(self) -> None:
+        self.items: tuple[MissionItem, ...] | None = None
+        self.opaque_id = 0
+        self.learned_at = -math.inf
+        self.has_file: bool | None = None
+        """Whether the vehicle has a file of it; None: not tried yet."""
+
+    def learn(self, items: Sequence[MissionItem], opaque_id: int, now: float) -> None:
+        """The vehicle holds these."""
+        self.items, self.opaque_id, self.learned_at = tuple(items), opaque_id, now
+
+    def forget(self) -> None:
+        """The vehicle may hold anything from now on."""
+        self.items, self.opaque_id = None, 0
+
+
+class PlanContext:
+    """One lock, since autopilots have one state for the transfers of all three; what MISSION_CURRENT calls them."""
+
+    def __init__(self, vehicle: Vehicle, files: PlanFiles | None) -> None:
+        self.vehicle, self.files = vehicle, files
+        self.transfers = vehicle._transfers
+        self.autopilot = vehicle.autopilot
+        self.lock = asyncio.Lock()
+        self.memories = (PlanMemory(), PlanMemory(), PlanMemory())
+        """By MAV_MISSION_TYPE."""
+        self._ids: tuple[int, ...] = (0, 0, 0)
+        self._ids_at = -math.inf
+        bus = vehicle.connection.bus
+        vehicle._detach.append(bus.attach(MissionCurrent, self._note_ids, system_id=vehicle.system_id))
+
+    def now(self) -> float:
+        """Seconds on the loop's clock."""
+        return self.vehicle.connection.now()
+
+    def offset_of(self, mission_type: int) -> int:
+        """How much higher the vehicle counts items than the program does: home may be its item 0."""
+        return int(mission_type == 0 and self.autopilot.home_is_item_0)
+
+    @property
+    def home(self) -> Position | None:
+        """Where the vehicle says that its home is."""
+        home = self.vehicle.telemetry.home.latest
+        return None if home is None else home.position.replace(altitude_amsl_m=home.altitude_amsl_m)
+
+    @property
+    def is_flown(self) -> bool:
+        """Whether the vehicle is flying its mission."""
+        mode = self.autopilot.mode_for("mission", is_vtol=self.vehicle.is_vtol)
+        return mode is not None and self.vehicle._is_in(mode) and not self.vehicle.is_surely_disarmed
+
+    def id_of(self, mission_type: int, since: float) -> int:
+        """What a MISSION_CURRENT that came lately, and after ``since``, calls the plan; 0 where it does not."""
+        is_fresh = self._ids_at > since and self.now() - self._ids_at <= FRESH_IDS_S
+        return self._ids[mission_type] if is_fresh else 0
+
+    def _note_ids(self, message: MissionCurrent) -> None:
+        """``mission_id``, ``fence_id``, ``rally_points_id``: extensions that are not in the dialect yet."""
+        frame = message.received_frame
+        if frame is not None and self.vehicle.telemetry.accepts(frame):
+            self._ids = tuple(int.from_bytes(frame.payload[at : at + 4], "little") for at in (6, 10, 14))
+            self._ids_at = self.now()
