@@ -212,6 +212,7 @@ def test_parameters_are_read_by_name_and_index_and_set() -> None:
     copter, client = ready_copter()
     client.send(m.ParamRequestRead(1, 1, "WPNAV_SPEED", -1))
     assert client.last(m.ParamValue).param_value == 1000.0
+    client.run(0.05)
     client.send(m.ParamRequestRead(1, 1, "", 0))
     assert client.last(m.ParamValue).param_id == copter.parameters.names[0]
     client.send(m.ParamSet(1, 1, "WPNAV_SPEED", 525.0, 9))

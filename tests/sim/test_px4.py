@@ -404,6 +404,7 @@ def test_integers_travel_as_their_bytes() -> None:
     bits = struct.unpack("<f", struct.pack("<i", 2))[0]
     client.send(m.ParamSet(1, 1, "COM_LOW_BAT_ACT", bits, MavParamType.INT32))
     assert px4.parameters["COM_LOW_BAT_ACT"] == 2
+    client.run(0.1)
     assert len(client.all(m.ParamValue)) == 2, "echoed twice"
     client.send(m.ParamRequestRead(1, 1, "NO_SUCH_PARAM", -1))
     assert len(client.all(m.ParamValue)) == 2

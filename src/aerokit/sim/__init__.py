@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from aerokit.sim.ardupilot import BootTimeline, SimulatedCopter
 from aerokit.sim.faults import CommandFault, Faults
+from aerokit.sim.logs import SimulatedLog
 from aerokit.sim.motion import Wind
 from aerokit.sim.px4 import SimulatedPx4
 from aerokit.sim.server import SimulatorServer, open_simulator, simulated_link
@@ -27,6 +28,7 @@ __all__ = [
     "ExtraComponent",
     "Faults",
     "SimulatedCopter",
+    "SimulatedLog",
     "SimulatedPx4",
     "SimulatedVehicle",
     "SimulatorServer",

@@ -41,6 +41,10 @@ class Faults:
     - ``drop_outgoing``, ``drop_incoming``: this many of the next frames are lost (they count down)
     - ``loss``: share of the outgoing frames that is lost at random, 0 to 1, the same for the same seed
     - ``motor_failed``: a motor stands still; the vehicle cannot hold its height and comes down
+    - ``no_ftp``: FILE_TRANSFER_PROTOCOL is neither answered nor among the capabilities
+    - ``parameter_limits``: name → lowest and highest value; what is set is clamped to them without a word
+    - ``read_only_parameters``: names whose values cannot be set
+    - ``mute_parameters``: names whose PARAM_VALUE never gets through
     """
 
     gps_lost: bool = False
@@ -52,6 +56,10 @@ class Faults:
     drop_incoming: int = 0
     loss: float = 0.0
     motor_failed: bool = False
+    no_ftp: bool = False
+    parameter_limits: dict[str, tuple[float, float]] = field(default_factory=dict)
+    read_only_parameters: set[str] = field(default_factory=set)
+    mute_parameters: set[str] = field(default_factory=set)
     commands: dict[int, CommandFault] = field(default_factory=dict)
 
     def refuse(

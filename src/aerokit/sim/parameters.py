@@ -1,178 +1,134 @@
-"""Parameters of a simulated vehicle and the protocol that reads and sets them.
-
-https://mavlink.io/en/services/parameter.html
-"""
+"""The parameters of a simulated vehicle: names, values, types and defaults."""
 
 from __future__ import annotations
 
 import math
 import struct
-import zlib
 from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 from aerokit.mavlink.enums import MavParamType
-from aerokit.mavlink.messages import ParamRequestList, ParamRequestRead, ParamSet, ParamValue
 
-if TYPE_CHECKING:
-    from aerokit.sim.channel import Channel
-    from aerokit.sim.vehicle import SimulatedVehicle
+__all__ = ["ParameterRow", "Parameters", "stored"]
 
-__all__ = ["ParameterServer", "Parameters"]
-
-_UNCOUNTED = 0xFFFF
-_HASH_NAME = "_HASH_CHECK"
-_NO_NAN = 0xFEFFFFFF
-_LIST_BURST = 10
-_LIST_PERIOD_S = 0.005
-
-_FORMATS = {
-    MavParamType.UINT8: "<B",
-    MavParamType.INT8: "<b",
-    MavParamType.UINT16: "<H",
-    MavParamType.INT16: "<h",
-    MavParamType.UINT32: "<I",
-    MavParamType.INT32: "<i",
+_RANGES = {
+    MavParamType.UINT8: (0, (1 << 8) - 1),
+    MavParamType.INT8: (-(1 << 7), (1 << 7) - 1),
+    MavParamType.UINT16: (0, (1 << 16) - 1),
+    MavParamType.INT16: (-(1 << 15), (1 << 15) - 1),
+    MavParamType.UINT32: (0, (1 << 32) - 1),
+    MavParamType.INT32: (-(1 << 31), (1 << 31) - 1),
 }
 
 
-class Parameters:
-    """Names, values and MAV_PARAM_TYPEs, in the vehicle's order. They survive a reboot."""
+@dataclass
+class ParameterRow:
+    """One parameter."""
 
-    def __init__(self, table: Iterable[tuple[str, float, int]]) -> None:
-        self._values: dict[str, float] = {}
-        self._types: dict[str, int] = {}
-        for name, value, type_ in table:
-            self._values[name], self._types[name] = value, type_
-        self.names = tuple(self._values)
+    name: str
+    type: int
+    """MAV_PARAM_TYPE."""
+    value: float
+    default: float
+    is_volatile: bool = False
+    """Left out of PX4's hash: the vehicle changes it by itself."""
+
+
+class Parameters:
+    """By name, in the vehicle's order. They survive a reboot.
+
+    A value is what the vehicle can store: 32-bit floats, whole numbers within the type's range.
+    """
+
+    def __init__(self, rows: Iterable[ParameterRow]) -> None:
+        self._rows = {row.name: row for row in rows}
+        self._names: tuple[str, ...] | None = None
+        self._indices: dict[str, int] = {}
 
     @classmethod
-    def from_text(cls, text: str) -> Parameters:
-        """One ``name,value,type`` a line."""
-        rows = (line.split(",") for line in text.split())
-        return cls((name, float(value), int(type_)) for name, value, type_ in rows)
+    def from_text(cls, text: str, *, used: Iterable[str] = (), count: int | None = None) -> Parameters:
+        """One ``name,type,value[,default[,v]]`` a line; ``v`` is volatile.
+
+        ``count``: only so many, in the text's order, the ``used`` ones among them in any case.
+        """
+        lines = text.split()
+        if count is not None:
+            lines = _some_of(lines, frozenset(used), count)
+        return cls(_row(line.split(",")) for line in lines)
 
     def __getitem__(self, name: str) -> float:
-        return self._values[name]
+        return self._rows[name].value
 
     def __setitem__(self, name: str, value: float) -> None:
-        if name not in self._values:
-            raise KeyError(name)
-        self._values[name] = self._rounded(name, value)
+        """Raises KeyError for an unknown name."""
+        row = self._rows[name]
+        row.value = stored(value, row.type)
 
     def __contains__(self, name: object) -> bool:
-        return name in self._values
+        return name in self._rows
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self.names)
+        return iter(self._rows)
 
     def __len__(self) -> int:
-        return len(self.names)
+        return len(self._rows)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """In the vehicle's order: the place here is the index in messages."""
+        if self._names is None:
+            self._names = tuple(self._rows)
+            self._indices = {name: index for index, name in enumerate(self._names)}
+        return self._names
+
+    def index(self, name: str) -> int:
+        """The place in ``names``."""
+        _ = self.names
+        return self._indices[name]
 
     def type(self, name: str) -> int:
         """The MAV_PARAM_TYPE."""
-        return self._types[name]
+        return self._rows[name].type
 
-    def _rounded(self, name: str, value: float) -> float:
-        """What the vehicle can store: 32-bit floats and whole numbers within the type's range."""
-        format_ = _FORMATS.get(MavParamType(self._types[name]))
-        if format_ is None:
-            return float(struct.unpack("<f", struct.pack("<f", value))[0])
-        bits = struct.calcsize(format_) * 8
-        low, high = (0, (1 << bits) - 1) if format_[1].isupper() else (-(1 << bits - 1), (1 << bits - 1) - 1)
-        return float(max(low, min(high, int(value))))
+    def default(self, name: str) -> float:
+        """What it is after a reset."""
+        return self._rows[name].default
+
+    def row(self, name: str) -> ParameterRow:
+        """Everything about one of them."""
+        return self._rows[name]
+
+    def add(self, name: str, value: float, type: int = MavParamType.REAL32) -> None:  # noqa: A002
+        """One more at the end, as when a feature is switched on: the count changes while the vehicle runs."""
+        self._rows[name] = ParameterRow(name, type, stored(value, type), stored(value, type))
+        self._names = None
+
+    def remove(self, name: str) -> None:
+        """One less: the indices behind it change."""
+        del self._rows[name]
+        self._names = None
 
 
-class ParameterServer:
-    """Answers PARAM_REQUEST_LIST, PARAM_REQUEST_READ and PARAM_SET.
+def stored(value: float, type_: int) -> float:
+    """What a parameter of this MAV_PARAM_TYPE holds after it was given a value."""
+    range_ = _RANGES.get(MavParamType(type_))
+    if range_ is None:
+        return float(struct.unpack("<f", struct.pack("<f", value))[0]) if math.isfinite(value) else value
+    return float(max(range_[0], min(range_[1], int(value))))
 
-    With ``bytewise`` integers travel as their bytes (PX4), otherwise as numbers (ArduPilot). With ``hash_check`` a
-    list begins with PX4's uncounted _HASH_CHECK, and setting that ends a running list. ``echoes`` PARAM_VALUEs
-    follow a PARAM_SET. An unknown name is met with silence (but PX4 "main" sends PARAM_ERROR).
-    """
 
-    def __init__(
-        self,
-        vehicle: SimulatedVehicle,
-        parameters: Parameters,
-        *,
-        bytewise: bool = False,
-        hash_check: bool = False,
-        echoes: int = 1,
-    ) -> None:
-        self._vehicle = vehicle
-        self._parameters = parameters
-        self._bytewise = bytewise
-        self._hash_check = hash_check
-        self._echoes = echoes
-        self._list_number = 0
-        vehicle.on(ParamRequestList, self._on_list)
-        vehicle.on(ParamRequestRead, self._on_read)
-        vehicle.on(ParamSet, self._on_set)
+def _row(fields: list[str]) -> ParameterRow:
+    name, type_, value = fields[0], int(fields[1]), float(fields[2])
+    default = float(fields[3]) if len(fields) > 3 else value
+    return ParameterRow(name, type_, stored(value, type_), stored(default, type_), len(fields) > 4)
 
-    def _on_list(self, _: ParamRequestList, channel: Channel) -> None:
-        self._list_number += 1
-        if self._hash_check:
-            self._send_hash(channel)
-        self._send_from(0, channel, self._list_number)
 
-    def _send_from(self, index: int, channel: Channel, list_number: int) -> None:
-        names = self._parameters.names
-        if list_number != self._list_number:
-            return
-        for position in range(index, min(index + _LIST_BURST, len(names))):
-            self._send(names[position], position, channel)
-        if index + _LIST_BURST < len(names):
-            self._vehicle.call_later(
-                _LIST_PERIOD_S, lambda: self._send_from(index + _LIST_BURST, channel, list_number)
-            )
-
-    def _on_read(self, request: ParamRequestRead, channel: Channel) -> None:
-        names = self._parameters.names
-        if request.param_index >= 0:
-            if request.param_index < len(names):
-                self._send(names[request.param_index], request.param_index, channel)
-        elif request.param_id == _HASH_NAME and self._hash_check:
-            self._send_hash(channel)
-        elif request.param_id in self._parameters:
-            self._send(request.param_id, names.index(request.param_id), channel)
-
-    def _on_set(self, request: ParamSet, channel: Channel) -> None:
-        name = request.param_id
-        if name == _HASH_NAME and self._hash_check:
-            self._list_number += 1
-        if name not in self._parameters:
-            return
-        value = self._from_wire(request.param_value, self._parameters.type(name))
-        if not math.isfinite(value):
-            return
-        self._parameters[name] = value
-        for _ in range(self._echoes):
-            self._send(name, _UNCOUNTED, None)
-
-    def _send_hash(self, channel: Channel) -> None:
-        """A checksum over names and values, so that a client can keep its list when nothing has changed."""
-        parameters = self._parameters
-        crc = 0
-        for name in parameters.names:
-            crc = zlib.crc32(name.encode() + struct.pack("<f", parameters[name]), crc)
-        value = float(struct.unpack("<f", struct.pack("<I", crc & _NO_NAN))[0])
-        count = len(parameters)
-        self._vehicle.send(ParamValue(_HASH_NAME, value, MavParamType.UINT32, count, _UNCOUNTED), channel)
-
-    def _send(self, name: str, index: int, channel: Channel | None) -> None:
-        type_ = self._parameters.type(name)
-        value = self._to_wire(self._parameters[name], type_)
-        self._vehicle.send(ParamValue(name, value, type_, len(self._parameters), index), channel)
-
-    def _to_wire(self, value: float, type_: int) -> float:
-        format_ = _FORMATS.get(MavParamType(type_)) if self._bytewise else None
-        if format_ is None:
-            return value
-        return float(struct.unpack("<f", struct.pack(format_, int(value)).ljust(4, b"\0"))[0])
-
-    def _from_wire(self, value: float, type_: int) -> float:
-        format_ = _FORMATS.get(MavParamType(type_)) if self._bytewise else None
-        if format_ is None:
-            return value
-        return float(struct.unpack_from(format_, struct.pack("<f", value))[0])
+def _some_of(lines: list[str], used: frozenset[str], count: int) -> list[str]:
+    is_used = [line.partition(",")[0] in used for line in lines]
+    others = max(0, count - sum(is_used))
+    chosen: list[str] = []
+    for line, needed in zip(lines, is_used, strict=True):
+        if needed or others > 0:
+            chosen.append(line)
+            others -= not needed
+    return chosen

@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from typing import TYPE_CHECKING, ClassVar
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import CopterMode, MavFrame, MavModeFlag, MavResult, MavSeverity
+from aerokit.mavlink.enums import (
+    CopterMode,
+    MavFrame,
+    MavModeFlag,
+    MavProtocolCapability,
+    MavResult,
+    MavSeverity,
+)
 from aerokit.sim.ardupilot.arming import Arming
 from aerokit.sim.ardupilot.auto import Auto
 from aerokit.sim.ardupilot.boot import BootTimeline
 from aerokit.sim.ardupilot.copter_commands import copter_commands
-from aerokit.sim.ardupilot.copter_parameters import COPTER_PARAMETERS
+from aerokit.sim.ardupilot.copter_parameters import copter_parameters
 from aerokit.sim.ardupilot.failsafes import Failsafes
 from aerokit.sim.ardupilot.guided import Guided
 from aerokit.sim.ardupilot.mission_run import MissionRun
@@ -23,6 +30,7 @@ from aerokit.sim.ardupilot.navigation import Navigation
 from aerokit.sim.ardupilot.requests import Requests
 from aerokit.sim.ardupilot.returning import Land, Rtl, SmartRtl
 from aerokit.sim.ardupilot.setpoints import Setpoints
+from aerokit.sim.ardupilot.storage import DEFAULT_LOGS, Storage
 from aerokit.sim.ardupilot.telemetry import BUILDERS
 from aerokit.sim.ardupilot.telemetry_position import global_origin, home_position
 from aerokit.sim.ardupilot.telemetry_state import heartbeat, mission_current
@@ -31,13 +39,15 @@ from aerokit.sim.battery import Battery
 from aerokit.sim.commands import CommandServer
 from aerokit.sim.local_frame import GlobalPoint, LocalFrame
 from aerokit.sim.motion import Motion, Wind
-from aerokit.sim.parameters import Parameters, ParameterServer
 from aerokit.sim.vehicle import ExtraComponent, SimulatedVehicle, sender_of
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
+    from aerokit.sim.ardupilot.ftp import ArduPilotFtp
     from aerokit.sim.ardupilot.navigation import Ned
     from aerokit.sim.channel import Channel
+    from aerokit.sim.file_tree import FileTree
+    from aerokit.sim.logs import SimulatedLog
 
 __all__ = ["SimulatedCopter"]
 
@@ -62,7 +72,9 @@ class SimulatedCopter(SimulatedVehicle):
       ``heading_deg``: where its nose points then
     - ``boot_time_s``: seconds until the estimator has a position; the real one needs 41.5, 0 is ready at once
     - ``boot_text``: the plain text that a serial or TCP port gives before the first frame
-    - ``version``: goes into AUTOPILOT_VERSION and the banner; ``parameters``: values other than the defaults
+    - ``version``: goes into AUTOPILOT_VERSION and the banner; ``parameters``: values other than the defaults,
+      ``parameter_count``: fewer than all 1,349, for quick tests; ``parameter_errors``: it says PARAM_ERROR
+    - ``logs``: what flights have left; ``link_bytes_per_s``: see `Storage`
     - ``battery_percent``: charge at the start; ``battery_capacity_mah``: the size of the pack
     - ``wind``: constant wind and gusts; ``rangefinder_reach_m``: 0 means that there is no range finder
     - ``unsupported_commands``: MAV_CMDs that this firmware does not know (SET_MESSAGE_INTERVAL if it is old);
@@ -70,7 +82,7 @@ class SimulatedCopter(SimulatedVehicle):
     - ``components``: other components on its links (gimbal, camera), heartbeats only
     - ``unix_time_at_boot``: what its GPS clock says at simulated second 0
 
-    Not simulated yet: keeping within a fence, flying to rally points, files, logs, a gimbal, radio failsafe.
+    Not simulated yet: keeping within a fence, flying to rally points, a gimbal, radio failsafe.
     """
 
     CAPABILITIES: ClassVar[int] = 0xFBEF
@@ -87,6 +99,10 @@ class SimulatedCopter(SimulatedVehicle):
         boot_text: bool = False,
         version: str = "4.7.0-dev",
         parameters: dict[str, float] | None = None,
+        parameter_count: int | None = None,
+        parameter_errors: bool = False,
+        logs: Sequence[SimulatedLog] = DEFAULT_LOGS,
+        link_bytes_per_s: float | None = None,
         battery_percent: float = 100.0,
         battery_capacity_mah: float = 3300.0,
         wind: Wind | None = None,
@@ -96,7 +112,7 @@ class SimulatedCopter(SimulatedVehicle):
         components: Iterable[ExtraComponent] = (),
         unix_time_at_boot: float = 1_790_000_000.0,
     ) -> None:
-        self.parameters = Parameters.from_text(COPTER_PARAMETERS)
+        self.parameters = copter_parameters(parameter_count)
         """By name; change them as a test needs it. They survive a reboot."""
         self.parameters["MAV_SYSID"] = system_id
         for name, value in (parameters or {}).items():
@@ -120,6 +136,10 @@ class SimulatedCopter(SimulatedVehicle):
         """Mission, fence and rally points; they survive a reboot."""
         self._reset()
         self._listen()
+        self.storage = Storage(
+            self, logs, parameter_errors=parameter_errors, link_bytes_per_s=link_bytes_per_s
+        )
+        """Files, logs, and the servers of them and of the parameters."""
 
     def _reset(self) -> None:
         """What a power cycle makes new."""
@@ -144,7 +164,6 @@ class SimulatedCopter(SimulatedVehicle):
 
     def _listen(self) -> None:
         self.requests = Requests(self, stream_groups=self._stream_groups)
-        ParameterServer(self, self.parameters)
         CommandServer(self, copter_commands(self))
         Setpoints(self)
         self.on(m.Heartbeat, self._on_heartbeat)
@@ -156,6 +175,21 @@ class SimulatedCopter(SimulatedVehicle):
         self.missions.listen()
 
     # ---------------------------------------------------------------------------------------- state
+
+    @property
+    def files(self) -> FileTree:
+        """What is on its card, and what it makes up when it is read; it survives a reboot."""
+        return self.storage.files
+
+    @property
+    def capabilities(self) -> int:
+        """MAV_PROTOCOL_CAPABILITYs, for AUTOPILOT_VERSION."""
+        return self.CAPABILITIES & ~MavProtocolCapability.FTP if self.faults.no_ftp else self.CAPABILITIES
+
+    @property
+    def ftp(self) -> ArduPilotFtp:
+        """The server of the files."""
+        return self.storage.ftp
 
     @property
     def is_armed(self) -> bool:
@@ -184,6 +218,7 @@ class SimulatedCopter(SimulatedVehicle):
     def boot(self) -> None:
         """Say what a booting ArduCopter says, when it says it."""
         line, later = self.timeline, self.call_later
+        self.storage.restart()
         if self._boot_text:
             for channel in self.channels:
                 channel.write(

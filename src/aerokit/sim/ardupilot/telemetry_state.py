@@ -156,7 +156,7 @@ def _esc_telemetry(copter: SimulatedCopter) -> m.EscTelemetry1To4:
 
 def _autopilot_version(copter: SimulatedCopter) -> m.AutopilotVersion:
     return m.AutopilotVersion(
-        copter.CAPABILITIES,
+        copter.capabilities,
         copter.version_number,
         0,
         0,

@@ -240,7 +240,7 @@ def _ping(px4: SimulatedPx4) -> m.Ping:
 def _autopilot_version(px4: SimulatedPx4) -> m.AutopilotVersion:
     number, commit = px4.version_number, b"\0\0\0\xfd\xaf\xd6\xde\x59"
     return m.AutopilotVersion(
-        px4.CAPABILITIES, number, number, 101854463, 1, commit, commit, bytes(8), 0, 0, 5283920058631409231
+        px4.capabilities, number, number, 101854463, 1, commit, commit, bytes(8), 0, 0, 5283920058631409231
     )
 
 

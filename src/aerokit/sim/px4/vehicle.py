@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from typing import TYPE_CHECKING, ClassVar
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavCmd, MavMissionResult, MavResult, MavSeverity
+from aerokit.mavlink.enums import MavCmd, MavMissionResult, MavProtocolCapability, MavResult, MavSeverity
 from aerokit.sim.battery import Battery
 from aerokit.sim.commands import Command, CommandServer
 from aerokit.sim.local_frame import GlobalPoint, LocalFrame
 from aerokit.sim.motion import GRAVITY_M_S2, Motion, MotionLimits, Wind
-from aerokit.sim.parameters import Parameters, ParameterServer
 from aerokit.sim.px4.commands import px4_commands
 from aerokit.sim.px4.flight import Flight
 from aerokit.sim.px4.modes import (
@@ -28,13 +27,17 @@ from aerokit.sim.px4.modes import (
     mode_from_custom,
 )
 from aerokit.sim.px4.offboard import Offboard
-from aerokit.sim.px4.parameters import PX4_PARAMETERS
+from aerokit.sim.px4.parameters import px4_parameters
+from aerokit.sim.px4.storage import DEFAULT_LOGS, Storage
 from aerokit.sim.px4.telemetry import BUILDERS, DEFAULT_RATES_HZ, FAST_MESSAGES
 from aerokit.sim.vehicle import ExtraComponent, SimulatedVehicle, sender_of
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.sim.channel import Channel
+    from aerokit.sim.file_tree import FileTree
+    from aerokit.sim.logs import SimulatedLog
+    from aerokit.sim.px4.ftp import Px4Ftp
 
 __all__ = ["SimulatedPx4"]
 
@@ -54,7 +57,7 @@ class SimulatedPx4(SimulatedVehicle):
     reposition, land, return, offboard with its time-out and failsafe, streams without being asked, heartbeats only
     once a second, chunked texts with a tab at the end, bytewise parameters with _HASH_CHECK, commands of its own to
     component 0, pings to everybody.
-    Not simulated: missions, fence, rally, files, logs, the events interface, sticks (POSITION and the manual modes
+    Not simulated: missions, fence, rally, the events interface, sticks (POSITION and the manual modes
     stay where they are), battery and data-link failsafes, estimator failures other than a lost GPS.
 
     - ``home``: latitude, longitude (degrees), altitude AMSL (m); ``heading_deg``: where its nose points
@@ -62,6 +65,8 @@ class SimulatedPx4(SimulatedVehicle):
     - ``version``: 1.16 accepts unknown modes and falls back to POSITION when offboard set-points stop, 1.17 refuses
       them and returns
     - ``fast_rate_hz``: rate of attitude, position and targets
+    - ``parameters``: values other than the defaults; ``parameter_count``: fewer than all 889, for quick tests;
+      ``parameter_file``, ``link_bytes_per_s``: see `Storage`; ``logs``: what flights have left
     """
 
     CAPABILITIES: ClassVar[int] = 0xE8FF
@@ -76,6 +81,10 @@ class SimulatedPx4(SimulatedVehicle):
         boot_time_s: float = 3.5,
         version: str = "1.17.0-alpha",
         parameters: dict[str, float] | None = None,
+        parameter_count: int | None = None,
+        parameter_file: bool = False,
+        logs: Sequence[SimulatedLog] = DEFAULT_LOGS,
+        link_bytes_per_s: float | None = None,
         battery_percent: float = 100.0,
         wind: Wind | None = None,
         fast_rate_hz: float = 50.0,
@@ -83,7 +92,7 @@ class SimulatedPx4(SimulatedVehicle):
         components: Iterable[ExtraComponent] = (),
         unix_time_at_boot: float = 1_790_000_000.0,
     ) -> None:
-        self.parameters = Parameters.from_text(PX4_PARAMETERS)
+        self.parameters = px4_parameters(parameter_count)
         """By name; they survive a reboot."""
         self.parameters["MAV_SYS_ID"] = system_id
         for name, value in (parameters or {}).items():
@@ -106,6 +115,8 @@ class SimulatedPx4(SimulatedVehicle):
         self.home = (0.0, 0.0, 0.0)
         self._reset()
         self._listen()
+        self.storage = Storage(self, logs, parameter_file=parameter_file, link_bytes_per_s=link_bytes_per_s)
+        """Files, logs, and the servers of them and of the parameters."""
 
     def _reset(self) -> None:
         self.is_ready = self.is_armed = False
@@ -124,7 +135,6 @@ class SimulatedPx4(SimulatedVehicle):
         self.flight = Flight(self)
 
     def _listen(self) -> None:
-        ParameterServer(self, self.parameters, bytewise=True, hash_check=True, echoes=2)
         self.offboard = Offboard(self)
         self.commands = CommandServer(self, px4_commands(self))
         self.on(m.SetMode, self._on_set_mode)
@@ -135,6 +145,21 @@ class SimulatedPx4(SimulatedVehicle):
         self.on(m.MissionClearAll, self._on_mission_clear)
 
     # ----------------------------------------------------------------------------------------- state
+
+    @property
+    def files(self) -> FileTree:
+        """What is on its card; it survives a reboot."""
+        return self.storage.files
+
+    @property
+    def capabilities(self) -> int:
+        """MAV_PROTOCOL_CAPABILITYs, for AUTOPILOT_VERSION."""
+        return self.CAPABILITIES & ~MavProtocolCapability.FTP if self.faults.no_ftp else self.CAPABILITIES
+
+    @property
+    def ftp(self) -> Px4Ftp:
+        """The server of the files."""
+        return self.storage.ftp
 
     @property
     def altitude_m(self) -> float:
@@ -187,6 +212,7 @@ class SimulatedPx4(SimulatedVehicle):
 
     def boot(self) -> None:
         """Start up."""
+        self.storage.restart()
         self.call_later(0.3 * self._boot_time_s, self._warn_while_booting)
         self.call_later(self._boot_time_s, self._become_ready)
 

@@ -1,0 +1,306 @@
+"""MAVFTP as ArduPilot 4.7 serves it: one session for everybody, one worker with a short queue."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode, MavSeverity
+from aerokit.sim.file_tree import FileFault
+from aerokit.sim.ftp import DATA_SIZE, FtpPacket, FtpServer, path_in, read_crc32
+
+if TYPE_CHECKING:
+    from aerokit.sim.channel import Channel
+    from aerokit.sim.file_tree import FileTree, OpenFile
+    from aerokit.sim.vehicle import SimulatedVehicle
+
+__all__ = ["ArduPilotFtp"]
+
+_SESSION_TIMEOUT_S = 3.0
+_QUEUE_DEPTH = 5
+_WORKER_PERIOD_S = 0.002
+_BURST_BLOCKS = 500
+_FRAME_BYTES = 12 + 15
+_CRC_BLOCK = 64
+_NO_SESSION = 0xFF
+
+Op = MavFtpOpcode
+
+
+class ArduPilotFtp(FtpServer):
+    """The worker looks at its queue every 2 ms; requests beyond five are lost, and so is what comes during a burst
+    beyond five. A burst cannot be stopped. The last reply is repeated for the same sequence number.
+
+    A session is what the client calls it. While it has a file open and was used in the last 3 s, requests of
+    other sessions are refused; nobody closes it but its client, or the next session after those 3 s. A close
+    is always acknowledged, whatever becomes of what was written.
+    """
+
+    burst_interval_s: float
+    """Between two blocks of a burst: no time with flow control, else so much that a third of the link is used."""
+
+    def __init__(
+        self,
+        vehicle: SimulatedVehicle,
+        files: FileTree,
+        *,
+        burst_interval_s: float = 0.0002,
+        send_banner: Callable[[], None] = lambda: None,
+    ) -> None:
+        super().__init__(vehicle, files)
+        self.burst_interval_s = burst_interval_s
+        self._send_banner = send_banner
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget everything, as a reboot does."""
+        self._queue: deque[tuple[FtpPacket, Channel]] = deque()
+        self._is_awake = False
+        self._file: OpenFile | None = None
+        self._writing = False
+        self._session = _NO_SESSION
+        self._used_at = float("-inf")
+        self._reply = FtpPacket(0, _NO_SESSION, 0)
+        self._banner_wanted = False
+
+    @property
+    def open_sessions(self) -> int:
+        """1 while a file is open that keeps other sessions out."""
+        return int(self._file is not None and not self._is_idle())
+
+    def receive(self, request: FtpPacket, channel: Channel) -> None:
+        """Queue it; what does not fit is lost."""
+        if len(self._queue) < _QUEUE_DEPTH:
+            self._queue.append((request, channel))
+        if not self._is_awake:
+            self._is_awake = True
+            self._vehicle.call_later(_WORKER_PERIOD_S, self._work)
+
+    # ------------------------------------------------------------------------------------------ worker
+
+    def _work(self) -> None:
+        """Do what is queued; a burst goes on by itself and comes back here."""
+        while self._queue:
+            request, channel = self._queue.popleft()
+            if self._is_repeated(request):
+                self._send(self._reply, channel)
+            elif request.opcode not in (Op.ACK, Op.NAK):
+                answer = self._answer(request, channel)
+                if answer is None:
+                    return
+                self._send(answer, channel)
+        self._is_awake = False
+
+    def _is_repeated(self, request: FtpPacket) -> bool:
+        last = self._reply
+        same = request.client == last.client and request.session == last.session
+        return same and request.sequence + 1 == last.sequence
+
+    def _send(self, reply: FtpPacket, channel: Channel) -> None:
+        self._reply = reply
+        self._vehicle.send(reply.message(), channel)
+        ended = reply.request_opcode == Op.TERMINATESESSION
+        self._used_at = float("-inf") if ended else self._vehicle.now
+        if self._banner_wanted:
+            self._banner_wanted = False
+            self._send_banner()
+
+    def _is_idle(self) -> bool:
+        return self._vehicle.now - self._used_at >= _SESSION_TIMEOUT_S
+
+    def _answer(self, request: FtpPacket, channel: Channel) -> FtpPacket | None:
+        if request.size > DATA_SIZE:
+            return request.refuse(MavFtpErr.INVALIDDATASIZE)
+        if request.session != self._session:
+            if request.opcode in (Op.TERMINATESESSION, Op.RESETSESSION):
+                return request.acknowledge()
+            if self._file is not None and not self._is_idle():
+                return request.refuse(MavFtpErr.INVALIDSESSION)
+            self._close()
+        if request.opcode == Op.BURSTREADFILE:
+            return self._start_burst(request, channel)
+        handler = _HANDLERS.get(request.opcode)
+        if handler is None:
+            self._vehicle.send_text(MavSeverity.DEBUG, f"Unsupported FTP: {request.opcode}")
+            return request.refuse(MavFtpErr.FAIL)
+        try:
+            return handler(self, request)
+        except FileFault as fault:
+            return request.refuse_errno(fault.errno)
+
+    def _close(self) -> None:
+        file, self._file = self._file, None
+        if file is None:
+            return
+        self._session = _NO_SESSION
+        with suppress(FileFault):  # as in the firmware, nobody is told
+            file.close()
+
+    # ---------------------------------------------------------------------------------------- sessions
+
+    def _none(self, request: FtpPacket) -> FtpPacket:
+        return request.acknowledge()
+
+    def _terminate(self, request: FtpPacket) -> FtpPacket:
+        self._close()
+        self._session = _NO_SESSION
+        return request.acknowledge()
+
+    def _open(self, request: FtpPacket) -> FtpPacket:
+        if self._file is not None and self._vehicle.now - self._used_at > _SESSION_TIMEOUT_S:
+            self._close()
+        if self._file is not None:
+            return request.refuse(MavFtpErr.FAIL)
+        if not _is_path(request):
+            return request.refuse(MavFtpErr.INVALIDDATASIZE)
+        path = path_in(request.data)
+        size = self.files.size(path)
+        self._file, self._writing, self._session = self.files.open(path), False, request.session
+        self._banner_wanted = path.startswith("@PARAM/param.pck")
+        return request.acknowledge(size.to_bytes(4, "little"))
+
+    def _open_for_writing(self, request: FtpPacket) -> FtpPacket:
+        if self._file is not None:
+            return request.refuse(MavFtpErr.FAIL)
+        if not _is_path(request):
+            return request.refuse(MavFtpErr.INVALIDDATASIZE)
+        create = request.opcode == Op.CREATEFILE
+        self._file = self.files.open(path_in(request.data), writing=True, create=create)
+        self._writing, self._session = True, request.session
+        return request.acknowledge()
+
+    def _read(self, request: FtpPacket) -> FtpPacket:
+        if self._file is None:
+            return request.refuse(MavFtpErr.FILENOTFOUND)
+        if self._writing:
+            return request.refuse(MavFtpErr.FAIL)
+        data = self._file.read(request.offset, request.size)
+        if not data:
+            return request.refuse(MavFtpErr.EOF)
+        return request.acknowledge(data, offset=request.offset)
+
+    def _write(self, request: FtpPacket) -> FtpPacket:
+        if self._file is None:
+            return request.refuse(MavFtpErr.FILENOTFOUND)
+        if not self._writing:
+            return request.refuse(MavFtpErr.FAIL)
+        self._file.write(request.offset, request.data[: request.size])
+        return request.acknowledge(offset=request.offset)
+
+    # ------------------------------------------------------------------------------------------- burst
+
+    def _start_burst(self, request: FtpPacket, channel: Channel) -> FtpPacket | None:
+        if self._file is None:
+            return request.refuse(MavFtpErr.FILENOTFOUND)
+        if self._writing:
+            return request.refuse(MavFtpErr.FAIL)
+        self._burst(request, channel, 0)
+        return None
+
+    def _burst(self, request: FtpPacket, channel: Channel, number: int) -> None:
+        """Send one block, and plan the next; the session cannot change meanwhile."""
+        step = request.size or DATA_SIZE
+        offset = request.offset + number * step
+        try:
+            data = self._file.read(offset, step) if self._file is not None else b""
+            refusal = None if data else request.refuse(MavFtpErr.EOF)
+        except FileFault as fault:
+            data, refusal = b"", request.refuse_errno(fault.errno)
+        sequence = request.sequence + 1 + number & 0xFFFF
+        if refusal is not None:
+            self._send(
+                replace(refusal, sequence=sequence, offset=self._reply.offset if number else 0), channel
+            )
+            self._work()
+            return
+        is_last = number == _BURST_BLOCKS - 1
+        complete = int(len(data) < step or is_last)
+        block = request.acknowledge(data, offset=offset)
+        self._send(replace(block, sequence=sequence, burst_complete=complete), channel)
+        after = offset + len(data) if len(data) < step else offset
+        self._reply = replace(self._reply, sequence=sequence + 1 & 0xFFFF, offset=after, burst_complete=0)
+        if is_last:
+            self._vehicle.call_later(self.burst_interval_s, self._work)
+        else:
+            again = lambda: self._burst(request, channel, number + 1)  # noqa: E731
+            self._vehicle.call_later(self.burst_interval_s, again)
+
+    # ------------------------------------------------------------------------------------ whole files
+
+    def _list(self, request: FtpPacket) -> FtpPacket:
+        if not _is_path(request):
+            return replace(request.refuse(MavFtpErr.INVALIDDATASIZE), offset=request.offset)
+        try:
+            entries = self.files.entries(path_in(request.data))
+        except FileFault as fault:
+            return replace(request.refuse_errno(fault.errno), offset=request.offset)
+        listing = b""
+        for name, size in entries[request.offset :]:
+            text = f"D{name}" if size is None else f"F{name}\t{size}"
+            if len(listing) + len(text) + 1 >= DATA_SIZE:
+                break
+            listing += text.encode() + b"\0"
+        if not listing:
+            return replace(request.refuse(MavFtpErr.EOF), offset=request.offset)
+        return request.acknowledge(listing, offset=request.offset)
+
+    def _make_folder(self, request: FtpPacket) -> FtpPacket:
+        return self._change(request, self.files.make_folder)
+
+    def _remove(self, request: FtpPacket) -> FtpPacket:
+        return self._change(request, self._remove_either)
+
+    def _remove_either(self, path: str) -> None:
+        """RemoveFile and RemoveDirectory are one and the same."""
+        try:
+            self.files.remove_folder(path)
+        except FileFault:
+            self.files.remove_file(path)
+
+    def _change(self, request: FtpPacket, change: Callable[[str], None]) -> FtpPacket:
+        if not _is_path(request):
+            return request.refuse(MavFtpErr.INVALIDDATASIZE)
+        change(path_in(request.data))
+        return request.acknowledge()
+
+    def _rename(self, request: FtpPacket) -> FtpPacket:
+        first = path_in(request.data)
+        second = path_in(request.data[len(first.encode()) + 1 :])
+        length = len(first.encode()) + len(second.encode())
+        if request.size == 0 or request.size not in (length + 1, length + 2):
+            return request.refuse(MavFtpErr.INVALIDDATASIZE)
+        self.files.rename(first, second)
+        return request.acknowledge()
+
+    def _crc32(self, request: FtpPacket) -> FtpPacket:
+        if not _is_path(request):
+            return request.refuse(MavFtpErr.INVALIDDATASIZE)
+        checksum = read_crc32(self.files, path_in(request.data), _CRC_BLOCK)
+        return request.acknowledge(checksum.to_bytes(4, "little"))
+
+
+def _is_path(request: FtpPacket) -> bool:
+    """The size must be that of the text; one more for its NUL is fine."""
+    length = len(request.data.partition(b"\0")[0])
+    return request.size != 0 and request.size - length in (0, 1)
+
+
+_HANDLERS: dict[int, Callable[[ArduPilotFtp, FtpPacket], FtpPacket]] = {
+    Op.NONE: ArduPilotFtp._none,
+    Op.TERMINATESESSION: ArduPilotFtp._terminate,
+    Op.RESETSESSION: ArduPilotFtp._terminate,
+    Op.LISTDIRECTORY: ArduPilotFtp._list,
+    Op.OPENFILERO: ArduPilotFtp._open,
+    Op.READFILE: ArduPilotFtp._read,
+    Op.CREATEFILE: ArduPilotFtp._open_for_writing,
+    Op.OPENFILEWO: ArduPilotFtp._open_for_writing,
+    Op.WRITEFILE: ArduPilotFtp._write,
+    Op.REMOVEFILE: ArduPilotFtp._remove,
+    Op.REMOVEDIRECTORY: ArduPilotFtp._remove,
+    Op.CREATEDIRECTORY: ArduPilotFtp._make_folder,
+    Op.RENAME: ArduPilotFtp._rename,
+    Op.CALCFILECRC: ArduPilotFtp._crc32,
+}

@@ -1,0 +1,80 @@
+"""What a simulated ArduPilot keeps in files, and how fast it gives it away on a slow link."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from aerokit.sim.ardupilot.ftp import ArduPilotFtp
+from aerokit.sim.ardupilot.parameter_server import ArduPilotParameterServer, rounded
+from aerokit.sim.file_tree import FileTree
+from aerokit.sim.logs import ArduPilotLogServer, SimulatedLog
+from aerokit.sim.mission_files import MissionMount
+from aerokit.sim.parameter_pack_file import ParameterPackMount
+
+if TYPE_CHECKING:
+    from aerokit.sim.ardupilot.copter import SimulatedCopter
+
+__all__ = ["DEFAULT_LOGS", "LOG_FOLDER", "Storage"]
+
+LOG_FOLDER = "/APM/LOGS"
+DEFAULT_LOGS = (SimulatedLog(186_432, 1_789_990_000), SimulatedLog(45_103, 1_789_995_000))
+
+_PARAM_VALUE_FRAME, _FTP_FRAME, _LOG_DATA_FRAME = 37, 266, 109
+_PARAMETERS_SHARE, _BURST_SHARE, _LOG_SHARE = 0.3, 1 / 3, 0.5
+
+
+class Storage:
+    """Files, logs and parameters, and the servers that give them away.
+
+    ``link_bytes_per_s`` is what the firmware takes the port to be able to carry when it has no flow control: a
+    list of parameters uses 30 % of it, a burst of a file a third. None: flow control, as on USB and in a network.
+    """
+
+    def __init__(
+        self,
+        copter: SimulatedCopter,
+        logs: Sequence[SimulatedLog],
+        *,
+        parameter_errors: bool,
+        link_bytes_per_s: float | None,
+    ) -> None:
+        self._copter = copter
+        self.files = FileTree()
+        self._put_logs(logs)
+        self.files.mounts["@PARAM"] = ParameterPackMount(copter.parameters, self._apply)
+        self.files.mounts["@MISSION"] = MissionMount(copter.missions, (copter.system_id, copter.component_id))
+        banner = copter.send_banner
+        self.parameters = ArduPilotParameterServer(
+            copter, copter.parameters, errors=parameter_errors, send_banner=banner
+        )
+        self.ftp = ArduPilotFtp(copter, self.files, send_banner=banner)
+        self.logs = ArduPilotLogServer(
+            copter, logs, is_armed=lambda: copter.is_armed, erase_files=self._erase_logs
+        )
+        if link_bytes_per_s is not None:
+            self.parameters.list_rate_hz = _PARAMETERS_SHARE * link_bytes_per_s / _PARAM_VALUE_FRAME
+            self.ftp.burst_interval_s = _FTP_FRAME / (_BURST_SHARE * link_bytes_per_s)
+            self.logs.rate_hz = _LOG_SHARE * link_bytes_per_s / _LOG_DATA_FRAME
+            self.parameters.burst = self.logs.burst = 1
+
+    def restart(self) -> None:
+        """Transfers end, sessions are gone; files remain."""
+        self.parameters.restart()
+        self.ftp.restart()
+        self.logs.restart()
+
+    def _put_logs(self, logs: Sequence[SimulatedLog]) -> None:
+        for number, log in enumerate(logs, start=1):
+            self.files.put(f"{LOG_FOLDER}/{number:08}.BIN", log.make, size=log.size)
+        self.files.put(f"{LOG_FOLDER}/LASTLOG.TXT", f"{len(logs)}\r\n".encode())
+
+    def _erase_logs(self) -> None:
+        for name, _ in self.files.entries(LOG_FOLDER):
+            self.files.remove_file(f"{LOG_FOLDER}/{name}")
+
+    def _apply(self, name: str, value: float) -> None:
+        """One parameter of an uploaded file."""
+        parameters = self._copter.parameters
+        if name not in self._copter.faults.read_only_parameters:
+            parameters[name] = rounded(self.parameters.clamped(name, value), parameters.type(name))

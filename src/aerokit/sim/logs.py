@@ -1,0 +1,233 @@
+"""Flight logs of a simulated vehicle, and LOG_REQUEST_LIST, LOG_REQUEST_DATA, LOG_ERASE as both autopilots serve them.
+
+There is no page of the protocol but the messages': https://mavlink.io/en/messages/common.html#LOG_REQUEST_LIST
+"""
+
+from __future__ import annotations
+
+import random
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from aerokit.mavlink.messages import (
+    LogData,
+    LogEntry,
+    LogErase,
+    LogRequestData,
+    LogRequestEnd,
+    LogRequestList,
+)
+
+if TYPE_CHECKING:
+    from aerokit.mavlink.message import Message
+    from aerokit.sim.channel import Channel
+    from aerokit.sim.vehicle import SimulatedVehicle
+
+__all__ = ["ArduPilotLogServer", "LogServer", "Px4LogServer", "SimulatedLog"]
+
+_BLOCK = 90
+
+
+@dataclass(frozen=True)
+class SimulatedLog:
+    """One log; its content is noise that follows from size and time, so that every run gives the same."""
+
+    size: int
+    time_utc: int = 1_790_000_000
+    """Seconds since 1970."""
+
+    def make(self) -> bytes:
+        """All of its content."""
+        return random.Random(self.size * 31 + self.time_utc).randbytes(self.size)
+
+
+class LogServer:
+    """Lists logs and sends their content in blocks of 90 bytes, ``rate_hz`` messages a second, ``burst`` at once.
+
+    One transfer at a time; an autopilot's own class says what else differs.
+    """
+
+    burst = 10
+
+    def __init__(
+        self,
+        vehicle: SimulatedVehicle,
+        logs: Sequence[SimulatedLog],
+        *,
+        rate_hz: float,
+        erase_files: Callable[[], None] = lambda: None,
+    ) -> None:
+        self.logs = list(logs)
+        self.rate_hz = rate_hz
+        self._vehicle = vehicle
+        self._erase_files = erase_files
+        self._outgoing: deque[Callable[[], Message]] = deque()
+        self._channel: Channel | None = None
+        self._transfer = 0
+        self._content: tuple[int, bytes] = (-1, b"")
+        vehicle.on(LogRequestList, self._on_list)
+        vehicle.on(LogRequestData, self._on_data)
+        vehicle.on(LogErase, self._on_erase)
+        vehicle.on(LogRequestEnd, self._on_end)
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether a list or a log is on its way."""
+        return bool(self._outgoing)
+
+    def restart(self) -> None:
+        """Stop whatever is on its way."""
+        self._transfer += 1
+        self._outgoing.clear()
+
+    # ------------------------------------------------------------------------------------- what differs
+
+    def _on_list(self, request: LogRequestList, channel: Channel) -> None:
+        raise NotImplementedError
+
+    def _on_data(self, request: LogRequestData, channel: Channel) -> None:
+        raise NotImplementedError
+
+    # ------------------------------------------------------------------------------------ what does not
+
+    def _on_erase(self, _: LogErase, __: Channel) -> None:
+        self.restart()
+        self.logs.clear()
+        self._content = (-1, b"")
+        self._erase_files()
+
+    def _on_end(self, _: LogRequestEnd, __: Channel) -> None:
+        self.restart()
+
+    def content(self, number: int) -> bytes:
+        """All of the log at this place of the list."""
+        if self._content[0] != number:
+            self._content = (number, self.logs[number].make())
+        return self._content[1]
+
+    def blocks(self, number: int, log_id: int, offset: int, count: int) -> list[Callable[[], Message]]:
+        """What sends ``count`` bytes from ``offset`` on, block by block; an empty block where there are none."""
+        data = self.content(number)
+        end = min(len(data), offset + count)
+        starts = range(offset, end, _BLOCK) if offset < end else range(offset, offset + 1)
+        return [lambda start=start: _block(data, log_id, start, end) for start in starts]  # type: ignore[misc]
+
+    def transfer(self, messages: Sequence[Callable[[], Message]], channel: Channel) -> None:
+        """Send these one after the other, instead of what was on its way."""
+        self.restart()
+        self._outgoing.extend(messages)
+        self._channel = channel
+        self._send_next(self._transfer)
+
+    def _send_next(self, transfer: int) -> None:
+        if transfer != self._transfer:
+            return
+        for _ in range(min(self.burst, len(self._outgoing))):
+            self._vehicle.send(self._outgoing.popleft()(), self._channel)
+        if self._outgoing:
+            self._vehicle.call_later(self.burst / self.rate_hz, lambda: self._send_next(transfer))
+
+
+class ArduPilotLogServer(LogServer):
+    """Logs have the numbers 1, 2, 3 …; what is asked for during a transfer is ignored, data of an unknown log ends it.
+
+    Nothing is listed or sent while armed.
+    """
+
+    def __init__(
+        self,
+        vehicle: SimulatedVehicle,
+        logs: Sequence[SimulatedLog],
+        *,
+        is_armed: Callable[[], bool],
+        rate_hz: float = 4000.0,
+        erase_files: Callable[[], None] = lambda: None,
+    ) -> None:
+        super().__init__(vehicle, logs, rate_hz=rate_hz, erase_files=erase_files)
+        self._is_armed = is_armed
+        self._has_warned = False
+
+    def _on_list(self, request: LogRequestList, channel: Channel) -> None:
+        if self._refuses():
+            return
+        if self.is_busy:
+            self._vehicle.info("Log download in progress")
+            return
+        count = len(self.logs)
+        first, last = (max(1, request.start), min(count, request.end)) if count else (0, 0)
+        numbers = range(first, last + 1) if first <= last else range(0)
+        self.transfer([lambda n=n: self._entry(n, last) for n in numbers], channel)  # type: ignore[misc]
+
+    def _entry(self, number: int, last: int) -> LogEntry:
+        if number == 0:
+            return LogEntry(0, 0, 0, 0, 0)
+        log = self.logs[number - 1]
+        return LogEntry(number, len(self.logs), last, log.time_utc, log.size)
+
+    def _on_data(self, request: LogRequestData, channel: Channel) -> None:
+        if self._refuses() or self.is_busy:
+            return
+        if not 1 <= request.id <= len(self.logs):
+            self.restart()
+            return
+        self.transfer(self.blocks(request.id - 1, request.id, request.ofs, request.count), channel)
+
+    def _on_erase(self, request: LogErase, channel: Channel) -> None:
+        if not self._refuses():
+            super()._on_erase(request, channel)
+
+    def _on_end(self, request: LogRequestEnd, channel: Channel) -> None:
+        if not self._refuses():
+            super()._on_end(request, channel)
+
+    def _refuses(self) -> bool:
+        armed = self._is_armed()
+        if armed and not self._has_warned:
+            self._vehicle.send_text(3, "Disarm for log download")
+        self._has_warned = armed
+        return armed
+
+
+class Px4LogServer(LogServer):
+    """Logs have the numbers 0, 1, 2 …; the end of a list request is ignored, data only comes once there was a list.
+
+    A new request replaces the one that runs. The last block is not cut to what was asked for. Without logs a list
+    request is met with silence.
+    """
+
+    def __init__(
+        self,
+        vehicle: SimulatedVehicle,
+        logs: Sequence[SimulatedLog],
+        *,
+        rate_hz: float = 4000.0,
+        erase_files: Callable[[], None] = lambda: None,
+    ) -> None:
+        super().__init__(vehicle, logs, rate_hz=rate_hz, erase_files=erase_files)
+        self._was_listed = False
+
+    def _on_list(self, request: LogRequestList, channel: Channel) -> None:
+        self._was_listed = True
+        count = len(self.logs)
+        last = count if request.end == 0xFFFF else request.end
+        numbers = range(request.start, count)
+        self.transfer([lambda n=n: self._entry(n, last) for n in numbers], channel)  # type: ignore[misc]
+
+    def _entry(self, number: int, last: int) -> LogEntry:
+        log = self.logs[number]
+        return LogEntry(number, len(self.logs), last, log.time_utc, log.size)
+
+    def _on_data(self, request: LogRequestData, channel: Channel) -> None:
+        known = self._was_listed and request.id < len(self.logs)
+        if not known or request.ofs >= self.logs[request.id].size:
+            self.restart()
+            return
+        whole = -(-request.count // _BLOCK) * _BLOCK or _BLOCK
+        self.transfer(self.blocks(request.id, request.id, request.ofs, whole), channel)
+
+
+def _block(data: bytes, log_id: int, start: int, end: int) -> LogData:
+    piece = data[start : min(end, start + _BLOCK)]
+    return LogData(log_id, start, len(piece), piece)

@@ -1,0 +1,293 @@
+"""MAVFTP as PX4 serves it: one session on each port, answers at once, bursts from the main loop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
+from aerokit.sim.file_tree import EEXIST, EINVAL, FileFault
+from aerokit.sim.ftp import DATA_SIZE, FtpPacket, FtpServer, path_in, read_crc32
+
+if TYPE_CHECKING:
+    from aerokit.sim.channel import Channel
+    from aerokit.sim.file_tree import FileTree, OpenFile
+    from aerokit.sim.vehicle import SimulatedVehicle
+
+__all__ = ["Px4Ftp"]
+
+_SESSION_TIMEOUT_S = 10.0
+_REPLY_KEPT = 4
+_CRC_BLOCK = 256
+
+Op = MavFtpOpcode
+
+
+@dataclass(eq=False)
+class _Port:
+    """What the server of one port knows."""
+
+    channel: Channel
+    file: OpenFile | None = None
+    path: str = ""
+    size: int = 0
+    used_at: float = 0.0
+    errno: int = 0
+    """Of the latest failure; it is never forgotten, and EEXIST colours every later refusal."""
+    reply: FtpPacket | None = None
+    burst: FtpPacket | None = field(default=None, repr=False)
+    """The next block's sequence and offset."""
+
+
+class Px4Ftp(FtpServer):
+    """A session is number 0, whatever the client says when it opens; it is closed after 10 s without a request.
+
+    A burst ignores the size that is asked for, sends ``burst`` blocks every ``burst_interval_s`` seconds to the
+    end of the file, and ends with a refusal "end of file"; it is never complete before. Small replies are
+    repeated for the same sequence number.
+    """
+
+    burst = 5
+
+    def __init__(self, vehicle: SimulatedVehicle, files: FileTree, *, burst_interval_s: float = 0.01) -> None:
+        super().__init__(vehicle, files)
+        self.burst_interval_s = burst_interval_s
+        self._ports: dict[Channel, _Port] = {}
+
+    @property
+    def open_sessions(self) -> int:
+        """How many ports have a file open."""
+        return sum(port.file is not None for port in self._ports.values())
+
+    def restart(self) -> None:
+        """Forget everything, as a reboot does."""
+        self._ports.clear()
+
+    def receive(self, request: FtpPacket, channel: Channel) -> None:
+        """Answer at once."""
+        port = self._ports.setdefault(channel, _Port(channel))
+        port.used_at = self._vehicle.now
+        if request.size > DATA_SIZE:
+            self._reply(port, request.refuse(MavFtpErr.INVALIDDATASIZE))
+        elif (last := port.reply) is not None and _is_repeated(request, last):
+            self._vehicle.send(last.message(), channel)
+        else:
+            self._answer(port, request)
+
+    def _answer(self, port: _Port, request: FtpPacket) -> None:
+        handler = _HANDLERS.get(request.opcode)
+        try:
+            answer = (
+                request.refuse(MavFtpErr.UNKNOWNCOMMAND) if handler is None else handler(self, port, request)
+            )
+        except FileFault as fault:
+            port.errno = fault.errno
+            answer = request.refuse_errno(fault.errno)
+        port.reply = None
+        if answer is None:
+            return
+        if answer.opcode == Op.NAK and port.errno == EEXIST:
+            answer = request.refuse(MavFtpErr.FILEEXISTS)
+        self._reply(port, answer)
+
+    def _reply(self, port: _Port, answer: FtpPacket) -> None:
+        if answer.size <= _REPLY_KEPT and answer.data[:1] != bytes([MavFtpErr.NOSESSIONSAVAILABLE]):
+            port.reply = answer
+        self._vehicle.send(answer.message(), port.channel)
+
+    # ---------------------------------------------------------------------------------------- sessions
+
+    def _none(self, port: _Port, request: FtpPacket) -> FtpPacket:
+        return request.acknowledge(offset=request.offset)
+
+    def _terminate(self, port: _Port, request: FtpPacket) -> FtpPacket:
+        if request.session != 0 or port.file is None:
+            return request.refuse(MavFtpErr.INVALIDSESSION)
+        return self._reset(port, request)
+
+    def _reset(self, port: _Port, request: FtpPacket) -> FtpPacket:
+        self._close(port)
+        return request.acknowledge(offset=request.offset)
+
+    def _close(self, port: _Port) -> None:
+        file, port.file, port.burst = port.file, None, None
+        if file is not None:
+            file.close()
+
+    def _open(self, port: _Port, request: FtpPacket) -> FtpPacket:
+        if port.file is not None:
+            return request.refuse(MavFtpErr.NOSESSIONSAVAILABLE)
+        path = path_in(request.data[: request.size])
+        if _leaves(path):
+            return request.refuse(MavFtpErr.FILEPROTECTED)
+        reading = request.opcode == Op.OPENFILERO
+        size = self._size(path, reading=reading)
+        create = request.opcode == Op.CREATEFILE or (not reading and path not in self.files)
+        port.file = self.files.open(path, writing=not reading, create=create)
+        port.path, port.size, port.burst = path, size, None
+        self._watch(port)
+        return request.acknowledge(size.to_bytes(4, "little"), offset=request.offset, session=0)
+
+    def _size(self, path: str, *, reading: bool) -> int:
+        try:
+            return self.files.size(path)
+        except FileFault:
+            if reading:
+                raise
+            return 0
+
+    def _watch(self, port: _Port) -> None:
+        """Close the session once nobody has asked for anything for so long."""
+        file = port.file
+
+        def look() -> None:
+            if port.file is not file or file is None:
+                return
+            if self._vehicle.now - port.used_at < _SESSION_TIMEOUT_S:
+                self._vehicle.call_at(port.used_at + _SESSION_TIMEOUT_S, look)
+                return
+            port.reply = None
+            with suppress(FileFault):
+                self._close(port)
+
+        self._vehicle.call_at(port.used_at + _SESSION_TIMEOUT_S, look)
+
+    def _read(self, port: _Port, request: FtpPacket) -> FtpPacket:
+        if request.session != 0 or port.file is None:
+            return request.refuse(MavFtpErr.INVALIDSESSION)
+        if request.offset >= port.size:
+            return request.refuse(MavFtpErr.EOF)
+        return request.acknowledge(port.file.read(request.offset, request.size), offset=request.offset)
+
+    def _write(self, port: _Port, request: FtpPacket) -> FtpPacket:
+        if request.session != 0 or port.file is None:
+            return request.refuse(MavFtpErr.INVALIDSESSION)
+        port.file.write(request.offset, request.data[: request.size])
+        return request.acknowledge(request.size.to_bytes(4, "little"), offset=request.offset)
+
+    # ------------------------------------------------------------------------------------------- burst
+
+    def _start_burst(self, port: _Port, request: FtpPacket) -> FtpPacket | None:
+        if request.session != 0 or port.file is None:
+            return request.refuse(MavFtpErr.INVALIDSESSION)
+        is_running = port.burst is not None
+        port.burst = replace(request, sequence=request.sequence + 1 & 0xFFFF)
+        if not is_running:
+            self._vehicle.call_later(self.burst_interval_s, lambda: self._send_blocks(port))
+        return None
+
+    def _send_blocks(self, port: _Port) -> None:
+        for _ in range(self.burst):
+            if port.burst is None or port.file is None:
+                return
+            self._send_block(port, port.file, port.burst)
+        self._vehicle.call_later(self.burst_interval_s, lambda: self._send_blocks(port))
+
+    def _send_block(self, port: _Port, file: OpenFile, burst: FtpPacket) -> None:
+        answer = replace(burst.acknowledge(offset=burst.offset, session=0), sequence=burst.sequence)
+        refusal = replace(
+            burst.refuse(MavFtpErr.EOF), sequence=burst.sequence, offset=burst.offset, session=0
+        )
+        try:
+            data = b"" if burst.offset >= port.size else file.read(burst.offset, DATA_SIZE)
+        except FileFault as fault:
+            data, port.errno = b"", fault.errno
+            refusal = replace(refusal, data=bytes([MavFtpErr.FAILERRNO, port.errno]), size=2)
+        if not data:
+            port.burst = None
+            self._reply(port, refusal)
+            return
+        self._reply(port, replace(answer, data=data, size=len(data)))
+        port.burst = replace(burst, sequence=burst.sequence + 1 & 0xFFFF, offset=burst.offset + len(data))
+
+    # ------------------------------------------------------------------------------------ whole files
+
+    def _list(self, port: _Port, request: FtpPacket) -> FtpPacket:
+        path = path_in(request.data[: request.size])
+        if _leaves(path):
+            return request.refuse(MavFtpErr.FILEPROTECTED)
+        try:
+            entries = self.files.entries(path)
+        except FileFault as fault:
+            port.errno = fault.errno
+            return request.refuse(MavFtpErr.FILENOTFOUND)
+        port.errno = 0
+        listing = b""
+        for text in [b"S", b"S", *map(_line, entries)][request.offset :]:
+            if len(listing) + len(text) + 1 > DATA_SIZE:
+                break
+            listing += text + b"\0"
+        if not listing:
+            return request.refuse(MavFtpErr.EOF)
+        return request.acknowledge(listing, offset=request.offset)
+
+    def _change(self, request: FtpPacket, change: Callable[[str], None]) -> FtpPacket:
+        path = path_in(request.data[: request.size])
+        if _leaves(path):
+            return request.refuse(MavFtpErr.FILEPROTECTED)
+        change(path)
+        return request.acknowledge(offset=request.offset)
+
+    def _remove_file(self, _: _Port, request: FtpPacket) -> FtpPacket:
+        return self._change(request, self.files.remove_file)
+
+    def _remove_folder(self, _: _Port, request: FtpPacket) -> FtpPacket:
+        return self._change(request, self.files.remove_folder)
+
+    def _make_folder(self, _: _Port, request: FtpPacket) -> FtpPacket:
+        return self._change(request, self.files.make_folder)
+
+    def _truncate(self, _: _Port, request: FtpPacket) -> FtpPacket:
+        return self._change(request, lambda path: self.files.truncate(path, request.offset))
+
+    def _rename(self, port: _Port, request: FtpPacket) -> FtpPacket:
+        first, _, rest = request.data[: request.size].partition(b"\0")
+        if len(first) + 2 >= request.size:
+            return request.refuse_errno(port.errno or EINVAL)
+        path, to = path_in(first), path_in(rest)
+        if _leaves(path) or _leaves(to):
+            return request.refuse(MavFtpErr.FILEPROTECTED)
+        self.files.rename(path, to)
+        return request.acknowledge(offset=request.offset)
+
+    def _crc32(self, _: _Port, request: FtpPacket) -> FtpPacket:
+        path = path_in(request.data[: request.size])
+        if _leaves(path):
+            return request.refuse(MavFtpErr.FILEPROTECTED)
+        checksum = read_crc32(self.files, path, _CRC_BLOCK)
+        return request.acknowledge(checksum.to_bytes(4, "little"), offset=request.offset)
+
+
+def _is_repeated(request: FtpPacket, last: FtpPacket) -> bool:
+    return request.sequence + 1 == last.sequence and request.client == last.client
+
+
+def _leaves(path: str) -> bool:
+    return ".." in path.split("/")
+
+
+def _line(entry: tuple[str, int | None]) -> bytes:
+    name, size = entry
+    return (f"D{name}" if size is None else f"F{name}\t{size}").encode()
+
+
+_HANDLERS: dict[int, Callable[[Px4Ftp, _Port, FtpPacket], FtpPacket | None]] = {
+    Op.NONE: Px4Ftp._none,
+    Op.TERMINATESESSION: Px4Ftp._terminate,
+    Op.RESETSESSION: Px4Ftp._reset,
+    Op.LISTDIRECTORY: Px4Ftp._list,
+    Op.OPENFILERO: Px4Ftp._open,
+    Op.READFILE: Px4Ftp._read,
+    Op.CREATEFILE: Px4Ftp._open,
+    Op.WRITEFILE: Px4Ftp._write,
+    Op.REMOVEFILE: Px4Ftp._remove_file,
+    Op.CREATEDIRECTORY: Px4Ftp._make_folder,
+    Op.REMOVEDIRECTORY: Px4Ftp._remove_folder,
+    Op.OPENFILEWO: Px4Ftp._open,
+    Op.TRUNCATEFILE: Px4Ftp._truncate,
+    Op.RENAME: Px4Ftp._rename,
+    Op.CALCFILECRC: Px4Ftp._crc32,
+    Op.BURSTREADFILE: Px4Ftp._start_burst,
+}
