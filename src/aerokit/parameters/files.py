@@ -1,0 +1,258 @@
+"""Parameter files of Mission Planner, MAVProxy and QGroundControl: read, told apart, written.
+
+Mission Planner has ``NAME,VALUE`` lines, MAVProxy ``NAME    VALUE``, both with ``#`` comments and no types.
+QGroundControl has five columns with tabs between them: system, component, name, value, MAV_PARAM_TYPE
+(https://docs.qgroundcontrol.com/master/en/qgc-dev-guide/file_formats/parameters.html). A file that is not whole in
+every line is refused: half a set of parameters is worse than none.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Literal
+
+from aerokit.errors import FileFormatError, LocalProtocolError
+from aerokit.parameters.diff import ParameterValues, plain_values
+from aerokit.parameters.number_text import number_text, parse_number
+from aerokit.parameters.parameter import Parameter, ParameterType, check_name, checked_value
+from aerokit.parameters.table import ParameterTable
+
+__all__ = [
+    "FileFormat",
+    "ParameterFile",
+    "parameter_file_text",
+    "parse_parameter_file",
+    "read_parameter_file",
+    "write_parameter_file",
+]
+
+FileFormat = Literal["missionplanner", "mavproxy", "qgroundcontrol"]
+"""Whose file it is."""
+
+_AUTOPILOT = 1
+_COLUMNS = "system id, component id, name, value and type with tabs between them"
+
+
+class ParameterFile(Mapping[str, "int | float"]):
+    """What a parameter file says: name → value, and what else there is.
+
+    A value is an int when it is written like one. ``types`` are those that the file tells (QGroundControl's do),
+    ``comments`` the texts behind ``#`` on lines of their own, ``component_id`` whose parameters they are.
+    """
+
+    def __init__(
+        self,
+        values: Mapping[str, int | float],
+        *,
+        format: FileFormat,  # noqa: A002
+        types: Mapping[str, ParameterType] | None = None,
+        comments: Iterable[str] = (),
+        component_id: int | None = None,
+    ) -> None:
+        self._values = dict(values)
+        self.format: FileFormat = format
+        self.types = dict(types or {})
+        self.comments = tuple(comments)
+        self.component_id = component_id
+
+    def __getitem__(self, name: str) -> int | float:
+        return self._values[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+    def __repr__(self) -> str:
+        return f"<ParameterFile: {len(self)} parameters ({self.format})>"
+
+    def table(self) -> ParameterTable:
+        """As a table; what the file tells no type of becomes REAL32."""
+        return ParameterTable.from_values(self._values, self.types)
+
+
+def read_parameter_file(path: str | os.PathLike[str], *, component_id: int | None = None) -> ParameterFile:
+    """Read a file of any of the three formats; which one is seen from its first parameter.
+
+    Of a QGroundControl file with several components ``component_id`` chooses one; the autopilot's (1) otherwise. Raises
+    :class:`FileFormatError` naming the line for a damaged one, a name twice, NaN, a name over 16 characters;
+    OSError when the file cannot be read.
+    """
+    try:
+        text = Path(path).read_bytes().decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise FileFormatError(f"{os.fspath(path)} is no parameter file: it is no text (UTF-8)") from None
+    return parse_parameter_file(text, os.fspath(path), component_id=component_id)
+
+
+def parse_parameter_file(
+    text: str, source: str = "parameters", *, component_id: int | None = None
+) -> ParameterFile:
+    """The same of a text; ``source`` is its name in errors."""
+    comments: list[str] = []
+    lines: list[tuple[str, str]] = []
+    for number, line in enumerate(text.splitlines(), 1):
+        content, mark, comment = line.partition("#")
+        if content.strip():
+            lines.append((f"{source}, line {number}", content))
+        elif mark:
+            comments.append(comment.strip())
+    if not lines:
+        raise FileFormatError(f"{source} has no parameters in it")
+    if "\t" in lines[0][1] and len(lines[0][1].split()) > 2:
+        return _parse_qgroundcontrol(lines, comments, source, component_id)
+    return _parse_names_and_values(lines, comments)
+
+
+def write_parameter_file(
+    path: str | os.PathLike[str],
+    values: ParameterValues,
+    format: FileFormat = "missionplanner",  # noqa: A002
+    *,
+    comments: Iterable[str] = (),
+    system_id: int = 1,
+    component_id: int = _AUTOPILOT,
+) -> None:
+    """Write a table, the values of another file, or a dict, sorted by name, with the digits that 32-bit numbers have.
+
+    The file appears whole or not at all. Raises :class:`LocalProtocolError` for names and values that cannot be sent,
+    before anything is written. ``system_id`` and ``component_id`` stand in QGroundControl's format only.
+    """
+    text = parameter_file_text(
+        values, format, comments=comments, system_id=system_id, component_id=component_id
+    )
+    target = Path(path)
+    part = target.with_name(target.name + ".part")
+    try:
+        part.write_text(text, encoding="utf-8", newline="\n")
+        part.replace(target)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def parameter_file_text(
+    values: ParameterValues,
+    format: FileFormat = "missionplanner",  # noqa: A002
+    *,
+    comments: Iterable[str] = (),
+    system_id: int = 1,
+    component_id: int = _AUTOPILOT,
+) -> str:
+    """What :func:`write_parameter_file` writes."""
+    if format not in ("missionplanner", "mavproxy", "qgroundcontrol"):
+        raise LocalProtocolError(f"format = {format!r} must be missionplanner, mavproxy or qgroundcontrol")
+    rows = sorted(_rows(values), key=lambda row: row[0])
+    if not rows:
+        raise LocalProtocolError("there are no parameters to write")
+    lines = [f"# {line}".rstrip() for comment in comments for line in comment.splitlines() or [""]]
+    if format == "qgroundcontrol":
+        lines += ["# Vehicle-Id Component-Id Name Value Type"]
+        lines += [f"{system_id}\t{component_id}\t{n}\t{value}\t{int(kind)}" for n, value, kind in rows]
+    else:
+        template = "{},{}" if format == "missionplanner" else "{:<16} {}"
+        lines += [template.format(name, value) for name, value, _ in rows]
+    return "\n".join(lines) + "\n"
+
+
+# --------------------------------------------------------------------------------------- reading
+
+
+def _parse_names_and_values(lines: list[tuple[str, str]], comments: list[str]) -> ParameterFile:
+    values: dict[str, int | float] = {}
+    for place, line in lines:
+        fields = line.replace(",", " ").split()
+        if len(fields) != 2:
+            raise FileFormatError(f"{place}: {line.strip()!r} is no NAME,VALUE or NAME VALUE{_hint(fields)}")
+        _put(values, place, fields[0], fields[1], ParameterType.REAL32)
+    is_planner = "," in lines[0][1]
+    return ParameterFile(values, format="missionplanner" if is_planner else "mavproxy", comments=comments)
+
+
+def _parse_qgroundcontrol(
+    lines: list[tuple[str, str]], comments: list[str], source: str, component_id: int | None
+) -> ParameterFile:
+    values: dict[int, dict[str, int | float]] = {}
+    types: dict[int, dict[str, ParameterType]] = {}
+    for place, line in lines:
+        component, name, text, kind = _columns(place, line)
+        _put(values.setdefault(component, {}), place, name, text, kind)
+        types.setdefault(component, {})[name] = kind
+    chosen = _component(component_id, values, source)
+    return ParameterFile(
+        values[chosen],
+        format="qgroundcontrol",
+        types=types[chosen],
+        comments=comments,
+        component_id=chosen,
+    )
+
+
+def _columns(place: str, line: str) -> tuple[int, str, str, ParameterType]:
+    fields = line.strip().split("\t")
+    numbers = [fields[i] if len(fields) == 5 else "" for i in (0, 1, 4)]
+    if not all(number.isascii() and number.isdigit() for number in numbers):
+        raise FileFormatError(f"{place}: {line.strip()!r} is not {_COLUMNS}")
+    kind = int(numbers[2])
+    if not 1 <= kind <= 10:
+        raise FileFormatError(f"{place}: type {kind} is no MAV_PARAM_TYPE (1 to 10)")
+    return int(numbers[1]), fields[2].strip(), fields[3].strip(), ParameterType(kind)
+
+
+def _component(asked: int | None, values: Mapping[int, object], source: str) -> int:
+    if asked is not None and asked in values:
+        return asked
+    if asked is None and (_AUTOPILOT in values or len(values) == 1):
+        return _AUTOPILOT if _AUTOPILOT in values else next(iter(values))
+    there = ", ".join(str(component) for component in sorted(values))
+    wanted = "which component is meant" if asked is None else f"nothing of component {asked}"
+    raise FileFormatError(f"{source} does not say {wanted}: it has the components {there}")
+
+
+def _put(values: dict[str, int | float], place: str, name: str, text: str, kind: ParameterType) -> None:
+    """Check a name and a value as for sending, and keep the value as it is written."""
+    try:
+        number = parse_number(text)
+    except ValueError:
+        raise FileFormatError(f"{place}: {name} = {text!r} is no finite number") from None
+    try:
+        checked = checked_value(check_name(name), number, kind)
+    except LocalProtocolError as error:
+        raise FileFormatError(f"{place}: {error}") from None
+    if name in values:
+        raise FileFormatError(f"{place}: {name} stands in the file a second time")
+    values[name] = checked if kind.is_integer else number
+
+
+def _hint(fields: list[str]) -> str:
+    if fields[0].startswith("@") or fields[-1].upper() == "@READONLY":
+        return " (@include and @READONLY of ArduPilot's files of defaults are not understood)"
+    return ""
+
+
+# --------------------------------------------------------------------------------------- writing
+
+
+def _rows(values: ParameterValues) -> Iterator[tuple[str, str, ParameterType]]:
+    """Name, text of the value, type; all of it checked."""
+    types = values.types if isinstance(values, ParameterFile) else {}
+    numbers = plain_values(values)
+    for name, number in numbers.items():
+        given = values[name]
+        guess = ParameterType.INT32 if isinstance(number, int) else ParameterType.REAL32
+        kind = given.type if isinstance(given, Parameter) else types.get(name, guess)
+        yield _writable(name), _value_text(name, number, kind), kind
+
+
+def _writable(name: str) -> str:
+    """A name that its line can be read back with."""
+    if any(character in check_name(name) for character in "#,"):
+        raise LocalProtocolError(f"parameter name = {name!r} cannot stand in a file: it has a # or a comma")
+    return name
+
+
+def _value_text(name: str, number: float, kind: ParameterType) -> str:
+    checked = checked_value(name, number, kind)
+    return repr(checked) if kind is ParameterType.REAL64 else number_text(checked)
