@@ -17,12 +17,14 @@ from served_copter import served, served_copter
 
 import aerokit
 import aerokit.sync
+import aerokit.sync.files
 from aerokit import errors, events, messages
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.runtime.cells import StateCell
 from aerokit.runtime.connection import open_connection
 from aerokit.runtime.subscription import Subscription
 from aerokit.sim import SimulatedCopter
+from aerokit.vehicle.files import Files
 from aerokit.vehicle.guided import Guided, SetpointStream
 from aerokit.vehicle.setpoints import VelocitySetpoint
 
@@ -71,6 +73,7 @@ TWINS: list[tuple[type, type, set[str]]] = [
     (StateCell, aerokit.sync.StateCell, {"observe", "set", "forget", "close"}),
     (Guided, aerokit.sync.Guided, set()),
     (SetpointStream, aerokit.sync.SetpointStream, set()),
+    (Files, aerokit.sync.files.Files, set()),
     (Subscription, aerokit.sync.Subscription, set()),
 ]
 MEMBERS = [

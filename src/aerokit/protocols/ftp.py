@@ -9,13 +9,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, TypeVar
 
 from aerokit.errors import FileError, FileTimeout
+from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
 from aerokit.mavlink.messages import FileTransferProtocol
 from aerokit.protocols.ftp_message import (
     DATA_SIZE,
     OPERATIONS,
-    FtpErrorCode,
     FtpMessage,
-    FtpOpcode,
     file_error,
     path_bytes,
 )
@@ -28,10 +27,8 @@ if TYPE_CHECKING:
 __all__ = [
     "DATA_SIZE",
     "FtpClient",
-    "FtpErrorCode",
     "FtpExchange",
     "FtpMessage",
-    "FtpOpcode",
     "FtpRequest",
     "FtpSessionLost",
     "path_bytes",
@@ -41,10 +38,15 @@ ResultT = TypeVar("ResultT")
 
 SEQUENCES = 0x10000
 SESSIONS = 255
-SLOW_REQUESTS = (FtpOpcode.CALC_FILE_CRC32, FtpOpcode.TERMINATE_SESSION)
+SLOW_REQUESTS = (MavFtpOpcode.CALCFILECRC, MavFtpOpcode.TERMINATESESSION)
 """The vehicle reads a whole file, or takes over what was written to it, before it answers."""
 SLOW_ANSWER_S = 0.25
 MOST_RENUMBERED = 3
+NEED_SESSION = (MavFtpOpcode.READFILE, MavFtpOpcode.WRITEFILE, MavFtpOpcode.BURSTREADFILE)
+NO_SESSION = (MavFtpErr.INVALIDSESSION, MavFtpErr.FILENOTFOUND, MavFtpErr.FILEEXISTS)
+"""What they are answered when no file is open: by PX4, by ArduPilot, and by a PX4 that has said once that a file exists
+already: it says so of whatever it refuses until another operation fails in the system.
+"""
 
 
 class FtpSessionLost(FileError):
@@ -124,7 +126,7 @@ class FtpExchange(Transfer[ResultT]):
             return
         if self._is_from_target(message) and self._client.is_for_us(message):
             reply = FtpMessage.decode(message.payload)
-            if reply.opcode in (FtpOpcode.ACK, FtpOpcode.NAK):
+            if reply.opcode in (MavFtpOpcode.ACK, MavFtpOpcode.NAK):
                 self._receive_reply(reply, now)
 
     def _receive_reply(self, reply: FtpMessage, now: float) -> None:
@@ -134,7 +136,10 @@ class FtpExchange(Transfer[ResultT]):
         self._outbox.append(self._client.message(request))
 
     def _refused(self, reply: FtpMessage) -> FileError:
-        return file_error(reply.request_opcode, self._path, reply.error_code, reply.errno)
+        error = file_error(reply.request_opcode, self._path, reply.error_code, reply.errno)
+        if reply.request_opcode in NEED_SESSION and error.code in NO_SESSION:
+            return FtpSessionLost(str(error), path=error.path, code=error.code)
+        return error
 
 
 class FtpRequest(FtpExchange[FtpMessage]):
@@ -148,7 +153,7 @@ class FtpRequest(FtpExchange[FtpMessage]):
     def __init__(
         self,
         client: FtpClient,
-        opcode: FtpOpcode,
+        opcode: MavFtpOpcode,
         *,
         path: str,
         session: int = 0,
@@ -172,6 +177,21 @@ class FtpRequest(FtpExchange[FtpMessage]):
     def message(self) -> FileTransferProtocol:
         """The request as it is sent."""
         return self._client.message(self._request)
+
+    @property
+    def path(self) -> str:
+        """What it is about."""
+        return self._path
+
+    @property
+    def session(self) -> int:
+        """The session that it names."""
+        return self._request.session
+
+    @property
+    def is_answered(self) -> bool:
+        """Whether it was carried out."""
+        return self._result is not None
 
     def start(self, now: float) -> None:
         """Send it, unless that was done."""
@@ -222,7 +242,7 @@ class FtpRequest(FtpExchange[FtpMessage]):
 
     def _receive_other(self, reply: FtpMessage, now: float) -> None:
         """ArduPilot finishes a burst before it looks at the next request."""
-        if self._request.opcode == FtpOpcode.TERMINATE_SESSION and reply.session == self._request.session:
+        if self._request.opcode == MavFtpOpcode.TERMINATESESSION and reply.session == self._request.session:
             self._moved_at = now
             self._wait(now)
 
@@ -235,13 +255,13 @@ class FtpRequest(FtpExchange[FtpMessage]):
     def _is_done_before(self, reply: FtpMessage) -> bool:
         """A NAK says that what was asked for is so already."""
         opcode, code = self._request.opcode, reply.error_code
-        if opcode == FtpOpcode.TERMINATE_SESSION:
+        if opcode == MavFtpOpcode.TERMINATESESSION:
             return True  # there is no such session, or no longer
         if self.attempts == 1:
             return False  # else: an earlier sending did it, and its answer was lost
-        if opcode in (FtpOpcode.REMOVE_FILE, FtpOpcode.REMOVE_DIRECTORY):
-            return code == FtpErrorCode.FILE_NOT_FOUND
-        return opcode == FtpOpcode.CREATE_DIRECTORY and code == FtpErrorCode.FILE_EXISTS
+        if opcode in (MavFtpOpcode.REMOVEFILE, MavFtpOpcode.REMOVEDIRECTORY):
+            return code == MavFtpErr.FILENOTFOUND
+        return opcode == MavFtpOpcode.CREATEDIRECTORY and code == MavFtpErr.FILEEXISTS
 
     @property
     def _operation(self) -> str:

@@ -6,17 +6,15 @@ See https://mavlink.io/en/services/ftp.html.
 from __future__ import annotations
 
 import struct
-from enum import IntEnum
 
 from aerokit.errors import FileError, LocalProtocolError
+from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
 from aerokit.snapshot import Snapshot
 
 __all__ = [
     "DATA_SIZE",
     "PATH_SIZE",
-    "FtpErrorCode",
     "FtpMessage",
-    "FtpOpcode",
     "file_error",
     "path_bytes",
 ]
@@ -29,57 +27,18 @@ HEADER = struct.Struct("<HBBBBBxI")
 PAYLOAD_SIZE = HEADER.size + DATA_SIZE
 
 
-class FtpOpcode(IntEnum):
-    """What a message asks for or answers (https://mavlink.io/en/services/ftp.html#opcodes)."""
-
-    NONE = 0
-    TERMINATE_SESSION = 1
-    RESET_SESSIONS = 2
-    LIST_DIRECTORY = 3
-    OPEN_FILE_RO = 4
-    READ_FILE = 5
-    CREATE_FILE = 6
-    WRITE_FILE = 7
-    REMOVE_FILE = 8
-    CREATE_DIRECTORY = 9
-    REMOVE_DIRECTORY = 10
-    OPEN_FILE_WO = 11
-    TRUNCATE_FILE = 12
-    RENAME = 13
-    CALC_FILE_CRC32 = 14
-    BURST_READ_FILE = 15
-    ACK = 128
-    NAK = 129
-
-
-class FtpErrorCode(IntEnum):
-    """Why a request was refused (https://mavlink.io/en/services/ftp.html#error_codes)."""
-
-    NONE = 0
-    FAIL = 1
-    FAIL_ERRNO = 2
-    INVALID_DATA_SIZE = 3
-    INVALID_SESSION = 4
-    NO_SESSIONS_AVAILABLE = 5
-    EOF = 6
-    UNKNOWN_COMMAND = 7
-    FILE_EXISTS = 8
-    FILE_PROTECTED = 9
-    FILE_NOT_FOUND = 10
-
-
 CODES: dict[int, str] = {
-    FtpErrorCode.NONE: "no reason given",
-    FtpErrorCode.FAIL: "it failed, no reason given",
-    FtpErrorCode.FAIL_ERRNO: "it failed",
-    FtpErrorCode.INVALID_DATA_SIZE: "the size of the data is not valid",
-    FtpErrorCode.INVALID_SESSION: "no file is open in this session, or another program has one open",
-    FtpErrorCode.NO_SESSIONS_AVAILABLE: "another program has a file open, or left one open",
-    FtpErrorCode.EOF: "end of file",
-    FtpErrorCode.UNKNOWN_COMMAND: "the vehicle does not know this operation",
-    FtpErrorCode.FILE_EXISTS: "it exists already",
-    FtpErrorCode.FILE_PROTECTED: "it is write protected",
-    FtpErrorCode.FILE_NOT_FOUND: "no such file or directory",
+    MavFtpErr.NONE: "no reason given",
+    MavFtpErr.FAIL: "it failed, no reason given",
+    MavFtpErr.FAILERRNO: "it failed",
+    MavFtpErr.INVALIDDATASIZE: "the size of the data is not valid",
+    MavFtpErr.INVALIDSESSION: "no file is open in this session, or another program has one open",
+    MavFtpErr.NOSESSIONSAVAILABLE: "another program has a file open, or left one open",
+    MavFtpErr.EOF: "end of file",
+    MavFtpErr.UNKNOWNCOMMAND: "the vehicle does not know this operation",
+    MavFtpErr.FILEEXISTS: "it exists already",
+    MavFtpErr.FILEPROTECTED: "it is write protected",
+    MavFtpErr.FILENOTFOUND: "no such file or directory",
 }
 ERRNOS = {
     1: ("EPERM", "not permitted"),
@@ -110,28 +69,28 @@ ERRNOS = {
 """Of Linux, NuttX and newlib, which agree in the small numbers."""
 
 OPERATIONS: dict[int, str] = {
-    FtpOpcode.TERMINATE_SESSION: "close",
-    FtpOpcode.RESET_SESSIONS: "reset sessions",
-    FtpOpcode.LIST_DIRECTORY: "list",
-    FtpOpcode.OPEN_FILE_RO: "open for reading",
-    FtpOpcode.READ_FILE: "read",
-    FtpOpcode.CREATE_FILE: "create",
-    FtpOpcode.WRITE_FILE: "write",
-    FtpOpcode.REMOVE_FILE: "remove",
-    FtpOpcode.CREATE_DIRECTORY: "make directory",
-    FtpOpcode.REMOVE_DIRECTORY: "remove directory",
-    FtpOpcode.OPEN_FILE_WO: "open for writing",
-    FtpOpcode.TRUNCATE_FILE: "truncate",
-    FtpOpcode.RENAME: "rename",
-    FtpOpcode.CALC_FILE_CRC32: "compute CRC-32",
-    FtpOpcode.BURST_READ_FILE: "burst read",
+    MavFtpOpcode.TERMINATESESSION: "close",
+    MavFtpOpcode.RESETSESSION: "reset sessions",
+    MavFtpOpcode.LISTDIRECTORY: "list",
+    MavFtpOpcode.OPENFILERO: "open for reading",
+    MavFtpOpcode.READFILE: "read",
+    MavFtpOpcode.CREATEFILE: "create",
+    MavFtpOpcode.WRITEFILE: "write",
+    MavFtpOpcode.REMOVEFILE: "remove",
+    MavFtpOpcode.CREATEDIRECTORY: "make directory",
+    MavFtpOpcode.REMOVEDIRECTORY: "remove directory",
+    MavFtpOpcode.OPENFILEWO: "open for writing",
+    MavFtpOpcode.TRUNCATEFILE: "truncate",
+    MavFtpOpcode.RENAME: "rename",
+    MavFtpOpcode.CALCFILECRC: "compute CRC-32",
+    MavFtpOpcode.BURSTREADFILE: "burst read",
 }
 
 
 class FtpMessage(Snapshot):
     """The payload of one FILE_TRANSFER_PROTOCOL message, a request or a reply.
 
-    ``size`` is that of ``data``, except in READ_FILE and BURST_READ_FILE, where it says how much is wanted.
+    ``size`` is that of ``data``, except in READFILE and BURSTREADFILE, where it says how much is wanted.
     """
 
     sequence: int
@@ -167,17 +126,17 @@ class FtpMessage(Snapshot):
     @property
     def is_ack(self) -> bool:
         """Whether it is the answer to a request that was carried out."""
-        return self.opcode == FtpOpcode.ACK
+        return self.opcode == MavFtpOpcode.ACK
 
     @property
     def error_code(self) -> int:
-        """The reason of a NAK, one of :class:`FtpErrorCode`; FAIL when it gives none."""
-        return self.data[0] if self.data else FtpErrorCode.FAIL
+        """The reason of a NAK, a MAV_FTP_ERR; FAIL when it gives none."""
+        return self.data[0] if self.data else MavFtpErr.FAIL
 
     @property
     def errno(self) -> int | None:
-        """The system's error number behind FAIL_ERRNO."""
-        return self.data[1] if len(self.data) > 1 and self.data[0] == FtpErrorCode.FAIL_ERRNO else None
+        """The system's error number behind FAILERRNO."""
+        return self.data[1] if len(self.data) > 1 and self.data[0] == MavFtpErr.FAILERRNO else None
 
 
 def path_bytes(path: str) -> bytes:
@@ -205,7 +164,7 @@ def file_error(request_opcode: int, path: str, code: int, errno: int | None) -> 
     """The error for a NAK: operation, path, and the reason by name and in words."""
     operation = OPERATIONS.get(request_opcode, f"operation {request_opcode}")
     text = CODES.get(code, "not known to the standard")
-    name = FtpErrorCode(code).name if code in CODES else f"code {code}"
+    name = MavFtpErr(code).name if code in CODES else f"code {code}"
     if errno is not None:
         errno_name, text = ERRNOS.get(errno, (f"errno {errno}", text))
         name = f"{name}, {errno_name}"

@@ -11,6 +11,7 @@ from aerokit.mavlink.dialect import STANDARD
 from aerokit.runtime.connection import MAV_COMP_ID_MISSIONPLANNER
 from aerokit.sync.cells import StateCell
 from aerokit.sync.connection import Connection
+from aerokit.sync.files import Files
 from aerokit.sync.guided import Guided
 from aerokit.sync.loop_thread import LoopThread
 from aerokit.sync.state import VehicleState
@@ -94,6 +95,8 @@ class Vehicle(VehicleState):
         """The connection it is reached by."""
         self.guided = Guided(loop, self.aio.guided)
         """Set-point streams: velocity, position, acceleration, attitude."""
+        self.files = Files(loop, self.aio.files)
+        """The files on it, by MAVFTP."""
 
     def close(self) -> None:
         """Let the vehicle go: link, loop and thread end, calls that wait raise ConnectionClosed. Idempotent.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import anyio
 
@@ -67,7 +67,7 @@ class Transfers:
         except TimeoutError:
             raise OperationTimeout(f"not done within {timeout:g} s; {self._describe()}") from None
 
-    def in_background(self, exchange: Exchange[object], name: str) -> None:
+    def in_background(self, exchange: Exchange[Any], name: str) -> None:
         """Run an exchange that ends something, with nobody waiting; its failure is nobody's."""
 
         async def end() -> None:

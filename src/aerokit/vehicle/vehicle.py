@@ -8,6 +8,7 @@ import anyio
 
 from aerokit.errors import CommandRejected, CommandTimeout
 from aerokit.vehicle.fence import FenceControl
+from aerokit.vehicle.files import Files
 from aerokit.vehicle.flight import FlightActions
 from aerokit.vehicle.guided import Guided
 from aerokit.vehicle.mission import MissionControl
@@ -41,6 +42,8 @@ class Vehicle(FlightActions):
         super().__init__(connection, system_id, component_id, heartbeat)
         self.guided = Guided(self)
         """Set-point streams: velocity, position, acceleration, attitude."""
+        self.files = Files(self._transfers)
+        """The files on it, by MAVFTP."""
         plans = PlanContext(self, getattr(self, "files", None))
         self.mission = MissionControl(plans)
         """The mission it holds: upload, download, start, pause, wait until it is finished."""

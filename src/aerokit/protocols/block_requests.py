@@ -1,0 +1,167 @@
+"""``BlockRequests``: which blocks of a file are asked for or sent next, how many at a time, and which of them again."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from aerokit.protocols.round_trip import RoundTrip
+
+__all__ = ["AdaptiveWindow", "BlockRequests"]
+
+OVERTAKEN = 3
+"""Answers come in the order of their requests. One that so many later ones have overtaken was lost."""
+
+
+class AdaptiveWindow:
+    """How many requests may be under way: as many as the link carries without their answers taking longer.
+
+    It grows while answers come as fast as the fastest ones, and shrinks when they take much longer: they wait in a
+    queue then. Loss says nothing, radios lose frames; only when most is lost, something is too full.
+    """
+
+    def __init__(self, *, start: int = 4, lowest: int = 2, highest: int = 64) -> None:
+        self._size = float(start)
+        self._lowest, self._highest = lowest, highest
+        self._fastest_s: float | None = None
+        self._loss = 0.0
+
+    @property
+    def size(self) -> int:
+        """Requests that may be under way."""
+        return int(self._size)
+
+    def answered(self, seconds: float | None) -> None:
+        """An answer came so long after its request; None when that is not known for sure."""
+        self._loss -= self._loss / 16
+        if seconds is None:
+            return
+        if self._fastest_s is None or seconds < self._fastest_s:
+            self._fastest_s = seconds
+        if seconds <= 1.25 * self._fastest_s + 0.01:
+            self._size = min(self._highest, self._size + 0.5)
+        elif seconds > 2.0 * self._fastest_s + 0.05:
+            self._size = max(self._lowest, self._size - 0.25)
+
+    def lost(self) -> None:
+        """No answer came in time."""
+        self._loss += (1.0 - self._loss) / 16
+        if self._loss > 0.75:
+            self._size = max(self._lowest, self._size / 2)
+            self._loss = 0.5
+
+
+class _Block:
+    __slots__ = ("attempts", "is_clean", "order", "sent_at")
+
+    def __init__(self) -> None:
+        self.attempts = self.order = 0
+        self.sent_at = 0.0
+        self.is_clean = True
+
+
+class BlockRequests:
+    """Requests for blocks by their offsets, a window of them under way.
+
+    One is sent again when its answer is overdue (:class:`RoundTrip`), or when later ones were answered before it.
+    """
+
+    def __init__(
+        self, round_trip: RoundTrip, window: AdaptiveWindow | None = None, *, measures: bool = True
+    ) -> None:
+        self.window = AdaptiveWindow() if window is None else window
+        self._round_trip, self._measures = round_trip, measures
+        self._waiting: dict[int, None] = {}
+        self._under_way: dict[int, _Block] = {}  # in the order of sending
+        self._blocks: dict[int, _Block] = {}
+        self._orders = 0
+        self._busy_at = float("-inf")
+
+    def __len__(self) -> int:
+        return len(self._waiting) + len(self._under_way)
+
+    @property
+    def under_way(self) -> int:
+        """How many wait for their answers."""
+        return len(self._under_way)
+
+    @property
+    def deadline(self) -> float | None:
+        """When the next answer is overdue; None while none is waited for."""
+        return min((self._due_at(block) for block in self._under_way.values()), default=None)
+
+    def ask(self, offset: int) -> None:
+        """Have it sent as soon as there is room; nothing happens when it waits or is under way."""
+        if offset not in self._under_way:
+            self._waiting[offset] = None
+
+    def forget(self, offset: int) -> None:
+        """Send it no more: the block came another way."""
+        self._waiting.pop(offset, None)
+        self._under_way.pop(offset, None)
+        self._blocks.pop(offset, None)
+
+    def forget_from(self, end: int) -> None:
+        """There are no blocks from there on."""
+        for offset in [each for each in (*self._waiting, *self._under_way) if each >= end]:
+            self.forget(offset)
+
+    def busy(self, until: float) -> None:
+        """The server has something else to do: nothing is overdue, and no answer measures."""
+        self._busy_at = until
+
+    def answered(self, offset: int, now: float) -> None:
+        """Its answer has come."""
+        block = self._blocks.get(offset)
+        self.forget(offset)
+        if block is None:
+            return
+        is_clean = block.attempts == 1 and block.sent_at > self._busy_at
+        if is_clean and self._measures:
+            self._round_trip.measured(now - block.sent_at)
+        self.window.answered(now - block.sent_at if is_clean else None)
+        if block.attempts == 1:
+            self._give_up_overtaken(block.order)
+
+    def take_due(self, now: float, *, limit: int | None = None) -> list[int]:
+        """The offsets to be sent now, first those to be sent again; they count as sent. ``limit``: of the window."""
+        overdue = [offset for offset, block in self._under_way.items() if self._due_at(block) <= now]
+        self._put_first(overdue)
+        size = self.window.size if limit is None else min(limit, self.window.size)
+        due: list[int] = []
+        while self._waiting and len(self._under_way) < size:
+            offset = next(iter(self._waiting))
+            del self._waiting[offset]
+            self._send(offset, now)
+            due.append(offset)
+        return due
+
+    def attempts(self, offset: int) -> int:
+        """How often it was sent."""
+        block = self._blocks.get(offset)
+        return 0 if block is None else block.attempts
+
+    def _due_at(self, block: _Block) -> float:
+        return max(block.sent_at, self._busy_at) + self._round_trip.timeout_s(block.attempts)
+
+    def _send(self, offset: int, now: float) -> None:
+        self._orders += 1
+        block = self._blocks.setdefault(offset, _Block())
+        block.attempts += 1
+        block.order, block.sent_at = self._orders, now
+        self._under_way[offset] = block
+
+    def _give_up_overtaken(self, order: int) -> None:
+        overtaken = []
+        for offset, block in self._under_way.items():
+            if block.order > order - OVERTAKEN:
+                break
+            overtaken.append(offset)
+        self._put_first(overtaken)
+
+    def _put_first(self, offsets: list[int]) -> None:
+        if offsets:
+            for offset in offsets:
+                del self._under_way[offset]
+                self.window.lost()
+            self._waiting = {**dict.fromkeys(offsets), **self._waiting}

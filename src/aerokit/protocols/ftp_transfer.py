@@ -1,0 +1,361 @@
+"""MAVFTP: the content of an open file, down by bursts and up by many writes at a time.
+
+What servers do (ArduPilot 4.7, PX4 1.17), and what follows from it:
+
+- A burst is answered by blocks without further requests. ArduPilot sends 500 of them and looks at nothing else
+  meanwhile; five requests wait, more are dropped. PX4 answers reads while it bursts, and a new burst replaces the
+  one under way. So missing blocks are asked for at once, four at a time while the burst goes on, more afterwards.
+- Blocks are always asked for whole and at multiples of their size: ``@PARAM/param.pck`` is packed for one block size.
+- The size that ArduPilot gives for what begins with ``@`` is a guess. Only the end of file tells.
+- The end of file of a burst comes as a NAK. ArduPilot's has the offset of the last block when that one was full.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+from aerokit.errors import FileTimeout
+from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
+from aerokit.protocols.block_requests import BlockRequests
+from aerokit.protocols.ftp import SEQUENCES, FtpClient, FtpExchange
+from aerokit.protocols.ftp_message import DATA_SIZE, FtpMessage
+from aerokit.protocols.round_trip import RoundTrip
+from aerokit.protocols.transfer import PATIENCE_S, OnProgress
+
+if TYPE_CHECKING:
+    from aerokit.protocols.reassembly import Reassembly
+
+__all__ = ["FtpDownload", "FtpUpload", "is_virtual"]
+
+NO_BURST = (MavFtpErr.FAIL, MavFtpErr.UNKNOWNCOMMAND)
+WHILE_BURSTING = 4
+MOST_GAPS = 512
+"""With more blocks missing than that, they are fetched before the burst goes on: their followers are in memory."""
+BURST_BLOCKS = 500
+BUSY_BLOCKS = 3
+SILENT_BLOCKS = 10
+"""So many blocks in a row are hardly ever lost: the burst has ended."""
+
+
+def is_virtual(path: str) -> bool:
+    """Whether the vehicle makes this file up when it is read: its size is a guess, and so is its checksum."""
+    return path.startswith("@")
+
+
+class _Burst(NamedTuple):
+    sequence: int
+    offset: int
+
+    def blocks_before(self, reply: FtpMessage) -> int:
+        """How many blocks were sent before this reply to it."""
+        return (reply.sequence - self.sequence - 1) % SEQUENCES
+
+    def has_sent(self, reply: FtpMessage) -> bool:
+        """Whether this block is of this burst: number and place belong together."""
+        blocks, rest = divmod(reply.offset - self.offset, DATA_SIZE)
+        return rest == 0 and blocks >= 0 and blocks % SEQUENCES == self.blocks_before(reply)
+
+    def end(self, reply: FtpMessage) -> int | None:
+        """Where the file ends according to this NAK; None when it is not of this burst."""
+        blocks = self.blocks_before(reply)
+        if blocks == 0:
+            return self.offset
+        last = self.offset + (blocks - 1) * DATA_SIZE
+        if not last <= reply.offset <= last + DATA_SIZE:
+            return None
+        return reply.offset if reply.offset > last else last + DATA_SIZE
+
+
+class FtpDownload(FtpExchange[int]):
+    """All of an open file from ``into.position`` on; the result is its size. ``into`` keeps what came in any case.
+
+    Args:
+        session: of the open file.
+        size: what the server said of it when it was opened.
+    """
+
+    def __init__(
+        self,
+        client: FtpClient,
+        path: str,
+        into: Reassembly,
+        *,
+        session: int,
+        size: int,
+        round_trip: RoundTrip | None = None,
+        patience_s: float = PATIENCE_S,
+        on_progress: OnProgress | None = None,
+    ) -> None:
+        super().__init__(client, path, round_trip=round_trip, patience_s=patience_s, on_progress=on_progress)
+        self._into, self._session = into, session
+        self._size = None if is_virtual(path) or size == 0 else size
+        self._seen = into.position
+        self._requests = BlockRequests(self.round_trip)
+        self._reads: dict[int, int] = {}
+        """Sequence numbers of reads, and the offsets of their blocks."""
+        self._bursts: list[_Burst] = []
+        self._is_bursting = False
+        self._burst_fails = 0
+        self._has_burst = True
+        self._burst_at = 0.0
+        self._last_block = (0.0, -1)
+        self._interval = RoundTrip(shortest_s=0.001)
+
+    def start(self, now: float) -> None:
+        """Ask for the first burst, and for the blocks that are missing already."""
+        self._begin(now)
+        self._go_on(now)
+
+    def expire(self, now: float) -> None:
+        """Ask again for what is overdue, or give up."""
+        if self.done:
+            return
+        if self._is_out_of_patience(now):
+            self._fail(self._timed_out())
+            return
+        if self._is_bursting and now >= self._burst_due_at:
+            self._is_bursting = False
+            self._burst_fails += 1
+        self._go_on(now)
+
+    # ------------------------------------------------------------------------------- replies
+
+    def _receive_reply(self, reply: FtpMessage, now: float) -> None:
+        if reply.request_opcode == MavFtpOpcode.BURSTREADFILE:
+            self._receive_burst(reply, now)
+        elif reply.request_opcode == MavFtpOpcode.READFILE:
+            offset = self._reads.pop((reply.sequence - 1) % SEQUENCES, None)
+            if offset is not None:
+                self._receive_read(offset, reply, now)
+        if not self.done:
+            self._go_on(now)
+
+    def _receive_burst(self, reply: FtpMessage, now: float) -> None:
+        for burst in reversed(self._bursts):
+            if reply.is_ack and burst.has_sent(reply):
+                self._take_block(burst, reply, now)
+                return
+            end = None if reply.is_ack else burst.end(reply)
+            if end is not None:
+                self._end_burst(burst, end, reply)
+                return
+
+    def _take_block(self, burst: _Burst, reply: FtpMessage, now: float) -> None:
+        is_latest = burst is self._bursts[-1]
+        if is_latest:
+            self._note_time(burst.blocks_before(reply), now)
+        self._burst_at, self._burst_fails = now, 0
+        self._requests.busy(now + BUSY_BLOCKS * (self._interval.smoothed_s or 0.0))
+        if is_latest and reply.burst_complete:
+            self._is_bursting = False
+        self._add(reply.offset, reply.data, now)
+
+    def _note_time(self, number: int, now: float) -> None:
+        """How long answers take, and how fast the blocks follow each other."""
+        before_at, before = self._last_block
+        if before < 0 and number == 0 and self._burst_fails == 0:
+            self.round_trip.measured(now - before_at)
+        elif 0 <= before < number:
+            self._interval.measured((now - before_at) / (number - before))
+        self._last_block = (now, max(number, before))
+
+    def _end_burst(self, burst: _Burst, end: int, reply: FtpMessage) -> None:
+        is_latest = burst is self._bursts[-1]
+        if is_latest:
+            self._is_bursting, self._burst_fails = False, 0
+        if reply.error_code == MavFtpErr.EOF:
+            self._end_at(end)
+        elif is_latest and reply.error_code in NO_BURST and self._into.done == self._into.start:
+            self._has_burst = False
+        elif is_latest:
+            self._fail(self._refused(reply))
+
+    def _receive_read(self, offset: int, reply: FtpMessage, now: float) -> None:
+        self._requests.answered(offset, now)
+        if reply.is_ack and reply.data:
+            self._add(offset, reply.data, now)
+        elif reply.is_ack or reply.error_code == MavFtpErr.EOF or self._is_past_size(offset):
+            self._end_at(offset)
+        else:
+            self._fail(self._refused(reply))
+
+    def _end_at(self, end: int) -> None:
+        self._into.end_at(end)
+        self._requests.forget_from(end)
+
+    def _is_past_size(self, offset: int) -> bool:
+        """PX4 says that a file exists already where it means its end, once it has said so of another file."""
+        return self._size is not None and offset >= self._size
+
+    def _add(self, offset: int, data: bytes, now: float) -> None:
+        if self._into.add(offset, data):
+            self._requests.forget(offset)
+            self._move(now, self._into.done, self._total)
+
+    # -------------------------------------------------------------------------------- requests
+
+    def _go_on(self, now: float) -> None:
+        """Finish, or ask for whatever can be asked for now."""
+        into = self._into
+        if into.is_complete or (self._size is not None and into.position >= self._size):
+            self._finish(into.position)
+            return
+        self._ask_for_gaps()
+        if not self._has_burst:
+            self._ask_ahead()
+        limit = WHILE_BURSTING if self._is_bursting else None
+        for offset in self._requests.take_due(now, limit=limit):
+            self._read(offset)
+        if self._wants_burst:
+            self._burst(now)
+        self._set_deadline()
+
+    def _ask_for_gaps(self) -> None:
+        """Those that were not seen before."""
+        while self._seen < self._into.tail:
+            if self._seen in self._into.gaps:
+                self._requests.ask(self._seen)
+            self._seen += DATA_SIZE
+
+    @property
+    def _wants_burst(self) -> bool:
+        if self._is_bursting or not self._has_burst or self._into.end is not None:
+            return False
+        is_all_sent = self._size is not None and self._into.tail >= self._size
+        return not is_all_sent and len(self._into.gaps) < MOST_GAPS
+
+    def _ask_ahead(self) -> None:
+        """Without bursts, ask for the blocks behind the last one, too."""
+        if self._into.end is None:
+            for number in range(self._requests.window.size):
+                self._requests.ask(self._into.tail + number * DATA_SIZE)
+
+    def _read(self, offset: int) -> None:
+        sequence = self._client.next_sequence()
+        self._reads[sequence] = offset
+        self._send(FtpMessage(sequence, MavFtpOpcode.READFILE, self._session, DATA_SIZE, offset=offset))
+
+    def _burst(self, now: float) -> None:
+        """Ask for everything behind the last block. The numbers of its replies are kept free: else a server might take
+        a later request for this one, and give its last reply again.
+        """
+        offset = self._into.tail
+        blocks = BURST_BLOCKS if self._size is None else max(BURST_BLOCKS, (self._size - offset) // DATA_SIZE)
+        sequence = self._client.next_sequence(min(blocks + 3, SEQUENCES // 2))
+        self._bursts = [*self._bursts[-7:], _Burst(sequence, offset)]
+        self._is_bursting, self._burst_at, self._last_block = True, now, (now, -1)
+        self._send(FtpMessage(sequence, MavFtpOpcode.BURSTREADFILE, self._session, DATA_SIZE, offset=offset))
+
+    @property
+    def _burst_due_at(self) -> float:
+        """When the burst must have ended, or was never begun."""
+        silence = self.round_trip.timeout_s(1 + self._burst_fails)
+        if self._last_block[1] >= 0 and self._interval.smoothed_s is not None:
+            silence += max(SILENT_BLOCKS * self._interval.smoothed_s, self._interval.timeout_s())
+        return self._burst_at + silence
+
+    def _set_deadline(self) -> None:
+        deadline = self._moved_at + self._patience_s
+        due_at = self._requests.deadline
+        if due_at is not None:
+            deadline = min(deadline, due_at)
+        if self._is_bursting:
+            deadline = min(deadline, self._burst_due_at)
+        self.deadline = deadline
+
+    # ------------------------------------------------------------------------------------ ends
+
+    @property
+    def _total(self) -> int | None:
+        return self._size if self._into.end is None else self._into.end
+
+    def _timed_out(self) -> FileTimeout:
+        missing = self._into.missing(self._size)
+        return FileTimeout(
+            f"read {self._path}: nothing has come for {self._patience_s:g} s, {self._into.done} bytes are there,"
+            f" {len(missing)} ranges are missing, the first one from {missing[0][0] if missing else 0} on",
+            missing=missing,
+        )
+
+
+class FtpUpload(FtpExchange[None]):
+    """Write ``data`` to an open file: by blocks, several at a time, each of them until it is acknowledged."""
+
+    def __init__(
+        self,
+        client: FtpClient,
+        path: str,
+        data: bytes,
+        *,
+        session: int,
+        round_trip: RoundTrip | None = None,
+        patience_s: float = PATIENCE_S,
+        on_progress: OnProgress | None = None,
+    ) -> None:
+        super().__init__(client, path, round_trip=round_trip, patience_s=patience_s, on_progress=on_progress)
+        self._data, self._session = data, session
+        self._requests = BlockRequests(self.round_trip)
+        self._unwritten = dict.fromkeys(range(0, len(data), DATA_SIZE))
+        self._written = 0
+        self._sequences: dict[int, int] = {}
+        self._offsets: dict[int, int] = {}
+
+    def start(self, now: float) -> None:
+        """Send the first blocks."""
+        self._begin(now)
+        for offset in self._unwritten:
+            self._requests.ask(offset)
+        self._go_on(now)
+
+    def expire(self, now: float) -> None:
+        """Send again what is overdue, or give up."""
+        if self.done:
+            return
+        if self._is_out_of_patience(now):
+            missing = tuple((offset, len(self._block(offset))) for offset in self._unwritten)
+            self._fail(
+                FileTimeout(
+                    f"write {self._path}: nothing was acknowledged for {self._patience_s:g} s,"
+                    f" {len(missing)} of {-(-len(self._data) // DATA_SIZE)} blocks are missing",
+                    missing=missing,
+                )
+            )
+        else:
+            self._go_on(now)
+
+    def _receive_reply(self, reply: FtpMessage, now: float) -> None:
+        offset = self._offsets.get((reply.sequence - 1) % SEQUENCES)
+        if reply.request_opcode != MavFtpOpcode.WRITEFILE or offset not in self._unwritten:
+            return
+        if not reply.is_ack:
+            self._fail(self._refused(reply))
+            return
+        del self._unwritten[offset]
+        self._requests.answered(offset, now)
+        self._written += len(self._block(offset))
+        self._move(now, self._written, len(self._data))
+        self._go_on(now)
+
+    def _go_on(self, now: float) -> None:
+        if not self._unwritten:
+            self._finish(None)
+            return
+        for offset in self._requests.take_due(now):
+            self._write(offset)
+        patient = self._moved_at + self._patience_s
+        due_at = self._requests.deadline
+        self.deadline = patient if due_at is None else min(patient, due_at)
+
+    def _write(self, offset: int) -> None:
+        """Send a block; again under the same number, so that the server may answer without writing once more."""
+        sequence = self._sequences.get(offset)
+        if sequence is None:
+            sequence = self._sequences[offset] = self._client.next_sequence()
+            self._offsets[sequence] = offset
+        data = self._block(offset)
+        self._send(
+            FtpMessage(sequence, MavFtpOpcode.WRITEFILE, self._session, len(data), offset=offset, data=data)
+        )
+
+    def _block(self, offset: int) -> bytes:
+        return self._data[offset : offset + DATA_SIZE]
