@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import anyio
@@ -11,7 +12,7 @@ from aerokit.protocols.round_trip import RoundTrip
 from aerokit.runtime.driver import run_exchange
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     from aerokit.autopilots.base import Autopilot
     from aerokit.autopilots.version import AutopilotVersion
@@ -58,11 +59,20 @@ class Transfers:
         """
         if self.is_closed:
             raise ConnectionClosed("the block of this vehicle was left; nothing was sent")
+        with self.limit(timeout):
+            try:
+                return await run_exchange(self.connection, self.system_id, exchange)
+            except OperationTimeout as error:
+                error.args = (f"{error}; {self._describe()}",)
+                raise
+
+    @contextmanager
+    def limit(self, timeout: float | None) -> Iterator[None]:
+        """Seconds for all of a block; then :class:`OperationTimeout`. None: no limit."""
         try:
             with anyio.fail_after(timeout):
-                return await run_exchange(self.connection, self.system_id, exchange)
-        except OperationTimeout as error:
-            error.args = (f"{error}; {self._describe()}",)
+                yield
+        except OperationTimeout:
             raise
         except TimeoutError:
             raise OperationTimeout(f"not done within {timeout:g} s; {self._describe()}") from None
@@ -77,6 +87,17 @@ class Transfers:
                 return  # the vehicle ends it by itself after its own time-out
 
         self.background.start(end, f"aerokit {name}")
+
+    @property
+    def version(self) -> AutopilotVersion | None:
+        """What the autopilot said of itself, None while it has not."""
+        return self._version.latest
+
+    @property
+    def known_capabilities(self) -> int | None:
+        """MAV_PROTOCOL_CAPABILITY bits of the autopilot, None while it has not told them."""
+        version = self._version.latest
+        return None if version is None else version.capabilities
 
     async def capabilities(self) -> int | None:
         """MAV_PROTOCOL_CAPABILITY bits of the autopilot; None when it does not tell within a few seconds."""

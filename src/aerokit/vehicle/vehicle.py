@@ -12,6 +12,7 @@ from aerokit.vehicle.files import Files
 from aerokit.vehicle.flight import FlightActions
 from aerokit.vehicle.guided import Guided
 from aerokit.vehicle.mission import MissionControl
+from aerokit.vehicle.parameters import Parameters
 from aerokit.vehicle.plans import PlanContext
 from aerokit.vehicle.rally import RallyControl
 
@@ -44,6 +45,9 @@ class Vehicle(FlightActions):
         """Set-point streams: velocity, position, acceleration, attitude."""
         self.files = Files(self._transfers)
         """The files on it, by MAVFTP."""
+        self.parameters = Parameters(self._transfers, self.files)
+        """The autopilot's parameters: download, get, set, transactions, what was changed."""
+        self._detach.append(self.parameters._attach())
         plans = PlanContext(self, getattr(self, "files", None))
         self.mission = MissionControl(plans)
         """The mission it holds: upload, download, start, pause, wait until it is finished."""
@@ -60,6 +64,7 @@ class Vehicle(FlightActions):
     def _on_reboot(self) -> None:
         super()._on_reboot()
         self.mission._forget()
+        self.parameters._forget()
 
     def _start(self, heartbeat: Heartbeat, rates: Mapping[type[Message], float] | None) -> None:
         self.telemetry.receive(heartbeat)

@@ -1,0 +1,283 @@
+"""``ParameterList``: all parameters of a vehicle by PARAM_REQUEST_LIST, holes asked for as soon as they are seen.
+
+https://mavlink.io/en/services/parameter.html#read_all
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from aerokit.errors import ParameterTimeout
+from aerokit.mavlink.messages import ParamError, ParamRequestList, ParamRequestRead, ParamValue
+from aerokit.parameters import Parameter, ParameterTable
+from aerokit.parameters.encoding import UNKNOWN_INDEX, parameter_of
+from aerokit.parameters.px4_hash import HASH_NAME
+from aerokit.protocols.parameter_requests import updated
+from aerokit.protocols.request_window import RequestWindow
+from aerokit.protocols.transfer import PATIENCE_S, OnProgress, Transfer
+
+if TYPE_CHECKING:
+    from aerokit.mavlink.message import Message
+    from aerokit.protocols.round_trip import RoundTrip
+
+__all__ = ["ParameterList"]
+
+PAUSES = 4
+"""The stream has stopped when nothing comes for so many of its longest pauses."""
+BEGUN = 2
+"""With so many values the stream has begun: it is not asked for afresh any more."""
+SHORTEST_START_S = 0.3
+"""A list may take that long to begin; asking again would make it begin anew."""
+ROUNDS = 3
+"""How often indices are asked for again that have shifted since."""
+REFUSALS = 2
+DOES_NOT_EXIST = 1
+
+
+class _Slot:
+    __slots__ = ("count", "parameter")
+
+    def __init__(self, parameter: Parameter, count: int) -> None:
+        self.parameter, self.count = parameter, count
+
+
+class ParameterList(Transfer[ParameterTable]):
+    """Ask for the whole list once; a hole in the stream of answers is asked for by its index at once, in a window.
+
+    The vehicle says how many there are. That number may change meanwhile (ArduPilot shows a group when it is enabled,
+    PX4 counts a parameter once it is used), and the indices behind the change with it: when the names do not add up,
+    what came before the change is asked for again. Values with the index 65535 are no part of the list.
+
+    Raises from ``result()``:
+        ParameterTimeout: nothing new for ``patience_s`` seconds; ``missing`` are the indices that did not come.
+    """
+
+    expects = (ParamValue, ParamError)
+
+    def __init__(
+        self,
+        target_system: int,
+        target_component: int,
+        *,
+        bytewise: bool,
+        round_trip: RoundTrip | None = None,
+        patience_s: float = PATIENCE_S,
+        on_progress: OnProgress | None = None,
+    ) -> None:
+        super().__init__(
+            target_system,
+            target_component,
+            round_trip=round_trip,
+            patience_s=patience_s,
+            on_progress=on_progress,
+        )
+        self._bytewise = bytewise
+        self._window: RequestWindow[int] = RequestWindow(self.round_trip)
+        self._slots: dict[int, _Slot] = {}
+        self._names: dict[str, Parameter] = {}
+        self._refusals: dict[int, int] = {}
+        self._count: int | None = None
+        self._streamed_count: int | None = None
+        self._is_to_be_checked = False
+        self._next = 0  # the index that the stream brings next
+        self._streamed = 0
+        self._is_streaming = False
+        self._last_at = 0.0
+        self._pause_s = 0.0
+        self._quiet_at: float | None = None
+        self._list_attempts = 0
+        self._rounds = 0
+
+    # ---------------------------------------------------------------------------- as an exchange
+
+    def start(self, now: float) -> None:
+        """Ask for the list, and for one value beside: its answer tells how long answers take."""
+        self._begin(now)
+        self._ask_for_list(now)
+        if self.round_trip.smoothed_s is None:
+            self._window.ask(0)
+        self._step(now)
+
+    def receive(self, message: Message, now: float) -> None:
+        """Take one value of the list; others are ignored, as are those of other components."""
+        if self.done or not self._is_from_target(message):
+            return
+        if isinstance(message, ParamValue):
+            self._take(message, now)
+        elif isinstance(message, ParamError):
+            self._take_refusal(message)
+        else:
+            return
+        self._step(now)
+
+    def expire(self, now: float) -> None:
+        """Something is overdue: the beginning of the list, the rest of it, or an answer."""
+        if self.done or self.deadline is None or now < self.deadline:
+            return
+        if self._is_out_of_patience(now):
+            self._fail(ParameterTimeout(self._timeout_text(), missing=self._missing()))
+            return
+        if self._quiet_at is not None and now >= self._quiet_at:
+            self._on_quiet(now)
+        self._step(now)
+
+    # ------------------------------------------------------------------------------- what comes
+
+    def _take(self, message: ParamValue, now: float) -> None:
+        index = message.param_index
+        if index == UNKNOWN_INDEX or message.param_id == HASH_NAME:
+            self._take_uncounted(message, now)
+            return
+        is_streamed = self._is_streaming and index >= self._next
+        self._note_count(message.param_count, is_streamed)
+        if is_streamed:
+            self._take_streamed(index, now)
+        else:
+            self._window.answered(index, now)
+        is_new = index not in self._slots
+        parameter = parameter_of(message, self._bytewise)
+        self._slots[index] = _Slot(parameter, message.param_count)
+        self._names[parameter.name] = parameter
+        if is_new:
+            count = self._count or 0
+            self._move(now, min(len(self._slots), count), count)
+
+    def _take_uncounted(self, message: ParamValue, now: float) -> None:
+        """Somebody has set it, or it is the hash: the list is about to begin."""
+        self._note_count(message.param_count, False)
+        if message.param_id == HASH_NAME:
+            self._last_at = now
+            self._quiet_at = now + self._quiet_s() if self._is_streaming else None
+        elif message.param_id in self._names:
+            told = parameter_of(message, self._bytewise)
+            self._names[told.name] = updated(self._names[told.name], told, self._bytewise)
+
+    def _take_refusal(self, message: ParamError) -> None:
+        """An index that the vehicle has no more: the list has become shorter. Only the index counts, see PX4."""
+        index = message.param_index
+        if message.error != DOES_NOT_EXIST or index not in self._window or index in self._slots:
+            return
+        self._refusals[index] = self._refusals.get(index, 0) + 1
+        if self._refusals[index] >= REFUSALS and self._count is not None:
+            for beyond in range(index, self._count):
+                self._window.forget(beyond)
+            self._count = min(self._count, index)
+
+    def _note_count(self, count: int, is_streamed: bool) -> None:
+        """Take a new count; those in ArduPilot's stream stay what they were at its beginning, and are no news."""
+        if count == (self._streamed_count if is_streamed else self._count):
+            return
+        if is_streamed:
+            self._streamed_count = count
+        self._count, self._is_to_be_checked = count, True
+
+    def _take_streamed(self, index: int, now: float) -> None:
+        """Notice holes in the stream, and learn its pace."""
+        for hole in range(self._next, min(index, self._count or 0)):
+            self._window.ask(hole)
+        if self._streamed:
+            self._pause_s = max(now - self._last_at, 0.98 * self._pause_s)
+        self._next = index + 1
+        self._streamed += 1
+        self._last_at = now
+        self._quiet_at = now + self._quiet_s()
+        if index == 0:
+            self._window.answered(0, now)
+        else:
+            self._window.forget(index)
+        if self._count is not None and self._next >= self._count:
+            self._end_stream()
+
+    # -------------------------------------------------------------------------------- what is sent
+
+    def _ask_for_list(self, now: float) -> None:
+        self._list_attempts += 1
+        self._is_streaming = True
+        self._outbox.append(ParamRequestList(self.target_system, self.target_component))
+        self._quiet_at = now + max(self.round_trip.timeout_s(self._list_attempts), SHORTEST_START_S)
+
+    def _on_quiet(self, now: float) -> None:
+        """The stream has not begun, or has stopped before its end: the rest is asked for by index."""
+        if self._streamed < BEGUN and (self._count is None or self._count > BEGUN):
+            self._ask_for_list(now)
+            return
+        self._end_stream()
+
+    def _end_stream(self) -> None:
+        self._is_streaming, self._quiet_at, self._is_to_be_checked = False, None, True
+
+    def _quiet_s(self) -> float:
+        return max(self.round_trip.timeout_s(), PAUSES * self._pause_s)
+
+    def _step(self, now: float) -> None:
+        """End when all is there, else send what is due."""
+        if not self._is_streaming:
+            self._finish_when_complete()
+        if self.done:
+            return
+        if self._is_to_be_checked and not self._is_streaming:
+            self._is_to_be_checked = False
+            for index in self._missing():
+                self._window.ask(index)
+        for index in self._window.take_due(now):
+            self._outbox.append(ParamRequestRead(self.target_system, self.target_component, "", index))
+        times = (self._window.deadline, self._quiet_at, self._moved_at + self._patience_s)
+        self.deadline = min(at for at in times if at is not None)
+
+    # -------------------------------------------------------------------------------- the end
+
+    def _finish_when_complete(self) -> None:
+        count = self._count
+        if count is None or len(self._slots) < count:
+            return
+        held = [self._slots[index] for index in range(count) if index in self._slots]
+        names = {slot.parameter.name for slot in held}
+        adds_up = len(names) == count == len(self._names)
+        if len(held) == count and (adds_up or not self._drop_shifted(count)):
+            self._finish(ParameterTable(self._in_order(held, names)))
+
+    def _drop_shifted(self, count: int) -> bool:
+        """Forget what came under another count, a few times at most; whether there was any."""
+        shifted = [index for index, slot in self._slots.items() if slot.count != count]
+        if not shifted or self._rounds >= ROUNDS:
+            return False
+        self._rounds += 1
+        self._is_to_be_checked = True
+        for index in shifted:
+            del self._slots[index]
+        return True
+
+    def _in_order(self, held: list[_Slot], names: set[str]) -> list[Parameter]:
+        """By index, each name once and with the value that came last; names that have no index any more at the end."""
+        ordered = dict.fromkeys(slot.parameter.name for slot in held)
+        if self._rounds == 0:
+            ordered.update(dict.fromkeys(name for name in self._names if name not in names))
+        table = []
+        for index, name in enumerate(ordered):
+            latest = self._names[name]
+            table.append(Parameter(name, latest.value, latest.type, None, index))
+        return table
+
+    def _missing(self) -> tuple[int, ...]:
+        return tuple(index for index in range(self._count or 0) if index not in self._slots)
+
+    def _timeout_text(self) -> str:
+        if self._count is None:
+            return f"PARAM_REQUEST_LIST was not answered, sent {self._list_attempts} times"
+        missing = self._missing()
+        return (
+            f"{len(missing)} of {self._count} parameters did not come: nothing new for {self._patience_s:g} s,"
+            f" missing {_ranges(missing)}"
+        )
+
+
+def _ranges(numbers: tuple[int, ...]) -> str:
+    """``3, 7–12 and 40 more``."""
+    ranges: list[list[int]] = []
+    for number in numbers:
+        if ranges and number == ranges[-1][1] + 1:
+            ranges[-1][1] = number
+        else:
+            ranges.append([number, number])
+    texts = [f"{low}" if low == high else f"{low}–{high}" for low, high in ranges]
+    return ", ".join(texts[:10]) + (f" and {len(texts) - 10} more ranges" if len(texts) > 10 else "")

@@ -1,0 +1,107 @@
+"""``ParameterReads``: parameters by name (PARAM_REQUEST_READ).
+
+https://mavlink.io/en/services/parameter.html#read_single
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+from aerokit.errors import ParameterRejected
+from aerokit.mavlink.messages import ParamRequestRead
+from aerokit.parameters.encoding import parameter_of
+from aerokit.protocols.parameter_requests import ParameterRequests
+from aerokit.protocols.transfer import PATIENCE_S, OnProgress
+
+if TYPE_CHECKING:
+    from aerokit.mavlink.message import Message
+    from aerokit.mavlink.messages import ParamValue
+    from aerokit.protocols.round_trip import RoundTrip
+
+__all__ = ["ParameterReads"]
+
+READS_AT_ONCE = 20
+BY_NAME = -1
+PROBE, PROBE_INDEX = "", 0
+"""The request for a parameter that every vehicle has."""
+DOUBT = 1e-3
+"""How probable it may be that a parameter exists although the vehicle, which answers otherwise, says nothing of it."""
+LEAST_ATTEMPTS = 3
+
+
+class ParameterReads(ParameterRequests):
+    """Read some parameters by name; ends with one answer for each.
+
+    ArduPilot, and PX4 until 1.16, meet an unknown name with silence. So a name that is not answered is asked for
+    again together with the parameter of index 0, and when that one comes every time, the vehicle has none of this
+    name: the answer is a ParameterRejected without a code. ``are_doubtful`` begins with that at once.
+    """
+
+    def __init__(
+        self,
+        target_system: int,
+        target_component: int,
+        names: Iterable[str],
+        *,
+        bytewise: bool,
+        are_doubtful: bool = False,
+        own_system: int = 0,
+        round_trip: RoundTrip | None = None,
+        patience_s: float = PATIENCE_S,
+        on_progress: OnProgress | None = None,
+    ) -> None:
+        super().__init__(
+            target_system,
+            target_component,
+            names,
+            bytewise=bytewise,
+            window=READS_AT_ONCE,
+            own_system=own_system,
+            round_trip=round_trip,
+            patience_s=patience_s,
+            on_progress=on_progress,
+        )
+        self._is_probe_wanted = are_doubtful
+        self._probes_sent = self._probes_answered = 0
+
+    def _request(self, name: str) -> list[Message]:
+        target = self.target_system, self.target_component
+        if name == PROBE:
+            self._probes_sent += 1
+            return [ParamRequestRead(*target, "", PROBE_INDEX)]
+        return [ParamRequestRead(*target, name, BY_NAME)]
+
+    def _before_sending(self, now: float) -> None:
+        overdue = [name for name in self._window.overdue(now) if name != PROBE]
+        self._give_up_unknown(overdue, now)
+        self._is_probe_wanted |= bool(overdue)
+
+    def _after_sending(self, now: float) -> None:
+        if self._is_probe_wanted and PROBE not in self._window:
+            self._window.send(PROBE, now)
+            self._outbox += self._request(PROBE)
+        self._is_probe_wanted = False
+
+    def _take(self, message: ParamValue, now: float) -> None:
+        if message.param_index == PROBE_INDEX and self._window.attempts(PROBE):
+            self._probes_answered += 1
+            passed_over = self._window.answered(PROBE, now, overtaken=1)
+            self._give_up_unknown(passed_over, now)
+            self._is_probe_wanted |= bool(passed_over)
+        name = message.param_id
+        if name and name in self._window:
+            self._window.answered(name, now)
+            self._settle(name, parameter_of(message, self._bytewise), now)
+
+    def _give_up_unknown(self, names: list[str], now: float) -> None:
+        """Silence is an answer once it can hardly be loss."""
+        loss = (self._probes_sent - self._probes_answered + 1) / (self._probes_sent + 2)
+        for name in names:
+            attempts = self._window.attempts(name)
+            if self._probes_answered and attempts >= LEAST_ATTEMPTS and loss**attempts < DOUBT:
+                text = f"the vehicle has no parameter {name}: it answers others, and not this one"
+                self._settle(name, ParameterRejected(text, name=name), now)
+
+    def _timeout_text(self, name: str) -> str:
+        return f"{name} was not answered, asked for {self._window.attempts(name)} times"

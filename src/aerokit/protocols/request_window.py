@@ -1,0 +1,132 @@
+"""``RequestWindow``: which of many independent requests are sent when, and which of them again."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable
+from typing import TYPE_CHECKING, Generic, TypeVar
+
+if TYPE_CHECKING:
+    from aerokit.protocols.round_trip import RoundTrip
+
+__all__ = ["RequestWindow"]
+
+KeyT = TypeVar("KeyT", bound=Hashable)
+
+WINDOW = 20
+"""ArduPilot keeps 20 PARAM_REQUEST_READ waiting, and drops what comes beside."""
+OVERTAKEN = 3
+"""Answers come in the order of their requests. One that so many later ones have overtaken was lost."""
+
+
+class _Asked:
+    __slots__ = ("attempts", "due_at", "first_at", "first_order", "order")
+
+    def __init__(self, now: float, order: int) -> None:
+        self.first_at, self.first_order = now, order
+        self.attempts = 0
+        self.order = order
+        self.due_at = now
+
+
+class RequestWindow(Generic[KeyT]):
+    """Requests by key, at most ``size`` of them under way.
+
+    One is sent again when its answer is overdue (:class:`RoundTrip`), or when later requests were answered before it.
+    """
+
+    def __init__(self, round_trip: RoundTrip, *, size: int = WINDOW) -> None:
+        self._round_trip, self._size = round_trip, size
+        self._waiting: dict[KeyT, None] = {}
+        self._under_way: dict[KeyT, _Asked] = {}  # in the order of sending
+        self._asked: dict[KeyT, _Asked] = {}
+        self._ambiguous: dict[KeyT, float] = {}
+        self._orders = 0
+
+    def __len__(self) -> int:
+        return len(self._waiting) + len(self._under_way)
+
+    def __contains__(self, key: object) -> bool:
+        return key in self._waiting or key in self._under_way
+
+    @property
+    def deadline(self) -> float | None:
+        """When the next answer is overdue; None while nothing is under way."""
+        return min((asked.due_at for asked in self._under_way.values()), default=None)
+
+    def attempts(self, key: KeyT) -> int:
+        """How often it was sent so far."""
+        asked = self._asked.get(key)
+        return 0 if asked is None else asked.attempts
+
+    def overdue(self, now: float) -> list[KeyT]:
+        """Those whose answers should have come by now."""
+        return [key for key, asked in self._under_way.items() if asked.due_at <= now]
+
+    def ask(self, key: KeyT) -> None:
+        """Have it sent as soon as there is room; nothing happens when it waits or is under way."""
+        if key not in self:
+            self._waiting[key] = None
+
+    def send(self, key: KeyT, now: float) -> None:
+        """It is sent now, beside the window."""
+        self._waiting.pop(key, None)
+        self._send(key, now)
+
+    def forget(self, key: KeyT) -> None:
+        """Send it no more: its answer came from elsewhere, or is not wanted any longer."""
+        self._waiting.pop(key, None)
+        self._under_way.pop(key, None)
+        self._asked.pop(key, None)
+
+    def answered(self, key: KeyT, now: float, *, overtaken: int = OVERTAKEN) -> list[KeyT]:
+        """Its answer has come; returns those that were sent ``overtaken`` or more before it and are taken for lost."""
+        asked = self._asked.pop(key, None)
+        self._waiting.pop(key, None)
+        self._under_way.pop(key, None)
+        if asked is None:
+            self._answered_again(key)
+            return []
+        if asked.attempts == 1:
+            self._round_trip.measured(now - asked.first_at)
+        else:
+            self._ambiguous[key] = now - asked.first_at
+        lost = []
+        for other, each in self._under_way.items():
+            if each.order > asked.first_order - overtaken:
+                break
+            lost.append(other)
+        self._put_first(lost)
+        return lost
+
+    def take_due(self, now: float) -> list[KeyT]:
+        """What has to be sent now; it counts as sent."""
+        self._put_first(self.overdue(now))
+        due: list[KeyT] = []
+        while self._waiting and len(self._under_way) < self._size:
+            key = next(iter(self._waiting))
+            del self._waiting[key]
+            self._send(key, now)
+            due.append(key)
+        return due
+
+    def _send(self, key: KeyT, now: float) -> None:
+        self._orders += 1
+        asked = self._asked.get(key)
+        if asked is None:
+            asked = self._asked[key] = _Asked(now, self._orders)
+        asked.attempts += 1
+        asked.order = self._orders
+        asked.due_at = now + self._round_trip.timeout_s(asked.attempts)
+        self._under_way[key] = asked
+
+    def _put_first(self, keys: list[KeyT]) -> None:
+        if keys:
+            for key in keys:
+                del self._under_way[key]
+            self._waiting = {**dict.fromkeys(keys), **self._waiting}
+
+    def _answered_again(self, key: KeyT) -> None:
+        """A second answer: the first one was to the first sending, which we had given up too early."""
+        seconds = self._ambiguous.pop(key, None)
+        if seconds is not None:
+            self._round_trip.measured(seconds)

@@ -1,0 +1,278 @@
+"""``ParameterAccess``: parameters of one vehicle by the names they have there: lists, reads, writes."""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING, Literal
+
+import anyio
+
+from aerokit.errors import (
+    FileError,
+    FileTimeout,
+    LocalProtocolError,
+    NotSupported,
+    RemoteProtocolError,
+)
+from aerokit.parameters import Parameter, ParameterTable
+from aerokit.parameters.parameter import same_value
+from aerokit.parameters.px4_hash import HASH_NAME
+from aerokit.protocols.parameter_list import ParameterList
+from aerokit.protocols.parameter_read import ParameterReads
+from aerokit.protocols.parameter_write import ParameterWrites
+from aerokit.vehicle.parameter_cache import ParameterCache, vehicle_key
+from aerokit.vehicle.parameter_store import ParameterStore
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from aerokit.protocols.parameter_requests import Answer
+    from aerokit.protocols.transfer import OnProgress
+    from aerokit.vehicle.files import Files
+    from aerokit.vehicle.transfers import Transfers
+
+__all__ = ["CacheChoice", "DownloadMethod", "ParameterAccess", "UploadMethod"]
+
+DownloadMethod = Literal["auto", "ftp", "list"]
+UploadMethod = Literal["auto", "ftp", "set"]
+CacheChoice = bool | str | os.PathLike[str]
+"""False: no cache; True: the one of this user; or a directory."""
+
+CAPABILITY_FTP = 0x20
+NO_SESSIONS_AVAILABLE = 4
+LEAST_TO_PACK = 10
+"""Fewer changes than that are set one by one: it takes no longer, and each is confirmed by the vehicle itself."""
+MOST_TO_READ_BACK = 100
+"""More than that are read back by a download."""
+
+
+class ParameterAccess:
+    """What the vehicle has, and how to get and change it. Knows nothing of renamed parameters."""
+
+    def __init__(self, transfers: Transfers, files: Files) -> None:
+        self._transfers, self._files = transfers, files
+        self.store = ParameterStore(transfers)
+        self._downloading = anyio.Lock()
+        self._writing = anyio.Lock()
+        self._has_pack: bool | None = None
+
+    def forget(self) -> None:
+        """The vehicle has started anew, perhaps with another firmware."""
+        self.store.forget()
+        self._has_pack = None
+
+    # ------------------------------------------------------------------------------- all of them
+
+    async def download(
+        self,
+        method: DownloadMethod,
+        *,
+        refresh: bool,
+        cache: CacheChoice,
+        patience_s: float,
+        on_progress: OnProgress | None,
+    ) -> ParameterTable:
+        """The whole table; see :meth:`Parameters.download`."""
+        _check_method("method", method, ("auto", "ftp", "list"))
+        async with self._downloading:
+            if self.store.is_complete and not refresh:
+                return self.store.table
+            keeper = None
+            if cache is not False and self._transfers.autopilot.has_parameter_hash:
+                keeper = _Keeper(self, ParameterCache(None if cache is True else cache), patience_s)
+                if await keeper.begin(refresh):
+                    return self.store.table
+            await self._download(method, patience_s, on_progress)
+            if keeper is not None:
+                await keeper.keep()
+            return self.store.table
+
+    async def _download(
+        self, method: DownloadMethod, patience_s: float, on_progress: OnProgress | None
+    ) -> None:
+        if method == "ftp" or (method == "auto" and await self.has_pack()):
+            try:
+                await self._download_pack(patience_s, on_progress)
+                return
+            except (FileError, FileTimeout, NotSupported, RemoteProtocolError) as error:
+                if method == "ftp":
+                    raise
+                self._has_pack = None if getattr(error, "code", None) == NO_SESSIONS_AVAILABLE else False
+        await self._download_list(patience_s, on_progress)
+
+    async def has_pack(self) -> bool:
+        """Whether the vehicle seems to give ``@PARAM/param.pck``: it has MAVFTP, and did not refuse it."""
+        if self._has_pack is not None:
+            return self._has_pack
+        capabilities = await self._transfers.capabilities()
+        return bool(capabilities and capabilities & CAPABILITY_FTP)
+
+    async def _download_pack(self, patience_s: float, on_progress: OnProgress | None) -> None:
+        from aerokit.parameters.pack import PACK_PATH_WITH_DEFAULTS, unpack_parameters
+
+        since = self.store.updates
+        data = await self._files.read(PACK_PATH_WITH_DEFAULTS, patience_s=patience_s, on_progress=on_progress)
+        self.store.replace(unpack_parameters(data), since=since)
+        self._has_pack = True
+
+    async def _download_list(self, patience_s: float, on_progress: OnProgress | None) -> None:
+        transfers = self._transfers
+        table = await transfers.run(
+            ParameterList(
+                transfers.system_id,
+                transfers.component_id,
+                bytewise=self.store.bytewise,
+                round_trip=transfers.round_trip,
+                patience_s=patience_s,
+                on_progress=on_progress,
+            )
+        )
+        defaults = {name: each.default for name, each in self.store.table.items()}
+        self.store.replace(
+            ParameterTable(
+                Parameter(each.name, each.value, each.type, defaults.get(each.name), each.index)
+                for each in table.values()
+            ),
+            since=self.store.updates,
+        )
+
+    # ------------------------------------------------------------------------------- some of them
+
+    async def read(
+        self, names: Iterable[str], patience_s: float, *, are_doubtful: bool = False
+    ) -> dict[str, Answer]:
+        """What the vehicle says of each of them; ``are_doubtful``: perhaps it has none of these names."""
+        names = tuple(names)
+        if not names:
+            return {}
+        transfers = self._transfers
+        return await transfers.run(
+            ParameterReads(
+                transfers.system_id,
+                transfers.component_id,
+                names,
+                bytewise=self.store.bytewise,
+                are_doubtful=are_doubtful,
+                own_system=transfers.connection.source_system,
+                round_trip=transfers.round_trip,
+                patience_s=patience_s,
+            )
+        )
+
+    async def write(
+        self, wanted: Iterable[Parameter], patience_s: float, on_progress: OnProgress | None = None
+    ) -> dict[str, Answer]:
+        """Set each of them; what the vehicle says it is then. Writes of other tasks wait until it is done."""
+        wanted = tuple(wanted)
+        if not wanted:
+            return {}
+        transfers = self._transfers
+        async with self._writing:
+            before = {
+                each.name: each.value for each in map(self.store.get, _names(wanted)) if each is not None
+            }
+            return await transfers.run(
+                ParameterWrites(
+                    transfers.system_id,
+                    transfers.component_id,
+                    wanted,
+                    bytewise=self.store.bytewise,
+                    before=before,
+                    own_system=transfers.connection.source_system,
+                    round_trip=transfers.round_trip,
+                    patience_s=patience_s,
+                    on_progress=on_progress,
+                )
+            )
+
+    async def write_pack(
+        self,
+        wanted: Iterable[Parameter],
+        method: UploadMethod,
+        patience_s: float,
+        on_progress: OnProgress | None,
+    ) -> dict[str, Answer]:
+        """As :meth:`write`, all in one file where that works; what did not arrive that way is set one by one."""
+        _check_method("method", method, ("auto", "ftp", "set"))
+        wanted = tuple(wanted)
+        if method == "set" or (
+            method == "auto" and (len(wanted) < LEAST_TO_PACK or not await self.has_pack())
+        ):
+            return await self.write(wanted, patience_s, on_progress)
+        answers: dict[str, Answer] = {}
+        try:
+            async with self._writing:
+                await self._upload_pack(wanted, patience_s, on_progress)
+            answers = await self._read_back(wanted, patience_s)
+        except (FileError, FileTimeout, NotSupported):
+            if method == "ftp":
+                raise
+        left = [each for each in wanted if not self._is_there(each, answers.get(each.name))]
+        return {each.name: answers[each.name] for each in wanted if each not in left} | await self.write(
+            left, patience_s, on_progress
+        )
+
+    async def _upload_pack(
+        self, wanted: tuple[Parameter, ...], patience_s: float, on_progress: OnProgress | None
+    ) -> None:
+        from aerokit.parameters.pack import PACK_PATH, pack_parameters
+
+        await self._files.write(
+            PACK_PATH, pack_parameters(wanted), patience_s=patience_s, on_progress=on_progress
+        )
+
+    async def _read_back(self, wanted: tuple[Parameter, ...], patience_s: float) -> dict[str, Answer]:
+        if len(wanted) <= MOST_TO_READ_BACK:
+            return await self.read(_names(wanted), patience_s)
+        await self.download("auto", refresh=True, cache=False, patience_s=patience_s, on_progress=None)
+        table = self.store.table
+        return {name: table[name] for name in _names(wanted) if name in table}
+
+    def _is_there(self, wanted: Parameter, answer: Answer | None) -> bool:
+        """Whether a value has arrived; one read back as a number in a float has lost its last bits."""
+        if not isinstance(answer, Parameter):
+            return False
+        if self.store.bytewise:
+            return same_value(answer.value, wanted.value)
+        return same_value(float(answer.value), float(wanted.value))
+
+
+class _Keeper:
+    """One download and the file in the cache that spares it."""
+
+    def __init__(self, access: ParameterAccess, cache: ParameterCache, patience_s: float) -> None:
+        self._access, self._cache, self._patience_s = access, cache, patience_s
+        self._hash: int | None = None
+
+    async def begin(self, refresh: bool) -> bool:
+        """Whether the list on disk is that of the vehicle and wanted: then it is the store's now."""
+        key, store, since = await self._key(), self._access.store, self._access.store.updates
+        self._hash = await self._read_hash()
+        table = None if refresh or self._hash is None else self._cache.load(key, self._hash)
+        if table is None:
+            return False
+        store.replace(table, since=since)
+        return True
+
+    async def keep(self) -> None:
+        """Write the list to disk, if nothing has changed while it came."""
+        if self._hash is not None and self._hash == await self._read_hash():
+            self._cache.save(await self._key(), self._hash, self._access.store.table)
+
+    async def _key(self) -> str:
+        transfers = self._access._transfers
+        await transfers.capabilities()
+        return vehicle_key(transfers.autopilot.name, transfers.system_id, transfers.version)
+
+    async def _read_hash(self) -> int | None:
+        answer = (await self._access.read([HASH_NAME], self._patience_s))[HASH_NAME]
+        return int(answer.value) if isinstance(answer, Parameter) else None
+
+
+def _names(parameters: Iterable[Parameter]) -> list[str]:
+    return [each.name for each in parameters]
+
+
+def _check_method(field: str, method: str, allowed: tuple[str, ...]) -> None:
+    if method not in allowed:
+        raise LocalProtocolError(f"{field} = {method!r} is not allowed: {', '.join(allowed)}")
