@@ -18,14 +18,18 @@ from served_copter import served, served_copter
 import aerokit
 import aerokit.sync
 import aerokit.sync.files
+import aerokit.sync.mission
 from aerokit import errors, events, messages
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.runtime.cells import StateCell
 from aerokit.runtime.connection import open_connection
 from aerokit.runtime.subscription import Subscription
 from aerokit.sim import SimulatedCopter
+from aerokit.vehicle.fence import FenceControl
 from aerokit.vehicle.files import Files
 from aerokit.vehicle.guided import Guided, SetpointStream
+from aerokit.vehicle.mission import MissionControl
+from aerokit.vehicle.rally import RallyControl
 from aerokit.vehicle.setpoints import VelocitySetpoint
 
 LOOP_THREAD = "aerokit loop"
@@ -74,6 +78,9 @@ TWINS: list[tuple[type, type, set[str]]] = [
     (Guided, aerokit.sync.Guided, set()),
     (SetpointStream, aerokit.sync.SetpointStream, set()),
     (Files, aerokit.sync.files.Files, set()),
+    (MissionControl, aerokit.sync.mission.MissionControl, set()),
+    (FenceControl, aerokit.sync.mission.FenceControl, set()),
+    (RallyControl, aerokit.sync.mission.RallyControl, set()),
     (Subscription, aerokit.sync.Subscription, set()),
 ]
 MEMBERS = [

@@ -14,6 +14,7 @@ from aerokit.sync.connection import Connection
 from aerokit.sync.files import Files
 from aerokit.sync.guided import Guided
 from aerokit.sync.loop_thread import LoopThread
+from aerokit.sync.mission import FenceControl, MissionControl, RallyControl
 from aerokit.sync.state import VehicleState
 from aerokit.sync.subscription import Subscription
 from aerokit.vehicle.connect import connect as connect_async
@@ -97,6 +98,12 @@ class Vehicle(VehicleState):
         """Set-point streams: velocity, position, acceleration, attitude."""
         self.files = Files(loop, self.aio.files)
         """The files on it, by MAVFTP."""
+        self.mission = MissionControl(loop, self.aio.mission)
+        """The mission it holds: upload, download, start, pause, wait until it is finished."""
+        self.fence = FenceControl(loop, self.aio.fence)
+        """The fence it holds."""
+        self.rally = RallyControl(loop, self.aio.rally)
+        """The rally points it holds."""
 
     def close(self) -> None:
         """Let the vehicle go: link, loop and thread end, calls that wait raise ConnectionClosed. Idempotent.
