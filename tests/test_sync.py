@@ -19,6 +19,7 @@ import aerokit
 import aerokit.sync
 import aerokit.sync.files
 import aerokit.sync.mission
+import aerokit.sync.parameters
 from aerokit import errors, events, messages
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.runtime.cells import StateCell
@@ -29,6 +30,7 @@ from aerokit.vehicle.fence import FenceControl
 from aerokit.vehicle.files import Files
 from aerokit.vehicle.guided import Guided, SetpointStream
 from aerokit.vehicle.mission import MissionControl
+from aerokit.vehicle.parameters import Parameters, Transaction
 from aerokit.vehicle.rally import RallyControl
 from aerokit.vehicle.setpoints import VelocitySetpoint
 
@@ -81,6 +83,8 @@ TWINS: list[tuple[type, type, set[str]]] = [
     (MissionControl, aerokit.sync.mission.MissionControl, set()),
     (FenceControl, aerokit.sync.mission.FenceControl, set()),
     (RallyControl, aerokit.sync.mission.RallyControl, set()),
+    (Parameters, aerokit.sync.parameters.Parameters, set()),
+    (Transaction, aerokit.sync.parameters.Transaction, set()),
     (Subscription, aerokit.sync.Subscription, set()),
 ]
 MEMBERS = [

@@ -15,6 +15,7 @@ from aerokit.sync.files import Files
 from aerokit.sync.guided import Guided
 from aerokit.sync.loop_thread import LoopThread
 from aerokit.sync.mission import FenceControl, MissionControl, RallyControl
+from aerokit.sync.parameters import Parameters
 from aerokit.sync.state import VehicleState
 from aerokit.sync.subscription import Subscription
 from aerokit.vehicle.connect import connect as connect_async
@@ -98,6 +99,8 @@ class Vehicle(VehicleState):
         """Set-point streams: velocity, position, acceleration, attitude."""
         self.files = Files(loop, self.aio.files)
         """The files on it, by MAVFTP."""
+        self.parameters = Parameters(loop, self.aio.parameters)
+        """The autopilot's parameters: download, get, set, transactions, what was changed."""
         self.mission = MissionControl(loop, self.aio.mission)
         """The mission it holds: upload, download, start, pause, wait until it is finished."""
         self.fence = FenceControl(loop, self.aio.fence)
