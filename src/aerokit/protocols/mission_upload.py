@@ -94,6 +94,11 @@ class MissionUpload(MissionExchange[UploadEnd]):
         self._tail_was_repeated = False
         self._attempt = 1
 
+    @property
+    def was_changing(self) -> bool:
+        """Whether a vehicle that overwrites items as they come may have done so: the whole list is cut before that."""
+        return self.was_begun and not (self._is_partial and self._sent == self._first + 1)
+
     # --------------------------------------------------------------------------------- events
 
     def start(self, now: float) -> None:

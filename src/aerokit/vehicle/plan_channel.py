@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import anyio
 
 from aerokit.errors import MissionRejected, MissionTimeout
-from aerokit.mavlink.enums import MavProtocolCapability
+from aerokit.mavlink.enums import MavMissionType, MavProtocolCapability
 from aerokit.missions.pack import PACKED_NAMES, pack_items, unpack_items
 from aerokit.protocols.mission_download import Downloaded, MissionDownload
 from aerokit.protocols.mission_upload import MissionUpload, UploadEnd
@@ -41,6 +41,7 @@ class PlanChannel:
         self._context = context
         self._options: dict[str, Any] = {"patience_s": patience_s, "on_progress": on_progress}
         self._path = PACKED_NAMES[mission_type]
+        self._has_written = False
 
     # ------------------------------------------------------------------------------- one by one
 
@@ -67,16 +68,16 @@ class PlanChannel:
 
     async def receive(self, only: Sequence[int] | None = None) -> Downloaded:
         """Read all items, or ``only`` some."""
-        context = self._context
-        return await self._run(
+        received = await self._run(
             MissionDownload(
                 *self._target,
-                window=context.autopilot.mission_download_window,
+                window=self._context.autopilot.mission_download_window,
                 only=only,
                 gives_int=await self._has(MavProtocolCapability.MISSION_INT),
                 **self._wire_options,
             )
         )
+        return received.replace(items=self._tidy(received.items))
 
     async def clear(self) -> None:
         """Have the vehicle forget all items."""
@@ -94,14 +95,21 @@ class PlanChannel:
         """Write the file. ArduPilot looks at it when it is closed, and does not tell what it thinks of it."""
         assert self._context.files is not None
         await self._context.files.write(self._path, pack_items(items, self.mission_type), **self._options)
+        self._has_written = True
 
     async def read_file(self) -> tuple[MissionItem, ...]:
         """Read the file; RemoteProtocolError when it is none of this kind."""
         assert self._context.files is not None
         data = await self._context.files.read(self._path, **self._options)
-        return unpack_items(data, self.mission_type)
+        return self._tidy(unpack_items(data, self.mission_type))
 
     # ------------------------------------------------------------------------------------ inside
+
+    def _tidy(self, items: tuple[MissionItem, ...]) -> tuple[MissionItem, ...]:
+        """Outside missions ``autocontinue`` has no meaning, and comes back from ArduPilot as False."""
+        if self.mission_type == MavMissionType.MISSION:
+            return items
+        return tuple(item.replace(autocontinue=True) for item in items)
 
     @property
     def _target(self) -> tuple[int, int]:
@@ -157,6 +165,7 @@ class PlanChannel:
     def _what_is_left(self, exchange: MissionExchange[Any]) -> str:
         if not isinstance(exchange, MissionUpload):
             return ""
-        if exchange.was_begun and self.mission_type in self._context.autopilot.replaced_as_they_come:
+        has_begun = self._has_written or exchange.was_changing
+        if has_begun and self.mission_type in self._context.autopilot.replaced_as_they_come:
             return "; the vehicle now holds a part of the new items and a part of the old ones: upload again, or clear"
         return "; the vehicle holds what it held before"
