@@ -89,6 +89,7 @@ class VehicleCore:
             version=self.telemetry.version,
             background=self._background,
             describe=self.describe_link,
+            round_trip_s=lambda: self._link_watch.round_trip_s,
         )
         self._is_closed = False
         self._detach: list[Detach] = []

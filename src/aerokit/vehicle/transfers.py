@@ -41,15 +41,16 @@ class Transfers:
         version: StateCell[AutopilotVersion],
         background: Background,
         describe: Callable[[], str],
+        round_trip_s: Callable[[], float | None] = lambda: None,
     ) -> None:
         self.connection = connection
         self.system_id, self.component_id = system_id, component_id
         self.autopilot = autopilot
         self.background = background
         self.round_trip = RoundTrip()
-        """Measured by whatever was transferred before."""
+        """Measured by whatever was transferred before, at first by what keeps the clocks together."""
         self.is_closed = False
-        self._version, self._describe = version, describe
+        self._version, self._describe, self._round_trip_s = version, describe, round_trip_s
 
     async def run(self, exchange: Exchange[ResultT], *, timeout: float | None = None) -> ResultT:
         """Run one exchange to its end and return its result.
@@ -60,11 +61,17 @@ class Transfers:
         if self.is_closed:
             raise ConnectionClosed("the block of this vehicle was left; nothing was sent")
         with self.limit(timeout):
+            self._measure_link()
             try:
                 return await run_exchange(self.connection, self.system_id, exchange)
             except OperationTimeout as error:
                 error.args = (f"{error}; {self._describe()}",)
                 raise
+
+    def _measure_link(self) -> None:
+        seconds = self._round_trip_s() if self.round_trip.smoothed_s is None else None
+        if seconds is not None:
+            self.round_trip.measured(seconds)
 
     @contextmanager
     def limit(self, timeout: float | None) -> Iterator[None]:
