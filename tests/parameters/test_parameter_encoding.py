@@ -35,7 +35,7 @@ def over_the_air(message: ParamValue | ParamSet) -> Frame:
     return Frame.parse(FrameEncoder(1, 1).encode(message))
 
 
-@settings(max_examples=200)
+@settings(max_examples=100)
 @given(parameters())
 @example(Parameter("SIGNALLING", -5_000_000, ParameterType.INT32))
 @example(Parameter("SIGNALLING", 0x7F800001, ParameterType.UINT32))

@@ -40,7 +40,7 @@ def undefaulted(table: ParameterTable) -> ParameterTable:
     return ParameterTable(p.replace(default=None) for p in table.values())
 
 
-@settings(max_examples=60)
+@settings(max_examples=40)
 @given(tables(least=1), st.integers(6, 239))
 def test_what_is_served_is_read(table: ParameterTable, block_size: int) -> None:
     assert unpack_parameters(pack_served(table, block_size=block_size)) == undefaulted(table)
@@ -53,7 +53,7 @@ def test_what_is_served_is_read(table: ParameterTable, block_size: int) -> None:
     assert [(n.decode(), v) for n, v, _ in oracle.defaults] == [(p.name, p.default) for p in table.values()]
 
 
-@settings(max_examples=40)
+@settings(max_examples=25)
 @given(tables())
 def test_what_is_uploaded_is_read(table: ParameterTable) -> None:
     data = pack_parameters(table)
@@ -67,7 +67,7 @@ def test_what_is_uploaded_is_read(table: ParameterTable) -> None:
     assert [(n.decode(), v) for n, v, _ in oracle.params] == [(p.name, p.value) for p in table.values()]
 
 
-@settings(max_examples=40)
+@settings(max_examples=25)
 @given(tables(least=3), st.data())
 def test_a_part(table: ParameterTable, data: st.DataObject) -> None:
     start = data.draw(st.integers(0, len(table) - 1))
@@ -77,7 +77,7 @@ def test_a_part(table: ParameterTable, data: st.DataObject) -> None:
     assert unpack_parameters(served, start=start) == ParameterTable(part)
 
 
-@settings(max_examples=40)
+@settings(max_examples=25)
 @given(tables(least=1), st.sampled_from([20, 100, 239]), st.data())
 def test_blocks_of_two_readings_never_give_half_a_value(
     table: ParameterTable, block_size: int, data: st.DataObject
@@ -91,7 +91,7 @@ def test_blocks_of_two_readings_never_give_half_a_value(
     assert all(p.value in (table[p.name].value, later[p.name].value) for p in mixed.values())
 
 
-@settings(max_examples=100)
+@settings(max_examples=50)
 @given(tables(least=2), st.data())
 def test_damage_is_noticed_and_nothing_else_is_raised(table: ParameterTable, data: st.DataObject) -> None:
     whole = pack_served(table, with_defaults=data.draw(st.booleans()))

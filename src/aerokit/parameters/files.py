@@ -227,7 +227,7 @@ def _put(values: dict[str, int | float], place: str, name: str, text: str, kind:
 
 
 def _hint(fields: list[str]) -> str:
-    if fields[0].startswith("@") or fields[-1].upper() == "@READONLY":
+    if any(field.startswith("@") for field in (*fields[:1], *fields[2:])):
         return " (@include and @READONLY of ArduPilot's files of defaults are not understood)"
     return ""
 
