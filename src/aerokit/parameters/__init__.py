@@ -11,7 +11,7 @@ from aerokit.parameters.parameter import Parameter, ParameterType, check_name, c
 from aerokit.parameters.table import ParameterTable
 
 if TYPE_CHECKING:
-    from aerokit.parameters.diff import ParameterDifference, ParameterValues, diff
+    from aerokit.parameters.differences import ParameterDifference, ParameterValues, diff
     from aerokit.parameters.files import (
         FileFormat,
         ParameterFile,
@@ -61,7 +61,7 @@ __all__ = [
 ]
 
 _HOMES = {
-    "diff": "ParameterDifference ParameterValues diff",
+    "differences": "ParameterDifference ParameterValues diff",
     "files": "FileFormat ParameterFile parse_parameter_file read_parameter_file write_parameter_file",
     "metadata": "Metadata ParameterMetadata load_metadata parse_metadata",
     "pack": "pack_parameters unpack_parameters",

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Literal
 
 from aerokit.errors import FileFormatError, LocalProtocolError
-from aerokit.parameters.diff import ParameterValues, plain_values
+from aerokit.parameters.differences import ParameterValues, plain_values
 from aerokit.parameters.number_text import number_text, parse_number
 from aerokit.parameters.parameter import Parameter, ParameterType, check_name, checked_value
 from aerokit.parameters.table import ParameterTable
