@@ -13,53 +13,65 @@ mission = Mission([
 
 from __future__ import annotations
 
-from aerokit.missions.actions import (
-    change_speed,
-    condition_delay,
-    condition_distance,
-    condition_yaw,
-    delay,
-    delay_until,
-    enable_fence,
-    jump,
-    jump_tag,
-    jump_to_tag,
-    land_start,
-    set_relay,
-    set_servo,
-    vtol_transition,
-)
-from aerokit.missions.camera import (
-    point_gimbal,
-    region_of_interest,
-    region_of_interest_none,
-    set_camera_trigger_distance,
-    start_video,
-    stop_photos,
-    stop_video,
-    take_photo,
-    take_photos,
-    trigger_camera,
-)
-from aerokit.missions.fence import Fence, FenceCircle, FencePolygon
-from aerokit.missions.item import MissionItem
-from aerokit.missions.mission import Mission
-from aerokit.missions.navigation import (
-    land,
-    loiter_time,
-    loiter_to_altitude,
-    loiter_turns,
-    loiter_unlimited,
-    rally_point,
-    return_to_launch,
-    spline_waypoint,
-    take_off,
-    vtol_land,
-    vtol_take_off,
-    waypoint,
-)
-from aerokit.missions.rally import RallyPoints
-from aerokit.missions.storage import Storage
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from aerokit.missions.actions import (
+        change_speed,
+        condition_delay,
+        condition_distance,
+        condition_yaw,
+        delay,
+        delay_until,
+        enable_fence,
+        jump,
+        jump_tag,
+        jump_to_tag,
+        land_start,
+        set_relay,
+        set_servo,
+        vtol_transition,
+    )
+    from aerokit.missions.camera import (
+        point_gimbal,
+        region_of_interest,
+        region_of_interest_none,
+        set_camera_trigger_distance,
+        start_video,
+        stop_photos,
+        stop_video,
+        take_photo,
+        take_photos,
+        trigger_camera,
+    )
+    from aerokit.missions.fence import Fence, FenceCircle, FencePolygon
+    from aerokit.missions.item import MissionItem
+    from aerokit.missions.mission import Mission
+    from aerokit.missions.navigation import (
+        land,
+        loiter_time,
+        loiter_to_altitude,
+        loiter_turns,
+        loiter_unlimited,
+        rally_point,
+        return_to_launch,
+        spline_waypoint,
+        take_off,
+        vtol_land,
+        vtol_take_off,
+        waypoint,
+    )
+    from aerokit.missions.plan import Plan
+    from aerokit.missions.plan_file import format_plan, parse_plan, read_plan_file, write_plan_file
+    from aerokit.missions.rally import RallyPoints
+    from aerokit.missions.storage import Storage
+    from aerokit.missions.waypoint_file import (
+        format_waypoints,
+        parse_waypoints,
+        read_waypoint_file,
+        write_waypoint_file,
+    )
 
 __all__ = [
     "Fence",
@@ -67,6 +79,7 @@ __all__ = [
     "FencePolygon",
     "Mission",
     "MissionItem",
+    "Plan",
     "RallyPoints",
     "Storage",
     "change_speed",
@@ -76,6 +89,8 @@ __all__ = [
     "delay",
     "delay_until",
     "enable_fence",
+    "format_plan",
+    "format_waypoints",
     "jump",
     "jump_tag",
     "jump_to_tag",
@@ -85,8 +100,12 @@ __all__ = [
     "loiter_to_altitude",
     "loiter_turns",
     "loiter_unlimited",
+    "parse_plan",
+    "parse_waypoints",
     "point_gimbal",
     "rally_point",
+    "read_plan_file",
+    "read_waypoint_file",
     "region_of_interest",
     "region_of_interest_none",
     "return_to_launch",
@@ -105,4 +124,42 @@ __all__ = [
     "vtol_take_off",
     "vtol_transition",
     "waypoint",
+    "write_plan_file",
+    "write_waypoint_file",
 ]
+
+# Imported when first asked for: whoever flies no mission does not pay for these.
+_MODULES = {
+    "actions": (
+        "change_speed condition_delay condition_distance condition_yaw delay delay_until "
+        "enable_fence jump jump_tag jump_to_tag land_start set_relay set_servo vtol_transition"
+    ),
+    "camera": (
+        "point_gimbal region_of_interest region_of_interest_none set_camera_trigger_distance "
+        "start_video stop_photos stop_video take_photo take_photos trigger_camera"
+    ),
+    "fence": "Fence FenceCircle FencePolygon",
+    "item": "MissionItem",
+    "mission": "Mission",
+    "navigation": (
+        "land loiter_time loiter_to_altitude loiter_turns loiter_unlimited rally_point "
+        "return_to_launch spline_waypoint take_off vtol_land vtol_take_off waypoint"
+    ),
+    "plan": "Plan",
+    "plan_file": "format_plan parse_plan read_plan_file write_plan_file",
+    "rally": "RallyPoints",
+    "storage": "Storage",
+    "waypoint_file": "format_waypoints parse_waypoints read_waypoint_file write_waypoint_file",
+}
+_HOMES = {name: module for module, names in _MODULES.items() for name in names.split()}
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = globals()[name] = getattr(import_module(f"aerokit.missions.{_HOMES[name]}"), name)
+    return value
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *__all__]

@@ -1,0 +1,268 @@
+"""QGroundControl's ``.plan`` files, read and written.
+
+https://docs.qgroundcontrol.com/master/en/qgc-dev-guide/file_formats/plan.html
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from aerokit.errors import FileFormatError, LocalProtocolError
+from aerokit.mavlink.enums import MavCmd, MavFrame
+from aerokit.missions.commands import canonical_frame
+from aerokit.missions.fence import Fence, FenceCircle, FencePolygon
+from aerokit.missions.item import MissionItem
+from aerokit.missions.json_values import JsonValue, load_json
+from aerokit.missions.mission import Mission
+from aerokit.missions.plan import Plan
+from aerokit.missions.plan_items import json_number, merged_entries, read_entries
+from aerokit.missions.rally import RallyPoints
+from aerokit.missions.text_files import read_text
+from aerokit.missions.wire import in_degrees
+from aerokit.position import Position
+
+if TYPE_CHECKING:
+    import os
+
+__all__ = ["format_plan", "parse_plan", "read_plan_file", "write_plan_file"]
+
+_NUMBERS = {
+    "firmware_type": "firmwareType",
+    "vehicle_type": "vehicleType",
+    "cruise_speed_m_s": "cruiseSpeed",
+    "hover_speed_m_s": "hoverSpeed",
+}
+
+
+def read_plan_file(path: str | os.PathLike[str]) -> Plan:
+    """The plan in a file; :class:`FileFormatError` names the file, the place in it and what is expected there.
+
+    Surveys, corridor scans and landing patterns become the items they stand for; other complex items say only how they
+    were planned, so they are refused. Ranges of parameters are left to ``check`` and the vehicle.
+    """
+    return parse_plan(read_text(path), Path(path).name)
+
+
+def write_plan_file(path: str | os.PathLike[str], plan: Plan) -> None:
+    """Write the plan to a file; see :func:`format_plan`."""
+    Path(path).write_text(format_plan(plan), encoding="utf-8")
+
+
+def parse_plan(text: str, name: str = "plan") -> Plan:
+    """The plan of the text of a file; ``name`` is what errors call it."""
+    document = load_json(text, name)
+    document["fileType"].one_of("Plan")
+    document["version"].one_of(1)
+    mission = document.child("mission")
+    fence, rally = document.child("geoFence"), document.child("rallyPoints")
+    if mission is None and fence is None and rally is None:
+        document["mission"]
+    return Plan(
+        Mission() if mission is None else _read_mission(mission),
+        Fence() if fence is None else _read_fence(fence),
+        RallyPoints() if rally is None else _read_rally(rally),
+        *_read_numbers(mission),
+        text,
+    )
+
+
+def format_plan(plan: Plan) -> str:
+    """The text of a file. A plan that was read keeps all that stood there, but for what has become different.
+
+    Raises :class:`LocalProtocolError` for what such a file cannot keep: rally points and a return point of the fence
+    with altitudes other than above home, numbers that are infinite.
+    """
+    if plan.source:
+        document, old = json.loads(plan.source), parse_plan(plan.source)
+    else:
+        document, old = _new_document(), None
+    if old is None or (plan.mission, _numbers(plan)) != (old.mission, _numbers(old)):
+        _update_mission(document, plan, old)
+    if old is None or plan.fence != old.fence:
+        document.setdefault("geoFence", {}).update(_fence_members(plan.fence))
+        if plan.fence.return_point is None:
+            document["geoFence"].pop("breachReturn", None)
+    if old is None or plan.rally != old.rally:
+        points = [_rally_point(item, index) for index, item in enumerate(plan.rally)]
+        document.setdefault("rallyPoints", {}).update({"points": points, "version": 2})
+    try:
+        return json.dumps(document, indent=4, allow_nan=False) + "\n"
+    except ValueError as error:
+        raise LocalProtocolError("a number of the plan is not finite: a .plan file cannot keep it") from error
+
+
+# ------------------------------------------------------------------------------------------- reading
+
+
+def _read_mission(value: JsonValue) -> Mission:
+    value["version"].one_of(2)
+    groups = read_entries(value["items"].elements())
+    home = value.child("plannedHomePosition")
+    items = [item for group in groups for item in group]
+    return Mission(items, None if home is None else _read_place(home, altitude="amsl"))
+
+
+def _read_numbers(mission: JsonValue | None) -> tuple[int, int, float, float]:
+    defaults = _numbers(Plan())
+    if mission is None:
+        return defaults
+    firmware, vehicle, cruise, hover = (mission.child(key) for key in _NUMBERS.values())
+    return (
+        defaults[0] if firmware is None else firmware.integer(0, 0xFF),
+        defaults[1] if vehicle is None else vehicle.integer(0, 0xFF),
+        defaults[2] if cruise is None else cruise.number(),
+        defaults[3] if hover is None else hover.number(),
+    )
+
+
+def _read_fence(value: JsonValue) -> Fence:
+    if _is_empty_and_old(value, "polygon", "polygons", "circles"):
+        return Fence()
+    polygons, circles = (value.child(key) for key in ("polygons", "circles"))
+    point = value.child("breachReturn")
+    return Fence(
+        [_read_polygon(one) for one in (polygons.elements() if polygons else ())],
+        [_read_circle(one) for one in (circles.elements() if circles else ())],
+        None if point is None else _read_place(point, altitude="relative"),
+    )
+
+
+def _is_empty_and_old(value: JsonValue, *keys: str) -> bool:
+    """Of version 1, which had other contents, and without any; QGroundControl itself has written such."""
+    is_empty = not any(value.members().get(key) for key in keys)
+    value["version"].one_of(*((1, 2) if is_empty else (2,)))
+    return bool(value["version"].value == 1)
+
+
+def _read_polygon(value: JsonValue) -> FencePolygon:
+    corners = value["polygon"]
+    places = [_required_place(corner) for corner in corners.elements()]
+    if len(places) < 3:
+        raise corners.error(f"an array of at least 3 places, and it has {len(places)}")
+    return FencePolygon(places, value["inclusion"].boolean())
+
+
+def _read_circle(value: JsonValue) -> FenceCircle:
+    circle = value["circle"]
+    radius = circle["radius"]
+    center = _required_place(circle["center"])
+    try:
+        return FenceCircle(center, radius.number(), value["inclusion"].boolean())
+    except FileFormatError:
+        raise
+    except LocalProtocolError as error:
+        raise radius.error("a number of metres above 0") from error
+
+
+def _read_rally(value: JsonValue) -> RallyPoints:
+    if _is_empty_and_old(value, "points"):
+        return RallyPoints()
+    return RallyPoints([_read_rally_point(point) for point in value["points"].elements()])
+
+
+def _read_rally_point(value: JsonValue) -> MissionItem:
+    latitude, longitude, altitude = value.elements(3)
+    x, y = round(latitude.number(-90, 90) * 1e7), round(longitude.number(-180, 180) * 1e7)
+    frame = MavFrame.GLOBAL_RELATIVE_ALT
+    return MissionItem(MavCmd.NAV_RALLY_POINT, frame, x=x, y=y, z=altitude.number())
+
+
+def _required_place(value: JsonValue) -> Position:
+    latitude, longitude = value.elements(2)
+    return Position(latitude.number(-90, 90), longitude.number(-180, 180))
+
+
+def _read_place(value: JsonValue, *, altitude: str) -> Position | None:
+    """Latitude, longitude, and altitude, where it is given; all null: no place."""
+    elements = value.elements(2, 3)
+    latitude, longitude = elements[0].number(-90, 90, null=True), elements[1].number(-180, 180, null=True)
+    if math.isnan(latitude) or math.isnan(longitude):
+        return None
+    height = elements[2].number(null=True) if len(elements) == 3 else math.nan
+    place = Position(latitude, longitude)
+    return place if math.isnan(height) else place.replace(**{f"altitude_{altitude}_m": height})
+
+
+# ------------------------------------------------------------------------------------------- writing
+
+
+def _new_document() -> dict[str, Any]:
+    return {
+        "fileType": "Plan",
+        "geoFence": {"circles": [], "polygons": [], "version": 2},
+        "groundStation": "QGroundControl",
+        "mission": {},
+        "rallyPoints": {"points": [], "version": 2},
+        "version": 1,
+    }
+
+
+def _numbers(plan: Plan) -> tuple[int, int, float, float]:
+    return plan.firmware_type, plan.vehicle_type, plan.cruise_speed_m_s, plan.hover_speed_m_s
+
+
+def _update_mission(document: dict[str, Any], plan: Plan, old: Plan | None) -> None:
+    mission = document.setdefault("mission", {})
+    if not mission:
+        mission.update({"globalPlanAltitudeMode": 1, "items": [], "version": 2})
+        old = None
+    if old is None or plan.mission.items != old.mission.items:
+        groups = read_entries(JsonValue(mission["items"], "plan", "mission.items").elements())
+        mission["items"] = merged_entries(mission["items"], groups, plan.mission.items)
+    for name, key in _NUMBERS.items():
+        value = getattr(plan, name)
+        if old is None or value != getattr(old, name):
+            mission[key] = json_number(value)
+    if old is None or plan.mission.home != old.mission.home:
+        home = plan.mission.home
+        mission["plannedHomePosition"] = _place_members(home, None if home is None else home.altitude_amsl_m)
+
+
+def _fence_members(fence: Fence) -> dict[str, Any]:
+    members: dict[str, Any] = {
+        "version": 2,
+        "circles": [
+            {
+                "circle": {"center": _place(circle.center), "radius": json_number(circle.radius_m)},
+                "inclusion": circle.inclusion,
+                "version": 1,
+            }
+            for circle in fence.circles
+        ],
+        "polygons": [
+            {
+                "inclusion": polygon.inclusion,
+                "polygon": [_place(one) for one in polygon.vertices],
+                "version": 1,
+            }
+            for polygon in fence.polygons
+        ],
+    }
+    point = fence.return_point
+    if point is not None:
+        if point.altitude_amsl_m is not None:
+            raise LocalProtocolError(
+                f"return_point.altitude_amsl_m = {point.altitude_amsl_m!r}: a .plan file keeps it above home only"
+            )
+        members["breachReturn"] = _place_members(point, point.altitude_relative_m)
+    return members
+
+
+def _rally_point(item: MissionItem, index: int) -> list[int | float | None]:
+    if canonical_frame(item.frame) != MavFrame.GLOBAL_RELATIVE_ALT:
+        raise LocalProtocolError(
+            f"rally[{index}]: frame = {item.frame!r}: a .plan file keeps rally points above home only"
+        )
+    return [*map(json_number, (*in_degrees(item), item.z))]
+
+
+def _place(position: Position) -> list[int | float | None]:
+    return [json_number(position.latitude_deg), json_number(position.longitude_deg)]
+
+
+def _place_members(position: Position | None, altitude: float | None) -> list[int | float | None]:
+    place: list[int | float | None] = [None, None] if position is None else _place(position)
+    return [*place, None if altitude is None else json_number(altitude)]

@@ -1,0 +1,176 @@
+"""The items of a ``.plan`` file: simple ones, and complex ones (surveys, landings), which stand for several.
+
+https://docs.qgroundcontrol.com/master/en/qgc-dev-guide/file_formats/plan.html
+
+Altitudes: ``frame`` and the last of ``params`` are what is flown. ``AltitudeMode``, ``Altitude`` and
+``AMSLAltAboveTerrain`` are what the planner shows; they count where the last of ``params`` is null.
+Jumps lead to the ``doJumpId`` of an item, which QGroundControl counts from 1.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from typing import TYPE_CHECKING, Any
+
+from aerokit.mavlink.enums import MavCmd, MavFrame
+from aerokit.missions.commands import canonical_frame, has_place, xy_scale
+from aerokit.missions.item import MissionItem
+from aerokit.missions.plan_landing import LANDING_PATTERNS, landing_items
+from aerokit.missions.wire import from_degrees, in_degrees
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from aerokit.missions.json_values import JsonValue
+
+__all__ = ["json_number", "merged_entries", "read_entries", "simple_entry"]
+
+_FRAME_OF_MODE = {
+    1: MavFrame.GLOBAL_RELATIVE_ALT,
+    2: MavFrame.GLOBAL,
+    3: MavFrame.GLOBAL,
+    4: MavFrame.GLOBAL_TERRAIN_ALT,
+}
+_MODE_OF_FRAME: dict[int, int] = {0: 2, 3: 1, 10: 4}
+
+
+def read_entries(entries: Sequence[JsonValue]) -> list[tuple[MissionItem, ...]]:
+    """The items of each entry of ``mission.items``, jumps counted from 0 through all of them."""
+    values = [_simple_values(entry) for entry in entries]
+    made = [landing_items(entry) if group is None else () for entry, group in zip(entries, values)]  # noqa: B905
+    sizes = [len(items) if group is None else len(group) for items, group in zip(made, values)]  # noqa: B905
+    ids = _jump_ids(entries, values, sizes)
+    return [
+        items if group is None else tuple(_read_item(value, ids) for value in group)
+        for items, group in zip(made, values)  # noqa: B905 - of one length, all of them
+    ]
+
+
+def merged_entries(
+    entries: Sequence[Any], groups: Sequence[tuple[MissionItem, ...]], items: Sequence[MissionItem]
+) -> list[Any]:
+    """Entries for these items: those old ones at the beginning and the end which still stand for them, then new ones.
+
+    ``groups`` are the items that each old entry stands for.
+    """
+    head, used = 0, 0
+    while head < len(groups) and _alike(groups[head], items[used : used + len(groups[head])]):
+        used += len(groups[head])
+        head += 1
+    tail, left = len(groups), len(items)
+    while tail > head and left - len(groups[tail - 1]) >= used:
+        begin = left - len(groups[tail - 1])
+        if not _alike(groups[tail - 1], items[begin:left]):
+            break
+        tail, left = tail - 1, begin
+    middle = [simple_entry(item) for item in items[used:left]]
+    merged = [*copy.deepcopy(list(entries[:head])), *middle, *copy.deepcopy(list(entries[tail:]))]
+    sizes = [*map(len, groups[:head]), *(1,) * len(middle), *map(len, groups[tail:])]
+    _number(merged, sizes, items)
+    return merged
+
+
+def simple_entry(item: MissionItem) -> dict[str, Any]:
+    """A SimpleItem; its doJumpId and the target of a jump are still to be set."""
+    x, y = in_degrees(item)
+    numbers = (item.param1, item.param2, item.param3, item.param4, x, y, item.z)
+    entry: dict[str, Any] = {}
+    mode = _MODE_OF_FRAME.get(canonical_frame(item.frame))
+    if has_place(item.command) and mode is not None:
+        entry |= {"AMSLAltAboveTerrain": None, "Altitude": json_number(item.z), "AltitudeMode": mode}
+    entry |= {"autoContinue": item.autocontinue, "command": int(item.command), "doJumpId": 0}
+    return entry | {"frame": int(item.frame), "params": [*map(json_number, numbers)], "type": "SimpleItem"}
+
+
+def json_number(value: float) -> int | float | None:
+    """As QGroundControl writes it: null for NaN, no point behind a whole number."""
+    if math.isnan(value):
+        return None
+    return int(value) if math.isfinite(value) and value == int(value) and abs(value) < 2**53 else value
+
+
+def _simple_values(entry: JsonValue) -> list[JsonValue] | None:
+    """The simple items that an entry consists of; None for landing patterns, whose items are made."""
+    kind = entry["type"]
+    kind.one_of("SimpleItem", "ComplexItem")
+    if kind.value == "SimpleItem":
+        return [entry]
+    complex_type = entry["complexItemType"].value
+    if isinstance(complex_type, str) and complex_type in LANDING_PATTERNS:
+        return None
+    body = entry.child("TransectStyleComplexItem")
+    items = body.child("Items") if body is not None else None
+    if items is None or not items.elements():
+        raise entry.error(
+            f"a complex item with TransectStyleComplexItem.Items; this is a {complex_type!r}, of which the file says"
+            " how it was planned, and not which items it consists of"
+        )
+    return items.elements()
+
+
+def _jump_ids(
+    entries: Sequence[JsonValue], values: Sequence[Sequence[JsonValue] | None], sizes: Sequence[int]
+) -> dict[int, int]:
+    """From doJumpId to index; those of simple items win over those within surveys."""
+    found: dict[int, int] = {}
+    inner: dict[int, int] = {}
+    first = 0
+    for entry, group, size in zip(entries, values, sizes):  # noqa: B905 - of one length
+        for index, value in enumerate(group or (), first):
+            number = value.child("doJumpId")
+            key = index + 1 if number is None else number.integer(-1, 2**31)
+            (found if value is entry else inner).setdefault(key, index)
+        first += size
+    return inner | found
+
+
+def _read_item(value: JsonValue, ids: dict[int, int]) -> MissionItem:
+    command, frame = value["command"].integer(0, 0xFFFF), value["frame"].integer(0, 0xFF)
+    params = value["params"].elements(7)
+    numbers = [param.number(null=True) for param in params]
+    if xy_scale(command, frame) == 10_000_000:
+        params[4].number(-90, 90, null=True)
+        params[5].number(-180, 180, null=True)
+    if command == MavCmd.DO_JUMP:
+        numbers[0] = _jump_target(params[0], ids)
+    if math.isnan(numbers[6]) and has_place(command):
+        frame, numbers[6] = _planned_altitude(value, frame)
+    one, two, three, four, latitude, longitude, z = numbers
+    x, y = (from_degrees(number, command, frame) for number in (latitude, longitude))
+    return MissionItem(command, frame, one, two, three, four, x, y, z, value["autoContinue"].boolean())
+
+
+def _jump_target(param: JsonValue, ids: dict[int, int]) -> float:
+    number = param.number()
+    if number not in ids:
+        raise param.error("the doJumpId of an item")
+    return float(ids[int(number)])
+
+
+def _planned_altitude(value: JsonValue, frame: int) -> tuple[int, float]:
+    mode = value.child("AltitudeMode")
+    number = 0 if mode is None else mode.integer(0, 0xFF)
+    altitude = value.child("AMSLAltAboveTerrain" if number == 3 else "Altitude")
+    return _FRAME_OF_MODE.get(number, frame), math.nan if altitude is None else altitude.number(null=True)
+
+
+def _alike(group: Sequence[MissionItem], items: Sequence[MissionItem]) -> bool:
+    """Equal, but for the target of a single jump, which is written anew anyway."""
+    if len(group) == len(items) == 1 and group[0].command == items[0].command == MavCmd.DO_JUMP:
+        return group[0].replace(param1=0.0) == items[0].replace(param1=0.0)
+    return tuple(group) == tuple(items)
+
+
+def _number(entries: Sequence[Any], sizes: Sequence[int], items: Sequence[MissionItem]) -> None:
+    """Count the items from 1, and let jumps lead to these numbers."""
+    first = 0
+    for entry, size in zip(entries, sizes):  # noqa: B905 - of one length
+        body = entry.get("TransectStyleComplexItem", {})
+        for index, simple in enumerate(
+            [entry] if entry["type"] == "SimpleItem" else body.get("Items", []), first
+        ):
+            simple["doJumpId"] = index + 1
+            if simple["command"] == MavCmd.DO_JUMP:
+                simple["params"][0] = json_number(items[index].param1 + 1)
+        first += size

@@ -1,0 +1,182 @@
+"""``QGC WPL`` files (.waypoints, .txt), as Mission Planner, MAVProxy and QGroundControl have them.
+
+https://mavlink.io/en/file_formats/#mission_plain_text_file
+
+A line for each item: index, whether it is the current one, frame, command, parameters 1 to 4, latitude (or x, or
+parameter 5), longitude, altitude, autocontinue, with tabs between them. In version 110 item 0 is home, and jumps count
+it; in version 120 there is none.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from aerokit.errors import FileFormatError, LocalProtocolError
+from aerokit.mavlink.enums import MavCmd, MavFrame
+from aerokit.missions.commands import canonical_frame, xy_scale
+from aerokit.missions.item import MissionItem
+from aerokit.missions.mission import Mission
+from aerokit.missions.text_files import read_text
+from aerokit.missions.wire import from_degrees, in_degrees, shift_jumps
+from aerokit.position import Position
+
+if TYPE_CHECKING:
+    import os
+
+__all__ = ["format_waypoints", "parse_waypoints", "read_waypoint_file", "write_waypoint_file"]
+
+_COLUMNS = (
+    "index",
+    "current",
+    "frame",
+    "command",
+    "param1",
+    "param2",
+    "param3",
+    "param4",
+    "latitude",
+    "longitude",
+    "altitude",
+    "autocontinue",
+)
+
+
+def read_waypoint_file(path: str | os.PathLike[str]) -> Mission:
+    """The mission in a file; :class:`FileFormatError` names the file, the line and what is expected there.
+
+    Spaces will do for tabs, lines that are empty or begin with ``#`` are passed over. The home line becomes
+    ``mission.home``. Files of MAVProxy have places rounded to 1e-6 degrees.
+    """
+    return parse_waypoints(read_text(path), Path(path).name)
+
+
+def write_waypoint_file(path: str | os.PathLike[str], mission: Mission, *, version: int = 110) -> None:
+    """Write the mission to a file; see :func:`format_waypoints`."""
+    Path(path).write_text(format_waypoints(mission, version=version), encoding="utf-8", newline="\n")
+
+
+def parse_waypoints(text: str, name: str = "waypoints") -> Mission:
+    """The mission of the text of a file; ``name`` is what errors call it."""
+    lines = [(number, line.strip()) for number, line in enumerate(text.splitlines(), 1)]
+    lines = [(number, line) for number, line in lines if line and not line.startswith("#")]
+    version = lines[0][1].split() if lines else []
+    if version not in (["QGC", "WPL", "110"], ["QGC", "WPL", "120"]):
+        found = lines[0][1][:40] if lines else "nothing"
+        raise FileFormatError(f"{name}: line 1: expected 'QGC WPL 110', found {found!r}")
+    rows = [
+        _Row(f"{name}: line {number}", line.split(), index) for index, (number, line) in enumerate(lines[1:])
+    ]
+    home = rows[0].home() if rows and version[2] == "110" and rows[0].is_home() else None
+    if home is None:
+        return Mission([row.item() for row in rows])
+    return Mission(shift_jumps([row.item() for row in rows[1:]], -1), home[0])
+
+
+def format_waypoints(mission: Mission, *, version: int = 110) -> str:
+    """The text of a file, in Mission Planner's form; more digits where those would not do.
+
+    Raises :class:`LocalProtocolError` for numbers that are infinite.
+    """
+    if version not in (110, 120):
+        raise LocalProtocolError(
+            f"version = {version!r} is not allowed: 110 (home is item 0) or 120 (no home)"
+        )
+    rows = [f"QGC WPL {version}"]
+    items = mission.items
+    if version == 110:
+        rows.append(_home_row(mission.home))
+        items = shift_jumps(items, 1)
+    rows += [_item_row(item, index) for index, item in enumerate(items, len(rows) - 1)]
+    return "\n".join(rows) + "\n"
+
+
+class _Row:
+    """One line, split into its columns."""
+
+    def __init__(self, where: str, texts: list[str], index: int) -> None:
+        self.where, self.texts = where, texts
+        if len(texts) != len(_COLUMNS):
+            raise FileFormatError(f"{where}: expected {len(_COLUMNS)} columns, found {len(texts)}")
+        if self._integer("index", 0xFFFF) != index:
+            raise FileFormatError(
+                f"{where}: index = {texts[0]}: expected {index}, lines are missing or in disorder"
+            )
+        self.frame, self.command = self._integer("frame", 0xFF), self._integer("command", 0xFFFF)
+        self._integer("current", 0xFF)
+
+    def is_home(self) -> bool:
+        """A waypoint above the sea; Mission Planner has written command 0 there."""
+        return self.command in (0, MavCmd.NAV_WAYPOINT) and canonical_frame(self.frame) == MavFrame.GLOBAL
+
+    def home(self) -> tuple[Position | None]:
+        """Home, None when it is 0°, 0°."""
+        latitude, longitude = self._number("latitude", 90), self._number("longitude", 180)
+        return (Position(latitude, longitude, self._number("altitude")) if latitude or longitude else None,)
+
+    def item(self) -> MissionItem:
+        """The item, as the file counts items."""
+        in_degrees = xy_scale(self.command, self.frame) == 10_000_000
+        x, y = (
+            from_degrees(
+                self._number(column, limit if in_degrees else math.inf, nan=True), self.command, self.frame
+            )
+            for column, limit in (("latitude", 90.0), ("longitude", 180.0))
+        )
+        one, two, three, four = (self._number(f"param{number}", nan=True) for number in (1, 2, 3, 4))
+        z = self._number("altitude", nan=True)
+        return MissionItem(
+            self.command,
+            self.frame,
+            one,
+            two,
+            three,
+            four,
+            x,
+            y,
+            z,
+            bool(self._integer("autocontinue", 0xFF)),
+        )
+
+    def _integer(self, column: str, high: int) -> int:
+        text = self.texts[_COLUMNS.index(column)]
+        if not (text.isascii() and text.isdigit() and int(text[:9]) <= high and len(text) < 9):
+            raise FileFormatError(
+                f"{self.where}: {column} = {text!r}: expected a whole number from 0 to {high}"
+            )
+        return int(text)
+
+    def _number(self, column: str, limit: float = math.inf, *, nan: bool = False) -> float:
+        text = self.texts[_COLUMNS.index(column)]
+        try:
+            value = float(text) if "_" not in text else math.inf
+        except ValueError:
+            value = math.inf
+        if math.isinf(value) or (math.isnan(value) and not nan) or abs(value) > limit:
+            bounds = f" from {-limit:g} to {limit:g}" if math.isfinite(limit) else ""
+            raise FileFormatError(f"{self.where}: {column} = {text!r}: expected a number{bounds}")
+        return value
+
+
+def _home_row(home: Position | None) -> str:
+    latitude, longitude, altitude = (
+        (home.latitude_deg, home.longitude_deg, home.altitude_amsl_m or 0.0) if home else (0.0, 0.0, 0.0)
+    )
+    place = (_text(value, 6) for value in (latitude, longitude, altitude))
+    return "\t".join(("0\t1\t0\t16\t0\t0\t0\t0", *place, "1"))
+
+
+def _item_row(item: MissionItem, index: int) -> str:
+    integers = (index, 0, int(item.frame), int(item.command))
+    numbers = (item.param1, item.param2, item.param3, item.param4, *in_degrees(item))
+    if any(math.isinf(number) for number in (*numbers, item.z)):
+        raise LocalProtocolError(f"{item!r} has an infinite number, which a file cannot keep")
+    texts = (*map(str, integers), *(_text(number, 8) for number in numbers), _text(item.z, 6))
+    return "\t".join((*texts, str(int(item.autocontinue))))
+
+
+def _text(value: float, digits: int) -> str:
+    """That many digits behind the point, or as many as it takes to read the same number again."""
+    text = f"{value:.{digits}f}"
+    return text if float(text) == value or math.isnan(value) else repr(float(value))
