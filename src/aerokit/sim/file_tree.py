@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-__all__ = ["Entry", "FileFault", "FileTree", "Mount", "OpenFile"]
+__all__ = ["Entry", "FileFault", "FileTree", "Mount", "OpenFile", "TextMount"]
 
 ENOENT, EEXIST, ENOTDIR, EISDIR = 2, 17, 20, 21
 EINVAL, ENFILE, ENOSPC, EROFS, ENOTEMPTY = 22, 23, 28, 30, 39
@@ -45,6 +45,9 @@ class OpenFile(ABC):
 class Mount(ABC):
     """Files that are made on the fly, all below one prefix such as ``@PARAM``."""
 
+    is_listed = False
+    """Whether it shows up in the root, and tells what is in it."""
+
     @abstractmethod
     def size(self, path: str) -> int:
         """What an open tells; may be a guess. FileFault when there is no such file."""
@@ -56,6 +59,34 @@ class Mount(ABC):
     def entries(self) -> list[Entry]:
         """What is in it; FileFault when it does not tell."""
         raise FileFault(ENOENT)
+
+
+class TextMount(Mount):
+    """Files that can only be read, such as ArduPilot's ``@SYS``: an open tells 100,000 bytes, whatever there is."""
+
+    is_listed = True
+    _PLACEHOLDER = 100_000
+
+    def __init__(self, texts: dict[str, str]) -> None:
+        self._texts = texts
+
+    def size(self, path: str) -> int:
+        """A placeholder."""
+        if path not in self._texts:
+            raise FileFault(ENOENT)
+        return self._PLACEHOLDER
+
+    def open(self, path: str, *, writing: bool) -> OpenFile:
+        """Read a text."""
+        if writing:
+            raise FileFault(EROFS)
+        if path not in self._texts:
+            raise FileFault(ENOENT)
+        return _Opened(None, _File(self._texts[path].encode()))
+
+    def entries(self) -> list[Entry]:
+        """All of them."""
+        return [(name, self._PLACEHOLDER) for name in self._texts]
 
 
 class _File:
@@ -83,7 +114,7 @@ _Folder = dict[str, "_File | _Folder"]
 
 
 class _Opened(OpenFile):
-    def __init__(self, tree: FileTree, file: _File) -> None:
+    def __init__(self, tree: FileTree | None, file: _File) -> None:
         self._tree = tree
         self._file = file
 
@@ -91,6 +122,8 @@ class _Opened(OpenFile):
         return bytes(self._file.content[offset : offset + size])
 
     def write(self, offset: int, data: bytes) -> None:
+        if self._tree is None:
+            raise FileFault(EROFS)
         content = self._file.content
         self._tree.claim(max(0, offset + len(data) - len(content)))
         if offset > len(content):

@@ -11,6 +11,8 @@ from aerokit.mavlink.enums import MavParamType
 
 __all__ = ["ParameterRow", "Parameters", "stored"]
 
+_VOLATILE = "v"
+
 _RANGES = {
     MavParamType.UINT8: (0, (1 << 8) - 1),
     MavParamType.INT8: (-(1 << 7), (1 << 7) - 1),
@@ -32,6 +34,8 @@ class ParameterRow:
     default: float
     is_volatile: bool = False
     """Left out of PX4's hash: the vehicle changes it by itself."""
+    switch: str | None = None
+    """ArduPilot lists and counts it only while this parameter is not 0; it is there by name at any time."""
 
 
 class Parameters:
@@ -41,62 +45,72 @@ class Parameters:
     """
 
     def __init__(self, rows: Iterable[ParameterRow]) -> None:
-        self._rows = {row.name: row for row in rows}
+        self._rows: dict[str, ParameterRow | str] = {row.name: row for row in rows}
+        self._switched = {row.name: row.switch for row in self._all() if row.switch is not None}
         self._names: tuple[str, ...] | None = None
         self._indices: dict[str, int] = {}
 
     @classmethod
     def from_text(cls, text: str, *, used: Iterable[str] = (), count: int | None = None) -> Parameters:
-        """One ``name,type,value[,default[,v]]`` a line; ``v`` is volatile.
+        """One ``name,type,value[,default[,switch]]`` a line; a switch ``v`` means volatile.
 
         ``count``: only so many, in the text's order, the ``used`` ones among them in any case.
         """
         lines = text.split()
         if count is not None:
             lines = _some_of(lines, frozenset(used), count)
-        return cls(_row(line.split(",")) for line in lines)
+        parameters = cls(())
+        parameters._rows = {line.partition(",")[0]: line for line in lines}
+        parameters._switched = dict(filter(None, map(_switched, lines)))
+        return parameters
 
     def __getitem__(self, name: str) -> float:
-        return self._rows[name].value
+        return self.row(name).value
 
     def __setitem__(self, name: str, value: float) -> None:
         """Raises KeyError for an unknown name."""
-        row = self._rows[name]
+        row = self.row(name)
         row.value = stored(value, row.type)
+        if name in self._switched.values():
+            self._names = None
 
     def __contains__(self, name: object) -> bool:
         return name in self._rows
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._rows)
+        return iter(self.names)
 
     def __len__(self) -> int:
-        return len(self._rows)
+        return len(self.names)
 
     @property
     def names(self) -> tuple[str, ...]:
         """In the vehicle's order: the place here is the index in messages."""
         if self._names is None:
-            self._names = tuple(self._rows)
+            off = {name for name, switch in self._switched.items() if not self[switch]}
+            self._names = tuple(name for name in self._rows if name not in off)
             self._indices = {name: index for index, name in enumerate(self._names)}
         return self._names
 
     def index(self, name: str) -> int:
-        """The place in ``names``."""
+        """The place in ``names``; KeyError when it is not among them."""
         _ = self.names
         return self._indices[name]
 
     def type(self, name: str) -> int:
         """The MAV_PARAM_TYPE."""
-        return self._rows[name].type
+        return self.row(name).type
 
     def default(self, name: str) -> float:
         """What it is after a reset."""
-        return self._rows[name].default
+        return self.row(name).default
 
     def row(self, name: str) -> ParameterRow:
-        """Everything about one of them."""
-        return self._rows[name]
+        """Everything about one of them; read from its line when it is first asked for."""
+        row = self._rows[name]
+        if isinstance(row, str):
+            row = self._rows[name] = _row(row.split(","))
+        return row
 
     def add(self, name: str, value: float, type: int = MavParamType.REAL32) -> None:  # noqa: A002
         """One more at the end, as when a feature is switched on: the count changes while the vehicle runs."""
@@ -106,7 +120,11 @@ class Parameters:
     def remove(self, name: str) -> None:
         """One less: the indices behind it change."""
         del self._rows[name]
+        self._switched.pop(name, None)
         self._names = None
+
+    def _all(self) -> Iterator[ParameterRow]:
+        return (self.row(name) for name in list(self._rows))
 
 
 def stored(value: float, type_: int) -> float:
@@ -120,7 +138,16 @@ def stored(value: float, type_: int) -> float:
 def _row(fields: list[str]) -> ParameterRow:
     name, type_, value = fields[0], int(fields[1]), float(fields[2])
     default = float(fields[3]) if len(fields) > 3 else value
-    return ParameterRow(name, type_, stored(value, type_), stored(default, type_), len(fields) > 4)
+    extra = fields[4] if len(fields) > 4 else None
+    switch = None if extra == _VOLATILE else extra
+    return ParameterRow(name, type_, stored(value, type_), stored(default, type_), extra == _VOLATILE, switch)
+
+
+def _switched(line: str) -> tuple[str, str] | None:
+    """The name and its switch, if it has one."""
+    if line.count(",") < 4 or line.endswith("," + _VOLATILE):
+        return None
+    return line.partition(",")[0], line.rpartition(",")[2]
 
 
 def _some_of(lines: list[str], used: frozenset[str], count: int) -> list[str]:
@@ -128,7 +155,7 @@ def _some_of(lines: list[str], used: frozenset[str], count: int) -> list[str]:
     others = max(0, count - sum(is_used))
     chosen: list[str] = []
     for line, needed in zip(lines, is_used, strict=True):
-        if needed or others > 0:
+        if needed or (others > 0 and _switched(line) is None):
             chosen.append(line)
             others -= not needed
     return chosen

@@ -9,12 +9,12 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode, MavSeverity
-from aerokit.sim.file_tree import FileFault
+from aerokit.sim.file_tree import EISDIR, ENOENT, FileFault
 from aerokit.sim.ftp import DATA_SIZE, FtpPacket, FtpServer, path_in, read_crc32
 
 if TYPE_CHECKING:
     from aerokit.sim.channel import Channel
-    from aerokit.sim.file_tree import FileTree, OpenFile
+    from aerokit.sim.file_tree import Entry, FileTree, OpenFile
     from aerokit.sim.vehicle import SimulatedVehicle
 
 __all__ = ["ArduPilotFtp"]
@@ -129,7 +129,8 @@ class ArduPilotFtp(FtpServer):
         try:
             return handler(self, request)
         except FileFault as fault:
-            return request.refuse_errno(fault.errno)
+            is_open = request.opcode in (Op.OPENFILERO, Op.OPENFILEWO, Op.CREATEFILE)
+            return request.refuse_errno(ENOENT if is_open and fault.errno == EISDIR else fault.errno)
 
     def _close(self) -> None:
         file, self._file = self._file, None
@@ -211,9 +212,9 @@ class ArduPilotFtp(FtpServer):
             data, refusal = b"", request.refuse_errno(fault.errno)
         sequence = request.sequence + 1 + number & 0xFFFF
         if refusal is not None:
-            self._send(
-                replace(refusal, sequence=sequence, offset=self._reply.offset if number else 0), channel
-            )
+            last = self._reply if number else refusal
+            end = replace(refusal, sequence=sequence, offset=last.offset, burst_complete=last.burst_complete)
+            self._send(end, channel)
             self._work()
             return
         is_last = number == _BURST_BLOCKS - 1
@@ -221,7 +222,7 @@ class ArduPilotFtp(FtpServer):
         block = request.acknowledge(data, offset=offset)
         self._send(replace(block, sequence=sequence, burst_complete=complete), channel)
         after = offset + len(data) if len(data) < step else offset
-        self._reply = replace(self._reply, sequence=sequence + 1 & 0xFFFF, offset=after, burst_complete=0)
+        self._reply = replace(self._reply, sequence=sequence + 1 & 0xFFFF, offset=after)
         if is_last:
             self._vehicle.call_later(self.burst_interval_s, self._work)
         else:
@@ -234,7 +235,7 @@ class ArduPilotFtp(FtpServer):
         if not _is_path(request):
             return replace(request.refuse(MavFtpErr.INVALIDDATASIZE), offset=request.offset)
         try:
-            entries = self.files.entries(path_in(request.data))
+            entries = self._entries(path_in(request.data))
         except FileFault as fault:
             return replace(request.refuse_errno(fault.errno), offset=request.offset)
         listing = b""
@@ -242,10 +243,18 @@ class ArduPilotFtp(FtpServer):
             text = f"D{name}" if size is None else f"F{name}\t{size}"
             if len(listing) + len(text) + 1 >= DATA_SIZE:
                 break
-            listing += text.encode() + b"\0"
+            listing += text.encode() + b"\0\0"
         if not listing:
             return replace(request.refuse(MavFtpErr.EOF), offset=request.offset)
         return request.acknowledge(listing, offset=request.offset)
+
+    def _entries(self, path: str) -> list[Entry]:
+        """With the folder itself and the one above, as on Linux; in the root, with the mounts that can be listed."""
+        entries = self.files.entries(path)
+        if self.files.mounted(path) is not None:
+            return entries
+        mounts = [(name, None) for name, mount in self.files.mounts.items() if mount.is_listed]
+        return [(".", None), ("..", None), *entries, *(mounts if path == "/" else [])]
 
     def _make_folder(self, request: FtpPacket) -> FtpPacket:
         return self._change(request, self.files.make_folder)
@@ -263,7 +272,10 @@ class ArduPilotFtp(FtpServer):
     def _change(self, request: FtpPacket, change: Callable[[str], None]) -> FtpPacket:
         if not _is_path(request):
             return request.refuse(MavFtpErr.INVALIDDATASIZE)
-        change(path_in(request.data))
+        path = path_in(request.data)
+        if self.files.mounted(path) is not None:
+            return request.refuse_errno(ENOENT)
+        change(path)
         return request.acknowledge()
 
     def _rename(self, request: FtpPacket) -> FtpPacket:
@@ -272,6 +284,8 @@ class ArduPilotFtp(FtpServer):
         length = len(first.encode()) + len(second.encode())
         if request.size == 0 or request.size not in (length + 1, length + 2):
             return request.refuse(MavFtpErr.INVALIDDATASIZE)
+        if self.files.mounted(first) is not None or self.files.mounted(second) is not None:
+            return request.refuse_errno(ENOENT)
         self.files.rename(first, second)
         return request.acknowledge()
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from aerokit.sim.ardupilot.ftp import ArduPilotFtp
 from aerokit.sim.ardupilot.parameter_server import ArduPilotParameterServer, rounded
-from aerokit.sim.file_tree import FileTree
+from aerokit.sim.file_tree import FileTree, TextMount
 from aerokit.sim.logs import ArduPilotLogServer, SimulatedLog
 from aerokit.sim.mission_files import MissionMount
 from aerokit.sim.parameter_pack_file import ParameterPackMount
@@ -19,6 +19,14 @@ __all__ = ["DEFAULT_LOGS", "LOG_FOLDER", "Storage"]
 
 LOG_FOLDER = "/APM/LOGS"
 DEFAULT_LOGS = (SimulatedLog(186_432, 1_789_990_000), SimulatedLog(45_103, 1_789_995_000))
+
+_SYSTEM_TEXTS = {
+    "threads.txt": "ThreadsV1\n",
+    "tasks.txt": "TasksV2\n",
+    "memory.txt": "MemInfoV1\n",
+    "uarts.txt": "UARTV1\n",
+    "timers.txt": "TIMERV1\n",
+}
 
 _PARAM_VALUE_FRAME, _FTP_FRAME, _LOG_DATA_FRAME = 37, 266, 109
 _PARAMETERS_SHARE, _BURST_SHARE, _LOG_SHARE = 0.3, 1 / 3, 0.5
@@ -42,6 +50,7 @@ class Storage:
         self._copter = copter
         self.files = FileTree()
         self._put_logs(logs)
+        self.files.mounts["@SYS"] = TextMount(_SYSTEM_TEXTS)
         self.files.mounts["@PARAM"] = ParameterPackMount(copter.parameters, self._apply)
         self.files.mounts["@MISSION"] = MissionMount(copter.missions, (copter.system_id, copter.component_id))
         banner = copter.send_banner

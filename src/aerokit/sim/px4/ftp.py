@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
-from aerokit.sim.file_tree import EEXIST, EINVAL, FileFault
+from aerokit.sim.file_tree import EEXIST, FileFault
 from aerokit.sim.ftp import DATA_SIZE, FtpPacket, FtpServer, path_in, read_crc32
 
 if TYPE_CHECKING:
@@ -20,6 +20,7 @@ __all__ = ["Px4Ftp"]
 
 _SESSION_TIMEOUT_S = 10.0
 _REPLY_KEPT = 4
+_BURST_BYTES = 35_000
 _CRC_BLOCK = 256
 
 Op = MavFtpOpcode
@@ -39,19 +40,23 @@ class _Port:
     reply: FtpPacket | None = None
     burst: FtpPacket | None = field(default=None, repr=False)
     """The next block's sequence and offset."""
+    burst_sent: int = 0
+    """Bytes of the burst so far."""
 
 
 class Px4Ftp(FtpServer):
     """A session is number 0, whatever the client says when it opens; it is closed after 10 s without a request.
 
-    A burst ignores the size that is asked for, sends ``burst`` blocks every ``burst_interval_s`` seconds to the
-    end of the file, and ends with a refusal "end of file"; it is never complete before. Small replies are
+    A burst ignores the size that is asked for and sends ``burst`` blocks every ``burst_interval_s`` seconds. It
+    is complete after 35 kB, and to be asked for again, or ends with a refusal "end of file". Small replies are
     repeated for the same sequence number.
     """
 
-    burst = 5
+    burst = 21
 
-    def __init__(self, vehicle: SimulatedVehicle, files: FileTree, *, burst_interval_s: float = 0.01) -> None:
+    def __init__(
+        self, vehicle: SimulatedVehicle, files: FileTree, *, burst_interval_s: float = 0.005
+    ) -> None:
         super().__init__(vehicle, files)
         self.burst_interval_s = burst_interval_s
         self._ports: dict[Channel, _Port] = {}
@@ -88,8 +93,10 @@ class Px4Ftp(FtpServer):
         port.reply = None
         if answer is None:
             return
-        if answer.opcode == Op.NAK and port.errno == EEXIST:
-            answer = request.refuse(MavFtpErr.FILEEXISTS)
+        if answer.opcode == Op.NAK:
+            if port.errno == EEXIST:
+                answer = request.refuse(MavFtpErr.FILEEXISTS)
+            answer = replace(answer, offset=request.offset)
         self._reply(port, answer)
 
     def _reply(self, port: _Port, answer: FtpPacket) -> None:
@@ -100,7 +107,7 @@ class Px4Ftp(FtpServer):
     # ---------------------------------------------------------------------------------------- sessions
 
     def _none(self, port: _Port, request: FtpPacket) -> FtpPacket:
-        return request.acknowledge(offset=request.offset)
+        return request.acknowledge(request.data[: request.size], offset=request.offset)
 
     def _terminate(self, port: _Port, request: FtpPacket) -> FtpPacket:
         if request.session != 0 or port.file is None:
@@ -173,19 +180,21 @@ class Px4Ftp(FtpServer):
         if request.session != 0 or port.file is None:
             return request.refuse(MavFtpErr.INVALIDSESSION)
         is_running = port.burst is not None
-        port.burst = replace(request, sequence=request.sequence + 1 & 0xFFFF)
+        port.burst, port.burst_sent = replace(request, sequence=request.sequence + 1 & 0xFFFF), 0
         if not is_running:
             self._vehicle.call_later(self.burst_interval_s, lambda: self._send_blocks(port))
         return None
 
     def _send_blocks(self, port: _Port) -> None:
-        for _ in range(self.burst):
+        for number in range(self.burst):
             if port.burst is None or port.file is None:
                 return
-            self._send_block(port, port.file, port.burst)
+            self._send_block(port, port.file, port.burst, may_end=number == self.burst - 1)
+        if port.burst is None:
+            return
         self._vehicle.call_later(self.burst_interval_s, lambda: self._send_blocks(port))
 
-    def _send_block(self, port: _Port, file: OpenFile, burst: FtpPacket) -> None:
+    def _send_block(self, port: _Port, file: OpenFile, burst: FtpPacket, *, may_end: bool) -> None:
         answer = replace(burst.acknowledge(offset=burst.offset, session=0), sequence=burst.sequence)
         refusal = replace(
             burst.refuse(MavFtpErr.EOF), sequence=burst.sequence, offset=burst.offset, session=0
@@ -199,8 +208,11 @@ class Px4Ftp(FtpServer):
             port.burst = None
             self._reply(port, refusal)
             return
-        self._reply(port, replace(answer, data=data, size=len(data)))
-        port.burst = replace(burst, sequence=burst.sequence + 1 & 0xFFFF, offset=burst.offset + len(data))
+        port.burst_sent += len(data)
+        complete = may_end and port.burst_sent > _BURST_BYTES
+        self._reply(port, replace(answer, data=data, size=len(data), burst_complete=int(complete)))
+        following = replace(burst, sequence=burst.sequence + 1 & 0xFFFF, offset=burst.offset + len(data))
+        port.burst = None if complete else following
 
     # ------------------------------------------------------------------------------------ whole files
 
@@ -239,24 +251,30 @@ class Px4Ftp(FtpServer):
     def _make_folder(self, _: _Port, request: FtpPacket) -> FtpPacket:
         return self._change(request, self.files.make_folder)
 
-    def _truncate(self, _: _Port, request: FtpPacket) -> FtpPacket:
-        return self._change(request, lambda path: self.files.truncate(path, request.offset))
+    def _truncate(self, port: _Port, request: FtpPacket) -> FtpPacket:
+        try:
+            return self._change(request, lambda path: self.files.truncate(path, request.offset))
+        except FileFault:
+            return request.refuse_errno(port.errno)  # that of an earlier failure
 
     def _rename(self, port: _Port, request: FtpPacket) -> FtpPacket:
         first, _, rest = request.data[: request.size].partition(b"\0")
         if len(first) + 2 >= request.size:
-            return request.refuse_errno(port.errno or EINVAL)
+            return request.refuse_errno(port.errno)
         path, to = path_in(first), path_in(rest)
         if _leaves(path) or _leaves(to):
             return request.refuse(MavFtpErr.FILEPROTECTED)
         self.files.rename(path, to)
         return request.acknowledge(offset=request.offset)
 
-    def _crc32(self, _: _Port, request: FtpPacket) -> FtpPacket:
+    def _crc32(self, port: _Port, request: FtpPacket) -> FtpPacket:
         path = path_in(request.data[: request.size])
         if _leaves(path):
             return request.refuse(MavFtpErr.FILEPROTECTED)
-        checksum = read_crc32(self.files, path, _CRC_BLOCK)
+        try:
+            checksum = read_crc32(self.files, path, _CRC_BLOCK)
+        except FileFault:
+            return request.refuse_errno(port.errno)  # that of an earlier failure
         return request.acknowledge(checksum.to_bytes(4, "little"), offset=request.offset)
 
 

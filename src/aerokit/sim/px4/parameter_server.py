@@ -30,8 +30,8 @@ class Px4ParameterServer(ParameterServer):
     """With ``errors`` as main sends them (PARAM_ERROR); without, as v1.16, which says nothing.
 
     No value is checked: whatever the four bytes are is stored. Each PARAM_SET is confirmed to who has asked, and a
-    moment later to everybody. Setting _HASH_CHECK stops a list; a request for one that runs begins it anew without
-    the hash.
+    change is told to everybody a moment later. Setting _HASH_CHECK stops a list; a request for one that runs begins
+    it anew without the hash.
     """
 
     burst = 10
@@ -52,7 +52,9 @@ class Px4ParameterServer(ParameterServer):
         parameters, type_ = self._parameters, self._parameters.type(name)
         return _BytewiseParamValue(name, _bits(parameters[name], type_), type_, len(parameters), index)
 
-    def _on_list(self, _: ParamRequestList, channel: Channel) -> None:
+    def _on_list(self, request: ParamRequestList, channel: Channel) -> None:
+        if request.target_system == 0:
+            return
         if channel not in self._lists:
             self._send_hash(channel)
         self.start_list(channel)
@@ -87,10 +89,12 @@ class Px4ParameterServer(ParameterServer):
         frame = request.received_frame
         bits = struct.pack("<f", request.param_value) if frame is None else frame.payload[:4].ljust(4, b"\0")
         (value,) = struct.unpack("<i" if request.param_type == MavParamType.INT32 else "<f", bits)
+        before = parameters[name]
         if name not in self._vehicle.faults.read_only_parameters:
             parameters[name] = self.clamped(name, value)
         self.send(name, parameters.index(name), channel)
-        self._vehicle.call_later(_SECOND_ECHO_S, lambda: self.send(name, parameters.index(name), None))
+        if parameters[name] != before and value == value:
+            self._vehicle.call_later(_SECOND_ECHO_S, lambda: self.send(name, parameters.index(name), None))
 
     def _objection(self, name: str, type_: int) -> int | None:
         if name == HASH_NAME:
