@@ -190,8 +190,8 @@ def test_pymavlink_reads_what_we_write(tmp_path: Path) -> None:
     write_waypoint_file(path, MISSION)
     loader = mavwp.MAVWPLoader()
     assert loader.load(str(path)) == len(MISSION) + 1
-    assert (loader.wp(0).x, loader.wp(0).y, loader.wp(0).z) == (47.3977, 8.5456, 488.5)
-    assert loader.wp(0).current == 1
+    home = loader.wpoints[0]
+    assert (home.x, home.y, home.z, home.current) == (47.3977, 8.5456, 488.5, 1)
     for item, theirs in zip(MISSION.to_items(home_is_item_0=True)[1:], loader.wpoints[1:], strict=True):
         assert (theirs.command, theirs.frame, theirs.z) == (item.command, item.frame, item.z)
         parameters = (theirs.param1, theirs.param2, theirs.param3, theirs.param4)
@@ -199,7 +199,7 @@ def test_pymavlink_reads_what_we_write(tmp_path: Path) -> None:
         assert theirs.autocontinue == item.autocontinue
         scale = 1 if item.command == MavCmd.DO_DIGICAM_CONTROL else 1e7
         assert round(theirs.x * scale) == item.x
-    assert loader.wp(5).param1 == 2
+    assert loader.wpoints[5].param1 == 2
 
 
 def test_we_read_what_pymavlink_writes(tmp_path: Path) -> None:
