@@ -293,4 +293,6 @@ class MissionUpload(MissionExchange[UploadEnd]):
 
     def _is_under_way(self, seq: int, now: float) -> bool:
         sent_at, round_trip_s = self._sent_at.get(seq), self.round_trip.smoothed_s
-        return None not in (sent_at, round_trip_s) and now - sent_at < STILL_UNDER_WAY * round_trip_s  # type: ignore[operator]
+        if round_trip_s is None:  # without any limit each item sent in vain would bring forth a window of others
+            round_trip_s = self.round_trip.timeout_s()
+        return sent_at is not None and now - sent_at < STILL_UNDER_WAY * round_trip_s
