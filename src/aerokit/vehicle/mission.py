@@ -107,13 +107,13 @@ class MissionControl(HeldPlan["Mission"]):
             )
         order = self._order = vehicle._new_order(mode)
         self._is_paused = False
+        self._watch.start()
         try:
             await self._set_current(item, timeout, goes_on=False)
             await self._enter(mode, order, timeout)
         except (anyio.get_cancelled_exc_class(), OperationTimeout):  # it may have heard the order
             vehicle._hold_soon(order)
             raise
-        self._watch.start()
 
     async def pause(self) -> None:
         """Stop where it is and keep the place in the mission; returns when HEARTBEAT tells the mode for holding.
@@ -142,13 +142,13 @@ class MissionControl(HeldPlan["Mission"]):
         if not vehicle.is_armed:
             raise OperationRejected("mission.resume: the vehicle is not armed; nothing was sent")
         order = self._order = vehicle._new_order(mode)
+        self._watch.start()
         try:
             await self._enter(mode, order, timeout)
         except (anyio.get_cancelled_exc_class(), OperationTimeout):
             vehicle._hold_soon(order)
             raise
         self._is_paused = False
-        self._watch.start()
 
     async def wait_finished(self, *, timeout: float | None = None) -> None:
         """Wait until the mission has been flown to its end; for a mission that ends with landing, until it has landed.
@@ -174,7 +174,6 @@ class MissionControl(HeldPlan["Mission"]):
                 describe=end.describe,
                 timeout=timeout,
             )
-        self._watch.finish()
 
     # ------------------------------------------------------------------------------------ inside
 

@@ -17,18 +17,20 @@ if TYPE_CHECKING:
 
 __all__ = ["MissionEnd"]
 
-NAV_RETURN_TO_LAUNCH, NAV_LAND, NAV_VTOL_LAND, DO_LAND_START = 20, 21, 85, 189
+NAV_RETURN_TO_LAUNCH, NAV_LAND, NAV_VTOL_LAND = 20, 21, 85
 LANDINGS = (NAV_RETURN_TO_LAUNCH, NAV_LAND, NAV_VTOL_LAND)
 STATE_UNKNOWN = 0
+END_GRACE_S = 2.0
+"""MISSION_CURRENT comes at 1 Hz or faster, and may be lost."""
 LANDED_ON_GROUND = 1
 
 
 class MissionEnd:
     """The ends a mission can have.
 
-    MISSION_CURRENT says that it is complete. Or the vehicle has landed and disarmed at its last item: an ArduCopter
-    never says complete then. Or it has left the mission's mode for the one that its last item, a landing or a return,
-    is flown in, and has landed: PX4 flies a return so. Vehicles that do not tell the state have reached the last item.
+    The vehicle says that it is complete, or has landed and disarmed at its last item. A mission that ends with a return
+    or a landing ends on the ground: PX4 calls it complete when the return begins, which it flies in another mode.
+    Vehicles that do not tell the state have reached the last item.
     """
 
     def __init__(
@@ -43,36 +45,35 @@ class MissionEnd:
         self._grace_until = vehicle.connection.now() + MODE_GRACE_S
         self._was_in_mode = False
         self._left_at: float | None = None
-        self._was_armed = vehicle.is_armed
 
     def is_reached(self) -> bool:
         """Whether it is over."""
-        self._was_armed = self._was_armed or self._vehicle.is_armed
-        if self._watch.completed_at > 0:
+        if self._watch.is_complete:
             return not self._ends_by_landing or self._is_down
-        if self._is_at_last and self._is_disarmed and self._may_be_landing:
+        if self._vehicle.is_surely_disarmed and self._is_landing:
             return True
         progress = self._watch.progress.latest
         tells_state = progress is not None and progress.state != STATE_UNKNOWN
-        return not tells_state and self._watch.reached is not None and self._watch.reached == self._watch.last
+        return not tells_state and self._watch.last is not None and self._watch.reached == self._watch.last
 
     def trouble(self, order: Order | None, *, is_paused: bool) -> str | None:
         """Why it will not come to its end any more. ``order`` is the last one that was given for the mission."""
         vehicle, now = self._vehicle, self._vehicle.connection.now()
         if vehicle._order not in (self._order, order):
             return "another order was given"
-        if self._is_disarmed:
-            return f"the vehicle disarmed, {self.describe()}"
-        if is_paused or now < vehicle._mode_settles_at or vehicle._is_in(self._mode):
-            self._was_in_mode = self._was_in_mode or vehicle._is_in(self._mode)
+        is_in_mode = vehicle._is_in(self._mode)
+        self._was_in_mode = self._was_in_mode or is_in_mode
+        if not vehicle.is_surely_disarmed and (
+            is_paused or is_in_mode or self._is_landing or now < vehicle._mode_settles_at
+        ):
             self._left_at = None
             return None
-        if self._is_at_last and self._may_be_landing:
-            return None
-        if self._left_at is None:  # the end of the mission may be told after the mode it brings about
+        if self._left_at is None:  # the end of the mission may be told after what it brings about
             self._left_at = now
-        if now - self._left_at < MODE_GRACE_S or now < self._grace_until:
+        if now - self._left_at < END_GRACE_S or now < self._grace_until:
             return None
+        if vehicle.is_surely_disarmed:
+            return f"the vehicle is not armed, {self.describe()}"
         if self._was_in_mode:
             return f"the mode changed to {vehicle.mode_name}, {self.describe()}"
         return f"the vehicle does not fly its mission, it is in {vehicle.mode_name}"
@@ -84,18 +85,13 @@ class MissionEnd:
         return f"{where} of {'?' if count is None else count}"
 
     @property
-    def _is_at_last(self) -> bool:
-        current, last = self._watch.current.latest, self._watch.last
-        return current is not None and last is not None and current >= last
-
-    @property
-    def _may_be_landing(self) -> bool:
+    def _is_landing(self) -> bool:
+        """Whether it has left the mission's mode for that of its last item."""
         mode = self._vehicle.telemetry.mode.latest
-        return self._vehicle._is_in(self._mode) or (self._ends_by_landing and mode in self._landing_modes)
-
-    @property
-    def _is_disarmed(self) -> bool:
-        return self._was_armed and self._vehicle.is_surely_disarmed
+        current, last = self._watch.current.latest, self._watch.last
+        return (
+            self._ends_by_landing and current is not None and current == last and mode in self._landing_modes
+        )
 
     @property
     def _is_down(self) -> bool:

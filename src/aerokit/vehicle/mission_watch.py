@@ -18,10 +18,20 @@ __all__ = ["MissionWatch"]
 STATE_NO_MISSION, STATE_ACTIVE, STATE_COMPLETE = 1, 3, 5
 TWICE_S = 0.3
 """The same item reached again so soon is one message that came twice."""
+AGAIN_S = 1.0
+LAST_S = 3.0
+"""How long before it disarms a vehicle that has landed may have left its last item."""
+STALE_S = 3.0
+"""How long a vehicle that starts its mission anew may go on saying that it is complete."""
 
 
 class MissionWatch:
-    """Cells and events. Items are counted without home."""
+    """Cells and events. Items are counted without home.
+
+    An ArduCopter that lands at the end disarms and goes back to its first item, and never says that it is complete.
+    PX4 says so until the next mission is under way, says that it is active in its landing mode too, and tells each item
+    reached ten times over.
+    """
 
     def __init__(self, vehicle: Vehicle) -> None:
         self._vehicle = vehicle
@@ -33,15 +43,17 @@ class MissionWatch:
         self.progress: StateCell[MissionProgress] = StateCell("mission.progress", now, "MISSION_CURRENT")
         self.reached: int | None = None
         """The item that was reached last."""
-        self._reached_at = -math.inf
-        self._moved_since = True
-        self.completed_at = -math.inf
-        """When the vehicle last said that its mission is complete."""
+        self.is_complete = False
+        """Whether the mission that was flown last came to its end."""
+        self._reached_at = self._at_last_at = -math.inf
+        self._may_repeat = False
         self._was_active = False
+        self._stale_until = -math.inf
         telemetry = vehicle.telemetry
         vehicle._detach += [
             telemetry.mission_current.observe(self._on_current, every_arrival=True),
             telemetry.mission_reached.observe(self._on_reached, every_arrival=True),
+            telemetry.armed.observe(self._on_armed),
             vehicle.connection.on_end(self.close),
             lambda: self.close(ConnectionClosed("the block of this vehicle was left")),
         ]
@@ -52,26 +64,25 @@ class MissionWatch:
         count = self.count.latest
         return count - 1 if count else None
 
+    @property
+    def is_at_last(self) -> bool:
+        """Whether it goes for the last item, or did so a moment ago."""
+        return self._vehicle.connection.now() - self._at_last_at <= LAST_S
+
     def counted(self, count: int) -> None:
         """A transfer has told how many items there are."""
         self._set_count(count, "MISSION_COUNT")
-        self.reached = None
-
-    def finish(self) -> None:
-        """It was seen that the mission has come to its end."""
-        if self._was_active:
-            self._was_active = False
-            self._vehicle._publish(MissionFinished)
 
     def start(self) -> None:
-        """The mission is flown from now on."""
-        self._was_active, self._moved_since, self.completed_at = True, True, -math.inf
+        """The mission is flown from now on; what is told of the one before does not count."""
+        self.is_complete = self._was_active = False
+        self._stale_until = self._vehicle.connection.now() + STALE_S
 
     def forget(self) -> None:
         """The vehicle has rebooted."""
         for cell in (self.current, self.count, self.progress):
             cell.forget()
-        self.reached, self._was_active = None, False
+        self.reached, self._was_active, self.is_complete = None, False, False
 
     def close(self, error: Exception) -> None:
         """Nothing more will come."""
@@ -83,37 +94,66 @@ class MissionWatch:
     def _on_current(self, _: MissionProgress | None, told: MissionProgress) -> None:
         before = self.current.latest
         current = None if told.current is None or told.current < self._offset else told.current - self._offset
-        source = Source(self._vehicle.system_id, self._vehicle.component_id, "MISSION_CURRENT")
         if told.total is None and told.state == STATE_NO_MISSION:
             current = None
             self._set_count(0, "MISSION_CURRENT")
         elif told.total is not None:
             self._set_count(told.total, "MISSION_CURRENT")
-        self.progress.set(MissionProgress(current, self.count.latest, told.state), source)
-        self.current.set(current, source)
+        self.progress.set(
+            MissionProgress(current, self.count.latest, told.state), self._source("MISSION_CURRENT")
+        )
+        self.current.set(current, self._source("MISSION_CURRENT"))
+        if current is not None and current == self.last:
+            self._at_last_at = self._vehicle.connection.now()
         if current != before:
-            self._moved_since = True
+            self._note_return(before, current)
             self._vehicle._publish(MissionCurrentChanged, before, current)
         self._on_state(told.state)
 
+    def _note_return(self, before: int | None, current: int | None) -> None:
+        """Going for an item again that was reached before; PX4 may tell that it is reached before it is the current."""
+        if current is not None and current == self.reached:
+            is_long_ago = self._vehicle.connection.now() - self._reached_at > AGAIN_S
+            self._may_repeat = self._may_repeat or is_long_ago or (before is not None and before > current)
+
     def _on_state(self, state: int) -> None:
-        if state == STATE_ACTIVE:
-            self._was_active = True
-            self.completed_at = -math.inf
-        elif state == STATE_COMPLETE:
-            self.completed_at = self._vehicle.connection.now()
-            self.finish()
+        if state != STATE_COMPLETE:
+            self._stale_until = -math.inf
+            if state == STATE_ACTIVE and self._is_in_mission_mode:
+                self._was_active, self.is_complete = True, False
+        elif self._vehicle.connection.now() >= self._stale_until:
+            self._complete()
+
+    def _on_armed(self, _: bool | None, is_armed: bool) -> None:
+        if not is_armed and self._was_active and self.is_at_last and self._is_in_mission_mode:
+            self._complete()
 
     def _on_reached(self, _: int | None, seq: int) -> None:
-        """PX4 tells an item ten times over; ArduPilot once, and item 0 when it has come to a guided target."""
+        """ArduPilot tells item 0, home, when it has come to a guided target."""
         item, now = seq - self._offset, self._vehicle.connection.now()
         is_again = item == self.reached and (
-            not self._moved_since if self._repeats else now - self._reached_at < TWICE_S
+            not self._may_repeat if self._repeats else now - self._reached_at < TWICE_S
         )
         if item < 0 or is_again:
             return
-        self.reached, self._reached_at, self._moved_since = item, now, False
+        self.reached, self._reached_at, self._may_repeat = item, now, False
         self._vehicle._publish(MissionItemReached, item)
 
+    # ------------------------------------------------------------------------------------ inside
+
+    def _complete(self) -> None:
+        self.is_complete = True
+        if self._was_active:
+            self._was_active = False
+            self._vehicle._publish(MissionFinished)
+
+    @property
+    def _is_in_mission_mode(self) -> bool:
+        mode = self._vehicle.autopilot.mode_for("mission", is_vtol=self._vehicle.is_vtol)
+        return mode is not None and self._vehicle._is_in(mode)
+
     def _set_count(self, count: int, message: str) -> None:
-        self.count.set(count, Source(self._vehicle.system_id, self._vehicle.component_id, message))
+        self.count.set(count, self._source(message))
+
+    def _source(self, message: str) -> Source:
+        return Source(self._vehicle.system_id, self._vehicle.component_id, message)
