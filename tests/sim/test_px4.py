@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
+from collections import Counter
 
 import pytest
 from hypothesis import given, settings
@@ -73,10 +74,7 @@ def stream_velocity(client: Client, seconds: float, velocity: tuple[float, float
 def test_streams_without_being_asked() -> None:
     client = Client(SimulatedPx4())
     client.run(30.0)
-    kinds = {
-        message.NAME: len([x for _, x in client.heard if x.NAME == message.NAME])
-        for _, message in client.heard
-    }
+    kinds = Counter(message.NAME for _, message in client.heard)
     assert kinds["ATTITUDE"] == pytest.approx(30 * 50, rel=0.05)
     assert kinds["HEARTBEAT"] == pytest.approx(30, abs=1)
     assert kinds["GPS_RAW_INT"] == pytest.approx(150, abs=5)

@@ -133,4 +133,5 @@ class Arming:
         copter.info("Disarming motors")
         copter.motors.set_armed(False, copter.now)
         copter.mission.reset()
+        copter.call_later(0.0, copter.auto.disarmed)
         return True

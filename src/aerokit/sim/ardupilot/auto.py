@@ -61,7 +61,8 @@ class Auto(Mode):
         """On the ground a take-off waits for MISSION_START or a raised throttle."""
         self._leg: Leg = Stay(copter)
         self._is_waiting = False
-        self._is_paused = False
+        self.is_paused = False
+        self._last_reached = 0
         self._reached_at = self._condition_from = self._delay_until = 0.0
         self._version = -1
         self._seen: tuple[tuple[int, MissionItem], ...] = ()
@@ -117,12 +118,12 @@ class Auto(Mode):
         """Stop on the way to a waypoint; elsewhere there is nothing to stop."""
         if not isinstance(self._leg, Way) or self._leg.is_complete:
             return False
-        self._is_paused = True
+        self.is_paused = True
         return True
 
     def resume(self) -> bool:
         """Go on; always possible."""
-        self._is_paused = False
+        self.is_paused = False
         return True
 
     def enter(self, *, force: bool) -> bool:
@@ -138,10 +139,15 @@ class Auto(Mode):
         parameters = self.copter.parameters
         self.speed = parameters["WPNAV_SPEED"] / 100.0
         self.climb, self.descent = parameters["WPNAV_SPEED_UP"] / 100.0, parameters["WPNAV_SPEED_DN"] / 100.0
-        self._leg, self._is_waiting, self._is_paused = Stay(self.copter), True, False
+        self._leg, self._is_waiting, self.is_paused = Stay(self.copter), True, False
         self.may_lift_off = False
         self.copter.call_later(0.0, self._start_if_waiting)
         return True
+
+    def disarmed(self) -> None:
+        """In AUTO a mission that was not over begins once more, and waits on the ground."""
+        if self.copter.mode is self:
+            self.copter.mission.update()
 
     def leave(self) -> None:
         """The mission stops where it is."""
@@ -166,7 +172,7 @@ class Auto(Mode):
             self.copter.mission.update()
         if self.copter.mode is not self:
             return
-        if self._is_paused and isinstance(self._leg, Way):
+        if self.is_paused and isinstance(self._leg, Way):
             self.stay()
         else:
             self._leg.update(dt)
@@ -207,8 +213,15 @@ class Auto(Mode):
         """See `MissionFlyer`; everybody is told."""
         if self.copter.mode is not self or not self._is_done(index, item):
             return False
-        self.copter.call_later(0.0, lambda: self.copter.send(MissionItemReached(index)))
+        if not self._last_reached:
+            self.copter.call_later(0.0, self._tell_reached)
+        self._last_reached = index
         return True
+
+    def _tell_reached(self) -> None:
+        """Of several at the same time only the last."""
+        index, self._last_reached = self._last_reached, 0
+        self.copter.send(MissionItemReached(index))
 
     def end_mission(self) -> None:
         """Stay in the air, or disarm on the ground."""
@@ -289,7 +302,7 @@ class Auto(Mode):
         return (north, east, here[2] if item.z == 0 else point[2])
 
     def _go(self, place: Ned, *, stops: bool = True) -> None:
-        self._reached_at, self._is_paused = 0.0, False
+        self._reached_at, self.is_paused = 0.0, False
         if not self.copter.yaw.has_region_of_interest:
             self.copter.yaw.default()
         self._leg = Way(self.copter, self, place, stops=stops)

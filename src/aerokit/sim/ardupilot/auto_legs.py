@@ -111,10 +111,11 @@ class Circle:
             if self._way.is_complete:
                 self._way = None
             return
-        self._say()
         motion, rate = self._copter.motion, self._limited_rate()
+        self._say()
         self._angle += rate * dt
         self._done += abs(rate) * dt
+        self._say()
         point, speed = self._point(), rate * self._radius
         motion.seek_velocity(
             point[0] - motion.north - speed * math.sin(self._angle),

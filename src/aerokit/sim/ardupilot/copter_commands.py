@@ -98,6 +98,8 @@ class _Flight:
         result = self.change_to(CopterMode.AUTO)
         if result == MavResult.ACCEPTED:
             self._copter.auto.may_lift_off = self._copter.is_armed
+            if not self._copter.mission.is_running:
+                self._copter.mission.start_or_resume()
         return result
 
     def set_mission_current(self, command: Command) -> int:

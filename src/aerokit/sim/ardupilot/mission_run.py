@@ -58,6 +58,9 @@ _DONE_AT_ONCE = frozenset(
 class MissionFlyer(Protocol):
     """The mode that carries commands out."""
 
+    is_paused: bool
+    """Whether somebody stopped it on its way."""
+
     def start_command(self, index: int, item: MissionItem) -> bool:
         """Begin; False when this vehicle cannot, and the next one is to be tried."""
 
@@ -107,7 +110,9 @@ class MissionRun:
     @property
     def state(self) -> int:
         """MISSION_STATE, as MISSION_CURRENT has it."""
-        return self._state if self.is_present else MissionState.NO_MISSION
+        if not self.is_present:
+            return MissionState.NO_MISSION
+        return MissionState.PAUSED if self.is_running and self._flyer.is_paused else self._state
 
     @property
     def count(self) -> int:
@@ -167,6 +172,11 @@ class MissionRun:
         """Forget the place and how often was jumped, as disarming does."""
         self.nav_index, self._nav, self._do, self._do_index = 0, None, None, 0
         self._jumps.clear()
+
+    def clear(self) -> None:
+        """There is no mission any more."""
+        self.reset()
+        self._state = MissionState.NOT_STARTED
 
     def set_current(self, index: int) -> bool:
         """Go on from this command; False when there is none."""

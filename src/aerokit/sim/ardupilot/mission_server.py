@@ -96,7 +96,7 @@ class MissionServer:
         """Store items as a file does; the MAV_MISSION_RESULT. Without ``clear`` only commands can be changed."""
         if mission_type == MavMissionType.MISSION:
             if clear:
-                self.commands.clear()
+                self._clear(self.commands)
             return self.commands.write_file(list(items), start)
         if not clear:
             return _R.ERROR
@@ -344,8 +344,14 @@ class MissionServer:
         if items is None:
             self._acknowledge(request, _R.UNSUPPORTED, mission_type, channel)
             return
-        done = self._cancel(request, mission_type, channel) and items.clear()
+        done = self._cancel(request, mission_type, channel) and self._clear(items)
         self._acknowledge(request, _R.ACCEPTED if done else _R.ERROR, mission_type, channel)
+
+    def _clear(self, items: ItemList) -> bool:
+        done = items.clear()
+        if done and items is self.commands:
+            self._copter.mission.clear()
+        return done
 
     def _guide(self, item: MissionItem, current: int) -> int:
         """An item that is no item but a target for GUIDED; `current` says so."""

@@ -109,9 +109,18 @@ class _Flight:
     def return_to_launch(self, _: Command) -> int:
         return self._change(RTL, "Returning to launch")
 
-    def start_mission(self, _: Command) -> int:
-        self._px4.send_text(MavSeverity.CRITICAL, "Mission start denied! No valid mission")
-        return MavResult.DENIED
+    def start_mission(self, command: Command) -> int:
+        """Changes the mode and arms."""
+        px4 = self._px4
+        if not px4.mission.count:
+            px4.send_text(MavSeverity.CRITICAL, "Mission start denied! No valid mission")
+            return MavResult.DENIED
+        if not -1 <= command.param1 < px4.mission.count:
+            return MavResult.DENIED
+        result = self._change(MISSION)
+        if result == MavResult.ACCEPTED and not px4.arm():
+            return MavResult.TEMPORARILY_REJECTED
+        return result
 
     def reposition(self, command: Command) -> int:
         """Latitude and longitude NaN (INT32_MAX) keep the place, altitude NaN the height; altitude is AMSL."""

@@ -42,6 +42,8 @@ class Flight:
         self.stay_here()
         if mode == RTL:
             self._plan_return()
+        elif mode == MISSION:
+            self._vehicle.mission.enter()
 
     def stay_here(self) -> None:
         """Make the present place the target."""
@@ -52,20 +54,26 @@ class Flight:
         """Tell the motion what to do until the next tick."""
         vehicle = self._vehicle
         mode = vehicle.mode
-        self.lifts_off = mode == TAKEOFF or (mode == OFFBOARD and vehicle.offboard.wants_up)
+        self.lifts_off = (
+            mode == TAKEOFF
+            or (mode == OFFBOARD and vehicle.offboard.wants_up)
+            or (mode == MISSION and vehicle.mission.wants_up)
+        )
         if vehicle.is_landed:
             self._lift_off()
             return
         if mode == TAKEOFF:
             self._take_off()
         elif mode == LAND:
-            self._descend()
+            self.descend()
         elif mode == RTL:
             self._return()
         elif mode == OFFBOARD:
             vehicle.offboard.fly()
-        elif mode in (HOLD, MISSION):
-            self._go()
+        elif mode == MISSION:
+            vehicle.mission.update()
+        elif mode == HOLD:
+            self.go()
         else:
             vehicle.motion.seek_velocity(0.0, 0.0, 0.0)
 
@@ -85,7 +93,8 @@ class Flight:
             vehicle.switch_to(HOLD)
             self.target = target
 
-    def _go(self) -> None:
+    def go(self) -> None:
+        """Towards the target, and stay there."""
         vehicle, limits = self._vehicle, self._vehicle.parameters
         up, down = limits["MPC_Z_V_AUTO_UP"], limits["MPC_Z_V_AUTO_DN"]
         vehicle.motion.seek_position(*self.target, speed=self.speed_m_s, climb=up, descent=down)
@@ -98,7 +107,7 @@ class Flight:
         elif motion.ground_speed_m_s > _YAW_FROM_M_S:
             motion.face(math.atan2(motion.velocity_east, motion.velocity_north))
 
-    def _descend(self) -> None:
+    def descend(self) -> None:
         """MPC_Z_V_AUTO_DN above MPC_LAND_ALT1, MPC_LAND_SPEED below MPC_LAND_ALT2, in between in between."""
         vehicle, limits = self._vehicle, self._vehicle.parameters
         fast, slow = limits["MPC_Z_V_AUTO_DN"], limits["MPC_LAND_SPEED"]
@@ -120,9 +129,9 @@ class Flight:
     def _return(self) -> None:
         vehicle, motion = self._vehicle, self._vehicle.motion
         if self._phase == "land":
-            self._descend()
+            self.descend()
             return
-        self._go()
+        self.go()
         if math.dist(self.target, (motion.north, motion.east, motion.down)) > _ARRIVED_M:
             return
         if self._phase == "climb":

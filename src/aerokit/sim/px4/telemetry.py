@@ -18,8 +18,9 @@ from aerokit.mavlink.enums import (
     MavModeFlag,
     MavState,
     MavType,
-    MissionState,
 )
+from aerokit.sim.missions import INVALID_INDEX
+from aerokit.sim.px4.mission_messages import CurrentWithIds
 from aerokit.sim.px4.modes import KNOWN, LAND, OFFBOARD, TAKEOFF, custom_mode
 from aerokit.sim.rotations import quaternion_from_euler
 
@@ -218,7 +219,10 @@ def _servo_output(px4: SimulatedPx4) -> m.ServoOutputRaw:
 
 
 def _mission_current(px4: SimulatedPx4) -> m.MissionCurrent:
-    return m.MissionCurrent(0, 65535, MissionState.NO_MISSION, 2)
+    mission, store = px4.mission, px4.missions
+    ids = (store.id(0), store.id(1), store.id(2))
+    total = mission.count or INVALID_INDEX
+    return CurrentWithIds(mission.current, total, mission.state, mission.mode, ids)
 
 
 def _vibration(px4: SimulatedPx4) -> m.Vibration:

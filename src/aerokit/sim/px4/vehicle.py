@@ -7,13 +7,15 @@ from collections.abc import Collection, Iterable, Sequence
 from typing import TYPE_CHECKING, ClassVar
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavCmd, MavMissionResult, MavProtocolCapability, MavResult, MavSeverity
+from aerokit.mavlink.enums import MavCmd, MavProtocolCapability, MavResult, MavSeverity
 from aerokit.sim.battery import Battery
 from aerokit.sim.commands import Command, CommandServer
 from aerokit.sim.local_frame import GlobalPoint, LocalFrame
 from aerokit.sim.motion import GRAVITY_M_S2, Motion, MotionLimits, Wind
 from aerokit.sim.px4.commands import px4_commands
 from aerokit.sim.px4.flight import Flight
+from aerokit.sim.px4.mission import Mission
+from aerokit.sim.px4.mission_server import MissionServer
 from aerokit.sim.px4.modes import (
     HOLD,
     KNOWN,
@@ -57,8 +59,8 @@ class SimulatedPx4(SimulatedVehicle):
     reposition, land, return, offboard with its time-out and failsafe, streams without being asked, heartbeats only
     once a second, chunked texts with a tab at the end, bytewise parameters with _HASH_CHECK, commands of its own to
     component 0, pings to everybody.
-    Not simulated: missions, fence, rally, the events interface, sticks (POSITION and the manual modes
-    stay where they are), battery and data-link failsafes, estimator failures other than a lost GPS.
+    Not simulated: keeping within a fence, flying to rally points, the events interface, sticks (POSITION and the
+    manual modes stay where they are), battery and data-link failsafes, estimator failures other than a lost GPS.
 
     - ``home``: latitude, longitude (degrees), altitude AMSL (m); ``heading_deg``: where its nose points
     - ``boot_time_s``: seconds until it can be armed
@@ -113,6 +115,8 @@ class SimulatedPx4(SimulatedVehicle):
         self._next_text_id = 0
         self._pings = 0
         self.home = (0.0, 0.0, 0.0)
+        self.missions = MissionServer(self)
+        """Mission, fence and rally points; they survive a reboot."""
         self._reset()
         self._listen()
         self.storage = Storage(self, logs, parameter_file=parameter_file, link_bytes_per_s=link_bytes_per_s)
@@ -133,6 +137,8 @@ class SimulatedPx4(SimulatedVehicle):
         self._has_flown = False
         self._failsafe_at = math.nan
         self.flight = Flight(self)
+        self.mission = Mission(self)
+        self.missions.reset()
 
     def _listen(self) -> None:
         self.offboard = Offboard(self)
@@ -140,9 +146,7 @@ class SimulatedPx4(SimulatedVehicle):
         self.on(m.SetMode, self._on_set_mode)
         self.on(m.Timesync, self._on_timesync)
         self.on(m.Ping, self._on_ping)
-        self.on(m.MissionRequestList, self._on_mission_request_list)
-        self.on(m.MissionCount, self._on_mission_count)
-        self.on(m.MissionClearAll, self._on_mission_clear)
+        self.missions.listen()
 
     # ----------------------------------------------------------------------------------------- state
 
@@ -214,6 +218,7 @@ class SimulatedPx4(SimulatedVehicle):
         """Start up."""
         self.storage.restart()
         self.call_later(0.3 * self._boot_time_s, self._warn_while_booting)
+        self.mission.start()
         self.call_later(self._boot_time_s, self._become_ready)
 
     def _warn_while_booting(self) -> None:
@@ -267,6 +272,8 @@ class SimulatedPx4(SimulatedVehicle):
         if not self.home_is_set_by_hand:
             self.home = (self.motion.north, self.motion.east, self.motion.down)
         self.info("Armed by external command")
+        if self.mode == MISSION:
+            self.mission.enter()
         self.set_ticking(True)
         return True
 
@@ -292,7 +299,9 @@ class SimulatedPx4(SimulatedVehicle):
             self._mode_after_landing = mode
         self.is_in_failsafe, self._failsafe_at = False, math.nan
         self.intended_mode = mode
-        if mode == self.mode:
+        if mode == self.mode == MISSION:
+            self.mission.enter()
+        elif mode == self.mode:
             self.flight.stay_here()
         else:
             self.switch_to(mode)
@@ -303,7 +312,9 @@ class SimulatedPx4(SimulatedVehicle):
 
     def can_run(self, mode: Px4Mode) -> bool:
         """Whether the mode has what it needs: sticks, a mission, set-points, a position."""
-        if mode in (POSITION, MISSION) or mode not in KNOWN or (mode[0] != 4 and mode != OFFBOARD):
+        if mode == MISSION and not self.mission.count:
+            return False
+        if mode == POSITION or mode not in KNOWN or (mode[0] != 4 and mode != OFFBOARD):
             return False
         return self.has_position and (mode != OFFBOARD or self.offboard.is_fresh)
 
@@ -354,6 +365,7 @@ class SimulatedPx4(SimulatedVehicle):
             self.is_landed, self._landed_at = True, self.now
             self.motion.settle()
             self.info("Landing detected")
+            self.mission.landed()
 
     def _disarm_by_itself(self) -> None:
         if not self.is_armed or not self.is_landed or self.flight.lifts_off:
@@ -395,12 +407,3 @@ class SimulatedPx4(SimulatedVehicle):
     def _on_ping(self, ping: m.Ping, channel: Channel) -> None:
         if ping.target_system == 0:
             self.send(m.Ping(ping.time_usec, ping.seq, *sender_of(ping)), channel)
-
-    def _on_mission_request_list(self, request: m.MissionRequestList, channel: Channel) -> None:
-        self.send(m.MissionCount(*sender_of(request), 0, request.mission_type), channel)
-
-    def _on_mission_count(self, count: m.MissionCount, channel: Channel) -> None:
-        self.send(m.MissionAck(*sender_of(count), MavMissionResult.NO_SPACE, count.mission_type), channel)
-
-    def _on_mission_clear(self, clear: m.MissionClearAll, channel: Channel) -> None:
-        self.send(m.MissionAck(*sender_of(clear), MavMissionResult.ACCEPTED, clear.mission_type), channel)

@@ -1,0 +1,307 @@
+"""AUTO.MISSION: where a PX4 is in its mission, and how it flies each item.
+
+Simulated: take-off, waypoints with hold time, acceptance radius and heading, loitering, delays, landing, return,
+speed, jumps; the other commands in passing. Not simulated: regions of interest, circles, feasibility checks.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from aerokit.mavlink.enums import MavCmd, MavFrame, MavSeverity, MissionState
+from aerokit.mavlink.messages import MissionItemReached
+from aerokit.sim.px4.modes import HOLD, LAND, MISSION, RTL, TAKEOFF
+
+if TYPE_CHECKING:
+    from aerokit.missions import MissionItem
+    from aerokit.sim.px4.vehicle import SimulatedPx4
+
+__all__ = ["Mission"]
+
+_C = MavCmd
+_REPEATS = 10
+_HEIGHT_REACHED_M = 0.8
+_TAKE_OFFS = (_C.NAV_TAKEOFF, _C.NAV_VTOL_TAKEOFF)
+_LANDINGS = (_C.NAV_LAND, _C.NAV_VTOL_LAND)
+_PLACES = (
+    _C.NAV_WAYPOINT,
+    _C.NAV_LOITER_UNLIM,
+    _C.NAV_LOITER_TIME,
+    _C.NAV_LOITER_TO_ALT,
+    *_TAKE_OFFS,
+    *_LANDINGS,
+)
+_STAYING = (_C.NAV_WAYPOINT, _C.NAV_LOITER_TIME)
+_MOST_JUMPS = 100
+_ACTIVE_MODES = (MISSION, TAKEOFF, LAND)
+
+
+class Mission:
+    """The navigator's mission mode. `update` is called while it is in charge."""
+
+    def __init__(self, px4: SimulatedPx4) -> None:
+        self._px4 = px4
+        self.current = 0
+        """The item that is flown, or will be."""
+        self.reached = -1
+        """The item that was reached last; -1 before the first."""
+        self.is_finished = False
+        """Whether the last item was done."""
+        self._phase = ""
+        self._arrived_at = math.nan
+        self._jumps: dict[int, int] = {}
+        self._state = int(MissionState.NO_MISSION)
+        self._repeats = 0
+        self._has_news = False
+
+    def start(self) -> None:
+        """Begin to tell the last item reached once a second; from a boot on."""
+        self._px4.every(1.0, self._repeat_reached)
+
+    # ----------------------------------------------------------------------------------------- asking
+
+    @property
+    def count(self) -> int:
+        """How many items there are."""
+        return len(self._px4.missions.commands)
+
+    @property
+    def _item(self) -> MissionItem | None:
+        return self._px4.missions.item(0, self.current)
+
+    @property
+    def mode(self) -> int:
+        """MISSION_CURRENT's ``mission_mode``: 1 while a mode is on that flies missions, 2 otherwise."""
+        return 1 if self._px4.mode in _ACTIVE_MODES else 2
+
+    @property
+    def state(self) -> int:
+        """MISSION_STATE; what fits no case stays as it was."""
+        if not self.count:
+            self._state = MissionState.NO_MISSION
+        elif self.is_finished:
+            self._state = MissionState.COMPLETE
+        elif self.mode == 1:
+            self._state = MissionState.ACTIVE
+        elif self.reached >= 0:
+            self._state = MissionState.PAUSED
+        elif self.current < 1:
+            self._state = MissionState.NOT_STARTED
+        return self._state
+
+    @property
+    def wants_up(self) -> bool:
+        """Whether it leaves the ground."""
+        return self._item is not None and not self.is_finished and self._phase != "land"
+
+    # -------------------------------------------------------------------------------------- directing
+
+    def replaced(self, current: int) -> None:
+        """There is another mission; if one is being flown, begin with the new one."""
+        self.current, self.is_finished = max(0, current), False
+        self.forget_reached()
+        self._jumps.clear()
+        if self._px4.mode != MISSION:
+            return
+        if self.count:
+            self._begin_item()
+        elif self._px4.is_armed and not self._px4.is_landed:
+            self._px4.send_text(MavSeverity.CRITICAL, "No valid mission available, loitering")
+            self._px4.change_mode(HOLD)
+
+    def forget_reached(self) -> None:
+        """Nothing of the mission was reached yet."""
+        self.reached, self._repeats = -1, 0
+
+    def set_current(self, seq: int) -> None:
+        """Fly this item next."""
+        self.current = seq
+        self._jumps.clear()
+        if self._px4.mode == MISSION:
+            self.is_finished = False
+            self._begin_item()
+
+    def enter(self) -> None:
+        """The mode begins: a finished mission once more from its start."""
+        if not self.count:
+            return
+        if self.is_finished or self.current >= self.count:
+            self.current, self.is_finished = 0, False
+            self.forget_reached()
+            self._jumps.clear()
+        if self._px4.is_armed:
+            self._px4.info("Executing Mission")
+        self._begin_item()
+
+    # ----------------------------------------------------------------------------------------- flying
+
+    def _begin_item(self) -> None:
+        """Make the item the target; what needs no flying is done at once, and the next one begun."""
+        for _ in range(_MOST_JUMPS + self.count):
+            item, self._arrived_at = self._item, math.nan
+            if item is None:
+                self._finish()
+                return
+            if item.command in _PLACES or item.command == _C.NAV_DELAY:
+                self._aim(item)
+                return
+            if item.command == _C.DO_JUMP:
+                self.current = self._jump(item)
+                continue
+            self._do(item)
+            self._reach()
+            if not self._advance():
+                return
+
+    def _do(self, item: MissionItem) -> None:
+        px4 = self._px4
+        if item.command == _C.DO_CHANGE_SPEED and item.param2 > 0:
+            px4.flight.speed_m_s = min(item.param2, px4.parameters["MPC_XY_VEL_MAX"])
+        elif item.command == _C.NAV_RETURN_TO_LAUNCH:
+            px4.call_later(0.0, self._return)
+
+    def _return(self) -> None:
+        if self._px4.change_mode(RTL):
+            self._px4.info("Returning to launch")
+
+    def _jump(self, item: MissionItem) -> int:
+        """Where it goes on; each jump is made as often as it says, and told to who sent the mission."""
+        done, index = self._jumps.get(self.current, 0), self.current
+        if done >= item.param2:
+            self._jumps.pop(index, None)
+            return index + 1
+        self._jumps[index] = done + 1
+        self._px4.missions.item_changed(index)
+        return int(item.param1) if 0 <= item.param1 < self.count else index + 1
+
+    def _aim(self, item: MissionItem) -> None:
+        px4, motion = self._px4, self._px4.motion
+        self._phase = "go"
+        if item.command == _C.NAV_DELAY:
+            px4.flight.stay_here()
+            return
+        target = self._place(item)
+        px4.flight.heading = math.radians(item.param4) if self._has_heading(item) else None
+        if px4.is_landed or item.command in _TAKE_OFFS:
+            self._climb(target[2] if item.command in _TAKE_OFFS else None)
+        elif item.command in _LANDINGS:
+            px4.flight.target = (target[0], target[1], motion.down)
+        else:
+            px4.flight.target = target
+
+    def _climb(self, down: float | None) -> None:
+        """Straight up first, to the height of the take-off item or MIS_TAKEOFF_ALT above home."""
+        px4, motion = self._px4, self._px4.motion
+        if down is None:
+            down = px4.home[2] - px4.parameters["MIS_TAKEOFF_ALT"]
+        self._phase = "climb"
+        px4.flight.target = (motion.north, motion.east, min(down, motion.down))
+        if px4.is_armed:
+            px4.info(f"Climb to {px4.home[2] - down:.1f} meters above home")
+
+    def _has_heading(self, item: MissionItem) -> bool:
+        return item.command == _C.NAV_WAYPOINT and math.isfinite(item.param4)
+
+    def _place(self, item: MissionItem) -> tuple[float, float, float]:
+        """Where an item leads; 0, 0 is where the vehicle is."""
+        px4, motion = self._px4, self._px4.motion
+        north, east = motion.north, motion.east
+        if (item.x, item.y) != (0, 0):
+            north, east = px4.frame.to_local(round(item.x), round(item.y))
+        above = px4.home[2] if item.frame == MavFrame.GLOBAL_RELATIVE_ALT else px4.frame.origin.altitude_m
+        return (north, east, above - item.z if math.isfinite(item.z) else motion.down)
+
+    def update(self) -> None:
+        """One tick in the air: steer, and look whether the item is reached."""
+        item, flight = self._item, self._px4.flight
+        if item is None or self.is_finished:
+            flight.go()
+            return
+        if self._phase == "land":
+            flight.descend()
+            return
+        flight.go()
+        if not self._is_there(item):
+            return
+        if self._phase == "climb":
+            self._phase = "go"
+            flight.target = self._place(item)
+            return
+        if math.isnan(self._arrived_at):
+            self._arrived_at = self._px4.now
+        if item.command in _LANDINGS:
+            self._phase = "land"
+            self._reach()
+        elif self._is_done(item):
+            self._reach()
+            if item.autocontinue and self._advance():
+                self._begin_item()
+
+    def _is_there(self, item: MissionItem) -> bool:
+        if item.command == _C.NAV_DELAY:
+            return True
+        motion, (north, east, down) = self._px4.motion, self._px4.flight.target
+        radius = self._px4.parameters["NAV_ACC_RAD"]
+        if item.command == _C.NAV_WAYPOINT and item.param2 > 0:
+            radius = item.param2
+        near = math.hypot(north - motion.north, east - motion.east) <= radius
+        return near and abs(down - motion.down) <= _HEIGHT_REACHED_M
+
+    def _is_done(self, item: MissionItem) -> bool:
+        if item.command == _C.NAV_LOITER_UNLIM:
+            return False
+        waits = item.command in _STAYING or item.command == _C.NAV_DELAY
+        return self._px4.now - self._arrived_at >= (item.param1 if waits else 0.0)
+
+    def landed(self) -> None:
+        """The ground is reached: the end of a mission that landed."""
+        if self._px4.mode == MISSION and self._phase == "land" and not self.is_finished:
+            self._reach()
+            if self._advance():
+                self._begin_item()
+
+    def _advance(self) -> bool:
+        """Whether there is a next item."""
+        if self.current + 1 < self.count:
+            self.current += 1
+            return True
+        self._finish()
+        return False
+
+    def _finish(self) -> None:
+        px4 = self._px4
+        self.is_finished = True
+        self.current = max(0, min(self.current, self.count - 1))
+        if px4.is_landed:
+            px4.info("Mission finished, landed")
+            return
+        px4.info("Mission finished, loitering")
+        px4.flight.stay_here()
+        px4.call_later(0.0, self._hold)
+
+    def _hold(self) -> None:
+        """What the commander does when a mission has ended and nobody wanted anything else."""
+        if self.is_finished and self._px4.mode == MISSION and self._px4.is_armed and not self._px4.is_landed:
+            self._px4.change_mode(HOLD)
+
+    # ---------------------------------------------------------------------------------------- telling
+
+    def _reach(self) -> None:
+        """Told at once; of several at the same time only the last."""
+        if self.reached == self.current:
+            return
+        self.reached, self._repeats = self.current, _REPEATS
+        if not self._has_news:
+            self._has_news = True
+            self._px4.call_later(0.0, self._tell_reached)
+
+    def _tell_reached(self) -> None:
+        self._has_news = False
+        if self.reached >= 0:
+            self._px4.send(MissionItemReached(self.reached))
+
+    def _repeat_reached(self) -> None:
+        if self._repeats > 0 and self.reached >= 0 and self.count:
+            self._repeats -= 1
+            self._px4.send(MissionItemReached(self.reached))

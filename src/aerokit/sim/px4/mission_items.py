@@ -1,0 +1,196 @@
+"""What PX4 keeps of a mission item: a structure of its own, so that parameters it has no use for come back as 0."""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from collections.abc import Callable, Sequence
+
+from aerokit.mavlink.enums import MavCmd, MavFrame, MavMissionResult, MavMissionType, MavRoi
+from aerokit.missions import MissionItem
+from aerokit.sim.missions import float32
+
+__all__ = ["checksum", "given_back", "stored"]
+
+_C, _F = MavCmd, MavFrame
+_PLACES: dict[int, str] = {
+    _C.NAV_WAYPOINT: "ff-y",
+    _C.NAV_LOITER_UNLIM: "--fy",
+    _C.NAV_LOITER_TIME: "f?f?",
+    _C.NAV_LAND: "-u-y",
+    _C.NAV_TAKEOFF: "---y",
+    _C.NAV_LOITER_TO_ALT: "?f-?",
+    _C.NAV_ROI: "----",
+    _C.DO_SET_ROI: "----",
+    _C.DO_SET_ROI_LOCATION: "----",
+    _C.NAV_VTOL_TAKEOFF: "---y",
+    _C.NAV_VTOL_LAND: "---y",
+    _C.CONDITION_GATE: "----",
+    _C.NAV_FENCE_RETURN_POINT: "----",
+    _C.NAV_FENCE_POLYGON_VERTEX_INCLUSION: "v---",
+    _C.NAV_FENCE_POLYGON_VERTEX_EXCLUSION: "v---",
+    _C.NAV_FENCE_CIRCLE_INCLUSION: "f---",
+    _C.NAV_FENCE_CIRCLE_EXCLUSION: "f---",
+    _C.NAV_RALLY_POINT: "----",
+    _C.COMPONENT_ARM_DISARM: "----",
+    _C.DO_AUTOTUNE_ENABLE: "----",
+}
+"""In a global frame: command → how params 1 to 4 are kept; see `_KEEPERS`."""
+
+_WITHOUT_PLACE: frozenset[int] = frozenset(
+    {
+        _C.DO_JUMP,
+        _C.NAV_ROI,
+        _C.DO_SET_ROI,
+        _C.DO_WINCH,
+        _C.DO_GRIPPER,
+        _C.DO_CHANGE_SPEED,
+        _C.DO_SET_HOME,
+        _C.DO_LAND_START,
+        _C.DO_TRIGGER_CONTROL,
+        _C.DO_DIGICAM_CONTROL,
+        _C.DO_MOUNT_CONFIGURE,
+        _C.DO_MOUNT_CONTROL,
+        _C.DO_GIMBAL_MANAGER_PITCHYAW,
+        _C.DO_GIMBAL_MANAGER_CONFIGURE,
+        _C.SET_CAMERA_FOCUS,
+        _C.SET_CAMERA_MODE,
+        _C.SET_CAMERA_SOURCE,
+        _C.IMAGE_START_CAPTURE,
+        _C.IMAGE_STOP_CAPTURE,
+        _C.VIDEO_START_CAPTURE,
+        _C.VIDEO_STOP_CAPTURE,
+        _C.DO_CONTROL_VIDEO,
+        _C.DO_SET_CAM_TRIGG_DIST,
+        _C.DO_SET_CAM_TRIGG_INTERVAL,
+        _C.OBLIQUE_SURVEY,
+        _C.DO_VTOL_TRANSITION,
+        _C.NAV_DELAY,
+        _C.NAV_RETURN_TO_LAUNCH,
+        _C.DO_SET_ROI_WPNEXT_OFFSET,
+        _C.DO_SET_ROI_NONE,
+        _C.CONDITION_DELAY,
+        _C.CONDITION_DISTANCE,
+        _C.DO_SET_ACTUATOR,
+        _C.DO_AUTOTUNE_ENABLE,
+        _C.COMPONENT_ARM_DISARM,
+    }
+)
+"""In MAV_FRAME_MISSION; all seven numbers are kept."""
+
+_ROI_COMMANDS = (_C.NAV_ROI, _C.DO_SET_ROI)
+_ROI_WITH_PLACE = (MavRoi.NONE, MavRoi.LOCATION)
+_ROI_WITHOUT_PLACE = (MavRoi.NONE, MavRoi.WPNEXT, MavRoi.WPINDEX)
+_INT_FRAMES: dict[int, int] = {
+    _F.GLOBAL_INT: _F.GLOBAL,
+    _F.GLOBAL_RELATIVE_ALT_INT: _F.GLOBAL_RELATIVE_ALT,
+}
+_AS_INT = {plain: int_frame for int_frame, plain in _INT_FRAMES.items()}
+_POLYGONS = (_C.NAV_FENCE_POLYGON_VERTEX_INCLUSION, _C.NAV_FENCE_POLYGON_VERTEX_EXCLUSION)
+_NO_MISSION_COMMANDS = frozenset(
+    {*_POLYGONS, _C.NAV_FENCE_CIRCLE_INCLUSION, _C.NAV_FENCE_CIRCLE_EXCLUSION, _C.NAV_RALLY_POINT}
+)
+_INT_MIN = -(1 << 31)
+
+
+def stored(item: MissionItem, mission_type: int, *, is_int: bool = True) -> MissionItem | int:
+    """The item as the vehicle keeps it (in frames 0, 2 and 3), or the MAV_MISSION_RESULT that refuses it.
+
+    ``is_int``: it came as MISSION_ITEM_INT; only there the vehicle knows the frames 5 and 6.
+    """
+    frame = _INT_FRAMES.get(item.frame, item.frame) if is_int else item.frame
+    if frame in (_F.GLOBAL, _F.GLOBAL_RELATIVE_ALT):
+        kept = _with_place(item, frame)
+    elif frame == _F.MISSION:
+        kept = _without_place(item)
+    else:
+        return MavMissionResult.UNSUPPORTED_FRAME
+    if isinstance(kept, int):
+        return kept
+    if mission_type == MavMissionType.MISSION and kept.command in _NO_MISSION_COMMANDS:
+        return MavMissionResult.ERROR
+    if mission_type == MavMissionType.FENCE:
+        if kept.command in _POLYGONS and kept.param1 < 3:
+            return MavMissionResult.ERROR
+        return kept.replace(frame=_F.GLOBAL)  # whether the altitude was relative is forgotten
+    return kept
+
+
+def given_back(item: MissionItem, *, as_int: bool) -> MissionItem:
+    """The item as it is sent: a place gets the frame that fits the message."""
+    return item.replace(frame=_AS_INT.get(item.frame, item.frame)) if as_int else item
+
+
+def checksum(items: Sequence[MissionItem], before: int = 0) -> int:
+    """What PX4 makes an opaque id of: a CRC-32 over the items as they came."""
+    crc = before
+    for item in items:
+        head = struct.pack("<BHB4f", item.frame, item.command, item.autocontinue, *_params(item))
+        place = struct.pack("<iif", item.x, item.y, item.z) if isinstance(item.x, int) else _floats(item)
+        crc = zlib.crc32(head + place, crc ^ 0xFFFFFFFF) ^ 0xFFFFFFFF
+    return crc
+
+
+def _params(item: MissionItem) -> tuple[float, float, float, float]:
+    return item.param1, item.param2, item.param3, item.param4
+
+
+def _floats(item: MissionItem) -> bytes:
+    return struct.pack("<3f", item.x, item.y, item.z)
+
+
+def _with_place(item: MissionItem, frame: int) -> MissionItem | int:
+    layout = _PLACES.get(item.command)
+    if layout is None:
+        return MavMissionResult.UNSUPPORTED
+    command = item.command
+    if command in _ROI_COMMANDS:
+        if _whole(item.param1) not in _ROI_WITH_PLACE:
+            return MavMissionResult.INVALID_PARAM1
+        command = _C.DO_SET_ROI
+    numbers = (item.param1, item.param2, item.param3, item.param4)
+    one, two, three, four = (_KEEPERS[kind](number) for kind, number in zip(layout, numbers, strict=True))
+    return item.replace(command=command, frame=frame, param1=one, param2=two, param3=three, param4=four)
+
+
+def _without_place(item: MissionItem) -> MissionItem | int:
+    if item.command not in _WITHOUT_PLACE:
+        return MavMissionResult.UNSUPPORTED
+    one, two, command = item.param1, item.param2, item.command
+    if command == _C.DO_JUMP:
+        jump = _whole(one) & 0xFFFF
+        one, two = float(jump - 0x10000 if jump & 0x8000 else jump), float(_whole(two) & 0xFFFF)
+    if command in _ROI_COMMANDS:
+        if _whole(one) not in _ROI_WITHOUT_PLACE:
+            return MavMissionResult.INVALID_PARAM1
+        command = _C.DO_SET_ROI
+    x, y = (_rounded(float32(number)) for number in (item.x, item.y))
+    return item.replace(command=command, frame=_F.MISSION, param1=one, param2=two, x=x, y=y)
+
+
+def _whole(value: float) -> int:
+    return int(value) if abs(value) < 2**31 else 0
+
+
+def _rounded(value: float) -> int:
+    return round(value) if abs(value) < 2**31 else _INT_MIN
+
+
+def _heading(degrees: float) -> float:
+    """0 to 360; it was kept in radians."""
+    if not math.isfinite(degrees):
+        return math.nan
+    radians = float32(math.radians(degrees))
+    return float32(math.degrees(float32(radians % math.tau)))
+
+
+_KEEPERS: dict[str, Callable[[float], float]] = {
+    "-": lambda _: 0.0,
+    "f": float32,
+    "u": lambda value: float(_whole(value) & 0xFFFF),
+    "v": lambda value: float(_whole(value + 0.5) & 0xFFFF),
+    "?": lambda value: 1.0 if value > 0 else 0.0,
+    "y": _heading,
+}
+"""How a number is kept: as it is, as a 16-bit integer, rounded to one, as a yes or no, as a heading, or not at all."""
