@@ -11,6 +11,12 @@ __all__ = ["AdaptiveWindow", "BlockRequests"]
 
 OVERTAKEN = 3
 """Answers come in the order of their requests. One that so many later ones have overtaken was lost."""
+AT_ONCE = 4
+"""ArduPilot keeps five requests waiting, drops what comes beside, and looks at them every 2 ms."""
+SPACING_S = 0.002
+"""Between further ones."""
+STEADY = 3
+"""So often in a row an answer may be overdue before requests come more rarely: radios lose single frames."""
 
 
 class AdaptiveWindow:
@@ -75,7 +81,9 @@ class BlockRequests:
         self._under_way: dict[int, _Block] = {}  # in the order of sending
         self._blocks: dict[int, _Block] = {}
         self._orders = 0
-        self._busy_at = float("-inf")
+        self._silent = 0
+        self._busy_at = self._free_at = float("-inf")
+        self._is_held_back = False
 
     def __len__(self) -> int:
         return len(self._waiting) + len(self._under_way)
@@ -87,8 +95,11 @@ class BlockRequests:
 
     @property
     def deadline(self) -> float | None:
-        """When the next answer is overdue; None while none is waited for."""
-        return min((self._due_at(block) for block in self._under_way.values()), default=None)
+        """When an answer is overdue or another request may be sent; None while none is waited for."""
+        overdue_at = min((self._due_at(block) for block in self._under_way.values()), default=None)
+        if self._is_held_back and overdue_at is not None:
+            return min(overdue_at, self._free_at)
+        return overdue_at
 
     def ask(self, offset: int) -> None:
         """Have it sent as soon as there is room; nothing happens when it waits or is under way."""
@@ -114,6 +125,7 @@ class BlockRequests:
         """Its answer has come."""
         block = self._blocks.get(offset)
         self.forget(offset)
+        self._silent = 0
         if block is None:
             return
         is_clean = block.attempts == 1 and block.sent_at > self._busy_at
@@ -127,9 +139,16 @@ class BlockRequests:
         """The offsets to be sent now, first those to be sent again; they count as sent. ``limit``: of the window."""
         overdue = [offset for offset, block in self._under_way.items() if self._due_at(block) <= now]
         self._put_first(overdue)
+        self._silent += bool(overdue)
         size = self.window.size if limit is None else min(limit, self.window.size)
         due: list[int] = []
+        self._is_held_back = False
         while self._waiting and len(self._under_way) < size:
+            if len(self._under_way) >= AT_ONCE:
+                if now < self._free_at:
+                    self._is_held_back = True
+                    break
+                self._free_at = now + SPACING_S
             offset = next(iter(self._waiting))
             del self._waiting[offset]
             self._send(offset, now)
@@ -142,7 +161,7 @@ class BlockRequests:
         return 0 if block is None else block.attempts
 
     def _due_at(self, block: _Block) -> float:
-        return max(block.sent_at, self._busy_at) + self._round_trip.timeout_s(block.attempts)
+        return max(block.sent_at, self._busy_at) + self._round_trip.timeout_s(max(1, self._silent - STEADY))
 
     def _send(self, offset: int, now: float) -> None:
         self._orders += 1

@@ -40,7 +40,7 @@ class OpenFile(NamedTuple):
 
 
 class FileChannel:
-    """Requests of one client, in order. Sessions that are left in a hurry are closed in the background."""
+    """Requests of one client, in order. What was read, or left in a hurry, is closed in the background."""
 
     def __init__(self, transfers: Transfers) -> None:
         connection = transfers.connection
@@ -54,7 +54,7 @@ class FileChannel:
         )
         """Addresses and numbers."""
         self._lock = asyncio.Lock()
-        self._closing: dict[int, FtpRequest] = {}
+        self._closing: dict[int, _Closing] = {}
 
     @asynccontextmanager
     async def operation(
@@ -132,7 +132,10 @@ class FileChannel:
                 self._leave(file.session, path)
                 raise
             else:
-                await self._close(file.session, path, patience_s)
+                if opcode == MavFtpOpcode.OPENFILERO:
+                    self._leave(file.session, path)  # what was read is here, whatever comes of it
+                else:
+                    await self._close(file.session, path, patience_s)
                 return result
         raise AssertionError("a loop that returns or raises")
 
@@ -184,7 +187,7 @@ class FileChannel:
             await self._close(session, path, patience_s)
 
     async def _close(self, session: int, path: str, patience_s: float) -> None:
-        """Close a session and have that confirmed; what goes wrong meanwhile leaves that to the background."""
+        """Close a session and have that confirmed; when that goes wrong, it is left to the background."""
         request = self._request(MavFtpOpcode.TERMINATESESSION, path, session, patience_s)
         try:
             await self.transfers.run(request)
@@ -193,7 +196,7 @@ class FileChannel:
             raise
 
     def _leave(self, session: int, path: str) -> None:
-        """Close a session at once, without waiting for its confirmation."""
+        """Close a session at once, and have that confirmed in the background; the next operation waits for it."""
         request = FtpRequest(
             self.client,
             MavFtpOpcode.TERMINATESESSION,
@@ -204,13 +207,27 @@ class FileChannel:
         )
         with suppress(AerokitError):  # when nothing can be sent any more, there is nobody to tell
             self.transfers.connection.send(request.message)
-            self._closing[session] = request
-            self.transfers.in_background(request, "close file")
+            closing = self._closing[session] = _Closing(request)
+            self.transfers.background.start(lambda: closing.confirm(self.transfers), "aerokit close file")
 
     async def _close_left(self, session: int, patience_s: float) -> None:
         """Make sure that a session is closed that was left before."""
-        request = self._closing.pop(session)
-        if request.done and request.is_answered:
-            return
-        request.abort(FileTimeout("superseded"))
-        await self._close(session, request.path, patience_s)
+        closing = self._closing[session]
+        await closing.ended.wait()
+        if not closing.request.is_answered:
+            await self._close(session, closing.request.path, patience_s)
+        self._closing.pop(session, None)
+
+
+class _Closing:
+    """A session that is being closed with nobody waiting."""
+
+    def __init__(self, request: FtpRequest) -> None:
+        self.request, self.ended = request, asyncio.Event()
+
+    async def confirm(self, transfers: Transfers) -> None:
+        try:
+            with suppress(AerokitError):  # the vehicle closes it by itself after its own time-out
+                await transfers.run(self.request)
+        finally:
+            self.ended.set()

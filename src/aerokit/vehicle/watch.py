@@ -157,6 +157,8 @@ class LinkWatch:
 
     async def run(self, on_tick: Callable[[], None]) -> None:
         """Report once a second until cancelled or the connection ends; ``on_tick`` is called as often."""
+        self._ask()
+        self._ask_at = self._connection.now()  # once more with the first report
         while self._connection.is_open:
             await anyio.sleep(REPORT_PERIOD_S)
             if self._connection.is_open:
