@@ -133,6 +133,8 @@ class SimulatedCopter(SimulatedVehicle):
         self._unix_time_at_start = unix_time_at_boot
         self._frame = LocalFrame(GlobalPoint(round(home[0] * 1e7), round(home[1] * 1e7), home[2]))
         self.missions = MissionServer(self)
+        self.is_fence_enabled = False
+        """As DO_FENCE_ENABLE has left it."""
         """Mission, fence and rally points; they survive a reboot."""
         self._reset()
         self._listen()

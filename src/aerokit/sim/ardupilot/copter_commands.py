@@ -5,7 +5,15 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from aerokit.mavlink.enums import CopterMode, MavCmd, MavFrame, MavResult, MavSeverity, SpeedType
+from aerokit.mavlink.enums import (
+    CopterMode,
+    MavCmd,
+    MavFrame,
+    MavMissionType,
+    MavResult,
+    MavSeverity,
+    SpeedType,
+)
 from aerokit.mavlink.messages import AutopilotVersion, MissionCurrent
 from aerokit.sim.ardupilot.auto import Auto
 from aerokit.sim.ardupilot.guided import Guided
@@ -20,6 +28,7 @@ _FORCE_ARM_OR_DISARM, _FORCE_ARM = 21196.0, 2989.0
 _FORCE_REBOOT = 20190226
 _CHANGE_MODE = 1
 _GYRO_CALIBRATION_S = 1.0
+_ALL_FENCES, _POLYGON_FENCES = 15, 4
 
 
 def copter_commands(copter: SimulatedCopter) -> dict[int, CommandHandler]:
@@ -48,6 +57,7 @@ def copter_commands(copter: SimulatedCopter) -> dict[int, CommandHandler]:
         MavCmd.REQUEST_MESSAGE: copter.requests.request_message,
         MavCmd.SET_MESSAGE_INTERVAL: copter.requests.set_interval,
         MavCmd.GET_MESSAGE_INTERVAL: copter.requests.get_interval,
+        MavCmd.DO_FENCE_ENABLE: setup.enable_fence,
         MavCmd.RUN_PREARM_CHECKS: setup.run_prearm_checks,
         MavCmd.PREFLIGHT_CALIBRATION: setup.calibrate,
         MavCmd.PREFLIGHT_REBOOT_SHUTDOWN: setup.reboot,
@@ -216,6 +226,16 @@ class _Setup:
         if self._copter.navigation.home is None:
             return MavResult.FAILED
         self._copter.send_home(command.channel)
+        return MavResult.ACCEPTED
+
+    def enable_fence(self, command: Command) -> int:
+        """Nothing keeps the simulated copter inside; what a client sees of the switch is there."""
+        kinds = int(self._copter.parameters["FENCE_TYPE"]) & (int(command.param2) or _ALL_FENCES)
+        if not self._copter.missions.items(MavMissionType.FENCE):
+            kinds &= ~_POLYGON_FENCES
+        if command.param1 not in (0.0, 1.0, 2.0) or (command.param1 == 1.0 and not kinds):
+            return MavResult.FAILED
+        self._copter.is_fence_enabled = command.param1 == 1.0
         return MavResult.ACCEPTED
 
     def request_capabilities(self, command: Command) -> int:
