@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Hashable
 from typing import TYPE_CHECKING, Generic, TypeVar
 
@@ -14,28 +15,36 @@ KeyT = TypeVar("KeyT", bound=Hashable)
 
 WINDOW = 20
 """ArduPilot keeps 20 PARAM_REQUEST_READ waiting, and drops what comes beside."""
+WIDEST = 5
+"""So many times the size at most are under way."""
+QUEUED, QUEUED_S = 1.5, 0.02
+"""An answer that takes longer than that many times the fastest one, and some, has waited in a queue."""
+FEW, UNLUCKY = 5, 3
+"""When so few are left, those that are sent the third time are sent twice: on a bad radio they would be waited for."""
 OVERTAKEN = 3
 """Answers come in the order of their requests. One that so many later ones have overtaken was lost."""
 
 
 class _Asked:
-    __slots__ = ("attempts", "due_at", "first_at", "first_order", "order")
+    __slots__ = ("attempts", "due_at", "first_at", "first_order", "order", "sent_at")
 
     def __init__(self, now: float, order: int) -> None:
-        self.first_at, self.first_order = now, order
+        self.first_at = self.sent_at = self.due_at = now
+        self.first_order = self.order = order
         self.attempts = 0
-        self.order = order
-        self.due_at = now
 
 
 class RequestWindow(Generic[KeyT]):
-    """Requests by key, at most ``size`` of them under way.
+    """Requests by key, ``size`` of them under way, and more while that does not make answers take longer.
 
     One is sent again when its answer is overdue (:class:`RoundTrip`), or when later requests were answered before it.
     """
 
     def __init__(self, round_trip: RoundTrip, *, size: int = WINDOW) -> None:
-        self._round_trip, self._size = round_trip, size
+        self._round_trip, self._size, self._room = round_trip, size, size
+        self._shortest_s = math.inf
+        self._answered_at = self._silent_until = -math.inf
+        self._silences = 0
         self._waiting: dict[KeyT, None] = {}
         self._under_way: dict[KeyT, _Asked] = {}  # in the order of sending
         self._asked: dict[KeyT, _Asked] = {}
@@ -83,11 +92,12 @@ class RequestWindow(Generic[KeyT]):
         asked = self._asked.pop(key, None)
         self._waiting.pop(key, None)
         self._under_way.pop(key, None)
+        self._answered_at, self._silences = now, 0
         if asked is None:
             self._answered_again(key)
             return []
         if asked.attempts == 1:
-            self._round_trip.measured(now - asked.first_at)
+            self._measured(now - asked.first_at)
         else:
             self._ambiguous[key] = now - asked.first_at
         lost = []
@@ -99,15 +109,39 @@ class RequestWindow(Generic[KeyT]):
         return lost
 
     def take_due(self, now: float) -> list[KeyT]:
-        """What has to be sent now; it counts as sent."""
-        self._put_first(self.overdue(now))
+        """What has to be sent now, some of it twice; it counts as sent."""
+        overdue = self.overdue(now)
+        if any(self._under_way[key].sent_at >= self._answered_at for key in overdue):
+            self._note_silence(now)
+        self._put_first(overdue)
         due: list[KeyT] = []
-        while self._waiting and len(self._under_way) < self._size:
+        while self._waiting and len(self._under_way) < self._room:
             key = next(iter(self._waiting))
             del self._waiting[key]
             self._send(key, now)
             due.append(key)
+        if len(self._under_way) <= FEW and not self._waiting:
+            due += [key for key in due if self._asked[key].attempts >= UNLUCKY]
         return due
+
+    def _note_silence(self, now: float) -> None:
+        """Nothing comes any more. These are no single losses: ask for less, and less often."""
+        self._room = self._size
+        if now >= self._silent_until:
+            self._silences += 1
+            self._silent_until = now + self._timeout_s(1)
+
+    def _timeout_s(self, attempts: int) -> float:
+        return self._round_trip.timeout_s(min(attempts, 2) + self._silences)
+
+    def _measured(self, seconds: float) -> None:
+        """Ask for more at once as long as answers come as fast as ever: a queue is building up somewhere otherwise."""
+        self._round_trip.measured(seconds)
+        self._shortest_s = min(self._shortest_s, seconds)
+        if seconds <= QUEUED * self._shortest_s + QUEUED_S:
+            self._room = min(self._room + 1, WIDEST * self._size)
+        else:
+            self._room = max(self._room - 1, self._size)
 
     def _send(self, key: KeyT, now: float) -> None:
         self._orders += 1
@@ -115,8 +149,8 @@ class RequestWindow(Generic[KeyT]):
         if asked is None:
             asked = self._asked[key] = _Asked(now, self._orders)
         asked.attempts += 1
-        asked.order = self._orders
-        asked.due_at = now + self._round_trip.timeout_s(asked.attempts)
+        asked.order, asked.sent_at = self._orders, now
+        asked.due_at = now + self._timeout_s(asked.attempts)
         self._under_way[key] = asked
 
     def _put_first(self, keys: list[KeyT]) -> None:
