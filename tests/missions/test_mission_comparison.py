@@ -178,7 +178,9 @@ def test_fences() -> None:
     fence = Fence(
         [FencePolygon(corners)], [FenceCircle(corners[0], 100.3)], Position(47, 8, altitude_relative_m=20)
     )
-    ardupilot = Fence.from_items([back(item, frame=0, z=0.0) for item in fence.to_items()])
+    ardupilot = Fence.from_items(
+        [back(item, frame=0, z=0.0, autocontinue=False) for item in fence.to_items()]
+    )
     px4 = Fence.from_items([back(item, frame=5) for item in fence.to_items()])
     assert fence.matches(ardupilot, Storage.ARDUPILOT)
     assert fence.matches(px4, Storage.PX4)
@@ -192,7 +194,7 @@ def test_fences() -> None:
 
 def test_rally_points() -> None:
     points = RallyPoints([rally_point(*PLACE, altitude_relative_m=30.7)])
-    assert points.matches(RallyPoints([back(points[0], z=30.0)]), Storage.ARDUPILOT)
+    assert points.matches(RallyPoints([back(points[0], z=30.0, autocontinue=False)]), Storage.ARDUPILOT)
     assert points.matches(RallyPoints([back(points[0], frame=6)]), Storage.PX4)
     assert not points.matches(RallyPoints([back(points[0], z=29.0)]))
 

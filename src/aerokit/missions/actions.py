@@ -125,7 +125,7 @@ def condition_yaw(
 
 
 def set_servo(servo: int, pwm_us: int) -> MissionItem:
-    """Put an output (1 to 32) to a pulse of 500 to 2,500 microseconds, or 0: no pulse.
+    """Put an output (1 to 32) to a pulse of 500 to 2,500 microseconds, or 0: no pulse (ArduPilot; PX4 refuses it).
 
     https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_SERVO
     """
@@ -134,7 +134,7 @@ def set_servo(servo: int, pwm_us: int) -> MissionItem:
 
 
 def set_relay(relay: int, on: bool) -> MissionItem:
-    """Switch a relay; the first one is 0, the last one 15.
+    """Switch a relay, 0 to 15 (ArduPilot; PX4 refuses it).
 
     https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_RELAY
     """

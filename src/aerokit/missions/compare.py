@@ -82,9 +82,15 @@ def _different_fields(wanted: MissionItem, found: MissionItem, storage: Storage)
             yield field
     if not _same_altitude(wanted, found, storage):
         yield "z"
-    forgets = storage in (Storage.ARDUPILOT, Storage.ANY) and found.autocontinue
-    if bool(wanted.autocontinue) != bool(found.autocontinue) and not forgets:
+    if bool(wanted.autocontinue) != bool(found.autocontinue) and not _forgets_autocontinue(found, storage):
         yield "autocontinue"
+
+
+def _forgets_autocontinue(found: MissionItem, storage: Storage) -> bool:
+    """ArduPilot gives back True for items of missions, False for those of fences and rally points."""
+    if found.command in FENCE_COMMANDS | RALLY_COMMANDS:
+        return True
+    return storage in (Storage.ARDUPILOT, Storage.ANY) and found.autocontinue
 
 
 def _frames_alike(wanted: MissionItem, found: MissionItem, storage: Storage) -> bool:
