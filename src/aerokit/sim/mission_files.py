@@ -8,6 +8,7 @@ from __future__ import annotations
 import struct
 from typing import TYPE_CHECKING
 
+from aerokit.errors import LocalProtocolError
 from aerokit.mavlink.enums import MavMissionResult, MavMissionType
 from aerokit.mavlink.messages import MissionItemInt
 from aerokit.sim.file_tree import EINVAL, ENFILE, ENOENT, FileFault, Mount, OpenFile
@@ -33,9 +34,8 @@ _PLACEHOLDER_SIZE = 1 << 20
 class MissionMount(Mount):
     """Mounted as ``@MISSION``; one upload at a time. An open tells one mebibyte, whatever there is."""
 
-    def __init__(self, store: MissionStore, target: tuple[int, int]) -> None:
+    def __init__(self, store: MissionStore) -> None:
         self._store = store
-        self._target = target
         self._writer: _Writer | None = None
 
     def size(self, path: str) -> int:
@@ -47,7 +47,7 @@ class MissionMount(Mount):
         """Read what the vehicle has, or write what it shall have."""
         type_ = _type_of(path)
         if not writing:
-            return _Reader(_packed(self._store.items(type_), type_, self._target))
+            return _Reader(_packed(self._store.items(type_), type_))
         if self._writer is not None and not self._writer.is_closed:
             raise FileFault(ENFILE)
         self._writer = _Writer(self._store, type_)
@@ -93,20 +93,27 @@ class _Writer(OpenFile):
         pieces = [content[at : at + step] for at in range(_HEADER.size, len(content) - step + 1, step)]
         if magic != _MAGIC or count != len(pieces) or not all(any(piece) for piece in pieces):
             raise FileFault(EINVAL)
-        items = [item_from(MissionItemInt.decode(piece)) for piece in pieces]
+        items = _unpacked(pieces)
         clear = not options & _NO_CLEAR
         if self._store.replace(self._type, items, start=start, clear=clear) != MavMissionResult.ACCEPTED:
             raise FileFault(EINVAL)
 
 
-def _packed(items: list[MissionItem], type_: int, target: tuple[int, int]) -> bytes:
+def _packed(items: list[MissionItem], type_: int) -> bytes:
     content = bytearray(_HEADER.pack(_MAGIC, type_, 0, 0, len(items)))
     for seq, item in enumerate(items):
         params = (item.param1, item.param2, item.param3, item.param4)
         place = (int(item.x), int(item.y), item.z)
-        head = (*target, seq, item.frame, item.command, 0, int(item.autocontinue))
+        head = (0, 0, seq, item.frame, item.command, 0, int(item.autocontinue))
         content.extend(MissionItemInt(*head, *params, *place, type_).encode())
     return bytes(content)
+
+
+def _unpacked(pieces: list[bytes]) -> list[MissionItem]:
+    try:
+        return [item_from(MissionItemInt.decode(piece)) for piece in pieces]
+    except LocalProtocolError:  # no value of ours, such as one of a command 0
+        raise FileFault(EINVAL) from None
 
 
 def _type_of(path: str) -> int:

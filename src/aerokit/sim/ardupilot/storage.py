@@ -52,7 +52,7 @@ class Storage:
         self._put_logs(logs)
         self.files.mounts["@SYS"] = TextMount(_SYSTEM_TEXTS)
         self.files.mounts["@PARAM"] = ParameterPackMount(copter.parameters, self._apply)
-        self.files.mounts["@MISSION"] = MissionMount(copter.missions, (copter.system_id, copter.component_id))
+        self.files.mounts["@MISSION"] = MissionMount(copter.missions)
         banner = copter.send_banner
         self.parameters = ArduPilotParameterServer(
             copter, copter.parameters, errors=parameter_errors, send_banner=banner

@@ -52,7 +52,7 @@ class Px4Ftp(FtpServer):
     repeated for the same sequence number.
     """
 
-    burst = 21
+    burst = 24
 
     def __init__(
         self, vehicle: SimulatedVehicle, files: FileTree, *, burst_interval_s: float = 0.005
@@ -152,8 +152,8 @@ class Px4Ftp(FtpServer):
         def look() -> None:
             if port.file is not file or file is None:
                 return
-            if self._vehicle.now - port.used_at < _SESSION_TIMEOUT_S:
-                self._vehicle.call_at(port.used_at + _SESSION_TIMEOUT_S, look)
+            if self._vehicle.now < (end := port.used_at + _SESSION_TIMEOUT_S):
+                self._vehicle.call_at(end, look)
                 return
             port.reply = None
             with suppress(FileFault):
