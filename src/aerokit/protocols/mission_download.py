@@ -16,7 +16,14 @@ from aerokit.mavlink.messages import (
     MissionRequestList,
 )
 from aerokit.missions.wire import from_wire
-from aerokit.protocols.missions import BUSY_AGAIN_S, BUSY_S, MissionExchange, opaque_id_of, ranges
+from aerokit.protocols.missions import (
+    BUSY_AGAIN_S,
+    BUSY_S,
+    FORGOTTEN_S,
+    MissionExchange,
+    opaque_id_of,
+    ranges,
+)
 from aerokit.snapshot import Snapshot
 
 if TYPE_CHECKING:
@@ -27,8 +34,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Downloaded", "MissionDownload"]
 
-FORGOTTEN_S = 4.0
-"""A vehicle that has not answered for so long has given the transfer up (PX4 after 5 s): begin anew."""
 MAX_RESTARTS = 8
 
 
@@ -114,7 +119,7 @@ class MissionDownload(MissionExchange[Downloaded]):
     def _take_count(self, message: MissionCount, now: float) -> None:
         opaque_id = opaque_id_of(message)
         if self._count is None:
-            if self._attempt == 1 and not self._restarts:
+            if self._attempt == 1 and not self._restarts and self._window > 1:  # PX4 repeats it by itself
                 self.round_trip.measured(now - self._list_at)
             if self._items and (not opaque_id or opaque_id != self._opaque_id):
                 self._items.clear()
@@ -207,7 +212,7 @@ class MissionDownload(MissionExchange[Downloaded]):
         self._wait(now)
 
     def _due_at(self, seq: int) -> float:
-        return self._asked_at[seq] + self.round_trip.timeout_s(self._askings[seq])
+        return self._asked_at[seq] + self._timeout_s(self._askings[seq])
 
     def _wait_for_items(self, now: float) -> None:
         if self._asked_at:

@@ -15,7 +15,14 @@ from aerokit.mavlink.messages import (
     MissionWritePartialList,
 )
 from aerokit.missions.wire import to_wire, to_wire_float
-from aerokit.protocols.missions import BUSY_AGAIN_S, BUSY_S, MissionExchange, opaque_id_of, ranges
+from aerokit.protocols.missions import (
+    BUSY_AGAIN_S,
+    BUSY_S,
+    FORGOTTEN_S,
+    MissionExchange,
+    opaque_id_of,
+    ranges,
+)
 from aerokit.snapshot import Snapshot
 
 if TYPE_CHECKING:
@@ -80,7 +87,7 @@ class MissionUpload(MissionExchange[UploadEnd]):
         """Whether the vehicle has asked for an item: then it may have overwritten some."""
         self._restarts = 0
         self._busy_until: float | None = None
-        self._announced_at = 0.0
+        self._heard_at = 0.0
         self._reset()
 
     def _reset(self) -> None:
@@ -104,14 +111,19 @@ class MissionUpload(MissionExchange[UploadEnd]):
     def start(self, now: float) -> None:
         """Announce it."""
         self._begin(now)
+        self._heard_at = now
         self._announce(now)
 
     def receive(self, message: Message, now: float) -> None:
         """Take a request or the acknowledgement."""
         if not self._is_ours(message):
             return
+        silence_s, self._heard_at = now - self._heard_at, now
         if isinstance(message, MissionAck):
-            self._take_ack(message, now)
+            if message.type == MavMissionResult.ERROR and self._is_asked and silence_s >= FORGOTTEN_S:
+                self._begin_anew(now)
+            else:
+                self._take_ack(message, now)
         elif (
             isinstance(message, (MissionRequestInt, MissionRequest))
             and self._first <= message.seq < self._end
@@ -145,13 +157,13 @@ class MissionUpload(MissionExchange[UploadEnd]):
         if not self._is_asked:
             self._is_asked = self.was_begun = True
             self._busy_until = None
-            if self._attempt == 1:
-                self.round_trip.measured(now - self._announced_at)
             self._move(now, 0, len(self._items))
         if seq > self._taken:
             self._advance(seq, now)
-        elif seq < self._taken or seq in self._asked:
-            self._send(seq, now, again=True)  # lost on the way, or it has begun anew
+        elif seq < self._taken:
+            self._send(seq, now, again=True)  # an old request, or it has begun anew
+        elif seq in self._asked:
+            self._send_window(now)  # lost on the way; what was sent behind it, it has passed over
         self._asked.add(seq)
         while self._sent < min(self._end, self._taken + self._window):
             self._send(self._sent, now)
@@ -159,11 +171,16 @@ class MissionUpload(MissionExchange[UploadEnd]):
 
     def _advance(self, seq: int, now: float) -> None:
         if self._sendings.get(seq - 1) == 1:
-            self.round_trip.measured(now - self._sent_at[seq - 1])
+            self._measure(now - self._sent_at[seq - 1])
         self._taken = seq
         self._attempt = 1
         self._doubt_since = None
         self._move(now, seq - self._first, len(self._items))
+
+    def _measure(self, seconds: float) -> None:
+        """A vehicle repeats its requests: one that is later than it should be may be a second one."""
+        if self.round_trip.smoothed_s is None or seconds <= self.round_trip.timeout_s():
+            self.round_trip.measured(seconds)
 
     # ------------------------------------------------------------------------ acknowledgements
 
@@ -218,7 +235,7 @@ class MissionUpload(MissionExchange[UploadEnd]):
             self._wait(now, BUSY_AGAIN_S)
 
     def _begin_anew(self, now: float) -> None:
-        """ArduPilot has waited 8 s in vain and given up. Before the first request it is an older transfer's end."""
+        """It has waited in vain and given up. Before the first request it is an older transfer's end."""
         if not self._is_asked:
             return
         if self._is_partial or self._restarts >= MAX_RESTARTS:
@@ -261,7 +278,6 @@ class MissionUpload(MissionExchange[UploadEnd]):
             self._outbox.append(partial)
         else:
             self._outbox.append(MissionCount(*target, self._end, self.mission_type))
-        self._announced_at = now
         self._wait(now)
 
     def _send_window(self, now: float, *, ahead: int = 0) -> None:
@@ -293,6 +309,8 @@ class MissionUpload(MissionExchange[UploadEnd]):
 
     def _is_under_way(self, seq: int, now: float) -> bool:
         sent_at, round_trip_s = self._sent_at.get(seq), self.round_trip.smoothed_s
-        if round_trip_s is None:  # without any limit each item sent in vain would bring forth a window of others
+        if (
+            round_trip_s is None
+        ):  # without any limit an item sent in vain would bring forth a window of others
             round_trip_s = self.round_trip.timeout_s()
         return sent_at is not None and now - sent_at < STILL_UNDER_WAY * round_trip_s

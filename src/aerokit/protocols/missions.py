@@ -19,7 +19,9 @@ if TYPE_CHECKING:
     from aerokit.protocols.round_trip import RoundTrip
 
 __all__ = [
+    "BUSY_AGAIN_S",
     "BUSY_S",
+    "FORGOTTEN_S",
     "MissionClear",
     "MissionExchange",
     "opaque_id_of",
@@ -32,6 +34,9 @@ BUSY_S = 9.0
 """How long a vehicle may be busy with a transfer that nobody goes on with: ArduPilot waits 8 s, PX4 5 s."""
 BUSY_AGAIN_S = 1.0
 """How often a busy vehicle is asked again."""
+MOST_PATIENT = 5
+FORGOTTEN_S = 4.5
+"""After so long a silence a vehicle may have given the transfer up (PX4 after 5 s, ArduPilot after 8)."""
 NAMES = {
     MavMissionType.MISSION: "mission",
     MavMissionType.FENCE: "fence",
@@ -123,7 +128,11 @@ class MissionExchange(Transfer[ResultT]):
 
     def _wait(self, now: float, seconds: float | None = None) -> None:
         """Set the deadline: an answer is due by then."""
-        self.deadline = now + (self.round_trip.timeout_s(self._attempt) if seconds is None else seconds)
+        self.deadline = now + (self._timeout_s(self._attempt) if seconds is None else seconds)
+
+    def _timeout_s(self, attempt: int) -> float:
+        """One small message is under way, or a few: a choked link is no reason to wait ever longer."""
+        return self.round_trip.timeout_s(min(attempt, MOST_PATIENT))
 
     def _reject(self, result: int, *, seq: int | None = None) -> None:
         item = None if seq is None or seq < self.offset else seq - self.offset

@@ -6,9 +6,7 @@ import asyncio
 import math
 from typing import TYPE_CHECKING, Generic, Literal, Protocol, TypeVar
 
-import anyio
-
-from aerokit.errors import LocalProtocolError, OperationTimeout
+from aerokit.errors import LocalProtocolError
 from aerokit.mavlink.messages import MissionCurrent
 from aerokit.vehicle.checks import check_seconds
 
@@ -150,15 +148,9 @@ class HeldPlan(Generic[PlanT]):
         check_seconds("timeout", timeout, none_is_allowed=True)
         context = self._context
         transfer = PlanTransfer(context, self._plan_type(), patience_s=patience_s, on_progress=on_progress)
-        try:
-            with anyio.fail_after(timeout):
-                async with context.lock:
-                    return await work(transfer)
-        except OperationTimeout:
-            raise
-        except TimeoutError:
-            link = context.vehicle.describe_link()
-            raise OperationTimeout(f"not done within {timeout:g} s; {link}") from None
+        with context.transfers.limit(timeout):
+            async with context.lock:
+                return await work(transfer)
 
 
 class PlanFiles(Protocol):

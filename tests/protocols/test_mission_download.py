@@ -1,0 +1,184 @@
+"""Downloads: all items exactly, or an error that names what is missing. And clearing, and setting the current item."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mission_vehicles import GCS, ArduPilotModel, Px4Model, Radio, Store, items, run
+
+from aerokit import messages as m
+from aerokit.errors import MissionRejected, MissionTimeout, OperationTimeout
+from aerokit.mavlink.enums import MavMissionResult as Result
+from aerokit.missions import MissionItem
+from aerokit.missions.wire import to_wire_float
+from aerokit.protocols.mission_current import MissionSetCurrent
+from aerokit.protocols.mission_download import MissionDownload
+from aerokit.protocols.missions import MissionClear
+from aerokit.protocols.round_trip import RoundTrip
+
+HELD = items(50)
+WINDOWS: list[tuple[type[Store], int]] = [(ArduPilotModel, 10), (ArduPilotModel, 1), (Px4Model, 1)]
+
+
+def download(window: int = 10, **options: Any) -> MissionDownload:
+    return MissionDownload(1, 1, window=window, **options)
+
+
+@pytest.mark.parametrize(("model", "window"), WINDOWS)
+def test_over_a_good_link_nothing_is_asked_twice(model: type[Store], window: int) -> None:
+    vehicle, exchange = model(HELD), download(window)
+    result = run(exchange, vehicle, Radio())
+    assert list(exchange.result().items) == HELD
+    assert sum(isinstance(message, m.MissionRequestInt) for message in result.sent) == len(HELD)
+    assert result.seconds <= (2 + len(HELD) / window) * 0.1 + 0.01
+    assert isinstance(result.sent[-1], m.MissionAck)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    model_and_window=st.sampled_from(WINDOWS),
+    seed=st.integers(0, 1 << 30),
+    loss=st.sampled_from([0.0, 0.05, 0.1, 0.2, 0.3]),
+    doubling=st.sampled_from([0.0, 0.2]),
+    jitter_s=st.sampled_from([0.0, 0.03, 0.2]),
+    number=st.integers(0, 40),
+)
+def test_exactly_what_is_held(
+    model_and_window: tuple[type[Store], int],
+    seed: int,
+    loss: float,
+    doubling: float,
+    jitter_s: float,
+    number: int,
+) -> None:
+    model, window = model_and_window
+    held = items(number)
+    vehicle, exchange = model(held), download(window)
+    result = run(exchange, vehicle, Radio(seed, loss, doubling, jitter_s=jitter_s))
+    if result.error is None:
+        assert list(exchange.result().items) == held
+    else:  # PX4 gives up whenever requests overtake each other
+        assert jitter_s or doubling
+        assert isinstance(result.error, (MissionTimeout, MissionRejected))
+    assert len(result.sent) <= 60 + 30 * number
+
+
+@pytest.mark.parametrize(("model", "window"), WINDOWS)
+@pytest.mark.parametrize(("loss", "times"), [(0.05, 2.0), (0.2, 4.0)])
+def test_time_over_a_bad_radio(model: type[Store], window: int, loss: float, times: float) -> None:
+    """Compared with what this vehicle takes when nothing is lost."""
+    for seed in range(8):
+        exchange = download(window, round_trip=RoundTrip(0.1))
+        result = run(exchange, model(HELD), Radio(seed, loss))
+        assert result.error is None
+        assert result.seconds < times * max(0.1 * (2 + len(HELD) / window), 0.8)
+
+
+def test_only_some() -> None:
+    exchange = download(only=(3, 4, 20, 77))
+    result = run(exchange, ArduPilotModel(HELD), Radio(seed=5, loss=0.2))
+    assert result.error is None
+    assert list(exchange.result().items) == [HELD[3], HELD[4], HELD[20]]
+    assert exchange.result().count == 50
+
+
+def test_silence_names_what_is_missing() -> None:
+    exchange = download(window=1, offset=1)
+    result = run(exchange, ArduPilotModel(HELD), Radio(silences=[(1.05, 100.0)]))
+    assert isinstance(result.error, MissionTimeout)
+    assert result.error.missing == tuple(range(result.error.missing[0], 49))
+    assert result.seconds < 14.0
+
+
+def test_a_mission_that_changes_meanwhile_is_read_anew() -> None:
+    vehicle, exchange = ArduPilotModel(HELD), download(window=1)
+    others = [(0.5, m.MissionClearAll(1, 1), (254, 190))]
+    run(exchange, vehicle, Radio(), others=others)
+    assert exchange.result().items == ()
+
+
+def test_an_upload_that_was_given_up_is_waited_for() -> None:
+    """ArduPilot gives nothing away for 8 s."""
+    vehicle, exchange = ArduPilotModel(HELD), download()
+    vehicle.receive(m.MissionCount(1, 1, 50), 0.0)
+    vehicle.out.clear()
+    result = run(exchange, vehicle, Radio())
+    assert list(exchange.result().items) == HELD
+    assert 8.0 < result.seconds < 10.0
+
+
+def test_a_vehicle_that_has_none_of_these() -> None:
+    exchange = download(mission_type=2)
+    exchange.start(0.0)
+    exchange.receive(m.MissionAck(*GCS, Result.UNSUPPORTED, 2), 0.1)
+    with pytest.raises(MissionRejected, match=r"rally points: .* not supported"):
+        exchange.result()
+
+
+def test_the_float_form() -> None:
+    exchange = download(gives_int=False)
+    exchange.start(0.0)
+    exchange.receive(m.MissionCount(*GCS, 1), 0.1)
+    assert isinstance(exchange.take_outbox()[-1], m.MissionRequest)
+    item = MissionItem(16, 3, x=470_000_000, y=80_000_000, z=7.0)
+    exchange.receive(to_wire_float(item, 0, target_system=255, target_component=190), 0.2)
+    assert exchange.result().items[0].x == pytest.approx(item.x, abs=50)
+
+
+@pytest.mark.parametrize("model", [ArduPilotModel, Px4Model])
+@settings(max_examples=10, deadline=None)
+@given(seed=st.integers(0, 1 << 30))
+def test_clearing(model: type[Store], seed: int) -> None:
+    vehicle, exchange = model(HELD), MissionClear(1, 1)
+    result = run(exchange, vehicle, Radio(seed, 0.3))
+    assert result.error is None
+    assert vehicle.stored == []
+    assert len(result.sent) < 20
+
+
+def test_clearing_refused() -> None:
+    exchange = MissionClear(1, 1)
+    exchange.start(0.0)
+    exchange.receive(m.MissionAck(*GCS, Result.ERROR), 0.1)
+    with pytest.raises(MissionRejected):
+        exchange.result()
+
+
+def test_clearing_unanswered() -> None:
+    result = run(MissionClear(1, 1), ArduPilotModel(HELD), Radio(loss=1.0))
+    assert isinstance(result.error, MissionTimeout)
+    assert "not known" in str(result.error)
+
+
+def test_setting_the_current_item() -> None:
+    exchange = MissionSetCurrent(1, 1, 4, patience_s=5.0)
+    exchange.start(0.0)
+    assert exchange.take_outbox() == [m.MissionSetCurrent(1, 1, 4)]
+    exchange.receive(m.MissionCurrent(2), 0.1)
+    exchange.receive(m.MissionCurrent(3), 0.2)
+    assert not exchange.done
+    exchange.expire(1.1)
+    assert exchange.take_outbox() == [m.MissionSetCurrent(1, 1, 4)]
+    exchange.receive(m.MissionCurrent(4), 1.2)
+    exchange.result()
+
+
+def test_a_current_item_that_is_run_through_at_once() -> None:
+    exchange = MissionSetCurrent(1, 1, 4)
+    exchange.start(0.0)
+    exchange.receive(m.MissionCurrent(2), 0.1)
+    exchange.receive(m.MissionCurrent(5), 0.2)
+    exchange.result()
+
+
+def test_a_current_item_that_is_not_taken() -> None:
+    exchange = MissionSetCurrent(1, 1, 4, patience_s=3.0)
+    exchange.start(0.0)
+    exchange.receive(m.MissionCurrent(2), 0.1)
+    for at in (1.0, 2.0, 3.0):
+        exchange.expire(at)
+    with pytest.raises(OperationTimeout, match="told item 2"):
+        exchange.result()

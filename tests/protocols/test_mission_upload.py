@@ -1,0 +1,246 @@
+"""Uploads: any vehicle, any radio. What is reported is what happened."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mission_vehicles import GCS, ArduPilotModel, Px4Model, Radio, Run, Store, items, run
+
+from aerokit import messages as m
+from aerokit.errors import MissionRejected, MissionTimeout
+from aerokit.mavlink.enums import MavMissionResult as Result
+from aerokit.mavlink.message import Message
+from aerokit.protocols.mission_upload import MissionUpload
+from aerokit.protocols.round_trip import RoundTrip
+from aerokit.protocols.transfer import Progress
+
+MODELS = [ArduPilotModel, Px4Model]
+OLD = items(30, seed=7)
+NEW = items(40)
+
+
+def upload(new: list[Any], **options: Any) -> MissionUpload:
+    return MissionUpload(1, 1, new, **{"window": 6, **options})
+
+
+def sent(result: Run, kind: type[Message]) -> int:
+    return sum(isinstance(message, kind) for message in result.sent)
+
+
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("window", [1, 6])
+def test_over_a_good_link_nothing_is_sent_twice(model: type[Store], window: int) -> None:
+    vehicle, exchange = model(OLD), upload(NEW, window=window)
+    result = run(exchange, vehicle, Radio())
+    assert exchange.result().is_sure
+    assert vehicle.stored == NEW
+    assert sent(result, m.MissionCount) == 1
+    assert sent(result, m.MissionItemInt) == len(NEW)
+    assert result.seconds <= (2 + len(NEW) / window) * 0.1 + 0.01
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    model=st.sampled_from(MODELS),
+    window=st.sampled_from([1, 6]),
+    seed=st.integers(0, 1 << 30),
+    loss=st.sampled_from([0.0, 0.05, 0.1, 0.2, 0.3]),
+    doubling=st.sampled_from([0.0, 0.2]),
+    jitter_s=st.sampled_from([0.0, 0.03, 0.3]),
+    number=st.integers(1, 40),
+)
+def test_what_is_confirmed_is_there(
+    model: type[Store], window: int, seed: int, loss: float, doubling: float, jitter_s: float, number: int
+) -> None:
+    new, vehicle = items(number), model(OLD)
+    exchange = upload(new, window=window)
+    result = run(exchange, vehicle, Radio(seed, loss, doubling, jitter_s=jitter_s))
+    assert result.error is None
+    if exchange.result().is_sure:
+        assert vehicle.stored == new
+    assert len(result.sent) <= 60 + 25 * number
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    model=st.sampled_from(MODELS),
+    seed=st.integers(0, 1 << 30),
+    loss=st.sampled_from([0.0, 0.1, 0.3]),
+    refuses=st.integers(0, 39),
+)
+def test_a_refusal_is_never_a_success(model: type[Store], seed: int, loss: float, refuses: int) -> None:
+    vehicle = model(OLD, refuses=refuses)
+    exchange = upload(NEW)
+    result = run(exchange, vehicle, Radio(seed, loss))
+    if result.error is None:
+        assert not exchange.result().is_sure
+    elif isinstance(result.error, MissionRejected):
+        assert result.error.item == refuses or exchange.was_vague or result.error.item is None
+    if model is Px4Model:
+        assert vehicle.stored == OLD
+
+
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize(("loss", "times"), [(0.05, 2.0), (0.2, 4.0)])
+def test_time_over_a_bad_radio(model: type[Store], loss: float, times: float) -> None:
+    """Compared with a vehicle that is asked one item after the other, as the standard has it, and loses none."""
+    seconds = []
+    for seed in range(12):
+        vehicle, exchange = model(OLD), upload(items(100), round_trip=RoundTrip(0.1))
+        seconds.append(run(exchange, vehicle, Radio(seed, loss)).seconds)
+    assert max(seconds) < times * 101 * 0.1 * 0.5
+    assert sum(seconds) / len(seconds) < 101 * 0.1
+
+
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("refuses", [0, 7, 39])
+def test_the_vehicles_reason_and_the_item(model: type[Store], refuses: int) -> None:
+    vehicle, exchange = model(OLD, refuses=refuses), upload(NEW, window=1, offset=1)
+    error = run(exchange, vehicle, Radio()).error
+    assert isinstance(error, MissionRejected)
+    assert error.item == (refuses - 1 if refuses else None)
+    assert not exchange.was_vague
+    assert error.result in (Result.INVALID_PARAM1, Result.UNSUPPORTED)
+
+
+def test_sent_ahead_a_refusal_is_vague() -> None:
+    exchange = upload(NEW)
+    error = run(exchange, ArduPilotModel(OLD, refuses=7), Radio()).error
+    assert isinstance(error, MissionRejected)
+    assert exchange.was_vague
+    assert exchange.was_changing
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_a_lost_acknowledgement_is_found_out(model: type[Store]) -> None:
+    """PX4 says it again; ArduPilot says ERROR to an item after the end, so that it has to be read back."""
+    lost = iter([True])
+    radio = Radio(drops=lambda message: isinstance(message, m.MissionAck) and next(lost, False))
+    vehicle, exchange = model(OLD), upload(NEW)
+    run(exchange, vehicle, radio)
+    assert exchange.result().is_sure == (model is Px4Model)
+    assert vehicle.stored == NEW
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_requests_that_are_lost_are_not_waited_for(model: type[Store]) -> None:
+    """The vehicle's own repeat comes after 0.25 or 1 s."""
+    lost = iter([True] * 3)
+    radio = Radio(
+        drops=lambda message: isinstance(message, m.MissionRequest) and message.seq == 3 and next(lost, False)
+    )
+    vehicle, exchange = model(OLD), upload(NEW)
+    assert run(exchange, vehicle, radio).seconds < 2.0
+    assert vehicle.stored == NEW
+
+
+def test_an_older_transfers_end_is_not_this_ones() -> None:
+    exchange = upload(NEW)
+    exchange.start(0.0)
+    for result in (Result.ACCEPTED, Result.OPERATION_CANCELLED, Result.INVALID_SEQUENCE):
+        exchange.receive(m.MissionAck(*GCS, result), 0.01)
+    assert not exchange.done
+
+
+@pytest.mark.parametrize(
+    "ack",
+    [m.MissionAck(254, 190, Result.DENIED), m.MissionAck(*GCS, Result.DENIED, 1), m.MissionAck(255, 1, 5)],
+)
+def test_what_is_for_others_does_not_count(ack: m.MissionAck) -> None:
+    exchange = upload(NEW)
+    exchange.start(0.0)
+    exchange.receive(m.MissionRequest(*GCS, 0), 0.1)
+    exchange.take_outbox()
+    exchange.receive(ack, 0.1)
+    exchange.receive(m.MissionRequestInt(254, 190, 5), 0.1)
+    exchange.receive(m.MissionRequestInt(*GCS, 39), 0.1)  # nobody needs it before he has the one before it
+    assert not exchange.done
+    assert exchange.take_outbox() == []
+
+
+def test_another_ground_station_is_uploading() -> None:
+    vehicle = ArduPilotModel(OLD)
+    count = m.MissionCount(1, 1, 3)
+    error = run(upload(NEW), vehicle, Radio(), others=[(0.0, count, (254, 190))]).error
+    assert isinstance(error, MissionRejected)
+    assert error.result == Result.DENIED
+    assert vehicle.stored == OLD[:3]
+
+
+def test_px4_is_busy_until_it_has_forgotten_a_download() -> None:
+    vehicle, exchange = Px4Model(OLD), upload(NEW)
+    others: list[tuple[float, Message, tuple[int, int]]] = [(0.0, m.MissionRequestList(1, 1), (254, 190))]
+    radio = Radio(drops=lambda message: isinstance(message, m.MissionAck) and message.target_system == 1)
+    result = run(exchange, vehicle, radio, others=others)
+    assert vehicle.stored == NEW
+    assert 5.0 < result.seconds < 9.0
+
+
+def test_our_own_download_that_px4_did_not_hear_the_end_of() -> None:
+    vehicle, exchange = Px4Model(OLD), upload(NEW)
+    vehicle.receive(m.MissionRequestList(1, 1), 0.0)
+    vehicle.out.clear()
+    assert run(exchange, vehicle, Radio()).seconds < 3.0
+    assert vehicle.stored == NEW
+
+
+def test_a_vehicle_that_gave_up_is_begun_anew_with() -> None:
+    vehicle, exchange = ArduPilotModel(OLD), upload(NEW, patience_s=30.0)
+    run(exchange, vehicle, Radio(silences=[(0.3, 10.0)]))
+    assert vehicle.stored == NEW
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_silence_names_what_was_not_confirmed(model: type[Store]) -> None:
+    vehicle, exchange = model(OLD), upload(NEW, window=1, offset=1)
+    result = run(exchange, vehicle, Radio(silences=[(1.0, 100.0)]))
+    assert isinstance(result.error, MissionTimeout)
+    assert result.error.missing == tuple(range(result.error.missing[0], 39))
+    assert 5 <= result.error.missing[0] <= 10
+    assert 10.0 <= result.seconds < 14.0
+    assert result.sent[-1] == m.MissionAck(1, 1, Result.OPERATION_CANCELLED)
+    assert len(result.sent) < 40
+
+
+def test_nobody_there() -> None:
+    result = run(upload(NEW), ArduPilotModel(OLD), Radio(loss=1.0))
+    assert isinstance(result.error, MissionTimeout)
+    assert "never asked" in str(result.error)
+    assert len(result.sent) < 14
+
+
+def test_a_part_replaces_what_is_there() -> None:
+    vehicle, exchange = ArduPilotModel(OLD), upload(NEW[4:6], first=4, window=1)
+    result = run(exchange, vehicle, Radio(seed=3, loss=0.3))
+    assert result.error is None
+    assert vehicle.stored == [*OLD[:4], *NEW[4:6], *OLD[6:]]
+
+
+def test_a_part_of_what_is_not_there() -> None:
+    vehicle, exchange = ArduPilotModel(OLD[:2]), upload(NEW[4:6], first=4, window=1)
+    error = run(exchange, vehicle, Radio()).error
+    assert isinstance(error, MissionRejected)
+    assert not exchange.was_begun
+
+
+def test_the_float_form_is_for_those_who_know_no_other() -> None:
+    for takes_int, request, kind in (
+        (True, m.MissionRequest, m.MissionItemInt),
+        (False, m.MissionRequest, m.MissionItem),
+        (False, m.MissionRequestInt, m.MissionItemInt),
+    ):
+        exchange = upload(NEW, window=1, takes_int=takes_int)
+        exchange.start(0.0)
+        exchange.take_outbox()
+        exchange.receive(request(*GCS, 0), 0.1)
+        assert [type(message) for message in exchange.take_outbox()] == [kind]
+
+
+def test_progress_is_told() -> None:
+    told: list[Progress] = []
+    run(upload(NEW, on_progress=told.append), ArduPilotModel(), Radio())
+    assert [progress.done for progress in told] == sorted(progress.done for progress in told)
+    assert (told[-1].done, told[-1].total) == (40, 40)
