@@ -18,6 +18,7 @@ from served_copter import served, served_copter
 import aerokit
 import aerokit.sync
 import aerokit.sync.files
+import aerokit.sync.logs
 import aerokit.sync.mission
 import aerokit.sync.parameters
 from aerokit import errors, events, messages
@@ -29,6 +30,7 @@ from aerokit.sim import SimulatedCopter
 from aerokit.vehicle.fence import FenceControl
 from aerokit.vehicle.files import Files
 from aerokit.vehicle.guided import Guided, SetpointStream
+from aerokit.vehicle.logs import Logs
 from aerokit.vehicle.mission import MissionControl
 from aerokit.vehicle.parameters import Parameters, Transaction
 from aerokit.vehicle.rally import RallyControl
@@ -80,6 +82,7 @@ TWINS: list[tuple[type, type, set[str]]] = [
     (Guided, aerokit.sync.Guided, set()),
     (SetpointStream, aerokit.sync.SetpointStream, set()),
     (Files, aerokit.sync.files.Files, set()),
+    (Logs, aerokit.sync.logs.Logs, set()),
     (MissionControl, aerokit.sync.mission.MissionControl, set()),
     (FenceControl, aerokit.sync.mission.FenceControl, set()),
     (RallyControl, aerokit.sync.mission.RallyControl, set()),

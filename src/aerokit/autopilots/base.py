@@ -147,6 +147,8 @@ class Autopilot:
     """Where MAVFTP finds the flight logs, or the directories with them: the first of these that exists."""
     first_log_id = 0
     """The id of the oldest log in LOG_ENTRY."""
+    silent_without_logs = False
+    """Whether LOG_REQUEST_LIST is not answered when there are no logs."""
     unknown_currents_ca: frozenset[int] = frozenset((-1,))
     """What a battery's current in 0.01 A says when it is not known; the standard says −1."""
     estimator_message = "ESTIMATOR_STATUS"

@@ -91,6 +91,8 @@ class Px4(Autopilot):
     modes = MODES
     setpoints = SetpointRules(before_mode=True, minimum_hz=2.0, timeout_s=0.5)
     reposition = Reposition(relative_altitude=False, yaw=True, speed=True, armed_only=True)
+    log_directories = ("/fs/microsd/log", "/log")
+    silent_without_logs = True
     changes_speed = True
     _bytewise_by_default = True
     has_parameter_hash = True

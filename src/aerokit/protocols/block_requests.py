@@ -67,16 +67,17 @@ class _Block:
 
 
 class BlockRequests:
-    """Requests for blocks by their offsets, a window of them under way.
+    """Requests for blocks by their offsets, a window of them under way; beyond ``at_once`` they are sent ``spacing_s``
+    seconds apart.
 
     One is sent again when its answer is overdue (:class:`RoundTrip`), or when later ones were answered before it.
     """
 
     def __init__(
-        self, round_trip: RoundTrip, window: AdaptiveWindow | None = None, *, measures: bool = True
+        self, round_trip: RoundTrip, *, at_once: int = AT_ONCE, spacing_s: float = SPACING_S
     ) -> None:
-        self.window = AdaptiveWindow() if window is None else window
-        self._round_trip, self._measures = round_trip, measures
+        self.window = AdaptiveWindow()
+        self._round_trip, self._at_once, self._spacing_s = round_trip, at_once, spacing_s
         self._waiting: dict[int, None] = {}
         self._under_way: dict[int, _Block] = {}  # in the order of sending
         self._blocks: dict[int, _Block] = {}
@@ -129,7 +130,7 @@ class BlockRequests:
         if block is None:
             return
         is_clean = block.attempts == 1 and block.sent_at > self._busy_at
-        if is_clean and self._measures:
+        if is_clean:
             self._round_trip.measured(now - block.sent_at)
         self.window.answered(now - block.sent_at if is_clean else None)
         if block.attempts == 1:
@@ -144,11 +145,11 @@ class BlockRequests:
         due: list[int] = []
         self._is_held_back = False
         while self._waiting and len(self._under_way) < size:
-            if len(self._under_way) >= AT_ONCE:
+            if len(self._under_way) >= self._at_once:
                 if now < self._free_at:
                     self._is_held_back = True
                     break
-                self._free_at = now + SPACING_S
+                self._free_at = now + self._spacing_s
             offset = next(iter(self._waiting))
             del self._waiting[offset]
             self._send(offset, now)

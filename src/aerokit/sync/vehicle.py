@@ -13,6 +13,7 @@ from aerokit.sync.cells import StateCell
 from aerokit.sync.connection import Connection
 from aerokit.sync.files import Files
 from aerokit.sync.guided import Guided
+from aerokit.sync.logs import Logs
 from aerokit.sync.loop_thread import LoopThread
 from aerokit.sync.mission import FenceControl, MissionControl, RallyControl
 from aerokit.sync.parameters import Parameters
@@ -99,6 +100,8 @@ class Vehicle(VehicleState):
         """Set-point streams: velocity, position, acceleration, attitude."""
         self.files = Files(loop, self.aio.files)
         """The files on it, by MAVFTP."""
+        self.logs = Logs(loop, self.aio.logs)
+        """Its flight logs."""
         self.parameters = Parameters(loop, self.aio.parameters)
         """The autopilot's parameters: download, get, set, transactions, what was changed."""
         self.mission = MissionControl(loop, self.aio.mission)

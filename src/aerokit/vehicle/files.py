@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import zlib
 from contextlib import suppress
 from pathlib import Path
@@ -16,8 +15,11 @@ from aerokit.protocols.reassembly import Reassembly
 from aerokit.protocols.transfer import PATIENCE_S, OnProgress
 from aerokit.snapshot import Snapshot
 from aerokit.vehicle.file_channel import FileChannel
+from aerokit.vehicle.part_file import PartFile
 
 if TYPE_CHECKING:
+    import os
+
     from aerokit.protocols.ftp import FtpMessage
     from aerokit.vehicle.file_channel import OpenFile
     from aerokit.vehicle.transfers import Transfers
@@ -98,8 +100,8 @@ class Files:
             OSError: the file cannot be written here.
         """
         path_bytes(path)
-        part = Path(f"{os.fspath(to)}.part")
-        start = _size_of(part) if resume and not is_virtual(path) else 0
+        part = PartFile(to)
+        start = part.size if resume and not is_virtual(path) else 0
         try:
             await self._fetch_to(part, path, start, patience_s, timeout, on_progress)
             is_whole = not start or await self._is_same(path, part, patience_s, timeout)
@@ -107,7 +109,7 @@ class Files:
             is_whole = False
         if not is_whole:
             await self._fetch_to(part, path, 0, patience_s, timeout, on_progress)
-        os.replace(part, to)
+        part.finish()
 
     async def list(
         self, path: str, *, patience_s: float = PATIENCE_S, timeout: float | None = None
@@ -292,7 +294,7 @@ class Files:
 
     async def _fetch_to(
         self,
-        part: Path,
+        part: PartFile,
         path: str,
         start: int,
         patience_s: float,
@@ -300,20 +302,18 @@ class Files:
         on_progress: OnProgress | None,
     ) -> None:
         """Append to a file here what is missing from ``start`` on."""
-        with part.open("r+b" if start else "wb") as disk:
-            disk.seek(start)
+        with part.writing(start) as disk:
             into = Reassembly(disk.write, block_size=DATA_SIZE, start=start)
             await self._fetch(path, into, patience_s, timeout, on_progress)
-            disk.truncate()
 
-    async def _is_same(self, path: str, part: Path, patience_s: float, timeout: float | None) -> bool:
+    async def _is_same(self, path: str, part: PartFile, patience_s: float, timeout: float | None) -> bool:
         try:
             theirs = await self.crc32(path, patience_s=patience_s, timeout=timeout)
         except FileError as error:
             if error.code in NO_CRC:
                 return True
             raise
-        return theirs == _crc32_of_file(part)
+        return theirs == _crc32_of_file(part.path)
 
     async def _put(
         self, file: OpenFile, path: str, data: bytes, patience_s: float, on_progress: OnProgress | None
@@ -343,10 +343,6 @@ class Files:
 
 class _ShorterError(Exception):
     """The vehicle's file is shorter than what was left of an interrupted download."""
-
-
-def _size_of(path: Path) -> int:
-    return path.stat().st_size if path.exists() else 0
 
 
 def _content_of(source: str | os.PathLike[str]) -> bytes:

@@ -11,6 +11,7 @@ from aerokit.vehicle.fence import FenceControl
 from aerokit.vehicle.files import Files
 from aerokit.vehicle.flight import FlightActions
 from aerokit.vehicle.guided import Guided
+from aerokit.vehicle.logs import Logs
 from aerokit.vehicle.mission import MissionControl
 from aerokit.vehicle.parameters import Parameters
 from aerokit.vehicle.plans import PlanContext
@@ -45,6 +46,8 @@ class Vehicle(FlightActions):
         """Set-point streams: velocity, position, acceleration, attitude."""
         self.files = Files(self._transfers)
         """The files on it, by MAVFTP."""
+        self.logs = Logs(self._transfers, self.files)
+        """Its flight logs."""
         self.parameters = Parameters(self._transfers, self.files)
         """The autopilot's parameters: download, get, set, transactions, what was changed."""
         self._detach.append(self.parameters._attach())

@@ -1,0 +1,66 @@
+"""Which file by MAVFTP is the log with this id: the two protocols name them differently."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING
+
+from aerokit.errors import FileError
+
+if TYPE_CHECKING:
+    from aerokit.vehicle.files import FileEntry, Files
+    from aerokit.vehicle.logs import LogEntry
+
+__all__ = ["log_path"]
+
+ARDUPILOT_NAME = re.compile(r"(\d{8})\.BIN", re.IGNORECASE)
+PX4_LIST = "logdata.txt"
+PX4_LINE = re.compile(r"(\d+) (\d+) (\S+)")
+
+
+async def log_path(
+    files: Files, directories: tuple[str, ...], log: LogEntry, patience_s: float
+) -> str | None:
+    """The path of a log for MAVFTP; None when it is not certain.
+
+    ArduPilot's log 1 is the oldest of its ``00000001.BIN``, and the others follow in the order of their numbers. PX4
+    writes its list to a file when it is asked for it, in the order of the ids, with the paths. In both cases the size
+    must be that of the entry, or larger for a log that still grows.
+    """
+    for directory in directories:
+        try:
+            entries = await files.list(directory, patience_s=patience_s)
+        except FileError:
+            continue
+        numbered = {
+            int(match[1]): entry for entry in entries if (match := ARDUPILOT_NAME.fullmatch(entry.name))
+        }
+        if numbered:
+            return _numbered_path(directory, numbered, log)
+        if any(entry.is_directory for entry in entries):
+            return await _listed_path(files, directory, log, patience_s)
+    return None
+
+
+def _numbered_path(directory: str, entries: dict[int, FileEntry], log: LogEntry) -> str | None:
+    number = min(entries) + log.id - 1
+    entry = entries.get(number)
+    if entry is None or entry.size is None:
+        return None
+    is_newest = number == max(entries)
+    is_it = entry.size == log.size or (is_newest and entry.size > log.size)
+    return f"{directory}/{entry.name}" if is_it else None
+
+
+async def _listed_path(files: Files, directory: str, log: LogEntry, patience_s: float) -> str | None:
+    root = directory.rpartition("/")[0]
+    try:
+        text = await files.read(f"{root}/{PX4_LIST}", patience_s=patience_s)
+    except FileError:
+        return None
+    lines = text.decode("utf-8", "replace").splitlines()
+    match = PX4_LINE.fullmatch(lines[log.id]) if log.id < len(lines) else None
+    if match is None or int(match[2]) != log.size:
+        return None
+    _, found, rest = match[3].partition("/log/")
+    return f"{directory}/{rest}" if found else None
