@@ -9,6 +9,7 @@ DEVIATIONS = 4.0
 SPARE_S = 0.03
 """What the vehicle's main loop and the resolution of clocks add, however steady the answers come."""
 BACKOFF = 1.5
+MOST_BACKOFFS = 30
 
 
 class RoundTrip:
@@ -45,5 +46,5 @@ class RoundTrip:
             first = min(1.0, self._longest_s)
         else:
             first = self.smoothed_s + max(DEVIATIONS * self._deviation_s, SPARE_S)
-        patient = max(first, self._shortest_s) * BACKOFF ** max(0, attempt - 2)
+        patient = max(first, self._shortest_s) * BACKOFF ** min(max(0, attempt - 2), MOST_BACKOFFS)
         return min(patient, max(self._longest_s, first))

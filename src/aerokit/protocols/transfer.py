@@ -79,7 +79,7 @@ class Transfer(Exchange[ResultT]):
             self._on_progress(Progress(done, total, now - self._started_at))
 
     def _is_out_of_patience(self, now: float) -> bool:
-        return now - self._moved_at >= self._patience_s
+        return now >= self._moved_at + self._patience_s  # as the deadline is computed, to the last bit
 
     def _is_from_target(self, message: Message) -> bool:
         """Whether the component we talk to sent it; other components of the same vehicle do not count."""
