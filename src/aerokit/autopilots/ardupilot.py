@@ -58,6 +58,7 @@ class ArduPilot(Autopilot):
     firmware = "ArduPilot"
     home_is_item_0 = True
     runs_prearm_checks = True
+    parameter_interval_s = 0.02
     sends_mission_requests_float = True
     mission_storage = "ardupilot"
     mission_upload_window = 6
@@ -67,6 +68,7 @@ class ArduPilot(Autopilot):
     mission_starts_by_command = True
     sets_current_by_command = True
     takes_file_sessions = True
+    log_suffix = ".bin"
     log_directories = ("/APM/LOGS", "/logs")
     first_log_id = 1
     estimator_message = "EKF_STATUS_REPORT"

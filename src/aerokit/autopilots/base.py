@@ -143,6 +143,8 @@ class Autopilot:
     """Whether MISSION_ITEM_REACHED is sent again and again for one item."""
     takes_file_sessions = False
     """Whether a MAVFTP session has the number that the client gave it, not one that the vehicle answers."""
+    log_suffix = ".log"
+    """What files with its flight logs are called: ``.bin`` (dataflash) or ``.ulg``."""
     log_directories: ClassVar[tuple[str, ...]] = ()
     """Where MAVFTP finds the flight logs, or the directories with them: the first of these that exists."""
     first_log_id = 0
@@ -272,6 +274,9 @@ class Autopilot:
         return self._bytewise_by_default
 
     _bytewise_by_default = False
+    parameter_interval_s: float | None = None
+    """How often it may be made to see to parameters for the time of a transfer, by MAV_CMD_SET_MESSAGE_INTERVAL of
+    PARAM_VALUE; None where that changes nothing."""
     has_parameter_hash = False
     """Whether the parameter ``_HASH_CHECK`` is a checksum over all others."""
 

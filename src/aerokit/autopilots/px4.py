@@ -91,6 +91,7 @@ class Px4(Autopilot):
     modes = MODES
     setpoints = SetpointRules(before_mode=True, minimum_hz=2.0, timeout_s=0.5)
     reposition = Reposition(relative_altitude=False, yaw=True, speed=True, armed_only=True)
+    log_suffix = ".ulg"
     log_directories = ("/fs/microsd/log", "/log")
     silent_without_logs = True
     changes_speed = True

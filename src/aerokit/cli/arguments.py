@@ -14,7 +14,7 @@ from aerokit.links import parse_address
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = ["address", "home", "number", "system_id", "writable_file"]
+__all__ = ["address", "directory", "home", "number", "system_id", "writable_file"]
 
 
 def address(text: str) -> str:
@@ -68,3 +68,11 @@ def writable_file(text: str) -> str:
     if path.is_dir() or not path.parent.is_dir():
         raise ArgumentTypeError(f"{text!r} cannot be written: it is a directory, or its directory is missing")
     return text
+
+
+def directory(text: str) -> Path:
+    """A directory that is there."""
+    path = Path(text)
+    if not path.is_dir():
+        raise ArgumentTypeError(f"{text!r} is no directory that is there")
+    return path

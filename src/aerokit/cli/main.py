@@ -9,6 +9,10 @@ import sys
 from typing import TYPE_CHECKING
 
 from aerokit.cli.arguments import address, home, number, system_id, writable_file
+from aerokit.cli.files import add_files
+from aerokit.cli.logs import add_logs
+from aerokit.cli.mission import add_mission
+from aerokit.cli.params import add_params
 from aerokit.cli.vehicles import HOME, NAMES
 from aerokit.errors import AerokitError, LocalProtocolError
 
@@ -54,6 +58,8 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(required=True, metavar="COMMAND", title="commands")
     _add_demo(commands)
     _add_sim(commands)
+    for add in (add_params, add_mission, add_files, add_logs):
+        add(commands)
     return parser
 
 

@@ -1,0 +1,105 @@
+"""``aerokit files``: the files on a vehicle, by MAVFTP."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path, PurePosixPath
+
+from aerokit.cli.progress import file_size, progress_bar
+from aerokit.cli.vehicle_command import add_action, connected
+
+__all__ = ["add_files"]
+
+DONE = 0
+
+
+def add_files(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command to the parser."""
+    text = "List, fetch and change files on a vehicle by MAVFTP."
+    files = commands.add_parser("files", help="files on a vehicle", description=text)
+    actions = files.add_subparsers(required=True, metavar="ACTION", title="actions")
+    listing = add_action(actions, "ls", _list, "List a directory.")
+    listing.add_argument("path", nargs="?", default="/", help="directory on the vehicle (/)")
+    get = add_action(actions, "get", _get, "Fetch a file; one begun before is continued.")
+    get.add_argument("path", help="on the vehicle")
+    get.add_argument("to", nargs="?", help="here (the same name in this directory)")
+    put = add_action(actions, "put", _put, "Write a file to the vehicle.")
+    put.add_argument("file", help="here")
+    put.add_argument("path", help="on the vehicle")
+    for name, run, text in (
+        ("rm", _remove, "Remove a file."),
+        ("rmdir", _remove_directory, "Remove an empty directory."),
+        ("mkdir", _make_directory, "Make a directory."),
+        ("crc", _crc, "Print the CRC-32 that the vehicle computes of a file."),
+    ):
+        add_action(actions, name, run, text).add_argument("path", help="on the vehicle")
+    move = add_action(actions, "mv", _move, "Rename a file or directory.")
+    move.add_argument("path", help="on the vehicle")
+    move.add_argument("new_path", help="on the vehicle")
+
+
+async def _list(options: argparse.Namespace) -> int:
+    async with connected(options) as vehicle:
+        for entry in await vehicle.files.list(options.path, patience_s=options.patience):
+            size = "" if entry.size is None else f"{entry.size}"
+            print(f"{size:>12}  {entry.name}{'/' if entry.is_directory else ''}")
+    return DONE
+
+
+async def _get(options: argparse.Namespace) -> int:
+    to = _destination(options)
+    async with connected(options) as vehicle:
+        with progress_bar(to.name, "B") as show:
+            await vehicle.files.download(
+                options.path, to, resume=True, patience_s=options.patience, on_progress=show
+            )
+    print(f"{to}: {file_size(to)} bytes")
+    return DONE
+
+
+def _destination(options: argparse.Namespace) -> Path:
+    """Where to put a file: where it is wanted, or under its own name."""
+    name = PurePosixPath(options.path).name
+    to = Path(options.to or name)
+    return to / name if to.is_dir() else to
+
+
+async def _put(options: argparse.Namespace) -> int:
+    size = file_size(options.file)
+    async with connected(options) as vehicle:
+        with progress_bar(Path(options.file).name, "B") as show:
+            await vehicle.files.upload(
+                options.file, options.path, patience_s=options.patience, on_progress=show
+            )
+    print(f"{options.path}: {size} bytes")
+    return DONE
+
+
+async def _remove(options: argparse.Namespace) -> int:
+    async with connected(options) as vehicle:
+        await vehicle.files.remove(options.path, patience_s=options.patience)
+    return DONE
+
+
+async def _remove_directory(options: argparse.Namespace) -> int:
+    async with connected(options) as vehicle:
+        await vehicle.files.remove_directory(options.path, patience_s=options.patience)
+    return DONE
+
+
+async def _make_directory(options: argparse.Namespace) -> int:
+    async with connected(options) as vehicle:
+        await vehicle.files.make_directory(options.path, patience_s=options.patience)
+    return DONE
+
+
+async def _move(options: argparse.Namespace) -> int:
+    async with connected(options) as vehicle:
+        await vehicle.files.rename(options.path, options.new_path, patience_s=options.patience)
+    return DONE
+
+
+async def _crc(options: argparse.Namespace) -> int:
+    async with connected(options) as vehicle:
+        print(f"{await vehicle.files.crc32(options.path, patience_s=options.patience):08x}")
+    return DONE

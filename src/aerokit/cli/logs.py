@@ -1,0 +1,91 @@
+"""``aerokit logs``: the flight logs on a vehicle."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from aerokit.cli.arguments import directory
+from aerokit.cli.progress import file_size, progress_bar
+from aerokit.cli.vehicle_command import add_action, connected
+from aerokit.errors import LocalProtocolError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from aerokit.vehicle.logs import LogEntry
+
+__all__ = ["add_logs"]
+
+DONE, FAILED = 0, 1
+
+
+def add_logs(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command to the parser."""
+    text = "List, download and erase the flight logs of a vehicle."
+    logs = commands.add_parser("logs", help="flight logs of a vehicle", description=text)
+    actions = logs.add_subparsers(required=True, metavar="ACTION", title="actions")
+    add_action(actions, "list", _list, "List the flight logs.")
+    get = add_action(actions, "get", _get, "Download flight logs; what was begun before is continued.")
+    get.add_argument("ids", nargs="*", type=int, metavar="ID", help="of the logs (the newest)")
+    get.add_argument("--all", action="store_true", help="every log")
+    get.add_argument(
+        "--to", type=directory, default=Path(), metavar="DIRECTORY", help="where to put them (this directory)"
+    )
+    get.add_argument(
+        "--method", choices=("auto", "ftp", "log"), default="auto", help="of the download (auto)"
+    )
+    erase = add_action(actions, "erase", _erase, "Erase all flight logs.")
+    erase.add_argument("--yes", action="store_true", help="do not ask")
+
+
+async def _list(options: argparse.Namespace) -> int:
+    async with connected(options) as vehicle:
+        for entry in await vehicle.logs.list(patience_s=options.patience):
+            time = "" if entry.time_utc is None else f"{entry.time_utc:%Y-%m-%d %H:%M:%S}"
+            print(f"{entry.id:>6}  {entry.size:>12}  {time}".rstrip())
+    return DONE
+
+
+async def _get(options: argparse.Namespace) -> int:
+    async with connected(options) as vehicle:
+        entries = await vehicle.logs.list(patience_s=options.patience)
+        for entry in _chosen(entries, options):
+            to = options.to / f"log{entry.id:05}{vehicle.autopilot.log_suffix}"
+            with progress_bar(to.name, "B") as show:
+                await vehicle.logs.download(
+                    entry, to, method=options.method, patience_s=options.patience, on_progress=show
+                )
+            print(f"{to}: {file_size(to)} bytes")
+    return DONE
+
+
+def _chosen(entries: Sequence[LogEntry], options: argparse.Namespace) -> Sequence[LogEntry]:
+    if options.all or not options.ids:
+        return entries if options.all else entries[-1:]
+    known = {entry.id: entry for entry in entries}
+    for log_id in options.ids:
+        if log_id not in known:
+            raise LocalProtocolError(
+                f"there is no log {log_id}: {', '.join(map(str, known)) or 'there are none'}"
+            )
+    return [known[log_id] for log_id in options.ids]
+
+
+async def _erase(options: argparse.Namespace) -> int:
+    if not options.yes and not _agreed():
+        print("nothing was erased")
+        return FAILED
+    async with connected(options) as vehicle:
+        await vehicle.logs.erase(patience_s=options.patience)
+    print("erased")
+    return DONE
+
+
+def _agreed() -> bool:
+    """Whether somebody at a terminal says yes; nobody there means no."""
+    if not sys.stdin.isatty():
+        return False
+    return input("erase all flight logs of the vehicle? [y/N] ").strip().lower() in ("y", "yes")
