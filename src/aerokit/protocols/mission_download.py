@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 __all__ = ["Downloaded", "MissionDownload"]
 
 MAX_RESTARTS = 8
+EARLIEST_ANSWER = 0.8
+"""Of a round trip: what comes earlier is no answer to the request."""
 
 
 class Downloaded(Snapshot):
@@ -152,7 +154,8 @@ class MissionDownload(MissionExchange[Downloaded]):
         if result == MavMissionResult.DENIED:
             self._wait_while_busy(result, now)
         elif result == MavMissionResult.ERROR:
-            self._begin_anew(now)
+            if now - self._list_at >= EARLIEST_ANSWER * (self.round_trip.smoothed_s or 0.0):
+                self._begin_anew(now)  # else it is about something sent before, a repeated item of an upload perhaps
         elif result not in (
             MavMissionResult.ACCEPTED,
             MavMissionResult.INVALID_SEQUENCE,  # MISSION_COUNT comes with it and tells the new number
