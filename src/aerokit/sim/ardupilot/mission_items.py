@@ -91,7 +91,7 @@ _LAYOUTS: dict[int, str] = {
     _C.DO_VTOL_TRANSITION: "B---",
     _C.DO_WINCH: "BBff",
     _C.NAV_SCRIPT_TIME: "BBeehh-",
-    _C.NAV_ATTITUDE_TIME: "Hhbhh--",
+    _C.NAV_ATTITUDE_TIME: "tapwh--",
 }
 """Command → how each of params 1 to 4 (and x, y, z where they are no place) is kept; see `_KEEPERS`."""
 
@@ -198,12 +198,11 @@ def has_location(command: int) -> bool:
 
 
 def is_place(latitude_e7: float, longitude_e7: float) -> int:
-    """ACCEPTED, or which of the two cannot be."""
-    if not abs(latitude_e7) <= 900_000_000:
+    """ACCEPTED, or which of the two cannot be; compared as 32-bit floats, so that some units more pass."""
+    if not abs(float32(latitude_e7)) <= 900_000_000:
         return MavMissionResult.INVALID_PARAM5_X
-    return (
-        MavMissionResult.ACCEPTED if abs(longitude_e7) <= 1_800_000_000 else MavMissionResult.INVALID_PARAM6_Y
-    )
+    in_range = abs(float32(longitude_e7)) <= 1_800_000_000
+    return MavMissionResult.ACCEPTED if in_range else MavMissionResult.INVALID_PARAM6_Y
 
 
 def altitude_frame(frame: int) -> int | None:
@@ -272,6 +271,10 @@ def whole(value: float) -> int:
     return int(value) if abs(value) < 2**31 else 0
 
 
+def _whole_within(value: float, low: int, high: int) -> int:
+    return int(value) if low <= value <= high else 0
+
+
 def _half(value: float) -> float:
     try:
         return float(struct.unpack("<e", struct.pack("<e", value))[0])
@@ -298,5 +301,9 @@ _KEEPERS: dict[str, Callable[[float], float]] = {
     "+": lambda value: 1.0 if value > 0 else 0.0,
     "1": lambda value: float(whole(value) & 1),
     "2": lambda _: 2.0,
+    "t": lambda value: float(int(max(0.0, min(65535.0, value)))),
+    "a": lambda value: float(_whole_within(value, -180, 180)),
+    "p": lambda value: float(_whole_within(value, -90, 90)),
+    "w": lambda value: float(_whole_within(value, -180, 360)),
 }
-"""How a number is kept: as a C type, in hundredths, with a sign, as a yes or no, or not at all."""
+"""How a number is kept: as a C type, in hundredths, with a sign, as an angle, as a yes or no, or not at all."""

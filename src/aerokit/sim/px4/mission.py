@@ -162,6 +162,8 @@ class Mission:
             px4.call_later(0.0, self._return)
 
     def _return(self) -> None:
+        """The mission is over: after the landing it does not come back."""
+        self._px4.change_mode(HOLD)
         if self._px4.change_mode(RTL):
             self._px4.info("Returning to launch")
 

@@ -92,6 +92,9 @@ _NO_MISSION_COMMANDS = frozenset(
     {*_POLYGONS, _C.NAV_FENCE_CIRCLE_INCLUSION, _C.NAV_FENCE_CIRCLE_EXCLUSION, _C.NAV_RALLY_POINT}
 )
 _INT_MIN = -(1 << 31)
+_PI = float32(math.pi)
+_TURN = float32(math.tau)
+_RADIANS_PER_DEGREE, _DEGREES_PER_RADIAN = float32(_PI / 180.0), float32(180.0 / _PI)
 
 
 def stored(item: MissionItem, mission_type: int, *, is_int: bool = True) -> MissionItem | int:
@@ -113,7 +116,7 @@ def stored(item: MissionItem, mission_type: int, *, is_int: bool = True) -> Miss
     if mission_type == MavMissionType.FENCE:
         if kept.command in _POLYGONS and kept.param1 < 3:
             return MavMissionResult.ERROR
-        return kept.replace(frame=_F.GLOBAL)  # whether the altitude was relative is forgotten
+        return _as_fence_point(kept)
     return kept
 
 
@@ -138,6 +141,14 @@ def _params(item: MissionItem) -> tuple[float, float, float, float]:
 
 def _floats(item: MissionItem) -> bytes:
     return struct.pack("<3f", item.x, item.y, item.z)
+
+
+def _as_fence_point(item: MissionItem) -> MissionItem:
+    """A place, a size and an altitude, of which it is forgotten what it is above."""
+    if item.frame == _F.MISSION:
+        return MissionItem(item.command, item.frame, item.param1, z=item.z, autocontinue=False)
+    place = {"x": item.x, "y": item.y, "z": item.z}
+    return MissionItem(item.command, _F.GLOBAL, item.param1, **place, autocontinue=False)
 
 
 def _with_place(item: MissionItem, frame: int) -> MissionItem | int:
@@ -178,11 +189,14 @@ def _rounded(value: float) -> int:
 
 
 def _heading(degrees: float) -> float:
-    """0 to 360; it was kept in radians."""
+    """0 to 360; it was kept in radians, and all that in 32-bit floats."""
     if not math.isfinite(degrees):
         return math.nan
-    radians = float32(math.radians(degrees))
-    return float32(math.degrees(float32(radians % math.tau)))
+    radians = float32(degrees * _RADIANS_PER_DEGREE)
+    if not 0.0 <= radians < _TURN:
+        turns = math.floor(float32(radians * float32(1.0 / _TURN)))
+        radians = float32(radians - float32(_TURN * turns))
+    return float32(radians * _DEGREES_PER_RADIAN)
 
 
 _KEEPERS: dict[str, Callable[[float], float]] = {

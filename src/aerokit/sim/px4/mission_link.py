@@ -110,10 +110,9 @@ class MissionLink:
         self._watch_number += 1
         self._watch(self._watch_number)
 
-    def _end(self) -> None:
+    def _end_upload(self) -> None:
         self._state = State.IDLE
-        if self._server.uploading is self:
-            self._server.uploading = None
+        self._server.uploading = None
 
     def _watch(self, number: int) -> None:
         due = self._received_at + _GIVE_UP_S
@@ -131,7 +130,7 @@ class MissionLink:
         now = self._px4.now
         if now >= self._received_at + _GIVE_UP_S:
             self._complain("Mission sync timeout")
-            self._end()
+            self._end_upload()
             return
         if self._repeats and now >= self._sent_at + _ASK_AGAIN_S:
             if self._state is State.GETTING:
@@ -143,9 +142,14 @@ class MissionLink:
     # --------------------------------------------------------------------------------------- download
 
     def on_request_list(self, request: m.MissionRequestList) -> None:
-        """Somebody wants a list: begin, or begin again."""
+        """Somebody wants a list: begin, or begin again.
+
+        When everything was sent, only the last acknowledgement is missing. The firmware takes an upload for that, too,
+        when as many items have come as it had before: the upload is over then, but blocks all others, until a
+        download is given up.
+        """
         if self._seq == self._server.count(self._type):
-            self._end()  # everything was sent, only the last acknowledgement is missing
+            self._state = State.IDLE
         same = self._partner == sender_of(request) and self._type == request.mission_type
         if not (self._state is State.IDLE or (self._state is State.SENDING and same)):
             self._px4.info("Mission download request ignored, already active")
@@ -177,7 +181,7 @@ class MissionLink:
             self._refuse_request()
 
     def _refuse_request(self) -> None:
-        self._end()
+        self._state = State.IDLE
         self._acknowledge(self._partner, _R.ERROR)
         self._complain("WPM: REJ. CMD: Req. WP was unexpected")
 
@@ -187,12 +191,12 @@ class MissionLink:
             self._complain("REJ. WP CMD: partner id mismatch")
         elif self._state is State.SENDING and ack.mission_type == self._type:
             self._received_at = self._px4.now
-            self._end()
+            self._state = State.IDLE
         elif self._state is State.GETTING and ack.type == _R.UNSUPPORTED:
             self._speaks_int = not self._speaks_int
             self._ask()
         elif self._state is State.GETTING and ack.type == _R.OPERATION_CANCELLED:
-            self._end()
+            self._end_upload()
 
     # ----------------------------------------------------------------------------------------- upload
 
@@ -264,7 +268,7 @@ class MissionLink:
             if kept != _R.ERROR:
                 self._complain("IGN MISSION_ITEM: Invalid item")
             self._acknowledge(self._partner, kept)
-            self._end()
+            self._end_upload()
             return
         self._id = checksum([place], self._id)
         self._items.append(kept)
@@ -275,7 +279,7 @@ class MissionLink:
             self._ask()
             return
         self._server.store(self._type, self._items, self._id, self._current)
-        self._end()
+        self._end_upload()
         self._acknowledge(self._partner, _R.ACCEPTED, self._id)
 
     # ---------------------------------------------------------------------------------------- at once

@@ -75,7 +75,7 @@ class MissionServer:
     @property
     def transfer_is_open(self) -> bool:
         """Whether an upload or a download is going on, on any link."""
-        return any(not link.is_idle for link in self._links.values())
+        return self.uploading is not None or any(not link.is_idle for link in self._links.values())
 
     def items(self, mission_type: int) -> list[MissionItem]:
         """All items as they are given back; empty for an unknown type."""
