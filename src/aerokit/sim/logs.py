@@ -92,13 +92,13 @@ class LogServer:
 
     # ------------------------------------------------------------------------------------ what does not
 
-    def _on_erase(self, _: LogErase, __: Channel) -> None:
+    def _on_erase(self, request: LogErase, channel: Channel) -> None:
         self.restart()
         self.logs.clear()
         self._content = (-1, b"")
         self._erase_files()
 
-    def _on_end(self, _: LogRequestEnd, __: Channel) -> None:
+    def _on_end(self, request: LogRequestEnd, channel: Channel) -> None:
         self.restart()
 
     def content(self, number: int) -> bytes:

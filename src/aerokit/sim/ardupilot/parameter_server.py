@@ -54,7 +54,7 @@ class ArduPilotParameterServer(ParameterServer):
         self._reads.clear()
         self._is_reading = False
 
-    def _on_list(self, _: ParamRequestList, channel: Channel) -> None:
+    def _on_list(self, request: ParamRequestList, channel: Channel) -> None:
         self._send_banner()
         self.start_list(channel)
 

@@ -1,0 +1,319 @@
+from __future__ import annotations
+
+import math
+import struct
+from contextlib import suppress
+
+import pytest
+from ftp_client import Err, FtpClient, Op
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from simulated_client import Client
+
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import MavParamError, MavParamType
+from aerokit.mavlink.message import Message
+from aerokit.parameters import (
+    Parameter,
+    ParameterTable,
+    ParameterType,
+    pack_parameters,
+    unpack_parameters,
+)
+from aerokit.parameters.px4_hash import px4_hash
+from aerokit.sim import SimulatedCopter, SimulatedPx4
+from aerokit.sim.ardupilot.copter_parameters import copter_parameters
+from aerokit.sim.ardupilot.parameter_server import rounded
+from aerokit.sim.file_tree import FileFault
+from aerokit.sim.parameter_pack_file import packed_parameters
+from aerokit.sim.px4.parameter_server import parameter_hash
+from aerokit.sim.px4.parameters import px4_parameters
+
+REAL, INT8, INT16, INT32 = MavParamType.REAL32, MavParamType.INT8, MavParamType.INT16, MavParamType.INT32
+
+
+def a_copter(**options: object) -> tuple[SimulatedCopter, Client]:
+    copter = SimulatedCopter(boot_time_s=0.0, **options)  # type: ignore[arg-type]
+    return copter, ready(copter)
+
+
+def a_px4(**options: object) -> tuple[SimulatedPx4, Client]:
+    px4 = SimulatedPx4(boot_time_s=0.0, fast_rate_hz=1.0, **options)  # type: ignore[arg-type]
+    return px4, ready(px4)
+
+
+def ready(vehicle: SimulatedCopter | SimulatedPx4) -> Client:
+    client = Client(vehicle)
+    client.run(1.0)
+    client.forget()
+    return client
+
+
+def told(client: Client, message: Message, seconds: float = 0.1) -> list[m.ParamValue]:
+    client.forget()
+    client.send(message)
+    client.run(seconds)
+    return client.all(m.ParamValue)
+
+
+def bits_of(message: m.ParamValue) -> int:
+    assert message.received_frame is not None
+    return int.from_bytes(message.received_frame.payload[:4], "little")
+
+
+# ---------------------------------------------------------------------------------------- tables
+
+
+def test_the_tables_are_those_of_the_firmwares() -> None:
+    assert (len(copter_parameters()), len(px4_parameters())) == (1349, 889)
+    assert len(copter_parameters(100)) == 100
+    assert px4_parameters().names == tuple(sorted(px4_parameters().names))
+    copter = copter_parameters()
+    assert sum(copter.default(name) != copter[name] for name in copter) == 41
+    assert all(math.isfinite(copter[name]) for name in copter)
+
+
+def test_switching_a_feature_on_changes_the_count() -> None:
+    copter = copter_parameters()
+    assert copter["BATT2_CAPACITY"] == 3300, "there by name at any time"
+    assert "BATT2_CAPACITY" not in copter.names
+    copter["BATT2_MONITOR"] = 4
+    assert len(copter) == 1362
+    assert copter.index("BATT2_CAPACITY") == copter.index("BATT2_MONITOR") + 1
+    copter["BATT2_MONITOR"] = 0
+    assert len(copter) == 1349
+    copter.add("NEW", 2.0)
+    assert copter.names[-1] == "NEW"
+    copter.remove("NEW")
+    assert len(copter) == 1349
+
+
+@pytest.mark.parametrize(
+    ("type_", "value", "kept"),
+    [(INT8, 20.7, 20), (INT8, 20.995, 21), (INT8, 300, 127), (INT8, -300, -128), (INT8, -2.5, -2),
+     (INT16, 70_000, 32_767), (INT32, 16_777_217, 16_777_216), (REAL, 0.1, pytest.approx(0.1, rel=1e-6))],
+)  # fmt: skip
+def test_ardupilot_keeps_what_a_float_gives(type_: int, value: float, kept: float) -> None:
+    copter, client = a_copter(parameter_count=80)
+    copter.parameters.add("X", 0, type_)
+    (echo,) = told(client, m.ParamSet(1, 1, "X", value, REAL))
+    assert (echo.param_value, echo.param_type, echo.param_index) == (kept, type_, 0xFFFF)
+    assert copter.parameters["X"] == kept
+
+
+# ------------------------------------------------------------------------------------- ArduPilot
+
+
+def test_ardupilots_list_begins_anew_and_comes_at_2000_a_second() -> None:
+    copter, client = a_copter()
+    client.send(m.ParamRequestList(1, 1))
+    client.run(0.2)
+    first = len(client.all(m.ParamValue))
+    assert first == pytest.approx(400, abs=30)
+    client.send(m.ParamRequestList(1, 1))
+    client.run(1.0)
+    indices = [value.param_index for value in client.all(m.ParamValue)[first:]]
+    assert indices == list(range(1349))
+    assert copter.storage.parameters.running_lists == 0
+    assert client.texts.count("Frame: QUAD/PLUS") == 2
+
+
+def test_on_a_slow_link_the_list_takes_30_percent() -> None:
+    _, client = a_copter(link_bytes_per_s=5760)
+    values = told(client, m.ParamRequestList(1, 1), 2.0)
+    assert len(values) * 37 == pytest.approx(2 * 0.3 * 5760, rel=0.05)
+
+
+def test_ardupilot_forgets_reads_beyond_twenty() -> None:
+    _, client = a_copter(parameter_count=100)
+    for index in range(50):
+        client.vehicle.receive(client._encoder.encode(m.ParamRequestRead(1, 1, "", index)), client.now)
+    client.run(0.1)
+    assert [value.param_index for value in client.all(m.ParamValue)] == list(range(20 + 1))
+    assert [v.param_index for v in told(client, m.ParamRequestRead(1, 1, "RTL_ALT", -1))] == [0xFFFF]
+
+
+def test_the_development_version_says_nothing_and_the_released_one_an_error() -> None:
+    questions = (
+        (m.ParamSet(1, 1, "NOPE", 1.0, REAL), MavParamError.DOES_NOT_EXIST, -1),
+        (m.ParamSet(1, 1, "RTL_ALT", math.nan, REAL), MavParamError.VALUE_OUT_OF_RANGE, -1),
+        (m.ParamRequestRead(1, 1, "NOPE", -1), MavParamError.DOES_NOT_EXIST, -1),
+        (m.ParamRequestRead(1, 1, "", 5000), MavParamError.DOES_NOT_EXIST, 5000),
+    )
+    _, silent = a_copter(parameter_count=80)
+    _, frank = a_copter(parameter_count=80, parameter_errors=True)
+    for question, code, index in questions:
+        assert told(silent, question) == []
+        assert told(frank, question) == []
+        (error,) = frank.all(m.ParamError)
+        assert (error.error, error.param_index, error.target_system) == (code, index, 255)
+    assert silent.all(m.ParamError) == []
+    assert len(told(frank, m.ParamSet(1, 1, "RTL_ALT", 1000.0, REAL))) == 2
+
+
+def test_faults_clamp_protect_and_mute() -> None:
+    copter, client = a_copter(parameter_count=80, parameter_errors=True)
+    copter.faults.parameter_limits["RTL_ALT"] = (300.0, 8000.0)
+    assert told(client, m.ParamSet(1, 1, "RTL_ALT", 10.0, REAL))[0].param_value == 300.0
+    copter.faults.read_only_parameters.add("RTL_ALT")
+    assert told(client, m.ParamSet(1, 1, "RTL_ALT", 500.0, REAL))[0].param_value == 300.0
+    assert client.all(m.ParamError)[0].error == MavParamError.PERMISSION_DENIED
+    assert "Param write denied (RTL_ALT)" in client.texts
+    copter.faults.mute_parameters.add("RTL_ALT")
+    names = [value.param_id for value in told(client, m.ParamRequestList(1, 1), 1.0)]
+    assert len(names) == 79
+    assert "RTL_ALT" not in names
+
+
+# --------------------------------------------------------------------------------- param.pck
+
+
+@pytest.mark.parametrize("block", [239, 80, 100, 17])
+def test_the_pack_is_what_the_firmware_packs(block: int) -> None:
+    parameters = copter_parameters()
+    rows = [parameters.row(name) for name in parameters.names]
+    table = unpack_parameters(packed_parameters(rows, len(rows), block, with_defaults=True))
+    assert list(table) == [row.name for row in rows]
+    for row in rows:
+        assert (table[row.name].value, table[row.name].default) == (row.value, row.default)
+
+
+def test_a_pack_is_read_by_parts_and_in_one_block_size() -> None:
+    copter, client = a_copter(parameter_count=100)
+    ftp = FtpClient(client)
+    assert ftp.data(Op.OPENFILERO, "@PARAM/param.pck?start=98&count=5") == (1200).to_bytes(4, "little")
+    part = ftp.data(Op.READFILE, size=200)
+    assert struct.unpack_from("<HHH", part) == (0x671B, 2, 100)
+    assert ftp.refusal(Op.READFILE, size=100) == (Err.FAILERRNO, 22)
+    ftp.data(Op.TERMINATESESSION)
+    assert any("ArduCopter" in text for text in client.texts) or copter.now > 0
+    for path in ("@PARAM/param.pck?start=70000", "@PARAM/param.pck?withdefaults=2"):
+        assert ftp.refusal(Op.OPENFILERO, path) == (Err.FAILERRNO, 22)
+    for path in ("@PARAM/other", "@PARAM/param.pckx"):
+        assert ftp.refusal(Op.OPENFILERO, path) == (Err.FILENOTFOUND,)
+
+
+def test_an_uploaded_pack_takes_effect_at_its_end() -> None:
+    copter, client = a_copter(parameter_count=100)
+    ftp = FtpClient(client)
+    some = [copter.parameters.row(name) for name in copter.parameters.names]
+    assert some
+    table = unpack_parameters(packed_parameters(some, len(some), 239))
+    content = pack_parameters(table)
+    for name in ("RTL_ALT", "WPNAV_SPEED", "DISARM_DELAY"):
+        copter.parameters[name] = 1
+    ftp.upload("@PARAM/param.pck", content)
+    assert {name: copter.parameters[name] for name in copter.parameters} == table.values_by_name()
+    copter.parameters["RTL_ALT"] = 1
+    for broken in (b"", content + b"\0", b"\0" + content[1:]):
+        ftp.upload("@PARAM/param.pck", broken)
+    assert copter.parameters["RTL_ALT"] == 1
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.binary(max_size=200), st.integers(0, 5))
+def test_no_uploaded_bytes_break_the_vehicle(noise: bytes, count: int) -> None:
+    copter = SimulatedCopter(parameter_count=70)
+    file = copter.files.open("@PARAM/param.pck", writing=True)
+    file.write(0, struct.pack("<HHH", 0x671B, count, 6 + len(noise)) + noise)
+    with suppress(FileFault):
+        file.close()
+
+
+# ------------------------------------------------------------------------------------------ PX4
+
+
+def test_px4s_hash_is_that_of_the_library() -> None:
+    parameters = px4_parameters()
+    rows = [parameters.row(name) for name in parameters.names]
+    volatile = {row.name for row in rows if row.is_volatile}
+    assert "CAL_ACC0_XOFF" in volatile
+    table = ParameterTable(
+        Parameter(row.name, int(row.value) if row.type == INT32 else row.value, ParameterType(row.type))
+        for row in rows
+    )
+    assert parameter_hash(parameters) == px4_hash(table, volatile)
+    parameters["CAL_ACC0_XOFF"] = 1.0
+    assert parameter_hash(parameters) == px4_hash(table, volatile)
+    parameters["MPC_XY_CRUISE"] = 6.0
+    assert parameter_hash(parameters) != px4_hash(table, volatile)
+
+
+def test_px4_sends_its_hash_first_and_a_second_request_begins_without() -> None:
+    px4, client = a_px4()
+    client.send(m.ParamRequestList(1, 1))
+    client.run(0.2)
+    client.send(m.ParamRequestList(1, 1))
+    client.run(1.5)
+    values = client.all(m.ParamValue)
+    assert [v.param_id for v in values].count("_HASH_CHECK") == 1
+    assert (bits_of(values[0]), values[0].param_index) == (parameter_hash(px4.parameters), 0xFFFF)
+    assert [v.param_index for v in values[-889:]] == list(range(889))
+    assert told(client, m.ParamRequestList(0, 0), 1.0) == []
+
+
+@pytest.mark.parametrize("value", [0, 1, -1, -5_000_000, 0x7F800001, -(2**31), 2**31 - 1])
+def test_px4_keeps_every_bit(value: int) -> None:
+    px4, client = a_px4(parameter_count=70)
+    px4.parameters["COM_LOW_BAT_ACT"] = value
+    (echo,) = told(client, m.ParamRequestRead(1, 1, "COM_LOW_BAT_ACT", -1))
+    assert bits_of(echo) == value & 0xFFFFFFFF
+    payload = bytearray(m.ParamSet(1, 1, "COM_RC_IN_MODE", 0.0, INT32).encode())
+    payload[:4] = struct.pack("<i", value)
+    message = m.ParamSet.decode(bytes(payload))
+    frame = client._encoder.encode(message)
+    if struct.pack("<f", message.param_value) == struct.pack(
+        "<i", value
+    ):  # as many bits as a float keeps here
+        px4.receive(frame, client.now)
+        assert px4.parameters["COM_RC_IN_MODE"] == value
+
+
+def test_px4_tells_a_change_twice_and_the_same_value_once() -> None:
+    px4, client = a_px4(parameter_count=70)
+    index = px4.parameters.index("MIS_TAKEOFF_ALT")
+    first, second = told(client, m.ParamSet(1, 1, "MIS_TAKEOFF_ALT", 3.0, REAL))
+    assert (first.param_index, second.param_index, first.param_value) == (index, index, 3.0)
+    assert len(told(client, m.ParamSet(1, 1, "MIS_TAKEOFF_ALT", 3.0, REAL))) == 1
+    (nan,) = told(client, m.ParamSet(1, 1, "MIS_TAKEOFF_ALT", math.nan, REAL))
+    assert math.isnan(nan.param_value)
+    assert math.isnan(px4.parameters["MIS_TAKEOFF_ALT"])
+
+
+def test_px4_says_what_is_wrong_and_its_older_version_does_not() -> None:
+    questions = (
+        (m.ParamSet(1, 1, "NOPE", 1.0, REAL), MavParamError.DOES_NOT_EXIST),
+        (m.ParamSet(1, 1, "COM_LOW_BAT_ACT", 1.0, REAL), 7),
+        (m.ParamSet(1, 1, "COM_LOW_BAT_ACT", 1.0, INT16), 6),
+        (m.ParamSet(1, 1, "_HASH_CHECK", 0.0, REAL), MavParamError.READ_ONLY),
+        (m.ParamRequestRead(1, 1, "NOPE", -1), MavParamError.DOES_NOT_EXIST),
+        (m.ParamRequestRead(1, 1, "", 5000), MavParamError.DOES_NOT_EXIST),
+    )
+    _, new = a_px4(parameter_count=70)
+    _, old = a_px4(parameter_count=70, version="1.16.1")
+    for question, code in questions:
+        assert told(new, question) == []
+        (error,) = new.all(m.ParamError)
+        assert error.error == code
+        assert told(old, question) == []
+        assert old.all(m.ParamError) == []
+
+
+def test_px4_has_the_file_when_it_is_new_enough() -> None:
+    px4, client = a_px4(parameter_count=100)
+    assert FtpClient(client).refusal(Op.OPENFILERO, "@PARAM/param.pck") == (Err.FILENOTFOUND,)
+    px4, client = a_px4(parameter_count=100, parameter_file=True)
+    ftp = FtpClient(client)
+    size = int.from_bytes(ftp.data(Op.OPENFILERO, "@PARAM/param.pck?withdefaults=1"), "little")
+    ftp.data(Op.TERMINATESESSION)
+    content = ftp.download("@PARAM/param.pck?withdefaults=1")
+    assert len(content) == size, "an open tells the exact size"
+    table = unpack_parameters(content)
+    assert table.values_by_name() == {name: px4.parameters[name] for name in px4.parameters}
+    assert table["CA_ROTOR_COUNT" if "CA_ROTOR_COUNT" in table else "BAT1_N_CELLS"].default == 0
+
+
+@given(st.floats(-200, 200), st.sampled_from([INT8, INT16, INT32]))
+def test_rounding_is_towards_zero_but_for_a_hundredth(value: float, type_: int) -> None:
+    assert abs(rounded(value, type_)) <= abs(value) + 0.011
+    assert abs(rounded(value, type_) - value) < 1.0
