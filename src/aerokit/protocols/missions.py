@@ -34,7 +34,7 @@ BUSY_S = 9.0
 """How long a vehicle may be busy with a transfer that nobody goes on with: ArduPilot waits 8 s, PX4 5 s."""
 BUSY_AGAIN_S = 1.0
 """How often a busy vehicle is asked again."""
-MOST_PATIENT = 5
+FEW_ATTEMPTS, SAME_ATTEMPTS = 5, 7
 FORGOTTEN_S = 4.5
 """After so long a silence a vehicle may have given the transfer up (PX4 after 5 s, ArduPilot after 8)."""
 NAMES = {
@@ -131,8 +131,8 @@ class MissionExchange(Transfer[ResultT]):
         self.deadline = now + (self._timeout_s(self._attempt) if seconds is None else seconds)
 
     def _timeout_s(self, attempt: int) -> float:
-        """One small message is under way, or a few: a choked link is no reason to wait ever longer."""
-        return self.round_trip.timeout_s(min(attempt, MOST_PATIENT))
+        """Small messages do not choke a link: wait longer after each attempt only while few, or many, were in vain."""
+        return self.round_trip.timeout_s(min(attempt, max(FEW_ATTEMPTS, attempt - SAME_ATTEMPTS)))
 
     def _reject(self, result: int, *, seq: int | None = None) -> None:
         item = None if seq is None or seq < self.offset else seq - self.offset

@@ -191,7 +191,7 @@ class MissionControl(HeldPlan["Mission"]):
     def _check_item(self, item: int) -> None:
         count = self._watch.count.latest
         last = LAST_ITEM if count is None else count - 1
-        if not isinstance(item, int) or isinstance(item, bool) or not 0 <= item <= max(last, 0):
+        if not isinstance(item, int) or isinstance(item, bool) or not 0 <= item <= last:
             allowed = "the mission is empty" if count == 0 else f"0 to {last}"
             raise LocalProtocolError(f"item = {item!r} is not allowed: {allowed}")
 

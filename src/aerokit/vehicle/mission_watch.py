@@ -119,7 +119,7 @@ class MissionWatch:
     def _on_state(self, state: int) -> None:
         if state != STATE_COMPLETE:
             self._stale_until = -math.inf
-            if state == STATE_ACTIVE and self._is_in_mission_mode:
+            if state == STATE_ACTIVE and self._is_in_mission_mode and self._vehicle.is_armed:
                 self._was_active, self.is_complete = True, False
         elif self._vehicle.connection.now() >= self._stale_until:
             self._complete()

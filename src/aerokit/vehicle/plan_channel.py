@@ -155,17 +155,19 @@ class PlanChannel:
             message = f"{error}{self._what_is_left(exchange)}"
             raise MissionRejected(message, result=error.result, item=error.item, reasons=texts) from None
         except MissionTimeout as error:
-            error.args = (f"{error}{self._what_is_left(exchange)}",)
+            error.args = (f"{error}{self._what_is_left(exchange, is_silent=True)}",)
             raise
         finally:
             if not exchange.done and connection.is_open:
                 for goodbye in exchange.cancellation():
                     connection.send(goodbye)
 
-    def _what_is_left(self, exchange: MissionExchange[Any]) -> str:
+    def _what_is_left(self, exchange: MissionExchange[Any], *, is_silent: bool = False) -> str:
         if not isinstance(exchange, MissionUpload):
             return ""
-        has_begun = self._has_written or exchange.was_changing
-        if has_begun and self.mission_type in self._context.autopilot.replaced_as_they_come:
+        is_overwritten = self.mission_type in self._context.autopilot.replaced_as_they_come
+        if is_overwritten and (self._has_written or exchange.was_changing):
             return "; the vehicle now holds a part of the new items and a part of the old ones: upload again, or clear"
+        if is_overwritten and is_silent:
+            return "; if the vehicle heard of it, it has cut what it held to the new number of items"
         return "; the vehicle holds what it held before"

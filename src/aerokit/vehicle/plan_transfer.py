@@ -87,7 +87,7 @@ class PlanTransfer(Generic[PlanT]):
         if await self._uses_file(method, is_upload=True):
             await self._send_file(items, method)
         else:
-            await self._send_items(items, verify=verify)
+            await self._send_items(items, method, verify=verify)
 
     async def download(self, method: str) -> PlanT:
         """Read the plan that the vehicle holds."""
@@ -133,13 +133,13 @@ class PlanTransfer(Generic[PlanT]):
             raise error
         self._memory.has_file = False
 
-    async def _send_items(self, items: Sequence[MissionItem], *, verify: bool) -> None:
+    async def _send_items(self, items: Sequence[MissionItem], method: str, *, verify: bool) -> None:
         end = await self._channel.send(items)
         self._memory.learn(items, end.opaque_id, self._context.now())
         if end.is_sure and not verify:
             return
         try:
-            await self._verify(items, "auto")
+            await self._verify(items, method)
         except VerificationFailed as error:
             if end.is_sure:
                 raise
@@ -161,7 +161,7 @@ class PlanTransfer(Generic[PlanT]):
                 self._compare(dict(enumerate(items)), dict(enumerate(found)))
                 return
         # there is no such file; or a refusal half way, and the other protocol tells which item, and why
-        await self._send_items(items, verify=True)
+        await self._send_items(items, method, verify=True)
 
     # -------------------------------------------------------------------------------- changes
 

@@ -1,0 +1,83 @@
+"""vehicle.fence: up, down, cleared, on and off."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from flight_harness import open_flight, open_px4
+from plan_flights import near_home, sent_for_plans
+
+from aerokit import messages as m
+from aerokit.errors import CommandRejected, LocalProtocolError, MissionRejected
+from aerokit.mavlink.enums import MavCmd
+from aerokit.missions import Fence, FenceCircle, FencePolygon, Mission
+from aerokit.missions.storage import Storage
+from aerokit.position import Position
+
+pytestmark = pytest.mark.anyio
+
+
+def place(north_m: float, east_m: float) -> Position:
+    return Position(*near_home(north_m, east_m))
+
+
+FENCE = Fence(
+    [
+        FencePolygon([place(500, 500), place(500, -500), place(-500, -500), place(-500, 500)]),
+        FencePolygon([place(100, 100), place(100, 120), place(120, 120)], inclusion=False),
+    ],
+    [FenceCircle(place(0, 0), 400.0), FenceCircle(place(200, 0), 20.5, inclusion=False)],
+)
+
+
+@pytest.mark.parametrize("opened", [open_flight, open_px4])
+@pytest.mark.parametrize("method", ["auto", "items"])
+async def test_there_and_back(opened: Any, method: Any) -> None:
+    async with opened() as flight:
+        fence = flight.vehicle.fence
+        await fence.upload(FENCE, method=method)
+        assert FENCE.matches(await fence.download(method=method))
+        await fence.clear()
+        assert await fence.download(method=method) == Fence()
+
+
+async def test_one_circle_more_for_ardupilot() -> None:
+    """ArduPilot writes a fence only when it has all of it, also in parts."""
+    wider = FENCE.replace(circles=[FenceCircle(place(0, 0), 450.0), FENCE.circles[1]])
+    async with open_flight() as flight:
+        await flight.vehicle.fence.upload(FENCE, method="items")
+        flight.wire.forget()
+        await flight.vehicle.fence.upload(wider, method="items")
+        assert len(flight.wire.all(m.MissionItemInt)) == 1
+        assert wider.matches(await flight.vehicle.fence.download(), Storage.ARDUPILOT)
+
+
+@pytest.mark.parametrize("opened", [open_flight, open_px4])
+async def test_a_fence_that_is_refused_leaves_the_old_one(opened: Any) -> None:
+    async with opened() as flight:
+        await flight.vehicle.fence.upload(FENCE)
+        many = Fence([FencePolygon([place(i, i % 2) for i in range(70)])] * 200)
+        with pytest.raises(MissionRejected, match="the vehicle holds what it held before"):
+            await flight.vehicle.fence.upload(many, method="items")
+        assert FENCE.matches(await flight.vehicle.fence.download())
+
+
+async def test_on_and_off() -> None:
+    async with open_flight() as flight:
+        await flight.vehicle.fence.upload(FENCE)
+        await flight.vehicle.fence.enable()
+        await flight.vehicle.fence.enable(False)
+        orders = flight.wire.commands(MavCmd.DO_FENCE_ENABLE)
+        assert [order.param1 for order in orders] == [1, 0]
+    async with open_px4() as other:
+        with pytest.raises(CommandRejected, match="does not know"):
+            await other.vehicle.fence.enable()
+
+
+async def test_a_mission_is_no_fence() -> None:
+    async with open_flight() as flight:
+        plan: Any = Mission()
+        with pytest.raises(LocalProtocolError, match="a Fence"):
+            await flight.vehicle.fence.upload(plan)
+        assert sent_for_plans(flight.wire) == []

@@ -1,0 +1,265 @@
+"""Flying a mission: started, paused, resumed, waited for; who steers; what is told on the way."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import Any
+
+import anyio
+import pytest
+from flight_harness import Flight, Px4Flight, now, open_flight, open_px4
+from plan_flights import long_mission, short_mission
+
+from aerokit import events
+from aerokit import messages as m
+from aerokit.errors import (
+    CommandRejected,
+    HeartbeatTimeout,
+    LocalProtocolError,
+    OperationRejected,
+    OperationTimeout,
+)
+from aerokit.mavlink.enums import CopterMode, MavCmd
+from aerokit.missions import Mission, MissionItem
+from aerokit.missions.actions import jump
+from aerokit.missions.navigation import return_to_launch
+from aerokit.runtime.subscription import Subscription
+
+pytestmark = pytest.mark.anyio
+
+AnyFlight = Flight | Px4Flight
+
+
+@asynccontextmanager
+async def armed(opened: Any, *ends: MissionItem) -> AsyncIterator[AnyFlight]:
+    """A short mission is there, the vehicle stands armed on the ground."""
+    async with opened() as flight:
+        await flight.vehicle.wait_ready()
+        await flight.vehicle.mission.upload(short_mission(flight, *ends))
+        if isinstance(flight, Flight):
+            await flight.vehicle.set_mode("GUIDED")
+        await flight.vehicle.arm()
+        flight.wire.forget()
+        yield flight
+
+
+def landing() -> MissionItem:
+    """Where it is, which ArduPilot alone understands."""
+    return MissionItem(MavCmd.NAV_LAND, 3)
+
+
+def all_of(told: Subscription[Any]) -> list[Any]:
+    return list(iter(told.get_nowait, None))
+
+
+async def reaches(flight: AnyFlight, item: int) -> None:
+    await flight.vehicle.mission.current.wait_until(lambda current: (current or 0) >= item, timeout=60)
+
+
+# ------------------------------------------------------------------------------------ to its end
+
+
+@pytest.mark.parametrize(
+    ("opened", "end"),
+    [(open_flight, None), (open_flight, landing()), (open_px4, None), (open_px4, return_to_launch())],
+)
+async def test_from_the_ground_to_the_end(opened: Any, end: MissionItem | None) -> None:
+    kinds = (events.MissionItemReached, events.MissionCurrentChanged, events.MissionFinished)
+    async with armed(opened, *([] if end is None else [end])) as flight:
+        vehicle, mission = flight.vehicle, flight.vehicle.mission
+        with vehicle.subscribe(*kinds, capacity=50) as told:
+            await mission.start()
+            await mission.wait_finished(timeout=200)
+            if end is not None:
+                assert vehicle.landed_state.value == 1 or not vehicle.is_armed
+            await anyio.sleep(0.1)
+            seen = all_of(told)
+        reached = [event.item for event in seen if isinstance(event, events.MissionItemReached)]
+        assert reached == sorted(set(reached))
+        assert reached[:2] == [0, 1]  # PX4 may leave one out
+        assert mission.reached == reached[-1]
+        current = [event.after for event in seen if isinstance(event, events.MissionCurrentChanged)]
+        assert [item for item in current if item][:2] == [1, 2]
+        assert sum(isinstance(event, events.MissionFinished) for event in seen) == 1
+
+
+async def test_a_pause_is_waited_through() -> None:
+    async with armed(open_flight) as flight:
+        mission = flight.vehicle.mission
+        await mission.start()
+        await reaches(flight, 1)
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(mission.wait_finished)
+            await mission.pause()
+            assert flight.vehicle.mode_name == "BRAKE"
+            await anyio.sleep(5)
+            assert mission.current.value == 1
+            await mission.resume()
+        assert mission.progress.value.state == 5
+        await mission.start(1)  # again, from elsewhere
+        assert not mission._watch.is_complete
+        await mission.wait_finished(timeout=60)
+
+
+async def test_px4_pauses_and_flies_it_twice() -> None:
+    async with armed(open_px4) as flight:
+        mission = flight.vehicle.mission
+        await mission.start()
+        await reaches(flight, 1)
+        await mission.pause()
+        assert flight.vehicle.mode_name == "LOITER"
+        await mission.resume()
+        await mission.wait_finished(timeout=60)
+        started = now()
+        await mission.start(1)
+        await mission.wait_finished(timeout=60)
+        assert now() - started > 2  # what it said of the first time did not count
+
+
+async def test_the_current_item() -> None:
+    async with armed(open_flight) as flight:
+        mission = flight.vehicle.mission
+        await mission.set_current(2)
+        await mission.current.wait_until(lambda current: current == 2, timeout=3)
+        assert flight.wire.commands(MavCmd.DO_SET_MISSION_CURRENT)[0].param1 == 3
+        await mission.start(0)
+        assert flight.wire.commands(MavCmd.DO_SET_MISSION_CURRENT)[-1].param1 == 0  # with jumps counted anew
+        await mission.current.wait_until(lambda current: current == 0, timeout=3)
+    async with armed(open_px4) as other:
+        await other.vehicle.mission.set_current(2)
+        assert other.vehicle.mission.current.value == 2
+        assert other.wire.last(m.MissionSetCurrent).seq == 2
+        assert not other.wire.commands(MavCmd.DO_SET_MISSION_CURRENT)
+
+
+async def test_jumps_lead_to_the_item_that_is_meant() -> None:
+    async with armed(open_flight) as flight:
+        vehicle = flight.vehicle
+        await vehicle.mission.upload(Mission([*short_mission(flight), jump(1, repeat=1)]))
+        with vehicle.subscribe(events.MissionItemReached, capacity=50) as told:
+            await vehicle.mission.start()
+            await vehicle.mission.wait_finished(timeout=100)
+            await anyio.sleep(0.1)
+            assert [event.item for event in all_of(told)] == [0, 1, 2, 1, 2]
+
+
+async def test_count_and_current_without_a_mission() -> None:
+    async with open_flight() as flight:
+        await flight.vehicle.mission.count.wait_until(lambda count: count == 0, timeout=5)
+        assert flight.vehicle.mission.current.value is None
+        await flight.vehicle.mission.upload(long_mission(5))
+        assert flight.vehicle.mission.count.value == 5
+        assert flight.vehicle.mission.reached is None
+    async with open_px4() as other:
+        await other.vehicle.mission.count.wait_until(lambda count: count == 0, timeout=5)
+        assert other.vehicle.mission.current.value is None
+
+
+# ---------------------------------------------------------------------------------- who steers
+
+
+async def test_a_pilot_takes_it_out_of_its_mission() -> None:
+    async with armed(open_flight) as flight:
+        assert isinstance(flight, Flight)
+        mission = flight.vehicle.mission
+        await mission.start()
+        await reaches(flight, 1)
+        flight.pilot_takes_over(CopterMode.LOITER)
+        with pytest.raises(OperationRejected, match="the mode changed to LOITER, at item 1 of 3"):
+            await mission.wait_finished(timeout=60)
+        assert not flight.wire.mode_orders()
+
+
+@pytest.mark.parametrize("opened", [open_flight, open_px4])
+async def test_another_order_ends_the_waiting(opened: Any) -> None:
+    async with armed(opened) as flight:
+        await flight.vehicle.mission.start()
+        await reaches(flight, 1)
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(flight.vehicle.hold)
+            with pytest.raises(OperationRejected, match="another order was given"):
+                await flight.vehicle.mission.wait_finished()
+
+
+async def test_it_is_not_flown_at_all() -> None:
+    async with armed(open_flight) as flight:
+        with pytest.raises(OperationRejected, match="does not fly its mission, it is in GUIDED"):
+            await flight.vehicle.mission.wait_finished(timeout=20)
+        with pytest.raises(
+            OperationRejected, match="does not fly its mission, it is in GUIDED; nothing was sent"
+        ):
+            await flight.vehicle.mission.pause()
+
+
+async def test_disarmed_on_the_way() -> None:
+    async with armed(open_flight) as flight:
+        await flight.vehicle.mission.start()
+        await reaches(flight, 1)
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(lambda: flight.vehicle.disarm(force=True))
+            with pytest.raises(OperationRejected, match="not armed"):
+                await flight.vehicle.mission.wait_finished()
+
+
+async def test_silence_and_impatience() -> None:
+    async with armed(open_flight) as flight:
+        await flight.vehicle.mission.start()
+        with pytest.raises(OperationTimeout, match=r"not done within 2 s; at item 0 of 3"):
+            await flight.vehicle.mission.wait_finished(timeout=2)
+        assert flight.vehicle.mode_name == "AUTO"  # it goes on
+        assert isinstance(flight, Flight)
+        flight.copter.faults.silent = True
+        with pytest.raises(HeartbeatTimeout):
+            await flight.vehicle.mission.wait_finished()
+
+
+async def test_a_start_that_is_given_up_ends_in_holding() -> None:
+    async with armed(open_flight) as flight:
+        assert isinstance(flight, Flight)
+        flight.copter.faults.ignore(MavCmd.MISSION_START)
+        with anyio.move_on_after(0.3):
+            await flight.vehicle.mission.start()
+        await anyio.sleep(2)
+        assert CopterMode.BRAKE in flight.wire.mode_orders()
+
+
+@pytest.mark.parametrize("opened", [open_flight, open_px4])
+async def test_what_cannot_be_started(opened: Any) -> None:
+    async with opened() as flight:
+        await flight.vehicle.wait_ready()
+        mission = flight.vehicle.mission
+        await mission.upload(short_mission(flight))
+        flight.wire.forget()
+        with pytest.raises(OperationRejected, match=r"not armed: await arm\(\) first; nothing was sent"):
+            await mission.start()
+        with pytest.raises(OperationRejected, match="not armed"):
+            await mission.resume()
+        for item in (3, -1, 1.5, True, math.nan):
+            with pytest.raises(LocalProtocolError, match="0 to 2"):
+                await mission.start(item)
+            with pytest.raises(LocalProtocolError, match="0 to 2"):
+                await mission.set_current(item)
+        assert not flight.wire.commands(MavCmd.MISSION_START)
+        assert not flight.wire.commands(MavCmd.DO_SET_MODE)
+
+
+async def test_the_vehicles_reason_for_not_starting() -> None:
+    async with armed(open_flight) as flight:
+        await flight.vehicle.mission.clear()
+        with pytest.raises(LocalProtocolError, match="the mission is empty"):
+            await flight.vehicle.mission.start()
+        assert isinstance(flight, Flight)
+        with pytest.raises(CommandRejected):
+            await flight.vehicle.mission.resume()
+
+
+async def test_a_mission_that_is_flown_is_not_cleared_but_replaced() -> None:
+    async with armed(open_flight) as flight:
+        await flight.vehicle.mission.start()
+        flight.wire.forget()
+        await flight.vehicle.mission.upload(Mission([*short_mission(flight), return_to_launch()]))
+        assert flight.wire.all(m.MissionCount)  # ArduPilot cannot empty it for a file
+        assert flight.vehicle.mission.count.value == 4
+        assert flight.vehicle.mode_name == "AUTO"

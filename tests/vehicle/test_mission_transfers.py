@@ -1,0 +1,315 @@
+"""vehicle.mission: up, down, cleared, changed in part, by items and by file; and what goes wrong."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from typing import Any
+
+import anyio
+import pytest
+from flight_harness import Flight, Px4Flight, open_flight, open_px4
+from plan_flights import changed, long_mission, near_home, sent_for_plans
+
+from aerokit import messages as m
+from aerokit.errors import (
+    ConnectionClosed,
+    LocalProtocolError,
+    MissionRejected,
+    MissionTimeout,
+    NotSupported,
+    OperationTimeout,
+    VerificationFailed,
+)
+from aerokit.mavlink.enums import MavMissionResult as Result
+from aerokit.missions import Fence, FenceCircle, Mission, MissionItem
+from aerokit.missions.actions import jump
+from aerokit.missions.storage import Storage
+from aerokit.position import Position
+from aerokit.protocols.transfer import Progress
+from aerokit.sim import SimulatedCopter
+
+pytestmark = pytest.mark.anyio
+
+UNKNOWN = MissionItem(31_000, 3)
+"""No autopilot knows this command, and nothing says so before it is asked."""
+
+
+def held_by(flight: Flight | Px4Flight) -> Mission:
+    vehicle = flight.copter if isinstance(flight, Flight) else flight.px4
+    return Mission.from_items(vehicle.missions.items(0), home_is_item_0=isinstance(flight, Flight))
+
+
+def holds(flight: Flight | Px4Flight, mission: Mission) -> bool:
+    storage = Storage.ARDUPILOT if isinstance(flight, Flight) else Storage.PX4
+    return mission.matches(held_by(flight), storage)
+
+
+# -------------------------------------------------------------------------------- there and back
+
+
+@pytest.mark.parametrize("method", ["items", "ftp", "auto"])
+async def test_a_copters_home_is_hidden(method: Any) -> None:
+    mission = Mission([*long_mission(12), jump(2, repeat=3)])
+    async with open_flight(latency_s=0.02) as flight:
+        await flight.vehicle.wait_ready()
+        await flight.vehicle.mission.upload(mission, method=method)
+        assert holds(flight, mission)
+        assert len(flight.copter.missions.items(0)) == 14
+        assert flight.copter.missions.items(0)[13].param1 == 3
+        found = await flight.vehicle.mission.download(method=method)
+        assert mission.matches(found, Storage.ARDUPILOT)
+        assert found.home is not None
+        assert flight.vehicle.mission.count.value == 13
+        assert bool(flight.wire.all(m.FileTransferProtocol)) == (method != "items")
+        assert bool(flight.wire.all(m.MissionItemInt)) == (method == "items")
+
+
+async def test_px4_has_no_home_and_no_file() -> None:
+    mission = long_mission(12)
+    async with open_px4() as flight:
+        await flight.vehicle.mission.upload(mission)
+        assert holds(flight, mission)
+        assert mission.matches(await flight.vehicle.mission.download(), Storage.PX4)
+        asked = len(flight.wire.all(m.FileTransferProtocol))
+        await flight.vehicle.mission.download()
+        assert len(flight.wire.all(m.FileTransferProtocol)) == asked  # once is enough to know
+
+
+async def test_items_are_sent_ahead() -> None:
+    async with open_flight(latency_s=0.05) as flight:
+        started = asyncio.get_running_loop().time()
+        await flight.vehicle.mission.upload(long_mission(50), method="items", verify=False)
+        assert asyncio.get_running_loop().time() - started < 1.5
+        assert len(flight.wire.all(m.MissionItemInt)) == 51
+
+
+@pytest.mark.parametrize("opened", [open_flight, open_px4])
+async def test_an_empty_mission_is_none(opened: Any) -> None:
+    async with opened() as flight:
+        await flight.vehicle.mission.upload(long_mission(3))
+        await flight.vehicle.mission.upload(Mission())
+        assert len(held_by(flight)) == 0
+        assert flight.vehicle.mission.count.value == 0
+        assert flight.wire.all(m.MissionClearAll)
+        assert await flight.vehicle.mission.download() == Mission(
+            home=(await flight.vehicle.mission.download()).home
+        )
+        await flight.vehicle.mission.upload(long_mission(3))
+        await flight.vehicle.mission.clear()
+        assert len(held_by(flight)) == 0
+
+
+async def test_progress() -> None:
+    told: list[Progress] = []
+    async with open_flight(latency_s=0.02) as flight:
+        await flight.vehicle.mission.upload(
+            long_mission(20), method="items", verify=False, on_progress=told.append
+        )
+    assert (told[-1].done, told[-1].total) == (21, 21)
+    assert told[-1].rate > 0
+
+
+# ----------------------------------------------------------------------------------------- changes
+
+
+async def test_nothing_is_sent_when_px4_holds_it_already() -> None:
+    async with open_px4() as flight:
+        mission = flight.vehicle.mission
+        await mission.upload(long_mission(12))
+        await anyio.sleep(1.5)
+        flight.wire.forget()
+        await mission.upload(long_mission(12))
+        assert sent_for_plans(flight.wire) == []
+        await mission.upload(long_mission(12), only_changes=False)
+        assert len(flight.wire.all(m.MissionItemInt)) == 12
+        await mission.upload(changed(long_mission(12), 4))  # it takes no parts
+        assert holds(flight, changed(long_mission(12), 4))
+
+
+async def test_only_what_differs_is_sent_to_ardupilot() -> None:
+    async with open_flight() as flight:
+        mission = flight.vehicle.mission
+        await mission.upload(long_mission(40))
+        flight.wire.forget()
+        await mission.upload(changed(long_mission(40), 3, 4, 20), method="items")
+        assert holds(flight, changed(long_mission(40), 3, 4, 20))
+        parts = [(part.start_index, part.end_index) for part in flight.wire.all(m.MissionWritePartialList)]
+        assert parts == [(4, 5), (21, 21)]  # home is item 0
+        assert len(flight.wire.all(m.MissionItemInt)) == 3
+        flight.wire.forget()
+        await mission.upload(changed(long_mission(40), 3, 4, 20))
+        assert not flight.wire.all(m.MissionItemInt)
+        flight.wire.forget()
+        await mission.upload(changed(long_mission(40), *range(0, 40, 2)), method="items")  # too many for that
+        assert not flight.wire.all(m.MissionWritePartialList)
+        assert holds(flight, changed(long_mission(40), *range(0, 40, 2)))
+
+
+async def test_somebody_else_has_changed_it_meanwhile() -> None:
+    async with open_flight() as flight:
+        mission = flight.vehicle.mission
+        await mission.upload(long_mission(40))
+        flight.copter.missions.replace(0, changed(long_mission(40), 30).to_items(home_is_item_0=True))
+        await mission.upload(changed(long_mission(40), 3))
+        assert holds(flight, changed(long_mission(40), 3))
+        flight.copter.missions.replace(0, long_mission(7).to_items(home_is_item_0=True))
+        await mission.upload(changed(long_mission(40), 4))
+        assert holds(flight, changed(long_mission(40), 4))
+
+
+async def test_and_px4_tells_so() -> None:
+    async with open_px4() as flight:
+        await flight.vehicle.mission.upload(long_mission(5))
+        flight.px4.missions.replace(0, long_mission(6).to_items())
+        await anyio.sleep(1.5)
+        await flight.vehicle.mission.upload(long_mission(5))
+        assert holds(flight, long_mission(5))
+
+
+# ---------------------------------------------------------------------------------------- refusals
+
+
+@pytest.mark.parametrize("opened", [open_flight, open_px4])
+@pytest.mark.parametrize("method", ["auto", "items"])
+async def test_the_item_and_what_is_left(opened: Any, method: Any) -> None:
+    async with opened(latency_s=0.02) if opened is open_flight else opened() as flight:
+        await flight.vehicle.mission.upload(long_mission(30))
+        bad = Mission([*long_mission(17), UNKNOWN, *long_mission(4)])
+        with pytest.raises(MissionRejected, match="item 17: the command is not supported") as caught:
+            await flight.vehicle.mission.upload(bad, method=method)
+        assert (caught.value.item, caught.value.result) == (17, Result.UNSUPPORTED)
+        keeps = opened is open_px4
+        assert ("holds what it held before" in str(caught.value)) == keeps
+        assert holds(flight, long_mission(30)) == keeps
+        await flight.vehicle.mission.upload(long_mission(30))  # it is not taken for held
+        assert holds(flight, long_mission(30))
+
+
+async def test_a_part_that_is_refused() -> None:
+    async with open_flight() as flight:
+        await flight.vehicle.mission.upload(long_mission(30))
+        items = list(long_mission(30))
+        items[7] = UNKNOWN
+        with pytest.raises(MissionRejected, match=r"item 7.*holds what it held before") as caught:
+            await flight.vehicle.mission.upload(Mission(items))
+        assert caught.value.item == 7
+        assert holds(flight, long_mission(30))
+
+
+async def test_too_many_and_its_own_words() -> None:
+    async with open_flight() as flight:
+        with pytest.raises(MissionRejected, match="items are supported") as caught:
+            await flight.vehicle.mission.upload(long_mission(1200), method="items")
+        assert caught.value.result == Result.NO_SPACE
+        assert caught.value.item is None
+        assert caught.value.reasons
+
+
+async def test_a_vehicle_that_keeps_something_else() -> None:
+    async with open_flight() as flight:
+        items = flight.copter.missions
+
+        def keep_something_else(message: Any) -> None:
+            if message.type == Result.ACCEPTED:
+                items.replace(0, changed(long_mission(9), 5).to_items(home_is_item_0=True))
+
+        flight.vehicle.connection.bus.attach(m.MissionAck, keep_something_else)
+        with pytest.raises(VerificationFailed) as caught:
+            await flight.vehicle.mission.upload(long_mission(9), method="items")
+        assert caught.value.differences == ("item 5 (NAV_WAYPOINT): z is 33.0 instead of 20.0",)
+        await flight.vehicle.mission.upload(long_mission(9), method="items", only_changes=False, verify=False)
+
+
+async def test_no_files() -> None:
+    copter = SimulatedCopter(boot_time_s=0.0)
+    copter.faults.no_ftp = True
+    async with open_flight(copter) as flight:
+        with pytest.raises(NotSupported, match="no file transfer; nothing was sent"):
+            await flight.vehicle.mission.upload(long_mission(3), method="ftp")
+        await flight.vehicle.mission.upload(long_mission(3))
+        assert holds(flight, long_mission(3))
+
+
+@pytest.mark.parametrize(
+    ("plan", "options", "text"),
+    [
+        (Mission([MissionItem(16, 77)]), {}, "frame"),
+        (Mission([MissionItem(16, 3, param1=math.nan)]), {}, "param1"),
+        (Mission([MissionItem(16, 3, x=910_000_000)]), {}, "latitude"),
+        (Fence(circles=[FenceCircle(Position(47, 8), 10)]), {}, "plan"),
+        ([MissionItem(16, 3)], {}, "plan"),
+        (long_mission(2), {"method": "ftpp"}, "method"),
+        (long_mission(2), {"patience_s": 0}, "patience_s"),
+        (long_mission(2), {"timeout": -1.0}, "timeout"),
+    ],
+)
+async def test_nonsense_is_not_sent(plan: Any, options: dict[str, Any], text: str) -> None:
+    async with open_flight() as flight:
+        flight.wire.forget()
+        with pytest.raises(LocalProtocolError, match=text):
+            await flight.vehicle.mission.upload(plan, **options)
+        assert sent_for_plans(flight.wire) == []
+
+
+# --------------------------------------------------------------------------- one at a time, given up
+
+
+async def test_transfers_wait_for_their_turn() -> None:
+    async with open_px4() as flight:
+        vehicle = flight.vehicle
+        fence = Fence(circles=[FenceCircle(Position(*near_home(0)), 300.0)])
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(vehicle.mission.upload, long_mission(40))
+            tasks.start_soon(vehicle.fence.upload, fence)
+            tasks.start_soon(vehicle.mission.upload, long_mission(7))
+        assert holds(flight, long_mission(7))
+        assert len(flight.px4.missions.items(1)) == 1
+    async with open_flight() as other:
+        async with anyio.create_task_group() as tasks:
+            for count in (40, 7):
+                tasks.start_soon(other.vehicle.mission.upload, long_mission(count))
+        assert holds(other, long_mission(7))
+
+
+@pytest.mark.parametrize("opened", [open_flight, open_px4])
+@pytest.mark.parametrize("after_s", [0.0, 0.05, 0.13, 0.2])
+async def test_given_up_half_way(opened: Any, after_s: float) -> None:
+    async with opened(latency_s=0.02) if opened is open_flight else opened() as flight:
+        with anyio.move_on_after(after_s):
+            await flight.vehicle.mission.upload(long_mission(100), method="items")
+        await flight.vehicle.mission.upload(long_mission(8), method="items")
+        assert holds(flight, long_mission(8))
+        with anyio.move_on_after(after_s):
+            await flight.vehicle.mission.download(method="items")
+        assert long_mission(8).matches(await flight.vehicle.mission.download(method="items"))
+        vehicle = flight.copter if isinstance(flight, Flight) else flight.px4
+        assert not vehicle.missions.transfer_is_open
+
+
+async def test_the_vehicle_is_told_when_an_upload_is_given_up() -> None:
+    async with open_flight(latency_s=0.05) as flight:
+        with pytest.raises(OperationTimeout, match=r"not done within 0\.4 s"):
+            await flight.vehicle.mission.upload(long_mission(100), method="items", timeout=0.4)
+        assert flight.wire.last(m.MissionAck).type == Result.OPERATION_CANCELLED
+
+
+async def test_silence() -> None:
+    async with open_flight() as flight:
+        await flight.vehicle.mission.upload(long_mission(5))
+        flight.copter.faults.silent = True
+        with pytest.raises(MissionTimeout, match=r"never asked.*last heartbeat.*if the vehicle heard of it"):
+            await flight.vehicle.mission.upload(long_mission(9), method="items", patience_s=4)
+        with pytest.raises(MissionTimeout, match="did not say how many"):
+            await flight.vehicle.mission.download(method="items", patience_s=4)
+        with pytest.raises(MissionTimeout, match="not known"):
+            await flight.vehicle.mission.clear(patience_s=4)
+
+
+async def test_the_block_is_left() -> None:
+    async with open_flight() as flight:
+        mission = flight.vehicle.mission
+    with pytest.raises(ConnectionClosed):
+        await mission.upload(long_mission(3))
+    with pytest.raises(ConnectionClosed):
+        await mission.current.wait_until(lambda _: True)
