@@ -24,6 +24,10 @@ __all__ = ["ParameterList"]
 
 PAUSES = 4
 """The stream has stopped when nothing comes for so many of its longest pauses."""
+LONGEST_TICK_S = 1.1
+"""ArduPilot sends some of the list ten times a second, or as rarely as once (MAV1_PARAMS)."""
+NEAR_END = 20
+"""So few are asked for by index without waiting for that: it costs little if they were still to come."""
 BEGUN = 2
 """With so many values the stream has begun: it is not asked for afresh any more."""
 SHORTEST_START_S = 0.3
@@ -134,6 +138,8 @@ class ParameterList(Transfer[ParameterTable]):
             self._take_streamed(index, now)
         else:
             self._window.answered(index, now)
+        if self._is_streaming:
+            self._quiet_at = now + self._quiet_s()
         is_new = index not in self._slots
         parameter = parameter_of(message, self._bytewise)
         self._slots[index] = _Slot(parameter, message.param_count)
@@ -180,7 +186,6 @@ class ParameterList(Transfer[ParameterTable]):
         self._next = index + 1
         self._streamed += 1
         self._last_at = now
-        self._quiet_at = now + self._quiet_s()
         if index == 0:
             self._window.answered(0, now)
         else:
@@ -207,7 +212,10 @@ class ParameterList(Transfer[ParameterTable]):
         self._is_streaming, self._quiet_at, self._is_to_be_checked = False, None, True
 
     def _quiet_s(self) -> float:
-        return max(self.round_trip.timeout_s(), PAUSES * self._pause_s)
+        """How long nothing at all has to come until the stream has stopped. Answers come in its place."""
+        seconds = max(self.round_trip.timeout_s(), PAUSES * self._pause_s)
+        is_near_end = self._count is not None and self._count - self._next <= NEAR_END
+        return seconds if is_near_end else max(seconds, LONGEST_TICK_S)
 
     def _step(self, now: float) -> None:
         """End when all is there, else send what is due."""

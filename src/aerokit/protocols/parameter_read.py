@@ -5,24 +5,27 @@ https://mavlink.io/en/services/parameter.html#read_single
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from aerokit.errors import ParameterRejected
 from aerokit.mavlink.messages import ParamRequestRead
 from aerokit.parameters.encoding import parameter_of
+from aerokit.parameters.parameter import same_value
 from aerokit.protocols.parameter_requests import ParameterRequests
 from aerokit.protocols.transfer import PATIENCE_S, OnProgress
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
-    from aerokit.mavlink.messages import ParamValue
+    from aerokit.mavlink.messages import ParamError, ParamValue
     from aerokit.protocols.round_trip import RoundTrip
 
 __all__ = ["ParameterReads"]
 
 READS_AT_ONCE = 20
 BY_NAME = -1
+DOES_NOT_EXIST = 1
 PROBE, PROBE_INDEX = "", 0
 """The request for a parameter that every vehicle has."""
 DOUBT = 1e-3
@@ -36,6 +39,8 @@ class ParameterReads(ParameterRequests):
     ArduPilot, and PX4 until 1.16, meet an unknown name with silence. So a name that is not answered is asked for
     again together with the parameter of index 0, and when that one comes every time, the vehicle has none of this
     name: the answer is a ParameterRejected without a code. ``are_doubtful`` begins with that at once.
+
+    An answer that tells a ``distrusted`` value may have been under way for long: it is believed the second time.
     """
 
     def __init__(
@@ -46,6 +51,7 @@ class ParameterReads(ParameterRequests):
         *,
         bytewise: bool,
         are_doubtful: bool = False,
+        distrusted: Mapping[str, float] = MappingProxyType({}),
         own_system: int = 0,
         round_trip: RoundTrip | None = None,
         patience_s: float = PATIENCE_S,
@@ -63,6 +69,8 @@ class ParameterReads(ParameterRequests):
             on_progress=on_progress,
         )
         self._is_probe_wanted = are_doubtful
+        self._distrusted = dict(distrusted)
+        self._refused: set[str] = set()
         self._probes_sent = self._probes_answered = 0
 
     def _request(self, name: str) -> list[Message]:
@@ -92,7 +100,22 @@ class ParameterReads(ParameterRequests):
         name = message.param_id
         if name and name in self._window:
             self._window.answered(name, now)
-            self._settle(name, parameter_of(message, self._bytewise), now)
+            told = parameter_of(message, self._bytewise)
+            old = self._distrusted.pop(name, None)
+            if old is not None and same_value(old, told.value):
+                self._window.ask(name)
+            else:
+                self._settle(name, told, now)
+
+    def _take_error(self, message: ParamError, now: float) -> None:
+        """PX4 says that there is no such parameter also when it has no room to send it: once more, then."""
+        name = message.param_id
+        if message.error == DOES_NOT_EXIST and name in self._window and name not in self._refused:
+            self._refused.add(name)
+            self._window.answered(name, now)
+            self._window.ask(name)
+        else:
+            super()._take_error(message, now)
 
     def _give_up_unknown(self, names: list[str], now: float) -> None:
         """Silence is an answer once it can hardly be loss."""

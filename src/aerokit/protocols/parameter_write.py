@@ -10,7 +10,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink.messages import ParamRequestRead
-from aerokit.parameters import Parameter
+from aerokit.parameters import Parameter, ParameterType
 from aerokit.parameters.encoding import parameter_of, set_message
 from aerokit.parameters.parameter import same_value
 from aerokit.protocols.parameter_requests import ParameterRequests
@@ -83,7 +83,8 @@ class ParameterWrites(ParameterRequests):
         name = message.param_id
         if not self._window.attempts(name):
             return  # it has not been sent yet
-        told, wanted = parameter_of(message, self._bytewise), self._wanted[name]
+        wanted = self._wanted[name]
+        told = self._typed(parameter_of(message, self._bytewise), wanted.type)
         others = self._others.setdefault(name, [])
         is_as_asked = same_value(told.value, wanted.value)
         if is_as_asked and (told.type == wanted.type or (others and _is_same(others[-1], told))):
@@ -99,6 +100,13 @@ class ParameterWrites(ParameterRequests):
             self._settle(name, told, now)
         else:
             self._window.ask(name)
+
+    def _typed(self, told: Parameter, type_: ParameterType) -> Parameter:
+        """ArduPilot calls an integer that holds its default a float, in answers to PARAM_SET alone."""
+        is_whole = told.type is ParameterType.REAL32 and told.value == told.value // 1
+        if self._bytewise or not type_.is_integer or not is_whole:
+            return told
+        return Parameter(told.name, int(told.value), type_, None, told.index)
 
     def _timeout_text(self, name: str) -> str:
         return f"PARAM_SET of {name} was not confirmed, sent {self._window.attempts(name)} times"

@@ -21,6 +21,8 @@ QUEUED, QUEUED_S = 1.5, 0.02
 """An answer that takes longer than that many times the fastest one, and some, has waited in a queue."""
 FEW, UNLUCKY = 5, 3
 """When so few are left, those that are sent the third time are sent twice: on a bad radio they would be waited for."""
+LAST_S = 0.5
+"""The last few are not waited for longer than that, or two round trips: asking for them costs little."""
 OVERTAKEN = 3
 """Answers come in the order of their requests. One that so many later ones have overtaken was lost."""
 
@@ -132,7 +134,11 @@ class RequestWindow(Generic[KeyT]):
             self._silent_until = now + self._timeout_s(1)
 
     def _timeout_s(self, attempts: int) -> float:
-        return self._round_trip.timeout_s(min(attempts, 2) + self._silences)
+        seconds = self._round_trip.timeout_s(min(attempts, 2) + self._silences)
+        smoothed_s = self._round_trip.smoothed_s
+        if len(self) <= FEW and smoothed_s is not None:
+            return min(seconds, max(LAST_S, 2 * smoothed_s))
+        return seconds
 
     def _measured(self, seconds: float) -> None:
         """Ask for more at once as long as answers come as fast as ever: a queue is building up somewhere otherwise."""

@@ -90,6 +90,7 @@ class VehicleCore:
             background=self._background,
             describe=self.describe_link,
             round_trip_s=lambda: self._link_watch.round_trip_s,
+            send_command=self._commands.send_long,
         )
         self._is_closed = False
         self._detach: list[Detach] = []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import contextmanager, nullcontext
 from typing import TYPE_CHECKING, Literal
 
 import anyio
@@ -14,17 +15,19 @@ from aerokit.errors import (
     NotSupported,
     RemoteProtocolError,
 )
+from aerokit.mavlink.messages import ParamValue
 from aerokit.parameters import Parameter, ParameterTable
 from aerokit.parameters.parameter import same_value
 from aerokit.parameters.px4_hash import HASH_NAME
 from aerokit.protocols.parameter_list import ParameterList
 from aerokit.protocols.parameter_read import ParameterReads
 from aerokit.protocols.parameter_write import ParameterWrites
+from aerokit.protocols.round_trip import RoundTrip
 from aerokit.vehicle.parameter_cache import ParameterCache, vehicle_key
 from aerokit.vehicle.parameter_store import ParameterStore
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Iterator
 
     from aerokit.protocols.parameter_requests import Answer
     from aerokit.protocols.transfer import OnProgress
@@ -40,6 +43,10 @@ CacheChoice = bool | str | os.PathLike[str]
 
 CAPABILITY_FTP = 0x20
 NO_SESSIONS_AVAILABLE = 4
+ANSWER_S = 0.1
+SET_MESSAGE_INTERVAL, AS_BEFORE = 511, 0
+FEW_READS = 5
+"""More are not answered at once."""
 LEAST_TO_PACK = 10
 """Fewer changes than that are set one by one: it takes no longer, and each is confirmed by the vehicle itself."""
 MOST_TO_READ_BACK = 100
@@ -55,6 +62,16 @@ class ParameterAccess:
         self._downloading = anyio.Lock()
         self._writing = anyio.Lock()
         self._has_pack: bool | None = None
+        self._answers: RoundTrip | None = None
+        self._attending = 0
+
+    @property
+    def _answer_time(self) -> RoundTrip:
+        """How long reads take. Not the link's own time: ArduPilot answers ten times a second, five reads each time."""
+        if self._answers is None:
+            link_s = self._transfers.round_trip.smoothed_s
+            self._answers = RoundTrip(None if link_s is None else link_s + ANSWER_S)
+        return self._answers
 
     def forget(self) -> None:
         """The vehicle has started anew, perhaps with another firmware."""
@@ -117,16 +134,16 @@ class ParameterAccess:
 
     async def _download_list(self, patience_s: float, on_progress: OnProgress | None) -> None:
         transfers = self._transfers
-        table = await transfers.run(
-            ParameterList(
-                transfers.system_id,
-                transfers.component_id,
-                bytewise=self.store.bytewise,
-                round_trip=transfers.round_trip,
-                patience_s=patience_s,
-                on_progress=on_progress,
-            )
+        exchange = ParameterList(
+            transfers.system_id,
+            transfers.component_id,
+            bytewise=self.store.bytewise,
+            round_trip=self._answer_time,
+            patience_s=patience_s,
+            on_progress=on_progress,
         )
+        with self._attended():
+            table = await transfers.run(exchange)
         defaults = {name: each.default for name, each in self.store.table.items()}
         self.store.replace(
             ParameterTable(
@@ -145,19 +162,37 @@ class ParameterAccess:
         names = tuple(names)
         if not names:
             return {}
-        transfers = self._transfers
-        return await transfers.run(
-            ParameterReads(
-                transfers.system_id,
-                transfers.component_id,
-                names,
-                bytewise=self.store.bytewise,
-                are_doubtful=are_doubtful,
-                own_system=transfers.connection.source_system,
-                round_trip=transfers.round_trip,
-                patience_s=patience_s,
-            )
+        transfers, store = self._transfers, self.store
+        exchange = ParameterReads(
+            transfers.system_id,
+            transfers.component_id,
+            names,
+            bytewise=store.bytewise,
+            are_doubtful=are_doubtful,
+            distrusted={name: old for name in names if (old := store.distrusted(name)) is not None},
+            own_system=transfers.connection.source_system,
+            round_trip=self._answer_time,
+            patience_s=patience_s,
         )
+        with self._attended() if are_doubtful or len(names) > FEW_READS else nullcontext():
+            return await transfers.run(exchange)
+
+    @contextmanager
+    def _attended(self) -> Iterator[None]:
+        """Have the vehicle see to parameters more often for a while, where that can be had."""
+        interval_s = self._transfers.autopilot.parameter_interval_s
+        if interval_s is None:
+            yield
+            return
+        self._attending += 1
+        if self._attending == 1:
+            self._transfers.command_in_background(SET_MESSAGE_INTERVAL, ParamValue.ID, interval_s * 1e6)
+        try:
+            yield
+        finally:
+            self._attending -= 1
+            if not self._attending:
+                self._transfers.command_in_background(SET_MESSAGE_INTERVAL, ParamValue.ID, AS_BEFORE)
 
     async def write(
         self, wanted: Iterable[Parameter], patience_s: float, on_progress: OnProgress | None = None
@@ -171,7 +206,9 @@ class ParameterAccess:
             before = {
                 each.name: each.value for each in map(self.store.get, _names(wanted)) if each is not None
             }
-            return await transfers.run(
+            for name in before:
+                self.store.trust(name)
+            answers = await transfers.run(
                 ParameterWrites(
                     transfers.system_id,
                     transfers.component_id,
@@ -184,6 +221,10 @@ class ParameterAccess:
                     on_progress=on_progress,
                 )
             )
+            for name, answer in answers.items():
+                if isinstance(answer, Parameter) and name in before and answer.value != before[name]:
+                    self.store.distrust(name, before[name])
+            return answers
 
     async def write_pack(
         self,

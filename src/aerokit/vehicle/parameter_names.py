@@ -116,7 +116,7 @@ class ParameterNames:
 
 def _warn_of(renamed: Renamed) -> None:
     """Warn in the name of the program's own line, however deep inside aerokit this is."""
-    depth, frame = 1, sys._getframe(1)
+    depth, frame = 2, sys._getframe(1)
     while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("aerokit."):
         depth, frame = depth + 1, frame.f_back
     warnings.warn(renamed.warning, ParameterRenamedWarning, stacklevel=depth)

@@ -54,6 +54,8 @@ def outcome_of(wanted: Parameter, before: Parameter | None, answer: Answer) -> O
     if before is not None and same_value(before.value, answer.value):
         text = f"{wanted.name} = {wanted.value:g} was refused: the vehicle keeps {answer.value:g}"
         return ParameterRejected(text, name=wanted.name)
+    if same_value(float(answer.value), float(wanted.value)):
+        return "rounded"  # an integer that a float does not hold
     distance = abs(answer.value - wanted.value)
     near = (
         distance < ROUNDED_WITHIN

@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 __all__ = ["ParameterStore"]
 
 
+UNDER_WAY_S = 1.0
+
+
 class ParameterStore:
     """Name → parameter. Publishes :class:`ParameterChanged` when a value that was known becomes another one."""
 
@@ -33,6 +36,7 @@ class ParameterStore:
         self.count: int | None = None
         """How many there are by the last message; the vehicle may show and hide some at any time."""
         self._updated_at: dict[str, int] = {}
+        self._replaced: dict[str, tuple[int | float, float]] = {}
 
     @property
     def table(self) -> ParameterTable:
@@ -54,6 +58,22 @@ class ParameterStore:
     def __contains__(self, name: object) -> bool:
         return name in self._known
 
+    def distrust(self, name: str, value: float) -> None:
+        """This value has just been replaced: a message that still tells it was under way, and does not count.
+
+        ArduPilot answers PARAM_SET at once, but reads up to a tenth of a second after it looked the value up.
+        """
+        self._replaced[name] = value, self._transfers.connection.now() + UNDER_WAY_S
+
+    def trust(self, name: str) -> None:
+        """Take whatever comes: it is being written."""
+        self._replaced.pop(name, None)
+
+    def distrusted(self, name: str) -> int | float | None:
+        """The value that it had a moment ago."""
+        value, until = self._replaced.get(name, (0, 0.0))
+        return value if self._transfers.connection.now() < until else None
+
     def attach(self) -> Detach:
         """Begin to listen."""
         transfers = self._transfers
@@ -63,6 +83,7 @@ class ParameterStore:
         """The vehicle has started anew: nothing is known."""
         self._known.clear()
         self._updated_at.clear()
+        self._replaced.clear()
         self._table, self.is_complete, self.count = None, False, None
 
     def replace(self, table: ParameterTable, *, since: int) -> None:
@@ -87,7 +108,9 @@ class ParameterStore:
         if message.param_id == HASH_NAME or not message.param_id:
             return
         told = parameter_of(message, self.bytewise)
-        known = self._known.get(told.name)
+        known, old = self._known.get(told.name), self.distrusted(told.name)
+        if known is not None and old is not None and same_value(told.value, old):
+            return
         after = told if known is None else updated(known, told, self.bytewise)
         self._known[told.name], self._table = after, None
         self.updates += 1

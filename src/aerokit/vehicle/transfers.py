@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import anyio
 
-from aerokit.errors import ConnectionClosed, OperationTimeout
+from aerokit.errors import AerokitError, ConnectionClosed, OperationTimeout
 from aerokit.protocols.round_trip import RoundTrip
 from aerokit.runtime.driver import run_exchange
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Awaitable, Callable, Iterator
 
     from aerokit.autopilots.base import Autopilot
     from aerokit.autopilots.version import AutopilotVersion
@@ -42,6 +42,7 @@ class Transfers:
         background: Background,
         describe: Callable[[], str],
         round_trip_s: Callable[[], float | None] = lambda: None,
+        send_command: Callable[..., Awaitable[object]] | None = None,
     ) -> None:
         self.connection = connection
         self.system_id, self.component_id = system_id, component_id
@@ -50,6 +51,7 @@ class Transfers:
         self.round_trip = RoundTrip()
         """Measured by whatever was transferred before, at first by what keeps the clocks together."""
         self.is_closed = False
+        self._send_command = send_command
         self._version, self._describe, self._round_trip_s = version, describe, round_trip_s
 
     async def run(self, exchange: Exchange[ResultT], *, timeout: float | None = None) -> ResultT:
@@ -94,6 +96,18 @@ class Transfers:
                 return  # the vehicle ends it by itself after its own time-out
 
         self.background.start(end, f"aerokit {name}")
+
+    def command_in_background(self, command: int, *params: float) -> None:
+        """Send a command that makes things better, with nobody waiting; its failure is nobody's."""
+        send = self._send_command
+
+        async def order() -> None:
+            if send is not None:
+                with suppress(AerokitError):
+                    await send(command, *params)
+
+        if not self.is_closed:
+            self.background.start(order, "aerokit command of a transfer")
 
     @property
     def version(self) -> AutopilotVersion | None:
