@@ -44,9 +44,9 @@ HOME = item(WAYPOINT, 0)
 
 
 def message(one: MissionItem, seq: int, mission_type: int = 0, current: int = 0) -> m.MissionItemInt:
-    numbers = (one.param1, one.param2, one.param3, one.param4, round(one.x), round(one.y), one.z)
     head = (seq, one.frame, one.command, current, int(one.autocontinue))
-    return m.MissionItemInt(1, 1, *head, *numbers, mission_type)
+    numbers = (one.param1, one.param2, one.param3, one.param4)
+    return m.MissionItemInt(1, 1, *head, *numbers, round(one.x), round(one.y), one.z, mission_type)
 
 
 def results(client: Client) -> list[int]:

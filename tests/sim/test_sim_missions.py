@@ -439,8 +439,8 @@ def test_px4_refuses_a_second_station_and_whoever_is_not_its_partner() -> None:
     ]
     channel = px4.open_channel()
     px4.receive(FrameEncoder(255, 78).encode(m.MissionCount(1, 1, 2, 0)), other.now, channel=channel)
-    (frame, *_) = Framer().receive(channel.take_outbox())
-    assert STANDARD.decode(frame) == m.MissionAck(255, 78, R.ERROR, 0)
+    answers = [STANDARD.decode(frame) for frame in Framer().receive(channel.take_outbox())]
+    assert m.MissionAck(255, 78, R.ERROR, 0) in answers
 
 
 def test_px4_repeats_a_lost_last_acknowledgement() -> None:
