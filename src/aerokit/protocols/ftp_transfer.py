@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
-from aerokit.errors import FileTimeout
+from aerokit.errors import FileTimeout, RemoteProtocolError
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
 from aerokit.protocols.block_requests import BlockRequests
 from aerokit.protocols.ftp import SEQUENCES, FtpClient, FtpExchange
@@ -33,6 +33,8 @@ MOST_GAPS = 512
 """With more blocks missing than that, they are fetched before the burst goes on: their followers are in memory."""
 BURST_BLOCKS = 500
 BUSY_BLOCKS = 3
+MOST_AHEAD = SEQUENCES // 2 * DATA_SIZE
+"""Beyond that, the number of a block could mean another one, too."""
 SILENT_BLOCKS = 10
 """So many blocks in a row are hardly ever lost: the burst has ended."""
 
@@ -141,6 +143,8 @@ class FtpDownload(FtpExchange[int]):
                 return
 
     def _take_block(self, burst: _Burst, reply: FtpMessage, now: float) -> None:
+        if not self._is_plausible(reply.offset):
+            return
         is_latest = burst is self._bursts[-1]
         if is_latest:
             self._note_time(burst.blocks_before(reply), now)
@@ -183,12 +187,21 @@ class FtpDownload(FtpExchange[int]):
         self._into.end_at(end)
         self._requests.forget_from(end)
 
+    def _is_plausible(self, offset: int) -> bool:
+        """Whether a block can be there. What lies far behind all others would make millions of gaps."""
+        return not self._is_past_size(offset) and offset - self._into.tail < MOST_AHEAD
+
     def _is_past_size(self, offset: int) -> bool:
         """PX4 says that a file exists already where it means its end, once it has said so of another file."""
         return self._size is not None and offset >= self._size
 
     def _add(self, offset: int, data: bytes, now: float) -> None:
-        if self._into.add(offset, data):
+        try:
+            is_new = self._into.add(offset, data)
+        except Exception as error:  # the disk is full: nothing that comes from now on can be kept
+            self._fail(error)
+            return
+        if is_new:
             self._requests.forget(offset)
             self._move(now, self._into.done, self._total)
 
@@ -197,8 +210,11 @@ class FtpDownload(FtpExchange[int]):
     def _go_on(self, now: float) -> None:
         """Finish, or ask for whatever can be asked for now."""
         into = self._into
-        if into.is_complete or (self._size is not None and into.position >= self._size):
+        if self._size is not None and into.position >= self._size:
             self._finish(into.position)
+            return
+        if into.is_complete:
+            self._end()
             return
         self._ask_for_gaps()
         if not self._has_burst:
@@ -268,6 +284,18 @@ class FtpDownload(FtpExchange[int]):
     @property
     def _total(self) -> int | None:
         return self._size if self._into.end is None else self._into.end
+
+    def _end(self) -> None:
+        """The vehicle says that this is all: true unless it had said before that there is more."""
+        end = self._into.position
+        if self._size is None:
+            self._finish(end)
+        else:
+            self._fail(
+                RemoteProtocolError(
+                    f"read {self._path}: it ended after {end} of the {self._size} bytes it had"
+                )
+            )
 
     def _timed_out(self) -> FileTimeout:
         missing = self._into.missing(self._size)

@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from aerokit.errors import FileError, LocalProtocolError, VerificationFailed
+from aerokit.errors import FileError, LocalProtocolError, RemoteProtocolError, VerificationFailed
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
 from aerokit.protocols.ftp import DATA_SIZE, path_bytes
 from aerokit.protocols.ftp_transfer import FtpDownload, FtpUpload, is_virtual
@@ -30,6 +30,8 @@ CAPABILITY_FTP = 0x20
 NO_CRC = (MavFtpErr.FAIL, MavFtpErr.UNKNOWNCOMMAND)
 LARGEST = 0xFFFFFFFF
 BLOCK = 1 << 16
+MOST_FRUITLESS, MOST_ENTRIES = 50, 1_000_000
+"""Answers of a listing in a row that hold nothing new, and entries, before it is taken for endless."""
 
 
 class FileEntry(Snapshot):
@@ -52,6 +54,7 @@ class Files:
         LocalProtocolError: a path is empty, has a NUL, is not encodable, or is longer than 238 bytes. Nothing was sent.
         FileError: the vehicle refused; ``code`` and ``errno`` say why.
         FileTimeout: it did not end; ``missing`` has the ranges that did not arrive.
+        RemoteProtocolError: the vehicle's answers make no sense, or its file became shorter while it was read.
     """
 
     def __init__(self, transfers: Transfers) -> None:
@@ -117,12 +120,18 @@ class Files:
         """Return what is in a directory, without ``.`` and ``..``, in the vehicle's order."""
         path_bytes(path)
         entries: dict[str, FileEntry] = {}
-        offset = 0
+        offset = fruitless = 0
         async with self._channel.operation(f"list {path}", timeout=timeout, patience_s=patience_s):
             while (reply := await self._list_from(path, offset, patience_s)) is not None:
                 texts = [text for text in reply.data.split(b"\0") if text]
+                before = len(entries)
                 entries.update((entry.name, entry) for entry in map(_entry, texts) if entry is not None)
                 offset += len(texts) or 1  # a name that fits into no message is passed over
+                fruitless = fruitless + 1 if len(entries) == before else 0
+                if fruitless > MOST_FRUITLESS or offset > MOST_ENTRIES:
+                    raise RemoteProtocolError(
+                        f"list {path}: the vehicle's list does not end, it is at {offset}"
+                    )
         return tuple(entries.values())
 
     async def crc32(self, path: str, *, patience_s: float = PATIENCE_S, timeout: float | None = None) -> int:
@@ -275,6 +284,8 @@ class Files:
         async def use(file: OpenFile) -> None:
             if file.size < into.start:
                 raise _ShorterError
+            if file.size < into.position and not is_virtual(path):
+                raise RemoteProtocolError(f"read {path}: it became shorter while it was read")
             transfer = FtpDownload(
                 channel.client,
                 path,
@@ -356,7 +367,7 @@ def _entry(text: bytes) -> FileEntry | None:
         return FileEntry(rest.partition("\t")[0], None, True)
     if kind == b"F":
         name, _, size = rest.partition("\t")
-        return FileEntry(name, int(size) if size.isdigit() else None, False)
+        return FileEntry(name, int(size) if size.isascii() and size.isdigit() else None, False)
     return None
 
 
