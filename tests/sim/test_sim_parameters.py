@@ -172,7 +172,10 @@ def test_faults_clamp_protect_and_mute() -> None:
 def test_the_pack_is_what_the_firmware_packs(block: int) -> None:
     parameters = copter_parameters()
     rows = [parameters.row(name) for name in parameters.names]
-    table = unpack_parameters(packed_parameters(rows, len(rows), block, with_defaults=True))
+    for whole in (False, True):
+        packed = packed_parameters(rows, len(rows), block, with_defaults=True, whole_defaults=whole)
+        assert list(unpack_parameters(packed)) == [row.name for row in rows]
+    table = unpack_parameters(packed)
     assert list(table) == [row.name for row in rows]
     for row in rows:
         assert (table[row.name].value, table[row.name].default) == (row.value, row.default)
@@ -311,6 +314,28 @@ def test_px4_has_the_file_when_it_is_new_enough() -> None:
     table = unpack_parameters(content)
     assert table.values_by_name() == {name: px4.parameters[name] for name in px4.parameters}
     assert table["CA_ROTOR_COUNT" if "CA_ROTOR_COUNT" in table else "BAT1_N_CELLS"].default == 0
+
+
+def test_px4_takes_a_pack_in_order_only() -> None:
+    px4, client = a_px4(parameter_count=100, parameter_file=True)
+    ftp = FtpClient(client)
+    rows = [px4.parameters.row(name) for name in px4.parameters.names]
+    content = pack_parameters(unpack_parameters(packed_parameters(rows, len(rows), 239)))
+    first, second = content[:239], content[239:478]
+    names = px4.parameters.names
+    for name in names:
+        px4.parameters[name] = 77
+    ftp.upload("@PARAM/param.pck", content)
+    assert 77 not in {px4.parameters[name] for name in names}
+    px4.parameters[names[0]] = 77
+    ftp.data(Op.CREATEFILE, "@PARAM/param.pck")
+    ftp.data(Op.WRITEFILE, first)
+    ftp.data(Op.WRITEFILE, first)
+    assert px4.parameters[names[0]] != 77, "before the end"
+    assert ftp.refusal(Op.WRITEFILE, second, offset=478) == (Err.FAILERRNO, 22)
+    assert ftp.refusal(Op.WRITEFILE, second, offset=239) == (Err.FAILERRNO, 22), "a gap spoils it"
+    assert ftp.refusal(Op.TERMINATESESSION) == (Err.FAILERRNO, 22)
+    assert px4.ftp.open_sessions == 0
 
 
 @given(st.floats(-200, 200), st.sampled_from([INT8, INT16, INT32]))

@@ -15,13 +15,13 @@ from aerokit.sim.file_tree import EINVAL, ENOENT, FileFault, Mount, OpenFile
 if TYPE_CHECKING:
     from aerokit.sim.parameters import ParameterRow, Parameters
 
-__all__ = ["ParameterPackMount", "packed_parameters"]
+__all__ = ["FORMATS", "HEADER", "MAGIC", "ParameterPackMount", "packed_parameters"]
 
 _NAME = "param.pck"
-_MAGIC, _MAGIC_WITH_DEFAULTS = 0x671B, 0x671C
-_HEADER = struct.Struct("<HHH")
+MAGIC, _MAGIC_WITH_DEFAULTS = 0x671B, 0x671C
+HEADER = struct.Struct("<HHH")
 _TYPES = {MavParamType.INT8: 1, MavParamType.INT16: 2, MavParamType.INT32: 3, MavParamType.REAL32: 4}
-_FORMATS = {1: "<b", 2: "<h", 3: "<i", 4: "<f"}
+FORMATS = {1: "<b", 2: "<h", 3: "<i", 4: "<f"}
 _GUESSED_ROW_SIZE = 12
 
 
@@ -65,6 +65,7 @@ class _Reader(OpenFile):
         if self._with_defaults > 1 or max(self._start, self._count) >= 0xFFFF:
             raise FileFault(EINVAL)
         self._block = block or 0
+        self._whole_defaults = block is not None
         self._content: bytes | None = None
 
     @property
@@ -76,8 +77,13 @@ class _Reader(OpenFile):
                 raise FileFault(EINVAL)
             end = self._start + self._count if self._count else None
             rows = [parameters.row(name) for name in parameters.names[self._start : end]]
-            defaults = bool(self._with_defaults)
-            self._content = packed_parameters(rows, len(parameters), self._block, with_defaults=defaults)
+            self._content = packed_parameters(
+                rows,
+                len(parameters),
+                self._block,
+                with_defaults=bool(self._with_defaults),
+                whole_defaults=self._whole_defaults,
+            )
         return self._content
 
     def read(self, offset: int, size: int) -> bytes:
@@ -102,19 +108,19 @@ class _Writer(OpenFile):
 
     def write(self, offset: int, data: bytes) -> None:
         content = self._content
-        if offset == 0 and len(data) >= _HEADER.size:
-            magic, _, total = _HEADER.unpack_from(data)
-            if magic == _MAGIC:
+        if offset == 0 and len(data) >= HEADER.size:
+            magic, _, total = HEADER.unpack_from(data)
+            if magic == MAGIC:
                 content.extend(bytes(max(0, total - len(content))))
         content.extend(bytes(max(0, offset + len(data) - len(content))))
         content[offset : offset + len(data)] = data
 
     def close(self) -> None:
         content = bytes(self._content)
-        if len(content) < _HEADER.size:
+        if len(content) < HEADER.size:
             raise FileFault(EINVAL)
-        magic, count, total = _HEADER.unpack_from(content)
-        if magic != _MAGIC or total != len(content):
+        magic, count, total = HEADER.unpack_from(content)
+        if magic != MAGIC or total != len(content):
             raise FileFault(EINVAL)
         try:
             self._read_rows(content, count)
@@ -122,7 +128,7 @@ class _Writer(OpenFile):
             raise FileFault(EINVAL) from None
 
     def _read_rows(self, content: bytes, count: int) -> None:
-        position, last = _HEADER.size, b""
+        position, last = HEADER.size, b""
         for _ in range(count):
             kind, flags = content[position] & 0xF, content[position] >> 4
             common, length = content[position + 1] & 0xF, (content[position + 1] >> 4) + 1
@@ -130,32 +136,41 @@ class _Writer(OpenFile):
                 raise FileFault(EINVAL)
             last = last[:common] + content[position + 2 : position + 2 + length]
             position += 2 + length
-            format_ = _FORMATS.get(kind, "<f")
+            format_ = FORMATS.get(kind, "<f")
             (value,) = struct.unpack_from(format_, content, position)
             position += struct.calcsize(format_)
             name = last.decode()
-            if kind in _FORMATS and name in self._parameters:
+            if kind in FORMATS and name in self._parameters:
                 self._apply(name, value)
 
 
 def packed_parameters(
-    rows: list[ParameterRow], total: int, block: int, *, with_defaults: bool = False
+    rows: list[ParameterRow],
+    total: int,
+    block: int,
+    *,
+    with_defaults: bool = False,
+    whole_defaults: bool = False,
 ) -> bytes:
-    """The file: zeros are put in front of a parameter whose value would lie across two blocks of ``block`` bytes."""
-    content = bytearray(_HEADER.pack(_MAGIC_WITH_DEFAULTS if with_defaults else _MAGIC, len(rows), total))
+    """The file: zeros are put in front of a parameter whose value would lie across two blocks of ``block`` bytes.
+
+    With ``whole_defaults`` value and default together do not (PX4); else a default alone is looked at.
+    """
+    content = bytearray(HEADER.pack(_MAGIC_WITH_DEFAULTS if with_defaults else MAGIC, len(rows), total))
     last = b""
     for row in rows:
-        packed, width = _packed_row(row, last, with_defaults=with_defaults)
+        packed, width, has_default = _packed_row(row, last, with_defaults=with_defaults)
+        kept = 2 * width if has_default and whole_defaults else width
         over = (len(content) + len(packed)) % block
-        if width > 1 and 0 < over < width:
-            content.extend(bytes(width - over))
+        if kept > 1 and 0 < over < kept:
+            content.extend(bytes(kept - over))
         content.extend(packed)
         last = row.name.encode()
     return bytes(content)
 
 
-def _packed_row(row: ParameterRow, last: bytes, *, with_defaults: bool) -> tuple[bytes, int]:
-    """The bytes, and how many of them the value has."""
+def _packed_row(row: ParameterRow, last: bytes, *, with_defaults: bool) -> tuple[bytes, int, bool]:
+    """The bytes, how many of them the value has, and whether a default follows it."""
     name, kind = row.name.encode(), _TYPES[MavParamType(row.type)]
     common = 0
     while common < len(name) - 1 and name[common : common + 1] == last[common : common + 1]:
@@ -163,11 +178,11 @@ def _packed_row(row: ParameterRow, last: bytes, *, with_defaults: bool) -> tuple
     differs = with_defaults and row.default != row.value
     head = bytes([kind | differs << 4, common | (len(name) - common - 1) << 4]) + name[common:]
     value = _value(row.value, kind)
-    return head + value + (_value(row.default, kind) if differs else b""), len(value)
+    return head + value + (_value(row.default, kind) if differs else b""), len(value), differs
 
 
 def _value(value: float, kind: int) -> bytes:
-    return struct.pack(_FORMATS[kind], value if kind == _TYPES[MavParamType.REAL32] else int(value))
+    return struct.pack(FORMATS[kind], value if kind == _TYPES[MavParamType.REAL32] else int(value))
 
 
 def _query(path: str) -> dict[str, int]:

@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from aerokit.sim.file_tree import FileTree
-from aerokit.sim.ftp import DATA_SIZE
 from aerokit.sim.logs import Px4LogServer, SimulatedLog
-from aerokit.sim.parameter_pack_file import ParameterPackMount
 from aerokit.sim.px4.ftp import Px4Ftp
+from aerokit.sim.px4.parameter_file import Px4ParameterMount
 from aerokit.sim.px4.parameter_server import Px4ParameterServer
 
 if TYPE_CHECKING:
@@ -43,7 +42,7 @@ class Storage:
         self.files = FileTree()
         self._put_logs(logs)
         if parameter_file:
-            self.files.mounts["@PARAM"] = ParameterPackMount(px4.parameters, self._apply, block=DATA_SIZE)
+            self.files.mounts["@PARAM"] = Px4ParameterMount(px4.parameters, self._apply)
         errors = not px4.version.startswith("1.16")
         self.parameters = Px4ParameterServer(px4, px4.parameters, errors=errors)
         self.ftp = Px4Ftp(px4, self.files)
