@@ -68,6 +68,7 @@ class ArduPilot(Autopilot):
     mission_starts_by_command = True
     sets_current_by_command = True
     takes_file_sessions = True
+    has_upper_case_parameters = True
     log_suffix = ".bin"
     log_directories = ("/APM/LOGS", "/logs")
     first_log_id = 1

@@ -143,6 +143,8 @@ class Autopilot:
     """Whether MISSION_ITEM_REACHED is sent again and again for one item."""
     takes_file_sessions = False
     """Whether a MAVFTP session has the number that the client gave it, not one that the vehicle answers."""
+    has_upper_case_parameters = False
+    """Whether it confirms a parameter in capitals, however it was asked for."""
     log_suffix = ".log"
     """What files with its flight logs are called: ``.bin`` (dataflash) or ``.ulg``."""
     log_directories: ClassVar[tuple[str, ...]] = ()

@@ -110,7 +110,8 @@ class ParameterReads(ParameterRequests):
     def _take_error(self, message: ParamError, now: float) -> None:
         """PX4 says that there is no such parameter also when it has no room to send it: once more, then."""
         name = message.param_id
-        if message.error == DOES_NOT_EXIST and name in self._window and name not in self._refused:
+        is_first = name in self._names and name in self._window and name not in self._refused
+        if is_first and message.error == DOES_NOT_EXIST:
             self._refused.add(name)
             self._window.answered(name, now)
             self._window.ask(name)

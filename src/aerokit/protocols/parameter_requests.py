@@ -119,7 +119,7 @@ class ParameterRequests(Transfer[dict[str, Answer]]):
 
     def _take_error(self, message: ParamError, now: float) -> None:
         name = message.param_id
-        if name in self._window:
+        if name in self._names and name in self._window:
             self._window.answered(name, now)
             self._settle(name, rejection(name, message.error), now)
 

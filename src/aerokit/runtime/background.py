@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 import anyio
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
+    from collections.abc import Awaitable, Callable, Coroutine
+    from typing import Any
 
-__all__ = ["Background"]
+__all__ = ["Background", "to_its_end"]
 
 
 class Background:
@@ -62,3 +63,22 @@ class Background:
             await function()
         except Exception as error:
             self._on_mistake(error)
+
+
+async def to_its_end(work: Coroutine[Any, Any, None]) -> None:
+    """Await what must not be cut short, also when the caller is being cancelled, in whatever way and however often.
+
+    anyio's shield holds off the scopes of anyio, not ``task.cancel()`` or ``asyncio.timeout``. The work must be bounded
+    in time. A cancellation that came meanwhile is raised afterwards; what the work raised is its cause then.
+    """
+    task = asyncio.get_running_loop().create_task(work)
+    cancelled: asyncio.CancelledError | None = None
+    with anyio.CancelScope(shield=True):
+        while not task.done():
+            try:
+                await asyncio.wait((task,))
+            except asyncio.CancelledError as error:
+                cancelled = error
+    if cancelled is not None:
+        raise cancelled from task.exception()
+    await task

@@ -136,7 +136,7 @@ class StreamUnavailable(Event):
 
 
 class ParameterChanged(Event):
-    """A parameter whose value was known has another one now, whoever changed it (the autopilot's own, not a camera's)."""
+    """A parameter of the autopilot whose value was known has another one now, whoever changed it."""
 
     name: str
     before: int | float

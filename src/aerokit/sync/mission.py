@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 from aerokit.sync.cells import StateCell
 
 if TYPE_CHECKING:
-    from aerokit.missions import Fence, Mission, RallyPoints
+    from aerokit.missions import Fence, Mission, RallyPoints  # noqa: F401 - named in the base classes below
     from aerokit.protocols.transfer import OnProgress
     from aerokit.sync.loop_thread import LoopThread
     from aerokit.vehicle.fence import FenceControl as AsyncFenceControl

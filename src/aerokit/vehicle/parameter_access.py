@@ -73,6 +73,11 @@ class ParameterAccess:
             self._answers = RoundTrip(None if link_s is None else link_s + ANSWER_S)
         return self._answers
 
+    @property
+    def has_upper_case_names(self) -> bool:
+        """Whether all parameters of this autopilot are spelled in capitals."""
+        return self._transfers.autopilot.has_upper_case_parameters
+
     def forget(self) -> None:
         """The vehicle has started anew, perhaps with another firmware."""
         self.store.forget()

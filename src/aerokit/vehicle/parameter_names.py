@@ -68,17 +68,18 @@ class ParameterNames:
 
         Raises :class:`LocalProtocolError` for a name that no message can carry, before anything is sent.
         """
-        names = [check_name(name) for name in names]
+        spelled = {check_name(name): self._spelled(name) for name in names}
         found: dict[str, Found | NotFound] = {}
-        answers = await self._access.read(self._to_read(names), patience_s, are_doubtful=True)
-        for name in names:
-            found[name] = each = self._found(name, answers)
+        answers = await self._access.read(self._to_read(spelled.values()), patience_s, are_doubtful=True)
+        for asked, name in spelled.items():
+            found[asked] = each = self._found(name, answers)
             if isinstance(each, Found) and each.renamed is not None:
                 _warn_of(each.renamed)
         return found
 
     def translated(self, values: Mapping[str, float], table: ParameterTable) -> dict[str, int | float]:
         """Values under the names and in the units of the vehicle; names that it does not know stay."""
+        values = {self._spelled(name): value for name, value in values.items()}
         translated, renamed = translate_values(values, table, table.types_by_name())
         for each in renamed:
             _warn_of(each)
@@ -93,7 +94,11 @@ class ParameterNames:
             if (own := renamed[name]) is None or own.name not in values
         }
 
-    def _to_read(self, names: list[str]) -> dict[str, None]:
+    def _spelled(self, name: str) -> str:
+        """ArduPilot finds ``wp_spd``, too, but confirms it as ``WP_SPD``."""
+        return name.upper() if self._access.has_upper_case_names else name
+
+    def _to_read(self, names: Iterable[str]) -> dict[str, None]:
         """What is not known under any of its names, under all of them."""
         store = self._access.store
         wanted: dict[str, None] = {}

@@ -10,6 +10,7 @@ import anyio
 from aerokit.errors import AerokitError, LocalProtocolError, RollbackFailed, VerificationFailed
 from aerokit.parameters import Parameter
 from aerokit.parameters.parameter import same_value
+from aerokit.runtime.background import to_its_end
 from aerokit.vehicle.parameter_names import Found
 
 if TYPE_CHECKING:
@@ -74,7 +75,9 @@ class _Block:
             if not isinstance(answer, Parameter):
                 raise answer
             if name not in self._before:
-                self._before[name] = answer
+                self._before[name] = (
+                    self._access.store.get(name) or answer
+                )  # a read may have lost the last bits
                 self._holds.add(name, self)
 
     def _release(self) -> list[Parameter]:
@@ -94,17 +97,19 @@ class _Block:
 
     async def _put_back(self, cause: BaseException | None) -> None:
         """Bounded, and not to be cancelled; RollbackFailed names what could not be restored."""
-        wanted = self._release()
+        await to_its_end(self._write_back(self._release(), cause))
+
+    async def _write_back(self, wanted: list[Parameter], cause: BaseException | None) -> None:
         answers: Mapping[str, object] = {}
         reason = ""
-        with anyio.move_on_after(LONGEST_PUTTING_BACK * self._patience_s, shield=True):
+        with anyio.move_on_after(LONGEST_PUTTING_BACK * self._patience_s):
             try:
                 answers = await self._access.write(wanted, self._patience_s)
             except AerokitError as error:
                 reason = f" ({error})"
         left = {each.name: each.value for each in wanted if not _is_back(each, answers.get(each.name))}
         if left:
-            names = ", ".join(f"{name} = {value:g}" for name, value in left.items())
+            names = ", ".join(f"{name} = {value!r}" for name, value in left.items())
             raise RollbackFailed(f"could not be put back{reason}: {names}", not_restored=left) from cause
 
 
