@@ -7,7 +7,7 @@ import asyncio
 import anyio
 import pytest
 
-from aerokit.runtime.background import Background
+from aerokit.runtime.background import Background, to_its_end
 
 pytestmark = pytest.mark.anyio
 
@@ -82,3 +82,38 @@ async def test_one_of_them_may_end_them_all() -> None:
     background.start(end_all)
     await anyio.sleep(0.1)
     assert len(background) == 0
+
+
+# ------------------------------------------------------------------------- what must not be cut short
+
+
+async def test_work_goes_to_its_end_however_often_its_caller_is_cancelled() -> None:
+    done: list[str] = []
+
+    async def work() -> None:
+        for _ in range(5):
+            await asyncio.sleep(0)
+        done.append("done")
+
+    task = asyncio.get_running_loop().create_task(to_its_end(work()))
+    for _ in range(3):
+        await asyncio.sleep(0)
+        task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task
+    assert done == ["done"]
+
+
+async def test_what_such_work_raises_comes_out_and_is_the_cause_of_a_cancellation() -> None:
+    async def work() -> None:
+        await asyncio.sleep(0)
+        raise ValueError("it did not work")
+
+    with pytest.raises(ValueError, match="it did not work"):
+        await to_its_end(work())
+    task = asyncio.get_running_loop().create_task(to_its_end(work()))
+    await asyncio.sleep(0)
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError) as cancelled:
+        await task
+    assert isinstance(cancelled.value.__cause__, ValueError)
