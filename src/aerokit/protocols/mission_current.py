@@ -38,10 +38,9 @@ class MissionSetCurrent(Transfer[None]):
         """Take a MISSION_CURRENT; one that was under way may come first."""
         if not isinstance(message, MissionCurrent) or not self._is_from_target(message):
             return
-        moved_on = self._told is not None and message.seq != self._told and message.seq > self._seq
-        self._told = message.seq
-        if message.seq == self._seq or moved_on:
+        if message.seq == self._seq or self._has_passed(message.seq):
             self._finish(None)
+        self._told = message.seq
 
     def expire(self, now: float) -> None:
         """Send it again, or give up."""
@@ -55,6 +54,11 @@ class MissionSetCurrent(Transfer[None]):
             )
             return
         self._send(now)
+
+    def _has_passed(self, seq: int) -> bool:
+        """Whether it has gone to our item and run through it: not what flying on from where it was comes to."""
+        told = self._told
+        return told is not None and (told < self._seq < seq or self._seq < seq < told)
 
     def _send(self, now: float) -> None:
         self._attempts += 1

@@ -106,6 +106,11 @@ class MissionUpload(MissionExchange[UploadEnd]):
         """Whether a vehicle that overwrites items as they come may have done so: the whole list is cut before that."""
         return self.was_begun and not (self._is_partial and self._sent == self._first + 1)
 
+    @property
+    def was_sent_whole(self) -> bool:
+        """Whether the vehicle may have everything, whatever became of its answer."""
+        return self.was_begun and self._sent == self._end
+
     # --------------------------------------------------------------------------------- events
 
     def start(self, now: float) -> None:

@@ -41,7 +41,8 @@ class PlanChannel:
         self._context = context
         self._options: dict[str, Any] = {"patience_s": patience_s, "on_progress": on_progress}
         self._path = PACKED_NAMES[mission_type]
-        self._has_written = False
+        self._has_changed = False
+        """Whether something of ours may be among what the vehicle holds."""
 
     # ------------------------------------------------------------------------------- one by one
 
@@ -60,7 +61,9 @@ class PlanChannel:
         """Send the items from ``first`` on in place of those there; None: the vehicle will not have it in parts."""
         exchange = await self._upload(items, window=1, first=first)
         try:
-            return await self._run(exchange)
+            end = await self._run(exchange)
+            self._has_changed = True
+            return end
         except MissionRejected:
             if exchange.was_begun:
                 raise
@@ -95,7 +98,7 @@ class PlanChannel:
         """Write the file. ArduPilot looks at it when it is closed, and does not tell what it thinks of it."""
         assert self._context.files is not None
         await self._context.files.write(self._path, pack_items(items, self.mission_type), **self._options)
-        self._has_written = True
+        self._has_changed = True
 
     async def read_file(self) -> tuple[MissionItem, ...]:
         """Read the file; RemoteProtocolError when it is none of this kind."""
@@ -165,8 +168,11 @@ class PlanChannel:
     def _what_is_left(self, exchange: MissionExchange[Any], *, is_silent: bool = False) -> str:
         if not isinstance(exchange, MissionUpload):
             return ""
+        self._has_changed |= exchange.was_changing
         is_overwritten = self.mission_type in self._context.autopilot.replaced_as_they_come
-        if is_overwritten and (self._has_written or exchange.was_changing):
+        if is_silent and exchange.was_sent_whole:
+            return "; everything was sent, and it is not known whether the vehicle took it: download to see"
+        if is_overwritten and self._has_changed:
             return "; the vehicle now holds a part of the new items and a part of the old ones: upload again, or clear"
         if is_overwritten and is_silent:
             return "; if the vehicle heard of it, it has cut what it held to the new number of items"

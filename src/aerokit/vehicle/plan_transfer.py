@@ -157,10 +157,13 @@ class PlanTransfer(Generic[PlanT]):
             self._note_no_file(error, method)
         else:
             found = await self._read(method)
-            if len(found) == len(items) or method == "ftp":
+            try:
                 self._compare(dict(enumerate(items)), dict(enumerate(found)))
                 return
-        # there is no such file; or a refusal half way, and the other protocol tells which item, and why
+            except VerificationFailed:
+                if method == "ftp":
+                    raise
+        # there is no such file; or something was refused, and the other protocol tells which item, and why
         await self._send_items(items, method, verify=True)
 
     # -------------------------------------------------------------------------------- changes
