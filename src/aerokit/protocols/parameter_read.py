@@ -5,6 +5,7 @@ https://mavlink.io/en/services/parameter.html#read_single
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING
@@ -28,17 +29,16 @@ BY_NAME = -1
 DOES_NOT_EXIST = 1
 PROBE, PROBE_INDEX = "", 0
 """The request for a parameter that every vehicle has."""
-DOUBT = 1e-3
+DOUBT = 1e-4
 """How probable it may be that a parameter exists although the vehicle, which answers otherwise, says nothing of it."""
-LEAST_ATTEMPTS = 3
 
 
 class ParameterReads(ParameterRequests):
     """Read some parameters by name; ends with one answer for each.
 
-    ArduPilot, and PX4 until 1.16, meet an unknown name with silence. So a name that is not answered is asked for
-    again together with the parameter of index 0, and when that one comes every time, the vehicle has none of this
-    name: the answer is a ParameterRejected without a code. ``are_doubtful`` begins with that at once.
+    ArduPilot, and PX4 until 1.16, meet an unknown name with silence. So names that ``are_doubtful`` are asked for
+    together with the parameter of index 0, and when that one comes time and again, the vehicle has none of the name
+    that does not: the answer is a ParameterRejected without a code.
 
     An answer that tells a ``distrusted`` value may have been under way for long: it is believed the second time.
     """
@@ -68,7 +68,7 @@ class ParameterReads(ParameterRequests):
             patience_s=patience_s,
             on_progress=on_progress,
         )
-        self._is_probe_wanted = are_doubtful
+        self._are_doubtful = self._is_probe_wanted = are_doubtful
         self._distrusted = dict(distrusted)
         self._refused: set[str] = set()
         self._probes_sent = self._probes_answered = 0
@@ -82,8 +82,9 @@ class ParameterReads(ParameterRequests):
 
     def _before_sending(self, now: float) -> None:
         overdue = [name for name in self._window.overdue(now) if name != PROBE]
-        self._give_up_unknown(overdue, now)
-        self._is_probe_wanted |= bool(overdue)
+        if self._are_doubtful and overdue:
+            self._give_up_unknown(overdue, now)
+            self._is_probe_wanted = True
 
     def _after_sending(self, now: float) -> None:
         if self._is_probe_wanted and PROBE not in self._window:
@@ -120,12 +121,16 @@ class ParameterReads(ParameterRequests):
 
     def _give_up_unknown(self, names: list[str], now: float) -> None:
         """Silence is an answer once it can hardly be loss."""
-        loss = (self._probes_sent - self._probes_answered + 1) / (self._probes_sent + 2)
         for name in names:
-            attempts = self._window.attempts(name)
-            if self._probes_answered and attempts >= LEAST_ATTEMPTS and loss**attempts < DOUBT:
+            if self._probability_of_silence(self._window.attempts(name)) < DOUBT:
                 text = f"the vehicle has no parameter {name}: it answers others, and not this one"
                 self._settle(name, ParameterRejected(text, name=name), now)
+
+    def _probability_of_silence(self, attempts: int) -> float:
+        """How probable it is to lose all answers to so many requests, after what became of the probes (Laplace)."""
+        lost = self._probes_sent - self._probes_answered
+        chances = ((lost + 1 + i) / (self._probes_sent + 2 + i) for i in range(attempts))
+        return math.prod(chances) if self._probes_answered else 1.0
 
     def _timeout_text(self, name: str) -> str:
         return f"{name} was not answered, asked for {self._window.attempts(name)} times"

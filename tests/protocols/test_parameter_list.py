@@ -1,0 +1,342 @@
+"""The list of parameters: holes, changes while it comes, and every degree of loss."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from parameter_channel import Channel, FakeVehicle, table_of
+
+from aerokit.errors import LocalProtocolError, ParameterTimeout
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.message import Message
+from aerokit.parameters import Parameter, ParameterTable, ParameterType
+from aerokit.protocols.parameter_list import ParameterList
+from aerokit.protocols.round_trip import RoundTrip
+from aerokit.protocols.transfer import Progress
+
+RTT_S = 0.1
+
+
+def listing(bytewise: bool = False, **options: Any) -> ParameterList:
+    options.setdefault("round_trip", RoundTrip(RTT_S))
+    return ParameterList(1, 1, bytewise=bytewise, **options)
+
+
+def is_value(message: Message, *indices: int) -> bool:
+    return isinstance(message, m.ParamValue) and message.param_index in indices
+
+
+def lose_once(channel: Channel, *indices: int) -> None:
+    """These values of the list get lost, and come when they are asked for again."""
+    left = set(indices)
+
+    def is_lost(message: Message) -> bool:
+        lost = isinstance(message, m.ParamValue) and message.param_index in left
+        if lost:
+            assert isinstance(message, m.ParamValue)
+            left.discard(message.param_index)
+        return lost
+
+    channel.is_lost = is_lost
+
+
+def asked_again(channel: Channel) -> list[int]:
+    return [each.param_index for each in channel.all(m.ParamRequestRead)]
+
+
+# ---------------------------------------------------------------------------------- a good link
+
+
+@pytest.mark.parametrize("bytewise", [False, True])
+def test_one_request_brings_all(bytewise: bool) -> None:
+    table = table_of(300)
+    channel = Channel(FakeVehicle(table, bytewise=bytewise))
+    assert list(channel.run(listing(bytewise)).values()) == table
+    assert channel.kinds() == {"PARAM_REQUEST_LIST": 1}
+
+
+def test_it_ends_with_the_last_value_and_not_later() -> None:
+    channel = Channel(FakeVehicle(table_of(300)))
+    channel.run(listing())
+    assert channel.now == pytest.approx(2 * channel.delay_s + FakeVehicle.tick_s * 59)
+
+
+def test_without_a_known_round_trip_one_value_is_asked_for_beside() -> None:
+    channel = Channel(FakeVehicle(table_of(20)))
+    round_trip = RoundTrip()
+    channel.run(listing(round_trip=round_trip))
+    assert asked_again(channel) == [0]
+    assert round_trip.smoothed_s == pytest.approx(RTT_S)
+
+
+def test_the_hash_is_no_parameter() -> None:
+    vehicle = FakeVehicle(table_of(50), bytewise=True)
+    vehicle.hash_first = True
+    assert list(Channel(vehicle).run(listing(True)).values()) == table_of(50)
+
+
+def test_progress_is_told() -> None:
+    seen: list[Progress] = []
+    Channel(FakeVehicle(table_of(30))).run(listing(on_progress=seen.append))
+    assert [each.done for each in seen] == list(range(1, 31))
+    assert {each.total for each in seen} == {30}
+    assert seen[-1].fraction == 1.0
+
+
+def test_patience_is_above_zero() -> None:
+    with pytest.raises(LocalProtocolError, match="patience_s"):
+        listing(patience_s=0.0)
+
+
+# ---------------------------------------------------------------------------------------- holes
+
+
+def test_only_holes_are_asked_for_again_and_at_once() -> None:
+    channel = Channel(FakeVehicle(table_of(300)))
+    lose_once(channel, 20, 21, 150)
+    channel.run(listing())
+    assert asked_again(channel) == [20, 21, 150]
+    times = [at for at, each in channel.sent if isinstance(each, m.ParamRequestRead)]
+    assert times[0] == pytest.approx(2 * channel.delay_s + FakeVehicle.tick_s * 4)  # with the value behind it
+
+
+def test_a_request_is_not_repeated_before_its_answer_is_overdue() -> None:
+    channel = Channel(FakeVehicle(table_of(100)))
+    lost = {50: 2}
+
+    def is_lost(message: Message) -> bool:
+        if is_value(message, 50) and lost[50]:
+            lost[50] -= 1
+            return True
+        return False
+
+    channel.is_lost = is_lost
+    channel.run(listing())
+    times = [at for at, each in channel.sent if isinstance(each, m.ParamRequestRead)]
+    assert len(times) == 2
+    assert times[1] - times[0] >= RTT_S
+
+
+def test_a_lost_end_is_asked_for_when_nothing_comes_any_more() -> None:
+    channel = Channel(FakeVehicle(table_of(100)))
+    lose_once(channel, 97, 98, 99)
+    assert len(channel.run(listing())) == 100
+    assert asked_again(channel) == [97, 98, 99]
+    assert channel.now < 2.0
+
+
+def test_a_stream_that_stops_in_the_middle_is_read_by_index() -> None:
+    class Stopping(FakeVehicle):
+        def on_list(self) -> None:
+            for index, name in enumerate(list(self.parameters)[:200]):
+                self.say(self.value(name, index), self.tick_s * (index // self.burst))
+
+    channel = Channel(Stopping(table_of(500)))
+    assert list(channel.run(listing()).values()) == table_of(500)
+    assert sorted(asked_again(channel)) == list(range(200, 500))
+    assert channel.kinds()["PARAM_REQUEST_LIST"] == 1
+
+
+def test_a_stream_that_pauses_is_waited_for() -> None:
+    class Pausing(FakeVehicle):
+        tick_s = 1.0
+        burst = 100
+
+    channel = Channel(Pausing(table_of(400)))
+    channel.run(listing())
+    assert asked_again(channel) == []
+
+
+def test_a_lost_request_for_the_list_is_repeated() -> None:
+    channel = Channel(FakeVehicle(table_of(100)))
+    lost = [True, True]
+    channel.is_lost = lambda message: isinstance(message, m.ParamRequestList) and bool(lost and lost.pop())
+    assert len(channel.run(listing())) == 100
+    assert channel.kinds()["PARAM_REQUEST_LIST"] == 3
+
+
+def test_only_a_window_of_requests_is_under_way() -> None:
+    class Mute(FakeVehicle):
+        def on_list(self) -> None:
+            self.say(self.value("PARAM_0000", 0))
+            self.say(self.value("PARAM_0001", 1))
+
+        def on_read(self, request: m.ParamRequestRead) -> None:
+            pass
+
+    channel = Channel(Mute(table_of(1000)))
+    with pytest.raises(ParameterTimeout) as timeout:
+        channel.run(listing(patience_s=3.0))
+    assert set(asked_again(channel)) == set(range(2, 22))
+    assert len(channel.sent) < 200
+    assert timeout.value.missing == tuple(range(2, 1000))
+
+
+# ---------------------------------------------------------------------------- others and repeats
+
+
+def test_values_of_another_component_do_not_count() -> None:
+    vehicle = FakeVehicle(table_of(30))
+    channel = Channel(vehicle)
+    stranger = m.ParamValue("CAM_MODE", 1.0, 9, 3, 2)
+    channel.at(0.06, lambda: channel.from_vehicle(stranger, component_id=100))
+    assert list(channel.run(listing()).values()) == table_of(30)
+
+
+def test_values_come_twice_and_out_of_order() -> None:
+    class Twice(FakeVehicle):
+        def say(self, message: Message, after: float = 0.0) -> None:
+            super().say(message, after)
+            super().say(message, after)
+
+    channel = Channel(Twice(table_of(200)), jitter_s=0.05, seed=3)
+    assert list(channel.run(listing()).values()) == table_of(200)
+
+
+def test_a_value_set_meanwhile_is_the_one_in_the_table() -> None:
+    channel = Channel(FakeVehicle(table_of(100)))
+    news = m.ParamValue("PARAM_0001", 42.0, 9, 100, 0xFFFF)
+    channel.at(0.15, lambda: channel.from_vehicle(news))
+    assert channel.run(listing())["PARAM_0001"].value == 42.0
+
+
+def test_an_index_beyond_the_count_makes_no_flood() -> None:
+    channel = Channel(FakeVehicle(table_of(60)))
+    channel.at(0.06, lambda: channel.from_vehicle(m.ParamValue("PARAM_0003", 3.0, 2, 60, 65_000)))
+    assert len(channel.run(listing())) == 60
+    assert len(channel.sent) < 100
+
+
+# ------------------------------------------------------------------- the count changes meanwhile
+
+
+class Growing(FakeVehicle):
+    """As ArduPilot: a group is shown after ``shown_at`` values. The stream goes on behind it, with the old count."""
+
+    shown_at = 60
+    place = 80
+
+    def on_list(self) -> None:
+        old = list(self.parameters)
+        new = [Parameter(f"GROUP_{i}", i, ParameterType.INT8) for i in range(3)]
+        for index, name in enumerate(old[: self.shown_at]):
+            self.say(self.value(name, index), self.tick_s * (index // self.burst))
+        begin = self.tick_s * (self.shown_at // self.burst + 1)
+
+        def go_on() -> None:
+            rows = list(self.parameters.values())
+            rows[self.place : self.place] = new
+            count = len(rows)
+            self.parameters = {each.name: each for each in rows}
+            self.say(m.ParamValue("GROUP_0", 0.0, 2, count, 0xFFFF))
+            names = [each.name for each in rows]
+            shift = 3 if self.place < self.shown_at else 0
+            for place, name in enumerate(names[self.shown_at + shift :]):
+                message = self.value(name, self.shown_at + place)
+                message = m.ParamValue(**(message.to_dict() | {"param_count": len(old)}))
+                self.say(message, self.tick_s * (place // self.burst))
+
+        assert self.channel is not None
+        self.channel.at(self.channel.now + begin, go_on)
+
+
+@pytest.mark.parametrize("place", [80, 20])
+def test_a_group_that_is_shown_meanwhile_is_in_the_table(place: int) -> None:
+    vehicle = Growing(table_of(100))
+    vehicle.place = place
+    table = Channel(vehicle).run(listing())
+    assert set(table) == set(vehicle.parameters)
+    assert table["PARAM_0099"].value == 99
+
+
+class Px4Growing(FakeVehicle):
+    """As PX4: count and indices are those of the moment; what is inserted before the stream's place is skipped."""
+
+    def on_list(self) -> None:
+        names = list(self.parameters)
+        for place, name in enumerate(names):
+            assert self.channel is not None
+            self.channel.at(self.channel.now + self.tick_s * (place // 5), partial(self.say_now, name))
+
+    def say_now(self, name: str) -> None:
+        if name == "PARAM_0050" and "INSERTED" not in self.parameters:
+            rows = list(self.parameters.values())
+            rows.insert(10, Parameter("INSERTED", 1, ParameterType.INT32))
+            self.parameters = {each.name: each for each in rows}
+        self.say(self.value(name, list(self.parameters).index(name)))
+
+
+def test_a_parameter_inserted_before_the_place_of_the_stream_is_found() -> None:
+    vehicle = Px4Growing(table_of(100), bytewise=True)
+    table = Channel(vehicle).run(listing(True))
+    assert list(table) == list(vehicle.parameters)
+
+
+def test_a_list_that_becomes_shorter_ends() -> None:
+    class Shrinking(FakeVehicle):
+        refuses = True
+
+        def on_list(self) -> None:
+            super().on_list()
+            self.parameters.popitem()
+
+        def on_read(self, request: m.ParamRequestRead) -> None:
+            if request.param_index >= len(self.parameters):
+                self.say(m.ParamError(255, 190, "rubbish", request.param_index, 1))
+            else:
+                super().on_read(request)
+
+    channel = Channel(Shrinking(table_of(100)))
+    lose_once(channel, 99)
+    assert list(channel.run(listing()).values()) == table_of(99)
+
+
+# ----------------------------------------------------------------------------------------- loss
+
+
+def test_silence_is_a_timeout_that_says_so() -> None:
+    channel = Channel(FakeVehicle(table_of(10)), loss=1.0)
+    with pytest.raises(ParameterTimeout, match="PARAM_REQUEST_LIST was not answered") as timeout:
+        channel.run(listing())
+    assert timeout.value.missing == ()
+    assert channel.now == pytest.approx(10.0)
+    assert len(channel.sent) < 30
+
+
+def test_what_never_comes_is_named() -> None:
+    channel = Channel(FakeVehicle(table_of(100)))
+    channel.is_lost = lambda message: is_value(message, 7, 8, 9, 41)
+    with pytest.raises(ParameterTimeout, match=r"4 of 100 .* missing 7–9, 41") as timeout:
+        channel.run(listing())
+    assert timeout.value.missing == (7, 8, 9, 41)
+
+
+def complete(count: int, loss: float, seed: int, **options: Any) -> tuple[ParameterTable, Channel]:
+    channel = Channel(FakeVehicle(table_of(count)), loss=loss, seed=seed, **options)
+    return channel.run(listing()), channel
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10**6), loss=st.sampled_from([0.05, 0.1, 0.2, 0.3]), count=st.integers(1, 150))
+def test_it_is_exact_whatever_is_lost(seed: int, loss: float, count: int) -> None:
+    table, channel = complete(count, loss, seed, jitter_s=0.002)
+    assert list(table.values()) == table_of(count)
+    assert len(channel.sent) < 50 + 3 * count
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_thousand_take_less_than_a_second_more_at_five_percent(seed: int) -> None:
+    _, channel = complete(1000, 0.05, seed)
+    clean = 2 * channel.delay_s + FakeVehicle.tick_s * 199
+    assert channel.now < clean + 1.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_outage_is_waited_through(seed: int) -> None:
+    channel = Channel(FakeVehicle(table_of(400)), seed=seed)
+    channel.is_lost = lambda message: 0.3 < channel.now < 5.0
+    assert list(channel.run(listing()).values()) == table_of(400)

@@ -1,0 +1,296 @@
+"""Parameters read and written by name: unknown names, confirmation, rounding, refusals, loss."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from parameter_channel import Channel, FakeVehicle, framed, table_of
+
+from aerokit.errors import ParameterRejected, ParameterTimeout
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.message import Message
+from aerokit.parameters import Parameter, ParameterType
+from aerokit.protocols.parameter_read import ParameterReads
+from aerokit.protocols.parameter_requests import Answer, rejection
+from aerokit.protocols.parameter_write import ParameterWrites
+from aerokit.protocols.round_trip import RoundTrip
+
+RTT_S = 0.1
+INT32, INT8, REAL32 = ParameterType.INT32, ParameterType.INT8, ParameterType.REAL32
+
+
+def reads(*names: str, bytewise: bool = False, **options: Any) -> ParameterReads:
+    options.setdefault("round_trip", RoundTrip(RTT_S))
+    return ParameterReads(1, 1, names, bytewise=bytewise, own_system=255, **options)
+
+
+def writes(*wanted: Parameter, bytewise: bool = False, **options: Any) -> ParameterWrites:
+    options.setdefault("round_trip", RoundTrip(RTT_S))
+    return ParameterWrites(1, 1, wanted, bytewise=bytewise, own_system=255, **options)
+
+
+def value(answer: Answer) -> float:
+    assert isinstance(answer, Parameter)
+    return answer.value
+
+
+# -------------------------------------------------------------------------------------- reading
+
+
+def test_one_request_reads_one() -> None:
+    channel = Channel(FakeVehicle(table_of(10)))
+    answers = channel.run(reads("PARAM_0004"))
+    assert answers == {"PARAM_0004": Parameter("PARAM_0004", 2.0, REAL32)}
+    assert channel.kinds() == {"PARAM_REQUEST_READ": 1}
+
+
+def test_many_are_read_in_a_window_in_the_order_asked() -> None:
+    channel = Channel(FakeVehicle(table_of(100)))
+    names = [f"PARAM_{i:04}" for i in range(99, -1, -1)]
+    assert list(channel.run(reads(*names))) == names
+    assert sum(at == 0.0 for at, _ in channel.sent) == 20
+    assert channel.kinds() == {"PARAM_REQUEST_READ": 100}
+
+
+def test_nothing_to_read() -> None:
+    answers = Channel(FakeVehicle(table_of(1))).run(reads())
+    assert not answers
+
+
+def test_an_unknown_name_is_rejected_by_param_error() -> None:
+    vehicle = FakeVehicle(table_of(10))
+    vehicle.refuses = True
+    answer = Channel(vehicle).run(reads("NOPE"))["NOPE"]
+    assert isinstance(answer, ParameterRejected)
+    assert (answer.name, answer.code) == ("NOPE", 1)
+    assert "no such parameter" in str(answer)
+
+
+def test_a_single_error_may_mean_that_there_was_no_room_to_answer() -> None:
+    """PX4 says DOES_NOT_EXIST also when its buffer is full."""
+
+    class Full(FakeVehicle):
+        refused = 0
+
+        def on_read(self, request: m.ParamRequestRead) -> None:
+            self.refused += 1
+            if self.refused == 1:
+                self.say(m.ParamError(255, 190, request.param_id, 0, 1))
+            else:
+                super().on_read(request)
+
+    assert value(Channel(Full(table_of(10))).run(reads("PARAM_0004"))["PARAM_0004"]) == 2.0
+
+
+def test_errors_for_another_ground_station_do_not_count() -> None:
+    channel = Channel(FakeVehicle(table_of(10)))
+    for at in (0.01, 0.02):
+        channel.at(at, lambda: channel.from_vehicle(m.ParamError(254, 190, "PARAM_0004", -1, 1)))
+    assert value(channel.run(reads("PARAM_0004"))["PARAM_0004"]) == 2.0
+
+
+def test_silence_about_one_name_alone_is_an_answer() -> None:
+    channel = Channel(FakeVehicle(table_of(10)))
+    answers = channel.run(reads("NOPE", "PARAM_0004", are_doubtful=True))
+    answer = answers["NOPE"]
+    assert isinstance(answer, ParameterRejected)
+    assert answer.code is None
+    assert "it answers others" in str(answer)
+    assert value(answers["PARAM_0004"]) == 2.0
+    assert channel.now < 1.5
+
+
+def test_many_unknown_names_cost_few_messages_each() -> None:
+    channel = Channel(FakeVehicle(table_of(10)))
+    answers = channel.run(reads(*(f"NOPE_{i}" for i in range(100)), are_doubtful=True))
+    assert all(isinstance(each, ParameterRejected) for each in answers.values())
+    assert len(channel.sent) < 600
+
+
+def test_silence_of_the_vehicle_is_a_timeout() -> None:
+    channel = Channel(FakeVehicle(table_of(10)), loss=1.0)
+    answer = channel.run(reads("PARAM_0004", patience_s=5.0))["PARAM_0004"]
+    assert isinstance(answer, ParameterTimeout)
+    assert answer.missing == ("PARAM_0004",)
+    assert channel.now == pytest.approx(5.0)
+    assert len(channel.sent) < 60
+
+
+def test_a_distrusted_value_is_believed_the_second_time() -> None:
+    channel = Channel(FakeVehicle(table_of(10)))
+    answers = channel.run(reads("PARAM_0004", distrusted={"PARAM_0004": 2.0}))
+    assert value(answers["PARAM_0004"]) == 2.0
+    assert channel.kinds() == {"PARAM_REQUEST_READ": 2}
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10**6), loss=st.sampled_from([0.05, 0.1, 0.2, 0.3]), count=st.integers(1, 60))
+def test_reads_are_exact_whatever_is_lost(seed: int, loss: float, count: int) -> None:
+    table = table_of(60)
+    channel = Channel(FakeVehicle(table), loss=loss, seed=seed)
+    answers = channel.run(reads(*(each.name for each in table[:count]), are_doubtful=True))
+    assert [value(each) for each in answers.values()] == [each.value for each in table[:count]]
+    assert len(channel.sent) < 100 + 6 * count
+
+
+# -------------------------------------------------------------------------------------- writing
+
+
+@pytest.mark.parametrize("bytewise", [False, True])
+@pytest.mark.parametrize(
+    ("number", "type_"),
+    [
+        (5, INT32),
+        (-5_000_000, INT32),
+        (0.1, REAL32),
+        (-3, INT8),
+        (1e-30, REAL32),
+        (2_139_095_041 // 128 * 128, INT32),
+    ],
+)
+def test_a_write_is_confirmed_by_value_and_type(bytewise: bool, number: float, type_: ParameterType) -> None:
+    """-5,000,000 as bytes is a signalling NaN."""
+    vehicle = FakeVehicle([Parameter("A", 0, type_)], bytewise=bytewise)
+    channel = Channel(vehicle)
+    answer = channel.run(writes(Parameter("A", number, type_), bytewise=bytewise))["A"]
+    assert value(answer) == pytest.approx(number, rel=1e-6)
+    assert isinstance(answer, Parameter)
+    assert answer.type == type_
+    assert isinstance(answer.value, int) == type_.is_integer
+    assert channel.kinds() == {"PARAM_SET": 1}
+
+
+def test_many_writes_are_under_way_at_once() -> None:
+    table = table_of(50)
+    channel = Channel(FakeVehicle(table))
+    answers = channel.run(writes(*(each.replace(value=1) for each in table)))
+    assert {value(each) for each in answers.values()} == {1}
+    assert channel.kinds() == {"PARAM_SET": 50}
+    assert channel.now < 0.6
+
+
+class Clamping(FakeVehicle):
+    def store(self, name: str, value: float) -> None:
+        super().store(name, min(value, 10))
+
+
+def test_a_clamped_value_is_believed_and_not_set_for_ever() -> None:
+    channel = Channel(Clamping([Parameter("A", 0, INT32)]))
+    assert value(channel.run(writes(Parameter("A", 50, INT32), before={"A": 0}))["A"]) == 10
+    assert len(channel.sent) < 6
+
+
+class ReadOnly(FakeVehicle):
+    def store(self, name: str, value: float) -> None:
+        pass
+
+
+def test_a_value_that_the_vehicle_keeps_is_told() -> None:
+    channel = Channel(ReadOnly([Parameter("A", 7, INT32)]))
+    assert value(channel.run(writes(Parameter("A", 50, INT32), before={"A": 7}))["A"]) == 7
+    assert len(channel.sent) < 10
+
+
+def test_an_old_value_under_way_is_not_the_answer() -> None:
+    vehicle = FakeVehicle([Parameter("A", 1, INT32)])
+    channel = Channel(vehicle)
+    channel.is_lost = lambda message: isinstance(message, m.ParamSet) and channel.now < 0.01
+    for at in (0.0, 0.01, 0.02):
+        channel.at(at, lambda: channel.from_vehicle(m.ParamValue("A", 1.0, 6, 1, 0xFFFF)))
+    assert value(channel.run(writes(Parameter("A", 2, INT32), before={"A": 1}))["A"]) == 2
+    assert vehicle.parameters["A"].value == 2
+
+
+def test_what_comes_before_the_write_was_sent_does_not_confirm_it() -> None:
+    table = [Parameter(f"P{i}", 0, INT32) for i in range(30)]
+    vehicle = FakeVehicle(table)
+    channel = Channel(vehicle, delay_s=0.05)
+    channel.at(0.0, lambda: channel.from_vehicle(m.ParamValue("P29", 1.0, 6, 30, 0xFFFF)))
+    channel.run(writes(*(each.replace(value=1) for each in table)))
+    assert {each.value for each in vehicle.parameters.values()} == {1}
+
+
+def test_an_integer_that_ardupilot_calls_a_float_is_confirmed() -> None:
+    class DefaultAsFloat(FakeVehicle):
+        def value(self, name: str, index: int | None) -> m.ParamValue:
+            return m.ParamValue(**(super().value(name, index).to_dict() | {"param_type": 9}))
+
+    channel = Channel(DefaultAsFloat([Parameter("A", 0, INT8)]))
+    answer = channel.run(writes(Parameter("A", 3, INT8)))["A"]
+    assert answer == Parameter("A", 3, INT8)
+    assert channel.kinds() == {"PARAM_SET": 1}
+
+
+def test_another_type_is_told_after_it_was_read_back() -> None:
+    class OtherType(FakeVehicle):
+        def value(self, name: str, index: int | None) -> m.ParamValue:
+            return m.ParamValue(name, 5.0, 9, 1, 0xFFFF)
+
+    channel = Channel(OtherType([Parameter("A", 5.0, REAL32)], bytewise=True))
+    answer = channel.run(writes(Parameter("A", 5, INT32), bytewise=True))["A"]
+    assert answer == Parameter("A", 5.0, REAL32)
+    assert len(channel.sent) < 6
+
+
+def test_a_refusal_is_told_in_words() -> None:
+    vehicle = FakeVehicle([])
+    vehicle.refuses = True
+    answer = Channel(vehicle).run(writes(Parameter("A", 5, INT32)))["A"]
+    assert isinstance(answer, ParameterRejected)
+    assert answer.code == 1
+
+
+@pytest.mark.parametrize(
+    ("code", "words"), [(2, "this value"), (5, "read-only"), (7, "another type"), (99, "99")]
+)
+def test_errors_in_words(code: int, words: str) -> None:
+    assert words in str(rejection("A", code))
+
+
+def test_an_unconfirmed_write_is_a_timeout() -> None:
+    channel = Channel(FakeVehicle([]))
+    answer = channel.run(writes(Parameter("A", 5, INT32), patience_s=2.0))["A"]
+    assert isinstance(answer, ParameterTimeout)
+    assert "not confirmed" in str(answer)
+    assert len(channel.sent) < 30
+
+
+def test_values_of_another_component_confirm_nothing() -> None:
+    vehicle = FakeVehicle([])
+    channel = Channel(vehicle)
+    channel.at(0.01, lambda: channel.from_vehicle(m.ParamValue("A", 5.0, 6, 1, 0xFFFF), component_id=100))
+    answer = channel.run(writes(Parameter("A", 5, INT32), patience_s=1.0))["A"]
+    assert isinstance(answer, ParameterTimeout)
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10**6), loss=st.sampled_from([0.05, 0.1, 0.2, 0.3]), count=st.integers(1, 40))
+def test_writes_arrive_whatever_is_lost(seed: int, loss: float, count: int) -> None:
+    table = table_of(count)
+    vehicle = FakeVehicle(table)
+    channel = Channel(vehicle, loss=loss, seed=seed)
+    before = {each.name: each.value for each in table}
+    answers = channel.run(writes(*(each.replace(value=101) for each in table), before=before))
+    assert {value(each) for each in answers.values()} == {101}
+    assert {each.value for each in vehicle.parameters.values()} == {101}
+    assert len(channel.sent) < 50 + 6 * count
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10**6), loss=st.sampled_from([0.1, 0.3]))
+def test_clamping_is_told_whatever_is_lost(seed: int, loss: float) -> None:
+    channel = Channel(Clamping([Parameter("A", 0, INT32)]), loss=loss, seed=seed)
+    assert value(channel.run(writes(Parameter("A", 50, INT32), before={"A": 0}))["A"]) == 10
+    assert len(channel.sent) < 80
+
+
+def test_messages_that_were_not_asked_for_are_ignored() -> None:
+    exchange = reads("A")
+    exchange.start(0.0)
+    others: list[Message] = [m.ParamValue("B", 1.0, 6, 1, 0), m.Heartbeat(2, 3, 0, 0, 3, 3)]
+    for message in others:
+        exchange.receive(framed(message), 0.01)
+    assert not exchange.done
