@@ -1,4 +1,4 @@
-"""Sessions: tests (each Python that is there), lint, types, docs, bench, demo. `nox -l` lists them."""
+"""Sessions: tests (each Python that is there), lint, types, docs, bench, badlinks, demo. `nox -l` lists them."""
 
 from __future__ import annotations
 
@@ -54,6 +54,13 @@ def bench(session: nox.Session) -> None:
     """Measure beside pymavlink and MAVSDK, print the table, write bench.json."""
     session.install("-e", ".[fast]", "mavsdk>=4")
     session.run("python", "benchmarks/run.py", *session.posargs)
+
+
+@nox.session
+def badlinks(session: nox.Session) -> None:
+    """Judge every transfer over bad radios, 200 seeds of each, and print the table; half an hour and more."""
+    session.install("-e", ".[test]")
+    session.run("python", "tests/badlink/survey.py", *session.posargs, env={"PYTHONPATH": "tests"})
 
 
 @nox.session

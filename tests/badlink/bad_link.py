@@ -10,7 +10,7 @@ import asyncio
 from collections import Counter
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import anyio
@@ -38,9 +38,26 @@ class Radio:
     name: str
     model: FaultModel = PERFECT
     half_duplex: bool = False
+    port_bytes_per_s: float | None = None
+    """What the vehicle takes its port to be able to carry; None: it has flow control."""
+    outage_after_s: float | None = None
+    """Seconds from the beginning of the transfer, after which nothing gets through."""
+    outage_s: float = 0.0
+    """For so long; infinite: the link dies."""
 
     def with_loss(self, share: float) -> Radio:
-        return Radio(f"{self.name}, {share:.0%} loss", self.model.replace(loss=share), self.half_duplex)
+        return replace(self, model=self.model.replace(loss=share))
+
+
+WIDE = Radio("50 ms each way")
+"""A network: the vehicle's own pace is what limits it."""
+NARROW = Radio(
+    "57,600 baud, half duplex",
+    FaultModel(delay_s=DELAY_S, bandwidth=5760.0, queue_bytes=4000.0),
+    half_duplex=True,
+    port_bytes_per_s=5760.0,
+)
+"""A telemetry radio: one frequency for both directions, and a queue that overflows."""
 
 
 @dataclass
@@ -51,9 +68,17 @@ class Program:
     simulated: Any
     wire: Wire
     radio: FaultyLink
+    opened_at: float
+    known: Any = None
+    """What was found out while the radio was good."""
 
     def turn_bad(self, radio: Radio) -> None:
-        self.radio.outgoing.model = self.radio.incoming.model = radio.model
+        """From now on."""
+        model = radio.model
+        if radio.outage_after_s is not None:
+            begin = asyncio.get_running_loop().time() - self.opened_at + radio.outage_after_s
+            model = model.replace(outages=((begin, begin + radio.outage_s),))
+        self.radio.outgoing.model = self.radio.incoming.model = model
 
 
 @dataclass
@@ -82,11 +107,15 @@ def attempt(
     seed: int,
     make_vehicle: Callable[[], SimulatedVehicle],
     *,
-    timeout_s: float = 600.0,
+    before: Work | None = None,
+    timeout_s: float = 900.0,
     leftovers: Callable[[Any], Iterator[str]] = lambda simulated: iter(()),
 ) -> Attempt:
-    """One transfer; the radio turns bad when the vehicle is connected, ``leftovers`` names what the vehicle kept."""
-    return run_virtual(_attempt(work, radio, seed, make_vehicle(), timeout_s, leftovers))
+    """One transfer. The radio turns bad when the vehicle is connected and ``before`` was done.
+
+    ``leftovers`` names what the vehicle kept.
+    """
+    return run_virtual(_attempt(work, radio, seed, make_vehicle(), before, timeout_s, leftovers))
 
 
 async def _attempt(
@@ -94,12 +123,15 @@ async def _attempt(
     radio: Radio,
     seed: int,
     simulated: SimulatedVehicle,
+    before: Work | None,
     timeout_s: float,
     leftovers: Callable[[Any], Iterator[str]],
 ) -> Attempt:
     loop = asyncio.get_running_loop()
     async with open_program(simulated, seed, half_duplex=radio.half_duplex) as program:
-        before = _held(program)
+        if before is not None:
+            await before(program)
+        held = _held(program)
         program.turn_bad(radio)
         program.wire.forget()
         heard, begun = program.radio.incoming.frames, loop.time()
@@ -111,7 +143,7 @@ async def _attempt(
             outcome.error = error
         outcome.seconds = loop.time() - begun
         outcome.heard = program.radio.incoming.frames - heard
-        outcome.left = await _what_is_left(program, before, leftovers)
+        outcome.left = await _what_is_left(program, held, leftovers)
         outcome.sent = Counter(
             type(each).NAME for _, each in program.wire.sent if not isinstance(each, OWN_LIFE)
         )
@@ -125,11 +157,12 @@ async def open_program(
     """Connected, what it is known to be able to do, no streams but the vehicle's own; the radio is still good."""
     async with simulated_link(simulated) as link:
         radio = FaultyLink(link, PERFECT, seed=seed, half_duplex=half_duplex)
+        opened_at = asyncio.get_running_loop().time()
         wire = Wire(radio)
         async with aerokit.connect(wire, rates={}, system_id=simulated.system_id) as vehicle:
             await vehicle.version.wait_until(lambda _: True)
             await anyio.sleep(0.5)
-            yield Program(vehicle, simulated, wire, radio)
+            yield Program(vehicle, simulated, wire, radio, opened_at)
 
 
 def _held(program: Program) -> tuple[int, int, int, int]:
@@ -143,7 +176,7 @@ def _held(program: Program) -> tuple[int, int, int, int]:
 
 
 async def _what_is_left(
-    program: Program, before: tuple[int, ...], leftovers: Callable[[Any], Iterator[str]]
+    program: Program, held: tuple[int, ...], leftovers: Callable[[Any], Iterator[str]]
 ) -> list[str]:
     """At once if possible: the radio is still as bad, and closing needs it."""
     names = ("sinks", "waiters", "deadlines", "tasks")
@@ -151,7 +184,7 @@ async def _what_is_left(
     while True:
         left = [
             f"{now - then} {name}"
-            for name, then, now in zip(names, before, _held(program), strict=True)
+            for name, then, now in zip(names, held, _held(program), strict=True)
             if now > then
         ]
         left += leftovers(program.simulated)
