@@ -3,8 +3,9 @@
 What vehicles do (ArduPilot 4.7, PX4 1.17), and what follows from it:
 
 - ArduPilot serves one request at a time and ignores what comes meanwhile; a request for one block is served at once.
-  PX4 serves the latest request, and forgets the one before. So a long range is asked for alone; the blocks of it that
-  were lost are asked for when it has ended, many at a time and a little apart.
+  PX4 serves the latest request, and forgets the one before; over UDP it sends 256 kB at once, whatever becomes of them.
+  So a long range is asked for alone; what was lost of it is asked for when it has ended: long holes as ranges of their
+  own, single blocks many at a time and a little apart. The ranges get shorter when most of them is lost.
 - ArduPilot answers nothing while it is armed, and sends nothing while it has not heard a heartbeat for three seconds.
 - ArduPilot counts logs from 1, PX4 from 0. PX4 sends all logs from the first one that is asked for, and is silent when
   it has none. It gives data only after it has listed its logs since it was started.
@@ -33,7 +34,9 @@ SILENT_MESSAGES = 10
 """So many messages in a row are hardly ever lost: the vehicle has sent all that it was asked for."""
 SPACING_S = 0.005
 """Between requests for single blocks: PX4 looks at the latest one every 2 to 10 ms."""
-SHORTEST_RANGE, LONGEST_RANGE = 512, 40_000
+FIRST_RANGE, SHORTEST_RANGE, LONGEST_RANGE = 512, 64, 40_000
+"""In blocks."""
+LONG_HOLE = 8
 RANGE_ROUND_TRIPS = 60
 """A range lasts so many round trips at least, so that the pauses after it do not count."""
 EARLY_ENDS = 3
@@ -214,8 +217,11 @@ class LogDownload(Transfer[int]):
         self._is_streaming = False
         self._until = into.position
         """Where the range ends that is being sent."""
+        self._latest = self._until
+        self._range, self._asked_for, self._received = FIRST_RANGE, 0, 0
+        """In blocks."""
         self._early_ends = 0
-        self._has_asked = False
+        self._has_looked = True
 
     def start(self, now: float) -> None:
         """Ask for the first range."""
@@ -257,15 +263,15 @@ class LogDownload(Transfer[int]):
         self._go_on(now)
 
     def _take_block(self, message: LogData, now: float) -> None:
-        into = self._into
-        if self._is_streaming and message.ofs >= into.tail:
-            self._stream.heard(now, (message.ofs - into.tail) // LOG_BLOCK + 1)
-            self._requests.busy(now)
-        if message.ofs + message.count >= self._until:
-            self._is_streaming = False
-        if into.add(message.ofs, bytes(message.data[: message.count])):
+        offset, into = message.ofs, self._into
+        if self._is_streaming and offset > self._latest:
+            self._stream.heard(now, (offset - self._latest) // LOG_BLOCK)
+            self._latest = offset
+            self._received += 1
+            self._is_streaming = offset + LOG_BLOCK < self._until
+        if into.add(offset, bytes(message.data[: message.count])):
             self._move(now, into.done, self._size)
-        self._requests.answered(message.ofs, now)
+        self._requests.answered(offset, now)
 
     def _end_early(self, end: int) -> None:
         """The vehicle could not read its own log; that may pass."""
@@ -286,29 +292,54 @@ class LogDownload(Transfer[int]):
             self._say_end()
             return
         if not self._is_streaming:
-            self._ask_for_gaps()
-            for offset in self._requests.take_due(now):
-                self._request(offset, LOG_BLOCK)
-            if not into.gaps:
-                self._stream_on(now)
+            self._fill_holes(now)
+        if not self._is_streaming and not into.gaps:
+            self._stream_range(into.tail, self._size, now)
         self._set_deadline()
 
-    def _ask_for_gaps(self) -> None:
-        if not self._has_asked:
-            self._has_asked = True
+    def _fill_holes(self, now: float) -> None:
+        """After a range: long holes one after the other, then whatever else is missing."""
+        if not self._has_looked:
+            hole = self._long_hole()
+            if hole is not None:
+                self._stream_range(*hole, now)
+                return
+            self._has_looked = True
             for offset in self._into.gaps:
                 self._requests.ask(offset)
+        for offset in self._requests.take_due(now):
+            self._request(offset, LOG_BLOCK)
 
-    def _stream_on(self, now: float) -> None:
-        """Ask for the next range."""
-        blocks: float = SHORTEST_RANGE
-        if self._stream.interval_s:
-            blocks = RANGE_ROUND_TRIPS * self.round_trip.timeout_s() / self._stream.interval_s
-        size = LOG_BLOCK * int(min(max(blocks, SHORTEST_RANGE), LONGEST_RANGE))
-        self._until = min(self._into.tail + size, self._size)
-        self._is_streaming, self._has_asked = True, False
+    def _long_hole(self) -> tuple[int, int] | None:
+        """The first one, from where to where."""
+        start = end = -1
+        for offset in self._into.gaps:
+            if offset != end:
+                if end - start >= LONG_HOLE * LOG_BLOCK:
+                    break
+                start = offset
+            end = offset + LOG_BLOCK
+        return (start, end) if end - start >= LONG_HOLE * LOG_BLOCK else None
+
+    def _stream_range(self, start: int, end: int, now: float) -> None:
+        """Ask for a range, or its first part."""
+        self._adapt_range()
+        self._until = min(start + self._range * LOG_BLOCK, end, self._size)
+        self._asked_for = -(-(self._until - start) // LOG_BLOCK)
+        self._latest, self._received = start - LOG_BLOCK, 0
+        self._is_streaming, self._has_looked = True, False
         self._stream.asked(now)
-        self._request(self._into.tail, self._until - self._into.tail)
+        self._request(start, self._until - start)
+
+    def _adapt_range(self) -> None:
+        """By what came of the last one. Radios lose a third of their messages; more is lost when a queue is full."""
+        if self._stream.fails or not self._asked_for:
+            return
+        if self._received < self._asked_for / 2:
+            self._range = max(self._range // 2, SHORTEST_RANGE)
+        elif self._asked_for >= self._range and self._stream.interval_s:
+            longest = RANGE_ROUND_TRIPS * self.round_trip.timeout_s() / self._stream.interval_s
+            self._range = min(2 * self._range, max(int(longest), FIRST_RANGE), LONGEST_RANGE)
 
     def _request(self, offset: int, count: int) -> None:
         self._outbox.append(

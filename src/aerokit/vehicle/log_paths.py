@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from aerokit.errors import FileError
 
@@ -11,11 +11,19 @@ if TYPE_CHECKING:
     from aerokit.vehicle.files import FileEntry, Files
     from aerokit.vehicle.logs import LogEntry
 
-__all__ = ["log_path"]
+__all__ = ["ListedLog", "listed_logs", "log_path"]
 
 ARDUPILOT_NAME = re.compile(r"(\d{8})\.BIN", re.IGNORECASE)
 PX4_LIST = "logdata.txt"
 PX4_LINE = re.compile(r"(\d+) (\d+) (\S+)")
+
+
+class ListedLog(NamedTuple):
+    """A line of the list that PX4 writes when it is asked for its logs; the line's number is the id."""
+
+    time_utc: int
+    size: int
+    path: str
 
 
 async def log_path(
@@ -38,8 +46,40 @@ async def log_path(
         if numbered:
             return _numbered_path(directory, numbered, log)
         if any(entry.is_directory for entry in entries):
-            return await _listed_path(files, directory, log, patience_s)
+            logs = await _list_in(files, directory, patience_s)
+            is_there = log.id < len(logs) and logs[log.id].size == log.size
+            return logs[log.id].path if is_there else None
     return None
+
+
+async def listed_logs(
+    files: Files, directories: tuple[str, ...], patience_s: float
+) -> tuple[ListedLog, ...] | None:
+    """The logs by PX4's list, which must have been asked for; None when there are logs and no list."""
+    for directory in directories:
+        try:
+            entries = await files.list(directory, patience_s=patience_s)
+        except FileError:
+            continue
+        logs = await _list_in(files, directory, patience_s)
+        return None if entries and not logs else logs
+    return ()
+
+
+async def _list_in(files: Files, directory: str, patience_s: float) -> tuple[ListedLog, ...]:
+    """The list beside the directory of the logs; an empty tuple when there is none."""
+    root = directory.rpartition("/")[0]
+    try:
+        text = await files.read(f"{root}/{PX4_LIST}", patience_s=patience_s)
+    except FileError:
+        return ()
+    matches = [PX4_LINE.fullmatch(line) for line in text.decode("utf-8", "replace").splitlines()]
+    logs = [
+        ListedLog(int(match[1]), int(match[2]), f"{directory}/{match[3].partition('/log/')[2]}")
+        for match in matches
+        if match is not None
+    ]
+    return tuple(logs) if len(logs) == len(matches) else ()
 
 
 def _numbered_path(directory: str, entries: dict[int, FileEntry], log: LogEntry) -> str | None:
@@ -50,17 +90,3 @@ def _numbered_path(directory: str, entries: dict[int, FileEntry], log: LogEntry)
     is_newest = number == max(entries)
     is_it = entry.size == log.size or (is_newest and entry.size > log.size)
     return f"{directory}/{entry.name}" if is_it else None
-
-
-async def _listed_path(files: Files, directory: str, log: LogEntry, patience_s: float) -> str | None:
-    root = directory.rpartition("/")[0]
-    try:
-        text = await files.read(f"{root}/{PX4_LIST}", patience_s=patience_s)
-    except FileError:
-        return None
-    lines = text.decode("utf-8", "replace").splitlines()
-    match = PX4_LINE.fullmatch(lines[log.id]) if log.id < len(lines) else None
-    if match is None or int(match[2]) != log.size:
-        return None
-    _, found, rest = match[3].partition("/log/")
-    return f"{directory}/{rest}" if found else None

@@ -17,14 +17,13 @@ from aerokit.protocols.reassembly import Reassembly
 from aerokit.protocols.transfer import PATIENCE_S, OnProgress
 from aerokit.snapshot import Snapshot
 from aerokit.vehicle.checks import check_seconds
-from aerokit.vehicle.log_paths import log_path
+from aerokit.vehicle.log_paths import listed_logs, log_path
 from aerokit.vehicle.part_file import PartFile
 
 if TYPE_CHECKING:
     import os
     from collections.abc import AsyncIterator, Callable
 
-    from aerokit.mavlink import messages
     from aerokit.vehicle.files import Files
     from aerokit.vehicle.transfers import Transfers
 
@@ -169,22 +168,19 @@ class Logs:
         self, log: LogEntry | int, method: LogMethod, patience_s: float, timeout: float | None
     ) -> tuple[str | None, LogEntry]:
         """Where it is for MAVFTP (None: by LOG_*), and its entry, which LOG_* needs to be fresh."""
-        entry = log if isinstance(log, LogEntry) else await self._entry(log, patience_s, timeout)
-        if method != "log":
-            path = await self._path(entry, patience_s)
+        if isinstance(log, LogEntry) and method != "log":
+            path = await self._path(log, patience_s)
             if path is not None:
-                return path, entry
-            if method == "ftp":
-                raise FileError(
-                    f"log {entry.id}: it is not certain which file on the vehicle it is",
-                    path=f"log {entry.id}",
-                    code=MavFtpErr.FILENOTFOUND,
-                )
-        if isinstance(log, LogEntry):
-            entry = await self._entry(log.id, patience_s, timeout)
-            if entry.time_utc != log.time_utc or entry.size < log.size:
-                raise _no_such_log(log.id, "the vehicle has another log of this id now; list them again")
-        return None, entry
+                return path, log
+        entry = await self._entry(log if isinstance(log, int) else log.id, patience_s, timeout)
+        if isinstance(log, LogEntry) and _is_other(log, entry):
+            raise _no_such_log(log.id, "the vehicle has another log of this id now; list them again")
+        if method == "log":
+            return None, entry
+        path = await self._path(entry, patience_s)
+        if path is None and method == "ftp":
+            raise _no_such_log(entry.id, "it is not certain which file on the vehicle it is")
+        return path, entry
 
     async def _path(self, entry: LogEntry, patience_s: float) -> str | None:
         directories = self._transfers.autopilot.log_directories
@@ -201,12 +197,20 @@ class Logs:
         raise _no_such_log(log_id, "there is no such log")
 
     async def _entries(self, patience_s: float, only: int | None = None) -> tuple[LogEntry, ...]:
-        if self._transfers.autopilot.silent_without_logs and await self._files.is_supported():
-            with suppress(FileTimeout):
-                return await self._listed(patience_s, only, most_unanswered=SILENT_REQUESTS)
-            if not await self._has_log_files(patience_s):
-                return ()
-        return await self._listed(patience_s, only, most_unanswered=None)
+        """What the vehicle lists. ArduPilot also lists logs that were erased, with nothing in them."""
+        entries = await self._listed_somehow(patience_s, only)
+        return tuple(entry for entry in entries if entry.size)
+
+    async def _listed_somehow(self, patience_s: float, only: int | None) -> tuple[LogEntry, ...]:
+        autopilot = self._transfers.autopilot
+        if not autopilot.silent_without_logs or not await self._files.is_supported():
+            return await self._listed(patience_s, only, most_unanswered=None)
+        with suppress(FileTimeout):
+            return await self._listed(patience_s, only, most_unanswered=SILENT_REQUESTS)
+        logs = await listed_logs(self._files, autopilot.log_directories, patience_s)
+        if logs is None:
+            return await self._listed(patience_s, only, most_unanswered=None)
+        return tuple(_make_entry(number, log.size, log.time_utc) for number, log in enumerate(logs))
 
     async def _listed(
         self, patience_s: float, only: int | None, *, most_unanswered: int | None
@@ -221,17 +225,8 @@ class Logs:
             round_trip=self._transfers.round_trip,
             patience_s=patience_s,
         )
-        return tuple(_entry(each) for each in await self._transfers.run(exchange))
-
-    async def _has_log_files(self, patience_s: float) -> bool:
-        """Whether MAVFTP finds any; a directory may be empty."""
-        for directory in self._transfers.autopilot.log_directories:
-            with suppress(FileError):
-                for entry in await self._files.list(directory, patience_s=patience_s):
-                    path = f"{directory}/{entry.name}"
-                    if not entry.is_directory or await self._files.list(path, patience_s=patience_s):
-                        return True
-        return False
+        entries = await self._transfers.run(exchange)
+        return tuple(_make_entry(each.id, each.size, each.time_utc) for each in entries)
 
     # --------------------------------------------------------------------------- transfer
 
@@ -313,9 +308,15 @@ def _check(log: LogEntry | int, method: str) -> None:
         raise LocalProtocolError(f"log = {log!r} is not allowed: an entry, or an id from 0 to {LARGEST_ID}")
 
 
-def _entry(message: messages.LogEntry) -> LogEntry:
-    time_utc = datetime.fromtimestamp(message.time_utc, tz=timezone.utc) if message.time_utc else None
-    return LogEntry(message.id, message.size, time_utc)
+def _make_entry(log_id: int, size: int, time_utc: int) -> LogEntry:
+    return LogEntry(log_id, size, datetime.fromtimestamp(time_utc, tz=timezone.utc) if time_utc else None)
+
+
+def _is_other(before: LogEntry, now: LogEntry) -> bool:
+    """Logs grow while they are written, and are written later; they do not shrink."""
+    if now.size < before.size:
+        return True
+    return before.time_utc is not None and (now.time_utc is None or now.time_utc < before.time_utc)
 
 
 def _no_such_log(log_id: int, text: str) -> FileError:

@@ -31,15 +31,21 @@ class PartFile:
 
     @contextmanager
     def writing(self, start: int) -> Iterator[BinaryIO]:
-        """Open it for writing from ``start`` on; what was behind is gone.
+        """Open it for writing from ``start`` on; what was behind is gone. Nothing stays of
+        an attempt that has brought nothing.
 
         Raises:
             OSError: it cannot be written.
         """
-        with self.path.open("r+b" if start else "wb") as disk:
-            disk.seek(start)
-            disk.truncate()
-            yield disk
+        try:
+            with self.path.open("r+b" if start else "wb") as disk:
+                disk.seek(start)
+                disk.truncate()
+                yield disk
+        except BaseException:
+            if not self.size:
+                self.path.unlink(missing_ok=True)
+            raise
 
     def finish(self) -> None:
         """Give it its name, in place of the file that may have it."""
