@@ -429,3 +429,38 @@ def test_px4_climbs_first_when_the_mission_forgets_to() -> None:
     assert "Climb to 2.5 meters above home\t" in client.texts
     assert px4.motion.north == pytest.approx(20.0, abs=2.0)
     assert px4.altitude_m == pytest.approx(10.0, abs=1.0)
+
+
+@pytest.mark.parametrize(
+    ("items", "reason"),
+    [
+        ([go(20), PX4_CLIMB], "takeoff not first waypoint item"),
+        ([item(TAKE_OFF, 6, x=PX4_NORTH, y=PX4_EAST)], "Takeoff altitude below home altitude!"),
+        ([item(LAND, 6, x=PX4_NORTH, y=PX4_EAST)], "starts with landing"),
+        ([go(20), item(MavCmd.CONDITION_DELAY, 2, 3.0)], "item 2: unsupported cmd: 112"),
+        ([go(20), *[item(MavCmd.DO_LAND_START, 2)] * 2], "more than one land start."),
+        (
+            [go(20), item(MavCmd.DO_LAND_START, 2), item(RETURN, 2)],
+            "land start item before RTL item not possible.",
+        ),
+        ([go(20), item(MavCmd.DO_LAND_START, 2)], "invalid land start."),
+    ],
+)
+def test_px4_takes_a_mission_and_rejects_it_afterwards(items: list[MissionItem], reason: str) -> None:
+    px4 = SimulatedPx4(fast_rate_hz=1.0, boot_time_s=0.5)
+    client = Client(px4)
+    client.run(2.0)
+    assert upload(client, items) == 0
+    client.run(1.1)
+    assert f"Mission rejected: {reason}\t" in "".join(client.texts)
+    assert client.last(m.MissionCurrent).mission_state == MissionState.NO_MISSION
+    assert client.last(m.MissionCurrent).total == len(items)
+    assert client.command(START) == MavResult.DENIED
+
+
+def test_px4_flies_to_null_island_when_told_so() -> None:
+    px4, client = start_px4(item(TAKE_OFF, 6, param4=math.nan, z=10.0), go(20))
+    client.run_until(lambda: px4.altitude_m > 9.0, 40.0)
+    client.run(15.0)
+    assert px4.motion.north < -20.0
+    assert px4.motion.east < -2.0

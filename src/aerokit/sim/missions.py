@@ -39,14 +39,17 @@ class MissionStore(Protocol):
     @property
     def transfer_is_open(self) -> bool:
         """Whether somebody's upload or download is going on."""
+        ...
 
     def items(self, mission_type: int) -> list[MissionItem]:
         """What the vehicle has, as it gives it back: ArduPilot's home, item 0, included."""
+        ...
 
     def replace(
         self, mission_type: int, items: Sequence[MissionItem], *, start: int = 0, clear: bool = True
     ) -> int:
         """Store items at once, as a file does; the MAV_MISSION_RESULT."""
+        ...
 
 
 def float32(value: float) -> float:

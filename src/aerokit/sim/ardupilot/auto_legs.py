@@ -35,10 +35,12 @@ class Leg(Protocol):
 
     def update(self, dt: float) -> None:
         """One step."""
+        ...
 
     @property
     def is_complete(self) -> bool:
         """Whether the aim is reached."""
+        ...
 
 
 class Stay:

@@ -33,7 +33,7 @@ from aerokit.sim.ardupilot.setpoints import Setpoints
 from aerokit.sim.ardupilot.storage import DEFAULT_LOGS, Storage
 from aerokit.sim.ardupilot.telemetry import BUILDERS
 from aerokit.sim.ardupilot.telemetry_position import global_origin, home_position
-from aerokit.sim.ardupilot.telemetry_state import heartbeat, mission_current
+from aerokit.sim.ardupilot.telemetry_state import heartbeat
 from aerokit.sim.ardupilot.yaw import AutoYaw
 from aerokit.sim.battery import Battery
 from aerokit.sim.commands import CommandServer
@@ -173,7 +173,6 @@ class SimulatedCopter(SimulatedVehicle):
         self.on(m.Timesync, self._on_timesync)
         self.on(m.Ping, self._on_ping)
         self.on(m.RcChannelsOverride, self._on_rc_override)
-        self.on(m.MissionSetCurrent, self._on_mission_set_current)
         self.missions.listen()
 
     # ---------------------------------------------------------------------------------------- state
@@ -396,8 +395,3 @@ class SimulatedCopter(SimulatedVehicle):
                 self.rc[index] = _RC_AT_REST[index]
             elif value != 0xFFFF:
                 self.rc[index] = value
-
-    def _on_mission_set_current(self, request: m.MissionSetCurrent, channel: Channel) -> None:
-        """Answered with the number that was asked for, also when another one is flown."""
-        if self.mission.set_current(request.seq):
-            self.send(mission_current(self, request.seq), channel)

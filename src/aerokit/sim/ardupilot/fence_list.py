@@ -54,7 +54,8 @@ class FenceList(ItemList):
 
     def begin(self, count: int) -> None:
         """Make room beside the stored fence."""
-        self._coming = [None] * count
+        coming: list[MissionItem | None] = [None for _ in range(count)]
+        self._coming = coming
 
     def begin_update(self) -> None:
         """What is not sent stays as it is."""

@@ -63,12 +63,15 @@ class MissionFlyer(Protocol):
 
     def start_command(self, index: int, item: MissionItem) -> bool:
         """Begin; False when this vehicle cannot, and the next one is to be tried."""
+        ...
 
     def is_complete(self, index: int, item: MissionItem) -> bool:
         """Whether it is done; called again and again."""
+        ...
 
     def end_mission(self) -> None:
         """There is nothing more to do."""
+        ...
 
 
 def is_navigation(item: MissionItem) -> bool:

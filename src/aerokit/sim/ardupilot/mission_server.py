@@ -17,6 +17,7 @@ from aerokit.missions.wire import to_wire
 from aerokit.sim.ardupilot.fence_list import FenceList
 from aerokit.sim.ardupilot.mission_items import has_location, stored, whole
 from aerokit.sim.ardupilot.mission_lists import CommandList, ItemList, RallyList
+from aerokit.sim.ardupilot.telemetry_state import mission_current
 from aerokit.sim.missions import AnyItem, float32, item_from, item_message_float
 from aerokit.sim.vehicle import sender_of
 
@@ -77,6 +78,7 @@ class MissionServer:
         on(m.MissionItemInt, self._on_item)
         on(m.MissionItem, self._on_item)
         on(m.MissionClearAll, self._on_clear_all)
+        on(m.MissionSetCurrent, self._on_set_current)
 
     # ---------------------------------------------------------------------- for others in the vehicle
 
@@ -346,6 +348,11 @@ class MissionServer:
             return
         done = self._cancel(request, mission_type, channel) and self._clear(items)
         self._acknowledge(request, _R.ACCEPTED if done else _R.ERROR, mission_type, channel)
+
+    def _on_set_current(self, request: m.MissionSetCurrent, channel: Channel) -> None:
+        """Answered with the number that was asked for, also when another one is flown."""
+        if self._copter.mission.set_current(request.seq):
+            self._copter.send(mission_current(self._copter, request.seq), channel)
 
     def _clear(self, items: ItemList) -> bool:
         done = items.clear()

@@ -112,7 +112,7 @@ class _Flight:
     def start_mission(self, command: Command) -> int:
         """Changes the mode and arms."""
         px4 = self._px4
-        if not px4.mission.count:
+        if not px4.mission.is_valid:
             px4.send_text(MavSeverity.CRITICAL, "Mission start denied! No valid mission")
             return MavResult.DENIED
         if not -1 <= command.param1 < px4.mission.count:

@@ -1,7 +1,7 @@
 """AUTO.MISSION: where a PX4 is in its mission, and how it flies each item.
 
 Simulated: take-off, waypoints with hold time, acceptance radius and heading, loitering, delays, landing, return,
-speed, jumps; the other commands in passing. Not simulated: regions of interest, circles, feasibility checks.
+speed, jumps; the other commands in passing. Not simulated: regions of interest, circles.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavSeverity, MissionState
 from aerokit.mavlink.messages import MissionItemReached
+from aerokit.sim.px4.feasibility import rejection, warning
 from aerokit.sim.px4.modes import HOLD, LAND, MISSION, RTL, TAKEOFF
 
 if TYPE_CHECKING:
@@ -48,6 +49,8 @@ class Mission:
         """The item that was reached last; -1 before the first."""
         self.is_finished = False
         """Whether the last item was done."""
+        self.is_valid = False
+        """Whether there is a mission, and one that can be flown."""
         self._phase = ""
         self._arrived_at = math.nan
         self._jumps: dict[int, int] = {}
@@ -56,7 +59,8 @@ class Mission:
         self._has_news = False
 
     def start(self) -> None:
-        """Begin to tell the last item reached once a second; from a boot on."""
+        """A boot: look at the mission, tell the last item reached once a second."""
+        self.is_valid = bool(self.count) and rejection(self._px4, self._px4.missions.commands) is None
         self._px4.every(1.0, self._repeat_reached)
 
     # ----------------------------------------------------------------------------------------- asking
@@ -78,7 +82,7 @@ class Mission:
     @property
     def state(self) -> int:
         """MISSION_STATE; what fits no case stays as it was."""
-        if not self.count:
+        if not self.is_valid:
             self._state = MissionState.NO_MISSION
         elif self.is_finished:
             self._state = MissionState.COMPLETE
@@ -102,13 +106,24 @@ class Mission:
         self.current, self.is_finished = max(0, current), False
         self.forget_reached()
         self._jumps.clear()
+        self._check()
         if self._px4.mode != MISSION:
             return
-        if self.count:
+        if self.is_valid:
             self._begin_item()
         elif self._px4.is_armed and not self._px4.is_landed:
             self._px4.send_text(MavSeverity.CRITICAL, "No valid mission available, loitering")
             self._px4.change_mode(HOLD)
+
+    def _check(self) -> None:
+        """A rejected mission stays in the vehicle, and is treated as none."""
+        items = self._px4.missions.commands
+        problem, doubt = rejection(self._px4, items), warning(self._px4, items)
+        self.is_valid = bool(items) and problem is None
+        if problem is not None:
+            self._px4.send_text(MavSeverity.CRITICAL, f"Mission rejected: {problem}")
+        if doubt is not None:
+            self._px4.send_text(MavSeverity.CRITICAL, doubt)
 
     def forget_reached(self) -> None:
         """Nothing of the mission was reached yet."""
@@ -124,7 +139,7 @@ class Mission:
 
     def enter(self) -> None:
         """The mode begins: a finished mission once more from its start."""
-        if not self.count:
+        if not self.is_valid:
             return
         if self.is_finished or self.current >= self.count:
             self.current, self.is_finished = 0, False
@@ -206,11 +221,9 @@ class Mission:
         return item.command == _C.NAV_WAYPOINT and math.isfinite(item.param4)
 
     def _place(self, item: MissionItem) -> tuple[float, float, float]:
-        """Where an item leads; 0, 0 is where the vehicle is."""
+        """Where an item leads; 0, 0 is a place like others, and was seen to be flown to."""
         px4, motion = self._px4, self._px4.motion
-        north, east = motion.north, motion.east
-        if (item.x, item.y) != (0, 0):
-            north, east = px4.frame.to_local(round(item.x), round(item.y))
+        north, east = px4.frame.to_local(round(item.x), round(item.y))
         above = px4.home[2] if item.frame == MavFrame.GLOBAL_RELATIVE_ALT else px4.frame.origin.altitude_m
         return (north, east, above - item.z if math.isfinite(item.z) else motion.down)
 

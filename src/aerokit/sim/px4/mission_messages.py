@@ -16,10 +16,11 @@ class AckWithId(m.MissionAck):
     """MISSION_ACK with ``opaque_id``, which names the list that is now in the vehicle."""
 
     __slots__ = ("_ids",)
+    _ids: bytes
 
     def __init__(self, to: tuple[int, int], type_: int, mission_type: int, opaque_id: int) -> None:
         super().__init__(*to, type_, mission_type)
-        self._ids = struct.pack("<I", opaque_id)
+        object.__setattr__(self, "_ids", struct.pack("<I", opaque_id))
 
     def encode(self) -> bytes:
         """With the id behind the other fields."""
@@ -30,10 +31,11 @@ class CountWithId(m.MissionCount):
     """MISSION_COUNT with ``opaque_id``."""
 
     __slots__ = ("_ids",)
+    _ids: bytes
 
     def __init__(self, to: tuple[int, int], count: int, mission_type: int, opaque_id: int) -> None:
         super().__init__(*to, count, mission_type)
-        self._ids = struct.pack("<I", opaque_id)
+        object.__setattr__(self, "_ids", struct.pack("<I", opaque_id))
 
     def encode(self) -> bytes:
         """With the id behind the other fields."""
@@ -44,10 +46,11 @@ class CurrentWithIds(m.MissionCurrent):
     """MISSION_CURRENT with the ids of mission, fence and rally points."""
 
     __slots__ = ("_ids",)
+    _ids: bytes
 
     def __init__(self, seq: int, total: int, state: int, mode: int, ids: tuple[int, int, int]) -> None:
         super().__init__(seq, total, state, mode)
-        self._ids = struct.pack("<III", *ids)
+        object.__setattr__(self, "_ids", struct.pack("<III", *ids))
 
     def encode(self) -> bytes:
         """With the ids behind the other fields."""

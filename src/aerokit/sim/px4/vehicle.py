@@ -312,7 +312,7 @@ class SimulatedPx4(SimulatedVehicle):
 
     def can_run(self, mode: Px4Mode) -> bool:
         """Whether the mode has what it needs: sticks, a mission, set-points, a position."""
-        if mode == MISSION and not self.mission.count:
+        if mode == MISSION and not self.mission.is_valid:
             return False
         if mode == POSITION or mode not in KNOWN or (mode[0] != 4 and mode != OFFBOARD):
             return False
