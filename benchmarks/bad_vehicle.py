@@ -14,10 +14,16 @@ import json
 import sys
 from pathlib import Path
 
+from content import DOWNLOAD_PATH, PARAMETERS, UPLOAD_PATH, as_numbers, file_content, mission_items
+
 from aerokit.links import FaultModel, FaultyLink, create_link
+from aerokit.missions import MissionItem
 from aerokit.sim import SimulatedCopter, SimulatorServer
 
 __all__ = ["main"]
+
+FEW_PARAMETERS = 100
+"""DroneKit fetches all of them before it does anything else."""
 
 
 def main(arguments: list[str]) -> None:
@@ -42,17 +48,27 @@ async def _serve(radio: FaultyLink, copter: SimulatedCopter) -> None:
 
 
 def _copter(task: str, size: int) -> SimulatedCopter:
-    copter = SimulatedCopter(boot_time_s=0.0)
+    copter = SimulatedCopter(
+        boot_time_s=0.0, parameter_count=None if task == "parameters" else FEW_PARAMETERS
+    )
+    while task == "parameters" and len(copter.parameters) < PARAMETERS:
+        copter.parameters.add(f"BENCH_{len(copter.parameters)}", 0.5)
     if task == "mission_download":
-        pass
+        home = MissionItem(16, 0)
+        copter.missions.replace(0, [home, *(MissionItem(*item) for item in mission_items(size))])
     if task == "file_download":
-        pass
+        copter.files.put(DOWNLOAD_PATH, file_content(size))
     return copter
 
 
 def _dump(copter: SimulatedCopter, folder: Path) -> None:
     values = {name: copter.parameters[name] for name in copter.parameters}
     (folder / "vehicle-parameters.json").write_text(json.dumps(values))
+    (folder / "vehicle.json").write_text(
+        json.dumps([as_numbers(item) for item in copter.missions.items(0)[1:]])
+    )
+    if UPLOAD_PATH in copter.files:
+        (folder / "vehicle.bin").write_bytes(copter.files.get(UPLOAD_PATH))
 
 
 if __name__ == "__main__":

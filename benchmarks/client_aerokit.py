@@ -9,7 +9,7 @@ import asyncio
 from typing import Any
 
 from client import Task, run
-from content import DOWNLOAD_PATH, UPLOAD_PATH, mission_items
+from content import DOWNLOAD_PATH, UPLOAD_PATH, as_numbers, mission_items
 
 import aerokit
 from aerokit.missions import Mission, MissionItem
@@ -45,11 +45,7 @@ async def _mission_upload(vehicle: Any, task: Task) -> None:
 
 
 async def _mission_download(vehicle: Any, task: Task) -> list[Any]:
-    mission = await vehicle.mission.download(method=task.way)
-    return [
-        (item.command, item.frame, item.param1, item.param2, item.param3, item.param4, item.x, item.y, item.z)
-        for item in mission.items
-    ]
+    return [as_numbers(item) for item in await vehicle.mission.download(method=task.way)]
 
 
 async def _file_download(vehicle: Any, task: Task) -> None:

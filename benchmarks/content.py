@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from dataclasses import dataclass
+from typing import Any
 
 __all__ = [
     "DOWNLOAD_PATH",
@@ -17,6 +18,7 @@ __all__ = [
     "mission_items",
 ]
 
+PARAMETERS = 1350
 DOWNLOAD_PATH = "/APM/bench.bin"
 UPLOAD_PATH = "/APM/upload.bin"
 LIMIT_S = 120.0
@@ -30,7 +32,7 @@ Item = tuple[int, int, float, float, float, float, int, int, float]
 
 @dataclass(frozen=True)
 class Sizes:
-    """How much is transferred; parameters are those that the simulated vehicle has."""
+    """How much is transferred."""
 
     items: int = 200
     file_bytes: int = 1_000_000
@@ -47,6 +49,12 @@ def mission_items(count: int) -> list[Item]:
          -353632610 + 1000 * n, 1491652299 + 700 * n, 20.0 + n % 50)
         for n in range(count)
     ]  # fmt: skip
+
+
+def as_numbers(item: Any) -> Item:
+    """The same of a MissionItem."""
+    numbers = (item.param1, item.param2, item.param3, item.param4, item.x, item.y, item.z)
+    return (int(item.command), int(item.frame), *numbers)
 
 
 def file_content(size: int) -> bytes:
