@@ -72,6 +72,7 @@ class ArduPilot(Autopilot):
     log_suffix = ".bin"
     log_directories = ("/APM/LOGS", "/logs")
     first_log_id = 1
+    logs_by_messages = True
     estimator_message = "EKF_STATUS_REPORT"
     wind_message = "WIND"
     stream_groups = ARDUPILOT_GROUPS

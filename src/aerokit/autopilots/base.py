@@ -151,6 +151,8 @@ class Autopilot:
     """Where MAVFTP finds the flight logs, or the directories with them: the first of these that exists."""
     first_log_id = 0
     """The id of the oldest log in LOG_ENTRY."""
+    logs_by_messages = False
+    """Whether flight logs come faster by the LOG_* messages than by MAVFTP."""
     silent_without_logs = False
     """Whether LOG_REQUEST_LIST is not answered when there are no logs."""
     unknown_currents_ca: frozenset[int] = frozenset((-1,))

@@ -138,6 +138,7 @@ class LogList(Transfer[tuple[LogEntry, ...]]):
             self._move(now, len(self._entries), len(self._entries) + len(self._missing))
         if not self._missing:
             self._finish(tuple(self._entries[number] for number in sorted(self._entries)))
+            self._outbox.append(LogRequestEnd(self.target_system, self.target_component))
         elif message.id > max(self._missing):
             self._ask_for_missing(now)
         self._set_deadline()
@@ -150,6 +151,7 @@ class LogList(Transfer[tuple[LogEntry, ...]]):
         is_unanswered = self._missing is None and self._stream.fails == self._most_unanswered
         if is_unanswered or self._is_out_of_patience(now):
             self._fail(self._timed_out())
+            self._outbox.append(LogRequestEnd(self.target_system, self.target_component))
         elif self._missing is None:
             self._request(now, self._start, LAST if self._end is None else self._end)
         else:

@@ -93,8 +93,8 @@ class Logs:
             log: an entry of :meth:`list`, or its id.
             to: the file here.
             resume: go on where an interrupted download of this log to this file has ended.
-            method: ``"ftp"``, ``"log"`` (the LOG_* messages), or ``"auto"``: MAVFTP when the vehicle has it and it is
-                certain which file the log is.
+            method: ``"ftp"``, ``"log"`` (the LOG_* messages), or ``"auto"``: what is faster with this autopilot, and
+                the other one where that does not work. By MAVFTP it must be certain which file the log is.
             patience_s: see above.
             timeout: see above.
             on_progress: called with bytes, and the bytes there will be.
@@ -168,14 +168,19 @@ class Logs:
         self, log: LogEntry | int, method: LogMethod, patience_s: float, timeout: float | None
     ) -> tuple[str | None, LogEntry]:
         """Where it is for MAVFTP (None: by LOG_*), and its entry, which LOG_* needs to be fresh."""
-        if isinstance(log, LogEntry) and method != "log":
+        prefers_messages = method == "log" or (method == "auto" and self._transfers.autopilot.logs_by_messages)
+        if isinstance(log, LogEntry) and not prefers_messages:
             path = await self._path(log, patience_s)
             if path is not None:
                 return path, log
-        entry = await self._entry(log if isinstance(log, int) else log.id, patience_s, timeout)
-        if isinstance(log, LogEntry) and _is_other(log, entry):
-            raise _no_such_log(log.id, "the vehicle has another log of this id now; list them again")
-        if method == "log":
+        try:
+            entry = await self._entry(log, patience_s, timeout, may_be_silent=method == "auto")
+        except FileTimeout:  # ArduPilot while it is armed
+            path = await self._path(log, patience_s) if isinstance(log, LogEntry) and method == "auto" else None
+            if path is None or not isinstance(log, LogEntry):
+                raise
+            return path, log
+        if prefers_messages:
             return None, entry
         path = await self._path(entry, patience_s)
         if path is None and method == "ftp":
@@ -188,23 +193,34 @@ class Logs:
             return None
         return await log_path(self._files, directories, entry, patience_s)
 
-    async def _entry(self, log_id: int, patience_s: float, timeout: float | None) -> LogEntry:
+    async def _entry(
+        self, log: LogEntry | int, patience_s: float, timeout: float | None, *, may_be_silent: bool
+    ) -> LogEntry:
+        """The fresh entry of a log."""
+        log_id = log if isinstance(log, int) else log.id
         async with self._operation(f"log {log_id}", timeout, patience_s):
-            entries = await self._entries(patience_s, log_id)
+            entries = await self._entries(patience_s, log_id, SILENT_REQUESTS if may_be_silent else None)
         for entry in entries:
             if entry.id == log_id:
+                if isinstance(log, LogEntry) and _is_other(log, entry):
+                    break
                 return entry
-        raise _no_such_log(log_id, "there is no such log")
+        text = "there is no such log" if isinstance(log, int) else "the vehicle's logs are others now, list them again"
+        raise _no_such_log(log_id, text)
 
-    async def _entries(self, patience_s: float, only: int | None = None) -> tuple[LogEntry, ...]:
+    async def _entries(
+        self, patience_s: float, only: int | None = None, most_unanswered: int | None = None
+    ) -> tuple[LogEntry, ...]:
         """What the vehicle lists. ArduPilot also lists logs that were erased, with nothing in them."""
-        entries = await self._listed_somehow(patience_s, only)
+        entries = await self._listed_somehow(patience_s, only, most_unanswered)
         return tuple(entry for entry in entries if entry.size)
 
-    async def _listed_somehow(self, patience_s: float, only: int | None) -> tuple[LogEntry, ...]:
+    async def _listed_somehow(
+        self, patience_s: float, only: int | None, most_unanswered: int | None
+    ) -> tuple[LogEntry, ...]:
         autopilot = self._transfers.autopilot
         if not autopilot.silent_without_logs or not await self._files.is_supported():
-            return await self._listed(patience_s, only, most_unanswered=None)
+            return await self._listed(patience_s, only, most_unanswered=most_unanswered)
         with suppress(FileTimeout):
             return await self._listed(patience_s, only, most_unanswered=SILENT_REQUESTS)
         logs = await listed_logs(self._files, autopilot.log_directories, patience_s)
@@ -270,15 +286,16 @@ class Logs:
                         await self._ending.wait()
                     try:
                         yield
-                    finally:
+                    except BaseException:
                         self._end()
+                        raise
         except OperationTimeout:
             raise
         except TimeoutError:
             raise FileTimeout(f"{what}: not done within {timeout:g} s", missing=missing()) from None
 
     def _end(self) -> None:
-        """Have the vehicle stop sending at once, and make sure of it in the background."""
+        """Have the vehicle stop sending at once, and make sure of it in the background before the next operation."""
         exchange = LogEnd(
             self._transfers.system_id,
             self._transfers.component_id,
