@@ -133,6 +133,8 @@ class Autopilot:
     """How many mission items may be asked for before they come, in any order: 1 is the standard."""
     writes_partial_missions = False
     """Whether MISSION_WRITE_PARTIAL_LIST (38) works."""
+    tells_mission_checksum = False
+    """Whether MISSION_CURRENT tells the checksum of the items it holds."""
     replaced_as_they_come: frozenset[int] = frozenset((0, 1, 2))
     """MAV_MISSION_TYPEs whose old items are overwritten while new ones come; the others keep theirs until the end."""
     mission_starts_by_command = False

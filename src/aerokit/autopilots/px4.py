@@ -109,6 +109,7 @@ class Px4(Autopilot):
     }
     mission_storage = "px4"
     mission_upload_window = 6
+    tells_mission_checksum = True
     replaced_as_they_come = frozenset()  # the new items go into a second place
     repeats_item_reached = True
     never_sent = frozenset(

@@ -81,7 +81,6 @@ class MissionDownload(MissionExchange[Downloaded]):
         self._heard_at = 0.0
         self._busy_until: float | None = None
         self._restarts = 0
-        self._most = 0
 
     def start(self, now: float) -> None:
         """Ask how many there are."""
@@ -134,7 +133,6 @@ class MissionDownload(MissionExchange[Downloaded]):
         self._wanted = (
             range(self._count) if self._only is None else [n for n in self._only if n < message.count]
         )
-        self._most = min(self._most, len(self._wanted))
         self._move(now, len(self._items), len(self._wanted))
         self._go_on(now)
 
@@ -145,9 +143,7 @@ class MissionDownload(MissionExchange[Downloaded]):
             self.round_trip.measured(now - self._asked_at[item.seq])
         del self._asked_at[item.seq]
         self._items[item.seq] = from_wire(item)
-        if len(self._items) > self._most:
-            self._most = len(self._items)
-            self._move(now, self._most, len(self._wanted))
+        self._move(now, len(self._items), len(self._wanted))  # also what was read before: it answers
         self._go_on(now)
 
     def _take_ack(self, result: int, now: float) -> None:
@@ -155,7 +151,9 @@ class MissionDownload(MissionExchange[Downloaded]):
             self._wait_while_busy(result, now)
         elif result == MavMissionResult.ERROR:
             if now - self._list_at >= EARLIEST_ANSWER * (self.round_trip.smoothed_s or 0.0):
-                self._begin_anew(now)  # else it is about something sent before, a repeated item of an upload perhaps
+                self._begin_anew(
+                    now
+                )  # else it is about something sent before, a repeated item of an upload perhaps
         elif result not in (
             MavMissionResult.ACCEPTED,
             MavMissionResult.INVALID_SEQUENCE,  # MISSION_COUNT comes with it and tells the new number

@@ -16,6 +16,7 @@ from aerokit.mavlink.enums import MavMissionResult
 from aerokit.missions.compare import changed_items, item_differences
 from aerokit.missions.storage import Storage
 from aerokit.missions.wire import shift_jumps, with_home
+from aerokit.protocols.mission_checksum import mission_checksum
 from aerokit.vehicle.plan_channel import PlanChannel
 
 if TYPE_CHECKING:
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
 __all__ = ["Plan", "PlanTransfer"]
 
 KINDS = ("mission", "fence", "rally points")
+CHECKSUM_TAKES_S = 1.0
+"""MISSION_CURRENT comes at 1 Hz."""
 PART_COSTS = 4
 """A stretch of changed items costs about as many messages more as so many items."""
 
@@ -83,7 +86,7 @@ class PlanTransfer(Generic[PlanT]):
             return
         if only_changes and await self._send_changes(items, method, verify=verify):
             return
-        self._memory.forget()
+        self._memory.forget(self._context.now())
         if await self._uses_file(method, is_upload=True):
             await self._send_file(items, method)
         else:
@@ -95,7 +98,7 @@ class PlanTransfer(Generic[PlanT]):
 
     async def clear(self) -> None:
         """Have the vehicle hold nothing, and see that it does."""
-        self._memory.forget()
+        self._memory.forget(self._context.now())
         await self._channel.clear()
         left = (await self._channel.receive(only=())).count - self._offset
         if left > 0:
@@ -109,10 +112,10 @@ class PlanTransfer(Generic[PlanT]):
                 self._note_no_file(error, method)
             else:
                 self._memory.has_file = True
-                self._memory.learn(items, 0, self._context.now())
+                self._memory.learn(items, self._context.now())
                 return items
         received = await self._channel.receive()
-        self._memory.learn(received.items, received.opaque_id, self._context.now())
+        self._memory.learn(received.items, self._context.now())
         return received.items
 
     async def _uses_file(self, method: str, *, is_upload: bool = False) -> bool:
@@ -135,8 +138,8 @@ class PlanTransfer(Generic[PlanT]):
 
     async def _send_items(self, items: Sequence[MissionItem], method: str, *, verify: bool) -> None:
         end = await self._channel.send(items)
-        self._memory.learn(items, end.opaque_id, self._context.now())
-        if end.is_sure and not verify:
+        self._memory.learn(items, self._context.now())
+        if (end.is_sure and not verify) or await self._has_checksum_of(items):
             return
         try:
             await self._verify(items, method)
@@ -170,25 +173,26 @@ class PlanTransfer(Generic[PlanT]):
 
     async def _send_changes(self, items: Sequence[MissionItem], method: str, *, verify: bool) -> bool:
         """Send only what differs; False when it is not known what the vehicle holds, or this is no shorter way."""
-        if not self._is_short(self._changes(items), len(items)):
+        autopilot = self._context.autopilot
+        if autopilot.tells_mission_checksum:
+            told = self._context.id_of(self._type, self._memory.learned_at)
+            if told == mission_checksum(items):
+                return True
+        if not autopilot.writes_partial_missions or not self._is_short(self._changes(items), len(items)):
             return False
-        can_write_parts = self._context.autopilot.writes_partial_missions
-        if not self._is_unchanged():
-            if not can_write_parts:
-                return False
-            await self._read(method)
+        await self._read(method)  # somebody else may have changed it since
         changes = self._changes(items)
         if changes == []:
             return True
-        if changes is None or not can_write_parts or not self._is_short(changes, len(items)):
+        if changes is None or not self._is_short(changes, len(items)):
             return False
         held = list(self._memory.items or ())
-        self._memory.forget()
+        self._memory.forget(self._context.now())
         for part in _stretches(changes):
             if not await self._send_part(items[part.start : part.stop], part.start, verify=verify):
                 return False
             held[part.start : part.stop] = items[part.start : part.stop]
-        self._memory.learn(held, 0, self._context.now())
+        self._memory.learn(held, self._context.now())
         return True
 
     async def _send_part(self, items: Sequence[MissionItem], first: int, *, verify: bool) -> bool:
@@ -214,12 +218,20 @@ class PlanTransfer(Generic[PlanT]):
             return False
         return len(changes) + PART_COSTS * len(list(_stretches(changes))) < count or len(changes) == 0
 
-    def _is_unchanged(self) -> bool:
-        """Whether the vehicle says that it holds what it held when it was last sent or read."""
-        opaque_id = self._memory.opaque_id
-        return opaque_id != 0 and self._context.id_of(self._type, self._memory.learned_at) == opaque_id
-
     # ------------------------------------------------------------------------------ verifying
+
+    async def _has_checksum_of(self, items: Sequence[MissionItem]) -> bool:
+        """Whether the vehicle soon tells the checksum of these items, where that is quicker than reading them back."""
+        autopilot = self._context.autopilot
+        round_trip_s = self._context.transfers.round_trip.smoothed_s or 0.0
+        takes_s = len(items) / autopilot.mission_download_window * round_trip_s
+        if not autopilot.tells_mission_checksum or takes_s < CHECKSUM_TAKES_S:
+            return False
+        checksum = mission_checksum(items)
+        if not await self._context.is_called(self._type, checksum):
+            return False
+        self._memory.learn(items, self._context.now())
+        return True
 
     async def _verify(self, items: Sequence[MissionItem], method: str) -> None:
         found = await self._read(method)
@@ -239,7 +251,7 @@ class PlanTransfer(Generic[PlanT]):
             self._fail(tuple(differences))
 
     def _fail(self, differences: tuple[str, ...]) -> None:
-        self._memory.forget()
+        self._memory.forget(self._context.now())
         message = f"{self._kind}: the vehicle confirmed, and holds something else than it was sent"
         raise VerificationFailed(message, differences=differences)
 

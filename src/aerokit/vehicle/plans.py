@@ -6,6 +6,8 @@ import asyncio
 import math
 from typing import TYPE_CHECKING, Generic, Literal, Protocol, TypeVar
 
+import anyio
+
 from aerokit.errors import LocalProtocolError
 from aerokit.mavlink.messages import MissionCurrent
 from aerokit.vehicle.checks import check_seconds
@@ -58,7 +60,8 @@ class HeldPlan(Generic[PlanT]):
                 vehicle has.
             only_changes: when it is known what the vehicle holds, from an upload or a download and confirmed by the
                 vehicle, send nothing if it is the same, and only the items that differ if the vehicle takes them alone.
-            verify: read it back and compare. What was sent as a file is always read back.
+            verify: read it back and compare, or compare the checksum that PX4 tells when that is quicker. What was sent
+                as a file is always read back.
             patience_s: give up after so many seconds without progress.
             timeout: seconds for all of it.
             on_progress: called with how far it is, in items, or in bytes of a file.
@@ -170,18 +173,17 @@ class PlanMemory:
 
     def __init__(self) -> None:
         self.items: tuple[MissionItem, ...] | None = None
-        self.opaque_id = 0
         self.learned_at = -math.inf
         self.has_file: bool | None = None
         """Whether the vehicle has a file of it; None: not tried yet."""
 
-    def learn(self, items: Sequence[MissionItem], opaque_id: int, now: float) -> None:
+    def learn(self, items: Sequence[MissionItem], now: float) -> None:
         """The vehicle holds these."""
-        self.items, self.opaque_id, self.learned_at = tuple(items), opaque_id, now
+        self.items, self.learned_at = tuple(items), now
 
-    def forget(self) -> None:
+    def forget(self, now: float) -> None:
         """The vehicle may hold anything from now on."""
-        self.items, self.opaque_id = None, 0
+        self.items, self.learned_at = None, now
 
 
 class PlanContext:
@@ -223,6 +225,22 @@ class PlanContext:
         """What a MISSION_CURRENT that came lately, and after ``since``, calls the plan; 0 where it does not."""
         is_fresh = self._ids_at > since and self.now() - self._ids_at <= FRESH_IDS_S
         return self._ids[mission_type] if is_fresh else 0
+
+    async def is_called(self, mission_type: int, opaque_id: int) -> bool:
+        """Whether MISSION_CURRENT, waited for, calls the plan so."""
+        told, now = asyncio.Event(), self.now()
+
+        def look(_: MissionCurrent) -> None:
+            if self.id_of(mission_type, now) == opaque_id:
+                told.set()
+
+        detach = self.vehicle.connection.bus.attach(MissionCurrent, look, system_id=self.vehicle.system_id)
+        try:
+            with anyio.move_on_after(FRESH_IDS_S):
+                await told.wait()
+        finally:
+            detach()
+        return told.is_set()
 
     def _note_ids(self, message: MissionCurrent) -> None:
         """``mission_id``, ``fence_id``, ``rally_points_id``: extensions that are not in the dialect yet."""
