@@ -237,7 +237,9 @@ class Growing(FakeVehicle):
             shift = 3 if self.place < self.shown_at else 0
             for place, name in enumerate(names[self.shown_at + shift :]):
                 message = self.value(name, self.shown_at + place)
-                message = m.ParamValue(**(message.to_dict() | {"param_count": len(old)}))
+                message = m.ParamValue(
+                    message.param_id, message.param_value, message.param_type, len(old), message.param_index
+                )
                 self.say(message, self.tick_s * (place // self.burst))
 
         assert self.channel is not None

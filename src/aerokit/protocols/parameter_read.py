@@ -94,7 +94,9 @@ class ParameterReads(ParameterRequests):
 
     def _take(self, message: ParamValue, now: float) -> None:
         if message.param_index == PROBE_INDEX and self._window.attempts(PROBE):
-            self._probes_answered += 1
+            self._probes_answered = min(
+                self._probes_answered + 1, self._probes_sent
+            )  # repeated ones count once
             passed_over = self._window.answered(PROBE, now, overtaken=1)
             self._give_up_unknown(passed_over, now)
             self._is_probe_wanted |= bool(passed_over)

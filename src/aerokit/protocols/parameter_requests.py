@@ -25,6 +25,9 @@ __all__ = ["Answer", "ParameterRequests", "rejection", "updated"]
 Answer = Parameter | ParameterRejected | ParameterTimeout
 """What came of one request: what the vehicle says the parameter is, or why there is nothing to say."""
 
+SOONEST = 0.5
+"""An answer takes at least this part of the fastest round trip so far."""
+EARLY_ONES = 2
 ERRORS = {
     1: "the vehicle has no such parameter",
     2: "the vehicle does not accept this value",
@@ -69,6 +72,8 @@ class ParameterRequests(Transfer[dict[str, Answer]]):
         self._bytewise, self._own_system = bytewise, own_system
         self._window: RequestWindow[str] = RequestWindow(self.round_trip, size=window)
         self._answers: dict[str, Answer] = {}
+        self._sent_at: dict[str, float] = {}
+        self._early: dict[str, int] = {}
 
     def start(self, now: float) -> None:
         """Ask for the first of them."""
@@ -123,6 +128,15 @@ class ParameterRequests(Transfer[dict[str, Answer]]):
             self._window.answered(name, now)
             self._settle(name, rejection(name, message.error), now)
 
+    def _is_too_early(self, name: str, now: float) -> bool:
+        """Whether this is hardly an answer to what was sent last, but a late or repeated one to something before.
+
+        A few times at most for one name: perhaps the vehicle has become that fast.
+        """
+        is_early = now - self._sent_at.get(name, now) < SOONEST * (self.round_trip.fastest_s or 0.0)
+        self._early[name] = self._early.get(name, 0) + is_early
+        return is_early and self._early[name] <= EARLY_ONES
+
     def _settle(self, name: str, answer: Answer, now: float) -> None:
         self._window.forget(name)
         self._answers[name] = answer
@@ -136,6 +150,7 @@ class ParameterRequests(Transfer[dict[str, Answer]]):
             return
         for name in self._window.take_due(now):
             self._outbox += self._request(name)
+            self._sent_at[name] = now
         self._after_sending(now)
         times = (self._window.deadline, self._moved_at + self._patience_s)
         self.deadline = min(at for at in times if at is not None)

@@ -26,7 +26,7 @@ __all__ = ["ParameterWrites"]
 WRITES_AT_ONCE = 10
 """ArduPilot saves through a queue of 30, which it must not overflow while it is armed."""
 BY_NAME = -1
-VERDICT, VERDICT_OF_NO_CHANGE = 2, 4
+VERDICT, VERDICT_OF_NO_CHANGE = 2, 10
 """So many answers with another value than asked for are a verdict; more when it is the value from before, which may
 also stand in a message that was under way, while PARAM_SET was lost."""
 
@@ -90,6 +90,8 @@ class ParameterWrites(ParameterRequests):
         if is_as_asked and (told.type == wanted.type or (others and _is_same(others[-1], told))):
             self._window.answered(name, now)
             self._settle(name, told, now)
+            return
+        if self._is_too_early(name, now):
             return
         if others and not _is_same(others[-1], told):
             others.clear()

@@ -1,0 +1,270 @@
+"""Parameters that are put back: `temporarily` and `transaction`, whatever ends them."""
+
+from __future__ import annotations
+
+import asyncio
+
+import anyio
+import pytest
+from flight_harness import Flight, open_flight, open_px4
+
+from aerokit import messages
+from aerokit.errors import (
+    LinkLost,
+    LocalProtocolError,
+    ParameterRejected,
+    RollbackFailed,
+    VerificationFailed,
+)
+from aerokit.sim import SimulatedCopter, SimulatedPx4
+from aerokit.vehicle.parameters import Parameters
+
+pytestmark = pytest.mark.anyio
+
+
+def copter() -> SimulatedCopter:
+    return SimulatedCopter(boot_time_s=0.0, parameter_count=100)
+
+
+def values(flight: Flight) -> tuple[float, float]:
+    return flight.copter.parameters["RTL_ALT"], flight.copter.parameters["LAND_SPEED"]
+
+
+BEFORE: tuple[float, float] = (1500.0, 50.0)
+
+
+# ---------------------------------------------------------------------------------- temporarily
+
+
+async def test_values_for_the_time_of_a_block() -> None:
+    async with open_flight(copter()) as flight:
+        parameters = flight.vehicle.parameters
+        async with parameters.temporarily({"RTL_ALT": 2000, "LAND_SPEED": 60}) as results:
+            assert values(flight) == (2000, 60)
+            assert {each.outcome for each in results.values()} == {"set"}
+        assert values(flight) == BEFORE
+        assert parameters.table["RTL_ALT"].value == 1500
+
+
+async def test_px4_too() -> None:
+    px4 = SimulatedPx4(boot_time_s=0.0, parameter_count=100)
+    async with open_px4(px4) as flight:
+        before = px4.parameters["COM_RC_IN_MODE"]
+        async with flight.vehicle.parameters.temporarily({"COM_RC_IN_MODE": -5_000_000}):
+            assert px4.parameters["COM_RC_IN_MODE"] == -5_000_000
+        assert px4.parameters["COM_RC_IN_MODE"] == before
+
+
+async def test_an_exception_puts_them_back_and_goes_on() -> None:
+    async with open_flight(copter()) as flight:
+        with pytest.raises(ZeroDivisionError):
+            async with flight.vehicle.parameters.temporarily({"RTL_ALT": 2000}):
+                _ = 1 / 0
+        assert values(flight) == BEFORE
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.02, 0.06, 0.11, 0.16, 0.21, 0.5])
+async def test_cancelled_at_any_moment_they_are_put_back(delay_s: float) -> None:
+    async with open_flight(copter(), latency_s=0.05) as flight:
+
+        async def block() -> None:
+            async with flight.vehicle.parameters.temporarily({"RTL_ALT": 2000, "LAND_SPEED": 60}):
+                await anyio.sleep(10.0)
+
+        task = asyncio.create_task(block())
+        await anyio.sleep(delay_s)
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+        await anyio.sleep(0.2)
+        assert values(flight) == BEFORE
+
+
+async def test_a_cancelled_scope_puts_them_back() -> None:
+    async with open_flight(copter(), latency_s=0.05) as flight:
+        with anyio.move_on_after(1.0):
+            async with flight.vehicle.parameters.temporarily({"RTL_ALT": 2000}):
+                await anyio.sleep(10.0)
+        assert values(flight) == BEFORE
+
+
+async def test_when_one_cannot_be_set_none_is() -> None:
+    simulated = copter()
+    simulated.faults.read_only_parameters = {"LAND_SPEED"}
+    async with open_flight(simulated) as flight:
+        for name in ("LAND_SPEED", "NO_SUCH_ONE"):
+            with pytest.raises(ParameterRejected):
+                async with flight.vehicle.parameters.temporarily({"RTL_ALT": 2000, name: 60}):
+                    pytest.fail("the block was entered")
+            assert values(flight) == BEFORE
+
+
+async def test_impossible_values_are_refused_before_anything_is_set() -> None:
+    async with open_flight(copter()) as flight:
+        with pytest.raises(LocalProtocolError):
+            async with flight.vehicle.parameters.temporarily({"RTL_ALT": 2000, "LAND_SPEED": 1e9}):
+                pytest.fail("the block was entered")
+        assert {each.param_value for each in flight.wire.all(messages.ParamSet)} <= {1500.0, 50.0}
+        assert values(flight) == BEFORE
+
+
+async def test_nested_and_overlapping_blocks_end_with_the_first_value() -> None:
+    async with open_flight(copter()) as flight:
+        parameters = flight.vehicle.parameters
+        async with parameters.temporarily({"RTL_ALT": 2000}):
+            async with parameters.temporarily({"RTL_ALT": 3000}):
+                assert values(flight)[0] == 3000
+            assert values(flight)[0] == 2000
+        assert values(flight) == BEFORE
+        first, second = parameters.temporarily({"RTL_ALT": 2000}), parameters.temporarily({"RTL_ALT": 3000})
+        await first.__aenter__()
+        await second.__aenter__()
+        await first.__aexit__(None, None, None)
+        assert values(flight)[0] == 3000
+        await second.__aexit__(None, None, None)
+        assert values(flight) == BEFORE
+
+
+async def test_what_cannot_be_put_back_is_named() -> None:
+    async with open_flight(copter()) as flight:
+        with pytest.raises(RollbackFailed, match="RTL_ALT = 1500") as failed:
+            async with flight.vehicle.parameters.temporarily({"RTL_ALT": 2000}, patience_s=1.0):
+                flight.copter.faults.read_only_parameters = {"RTL_ALT"}
+        assert failed.value.not_restored == {"RTL_ALT": 1500}
+
+
+async def test_the_end_of_a_block_is_bounded_when_the_vehicle_is_silent() -> None:
+    async with open_flight(copter()) as flight:
+        loop = asyncio.get_running_loop()
+        ended = loop.time()
+        with pytest.raises(RollbackFailed) as failed:
+            async with flight.vehicle.parameters.temporarily({"RTL_ALT": 2000}, patience_s=2.0):
+                flight.copter.faults.silent = True
+                ended = loop.time()
+        assert failed.value.not_restored == {"RTL_ALT": 1500}
+        assert loop.time() - ended == pytest.approx(2.0, abs=0.1)
+
+
+async def test_a_block_is_entered_once() -> None:
+    async with open_flight(copter()) as flight:
+        block = flight.vehicle.parameters.temporarily({"RTL_ALT": 2000})
+        async with block:
+            pass
+        with pytest.raises(LocalProtocolError, match="already"):
+            async with block:
+                pass
+
+
+# ---------------------------------------------------------------------------------- transaction
+
+
+async def test_a_transaction_that_succeeds_stays() -> None:
+    async with open_flight(copter()) as flight:
+        async with flight.vehicle.parameters.transaction() as transaction:
+            assert (await transaction.set("RTL_ALT", 2000)).outcome == "set"
+            await transaction.set_many({"LAND_SPEED": 60, "RTL_ALT": 2500})
+            assert [(each.name, each.before, each.after) for each in transaction.changes] == [
+                ("RTL_ALT", 1500, 2500),
+                ("LAND_SPEED", 50, 60),
+            ]
+            assert transaction.needs_reboot == ()
+        assert values(flight) == (2500, 60)
+        with pytest.raises(LocalProtocolError, match="not open"):
+            await transaction.set("RTL_ALT", 1)
+
+
+async def fail_after_writing(parameters: Parameters, error: Exception) -> None:
+    async with parameters.transaction() as transaction:
+        await transaction.set("RTL_ALT", 2000)
+        await transaction.set("LAND_SPEED", 60)
+        raise error
+
+
+async def test_an_exception_rolls_back() -> None:
+    async with open_flight(copter()) as flight:
+        with pytest.raises(KeyError, match="mine"):
+            await fail_after_writing(flight.vehicle.parameters, KeyError("mine"))
+        assert values(flight) == BEFORE
+
+
+async def test_a_cancelled_transaction_rolls_back() -> None:
+    async with open_flight(copter(), latency_s=0.05) as flight:
+        with anyio.move_on_after(1.0):
+            async with flight.vehicle.parameters.transaction() as transaction:
+                await transaction.set("RTL_ALT", 2000)
+                await anyio.sleep(10.0)
+        assert values(flight) == BEFORE
+
+
+async def test_a_refused_write_rolls_back() -> None:
+    simulated = copter()
+    simulated.faults.read_only_parameters = {"LAND_SPEED"}
+    async with open_flight(simulated) as flight:
+        with pytest.raises(ParameterRejected):
+            async with flight.vehicle.parameters.transaction() as transaction:
+                await transaction.set("RTL_ALT", 2000)
+                await transaction.set("LAND_SPEED", 60)
+        assert values(flight) == BEFORE
+
+
+async def test_a_clamped_write_rolls_back() -> None:
+    simulated = copter()
+    simulated.faults.parameter_limits = {"LAND_SPEED": (0, 55)}
+    async with open_flight(simulated) as flight:
+        with pytest.raises(VerificationFailed, match="asked for 60, is 55"):
+            async with flight.vehicle.parameters.transaction() as transaction:
+                await transaction.set_many({"RTL_ALT": 2000, "LAND_SPEED": 60})
+        assert values(flight) == BEFORE
+
+
+async def test_a_write_that_the_program_can_do_without() -> None:
+    async with open_flight(copter()) as flight:
+        async with flight.vehicle.parameters.transaction() as transaction:
+            await transaction.set("RTL_ALT", 2000)
+            with pytest.raises(ParameterRejected):
+                await transaction.set("NO_SUCH_ONE", 1)
+        assert values(flight) == (2000, 50)
+
+
+async def test_a_lost_link_names_what_was_written() -> None:
+    async with open_flight(copter()) as flight:
+        with pytest.raises(RollbackFailed) as failed:
+            async with flight.vehicle.parameters.transaction() as transaction:
+                await transaction.set("RTL_ALT", 2000)
+                flight.wire.lose()
+                await transaction.set("LAND_SPEED", 60)
+        assert failed.value.not_restored == {"RTL_ALT": 1500}
+        assert isinstance(failed.value.__cause__, LinkLost)
+        assert values(flight) == (2000, 50)
+
+
+async def test_an_inner_transaction_is_undone_by_the_outer_one() -> None:
+    async with open_flight(copter()) as flight:
+        parameters = flight.vehicle.parameters
+        with pytest.raises(ZeroDivisionError):
+            async with parameters.transaction() as outer:
+                await outer.set("RTL_ALT", 2000)
+                async with parameters.transaction() as inner:
+                    await inner.set("RTL_ALT", 3000)
+                assert values(flight)[0] == 3000
+                _ = 1 / 0
+        assert values(flight) == BEFORE
+
+
+async def test_a_transaction_is_entered_once() -> None:
+    async with open_flight(copter()) as flight:
+        transaction = flight.vehicle.parameters.transaction()
+        async with transaction:
+            with pytest.raises(LocalProtocolError, match="already"):
+                await transaction.__aenter__()
+
+
+async def test_values_are_read_before_they_are_written() -> None:
+    """What is known may be old: somebody else has written it, and the message was lost."""
+    async with open_flight(copter()) as flight:
+        parameters = flight.vehicle.parameters
+        await parameters.download()
+        flight.copter.parameters["RTL_ALT"] = 1800
+        async with parameters.temporarily({"RTL_ALT": 2000}):
+            pass
+        assert values(flight)[0] == 1800

@@ -1,0 +1,596 @@
+"""``vehicle.parameters`` on simulated vehicles: downloads, reads, writes, names old and new, events."""
+
+from __future__ import annotations
+
+import asyncio
+import struct
+import warnings
+from pathlib import Path
+from typing import Any
+
+import anyio
+import pytest
+from flight_harness import Flight, Px4Flight, open_flight, open_px4
+
+from aerokit import events, messages
+from aerokit.errors import (
+    FileError,
+    LocalProtocolError,
+    NotSupported,
+    OperationTimeout,
+    ParameterRejected,
+    ParameterTimeout,
+)
+from aerokit.links import FaultModel, FaultyLink
+from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.parameters import ParameterRenamedWarning, ParameterType
+from aerokit.protocols.transfer import Progress
+from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
+from aerokit.vehicle.connect import connect
+from aerokit.vehicle.parameters import Parameters
+
+pytestmark = pytest.mark.anyio
+
+
+def now() -> float:
+    return asyncio.get_running_loop().time()
+
+
+def copter(count: int | None = 120, **options: Any) -> SimulatedCopter:
+    return SimulatedCopter(boot_time_s=0.0, parameter_count=count, **options)
+
+
+def px4(**options: Any) -> SimulatedPx4:
+    return SimulatedPx4(boot_time_s=0.0, parameter_count=120, **options)
+
+
+def sent_writes(flight: Flight | Px4Flight) -> list[str]:
+    return [each.param_id for each in flight.wire.all(messages.ParamSet)]
+
+
+def reads_and_lists(flight: Flight | Px4Flight) -> int:
+    wire = flight.wire
+    return len(wire.all(messages.ParamRequestRead)) + len(wire.all(messages.ParamRequestList))
+
+
+def files_in(directory: Path) -> list[str]:
+    return [each.name for each in directory.iterdir()]
+
+
+class Heard:
+    """The ParameterChanged events of a vehicle."""
+
+    def __init__(self, flight: Flight | Px4Flight) -> None:
+        self.events: list[tuple[str, float, float]] = []
+        flight.vehicle.connection.bus.attach_event(events.ParameterChanged, self._take)
+
+    def _take(self, event: events.ParameterChanged) -> None:
+        self.events.append((event.name, event.before, event.after))
+
+
+# ---------------------------------------------------------------------------------- downloading
+
+
+@pytest.mark.parametrize("method", ["auto", "ftp", "list"])
+async def test_every_way_brings_the_same(method: Any) -> None:
+    simulated = copter()
+    async with open_flight(simulated) as flight:
+        parameters = flight.vehicle.parameters
+        assert len(parameters.table) == 0
+        was_complete = parameters.is_complete
+        table = await parameters.download(method=method)
+        assert list(table) == list(simulated.parameters)
+        assert table.values_by_name() == {name: simulated.parameters[name] for name in simulated.parameters}
+        assert table is parameters.table
+        assert (was_complete, parameters.is_complete) == (False, True)
+        assert table.has_defaults == (method != "list")
+        assert bool(flight.wire.all(messages.ParamRequestList)) == (method == "list")
+
+
+async def test_what_is_known_is_not_downloaded_again_unless_asked_for() -> None:
+    simulated = copter()
+    async with open_flight(simulated) as flight:
+        parameters = flight.vehicle.parameters
+        await parameters.download(method="list")
+        simulated.parameters["RTL_ALT"] = 2000  # without telling anybody
+        assert (await parameters.download())["RTL_ALT"].value == 1500
+        heard = Heard(flight)
+        assert (await parameters.download(method="list", refresh=True))["RTL_ALT"].value == 2000
+        assert heard.events == [("RTL_ALT", 1500, 2000)]
+
+
+async def test_without_mavftp_the_list_is_taken() -> None:
+    simulated = copter()
+    simulated.faults.no_ftp = True
+    async with open_flight(simulated) as flight:
+        assert len(await flight.vehicle.parameters.download()) == 120
+        assert len(flight.wire.all(messages.ParamRequestList)) == 1
+        assert not flight.wire.all(messages.FileTransferProtocol)
+
+
+async def test_a_vehicle_without_the_file_is_asked_for_it_once_until_it_reboots() -> None:
+    async with open_px4(px4()) as flight:
+        parameters = flight.vehicle.parameters
+        assert len(await parameters.download()) == 120
+        asked = len(flight.wire.all(messages.FileTransferProtocol))
+        assert asked
+        await parameters.download(refresh=True)
+        assert len(flight.wire.all(messages.FileTransferProtocol)) == asked
+        parameters._forget()
+        await parameters.download()
+        assert len(flight.wire.all(messages.FileTransferProtocol)) > asked
+        with pytest.raises(FileError):
+            await parameters.download(method="ftp", refresh=True)
+
+
+async def test_defaults_of_an_earlier_file_are_kept_by_a_list() -> None:
+    async with open_flight(copter()) as flight:
+        await flight.vehicle.parameters.download(method="ftp")
+        table = await flight.vehicle.parameters.download(method="list", refresh=True)
+        assert table.has_defaults
+
+
+async def test_two_downloads_at_once_are_one() -> None:
+    async with open_flight(copter()) as flight, anyio.create_task_group() as tasks:
+        for _ in range(3):
+            tasks.start_soon(flight.vehicle.parameters.download)
+    assert len(flight.wire.all(messages.ParamRequestList)) <= 1
+
+
+async def test_progress_ends_with_all_of_it() -> None:
+    seen: list[Progress] = []
+    async with open_flight(copter()) as flight:
+        await flight.vehicle.parameters.download(method="list", on_progress=seen.append)
+        assert (seen[-1].done, seen[-1].total) == (120, 120)
+        await flight.vehicle.parameters.download(method="ftp", refresh=True, on_progress=seen.append)
+        assert seen[-1].done == seen[-1].total or seen[-1].total is None
+
+
+async def test_what_does_not_come_is_named_and_the_rest_is_known() -> None:
+    simulated = copter()
+    simulated.faults.mute_parameters = {"RTL_ALT", "LAND_SPEED"}
+    async with open_flight(simulated) as flight:
+        parameters = flight.vehicle.parameters
+        with pytest.raises(ParameterTimeout, match="last heartbeat") as timeout:
+            await parameters.download(method="list", patience_s=3.0)
+        names = list(simulated.parameters)
+        assert {names[int(index)] for index in timeout.value.missing} == {"RTL_ALT", "LAND_SPEED"}
+        assert len(parameters.table) == 118
+        assert not parameters.is_complete
+
+
+async def test_a_limit_for_all_of_it() -> None:
+    async with open_flight(copter(None)) as flight:
+        with pytest.raises(OperationTimeout, match=r"not done within 0.1 s"):
+            await flight.vehicle.parameters.download(method="list", timeout=0.1)
+        assert len(await flight.vehicle.parameters.download(method="list")) == 1349
+
+
+async def test_wrong_methods() -> None:
+    async with open_flight(copter()) as flight:
+        with pytest.raises(LocalProtocolError, match="auto, ftp, list"):
+            await flight.vehicle.parameters.download(method="fast")  # type: ignore[arg-type]
+        with pytest.raises(LocalProtocolError, match="auto, ftp, set"):
+            await flight.vehicle.parameters.upload({"RTL_ALT": 1}, method="fast")  # type: ignore[arg-type]
+
+
+async def test_a_list_over_a_bad_radio_is_exact() -> None:
+    simulated = copter()
+    async with simulated_link(simulated) as link:
+        radio = FaultyLink(link, FaultModel(delay_s=0.05), seed=5)
+        async with connect(radio, rates={}) as vehicle:
+            radio.incoming.model = radio.outgoing.model = FaultModel(
+                delay_s=0.05, loss=0.2, duplication=0.1, reordering=0.1, corruption=0.05, jitter_s=0.02
+            )
+            table = await vehicle.parameters.download(method="list")
+    assert table.values_by_name() == {name: simulated.parameters[name] for name in simulated.parameters}
+
+
+# ------------------------------------------------------------------------------ reboots, events
+
+
+async def test_a_reboot_forgets_all() -> None:
+    async with open_flight(copter()) as flight:
+        parameters = flight.vehicle.parameters
+        await parameters.download()
+        await flight.vehicle.reboot()
+        assert not parameters.is_complete
+        assert len(await parameters.download()) == 120
+
+
+async def test_what_others_change_is_told_and_known() -> None:
+    simulated = copter()
+    async with open_flight(simulated) as flight:
+        heard, parameters = Heard(flight), flight.vehicle.parameters
+        await parameters.download()
+        other = FrameEncoder(254, 190)
+        simulated.receive(other.encode(messages.ParamSet(1, 1, "RTL_ALT", 2500.0, 6)), simulated.now)
+        await anyio.sleep(0.5)
+        assert heard.events == [("RTL_ALT", 1500, 2500)]
+        changed = parameters.table["RTL_ALT"]
+        assert (changed.value, changed.type, changed.default) == (2500, ParameterType.INT32, 1500)
+
+
+async def test_values_of_other_components_change_nothing() -> None:
+    async with open_flight(copter()) as flight:
+        heard, parameters = Heard(flight), flight.vehicle.parameters
+        await parameters.download()
+        camera = FrameEncoder(1, 100)
+        flight.wire.deliver(camera.encode(messages.ParamValue("RTL_ALT", 7.0, 6, 1, 0)))
+        assert parameters.table["RTL_ALT"].value == 1500
+        assert not heard.events
+
+
+async def test_a_value_that_has_just_been_replaced_is_a_late_message() -> None:
+    """ArduPilot answers reads later than writes."""
+    async with open_flight(copter()) as flight:
+        parameters = flight.vehicle.parameters
+        await parameters.download()
+        await parameters.set("RTL_ALT", 2000)
+        late = FrameEncoder(1, 1).encode(messages.ParamValue("RTL_ALT", 1500.0, 6, 120, 0xFFFF))
+        flight.wire.deliver(late)
+        assert parameters.table["RTL_ALT"].value == 2000
+        await anyio.sleep(2.0)
+        flight.wire.deliver(late)
+        assert parameters.table["RTL_ALT"].value == 1500
+
+
+async def test_leaving_the_vehicle_stops_listening() -> None:
+    async with open_flight(copter()) as flight:
+        kept: Parameters = flight.vehicle.parameters
+        await kept.download()
+    assert len(kept.table) == 120
+    with pytest.raises(Exception, match=r"block|closed"):
+        await kept.get("RTL_ALT")
+
+
+# -------------------------------------------------------------------------------------- reading
+
+
+async def test_single_reads() -> None:
+    async with open_flight(copter()) as flight:
+        parameters = flight.vehicle.parameters
+        assert await parameters.get("RTL_ALT") == 1500
+        assert isinstance(await parameters.get("RTL_ALT"), int)
+        read = await parameters.read("WPNAV_SPEED")
+        assert (read.name, read.value, read.type) == ("WPNAV_SPEED", 1000.0, ParameterType.REAL32)
+        assert {"RTL_ALT", "WPNAV_SPEED"} <= set(parameters.table) < set(flight.copter.parameters)
+
+
+@pytest.mark.parametrize("errors", [False, True])
+async def test_unknown_names(errors: bool) -> None:
+    """Released ArduPilot says so, the version before it said nothing."""
+    async with open_flight(copter(parameter_errors=errors)) as flight:
+        with pytest.raises(ParameterRejected, match="NO_SUCH_ONE") as rejected:
+            await flight.vehicle.parameters.get("NO_SUCH_ONE")
+        assert rejected.value.code == (1 if errors else None)
+        with pytest.raises(ParameterRejected):
+            await flight.vehicle.parameters.set("NO_SUCH_ONE", 1)
+    assert not sent_writes(flight)
+
+
+async def test_a_silent_vehicle_is_a_timeout() -> None:
+    simulated = copter()
+    async with open_flight(simulated) as flight:
+        simulated.faults.silent = True
+        with pytest.raises(ParameterTimeout) as timeout:
+            await flight.vehicle.parameters.get("RTL_ALT", patience_s=2.0)
+        assert timeout.value.missing == ("RTL_ALT",)
+
+
+@pytest.mark.parametrize("name", ["", "A" * 17, "Ä", "A B"])
+async def test_impossible_names_are_refused_before_anything_is_sent(name: str) -> None:
+    async with open_flight(copter()) as flight:
+        parameters = flight.vehicle.parameters
+        for attempt in (
+            parameters.get(name),
+            parameters.set(name, 1),
+            parameters.set_many({"RTL_ALT": 1, name: 1}),
+        ):
+            with pytest.raises(LocalProtocolError):
+                await attempt
+        assert not reads_and_lists(flight)
+        assert not sent_writes(flight)
+
+
+# -------------------------------------------------------------------------------------- writing
+
+
+async def test_a_write_says_what_came_of_it() -> None:
+    simulated = copter()
+    async with open_flight(simulated) as flight:
+        result = await flight.vehicle.parameters.set("RTL_ALT", 2000)
+        assert (result.name, result.requested, result.value, result.type) == (
+            "RTL_ALT",
+            2000,
+            2000,
+            ParameterType.INT32,
+        )
+        assert (result.outcome, result.note, result.error) == ("set", "", None)
+        assert simulated.parameters["RTL_ALT"] == 2000
+        assert (await flight.vehicle.parameters.set("RTL_ALT", 2000)).outcome == "unchanged"
+        assert (await flight.vehicle.parameters.set("WPNAV_SPEED", 700.1)).outcome == "set"
+
+
+async def test_clamped_rounded_and_refused() -> None:
+    simulated = copter()
+    simulated.faults.parameter_limits = {"RTL_ALT": (0, 3000)}
+    simulated.faults.read_only_parameters = {"LAND_SPEED"}
+    async with open_flight(simulated) as flight:
+        parameters = flight.vehicle.parameters
+        clamped = await parameters.set("RTL_ALT", 9000)
+        assert (clamped.outcome, clamped.value, clamped.requested) == ("clamped", 3000, 9000)
+        rounded = await parameters.set("LOG_BITMASK", 16_777_217)
+        assert (rounded.outcome, rounded.value) == ("rounded", 16_777_216)
+        with pytest.raises(ParameterRejected, match="keeps 50"):
+            await parameters.set("LAND_SPEED", 60)
+    assert len(sent_writes(flight)) < 15
+
+
+async def test_px4_takes_integers_to_the_last_bit() -> None:
+    simulated = px4()
+    async with open_px4(simulated) as flight:
+        for value in (16_777_217, -5_000_000, -1, 2**31 - 1, 0):
+            result = await flight.vehicle.parameters.set("COM_RC_IN_MODE", value)
+            assert (result.value, result.type) == (value, ParameterType.INT32)
+            assert simulated.parameters["COM_RC_IN_MODE"] == value
+            assert await flight.vehicle.parameters.get("COM_RC_IN_MODE") == value
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e39, "5", None])
+async def test_impossible_numbers_are_refused_before_anything_is_set(value: Any) -> None:
+    async with open_flight(copter()) as flight:
+        parameters = flight.vehicle.parameters
+        await parameters.download()
+        with pytest.raises(LocalProtocolError, match="WPNAV_SPEED"):
+            await parameters.set_many({"RTL_ALT": 2000, "WPNAV_SPEED": value})
+        assert not sent_writes(flight)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("RTL_ALT", 1.5), ("FRAME_CLASS", 300), ("RTL_ALT_FINAL", 40_000)]
+)
+async def test_what_a_type_cannot_hold_is_refused_before_anything_is_set(name: str, value: float) -> None:
+    async with open_flight(copter()) as flight:
+        parameters = flight.vehicle.parameters
+        for _ in range(2):  # without and with what the vehicle has being known
+            with pytest.raises(LocalProtocolError, match=name):
+                await parameters.set_many({"LAND_SPEED": 60, name: value})
+            assert not sent_writes(flight)
+            await parameters.download()
+
+
+async def test_many_writes_with_one_result_each() -> None:
+    simulated = copter()
+    simulated.faults.read_only_parameters = {"LAND_SPEED"}
+    async with open_flight(simulated) as flight:
+        wanted = {"RTL_ALT": 2000, "LAND_SPEED": 60, "NO_SUCH_ONE": 1, "WPNAV_SPEED": 700}
+        results = await flight.vehicle.parameters.set_many(wanted)
+        assert list(results) == list(wanted)
+        outcomes = {name: each.outcome for name, each in results.items()}
+        assert outcomes == {
+            "RTL_ALT": "set",
+            "LAND_SPEED": "failed",
+            "NO_SUCH_ONE": "failed",
+            "WPNAV_SPEED": "set",
+        }
+        assert isinstance(results["LAND_SPEED"].error, ParameterRejected)
+        assert results["LAND_SPEED"].value == 50
+        assert results["NO_SUCH_ONE"].value != results["NO_SUCH_ONE"].value
+        assert await flight.vehicle.parameters.set_many({}) == {}
+
+
+async def test_an_unconfirmed_write_is_a_timeout() -> None:
+    simulated = copter()
+    async with open_flight(simulated) as flight:
+        await flight.vehicle.parameters.download()
+        simulated.faults.mute_parameters = {"RTL_ALT"}
+        with pytest.raises(ParameterTimeout, match="not confirmed"):
+            await flight.vehicle.parameters.set("RTL_ALT", 2000, patience_s=2.0)
+
+
+# ------------------------------------------------------------------------------------ uploading
+
+
+@pytest.mark.parametrize("method", ["auto", "ftp", "set"])
+async def test_only_what_differs_is_uploaded(method: Any, tmp_path: Path) -> None:
+    simulated = copter()
+    async with open_flight(simulated) as flight:
+        parameters = flight.vehicle.parameters
+        table = await parameters.download()
+        changed = [name for name, each in table.items() if each.type is ParameterType.REAL32][:15]
+        values = table.values_by_name() | {name: table[name].value + 1.25 for name in changed}
+        heard = Heard(flight)
+        results = await parameters.upload(values, method=method)
+        assert {name for name, each in results.items() if each.outcome == "set"} == set(changed)
+        assert {each.outcome for each in results.values()} == {"set", "unchanged"}
+        assert {name: simulated.parameters[name] for name in changed} == pytest.approx(
+            {name: values[name] for name in changed}
+        )
+        assert {name for name, _, _ in heard.events} == set(changed)
+        assert set(sent_writes(flight)) == (set(changed) if method == "set" else set())
+
+
+async def test_a_file_is_uploaded_and_compared(tmp_path: Path) -> None:
+    path = tmp_path / "copter.param"
+    path.write_text("RTL_ALT,2500\nLAND_SPEED,50\nNO_SUCH_ONE,1\n")
+    simulated = copter()
+    async with open_flight(simulated) as flight:
+        parameters = flight.vehicle.parameters
+        found = {each.name: (each.before, each.after) for each in await parameters.diff(path)}
+        assert found == {"RTL_ALT": (1500, 2500), "NO_SUCH_ONE": (None, 1)}
+        results = await parameters.upload(path)
+        assert {name: each.outcome for name, each in results.items()} == {
+            "RTL_ALT": "set",
+            "LAND_SPEED": "unchanged",
+            "NO_SUCH_ONE": "failed",
+        }
+        assert [each.name for each in await parameters.diff(path)] == ["NO_SUCH_ONE"]
+
+
+async def test_what_a_file_does_not_bring_about_is_set() -> None:
+    """The vehicle clamps: the file is taken without a word."""
+    simulated = copter()
+    simulated.faults.parameter_limits = {"LAND_SPEED": (0, 100)}
+    async with open_flight(simulated) as flight:
+        result = (await flight.vehicle.parameters.upload({"LAND_SPEED": 200, "RTL_ALT": 2000}, method="ftp"))[
+            "LAND_SPEED"
+        ]
+        assert result.outcome in ("clamped", "set")
+        assert result.value == simulated.parameters["LAND_SPEED"]
+
+
+async def test_what_was_changed() -> None:
+    simulated = copter()
+    simulated.parameters["RTL_ALT"] = 4000
+    async with open_flight(simulated) as flight:
+        changed = await flight.vehicle.parameters.changed_from_default()
+        assert (changed["RTL_ALT"].value, changed["RTL_ALT"].default) == (4000, 1500)
+        assert "LAND_SPEED" not in changed
+
+
+async def test_what_was_changed_needs_defaults() -> None:
+    async with open_px4(px4()) as flight:
+        with pytest.raises(NotSupported, match="load_metadata"):
+            await flight.vehicle.parameters.changed_from_default()
+
+
+# ------------------------------------------------------------------------------------- old names
+
+
+async def test_old_and_new_names_read_and_written_with_a_warning() -> None:
+    """This copter is between the versions: it has MAV_SYSID and ARMING_CHECK, and WPNAV_SPEED."""
+    simulated = copter()
+    async with open_flight(simulated) as flight:
+        parameters = flight.vehicle.parameters
+        for _ in range(2):  # without and with what the vehicle has being known
+            with pytest.warns(ParameterRenamedWarning, match="MAV_SYSID") as warned:
+                assert await parameters.get("SYSID_THISMAV") == 1
+            assert warned[0].filename == __file__
+            with pytest.warns(ParameterRenamedWarning, match="WP_SPD"):
+                speed = await parameters.read("WP_SPD")
+            assert (speed.name, speed.value) == ("WP_SPD", 10.0)
+            with pytest.warns(ParameterRenamedWarning):
+                assert await parameters.get("ARMING_SKIPCHK") == 0
+            await parameters.download()
+        with pytest.warns(ParameterRenamedWarning):
+            result = await parameters.set("WP_SPD", 7.5)
+        assert (result.name, result.requested, result.value) == ("WP_SPD", 7.5, 7.5)
+        assert "WPNAV_SPEED" in result.note
+        assert simulated.parameters["WPNAV_SPEED"] == 750
+
+
+async def test_renamed_names_in_files_and_blocks() -> None:
+    simulated = copter()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ParameterRenamedWarning)
+        async with open_flight(simulated) as flight:
+            parameters = flight.vehicle.parameters
+            differences = await parameters.diff({"WP_SPD": 8.0, "SYSID_THISMAV": 1})
+            assert [(each.name, each.before, each.after) for each in differences] == [
+                ("WPNAV_SPEED", 1000, 800)
+            ]
+            assert (await parameters.upload({"WP_SPD": 8.0}))["WP_SPD"].outcome == "set"
+            async with parameters.temporarily({"WP_SPD": 5.0}):
+                assert simulated.parameters["WPNAV_SPEED"] == 500
+            assert simulated.parameters["WPNAV_SPEED"] == 800
+            async with parameters.transaction() as transaction:
+                await transaction.set("WP_SPD", 6.0)
+            assert simulated.parameters["WPNAV_SPEED"] == 600
+            results = await parameters.upload({"WP_SPD": 9.0, "WPNAV_SPEED": 700})
+            assert list(results) == ["WPNAV_SPEED"]
+            with pytest.raises(LocalProtocolError, match="contradict"):
+                await parameters.set_many({"WP_SPD": 9.0, "WPNAV_SPEED": 800})
+            assert simulated.parameters["WPNAV_SPEED"] == 700
+
+
+# -------------------------------------------------------------------------------------- metadata
+
+PDEF = """<?xml version="1.0"?><paramfile><vehicles><parameters name="ArduCopter">
+<param humanName="RTL Altitude" name="ArduCopter:RTL_ALT" documentation="How high" user="Standard">
+<field name="Range">30 300000</field><field name="Units">cm</field><field name="RebootRequired">True</field></param>
+</parameters></vehicles></paramfile>"""
+
+
+async def test_metadata_are_advice(tmp_path: Path) -> None:
+    path = tmp_path / "apm.pdef.xml"
+    path.write_text(PDEF)
+    simulated = copter()
+    async with open_flight(simulated) as flight:
+        parameters = flight.vehicle.parameters
+        metadata = [parameters.metadata, parameters.load_metadata(path), parameters.metadata]
+        assert metadata[0] is None
+        assert metadata[1] is metadata[2]
+        result = await parameters.set("RTL_ALT", 10)
+        assert (result.outcome, simulated.parameters["RTL_ALT"]) == ("set", 10)
+        assert "30" in result.note
+        assert "reboot" in result.note
+        async with parameters.transaction() as transaction:
+            await transaction.set("LAND_SPEED", 70)
+            assert not transaction.needs_reboot
+            await transaction.set("RTL_ALT", 2000)
+            assert transaction.needs_reboot == ("RTL_ALT",)
+
+
+# ---------------------------------------------------------------------------------------- hash
+
+
+def hash_requests(flight: Px4Flight) -> list[str]:
+    return [each.param_id for each in flight.wire.all(messages.ParamRequestRead)]
+
+
+async def test_the_second_connect_takes_one_request(tmp_path: Path) -> None:
+    simulated = px4()
+    async with open_px4(simulated) as flight:
+        first = await flight.vehicle.parameters.download(cache=tmp_path)
+        assert len(files_in(tmp_path)) == 1
+    async with simulated_link(simulated) as link, connect(link) as vehicle:
+        await vehicle.version.wait_until(lambda _: True)
+        begun = now()
+        assert await vehicle.parameters.download(cache=tmp_path) == first
+        assert vehicle.parameters.is_complete
+        assert now() - begun < 0.05
+
+
+async def test_a_change_makes_the_cache_worthless(tmp_path: Path) -> None:
+    simulated = px4()
+    async with open_px4(simulated) as flight:
+        await flight.vehicle.parameters.download(cache=tmp_path)
+        simulated.parameters["COM_RC_IN_MODE"] = 4
+        flight.vehicle.parameters._forget()
+        flight.wire.forget()
+        table = await flight.vehicle.parameters.download(cache=tmp_path)
+        assert table["COM_RC_IN_MODE"].value == 4
+        assert len(flight.wire.all(messages.ParamRequestList)) == 1
+        flight.vehicle.parameters._forget()
+        flight.wire.forget()
+        await flight.vehicle.parameters.download(cache=tmp_path)
+        assert hash_requests(flight) == ["_HASH_CHECK"]
+        assert not flight.wire.all(messages.ParamRequestList)
+        await flight.vehicle.parameters.download(cache=tmp_path, refresh=True)
+        assert len(flight.wire.all(messages.ParamRequestList)) == 1
+
+
+async def test_nothing_is_written_to_disk_unless_asked_for(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    async with open_px4(px4()) as flight:
+        await flight.vehicle.parameters.download()
+        assert files_in(tmp_path) == []
+        await flight.vehicle.parameters.download(cache=True, refresh=True)
+        assert len(files_in(tmp_path / "aerokit" / "parameters")) == 1
+
+
+async def test_ardupilot_has_no_hash_and_no_cache(tmp_path: Path) -> None:
+    async with open_flight(copter()) as flight:
+        await flight.vehicle.parameters.download(cache=tmp_path)
+    assert files_in(tmp_path) == []
+
+
+def test_wire_bits_of_a_signalling_nan() -> None:
+    """What the tests with -5,000,000 are about."""
+    bits = struct.unpack("<I", struct.pack("<i", -5_000_000))[0]
+    assert bits & 0x7F800000 == 0x7F800000
+    assert bits & 0x007FFFFF
+    assert not bits & 0x00400000
