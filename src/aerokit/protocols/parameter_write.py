@@ -26,7 +26,7 @@ __all__ = ["ParameterWrites"]
 WRITES_AT_ONCE = 10
 """ArduPilot saves through a queue of 30, which it must not overflow while it is armed."""
 BY_NAME = -1
-VERDICT, VERDICT_OF_NO_CHANGE = 2, 10
+VERDICT, VERDICT_OF_NO_CHANGE = 2, 8
 """So many answers with another value than asked for are a verdict; more when it is the value from before, which may
 also stand in a message that was under way, while PARAM_SET was lost."""
 
