@@ -296,3 +296,12 @@ def test_messages_that_were_not_asked_for_are_ignored() -> None:
     for message in others:
         exchange.receive(framed(message), 0.01)
     assert not exchange.done
+
+
+def test_of_an_old_and_a_new_name_only_one_is_waited_for() -> None:
+    channel = Channel(FakeVehicle(table_of(10)))
+    rivals = {"PARAM_0004": ("OLD_NAME",), "OLD_NAME": ("PARAM_0004",)}
+    answers = channel.run(reads("OLD_NAME", "PARAM_0004", are_doubtful=True, rivals=rivals))
+    assert value(answers["PARAM_0004"]) == 2.0
+    assert isinstance(answers["OLD_NAME"], ParameterRejected)
+    assert channel.now == pytest.approx(RTT_S)

@@ -40,6 +40,7 @@ class ParameterReads(ParameterRequests):
     together with the parameter of index 0, and when that one comes time and again, the vehicle has none of the name
     that does not: the answer is a ParameterRejected without a code.
 
+    Of a name and its ``rivals`` the vehicle has one at most: the others are rejected when that one has come.
     An answer that tells a ``distrusted`` value may have been under way for long: it is believed the second time.
     """
 
@@ -52,6 +53,7 @@ class ParameterReads(ParameterRequests):
         bytewise: bool,
         are_doubtful: bool = False,
         distrusted: Mapping[str, float] = MappingProxyType({}),
+        rivals: Mapping[str, Iterable[str]] = MappingProxyType({}),
         own_system: int = 0,
         round_trip: RoundTrip | None = None,
         patience_s: float = PATIENCE_S,
@@ -63,6 +65,7 @@ class ParameterReads(ParameterRequests):
             names,
             bytewise=bytewise,
             window=READS_AT_ONCE,
+            doubles_last=not are_doubtful,
             own_system=own_system,
             round_trip=round_trip,
             patience_s=patience_s,
@@ -71,6 +74,7 @@ class ParameterReads(ParameterRequests):
         self._are_doubtful = self._is_probe_wanted = are_doubtful
         self._distrusted = dict(distrusted)
         self._refused: set[str] = set()
+        self._rivals = {name: tuple(others) for name, others in rivals.items()}
         self._probes_sent = self._probes_answered = 0
 
     def _request(self, name: str) -> list[Message]:
@@ -109,6 +113,13 @@ class ParameterReads(ParameterRequests):
                 self._window.ask(name)
             else:
                 self._settle(name, told, now)
+                self._reject_rivals(name, now)
+
+    def _reject_rivals(self, name: str, now: float) -> None:
+        for other in self._rivals.get(name, ()):
+            if other in self._names and other not in self._answers:
+                text = f"the vehicle has no parameter {other}, it has {name}"
+                self._settle(other, ParameterRejected(text, name=other), now)
 
     def _take_error(self, message: ParamError, now: float) -> None:
         """PX4 says that there is no such parameter also when it has no room to send it: once more, then."""

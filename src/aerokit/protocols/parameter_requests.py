@@ -56,6 +56,7 @@ class ParameterRequests(Transfer[dict[str, Answer]]):
         *,
         bytewise: bool,
         window: int,
+        doubles_last: bool = True,
         own_system: int = 0,
         round_trip: RoundTrip | None = None,
         patience_s: float = PATIENCE_S,
@@ -70,7 +71,9 @@ class ParameterRequests(Transfer[dict[str, Answer]]):
         )
         self._names = tuple(dict.fromkeys(names))
         self._bytewise, self._own_system = bytewise, own_system
-        self._window: RequestWindow[str] = RequestWindow(self.round_trip, size=window)
+        self._window: RequestWindow[str] = RequestWindow(
+            self.round_trip, size=window, doubles_last=doubles_last
+        )
         self._answers: dict[str, Answer] = {}
         self._sent_at: dict[str, float] = {}
         self._early: dict[str, int] = {}

@@ -42,9 +42,10 @@ class RequestWindow(Generic[KeyT]):
     One is sent again when its answer is overdue (:class:`RoundTrip`), or when later requests were answered before it.
     """
 
-    def __init__(self, round_trip: RoundTrip, *, size: int = WINDOW) -> None:
+    def __init__(self, round_trip: RoundTrip, *, size: int = WINDOW, doubles_last: bool = True) -> None:
         self._round_trip, self._size, self._room = round_trip, size, size
         self._shortest_s = math.inf
+        self._doubles_last = doubles_last
         self._answered_at = self._silent_until = -math.inf
         self._silences = 0
         self._waiting: dict[KeyT, None] = {}
@@ -122,7 +123,7 @@ class RequestWindow(Generic[KeyT]):
             del self._waiting[key]
             self._send(key, now)
             due.append(key)
-        if len(self._under_way) <= FEW and not self._waiting:
+        if self._doubles_last and len(self._under_way) <= FEW and not self._waiting:
             due += [key for key in due if self._asked[key].attempts >= UNLUCKY]
         return due
 

@@ -19,6 +19,7 @@ from aerokit.mavlink.messages import ParamValue
 from aerokit.parameters import Parameter, ParameterTable
 from aerokit.parameters.parameter import same_value
 from aerokit.parameters.px4_hash import HASH_NAME
+from aerokit.parameters.renames import other_names
 from aerokit.protocols.parameter_list import ParameterList
 from aerokit.protocols.parameter_read import ParameterReads
 from aerokit.protocols.parameter_write import ParameterWrites
@@ -174,6 +175,7 @@ class ParameterAccess:
             names,
             bytewise=store.bytewise,
             are_doubtful=are_doubtful,
+            rivals={name: other_names(name) for name in names} if are_doubtful else {},
             distrusted={name: old for name in names if (old := store.distrusted(name)) is not None},
             own_system=transfers.connection.source_system,
             round_trip=self._answer_time,
