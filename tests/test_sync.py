@@ -23,6 +23,7 @@ import aerokit.sync.mission
 import aerokit.sync.parameters
 from aerokit import errors, events, messages
 from aerokit.mavlink.enums import MavCmd, MavResult
+from aerokit.missions import Fence, FenceCircle, Mission, waypoint
 from aerokit.runtime.cells import StateCell
 from aerokit.runtime.connection import open_connection
 from aerokit.runtime.subscription import Subscription
@@ -357,6 +358,23 @@ def test_a_program_that_forgets_to_close_still_ends() -> None:
             check=False,
         )
     assert (done.returncode, done.stdout, done.stderr) == (0, "7\n", "")
+
+
+# --------------------------------------------------------------------------------- missions
+
+
+def test_missions_fences_and_rally_points(vehicle: aerokit.sync.Vehicle) -> None:
+    place = aerokit.Position(47.0, 8.0)
+    mission = Mission([waypoint(47.0, 8.0, altitude_relative_m=20)] * 3)
+    vehicle.mission.upload(mission)
+    assert mission.matches(vehicle.mission.download(method="items"))
+    assert vehicle.mission.count.value == 3
+    with pytest.raises(errors.OperationRejected, match="not armed"):
+        vehicle.mission.start()
+    vehicle.fence.upload(Fence(circles=[FenceCircle(place, 100.0)]))
+    vehicle.rally.clear()
+    vehicle.mission.clear()
+    assert vehicle.mission.count.value == 0
 
 
 # ------------------------------------------------------------------------- several vehicles

@@ -47,10 +47,12 @@ class Plan(Protocol):
 
     def to_items(self, *, home_is_item_0: bool = False) -> tuple[MissionItem, ...]:
         """Its items."""
+        ...
 
     @classmethod
     def from_items(cls, items: Sequence[MissionItem], *, home_is_item_0: bool = False) -> Self:
         """The plan of these items."""
+        ...
 
 
 PlanT = TypeVar("PlanT", bound=Plan)

@@ -161,6 +161,7 @@ class PlanFiles(Protocol):
 
     async def read(self, path: str, *, patience_s: float, on_progress: OnProgress | None) -> bytes:
         """Return the whole file."""
+        ...
 
     async def write(
         self, path: str, data: bytes, *, patience_s: float, on_progress: OnProgress | None
