@@ -12,7 +12,7 @@ from aerokit.mavlink.messages import ParamError, ParamRequestList, ParamRequestR
 from aerokit.parameters import Parameter, ParameterTable
 from aerokit.parameters.encoding import UNKNOWN_INDEX, parameter_of
 from aerokit.parameters.px4_hash import HASH_NAME
-from aerokit.protocols.parameter_requests import updated
+from aerokit.protocols.parameter_update import updated
 from aerokit.protocols.request_window import RequestWindow
 from aerokit.protocols.transfer import PATIENCE_S, OnProgress, Transfer
 

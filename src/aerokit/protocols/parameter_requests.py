@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 
 from aerokit.errors import ParameterRejected, ParameterTimeout
 from aerokit.mavlink.messages import ParamError, ParamValue
-from aerokit.parameters import Parameter, ParameterType
-from aerokit.parameters.parameter import same_value
+from aerokit.parameters import Parameter
 from aerokit.protocols.request_window import RequestWindow
 from aerokit.protocols.transfer import PATIENCE_S, OnProgress, Transfer
 
@@ -20,7 +19,7 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.protocols.round_trip import RoundTrip
 
-__all__ = ["Answer", "ParameterRequests", "rejection", "updated"]
+__all__ = ["Answer", "ParameterRequests", "rejection"]
 
 Answer = Parameter | ParameterRejected | ParameterTimeout
 """What came of one request: what the vehicle says the parameter is, or why there is nothing to say."""
@@ -132,13 +131,12 @@ class ParameterRequests(Transfer[dict[str, Answer]]):
             self._settle(name, rejection(name, message.error), now)
 
     def _is_too_early(self, name: str, now: float) -> bool:
-        """Whether this is hardly an answer to what was sent last, but a late or repeated one to something before.
-
-        A few times at most for one name: perhaps the vehicle has become that fast.
-        """
-        is_early = now - self._sent_at.get(name, now) < SOONEST * (self.round_trip.fastest_s or 0.0)
-        self._early[name] = self._early.get(name, 0) + is_early
-        return is_early and self._early[name] <= EARLY_ONES
+        """Whether this can be no answer to what was sent last: it is a late or repeated one to something before."""
+        elapsed_s = now - self._sent_at.get(name, now)
+        is_early = elapsed_s < SOONEST * (self.round_trip.fastest_s or 0.0)
+        if is_early and self._window.attempts(name) == 1:
+            self.round_trip.measured(elapsed_s)  # perhaps this vehicle is so fast: believe it next time
+        return is_early
 
     def _settle(self, name: str, answer: Answer, now: float) -> None:
         self._window.forget(name)
@@ -163,19 +161,3 @@ def rejection(name: str, code: int) -> ParameterRejected:
     """The exception that stands for a PARAM_ERROR (https://mavlink.io/en/messages/common.html#PARAM_ERROR)."""
     reason = ERRORS.get(code, f"MAV_PARAM_ERROR {code}")
     return ParameterRejected(f"{name} was refused: {reason}", name=name, code=code)
-
-
-def updated(known: Parameter, told: Parameter, bytewise: bool) -> Parameter:
-    """What is known of a parameter after a PARAM_VALUE outside a list.
-
-    Where values travel as numbers, such a message tells less than a list or a file. ArduPilot calls an integer a float
-    in its answer to PARAM_SET when it holds its default, and an INT32 beyond 2**24 has lost its last bits.
-    """
-    value, type_ = told.value, told.type
-    if not bytewise and known.type.is_integer:
-        if type_ is ParameterType.REAL32 and value == value // 1:
-            value, type_ = int(value), known.type
-        if same_value(float(known.value), float(value)):
-            value = known.value
-    index = known.index if told.index is None else told.index
-    return Parameter(known.name, value, type_, known.default, index)

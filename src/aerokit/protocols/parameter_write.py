@@ -38,7 +38,8 @@ class ParameterWrites(ParameterRequests):
     write: it is set again and read back, and only what comes again is the answer. So a vehicle that rounds or clamps
     is believed after a second answer, and nothing is sent for ever.
 
-    ``before`` are the values known so far.
+    ``before`` are the values known so far. ``recent`` are names that were written a moment ago: echoes of that write
+    may still come, so that the first answer as asked is read back.
     """
 
     def __init__(
@@ -49,6 +50,7 @@ class ParameterWrites(ParameterRequests):
         *,
         bytewise: bool,
         before: Mapping[str, float] = MappingProxyType({}),
+        recent: Iterable[str] = (),
         own_system: int = 0,
         round_trip: RoundTrip | None = None,
         patience_s: float = PATIENCE_S,
@@ -67,6 +69,7 @@ class ParameterWrites(ParameterRequests):
             on_progress=on_progress,
         )
         self._before = dict(before)
+        self._recent = set(recent)
         self._others: dict[str, list[Parameter]] = {}
 
     def _request(self, name: str) -> list[Message]:
@@ -87,6 +90,12 @@ class ParameterWrites(ParameterRequests):
         told = self._typed(parameter_of(message, self._bytewise), wanted.type)
         others = self._others.setdefault(name, [])
         is_as_asked = same_value(told.value, wanted.value)
+        if is_as_asked and name in self._recent:
+            self._recent.remove(name)
+            others.append(told)
+            self._window.answered(name, now)
+            self._window.ask(name)
+            return
         if is_as_asked and (told.type == wanted.type or (others and _is_same(others[-1], told))):
             self._window.answered(name, now)
             self._settle(name, told, now)

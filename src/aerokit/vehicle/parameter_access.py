@@ -19,12 +19,7 @@ from aerokit.mavlink.messages import ParamValue
 from aerokit.parameters import Parameter, ParameterTable
 from aerokit.parameters.parameter import same_value
 from aerokit.parameters.px4_hash import HASH_NAME
-from aerokit.parameters.renames import other_names
-from aerokit.protocols.parameter_list import ParameterList
-from aerokit.protocols.parameter_read import ParameterReads
-from aerokit.protocols.parameter_write import ParameterWrites
 from aerokit.protocols.round_trip import RoundTrip
-from aerokit.vehicle.parameter_cache import ParameterCache, vehicle_key
 from aerokit.vehicle.parameter_store import ParameterStore
 
 if TYPE_CHECKING:
@@ -33,6 +28,7 @@ if TYPE_CHECKING:
     from aerokit.protocols.parameter_requests import Answer
     from aerokit.protocols.transfer import OnProgress
     from aerokit.vehicle.files import Files
+    from aerokit.vehicle.parameter_cache import ParameterCache
     from aerokit.vehicle.transfers import Transfers
 
 __all__ = ["CacheChoice", "DownloadMethod", "ParameterAccess", "UploadMethod"]
@@ -46,6 +42,8 @@ CAPABILITY_FTP = 0x20
 NO_SESSIONS_AVAILABLE = 4
 ANSWER_S = 0.1
 SET_MESSAGE_INTERVAL, AS_BEFORE = 511, 0
+ECHOES_S = 3.0
+"""How long after a write late and repeated answers to it may still come."""
 FEW_READS = 5
 """More are not answered at once."""
 LEAST_TO_PACK = 10
@@ -65,6 +63,7 @@ class ParameterAccess:
         self._has_pack: bool | None = None
         self._answers: RoundTrip | None = None
         self._attending = 0
+        self._written_at: dict[str, float] = {}
 
     @property
     def _answer_time(self) -> RoundTrip:
@@ -102,6 +101,8 @@ class ParameterAccess:
                 return self.store.table
             keeper = None
             if cache is not False and self._transfers.autopilot.has_parameter_hash:
+                from aerokit.vehicle.parameter_cache import ParameterCache
+
                 keeper = _Keeper(self, ParameterCache(None if cache is True else cache), patience_s)
                 if await keeper.begin(refresh):
                     return self.store.table
@@ -139,6 +140,8 @@ class ParameterAccess:
         self._has_pack = True
 
     async def _download_list(self, patience_s: float, on_progress: OnProgress | None) -> None:
+        from aerokit.protocols.parameter_list import ParameterList
+
         transfers = self._transfers
         exchange = ParameterList(
             transfers.system_id,
@@ -168,6 +171,9 @@ class ParameterAccess:
         names = tuple(names)
         if not names:
             return {}
+        from aerokit.parameters.renames import other_names
+        from aerokit.protocols.parameter_read import ParameterReads
+
         transfers, store = self._transfers, self.store
         exchange = ParameterReads(
             transfers.system_id,
@@ -208,6 +214,8 @@ class ParameterAccess:
         wanted = tuple(wanted)
         if not wanted:
             return {}
+        from aerokit.protocols.parameter_write import ParameterWrites
+
         transfers = self._transfers
         async with self._writing:
             before = {
@@ -222,6 +230,7 @@ class ParameterAccess:
                     wanted,
                     bytewise=self.store.bytewise,
                     before=before,
+                    recent=self._recently_written(),
                     own_system=transfers.connection.source_system,
                     round_trip=transfers.round_trip,
                     patience_s=patience_s,
@@ -229,9 +238,15 @@ class ParameterAccess:
                 )
             )
             for name, answer in answers.items():
+                self._written_at[name] = transfers.connection.now()
                 if isinstance(answer, Parameter) and name in before and answer.value != before[name]:
                     self.store.distrust(name, before[name])
             return answers
+
+    def _recently_written(self) -> list[str]:
+        now = self._transfers.connection.now()
+        self._written_at = {name: at for name, at in self._written_at.items() if now - at < ECHOES_S}
+        return list(self._written_at)
 
     async def write_pack(
         self,
@@ -308,6 +323,8 @@ class _Keeper:
             self._cache.save(await self._key(), self._hash, self._access.store.table)
 
     async def _key(self) -> str:
+        from aerokit.vehicle.parameter_cache import vehicle_key
+
         transfers = self._access._transfers
         await transfers.capabilities()
         return vehicle_key(transfers.autopilot.name, transfers.system_id, transfers.version)

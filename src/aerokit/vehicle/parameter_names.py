@@ -8,20 +8,13 @@ from typing import TYPE_CHECKING
 
 from aerokit.errors import ParameterRejected, ParameterTimeout
 from aerokit.parameters import Parameter, check_name
-from aerokit.parameters.renames import (
-    ParameterRenamedWarning,
-    Renamed,
-    find_rename,
-    other_names,
-    to_known,
-    translate_values,
-)
 from aerokit.snapshot import Snapshot
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from aerokit.parameters import ParameterTable
+    from aerokit.parameters.renames import Renamed
     from aerokit.protocols.parameter_requests import Answer
     from aerokit.vehicle.parameter_access import ParameterAccess
 
@@ -79,6 +72,8 @@ class ParameterNames:
 
     def translated(self, values: Mapping[str, float], table: ParameterTable) -> dict[str, int | float]:
         """Values under the names and in the units of the vehicle; names that it does not know stay."""
+        from aerokit.parameters.renames import translate_values
+
         values = {self._spelled(name): value for name, value in values.items()}
         translated, renamed = translate_values(values, table, table.types_by_name())
         for each in renamed:
@@ -87,6 +82,8 @@ class ParameterNames:
 
     def without_doubles(self, values: Mapping[str, float], table: ParameterTable) -> dict[str, int | float]:
         """The values without those that are given under the vehicle's own name, too."""
+        from aerokit.parameters.renames import to_known
+
         renamed = {name: to_known(name, table) for name in values}
         return {
             name: value
@@ -100,6 +97,8 @@ class ParameterNames:
 
     def _to_read(self, names: Iterable[str]) -> dict[str, None]:
         """What is not known under any of its names, under all of them."""
+        from aerokit.parameters.renames import other_names, to_known
+
         store = self._access.store
         wanted: dict[str, None] = {}
         for name in names:
@@ -111,6 +110,8 @@ class ParameterNames:
         own = answers.get(name, self._access.store.get(name))
         if isinstance(own, Parameter):
             return Found(name, own, name in answers)
+        from aerokit.parameters.renames import Renamed, find_rename, other_names
+
         for other in other_names(name):
             answer = answers.get(other, self._access.store.get(other))
             rename = find_rename(name)
@@ -121,6 +122,8 @@ class ParameterNames:
 
 def _warn_of(renamed: Renamed) -> None:
     """Warn in the name of the program's own line, however deep inside aerokit this is."""
+    from aerokit.parameters.renames import ParameterRenamedWarning
+
     depth, frame = 2, sys._getframe(1)
     while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("aerokit."):
         depth, frame = depth + 1, frame.f_back

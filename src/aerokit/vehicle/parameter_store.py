@@ -9,7 +9,7 @@ from aerokit.parameters import Parameter, ParameterTable
 from aerokit.parameters.encoding import parameter_of
 from aerokit.parameters.parameter import same_value
 from aerokit.parameters.px4_hash import HASH_NAME
-from aerokit.protocols.parameter_requests import updated
+from aerokit.protocols.parameter_update import updated
 from aerokit.runtime.events import ParameterChanged
 
 if TYPE_CHECKING:
