@@ -223,30 +223,32 @@ class ParameterAccess:
             }
             for name in before:
                 self.store.trust(name)
-            answers = await transfers.run(
-                ParameterWrites(
-                    transfers.system_id,
-                    transfers.component_id,
-                    wanted,
-                    bytewise=self.store.bytewise,
-                    before=before,
-                    recent=self._recently_written(),
-                    own_system=transfers.connection.source_system,
-                    round_trip=transfers.round_trip,
-                    patience_s=patience_s,
-                    on_progress=on_progress,
-                )
+            recent = self._recently_written() & set(_names(wanted))
+            exchange = ParameterWrites(
+                transfers.system_id,
+                transfers.component_id,
+                wanted,
+                bytewise=self.store.bytewise,
+                before=before,
+                recent=recent,
+                own_system=transfers.connection.source_system,
+                round_trip=self._answer_time if recent else transfers.round_trip,
+                patience_s=patience_s,
+                on_progress=on_progress,
             )
+            with self._attended() if len(recent) > FEW_READS else nullcontext():
+                answers = await transfers.run(exchange)
             for name, answer in answers.items():
                 self._written_at[name] = transfers.connection.now()
                 if isinstance(answer, Parameter) and name in before and answer.value != before[name]:
                     self.store.distrust(name, before[name])
             return answers
 
-    def _recently_written(self) -> list[str]:
+    def _recently_written(self) -> set[str]:
+        """Those are read back after the next write, too: echoes of the last one may still come."""
         now = self._transfers.connection.now()
         self._written_at = {name: at for name, at in self._written_at.items() if now - at < ECHOES_S}
-        return list(self._written_at)
+        return set(self._written_at)
 
     async def write_pack(
         self,
