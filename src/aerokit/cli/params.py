@@ -56,7 +56,11 @@ def assignment(text: str) -> tuple[str, float]:
     """``NAME=VALUE``."""
     name, _, value = text.partition("=")
     try:
-        return name, float(value) if "." in value or "e" in value.lower() else int(value, 0)
+        return name, int(value, 0)
+    except ValueError:
+        pass
+    try:
+        return name, float(value)
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is not NAME=VALUE with a number") from None
 
@@ -130,17 +134,23 @@ async def _download(vehicle: Vehicle, options: argparse.Namespace) -> ParameterT
 def _print(parameters: Iterable[Parameter]) -> None:
     for parameter in parameters:
         is_changed = parameter.default is not None and parameter.default != parameter.value
-        default = f"  (default {parameter.default:g})" if is_changed else ""
-        print(f"{parameter.name:16} {parameter.value:<12.9g}{default}".rstrip())
+        default = f"  (default {_text(parameter.default)})" if is_changed else ""
+        print(f"{parameter.name:16} {_text(parameter.value):<12}{default}".rstrip())
 
 
 def _print_results(results: Iterable[ParameterWrite]) -> int:
-    """One line each; FAILED when one of them did not succeed."""
+    """One line each; FAILED when one of them has not the value that was asked for, rounding apart."""
     code = DONE
     for result in results:
         if result.error is None:
-            print(f"{result.name:16} {result.value:<12.9g} {result.outcome} {result.note}".rstrip())
+            print(f"{result.name:16} {_text(result.value):<12} {result.outcome} {result.note}".rstrip())
         else:
             print(f"{result.name:16} not set: {result.error}")
+        if result.error is not None or result.outcome == "clamped":
             code = FAILED
     return code
+
+
+def _text(value: float | None) -> str:
+    """Integers whole, floats as far as 32 bits go."""
+    return str(value) if isinstance(value, int) else f"{value:.9g}"

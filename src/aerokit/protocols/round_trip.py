@@ -24,8 +24,6 @@ class RoundTrip:
         self.smoothed_s: float | None = None
         """Seconds; None before the first measurement."""
         self.fastest_s: float | None = None
-        """The shortest measurement so far, in seconds; None before the first."""
-        self.fastest_s: float | None = None
         """Seconds of the fastest one so far; nothing can be an answer sooner."""
         self._deviation_s = 0.0
         self._shortest_s, self._longest_s = shortest_s, longest_s
@@ -34,7 +32,6 @@ class RoundTrip:
 
     def measured(self, seconds: float) -> None:
         """An answer came so many seconds after its only request."""
-        self.fastest_s = seconds if self.fastest_s is None else min(self.fastest_s, seconds)
         self.fastest_s = seconds if self.fastest_s is None else min(self.fastest_s, seconds)
         if self.smoothed_s is None:
             self.smoothed_s, self._deviation_s = seconds, seconds / 2

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import zlib
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -140,7 +139,7 @@ class Files:
         That is ``zlib.crc32(data, 0xFFFFFFFF) ^ 0xFFFFFFFF``.
         """
         reply = await self._request(MavFtpOpcode.CALCFILECRC, path, patience_s, timeout)
-        return int.from_bytes(reply.data[:4], "little")
+        return _crc32_in(path, reply)
 
     # ------------------------------------------------------------------------------- writing
 
@@ -342,14 +341,18 @@ class Files:
 
     async def _verify(self, path: str, data: bytes, patience_s: float) -> None:
         ours = _crc32(data)
-        with suppress(FileError):
+        try:
             reply = await self._channel.request(MavFtpOpcode.CALCFILECRC, path, patience_s=patience_s)
-            theirs = int.from_bytes(reply.data[:4], "little")
-            if theirs != ours:
-                difference = f"CRC-32 0x{theirs:08x} on the vehicle, 0x{ours:08x} here"
-                raise VerificationFailed(
-                    f"{path} was written, and holds something else", differences=(difference,)
-                )
+        except FileError as error:
+            if error.code in NO_CRC:
+                return
+            raise
+        theirs = _crc32_in(path, reply)
+        if theirs != ours:
+            difference = f"CRC-32 0x{theirs:08x} on the vehicle, 0x{ours:08x} here"
+            raise VerificationFailed(
+                f"{path} was written, and holds something else", differences=(difference,)
+            )
 
 
 class _ShorterError(Exception):
@@ -369,6 +372,12 @@ def _entry(text: bytes) -> FileEntry | None:
         name, _, size = rest.partition("\t")
         return FileEntry(name, int(size) if size.isascii() and size.isdigit() else None, False)
     return None
+
+
+def _crc32_in(path: str, reply: FtpMessage) -> int:
+    if len(reply.data) < 4:
+        raise RemoteProtocolError(f"{path}: the vehicle's CRC-32 has {len(reply.data)} bytes instead of 4")
+    return int.from_bytes(reply.data[:4], "little")
 
 
 def _crc32(data: bytes, before: int = 0) -> int:
