@@ -52,6 +52,23 @@ class LoopThread:
             BusyError: called on the loop's own thread, which would wait for itself.
             ConnectionClosed: the loop was closed, before or meanwhile.
         """
+        return self._run(INTERRUPTED_CALL_ENDS_S, function, *args, **kwargs)
+
+    def run_to_its_end(self, function: Callable[P, Awaitable[T]], *args: P.args, **kwargs: P.kwargs) -> T:
+        """As :meth:`run`, for what leaves something undone when it is cut short, and is bounded by itself.
+
+        Ctrl-C waits for it, and goes on as KeyboardInterrupt afterwards; a second one does not wait.
+        """
+        return self._run(None, function, *args, **kwargs)
+
+    def _run(
+        self,
+        patience_s: float | None,
+        function: Callable[P, Awaitable[T]],
+        *args: P.args,
+        **kwargs: P.kwargs,
+    ) -> T:
+        """``patience_s``: how long to wait for the end of an interrupted call; None: as long as it takes."""
         ended = threading.Event()
 
         async def call() -> T:
@@ -65,7 +82,9 @@ class LoopThread:
             self.wait_for(future)
         except BaseException:
             future.cancel()
-            ended.wait(INTERRUPTED_CALL_ENDS_S)
+            while not ended.wait(WAKE_S if patience_s is None else patience_s):
+                if patience_s is not None or not self._thread.is_alive():
+                    break
             raise
         try:
             return future.result()

@@ -161,7 +161,7 @@ class Temporarily:
         self._loop, self._block = loop, block
 
     def __enter__(self) -> dict[str, ParameterWrite]:
-        return self._loop.run(self._block.__aenter__)
+        return self._loop.run_to_its_end(self._block.__aenter__)
 
     def __exit__(
         self,
@@ -169,7 +169,7 @@ class Temporarily:
         exc: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        self._loop.run(self._block.__aexit__, exc_type, exc, traceback)
+        self._loop.run_to_its_end(self._block.__aexit__, exc_type, exc, traceback)
 
 
 class Transaction:
@@ -197,7 +197,7 @@ class Transaction:
         return self._loop.run(self._block.set_many, values)
 
     def __enter__(self) -> Self:
-        self._loop.run(self._block.__aenter__)
+        self._loop.run_to_its_end(self._block.__aenter__)
         return self
 
     def __exit__(
@@ -206,4 +206,4 @@ class Transaction:
         exc: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        self._loop.run(self._block.__aexit__, exc_type, exc, traceback)
+        self._loop.run_to_its_end(self._block.__aexit__, exc_type, exc, traceback)
