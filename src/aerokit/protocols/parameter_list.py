@@ -214,6 +214,8 @@ class ParameterList(Transfer[ParameterTable]):
     def _quiet_s(self) -> float:
         """How long nothing at all has to come until the stream has stopped. Answers come in its place."""
         seconds = max(self.round_trip.timeout_s(), PAUSES * self._pause_s)
+        if self._streamed < BEGUN:  # perhaps only the answer to what was asked beside
+            return max(seconds, SHORTEST_START_S)
         is_near_end = self._count is not None and self._count - self._next <= NEAR_END
         return seconds if is_near_end else max(seconds, LONGEST_TICK_S)
 

@@ -23,6 +23,8 @@ FEW, UNLUCKY = 5, 3
 """When so few are left, those that are sent the third time are sent twice: on a bad radio they would be waited for."""
 LAST_S = 0.5
 """The last few are not waited for longer than that, or two round trips: asking for them costs little."""
+LONGEST_S = 2.0
+"""Nothing is waited for longer: a queue that made answers late may be gone by now."""
 OVERTAKEN = 3
 """Answers come in the order of their requests. One that so many later ones have overtaken was lost."""
 
@@ -135,11 +137,11 @@ class RequestWindow(Generic[KeyT]):
             self._silent_until = now + self._timeout_s(1)
 
     def _timeout_s(self, attempts: int) -> float:
-        seconds = self._round_trip.timeout_s(min(attempts, 2) + self._silences)
-        smoothed_s = self._round_trip.smoothed_s
-        if len(self) <= FEW and smoothed_s is not None:
-            return min(seconds, max(LAST_S, 2 * smoothed_s))
-        return seconds
+        round_trip = self._round_trip
+        seconds = round_trip.timeout_s(min(attempts, 2) + self._silences)
+        if len(self) <= FEW and round_trip.smoothed_s is not None:
+            seconds = min(seconds, max(LAST_S, 2 * round_trip.smoothed_s))
+        return min(seconds, LONGEST_S)
 
     def _measured(self, seconds: float) -> None:
         """Ask for more at once as long as answers come as fast as ever: a queue is building up somewhere otherwise."""
