@@ -73,9 +73,11 @@ class ExchangeRun(Generic[ResultT]):
         self._after_step()
 
     def _expire(self) -> None:
-        self._deadline = None
+        """The deadline has come; timers ring up to the clock's resolution early, which is no reason to wait again."""
+        now = self._connection.now()
+        now, self._deadline = max(now, now if self._deadline is None else self._deadline), None
         try:
-            self._exchange.expire(self._connection.now())
+            self._exchange.expire(now)
         except Exception as error:
             self._exchange.abort(error)
         self._after_step()
