@@ -92,7 +92,8 @@ class Logs:
         Args:
             log: an entry of :meth:`list`, or its id.
             to: the file here.
-            resume: go on where an interrupted download of this log to this file has ended.
+            resume: go on where an interrupted download of this log to this file has ended; by LOG_* only when the
+                vehicle tells its time.
             method: ``"ftp"``, ``"log"`` (the LOG_* messages), or ``"auto"``: what is faster with this autopilot, and
                 the other one where that does not work. By MAVFTP it must be certain which file the log is.
             patience_s: see above.
@@ -113,7 +114,8 @@ class Logs:
             )
             return
         part = PartFile(to, _mark(entry))
-        start = part.size if resume and part.size <= entry.size else 0
+        is_known = entry.time_utc is not None  # without a time, another flight's log may have the same mark
+        start = part.size if resume and is_known and part.size <= entry.size else 0
         with part.writing(start) as disk:
             into = Reassembly(disk.write, block_size=LOG_BLOCK, start=start)
             await self._fetch(entry, into, patience_s, timeout, on_progress)
@@ -168,7 +170,9 @@ class Logs:
         self, log: LogEntry | int, method: LogMethod, patience_s: float, timeout: float | None
     ) -> tuple[str | None, LogEntry]:
         """Where it is for MAVFTP (None: by LOG_*), and its entry, which LOG_* needs to be fresh."""
-        prefers_messages = method == "log" or (method == "auto" and self._transfers.autopilot.logs_by_messages)
+        prefers_messages = method == "log" or (
+            method == "auto" and self._transfers.autopilot.logs_by_messages
+        )
         if isinstance(log, LogEntry) and not prefers_messages:
             path = await self._path(log, patience_s)
             if path is not None:
@@ -176,7 +180,9 @@ class Logs:
         try:
             entry = await self._entry(log, patience_s, timeout, may_be_silent=method == "auto")
         except FileTimeout:  # ArduPilot while it is armed
-            path = await self._path(log, patience_s) if isinstance(log, LogEntry) and method == "auto" else None
+            path = (
+                await self._path(log, patience_s) if isinstance(log, LogEntry) and method == "auto" else None
+            )
             if path is None or not isinstance(log, LogEntry):
                 raise
             return path, log
@@ -205,7 +211,11 @@ class Logs:
                 if isinstance(log, LogEntry) and _is_other(log, entry):
                     break
                 return entry
-        text = "there is no such log" if isinstance(log, int) else "the vehicle's logs are others now, list them again"
+        text = (
+            "there is no such log"
+            if isinstance(log, int)
+            else "the vehicle's logs are others now, list them again"
+        )
         raise _no_such_log(log_id, text)
 
     async def _entries(

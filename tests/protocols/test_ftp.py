@@ -1,0 +1,209 @@
+"""MAVFTP: the payload, and one request until its answer."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from ftp_server import as_message, make_client, reply_to, requests_in
+from hypothesis import given
+from hypothesis import strategies as st
+
+from aerokit.errors import FileError, FileTimeout, LocalProtocolError
+from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
+from aerokit.mavlink.messages import FileTransferProtocol
+from aerokit.protocols.ftp import FtpMessage, FtpRequest, path_bytes
+from aerokit.protocols.round_trip import RoundTrip
+
+Op = MavFtpOpcode
+bytes_of_data = st.binary(max_size=239)
+
+
+def make_request(
+    opcode: MavFtpOpcode = Op.OPENFILERO, *, patience_s: float = 10.0, **options: Any
+) -> FtpRequest:
+    return FtpRequest(
+        make_client(7),
+        opcode,
+        path="/a",
+        data=b"/a",
+        round_trip=RoundTrip(0.1),
+        patience_s=patience_s,
+        **options,
+    )
+
+
+def started(request: FtpRequest) -> FtpMessage:
+    request.start(0.0)
+    (sent,) = requests_in(request.take_outbox())
+    return sent
+
+
+# -------------------------------------------------------------------------------- the payload
+
+
+@given(
+    st.integers(0, 0xFFFF),
+    st.integers(0, 255),
+    st.integers(0, 255),
+    st.integers(0, 255),
+    st.booleans(),
+    st.integers(0, 0xFFFFFFFF),
+    bytes_of_data,
+)
+def test_what_is_encoded_is_decoded(
+    sequence: int, opcode: int, session: int, asked: int, complete: bool, offset: int, data: bytes
+) -> None:
+    message = FtpMessage(sequence, opcode, session, len(data), asked, complete, offset, data)
+    assert len(message.encode()) == 251
+    assert FtpMessage.decode(message.encode()) == message
+
+
+@given(st.binary(max_size=300))
+def test_any_bytes_are_some_message(payload: bytes) -> None:
+    message = FtpMessage.decode(payload)
+    assert len(message.data) <= 239
+    assert 0 <= message.error_code <= 255
+
+
+@pytest.mark.parametrize("path", ["", "a\0b", "x" * 239, "ä" * 120, "\ud800"])
+def test_paths_that_cannot_be_sent(path: str) -> None:
+    with pytest.raises(LocalProtocolError, match="path"):
+        path_bytes(path)
+
+
+def test_paths_that_can() -> None:
+    assert path_bytes("@PARAM/param.pck?withdefaults=1") == b"@PARAM/param.pck?withdefaults=1"
+    assert len(path_bytes("x" * 238)) == 238
+    assert path_bytes("ä" * 119) == "ä".encode() * 119
+
+
+# -------------------------------------------------------------------------------- the request
+
+
+def test_the_answer_is_the_result_and_measures() -> None:
+    request = make_request()
+    sent = started(request)
+    assert (sent.sequence, sent.opcode, sent.data, sent.size) == (7, Op.OPENFILERO, b"/a", 2)
+    request.receive(as_message(reply_to(sent, b"\x05\0\0\0")), 0.2)
+    assert request.done
+    assert request.result().data == b"\x05\0\0\0"
+    assert request.round_trip.smoothed_s == pytest.approx(0.1 + 0.1 / 8)
+
+
+def test_it_is_sent_again_under_the_same_number_until_patience_ends() -> None:
+    request = make_request(patience_s=3.0)
+    sent, times = started(request), []
+    while not request.done:
+        assert request.deadline is not None
+        times.append(request.deadline)
+        request.expire(request.deadline)
+        assert all(each == sent for each in requests_in(request.take_outbox()))
+    assert times[0] < 0.4
+    assert times[-1] == pytest.approx(3.0)
+    assert len(times) < 12
+    with pytest.raises(FileTimeout, match="open for reading /a: no answer"):
+        request.result()
+    request.expire(4.0)
+    assert request.take_outbox() == []
+
+
+def test_a_refusal_says_what_and_why() -> None:
+    request = make_request()
+    sent = started(request)
+    refusal = reply_to(sent, code=MavFtpErr.FAILERRNO)
+    request.receive(as_message(refusal.replace(size=2, data=bytes([MavFtpErr.FAILERRNO, 28]))), 0.1)
+    with pytest.raises(
+        FileError, match=r"open for reading /a: no space left \(FAILERRNO, ENOSPC\)"
+    ) as raised:
+        request.result()
+    assert (raised.value.path, raised.value.code, raised.value.errno) == ("/a", MavFtpErr.FAILERRNO, 28)
+
+
+@pytest.mark.parametrize("code", [*MavFtpErr, 99])
+def test_every_code_has_its_words(code: int) -> None:
+    request = make_request()
+    request.receive(as_message(reply_to(started(request), code=code)), 0.1)
+    with pytest.raises(FileError, match="/a: "):
+        request.result()
+
+
+def test_what_is_not_ours_is_ignored() -> None:
+    request = make_request()
+    sent = started(request)
+    answer = reply_to(sent)
+    request.receive(as_message(answer.replace(sequence=100)), 0.1)
+    request.receive(FileTransferProtocol(0, 255, 191, answer.encode()), 0.1)
+    request.receive(FileTransferProtocol(0, 254, 190, answer.encode()), 0.1)
+    request.receive(as_message(sent), 0.1)
+    assert not request.done
+    request.receive(FileTransferProtocol(0, 0, 0, answer.encode()), 0.1)
+    assert request.done
+
+
+def test_an_answer_to_an_older_request_of_this_number_gets_a_new_number() -> None:
+    request = make_request()
+    sent = started(request)
+    stale = reply_to(sent).replace(request_opcode=Op.LISTDIRECTORY)
+    for attempt in range(5):
+        request.receive(as_message(stale), 0.1)
+        again = requests_in(request.take_outbox())
+        assert len(again) == (attempt < 3)  # a server that always does that is left alone
+        if again:
+            assert again[0].sequence == sent.sequence + 1
+            sent, stale = again[0], stale.replace(sequence=again[0].sequence + 1)
+    request.receive(as_message(reply_to(sent)), 0.2)
+    assert request.done
+
+
+def test_closing_what_is_closed_is_no_failure() -> None:
+    request = make_request(Op.TERMINATESESSION, session=3)
+    sent = started(request)
+    request.receive(as_message(reply_to(sent, code=MavFtpErr.INVALIDSESSION)), 0.1)
+    assert request.is_answered
+
+
+def test_closing_waits_for_the_end_of_a_burst() -> None:
+    request = make_request(Op.TERMINATESESSION, session=3, patience_s=2.0)
+    sent = started(request)
+    burst = reply_to(sent, b"x").replace(request_opcode=Op.BURSTREADFILE, sequence=500)
+    for tenth in range(1, 100):
+        request.receive(as_message(burst), tenth / 10)
+        assert request.deadline is not None
+        assert request.deadline > tenth / 10 + 0.1
+    assert request.take_outbox() == []
+    request.receive(as_message(reply_to(sent)), 10.0)
+    assert request.is_answered
+
+
+@pytest.mark.parametrize(
+    ("opcode", "code"),
+    [
+        (Op.REMOVEFILE, MavFtpErr.FILENOTFOUND),
+        (Op.REMOVEDIRECTORY, MavFtpErr.FILENOTFOUND),
+        (Op.CREATEDIRECTORY, MavFtpErr.FILEEXISTS),
+    ],
+)
+def test_what_an_earlier_sending_has_done_is_done(opcode: MavFtpOpcode, code: int) -> None:
+    request = make_request(opcode)
+    sent = started(request)
+    request.expire(0.5)
+    request.receive(as_message(reply_to(sent, code=code)), 0.6)
+    assert request.is_answered
+    first = make_request(opcode)
+    first.receive(as_message(reply_to(started(first), code=code)), 0.1)
+    assert not first.is_answered
+
+
+def test_what_was_sent_before_is_not_sent_at_once() -> None:
+    request = FtpRequest(make_client(), Op.TERMINATESESSION, path="/a", is_sent=True)
+    request.start(0.0)
+    assert request.take_outbox() == []
+    assert request.deadline is not None
+    request.expire(request.deadline)
+    assert len(request.take_outbox()) == 1
+
+
+def test_sessions_are_numbered_from_1_to_255() -> None:
+    client = make_client(254)
+    assert [client.next_session() for _ in range(3)] == [255, 1, 2]

@@ -1,0 +1,244 @@
+"""Downloads and uploads over a channel that loses, repeats and reorders, against servers of both kinds."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+import pytest
+from ftp_server import FileServer, as_message, make_client, reply_to, requests_in, run
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from aerokit.errors import FileError, FileTimeout
+from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
+from aerokit.protocols.ftp import DATA_SIZE, FtpSessionLost
+from aerokit.protocols.ftp_transfer import FtpDownload, FtpUpload, is_virtual
+from aerokit.protocols.reassembly import Reassembly
+from aerokit.protocols.round_trip import RoundTrip
+from aerokit.protocols.transfer import Progress
+
+Op = MavFtpOpcode
+SIZES = [0, 1, DATA_SIZE - 1, DATA_SIZE, DATA_SIZE + 1, 2 * DATA_SIZE, 5000, 20 * DATA_SIZE]
+
+
+def content(size: int) -> bytes:
+    return random.Random(size).randbytes(size)
+
+
+class Download:
+    """One, with what it wrote."""
+
+    def __init__(self, size: int | None, *, path: str = "/a", start: int = 0, **options: Any) -> None:
+        self.content = bytearray()
+        self.into = Reassembly(self.content.extend, block_size=DATA_SIZE, start=start)
+        self.exchange = FtpDownload(
+            make_client(), path, self.into, session=1, size=size or 0, round_trip=RoundTrip(0.1), **options
+        )
+
+
+# ---------------------------------------------------------------------------------- downloads
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("exact_end", [False, True])
+@pytest.mark.parametrize("path", ["/a", "@SYS/a"])
+def test_a_file_without_loss(size: int, exact_end: bool, path: str) -> None:
+    download = Download(size, path=path)
+    outcome = run(download.exchange, FileServer(bytearray(content(size)), exact_end=exact_end))
+    assert download.exchange.result() == size
+    assert download.content == content(size)
+    assert outcome.messages == 1
+
+
+def test_the_size_of_a_virtual_file_is_a_guess() -> None:
+    for guess in (10, 1_000_000):
+        download = Download(guess, path="@PARAM/param.pck")
+        run(download.exchange, FileServer(bytearray(content(5000))))
+        assert download.content == content(5000)
+
+
+def test_bursts_follow_each_other() -> None:
+    download = Download(5000)
+    outcome = run(download.exchange, FileServer(bytearray(content(5000)), burst_blocks=6))
+    assert download.content == content(5000)
+    assert outcome.messages == 4
+
+
+def test_a_server_without_bursts_is_read_block_by_block() -> None:
+    for path in ("/a", "@SYS/a"):
+        download = Download(5000, path=path)
+        run(download.exchange, FileServer(bytearray(content(5000)), has_burst=False, queue=None), loss=0.1)
+        assert download.content == content(5000)
+
+
+def test_it_goes_on_where_it_was_left() -> None:
+    download = Download(5000, start=1234)
+    run(download.exchange, FileServer(bytearray(content(5000))), loss=0.1)
+    assert download.content == content(5000)[1234:]
+    assert download.exchange.result() == 5000
+
+
+@given(
+    st.integers(0, 12_000),
+    st.sampled_from([0.0, 0.05, 0.3]),
+    st.sampled_from([0.0, 0.2]),
+    st.sampled_from([0.0, 0.06]),
+    st.sampled_from([5, 30, 500]),
+    st.sampled_from([None, 5]),
+    st.booleans(),
+    st.sampled_from(["/a", "@SYS/a"]),
+    st.integers(0, 2**32),
+)
+@settings(max_examples=60, deadline=None)
+def test_every_file_arrives(
+    size: int,
+    loss: float,
+    duplicates: float,
+    jitter_s: float,
+    burst_blocks: int,
+    queue: int | None,
+    exact_end: bool,
+    path: str,
+    seed: int,
+) -> None:
+    server = FileServer(bytearray(content(size)), burst_blocks, queue, exact_end=exact_end)
+    download = Download(size, path=path)
+    outcome = run(
+        download.exchange,
+        server,
+        loss=loss,
+        duplicates=duplicates,
+        jitter_s=jitter_s,
+        seed=seed,
+        longest_s=120,
+    )
+    assert download.exchange.done
+    assert download.exchange.result() == size
+    assert download.content == content(size)
+    assert outcome.messages <= 40 + 6 * (size // DATA_SIZE + 1)
+
+
+def test_a_hole_is_asked_for_as_soon_as_it_is_seen_and_while_the_burst_goes_on() -> None:
+    download = Download(10_000)
+    exchange = download.exchange
+    exchange.start(0.0)
+    (burst,) = requests_in(exchange.take_outbox())
+    exchange.receive(as_message(reply_to(burst, content(239), offset=0)), 0.1)
+    assert exchange.take_outbox() == []
+    exchange.receive(as_message(reply_to(burst, content(239), offset=7 * 239, ahead=8)), 0.11)
+    reads = requests_in(exchange.take_outbox())
+    assert [(each.opcode, each.offset) for each in reads] == [(Op.READFILE, 239 * n) for n in (1, 2, 3, 4)]
+    sequences = {each.sequence for each in reads}
+    assert not sequences & set(
+        range(burst.sequence, burst.sequence + 500)
+    )  # those may be replies of the burst
+    exchange.receive(as_message(reply_to(reads[0], content(239), offset=239)), 0.2)
+    assert [each.offset for each in requests_in(exchange.take_outbox())] == [239 * 5]
+
+
+def test_blocks_of_another_burst_are_not_taken() -> None:
+    download = Download(10_000)
+    exchange = download.exchange
+    exchange.start(0.0)
+    (burst,) = requests_in(exchange.take_outbox())
+    exchange.receive(as_message(reply_to(burst, b"x" * 239, offset=0, ahead=5)), 0.1)
+    assert not download.content
+    assert download.into.tail == 0
+
+
+def test_it_gives_up_and_says_what_is_missing() -> None:
+    download = Download(1000, patience_s=2.0)
+    exchange = download.exchange
+    exchange.start(0.0)
+    (burst,) = requests_in(exchange.take_outbox())
+    exchange.receive(as_message(reply_to(burst, content(239), offset=0)), 0.1)
+    exchange.receive(as_message(reply_to(burst, content(239), offset=478, ahead=3)), 0.1)
+    messages = len(exchange.take_outbox())
+    while not exchange.done:
+        assert exchange.deadline is not None
+        exchange.expire(exchange.deadline)
+        messages += len(exchange.take_outbox())
+    with pytest.raises(FileTimeout, match="read /a: nothing has come for 2 s") as raised:
+        exchange.result()
+    assert raised.value.missing == ((239, 239), (717, 283))
+    assert messages < 40
+
+
+def test_a_session_that_is_lost_is_told_apart() -> None:
+    download = Download(1000)
+    run(download.exchange, FileServer(bytearray(content(1000)), is_open=False))
+    with pytest.raises(FtpSessionLost):
+        download.exchange.result()
+
+
+def test_a_read_error_ends_it() -> None:
+    download = Download(1000)
+    download.exchange.start(0.0)
+    (burst,) = requests_in(download.exchange.take_outbox())
+    download.exchange.receive(as_message(reply_to(burst, code=MavFtpErr.FAILERRNO)), 0.1)
+    with pytest.raises(FileError, match="burst read /a"):
+        download.exchange.result()
+
+
+def test_progress_is_told() -> None:
+    told: list[Progress] = []
+    download = Download(1000, on_progress=told.append)
+    run(download.exchange, FileServer(bytearray(content(1000))))
+    assert [each.done for each in told] == [239, 478, 717, 956, 1000]
+    assert all(each.total == 1000 for each in told)
+
+
+# ------------------------------------------------------------------------------------ uploads
+
+
+@given(
+    st.integers(0, 12_000),
+    st.sampled_from([0.0, 0.1, 0.3]),
+    st.sampled_from([0.0, 0.2]),
+    st.sampled_from([0.0, 0.06]),
+    st.integers(0, 2**32),
+)
+@settings(max_examples=40, deadline=None)
+def test_every_upload_arrives(size: int, loss: float, duplicates: float, jitter_s: float, seed: int) -> None:
+    server = FileServer(bytearray())
+    upload = FtpUpload(make_client(65530), "/a", content(size), session=1, round_trip=RoundTrip(0.1))
+    outcome = run(
+        upload, server, loss=loss, duplicates=duplicates, jitter_s=jitter_s, seed=seed, longest_s=120
+    )
+    assert upload.done
+    upload.result()
+    assert server.content == content(size)
+    assert outcome.messages <= 40 + 6 * (size // DATA_SIZE + 1)
+
+
+def test_no_more_than_a_queue_holds_is_sent_at_once() -> None:
+    upload = FtpUpload(make_client(), "/a", content(5000), session=1, round_trip=RoundTrip(0.1))
+    upload.start(0.0)
+    writes = requests_in(upload.take_outbox())
+    assert [(each.opcode, each.offset, each.size) for each in writes] == [
+        (Op.WRITEFILE, 239 * n, 239) for n in range(4)
+    ]
+
+
+def test_an_upload_that_is_refused() -> None:
+    for code, kind in ((MavFtpErr.FAIL, FileError), (MavFtpErr.INVALIDSESSION, FtpSessionLost)):
+        upload = FtpUpload(make_client(), "/a", content(500), session=1)
+        upload.start(0.0)
+        first = requests_in(upload.take_outbox())[0]
+        upload.receive(as_message(reply_to(first, code=code)), 0.1)
+        with pytest.raises(kind, match="write /a"):
+            upload.result()
+
+
+def test_an_upload_that_gets_no_answer() -> None:
+    upload = FtpUpload(make_client(), "/a", content(500), session=1, patience_s=1.0)
+    run(upload, FileServer(bytearray()), loss=1.0)
+    with pytest.raises(FileTimeout, match="3 of 3 blocks") as raised:
+        upload.result()
+    assert raised.value.missing == ((0, 239), (239, 239), (478, 22))
+
+
+def test_virtual_files_begin_with_an_at() -> None:
+    assert is_virtual("@PARAM/param.pck")
+    assert not is_virtual("/APM/LOGS")
