@@ -1,8 +1,8 @@
 """pymavlink's side of ``transfers.py``: ``mavparm``-like list and ``mavftp``, ``mavwp`` with an item loop.
 
 What the library leaves to its user is written as MAVProxy has it, only more eager: after half a second of silence all
-missing parameters are asked for, after a second an item is sent or asked for again. ``mavftp`` gets blocks of 239
-bytes; its default is 80.
+missing parameters are asked for, after a second an item is asked for again. ``mavftp`` gets blocks of 239
+bytes; its default is 80. While items are uploaded the vehicle repeats its requests.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from pymavlink import mavftp, mavutil, mavwp
 
 SILENCE_S = 0.5
 RETRY_S = 1.0
+ACCEPTED, INVALID_SEQUENCE = 0, 13
 SETTINGS = [
     ("debug", int, 0),
     ("pkt_loss_tx", int, 0),
@@ -82,24 +83,24 @@ def _mission_upload(master: Any, task: Task) -> None:
     loader = mavwp.MAVWPLoader(master.target_system, master.target_component)
     for number, item in enumerate([mission_items(1)[0], *mission_items(task.size)]):
         loader.add(_wire_item(master, number, item))
-    last = None
-    master.waypoint_count_send(loader.count())
+    end, sent = loader.count(), -1
+    master.waypoint_count_send(end)
     while True:
         message = master.recv_match(
             type=["MISSION_REQUEST", "MISSION_REQUEST_INT", "MISSION_ACK"], blocking=True, timeout=RETRY_S
         )
-        if message is None:
-            if last is None:
-                master.waypoint_count_send(loader.count())
-            else:
-                master.mav.send(loader.wp(last))
-        elif message.get_type() == "MISSION_ACK":
-            if message.type != 0:
-                raise RuntimeError(f"MISSION_ACK {message.type}")
+        if message is None:  # the vehicle repeats its requests by itself
+            if sent < 0:
+                master.waypoint_count_send(end)
+            elif sent == end - 1:
+                master.mav.send(loader.wp(sent))
+        elif message.get_type() != "MISSION_ACK":
+            sent = max(sent, message.seq)
+            master.mav.send(loader.wp(message.seq))
+        elif message.type == ACCEPTED or sent == end - 1:  # else: taken already
             return
-        else:
-            last = message.seq
-            master.mav.send(loader.wp(last))
+        elif message.type != INVALID_SEQUENCE:
+            raise RuntimeError(f"MISSION_ACK {message.type}")
 
 
 def _mission_download(master: Any, task: Task) -> list[Any]:

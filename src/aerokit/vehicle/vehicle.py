@@ -29,6 +29,7 @@ __all__ = ["Vehicle"]
 REQUEST_MESSAGE = 512
 AUTOPILOT_VERSION, HOME_POSITION, GPS_GLOBAL_ORIGIN, AVAILABLE_MODES = 148, 242, 49, 435
 ASK_AGAIN_S = 3.0
+EAGER_REQUESTS, EAGER_S = 4, 0.3
 
 
 class Vehicle(FlightActions):
@@ -86,6 +87,7 @@ class Vehicle(FlightActions):
     async def _learn_constants(self) -> None:
         """Ask for what is not streamed, until it is known; a reboot makes it unknown again."""
         asked_for_modes = False
+        await self._learn_version()
         while self.connection.is_open:
             for message_id, cell in (
                 (AUTOPILOT_VERSION, self.telemetry.version),
@@ -98,10 +100,22 @@ class Vehicle(FlightActions):
                 asked_for_modes = await self._request(AVAILABLE_MODES)
             await anyio.sleep(ASK_AGAIN_S)
 
-    async def _request(self, message_id: int) -> bool:
+    async def _learn_version(self) -> None:
+        """The first transfer waits for what the vehicle can do: ask eagerly, an answer may get lost behind its ack."""
+        version = self.telemetry.version
+        for _ in range(EAGER_REQUESTS):
+            if version.is_known:
+                return
+            await self._request(AUTOPILOT_VERSION, attempt_timeout=EAGER_S)
+            with anyio.move_on_after(EAGER_S):
+                await version.wait_until(lambda _: True)
+
+    async def _request(self, message_id: int, *, attempt_timeout: float = 1.0) -> bool:
         """Ask for one message once; whether there was an answer, also that the vehicle does not have it."""
         try:
-            await self._commands.send_long(REQUEST_MESSAGE, message_id, attempts=2)
+            await self._commands.send_long(
+                REQUEST_MESSAGE, message_id, attempts=2, attempt_timeout=attempt_timeout
+            )
         except CommandTimeout:
             return False
         except CommandRejected:
