@@ -1,4 +1,7 @@
-"""Sessions: tests (each Python that is there), lint, types, docs, bench, badlinks, demo. `nox -l` lists them."""
+"""Sessions: tests (each Python that is there), lint, types, docs, bench, bench_transfers, badlinks, demo.
+
+`nox -l` lists them.
+"""
 
 from __future__ import annotations
 
@@ -54,6 +57,13 @@ def bench(session: nox.Session) -> None:
     """Measure beside pymavlink and MAVSDK, print the table, write bench.json."""
     session.install("-e", ".[fast]", "mavsdk>=4")
     session.run("python", "benchmarks/run.py", *session.posargs)
+
+
+@nox.session
+def bench_transfers(session: nox.Session) -> None:
+    """Measure transfers over bad radios beside pymavlink, MAVSDK and DroneKit; an hour. Writes bench-transfers.json."""
+    session.install("-e", ".", "mavsdk>=4", "dronekit==2.9.2", "future")
+    session.run("python", "benchmarks/transfers.py", *session.posargs)
 
 
 @nox.session

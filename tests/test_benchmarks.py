@@ -65,3 +65,18 @@ def test_rows_can_be_chosen_and_a_wrong_name_is_refused(tmp_path: Path) -> None:
     wrong = run("imports")
     assert wrong.returncode == 2
     assert "decode_skip, decode_typed" in wrong.stderr
+
+
+def test_transfers_are_measured_and_compared_with_what_they_should_be(tmp_path: Path) -> None:
+    path = tmp_path / "bench.json"
+    done = subprocess.run(
+        [sys.executable, "benchmarks/transfers.py", "--quick", "--library", "aerokit", "--library", "pymavlink",
+         "--output", str(path), "mission_download"],
+        cwd=BENCHMARKS.parent, capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "failed" not in done.stdout, done.stderr
+    (row,) = json.loads(path.read_text())
+    assert row["name"] == "transfer_mission_download_loss_0_pymavlink_items"
+    assert row["aerokit"] > 0
+    assert row["peer"] > 0
