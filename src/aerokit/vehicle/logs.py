@@ -12,7 +12,8 @@ import anyio
 from aerokit.errors import AerokitError, FileError, FileTimeout, LocalProtocolError, OperationTimeout
 from aerokit.mavlink.enums import MavFtpErr
 from aerokit.mavlink.messages import LogErase
-from aerokit.protocols.logs import LOG_BLOCK, LogDownload, LogEnd, LogList
+from aerokit.protocols.log_list import LogList
+from aerokit.protocols.logs import LOG_BLOCK, LogDownload, LogEnd
 from aerokit.protocols.reassembly import Reassembly
 from aerokit.protocols.transfer import PATIENCE_S, OnProgress
 from aerokit.snapshot import Snapshot
@@ -202,10 +203,10 @@ class Logs:
     async def _entry(
         self, log: LogEntry | int, patience_s: float, timeout: float | None, *, may_be_silent: bool
     ) -> LogEntry:
-        """The fresh entry of a log."""
-        log_id = log if isinstance(log, int) else log.id
+        """The fresh entry of a log. Asked for one that it has not, ArduPilot lists what it has not without an end."""
+        log_id, only = (log, None) if isinstance(log, int) else (log.id, log.id)
         async with self._operation(f"log {log_id}", timeout, patience_s):
-            entries = await self._entries(patience_s, log_id, SILENT_REQUESTS if may_be_silent else None)
+            entries = await self._entries(patience_s, only, SILENT_REQUESTS if may_be_silent else None)
         for entry in entries:
             if entry.id == log_id:
                 if isinstance(log, LogEntry) and _is_other(log, entry):

@@ -1,0 +1,263 @@
+"""Flight logs by LOG_* messages, from a vehicle that serves one request at a time or the latest one, over bad links."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import dataclass
+from heapq import heappop, heappush
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from aerokit.errors import FileTimeout, RemoteProtocolError
+from aerokit.mavlink.message import Message
+from aerokit.mavlink.messages import LogData, LogEntry, LogRequestData, LogRequestEnd, LogRequestList
+from aerokit.protocols.exchange import Exchange
+from aerokit.protocols.log_list import LogList
+from aerokit.protocols.logs import LOG_BLOCK, LogDownload, LogEnd
+from aerokit.protocols.reassembly import Reassembly
+from aerokit.protocols.round_trip import RoundTrip
+
+DELAY_S, INTERVAL_S = 0.05, 0.002
+
+
+def content(size: int) -> bytes:
+    return random.Random(size).randbytes(size)
+
+
+@dataclass
+class LogVehicle:
+    """Logs with ids from ``first_id`` on. ``latest_wins``: a request replaces the one under way, else it is ignored."""
+
+    logs: list[bytes]
+    first_id: int = 1
+    latest_wins: bool = False
+
+    def __post_init__(self) -> None:
+        self.queue: list[Message] = []
+
+    def receive(self, request: Message) -> None:
+        if isinstance(request, LogRequestEnd):
+            self.queue.clear()
+        elif self.latest_wins or not self.queue:
+            if isinstance(request, LogRequestList):
+                self.queue = self._entries(request)
+            elif isinstance(request, LogRequestData):
+                self.queue = self._blocks(request)
+
+    def _entries(self, request: LogRequestList) -> list[Message]:
+        count, last = len(self.logs), self.first_id + len(self.logs) - 1
+        if not self.logs:
+            return [LogEntry(0, 0, 0, 0, 0)]
+        first = max(request.start, self.first_id)
+        return [
+            LogEntry(number, count, last, 1000 + number, len(self.logs[number - self.first_id]))
+            for number in range(first, min(request.end, last) + 1)
+        ]
+
+    def _blocks(self, request: LogRequestData) -> list[Message]:
+        log = self.logs[request.id - self.first_id][: request.ofs + request.count]
+        blocks = []
+        for offset in range(request.ofs, len(log), LOG_BLOCK):
+            data = log[offset : offset + LOG_BLOCK]
+            blocks.append(LogData(request.id, offset, len(data), data.ljust(LOG_BLOCK, b"\0")))
+        return list(blocks)
+
+
+def run(
+    exchange: Exchange[Any],
+    vehicle: LogVehicle,
+    *,
+    loss: float = 0.0,
+    seed: int = 0,
+    longest_s: float = 300.0,
+) -> int:
+    """Let them talk until it is done; how many messages were sent."""
+    chance = random.Random(seed)
+    air: list[tuple[float, int, bool, Message]] = []
+    now = next_at = 0.0
+    sent = number = 0
+    exchange.start(now)
+    while True:
+        for message in exchange.take_outbox():
+            sent += 1
+            number += 1
+            if chance.random() >= loss:
+                heappush(air, (now + DELAY_S, number, True, message))
+        if exchange.done or now > longest_s:
+            return sent
+        dues = [
+            *([air[0][0]] if air else []),
+            *([max(next_at, now)] if vehicle.queue else []),
+            *([] if exchange.deadline is None else [exchange.deadline]),
+        ]
+        now = max(now, min(dues))
+        if air and air[0][0] <= now:
+            _, _, up, message = heappop(air)
+            if up:
+                vehicle.receive(message)
+            else:
+                exchange.receive(message, now)
+        elif vehicle.queue and next_at <= now:
+            next_at, number = now + INTERVAL_S, number + 1
+            message = vehicle.queue.pop(0)
+            if chance.random() >= loss:
+                heappush(air, (now + DELAY_S, number, False, message))
+        else:
+            exchange.expire(now)
+
+
+def make_list(first_id: int = 1, **options: Any) -> LogList:
+    return LogList(1, 1, first_id=first_id, round_trip=RoundTrip(0.1), **options)
+
+
+def make_download(
+    size: int, log_id: int = 1, *, start: int = 0, **options: Any
+) -> tuple[LogDownload, bytearray]:
+    written = bytearray()
+    into = Reassembly(written.extend, block_size=LOG_BLOCK, start=start)
+    return LogDownload(1, 1, log_id, size, into, round_trip=RoundTrip(0.1), **options), written
+
+
+# -------------------------------------------------------------------------------------- lists
+
+
+@given(
+    st.integers(1, 60),
+    st.sampled_from([0, 1]),
+    st.booleans(),
+    st.sampled_from([0.0, 0.1, 0.3]),
+    st.integers(0, 99),
+)
+@settings(max_examples=40, deadline=None)
+def test_every_entry_arrives(count: int, first_id: int, latest_wins: bool, loss: float, seed: int) -> None:
+    vehicle = LogVehicle([content(number) for number in range(count)], first_id, latest_wins)
+    exchange = make_list(first_id)
+    sent = run(exchange, vehicle, loss=loss, seed=seed)
+    entries = exchange.result()
+    assert [each.id for each in entries] == list(range(first_id, first_id + count))
+    assert [each.size for each in entries] == list(range(count))
+    assert sent < 100
+
+
+def test_a_vehicle_without_logs() -> None:
+    exchange = make_list()
+    run(exchange, LogVehicle([]))
+    assert exchange.result() == ()
+
+
+def test_one_entry_only() -> None:
+    exchange = make_list(start=2, end=2)
+    run(exchange, LogVehicle([content(5), content(6), content(7)]))
+    assert [each.size for each in exchange.result()] == [6]
+
+
+def test_a_list_that_does_not_come() -> None:
+    exchange = make_list(patience_s=3.0)
+    assert run(exchange, LogVehicle([b"a"]), loss=1.0) < 20
+    with pytest.raises(FileTimeout, match="does not answer"):
+        exchange.result()
+    exchange = make_list(most_unanswered=4)
+    assert run(exchange, LogVehicle([b"a"]), loss=1.0) == 5
+
+
+def test_entries_that_do_not_come_are_named() -> None:
+    exchange = make_list(patience_s=1.0)
+    exchange.start(0.0)
+    exchange.receive(LogEntry(2, 4, 4, 0, 7), 0.1)
+    while not exchange.done:
+        assert exchange.deadline is not None
+        exchange.expire(exchange.deadline)
+    with pytest.raises(FileTimeout, match="entries of 1, 3, 4") as raised:
+        exchange.result()
+    assert raised.value.missing == ((1, 1), (3, 1), (4, 1))
+    assert isinstance(exchange.take_outbox()[-1], LogRequestEnd)
+
+
+# ----------------------------------------------------------------------------------- downloads
+
+
+@pytest.mark.parametrize("size", [1, 89, 90, 91, 180, 5000, 512 * LOG_BLOCK + 1])
+@pytest.mark.parametrize("latest_wins", [False, True])
+def test_a_log_without_loss(size: int, latest_wins: bool) -> None:
+    exchange, written = make_download(size)
+    sent = run(exchange, LogVehicle([content(size)], latest_wins=latest_wins))
+    assert exchange.result() == size
+    assert written == content(size)
+    assert sent <= 3
+
+
+def test_an_empty_log_needs_no_messages_but_the_end() -> None:
+    exchange, written = make_download(0)
+    assert run(exchange, LogVehicle([b""])) == 1
+    assert written == b""
+
+
+@given(st.integers(1, 90_000), st.booleans(), st.sampled_from([0.0, 0.05, 0.3]), st.integers(0, 99))
+@settings(max_examples=25, deadline=None)
+def test_every_log_arrives(size: int, latest_wins: bool, loss: float, seed: int) -> None:
+    exchange, written = make_download(size)
+    sent = run(exchange, LogVehicle([content(size)], latest_wins=latest_wins), loss=loss, seed=seed)
+    assert exchange.done
+    assert exchange.result() == size
+    assert written == content(size)
+    assert sent < 60 + 30 * (size // LOG_BLOCK + 1) * loss + size / 4000
+
+
+def test_it_goes_on_where_it_was_left() -> None:
+    exchange, written = make_download(5000, start=1234)
+    run(exchange, LogVehicle([content(5000)]), loss=0.1)
+    assert written == content(5000)[1234:]
+
+
+def test_it_gives_up_and_tells_the_vehicle() -> None:
+    exchange, _ = make_download(1000, patience_s=2.0)
+    exchange.start(0.0)
+    exchange.receive(LogData(1, 0, 90, bytes(90)), 0.1)
+    exchange.receive(LogData(1, 180, 90, bytes(90)), 0.1)
+    exchange.receive(LogData(2, 270, 90, bytes(90)), 0.1)  # of another log
+    messages = exchange.take_outbox()
+    while not exchange.done:
+        assert exchange.deadline is not None
+        exchange.expire(exchange.deadline)
+        messages += exchange.take_outbox()
+    with pytest.raises(FileTimeout, match="log 1: nothing has come for 2 s") as raised:
+        exchange.result()
+    assert raised.value.missing == ((90, 90), (270, 730))
+    assert isinstance(messages[-1], LogRequestEnd)
+    assert len(messages) < 40
+
+
+def test_a_log_that_ends_before_its_end() -> None:
+    vehicle = LogVehicle([content(500)])
+    exchange, _ = make_download(1000)
+    exchange.start(0.0)
+    for _ in range(3):
+        exchange.receive(LogData(1, 450, 50, bytes(90)), 0.1)
+    with pytest.raises(RemoteProtocolError, match="ends after 500 bytes"):
+        exchange.result()
+    assert isinstance(exchange.take_outbox()[-1], LogRequestEnd)
+    assert vehicle.queue == []
+
+
+# ---------------------------------------------------------------------------------------- end
+
+
+def test_the_end_is_repeated_while_the_vehicle_goes_on() -> None:
+    exchange = LogEnd(1, 1, round_trip=RoundTrip(0.1))
+    exchange.start(0.0)
+    assert len(exchange.take_outbox()) == 1
+    exchange.receive(LogData(1, 0, 90, bytes(90)), 0.1)
+    exchange.expire(exchange.deadline or 0.0)
+    assert len(exchange.take_outbox()) == 1
+    exchange.expire(exchange.deadline or 0.0)
+    assert exchange.done
+    assert exchange.take_outbox() == []
+
+
+def test_an_end_that_was_sent_is_not_sent_again() -> None:
+    exchange = LogEnd(1, 1, is_sent=True)
+    exchange.start(0.0)
+    assert exchange.take_outbox() == []

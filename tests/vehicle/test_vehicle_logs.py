@@ -1,0 +1,224 @@
+"""Flight logs on both autopilots: by MAVFTP and by LOG_*, every kind of end, and nothing left sending."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import anyio
+import pytest
+from flight_harness import open_flight, open_px4
+
+import aerokit
+from aerokit import messages as m
+from aerokit.errors import FileError, FileTimeout, LocalProtocolError
+from aerokit.links import FaultModel, FaultyLink
+from aerokit.protocols.transfer import Progress
+from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
+from aerokit.testing import run_virtual
+from aerokit.vehicle.files import FileEntry
+from aerokit.vehicle.log_paths import log_path
+from aerokit.vehicle.logs import LogEntry
+
+pytestmark = pytest.mark.anyio
+
+
+class Bench:
+    """A simulated vehicle with flight logs, and a program on it."""
+
+    def __init__(self, simulated: Any, vehicle: aerokit.Vehicle, wire: Any) -> None:
+        self.simulated, self.vehicle, self.wire = simulated, vehicle, wire
+        self.logs = vehicle.logs
+        self.server = simulated.storage.logs
+
+    def content(self, number: int) -> bytes:
+        return bytes(self.server.logs[number].make())
+
+    def sent(self) -> int:
+        kinds = (m.LogRequestList, m.LogRequestData, m.LogRequestEnd, m.LogErase, m.FileTransferProtocol)
+        return sum(len(self.wire.all(kind)) for kind in kinds)
+
+    async def all_quiet(self) -> None:
+        for _ in range(100):
+            if not self.server.is_busy and not self.simulated.ftp.open_sessions:
+                return
+            await anyio.sleep(0.05)
+        raise AssertionError("the vehicle is still sending")
+
+
+@asynccontextmanager
+async def open_bench(kind: str) -> AsyncIterator[Bench]:
+    if kind == "ardupilot":
+        async with open_flight(latency_s=0.02, rates={}) as flight:
+            await flight.vehicle.version.wait_until(lambda _: True)
+            yield Bench(flight.copter, flight.vehicle, flight.wire)
+    else:
+        async with open_px4(rates={}) as flight_px4:
+            await flight_px4.vehicle.version.wait_until(lambda _: True)
+            yield Bench(flight_px4.px4, flight_px4.vehicle, flight_px4.wire)
+
+
+@pytest.fixture(params=["ardupilot", "px4"])
+async def bench(request: pytest.FixtureRequest) -> AsyncIterator[Bench]:
+    async with open_bench(request.param) as bench:
+        yield bench
+
+
+@pytest.fixture
+async def ardupilot() -> AsyncIterator[Bench]:
+    async with open_bench("ardupilot") as bench:
+        yield bench
+
+
+async def test_logs_are_listed(bench: Bench) -> None:
+    entries = await bench.logs.list()
+    assert [each.size for each in entries] == [each.size for each in bench.server.logs]
+    assert entries[0].id == bench.vehicle.autopilot.first_log_id
+    assert entries[0].time_utc == datetime.fromtimestamp(bench.server.logs[0].time_utc, tz=timezone.utc)
+
+
+async def test_logs_are_read_by_either_way(bench: Bench) -> None:
+    for number, entry in enumerate(await bench.logs.list()):
+        for method in ("auto", "log"):
+            assert await bench.logs.read(entry, method=method) == bench.content(number)
+        assert await bench.logs.read(entry.id) == bench.content(number)
+    await bench.all_quiet()
+
+
+async def test_logs_are_read_by_mavftp(ardupilot: Bench) -> None:
+    entries = await ardupilot.logs.list()
+    ardupilot.wire.forget()
+    assert await ardupilot.logs.read(entries[0], method="ftp") == ardupilot.content(0)
+    assert not ardupilot.wire.all(m.LogRequestData)
+
+
+async def test_in_flight_only_mavftp_reads_them(ardupilot: Bench) -> None:
+    """ArduPilot ignores LOG_* messages while it is armed."""
+    entries = await ardupilot.logs.list()
+    await ardupilot.vehicle.wait_ready()
+    await ardupilot.vehicle.arm()
+    assert await ardupilot.logs.read(entries[0]) == ardupilot.content(0)
+    with pytest.raises(FileTimeout, match="does not answer"):
+        await ardupilot.logs.list(patience_s=2.0)
+
+
+async def test_downloads_go_on_where_they_were_left(bench: Bench, tmp_path: Path) -> None:
+    entry, to = (await bench.logs.list())[0], tmp_path / "flight.bin"
+
+    def stop(progress: Progress) -> None:
+        assert progress.total == entry.size
+        if progress.done > 20_000:
+            scope.cancel()
+
+    with anyio.CancelScope() as scope:
+        await bench.logs.download(entry, to, method="log", on_progress=stop)
+    await bench.all_quiet()
+    (part,) = names_in(tmp_path)
+    assert part.startswith("flight.bin.log")
+    told: list[Progress] = []
+    await bench.logs.download(entry, to, method="log", on_progress=told.append)
+    assert told[0].done > 20_000
+    assert to.read_bytes() == bench.content(0)
+    assert names_in(tmp_path) == ["flight.bin"]
+
+
+async def test_downloads_by_mavftp(ardupilot: Bench, tmp_path: Path) -> None:
+    entry = (await ardupilot.logs.list())[1]
+    await ardupilot.logs.download(entry, tmp_path / "b.bin", method="ftp")
+    assert (tmp_path / "b.bin").read_bytes() == ardupilot.content(1)
+
+
+async def test_a_log_that_is_not_there(bench: Bench) -> None:
+    with pytest.raises(FileError, match="log 77: there is no such log"):
+        await bench.logs.read(77)
+    entry = (await bench.logs.list())[0]
+    larger = entry.replace(size=entry.size + 1)
+    with pytest.raises(FileError, match="list them again"):
+        await bench.logs.read(larger)
+
+
+async def test_arguments_that_cannot_be(bench: Bench) -> None:
+    bench.wire.forget()
+    logs: Any = bench.logs
+    for log in (-1, 65536, "1"):
+        with pytest.raises(LocalProtocolError, match="log"):
+            await logs.read(log)
+    with pytest.raises(LocalProtocolError, match="method"):
+        await logs.download(1, "to", method="carrier pigeon")
+    with pytest.raises(LocalProtocolError, match="timeout"):
+        await logs.list(timeout=-1.0)
+    assert bench.sent() == 0
+
+
+async def test_erased_logs_are_gone(bench: Bench) -> None:
+    await bench.logs.erase()
+    assert await bench.logs.list() == ()
+
+
+async def test_cancelled_at_any_moment_nothing_goes_on(bench: Bench) -> None:
+    entry = (await bench.logs.list())[0]
+    for milliseconds in range(0, 300, 37):
+        with anyio.move_on_after(milliseconds / 1000):
+            await bench.logs.read(entry, method="log")
+        await bench.all_quiet()
+    assert await bench.logs.read(entry, method="log") == bench.content(0)
+
+
+async def test_a_time_limit_for_all_of_it(bench: Bench) -> None:
+    entry = (await bench.logs.list())[0]
+    with pytest.raises(FileTimeout, match=r"not done within 0\.1 s") as raised:
+        await bench.logs.read(entry, method="log", timeout=0.1)
+    assert raised.value.missing
+    await bench.all_quiet()
+
+
+async def test_which_file_is_which_log() -> None:
+    class Listing:
+        """The files of a PX4 that has written its list."""
+
+        async def list(self, path: str, *, patience_s: float) -> tuple[FileEntry, ...]:
+            if path != "/fs/microsd/log":
+                raise FileError("no", path=path, code=10)
+            return (FileEntry("2026-11-21", None, True),)
+
+        async def read(self, path: str, *, patience_s: float) -> bytes:
+            assert path == "/fs/microsd/logdata.txt"
+            return b"1795 10 /fs/microsd/log/2026-11-21/a.ulg\n1796 20 /fs/microsd/log/2026-11-21/b.ulg\n"
+
+    files: Any = Listing()
+    directories = ("/nowhere", "/fs/microsd/log")
+    found = await log_path(files, directories, LogEntry(1, 20, None), 1.0)
+    assert found == "/fs/microsd/log/2026-11-21/b.ulg"
+    assert await log_path(files, directories, LogEntry(0, 20, None), 1.0) is None
+    assert await log_path(files, directories, LogEntry(2, 20, None), 1.0) is None
+
+
+def names_in(directory: Path) -> list[str]:
+    return sorted(each.name for each in directory.iterdir())
+
+
+@pytest.mark.parametrize("make", [SimulatedCopter, SimulatedPx4])
+@pytest.mark.parametrize("loss", [0.05, 0.3])
+@pytest.mark.parametrize("seed", range(2))
+def test_over_a_bad_radio(make: Any, loss: float, seed: int) -> None:
+    async def main() -> None:
+        simulated = make(boot_time_s=0.0)
+        async with simulated_link(simulated) as link:
+            radio = FaultyLink(link, FaultModel(delay_s=0.05), seed=random.Random(seed).randrange(1000))
+            async with aerokit.connect(radio, rates={}) as vehicle:
+                await vehicle.version.wait_until(lambda _: True)
+                model = FaultModel(delay_s=0.05, loss=loss, duplication=0.1, jitter_s=0.02)
+                radio.outgoing.model = radio.incoming.model = model
+                logs = simulated.storage.logs
+                entries = await vehicle.logs.list()
+                assert [each.size for each in entries] == [each.size for each in logs.logs]
+                assert await vehicle.logs.read(entries[-1], method="log") == logs.logs[-1].make()
+                radio.outgoing.model = radio.incoming.model = FaultModel(delay_s=0.05)
+                await anyio.sleep(5.0)
+                assert not logs.is_busy
+
+    run_virtual(main())
