@@ -23,6 +23,7 @@ from aerokit.missions.rally import RallyPoints
 from aerokit.missions.text_files import read_text
 from aerokit.missions.wire import in_degrees
 from aerokit.position import Position
+from aerokit.whole_file import write_whole
 
 if TYPE_CHECKING:
     import os
@@ -48,7 +49,7 @@ def read_plan_file(path: str | os.PathLike[str]) -> Plan:
 
 def write_plan_file(path: str | os.PathLike[str], plan: Plan) -> None:
     """Write the plan to a file; see :func:`format_plan`."""
-    Path(path).write_text(format_plan(plan), encoding="utf-8")
+    write_whole(path, format_plan(plan))
 
 
 def parse_plan(text: str, name: str = "plan") -> Plan:

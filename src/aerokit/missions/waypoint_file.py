@@ -21,6 +21,7 @@ from aerokit.missions.mission import Mission
 from aerokit.missions.text_files import read_text
 from aerokit.missions.wire import from_degrees, in_degrees, shift_jumps
 from aerokit.position import Position
+from aerokit.whole_file import write_whole
 
 if TYPE_CHECKING:
     import os
@@ -54,7 +55,7 @@ def read_waypoint_file(path: str | os.PathLike[str]) -> Mission:
 
 def write_waypoint_file(path: str | os.PathLike[str], mission: Mission, *, version: int = 110) -> None:
     """Write the mission to a file; see :func:`format_waypoints`."""
-    Path(path).write_text(format_waypoints(mission, version=version), encoding="utf-8", newline="\n")
+    write_whole(path, format_waypoints(mission, version=version))
 
 
 def parse_waypoints(text: str, name: str = "waypoints") -> Mission:

@@ -18,6 +18,7 @@ from aerokit.parameters.differences import ParameterValues, plain_values
 from aerokit.parameters.number_text import number_text, parse_number
 from aerokit.parameters.parameter import Parameter, ParameterType, check_name, checked_value
 from aerokit.parameters.table import ParameterTable
+from aerokit.whole_file import write_whole
 
 __all__ = [
     "FileFormat",
@@ -124,13 +125,7 @@ def write_parameter_file(
     text = parameter_file_text(
         values, format, comments=comments, system_id=system_id, component_id=component_id
     )
-    target = Path(path)
-    part = target.with_name(target.name + ".part")
-    try:
-        part.write_text(text, encoding="utf-8", newline="\n")
-        part.replace(target)
-    finally:
-        part.unlink(missing_ok=True)
+    write_whole(path, text)
 
 
 def parameter_file_text(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 from aerokit.errors import LocalProtocolError
 
 __all__ = ["check_range", "check_seconds"]
@@ -24,6 +22,6 @@ def check_seconds(name: str, value: float | None, *, none_is_allowed: bool = Fal
     """Raise LocalProtocolError unless ``value`` is a number of seconds above 0, inf allowed."""
     if value is None and none_is_allowed:
         return
-    if value is None or math.isnan(value) or value <= 0:
+    if not isinstance(value, (int, float)) or not value > 0:
         allowed = "above 0, or None" if none_is_allowed else "above 0"
         raise LocalProtocolError(f"{name} = {value!r} is not allowed: seconds {allowed}")

@@ -49,7 +49,7 @@ class ParameterCache:
             if (content["format"], content["vehicle"], content["hash"]) != (FORMAT, vehicle, hash_):
                 return None
             return ParameterTable(_parameter(row, i) for i, row in enumerate(content["parameters"]))
-        except (OSError, ValueError, KeyError, TypeError):
+        except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
             return None
 
     def save(self, vehicle: str, hash_: int, table: ParameterTable) -> None:

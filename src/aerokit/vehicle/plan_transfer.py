@@ -179,7 +179,9 @@ class PlanTransfer(Generic[PlanT]):
         if autopilot.tells_mission_checksum:
             told = self._context.id_of(self._type, self._memory.learned_at)
             checksum = mission_checksum(items)
-            if told == checksum and await self._context.is_called(self._type, checksum):  # still, not a moment ago
+            if told == checksum and await self._context.is_called(
+                self._type, checksum
+            ):  # still, not a moment ago
                 return True
         if not autopilot.writes_partial_missions or not self._is_short(self._changes(items), len(items)):
             return False
@@ -243,7 +245,7 @@ class PlanTransfer(Generic[PlanT]):
     def _compare(self, wanted: dict[int, MissionItem], found: dict[int, MissionItem]) -> None:
         differences = []
         if len(wanted) != len(found):
-            counts = (len(found) - self._offset, len(wanted) - self._offset)
+            counts = (max(0, len(found) - self._offset), len(wanted) - self._offset)
             differences = ["there are {} items instead of {}".format(*counts)]
         for seq in sorted(wanted.keys() & found.keys()):
             if seq >= self._offset:
