@@ -138,7 +138,7 @@ class ParameterList(Transfer[ParameterTable]):
             self._take_streamed(index, now)
         else:
             self._window.answered(index, now)
-        if self._is_streaming:
+        if self._is_streaming and (is_streamed or not self._is_near_end):
             self._quiet_at = now + self._quiet_s()
         is_new = index not in self._slots
         parameter = parameter_of(message, self._bytewise)
@@ -216,8 +216,11 @@ class ParameterList(Transfer[ParameterTable]):
         seconds = max(self.round_trip.timeout_s(), PAUSES * self._pause_s)
         if self._streamed < BEGUN:  # perhaps only the answer to what was asked beside
             return max(seconds, SHORTEST_START_S)
-        is_near_end = self._count is not None and self._count - self._next <= NEAR_END
-        return seconds if is_near_end else max(seconds, LONGEST_TICK_S)
+        return seconds if self._is_near_end else max(seconds, LONGEST_TICK_S)
+
+    @property
+    def _is_near_end(self) -> bool:
+        return self._count is not None and self._count - self._next <= NEAR_END
 
     def _step(self, now: float) -> None:
         """End when all is there, else send what is due."""

@@ -30,11 +30,12 @@ OVERTAKEN = 3
 
 
 class _Asked:
-    __slots__ = ("attempts", "due_at", "first_at", "first_order", "order", "sent_at")
+    __slots__ = ("attempts", "due_at", "first_at", "first_order", "order", "sent_at", "was_doubled")
 
     def __init__(self, now: float, order: int) -> None:
         self.first_at = self.sent_at = self.due_at = now
         self.first_order = self.order = order
+        self.was_doubled = False
         self.attempts = 0
 
 
@@ -103,7 +104,7 @@ class RequestWindow(Generic[KeyT]):
             return []
         if asked.attempts == 1:
             self._measured(now - asked.first_at)
-        else:
+        elif not asked.was_doubled:
             self._ambiguous[key] = now - asked.first_at
         lost = []
         for other, each in self._under_way.items():
@@ -126,7 +127,10 @@ class RequestWindow(Generic[KeyT]):
             self._send(key, now)
             due.append(key)
         if self._doubles_last and len(self._under_way) <= FEW and not self._waiting:
-            due += [key for key in due if self._asked[key].attempts >= UNLUCKY]
+            unlucky = [key for key in due if self._asked[key].attempts >= UNLUCKY]
+            for key in unlucky:
+                self._asked[key].was_doubled = True
+            due += unlucky
         return due
 
     def _note_silence(self, now: float) -> None:

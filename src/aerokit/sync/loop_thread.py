@@ -43,7 +43,7 @@ class LoopThread:
         self._stopping: asyncio.Task[None] | None = None
         atexit.register(self.close)
 
-    def run(self, function: Callable[P, Awaitable[T]], *args: P.args, **kwargs: P.kwargs) -> T:
+    def run(self, function: Callable[P, Awaitable[T]], /, *args: P.args, **kwargs: P.kwargs) -> T:
         """Await ``function(*args, **kwargs)`` on the loop and return its result or raise its exception, as it is.
 
         Ctrl-C cancels it there, waits until it has cleaned up, and goes on as KeyboardInterrupt.
@@ -54,7 +54,7 @@ class LoopThread:
         """
         return self._run(INTERRUPTED_CALL_ENDS_S, function, *args, **kwargs)
 
-    def run_to_its_end(self, function: Callable[P, Awaitable[T]], *args: P.args, **kwargs: P.kwargs) -> T:
+    def run_to_its_end(self, function: Callable[P, Awaitable[T]], /, *args: P.args, **kwargs: P.kwargs) -> T:
         """As :meth:`run`, for what leaves something undone when it is cut short, and is bounded by itself.
 
         Ctrl-C waits for it, and goes on as KeyboardInterrupt afterwards; a second one does not wait.
@@ -65,6 +65,7 @@ class LoopThread:
         self,
         patience_s: float | None,
         function: Callable[P, Awaitable[T]],
+        /,  # the function may have arguments of these names
         *args: P.args,
         **kwargs: P.kwargs,
     ) -> T:
@@ -91,7 +92,7 @@ class LoopThread:
         except concurrent.futures.CancelledError:
             raise ConnectionClosed("the connection was closed while this call waited") from None
 
-    def call(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+    def call(self, function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:
         """Call a function that does not wait on the loop's thread; else as :meth:`run`."""
 
         async def call() -> T:

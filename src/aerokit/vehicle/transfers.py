@@ -27,6 +27,7 @@ __all__ = ["Transfers"]
 ResultT = TypeVar("ResultT")
 
 VERSION_TIMEOUT_S = 3.0
+IN_BACKGROUND_S = 5.0
 
 
 class Transfers:
@@ -105,7 +106,7 @@ class Transfers:
 
         async def order() -> None:
             if send is not None:
-                with suppress(AerokitError):
+                with suppress(AerokitError), anyio.move_on_after(IN_BACKGROUND_S):
                     await send(command, *params)
 
         if not self.is_closed:
