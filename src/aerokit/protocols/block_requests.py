@@ -15,6 +15,8 @@ AT_ONCE = 4
 """ArduPilot keeps five requests waiting, drops what comes beside, and looks at them every 2 ms."""
 SPACING_S = 0.002
 """Between further ones."""
+SOON = 0.5
+"""An answer that comes within this part of a round trip was to an earlier sending."""
 STEADY = 3
 """So often in a row an answer may be overdue before requests come more rarely: radios lose single frames."""
 
@@ -58,12 +60,11 @@ class AdaptiveWindow:
 
 
 class _Block:
-    __slots__ = ("attempts", "is_clean", "order", "sent_at")
+    __slots__ = ("attempts", "first_at", "order", "sent_at")
 
     def __init__(self) -> None:
         self.attempts = self.order = 0
-        self.sent_at = 0.0
-        self.is_clean = True
+        self.first_at = self.sent_at = 0.0
 
 
 class BlockRequests:
@@ -122,19 +123,29 @@ class BlockRequests:
         """The server has something else to do: nothing is overdue, and no answer measures."""
         self._busy_at = until
 
-    def answered(self, offset: int, now: float) -> None:
-        """Its answer has come."""
+    def answered(self, offset: int, now: float, *, sent_at: float | None = None) -> None:
+        """Its answer has come; ``sent_at``: to the request that was sent then, None when that is not known."""
         block = self._blocks.get(offset)
         self.forget(offset)
-        self._silent = 0
         if block is None:
             return
-        is_clean = block.attempts == 1 and block.sent_at > self._busy_at
-        if is_clean:
-            self._round_trip.measured(now - block.sent_at)
-        self.window.answered(now - block.sent_at if is_clean else None)
+        if sent_at is None:
+            sent_at = self._answered_sending(block, now)
+        self._silent = 0
+        if sent_at is None or sent_at <= self._busy_at:
+            self.window.answered(None)
+            return
+        self._round_trip.measured(now - sent_at)
+        self.window.answered(now - sent_at)
         if block.attempts == 1:
             self._give_up_overtaken(block.order)
+
+    def _answered_sending(self, block: _Block, now: float) -> float | None:
+        """When that was sent which was answered, as far as it can be told."""
+        if block.attempts == 1:
+            return block.sent_at
+        soon_s = SOON * (self._round_trip.smoothed_s or 0.0)
+        return block.first_at if now - block.sent_at < soon_s else None
 
     def take_due(self, now: float, *, limit: int | None = None) -> list[int]:
         """The offsets to be sent now, first those to be sent again; they count as sent. ``limit``: of the window."""
@@ -168,6 +179,8 @@ class BlockRequests:
         self._orders += 1
         block = self._blocks.setdefault(offset, _Block())
         block.attempts += 1
+        if block.attempts == 1:
+            block.first_at = now
         block.order, block.sent_at = self._orders, now
         self._under_way[offset] = block
 

@@ -44,9 +44,17 @@ def is_virtual(path: str) -> bool:
     return path.startswith("@")
 
 
+class _Sent(NamedTuple):
+    """A request for one block: every sending has its own number, so that its answer measures."""
+
+    offset: int
+    at: float
+
+
 class _Burst(NamedTuple):
     sequence: int
     offset: int
+    sent_at: float
 
     def blocks_before(self, reply: FtpMessage) -> int:
         """How many blocks were sent before this reply to it."""
@@ -93,8 +101,8 @@ class FtpDownload(FtpExchange[int]):
         self._size = None if is_virtual(path) or size == 0 else size
         self._seen = into.position
         self._requests = BlockRequests(self.round_trip)
-        self._reads: dict[int, int] = {}
-        """Sequence numbers of reads, and the offsets of their blocks."""
+        self._reads: dict[int, _Sent] = {}
+        """By their sequence numbers."""
         self._bursts: list[_Burst] = []
         self._is_bursting = False
         self._burst_fails = 0
@@ -126,9 +134,9 @@ class FtpDownload(FtpExchange[int]):
         if reply.request_opcode == MavFtpOpcode.BURSTREADFILE:
             self._receive_burst(reply, now)
         elif reply.request_opcode == MavFtpOpcode.READFILE:
-            offset = self._reads.pop((reply.sequence - 1) % SEQUENCES, None)
-            if offset is not None:
-                self._receive_read(offset, reply, now)
+            sent = self._reads.pop((reply.sequence - 1) % SEQUENCES, None)
+            if sent is not None:
+                self._receive_read(sent, reply, now)
         if not self.done:
             self._go_on(now)
 
@@ -147,18 +155,18 @@ class FtpDownload(FtpExchange[int]):
             return
         is_latest = burst is self._bursts[-1]
         if is_latest:
-            self._note_time(burst.blocks_before(reply), now)
+            self._note_time(burst, burst.blocks_before(reply), now)
         self._burst_at, self._burst_fails = now, 0
         self._requests.busy(now + BUSY_BLOCKS * (self._interval.smoothed_s or 0.0))
         if is_latest and reply.burst_complete:
             self._is_bursting = False
         self._add(reply.offset, reply.data, now)
 
-    def _note_time(self, number: int, now: float) -> None:
+    def _note_time(self, burst: _Burst, number: int, now: float) -> None:
         """How long answers take, and how fast the blocks follow each other."""
         before_at, before = self._last_block
-        if before < 0 and number == 0 and self._burst_fails == 0:
-            self.round_trip.measured(now - before_at)
+        if before < 0 and number == 0:
+            self.round_trip.measured(now - burst.sent_at)
         elif 0 <= before < number:
             self._interval.measured((now - before_at) / (number - before))
         self._last_block = (now, max(number, before))
@@ -174,8 +182,9 @@ class FtpDownload(FtpExchange[int]):
         elif is_latest:
             self._fail(self._refused(reply))
 
-    def _receive_read(self, offset: int, reply: FtpMessage, now: float) -> None:
-        self._requests.answered(offset, now)
+    def _receive_read(self, sent: _Sent, reply: FtpMessage, now: float) -> None:
+        offset = sent.offset
+        self._requests.answered(offset, now, sent_at=sent.at)
         if reply.is_ack and reply.data:
             self._add(offset, reply.data, now)
         elif reply.is_ack or reply.error_code == MavFtpErr.EOF or self._is_past_size(offset):
@@ -221,7 +230,7 @@ class FtpDownload(FtpExchange[int]):
             self._ask_ahead()
         limit = WHILE_BURSTING if self._is_bursting else None
         for offset in self._requests.take_due(now, limit=limit):
-            self._read(offset)
+            self._read(offset, now)
         if self._wants_burst:
             self._burst(now)
         self._set_deadline()
@@ -246,9 +255,9 @@ class FtpDownload(FtpExchange[int]):
             for number in range(self._requests.window.size):
                 self._requests.ask(self._into.tail + number * DATA_SIZE)
 
-    def _read(self, offset: int) -> None:
+    def _read(self, offset: int, now: float) -> None:
         sequence = self._client.next_sequence()
-        self._reads[sequence] = offset
+        self._reads[sequence] = _Sent(offset, now)
         self._send(FtpMessage(sequence, MavFtpOpcode.READFILE, self._session, DATA_SIZE, offset=offset))
 
     def _burst(self, now: float) -> None:
@@ -258,7 +267,7 @@ class FtpDownload(FtpExchange[int]):
         offset = self._into.tail
         blocks = BURST_BLOCKS if self._size is None else max(BURST_BLOCKS, (self._size - offset) // DATA_SIZE)
         sequence = self._client.next_sequence(min(blocks + 3, SEQUENCES // 2))
-        self._bursts = [*self._bursts[-7:], _Burst(sequence, offset)]
+        self._bursts = [*self._bursts[-7:], _Burst(sequence, offset, now)]
         self._is_bursting, self._burst_at, self._last_block = True, now, (now, -1)
         self._send(FtpMessage(sequence, MavFtpOpcode.BURSTREADFILE, self._session, DATA_SIZE, offset=offset))
 
@@ -325,8 +334,8 @@ class FtpUpload(FtpExchange[None]):
         self._requests = BlockRequests(self.round_trip)
         self._unwritten = dict.fromkeys(range(0, len(data), DATA_SIZE))
         self._written = 0
-        self._sequences: dict[int, int] = {}
-        self._offsets: dict[int, int] = {}
+        self._writes: dict[int, _Sent] = {}
+        """By their sequence numbers."""
 
     def start(self, now: float) -> None:
         """Send the first blocks."""
@@ -352,14 +361,17 @@ class FtpUpload(FtpExchange[None]):
             self._go_on(now)
 
     def _receive_reply(self, reply: FtpMessage, now: float) -> None:
-        offset = self._offsets.get((reply.sequence - 1) % SEQUENCES)
-        if reply.request_opcode != MavFtpOpcode.WRITEFILE or offset not in self._unwritten:
+        if reply.request_opcode != MavFtpOpcode.WRITEFILE:
+            return
+        sent = self._writes.pop((reply.sequence - 1) % SEQUENCES, None)
+        if sent is None or sent.offset not in self._unwritten:
             return
         if not reply.is_ack:
             self._fail(self._refused(reply))
             return
+        offset = sent.offset
         del self._unwritten[offset]
-        self._requests.answered(offset, now)
+        self._requests.answered(offset, now, sent_at=sent.at)
         self._written += len(self._block(offset))
         self._move(now, self._written, len(self._data))
         self._go_on(now)
@@ -369,17 +381,14 @@ class FtpUpload(FtpExchange[None]):
             self._finish(None)
             return
         for offset in self._requests.take_due(now):
-            self._write(offset)
+            self._write(offset, now)
         patient = self._moved_at + self._patience_s
         due_at = self._requests.deadline
         self.deadline = patient if due_at is None else min(patient, due_at)
 
-    def _write(self, offset: int) -> None:
-        """Send a block; again under the same number, so that the server may answer without writing once more."""
-        sequence = self._sequences.get(offset)
-        if sequence is None:
-            sequence = self._sequences[offset] = self._client.next_sequence()
-            self._offsets[sequence] = offset
+    def _write(self, offset: int, now: float) -> None:
+        sequence = self._client.next_sequence()
+        self._writes[sequence] = _Sent(offset, now)
         data = self._block(offset)
         self._send(
             FtpMessage(sequence, MavFtpOpcode.WRITEFILE, self._session, len(data), offset=offset, data=data)
