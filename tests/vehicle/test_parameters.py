@@ -27,6 +27,7 @@ from aerokit.parameters import ParameterRenamedWarning, ParameterType
 from aerokit.protocols.transfer import Progress
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.vehicle.connect import connect
+from aerokit.vehicle.files import Files
 from aerokit.vehicle.parameters import Parameters
 
 pytestmark = pytest.mark.anyio
@@ -128,6 +129,27 @@ async def test_defaults_of_an_earlier_file_are_kept_by_a_list() -> None:
         await flight.vehicle.parameters.download(method="ftp")
         table = await flight.vehicle.parameters.download(method="list", refresh=True)
         assert table.has_defaults
+
+
+@pytest.mark.parametrize(("damaged", "reads"), [(1, 2), (2, 3), (3, 3)])
+async def test_a_file_that_does_not_hold_together_is_read_again(
+    monkeypatch: pytest.MonkeyPatch, damaged: int, reads: int
+) -> None:
+    """A parameter has come to differ from its default while holes were filled."""
+    read, paths = Files.read, []
+
+    async def read_damaged(files: Files, path: str, **options: Any) -> bytes:
+        paths.append(path)
+        data = await read(files, path, **options)
+        return data[:-3] if len(paths) <= damaged else data
+
+    monkeypatch.setattr(Files, "read", read_damaged)
+    async with open_flight(copter()) as flight:
+        table = await flight.vehicle.parameters.download()
+        assert len(table) == 120
+        assert len(paths) == reads
+        assert table.has_defaults == (damaged == 1)
+        assert bool(flight.wire.all(messages.ParamRequestList)) == (damaged == 3)
 
 
 async def test_two_downloads_at_once_are_one() -> None:

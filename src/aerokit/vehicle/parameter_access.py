@@ -121,7 +121,10 @@ class ParameterAccess:
             except (FileError, FileTimeout, NotSupported, RemoteProtocolError) as error:
                 if method == "ftp":
                     raise
-                self._has_pack = None if getattr(error, "code", None) == NO_SESSIONS_AVAILABLE else False
+                is_for_now = isinstance(error, RemoteProtocolError) or (
+                    isinstance(error, FileError) and error.code == NO_SESSIONS_AVAILABLE
+                )
+                self._has_pack = None if is_for_now else False
         await self._download_list(patience_s, on_progress)
 
     async def has_pack(self) -> bool:
@@ -132,12 +135,34 @@ class ParameterAccess:
         return bool(capabilities and capabilities & CAPABILITY_FTP)
 
     async def _download_pack(self, patience_s: float, on_progress: OnProgress | None) -> None:
-        from aerokit.parameters.pack import PACK_PATH_WITH_DEFAULTS, unpack_parameters
+        """Read the file, again when it does not hold together.
 
-        since = self.store.updates
-        data = await self._files.read(PACK_PATH_WITH_DEFAULTS, patience_s=patience_s, on_progress=on_progress)
-        self.store.replace(unpack_parameters(data), since=since)
-        self._has_pack = True
+        ArduPilot makes it up as it is read: where a parameter comes to differ from its default meanwhile, all behind it
+        moves by some bytes, and holes that are filled do not fit. Without defaults nothing moves.
+        """
+        from aerokit.parameters.pack import PACK_PATH, PACK_PATH_WITH_DEFAULTS, unpack_parameters
+
+        for path in (PACK_PATH_WITH_DEFAULTS, PACK_PATH_WITH_DEFAULTS, PACK_PATH):
+            since = self.store.updates
+            data = await self._files.read(path, patience_s=patience_s, on_progress=on_progress)
+            try:
+                table = unpack_parameters(data)
+            except RemoteProtocolError:
+                if path == PACK_PATH:
+                    raise
+            else:
+                self.store.replace(self._with_known_defaults(table), since=since)
+                self._has_pack = True
+                return
+
+    def _with_known_defaults(self, table: ParameterTable) -> ParameterTable:
+        known = self.store.table
+        return ParameterTable(
+            Parameter(each.name, each.value, each.type, known[each.name].default, each.index)
+            if each.default is None and each.name in known
+            else each
+            for each in table.values()
+        )
 
     async def _download_list(self, patience_s: float, on_progress: OnProgress | None) -> None:
         from aerokit.protocols.parameter_list import ParameterList
@@ -153,14 +178,7 @@ class ParameterAccess:
         )
         with self._attended():
             table = await transfers.run(exchange)
-        defaults = {name: each.default for name, each in self.store.table.items()}
-        self.store.replace(
-            ParameterTable(
-                Parameter(each.name, each.value, each.type, defaults.get(each.name), each.index)
-                for each in table.values()
-            ),
-            since=self.store.updates,
-        )
+        self.store.replace(self._with_known_defaults(table), since=self.store.updates)
 
     # ------------------------------------------------------------------------------- some of them
 
