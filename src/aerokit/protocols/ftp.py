@@ -42,6 +42,8 @@ SLOW_REQUESTS = (MavFtpOpcode.CALCFILECRC, MavFtpOpcode.TERMINATESESSION)
 """The vehicle reads a whole file, or takes over what was written to it, before it answers."""
 SLOW_ANSWER_S = 0.25
 MOST_RENUMBERED = 3
+STEADY = 3
+"""So often it is sent again before that happens ever more rarely: radios lose single frames."""
 NEED_SESSION = (MavFtpOpcode.READFILE, MavFtpOpcode.WRITEFILE, MavFtpOpcode.BURSTREADFILE)
 NO_SESSION = (MavFtpErr.INVALIDSESSION, MavFtpErr.FILENOTFOUND, MavFtpErr.FILEEXISTS)
 """What they are answered when no file is open: by PX4, by ArduPilot, and by a PX4 that has said once that a file exists
@@ -216,7 +218,7 @@ class FtpRequest(FtpExchange[FtpMessage]):
         self._wait(now)
 
     def _wait(self, now: float) -> None:
-        timeout_s = self.round_trip.timeout_s(self.attempts)
+        timeout_s = self.round_trip.timeout_s(max(1, self.attempts - STEADY))
         if self._request.opcode in SLOW_REQUESTS:
             timeout_s += SLOW_ANSWER_S * (self.attempts - 1)
         self.deadline = min(now + timeout_s, self._moved_at + self._patience_s)
