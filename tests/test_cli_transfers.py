@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -214,12 +215,14 @@ def test_logs_are_not_erased_unasked(run: Run, monkeypatch: pytest.MonkeyPatch) 
 def test_the_progress_bar_shows_what_is_done(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    threads = threading.active_count()
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
     with progress_bar("flight.bin", "B") as show:
         show(Progress(0, None, 0.0))
         show(Progress(512 * 1024, 1024 * 1024, 1.0))
         show(Progress(1024 * 1024, 1024 * 1024, 2.0))
     assert "flight.bin: 100%" in capsys.readouterr().err
+    assert threading.active_count() == threads
 
 
 def test_there_is_no_progress_bar_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:

@@ -17,11 +17,15 @@ if TYPE_CHECKING:
 __all__ = ["file_size", "progress_bar"]
 
 
+class _Bar(tqdm):  # type: ignore[type-arg,unused-ignore]
+    monitor_interval = 0  # else a thread stays behind, which looks after bars that are rarely updated
+
+
 @contextmanager
 def progress_bar(what: str, unit: str) -> Iterator[OnProgress]:
     """Give the callback for ``on_progress``; ``unit`` is ``"B"`` for bytes, else the name of one thing."""
     is_bytes = unit == "B"
-    with tqdm(
+    with _Bar(
         desc=what,
         unit=unit if is_bytes else f" {unit}",
         unit_scale=is_bytes,
