@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 __all__ = ["file_size", "progress_bar"]
 
 
-class _Bar(tqdm):  # type: ignore[type-arg,unused-ignore]
+class _Bar(tqdm):  # type: ignore[misc]  # it has no types
     monitor_interval = 0  # else a thread stays behind, which looks after bars that are rarely updated
 
 
