@@ -219,7 +219,7 @@ class FtpRequest(FtpExchange[FtpMessage]):
 
     def _wait(self, now: float) -> None:
         timeout_s = self.round_trip.timeout_s(max(1, self.attempts - STEADY))
-        if self._request.opcode in SLOW_REQUESTS:
+        if self._request.opcode == MavFtpOpcode.CALCFILECRC:
             timeout_s += SLOW_ANSWER_S * (self.attempts - 1)
         self.deadline = min(now + timeout_s, self._moved_at + self._patience_s)
 
