@@ -56,3 +56,23 @@ def test_ctrl_c_in_a_block_puts_back(vehicle: aerokit.sync.Vehicle, copter: Simu
         signal.pthread_kill(main, signal.SIGINT)
         time.sleep(10)
     assert copter.parameters["RTL_ALT"] == 1500
+
+
+@pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="needs POSIX signals")
+def test_ctrl_c_while_values_are_put_back_waits_for_it(
+    vehicle: aerokit.sync.Vehicle, copter: SimulatedCopter
+) -> None:
+    main = threading.main_thread().ident
+    assert main is not None
+
+    def back() -> None:
+        copter.faults.silent = False
+
+    radio = threading.Timer(0.5, back)
+    interrupt = threading.Timer(0.1, signal.pthread_kill, (main, signal.SIGINT))
+    with pytest.raises(KeyboardInterrupt), vehicle.parameters.temporarily({"RTL_ALT": 2000}):
+        copter.faults.silent = True
+        radio.start()
+        interrupt.start()
+    radio.join()
+    assert copter.parameters["RTL_ALT"] == 1500

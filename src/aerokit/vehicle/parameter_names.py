@@ -65,7 +65,8 @@ class ParameterNames:
         found: dict[str, Found | NotFound] = {}
         answers = await self._access.read(self._to_read(spelled.values()), patience_s, are_doubtful=True)
         for asked, name in spelled.items():
-            found[asked] = each = self._found(name, answers)
+            each = self._found(name, answers)
+            found[asked] = each = each.replace(asked=asked) if isinstance(each, Found) else each
             if isinstance(each, Found) and each.renamed is not None:
                 _warn_of(each.renamed)
         return found

@@ -1,0 +1,125 @@
+"""MAVFTP servers that break the standard: every call ends, with an error that says what was wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import pytest
+from flight_harness import Flight
+
+from aerokit.errors import FileError, RemoteProtocolError
+from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
+from aerokit.mavlink.messages import FileTransferProtocol
+from aerokit.protocols.ftp_message import DATA_SIZE, FtpMessage
+
+pytestmark = pytest.mark.anyio
+
+SIZE = 10_000
+Answer = Callable[[FtpMessage], Iterator[FtpMessage]]
+
+
+def ack(request: FtpMessage, data: bytes = b"", *, offset: int | None = None, number: int = 1) -> FtpMessage:
+    return FtpMessage(
+        (request.sequence + number) % 65536,
+        MavFtpOpcode.ACK,
+        session=request.session,
+        size=len(data),
+        request_opcode=request.opcode,
+        offset=request.offset if offset is None else offset,
+        data=data,
+    )
+
+
+def nak(request: FtpMessage, code: int) -> FtpMessage:
+    return FtpMessage(
+        (request.sequence + 1) % 65536,
+        MavFtpOpcode.NAK,
+        session=request.session,
+        size=1,
+        request_opcode=request.opcode,
+        offset=request.offset,
+        data=bytes([code]),
+    )
+
+
+def serve(flight: Flight, answer: Answer) -> None:
+    copter = flight.copter
+
+    def handle(message: FileTransferProtocol, channel: object) -> None:
+        for reply in answer(FtpMessage.decode(message.payload)):
+            copter.send(FileTransferProtocol(0, 255, 190, reply.encode()), channel)  # type: ignore[arg-type]
+
+    copter.handlers[FileTransferProtocol.ID] = handle
+
+
+def opened(request: FtpMessage) -> FtpMessage | None:
+    """The answers to everything but reads."""
+    if request.opcode == MavFtpOpcode.OPENFILERO:
+        return ack(request, SIZE.to_bytes(4, "little"))
+    if request.opcode in (MavFtpOpcode.BURSTREADFILE, MavFtpOpcode.READFILE):
+        return None
+    return ack(request)
+
+
+def short_block(request: FtpMessage) -> Iterator[FtpMessage]:
+    yield opened(request) or ack(request, b"x" * 100)
+
+
+def end_at_once(request: FtpMessage) -> Iterator[FtpMessage]:
+    yield opened(request) or nak(request, MavFtpErr.EOF)
+
+
+def empty_blocks(request: FtpMessage) -> Iterator[FtpMessage]:
+    if request.opcode == MavFtpOpcode.BURSTREADFILE:
+        yield nak(request, MavFtpErr.UNKNOWNCOMMAND)
+    else:
+        yield opened(request) or ack(request)
+
+
+@pytest.mark.parametrize("answer", [short_block, end_at_once, empty_blocks])
+async def test_a_file_that_ends_before_its_size_is_not_whole(grounded: Flight, answer: Answer) -> None:
+    serve(grounded, answer)
+    with pytest.raises(RemoteProtocolError, match=f"of the {SIZE} bytes"):
+        await grounded.vehicle.files.read("/a")
+
+
+async def test_a_block_far_beyond_the_others_is_not_waited_up_to(grounded: Flight) -> None:
+    def far_and_near(request: FtpMessage) -> Iterator[FtpMessage]:
+        if request.opcode == MavFtpOpcode.OPENFILERO:
+            yield ack(request, (0xFFFF_FFFF).to_bytes(4, "little"))
+        elif request.opcode == MavFtpOpcode.BURSTREADFILE:
+            yield ack(request, b"y" * DATA_SIZE, offset=request.offset + 65536 * 200 * DATA_SIZE)
+        else:
+            yield nak(request, MavFtpErr.FAIL)
+
+    serve(grounded, far_and_near)
+    with pytest.raises(FileError):
+        await grounded.vehicle.files.crc32("/a")
+    with pytest.raises(Exception, match="0 bytes are there"):
+        await grounded.vehicle.files.read("/a", patience_s=2.0)
+
+
+@pytest.mark.parametrize("data", [b"Fa\t1\0", b""])
+async def test_a_listing_without_an_end_is_an_error(grounded: Flight, data: bytes) -> None:
+    serve(grounded, lambda request: iter([ack(request, data)]))
+    with pytest.raises(RemoteProtocolError, match="does not end"):
+        await grounded.vehicle.files.list("/")
+
+
+async def test_a_size_that_is_no_number_is_not_known(grounded: Flight) -> None:
+    def listing(request: FtpMessage) -> Iterator[FtpMessage]:
+        yield ack(request, "Fa\t²\0".encode()) if request.offset == 0 else nak(request, MavFtpErr.EOF)
+
+    serve(grounded, listing)
+    (entry,) = await grounded.vehicle.files.list("/")
+    assert (entry.name, entry.size) == ("a", None)
+
+
+async def test_a_file_that_is_not_there_after_writing_is_told(grounded: Flight) -> None:
+    def forgetful(request: FtpMessage) -> Iterator[FtpMessage]:
+        missing = request.opcode == MavFtpOpcode.CALCFILECRC
+        yield nak(request, MavFtpErr.FILENOTFOUND) if missing else ack(request, bytes(4))
+
+    serve(grounded, forgetful)
+    with pytest.raises(FileError, match="no such file"):
+        await grounded.vehicle.files.write("/a", b"data")
