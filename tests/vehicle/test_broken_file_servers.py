@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import pytest
 from flight_harness import Flight
@@ -45,9 +46,9 @@ def nak(request: FtpMessage, code: int) -> FtpMessage:
 def serve(flight: Flight, answer: Answer) -> None:
     copter = flight.copter
 
-    def handle(message: FileTransferProtocol, channel: object) -> None:
+    def handle(message: FileTransferProtocol, channel: Any) -> None:
         for reply in answer(FtpMessage.decode(message.payload)):
-            copter.send(FileTransferProtocol(0, 255, 190, reply.encode()), channel)  # type: ignore[arg-type]
+            copter.send(FileTransferProtocol(0, 255, 190, reply.encode()), channel)
 
     copter.handlers[FileTransferProtocol.ID] = handle
 

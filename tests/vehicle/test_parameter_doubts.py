@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 from flight_harness import Flight
 
@@ -15,9 +17,9 @@ async def test_an_error_without_a_name_ends_nothing(grounded: Flight) -> None:
     copter = grounded.copter
     on_read = copter.handlers[ParamRequestRead.ID]
 
-    def doubtful(message: ParamRequestRead, channel: object) -> None:
+    def doubtful(message: ParamRequestRead, channel: Any) -> None:
         copter.send(ParamError(255, 190, "", 7, 1))
-        on_read(message, channel)  # type: ignore[arg-type]
+        on_read(message, channel)
 
     copter.handlers[ParamRequestRead.ID] = doubtful
     assert await grounded.vehicle.parameters.get("LAND_SPEED", timeout=5) == 50
@@ -40,9 +42,9 @@ async def test_an_echo_of_the_write_before_confirms_nothing(grounded: Flight) ->
     on_set = copter.handlers[ParamSet.ID]
     lost: list[ParamSet] = []
 
-    def lose_first(message: ParamSet, channel: object) -> None:
+    def lose_first(message: ParamSet, channel: Any) -> None:
         if lost:
-            on_set(message, channel)  # type: ignore[arg-type]
+            on_set(message, channel)
         else:
             lost.append(message)
             copter.send(ParamValue("LAND_SPEED", 61, message.param_type, len(copter.parameters), 65535))
