@@ -165,7 +165,7 @@ class FtpDownload(FtpExchange[int]):
     def _note_time(self, burst: _Burst, number: int, now: float) -> None:
         """How long answers take, and how fast the blocks follow each other."""
         before_at, before = self._last_block
-        if before < 0 and number == 0:
+        if before < 0 and number == 0 and burst is self._bursts[0]:  # else one before it may be sent first
             self.round_trip.measured(now - burst.sent_at)
         elif 0 <= before < number:
             self._interval.measured((now - before_at) / (number - before))
