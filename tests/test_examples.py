@@ -26,12 +26,18 @@ IN_VIRTUAL_TIME: dict[str, tuple[list[Any], list[str]]] = {
     "guided_velocity": ([], ["holding in BRAKE", "landed"]),
     "custom_mode_and_command": ([], ["mode BRAKE", "'FASTER'", "AutopilotVersion(", "result 4: "]),
     "land_on_low_battery": ([95.0], ["landing with 94 %"]),
+    "mission": ([], ["item 3 was reached", "flown"]),
+    "parameters": (
+        [],
+        ["1349 parameters", " instead of ", "LAND_SPEED is 40 for now", "LAND_SPEED is 50 again"],
+    ),
     "two_vehicles": ([], ["system 1 is at", "system 2 is at", "both landed"]),
 }
 """Example: what its ``main`` takes behind the address, and what it must print."""
 AS_PROGRAMS: dict[str, list[str]] = {
     "hello": ["ArduCopter 4.7.0", "disarmed", "could be armed"],
     "blocking_hello": ["ArduCopter 4.7.0", "landed"],
+    "download_logs": [" bytes", "log 2 is in log00002.bin"],
     "blocking_messages": ["m/s at", "holding in BRAKE"],
 }
 """Example: what it must print, given an address."""
@@ -77,9 +83,11 @@ def command(name: str, *arguments: str) -> list[str]:
 
 
 @pytest.mark.parametrize("name", AS_PROGRAMS)
-def test_example_as_a_program(name: str) -> None:
+def test_example_as_a_program(name: str, tmp_path: Path) -> None:
     with served_copter() as address:
-        done = subprocess.run(command(name, address), capture_output=True, text=True, timeout=60, check=False)
+        done = subprocess.run(
+            command(name, address), capture_output=True, text=True, timeout=60, check=False, cwd=tmp_path
+        )
     assert (done.returncode, done.stderr) == (0, ""), done.stdout
     for text in AS_PROGRAMS[name]:
         assert text in done.stdout

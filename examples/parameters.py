@@ -1,0 +1,36 @@
+"""What was changed on this vehicle, and a value changed for a while.
+
+python examples/parameters.py udpin:0.0.0.0:14550 [NAME VALUE]
+"""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+
+import aerokit
+from aerokit import errors
+
+
+async def main(address: str, name: str = "LAND_SPEED", value: float = 40) -> None:
+    """The defaults come with a download by MAVFTP; other vehicles tell none."""
+    async with aerokit.connect(address) as vehicle:
+        table = await vehicle.parameters.download()
+        print(f"{len(table)} parameters")
+        try:
+            for parameter in (await vehicle.parameters.changed_from_default()).values():
+                print(f"{parameter.name} = {parameter.value} instead of {parameter.default}")
+        except errors.NotSupported as error:
+            print(error)
+        async with vehicle.parameters.temporarily({name: value}):
+            print(f"{name} is {await vehicle.parameters.get(name)} for now")
+        print(f"{name} is {await vehicle.parameters.get(name)} again")
+
+
+if __name__ == "__main__":
+    asyncio.run(
+        main(
+            sys.argv[1] if len(sys.argv) > 1 else "udpin:0.0.0.0:14550",
+            *((sys.argv[2], float(sys.argv[3])) if len(sys.argv) > 3 else ()),
+        )
+    )
