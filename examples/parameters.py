@@ -28,9 +28,8 @@ async def main(address: str, name: str = "LAND_SPEED", value: float = 40) -> Non
 
 
 if __name__ == "__main__":
-    asyncio.run(
-        main(
-            sys.argv[1] if len(sys.argv) > 1 else "udpin:0.0.0.0:14550",
-            *((sys.argv[2], float(sys.argv[3])) if len(sys.argv) > 3 else ()),
-        )
-    )
+    address, name, value, *_ = [
+        *sys.argv[1:],
+        *["udpin:0.0.0.0:14550", "LAND_SPEED", "40"][len(sys.argv) - 1 :],
+    ]
+    asyncio.run(main(address, name, float(value)))
