@@ -33,9 +33,11 @@ MOST_GAPS = 512
 """With more blocks missing than that, they are fetched before the burst goes on: their followers are in memory."""
 BURST_BLOCKS = 500
 BUSY_BLOCKS = 3
+MOST_BURSTS = 32
+"""So many that may still be on their way are remembered."""
 MOST_AHEAD = SEQUENCES // 2 * DATA_SIZE
 """Beyond that, the number of a block could mean another one, too."""
-SILENT_BLOCKS = 10
+FIRST_BLOCKS, SILENT_BLOCKS = 4, 10
 """So many blocks in a row are hardly ever lost: the burst has ended."""
 
 
@@ -108,7 +110,7 @@ class FtpDownload(FtpExchange[int]):
         self._burst_fails = 0
         self._has_burst = True
         self._burst_at = 0.0
-        self._last_block = (0.0, -1)
+        self._last_block: tuple[_Burst | None, float, int] = (None, 0.0, -1)
         self._interval = RoundTrip(shortest_s=0.001)
 
     def start(self, now: float) -> None:
@@ -154,27 +156,33 @@ class FtpDownload(FtpExchange[int]):
         if not self._is_plausible(reply.offset):
             return
         is_latest = burst is self._bursts[-1]
-        if is_latest:
-            self._note_time(burst, burst.blocks_before(reply), now)
+        self._note_time(burst, burst.blocks_before(reply), now)
         self._burst_at, self._burst_fails = now, 0
         self._requests.busy(now + BUSY_BLOCKS * (self._interval.smoothed_s or 0.0))
         if is_latest and reply.burst_complete:
-            self._is_bursting = False
+            self._stop_bursting()
         self._add(reply.offset, reply.data, now)
 
     def _note_time(self, burst: _Burst, number: int, now: float) -> None:
         """How long answers take, and how fast the blocks follow each other."""
-        before_at, before = self._last_block
-        if before < 0 and number == 0 and burst is self._bursts[0]:  # else one before it may be sent first
+        last, before_at, before = self._last_block
+        if last is None and number == 0 and len(self._bursts) == 1:  # else one before it may be sent first
             self.round_trip.measured(now - burst.sent_at)
-        elif 0 <= before < number:
+        elif last is burst and number > before:
             self._interval.measured((now - before_at) / (number - before))
-        self._last_block = (now, max(number, before))
+        self._last_block = (burst, now, max(number, before) if last is burst else number)
+
+    def _stop_bursting(self) -> None:
+        """The blocks have shown how many of them a round trip has room for."""
+        self._is_bursting = False
+        if self._interval.smoothed_s and self.round_trip.smoothed_s:
+            self._requests.window.widen(self.round_trip.smoothed_s / self._interval.smoothed_s)
 
     def _end_burst(self, burst: _Burst, end: int, reply: FtpMessage) -> None:
         is_latest = burst is self._bursts[-1]
         if is_latest:
-            self._is_bursting, self._burst_fails = False, 0
+            self._burst_fails = 0
+            self._stop_bursting()
         if reply.error_code == MavFtpErr.EOF:
             self._end_at(end)
         elif is_latest and reply.error_code in NO_BURST and self._into.done == self._into.start:
@@ -267,16 +275,17 @@ class FtpDownload(FtpExchange[int]):
         offset = self._into.tail
         blocks = BURST_BLOCKS if self._size is None else max(BURST_BLOCKS, (self._size - offset) // DATA_SIZE)
         sequence = self._client.next_sequence(min(blocks + 3, SEQUENCES // 2))
-        self._bursts = [*self._bursts[-7:], _Burst(sequence, offset, now)]
-        self._is_bursting, self._burst_at, self._last_block = True, now, (now, -1)
+        self._bursts = [*self._bursts[1 - MOST_BURSTS :], _Burst(sequence, offset, now)]
+        self._is_bursting, self._burst_at = True, now
         self._send(FtpMessage(sequence, MavFtpOpcode.BURSTREADFILE, self._session, DATA_SIZE, offset=offset))
 
     @property
     def _burst_due_at(self) -> float:
         """When the burst must have ended, or was never begun."""
         silence = self.round_trip.timeout_s(1 + self._burst_fails)
-        if self._last_block[1] >= 0 and self._interval.smoothed_s is not None:
-            silence += max(SILENT_BLOCKS * self._interval.smoothed_s, self._interval.timeout_s())
+        if self._interval.smoothed_s is not None:
+            blocks = SILENT_BLOCKS if self._last_block[0] is self._bursts[-1] else FIRST_BLOCKS
+            silence += max(blocks * self._interval.smoothed_s, self._interval.timeout_s())
         return self._burst_at + silence
 
     def _set_deadline(self) -> None:
