@@ -2,9 +2,10 @@
 
 ``ideal = round trips that depend on each other × round-trip time + the longer of (bytes / bandwidth, vehicle's pace)``
 
-It is a lower bound for a client that makes no mistake over a radio that loses nothing: requests that do not depend on
-each other's answers are all sent at once, nothing is sent twice, no time is taken to think. With a radio of two
-frequencies the busier direction counts, with one frequency both.
+It is what a client takes that makes no mistake over a radio that loses nothing: requests that do not depend on each
+other's answers are all sent at once, nothing is sent twice, no time is taken to think. With a radio of two frequencies
+the busier direction counts, with one frequency both. (A little less is possible where bytes move while others wait for
+their round trip.)
 """
 
 from __future__ import annotations
@@ -61,10 +62,16 @@ def parameter_writes(count: int) -> Ideal:
     return Ideal(math.ceil(count / QUEUE), count * PARAM_SET, count * PARAM_VALUE)
 
 
+def parameter_reads(count: int) -> Ideal:
+    """As for writes."""
+    return Ideal(math.ceil(count / QUEUE), count * PARAM_REQUEST, count * PARAM_VALUE)
+
+
 def file_read(size: int, *, blocks_per_second: float = math.inf) -> Ideal:
     """Open, burst. (That the session is closed need not be waited for.)"""
     blocks = math.ceil(size / FTP_DATA)
-    return Ideal(2, 3 * FTP_REQUEST, size + (blocks + 2) * (FTP_BLOCK - FTP_DATA), blocks / blocks_per_second)
+    pace_s = max(0, blocks - 1) / blocks_per_second
+    return Ideal(2, 3 * FTP_REQUEST, size + (blocks + 2) * (FTP_BLOCK - FTP_DATA), pace_s)
 
 
 def file_write(size: int) -> Ideal:
@@ -101,4 +108,4 @@ def log_list(count: int, *, per_second: float) -> Ideal:
 def log_read(size: int, *, blocks_per_second: float = math.inf) -> Ideal:
     """One request, and what comes of it."""
     blocks = math.ceil(size / LOG_DATA)
-    return Ideal(1, SHORT, blocks * LOG_BLOCK, blocks / blocks_per_second)
+    return Ideal(1, SHORT, blocks * LOG_BLOCK, max(0, blocks - 1) / blocks_per_second)

@@ -182,8 +182,8 @@ PARAMETERS = [
         "param.pck upload",
         upload_parameters,
         check_writes,
-        # what has become of it is read back
-        lambda copter, sizes: ideals.file_write(16 * sizes.writes) + read_pack(copter),
+        # what has become of them is read back one by one
+        lambda copter, sizes: ideals.file_write(16 * sizes.writes) + ideals.parameter_reads(sizes.writes),
         lambda copter, sizes: blocks(pack_size(copter)) + 2 * sizes.writes,
         before=know_parameters,
     ),
