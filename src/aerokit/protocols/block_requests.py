@@ -16,7 +16,7 @@ AT_ONCE = 4
 SPACING_S = 0.002
 """Between further ones."""
 SOON = 0.5
-"""An answer that comes within this part of a round trip was to an earlier sending."""
+"""An answer that comes within this part of the fastest round trip was to an earlier sending."""
 STEADY = 3
 """So often in a row an answer may be overdue before requests come more rarely: radios lose single frames."""
 
@@ -64,11 +64,11 @@ class AdaptiveWindow:
 
 
 class _Block:
-    __slots__ = ("attempts", "first_at", "order", "sent_at")
+    __slots__ = ("attempts", "before_at", "order", "sent_at")
 
     def __init__(self) -> None:
         self.attempts = self.order = 0
-        self.first_at = self.sent_at = 0.0
+        self.before_at = self.sent_at = 0.0
 
 
 class BlockRequests:
@@ -148,8 +148,8 @@ class BlockRequests:
         """When that was sent which was answered, as far as it can be told."""
         if block.attempts == 1:
             return block.sent_at
-        soon_s = SOON * (self._round_trip.smoothed_s or 0.0)
-        return block.first_at if now - block.sent_at < soon_s else None
+        fastest_s = self._round_trip.fastest_s or 0.0
+        return block.before_at if now - block.sent_at < SOON * fastest_s else None  # not long enough
 
     def take_due(self, now: float, *, limit: int | None = None) -> list[int]:
         """The offsets to be sent now, first those to be sent again; they count as sent. ``limit``: of the window."""
@@ -183,9 +183,7 @@ class BlockRequests:
         self._orders += 1
         block = self._blocks.setdefault(offset, _Block())
         block.attempts += 1
-        if block.attempts == 1:
-            block.first_at = now
-        block.order, block.sent_at = self._orders, now
+        block.order, block.before_at, block.sent_at = self._orders, block.sent_at, now
         self._under_way[offset] = block
 
     def _give_up_overtaken(self, order: int) -> None:

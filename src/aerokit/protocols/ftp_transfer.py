@@ -33,6 +33,10 @@ MOST_GAPS = 512
 """With more blocks missing than that, they are fetched before the burst goes on: their followers are in memory."""
 BURST_BLOCKS = 500
 BUSY_BLOCKS = 3
+FIRST_BLOCK_S = 0.5
+"""A slow radio carries a few blocks in that time."""
+SHORT_FILE = 20 * DATA_SIZE
+MOST_REPEATED = 3
 MOST_BURSTS = 32
 """So many that may still be on their way are remembered."""
 MOST_AHEAD = SEQUENCES // 2 * DATA_SIZE
@@ -108,6 +112,10 @@ class FtpDownload(FtpExchange[int]):
         self._bursts: list[_Burst] = []
         self._is_bursting = False
         self._burst_fails = 0
+        self._repeated_bursts = 0
+        """So many were asked for since something new has come."""
+        self._sent: dict[int, int] = {}
+        """Bursts by their numbers, and how many blocks of each have been sent, as far as is known."""
         self._has_burst = True
         self._burst_at = 0.0
         self._last_block: tuple[_Burst | None, float, int] = (None, 0.0, -1)
@@ -164,7 +172,12 @@ class FtpDownload(FtpExchange[int]):
         self._add(reply.offset, reply.data, now)
 
     def _note_time(self, burst: _Burst, number: int, now: float) -> None:
-        """How long answers take, and how fast the blocks follow each other."""
+        """How long answers take, and how fast the blocks follow each other.
+
+        While a burst goes on the vehicle is not silent, even if we have its blocks from another one already.
+        """
+        if number > self._sent.get(burst.sequence, -1) and self._repeated_bursts <= MOST_REPEATED:
+            self._sent[burst.sequence], self._moved_at = number, now
         last, before_at, before = self._last_block
         if last is None and number == 0 and len(self._bursts) == 1:  # else one before it may be sent first
             self.round_trip.measured(now - burst.sent_at)
@@ -219,6 +232,7 @@ class FtpDownload(FtpExchange[int]):
             self._fail(error)
             return
         if is_new:
+            self._repeated_bursts = 0
             self._requests.forget(offset)
             self._move(now, self._into.done, self._total)
 
@@ -277,13 +291,17 @@ class FtpDownload(FtpExchange[int]):
         sequence = self._client.next_sequence(min(blocks + 3, SEQUENCES // 2))
         self._bursts = [*self._bursts[1 - MOST_BURSTS :], _Burst(sequence, offset, now)]
         self._is_bursting, self._burst_at = True, now
+        self._repeated_bursts += 1
         self._send(FtpMessage(sequence, MavFtpOpcode.BURSTREADFILE, self._session, DATA_SIZE, offset=offset))
 
     @property
     def _burst_due_at(self) -> float:
         """When the burst must have ended, or was never begun."""
         silence = self.round_trip.timeout_s(1 + self._burst_fails)
-        if self._interval.smoothed_s is not None:
+        if self._interval.smoothed_s is None:
+            if self._size is not None and self._size > SHORT_FILE:  # a second burst of it would take long
+                silence = max(silence, FIRST_BLOCK_S)
+        else:
             blocks = SILENT_BLOCKS if self._last_block[0] is self._bursts[-1] else FIRST_BLOCKS
             silence += max(blocks * self._interval.smoothed_s, self._interval.timeout_s())
         return self._burst_at + silence
