@@ -1,0 +1,15 @@
+"""The two errors of the DroneKit API."""
+
+from __future__ import annotations
+
+import builtins
+
+__all__ = ["APIException", "TimeoutError"]
+
+
+class APIException(Exception):
+    """Any failure of the vehicle or its link; the aerokit error behind it is its `__cause__`."""
+
+
+class TimeoutError(APIException, builtins.TimeoutError):  # noqa: A001 - the name is DroneKit's
+    """The awaited answer or state did not come in time; the built-in `TimeoutError` catches it too."""
