@@ -6,6 +6,7 @@ import asyncio
 import atexit
 import concurrent.futures
 import contextlib
+import functools
 import threading
 from typing import TYPE_CHECKING, Any, Generic, ParamSpec, TypeVar
 
@@ -34,10 +35,11 @@ class LoopThread:
     """One asyncio loop on one thread. The thread does not keep the interpreter alive; at its exit it is closed."""
 
     def __init__(self) -> None:
-        started: concurrent.futures.Future[BlockingPortal] = concurrent.futures.Future()
+        started: concurrent.futures.Future[tuple[BlockingPortal, asyncio.AbstractEventLoop]]
+        started = concurrent.futures.Future()
         self._thread = threading.Thread(target=_run, args=(started,), name="aerokit loop", daemon=True)
         self._thread.start()
-        self._portal = started.result()
+        self._portal, self._loop = started.result()
         self._is_closed = False
         self._lock = threading.Lock()
         self._stopping: asyncio.Task[None] | None = None
@@ -99,6 +101,19 @@ class LoopThread:
             return function(*args, **kwargs)
 
         return self.run(call)
+
+    def call_soon(self, function: Callable[P, object], /, *args: P.args, **kwargs: P.kwargs) -> None:
+        """Have a function that does not wait called on the loop's thread, after those asked for before; from any thread.
+
+        Nobody waits for it or hears what it raises: it must not raise.
+
+        Raises:
+            ConnectionClosed: the loop was closed.
+        """
+        with self._lock:
+            if self._is_closed:
+                raise ConnectionClosed("the connection was closed")
+            self._loop.call_soon_threadsafe(functools.partial(function, *args, **kwargs))
 
     def hold_open(self, context: AbstractAsyncContextManager[T]) -> Held[T]:
         """Enter an asynchronous context manager on the loop; it is left, in the same task, when it is closed."""
@@ -177,12 +192,12 @@ class Held(Generic[T]):
         return self._opened.result()
 
 
-def _run(started: concurrent.futures.Future[BlockingPortal]) -> None:
+def _run(started: concurrent.futures.Future[tuple[BlockingPortal, asyncio.AbstractEventLoop]]) -> None:
     """What the thread does."""
 
     async def main() -> None:
         async with BlockingPortal() as portal:
-            started.set_result(portal)
+            started.set_result((portal, asyncio.get_running_loop()))
             await portal.sleep_until_stopped()
 
     anyio.run(main)

@@ -1,0 +1,399 @@
+"""Making a vehicle move: modes, arming, take-off, places, speeds, and waiting for what comes of it."""
+
+from __future__ import annotations
+
+import concurrent.futures
+import contextlib
+import math
+import time
+from typing import TYPE_CHECKING, Any
+
+from aerokit.autopilots.px4 import Px4
+from aerokit.dronekit.attributes import VehicleAttributes
+from aerokit.dronekit.exceptions import APIException, TimeoutError  # noqa: A004 - DroneKit's name
+from aerokit.dronekit.modes import change_mode, mode_name, mode_order
+from aerokit.dronekit.values import LocationGlobal, LocationGlobalRelative, VehicleMode
+from aerokit.errors import CommandRejected, LocalProtocolError
+from aerokit.mavlink.messages import HomePosition, SetPositionTargetGlobalInt
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+    from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
+
+__all__ = ["FlightMethods"]
+
+NAV_TAKEOFF, DO_CHANGE_SPEED, DO_SET_HOME, DO_REPOSITION = 22, 178, 179, 192
+AIRSPEED, GROUNDSPEED = 0, 1
+GLOBAL, GLOBAL_RELATIVE_ALT_INT = 0, 6
+POSITION_ONLY = 0x0DF8
+RESULT_UNSUPPORTED = 3
+CHANGE_MODE = 1
+REQUEST_MESSAGE = 512
+HOME_TIMEOUT_S = 10.0
+PX4_FLIES_TO_PLACES_IN = ("LOITER", "TAKEOFF")
+POLL_S = 0.1
+
+
+class FlightMethods(VehicleAttributes):
+    """Setters and the ``simple_…`` methods return at once: the order is sent, repeated until it is answered, and a
+    refusal becomes a warning of the logger ``dronekit``. The ``wait_…`` methods, :meth:`arm` and :meth:`disarm` wait.
+    """
+
+    if TYPE_CHECKING:
+
+        def _check_link(self) -> AsyncVehicle: ...
+        def _run(self, function: Callable[..., Awaitable[Any]], *args: Any, **kwargs: Any) -> Any: ...
+        def _order(
+            self, kind: str, function: Callable[..., Awaitable[object]], *args: Any, **kwargs: Any
+        ) -> concurrent.futures.Future[None]: ...
+        def _pause(self, seconds: float) -> None: ...
+
+    # --------------------------------------------------------------------------------- modes
+
+    @property
+    def mode(self) -> VehicleMode:
+        """The flight mode by HEARTBEAT, by pymavlink's name for it; ``UNKNOWN`` before the first.
+
+        Set it to a :class:`VehicleMode`, to a name, or on ArduPilot to a number: the order is sent at once
+        (MAV_CMD_DO_SET_MODE, and SET_MODE where that is not known). :meth:`wait_for_mode` waits.
+
+        Raises:
+            KeyError: this vehicle has no such mode; nothing was sent.
+            APIException: the link is down.
+        """
+        return VehicleMode(self._flightmode)
+
+    @mode.setter
+    def mode(self, value: VehicleMode | str | int) -> None:
+        self._set_mode(value)
+
+    def _set_mode(self, value: VehicleMode | str | int) -> concurrent.futures.Future[None]:
+        aio = self._check_link()
+        order = mode_order(aio, value.name if isinstance(value, VehicleMode) else value)
+        return self._order("mode", change_mode, aio, order)
+
+    def wait_for_mode(self, mode: VehicleMode | str | int, timeout: float | None = None) -> None:
+        """Set the mode and wait until the vehicle is in it.
+
+        Raises:
+            TimeoutError: it is not within ``timeout`` seconds, or, sooner, the vehicle has refused it.
+            KeyError: this vehicle has no such mode.
+        """
+        order = self._set_mode(mode)
+        aio = self._check_link()
+        base, main, sub = mode_order(aio, mode.name if isinstance(mode, VehicleMode) else mode)
+        custom = main << 16 | sub << 24 if isinstance(aio.autopilot, Px4) else main
+        name = mode_name(aio, base, custom)
+        self._wait_for_order(order, lambda: self._flightmode == name, timeout, "failed to set flight mode")
+
+    # -------------------------------------------------------------------------------- arming
+
+    @property
+    def armed(self) -> bool:
+        """Whether the motors are armed, by HEARTBEAT. Setting it sends the order, if it is another value than told.
+
+        **Propellers may start to turn.** :meth:`arm` waits, and tells why the vehicle refuses.
+        """
+        return self._armed
+
+    @armed.setter
+    def armed(self, value: bool) -> None:
+        if bool(value) != self._armed:
+            self._set_armed(bool(value))
+        else:
+            self._check_link()
+
+    def _set_armed(self, value: bool) -> concurrent.futures.Future[None]:
+        aio = self._check_link()
+        return self._order("arm" if value else "disarm", aio.arm if value else aio.disarm)
+
+    def arm(self, wait: bool = True, timeout: float | None = None) -> None:
+        """Arm the motors: **propellers may start to turn**; with ``wait`` until HEARTBEAT says armed.
+
+        Raises:
+            TimeoutError: not within ``timeout`` seconds, or, sooner, the vehicle has refused; the text has its reasons.
+        """
+        self._change_armed(True, wait, timeout, "failed to arm vehicle")
+
+    def disarm(self, wait: bool = True, timeout: float | None = None) -> None:
+        """Stop the motors; with ``wait`` until HEARTBEAT says disarmed.
+
+        Raises:
+            TimeoutError: not within ``timeout`` seconds, or, sooner, the vehicle has refused, as it does in the air.
+        """
+        self._change_armed(False, wait, timeout, "failed to disarm vehicle")
+
+    def _change_armed(self, value: bool, wait: bool, timeout: float | None, text: str) -> None:
+        if self._armed == value:
+            self._check_link()
+            return
+        order = self._set_armed(value)
+        if wait:
+            self._wait_for_order(order, lambda: self._armed == value, timeout, text)
+
+    # -------------------------------------------------------------------------------- flying
+
+    def simple_takeoff(self, alt: float | None = None) -> None:
+        """Take off and climb to ``alt`` metres above home; returns at once. Copters, armed and in GUIDED mode.
+
+        Without an altitude nothing is sent.
+
+        Raises:
+            ValueError: the altitude is not a finite number.
+        """
+        if alt is None:
+            return
+        altitude = float(alt)
+        if not math.isfinite(altitude):
+            raise ValueError("Altitude was NaN or Infinity. Please provide a real number")
+        aio = self._check_link()
+        if isinstance(aio.autopilot, Px4):  # it counts from the sea
+            home = self._known_home().alt
+            plan = aio.autopilot.take_off(altitude, home, is_vtol=aio.is_vtol)
+            if plan is None or plan.command is None:
+                raise APIException("this vehicle cannot take off by a command")
+            self._order("takeoff", aio.command, plan.command, *plan.params)
+        else:
+            self._order("takeoff", aio.command, NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude)
+
+    def wait_simple_takeoff(
+        self, alt: float | None = None, epsilon: float = 0.1, timeout: float | None = None
+    ) -> None:
+        """:meth:`simple_takeoff`, then :meth:`wait_for_alt`."""
+        self.simple_takeoff(alt)
+        if alt is not None:
+            self.wait_for_alt(float(alt), epsilon, timeout=timeout)
+
+    def simple_goto(
+        self,
+        location: LocationGlobal | LocationGlobalRelative,
+        airspeed: float | None = None,
+        groundspeed: float | None = None,
+    ) -> None:
+        """Send the vehicle to a place; returns at once, and nothing tells of the arrival.
+
+        In GUIDED mode only (PX4: LOITER): the mode is left as it is, so that a pilot who has taken over keeps the
+        vehicle; the vehicle's refusal becomes a warning of the logger ``dronekit``.
+
+        Args:
+            location: latitude and longitude in degrees; altitude in metres above the sea or above home, by its class.
+            airspeed: m/s, as the attribute.
+            groundspeed: m/s, as the attribute.
+
+        Raises:
+            ValueError: it is no such location, or one of its numbers is missing or wrong. Nothing was sent.
+        """
+        aio = self._check_link()
+        place = self._relative_place(location)
+        for name, speed in (("airspeed", airspeed), ("groundspeed", groundspeed)):
+            _check_speed(name, speed)
+        if isinstance(aio.autopilot, Px4) and self._flightmode not in PX4_FLIES_TO_PLACES_IN:
+            self._order("goto", _refuse, f"not in {self._flightmode}: set the mode LOITER first")
+        else:
+            self._order("goto", _go_to, aio, *place)
+        if airspeed is not None:
+            self.airspeed = airspeed
+        if groundspeed is not None:
+            self.groundspeed = groundspeed
+
+    def _relative_place(self, location: object) -> tuple[int, int, float]:
+        """Latitude and longitude in 1e-7 degrees, altitude above home."""
+        if not isinstance(location, (LocationGlobal, LocationGlobalRelative)):
+            raise ValueError("Expecting location to be LocationGlobal or LocationGlobalRelative.")
+        latitude, longitude, altitude = _checked_place(location)
+        if isinstance(location, LocationGlobal):
+            home = self._known_home()
+            altitude -= home.alt or 0.0
+        return latitude, longitude, altitude
+
+    # -------------------------------------------------------------------------------- speeds
+
+    @property
+    def airspeed(self) -> float | None:
+        """Speed through the air in m/s (VFR_HUD). Setting it asks for this speed (MAV_CMD_DO_CHANGE_SPEED)."""
+        message = self._vfr_hud
+        return None if message is None else message.airspeed
+
+    @airspeed.setter
+    def airspeed(self, speed: float) -> None:
+        self._change_speed("airspeed", AIRSPEED, speed)
+
+    @property
+    def groundspeed(self) -> float | None:
+        """Speed over ground in m/s (VFR_HUD). Setting it asks for this speed (MAV_CMD_DO_CHANGE_SPEED)."""
+        message = self._vfr_hud
+        return None if message is None else message.groundspeed
+
+    @groundspeed.setter
+    def groundspeed(self, speed: float) -> None:
+        self._change_speed("groundspeed", GROUNDSPEED, speed)
+
+    def _change_speed(self, name: str, kind: int, speed: float) -> None:
+        _check_speed(name, speed)
+        aio = self._check_link()
+        self._order(name, aio.command, DO_CHANGE_SPEED, kind, float(speed), -1)
+
+    # ---------------------------------------------------------------------------------- home
+
+    @property
+    def home_location(self) -> LocationGlobal | None:
+        """Where it returns to, a new object each time; None until HOME_POSITION or a mission told it.
+
+        Setting it sends MAV_CMD_DO_SET_HOME, and the attribute has the new place at once.
+
+        Raises:
+            ValueError: not a LocationGlobal, or one of its numbers is missing or wrong. Nothing was sent.
+        """
+        home = self._home_location
+        return None if home is None else LocationGlobal(home.lat, home.lon, home.alt)
+
+    @home_location.setter
+    def home_location(self, pos: LocationGlobal) -> None:
+        if not isinstance(pos, LocationGlobal):
+            raise ValueError("Expecting home_location to be set to a LocationGlobal.")
+        latitude, longitude, altitude = _checked_place(pos)
+        aio = self._check_link()
+        self._order("home", _set_home, aio, latitude, longitude, altitude)
+        self._set_home(pos.lat, pos.lon, altitude)
+
+    def _known_home(self) -> LocationGlobal:
+        if self._home_location is None:
+            self._run(self._fetch_home)
+        home = self.home_location
+        if home is None:
+            raise APIException(
+                "the vehicle does not know its home yet: it is set with the first good position"
+            )
+        return home
+
+    async def _fetch_home(self) -> None:
+        aio = self._check_link()
+        with contextlib.suppress(CommandRejected):
+            await aio.command(REQUEST_MESSAGE, HomePosition.ID)
+        await aio.telemetry.home.wait_until(lambda _: True, timeout=HOME_TIMEOUT_S, description="home")
+
+    # ------------------------------------------------------------------------------- waiting
+
+    def wait_for(
+        self,
+        condition: Callable[[], object],
+        timeout: float | None = None,
+        interval: float = 0.1,
+        errmsg: str | None = None,
+    ) -> None:
+        """Wait until ``condition()`` is true, asked every ``interval`` seconds on the caller's thread.
+
+        Raises:
+            TimeoutError: it is not within ``timeout`` seconds (None: as long as it takes); the text is ``errmsg``.
+            APIException: the link is down.
+        """
+        deadline = math.inf if not timeout else time.monotonic() + timeout
+        while not condition():
+            self._check_link()
+            if time.monotonic() >= deadline:
+                raise TimeoutError(errmsg)
+            self._pause(min(interval, max(deadline - time.monotonic(), 0.0)))
+
+    def wait_for_armable(self, timeout: float | None = None) -> None:
+        """Wait until :attr:`is_armable`; TimeoutError after ``timeout`` seconds."""
+        self.wait_for(lambda: self.is_armable, timeout, errmsg="the vehicle did not become armable")
+
+    def wait_for_alt(
+        self, alt: float, epsilon: float = 0.1, rel: bool = True, timeout: float | None = None
+    ) -> None:
+        """Wait until the altitude is within ``epsilon`` metres of ``alt``, or has passed it on the way.
+
+        ``rel``: above home, otherwise above the sea. TimeoutError after ``timeout`` seconds.
+        """
+        start: float | None = None
+
+        def is_there() -> bool:
+            nonlocal start
+            now = self._altitude(rel)
+            if now is None:
+                return False
+            start = now if start is None else start
+            return abs(now - alt) <= epsilon or (start < alt <= now) or (now <= alt < start)
+
+        self.wait_for(is_there, timeout, errmsg="failed to reach specified altitude")
+
+    def _altitude(self, is_relative: bool) -> float | None:
+        location: Any = self.location  # type: ignore[attr-defined]
+        frame = location.global_relative_frame if is_relative else location.global_frame
+        altitude: float | None = frame.alt
+        return altitude
+
+    def _wait_for_order(
+        self,
+        order: concurrent.futures.Future[None],
+        is_done: Callable[[], bool],
+        timeout: float | None,
+        text: str,
+    ) -> None:
+        """Wait for the end of an order; that it failed is known before the time is over."""
+        deadline = math.inf if not timeout else time.monotonic() + timeout
+        while not is_done():
+            self._check_link()
+            if order.done() and order.exception() is not None and not is_done():
+                raise TimeoutError(f"{text}: {order.exception()}") from order.exception()
+            if time.monotonic() >= deadline:
+                raise TimeoutError(text)
+            if order.done():
+                self._pause(min(POLL_S, max(deadline - time.monotonic(), 0.0)))
+            else:
+                concurrent.futures.wait([order], min(POLL_S, max(deadline - time.monotonic(), 0.0)))
+
+
+async def _go_to(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: float) -> None:
+    """DO_REPOSITION, which is answered; and the message for a vehicle that does not know it."""
+    if isinstance(vehicle.autopilot, Px4):
+        home = vehicle.telemetry.home.value.altitude_amsl_m
+        await vehicle.command_int(
+            DO_REPOSITION, -1, CHANGE_MODE, 0, math.nan, frame=5, x=latitude, y=longitude, z=altitude + home
+        )
+        return
+    place = {"x": latitude, "y": longitude, "z": altitude}
+    try:
+        await vehicle.command_int(DO_REPOSITION, -1, 0, 0, math.nan, frame=GLOBAL_RELATIVE_ALT_INT, **place)
+    except CommandRejected as error:
+        if error.result != RESULT_UNSUPPORTED:
+            raise
+        target = (vehicle.system_id, vehicle.component_id, GLOBAL_RELATIVE_ALT_INT, POSITION_ONLY)
+        vehicle.send(SetPositionTargetGlobalInt(0, *target, latitude, longitude, altitude, *(0.0,) * 8))
+
+
+async def _set_home(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: float) -> None:
+    try:
+        await vehicle.command_int(DO_SET_HOME, 0, frame=GLOBAL, x=latitude, y=longitude, z=altitude)
+    except CommandRejected as error:
+        if error.result != RESULT_UNSUPPORTED:
+            raise
+        await vehicle.command(DO_SET_HOME, 0, 0, 0, 0, latitude * 1e-7, longitude * 1e-7, altitude)
+
+
+async def _refuse(reason: str) -> None:
+    raise APIException(reason)
+
+
+def _checked_place(location: LocationGlobal | LocationGlobalRelative) -> tuple[int, int, float]:
+    """Latitude and longitude in 1e-7 degrees, altitude in metres.
+
+    Raises:
+        LocalProtocolError: a ValueError, which names the number that is missing or wrong.
+    """
+    for name, limit in (("lat", 90.0), ("lon", 180.0), ("alt", math.inf)):
+        value = getattr(location, name)
+        try:
+            is_good = math.isfinite(value) and abs(value) <= limit
+        except TypeError:
+            is_good = False
+        if not is_good:
+            allowed = "a number of metres" if limit == math.inf else f"-{limit:g} to {limit:g} degrees"
+            raise LocalProtocolError(f"location.{name} = {value!r} is not allowed: {allowed}")
+    return round(location.lat * 1e7), round(location.lon * 1e7), float(location.alt)  # type: ignore[operator, arg-type]
+
+
+def _check_speed(name: str, speed: float | None) -> None:
+    if speed is not None and not math.isfinite(speed):
+        raise LocalProtocolError(f"{name} = {speed!r} is not allowed: a number of m/s")

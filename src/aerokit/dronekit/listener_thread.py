@@ -1,0 +1,107 @@
+"""The thread on which a program's callbacks run, one after the other, apart from reception and heartbeat."""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+from collections.abc import Callable
+from typing import Any
+
+__all__ = ["ListenerThread"]
+
+logger = logging.getLogger("dronekit")
+
+MOST_WAITING = 10_000
+"""What a listener that does not come back lets wait at most; values that come again and again are dropped then."""
+JOIN_S = 2.0
+
+
+class ListenerThread:
+    """Calls functions in the order in which they were posted. The thread starts with the first of them.
+
+    What a function raises is logged. The thread does not keep the interpreter alive.
+    """
+
+    def __init__(self, name: str = "dronekit listeners") -> None:
+        self._name = name
+        self._calls: queue.SimpleQueue[tuple[Callable[..., object], tuple[Any, ...]]] = queue.SimpleQueue()
+        self._thread: threading.Thread | None = None
+        self._lock = threading.Lock()
+        self._is_stopped = False
+        self._dropped = 0
+
+    def post(self, function: Callable[..., object], *args: Any) -> None:
+        """Have ``function(*args)`` called; from any thread, never blocks. Nothing happens once it is stopped."""
+        if self._thread is None:
+            self._start()
+        if not self._is_stopped:
+            self._calls.put((function, args))
+
+    def offer(self, function: Callable[..., object], *args: Any) -> None:
+        """As :meth:`post`, for what comes again anyway: dropped while 10,000 others wait."""
+        if self._calls.qsize() < MOST_WAITING:
+            self.post(function, *args)
+            return
+        if not self._dropped:
+            logger.warning("a listener does not come back; values are dropped that it would be told of")
+        self._dropped += 1
+
+    def call(self, function: Callable[..., object], *args: Any) -> None:
+        """Have it called, and wait until it was: at once on this thread itself and when the thread has ended."""
+        if self.is_current or self._is_stopped:
+            function(*args)
+            return
+        called = threading.Event()
+
+        def call_and_tell() -> None:
+            try:
+                function(*args)
+            finally:
+                called.set()
+
+        self.post(call_and_tell)
+        while not called.wait(0.2):  # in slices: Ctrl-C is noticed between them on every system
+            if self._is_stopped:
+                return
+
+    @property
+    def is_current(self) -> bool:
+        """Whether the caller is on this thread."""
+        return threading.current_thread() is self._thread
+
+    @property
+    def dropped(self) -> int:
+        """How many calls were dropped because a listener did not come back."""
+        return self._dropped
+
+    def stop(self) -> None:
+        """Call nothing more. Idempotent; never blocks."""
+        with self._lock:
+            self._is_stopped = True
+        self._calls.put((_nothing, ()))
+
+    def join(self) -> None:
+        """Wait until the thread has ended, at most two seconds: a callback may be stuck in the program's own code."""
+        if self._thread is not None and not self.is_current:
+            self._thread.join(JOIN_S)
+
+    def _start(self) -> None:
+        with self._lock:
+            if self._thread is None and not self._is_stopped:
+                self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
+                self._thread.start()
+
+    def _run(self) -> None:
+        while not self._is_stopped:
+            function, args = self._calls.get()
+            if self._is_stopped:
+                return
+            try:
+                function(*args)
+            except BaseException:  # sys.exit() in a callback would end the callbacks, and nothing else
+                logger.exception("Exception in a callback")
+
+
+def _nothing() -> None:
+    pass

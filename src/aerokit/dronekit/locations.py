@@ -1,0 +1,83 @@
+"""``vehicle.location``: where the vehicle is, in three frames."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from aerokit.dronekit.observers import HasObservers
+from aerokit.dronekit.values import LocationGlobal, LocationGlobalRelative, LocationLocal
+from aerokit.mavlink.messages import GlobalPositionInt, LocalPositionNed
+from aerokit.vehicle.decoding import place
+
+if TYPE_CHECKING:
+    from aerokit.dronekit.vehicle import Vehicle
+
+__all__ = ["Locations"]
+
+UNKNOWN = (None, None)
+
+
+class Locations(HasObservers):
+    """The vehicle's location in global, global relative and local frames; each of them can be listened to.
+
+    Listeners get this object as their first argument. The three numbers of a location belong to one message.
+    """
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        super().__init__(vehicle._listener_thread)
+        self._vehicle = vehicle
+        self._global: tuple[float | None, float | None, float | None] = (None, None, None)
+        self._relative: tuple[float | None, float | None, float | None] = (None, None, None)
+        self._local: LocalPositionNed | None = None
+        self._has_altitude = False
+        vehicle._on(GlobalPositionInt, self._on_global_position)
+        vehicle._on(LocalPositionNed, self._on_local_position)
+
+    @property
+    def global_frame(self) -> LocationGlobal:
+        """Latitude, longitude in degrees and altitude above mean sea level in metres (GLOBAL_POSITION_INT).
+
+        A new object each time. Latitude and longitude are None without a fix, the altitude is None until one is known.
+        """
+        return LocationGlobal(*self._global)
+
+    @property
+    def global_relative_frame(self) -> LocationGlobalRelative:
+        """Latitude, longitude in degrees and altitude above home in metres (GLOBAL_POSITION_INT)."""
+        return LocationGlobalRelative(*self._relative)
+
+    @property
+    def local_frame(self) -> LocationLocal:
+        """Metres north, east and down from the estimator's origin (LOCAL_POSITION_NED)."""
+        message = self._local
+        if message is None:
+            return LocationLocal(None, None, None)
+        return LocationLocal(message.x, message.y, message.z)
+
+    # ------------------------------------------------------------------------------- inside
+
+    def _on_global_position(self, message: GlobalPositionInt) -> None:
+        latitude, longitude = place(message.lat, message.lon) or UNKNOWN
+        altitude = message.alt / 1000.0
+        self._has_altitude = self._has_altitude or altitude != 0
+        self._relative = (latitude, longitude, message.relative_alt / 1000.0)
+        self._global = (latitude, longitude, altitude if self._has_altitude else None)
+        self._announce("global_relative_frame")
+        if self._has_altitude:
+            self._announce("global_frame")
+        self._vehicle._tell("location", self)
+
+    def _on_local_position(self, message: LocalPositionNed) -> None:
+        self._local = message
+        self._announce("local_frame")
+        self._vehicle._tell("location", self)
+
+    def _announce(self, frame: str) -> None:
+        """Tell those who listen here, then those who listen to the vehicle."""
+        vehicle, name = self._vehicle, f"location.{frame}"
+        if self._attribute_listeners or vehicle._attribute_listeners:
+            value = getattr(self, frame)
+            self._tell(frame, value)
+            vehicle._tell(name, value)
+        else:
+            vehicle._note(name)

@@ -1,0 +1,291 @@
+"""``dronekit.mavlink``: the connection underneath a vehicle, as far as DroneKit programs touch it."""
+
+from __future__ import annotations
+
+import asyncio
+import atexit
+import contextlib
+import logging
+import queue
+import threading
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
+
+from aerokit import sync
+from aerokit.dronekit.exceptions import APIException
+from aerokit.dronekit.listener_thread import ListenerThread
+from aerokit.dronekit.orders import Orders
+from aerokit.errors import AerokitError, ConnectionClosed, LinkOpenError
+
+if TYPE_CHECKING:
+    from aerokit.dronekit.master import Master
+    from aerokit.links.link import Peer
+    from aerokit.mavlink.frame import Frame
+    from aerokit.mavlink.message import Message
+    from aerokit.runtime.bus import Detach
+    from aerokit.runtime.connection import Connection
+
+__all__ = ["MAVConnection", "MAVWriter", "mavudpin_multi"]
+
+logger = logging.getLogger("dronekit.mavlink")
+
+FunctionT = TypeVar("FunctionT", bound=Callable[..., object])
+
+ORDERS_END_S = 2.0
+"""How long closing waits for what was ordered a moment before to be answered."""
+TICK_S = 0.05
+
+
+class MAVConnection:
+    """A link, open until it is closed, with an event loop on a thread of its own.
+
+    ``ip`` is any connection string of DroneKit and pymavlink (a bare ``host:port`` and ``udp:`` listen), or of aerokit.
+    A link that is lost is opened again. ``use_native`` is accepted and means nothing.
+
+    Raises:
+        OSError: the link cannot be opened; ConnectionRefusedError, socket.gaierror, serial.SerialException as the
+            system says.
+        ValueError: the connection string or another argument is wrong.
+    """
+
+    def __init__(
+        self,
+        ip: str,
+        baud: int = 115200,
+        target_system: int = 0,
+        source_system: int = 255,
+        source_component: int = 0,
+        use_native: bool = False,
+    ) -> None:
+        self.target_system = target_system
+        """System id of the vehicle, 0 before it was heard."""
+        self.listener_thread = ListenerThread()
+        """Where the callbacks of the program run."""
+        self._sync = _open(ip, baud, source_system, source_component)
+        self.loop = self._sync._loop
+        """The event loop's thread."""
+        self.orders = Orders(self.loop)
+        """What was ordered without waiting."""
+        self._is_closed = threading.Event()
+        self._closing = threading.Lock()
+        self._detach: list[Detach] = []
+        self._at_close: list[Callable[[], object]] = []
+        self._master: Master | None = None
+        self.loop_listeners: list[Callable[[MAVConnection], object]] = []
+        """Functions that are called about 20 times a second; see :meth:`forward_loop`."""
+        self.message_listeners: list[Callable[[MAVConnection, Any], object]] = []
+        """Functions that get every message; see :meth:`forward_message`."""
+        atexit.register(self.close)
+
+    # ------------------------------------------------------------------------------- sending
+
+    @property
+    def connection(self) -> Connection:
+        """The asynchronous connection, for code that runs on its loop."""
+        return self._sync.aio
+
+    def send(self, message: Message, *, to: int | None = None) -> None:
+        """Send a message, in the order of the calls; from any thread, never blocks.
+
+        Raises:
+            LocalProtocolError: a field is out of range; nothing was sent.
+            APIException: the connection is closed.
+        """
+        message.encode()  # so that what is wrong with it is told to who made it
+        try:
+            self.connection.raise_if_ended()
+            self.orders.post(self._send, message, to)
+        except AerokitError as error:
+            raise APIException(str(error)) from error
+
+    def _send(self, message: Message, to: int | None) -> None:
+        try:
+            self.connection.send(message, to=to)
+        except AerokitError as error:
+            logger.warning("%s was not sent: %s", message.NAME, error)
+
+    def fix_targets(self, message: Any) -> None:
+        """Write the vehicle's system id into ``message.target_system``, if the message has such a field."""
+        if hasattr(message, "target_system"):
+            message.target_system = self.target_system
+
+    @property
+    def master(self) -> Master:
+        """What DroneKit programs use of pymavlink's connection object."""
+        if self._master is None:
+            from aerokit.dronekit.master import Master
+
+            self._master = Master(self)
+        return self._master
+
+    # ----------------------------------------------------------------------------- receiving
+
+    def forward_message(self, fn: FunctionT) -> FunctionT:
+        """Have ``fn(connection, message)`` called on the listener thread for every message (pymavlink's classes).
+
+        Usable as a decorator.
+        """
+        self.message_listeners.append(fn)
+        if len(self.message_listeners) == 1:
+            self.loop.call_soon(self._tap, self._forward)
+        return fn
+
+    def forward_loop(self, fn: FunctionT) -> FunctionT:
+        """Have ``fn(connection)`` called on the listener thread about 20 times a second. Usable as a decorator."""
+        self.loop_listeners.append(fn)
+        if len(self.loop_listeners) == 1:
+            self.loop.call_soon(self._tick)
+        return fn
+
+    def pipe(self, target: MAVConnection) -> MAVConnection:
+        """Pass everything on that comes here to ``target``, and the other way round; returns ``target``."""
+        target.target_system = self.target_system
+        self.loop.call_soon(self._tap, lambda frame, peer: target._pass_on(frame))
+        target.loop.call_soon(target._tap, lambda frame, peer: self._pass_on(frame))
+        return target
+
+    # ---------------------------------------------------------------------------- life cycle
+
+    def start(self) -> None:
+        """Nothing is left to do: reception and heartbeat run since the connection was made."""
+        self.connection.raise_if_ended()
+
+    def stop_threads(self) -> None:
+        """As :meth:`close`."""
+        self.close()
+
+    def close(self) -> None:
+        """Wait shortly for the answers to what was ordered, then close the link and end the threads.
+
+        Idempotent; from any thread, callbacks included, at the interpreter's exit and after the link was lost.
+        """
+        with self._closing:
+            is_first, _ = not self._is_closed.is_set(), self._is_closed.set()
+        if not is_first:
+            return
+        atexit.unregister(self.close)
+        try:
+            self.orders.wait(ORDERS_END_S)
+        finally:
+            self.listener_thread.stop()
+            self._sync.close()
+            self.listener_thread.join()
+            for function in self._at_close:
+                function()
+
+    def on_close(self, function: Callable[[], object]) -> None:
+        """Have a function called when the connection is closed."""
+        self._at_close.append(function)
+
+    def wait_closed(self, timeout: float) -> bool:
+        """Wait at most ``timeout`` seconds for the connection to be closed by the program; says whether it is."""
+        return self._is_closed.wait(timeout)
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether it was closed by the program."""
+        return self._is_closed.is_set()
+
+    @property
+    def _alive(self) -> bool:
+        return self.connection.is_open
+
+    @property
+    def _accept_input(self) -> bool:
+        return self._alive
+
+    @property
+    def _death_error(self) -> Exception | None:
+        return self.connection._error
+
+    @property
+    def out_queue(self) -> queue.Queue[bytes]:
+        """Always empty: what is sent does not wait."""
+        return queue.Queue()
+
+    # ------------------------------------------------------------------------------- inside
+
+    def _tap(self, sink: Callable[[Frame, Peer], None]) -> None:
+        self._detach.append(self.connection.tap(sink))
+
+    def _forward(self, frame: Frame, peer: Peer) -> None:
+        self.listener_thread.offer(self._deliver, frame)
+
+    def _deliver(self, frame: Frame) -> None:
+        from aerokit.dronekit.pymavlink_messages import message_of
+
+        message = message_of(frame)
+        for listener in tuple(self.message_listeners):
+            self._call(listener, message)
+
+    def _tick(self) -> None:
+        if self.connection.is_open:
+            self.listener_thread.offer(self._tell_loop_listeners)
+            asyncio.get_running_loop().call_later(TICK_S, self._tick)
+
+    def _tell_loop_listeners(self) -> None:
+        for listener in tuple(self.loop_listeners):
+            self._call(listener)
+
+    def _call(self, listener: Callable[..., object], *args: Any) -> None:
+        try:
+            listener(self, *args)
+        except BaseException:
+            logger.exception("Exception in a listener of the connection")
+
+    def _pass_on(self, frame: Frame) -> None:
+        with contextlib.suppress(ConnectionClosed):
+            self.loop.call_soon(self._write_raw, frame)
+
+    def _write_raw(self, frame: Frame) -> None:
+        with contextlib.suppress(AerokitError):
+            self.connection.write_raw(frame.raw)
+
+    def follow_version(self, heartbeat: Message) -> None:
+        """Speak the version of MAVLink that the vehicle speaks: old firmware knows no other one (loop thread)."""
+        frame = heartbeat.received_frame
+        if frame is not None and frame.version != self.connection.mavlink_version:
+            self.connection.mavlink_version = frame.version
+
+
+def _open(ip: str, baud: int, source_system: int, source_component: int) -> sync.Connection:
+    try:
+        return sync.open_connection(
+            ip, baud=baud, source_system=source_system, source_component=source_component, reconnect=True
+        )
+    except LinkOpenError as error:
+        _raise_classic(error)
+
+
+def _raise_classic(error: LinkOpenError) -> NoReturn:
+    """As what the system called it: programs catch ConnectionRefusedError, socket.gaierror, SerialException."""
+    cause = error.__cause__
+    if isinstance(cause, OSError):
+        if cause.errno is not None:
+            raise type(cause)(cause.errno, str(error)) from error
+        raise type(cause)(str(error)) from error
+    raise error
+
+
+def mavudpin_multi(device: str, baud: int | None = None, **_: Any) -> MAVConnection:
+    """Listen for UDP and answer everybody heard: any connection that listens does."""
+    return MAVConnection(f"udpin:{device}")
+
+
+class MAVWriter:
+    """A file-like object whose ``write`` puts bytes into a queue, as programs that build their own MAVLink use it."""
+
+    def __init__(self, queue: queue.Queue[bytes]) -> None:
+        self.queue = queue
+
+    def write(self, pkt: bytes) -> None:
+        """Put them there."""
+        self.queue.put(pkt)
+
+    def read(self) -> NoReturn:
+        """Nothing can be read.
+
+        Raises:
+            RuntimeError: always.
+        """
+        raise RuntimeError("a MAVWriter is for writing")

@@ -1,0 +1,117 @@
+"""Who listens to which message: pymavlink objects for callbacks, made only when somebody listens."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from aerokit.dronekit.pymavlink_messages import message_of
+from aerokit.errors import AerokitError
+from aerokit.runtime.diagnosis import is_autopilot
+
+if TYPE_CHECKING:
+    from aerokit.dronekit.mavlink import MAVConnection
+    from aerokit.links.link import Peer
+    from aerokit.mavlink.frame import Frame
+    from aerokit.mavlink.message import Message
+    from aerokit.runtime.bus import Detach
+
+__all__ = ["MessageListener", "MessageListeners"]
+
+logger = logging.getLogger("dronekit")
+
+MessageListener = Callable[[Any, str, Any], object]
+"""``listener(vehicle, message_name, message)``; the message is pymavlink's."""
+
+EVERY_NAME = "*"
+
+
+class MessageListeners:
+    """The message listeners of one vehicle, called on its listener thread.
+
+    They hear what the vehicle's system says, every component of it, and what comes from radios, ground stations and
+    the like; not what other vehicles on the link say.
+    """
+
+    def __init__(self, owner: object, handler: MAVConnection) -> None:
+        self._owner, self._handler = owner, handler
+        self._listeners: dict[str, tuple[MessageListener, ...]] = {}
+        self._detach: dict[str, Detach] = {}
+        self._is_started = False
+
+    def add(self, name: str, listener: MessageListener) -> None:
+        """Have it called for every message of this name, or for every message (``'*'``); not twice."""
+        name = str(name)
+        present = self._listeners.get(name, ())
+        if listener not in present:
+            self._listeners[name] = (*present, listener)
+            self._attach_soon()
+
+    def remove(self, name: str, listener: MessageListener) -> None:
+        """Call it no more; silent when it does not listen."""
+        left = tuple(each for each in self._listeners.get(name, ()) if each != listener)
+        if left:
+            self._listeners[name] = left
+        elif self._listeners.pop(name, None) is not None:
+            self._attach_soon()
+
+    def notify(self, name: str, message: Any) -> None:
+        """Call the listeners of a message: those of its name, then those of every message."""
+        for key in (name, EVERY_NAME):
+            for listener in self._listeners.get(key, ()):
+                try:
+                    listener(self._owner, name, message)
+                except (
+                    BaseException
+                ):  # sys.exit() too: it would end the callbacks of everybody, and nothing else
+                    logger.exception("Exception in message handler for %s", name)
+
+    def start(self) -> None:
+        """The vehicle was found: hear what comes from now on (loop thread)."""
+        self._is_started = True
+        self._attach()
+
+    def _attach_soon(self) -> None:
+        if self._is_started:
+            with contextlib.suppress(AerokitError):  # the connection is closed: nothing will come
+                self._handler.orders.post(self._attach)
+
+    def _attach(self) -> None:
+        """Hear what is listened to: everything, or the messages of these names."""
+        wanted = [EVERY_NAME] if EVERY_NAME in self._listeners else list(self._listeners)
+        for name in set(self._detach).difference(wanted):
+            self._detach.pop(name)()
+        for name in wanted:
+            if name not in self._detach:
+                self._listen(name)
+
+    def _listen(self, name: str) -> None:
+        connection = self._handler.connection
+        if name == EVERY_NAME:
+            self._detach[name] = connection.tap(self._take_frame)
+            return
+        message_type = connection.bus.dialect.by_name(name)
+        if message_type is None:
+            logger.warning("there is no message %s: its listener will never be called", name)
+            self._detach[name] = lambda: None
+        else:
+            self._detach[name] = connection.bus.attach(message_type, self._take)
+
+    def _take(self, message: Message) -> None:
+        if message.received_frame is not None:
+            self._take_frame(message.received_frame, None)
+
+    def _take_frame(self, frame: Frame, peer: Peer) -> None:
+        if frame.system_id == self._handler.target_system or not self._is_of_another_vehicle(frame.system_id):
+            self._handler.listener_thread.offer(self._deliver, frame)
+
+    def _is_of_another_vehicle(self, system_id: int) -> bool:
+        heard = self._handler.connection.heard
+        return any(source[0] == system_id and is_autopilot(heartbeat) for source, heartbeat in heard.items())
+
+    def _deliver(self, frame: Frame) -> None:
+        message = message_of(frame)
+        if message is not None:
+            self.notify(message.get_type(), message)

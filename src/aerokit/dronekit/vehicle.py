@@ -1,0 +1,373 @@
+"""``Vehicle``: the classic API, spelled on top of ``aerokit.sync``."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING, Any
+
+import anyio
+
+from aerokit import sync
+from aerokit.dronekit.channels import Channels
+from aerokit.dronekit.commands import CommandSequence
+from aerokit.dronekit.exceptions import APIException, TimeoutError  # noqa: A004 - DroneKit's name
+from aerokit.dronekit.flight import FlightMethods
+from aerokit.dronekit.gimbal import Gimbal
+from aerokit.dronekit.link_watch import watch_link
+from aerokit.dronekit.locations import Locations
+from aerokit.dronekit.maintenance import Maintenance
+from aerokit.dronekit.message_listeners import MessageListener, MessageListeners
+from aerokit.dronekit.parameters import Parameters
+from aerokit.dronekit.pymavlink_messages import sendable
+from aerokit.dronekit.readiness import Readiness
+from aerokit.dronekit.streams import request_streams
+from aerokit.errors import AerokitError, ConnectFailed, LocalProtocolError, OperationTimeout
+from aerokit.runtime.background import Background
+from aerokit.vehicle.connect import connect as connect_async
+
+if TYPE_CHECKING:
+    import concurrent.futures
+    from collections.abc import AsyncIterator, Awaitable, Callable
+    from types import TracebackType
+
+    from typing_extensions import Self
+
+    from aerokit.dronekit.master import Master, MessageFactory
+    from aerokit.dronekit.mavlink import MAVConnection
+    from aerokit.mavlink.message import Message
+    from aerokit.vehicle.values import StatusText
+    from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
+
+__all__ = ["Vehicle"]
+
+CONNECT_S = 30.0
+"""How long a vehicle is waited for when the program sets no limit."""
+LEVELS = (logging.CRITICAL,) * 3 + (logging.ERROR, logging.WARNING, logging.INFO, logging.INFO, logging.DEBUG)
+"""MAV_SEVERITY → level of the logger ``autopilot``."""
+
+
+class Vehicle(FlightMethods, Maintenance, Readiness):
+    """A vehicle: attributes to read and to listen to, orders, parameters, missions.
+
+    Made by :func:`connect`, or of a subclass by ``connect(…, vehicle_class=…)``: the subclass passes on the one
+    argument it gets, and may add listeners and attributes of its own. Any thread may use it; callbacks run in order
+    on a thread of their own and may use it too. A context manager; :meth:`close` ends it.
+    """
+
+    def __init__(self, handler: MAVConnection) -> None:
+        super().__init__(handler.listener_thread)
+        self._handler = handler
+        self._logger = logging.getLogger("dronekit")
+        self._autopilot_logger = logging.getLogger("autopilot")
+        self._aio: AsyncVehicle | None = None
+        self._sync: sync.Vehicle | None = None
+        self._heartbeat_timeout: float = 0.0
+        self._message_handlers: list[tuple[type[Message], Callable[[Any], None], bool]] = []
+        self._starters: list[Callable[[], None]] = []
+        self._initializing = threading.Lock()
+        self._tasks: Background | None = None
+        self._message_listeners = MessageListeners(self, handler)
+        self._location = Locations(self)
+        self._attach_attributes()
+        self._channels = Channels(self, 8)
+        self._gimbal = Gimbal(self)
+        self._parameters = Parameters(self)
+        self._commands = CommandSequence(self)
+
+    # --------------------------------------------------------------------------------- parts
+
+    @property
+    def location(self) -> Locations:
+        """Where it is: ``.global_frame``, ``.global_relative_frame``, ``.local_frame``."""
+        return self._location
+
+    @property
+    def channels(self) -> Channels:
+        """RC channels by number, and ``.overrides`` of them."""
+        return self._channels
+
+    @property
+    def gimbal(self) -> Gimbal:
+        """The gimbal: where it points, and orders to it."""
+        return self._gimbal
+
+    @property
+    def mount_status(self) -> list[float | None]:
+        """``[pitch, yaw, roll]`` of the gimbal in degrees; use :attr:`gimbal`."""
+        return self._gimbal.mount_status
+
+    @property
+    def parameters(self) -> Parameters:
+        """The autopilot's parameters, as a mapping of names to values."""
+        return self._parameters
+
+    @property
+    def commands(self) -> CommandSequence:
+        """The mission: download, change, upload."""
+        return self._commands
+
+    def flush(self) -> None:
+        """As ``commands.upload()``."""
+        self._commands.upload()
+
+    @property
+    def aio(self) -> AsyncVehicle:
+        """The asynchronous vehicle (:class:`aerokit.Vehicle`) underneath, for coroutines on its own loop.
+
+        Its state cells (``vehicle.aio.position.latest``) may be read from any thread; coroutines are run by
+        :meth:`run`.
+
+        Raises:
+            APIException: the vehicle is not connected.
+        """
+        if self._aio is None:
+            raise APIException("the vehicle is not connected yet: call initialize()")
+        return self._aio
+
+    @property
+    def sync(self) -> sync.Vehicle:
+        """The blocking twin of the new API (:class:`aerokit.sync.Vehicle`) on the same connection.
+
+        A program moves over function by function: ``vehicle.sync.take_off(10)`` returns at altitude.
+
+        Raises:
+            APIException: the vehicle is not connected.
+        """
+        if self._sync is None:
+            raise APIException("the vehicle is not connected yet: call initialize()")
+        return self._sync
+
+    def run(self, function: Callable[..., Awaitable[Any]], /, *args: Any, **kwargs: Any) -> Any:
+        """Await a coroutine function on the vehicle's loop: ``vehicle.run(survey, vehicle.aio)``; Ctrl-C cancels it.
+
+        What it raises comes out as it is.
+        """
+        return self._handler.loop.run(function, *args, **kwargs)
+
+    # ------------------------------------------------------------------------------ messages
+
+    def add_message_listener(self, name: str, fn: MessageListener) -> None:
+        """Have ``fn(vehicle, name, message)`` called for every message of this name (``'*'``: every message).
+
+        Messages are objects of pymavlink. Attributes hold what the message says by the time it is called.
+        """
+        self._message_listeners.add(name, fn)
+
+    def remove_message_listener(self, name: str, fn: MessageListener) -> None:
+        """Call it no more; silent when it does not listen."""
+        self._message_listeners.remove(name, fn)
+
+    def on_message(
+        self, name: str | list[str] | tuple[str, ...]
+    ) -> Callable[[MessageListener], MessageListener]:
+        """Decorate a message listener with the name, or the list of names, of messages it listens to."""
+
+        def decorate(fn: MessageListener) -> MessageListener:
+            for each in (name,) if isinstance(name, str) else name:
+                self.add_message_listener(each, fn)
+            return fn
+
+        return decorate
+
+    def notify_message_listeners(self, name: str, msg: Any) -> None:
+        """Call the listeners of a message, as if it had come; returns when they have run."""
+        self._handler.listener_thread.call(self._message_listeners.notify, name, msg)
+
+    @property
+    def message_factory(self) -> MessageFactory:
+        """Makes pymavlink messages: ``vehicle.message_factory.command_long_encode(…)``, for :meth:`send_mavlink`."""
+        return self._handler.master.mav
+
+    def send_mavlink(self, message: Any) -> None:
+        """Send a message made by :attr:`message_factory`, by pymavlink or of ``aerokit.messages``, once.
+
+        ``target_system`` becomes this vehicle's, in the message itself; ``target_component`` stays. Never blocks.
+
+        Raises:
+            LocalProtocolError: a ValueError; a field is wrong. Nothing was sent.
+            APIException: the link is down.
+        """
+        self._check_link()
+        self._handler.send(sendable(message, self._target_system), to=self._target_system)
+
+    # ---------------------------------------------------------------------------- life cycle
+
+    def initialize(self, rate: float | None = 4, heartbeat_timeout: float = 30) -> None:
+        """Wait for the vehicle's first heartbeat and begin to listen; :func:`connect` calls it.
+
+        Args:
+            rate: Hz of the data streams to ask for; None asks for none.
+            heartbeat_timeout: seconds to wait for the first heartbeat (0: 30), and after which, in flight, orders
+                and waits raise APIException until heartbeats come again (0: never).
+
+        Raises:
+            APIException: no vehicle was heard in time; the text says what was heard instead.
+        """
+        with self._initializing:
+            if self._aio is not None:
+                return
+            self._heartbeat_timeout = heartbeat_timeout or 0.0
+            timeout = heartbeat_timeout or CONNECT_S
+            loop = self._handler.loop
+            try:
+                held = loop.hold_open(self._found(timeout, rate))
+                self._sync = sync.Vehicle(loop, held, owns_loop=False)
+                self._wait_until_booted(timeout)
+            except ConnectFailed as error:
+                raise APIException(f"Timeout in initializing connection. {error}") from error
+            except AerokitError as error:
+                raise APIException(str(error)) from error
+
+    def close(self) -> None:
+        """End it: what was ordered a moment before gets the time to be answered, then link and threads end.
+
+        Idempotent; from any thread, callbacks included. Nothing is sent: a vehicle in the air goes on with what it
+        does. Calls that wait raise APIException.
+        """
+        self._handler.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    @property
+    def _master(self) -> Master:
+        return self._handler.master
+
+    @property
+    def _target_system(self) -> int:
+        return self._handler.target_system
+
+    # -------------------------------------------------------------------- for the other parts
+
+    def _on(self, message_type: type[Message], handler: Callable[[Any], None]) -> None:
+        self._message_handlers.append((message_type, handler, True))
+
+    def _on_any_component(self, message_type: type[Message], handler: Callable[[Any], None]) -> None:
+        self._message_handlers.append((message_type, handler, False))
+
+    def _at_start(self, function: Callable[[], None]) -> None:
+        self._starters.append(function)
+
+    def _background(self, function: Callable[[], Awaitable[None]]) -> None:
+        if self._tasks is not None:
+            self._tasks.start(function, f"dronekit {getattr(function, '__name__', 'task')}")
+
+    def _check_link(self) -> AsyncVehicle:
+        """The asynchronous vehicle, if it can be talked to."""
+        aio = self.aio
+        if self._handler.is_closed:
+            raise APIException("the vehicle was closed")
+        try:
+            aio.connection.raise_if_ended()
+        except AerokitError as error:
+            raise APIException(str(error)) from error
+        age = aio.heartbeat_age
+        if self._heartbeat_timeout and age > self._heartbeat_timeout:
+            raise APIException(f"no heartbeat of the vehicle for {age:.0f} s")
+        return aio
+
+    def _run(self, function: Callable[..., Awaitable[Any]], *args: Any, **kwargs: Any) -> Any:
+        self._check_link()
+        try:
+            return self._handler.loop.run(function, *args, **kwargs)
+        except LocalProtocolError:
+            raise
+        except OperationTimeout as error:
+            raise TimeoutError(str(error)) from error
+        except AerokitError as error:
+            raise APIException(str(error)) from error
+
+    def _order(
+        self, kind: str, function: Callable[..., Awaitable[object]], *args: Any, **kwargs: Any
+    ) -> concurrent.futures.Future[None]:
+        self._check_link()
+        try:
+            return self._handler.orders.give(kind, function, *args, **kwargs)
+        except AerokitError as error:
+            raise APIException(str(error)) from error
+
+    def _send(self, message: Message) -> None:
+        self._check_link()
+        self._handler.send(message)
+
+    def _pause(self, seconds: float) -> None:
+        """Sleep, unless the vehicle is closed meanwhile."""
+        self._handler.wait_closed(seconds)
+
+    # ------------------------------------------------------------------------------- inside
+
+    @asynccontextmanager
+    async def _found(self, timeout: float, rate: float | None) -> AsyncIterator[AsyncVehicle]:
+        connection = self._handler.connection
+        async with connect_async(connection, timeout=timeout, rates={}) as aio:
+            self._tasks = Background(connection.fail)
+            try:
+                self._begin(aio, rate)
+                yield aio
+            finally:
+                await self._tasks.aclose()
+
+    def _begin(self, aio: AsyncVehicle, rate: float | None) -> None:
+        """On the loop, in the turn in which the vehicle was found."""
+        self._aio = aio
+        self._handler.target_system = aio.system_id
+        for message_type, handler, only_autopilot in self._message_handlers:
+            take = _only_of(aio.component_id, handler) if only_autopilot else handler
+            aio._detach.append(aio.connection.bus.attach(message_type, take, system_id=aio.system_id))
+        aio._detach.append(aio.telemetry.status_text.observe(self._on_status_text, every_arrival=True))
+        first = aio.connection.heard.get((aio.system_id, aio.component_id))
+        if first is not None:
+            self._handler.follow_version(first)
+            self._on_heartbeat(first)
+        self._message_listeners.start()
+        if rate is not None:
+            self._background(lambda: request_streams(aio, rate))
+        self._background(lambda: self._request_capabilities(aio))
+        self._background(lambda: watch_link(self, aio))
+        for starter in self._starters:
+            starter()
+
+    def _on_heartbeat(self, message: Any) -> None:
+        self._handler.follow_version(message)
+        super()._on_heartbeat(message)
+
+    def _on_status_text(self, before: StatusText | None, text: StatusText) -> None:
+        level = LEVELS[min(text.severity, len(LEVELS) - 1)]
+        if self._autopilot_logger.isEnabledFor(level):
+            self._handler.listener_thread.post(self._autopilot_logger.log, level, "%s", text.text.strip())
+
+    async def _request_capabilities(self, aio: AsyncVehicle) -> None:
+        """As old firmware wants to be asked, with each heartbeat until there is an answer."""
+        for _ in range(5):
+            if aio.telemetry.version.is_known:
+                return
+            self.send_capabilities_request(self, "HEARTBEAT", None)
+            await anyio.sleep(1.0)
+
+    def _wait_until_booted(self, timeout: float) -> None:
+        try:
+            self.wait_for(lambda: self._flightmode not in (None, "INITIALISING", "MAV"), timeout)
+        except TimeoutError:
+            raise APIException(
+                f"Timeout in initializing connection. The vehicle is still in mode {self._flightmode}"
+            ) from None
+
+
+def _only_of(component_id: int, handler: Callable[[Any], None]) -> Callable[[Any], None]:
+    """Other components of the system (gimbals, companions) have no say in the autopilot's state."""
+
+    def take(message: Any) -> None:
+        if message.received_frame.component_id == component_id:
+            handler(message)
+
+    return take
