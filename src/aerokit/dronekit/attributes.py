@@ -154,7 +154,7 @@ class VehicleAttributes(HasObservers):
 
     @property
     def is_armable(self) -> bool:
-        """Whether it has booted, has a GPS fix, and its estimator will have a position; on PX4: whether its checks pass.
+        """Whether it has booted, has a GPS fix, and its estimator will have a position; on PX4: its checks pass.
 
         The vehicle's own arming checks may still refuse: :meth:`Vehicle.arm` tells why.
         """

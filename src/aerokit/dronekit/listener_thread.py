@@ -89,8 +89,13 @@ class ListenerThread:
     def _start(self) -> None:
         with self._lock:
             if self._thread is None and not self._is_stopped:
-                self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
-                self._thread.start()
+                thread = threading.Thread(target=self._run, name=self._name, daemon=True)
+                try:
+                    thread.start()
+                except RuntimeError:  # the interpreter is ending: there is nobody left to be called
+                    self._is_stopped = True
+                else:
+                    self._thread = thread
 
     def _run(self) -> None:
         while not self._is_stopped:

@@ -69,6 +69,8 @@ class MAVConnection:
         self._is_closed = threading.Event()
         self._closing = threading.Lock()
         self._detach: list[Detach] = []
+        self.knows_mavlink_2 = False
+        """Whether the vehicle has said that it understands MAVLink 2, whichever version it speaks so far."""
         self._at_close: list[Callable[[], object]] = []
         self._master: Master | None = None
         self.loop_listeners: list[Callable[[MAVConnection], object]] = []
@@ -244,8 +246,10 @@ class MAVConnection:
     def follow_version(self, heartbeat: Message) -> None:
         """Speak the version of MAVLink that the vehicle speaks: old firmware knows no other one (loop thread)."""
         frame = heartbeat.received_frame
-        if frame is not None and frame.version != self.connection.mavlink_version:
-            self.connection.mavlink_version = frame.version
+        if frame is not None:
+            version = 2 if self.knows_mavlink_2 else frame.version
+            if version != self.connection.mavlink_version:
+                self.connection.mavlink_version = version
 
 
 def _open(ip: str, baud: int, source_system: int, source_component: int) -> sync.Connection:

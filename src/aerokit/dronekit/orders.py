@@ -55,7 +55,7 @@ class Orders:
         return future
 
     def post(self, function: Callable[..., object], *args: Any) -> None:
-        """Call a function that neither waits nor raises on the loop; in order with other calls and with :meth:`give`."""
+        """Call a function that neither waits nor raises on the loop; in order with other calls and :meth:`give`."""
         if self._loop.is_current:
             function(*args)
         else:

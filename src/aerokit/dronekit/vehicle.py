@@ -42,6 +42,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Vehicle"]
 
+MAVLINK_2 = 8192
+"""Bit of AUTOPILOT_VERSION.capabilities."""
 CONNECT_S = 30.0
 """How long a vehicle is waited for when the program sets no limit."""
 LEVELS = (logging.CRITICAL,) * 3 + (logging.ERROR, logging.WARNING, logging.INFO, logging.INFO, logging.DEBUG)
@@ -340,6 +342,10 @@ class Vehicle(FlightMethods, Maintenance, Readiness):
     def _on_heartbeat(self, message: Any) -> None:
         self._handler.follow_version(message)
         super()._on_heartbeat(message)
+
+    def _on_version(self, message: Any) -> None:
+        self._handler.knows_mavlink_2 = bool(message.capabilities & MAVLINK_2)
+        super()._on_version(message)
 
     def _on_status_text(self, before: StatusText | None, text: StatusText) -> None:
         level = LEVELS[min(text.severity, len(LEVELS) - 1)]
