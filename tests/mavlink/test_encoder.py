@@ -118,8 +118,8 @@ def test_what_fits_in_spite_of_its_type(message: Message) -> None:
     [
         ((0, 1), "system_id = 0 must be in 1..255"),
         ((256, 1), "system_id = 256 must be in 1..255"),
-        ((1, 0), "component_id = 0 must be in 1..255"),
-        ((1, -1), "component_id = -1 must be in 1..255"),
+        ((1, 256), "component_id = 256 must be in 0..255"),
+        ((1, -1), "component_id = -1 must be in 0..255"),
     ],
 )
 def test_wrong_ids(arguments: tuple[int, int], complaint: str) -> None:
@@ -127,9 +127,27 @@ def test_wrong_ids(arguments: tuple[int, int], complaint: str) -> None:
         FrameEncoder(*arguments)
 
 
+def test_component_0_is_nobody_and_may_send() -> None:
+    (frame,) = Framer().receive(FrameEncoder(255, 0).encode(attitude()))
+    assert (frame.system_id, frame.component_id) == (255, 0)
+
+
 def test_wrong_version() -> None:
     with pytest.raises(LocalProtocolError, match="version = 3 must be 1 or 2"):
         FrameEncoder(1, 1, version=3)
+    encoder = FrameEncoder(1, 1)
+    with pytest.raises(LocalProtocolError, match="version = 0 must be 1 or 2"):
+        encoder.version = 0
+    assert encoder.version == 2
+
+
+def test_the_version_may_change_between_two_frames() -> None:
+    encoder = FrameEncoder(1, 1)
+    data = encoder.encode(attitude())
+    encoder.version = 1
+    data += encoder.encode(attitude())
+    frames = Framer().receive(data)
+    assert [(frame.version, frame.sequence) for frame in frames] == [(2, 0), (1, 1)]
 
 
 def test_version_1_has_no_ids_above_255() -> None:

@@ -168,6 +168,7 @@ async def test_a_link_that_goes_while_waiting_is_told_at_once() -> None:
         ({"timeout": 0}, "timeout = 0"),
         ({"source_system": 0}, "source_system = 0"),
         ({"source_component": 256}, "source_component = 256"),
+        ({"source_component": -1}, "source_component = -1"),
         ({"mavlink_version": 3}, "mavlink_version = 3"),
         ({"timeout": math.nan}, "timeout = nan"),
         ({"baud": 0}, "baud = 0"),

@@ -21,19 +21,33 @@ class FrameEncoder:
     """
 
     def __init__(self, system_id: int, component_id: int, *, version: int = 2) -> None:
-        """Ids are 1..255, ``version`` is that of the frames, 1 or 2; LocalProtocolError otherwise."""
-        for name, value in (("system_id", system_id), ("component_id", component_id)):
-            if not 1 <= value <= 255:
-                raise LocalProtocolError(
-                    f"{name} = {value!r} must be in 1..255 (0 addresses everyone, and is nobody)"
-                )
-        if version not in (1, 2):
-            raise LocalProtocolError(f"version = {version!r} must be 1 or 2")
+        """``system_id`` is 1..255, ``component_id`` 0..255, ``version`` 1 or 2; LocalProtocolError otherwise.
+
+        Component 0 addresses everyone and is nobody's id; it is allowed because old ground stations call themselves so.
+        """
+        if not 1 <= system_id <= 255:
+            raise LocalProtocolError(
+                f"system_id = {system_id!r} must be in 1..255 (0 addresses everyone, and is nobody)"
+            )
+        if not 0 <= component_id <= 255:
+            raise LocalProtocolError(f"component_id = {component_id!r} must be in 0..255")
         self.system_id = int(system_id)
         self.component_id = int(component_id)
-        self.version = version
         self.sequence = 0
         """The sequence number of the next frame, 0..255."""
+        self._version = 2
+        self.version = version
+
+    @property
+    def version(self) -> int:
+        """Of the next frames, 1 or 2; LocalProtocolError when it is set to anything else."""
+        return self._version
+
+    @version.setter
+    def version(self, version: int) -> None:
+        if version not in (1, 2):
+            raise LocalProtocolError(f"version = {version!r} must be 1 or 2")
+        self._version = int(version)
 
     def encode(self, message: Message) -> bytes:
         """The whole frame. LocalProtocolError names a field that does not fit; the sequence number is not used then.
@@ -41,7 +55,7 @@ class FrameEncoder:
         MAVLink 2 drops zeros from the end of the payload, MAVLink 1 all extension fields; it has no ids above 255.
         """
         payload = message.encode()
-        if self.version == 2:
+        if self._version == 2:
             payload = payload.rstrip(b"\0") or payload[:1]  # the standard never cuts the first byte
             low, high = message.ID & 0xFFFF, message.ID >> 16
             source = self.system_id, self.component_id

@@ -5,7 +5,7 @@ https://mavlink.io/en/guide/serialization.html#packet_format
 
 from __future__ import annotations
 
-__all__ = ["MAGIC_V1", "MAGIC_V2", "SIGNED", "Frame"]
+__all__ = ["MAGIC_V1", "MAGIC_V2", "SIGNED", "Frame", "is_whole_frame"]
 
 MAGIC_V1 = 0xFE
 """First byte of a MAVLink 1 frame."""
@@ -95,3 +95,12 @@ class Frame:
     def __repr__(self) -> str:
         source = f"{self.system_id}/{self.component_id}"
         return f"<Frame v{self.version} id={self.message_id} from={source} seq={self.sequence}>"
+
+
+def is_whole_frame(data: bytes) -> bool:
+    """Whether these bytes have the form of exactly one frame; its checksum is not looked at."""
+    if len(data) < 8 or data[0] not in (MAGIC_V1, MAGIC_V2):
+        return False
+    if data[0] == MAGIC_V1:
+        return len(data) == data[1] + 8
+    return data[2] <= SIGNED and len(data) == data[1] + 12 + SIGNATURE_LENGTH * data[2]

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from aerokit.mavlink.dialect import Dialect
     from aerokit.mavlink.frame import Frame
 
-__all__ = ["Bus", "Detach", "Sink"]
+__all__ = ["Bus", "Detach", "Sink", "once"]
 
 logger = logging.getLogger("aerokit")
 
@@ -47,12 +47,12 @@ class Bus:
         self._sinks[key] = (*self._sinks.get(key, ()), sink)
         self._plans.clear()
         self.wanted[message_type.ID] = self.wanted.get(message_type.ID, 0) + 1
-        return _once(lambda: self._detach(key, sink))
+        return once(lambda: self._detach(key, sink))
 
     def attach_event(self, event_type: type[EventT], sink: Callable[[EventT], None]) -> Detach:
         """Have every event of this class and of its subclasses delivered to ``sink``."""
         self._event_sinks[event_type] = (*self._event_sinks.get(event_type, ()), sink)
-        return _once(lambda: self._detach_event(event_type, sink))
+        return once(lambda: self._detach_event(event_type, sink))
 
     def deliver(self, frame: Frame) -> None:
         """Decode the frame if anyone wants it and hand it over; a sink that raises is logged, the others go on."""
@@ -111,7 +111,8 @@ def _drop(table: dict[Any, tuple[Sink, ...]], key: object, sink: Sink) -> None:
         del table[key]
 
 
-def _once(action: Callable[[], None]) -> Detach:
+def once(action: Callable[[], None]) -> Detach:
+    """What calls ``action`` the first time it is called."""
     pending = [action]
 
     def detach() -> None:

@@ -14,11 +14,12 @@ from aerokit.links import create_link
 from aerokit.links.link import Link
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.frame import Frame, is_whole_frame
 from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import Heartbeat
 from aerokit.runtime.background import Background
-from aerokit.runtime.bus import Bus
+from aerokit.runtime.bus import Bus, once
 from aerokit.runtime.deadlines import Deadlines
 from aerokit.runtime.endings import raisable
 from aerokit.runtime.events import Event, HeardTwice, LinkClosed
@@ -32,9 +33,10 @@ if TYPE_CHECKING:
 
     from aerokit.links.link import Peer
     from aerokit.mavlink.dialect import Dialect
-    from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.statistics import FramerStatistics
     from aerokit.runtime.bus import Detach, Sink
+
+    Tap = Callable[[Frame, Peer], object]
 
 __all__ = ["Connection", "open_connection"]
 
@@ -73,7 +75,8 @@ async def open_connection(
     Args:
         address: a connection string (``"udpin:0.0.0.0:14550"``, ``"/dev/ttyACM0,57600"``, …) or a link not yet open.
         source_system: our own system id, 1–255; ground stations take 255.
-        source_component: our own component id, 1–255.
+        source_component: our own component id, 1–255. 0, which is nobody's, is allowed for programs that always were
+            that (DroneKit).
         baud: of a serial link whose address names none, bits per second, above 0.
         dialect: the messages that are understood.
         mavlink_version: of what we send, 1 or 2; both are understood.
@@ -126,11 +129,11 @@ class Connection:
         dialect: Dialect = STANDARD,
         mavlink_version: int = 2,
     ) -> None:
-        for field, value in (("source_system", source_system), ("source_component", source_component)):
-            if not 1 <= value <= 255:
-                raise LocalProtocolError(f"{field} = {value} is not allowed: 1 to 255")
-        if mavlink_version not in (1, 2):
-            raise LocalProtocolError(f"mavlink_version = {mavlink_version} is not allowed: 1 or 2")
+        if not 1 <= source_system <= 255:
+            raise LocalProtocolError(f"source_system = {source_system} is not allowed: 1 to 255")
+        if not 0 <= source_component <= 255:
+            raise LocalProtocolError(f"source_component = {source_component} is not allowed: 0 to 255")
+        _check_version(mavlink_version)
         if dialect.get(Heartbeat.ID) is not Heartbeat:
             raise LocalProtocolError(
                 f"dialect {dialect.name!r} has no HEARTBEAT: pass Dialect.extended_by of the standard one"
@@ -151,6 +154,7 @@ class Connection:
         self._routed_at: dict[tuple[int, int], float] = {}
         self._doubles: set[tuple[int, int, Peer]] = set()
         self._recording: Recording | None = None
+        self._taps: tuple[Tap, ...] = ()
         self._enders: list[Callable[[Exception], None]] = []
         self._background = Background(self.fail)
         self._error: Exception | None = None
@@ -170,12 +174,38 @@ class Connection:
             ConnectionClosed, LinkLost: the connection has ended.
         """
         self.raise_if_ended()
-        data = self._encoder.encode(message)
-        system_id = getattr(message, "target_system", 0) if to is None else to
-        for peer in self._peers_of(system_id, getattr(message, "target_component", 0)):
-            self.link.write(data, peer)
-        if self._recording is not None:
-            self._recording.write(data, self._clock())
+        self._write(self._encoder.encode(message), message, to)
+
+    def write_raw(self, data: bytes) -> None:
+        """Write one whole frame of somebody else as it is, for programs that forward; never blocks.
+
+        It goes where :meth:`send` would send its message: where its target was last heard, or to every peer.
+
+        Raises:
+            LocalProtocolError: this is not exactly one MAVLink frame; nothing was sent.
+            ConnectionClosed, LinkLost: the connection has ended.
+        """
+        self.raise_if_ended()
+        if not is_whole_frame(data):
+            raise LocalProtocolError(
+                f"{len(data)} bytes beginning with {bytes(data[:3]).hex()!r} are not one frame"
+            )
+        frame = Frame.parse(bytes(data))
+        known = self.bus.dialect.get(frame.message_id)
+        self._write(frame.raw, None if known is None else self.bus.dialect.decode(frame), None)
+
+    @property
+    def mavlink_version(self) -> int:
+        """Of what we send, 1 or 2. MAVLink 1 has no message ids above 255 and no extension fields.
+
+        May be set while the connection is open, to what the vehicle speaks; LocalProtocolError for another number.
+        """
+        return self._encoder.version
+
+    @mavlink_version.setter
+    def mavlink_version(self, version: int) -> None:
+        _check_version(version)
+        self._encoder.version = version
 
     def subscribe(
         self,
@@ -200,6 +230,17 @@ class Connection:
     def attach(self, types: Sequence[type[Any]], sink: Sink, *, system_id: int = 0) -> list[Detach]:
         """Have these messages and events, of one system or of all (0), delivered to ``sink``."""
         return [self._attach(item, sink, system_id) for item in types]
+
+    def tap(self, sink: Tap) -> Detach:
+        """Have every frame that is received given to ``sink(frame, peer)``, after those who subscribed to its message.
+
+        Frames of messages that the dialect does not know come too, their checksums unchecked; what a second peer says
+        in the name of a component of the first (:class:`HeardTwice`) does not. ``sink`` must be quick and must not
+        await; what it raises is logged. While nobody taps, frames that nobody subscribed to are not even made.
+        """
+        self._taps = (*self._taps, sink)
+        self._let_all_through()
+        return once(lambda: self._untap(sink))
 
     def check_types(self, types: tuple[type[Any], ...]) -> None:
         """Raise LocalProtocolError unless each of these can be subscribed to."""
@@ -286,8 +327,7 @@ class Connection:
         if self._recording is not None:
             raise BusyError("this connection is being recorded already")
         self._recording = Recording(path, self._clock())
-        for framer in self._framers.values():
-            self._let_through(framer)
+        self._let_all_through()
 
     # -------------------------------------------------------------------- what the link calls
 
@@ -307,6 +347,8 @@ class Connection:
                 if frame.message_id == Heartbeat.ID:
                     self._note_heartbeat(frame, peer)
                 self.bus.deliver(frame)
+                for tap in self._taps:
+                    self._give(tap, frame, peer)
         except Exception as error:
             self.fail(error)
 
@@ -346,6 +388,25 @@ class Connection:
         self.deadlines.close()
         self._background.cancel()
 
+    def _write(self, data: bytes, message: Message | None, to: int | None) -> None:
+        system_id = getattr(message, "target_system", 0) if to is None else to
+        for peer in self._peers_of(system_id, getattr(message, "target_component", 0)):
+            self.link.write(data, peer)
+        if self._recording is not None:
+            self._recording.write(data, self._clock())
+
+    def _untap(self, sink: Tap) -> None:
+        left = list(self._taps)
+        left.remove(sink)
+        self._taps = tuple(left)
+        self._let_all_through()
+
+    def _give(self, tap: Tap, frame: Frame, peer: Peer) -> None:
+        try:
+            tap(frame, peer)
+        except Exception:
+            logger.exception("a tap (%r) raised; the frame was delivered to the others", tap)
+
     def _peers_of(self, system_id: int, component_id: int) -> Collection[Peer]:
         """Where to send what is for this component, or for this system if the component is 0 or was never heard."""
         if system_id == 0:
@@ -369,14 +430,18 @@ class Connection:
         self._let_through(framer)
         return framer
 
+    def _let_all_through(self) -> None:
+        for framer in self._framers.values():
+            self._let_through(framer)
+
     def _peer_to_forget(self) -> Peer:
         """The oldest that no heartbeat came from, else the oldest."""
         routes = set(self._routes.values())
         return next((peer for peer in self._framers if peer not in routes), next(iter(self._framers)))
 
     def _let_through(self, framer: Framer) -> None:
-        """A recording holds everything, also what nobody wants and what the dialect does not know."""
-        framer.keep_unknown = self._recording is not None
+        """Recordings and taps get everything, also what nobody wants and what the dialect does not know."""
+        framer.keep_unknown = self._recording is not None or bool(self._taps)
         framer.wanted = None if framer.keep_unknown else self.bus.wanted
 
     def _note_heartbeat(self, frame: Frame, peer: Peer) -> None:
@@ -410,6 +475,11 @@ def _only(system_id: int, sink: Sink) -> Sink:
             sink(event)
 
     return filtered
+
+
+def _check_version(version: int) -> None:
+    if version not in (1, 2):
+        raise LocalProtocolError(f"mavlink_version = {version} is not allowed: 1 or 2")
 
 
 def _ignore(message: object) -> None:

@@ -64,7 +64,7 @@ async def connect(
         rates: message class → Hz (above 0, at most 1000), asked for instead of the default rates; ``{}`` asks for
             nothing.
         source_system: our own system id.
-        source_component: our own component id.
+        source_component: our own component id, 0–255; 0, which is nobody's, for programs that always were that.
         baud: of a serial link whose address names none.
         dialect: the messages that are understood.
         mavlink_version: of what we send, 1 or 2.
