@@ -353,9 +353,11 @@ async def _go_to(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude:
             DO_REPOSITION, -1, CHANGE_MODE, 0, math.nan, frame=5, x=latitude, y=longitude, z=altitude + home
         )
         return
-    place = {"x": latitude, "y": longitude, "z": altitude}
+    params = (-1, 0, 0, math.nan)
     try:
-        await vehicle.command_int(DO_REPOSITION, -1, 0, 0, math.nan, frame=GLOBAL_RELATIVE_ALT_INT, **place)
+        await vehicle.command_int(
+            DO_REPOSITION, *params, frame=GLOBAL_RELATIVE_ALT_INT, x=latitude, y=longitude, z=altitude
+        )
     except CommandRejected as error:
         if error.result != RESULT_UNSUPPORTED:
             raise

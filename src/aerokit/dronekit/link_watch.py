@@ -40,7 +40,7 @@ def _is_listened_to(vehicle: Vehicle) -> bool:
 
 def _log(vehicle: Vehicle, is_lost: bool) -> None:
     """On the listener thread: the program's log handlers may take their time."""
-    post, logger = vehicle._listener_thread.post, vehicle._logger
+    post, logger = vehicle._handler.listener_thread.post, vehicle._logger
     if is_lost:
         post(logger.warning, "Link timeout, no heartbeat in last %d seconds", SILENT_AFTER_S)
     else:

@@ -98,7 +98,7 @@ class ListenerThread:
                     self._thread = thread
 
     def _run(self) -> None:
-        while not self._is_stopped:
+        while True:
             function, args = self._calls.get()
             if self._is_stopped:
                 return

@@ -162,9 +162,9 @@ class MAVConnection:
         Idempotent; from any thread, callbacks included, at the interpreter's exit and after the link was lost.
         """
         with self._closing:
-            is_first, _ = not self._is_closed.is_set(), self._is_closed.set()
-        if not is_first:
-            return
+            if self._is_closed.is_set():
+                return
+            self._is_closed.set()
         atexit.unregister(self.close)
         try:
             self.orders.wait(ORDERS_END_S)

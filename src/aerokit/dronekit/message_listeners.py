@@ -92,8 +92,9 @@ class MessageListeners:
         if name == EVERY_NAME:
             self._detach[name] = connection.tap(self._take_frame)
             return
-        message_type = connection.bus.dialect.by_name(name)
-        if message_type is None:
+        try:
+            message_type = connection.bus.dialect.by_name(name)
+        except AerokitError:
             logger.warning("there is no message %s: its listener will never be called", name)
             self._detach[name] = lambda: None
         else:

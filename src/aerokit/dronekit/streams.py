@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import anyio
 
 from aerokit.mavlink import messages as m
-from aerokit.runtime.events import VehicleBack, VehicleRebooted
+from aerokit.runtime.events import Event, VehicleBack, VehicleRebooted
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
@@ -88,6 +88,6 @@ class _Heard:
     def _on_message(self, message: Message) -> None:
         self.something = True
 
-    def _on_event(self, event: VehicleBack | VehicleRebooted) -> None:
+    def _on_event(self, event: Event) -> None:
         if event.system_id == self._system_id:
             self.is_to_be_asked.set()

@@ -1,0 +1,104 @@
+"""Orders given without waiting: the order on the wire, replacement, failures, the end."""
+
+from __future__ import annotations
+
+import asyncio
+import concurrent.futures
+from collections.abc import Iterator
+
+import pytest
+
+from aerokit.dronekit.orders import Orders
+from aerokit.errors import ConnectionClosed
+from aerokit.sync.loop_thread import LoopThread
+
+LIMIT_S = 10.0
+
+
+@pytest.fixture
+def loop() -> Iterator[LoopThread]:
+    thread = LoopThread()
+    yield thread
+    thread.close()
+
+
+def test_what_is_sent_keeps_the_order_of_the_calls(loop: LoopThread) -> None:
+    orders, sent = Orders(loop), []
+
+    async def send_and_wait(name: str) -> None:
+        sent.append(name)
+        await asyncio.sleep(0)
+
+    for number in range(50):
+        orders.give(f"kind {number % 7}", send_and_wait, f"order {number}") if number % 3 else orders.post(
+            sent.append, f"message {number}"
+        )
+    orders.wait(LIMIT_S)
+    loop.call(lambda: None)
+    replaced = {each for each in range(50) if each % 3 and f"order {each}" not in sent}
+    expected = [f"order {n}" if n % 3 else f"message {n}" for n in range(50) if n not in replaced]
+    assert sent == expected
+    assert not replaced or all(any(later % 7 == n % 7 for later in range(n + 1, 50)) for n in replaced)
+
+
+def test_a_newer_order_of_a_kind_replaces_the_older_one(loop: LoopThread) -> None:
+    orders, ended = Orders(loop), []
+
+    async def for_ever(name: str) -> None:
+        try:
+            await asyncio.sleep(1000)
+        finally:
+            ended.append(name)
+
+    async def soon() -> None:
+        pass
+
+    first = orders.give("mode", for_ever, "mode")
+    other = orders.give("home", for_ever, "home")
+    second = orders.give("mode", soon)
+    second.result(LIMIT_S)
+    with pytest.raises(ConnectionClosed, match="mode: a newer order"):
+        first.result(LIMIT_S)
+    assert not other.done()
+    assert "home" not in ended
+
+
+def test_a_failure_is_one_warning_and_in_the_future(
+    loop: LoopThread, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def fail() -> None:
+        raise ValueError("the vehicle said no")
+
+    future = Orders(loop).give("arm", fail)
+    with pytest.raises(ValueError, match="said no"):
+        future.result(LIMIT_S)
+    assert [(each.name, each.levelname, each.message) for each in caplog.records] == [
+        ("dronekit", "WARNING", "arm: the vehicle said no")
+    ]
+
+
+def test_orders_end_with_the_loop(loop: LoopThread) -> None:
+    async def for_ever() -> None:
+        await asyncio.sleep(1000)
+
+    orders = Orders(loop)
+    future = orders.give("mode", for_ever)
+    loop.close()
+    done, _ = concurrent.futures.wait([future], LIMIT_S)
+    assert done
+    assert isinstance(future.exception(), ConnectionClosed)
+    with pytest.raises(ConnectionClosed):
+        orders.give("mode", for_ever)
+    with pytest.raises(ConnectionClosed):
+        orders.post(print)
+    orders.wait(0.0)
+
+
+def test_waiting_for_the_end_is_bounded(loop: LoopThread) -> None:
+    async def for_ever() -> None:
+        await asyncio.sleep(1000)
+
+    orders = Orders(loop)
+    future = orders.give("mode", for_ever)
+    orders.wait(0.01)
+    assert not future.done()
