@@ -8,7 +8,8 @@ import contextlib
 import logging
 import queue
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextvars import ContextVar
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from aerokit import sync
@@ -78,6 +79,9 @@ class MAVConnection:
         self.message_listeners: list[Callable[[MAVConnection, Any], object]] = []
         """Functions that get every message; see :meth:`forward_message`."""
         atexit.register(self.close)
+        made = _made.get()
+        if made is not None:
+            made.append(self)
 
     # ------------------------------------------------------------------------------- sending
 
@@ -250,6 +254,20 @@ class MAVConnection:
             version = 2 if self.knows_mavlink_2 else frame.version
             if version != self.connection.mavlink_version:
                 self.connection.mavlink_version = version
+
+
+_made: ContextVar[list[MAVConnection] | None] = ContextVar("connections_made", default=None)
+
+
+@contextlib.contextmanager
+def connections_made() -> Iterator[list[MAVConnection]]:
+    """Collect the connections that this thread makes in the block."""
+    connections: list[MAVConnection] = []
+    token = _made.set(connections)
+    try:
+        yield connections
+    finally:
+        _made.reset(token)
 
 
 def _open(ip: str, baud: int, source_system: int, source_component: int) -> sync.Connection:

@@ -1,0 +1,166 @@
+"""Running DroneKit programs unchanged, as ``python program.py`` would if DroneKit could still be imported."""
+
+from __future__ import annotations
+
+import argparse
+import builtins
+import contextlib
+import importlib.machinery
+import io
+import os
+import runpy
+import sys
+import types
+import zipfile
+from typing import TYPE_CHECKING
+
+from aerokit.dronekit.alias import install
+from aerokit.dronekit.mavlink import connections_made
+from aerokit.dronekit.util import errprinter
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from types import TracebackType
+
+__all__ = ["main", "parser", "run_script"]
+
+CANNOT_OPEN = 2
+OF_RUNPY = (runpy.__file__, "<frozen runpy>")
+
+
+def run_script(path: str | os.PathLike[str], arguments: Sequence[str] = ()) -> None:
+    """Run a DroneKit program in this process, and come back when its main program has ended.
+
+    It finds everything as with ``python program.py arguments…``: ``sys.argv``, its own folder first in ``sys.path``,
+    ``__name__ == '__main__'``. ``import dronekit`` means :mod:`aerokit.dronekit`, and goes on doing so afterwards. A
+    folder or zip file with a ``__main__.py`` is a program, too. ``sys`` is put back afterwards, and vehicles that the
+    program left open are closed.
+
+    Args:
+        path: the program.
+        arguments: what it finds behind its name in ``sys.argv``.
+
+    Raises:
+        OSError: the file cannot be read.
+        ImportError: the real ``dronekit`` was imported before, by somebody else.
+        SystemExit: the program called ``sys.exit``. Whatever else it raises comes out as well.
+    """
+    install()
+    with _sys_as_it_was(), connections_made() as connections:
+        try:
+            _run_file(os.fspath(path), arguments)
+        finally:
+            for connection in connections:
+                connection.close()
+
+
+def main(arguments: Sequence[str], prog: str = "python -m aerokit.dronekit") -> int:
+    """Run the program that a command line names, in the place of this one; what it raises comes out.
+
+    Args:
+        arguments: ``program.py arguments…`` or ``-m module arguments…``.
+        prog: how this command is called.
+
+    Returns:
+        Exit code: 0, or 2 if the program cannot be opened.
+    """
+    own, rest = _split(arguments)
+    options = parser(prog).parse_args(own)
+    if not options.module and (error := _unreadable(options.program)):
+        errprinter(f"{prog}: can't open file {options.program!r}: {error}")
+        return CANNOT_OPEN
+    install()
+    sys.excepthook = _print_without_us
+    if not getattr(sys.flags, "safe_path", False):
+        del sys.path[:1]  # ours: the folder of this command
+    run = _run_module if options.module else _run_file
+    run(options.program, rest)
+    return 0
+
+
+def parser(prog: str) -> argparse.ArgumentParser:
+    """The arguments in front of the program's own."""
+    parser = argparse.ArgumentParser(
+        prog=prog,
+        usage=f"{prog} [-h] (PROGRAM.py | -m MODULE) [ARGUMENT ...]",
+        description="Run a DroneKit program unchanged: its 'import dronekit' means aerokit.dronekit.",
+    )
+    parser.add_argument("-m", dest="module", action="store_true", help="the program is a module, not a file")
+    parser.add_argument(
+        "program", metavar="PROGRAM", help="a file, or a folder or zip file with a __main__.py"
+    )
+    parser.epilog = "Everything behind the program is the program's, options too."
+    return parser
+
+
+def _split(arguments: Sequence[str]) -> tuple[Sequence[str], Sequence[str]]:
+    """What is for us, the program included, and what is for the program."""
+    for place, argument in enumerate(arguments, 1):
+        if not argument.startswith("-"):
+            return arguments[:place], arguments[place:]
+    return arguments, []
+
+
+def _unreadable(path: str) -> str | None:
+    try:
+        io.open_code(os.path.abspath(path)).close()
+    except IsADirectoryError:
+        return None
+    except OSError as error:
+        return error.strerror
+    return None
+
+
+def _run_module(name: str, arguments: Sequence[str]) -> None:
+    _prepend_path(os.getcwd())
+    sys.argv[:] = ["-m", *arguments]
+    runpy.run_module(name, run_name="__main__", alter_sys=True)
+
+
+def _run_file(path: str, arguments: Sequence[str]) -> None:
+    sys.argv[:] = [path, *arguments]
+    if os.path.isdir(path) or path.endswith(".pyc") or zipfile.is_zipfile(path):
+        runpy.run_path(path, run_name="__main__")
+        return
+    path = os.path.abspath(path)
+    with io.open_code(path) as file:
+        source = file.read()
+    main = sys.modules["__main__"] = types.ModuleType("__main__")
+    main.__file__ = path
+    main.__loader__ = importlib.machinery.SourceFileLoader("__main__", path)
+    main.__dict__.update(__builtins__=builtins, __cached__=None)
+    _prepend_path(os.path.dirname(os.path.realpath(path)))
+    exec(compile(source, path, "exec", dont_inherit=True), main.__dict__)
+
+
+def _prepend_path(folder: str) -> None:
+    if not getattr(sys.flags, "safe_path", False):
+        sys.path.insert(0, folder)
+
+
+@contextlib.contextmanager
+def _sys_as_it_was() -> Iterator[None]:
+    argv, path, main = sys.argv[:], sys.path[:], sys.modules["__main__"]
+    try:
+        yield
+    finally:
+        sys.argv[:], sys.path[:], sys.modules["__main__"] = argv, path, main
+
+
+def _print_without_us(
+    kind: type[BaseException], error: BaseException, traceback: TracebackType | None
+) -> None:
+    """Print a traceback that begins in the program, as Python does for one that it runs itself."""
+    sys.__excepthook__(kind, error, _from_the_program_on(traceback))
+
+
+def _from_the_program_on(traceback: TracebackType | None) -> TracebackType | None:
+    rest = traceback
+    while rest is not None and rest.tb_frame.f_code not in (_run_file.__code__, _run_module.__code__):
+        rest = rest.tb_next
+    if rest is None:
+        return traceback
+    rest = rest.tb_next
+    while rest is not None and rest.tb_frame.f_code.co_filename in OF_RUNPY:
+        rest = rest.tb_next
+    return rest
