@@ -24,6 +24,7 @@ __all__ = [
     "OperationTimeout",
     "ParameterRejected",
     "ParameterTimeout",
+    "RecordingEnded",
     "RemoteProtocolError",
     "RollbackFailed",
     "SetpointStreamStopped",
@@ -51,6 +52,10 @@ class LinkOpenError(LinkError):
 
 class LinkLost(LinkError):
     """A link that was open has gone: the peer closed it or the device was unplugged."""
+
+
+class RecordingEnded(LinkLost):
+    """A recording that was replayed has come to its end, or cannot be read on."""
 
 
 class ConnectionClosed(AerokitError):

@@ -12,6 +12,7 @@ from .address import ACCEPTED_FORMS, LinkAddress, parse_address
 from .create import create_link
 from .link import Link, Peer, Receiver
 from .memory import MemoryLink, memory_link_pair
+from .reconnecting import Interruptible, ReconnectingLink
 from .replay import Replay
 from .serial import SerialLink
 from .tcp import TcpConnect, TcpListen
@@ -25,11 +26,13 @@ __all__ = [
     "ACCEPTED_FORMS",
     "FaultModel",
     "FaultyLink",
+    "Interruptible",
     "Link",
     "LinkAddress",
     "MemoryLink",
     "Peer",
     "Receiver",
+    "ReconnectingLink",
     "Replay",
     "SerialLink",
     "TcpConnect",

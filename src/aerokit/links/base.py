@@ -77,14 +77,14 @@ class BaseLink(Link):
         if self._receiver is not None:
             self._receiver.bytes_received(data, peer)
 
-    def _lose(self, reason: str, cause: BaseException | None = None) -> None:
+    def _lose(self, reason: str, cause: BaseException | None = None, kind: type[LinkLost] = LinkLost) -> None:
         """The link has gone by itself: says so once and releases what is left of it."""
         receiver, self._receiver = self._receiver, None
         if receiver is None:
             return
         self._state = _State.LOST
         self._release()
-        error = LinkLost(f"{self.address}: {reason}")
+        error = kind(f"{self.address}: {reason}")
         error.__cause__ = cause
         receiver.link_lost(error)
 

@@ -99,6 +99,10 @@ class FaultyLink(Link):
         for due, piece in self.outgoing.carry(bytes(data), on_the_way.loop.time()):
             on_the_way.put(due, lambda piece=piece: self.link.write(piece, peer))  # type: ignore[misc]
 
+    def has_peer(self, peer: Peer) -> bool:
+        """See `Link.has_peer`."""
+        return self.link.has_peer(peer)
+
     def close(self) -> None:
         """See `Link.close`; what is on its way still goes out, unless that takes longer than `LINGER_S`."""
         if self._is_closed:

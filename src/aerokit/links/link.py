@@ -57,6 +57,10 @@ class Link(ABC):
         before `open` and after the end it does nothing.
         """
 
+    def has_peer(self, peer: Peer) -> bool:
+        """Whether a peer that was heard could still be written to: not a client that has gone."""
+        return True
+
     @abstractmethod
     def close(self) -> None:
         """Closes the link: at once to the eye, no callback comes any more. Never blocks, idempotent.

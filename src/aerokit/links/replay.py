@@ -7,7 +7,7 @@ import math
 import os
 from collections.abc import Generator, Iterator
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import LocalProtocolError, RecordingEnded
 from aerokit.mavlink.tlog import read_tlog
 
 from .address import LinkAddress
@@ -81,7 +81,7 @@ class Replay(BaseLink):
         if self._receiver is None:
             return
         if self._next is None:
-            self._lose(f"end of recording after {self.frames} frames")
+            self._lose(f"end of recording after {self.frames} frames", kind=RecordingEnded)
         else:
             self._wake_up = self._loop.call_at(max(now, self._due), self._play)
 
@@ -91,7 +91,8 @@ class Replay(BaseLink):
         try:
             self._next = next(self._records, None)
         except OSError as error:
-            self._lose(f"the recording cannot be read on: {error.strerror or error}", error)
+            reason = f"the recording cannot be read on: {error.strerror or error}"
+            self._lose(reason, error, RecordingEnded)
             return
         if self._next is not None:
             gap = min(max(self._next[0] - self._last_stamp, 0.0), LONGEST_GAP_S)

@@ -156,6 +156,10 @@ class TcpListen(_TcpLink):
         else:
             self.dropped_writes += 1
 
+    def has_peer(self, peer: Peer) -> bool:
+        """See `Link.has_peer`."""
+        return peer in self._clients
+
     async def wait_closed(self) -> None:
         """See `Link.wait_closed`."""
         await super().wait_closed()

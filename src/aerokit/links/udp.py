@@ -162,6 +162,10 @@ class UdpListen(_UdpLink):
         else:
             self.dropped_writes += 1
 
+    def has_peer(self, peer: Peer) -> bool:
+        """See `Link.has_peer`."""
+        return peer in self._peers
+
     async def _make_socket(self) -> socket.socket:
         sock = await bound_socket(self._host, self._port, socket.SOCK_DGRAM)
         self.address = f"udpin:{host_and_port(self._host, sock.getsockname()[1])}"

@@ -120,6 +120,10 @@ class Framer:
             begin = end
         return frames
 
+    def begin_anew(self) -> None:
+        """Forget the beginning of a frame: what comes next is another stream of bytes."""
+        self._rest = b""
+
     @property
     def waiting(self) -> int:
         """Bytes kept because they may become a frame, a few hundred at most."""

@@ -5,12 +5,13 @@ from __future__ import annotations
 import asyncio
 import logging
 from contextlib import asynccontextmanager
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import anyio
 
 from aerokit.errors import AerokitError, BusyError, ConnectionClosed, LinkLost, LocalProtocolError
-from aerokit.links import create_link
+from aerokit.links import ReconnectingLink, create_link
 from aerokit.links.link import Link
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
@@ -22,14 +23,15 @@ from aerokit.runtime.background import Background
 from aerokit.runtime.bus import Bus, once
 from aerokit.runtime.deadlines import Deadlines
 from aerokit.runtime.endings import raisable
-from aerokit.runtime.events import Event, HeardTwice, LinkClosed
+from aerokit.runtime.events import Event, HeardTwice, LinkClosed, LinkInterrupted, LinkRestored
 from aerokit.runtime.loop_watch import watch_loop
 from aerokit.runtime.recording import Recording
+from aerokit.runtime.routes import Routes
 from aerokit.runtime.subscription import Overflow, Subscription
 
 if TYPE_CHECKING:
     import os
-    from collections.abc import AsyncIterator, Callable, Collection, Iterator, Sequence
+    from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 
     from aerokit.links.link import Peer
     from aerokit.mavlink.dialect import Dialect
@@ -51,9 +53,6 @@ MAV_COMP_ID_MISSIONPLANNER = 190
 HEARTBEAT_PERIOD_S = 1.0
 CLOSE_TIMEOUT_S = 2.0
 MOST_PEERS = 256
-MOVES_AFTER_S = 3.5
-"""A component that was silent for so long may come from another peer: its port has changed, or the link."""
-EVERY_PEER: tuple[Peer, ...] = (None,)
 
 
 @asynccontextmanager
@@ -66,6 +65,7 @@ async def open_connection(
     dialect: Dialect = STANDARD,
     mavlink_version: int = 2,
     record: str | os.PathLike[str] | None = None,
+    reconnect: bool = False,
 ) -> AsyncIterator[Connection]:
     """Open a link and be a MAVLink node on it for the time of the ``async with`` block.
 
@@ -82,6 +82,9 @@ async def open_connection(
         mavlink_version: of what we send, 1 or 2; both are understood.
         record: a ``.tlog`` file for everything received and sent, messages of unknown dialects too; an existing file
             is replaced. A disk that is full ends the recording, not the connection.
+        reconnect: whether a link that is lost, a device unplugged for example, is opened again until it is back,
+            instead of ending the connection: ``LinkInterrupted``, ``LinkRestored``. Not for the first opening, and not
+            at the end of a recording.
 
     Raises:
         LocalProtocolError: an argument is wrong; nothing was opened.
@@ -90,7 +93,7 @@ async def open_connection(
     """
     if not baud > 0:
         raise LocalProtocolError(f"baud = {baud} is not allowed: above 0")
-    link = create_link(address, baud=baud) if isinstance(address, str) else address
+    link = _link(address, baud, reconnect)
     connection = Connection(
         link,
         source_system=source_system,
@@ -150,9 +153,7 @@ class Connection:
         self._clock = asyncio.get_running_loop().time
         self._encoder = FrameEncoder(source_system, source_component, version=mavlink_version)
         self._framers: dict[Peer, Framer] = {}
-        self._routes: dict[tuple[int, int], Peer] = {}  # system, component → where its heartbeat came from
-        self._routed_at: dict[tuple[int, int], float] = {}
-        self._doubles: set[tuple[int, int, Peer]] = set()
+        self._routes = Routes(link.has_peer, self._heard_twice)
         self._recording: Recording | None = None
         self._taps: tuple[Tap, ...] = ()
         self._enders: list[Callable[[Exception], None]] = []
@@ -342,7 +343,7 @@ class Connection:
                     return
                 if self._recording is not None:
                     self._recording.write(frame.raw, frame.received_at)
-                if len(self._framers) > 1 and self._is_of_another(frame, peer):
+                if len(self._framers) > 1 and self._routes.is_of_another(frame, peer):
                     continue
                 if frame.message_id == Heartbeat.ID:
                     self._note_heartbeat(frame, peer)
@@ -351,6 +352,16 @@ class Connection:
                     self._give(tap, frame, peer)
         except Exception as error:
             self.fail(error)
+
+    def link_interrupted(self, error: LinkLost) -> None:
+        """The link has gone and is being opened again (called by the link)."""
+        self.bus.publish(LinkInterrupted(self._clock(), 0, error))
+
+    def link_restored(self, away_s: float) -> None:
+        """The link is back (called by the link)."""
+        for framer in self._framers.values():
+            framer.begin_anew()
+        self.bus.publish(LinkRestored(self._clock(), 0, away_s))
 
     def link_lost(self, error: LinkLost) -> None:
         """The link has gone (called by the link): whatever waits ends with this error."""
@@ -390,7 +401,7 @@ class Connection:
 
     def _write(self, data: bytes, message: Message | None, to: int | None) -> None:
         system_id = getattr(message, "target_system", 0) if to is None else to
-        for peer in self._peers_of(system_id, getattr(message, "target_component", 0)):
+        for peer in self._routes.peers_of(system_id, getattr(message, "target_component", 0)):
             self.link.write(data, peer)
         if self._recording is not None:
             self._recording.write(data, self._clock())
@@ -407,15 +418,6 @@ class Connection:
         except Exception:
             logger.exception("a tap (%r) raised; the frame was delivered to the others", tap)
 
-    def _peers_of(self, system_id: int, component_id: int) -> Collection[Peer]:
-        """Where to send what is for this component, or for this system if the component is 0 or was never heard."""
-        if system_id == 0:
-            return EVERY_PEER
-        try:
-            return (self._routes[system_id, component_id],)
-        except KeyError:
-            return {peer for (system, _), peer in self._routes.items() if system == system_id} or EVERY_PEER
-
     def _attach(self, item: type[Any], sink: Sink, system_id: int) -> Detach:
         if issubclass(item, Message):
             return self.bus.attach(item, sink, system_id=system_id)
@@ -423,9 +425,7 @@ class Connection:
 
     def _new_framer(self, peer: Peer) -> Framer:
         if len(self._framers) >= MOST_PEERS:
-            forgotten = self._peer_to_forget()
-            del self._framers[forgotten]
-            self._doubles = {double for double in self._doubles if double[2] != forgotten}
+            del self._framers[self._routes.least_wanted(self._framers)]
         framer = self._framers[peer] = Framer(self.bus.dialect)
         self._let_through(framer)
         return framer
@@ -433,11 +433,6 @@ class Connection:
     def _let_all_through(self) -> None:
         for framer in self._framers.values():
             self._let_through(framer)
-
-    def _peer_to_forget(self) -> Peer:
-        """The oldest that no heartbeat came from, else the oldest."""
-        routes = set(self._routes.values())
-        return next((peer for peer in self._framers if peer not in routes), next(iter(self._framers)))
 
     def _let_through(self, framer: Framer) -> None:
         """Recordings and taps get everything, also what nobody wants and what the dialect does not know."""
@@ -447,24 +442,23 @@ class Connection:
     def _note_heartbeat(self, frame: Frame, peer: Peer) -> None:
         heartbeat = self.bus.dialect.decode(frame)
         if frame.system_id != 0 and isinstance(heartbeat, Heartbeat):
-            source = frame.system_id, frame.component_id
-            self.heard[source], self._routes[source] = heartbeat, peer
-            self._routed_at[source] = frame.received_at
+            self.heard[frame.system_id, frame.component_id] = heartbeat
+            self._routes.note(frame, peer)
 
-    def _is_of_another(self, frame: Frame, peer: Peer) -> bool:
-        """Whether it is heard from another peer already: two vehicles with the same ids, or two ways to one.
+    def _heard_twice(self, frame: Frame) -> None:
+        self.bus.publish(HeardTwice(frame.received_at, frame.system_id, frame.component_id))
 
-        The first one stays; another takes its place when it has been silent for ``MOVES_AFTER_S``.
-        """
-        source = frame.system_id, frame.component_id
-        if self._routes.get(source, peer) == peer:
-            return False
-        if frame.received_at - self._routed_at[source] > MOVES_AFTER_S:
-            return False
-        if (*source, peer) not in self._doubles:
-            self._doubles.add((*source, peer))
-            self.bus.publish(HeardTwice(frame.received_at, *source))
-        return True
+
+def _link(address: str | Link, baud: int, reconnect: bool) -> Link:
+    if isinstance(address, str):
+        make_link = partial(create_link, address, baud=baud)
+        return ReconnectingLink(make_link) if reconnect else make_link()
+    if reconnect:
+        raise LocalProtocolError(
+            "reconnect = True is not allowed with a link, which can be opened once only: pass an address,"
+            " or a ReconnectingLink of aerokit.links"
+        )
+    return address
 
 
 def _only(system_id: int, sink: Sink) -> Sink:

@@ -18,7 +18,9 @@ __all__ = [
     "HeardTwice",
     "LandedStateChanged",
     "LinkClosed",
+    "LinkInterrupted",
     "LinkReport",
+    "LinkRestored",
     "LoopBlocked",
     "MissionCurrentChanged",
     "MissionFinished",
@@ -160,6 +162,18 @@ class LoopBlocked(Event):
     """The program kept the event loop from running for ``seconds``: nothing was received or sent meanwhile."""
 
     seconds: float
+
+
+class LinkInterrupted(Event):
+    """The link has gone and is being opened again (``reconnect=True``); what is sent meanwhile is lost."""
+
+    error: AerokitError
+
+
+class LinkRestored(Event):
+    """The link is there again after ``away_s`` seconds. Message rates are asked for again."""
+
+    away_s: float
 
 
 class LinkClosed(Event):

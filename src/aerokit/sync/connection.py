@@ -36,6 +36,7 @@ def open_connection(
     dialect: Dialect = STANDARD,
     mavlink_version: int = 2,
     record: str | os.PathLike[str] | None = None,
+    reconnect: bool = False,
 ) -> Connection:
     """Open a link and be a MAVLink node on it, on a loop thread of its own, until the connection is closed.
 
@@ -52,6 +53,7 @@ def open_connection(
                 dialect=dialect,
                 mavlink_version=mavlink_version,
                 record=record,
+                reconnect=reconnect,
             )
         )
     except BaseException:

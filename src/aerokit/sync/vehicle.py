@@ -56,6 +56,7 @@ def connect(
     dialect: Dialect = STANDARD,
     mavlink_version: int = 2,
     record: str | os.PathLike[str] | None = None,
+    reconnect: bool = False,
 ) -> Vehicle:
     """Connect to a vehicle and return it at its first heartbeat; use it in a ``with`` block, or close it yourself.
 
@@ -76,6 +77,7 @@ def connect(
                 dialect=dialect,
                 mavlink_version=mavlink_version,
                 record=record,
+                reconnect=reconnect,
             )
         )
     except BaseException:

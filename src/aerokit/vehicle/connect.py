@@ -49,6 +49,7 @@ async def connect(
     dialect: Dialect = STANDARD,
     mavlink_version: int = 2,
     record: str | os.PathLike[str] | None = None,
+    reconnect: bool = False,
 ) -> AsyncIterator[Vehicle]:
     """Connect to a vehicle for the time of the ``async with`` block.
 
@@ -69,6 +70,7 @@ async def connect(
         dialect: the messages that are understood.
         mavlink_version: of what we send, 1 or 2.
         record: a ``.tlog`` file for everything received and sent; an existing file is replaced.
+        reconnect: whether a link that is lost is opened again until it is back, instead of ending the connection.
 
     Raises:
         LocalProtocolError: an argument is wrong. Nothing was opened.
@@ -83,6 +85,10 @@ async def connect(
             raise LocalProtocolError(
                 "record = … is not allowed here: the connection is open; use its record()"
             )
+        if reconnect:
+            raise LocalProtocolError(
+                "reconnect = True is not allowed here: the connection is open; say it to open_connection"
+            )
         async with _attached(address, system_id, timeout, rates) as vehicle:
             yield vehicle
         return
@@ -95,6 +101,7 @@ async def connect(
             dialect=dialect,
             mavlink_version=mavlink_version,
             record=record,
+            reconnect=reconnect,
         ) as connection,
         _attached(connection, system_id, timeout, rates) as vehicle,
     ):

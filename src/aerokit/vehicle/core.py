@@ -18,6 +18,7 @@ from aerokit.runtime.events import (
     ArmedChanged,
     LandedStateChanged,
     LinkReport,
+    LinkRestored,
     ModeChanged,
     StatusTextReceived,
 )
@@ -332,7 +333,10 @@ class VehicleCore:
             self.telemetry.landed_state.observe(self._on_landed_state),
             self.telemetry.status_text.observe(self._on_status_text, every_arrival=True),
         ]
-        self._detach.append(self.connection.on_end(self._on_end))
+        self._detach += [
+            self.connection.bus.attach_event(LinkRestored, lambda _: self._rates.ask_again()),
+            self.connection.on_end(self._on_end),
+        ]
 
     def _before_command(self, command: int) -> None:
         """Any command is about to be sent by the program itself."""
