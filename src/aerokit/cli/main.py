@@ -22,10 +22,20 @@ if TYPE_CHECKING:
 __all__ = ["main"]
 
 FAILED, WRONG_ARGUMENTS, INTERRUPTED = 1, 2, 130
+RUN = "run"
+"""Handled apart: what comes behind its program is the program's, and nothing of it is ours to parse."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line and return its exit code: 0 done, 1 failed, 2 wrong arguments, 130 interrupted."""
+    """Run the command line and return its exit code: 0 done, 1 failed, 2 wrong arguments, 130 interrupted.
+
+    ``aerokit run`` ends as the program does that it runs; what that raises comes out.
+    """
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if arguments and arguments[0] == RUN:
+        from aerokit.dronekit.runner import main as run_program
+
+        return run_program(arguments[1:], "aerokit run")
     options = _parser().parse_args(arguments)
     try:
         code: int = asyncio.run(options.run(options))
@@ -60,6 +70,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_sim(commands)
     for add in (add_params, add_mission, add_files, add_logs):
         add(commands)
+    commands.add_parser(RUN, help="run a DroneKit program unchanged", add_help=False)
     return parser
 
 
