@@ -24,6 +24,7 @@ from aerokit.mavlink import messages as m
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from aerokit.dronekit.exceptions import APIException
     from aerokit.mavlink.message import Message
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
@@ -62,6 +63,7 @@ class VehicleAttributes(HasObservers):
 
     def _attach_attributes(self) -> None:
         self._ready_attrs: set[str] = set()
+        self._failures: dict[str, APIException] = {}
         self._became_ready = threading.Condition()
         for message_type, handler in self._handlers().items():
             self._on(message_type, handler)
@@ -287,10 +289,18 @@ class VehicleAttributes(HasObservers):
     def _mark_ready(self, name: str) -> None:
         """The attribute has a value: whoever waits for it goes on."""
         with self._became_ready:
+            self._failures.pop(name, None)
             self._ready_attrs.add(name)
             self._became_ready.notify_all()
 
     def _unready(self, name: str) -> None:
         """The attribute will get a new value, and is to be waited for."""
         with self._became_ready:
+            self._failures.pop(name, None)
             self._ready_attrs.discard(name)
+
+    def _fail(self, name: str, error: APIException) -> None:
+        """The attribute will get no value: whoever waits for it is told why."""
+        with self._became_ready:
+            self._failures[name] = error
+            self._became_ready.notify_all()

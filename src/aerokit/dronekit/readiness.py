@@ -6,7 +6,7 @@ import math
 import time
 from typing import TYPE_CHECKING, Any
 
-from aerokit.dronekit.exceptions import TimeoutError  # noqa: A004 - DroneKit's name
+from aerokit.dronekit.exceptions import APIException, TimeoutError  # noqa: A004 - DroneKit's name
 
 if TYPE_CHECKING:
     import threading
@@ -25,6 +25,7 @@ class Readiness:
 
     if TYPE_CHECKING:
         _ready_attrs: set[str]
+        _failures: dict[str, APIException]
         _became_ready: threading.Condition
 
         def _check_link(self) -> object: ...
@@ -54,7 +55,7 @@ class Readiness:
         Raises:
             TimeoutError: they have not in time, and ``raise_exception`` is true.
             ValueError: a name is no text.
-            APIException: the link is down.
+            APIException: the link is down, or what is waited for has failed.
         """
         names = DEFAULT_ATTRIBUTES if not types or types == (True,) else types
         if not all(isinstance(name, str) for name in names):
@@ -69,13 +70,21 @@ class Readiness:
                     raise TimeoutError(f"wait_ready experienced a timeout after {timeout} seconds.")
                 return False
             self._check_link()
+            if (failure := self._failure_of(missing)) is not None:
+                if raise_exception:
+                    raise type(failure)(str(failure)) from failure.__cause__
+                return False
             if still_waiting_callback is not None and now >= told_at + still_waiting_interval:
                 told_at = now
                 still_waiting_callback(missing)
             self._wait_a_little(wanted, deadline - now)
         return True
 
+    def _failure_of(self, names: set[str]) -> APIException | None:
+        return next((self._failures[name] for name in names if name in self._failures), None)
+
     def _wait_a_little(self, wanted: set[str], at_most_s: float) -> None:
         with self._became_ready:
-            if wanted - self._ready_attrs:
+            missing = wanted - self._ready_attrs
+            if missing and self._failure_of(missing) is None:
                 self._became_ready.wait(min(LONGEST_WAIT_S, at_most_s))

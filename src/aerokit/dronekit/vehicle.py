@@ -11,7 +11,7 @@ import anyio
 
 from aerokit import sync
 from aerokit.dronekit.channels import Channels
-from aerokit.dronekit.commands import CommandSequence
+from aerokit.dronekit.commands import CommandSequence, WaypointLoader
 from aerokit.dronekit.exceptions import APIException, TimeoutError  # noqa: A004 - DroneKit's name
 from aerokit.dronekit.flight import FlightMethods
 from aerokit.dronekit.gimbal import Gimbal
@@ -109,6 +109,10 @@ class Vehicle(FlightMethods, Maintenance, Readiness):
     def commands(self) -> CommandSequence:
         """The mission: download, change, upload."""
         return self._commands
+
+    @property
+    def _wploader(self) -> WaypointLoader:
+        return WaypointLoader(self._commands)
 
     def flush(self) -> None:
         """As ``commands.upload()``."""

@@ -1,0 +1,93 @@
+"""Which command a vehicle flies, counted as ``Command.seq``: 0 is home."""
+
+from __future__ import annotations
+
+import operator
+from typing import TYPE_CHECKING
+
+from aerokit.errors import CommandRejected, LocalProtocolError, OperationTimeout
+from aerokit.mavlink.messages import MissionCurrent
+
+if TYPE_CHECKING:
+    from aerokit.dronekit.vehicle import Vehicle
+    from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
+
+__all__ = ["CurrentCommand"]
+
+DO_SET_MISSION_CURRENT = 224
+CONFIRMED_S = 5.0
+MOST = 0xFFFF
+STATE_COMPLETE = 5
+NO_MISSION = 0xFFFF
+
+
+class CurrentCommand:
+    """MISSION_CURRENT and MISSION_SET_CURRENT of one vehicle.
+
+    ArduPilot counts home as 0, and is at 0 before it flies its mission. PX4 counts the first item as 0: that is 1
+    here, and 0 as long as it does not fly.
+    """
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        self._vehicle = vehicle
+        self._message: MissionCurrent | None = None
+        self._chosen: int | None = None
+        """What PX4 was told to fly next and has not gone past."""
+        vehicle._on(MissionCurrent, self._on_current)
+
+    @property
+    def seq(self) -> int:
+        """The command that the vehicle flies or will fly next; 0 before its first MISSION_CURRENT."""
+        message = self._message
+        if message is None:
+            return 0
+        if self._vehicle.aio.autopilot.home_is_item_0:
+            return int(message.seq)
+        if message.total == NO_MISSION or (self._is_over(message) and message.seq != self._chosen):
+            return 0
+        return int(message.seq) + 1
+
+    def choose(self, seq: int) -> None:
+        """Have the vehicle fly this one next; does not wait.
+
+        Raises:
+            LocalProtocolError: a ValueError; it is no number from 0 to 65,535.
+            APIException: the link is down.
+        """
+        if not 0 <= operator.index(seq) <= MOST:
+            raise LocalProtocolError(f"next = {seq!r} is not allowed, but 0 to {MOST}")
+        self._vehicle._order("commands.next", self._choose, operator.index(seq))
+
+    # ------------------------------------------------------------------------------- inside
+
+    def _on_current(self, message: MissionCurrent) -> None:
+        if message.seq != self._chosen:
+            self._chosen = None
+        self._message = message
+
+    def _is_over(self, message: MissionCurrent) -> bool:
+        is_at_an_end = message.seq == 0 or message.mission_state == STATE_COMPLETE
+        return is_at_an_end and not self._vehicle._armed
+
+    async def _choose(self, seq: int) -> None:
+        aio = self._vehicle.aio
+        if not aio.autopilot.home_is_item_0:
+            await aio.mission._set_current_by_message(max(seq - 1, 0), CONFIRMED_S)
+            self._chosen = seq - 1
+            return
+        try:
+            await aio.mission._set_current_by_message(seq, CONFIRMED_S)
+        except OperationTimeout as error:
+            await _choose_by_command(aio, seq, error)
+
+
+async def _choose_by_command(vehicle: AsyncVehicle, seq: int, before: OperationTimeout) -> None:
+    """The message is to be given up by firmware to come; the command also tells why it is refused."""
+    if not vehicle.autopilot.sets_current_by_command:
+        raise before
+    try:
+        await vehicle.command(DO_SET_MISSION_CURRENT, seq)
+    except CommandRejected as error:
+        if error.result == 3:
+            raise before from None
+        raise
