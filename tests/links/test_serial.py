@@ -1,19 +1,18 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import errno
 import importlib
 import importlib.util
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import anyio
 import pytest
+from far_end import far_end
 from link_harness import Recorder, each_loop, each_traffic, eventually
 
 from aerokit.errors import BusyError, ConnectionClosed, LinkOpenError
@@ -35,51 +34,6 @@ def package(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
     """Every test here runs on either package."""
     module = importlib.import_module(request.param)
     monkeypatch.setattr(serial, "_transports", lambda: module)
-
-
-class FarEnd:
-    """The other end of the cable: the master side of a pseudo-terminal."""
-
-    def __init__(self) -> None:
-        self.fd, slave = os.openpty()
-        self.device = os.ttyname(slave)
-        self._slave: int | None = slave  # held until the link has it: without any holder it hangs up
-        os.set_blocking(self.fd, False)
-        self.heard = Recorder()
-
-    def reads(self) -> None:
-        asyncio.get_running_loop().add_reader(self.fd, self._read)
-
-    def _read(self) -> None:
-        with contextlib.suppress(BlockingIOError):
-            try:
-                self.heard.bytes_received(os.read(self.fd, 65536), None)
-            except OSError:  # hung up
-                asyncio.get_running_loop().remove_reader(self.fd)
-
-    async def sends(self, data: bytes) -> None:
-        while data:
-            try:
-                data = data[os.write(self.fd, data) :]
-            except BlockingIOError:
-                await asyncio.sleep(0)
-
-    def unplug(self) -> None:
-        if self._slave is not None:
-            with contextlib.suppress(RuntimeError):
-                asyncio.get_running_loop().remove_reader(self.fd)
-            os.close(self._slave)
-            os.close(self.fd)
-            self._slave = None
-
-
-@contextlib.contextmanager
-def far_end() -> Iterator[FarEnd]:
-    far = FarEnd()
-    try:
-        yield far
-    finally:
-        far.unplug()
 
 
 @each_loop

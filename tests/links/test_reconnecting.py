@@ -1,0 +1,390 @@
+"""A link that comes back: when it is tried, what is told, and that nothing is left of it."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import logging
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+
+import anyio
+import pytest
+from leak_check import CountingLoop, run_and_do
+from link_harness import Recorder
+
+from aerokit.errors import (
+    BusyError,
+    ConnectionClosed,
+    LinkLost,
+    LinkOpenError,
+    LocalProtocolError,
+    RecordingEnded,
+)
+from aerokit.links import Peer, ReconnectingLink, Replay, create_link
+from aerokit.links.base import BaseLink
+from aerokit.links.reconnecting import STEADY_S
+
+pytestmark = pytest.mark.anyio
+
+
+class Plug(BaseLink):
+    """One link to a device that may be unplugged."""
+
+    def __init__(self, device: Device) -> None:
+        super().__init__("device")
+        self.device = device
+
+    async def _connect(self) -> None:
+        self.device.tried_at.append(asyncio.get_running_loop().time())
+        self._released.clear()
+        await anyio.sleep(self.device.opening_takes_s)
+        if not self.device.is_there:
+            raise OSError(errno.ENODEV, "no such device")
+        self.device.plugs.append(self)
+        if self.device.greeting:
+            self._deliver(self.device.greeting)
+
+    def _release(self) -> None:
+        if not self._released.is_set():
+            asyncio.get_running_loop().call_later(self.device.releasing_takes_s, self._released.set)
+
+    def write(self, data: bytes, peer: Peer = None) -> None:
+        if data == b"too much":
+            self.dropped_writes += 1
+        else:
+            self.device.written.append(data)
+
+    def hear(self, data: bytes) -> None:
+        self._deliver(data)
+
+    def pull(self) -> None:
+        self._lose("unplugged")
+
+
+class Device:
+    """What is at the other end of the cable."""
+
+    def __init__(self) -> None:
+        self.is_there = True
+        self.opening_takes_s = self.releasing_takes_s = 0.0
+        self.greeting = b""
+        self.plugs: list[Plug] = []
+        self.written: list[bytes] = []
+        self.tried_at: list[float] = []
+
+    def plug(self) -> Plug:
+        return Plug(self)
+
+    def unplug(self, *, gone: bool = True) -> None:
+        self.is_there = not gone
+        self.plugs[-1].pull()
+
+
+class Told(Recorder):
+    """A receiver that wants to be told."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.told: list[str] = []
+
+    def bytes_received(self, data: bytes, peer: Peer) -> None:
+        self.told.append(data.decode())
+        super().bytes_received(data, peer)
+
+    def link_interrupted(self, error: LinkLost) -> None:
+        self.told.append(f"away: {error}")
+
+    def link_restored(self, away_s: float) -> None:
+        self.told.append(f"back after {away_s:.1f} s")
+
+    def link_lost(self, error: LinkLost) -> None:
+        self.told.append(f"lost: {error}")
+        super().link_lost(error)
+
+
+def lines(caplog: pytest.LogCaptureFixture) -> list[tuple[str, str]]:
+    return [(record.levelname, record.getMessage()) for record in caplog.records if record.name == "aerokit"]
+
+
+# ------------------------------------------------------------------------------ opening it the first time
+
+
+async def test_the_first_opening_is_that_of_the_link_itself() -> None:
+    device, heard = Device(), Told()
+    device.is_there = False
+    link = ReconnectingLink(device.plug)
+    assert link.address == "device"
+    for _ in range(2):
+        with pytest.raises(LinkOpenError, match="cannot open device: no such device"):
+            await link.open(heard)
+    link.write(b"before")
+    await anyio.sleep(60)
+    assert len(device.tried_at) == 2
+    device.is_there = True
+    await link.open(heard)
+    link.write(b"after")
+    device.plugs[0].hear(b"hello")
+    with pytest.raises(BusyError):
+        await link.open(heard)
+    link.close()
+    link.close()
+    await link.wait_closed()
+    with pytest.raises(ConnectionClosed):
+        await link.open(heard)
+    assert (heard.told, device.written, link.dropped_writes) == (["hello"], [b"after"], 0)
+
+
+async def test_a_wrong_address_is_told_before_anything_is_opened() -> None:
+    with pytest.raises(LocalProtocolError):
+        ReconnectingLink(lambda: create_link("nonsense"))
+
+
+# -------------------------------------------------------------------------------------- losing it
+
+
+async def test_it_is_tried_more_and_more_rarely_until_it_is_back(caplog: pytest.LogCaptureFixture) -> None:
+    device, heard = Device(), Told()
+    link = ReconnectingLink(device.plug)
+    await link.open(heard)
+    device.tried_at[:] = [asyncio.get_running_loop().time()]
+    with caplog.at_level(logging.INFO, "aerokit"):
+        device.unplug()
+        link.write(b"into the void")
+        await anyio.sleep(25.9)
+        assert [later - sooner for sooner, later in pairwise(device.tried_at)] == pytest.approx(
+            [0.2, 0.4, 0.8, 1.6, 3.2, 5, 5, 5]
+        )
+        device.is_there = True
+        await anyio.sleep(0.5)
+        assert len(device.plugs) == 2
+        link.write(b"is anybody there?")
+        assert link.is_away
+        device.plugs[1].hear(b"yes")
+        device.unplug()
+        await anyio.sleep(0.3)
+        assert device.tried_at[-1] - device.tried_at[-2] == pytest.approx(0.5, abs=0.11)
+    assert heard.told == ["away: device: unplugged", "back after 26.4 s", "yes", "away: device: unplugged"]
+    assert device.written == [b"is anybody there?"]
+    assert link.dropped_writes == 1
+    lost, back = (
+        ("WARNING", "device: unplugged; trying to open it again"),
+        ("INFO", "device is back after 26.4 s"),
+    )
+    assert lines(caplog) == [lost, back, lost]
+    link.close()
+    await link.wait_closed()
+
+
+async def test_what_the_links_dropped_is_counted_together() -> None:
+    device = Device()
+    link = ReconnectingLink(device.plug)
+    await link.open(Recorder())
+    for _ in range(2):
+        link.write(b"too much")
+        device.unplug(gone=False)
+        link.write(b"into the void")
+        await anyio.sleep(5)
+    assert link.dropped_writes == 4
+    link.close()
+    link.write(b"after the end")
+    assert link.dropped_writes == 4
+    await link.wait_closed()
+
+
+async def test_one_that_is_open_and_says_nothing_is_back_after_a_while() -> None:
+    device, heard = Device(), Told()
+    link = ReconnectingLink(device.plug)
+    await link.open(heard)
+    device.unplug(gone=False)
+    await anyio.sleep(0.2 + STEADY_S - 0.01)
+    assert link.is_away
+    await anyio.sleep(0.02)
+    assert heard.told[1:] == ["back after 1.2 s"]
+    link.close()
+    await link.wait_closed()
+
+
+async def test_a_server_that_takes_connections_only_to_close_them_is_still_away(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    device, heard = Device(), Told()
+    link = ReconnectingLink(device.plug)
+    await link.open(heard)
+    with caplog.at_level(logging.INFO, "aerokit"):
+        device.unplug(gone=False)
+        for _ in range(200):
+            await anyio.sleep(0.1)
+            if len(device.plugs) > 1 and link._is_up:
+                device.unplug(gone=False)
+    assert heard.told == ["away: device: unplugged"]
+    assert len(lines(caplog)) == 1
+    assert len(device.plugs) < 12
+    link.close()
+    await link.wait_closed()
+
+
+async def test_bytes_may_come_before_it_is_open_and_it_may_be_lost_then() -> None:
+    device, heard = Device(), Told()
+    device.greeting = b"hello"
+    link = ReconnectingLink(device.plug)
+    heard.at_each_piece = lambda data, peer: device.plugs[-1].pull() if len(device.plugs) in (1, 2) else None
+    await link.open(heard)
+    await anyio.sleep(2)
+    assert heard.told == [
+        "hello",
+        "away: device: unplugged",
+        "back after 0.2 s",
+        "hello",
+        "away: device: unplugged",
+        "back after 0.2 s",
+        "hello",
+    ]
+    link.close()
+    await link.wait_closed()
+
+
+async def test_the_lost_one_is_gone_before_another_is_opened() -> None:
+    """A serial port is not shared; not even with the link that had it before."""
+    device = Device()
+    device.releasing_takes_s = 0.7
+    link = ReconnectingLink(device.plug)
+    await link.open(Recorder())
+    device.unplug(gone=False)
+    lost = device.plugs[0]
+    await anyio.sleep(0.69)
+    assert not lost._released.is_set()
+    assert len(device.tried_at) == 1
+    await anyio.sleep(0.5)
+    assert len(device.tried_at) == 2
+    link.close()
+    await link.wait_closed()
+
+
+async def test_a_receiver_that_does_not_want_to_be_told_is_not() -> None:
+    device, heard = Device(), Recorder()
+    link = ReconnectingLink(device.plug, first_delay_s=1, longest_delay_s=1)
+    await link.open(heard)
+    device.unplug(gone=False)
+    await anyio.sleep(1.1)
+    device.plugs[1].hear(b"again")
+    assert (heard.data, heard.losses) == (b"again", [])
+    link.close()
+    await link.wait_closed()
+
+
+async def test_peers_are_those_of_the_present_link() -> None:
+    device = Device()
+    link = ReconnectingLink(device.plug)
+    assert not link.has_peer(None)
+    await link.open(Recorder())
+    assert link.has_peer(None)
+    device.unplug()
+    assert not link.has_peer(None)
+    link.close()
+    await link.wait_closed()
+
+
+# ----------------------------------------------------------------------------- what cannot be mended
+
+
+async def test_the_end_of_a_recording_is_an_end(tmp_path: Path) -> None:
+    path = tmp_path / "empty.tlog"
+    path.write_bytes(b"")
+    heard = Told()
+    link = ReconnectingLink(lambda: Replay(path))
+    await link.open(heard)
+    error = await heard.until_lost()
+    assert isinstance(error, RecordingEnded)
+    await anyio.sleep(60)
+    assert len(heard.told) == 1
+    with pytest.raises(BusyError):
+        await link.open(heard)
+    await link.wait_closed()
+
+
+async def test_links_that_cannot_be_made_any_more_are_an_end() -> None:
+    device, heard = Device(), Told()
+    links: list[Callable[[], Plug]] = [device.plug]
+    link = ReconnectingLink(lambda: links.pop()())
+    await link.open(heard)
+    device.unplug()
+    error = await heard.until_lost()
+    assert str(error) == "device cannot be opened again: pop from empty list"
+    assert isinstance(error.__cause__, IndexError)
+    link.close()
+    await link.wait_closed()
+
+
+# ------------------------------------------------------------------------------- nothing is left
+
+
+async def lose_it_twice(heard: Told) -> None:
+    """Opens a link to a device that is unplugged, away for a while, back, and unplugged again."""
+    device = Device()
+    device.opening_takes_s = device.releasing_takes_s = 0.05
+    link = ReconnectingLink(device.plug)
+    try:
+        await link.open(heard)
+        device.unplug()
+        await anyio.sleep(0.5)
+        device.is_there = True
+        await anyio.sleep(2)
+        device.plugs[1].hear(b"again")
+        device.unplug()
+        await anyio.sleep(1)
+    finally:
+        told = list(heard.told)
+        link.close()
+        with anyio.CancelScope(shield=True):
+            await link.wait_closed()
+        assert heard.told == told
+        assert not device.plugs or not device.plugs[-1]._receiver
+
+
+def test_cancelled_at_any_turn_of_the_loop_nothing_is_left() -> None:
+    for turns in range(60):
+        run_and_do(lambda: lose_it_twice(Told()), turns, lambda task: task.cancel())
+
+
+def test_closed_at_any_turn_of_the_loop_nothing_is_left() -> None:
+    made: list[ReconnectingLink] = []
+
+    async def program() -> None:
+        device = Device()
+        device.opening_takes_s = device.releasing_takes_s = 0.05
+        made.append(ReconnectingLink(device.plug))
+        link, heard = made[-1], Told()
+        try:
+            await link.open(heard)
+            device.unplug()
+            await anyio.sleep(0.5)
+            device.is_there = True
+            await anyio.sleep(2)
+        except (ConnectionClosed, LinkOpenError):
+            pass
+        finally:
+            link.close()
+            await link.wait_closed()
+
+    for turns in range(60):
+        run_and_do(program, turns, lambda _: made[-1].close() if made else None)
+
+
+def test_closed_after_its_loop() -> None:
+    device = Device()
+
+    async def open_and_lose() -> ReconnectingLink:
+        link = ReconnectingLink(device.plug)
+        await link.open(Recorder())
+        device.unplug()
+        return link
+
+    loop = CountingLoop()
+    link = loop.run_until_complete(open_and_lose())
+    for task in asyncio.all_tasks(loop):
+        task.cancel()
+    loop.run_until_complete(asyncio.sleep(0))
+    loop.close()
+    link.close()
