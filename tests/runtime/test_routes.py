@@ -37,6 +37,7 @@ class PeersLink(MemoryLink):
     def __init__(self) -> None:
         super().__init__("memory:peers")
         self.sent: list[tuple[Peer, int]] = []
+        self.gone: set[Peer] = set()
         self._encoders: dict[tuple[int, int, Peer], FrameEncoder] = {}
         self.connection: Connection | None = None
 
@@ -46,6 +47,9 @@ class PeersLink(MemoryLink):
 
     def write(self, data: bytes, peer: Peer = None) -> None:
         self.sent += [(peer, frame.message_id) for frame in Framer().receive(data)]
+
+    def has_peer(self, peer: Peer) -> bool:
+        return peer not in self.gone
 
     def frame(self, peer: Peer, source: tuple[int, int], message: Message) -> bytes:
         encoder = self._encoders.setdefault((*source, peer), FrameEncoder(*source))
@@ -141,6 +145,21 @@ async def test_a_vehicle_that_comes_back_from_another_port(link: PeersLink, conn
             assert type(await heard.get(1)) is events.VehicleSilent
             assert type(await heard.get(1)) is events.VehicleBack
         assert vehicle.heartbeat_age < 1
+
+
+async def test_a_client_that_comes_back_is_not_taken_for_a_second_vehicle(
+    link: PeersLink, connection: Connection
+) -> None:
+    """A TCP client's new connection is a new peer; the old one is known to have gone."""
+    doubles: list[events.HeardTwice] = []
+    connection.bus.attach_event(events.HeardTwice, doubles.append)
+    attitudes: list[Message] = []
+    connection.bus.attach(Attitude, attitudes.append)
+    link.hear("old", (1, 1), COPTER)
+    link.gone.add("old")
+    link.hear("new", (1, 1), ATTITUDE, COPTER)
+    connection.send(command(1, 1))
+    assert (link.peers_of(CommandLong), len(attitudes), doubles) == (["new"], 1, [])
 
 
 async def test_many_peers_do_not_push_the_vehicle_out(link: PeersLink, connection: Connection) -> None:

@@ -1,0 +1,389 @@
+"""``connect(reconnect=True)``: the link goes and comes back, and the program goes on where it was."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import Any
+
+import anyio
+import pytest
+from leak_check import run_and_do
+
+from aerokit import Vehicle, connect, events, open_connection
+from aerokit import messages as m
+from aerokit.errors import (
+    CommandTimeout,
+    ConnectionClosed,
+    LinkLost,
+    LocalProtocolError,
+    OperationRejected,
+    RecordingEnded,
+)
+from aerokit.links import Link, Peer, ReconnectingLink, TcpConnect, TcpListen
+from aerokit.links.base import BaseLink
+from aerokit.mavlink.dialect import STANDARD
+from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.enums import MavCmd
+from aerokit.mavlink.framer import Framer
+from aerokit.runtime.connection import Connection
+from aerokit.sim import SimulatedCopter, open_simulator, simulated_link
+
+pytestmark = pytest.mark.anyio
+
+NEWS = (
+    events.LinkInterrupted,
+    events.LinkRestored,
+    events.VehicleSilent,
+    events.VehicleBack,
+    events.VehicleRebooted,
+    events.LinkClosed,
+)
+
+
+class CableEnd(BaseLink):
+    """The program's end of the cable, for as long as it is plugged in."""
+
+    def __init__(self, cable: Cable) -> None:
+        super().__init__("cable")
+        self._cable = cable
+
+    async def _connect(self) -> None:
+        if not self._cable.is_plugged:
+            raise OSError(errno.ENODEV, "no such device")
+        self._cable.end = self
+
+    def _release(self) -> None:
+        if self._cable.end is self:
+            self._cable.end = None
+
+    def write(self, data: bytes, peer: Peer = None) -> None:
+        self._cable.write(data)
+
+    def hear(self, data: bytes) -> None:
+        self._deliver(data)
+
+    def break_off(self) -> None:
+        self._lose("unplugged")
+
+
+class Cable:
+    """To a simulated vehicle; it can be pulled out and plugged in again."""
+
+    def __init__(self, link: Link) -> None:
+        self.link = link
+        self.is_plugged = True
+        self.end: CableEnd | None = None
+        self.sent: list[m.CommandLong] = []
+        self._framer = Framer()
+
+    def bytes_received(self, data: bytes, peer: Peer) -> None:
+        if self.end is not None:
+            self.end.hear(data)
+
+    def link_lost(self, error: LinkLost) -> None:
+        """The vehicle was switched off for good."""
+
+    def write(self, data: bytes) -> None:
+        for frame in self._framer.receive(data):
+            message = STANDARD.decode(frame)
+            if isinstance(message, m.CommandLong):
+                self.sent.append(message)
+        self.link.write(data)
+
+    def pull(self) -> None:
+        self.is_plugged = False
+        assert self.end is not None
+        self.end.break_off()
+
+    def plug_in(self) -> None:
+        self.is_plugged = True
+
+    async def is_away(self, seconds: float) -> None:
+        self.pull()
+        await anyio.sleep(seconds)
+        self.plug_in()
+
+    def asked_for(self, kind: type[m.Attitude]) -> int:
+        """How often the vehicle was asked for this message."""
+        return sum(
+            each.command == MavCmd.SET_MESSAGE_INTERVAL and each.param1 == kind.ID for each in self.sent
+        )
+
+
+@asynccontextmanager
+async def cabled(
+    copter: SimulatedCopter | None = None, **options: Any
+) -> AsyncIterator[tuple[Cable, Vehicle]]:
+    async with simulated_link(copter or SimulatedCopter(boot_time_s=0)) as link:
+        cable = Cable(link)
+        await link.open(cable)
+        try:
+            async with connect(ReconnectingLink(lambda: CableEnd(cable)), **options) as vehicle:
+                yield cable, vehicle
+        finally:
+            link.close()
+
+
+# ------------------------------------------------------------------------------ a program goes on
+
+
+async def test_what_is_told_of_an_interruption() -> None:
+    async with cabled() as (cable, vehicle):
+        await vehicle.wait_ready()
+        with vehicle.subscribe(*NEWS, capacity=9) as news:
+            await cable.is_away(6)
+            heard = [await news.get(10) for _ in range(4)]
+        assert [type(event).__name__ for event in heard] == [
+            "LinkInterrupted",
+            "VehicleSilent",
+            "LinkRestored",
+            "VehicleBack",
+        ]
+        interrupted, _, restored, _ = heard
+        assert isinstance(interrupted, events.LinkInterrupted)
+        assert str(interrupted.error) == "cable: unplugged"
+        assert isinstance(restored, events.LinkRestored)
+        assert restored.away_s == pytest.approx(restored.at - interrupted.at)
+        assert vehicle.connection.is_open
+
+
+async def test_telemetry_rates_commands_and_parameters_go_on() -> None:
+    async with cabled() as (cable, vehicle):
+        await vehicle.wait_ready()
+        asked = cable.asked_for(m.Attitude)
+        with vehicle.subscribe(m.Attitude, capacity=100) as attitudes:
+            await cable.is_away(3)
+            await vehicle.position.wait_until(lambda _: vehicle.position.age < 0.5, timeout=10)
+            await attitudes.get(5)
+        await anyio.sleep(1)
+        assert cable.asked_for(m.Attitude) == asked + 1
+        await vehicle.arm()
+        assert len(await vehicle.parameters.download()) > 100
+
+
+async def test_what_is_asked_while_the_link_is_away_times_out_and_raises_nothing_else() -> None:
+    async with cabled() as (cable, vehicle):
+        cable.pull()
+        vehicle.send(m.Ping(0, 0, 0, 0))
+        with pytest.raises(CommandTimeout, match=r"last heartbeat \d"):
+            await vehicle.command(MavCmd.DO_SEND_BANNER)
+        assert vehicle.connection.link.dropped_writes >= 5
+        cable.plug_in()
+        await anyio.sleep(6)
+        await vehicle.command(MavCmd.DO_SEND_BANNER)
+
+
+async def test_a_transfer_and_a_flight_outlive_a_short_interruption() -> None:
+    async with cabled() as (cable, vehicle):
+        await vehicle.wait_ready()
+        await vehicle.set_mode("GUIDED")
+        await vehicle.arm()
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(vehicle.take_off, 10)
+            await anyio.sleep(2)
+            await cable.is_away(2)
+        assert vehicle.position.value.altitude_relative_m == pytest.approx(10, abs=1)
+        tables: list[Any] = []
+
+        async def download() -> None:
+            tables.append(await vehicle.parameters.download(method="list"))
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(download)
+            await anyio.sleep(0.5)
+            await cable.is_away(2)
+        assert len(tables[0]) > 100
+
+
+async def test_a_vehicle_that_was_switched_off_with_its_cable() -> None:
+    copter = SimulatedCopter(boot_time_s=3)
+    async with cabled(copter) as (cable, vehicle):
+        await vehicle.wait_ready()
+        await anyio.sleep(20)
+        with vehicle.subscribe(events.VehicleRebooted) as reboots:
+            cable.pull()
+            copter.reboot(1.0)
+            await anyio.sleep(5)
+            cable.plug_in()
+            await reboots.get(20)
+        await vehicle.wait_ready()
+
+
+async def test_a_vehicle_is_looked_for_on_a_link_that_comes_back() -> None:
+    copter = SimulatedCopter(boot_time_s=0)
+    copter.faults.silent = True
+
+    async def lose_it(cable: Cable) -> None:
+        await anyio.sleep(1)
+        await cable.is_away(7)
+        copter.faults.silent = False
+
+    async with simulated_link(copter) as link:
+        cable = Cable(link)
+        await link.open(cable)
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(lose_it, cable)
+            async with connect(ReconnectingLink(lambda: CableEnd(cable))) as vehicle:
+                assert vehicle.heartbeat_age < 1
+        link.close()
+
+
+async def test_half_a_frame_and_the_beginning_of_a_new_stream() -> None:
+    link, encoder = OneEnd(), FrameEncoder(1, 1)
+    heard: list[int] = []
+    async with open_connection(link) as connection:
+        connection.attach([m.Attitude], lambda attitude: heard.append(attitude.time_boot_ms))
+        frames = [encoder.encode(m.Attitude(n, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6)) for n in range(3)]
+        link.hear(frames[0] + frames[1][:20])
+        assert link.connection is not None
+        link.connection.link_interrupted(LinkLost("unplugged"))
+        link.connection.link_restored(1.0)
+        link.hear(frames[1][20:] + frames[2])
+        (statistics,) = connection.statistics()
+        assert heard == [0, 2]
+        assert statistics.bad_crcs == 0
+
+
+class OneEnd(BaseLink):
+    """A link that is nothing but its receiver."""
+
+    def __init__(self) -> None:
+        super().__init__("one end")
+        self.connection: Connection | None = None
+
+    async def _connect(self) -> None:
+        assert isinstance(self._receiver, Connection)
+        self.connection = self._receiver
+
+    def _release(self) -> None:
+        pass
+
+    def write(self, data: bytes, peer: Peer = None) -> None:
+        pass
+
+    def hear(self, data: bytes) -> None:
+        self._deliver(data)
+
+
+# ----------------------------------------------------------------------------------- arguments
+
+
+async def test_a_link_can_be_opened_once_only() -> None:
+    with pytest.raises(LocalProtocolError, match="ReconnectingLink"):
+        async with connect(OneEnd(), reconnect=True):
+            pytest.fail("it could not be opened again")
+    async with open_connection(OneEnd()) as connection:
+        with pytest.raises(LocalProtocolError, match="say it to open_connection"):
+            async with connect(connection, reconnect=True):
+                pytest.fail("the connection is open already")
+
+
+async def test_a_recording_ends_all_the_same(tmp_path: Any) -> None:
+    path = tmp_path / "flight.tlog"
+    async with simulated_link(SimulatedCopter(boot_time_s=0)) as link, connect(link, record=path) as vehicle:
+        await vehicle.wait_ready()
+    with pytest.raises(RecordingEnded, match="end of recording"):
+        async with connect(f"replay:{path}?speed=max", rates={}, reconnect=True) as vehicle:
+            await vehicle.mode.wait_until(lambda _: False)
+
+
+# ------------------------------------------------------------------------------- nothing is left
+
+
+class Interrupted:
+    """A program whose cable is pulled out and plugged in again; it can be disturbed."""
+
+    def __init__(self) -> None:
+        self.vehicle: Vehicle | None = None
+
+    async def run(self) -> None:
+        try:
+            async with cabled() as (cable, self.vehicle):
+                await cable.is_away(1)
+                with contextlib.suppress(ConnectionClosed, OperationRejected):
+                    await self.vehicle.arm()
+        finally:
+            self.vehicle = None
+
+    def close(self, _task: object) -> None:
+        if self.vehicle is not None:
+            self.vehicle.connection.close()
+
+
+def test_cancelled_at_any_turn_of_the_loop_it_leaves_nothing_behind() -> None:
+    for turns in range(0, 150, 3):
+        run_and_do(Interrupted().run, turns, lambda task: task.cancel())
+
+
+def test_closed_at_any_turn_of_the_loop_it_leaves_nothing_behind() -> None:
+    for turns in range(0, 150, 3):
+        program = Interrupted()
+        run_and_do(program.run, turns, program.close)
+
+
+# ---------------------------------------------------------------------------- with real sockets
+
+
+class TestServers:
+    """A vehicle behind a TCP server that ends and is started again."""
+
+    @pytest.fixture
+    def anyio_backend(self) -> tuple[str, dict[str, Any]]:
+        return "asyncio", {}
+
+    async def test_a_server_that_is_started_again(self) -> None:
+        copter = SimulatedCopter(boot_time_s=0)
+        async with open_simulator(copter, "tcpin:127.0.0.1:0", speedup=20) as simulator:
+            address = simulator.addresses[0]
+            exit_stack = connect(address.replace("tcpin", "tcp"), reconnect=True)
+            vehicle = await exit_stack.__aenter__()
+            await vehicle.wait_ready()
+        try:
+            with vehicle.subscribe(events.LinkRestored) as restored:
+                async with open_simulator(copter, address, speedup=20):
+                    await restored.get(20)
+                    await vehicle.position.wait_until(lambda _: vehicle.position.age < 1, timeout=20)
+                    await vehicle.arm()
+                    assert len(await vehicle.parameters.download()) > 100
+        finally:
+            await exit_stack.__aexit__(None, None, None)
+
+    async def test_a_client_that_comes_back_from_another_port_is_heard_at_once(self) -> None:
+        """With ``tcpin:`` the link is never lost; the vehicle's new connection is not a second vehicle."""
+        doubles: list[events.HeardTwice] = []
+        encoder = FrameEncoder(1, 1)
+        async with open_connection("tcpin:127.0.0.1:0") as connection:
+            connection.bus.attach_event(events.HeardTwice, doubles.append)
+            port = int(connection.link.address.rpartition(":")[2])
+            with connection.subscribe(m.Heartbeat, capacity=9) as heartbeats:
+                for _ in range(2):
+                    link = TcpConnect("127.0.0.1", port)
+                    await link.open(Deaf())
+                    link.write(encoder.encode(m.Heartbeat(2, 3, 81, 0, 3)))
+                    await heartbeats.get(20)
+                    link.close()
+                    await link.wait_closed()
+                    await eventually_gone(connection.link)
+        assert doubles == []
+
+
+async def eventually_gone(link: Link) -> None:
+    """Waits until the server has noticed that its client has gone; 20 s are for hung tests only."""
+    assert isinstance(link, TcpListen)
+    with anyio.fail_after(20):
+        while link.peers:  # noqa: ASYNC110
+            await asyncio.sleep(0)
+
+
+class Deaf:
+    """A receiver that does not listen."""
+
+    def bytes_received(self, data: bytes, peer: Peer) -> None:
+        """Nothing to do."""
+
+    def link_lost(self, error: LinkLost) -> None:
+        """Nothing to do."""
