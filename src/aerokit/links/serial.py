@@ -17,6 +17,7 @@ import contextlib
 import errno
 import importlib
 import os
+import sys
 from collections.abc import Callable
 from functools import partial
 from types import ModuleType
@@ -25,6 +26,11 @@ from typing import Any
 from .address import LinkAddress
 from .base import BaseLink, link_open_error
 from .link import LINGER_S, Peer
+
+if sys.platform == "win32":
+    _TermiosError = OSError
+else:
+    from termios import error as _TermiosError  # noqa: N812
 
 __all__ = ["SerialLink"]
 
@@ -79,6 +85,12 @@ class SerialLink(BaseLink):
             )
         except (OSError, ValueError, OverflowError) as error:
             raise _open_error(self.address, error) from error
+        except (
+            _TermiosError
+        ) as error:  # it vanished while it was being opened: pyserial lets this one through
+            failed = serial.SerialException(*error.args)
+            failed.__cause__ = error
+            raise _open_error(self.address, failed) from failed
 
     def _device_failed(self, error: OSError) -> None:
         """Reading or writing failed; said on a later turn, for it may be inside `write`."""
