@@ -327,6 +327,7 @@ class Vehicle(FlightMethods, Maintenance, Readiness):
         """On the loop, in the turn in which the vehicle was found."""
         self._aio = aio
         self._handler.target_system = aio.system_id
+        self._handler.master.vehicle = self
         for message_type, handler, only_autopilot in self._message_handlers:
             take = _only_of(aio.component_id, handler) if only_autopilot else handler
             aio._detach.append(aio.connection.bus.attach(message_type, take, system_id=aio.system_id))

@@ -25,7 +25,7 @@ from aerokit.mavlink.generator import xml_folder
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.rendering import render_message
 
-__all__ = ["compile_message", "dialect_from_pymavlink", "dialect_from_xml"]
+__all__ = ["class_from_pymavlink", "compile_message", "dialect_from_pymavlink", "dialect_from_xml"]
 
 
 def dialect_from_xml(path: str | Path) -> Dialect:
@@ -46,6 +46,15 @@ def dialect_from_pymavlink(module: str | ModuleType) -> Dialect:
     definitions = [_message(cls) for _, cls in sorted(known.items()) if cls.id >= 0]
     enums = [_enum(name, entries) for name, entries in getattr(module, "enums", {}).items()]
     return _dialect(module.__name__.rpartition(".")[2], definitions, [enum for enum in enums if enum.entries])
+
+
+def class_from_pymavlink(message_class: Any) -> type[Message]:
+    """The class for one of pymavlink's message classes: the committed one, if that says the same about the bytes.
+
+    Raises LocalProtocolError when pymavlink's class does not agree with its own CRC_EXTRA.
+    """
+    definition = _message(message_class)
+    return _standard_class(definition) or compile_message(definition)
 
 
 def compile_message(definition: MessageDefinition) -> type[Message]:

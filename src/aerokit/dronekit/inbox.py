@@ -1,0 +1,138 @@
+"""Messages for programs that read them from ``vehicle._master`` instead of listening to them."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Collection, Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+from aerokit.dronekit.exceptions import APIException
+from aerokit.dronekit.pymavlink_messages import message_of
+from aerokit.errors import LocalProtocolError
+from aerokit.mavlink.dialect import STANDARD
+from aerokit.runtime.diagnosis import is_autopilot
+
+if TYPE_CHECKING:
+    from aerokit.dronekit.mavlink import MAVConnection
+    from aerokit.links.link import Peer
+    from aerokit.mavlink.frame import Frame
+
+__all__ = ["Inbox"]
+
+MOST_KEPT = 1000
+OLDEST_S = 5.0
+"""A program that asks rarely gets what came lately, not what came when it asked last."""
+FIRST_S = 1.0
+"""How long the first look-ups wait for a message: nothing was kept before."""
+SLICE_S = 0.2
+"""Ctrl-C and the end of the connection are noticed between waits of this length."""
+
+
+class Inbox(Mapping[str, Any]):
+    """The last message of every type by its name, and what came since it was asked before, as pymavlink's objects.
+
+    It begins with the first question; the first look-ups of a second wait for their message. It hears the vehicle,
+    radios and ground stations; not other vehicles.
+    """
+
+    def __init__(self, connection: MAVConnection) -> None:
+        self._connection = connection
+        self._latest: dict[int, Frame] = {}
+        self._frames: deque[Frame] = deque(maxlen=MOST_KEPT)
+        self._came = threading.Condition()
+        self._started: float | None = None
+
+    def next_match(self, names: Collection[str] | None, condition: Any, timeout: float | None) -> Any:
+        """The next message of one of these types that meets ``condition(message)``.
+
+        None after ``timeout`` seconds (0: when there is none yet; None: never).
+
+        Raises:
+            APIException: the connection was closed meanwhile.
+        """
+        self._start()
+        end = None if timeout is None else time.monotonic() + timeout
+        while True:
+            frame = self._pop(end)
+            if frame is None:
+                return None
+            message = message_of(frame)
+            if (names is None or message.get_type() in names) and condition(message):
+                return message
+
+    def __getitem__(self, name: str) -> Any:
+        self._start()
+        message_id = _id_of(name)
+        frame = self._latest.get(message_id)
+        while frame is None and self._waits():
+            with self._came:
+                if message_id not in self._latest:
+                    self._came.wait(SLICE_S / 10)
+            frame = self._latest.get(message_id)
+        if frame is None:
+            raise KeyError(name)
+        return message_of(frame)
+
+    def __iter__(self) -> Iterator[str]:
+        self._start()
+        return iter([message_of(frame).get_type() for frame in self._latest.copy().values()])
+
+    def __len__(self) -> int:
+        self._start()
+        return len(self._latest)
+
+    # ------------------------------------------------------------------------------- inside
+
+    def _start(self) -> None:
+        with self._came:
+            is_first, self._started = self._started is None, self._started or time.monotonic()
+        if is_first:
+            self._connection.loop.call_soon(self._connection._tap, self._take)
+
+    def _waits(self) -> bool:
+        is_young = self._started is not None and time.monotonic() < self._started + FIRST_S
+        return is_young and self._connection._alive and not self._connection.loop.is_current
+
+    def _take(self, frame: Frame, peer: Peer) -> None:
+        """On the loop's thread."""
+        if self._is_of_another_vehicle(frame.system_id):
+            return
+        with self._came:
+            self._latest[frame.message_id] = frame
+            self._frames.append(frame)
+            self._came.notify_all()
+
+    def _is_of_another_vehicle(self, system_id: int) -> bool:
+        if system_id == self._connection.target_system:
+            return False
+        heard = self._connection.connection.heard
+        return any(source[0] == system_id and is_autopilot(heartbeat) for source, heartbeat in heard.items())
+
+    def _pop(self, end: float | None) -> Frame | None:
+        """The oldest frame that is not too old; None when the time is over."""
+        now = self._connection.connection.now
+        while True:
+            with self._came:
+                while self._frames:
+                    frame = self._frames.popleft()
+                    if now() - frame.received_at < OLDEST_S:
+                        return frame
+                left = SLICE_S if end is None else min(end - time.monotonic(), SLICE_S)
+                if left > 0:
+                    self._check()
+                    self._came.wait(left)
+                elif not self._frames:
+                    return None
+
+    def _check(self) -> None:
+        if self._connection.is_closed or not self._connection._alive:
+            raise APIException("the connection was closed")
+
+
+def _id_of(name: str) -> int:
+    try:
+        return STANDARD.by_name(name).ID
+    except LocalProtocolError:
+        raise KeyError(name) from None

@@ -1,0 +1,208 @@
+"""``vehicle._master``: what programs use of pymavlink's connection object, which DroneKit keeps there."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+from pymavlink import mavutil
+
+from aerokit.dronekit.inbox import Inbox
+from aerokit.dronekit.message_factory import MessageFactory
+from aerokit.dronekit.pymavlink_messages import sendable
+from aerokit.runtime.diagnosis import is_autopilot
+
+if TYPE_CHECKING:
+    from aerokit.dronekit.mavlink import MAVConnection
+    from aerokit.dronekit.vehicle import Vehicle
+    from aerokit.mavlink.messages import Heartbeat
+
+__all__ = ["Master", "MessageFactory"]
+
+DO_SET_MODE, DO_SET_SERVO, COMPONENT_ARM_DISARM = 176, 183, 400
+CUSTOM_MODE_ENABLED = 1
+PX4 = 12
+ARMED = 128
+REAL32 = 9
+
+
+class Master:
+    """A part of pymavlink's ``mavfile``, for old programs; new ones find all of it on the vehicle.
+
+    Everything that sends returns at once, and says nothing of what becomes of it.
+    """
+
+    def __init__(self, connection: MAVConnection) -> None:
+        self._connection = connection
+        self.vehicle: Vehicle | None = None
+        """The vehicle of this connection, once there is one."""
+        ours = connection.connection
+        self.mav = MessageFactory(self._send, ours.source_system, ours.source_component)
+        """Makes and sends messages."""
+        self.messages = Inbox(connection)
+        """The last message of every type, by its name; begins when it is first asked."""
+
+    @property
+    def target_system(self) -> int:
+        """System id of the vehicle, 0 before it was heard."""
+        return self._connection.target_system
+
+    @property
+    def target_component(self) -> int:
+        """Component id of its autopilot, 0 before it was heard."""
+        return self._heard()[0]
+
+    @property
+    def address(self) -> str:
+        """The connection string."""
+        return self._connection.connection.link.address
+
+    @property
+    def flightmode(self) -> str:
+        """Name of the flight mode, ``UNKNOWN`` before it was heard."""
+        heartbeat = self._heard()[1]
+        return "UNKNOWN" if heartbeat is None else str(mavutil.mode_string_v10(heartbeat))
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._connection.close()
+
+    # --------------------------------------------------------------------------------- modes
+
+    def mode_mapping(self) -> dict[str, Any] | None:
+        """Mode names and their numbers (PX4: three numbers each); None for a vehicle without known modes."""
+        heartbeat = self._heard()[1]
+        if heartbeat is None:
+            return None
+        modes = mavutil.px4_map if heartbeat.autopilot == PX4 else mavutil.mode_mapping_byname(heartbeat.type)
+        return dict(modes) if modes is not None else None
+
+    def set_mode(self, mode: str | int, custom_mode: int | None = 0, custom_sub_mode: int | None = 0) -> None:
+        """Set a mode by its name or number; PX4 takes the three numbers of :meth:`mode_mapping`, too.
+
+        Raises:
+            KeyError: the vehicle has no mode of this name; nothing was sent.
+        """
+        heartbeat = self._heard()[1]
+        is_px4 = heartbeat is not None and heartbeat.autopilot == PX4
+        if self.vehicle is not None and (isinstance(mode, str) or not is_px4):
+            self.vehicle.mode = mode
+            return
+        order = (self.mode_mapping() or {})[mode] if isinstance(mode, str) else mode
+        if is_px4 and not isinstance(mode, str):
+            order = (mode, custom_mode or 0, custom_sub_mode or 0)
+        numbers = order if isinstance(order, tuple) else (CUSTOM_MODE_ENABLED, order, 0)
+        self._command(DO_SET_MODE, *numbers)
+
+    set_mode_apm = set_mode_px4 = set_mode
+
+    # -------------------------------------------------------------------------------- orders
+
+    def arducopter_arm(self) -> None:
+        """Ask for armed motors: **propellers may start to turn**."""
+        self._command(COMPONENT_ARM_DISARM, 1)
+
+    def arducopter_disarm(self) -> None:
+        """Ask for disarmed motors."""
+        self._command(COMPONENT_ARM_DISARM, 0)
+
+    def motors_armed(self) -> bool:
+        """Whether the last HEARTBEAT says armed."""
+        heartbeat = self._heard()[1]
+        return heartbeat is not None and bool(heartbeat.base_mode & ARMED)
+
+    def motors_armed_wait(self) -> None:
+        """Wait until HEARTBEAT says armed, however long that takes."""
+        while not self.motors_armed():
+            self.wait_heartbeat()
+
+    def motors_disarmed_wait(self) -> None:
+        """Wait until HEARTBEAT says disarmed, however long that takes."""
+        while self.motors_armed():
+            self.wait_heartbeat()
+
+    def set_servo(self, channel: int, pwm: int) -> None:
+        """Set an output (MAV_CMD_DO_SET_SERVO) to so many microseconds."""
+        self._command(DO_SET_SERVO, channel, pwm)
+
+    def _command(self, command: int, *params: float) -> None:
+        filled = (*params, *(0,) * (7 - len(params)))
+        self.mav.command_long_send(self.target_system, self.target_component, command, 0, *filled)
+
+    # -------------------------------------------------------------- parameters and missions, bare
+
+    def param_fetch_all(self) -> None:
+        """Ask for all parameters."""
+        self.mav.param_request_list_send(self.target_system, self.target_component)
+
+    def param_set_send(self, parm_name: str | bytes, parm_value: float, parm_type: int | None = None) -> None:
+        """Set a parameter, without a look at the answer; ``vehicle.parameters`` looks."""
+        kind = REAL32 if parm_type is None else parm_type
+        self.mav.param_set_send(self.target_system, self.target_component, parm_name, parm_value, kind)
+
+    def waypoint_clear_all_send(self) -> None:
+        """Empty the vehicle's mission."""
+        self.mav.mission_clear_all_send(self.target_system, self.target_component)
+
+    def waypoint_count_send(self, seq: int) -> None:
+        """Announce a mission of so many items."""
+        self.mav.mission_count_send(self.target_system, self.target_component, seq)
+
+    def waypoint_request_list_send(self) -> None:
+        """Ask how long the vehicle's mission is."""
+        self.mav.mission_request_list_send(self.target_system, self.target_component)
+
+    def waypoint_request_send(self, seq: int) -> None:
+        """Ask for one item of the vehicle's mission."""
+        self.mav.mission_request_send(self.target_system, self.target_component, seq)
+
+    def waypoint_set_current_send(self, seq: int) -> None:
+        """Have the mission go on at an item."""
+        self.mav.mission_set_current_send(self.target_system, self.target_component, seq)
+
+    # ----------------------------------------------------------------------------- receiving
+
+    def recv_match(
+        self,
+        condition: str | None = None,
+        type: str | Iterable[str] | None = None,  # noqa: A002 - pymavlink's word
+        blocking: bool = False,
+        timeout: float | None = None,
+    ) -> Any:
+        """The next message of a type (or of several, or any), which meets a ``condition`` as pymavlink writes them.
+
+        Nothing is lost between calls, up to the last five seconds and 1,000 messages; it begins with the first call.
+        Without ``blocking``, None when there is none yet; with it, None after ``timeout`` seconds (None: never).
+
+        Raises:
+            APIException: the connection was closed.
+        """
+        names = {type} if isinstance(type, str) else None if type is None else set(type)
+
+        def meets(message: Any) -> bool:
+            return bool(mavutil.evaluate_condition(condition, {message.get_type(): message}))
+
+        may_wait = blocking and not self._connection.loop.is_current
+        return self.messages.next_match(names, meets, timeout if may_wait else 0.0)
+
+    def wait_heartbeat(self, blocking: bool = True, timeout: float | None = None) -> Any:
+        """The next HEARTBEAT; None when there is none in ``timeout`` seconds."""
+        return self.recv_match(type="HEARTBEAT", blocking=blocking, timeout=timeout)
+
+    @staticmethod
+    def probably_vehicle_heartbeat(msg: Any) -> bool:
+        """Whether a HEARTBEAT is an autopilot's: not a gimbal's, a camera's or a ground station's."""
+        return is_autopilot(msg)
+
+    # -------------------------------------------------------------------------------- inside
+
+    def _send(self, message: Any) -> None:
+        target = self._connection.target_system
+        self._connection.send(sendable(message, target), to=target or None)
+
+    def _heard(self) -> tuple[int, Heartbeat | None]:
+        """Component id and last heartbeat of the vehicle's autopilot."""
+        for source, heartbeat in self._connection.connection.heard.copy().items():
+            if source[0] == self.target_system and is_autopilot(heartbeat):
+                return source[1], heartbeat
+        return 0, None
