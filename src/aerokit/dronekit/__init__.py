@@ -1,3 +1,132 @@
-"""The classic API of DroneKit-Python 2.9: unmodified programs run."""
+"""The classic API of DroneKit-Python 2.9, blocking and thread-safe: unmodified programs run.
+
+```python
+from aerokit.dronekit import VehicleMode, connect
+
+vehicle = connect("127.0.0.1:14550", wait_ready=True)
+print(vehicle.location.global_relative_frame)
+vehicle.mode = VehicleMode("RTL")
+vehicle.close()
+```
+
+A program that says ``import dronekit`` runs unchanged with ``python -m aerokit.dronekit program.py`` (or
+``aerokit run program.py``); ``import aerokit.dronekit as dronekit`` is the one-line port; :func:`install` makes
+``import dronekit`` work in a test runner. What differs from DroneKit, and why, is in docs/from-dronekit.md.
+
+From here a program can move on function by function: ``vehicle.sync`` is the blocking twin of the new API on the
+same connection, ``vehicle.aio`` the asynchronous vehicle underneath.
+"""
 
 from __future__ import annotations
+
+import collections
+import copy
+import importlib
+import logging
+import math
+import struct
+import time
+from typing import TYPE_CHECKING, Any
+
+from aerokit.dronekit import monotonic, util
+from aerokit.dronekit.alias import install
+from aerokit.dronekit.connect import connect, default_still_waiting_callback
+from aerokit.dronekit.exceptions import APIException, TimeoutError  # noqa: A004 - DroneKit has it
+from aerokit.dronekit.observers import HasObservers
+from aerokit.dronekit.util import ErrprinterHandler
+from aerokit.dronekit.values import (
+    Attitude,
+    Battery,
+    GPSInfo,
+    LocationGlobal,
+    LocationGlobalRelative,
+    LocationLocal,
+    Rangefinder,
+    SystemStatus,
+    VehicleMode,
+    Wind,
+)
+from aerokit.dronekit.version import Capabilities, Version
+
+if TYPE_CHECKING:
+    from pymavlink import mavutil, mavwp
+    from pymavlink.dialects.v10 import ardupilotmega
+
+    from aerokit.dronekit.channels import Channels, ChannelsOverride
+    from aerokit.dronekit.commands import Command, CommandSequence
+    from aerokit.dronekit.gimbal import Gimbal
+    from aerokit.dronekit.locations import Locations
+    from aerokit.dronekit.parameters import Parameters
+    from aerokit.dronekit.vehicle import Vehicle
+
+basestring = (str, bytes)
+"""For ``isinstance``, in programs that Python 2 also ran."""
+
+__all__ = [
+    "APIException",
+    "Attitude",
+    "Battery",
+    "Capabilities",
+    "Channels",
+    "ChannelsOverride",
+    "Command",
+    "CommandSequence",
+    "ErrprinterHandler",
+    "GPSInfo",
+    "Gimbal",
+    "HasObservers",
+    "LocationGlobal",
+    "LocationGlobalRelative",
+    "LocationLocal",
+    "Locations",
+    "Parameters",
+    "Rangefinder",
+    "SystemStatus",
+    "TimeoutError",
+    "Vehicle",
+    "VehicleMode",
+    "Version",
+    "Wind",
+    "ardupilotmega",
+    "basestring",
+    "collections",
+    "connect",
+    "copy",
+    "default_still_waiting_callback",
+    "install",
+    "logging",
+    "math",
+    "mavutil",
+    "mavwp",
+    "monotonic",
+    "struct",
+    "time",
+    "util",
+]
+
+_LATER = {
+    "Channels": "aerokit.dronekit.channels",
+    "ChannelsOverride": "aerokit.dronekit.channels",
+    "Command": "aerokit.dronekit.commands",
+    "CommandSequence": "aerokit.dronekit.commands",
+    "Gimbal": "aerokit.dronekit.gimbal",
+    "Locations": "aerokit.dronekit.locations",
+    "Parameters": "aerokit.dronekit.parameters",
+    "Vehicle": "aerokit.dronekit.vehicle",
+    "ardupilotmega": "pymavlink.dialects.v10.ardupilotmega",
+    "mavutil": "pymavlink.mavutil",
+    "mavwp": "pymavlink.mavwp",
+}
+"""Where a name is from that is imported when a program first uses it: what is behind them takes most of the time."""
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LATER:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module = importlib.import_module(_LATER[name])
+    value = globals()[name] = module if name.islower() else getattr(module, name)
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import sys
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from types import ModuleType
 
 __all__ = ["install", "uninstall"]
 
-PACKAGE = "aerokit.dronekit"
-SUBMODULES = ("lib", "mavlink", "monotonic", "util")
-"""Those that programs import."""
+ALIAS, PACKAGE = "dronekit", "aerokit.dronekit"
 
 
 def install() -> None:
@@ -22,22 +28,49 @@ def install() -> None:
         ImportError: another ``dronekit`` was imported already.
     """
     package = importlib.import_module(PACKAGE)
-    present = sys.modules.get("dronekit")
-    if present is not None and present is not package:
+    present = sys.modules.get(ALIAS)
+    if present is package:
+        return
+    if present is not None:
         where = getattr(present, "__file__", None) or "somewhere"
         raise ImportError(
             f"another dronekit was imported already, from {where}: call aerokit.dronekit.install() before anything"
             " imports it",
-            name="dronekit",
+            name=ALIAS,
         )
-    for name in SUBMODULES:
-        sys.modules[f"dronekit.{name}"] = importlib.import_module(f"{PACKAGE}.{name}")
-    sys.modules["dronekit"] = package
+    sys.modules[ALIAS] = package
+    sys.meta_path.insert(0, _SubmoduleFinder())
 
 
 def uninstall() -> None:
     """Undo :func:`install`; what was imported meanwhile stays as it is. Nothing happens without it."""
-    if sys.modules.get("dronekit") is not sys.modules.get(PACKAGE):
+    if sys.modules.get(ALIAS) is not sys.modules.get(PACKAGE):
         return
-    for name in ("dronekit", *(f"dronekit.{each}" for each in SUBMODULES)):
-        sys.modules.pop(name, None)
+    sys.meta_path[:] = [finder for finder in sys.meta_path if not isinstance(finder, _SubmoduleFinder)]
+    for name in list(sys.modules):
+        if name == ALIAS or name.startswith(f"{ALIAS}."):
+            del sys.modules[name]
+
+
+class _SubmoduleFinder(MetaPathFinder):
+    """``dronekit.mavlink`` is the module ``aerokit.dronekit.mavlink``, not a second one made of the same file."""
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        if not fullname.startswith(f"{ALIAS}."):
+            return None
+        spec = importlib.util.find_spec(PACKAGE + fullname.removeprefix(ALIAS))
+        return None if spec is None else ModuleSpec(fullname, _SubmoduleLoader(), origin=spec.origin)
+
+
+class _SubmoduleLoader(Loader):
+    def create_module(self, spec: ModuleSpec) -> ModuleType:
+        module = importlib.import_module(PACKAGE + spec.name.removeprefix(ALIAS))
+        self._own_spec = module.__spec__
+        return module
+
+    def exec_module(self, module: ModuleType) -> None:
+        module.__spec__ = (
+            self._own_spec
+        )  # it was executed under its own name; the import system has changed this

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable
-from typing import Any, TypeVar, overload
+from typing import TYPE_CHECKING, Any, TypeVar, overload
 
-from aerokit.dronekit.mavlink import MAVConnection
 from aerokit.dronekit.util import ErrprinterHandler
-from aerokit.dronekit.vehicle import Vehicle
 
-VehicleT = TypeVar("VehicleT", bound=Vehicle)
+if TYPE_CHECKING:
+    from aerokit.dronekit.mavlink import MAVConnection
+    from aerokit.dronekit.vehicle import Vehicle
+
+VehicleT = TypeVar("VehicleT", bound="Vehicle")
 
 __all__ = ["connect", "default_still_waiting_callback"]
 
@@ -97,6 +99,9 @@ def connect(
         APIException: no vehicle was heard in time; the text says what was heard instead.
         TimeoutError: ``wait_ready`` was not satisfied in time. Whatever fails, nothing stays open.
     """
+    from aerokit.dronekit.mavlink import MAVConnection
+    from aerokit.dronekit.vehicle import Vehicle
+
     handler = MAVConnection(
         ip, baud=baud, source_system=source_system, source_component=source_component, use_native=use_native
     )

@@ -15,7 +15,6 @@ import zipfile
 from typing import TYPE_CHECKING
 
 from aerokit.dronekit.alias import install
-from aerokit.dronekit.mavlink import connections_made
 from aerokit.dronekit.util import errprinter
 
 if TYPE_CHECKING:
@@ -45,6 +44,8 @@ def run_script(path: str | os.PathLike[str], arguments: Sequence[str] = ()) -> N
         ImportError: the real ``dronekit`` was imported before, by somebody else.
         SystemExit: the program called ``sys.exit``. Whatever else it raises comes out as well.
     """
+    from aerokit.dronekit.mavlink import connections_made
+
     install()
     with _sys_as_it_was(), connections_made() as connections:
         try:
@@ -151,7 +152,8 @@ def _print_without_us(
     kind: type[BaseException], error: BaseException, traceback: TracebackType | None
 ) -> None:
     """Print a traceback that begins in the program, as Python does for one that it runs itself."""
-    sys.__excepthook__(kind, error, _from_the_program_on(traceback))
+    error.__traceback__ = _from_the_program_on(traceback)
+    sys.__excepthook__(kind, error, error.__traceback__)
 
 
 def _from_the_program_on(traceback: TracebackType | None) -> TracebackType | None:
