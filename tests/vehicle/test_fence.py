@@ -9,9 +9,9 @@ from flight_harness import open_flight, open_px4
 from plan_flights import near_home, sent_for_plans
 
 from aerokit import messages as m
-from aerokit.errors import CommandRejected, LocalProtocolError, MissionRejected
+from aerokit.errors import CommandRejected, LocalProtocolError, MissionRejected, NotSupported
 from aerokit.mavlink.enums import MavCmd
-from aerokit.missions import Fence, FenceCircle, FencePolygon, Mission
+from aerokit.missions import Fence, FenceCircle, FencePolygon, Mission, waypoint
 from aerokit.missions.storage import Storage
 from aerokit.position import Position
 
@@ -40,6 +40,24 @@ async def test_there_and_back(opened: Any, method: Any) -> None:
         assert FENCE.matches(await fence.download(method=method))
         await fence.clear()
         assert await fence.download(method=method) == Fence()
+
+
+@pytest.mark.parametrize("opened", [open_flight, open_px4])
+async def test_nothing_about_a_fence_is_said_in_mavlink_1(opened: Any) -> None:
+    """Its mission type is an extension field, which MAVLink 1 cuts off: the vehicle would clear its mission."""
+    async with opened() as flight:
+        vehicle = flight.vehicle
+        mission = Mission([waypoint(*near_home(100, 0), altitude_relative_m=20)] * 3)
+        await vehicle.mission.upload(mission)
+        vehicle.connection.mavlink_version = 1
+        with pytest.raises(NotSupported, match="MAVLink 1"):
+            await vehicle.fence.upload(FENCE, method="items")
+        with pytest.raises(NotSupported, match="MAVLink 1"):
+            await vehicle.fence.download(method="items")
+        for plan in (vehicle.fence, vehicle.rally):
+            with pytest.raises(NotSupported, match="MAVLink 1"):
+                await plan.clear()
+        assert mission.matches(await vehicle.mission.download(method="items"))
 
 
 async def test_one_circle_more_for_ardupilot() -> None:

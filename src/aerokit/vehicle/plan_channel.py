@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import anyio
 
-from aerokit.errors import MissionRejected, MissionTimeout
+from aerokit.errors import MissionRejected, MissionTimeout, NotSupported
 from aerokit.mavlink.enums import MavMissionType, MavProtocolCapability
 from aerokit.missions.pack import PACKED_NAMES, pack_items, unpack_items
 from aerokit.protocols.mission_download import Downloaded, MissionDownload
@@ -149,6 +149,10 @@ class PlanChannel:
     async def _run(self, exchange: MissionExchange[ResultT]) -> ResultT:
         """Run it; given up from outside, it is given up at the vehicle too."""
         connection = self._context.transfers.connection
+        if self.mission_type != MavMissionType.MISSION and connection.mavlink_version == 1:
+            raise NotSupported(
+                "MAVLink 1 has messages for missions only: to the vehicle this would be its mission; nothing was sent"
+            )
         started = connection.now()
         try:
             return await self._context.transfers.run(exchange)
