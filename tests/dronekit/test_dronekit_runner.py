@@ -79,8 +79,10 @@ def test_install_makes_every_import_of_programs_work() -> None:
     assert program["LocationGlobalRelative"] is aerokit.dronekit.LocationGlobalRelative
     assert program["mavutil"].mavlink.MAV_CMD_NAV_WAYPOINT == 16
     assert sys.modules["dronekit.mavlink"] is sys.modules["aerokit.dronekit.mavlink"]
-    assert sys.modules["dronekit.mavlink"].__spec__.name == "aerokit.dronekit.mavlink"
-    with pytest.raises(ModuleNotFoundError, match="No module named 'dronekit.none'"):
+    spec = sys.modules["dronekit.mavlink"].__spec__
+    assert spec is not None
+    assert spec.name == "aerokit.dronekit.mavlink"
+    with pytest.raises(ModuleNotFoundError, match=r"No module named 'dronekit.none'"):
         importlib.import_module("dronekit.none")
 
 
