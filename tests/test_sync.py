@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import inspect
 import signal
 import socket
@@ -282,6 +283,20 @@ def test_the_end_of_the_link_ends_a_call_that_waits() -> None:
     waiting.join(10)
     assert not waiting.is_alive()
     vehicle.close()
+
+
+def test_a_link_that_comes_back(copter: SimulatedCopter) -> None:
+    with contextlib.ExitStack() as stack:
+        with served([copter]) as address:
+            vehicle = stack.enter_context(aerokit.sync.connect(address, reconnect=True))
+            restored = stack.enter_context(vehicle.subscribe(events.LinkRestored))
+            vehicle.wait_ready()
+        with served([copter], address.replace("tcp:", "tcpin:")):
+            restored.get(timeout=20)
+            vehicle.position.wait_until(lambda _: vehicle.position.age < 1, timeout=20)
+            vehicle.arm()
+            assert vehicle.is_armed
+            assert len(vehicle.parameters.download()) > 100
 
 
 def test_a_call_on_the_loop_thread_is_refused(vehicle: aerokit.sync.Vehicle) -> None:
