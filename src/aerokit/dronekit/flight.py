@@ -23,13 +23,15 @@ if TYPE_CHECKING:
 
 __all__ = ["FlightMethods"]
 
+COMPONENT_ARM_DISARM = 400
 NAV_TAKEOFF, DO_CHANGE_SPEED, DO_SET_HOME, DO_REPOSITION = 22, 178, 179, 192
 AIRSPEED, GROUNDSPEED = 0, 1
-GLOBAL, GLOBAL_RELATIVE_ALT_INT = 0, 6
+GLOBAL, GLOBAL_INT, GLOBAL_RELATIVE_ALT_INT = 0, 5, 6
 POSITION_ONLY = 0x0DF8
 RESULT_UNSUPPORTED = 3
 CHANGE_MODE = 1
 REQUEST_MESSAGE = 512
+ARMED_IS_TOLD_S = 10.0
 HOME_TIMEOUT_S = 10.0
 PX4_FLIES_TO_PLACES_IN = ("LOITER", "TAKEOFF")
 POLL_S = 0.1
@@ -106,7 +108,7 @@ class FlightMethods(VehicleAttributes):
 
     def _set_armed(self, value: bool) -> concurrent.futures.Future[None]:
         aio = self._check_link()
-        return self._order("arm" if value else "disarm", aio.arm if value else aio.disarm)
+        return self._order("arm" if value else "disarm", _change_armed, aio, value)
 
     def arm(self, wait: bool = True, timeout: float | None = None) -> None:
         """Arm the motors: **propellers may start to turn**; with ``wait`` until HEARTBEAT says armed.
@@ -153,9 +155,9 @@ class FlightMethods(VehicleAttributes):
             plan = aio.autopilot.take_off(altitude, home, is_vtol=aio.is_vtol)
             if plan is None or plan.command is None:
                 raise APIException("this vehicle cannot take off by a command")
-            self._order("takeoff", aio.command, plan.command, *plan.params)
+            self._order("takeoff", aio.command, plan.command, *plan.params, component_id=0)
         else:
-            self._order("takeoff", aio.command, NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude)
+            self._order("takeoff", aio.command, NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude, component_id=0)
 
     def wait_simple_takeoff(
         self, alt: float | None = None, epsilon: float = 0.1, timeout: float | None = None
@@ -232,7 +234,7 @@ class FlightMethods(VehicleAttributes):
     def _change_speed(self, name: str, kind: int, speed: float) -> None:
         _check_speed(name, speed)
         aio = self._check_link()
-        self._order(name, aio.command, DO_CHANGE_SPEED, kind, float(speed), -1)
+        self._order(name, aio.command, DO_CHANGE_SPEED, kind, float(speed), -1, component_id=0)
 
     # ---------------------------------------------------------------------------------- home
 
@@ -345,33 +347,54 @@ class FlightMethods(VehicleAttributes):
                 concurrent.futures.wait([order], min(POLL_S, max(deadline - time.monotonic(), 0.0)))
 
 
+async def _change_armed(vehicle: AsyncVehicle, value: bool) -> None:
+    await vehicle.command(COMPONENT_ARM_DISARM, float(value), component_id=0)
+    await vehicle.telemetry.armed.wait_until(
+        lambda armed: armed is value, timeout=ARMED_IS_TOLD_S, description="armed" if value else "disarmed"
+    )
+
+
 async def _go_to(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: float) -> None:
     """DO_REPOSITION, which is answered; and the message for a vehicle that does not know it."""
     if isinstance(vehicle.autopilot, Px4):
         home = vehicle.telemetry.home.value.altitude_amsl_m
         await vehicle.command_int(
-            DO_REPOSITION, -1, CHANGE_MODE, 0, math.nan, frame=5, x=latitude, y=longitude, z=altitude + home
+            DO_REPOSITION,
+            *(-1, CHANGE_MODE, 0, math.nan),
+            frame=GLOBAL_INT,
+            x=latitude,
+            y=longitude,
+            z=altitude + home,
+            component_id=0,
         )
         return
-    params = (-1, 0, 0, math.nan)
     try:
         await vehicle.command_int(
-            DO_REPOSITION, *params, frame=GLOBAL_RELATIVE_ALT_INT, x=latitude, y=longitude, z=altitude
+            DO_REPOSITION,
+            *(-1, 0, 0, math.nan),
+            frame=GLOBAL_RELATIVE_ALT_INT,
+            x=latitude,
+            y=longitude,
+            z=altitude,
+            component_id=0,
         )
     except CommandRejected as error:
         if error.result != RESULT_UNSUPPORTED:
             raise
-        target = (vehicle.system_id, vehicle.component_id, GLOBAL_RELATIVE_ALT_INT, POSITION_ONLY)
+        target = (vehicle.system_id, 0, GLOBAL_RELATIVE_ALT_INT, POSITION_ONLY)
         vehicle.send(SetPositionTargetGlobalInt(0, *target, latitude, longitude, altitude, *(0.0,) * 8))
 
 
 async def _set_home(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: float) -> None:
     try:
-        await vehicle.command_int(DO_SET_HOME, 0, frame=GLOBAL, x=latitude, y=longitude, z=altitude)
+        await vehicle.command_int(
+            DO_SET_HOME, 0, frame=GLOBAL, x=latitude, y=longitude, z=altitude, component_id=0
+        )
     except CommandRejected as error:
         if error.result != RESULT_UNSUPPORTED:
             raise
-        await vehicle.command(DO_SET_HOME, 0, 0, 0, 0, latitude * 1e-7, longitude * 1e-7, altitude)
+        place = (latitude * 1e-7, longitude * 1e-7, altitude)
+        await vehicle.command(DO_SET_HOME, 0, 0, 0, 0, *place, component_id=0)
 
 
 async def _refuse(reason: str) -> None:

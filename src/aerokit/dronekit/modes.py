@@ -75,7 +75,7 @@ async def change_mode(vehicle: Vehicle, order: Order) -> None:
     is_px4 = isinstance(vehicle.autopilot, Px4)
     custom_mode = main_mode << 16 | sub_mode << 24 if is_px4 else main_mode
     try:
-        await vehicle.command(DO_SET_MODE, *order)
+        await vehicle.command(DO_SET_MODE, *order, component_id=0)
     except CommandRejected as error:
         if error.result != RESULT_UNSUPPORTED:
             raise

@@ -24,6 +24,7 @@ from aerokit.dronekit.pymavlink_messages import sendable
 from aerokit.dronekit.readiness import Readiness
 from aerokit.dronekit.streams import request_streams
 from aerokit.errors import AerokitError, ConnectFailed, LocalProtocolError, OperationTimeout
+from aerokit.mavlink.messages import CommandLong
 from aerokit.runtime.background import Background
 from aerokit.vehicle.connect import connect as connect_async
 
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Vehicle"]
 
+REQUEST_AUTOPILOT_CAPABILITIES = 520
 MAVLINK_2 = 8192
 """Bit of AUTOPILOT_VERSION.capabilities."""
 CONNECT_S = 30.0
@@ -362,7 +364,7 @@ class Vehicle(FlightMethods, Maintenance, Readiness):
         for _ in range(5):
             if aio.telemetry.version.is_known:
                 return
-            self.send_capabilities_request(self, "HEARTBEAT", None)
+            aio.send(CommandLong(aio.system_id, 0, REQUEST_AUTOPILOT_CAPABILITIES, 0, 1, *(0.0,) * 6))
             await anyio.sleep(1.0)
 
     def _wait_until_booted(self, timeout: float) -> None:

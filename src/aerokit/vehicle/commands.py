@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 __all__ = ["CommandSender"]
 
 IN_PROGRESS = 5
-EVERY_COMPONENT = 0
 ROUND_TRIPS = 2
 """Nothing is sent again before so many measured round trips: the answer is still under way."""
 UNDER_WAY_S = 2.0
@@ -76,7 +75,8 @@ class CommandSender:
         on_progress: Callable[[int | None], None] | None = None,
     ) -> CommandAck:
         """Send a COMMAND_LONG with param1 to param7 and return its ACCEPTED ack; see :meth:`Vehicle.command`."""
-        message = command_long(self._system_id, component_id or self._component_id, command, params)
+        target = self._component_id if component_id is None else component_id
+        message = command_long(self._system_id, target, command, params)
         return await self._run(message, attempts, attempt_timeout, progress_timeout, on_progress)
 
     async def send_int(
@@ -94,7 +94,7 @@ class CommandSender:
         on_progress: Callable[[int | None], None] | None = None,
     ) -> CommandAck:
         """Send a COMMAND_INT with param1 to param4, x, y, z and return its ACCEPTED ack."""
-        target = component_id or self._component_id
+        target = self._component_id if component_id is None else component_id
         message = command_int(self._system_id, target, command, params, frame=frame, x=x, y=y, z=z)
         return await self._run(message, attempts, attempt_timeout, progress_timeout, on_progress)
 
@@ -123,7 +123,10 @@ class CommandSender:
         progress_timeout: float,
         on_progress: Callable[[int | None], None] | None,
     ) -> CommandAck:
-        key = (message.target_component, message.command)
+        key = (
+            message.target_component or self._component_id,
+            message.command,
+        )  # to all: the autopilot answers
         async with self._locks[key]:
             if self._is_closed:
                 raise ConnectionClosed("the block of this vehicle was left; nothing was sent")
@@ -165,7 +168,7 @@ class CommandSender:
         """Give an answer to the exchange that waits for it; without one, it was one of those under way."""
         frame = ack.received_frame
         key = (0 if frame is None else frame.component_id, ack.command)
-        run = self._runs.get(key) or self._runs.get((EVERY_COMPONENT, ack.command))
+        run = self._runs.get(key)
         if run is not None:
             run.receive(ack)
         elif key in self._under_way and ack.result != IN_PROGRESS:

@@ -116,7 +116,7 @@ class VehicleCore:
         Args:
             command: the number, or a member of ``enums.MavCmd``.
             params: param1 to param7; missing ones are 0, NaN where the command says so.
-            component_id: to another component than the autopilot.
+            component_id: to another component than the autopilot; 0: to all, and the autopilot's answer counts.
             attempts: how often it is sent at most; ``confirmation`` rises with each.
             attempt_timeout: seconds to wait for an ack after each, and at least two measured round trips.
             progress_timeout: seconds to wait after each IN_PROGRESS for the next answer; calibrations can take long.

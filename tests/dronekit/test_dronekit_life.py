@@ -1,0 +1,284 @@
+"""The life of a classic vehicle: what it leaves behind, whoever closes it, and Ctrl-C."""
+
+from __future__ import annotations
+
+import _thread
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from served_copter import served_copter
+
+import aerokit.dronekit as dronekit
+from aerokit.mavlink.messages import GlobalPositionInt
+
+LIMIT_S = 20.0
+SOURCES = Path(__file__).parent.parent.parent / "src"
+
+
+@pytest.fixture(scope="module")
+def address() -> Iterator[str]:
+    with served_copter() as each:
+        yield each
+
+
+@pytest.fixture
+def vehicle(address: str) -> Iterator[dronekit.Vehicle]:
+    each = dronekit.connect(address, wait_ready=["mode", "armed"])
+    yield each
+    each.close()
+
+
+def own_threads() -> list[str]:
+    return sorted(
+        each.name for each in threading.enumerate() if each.name.startswith(("aerokit", "dronekit"))
+    )
+
+
+def open_sockets() -> int:
+    found = 0
+    for number in os.listdir("/proc/self/fd"):
+        try:
+            found += os.readlink(f"/proc/self/fd/{number}").startswith("socket:")
+        except OSError:
+            continue
+    return found
+
+
+def eventually(is_true: Callable[[], object]) -> None:
+    deadline = time.monotonic() + LIMIT_S
+    while not is_true():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def test_nothing_is_left_after_closing(address: str) -> None:
+    threads, sockets = own_threads(), open_sockets()
+    vehicle = dronekit.connect(address, wait_ready=["attitude"])
+    vehicle.add_attribute_listener("attitude", lambda *_: None)
+    vehicle.on_message("*")(lambda *_: None)
+    assert len(own_threads()) >= len(threads) + 1
+    vehicle.close()
+    vehicle.close()
+    assert own_threads() == threads
+    eventually(lambda: open_sockets() <= sockets)  # the server's side of it closes, too
+
+
+def test_attributes_stay_and_orders_raise_after_closing(vehicle: dronekit.Vehicle) -> None:
+    vehicle.close()
+    assert vehicle.mode.name == "STABILIZE"
+    for use in (
+        lambda: setattr(vehicle, "mode", "LOITER"),
+        lambda: setattr(vehicle, "armed", True),
+        lambda: vehicle.simple_takeoff(10),
+        lambda: vehicle.arm(),
+        lambda: vehicle.wait_for_mode("LOITER"),
+        lambda: vehicle.wait_for(lambda: False),
+        lambda: vehicle.wait_ready("nothing"),
+        lambda: vehicle.send_mavlink(vehicle.message_factory.heartbeat_encode(6, 8, 0, 0, 0)),
+        lambda: vehicle.commands.upload(),
+        lambda: vehicle.reboot(),
+    ):
+        with pytest.raises(dronekit.APIException):
+            use()
+
+
+@pytest.mark.parametrize("kind", ["attribute", "message"])
+def test_a_callback_may_close_the_vehicle(address: str, kind: str) -> None:
+    threads = own_threads()
+    vehicle = dronekit.connect(address)
+    closed = threading.Event()
+
+    def close(*_: Any) -> None:
+        vehicle.close()
+        closed.set()
+
+    if kind == "attribute":
+        vehicle.add_attribute_listener("*", close)
+    else:
+        vehicle.add_message_listener("*", close)
+    assert closed.wait(LIMIT_S)
+    vehicle.close()
+    eventually(lambda: own_threads() == threads)
+
+
+def test_closing_ends_what_waits_on_other_threads(vehicle: dronekit.Vehicle) -> None:
+    errors: list[BaseException] = []
+
+    def wait(call: Callable[[], object]) -> None:
+        try:
+            call()
+        except dronekit.APIException as error:
+            errors.append(error)
+
+    calls = [
+        lambda: vehicle.wait_for(lambda: False, interval=100),
+        lambda: vehicle.wait_ready("nothing", timeout=100),
+        lambda: vehicle.wait_for_alt(1000),
+    ]
+    threads = [threading.Thread(target=wait, args=(call,)) for call in calls]
+    for each in threads:
+        each.start()
+    vehicle.close()
+    for each in threads:
+        each.join(LIMIT_S)
+    assert len(errors) == len(calls)
+
+
+def test_a_callback_may_call_what_blocks_while_reception_goes_on(vehicle: dronekit.Vehicle) -> None:
+    seen: list[str] = []
+    done = threading.Event()
+
+    def change_mode(self: dronekit.Vehicle, name: str, value: Any) -> None:
+        self.remove_attribute_listener(name, change_mode)
+        self.wait_for_mode("ALT_HOLD", timeout=LIMIT_S)
+        self.parameters["RTL_ALT"] = 2000
+        seen.append(self.mode.name)
+        self.wait_for_mode("STABILIZE", timeout=LIMIT_S)
+        done.set()
+
+    vehicle.add_attribute_listener("attitude", change_mode)
+    assert done.wait(LIMIT_S)
+    assert seen == ["ALT_HOLD"]
+
+
+def test_reading_does_not_wait_for_the_loop(vehicle: dronekit.Vehicle) -> None:
+    vehicle.wait_ready("attitude", "gps_0", "battery", "location", "heading", timeout=LIMIT_S)
+    is_held, may_go_on = threading.Event(), threading.Event()
+
+    def hold() -> None:
+        is_held.set()
+        may_go_on.wait(LIMIT_S)
+
+    vehicle._handler.loop.call_soon(hold)
+    assert is_held.wait(LIMIT_S)
+    try:
+        for name in "mode armed attitude location velocity gps_0 battery heading airspeed version".split():
+            getattr(vehicle, name)
+        assert vehicle.location.global_relative_frame.lat is not None
+    finally:
+        may_go_on.set()
+
+
+def test_the_numbers_of_a_location_belong_to_one_message(vehicle: dronekit.Vehicle) -> None:
+    ended, torn = threading.Event(), []
+    location = vehicle.location
+
+    def read() -> None:
+        while not ended.is_set():
+            place = location.global_frame
+            if place.alt != place.lat and place.alt is not None and place.alt < 90:
+                torn.append(str(place))
+
+    reader = threading.Thread(target=read)
+
+    def feed() -> None:
+        for number in range(1, 81):
+            degrees, millimetres = number * 10_000_000, number * 1000
+            location._on_global_position(GlobalPositionInt(0, degrees, degrees, millimetres, 0, 0, 0, 0, 0))
+
+    vehicle._handler.loop.call(feed)
+    reader.start()
+    for _ in range(20):
+        vehicle._handler.loop.call(feed)
+    ended.set()
+    reader.join(LIMIT_S)
+    assert not torn
+
+
+BLOCKING: dict[str, Callable[[dronekit.Vehicle], object]] = {
+    "wait_ready": lambda vehicle: vehicle.wait_ready("nothing", timeout=LIMIT_S),
+    "wait_for": lambda vehicle: vehicle.wait_for(lambda: False, timeout=LIMIT_S),
+    "wait_for_alt": lambda vehicle: vehicle.wait_for_alt(1000, timeout=LIMIT_S),
+    "run": lambda vehicle: vehicle.run(vehicle.aio.telemetry.mode.wait_until, lambda _: False),
+    "sync": lambda vehicle: vehicle.sync.mode.wait_until(lambda _: False, timeout=LIMIT_S),
+    "connect": lambda _: dronekit.connect("udpin:127.0.0.1:0", heartbeat_timeout=LIMIT_S),
+}
+
+
+@pytest.mark.parametrize("name", BLOCKING)
+def test_ctrl_c_ends_blocking_calls(vehicle: dronekit.Vehicle, name: str) -> None:
+    threads = own_threads()
+    timer = threading.Timer(0.3, _thread.interrupt_main)
+    timer.start()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            BLOCKING[name](vehicle)
+            time.sleep(LIMIT_S)  # pragma: no cover - only when the call returned instead
+    finally:
+        timer.cancel()
+    eventually(lambda: own_threads() == threads)
+
+
+@pytest.mark.parametrize(
+    ("ending", "last_mode"),
+    [("", None), ("vehicle.mode = 'RTL'", "RTL"), ("vehicle.mode = 'LAND'; vehicle.close()", "LAND")],
+)
+def test_a_program_that_just_ends_delivers_its_last_order(ending: str, last_mode: str | None) -> None:
+    with served_copter() as address:
+        program = f"""
+import logging
+logging.basicConfig()
+from aerokit.dronekit import connect
+vehicle = connect({address!r}, wait_ready=['mode', 'attitude'])
+vehicle.add_attribute_listener('attitude', lambda *_: None)
+{ending}
+"""
+        result = subprocess.run(
+            [sys.executable, "-c", program],
+            env={**os.environ, "PYTHONPATH": str(SOURCES)},
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+        assert (result.returncode, result.stdout) == (0, "")
+        assert "Traceback" not in result.stderr
+        if last_mode is not None:
+            vehicle = dronekit.connect(address)
+            assert vehicle.mode.name == last_mode
+            vehicle.close()
+
+
+def test_a_link_that_cannot_be_opened_raises_what_the_system_says() -> None:
+    threads = own_threads()
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        port = listener.getsockname()[1]
+    with pytest.raises(ConnectionRefusedError):
+        dronekit.connect(f"tcp:127.0.0.1:{port}")
+    with pytest.raises(OSError, match="no/such"):
+        dronekit.connect("/dev/no/such/device")
+    with pytest.raises(ValueError, match="port"):
+        dronekit.connect("udpin:127.0.0.1")
+    assert own_threads() == threads
+
+
+def test_without_a_vehicle_connect_has_a_deadline_and_leaves_nothing() -> None:
+    threads, sockets = own_threads(), open_sockets()
+    with pytest.raises(dronekit.APIException, match="Timeout in initializing connection") as caught:
+        dronekit.connect("udpin:127.0.0.1:0", heartbeat_timeout=0.2)
+    assert "not a single byte was heard" in str(caught.value)
+    with pytest.raises(builtin_timeout()):
+        with served_copter(boot_time_s=0.0) as address:
+            dronekit.connect(address, wait_ready=["no such attribute"], timeout=0.2)
+    assert own_threads() == threads
+    eventually(lambda: open_sockets() <= sockets)
+
+
+def builtin_timeout() -> type[Exception]:
+    return TimeoutError
+
+
+def test_as_a_context_manager(address: str) -> None:
+    threads = own_threads()
+    with dronekit.connect(address) as vehicle:
+        assert vehicle.mode.name == "STABILIZE"
+    assert own_threads() == threads
