@@ -53,10 +53,18 @@ def _item(cmd: Command, index: int) -> MissionItem:
     try:
         command, frame = int(cmd.command), int(cmd.frame)
         x, y = (_wire_number(value, command, frame) for value in (cmd.x, cmd.y))
-        param1, *params = (float(value) for value in (cmd.param1, cmd.param2, cmd.param3, cmd.param4))
-        if command == MavCmd.DO_JUMP:
-            param1 -= 1
-        return MissionItem(command, frame, param1, *params, x, y, float(cmd.z), bool(cmd.autocontinue))
+        return MissionItem(
+            command,
+            frame,
+            float(cmd.param1) - (command == MavCmd.DO_JUMP),
+            float(cmd.param2),
+            float(cmd.param3),
+            float(cmd.param4),
+            x,
+            y,
+            float(cmd.z),
+            bool(cmd.autocontinue),
+        )
     except (TypeError, ValueError, OverflowError) as error:
         raise LocalProtocolError(f"commands[{index}] is not allowed: {error}, in {cmd}") from None
 
@@ -68,7 +76,7 @@ def _wire_number(value: Any, command: int, frame: int) -> int | float:
 
 
 def _command(item: MissionItem, seq: int, own_ids: tuple[int, int]) -> Command:
-    param1 = item.param1 + 1 if item.command == MavCmd.DO_JUMP else item.param1
+    param1 = item.param1 + (item.command == MavCmd.DO_JUMP)
     x, y = in_degrees(item)
     params = (param1, item.param2, item.param3, item.param4)
     return Command(
