@@ -160,7 +160,18 @@ def test_reading_does_not_wait_for_the_loop(vehicle: dronekit.Vehicle) -> None:
     vehicle._handler.loop.call_soon(hold)
     assert is_held.wait(LIMIT_S)
     try:
-        for name in "mode armed attitude location velocity gps_0 battery heading airspeed version".split():
+        for name in [
+            "mode",
+            "armed",
+            "attitude",
+            "location",
+            "velocity",
+            "gps_0",
+            "battery",
+            "heading",
+            "airspeed",
+            "version",
+        ]:
             getattr(vehicle, name)
         assert vehicle.location.global_relative_frame.lat is not None
     finally:
@@ -266,9 +277,8 @@ def test_without_a_vehicle_connect_has_a_deadline_and_leaves_nothing() -> None:
     with pytest.raises(dronekit.APIException, match="Timeout in initializing connection") as caught:
         dronekit.connect("udpin:127.0.0.1:0", heartbeat_timeout=0.2)
     assert "not a single byte was heard" in str(caught.value)
-    with pytest.raises(builtin_timeout()):
-        with served_copter(boot_time_s=0.0) as address:
-            dronekit.connect(address, wait_ready=["no such attribute"], timeout=0.2)
+    with pytest.raises(builtin_timeout()), served_copter(boot_time_s=0.0) as address:
+        dronekit.connect(address, wait_ready=["no such attribute"], timeout=0.2)
     assert own_threads() == threads
     eventually(lambda: open_sockets() <= sockets)
 
