@@ -346,6 +346,7 @@ def test_places_go_out_in_full_precision_in_every_frame(
     cmds.download()
     cmds.wait_ready()
     assert {(each.x, each.y) for each in cmds} == {(-35.1234568, 149.7654321)}
+    assert [each.frame for each in cmds] == [0, 3, 10, 0, 3, 10]
 
 
 def test_numbers_that_are_no_places(empty: tuple[FlightController, CommandSequence]) -> None:

@@ -12,7 +12,7 @@ from aerokit.dronekit.command import Command
 from aerokit.errors import LocalProtocolError
 from aerokit.mavlink.enums import MavCmd, MavFrame
 from aerokit.missions import Mission
-from aerokit.missions.commands import DEFAULT_XY, DESTINATIONS, GLOBAL_FRAMES, has_place
+from aerokit.missions.commands import DEFAULT_XY, DESTINATIONS, GLOBAL_FRAMES, canonical_frame, has_place
 from aerokit.missions.item import MissionItem
 from aerokit.missions.wire import from_degrees, home_item, in_degrees
 
@@ -77,11 +77,10 @@ def _wire_number(value: Any, command: int, frame: int) -> int | float:
 
 def _command(item: MissionItem, seq: int, own_ids: tuple[int, int]) -> Command:
     param1 = item.param1 + (item.command == MavCmd.DO_JUMP)
+    frame = int(canonical_frame(item.frame))  # those of MISSION_ITEM, which is what a command is
     x, y = in_degrees(item)
     params = (param1, item.param2, item.param3, item.param4)
-    return Command(
-        *own_ids, seq, int(item.frame), int(item.command), 0, int(item.autocontinue), *params, x, y, item.z
-    )
+    return Command(*own_ids, seq, frame, int(item.command), 0, int(item.autocontinue), *params, x, y, item.z)
 
 
 # ------------------------------------------------------------------ what ArduPilot does by itself
