@@ -305,3 +305,49 @@ def test_of_an_old_and_a_new_name_only_one_is_waited_for() -> None:
     assert value(answers["PARAM_0004"]) == 2.0
     assert isinstance(answers["OLD_NAME"], ParameterRejected)
     assert channel.now == pytest.approx(RTT_S)
+
+
+# ------------------------------------------------------------------------------ few PARAM_SET
+
+
+class Deaf(FakeVehicle):
+    """Takes what is set, and loses the first answers to anything, or all."""
+
+    lost = 10**9
+
+    def receive(self, message: Message) -> None:
+        before, self.lost = self.lost, self.lost - 1
+        if before > 0 and not isinstance(message, m.ParamSet):
+            return
+        super().receive(message)
+
+    def on_set(self, request: m.ParamSet) -> None:
+        pass
+
+
+@pytest.mark.parametrize("most", [1, 2, 4])
+def test_a_silent_vehicle_gets_no_more_param_sets_than_allowed(most: int) -> None:
+    channel = Channel(Deaf(table_of(1)))
+    answers = channel.run(
+        writes(Parameter("PARAM_0000", 7, INT8), most_unanswered=most, patience_s=3.0),
+    )
+    assert isinstance(answers["PARAM_0000"], ParameterTimeout)
+    assert channel.kinds()["PARAM_SET"] == most
+    assert channel.kinds()["PARAM_REQUEST_READ"] > 1
+
+
+def test_an_answer_with_the_old_value_has_it_set_again() -> None:
+    class LosesSets(FakeVehicle):
+        lost = 3
+
+        def on_set(self, request: m.ParamSet) -> None:
+            self.lost -= 1
+            if self.lost < 0:
+                super().on_set(request)
+
+    channel = Channel(LosesSets(table_of(1)))
+    answers = channel.run(
+        writes(Parameter("PARAM_0000", 7, INT8), before={"PARAM_0000": 0}, most_unanswered=1)
+    )
+    assert value(answers["PARAM_0000"]) == 7
+    assert channel.kinds()["PARAM_SET"] == 4

@@ -38,6 +38,9 @@ class ParameterWrites(ParameterRequests):
     write: it is set again and read back, and only what comes again is the answer. So a vehicle that rounds or clamps
     is believed after a second answer, and nothing is sent for ever.
 
+    ``most_unanswered``: so many PARAM_SET are sent at most to a vehicle that answers nothing; after them it is asked
+    what it has, and an answer with another value has it set again.
+
     ``before`` are the values known so far. ``recent`` are names that were written a moment ago: echoes of that write
     may still come, so that the first answer as asked is read back.
     """
@@ -51,6 +54,7 @@ class ParameterWrites(ParameterRequests):
         bytewise: bool,
         before: Mapping[str, float] = MappingProxyType({}),
         recent: Iterable[str] = (),
+        most_unanswered: int | None = None,
         own_system: int = 0,
         round_trip: RoundTrip | None = None,
         patience_s: float = PATIENCE_S,
@@ -70,6 +74,8 @@ class ParameterWrites(ParameterRequests):
         )
         self._before = dict(before)
         self._recent = set(recent)
+        self._most_unanswered = most_unanswered
+        self._unanswered = dict.fromkeys(self._wanted, 0)
         self._others: dict[str, list[Parameter]] = {}
 
     def _request(self, name: str) -> list[Message]:
@@ -80,7 +86,11 @@ class ParameterWrites(ParameterRequests):
         write = set_message(
             self.target_system, self.target_component, name, wanted.value, wanted.type, self._bytewise
         )
-        return [write, read] if others else [write]
+        if others:
+            return [write, read]
+        self._unanswered[name] += 1
+        most = self._most_unanswered
+        return [write] if most is None or self._unanswered[name] <= most else [read]
 
     def _take(self, message: ParamValue, now: float) -> None:
         name = message.param_id

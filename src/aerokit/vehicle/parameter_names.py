@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from aerokit.protocols.parameter_requests import Answer
     from aerokit.vehicle.parameter_access import ParameterAccess
 
-__all__ = ["Found", "NotFound", "ParameterNames"]
+__all__ = ["Found", "NotFound", "ParameterNames", "warn_of_rename"]
 
 NotFound = ParameterRejected | ParameterTimeout
 
@@ -68,7 +68,7 @@ class ParameterNames:
             each = self._found(name, answers)
             found[asked] = each = each.replace(asked=asked) if isinstance(each, Found) else each
             if isinstance(each, Found) and each.renamed is not None:
-                _warn_of(each.renamed)
+                warn_of_rename(each.renamed)
         return found
 
     def translated(self, values: Mapping[str, float], table: ParameterTable) -> dict[str, int | float]:
@@ -78,7 +78,7 @@ class ParameterNames:
         values = {self._spelled(name): value for name, value in values.items()}
         translated, renamed = translate_values(values, table, table.types_by_name())
         for each in renamed:
-            _warn_of(each)
+            warn_of_rename(each)
         return translated
 
     def without_doubles(self, values: Mapping[str, float], table: ParameterTable) -> dict[str, int | float]:
@@ -121,7 +121,7 @@ class ParameterNames:
         return own or ParameterRejected(f"the vehicle has no parameter {name}", name=name)
 
 
-def _warn_of(renamed: Renamed) -> None:
+def warn_of_rename(renamed: Renamed) -> None:
     """Warn in the name of the program's own line, however deep inside aerokit this is."""
     from aerokit.parameters.renames import ParameterRenamedWarning
 
