@@ -65,6 +65,7 @@ class VehicleAttributes(HasObservers):
         self._ready_attrs: set[str] = set()
         self._failures: dict[str, APIException] = {}
         self._became_ready = threading.Condition()
+        self._seekers: dict[str, Callable[[], None]] = {}
         for message_type, handler in self._handlers().items():
             self._on(message_type, handler)
 

@@ -27,6 +27,7 @@ class Readiness:
         _ready_attrs: set[str]
         _failures: dict[str, APIException]
         _became_ready: threading.Condition
+        _seekers: dict[str, Callable[[], None]]
 
         def _check_link(self) -> object: ...
 
@@ -74,11 +75,17 @@ class Readiness:
                 if raise_exception:
                     raise type(failure)(str(failure)) from failure.__cause__
                 return False
+            self._seek(missing)
             if still_waiting_callback is not None and now >= told_at + still_waiting_interval:
                 told_at = now
                 still_waiting_callback(missing)
             self._wait_a_little(wanted, deadline - now)
         return True
+
+    def _seek(self, names: set[str]) -> None:
+        """Have what is not coming by itself fetched."""
+        for name in self._seekers.keys() & names:
+            self._seekers[name]()
 
     def _failure_of(self, names: set[str]) -> APIException | None:
         return next((self._failures[name] for name in names if name in self._failures), None)

@@ -1,0 +1,74 @@
+"""Setting one parameter as a program means it: any number, sent in the parameter's own type, confirmed."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, SupportsFloat, SupportsIndex
+
+from aerokit.errors import AerokitError, LocalProtocolError, ParameterRejected
+from aerokit.parameters import Parameter, checked_value
+from aerokit.vehicle.parameter_names import Found
+from aerokit.vehicle.parameter_results import outcome_of
+
+if TYPE_CHECKING:
+    from aerokit.parameters import ParameterType
+    from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
+
+__all__ = ["number_of", "set_parameter"]
+
+TRY_S = 1.0
+"""How long one attempt waits, unless the link is slower."""
+ROUND_TRIPS = 3
+ALMOST = 0.01
+"""ArduPilot adds it before it cuts off the fraction."""
+
+
+def number_of(name: str, value: object) -> int | float:
+    """The value, when it is a number: of Python, numpy or alike.
+
+    Raises:
+        LocalProtocolError: a ValueError; it is text, None or anything else.
+    """
+    if isinstance(value, (int, float)):
+        return value
+    if isinstance(value, SupportsIndex):
+        return value.__index__()
+    if isinstance(value, SupportsFloat):
+        return float(value)
+    raise LocalProtocolError(f"{name} = {value!r} is no number")
+
+
+async def set_parameter(aio: AsyncVehicle, name: str, value: float, retries: int) -> AerokitError | None:
+    """Have the vehicle take a value; returns why it has not, None when it has confirmed it.
+
+    A fraction given for an integer parameter is cut off, as by ArduPilot itself. To a vehicle that answers nothing
+    PARAM_SET is sent ``retries`` + 1 times, and as many seconds are waited.
+    """
+    access, names = aio.parameters._access, aio.parameters._names
+    patience_s = max(retries, 1) * _try_s(aio)
+    try:
+        found = (await names.find([name], patience_s))[name]
+        if not isinstance(found, Found):
+            return found
+        type_ = found.parameter.type
+        wanted = Parameter(found.name, as_held(found.name, found.to_vehicle(value), type_), type_)
+        answers = await access.write([wanted], patience_s, most_unanswered=retries + 1)
+    except LocalProtocolError as error:
+        return error
+    answer = answers[found.name]
+    outcome = outcome_of(wanted, found.parameter, answer)
+    if isinstance(outcome, AerokitError):
+        return outcome
+    if outcome == "clamped" and isinstance(answer, Parameter):
+        return ParameterRejected(f"the vehicle made it {answer.value:g}", name=found.name)
+    return None
+
+
+def as_held(name: str, value: float, type: ParameterType) -> int | float:  # noqa: A002
+    """The value as a parameter of that type holds it; LocalProtocolError when it cannot."""
+    if type.is_integer and isinstance(value, float) and abs(value) < float("inf"):
+        value = int(value - ALMOST if value < 0 else value + ALMOST)
+    return checked_value(name, value, type)
+
+
+def _try_s(aio: AsyncVehicle) -> float:
+    return max(TRY_S, ROUND_TRIPS * (aio.parameters._access._transfers.round_trip.smoothed_s or 0.0))

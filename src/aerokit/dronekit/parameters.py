@@ -1,0 +1,286 @@
+"""``vehicle.parameters``: the autopilot's parameters as a mapping of names to floats."""
+
+from __future__ import annotations
+
+from collections.abc import ItemsView, Iterator, KeysView, MutableMapping, ValuesView
+from typing import TYPE_CHECKING, Any
+
+import anyio
+
+from aerokit.dronekit.exceptions import APIException, TimeoutError  # noqa: A004 - DroneKit's name
+from aerokit.dronekit.observers import AttributeListener, HasObservers
+from aerokit.dronekit.parameter_reading import ParameterReading
+from aerokit.dronekit.parameter_set import number_of, set_parameter
+from aerokit.dronekit.parameter_values import ParameterValues
+from aerokit.errors import LocalProtocolError, ParameterTimeout
+from aerokit.mavlink.messages import ParamValue
+from aerokit.parameters import check_name
+from aerokit.runtime.events import ParameterChanged
+
+if TYPE_CHECKING:
+    from aerokit.dronekit.parameter_values import KnownParameter
+    from aerokit.dronekit.vehicle import Vehicle
+    from aerokit.parameters import ParameterTable
+
+__all__ = ["Parameters"]
+
+READY_S = 30.0
+"""How long reading waits."""
+
+
+class Parameters(MutableMapping[str, float], HasObservers):
+    """Name → value: ``vehicle.parameters['RTL_ALT']``, ``vehicle.parameters['RTL_ALT'] = 30``.
+
+    Names are upper-cased, values are floats. The list is downloaded in the background from the moment at which the
+    vehicle was found, and stays valid through reboots and lost links; every change that the vehicle tells of is taken.
+    Reading a value that has not come yet asks the vehicle for that one, so it seldom waits for the whole list;
+    iterating does, :func:`len` tells how many have come. A value that is known is read without waiting.
+
+    Names from before ArduPilot 4.7 and since are taken by both, and values converted, with a warning.
+
+    Listeners get ``(parameters, name, value)``, when a value has changed or has come for the first time.
+    """
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        HasObservers.__init__(self, vehicle._listener_thread)
+        self._vehicle = vehicle
+        self._values = ParameterValues()
+        self._reading = ParameterReading(vehicle, self._take_all)
+        vehicle._on(ParamValue, self._on_value)
+        vehicle._at_start(self._start)
+        vehicle._seekers["parameters"] = self._reading.seek
+
+    # ------------------------------------------------------------------------------- reading
+
+    def __getitem__(self, name: str) -> float:
+        value = self.get(name)
+        if value is None:
+            raise KeyError(name.upper() if isinstance(name, str) else name)
+        return value
+
+    def get(  # type: ignore[override]
+        self, name: str, wait_ready: object = True, *, default: float | None = None
+    ) -> float | None:
+        """Return a value; ``default`` when the vehicle has no such parameter.
+
+        The second argument is no default: false, it is what is known now that counts, and nothing is waited for.
+
+        Raises:
+            TimeoutError: it did not come within 30 seconds.
+            APIException: the link is down, and the value is not known.
+        """
+        if isinstance(name, str) and (value := self._values.get(name.upper())) is not None:
+            return value
+        known = self._find(name, waits=bool(wait_ready))
+        if known is None:
+            return default
+        known.warn()
+        return known.value_asked
+
+    def __contains__(self, name: object) -> bool:
+        return self._find(name) is not None
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._all())
+
+    def items(self) -> ItemsView[str, float]:
+        """Names and values; iterating waits for the download, and goes through what is known then."""
+        return _Items(self)
+
+    def values(self) -> ValuesView[float]:
+        """Values; iterating waits for the download, and goes through what is known then."""
+        return _Values(self)
+
+    def iteritems(self) -> Iterator[tuple[str, float]]:
+        """As ``iter(items())``, for programs from the days of Python 2."""
+        return iter(self.items())
+
+    def iterkeys(self) -> Iterator[str]:
+        """As ``iter(keys())``."""
+        return iter(self)
+
+    def itervalues(self) -> Iterator[float]:
+        """As ``iter(values())``."""
+        return iter(self.values())
+
+    def viewitems(self) -> ItemsView[str, float]:
+        """As :meth:`items`."""
+        return self.items()
+
+    def viewkeys(self) -> KeysView[str]:
+        """As ``keys()``."""
+        return self.keys()
+
+    def viewvalues(self) -> ValuesView[float]:
+        """As :meth:`values`."""
+        return self.values()
+
+    def has_key(self, name: str) -> bool:
+        """As ``name in parameters``."""
+        return name in self
+
+    def wait_ready(self, **kwargs: Any) -> None:
+        """Wait until all parameters are there: arguments as of ``Vehicle.wait_ready``.
+
+        A download that has failed is begun again.
+
+        Raises:
+            TimeoutError: they are not in time, 30 seconds by default.
+            APIException: the link is down.
+        """
+        self._vehicle.wait_ready("parameters", **kwargs)
+
+    # ------------------------------------------------------------------------------- writing
+
+    def __setitem__(self, name: str, value: float) -> None:
+        self.set(name, value)
+
+    def __delitem__(self, name: str) -> None:
+        raise APIException("Cannot delete value from parameters list.")
+
+    def set(self, name: str, value: float, retries: int = 3, wait_ready: bool = False) -> bool:
+        """Set a parameter, and wait until the vehicle has confirmed it.
+
+        An integer parameter takes a number without its fraction. ``parameters[name] = value`` does the same.
+
+        Args:
+            name: any case.
+            value: any number.
+            retries: how often it is sent again to a vehicle that does not answer, and how many seconds are waited.
+                0 does not wait: it is confirmed in the background, and the result is False.
+            wait_ready: whether to wait for the download of all parameters first; there is no need to.
+
+        Returns:
+            Whether the vehicle holds the value now. If not, the reason is logged as an error: no answer, no such
+            parameter, a value that the vehicle or the parameter's type does not take.
+
+        Raises:
+            LocalProtocolError: a ValueError; the name is no text, or the value no number.
+            APIException: the link is down.
+        """
+        name, number = _upper(name), number_of(name, value)
+        if wait_ready:
+            self.wait_ready()
+        known = self._values.find(name)
+        own, told = (name, number) if known is None else (known.name, known.to_vehicle(number))
+        if known is not None:
+            known.warn()
+        vehicle = self._vehicle
+        if retries <= 0:
+            vehicle._order(f"parameter {own}", set_parameter, vehicle.aio, own, told, 0)
+            return False
+        failure = vehicle._run(set_parameter, vehicle.aio, own, told, retries)
+        if isinstance(failure, ParameterTimeout):
+            vehicle._logger.error("timeout setting parameter %s to %f", name, number)
+        elif failure is not None:
+            vehicle._logger.error("could not set parameter %s to %f: %s", name, number, failure)
+        return failure is None
+
+    # ----------------------------------------------------------------------------- listeners
+
+    def add_attribute_listener(self, attr_name: str, observer: AttributeListener) -> None:
+        """Have ``observer(parameters, name, value)`` called when this parameter (``'*'``: any) changes."""
+        super().add_attribute_listener(attr_name.upper(), observer)
+
+    def remove_attribute_listener(self, attr_name: str, observer: AttributeListener) -> None:
+        """Call it no more. Silent when nobody listens to the name.
+
+        Raises:
+            ValueError: others listen to the name, but this one does not.
+        """
+        super().remove_attribute_listener(attr_name.upper(), observer)
+
+    def notify_attribute_listeners(self, attr_name: str, value: Any, cache: bool = True) -> None:
+        """Tell the listeners of a parameter a value, unless it is the one told before, whatever ``cache`` says."""
+        super().notify_attribute_listeners(attr_name.upper(), value, cache=True)
+
+    # ------------------------------------------------------------------------------- inside
+
+    def _find(self, name: object, *, waits: bool = True) -> KnownParameter | None:
+        """Waited for if need be; None when the vehicle has no such parameter."""
+        if not isinstance(name, str):
+            return None
+        name = name.upper()
+        known = self._values.find(name)
+        if known is None and waits and _is_possible(name) and not self._is_settled:
+            self._vehicle._run(self._wait_for, name)
+            known = self._values.find(name)
+        return known
+
+    @property
+    def _is_settled(self) -> bool:
+        """Whether the vehicle has nothing but what is known: the whole list has come, and is as long as it says."""
+        if not self._reading.is_complete:
+            return False
+        count = self._vehicle.aio.parameters._access.store.count
+        return count is None or count <= len(self._values)
+
+    async def _wait_for(self, name: str) -> None:
+        with anyio.move_on_after(READY_S) as waiting:
+            await self._reading.find(name)
+        if waiting.cancelled_caught:
+            raise TimeoutError(f"wait_ready experienced a timeout after {READY_S:.0f} seconds.")
+
+    def _all(self) -> dict[str, float]:
+        if not self._reading.is_complete:
+            self.wait_ready()
+        return self._values.copy()
+
+    def _start(self) -> None:
+        aio = self._vehicle.aio
+        aio._detach.append(aio.connection.bus.attach_event(ParameterChanged, self._on_changed))
+        self._reading.begin()
+
+    def _on_value(self, message: ParamValue) -> None:
+        """The table underneath has taken it already: there, integers are what they are."""
+        told = self._vehicle.aio.parameters._access.store.get(message.param_id)
+        if told is not None:
+            self._take(told.name, float(told.value))
+
+    def _on_changed(self, event: ParameterChanged) -> None:
+        """Also by a download that a program has begun by itself."""
+        if event.system_id == self._vehicle._target_system:
+            self._take(event.name, float(event.after))
+
+    def _take(self, name: str, value: float) -> None:
+        if self._values.take(name, value):
+            self._tell(name.upper(), value, cache=True)
+
+    def _take_all(self, table: ParameterTable) -> None:
+        news = self._values.replace(table.values_by_name())
+        if self._attribute_listeners:
+            for name, value in news.items():
+                self._tell(name.upper(), value, cache=True)
+        else:
+            self._attribute_cache.update(news)
+
+
+class _Items(ItemsView[str, float]):
+    _mapping: Parameters
+
+    def __iter__(self) -> Iterator[tuple[str, float]]:
+        return iter(self._mapping._all().items())
+
+
+class _Values(ValuesView[float]):
+    _mapping: Parameters
+
+    def __iter__(self) -> Iterator[float]:
+        return iter(self._mapping._all().values())
+
+
+def _upper(name: str) -> str:
+    if not isinstance(name, str):
+        raise LocalProtocolError(f"parameter name = {name!r} is no text")
+    return name.upper()
+
+
+def _is_possible(name: str) -> bool:
+    try:
+        check_name(name)
+    except LocalProtocolError:
+        return False
+    return True
