@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
-__all__ = ["FlightMethods"]
+__all__ = ["FlightMethods", "checked_place"]
 
 COMPONENT_ARM_DISARM = 400
 NAV_TAKEOFF, DO_CHANGE_SPEED, DO_SET_HOME, DO_REPOSITION = 22, 178, 179, 192
@@ -203,7 +203,7 @@ class FlightMethods(VehicleAttributes):
         """Latitude and longitude in 1e-7 degrees, altitude above home."""
         if not isinstance(location, (LocationGlobal, LocationGlobalRelative)):
             raise ValueError("Expecting location to be LocationGlobal or LocationGlobalRelative.")
-        latitude, longitude, altitude = _checked_place(location)
+        latitude, longitude, altitude = checked_place(location)
         if isinstance(location, LocationGlobal):
             home = self._known_home()
             altitude -= home.alt or 0.0
@@ -254,7 +254,7 @@ class FlightMethods(VehicleAttributes):
     def home_location(self, pos: LocationGlobal) -> None:
         if not isinstance(pos, LocationGlobal):
             raise ValueError("Expecting home_location to be set to a LocationGlobal.")
-        latitude, longitude, altitude = _checked_place(pos)
+        latitude, longitude, altitude = checked_place(pos)
         aio = self._check_link()
         self._order("home", _set_home, aio, latitude, longitude, altitude)
         self._set_home(pos.lat, pos.lon, altitude)
@@ -401,7 +401,7 @@ async def _refuse(reason: str) -> None:
     raise APIException(reason)
 
 
-def _checked_place(location: LocationGlobal | LocationGlobalRelative) -> tuple[int, int, float]:
+def checked_place(location: LocationGlobal | LocationGlobalRelative) -> tuple[int, int, float]:
     """Latitude and longitude in 1e-7 degrees, altitude in metres.
 
     Raises:
