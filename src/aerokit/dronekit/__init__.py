@@ -49,9 +49,10 @@ from aerokit.dronekit.values import (
 from aerokit.dronekit.version import Capabilities, Version
 
 if TYPE_CHECKING:
-    from pymavlink import mavutil, mavwp
+    from pymavlink import mavwp
     from pymavlink.dialects.v10 import ardupilotmega
 
+    from aerokit.dronekit import _mavutil as mavutil
     from aerokit.dronekit.channels import Channels, ChannelsOverride
     from aerokit.dronekit.commands import Command, CommandSequence
     from aerokit.dronekit.gimbal import Gimbal

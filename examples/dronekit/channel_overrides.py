@@ -1,0 +1,52 @@
+"""Read the sticks, and move them in the pilot's place. Not with a pilot's hands on them, and not in the air.
+
+python -m aerokit.dronekit examples/dronekit/channel_overrides.py --connect udp:127.0.0.1:14550
+"""
+
+import argparse
+import time
+
+from dronekit import Vehicle, connect
+
+POLL_S = 0.1
+HEARD_S = 5.0
+
+
+def wait_for_channels(vehicle: Vehicle, wanted: dict[str, int]) -> None:
+    """The vehicle tells what it works with: the receiver's values, or what overrides them."""
+
+    def has_them() -> bool:
+        return all(vehicle.channels[number] == value for number, value in wanted.items())
+
+    vehicle.wait_for(
+        has_them, timeout=HEARD_S, interval=POLL_S, errmsg=f"the channels do not become {wanted}"
+    )
+    print("channels:", vehicle.channels)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Override RC channels.")
+    parser.add_argument("--connect", metavar="ADDRESS", default="udp:127.0.0.1:14550")
+    options = parser.parse_args()
+
+    vehicle = connect(options.connect, wait_ready=True)
+    deadline = time.monotonic() + HEARD_S
+    while vehicle.channels["1"] is None and time.monotonic() < deadline:
+        time.sleep(POLL_S)
+    before = dict(vehicle.channels)
+    print("channels:", before)
+
+    vehicle.channels.overrides["3"] = 1100
+    wait_for_channels(vehicle, {"3": 1100})
+    vehicle.channels.overrides = {"1": 1600, "2": 1400}
+    print("overrides:", vehicle.channels.overrides)
+    wait_for_channels(vehicle, {"1": 1600, "2": 1400, "3": before["3"]})
+    del vehicle.channels.overrides["1"]
+    vehicle.channels.overrides["2"] = None
+    wait_for_channels(vehicle, {"1": before["1"], "2": before["2"]})
+    vehicle.channels.overrides = {}
+    vehicle.close()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,82 @@
+"""Fly where a recorded flight has been: its track becomes a mission.
+
+python -m aerokit.dronekit examples/dronekit/flight_replay.py flight.tlog --connect udp:127.0.0.1:14550
+"""
+
+import argparse
+import math
+import time
+
+from dronekit import Command, LocationGlobalRelative, Vehicle, VehicleMode, connect, mavutil
+
+POLL_S = 0.2
+METRES_PER_DEGREE = 111_320.0
+WAYPOINT = mavutil.mavlink.MAV_CMD_NAV_WAYPOINT
+ABOVE_HOME = mavutil.mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT
+
+
+def distance(one: LocationGlobalRelative, other: LocationGlobalRelative) -> float:
+    """Metres, altitude included."""
+    north = (other.lat - one.lat) * METRES_PER_DEGREE
+    east = (other.lon - one.lon) * METRES_PER_DEGREE * math.cos(math.radians(one.lat))
+    return math.hypot(north, east, other.alt - one.alt)
+
+
+def track_of(path: str, spacing: float, lowest: float) -> list[LocationGlobalRelative]:
+    """Places of a flight that are so many metres apart, those near the ground left out."""
+    track: list[LocationGlobalRelative] = []
+    recording = mavutil.mavlink_connection(path)
+    while (message := recording.recv_match(type="GLOBAL_POSITION_INT")) is not None:
+        place = LocationGlobalRelative(message.lat / 1e7, message.lon / 1e7, message.relative_alt / 1000)
+        if place.alt >= lowest and (not track or distance(track[-1], place) >= spacing):
+            track.append(place)
+    recording.close()
+    return track
+
+
+def upload(vehicle: Vehicle, track: list[LocationGlobalRelative]) -> None:
+    commands = vehicle.commands
+    commands.clear()
+    for place in track:
+        commands.add(
+            Command(0, 0, 0, ABOVE_HOME, WAYPOINT, 0, 0, 0, 0, 0, 0, place.lat, place.lon, place.alt)
+        )
+    commands.upload()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Fly the track of a recorded flight.")
+    parser.add_argument("recording", help="a .tlog file")
+    parser.add_argument("--connect", metavar="ADDRESS", default="udp:127.0.0.1:14550")
+    parser.add_argument("--spacing", type=float, default=5.0, help="metres between waypoints")
+    parser.add_argument("--farthest", type=float, default=1000.0, help="metres from here to its beginning")
+    options = parser.parse_args()
+
+    track = track_of(options.recording, options.spacing, lowest=2.0)
+    if not track:
+        raise SystemExit("nothing flies in this recording")
+    vehicle = connect(options.connect, wait_ready=True)
+    way = distance(vehicle.location.global_relative_frame, track[0])
+    if way > options.farthest:
+        raise SystemExit(f"the flight began {way:.0f} m from here")
+    print(f"{len(track)} waypoints")
+    upload(vehicle, track)
+
+    vehicle.wait_for_armable(timeout=60)
+    vehicle.wait_for_mode("GUIDED", timeout=10)
+    vehicle.arm(timeout=10)
+    vehicle.wait_simple_takeoff(track[0].alt, epsilon=0.5, timeout=60)
+    vehicle.commands.next = 1
+    vehicle.mode = VehicleMode("AUTO")
+    last = track[-1]
+    while distance(vehicle.location.global_relative_frame, last) > 2.0:
+        print(f"to waypoint {vehicle.commands.next}, {vehicle.location.global_relative_frame}")
+        time.sleep(POLL_S)
+    print("at the end of the track")
+    vehicle.mode = VehicleMode("RTL")
+    vehicle.wait_for(lambda: not vehicle.armed, timeout=300, errmsg="does not land")
+    vehicle.close()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,73 @@
+"""Fly above somebody who moves: another vehicle, or for trying it out a walker that exists only here.
+
+python -m aerokit.dronekit examples/dronekit/follow_me.py --connect udp:127.0.0.1:14550 [--leader udp:127.0.0.1:14560]
+"""
+
+import argparse
+import math
+import time
+from collections.abc import Callable
+
+from dronekit import LocationGlobalRelative, VehicleMode, connect
+
+POLL_S = 0.2
+METRES_PER_DEGREE = 111_320.0
+Position = Callable[[], LocationGlobalRelative]
+
+
+def distance(one: LocationGlobalRelative, other: LocationGlobalRelative) -> float:
+    """Metres along the ground."""
+    north = (other.lat - one.lat) * METRES_PER_DEGREE
+    east = (other.lon - one.lon) * METRES_PER_DEGREE * math.cos(math.radians(one.lat))
+    return math.hypot(north, east)
+
+
+def walker(start: LocationGlobalRelative, speed: float) -> Position:
+    """Somebody who walks north from a place, so many metres per second."""
+    started = time.monotonic()
+
+    def where() -> LocationGlobalRelative:
+        walked = speed * (time.monotonic() - started)
+        return LocationGlobalRelative(start.lat + walked / METRES_PER_DEGREE, start.lon, 0)
+
+    return where
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Follow a walker or another vehicle.")
+    parser.add_argument("--connect", metavar="ADDRESS", default="udp:127.0.0.1:14550")
+    parser.add_argument("--leader", metavar="ADDRESS", help="the vehicle to follow")
+    parser.add_argument("--altitude", type=float, default=10.0, help="metres above home")
+    parser.add_argument("--walking-speed", type=float, default=1.5, help="metres per second")
+    parser.add_argument("--seconds", type=float, default=30.0)
+    options = parser.parse_args()
+
+    vehicle = connect(options.connect, wait_ready=True)
+    leader = connect(options.leader, wait_ready=["location"]) if options.leader else None
+    vehicle.wait_for_armable(timeout=60)
+    vehicle.wait_for_mode("GUIDED", timeout=10)
+    vehicle.arm(timeout=10)
+    vehicle.wait_simple_takeoff(options.altitude, epsilon=0.5, timeout=60)
+
+    start = vehicle.location.global_relative_frame
+    where: Position = walker(start, options.walking_speed)
+    if leader is not None:
+        location = leader.location
+        where = lambda: location.global_relative_frame  # noqa: E731
+    end = time.monotonic() + options.seconds
+    while time.monotonic() < end and vehicle.mode == "GUIDED":  # a pilot who changes the mode has it back
+        place = where()
+        vehicle.simple_goto(LocationGlobalRelative(place.lat, place.lon, options.altitude))
+        print(f"{distance(vehicle.location.global_relative_frame, place):.0f} m behind")
+        time.sleep(POLL_S)
+    print(f"followed for {distance(start, vehicle.location.global_relative_frame):.0f} m")
+    vehicle.mode = VehicleMode("LAND")
+    vehicle.wait_for(lambda: not vehicle.armed, timeout=60, errmsg="does not land")
+    print("landed")
+    vehicle.close()
+    if leader is not None:
+        leader.close()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,64 @@
+"""Steer by velocities and headings, with messages of our own making.
+
+python -m aerokit.dronekit examples/dronekit/guided_velocity_and_yaw.py --connect udp:127.0.0.1:14550
+"""
+
+import argparse
+import time
+
+from dronekit import Vehicle, VehicleMode, connect, mavutil
+
+POLL_S = 0.1
+ONLY_VELOCITY = 0b110111000111
+"""Bits of what the vehicle is to ignore: position, acceleration, yaw and yaw rate."""
+
+
+def fly(vehicle: Vehicle, north: float, east: float, down: float, seconds: float) -> None:
+    """Metres per second; sent again and again, since the vehicle stops when it hears no more of it."""
+    message = vehicle.message_factory.set_position_target_local_ned_encode(
+        0, 0, 0, mavutil.mavlink.MAV_FRAME_LOCAL_NED, ONLY_VELOCITY, 0, 0, 0, north, east, down, 0, 0, 0, 0, 0
+    )
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        vehicle.send_mavlink(message)
+        time.sleep(POLL_S)
+
+
+def turn(vehicle: Vehicle, heading: float, timeout: float = 20.0) -> None:
+    """Point the nose to a heading in degrees; waits until it does."""
+    message = vehicle.message_factory.command_long_encode(
+        0, 0, mavutil.mavlink.MAV_CMD_CONDITION_YAW, 0, heading, 0, 0, 0, 0, 0, 0
+    )
+    vehicle.send_mavlink(message)
+
+    def points_there() -> bool:
+        return abs((vehicle.heading - heading + 180) % 360 - 180) < 5
+
+    vehicle.wait_for(points_there, timeout=timeout, errmsg=f"does not turn to {heading:g} degrees")
+    print(f"heading {vehicle.heading}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Fly by velocities.")
+    parser.add_argument("--connect", metavar="ADDRESS", default="udp:127.0.0.1:14550")
+    parser.add_argument("--seconds", type=float, default=5.0, help="for each leg")
+    options = parser.parse_args()
+
+    vehicle = connect(options.connect, wait_ready=True)
+    vehicle.wait_for_armable(timeout=60)
+    vehicle.wait_for_mode("GUIDED", timeout=10)
+    vehicle.arm(timeout=10)
+    vehicle.wait_simple_takeoff(10, epsilon=0.5, timeout=60)
+    for north, east, down in ((2, 0, 0), (0, 2, 0), (-2, -2, 0), (0, 0, -1)):
+        fly(vehicle, north, east, down, options.seconds)
+        print(f"{vehicle.location.local_frame} at {vehicle.velocity} m/s")
+    for heading in (90, 180):
+        turn(vehicle, heading)
+    vehicle.mode = VehicleMode("LAND")
+    vehicle.wait_for(lambda: not vehicle.armed, timeout=60, errmsg="does not land")
+    print("landed")
+    vehicle.close()
+
+
+if __name__ == "__main__":
+    main()

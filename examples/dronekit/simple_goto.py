@@ -1,0 +1,75 @@
+"""Take off, visit two places, come back.
+
+python -m aerokit.dronekit examples/dronekit/simple_goto.py --connect udp:127.0.0.1:14550
+"""
+
+import argparse
+import math
+import time
+
+from dronekit import LocationGlobalRelative, Vehicle, VehicleMode, connect
+
+POLL_S = 0.2
+METRES_PER_DEGREE = 111_320.0
+
+
+def offset(place: LocationGlobalRelative, north: float, east: float) -> LocationGlobalRelative:
+    """The place so many metres away, at the same altitude."""
+    lon = place.lon + east / METRES_PER_DEGREE / math.cos(math.radians(place.lat))
+    return LocationGlobalRelative(place.lat + north / METRES_PER_DEGREE, lon, place.alt)
+
+
+def distance(one: LocationGlobalRelative, other: LocationGlobalRelative) -> float:
+    """Metres along the ground."""
+    north = (other.lat - one.lat) * METRES_PER_DEGREE
+    east = (other.lon - one.lon) * METRES_PER_DEGREE * math.cos(math.radians(one.lat))
+    return math.hypot(north, east)
+
+
+def arm_and_take_off(vehicle: Vehicle, altitude: float) -> None:
+    while not vehicle.is_armable:
+        time.sleep(POLL_S)
+    vehicle.mode = VehicleMode("GUIDED")
+    while vehicle.mode != "GUIDED":
+        time.sleep(POLL_S)
+    vehicle.armed = True
+    while not vehicle.armed:
+        time.sleep(POLL_S)
+    vehicle.simple_takeoff(altitude)
+    while vehicle.location.global_relative_frame.alt < altitude * 0.95:
+        time.sleep(POLL_S)
+    print(f"at {altitude:g} m")
+
+
+def go_to(vehicle: Vehicle, place: LocationGlobalRelative, speed: float) -> None:
+    """Return when it is there, or when somebody else has taken over."""
+    vehicle.simple_goto(place, groundspeed=speed)
+    while vehicle.mode == "GUIDED":
+        left = distance(vehicle.location.global_relative_frame, place)
+        if left < 1.0:
+            print("there")
+            return
+        print(f"{left:.0f} m to go")
+        time.sleep(POLL_S)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Fly to two places in GUIDED mode.")
+    parser.add_argument("--connect", metavar="ADDRESS", default="udp:127.0.0.1:14550")
+    parser.add_argument("--altitude", type=float, default=10.0, help="metres above home")
+    options = parser.parse_args()
+
+    vehicle = connect(options.connect, wait_ready=True)
+    arm_and_take_off(vehicle, options.altitude)
+    start = vehicle.location.global_relative_frame
+    go_to(vehicle, offset(start, north=30, east=0), speed=5)
+    go_to(vehicle, offset(start, north=30, east=30), speed=10)
+    vehicle.mode = VehicleMode("RTL")
+    while vehicle.armed:
+        time.sleep(POLL_S)
+    print("landed")
+    vehicle.close()
+
+
+if __name__ == "__main__":
+    main()

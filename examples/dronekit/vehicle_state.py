@@ -1,0 +1,82 @@
+"""Read attributes, listen to them, read and set parameters.
+
+python -m aerokit.dronekit examples/dronekit/vehicle_state.py --connect udp:127.0.0.1:14550
+"""
+
+import argparse
+import time
+
+from dronekit import Vehicle, connect
+
+ATTRIBUTES = (
+    "version",
+    "mode",
+    "armed",
+    "is_armable",
+    "system_status",
+    "ekf_ok",
+    "attitude",
+    "velocity",
+    "heading",
+    "airspeed",
+    "groundspeed",
+    "gps_0",
+    "battery",
+    "rangefinder",
+    "last_heartbeat",
+    "home_location",
+)
+LISTEN_S = 1.0
+
+
+def print_attributes(vehicle: Vehicle) -> None:
+    for name in ATTRIBUTES:
+        print(f"{name}: {getattr(vehicle, name)}")
+    location = vehicle.location
+    for place in (location.global_frame, location.global_relative_frame, location.local_frame):
+        print(place)
+
+
+def listen_for_a_while(vehicle: Vehicle) -> None:
+    """A decorated listener stays for good; one that was added can be removed."""
+    headings: list[int] = []
+    names: set[str] = set()
+
+    @vehicle.on_attribute("heading")
+    def on_heading(vehicle: Vehicle, name: str, value: int) -> None:
+        headings.append(value)
+
+    def on_anything(vehicle: Vehicle, name: str, value: object) -> None:
+        names.add(name)
+
+    vehicle.add_attribute_listener("*", on_anything)
+    time.sleep(LISTEN_S)
+    vehicle.remove_attribute_listener("*", on_anything)
+    print(f"told {len(headings)} headings, and these attributes: {', '.join(sorted(names))}")
+
+
+def change_a_parameter(vehicle: Vehicle, name: str) -> None:
+    before = vehicle.parameters[name]
+    vehicle.parameters[name] = before + 1
+    print(f"{name} was {before}, is {vehicle.parameters[name]}")
+    vehicle.parameters[name] = before
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Print the state of a vehicle.")
+    parser.add_argument("--connect", metavar="ADDRESS", default="udp:127.0.0.1:14550")
+    parser.add_argument("--parameter", default="RTL_LOIT_TIME", help="one to change and to put back")
+    options = parser.parse_args()
+
+    vehicle = connect(options.connect, wait_ready=True)
+    vehicle.commands.download()  # which also brings home
+    vehicle.commands.wait_ready()
+    print_attributes(vehicle)
+    listen_for_a_while(vehicle)
+    print(f"{len(vehicle.parameters)} parameters")
+    change_a_parameter(vehicle, options.parameter)
+    vehicle.close()
+
+
+if __name__ == "__main__":
+    main()

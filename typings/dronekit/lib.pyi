@@ -1,0 +1,1 @@
+from aerokit.dronekit import *  # noqa: F403

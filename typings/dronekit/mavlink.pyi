@@ -1,0 +1,1 @@
+from aerokit.dronekit.mavlink import *  # noqa: F403

@@ -1,0 +1,1 @@
+from aerokit.dronekit.util import *  # noqa: F403
