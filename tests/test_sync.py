@@ -26,7 +26,7 @@ from aerokit import errors, events, messages
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.missions import Fence, FenceCircle, Mission, waypoint
 from aerokit.runtime.cells import StateCell
-from aerokit.runtime.connection import open_connection
+from aerokit.runtime.opening import open_connection
 from aerokit.runtime.subscription import Subscription
 from aerokit.sim import SimulatedCopter
 from aerokit.vehicle.fence import FenceControl

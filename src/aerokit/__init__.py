@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from aerokit.mavlink import enums, messages
     from aerokit.mavlink.dialect import Dialect
     from aerokit.position import Position
-    from aerokit.runtime.connection import Connection, open_connection
+    from aerokit.runtime.connection import Connection
+    from aerokit.runtime.opening import open_connection
     from aerokit.vehicle.connect import connect
     from aerokit.vehicle.setpoints import (
         AccelerationSetpoint,
@@ -74,7 +75,7 @@ _HOMES = {
     "errors": "aerokit.errors",
     "events": "aerokit.events",
     "messages": "aerokit.mavlink.messages",
-    "open_connection": "aerokit.runtime.connection",
+    "open_connection": "aerokit.runtime.opening",
 }
 
 

@@ -15,8 +15,8 @@ from aerokit import messages as m
 from aerokit.errors import BusyError, CommandTimeout
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import CopterMode, MavAutopilot, MavCmd, MavResult, MavState, MavType
-from aerokit.runtime.connection import open_connection
 from aerokit.runtime.events import ArmedChanged, ModeChanged, StatusTextReceived, VehicleSilent
+from aerokit.runtime.opening import open_connection
 from aerokit.sim import ExtraComponent, SimulatedCopter, SimulatedPx4, simulated_link
 
 pytestmark = pytest.mark.anyio

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import anyio
 
 from aerokit.mavlink import messages as m
-from aerokit.runtime.events import Event, VehicleBack, VehicleRebooted
+from aerokit.runtime.events import Event, LinkRestored, VehicleBack, VehicleRebooted
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
@@ -78,7 +78,7 @@ class _Heard:
         bus = vehicle.connection.bus
         for message_type in STREAMED:
             vehicle._detach.append(bus.attach(message_type, self._on_message, system_id=vehicle.system_id))
-        for event_type in (VehicleBack, VehicleRebooted):
+        for event_type in (LinkRestored, VehicleBack, VehicleRebooted):
             vehicle._detach.append(bus.attach_event(event_type, self._on_event))
         self._system_id = vehicle.system_id
 
@@ -89,5 +89,5 @@ class _Heard:
         self.something = True
 
     def _on_event(self, event: Event) -> None:
-        if event.system_id == self._system_id:
+        if event.system_id in (0, self._system_id):
             self.is_to_be_asked.set()

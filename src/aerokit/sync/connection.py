@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, TypeVar
 
 from aerokit.mavlink.dialect import STANDARD
-from aerokit.runtime import connection as aio
+from aerokit.runtime.connection import MAV_COMP_ID_MISSIONPLANNER
+from aerokit.runtime.opening import open_connection as open_async
 from aerokit.sync.loop_thread import LoopThread
 from aerokit.sync.subscription import Subscription
 
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from aerokit.links.link import Link
     from aerokit.mavlink.dialect import Dialect
     from aerokit.mavlink.message import Message
+    from aerokit.runtime.connection import Connection as AsyncConnection
     from aerokit.runtime.events import Event
     from aerokit.runtime.subscription import Overflow
     from aerokit.sync.loop_thread import Held
@@ -31,7 +33,7 @@ def open_connection(
     address: str | Link,
     *,
     source_system: int = 255,
-    source_component: int = aio.MAV_COMP_ID_MISSIONPLANNER,
+    source_component: int = MAV_COMP_ID_MISSIONPLANNER,
     baud: int = 57600,
     dialect: Dialect = STANDARD,
     mavlink_version: int = 2,
@@ -45,7 +47,7 @@ def open_connection(
     loop = LoopThread()
     try:
         held = loop.hold_open(
-            aio.open_connection(
+            open_async(
                 address,
                 source_system=source_system,
                 source_component=source_component,
@@ -66,7 +68,7 @@ class Connection:
     """One MAVLink node on one link; as :class:`aerokit.Connection`. A context manager."""
 
     def __init__(
-        self, loop: LoopThread, connection: aio.Connection, held: Held[aio.Connection] | None = None
+        self, loop: LoopThread, connection: AsyncConnection, held: Held[AsyncConnection] | None = None
     ) -> None:
         self._loop, self._held = loop, held
         self.aio = connection

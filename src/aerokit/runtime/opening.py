@@ -1,0 +1,98 @@
+"""``open_connection``: from an address to a connection, for the time of an ``async with`` block."""
+
+from __future__ import annotations
+
+from contextlib import asynccontextmanager
+from functools import partial
+from typing import TYPE_CHECKING
+
+import anyio
+
+from aerokit.errors import LocalProtocolError
+from aerokit.links import ReconnectingLink, create_link
+from aerokit.mavlink.dialect import STANDARD
+from aerokit.runtime.connection import MAV_COMP_ID_MISSIONPLANNER, Connection
+
+if TYPE_CHECKING:
+    import os
+    from collections.abc import AsyncIterator
+
+    from aerokit.links.link import Link
+    from aerokit.mavlink.dialect import Dialect
+
+__all__ = ["open_connection"]
+
+CLOSE_TIMEOUT_S = 2.0
+
+
+@asynccontextmanager
+async def open_connection(
+    address: str | Link,
+    *,
+    source_system: int = 255,
+    source_component: int = MAV_COMP_ID_MISSIONPLANNER,
+    baud: int = 57600,
+    dialect: Dialect = STANDARD,
+    mavlink_version: int = 2,
+    record: str | os.PathLike[str] | None = None,
+    reconnect: bool = False,
+) -> AsyncIterator[Connection]:
+    """Open a link and be a MAVLink node on it for the time of the ``async with`` block.
+
+    Runs in the asyncio loop that is already running; nothing outlives the block, and what the block raises comes out
+    of it as it is. Our HEARTBEAT goes out at 1 Hz from the start (https://mavlink.io/en/services/heartbeat.html).
+
+    Args:
+        address: a connection string (``"udpin:0.0.0.0:14550"``, ``"/dev/ttyACM0,57600"``, …) or a link not yet open.
+        source_system: our own system id, 1–255; ground stations take 255.
+        source_component: our own component id, 1–255. 0, which is nobody's, is allowed for programs that always were
+            that (DroneKit).
+        baud: of a serial link whose address names none, bits per second, above 0.
+        dialect: the messages that are understood.
+        mavlink_version: of what we send, 1 or 2; both are understood.
+        record: a ``.tlog`` file for everything received and sent, messages of unknown dialects too; an existing file
+            is replaced. A disk that is full ends the recording, not the connection.
+        reconnect: whether a link that is lost, a device unplugged for example, is opened again until it is back,
+            instead of ending the connection: ``LinkInterrupted``, ``LinkRestored``. Not for the first opening, and not
+            at the end of a recording.
+
+    Raises:
+        LocalProtocolError: an argument is wrong; nothing was opened.
+        LinkOpenError: the link or the file for the recording could not be opened.
+        ConnectionClosed, BusyError: the link given was used before.
+    """
+    if not baud > 0:
+        raise LocalProtocolError(f"baud = {baud} is not allowed: above 0")
+    link = _link(address, baud, reconnect)
+    connection = Connection(
+        link,
+        source_system=source_system,
+        source_component=source_component,
+        dialect=dialect,
+        mavlink_version=mavlink_version,
+    )
+    try:
+        if record is not None:
+            connection.record(record)
+        await link.open(connection)
+        connection._start()
+        yield connection
+    finally:
+        connection.close()
+        try:
+            await connection._background.aclose()
+        finally:
+            with anyio.CancelScope(shield=True), anyio.move_on_after(CLOSE_TIMEOUT_S):
+                await link.wait_closed()
+
+
+def _link(address: str | Link, baud: int, reconnect: bool) -> Link:
+    if isinstance(address, str):
+        make_link = partial(create_link, address, baud=baud)
+        return ReconnectingLink(make_link) if reconnect else make_link()
+    if reconnect:
+        raise LocalProtocolError(
+            "reconnect = True is not allowed with a link, which can be opened once only: pass an address,"
+            " or a ReconnectingLink of aerokit.links"
+        )
+    return address
