@@ -1,0 +1,194 @@
+"""A program of DroneKit and a flight controller, brought together; scenarios that give what was observed as plain data.
+
+Nothing here knows which implementation of DroneKit it is given.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import json
+import logging
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+from flight_controller import FlightController, Received
+
+__all__ = [
+    "PATIENCE_S",
+    "SCENARIOS",
+    "Scenario",
+    "Stage",
+    "as_json",
+    "caught",
+    "on_stage",
+    "plain",
+    "play",
+    "scenario",
+]
+
+PATIENCE_S = 10.0
+
+
+class Stage:
+    """A connected vehicle and its flight controller."""
+
+    def __init__(self, dronekit: Any, controller: FlightController, vehicle: Any) -> None:
+        self.dronekit, self.fc, self.vehicle = dronekit, controller, vehicle
+        self._numbers = itertools.count(1)
+        self._seen: set[int] = set()
+        self._saw = threading.Condition()
+        vehicle.add_message_listener("DEBUG", self._on_debug)
+
+    def settle(self) -> None:
+        """Wait until everything that the flight controller has sent is taken in, and all listeners have heard of it."""
+        number = next(self._numbers)
+        with self._saw:
+            for _ in range(int(PATIENCE_S)):  # datagrams get lost
+                self.fc.tell("DEBUG", ind=7, time_boot_ms=number)
+                if self._saw.wait_for(lambda: number in self._seen, 1.0):
+                    return
+        raise AssertionError("the vehicle's listeners heard nothing")
+
+    def reached(self) -> None:
+        """Wait until everything that the program has sent has come to the flight controller."""
+        number = next(self._numbers)
+        self.vehicle.send_mavlink(self.vehicle.message_factory.ping_encode(0, number, 0, 0))
+        self.fc.wait_for("PING", lambda frame: frame.seq == number)
+
+    def tell(self, name: str, **fields: Any) -> None:
+        """Have the flight controller say it, and wait until it is taken in."""
+        self.fc.tell(name, **fields)
+        self.settle()
+
+    def beat(self, **fields: Any) -> None:
+        """Have it send a heartbeat, and wait until it is taken in."""
+        self.fc.beat(**fields)
+        self.settle()
+
+    def sent_by(self, action: Callable[[], object], *names: str) -> list[Received]:
+        """What an action of the program had it send: these messages; without names, commands that change something."""
+        since = self.fc.mark()
+        action()
+        self.reached()
+        return self.fc.received(*names, since=since) if names else self.fc.commands(since=since)
+
+    def commands_of(self, action: Callable[[], object]) -> list[tuple[float, ...]]:
+        """The commands that an action had the program send: number, then param1 to param7."""
+        return [(frame.command, *(round(p, 5) for p in frame.params)) for frame in self.sent_by(action)]
+
+    def assign(self, name: str, value: Any) -> Callable[[], None]:
+        """``vehicle.name = value``, as an action."""
+        return lambda: setattr(self.vehicle, name, value)
+
+    def listen(
+        self, *names: str, to: Any = None, into: list[tuple[str, str, str]] | None = None
+    ) -> list[tuple[str, str, str]]:
+        """Listen to attributes: ``(class of the object, name, value)`` of each notification, in order."""
+        events: list[tuple[str, str, str]] = [] if into is None else into
+
+        def listener(source: Any, name: str, value: Any) -> None:
+            if name != "last_heartbeat":
+                events.append((type(source).__name__, name, plain(value)))
+
+        for name in names:
+            (self.vehicle if to is None else to).add_attribute_listener(name, listener)
+        return events
+
+    @contextlib.contextmanager
+    def logged(self, name: str = "dronekit") -> Iterator[list[str]]:
+        """What is logged meanwhile: ``LEVEL text``."""
+        lines: list[str] = []
+        handler = logging.Handler()
+        handler.emit = lambda record: lines.append(f"{record.levelname} {record.getMessage()}")  # type: ignore[method-assign]
+        logger = logging.getLogger(name)
+        level = logger.level
+        logger.addHandler(handler)
+        logger.setLevel(logging.DEBUG)
+        try:
+            yield lines
+        finally:
+            logger.removeHandler(handler)
+            logger.setLevel(level)
+
+    def _on_debug(self, _vehicle: Any, _name: str, message: Any) -> None:
+        with self._saw:
+            self._seen.add(message.time_boot_ms)
+            self._saw.notify_all()
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """One row of the behaviour table, or a part of it."""
+
+    name: str
+    play: Callable[[Stage], Any]
+    expected: Any
+    controller: dict[str, Any] = field(default_factory=dict)
+    connect: dict[str, Any] = field(default_factory=dict)
+    is_slow: bool = False
+    is_kept: bool = True
+    prepare: Callable[[FlightController], object] = lambda _: None
+
+
+SCENARIOS: list[Scenario] = []
+
+
+def scenario(expected: Any, **options: Any) -> Callable[[Callable[[Stage], Any]], Callable[[Stage], Any]]:
+    """Make a scenario of a function that is given a stage and gives what it observed.
+
+    Args:
+        expected: what it is to observe.
+        options: ``controller`` and ``connect``, arguments of both; ``is_slow``, it waits for timeouts; ``is_kept``,
+            DroneKit itself does so; ``prepare``, called with the flight controller before the program connects.
+    """
+
+    def register(function: Callable[[Stage], Any]) -> Callable[[Stage], Any]:
+        SCENARIOS.append(Scenario(function.__name__, function, expected, **options))
+        return function
+
+    return register
+
+
+@contextlib.contextmanager
+def on_stage(
+    dronekit: Any,
+    controller: dict[str, Any] | None = None,
+    connect: dict[str, Any] | None = None,
+    prepare: Callable[[FlightController], object] = lambda _: None,
+) -> Iterator[Stage]:
+    """Start a flight controller, connect to it, and close both in the end."""
+    with FlightController(**(controller or {})) as fc:
+        prepare(fc)
+        vehicle = dronekit.connect(fc.address, **(connect or {}))
+        try:
+            yield Stage(dronekit, fc, vehicle)
+        finally:
+            vehicle.close()
+
+
+def play(dronekit: Any, each: Scenario, **controller: Any) -> Any:
+    """What a scenario observes with this implementation."""
+    options = {**each.controller, **controller}
+    with on_stage(dronekit, options, each.connect, each.prepare) as stage:
+        return each.play(stage)
+
+
+def caught(action: Callable[[], object]) -> str:
+    """Class and text of what an action raises; nothing raised: what it gives."""
+    try:
+        return plain(action())
+    except Exception as error:
+        return f"{type(error).__name__}: {error}"
+
+
+def plain(value: Any) -> str:
+    """A value as text."""
+    return "Locations" if type(value).__name__ == "Locations" else str(value)
+
+
+def as_json(value: Any) -> Any:
+    """The same for tuples and lists, for 1 and 1.0: what is compared."""
+    return json.loads(json.dumps(value))

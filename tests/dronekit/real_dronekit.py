@@ -1,0 +1,39 @@
+"""Play the scenarios that DroneKit itself is said to play so in the interpreter that runs this, which has DroneKit.
+
+Prints a JSON object: name of the scenario → what was observed, as JSON has it.
+"""
+
+from __future__ import annotations
+
+import collections
+import collections.abc
+import json
+import logging
+import sys
+from typing import Any
+
+import dronekit_scenarios
+from dronekit_stage import Scenario, as_json, play
+
+
+def main(names: list[str]) -> None:
+    collections.MutableMapping = collections.abc.MutableMapping  # type: ignore[attr-defined]  # it is from Python 2
+    import dronekit  # type: ignore[import-not-found, unused-ignore]
+
+    logging.getLogger().addHandler(logging.NullHandler())
+    kept = [
+        each for each in dronekit_scenarios.SCENARIOS if each.is_kept and (not names or each.name in names)
+    ]
+    print(json.dumps({each.name: _observed(dronekit, each) for each in kept}))  # noqa: T201
+
+
+def _observed(dronekit: Any, each: Scenario) -> Any:
+    # of MAVLink 2 it makes broadcasts: its behaviour is that under MAVLink 1
+    try:
+        return as_json(play(dronekit, each, version=1))
+    except BaseException as error:
+        return f"{type(error).__name__}: {error}"
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
