@@ -1,0 +1,318 @@
+"""``Channels`` and ``ChannelsOverride``: what the RC receiver hears, and what is put in its place."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import ItemsView, Iterable, Iterator, KeysView, Mapping, ValuesView
+from operator import attrgetter
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from aerokit.dronekit.exceptions import APIException
+from aerokit.errors import LocalProtocolError
+from aerokit.mavlink.messages import RcChannels, RcChannelsOverride, RcChannelsRaw
+
+if TYPE_CHECKING:
+    from aerokit.dronekit.vehicle import Vehicle
+
+__all__ = ["Channels", "ChannelsOverride"]
+
+FEWEST, MOST = 8, 18
+UNUSED = 0xFFFF
+"""In RC_CHANNELS: there is no such channel. In an override: leave the channel as it is."""
+RELEASE_UPPER = 0xFFFE
+"""Gives a channel above 8 back to the radio; 0 leaves it alone."""
+NUMBERS = tuple(str(number) for number in range(1, MOST + 1))
+ALL_VALUES = attrgetter(*(f"chan{number}_raw" for number in NUMBERS))
+FIRST_VALUES = attrgetter(*(f"chan{number}_raw" for number in NUMBERS[:FEWEST]))
+MISSING: Any = object()
+
+
+class _ChannelDict(dict[str, Any]):
+    """Channels by number, as a text or an integer, with the methods that dictionaries had in Python 2."""
+
+    def __getitem__(self, channel: str | int) -> Any:
+        return super().__getitem__(str(channel))
+
+    def __contains__(self, channel: object) -> bool:
+        return super().__contains__(str(channel))
+
+    def get(self, channel: str | int, default: Any = None) -> Any:
+        """The value of a channel, or ``default``."""
+        return super().get(str(channel), default)
+
+    def has_key(self, channel: str | int) -> bool:
+        """As ``channel in channels``."""
+        return channel in self
+
+    def items(self) -> ItemsView[str, Any]:  # type: ignore[override]
+        """Pairs of number and value as they are at this moment."""
+        return self.copy().items()
+
+    def keys(self) -> KeysView[str]:  # type: ignore[override]
+        """The numbers, as texts, at this moment."""
+        return self.copy().keys()
+
+    def values(self) -> ValuesView[Any]:  # type: ignore[override]
+        """The values at this moment."""
+        return self.copy().values()
+
+    def iteritems(self) -> Iterator[tuple[str, Any]]:
+        """An iterator over :meth:`items`."""
+        return iter(self.items())
+
+    def iterkeys(self) -> Iterator[str]:
+        """An iterator over :meth:`keys`."""
+        return iter(self.keys())
+
+    def itervalues(self) -> Iterator[Any]:
+        """An iterator over :meth:`values`."""
+        return iter(self.values())
+
+    def viewitems(self) -> ItemsView[str, Any]:
+        """As :meth:`items`."""
+        return self.items()
+
+    def viewkeys(self) -> KeysView[str]:
+        """As :meth:`keys`."""
+        return self.keys()
+
+    def viewvalues(self) -> ValuesView[Any]:
+        """As :meth:`values`."""
+        return self.values()
+
+    @classmethod
+    def fromkeys(cls, channels: Iterable[Any], value: Any = None) -> dict[Any, Any]:
+        """A plain dictionary with these keys."""
+        return dict.fromkeys(channels, value)
+
+
+class Channels(_ChannelDict):
+    """What the autopilot hears on its RC channels, overrides included: microseconds by number (``'1'`` or 1).
+
+    Filled by RC_CHANNELS and RC_CHANNELS_RAW; None is a channel that it has not told yet, or that it does not have.
+    One message changes all values at once. Eight channels, 16 after RC_CHANNELS_RAW has told of more, or
+    :attr:`count`. Read only, except for :attr:`overrides`.
+    """
+
+    def __init__(self, vehicle: Vehicle, count: int) -> None:
+        super().__init__()
+        self._vehicle = vehicle
+        self._count = 0
+        self._changing = threading.Lock()
+        self._overrides = ChannelsOverride(vehicle)
+        self._grow(count)
+        vehicle._on(RcChannels, self._on_channels)
+        vehicle._on(RcChannelsRaw, self._on_raw)
+
+    @property
+    def count(self) -> int:
+        """How many channels are here. Set it to more than 8, at most 18, to read and override those too.
+
+        Raises:
+            ValueError: it is not 8 to 18.
+        """
+        return self._count
+
+    @count.setter
+    def count(self, count: int) -> None:
+        if not FEWEST <= count <= MOST:
+            raise LocalProtocolError(f"count = {count!r} is not allowed: {FEWEST} to {MOST}")
+        with self._changing:
+            self._grow(count)
+            for number in NUMBERS[count:]:
+                dict.pop(self, number, None)
+
+    @property
+    def overrides(self) -> ChannelsOverride:
+        """The channels that are overridden, see :class:`ChannelsOverride`. Assigning a mapping replaces all of them.
+
+        Raises:
+            KeyError: there is no such channel; nothing was changed or sent.
+            ValueError: a channel's number or value is wrong; nothing was changed or sent.
+        """
+        return self._overrides
+
+    @overrides.setter
+    def overrides(self, overrides: Mapping[Any, int | None]) -> None:
+        self._overrides._replace(overrides)
+
+    # ------------------------------------------------------------------------- not for programs
+
+    def __setitem__(self, channel: object, value: object) -> NoReturn:
+        raise TypeError("__setitem__ is not supported on Channels object")
+
+    def __delitem__(self, channel: object) -> NoReturn:
+        raise TypeError("__delitem__ is not supported on Channels object")
+
+    def __ior__(self, other: object) -> NoReturn:  # type: ignore[misc]
+        raise TypeError("__ior__ is not supported on Channels object")
+
+    def clear(self) -> NoReturn:
+        """Raises TypeError: channels are the vehicle's to change."""
+        raise TypeError("clear is not supported on Channels object")
+
+    def pop(self, *_: object) -> NoReturn:
+        """Raises TypeError: channels are the vehicle's to change."""
+        raise TypeError("pop is not supported on Channels object")
+
+    def popitem(self) -> NoReturn:
+        """Raises TypeError: channels are the vehicle's to change."""
+        raise TypeError("popitem is not supported on Channels object")
+
+    def setdefault(self, *_: object) -> NoReturn:
+        """Raises TypeError: channels are the vehicle's to change."""
+        raise TypeError("setdefault is not supported on Channels object")
+
+    def update(self, *_: object, **__: object) -> NoReturn:
+        """Raises TypeError: channels are the vehicle's to change."""
+        raise TypeError("update is not supported on Channels object")
+
+    # ------------------------------------------------------------------------------- inside
+
+    def _on_channels(self, message: RcChannels) -> None:
+        self._take(0, ALL_VALUES(message))
+
+    def _on_raw(self, message: RcChannelsRaw) -> None:
+        first = message.port * FEWEST
+        if self._count < first + FEWEST <= MOST:
+            with self._changing:
+                self._grow(first + FEWEST)
+        self._take(first, FIRST_VALUES(message))
+
+    def _take(self, first: int, heard: tuple[int, ...]) -> None:
+        """Channels ``first + 1`` and so on, as far as there are so many here."""
+        with self._changing:
+            numbers = NUMBERS[first : self._count]
+            values = (None if value == UNUSED else value for value in heard)
+            dict.update(self, dict(zip(numbers, values, strict=False)))  # readers see all of it or nothing
+        self._vehicle._tell("channels", self)
+
+    def _grow(self, count: int) -> None:
+        self._count = self._overrides._count = count
+        dict.update(self, {number: self.get(number) for number in NUMBERS[:count]})
+
+
+class ChannelsOverride(_ChannelDict):
+    """Channels that are overridden: microseconds by number. Each change is sent at once, as RC_CHANNELS_OVERRIDE.
+
+    Set a channel to 1000–2000 (whatever fits into 16 bits is sent), and to None or 0, or delete it, to give it back
+    to the radio. Channels that are not in here are the radio's; those above 8 are left as others have set them.
+
+    **Nothing is repeated**: a vehicle takes a channel back on its own when it has heard nothing for a while
+    (ArduPilot: RC_OVERRIDE_TIME, 3 s), which is what makes it safe that a program may hang. A program that keeps a
+    stick pressed sets it again, several times a second. ArduPilot listens only to the ground station it belongs to
+    (``connect(source_system=)`` and MAV_GCS_SYSID, 255).
+    """
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        super().__init__()
+        self._vehicle = vehicle
+        self._count = FEWEST
+        self._given_back: set[str] = set()
+        self._changing = threading.RLock()
+
+    def __setitem__(self, channel: str | int, value: int | None) -> None:
+        self._change({channel: value})
+
+    def __delitem__(self, channel: str | int) -> None:
+        with self._changing:
+            if channel not in self:
+                raise KeyError(str(channel))
+            self._change({channel: None})
+
+    def __ior__(self, other: Any) -> ChannelsOverride:  # type: ignore[override, misc]
+        self.update(other)
+        return self
+
+    def update(self, *others: Any, **more: Any) -> None:
+        """Override these channels too, by one message."""
+        self._change(dict(*others, **more))
+
+    def clear(self) -> None:
+        """Give all channels back to the radio, by one message."""
+        self._replace({})
+
+    def pop(self, channel: str | int, default: Any = MISSING) -> Any:
+        """Give a channel back to the radio and return its value.
+
+        Raises:
+            KeyError: it is not overridden, and there is no ``default``.
+        """
+        with self._changing:
+            if channel in self:
+                value = self[channel]
+                self._change({channel: None})
+                return value
+        if default is MISSING:
+            raise KeyError(str(channel))
+        return default
+
+    def popitem(self) -> tuple[str, int]:
+        """Give the channel that was overridden last back to the radio; KeyError if none is."""
+        with self._changing:
+            if not self:
+                raise KeyError("no channel is overridden")
+            channel = list(self)[-1]
+            return channel, self.pop(channel)
+
+    def setdefault(self, channel: str | int, default: Any = None) -> Any:
+        """Override a channel unless it is overridden; the value that it has then."""
+        with self._changing:
+            if channel not in self:
+                self._change({channel: default})
+            return self.get(channel)
+
+    # ------------------------------------------------------------------------------- inside
+
+    def _replace(self, overrides: Mapping[Any, int | None]) -> None:
+        with self._changing:
+            self._become(self._checked(overrides))
+
+    def _change(self, changes: Mapping[Any, int | None]) -> None:
+        with self._changing:
+            self._become({**self.copy(), **self._checked(changes)})
+
+    def _become(self, wanted: dict[str, int]) -> None:
+        """Send first: what cannot be sent changes nothing here."""
+        active = {channel: value for channel, value in wanted.items() if value}
+        given_back = (self._given_back | self.keys()) - active.keys()
+        self._send(active, given_back)
+        for channel in self.keys() - active.keys():
+            dict.pop(self, channel)
+        dict.update(self, active)
+        self._given_back = given_back
+
+    def _checked(self, overrides: Mapping[Any, int | None]) -> dict[str, int]:
+        """By number as a text; 0 gives a channel back."""
+        checked: dict[str, int] = {}
+        for channel, value in overrides.items():
+            number = int(channel)
+            if not 1 <= number <= self._count:
+                raise KeyError(f"Invalid channel index {channel}")
+            checked[str(number)] = _checked_value(number, value)
+        return checked
+
+    def _send(self, active: dict[str, int], given_back: set[str]) -> None:
+        aio = self._vehicle._check_link()
+        if aio.connection.mavlink_version == 1 and any(int(channel) > FEWEST for channel in active):
+            raise APIException("channels above 8 cannot be overridden: this vehicle speaks MAVLink 1")
+        values = [active.get(number, 0) for number in NUMBERS]
+        for channel in given_back:
+            if int(channel) > FEWEST:
+                values[int(channel) - 1] = RELEASE_UPPER
+        self._vehicle._send(RcChannelsOverride(self._vehicle._target_system, 0, *values))
+
+
+def _checked_value(number: int, value: Any) -> int:
+    """Microseconds; 0 gives the channel back.
+
+    Raises:
+        LocalProtocolError: a ValueError, which names the channel.
+    """
+    if value is None:
+        return 0
+    if isinstance(value, (int, float)) and 0 <= value <= UNUSED and value == int(value):
+        return int(value)
+    raise LocalProtocolError(
+        f"channel {number} = {value!r} is not allowed: whole microseconds, 1000 to 2000 as a rule; None gives it back"
+    )

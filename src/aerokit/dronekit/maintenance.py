@@ -1,0 +1,130 @@
+"""Calibrations, tunes and reboots: what a vehicle is asked on the ground."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from aerokit.autopilots.ardupilot import ArduPilot
+from aerokit.dronekit.exceptions import APIException
+from aerokit.errors import LocalProtocolError
+from aerokit.mavlink.messages import PlayTune
+from aerokit.protocols.command import command_long
+
+if TYPE_CHECKING:
+    import concurrent.futures
+    from collections.abc import Awaitable, Callable
+
+    from aerokit.mavlink.message import Message
+    from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
+
+__all__ = ["Maintenance"]
+
+PREFLIGHT_CALIBRATION, PREFLIGHT_REBOOT_SHUTDOWN = 241, 246
+REQUEST_AUTOPILOT_CAPABILITIES, DO_START_MAG_CAL = 520, 42424
+CALIBRATION_ATTEMPTS, CALIBRATION_S = 2, 35.0
+"""ArduPilot answers when it is done, half a minute if it is not held still, and calibrates again for each resend."""
+REBOOT_ATTEMPTS, REBOOT_S = 2, 1.5
+TUNE_SIZES = (30, 200)
+
+
+class Maintenance:
+    """Orders for a vehicle on the ground; they return at once, a refusal becomes a warning of the logger ``dronekit``."""
+
+    if TYPE_CHECKING:
+
+        @property
+        def _target_system(self) -> int: ...
+        def _check_link(self) -> AsyncVehicle: ...
+        def _order(
+            self, kind: str, function: Callable[..., Awaitable[object]], *args: Any, **kwargs: Any
+        ) -> concurrent.futures.Future[None]: ...
+        def _send(self, message: Message) -> None: ...
+
+    # -------------------------------------------------------------------------- calibrations
+
+    def send_calibrate_gyro(self) -> None:
+        """Calibrate the gyroscopes: keep the vehicle still."""
+        self._calibrate(PREFLIGHT_CALIBRATION, 1)
+
+    def send_calibrate_magnetometer(self) -> None:
+        """Calibrate the compasses: turn the vehicle about all axes until it says that it is done."""
+        if isinstance(self._check_link().autopilot, ArduPilot):
+            self._calibrate(DO_START_MAG_CAL, 0, 1, 1)  # all compasses; retry; save by itself
+        else:
+            self._calibrate(PREFLIGHT_CALIBRATION, 0, 1)
+
+    def send_calibrate_vehicle_level(self) -> None:
+        """Take the attitude of this moment for level."""
+        self._calibrate(PREFLIGHT_CALIBRATION, 0, 0, 0, 0, 2)
+
+    def send_calibrate_barometer(self) -> None:
+        """Take the pressure of this moment for altitude 0."""
+        self._calibrate(PREFLIGHT_CALIBRATION, 0, 0, 1)
+
+    def send_calibrate_accelerometer(self, simple: bool = False) -> None:
+        """Calibrate the accelerometers: in the six attitudes it asks for by texts, or, ``simple``, standing level."""
+        self._calibrate(PREFLIGHT_CALIBRATION, 0, 0, 0, 0, 4 if simple else 1)
+
+    def _calibrate(self, command: int, *params: float) -> None:
+        self._order(
+            "calibration",
+            self._check_link().command,
+            command,
+            *params,
+            component_id=0,
+            attempts=CALIBRATION_ATTEMPTS,
+            attempt_timeout=CALIBRATION_S,
+            progress_timeout=CALIBRATION_S,
+        )
+
+    # --------------------------------------------------------------------------------- rest
+
+    def play_tune(self, tune: str | bytes) -> None:
+        """Play a tune on the vehicle's buzzer: notes as ``"AAAA"``, in the format of the autopilot (PLAY_TUNE).
+
+        Args:
+            tune: at most 230 characters of ASCII; ArduPilot plays the first 99.
+
+        Raises:
+            ValueError: it is too long, or not ASCII. Nothing was sent.
+            APIException: the link is down, or the vehicle speaks MAVLink 1, which has no such message.
+        """
+        text = _tune_text(tune)
+        if self._check_link().connection.mavlink_version == 1:
+            raise APIException("play_tune needs MAVLink 2, which this vehicle does not speak")
+        first = TUNE_SIZES[0]
+        self._send(PlayTune(self._target_system, 0, text[:first], text[first:]))
+
+    def reboot(self) -> None:
+        """Reboot the autopilot. It is away for some seconds, and then boots anew. Refused while it is armed."""
+        self._order(
+            "reboot",
+            self._check_link().command,
+            PREFLIGHT_REBOOT_SHUTDOWN,
+            1,
+            component_id=0,
+            attempts=REBOOT_ATTEMPTS,
+            attempt_timeout=REBOOT_S,
+        )
+
+    def send_capabilities_request(self, vehicle: Any, name: str, m: Any) -> None:
+        """Ask for AUTOPILOT_VERSION once. Has the arguments of a message listener, and uses none of them."""
+        self._check_link()
+        self._send(command_long(self._target_system, 0, REQUEST_AUTOPILOT_CAPABILITIES, (1,)))
+
+    def send_capabilties_request(self, vehicle: Any, name: str, m: Any) -> None:
+        """As :meth:`send_capabilities_request`; this spelling was the first."""
+        self.send_capabilities_request(vehicle, name, m)
+
+
+def _tune_text(tune: str | bytes) -> str:
+    try:
+        text = tune.encode("ascii") if isinstance(tune, str) else bytes(tune)
+        notes = text.rstrip(b"\0").decode("ascii")
+    except (UnicodeError, TypeError):
+        raise LocalProtocolError(f"tune = {tune!r} is not allowed: a text of ASCII characters") from None
+    if "\0" in notes or len(notes) > sum(TUNE_SIZES):
+        raise LocalProtocolError(
+            f"tune of {len(notes)} characters is not allowed: at most {sum(TUNE_SIZES)}, none of them NUL"
+        )
+    return notes
