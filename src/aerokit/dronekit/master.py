@@ -9,7 +9,7 @@ from pymavlink import mavutil
 
 from aerokit.dronekit.inbox import Inbox
 from aerokit.dronekit.message_factory import MessageFactory
-from aerokit.dronekit.pymavlink_messages import sendable
+from aerokit.dronekit.pymavlink_messages import message_of, sendable
 from aerokit.runtime.diagnosis import is_autopilot
 
 if TYPE_CHECKING:
@@ -61,7 +61,9 @@ class Master:
     def flightmode(self) -> str:
         """Name of the flight mode, ``UNKNOWN`` before it was heard."""
         heartbeat = self._heard()[1]
-        return "UNKNOWN" if heartbeat is None else str(mavutil.mode_string_v10(heartbeat))
+        if heartbeat is None or heartbeat.received_frame is None:
+            return "UNKNOWN"
+        return str(mavutil.mode_string_v10(message_of(heartbeat.received_frame)))
 
     def close(self) -> None:
         """Close the connection."""

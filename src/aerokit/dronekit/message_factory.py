@@ -13,8 +13,10 @@ from aerokit.errors import LocalProtocolError
 
 __all__ = ["MessageFactory"]
 
+_MAVLink: Any = ardupilotmega.MAVLink  # its own types are stricter than what is taken here
 
-class MessageFactory(ardupilotmega.MAVLink):  # type: ignore[misc]
+
+class MessageFactory(_MAVLink):  # type: ignore[misc]
     """Has ``<message>_encode(…)``, which returns a message of pymavlink, and ``<message>_send(…)`` for every message.
 
     The messages are those of pymavlink's ardupilotmega dialect for MAVLink 2; those that only the dialect of the
@@ -49,7 +51,8 @@ class MessageFactory(ardupilotmega.MAVLink):  # type: ignore[misc]
 
     def __getattr__(self, name: str) -> Any:
         if name.endswith(("_encode", "_send")):
-            function = getattr(mavutil.mavlink.MAVLink, name, None)
+            dialect: Any = mavutil.mavlink
+            function = getattr(dialect.MAVLink, name, None)
             if function is not None:
                 return function.__get__(self)
         raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")

@@ -80,14 +80,21 @@ def _values(message_class: type[Message], message: Any) -> dict[str, Any]:
     values = {}
     for field in message_class.FIELDS:
         name = field.name.rstrip("_")
+        if field.extension and not _has(message, name):
+            continue
         try:
             value = _text_given(message, name) if field.type == "char" else getattr(message, name)
         except AttributeError:
-            if field.extension:
-                continue
             raise LocalProtocolError(f"{message_class.NAME}.{name} cannot be sent: it is missing") from None
         values[field.name] = _converted(message_class, field, value)
     return values
+
+
+def _has(message: Any, name: str) -> bool:
+    """Whether it is a field of it: every class of pymavlink has an ``id`` of its own."""
+    if name in getattr(message, "__dict__", ()):
+        return True
+    return hasattr(message, name) and not hasattr(type(message), "ordered_fieldnames")
 
 
 def _converted(message_class: type[Message], field: Field, value: Any) -> Any:

@@ -1,0 +1,360 @@
+"""``message_factory`` and ``_master``: what programs use of pymavlink's objects."""
+
+from __future__ import annotations
+
+import random
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from importlib import import_module
+from typing import Any
+
+import pytest
+from pymavlink import mavutil
+
+from aerokit.dronekit.exceptions import APIException
+from aerokit.dronekit.master import Master, MessageFactory
+from aerokit.dronekit.mavlink import MAVConnection
+from aerokit.dronekit.pymavlink_messages import sendable
+from aerokit.errors import LocalProtocolError
+from aerokit.mavlink.encoder import FrameEncoder
+
+v10: Any = import_module("pymavlink.dialects.v10.ardupilotmega")
+v20: Any = import_module("pymavlink.dialects.v20.ardupilotmega")
+storm32: Any = import_module("pymavlink.dialects.v20.storm32")
+
+SYSTEM, COMPONENT = 255, 190
+LIMIT_S = 10.0
+
+
+class Sent(list[Any]):
+    """What a factory sent."""
+
+    def bytes(self) -> bytes:
+        encoder = FrameEncoder(SYSTEM, COMPONENT)
+        return b"".join(encoder.encode(sendable(message)) for message in self)
+
+
+class Buffer:
+    def __init__(self) -> None:
+        self.data = b""
+
+    def write(self, data: bytes) -> None:
+        self.data += data
+
+
+@pytest.fixture
+def sent() -> Sent:
+    return Sent()
+
+
+@pytest.fixture
+def factory(sent: Sent) -> MessageFactory:
+    return MessageFactory(sent.append, SYSTEM, COMPONENT)
+
+
+def values_of(message_class: Any, randomness: random.Random, *, texts_as_str: bool = False) -> list[Any]:
+    """Random arguments, in the order of the definition."""
+    data = bytes(randomness.randrange(1, 127) for _ in range(message_class.unpacker.size))
+    unpacked, values, at = message_class.unpacker.unpack(data), {}, 0
+    for name, width in zip(message_class.ordered_fieldnames, message_class.lengths, strict=True):
+        value = unpacked[at] if width == 1 else list(unpacked[at : at + width])
+        values[name] = value.decode() if texts_as_str and isinstance(value, bytes) else value
+        at += width
+    return [values[name] for name in message_class.fieldnames]
+
+
+# --------------------------------------------------------------------------------------- factory
+
+
+def test_every_message_is_made_and_sent_as_pymavlink_does(factory: MessageFactory, sent: Sent) -> None:
+    randomness, golden = random.Random(1), Buffer()
+    theirs = v20.MAVLink(golden, SYSTEM, COMPONENT)
+    for message_class in v20.mavlink_map.values():
+        if message_class.id < 0:
+            continue
+        name = message_class.msgname.lower()
+        values = values_of(message_class, randomness)
+        made = getattr(factory, f"{name}_encode")(*values)
+        assert type(made) is message_class
+        getattr(factory, f"{name}_send")(*values)
+        getattr(theirs, f"{name}_send")(*values)
+        factory.send(made)
+        theirs.send(made)
+    assert sent.bytes() == golden.data
+    assert (factory.seq, factory.total_packets_sent) == (theirs.seq, theirs.total_packets_sent)
+
+
+def test_arguments_of_mavlink_1_are_enough(factory: MessageFactory, sent: Sent) -> None:
+    randomness, expected = random.Random(2), []
+    for message_class in v10.mavlink_map.values():
+        if message_class.id < 0:
+            continue
+        values = values_of(message_class, randomness, texts_as_str=True)
+        getattr(factory, f"{message_class.msgname.lower()}_send")(*values)
+        as_bytes = [value.encode() if isinstance(value, str) else value for value in values]
+        expected.append(message_class(*as_bytes))
+    encoder, theirs = FrameEncoder(SYSTEM, COMPONENT, version=1), Buffer()
+    mav = v10.MAVLink(theirs, SYSTEM, COMPONENT)
+    for message in expected:
+        mav.send(message)
+    assert b"".join(encoder.encode(sendable(message)) for message in sent) == theirs.data
+
+
+def test_floats_and_texts_are_taken(factory: MessageFactory, sent: Sent) -> None:
+    factory.mount_control_send(0, 1, -9050.4, 0.0, 1e3, 0)
+    factory.param_set_send(1, 1, param_id="WPNAV_SPEED", param_value=500, param_type=9.0)
+    factory.play_tune_send(1, 1, bytearray(b"CDE"))
+    factory.statustext_send(6, "gr\u00fc\u00df")
+    mount, param, tune, text = (sendable(message) for message in sent)
+    assert (mount.to_dict()["input_a"], mount.to_dict()["input_c"]) == (-9050, 1000)
+    assert (param.to_dict()["param_id"], param.to_dict()["param_type"]) == ("WPNAV_SPEED", 9)
+    assert tune.to_dict()["tune"] == "CDE"
+    assert text.to_dict()["text"] == "gr\u00fc\u00df"
+
+
+def test_wrong_values_are_found_when_they_are_sent(factory: MessageFactory) -> None:
+    message = factory.mission_set_current_encode(1, 1, None)
+    with pytest.raises(LocalProtocolError, match=r"MISSION_SET_CURRENT\.seq"):
+        sendable(message)
+    with pytest.raises(LocalProtocolError, match="play_tune_encode: a text must be"):
+        factory.play_tune_encode(1, 1, None)
+    with pytest.raises(TypeError):
+        factory.mission_set_current_encode(1, 1)
+    with pytest.raises(AttributeError, match="nothing_encode"):
+        _ = factory.nothing_encode
+
+
+def test_messages_of_the_programs_own_dialect(
+    monkeypatch: pytest.MonkeyPatch, factory: MessageFactory, sent: Sent
+) -> None:
+    name = next(c.msgname for i, c in sorted(storm32.mavlink_map.items()) if i not in v20.mavlink_map)
+    message_class = next(c for c in storm32.mavlink_map.values() if c.msgname == name)
+    assert not hasattr(factory, f"{name.lower()}_encode")
+    monkeypatch.setattr(mavutil, "mavlink", storm32)
+    getattr(factory, f"{name.lower()}_send")(*values_of(message_class, random.Random(3)))
+    assert [type(message) for message in sent] == [message_class]
+
+
+def test_who_it_is(factory: MessageFactory) -> None:
+    assert (factory.srcSystem, factory.srcComponent, factory.seq) == (SYSTEM, COMPONENT, 0)
+    told: list[Any] = []
+    factory.set_send_callback(lambda message, extra: told.append((message.get_type(), extra)), "extra")
+    factory.ping_send(1, 2, 3, 4)
+    assert told == [("PING", "extra")]
+
+
+# ---------------------------------------------------------------------------------------- master
+
+
+class Vehicle:
+    """A vehicle's side of a UDP link, spoken by pymavlink."""
+
+    def __init__(self, address: str, vehicle_type: int, autopilot: int) -> None:
+        host, port = address.rsplit(":", 2)[-2:]
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.connect((host, int(port)))
+        self._socket.settimeout(LIMIT_S)
+        self._kind = vehicle_type, autopilot
+        self.mav = v20.MAVLink(self, 1, 1)
+        self.mav.robust_parsing = True
+        self.base_mode, self.custom_mode = 81, 4
+
+    def write(self, data: bytes) -> None:
+        self._socket.send(data)
+
+    def beat(self) -> None:
+        self.mav.heartbeat_send(*self._kind, self.base_mode, self.custom_mode, 4)
+
+    def received(self, name: str) -> Any:
+        """The next message of this type."""
+        end = time.monotonic() + LIMIT_S
+        while time.monotonic() < end:
+            for message in self.mav.parse_buffer(self._socket.recv(2048)) or ():
+                if message.get_type() == name:
+                    return message
+        raise AssertionError(f"no {name}")
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+@pytest.fixture
+def connection() -> Iterator[MAVConnection]:
+    each = MAVConnection("udpin:127.0.0.1:0")
+    yield each
+    each.close()
+
+
+@pytest.fixture
+def connected(connection: MAVConnection, request: pytest.FixtureRequest) -> Iterator[tuple[Master, Vehicle]]:
+    """With a vehicle that was heard: a copter with ArduPilot, if the test does not want another one."""
+    kind = getattr(request, "param", (2, 3))
+    assert connection.master.target_component == 0
+    assert connection.master.mode_mapping() is None
+    vehicle = Vehicle(connection.master.address, *kind)
+    vehicle.beat()
+    connection.target_system = 1
+    until(lambda: connection.master.target_component == 1)
+    yield connection.master, vehicle
+    vehicle.close()
+
+
+def until(condition: Callable[[], bool]) -> None:
+    end = time.monotonic() + LIMIT_S
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.005)
+
+
+Connected = tuple[Master, Vehicle]
+
+
+def test_what_master_says(connected: Connected) -> None:
+    master, vehicle = connected
+    assert (master.target_system, master.target_component) == (1, 1)
+    assert (master.mav.srcSystem, master.mav.srcComponent) == (255, 0)
+    assert master.flightmode == "GUIDED"
+    assert not master.motors_armed()
+    master.motors_disarmed_wait()
+    assert master.mode_mapping() == mavutil.mode_mapping_byname(2)
+    assert master.probably_vehicle_heartbeat(v20.MAVLink_heartbeat_message(2, 3, 0, 0, 0, 3))
+    assert not master.probably_vehicle_heartbeat(v20.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3))
+    vehicle.base_mode |= 128
+    waiting = threading.Thread(target=master.motors_armed_wait)
+    waiting.start()
+    while waiting.is_alive():
+        vehicle.beat()
+        waiting.join(0.02)
+    assert master.motors_armed()
+
+
+def test_what_master_sends(connected: Connected) -> None:
+    master, vehicle = connected
+    for call, name, expected in (
+        (lambda: master.arducopter_arm(), "COMMAND_LONG", {"command": 400, "param1": 1}),
+        (lambda: master.arducopter_disarm(), "COMMAND_LONG", {"command": 400, "param1": 0}),
+        (lambda: master.set_mode(5), "COMMAND_LONG", {"command": 176, "param1": 1, "param2": 5}),
+        (lambda: master.set_mode("LOITER"), "COMMAND_LONG", {"command": 176, "param1": 1, "param2": 5}),
+        (lambda: master.set_servo(7, 1100), "COMMAND_LONG", {"command": 183, "param1": 7, "param2": 1100}),
+        (
+            lambda: master.param_set_send("FOO", 2),
+            "PARAM_SET",
+            {"param_id": "FOO", "param_value": 2, "param_type": 9},
+        ),
+        (master.param_fetch_all, "PARAM_REQUEST_LIST", {}),
+        (master.waypoint_clear_all_send, "MISSION_CLEAR_ALL", {}),
+        (lambda: master.waypoint_count_send(3), "MISSION_COUNT", {"count": 3}),
+        (master.waypoint_request_list_send, "MISSION_REQUEST_LIST", {}),
+        (lambda: master.waypoint_request_send(2), "MISSION_REQUEST", {"seq": 2}),
+        (lambda: master.waypoint_set_current_send(2), "MISSION_SET_CURRENT", {"seq": 2}),
+        (lambda: master.mav.set_mode_send(0, 1, 5), "SET_MODE", {"base_mode": 1, "custom_mode": 5}),
+    ):
+        call()
+        message = vehicle.received(name)
+        fields = message.to_dict()
+        assert fields["target_system"] == 1
+        assert fields.get("target_component", 1) == 1
+        assert {key: fields[key] for key in expected} == expected
+        assert (message.get_srcSystem(), message.get_srcComponent()) == (255, 0)
+
+
+def test_nonsense_is_not_sent(connected: Connected) -> None:
+    master, vehicle = connected
+    with pytest.raises(KeyError, match="NOPE"):
+        master.set_mode("NOPE")
+    with pytest.raises(LocalProtocolError):
+        master.waypoint_count_send(70_000)
+    master.mav.ping_send(1, 77, 0, 0)
+    assert vehicle.received("PING").seq == 77
+
+
+@pytest.mark.parametrize("connected", [(2, 12)], indirect=True)
+def test_modes_of_px4(connected: Connected) -> None:
+    master, vehicle = connected
+    assert master.mode_mapping() == mavutil.px4_map
+    calls: list[Callable[[], None]] = [
+        lambda: master.set_mode_px4("OFFBOARD", None, None),
+        lambda: master.set_mode(29, 6),
+    ]
+    for call in calls:
+        call()
+        message = vehicle.received("COMMAND_LONG")
+        assert (message.command, message.param1, message.param2, message.param3) == (176, 29, 6, 0)
+
+
+def test_a_mode_is_set_by_the_vehicle_if_there_is_one(connected: Connected) -> None:
+    class Known:
+        mode: Any = None
+
+    master, _ = connected
+    known: Any = Known()
+    master.vehicle = known
+    master.set_mode("LOITER")
+    assert known.mode == "LOITER"
+    master.set_mode(14)
+    assert known.mode == 14
+
+
+# ------------------------------------------------------------------------------------- receiving
+
+
+def test_messages_are_received_one_after_the_other(connected: Connected) -> None:
+    master, vehicle = connected
+    assert master.recv_match(type="ATTITUDE") is None, "nothing was kept before the first question"
+    for number in range(3):
+        vehicle.mav.attitude_send(number, 0, 0, 0, 0, 0, 0)
+        vehicle.mav.mission_current_send(number)
+    first = master.recv_match(type="ATTITUDE", blocking=True, timeout=LIMIT_S)
+    assert (first.get_type(), first.time_boot_ms) == ("ATTITUDE", 0)
+    assert isinstance(first, v20.MAVLink_attitude_message)
+    chosen = master.recv_match(
+        condition="MISSION_CURRENT.seq==2", type=["MISSION_CURRENT"], blocking=True, timeout=LIMIT_S
+    )
+    assert chosen.seq == 2
+    assert master.recv_match() is None
+    assert master.recv_match(type="ATTITUDE", blocking=True, timeout=0.01) is None
+
+
+def test_a_heartbeat_is_waited_for(connected: Connected) -> None:
+    master, vehicle = connected
+    found: list[Any] = []
+    waiting = threading.Thread(target=lambda: found.append(master.wait_heartbeat()))
+    waiting.start()
+    while waiting.is_alive():
+        vehicle.beat()
+        waiting.join(0.02)
+    assert found[0].get_srcSystem() == 1
+
+
+def test_the_last_message_of_every_type(connected: Connected) -> None:
+    master, vehicle = connected
+    timer = threading.Timer(0.05, vehicle.mav.raw_imu_send, range(10))
+    timer.start()
+    assert master.messages["RAW_IMU"].zmag == 9, "the first look-ups wait"
+    timer.join()
+    vehicle.mav.raw_imu_send(*range(10, 20))
+    until(lambda: bool(master.messages["RAW_IMU"].zmag == 19))
+    assert "RAW_IMU" in list(master.messages)
+    assert len(master.messages) >= 1
+    assert master.messages.get("NONSENSE") is None
+
+
+def test_closing_ends_the_waiting(connected: Connected) -> None:
+    master, _ = connected
+    ended: list[BaseException] = []
+
+    def wait() -> None:
+        try:
+            master.recv_match(type="ATTITUDE", blocking=True)
+        except APIException as error:
+            ended.append(error)
+
+    waiting = threading.Thread(target=wait)
+    waiting.start()
+    master.close()
+    waiting.join(LIMIT_S)
+    assert len(ended) == 1
+    with pytest.raises(APIException):
+        master.arducopter_arm()
