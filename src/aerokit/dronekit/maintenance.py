@@ -28,7 +28,7 @@ TUNE_SIZES = (30, 200)
 
 
 class Maintenance:
-    """Orders for a vehicle on the ground; they return at once, a refusal becomes a warning of the logger ``dronekit``."""
+    """Orders for a vehicle on the ground. They return at once; a refusal is a warning of the logger ``dronekit``."""
 
     if TYPE_CHECKING:
 
