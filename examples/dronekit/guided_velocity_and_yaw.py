@@ -42,14 +42,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Fly by velocities.")
     parser.add_argument("--connect", metavar="ADDRESS", default="udp:127.0.0.1:14550")
     parser.add_argument("--seconds", type=float, default=5.0, help="for each leg")
+    parser.add_argument("--altitude", type=float, default=10.0, help="metres above home")
     options = parser.parse_args()
 
     vehicle = connect(options.connect, wait_ready=True)
     vehicle.wait_for_armable(timeout=60)
     vehicle.wait_for_mode("GUIDED", timeout=10)
     vehicle.arm(timeout=10)
-    vehicle.wait_simple_takeoff(10, epsilon=0.5, timeout=60)
-    for north, east, down in ((2, 0, 0), (0, 2, 0), (-2, -2, 0), (0, 0, -1)):
+    vehicle.wait_simple_takeoff(options.altitude, epsilon=0.5, timeout=60)
+    for north, east, down in ((2, 0, 0), (0, 2, 0), (-2, -2, 0), (0, 0, 0.5)):
         fly(vehicle, north, east, down, options.seconds)
         print(f"{vehicle.location.local_frame} at {vehicle.velocity} m/s")
     for heading in (90, 180):

@@ -26,7 +26,6 @@ ATTRIBUTES = (
     "last_heartbeat",
     "home_location",
 )
-LISTEN_S = 1.0
 
 
 def print_attributes(vehicle: Vehicle) -> None:
@@ -37,7 +36,7 @@ def print_attributes(vehicle: Vehicle) -> None:
         print(place)
 
 
-def listen_for_a_while(vehicle: Vehicle) -> None:
+def listen_for_a_while(vehicle: Vehicle, seconds: float) -> None:
     """A decorated listener stays for good; one that was added can be removed."""
     headings: list[int] = []
     names: set[str] = set()
@@ -50,7 +49,7 @@ def listen_for_a_while(vehicle: Vehicle) -> None:
         names.add(name)
 
     vehicle.add_attribute_listener("*", on_anything)
-    time.sleep(LISTEN_S)
+    time.sleep(seconds)
     vehicle.remove_attribute_listener("*", on_anything)
     print(f"told {len(headings)} headings, and these attributes: {', '.join(sorted(names))}")
 
@@ -66,13 +65,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Print the state of a vehicle.")
     parser.add_argument("--connect", metavar="ADDRESS", default="udp:127.0.0.1:14550")
     parser.add_argument("--parameter", default="RTL_LOIT_TIME", help="one to change and to put back")
+    parser.add_argument("--seconds", type=float, default=3.0, help="how long to listen")
     options = parser.parse_args()
 
     vehicle = connect(options.connect, wait_ready=True)
     vehicle.commands.download()  # which also brings home
     vehicle.commands.wait_ready()
     print_attributes(vehicle)
-    listen_for_a_while(vehicle)
+    listen_for_a_while(vehicle, options.seconds)
     print(f"{len(vehicle.parameters)} parameters")
     change_a_parameter(vehicle, options.parameter)
     vehicle.close()

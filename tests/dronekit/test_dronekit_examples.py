@@ -1,0 +1,107 @@
+"""Every example in the classic style is an unmodified DroneKit program, and flies a simulated copter."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from served_copter import served_copter
+
+from aerokit.dronekit.alias import uninstall
+from aerokit.dronekit.runner import run_script
+
+ROOT = Path(__file__).parent.parent.parent
+EXAMPLES = ROOT / "examples" / "dronekit"
+RECORDING = ROOT / "tests" / "recordings" / "ardupilot-copter.tlog"
+
+EXPECTED: dict[str, tuple[float, list[str], list[str]]] = {
+    "hello": (20, [], ["firmware: APM:Copter-4.7.0", "mode: STABILIZE", "can be armed: True"]),
+    "vehicle_state": (
+        50,
+        ["--seconds", "0.2"],
+        [
+            "LocationGlobal:lat=-35.363261",
+            "location.global_frame",
+            "1349 parameters",
+            "was 5000.0, is 5001.0",
+        ],
+    ),
+    "simple_goto": (50, ["--altitude", "5"], ["at 5 m", "there\n", "landed"]),
+    "basic_mission": (
+        50,
+        ["--altitude", "5", "--side", "20"],
+        ["6: command 20", "flies command 6 of 6", "landed"],
+    ),
+    "guided_velocity_and_yaw": (
+        25,
+        ["--seconds", "0.2", "--altitude", "5"],
+        [" at [2.0, ", "heading ", "landed"],
+    ),
+    "channel_overrides": (50, [], ["'3': 1100", "overrides: {'1': 1600, '2': 1400}"]),
+    "create_attribute": (50, [], ["first: Vibration: x=", "\nvibration: Vibration: x="]),
+    "gimbal": (50, ["--seconds", "0.05"], ["Gimbal: pitch=None", "pitch -45, yaw 90", "released"]),
+    "follow_me": (
+        25,
+        ["--seconds", "0.6", "--walking-speed", "20", "--altitude", "5"],
+        ["m behind", "followed for ", "landed"],
+    ),
+    "flight_replay": (50, [str(RECORDING)], ["4 waypoints", "to waypoint ", "at the end of the track"]),
+}
+"""Example: times real time, its arguments beside the address, what it must print."""
+
+
+@pytest.fixture(autouse=True)
+def without_alias() -> Iterator[None]:
+    yield
+    uninstall()
+
+
+def test_every_example_is_run() -> None:
+    assert {path.stem for path in EXAMPLES.glob("*.py")} == set(EXPECTED)
+
+
+@pytest.mark.parametrize("name", EXPECTED)
+def test_example_says_dronekit_only(name: str) -> None:
+    text = (EXAMPLES / f"{name}.py").read_text(encoding="utf-8")
+    imported = [node.module for node in ast.walk(ast.parse(text)) if isinstance(node, ast.ImportFrom)]
+    assert "dronekit" in imported
+    assert "import aerokit" not in text
+    assert "from aerokit" not in text
+
+
+@pytest.mark.parametrize("name", EXPECTED)
+def test_example(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    speedup, arguments, expected = EXPECTED[name]
+    with served_copter(speedup=speedup) as address:
+        run_script(EXAMPLES / f"{name}.py", [*arguments, "--connect", address])
+    told = capsys.readouterr()
+    assert told.err == ""
+    for text in expected:
+        assert text in told.out
+
+
+def test_example_as_a_program() -> None:
+    with served_copter() as address:
+        done = subprocess.run(
+            [
+                sys.executable,
+                "-W",
+                "error",
+                "-m",
+                "aerokit",
+                "run",
+                EXAMPLES / "hello.py",
+                "--connect",
+                address,
+            ],
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "mode: STABILIZE" in done.stdout
