@@ -1,0 +1,263 @@
+"""What comes of commands on the vehicle: items, home, jumps, the current one; on ArduPilot and PX4."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+from flight_controller import FlightController
+from mission_stage import FIRST, HOME, LIMIT_S, SECOND, THIRD, Pair, connected, kept, transfers, waypoint
+from served_copter import served_copter
+
+from aerokit.dronekit.commands import CommandSequence
+from aerokit.dronekit.connect import connect
+from aerokit.dronekit.vehicle import Vehicle
+from aerokit.errors import LocalProtocolError
+
+TAKE_OFF, LAND, RETURN, JUMP, SPEED = 22, 21, 20, 177, 178
+
+
+@pytest.fixture
+def three() -> Iterator[Pair]:
+    """A vehicle with home and three waypoints, downloaded."""
+    with connected(HOME, FIRST, SECOND, THIRD) as (controller, vehicle):
+        vehicle.commands.download()
+        assert vehicle.commands.wait_ready()
+        yield controller, vehicle.commands
+
+
+@pytest.fixture
+def empty() -> Iterator[Pair]:
+    """A vehicle nothing is known of."""
+    with connected(HOME, FIRST) as (controller, vehicle):
+        yield controller, vehicle.commands
+
+
+@pytest.fixture
+def px4() -> Iterator[tuple[FlightController, Vehicle]]:
+    with connected(FIRST, SECOND, autopilot=12) as pair:
+        yield pair
+
+
+# --------------------------------------------------------------------------------------- items
+
+
+def test_what_cannot_be_right_is_told_before_anything_is_sent(
+    three: Pair,
+) -> None:
+    controller, cmds = three
+    before = controller.mark()
+    wrong: dict[str, Any] = {"x": 91.0, "y": "east", "param1": None, "frame": 99, "command": "go"}
+    told = ("latitude", "could not convert", "NoneType", "MAV_FRAME", "invalid literal")
+    for (field, value), text in zip(wrong.items(), told, strict=True):
+        cmds[0] = waypoint(**{field: value})
+        with pytest.raises(LocalProtocolError, match=text):
+            cmds.upload()
+    assert transfers(controller, before) == []
+
+
+def test_places_go_out_in_full_precision_in_every_frame(
+    empty: Pair,
+) -> None:
+    controller, cmds = empty
+    frames = [0, 3, 10, 5, 6, 11]
+    for frame in frames:
+        cmds.add(waypoint(-35.12345675, frame, y=149.7654321, z=30))
+    cmds.upload()
+    sent = controller.received("MISSION_ITEM_INT")[-6:]
+    assert [(each.x, each.y, each.frame) for each in sent] == [
+        (-351234568, 1497654321, frame) for frame in frames
+    ]
+    cmds.download()
+    cmds.wait_ready()
+    assert {(each.x, each.y) for each in cmds} == {(-35.1234568, 149.7654321)}
+    assert [each.frame for each in cmds] == [0, 3, 10, 0, 3, 10]
+
+
+def test_numbers_that_are_no_places(empty: Pair) -> None:
+    controller, cmds = empty
+    cmds.add(waypoint(frame=1, x=1.5, y=-2.00005, param4=math.nan))
+    cmds.add(waypoint(command=JUMP, param1=1, param2=3, x=0, y=0, z=0))
+    cmds.add(waypoint(command=RETURN, x=0, y=149.25, z=11))  # ArduPilot cuts it off, and does not use it
+    cmds.upload()
+    sent = controller.received("MISSION_ITEM_INT")[-3:]
+    assert [(frame.x, frame.y) for frame in sent] == [(15000, -20000), (0, 0), (0, 149)]
+    assert math.isnan(sent[0].param4)
+    assert sent[1].param1 == 1  # home is 0
+
+
+def test_jumps_come_back_as_they_were_written(three: Pair) -> None:
+    _, cmds = three
+    cmds.add(waypoint(command=JUMP, param1=2, param2=3, x=0, y=0, z=0))
+    cmds.upload()
+    cmds.download()
+    cmds.wait_ready()
+    assert (cmds[3].command, cmds[3].param1, cmds[3].param2) == (JUMP, 2, 3)
+
+
+# ----------------------------------------------------------------------------- home as first row
+
+
+def test_the_home_row_of_a_waypoint_file_is_not_flown_to(
+    three: Pair,
+) -> None:
+    controller, cmds = three
+    for row in (
+        waypoint(-35.3, 0, current=1, z=584),  # any home, from a file of a ground station
+        waypoint(0, 0, y=0, z=0),  # not known
+        waypoint(-35.36327, 0, y=149.16524, z=584.09),  # this one
+    ):
+        cmds.clear()
+        for cmd in (row, waypoint(), waypoint(-35.7)):
+            cmds.add(cmd)
+        assert ([each.x for each in cmds], [each.seq for each in cmds]) == ([-35.5, -35.7], [1, 2])
+    cmds.upload()
+    assert kept(controller)[1:] == [(16, -35.5, 30.0), (16, -35.7, 30.0)]
+
+
+def test_other_first_commands_are_commands(three: Pair) -> None:
+    _, cmds = three
+    for cmd in (
+        waypoint(-35.3, 3, current=1),
+        waypoint(-35.3, 0, z=584),
+        waypoint(0, 3, y=0, z=0),
+        waypoint(-35.36327, 0, y=149.16524, z=604),
+        waypoint(-35.3, 0, command=TAKE_OFF, current=1),
+        waypoint(-35.3, 0, x="south"),
+    ):
+        cmds.clear()
+        cmds.add(cmd)
+        assert len(cmds) == 1
+
+
+# ---------------------------------------------------------------------------------------- next
+
+
+def next_becomes(cmds: CommandSequence, number: int, tell: Callable[[], None]) -> bool:
+    tried = threading.Event()
+    for _ in range(int(LIMIT_S / 0.02)):
+        tell()
+        if cmds.next == number:
+            return True
+        tried.wait(0.02)
+    return False
+
+
+def test_next_is_told_and_chosen(three: Pair) -> None:
+    controller, cmds = three
+    cmds.next = 2
+    assert controller.wait_for("MISSION_SET_CURRENT").seq == 2
+    assert next_becomes(cmds, 2, lambda: None)
+    assert next_becomes(cmds, 3, lambda: controller.tell("MISSION_CURRENT", seq=3))
+    with pytest.raises(LocalProtocolError, match="next = -1"):
+        cmds.next = -1
+    with pytest.raises(TypeError):
+        cmds.next = "x"  # type: ignore[assignment]
+
+
+def test_next_is_chosen_by_command_where_the_message_is_not_heard(
+    three: Pair, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("aerokit.dronekit.current_command.CONFIRMED_S", 0.3)
+    controller, cmds = three
+    controller.answers["MISSION_SET_CURRENT"] = lambda frame: None
+    cmds.next = 2
+    assert controller.wait_for_command(224).param1 == 2
+
+
+# ---------------------------------------------------------------------------------------- PX4
+
+
+def test_px4_hides_nothing_and_counts_alike(px4: tuple[FlightController, Vehicle]) -> None:
+    controller, vehicle = px4
+    cmds = vehicle.commands
+    cmds.download()
+    cmds.wait_ready()
+    assert [(each.seq, each.z) for each in cmds] == [(1, 20.0), (2, 21.0)]
+    assert (vehicle._wploader.count(), vehicle._wploader.wp(1).z) == (3, 20.0)
+    cmds.next = 2
+    assert controller.wait_for("MISSION_SET_CURRENT").seq == 1
+    assert next_becomes(cmds, 2, lambda: None)
+
+
+def test_on_px4_next_is_0_unless_it_flies_as_on_ardupilot(px4: tuple[FlightController, Vehicle]) -> None:
+    controller, vehicle = px4
+    cmds = vehicle.commands
+
+    def tell(**fields: int) -> Callable[[], None]:
+        told: dict[str, Any] = {"total": 2, "mission_state": 3, **fields}
+        return lambda: controller.tell("MISSION_CURRENT", **told)
+
+    assert next_becomes(cmds, 2, tell(seq=1))
+    assert next_becomes(cmds, 0, tell(seq=0))
+    cmds.next = 1
+    assert next_becomes(cmds, 1, lambda: None)
+    assert next_becomes(cmds, 0, tell(seq=1, mission_state=5))
+    assert next_becomes(cmds, 2, tell(seq=1))
+    assert next_becomes(cmds, 0, tell(seq=1, total=65535))
+    controller.base_mode |= 128
+    controller.beat()
+    assert next_becomes(cmds, 1, tell(seq=0))
+
+
+def test_px4_is_given_what_ardupilot_works_out_by_itself(px4: tuple[FlightController, Vehicle]) -> None:
+    controller, vehicle = px4
+    controller.tell("GLOBAL_POSITION_INT", lat=470000000, lon=85000000, alt=500000)
+    controller.tell("GPS_RAW_INT", fix_type=3, lat=470000000, lon=85000000)
+    vehicle.wait_ready("location", timeout=LIMIT_S)
+    for cmd in (
+        waypoint(0, command=TAKE_OFF, y=0),
+        waypoint(command=SPEED, param1=1, param2=5, x=0, y=0, z=0),
+        waypoint(47.1, y=8.6),
+        waypoint(0, command=LAND, y=0, z=0),
+    ):
+        cmd.autocontinue = 1
+        vehicle.commands.add(cmd)
+    vehicle.commands.upload()
+    assert [(each.command, each.frame, each.x, each.y) for each in controller.missions.items] == [
+        (TAKE_OFF, 3, 47.0, 8.5),
+        (SPEED, 2, 0, 0),
+        (16, 3, 47.1, 8.6),
+        (LAND, 3, 47.1, 8.6),
+    ]
+
+
+# ------------------------------------------------------------------------------------ the rest
+
+
+def test_the_waypoint_loader_counts_home(three: Pair) -> None:
+    _, cmds = three
+    loader = cmds._vehicle._wploader
+    assert (loader.count(), loader.wp(0).z, loader.wp(3).z) == (4, 584.0, 22.0)
+    with pytest.raises(IndexError):
+        loader.wp(4)
+    cmds.clear()
+    assert loader.count() == 1
+
+
+# -------------------------------------------------------------------------- the simulated copter
+
+
+def test_a_long_mission_goes_to_the_simulated_copter_and_back() -> None:
+    with served_copter() as address, connect(address, rate=None) as vehicle:
+        cmds = vehicle.commands
+        cmds.clear()
+        cmds.add(waypoint(0, command=TAKE_OFF, y=0))
+        for number in range(100):
+            cmds.add(waypoint(round(-35.3 + number * 1e-7, 7), (0, 3, 10)[number % 3]))
+        cmds.add(waypoint(command=SPEED, param1=1, param2=5, x=0, y=0, z=0))
+        cmds.add(waypoint(command=JUMP, param1=2, param2=3, x=0, y=0, z=0))
+        written = [(each.command, each.x, each.param1, each.seq) for each in cmds]
+        cmds.upload(timeout=LIMIT_S)
+        cmds.download()
+        assert cmds.wait_ready(timeout=LIMIT_S)
+        assert [(each.command, each.x, each.param1, each.seq) for each in cmds] == written
+        cmds[50].z = 77
+        cmds.upload(timeout=LIMIT_S)
+        cmds.download()
+        assert cmds.wait_ready(timeout=LIMIT_S)
+        assert [each.seq for each in cmds if each.z == 77] == [51]
+        assert str(vehicle.home_location).startswith("LocationGlobal:lat=-35.36326")
