@@ -11,12 +11,14 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from served_copter import served_copter
 
 import aerokit.dronekit as dronekit
+from aerokit.dronekit import mavlink
 from aerokit.mavlink.messages import GlobalPositionInt
 
 LIMIT_S = 20.0
@@ -83,7 +85,7 @@ def test_attributes_stay_and_orders_raise_after_closing(vehicle: dronekit.Vehicl
         lambda: vehicle.wait_for(lambda: False),
         lambda: vehicle.wait_ready("nothing"),
         lambda: vehicle.send_mavlink(vehicle.message_factory.heartbeat_encode(6, 8, 0, 0, 0)),
-        lambda: vehicle.commands.upload(),
+        lambda: vehicle.commands.download(),
         lambda: vehicle.reboot(),
     ):
         with pytest.raises(dronekit.APIException):
@@ -258,13 +260,15 @@ vehicle.add_attribute_listener('attitude', lambda *_: None)
             vehicle.close()
 
 
-def test_a_link_that_cannot_be_opened_raises_what_the_system_says() -> None:
-    threads = own_threads()
+def test_a_link_that_cannot_be_opened_raises_what_the_system_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    threads, pauses = own_threads(), list[float]()
+    monkeypatch.setattr(mavlink, "time", SimpleNamespace(sleep=pauses.append))
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         port = listener.getsockname()[1]
     with pytest.raises(ConnectionRefusedError):
         dronekit.connect(f"tcp:127.0.0.1:{port}")
+    assert pauses == [1.0, 1.0]
     with pytest.raises(OSError, match="no/such"):
         dronekit.connect("/dev/no/such/device")
     with pytest.raises(ValueError, match="port"):

@@ -88,7 +88,7 @@ def test_what_waits_behind_a_stuck_listener_is_bounded(
     thread: ListenerThread, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(listener_thread, "MOST_WAITING", 5)
-    may_go_on, seen = threading.Event(), []
+    may_go_on, seen = threading.Event(), list[object]()
     thread.post(may_go_on.wait, LIMIT_S)
     for number in range(20):
         thread.offer(seen.append, number)
@@ -103,7 +103,7 @@ def test_what_waits_behind_a_stuck_listener_is_bounded(
 
 
 def test_listeners_of_a_name_come_before_those_of_every_name(thread: ListenerThread) -> None:
-    observed, seen = HasObservers(thread), []
+    observed, seen = HasObservers(thread), list[Any]()
 
     def every(*call: Any) -> None:
         seen.append(("*", *call))
@@ -129,7 +129,7 @@ def test_listeners_of_a_name_come_before_those_of_every_name(thread: ListenerThr
 
 
 def test_a_listener_that_removes_itself_does_not_cost_the_next_one(thread: ListenerThread) -> None:
-    observed, seen = HasObservers(thread), []
+    observed, seen = HasObservers(thread), list[Any]()
 
     def once(_: Any, name: str, value: Any) -> None:
         seen.append(("once", value))
@@ -145,7 +145,7 @@ def test_a_listener_that_removes_itself_does_not_cost_the_next_one(thread: Liste
 def test_a_raising_listener_is_logged_and_the_others_run(
     thread: ListenerThread, caplog: pytest.LogCaptureFixture, error: BaseException
 ) -> None:
-    observed, seen = HasObservers(thread), []
+    observed, seen = HasObservers(thread), list[Any]()
 
     def fail(*_: Any) -> None:
         raise error
@@ -162,7 +162,7 @@ def test_a_raising_listener_is_logged_and_the_others_run(
 
 
 def test_cached_attributes_are_told_when_they_change(thread: ListenerThread) -> None:
-    observed, seen = HasObservers(thread), []
+    observed, seen = HasObservers(thread), list[Any]()
     observed.add_attribute_listener("x", lambda _, name, value: seen.append(value))
     told(observed, thread, False, False, True, True, False, cache=True)
     assert seen == [False, True, False]
@@ -188,7 +188,7 @@ def test_removing(thread: ListenerThread) -> None:
 
 
 def test_decorators_take_a_name_or_a_list(thread: ListenerThread) -> None:
-    observed, seen = HasObservers(thread), []
+    observed, seen = HasObservers(thread), list[Any]()
 
     @observed.on_attribute(["x", "y"])
     def listener(_: Any, name: str, value: Any) -> None:
@@ -201,7 +201,7 @@ def test_decorators_take_a_name_or_a_list(thread: ListenerThread) -> None:
 
 
 def test_notifying_waits_for_the_listeners_and_works_inside_one(thread: ListenerThread) -> None:
-    observed, seen = HasObservers(thread), []
+    observed, seen = HasObservers(thread), list[Any]()
 
     def outer(_: Any, name: str, value: Any) -> None:
         observed.notify_attribute_listeners("inner", value + 1)
@@ -217,7 +217,7 @@ def test_notifying_waits_for_the_listeners_and_works_inside_one(thread: Listener
 
 
 def test_without_a_thread_listeners_run_where_they_are_told() -> None:
-    observed, seen = HasObservers(), []
+    observed, seen = HasObservers(), list[Any]()
     observed.add_attribute_listener("x", lambda *_: seen.append(threading.current_thread()))
     observed.notify_attribute_listeners("x", 1)
     observed._tell("x", 1)
@@ -231,7 +231,7 @@ def test_telling_nobody_does_not_start_the_thread() -> None:
 
 
 def test_a_blocked_listener_keeps_nobody_from_telling(thread: ListenerThread) -> None:
-    observed, may_go_on, seen = HasObservers(thread), threading.Event(), []
+    observed, may_go_on, seen = HasObservers(thread), threading.Event(), list[Any]()
 
     def block(_: Any, name: str, value: Any) -> None:
         may_go_on.wait(LIMIT_S)

@@ -92,7 +92,7 @@ class VehicleAttributes(HasObservers):
     # ------------------------------------------------------------------------------- reading
 
     @property
-    def system_status(self) -> SystemStatus | None:
+    def system_status(self) -> SystemStatus | Any:
         """HEARTBEAT.system_status by name (``'STANDBY'``, ``'ACTIVE'`` …); None before the first, and if unknown."""
         heartbeat = self._heartbeat
         if heartbeat is None or heartbeat.system_status >= len(STATES):
@@ -108,7 +108,7 @@ class VehicleAttributes(HasObservers):
         return Attitude(message.pitch, message.yaw, message.roll)
 
     @property
-    def velocity(self) -> list[float | None]:
+    def velocity(self) -> list[float | Any]:
         """``[vx, vy, vz]`` in m/s: north, east, down (GLOBAL_POSITION_INT)."""
         message = self._global_position
         if message is None:
@@ -116,7 +116,7 @@ class VehicleAttributes(HasObservers):
         return [message.vx / 100.0, message.vy / 100.0, message.vz / 100.0]
 
     @property
-    def heading(self) -> int | None:
+    def heading(self) -> int | Any:
         """Where the nose points, 0 to 360 degrees clockwise from north (VFR_HUD)."""
         message = self._vfr_hud
         return None if message is None else message.heading
@@ -130,7 +130,7 @@ class VehicleAttributes(HasObservers):
         return GPSInfo(message.eph, message.epv, message.fix_type, message.satellites_visible)
 
     @property
-    def battery(self) -> Battery | None:
+    def battery(self) -> Battery | Any:
         """Voltage, current and level of the main battery (SYS_STATUS); None before the first."""
         message = self._sys_status
         if message is None:
@@ -183,7 +183,7 @@ class VehicleAttributes(HasObservers):
         return Capabilities(None if version is None else version.capabilities)
 
     @property
-    def last_heartbeat(self) -> float | None:
+    def last_heartbeat(self) -> float | Any:
         """Seconds since the autopilot's last HEARTBEAT; None before the first."""
         return None if self._aio is None else self._aio.heartbeat_age
 

@@ -212,17 +212,20 @@ class FlightMethods(VehicleAttributes):
     # -------------------------------------------------------------------------------- speeds
 
     @property
-    def airspeed(self) -> float | None:
-        """Speed through the air in m/s (VFR_HUD). Setting it asks for this speed (MAV_CMD_DO_CHANGE_SPEED)."""
+    def airspeed(self) -> float | Any:
+        """Speed through the air in m/s (VFR_HUD), None where nobody knows it.
+
+        Setting it asks for this speed (MAV_CMD_DO_CHANGE_SPEED).
+        """
         message = self._vfr_hud
-        return None if message is None else message.airspeed
+        return None if message is None or math.isnan(message.airspeed) else message.airspeed
 
     @airspeed.setter
     def airspeed(self, speed: float) -> None:
         self._change_speed("airspeed", AIRSPEED, speed)
 
     @property
-    def groundspeed(self) -> float | None:
+    def groundspeed(self) -> float | Any:
         """Speed over ground in m/s (VFR_HUD). Setting it asks for this speed (MAV_CMD_DO_CHANGE_SPEED)."""
         message = self._vfr_hud
         return None if message is None else message.groundspeed
@@ -239,7 +242,7 @@ class FlightMethods(VehicleAttributes):
     # ---------------------------------------------------------------------------------- home
 
     @property
-    def home_location(self) -> LocationGlobal | None:
+    def home_location(self) -> LocationGlobal | Any:
         """Where it returns to, a new object each time; None until HOME_POSITION or a mission told it.
 
         Setting it sends MAV_CMD_DO_SET_HOME, and the attribute has the new place at once.

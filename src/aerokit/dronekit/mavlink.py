@@ -8,6 +8,7 @@ import contextlib
 import logging
 import queue
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
@@ -35,6 +36,7 @@ FunctionT = TypeVar("FunctionT", bound=Callable[..., object])
 ORDERS_END_S = 2.0
 """How long closing waits for what was ordered a moment before to be answered."""
 TICK_S = 0.05
+ATTEMPTS, BETWEEN_ATTEMPTS_S = 3, 1.0
 
 
 class MAVConnection:
@@ -271,12 +273,17 @@ def connections_made() -> Iterator[list[MAVConnection]]:
 
 
 def _open(ip: str, baud: int, source_system: int, source_component: int) -> sync.Connection:
-    try:
-        return sync.open_connection(
-            ip, baud=baud, source_system=source_system, source_component=source_component, reconnect=True
-        )
-    except LinkOpenError as error:
-        _raise_classic(error)
+    """Open it; what refuses at first may be a simulator that the program has just started."""
+    for attempt in range(ATTEMPTS):
+        try:
+            return sync.open_connection(
+                ip, baud=baud, source_system=source_system, source_component=source_component, reconnect=True
+            )
+        except LinkOpenError as error:
+            if attempt == ATTEMPTS - 1 or not isinstance(error.__cause__, ConnectionRefusedError):
+                _raise_classic(error)
+            time.sleep(BETWEEN_ATTEMPTS_S)
+    raise AssertionError
 
 
 def _raise_classic(error: LinkOpenError) -> NoReturn:
@@ -286,6 +293,8 @@ def _raise_classic(error: LinkOpenError) -> NoReturn:
         if cause.errno is not None:
             raise type(cause)(cause.errno, str(error)) from error
         raise type(cause)(str(error)) from error
+    if isinstance(cause, ValueError):  # pyserial: no such baud rate
+        raise ValueError(str(error)) from error
     raise error
 
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import anyio
 from pymavlink import mavutil
 
 from aerokit.autopilots.px4 import Px4
-from aerokit.errors import CommandRejected, LocalProtocolError
+from aerokit.errors import CommandRejected, LocalProtocolError, OperationTimeout
 from aerokit.mavlink.messages import SetMode
+from aerokit.protocols.command import result_name
 
 if TYPE_CHECKING:
     from aerokit.vehicle.vehicle import Vehicle
@@ -17,7 +19,10 @@ __all__ = ["change_mode", "mode_name", "mode_order"]
 
 DO_SET_MODE = 176
 RESULT_UNSUPPORTED = 3
+RESULT_TEMPORARILY_REJECTED = 1
 MODE_IS_TOLD_S = 5.0
+LOOK_S = 0.05
+ATTEMPTS, ASK_AGAIN_S = 4, 0.5
 CUSTOM_MODE_ENABLED = 1
 
 Order = tuple[int, int, int]
@@ -67,21 +72,59 @@ def _custom_mode(vehicle: Vehicle, mode: str) -> int:
 async def change_mode(vehicle: Vehicle, order: Order) -> None:
     """Send MAV_CMD_DO_SET_MODE, or SET_MODE to a vehicle that does not know it, and wait until HEARTBEAT tells it.
 
+    Asked again where the vehicle says that it is too early, as PX4 does while it checks a mission just uploaded.
+
     Raises:
         CommandRejected: the vehicle refused.
         OperationTimeout: it accepted and stays in another mode.
     """
+    for attempts_left in reversed(range(ATTEMPTS)):
+        try:
+            await _change_mode(vehicle, order)
+        except CommandRejected as error:
+            if error.result != RESULT_TEMPORARILY_REJECTED or not attempts_left:
+                raise
+            await anyio.sleep(ASK_AGAIN_S)
+        else:
+            return
+
+
+async def _change_mode(vehicle: Vehicle, order: Order) -> None:
+    """PX4 acks twice: the first ack is always ACCEPTED, the second one may take it back."""
     base_mode, main_mode, sub_mode = order
-    is_px4 = isinstance(vehicle.autopilot, Px4)
-    custom_mode = main_mode << 16 | sub_mode << 24 if is_px4 else main_mode
+    custom_mode = main_mode << 16 | sub_mode << 24 if isinstance(vehicle.autopilot, Px4) else main_mode
+    started = vehicle.connection.now()
+    with vehicle._refusals_of(DO_SET_MODE) as refusals:
+        await _request(vehicle, order, custom_mode)
+        with anyio.move_on_after(MODE_IS_TOLD_S):
+            while not _is_in(vehicle, custom_mode):
+                if refusals:
+                    raise _refused(vehicle, refusals[-1].result, started)
+                await anyio.sleep(LOOK_S)
+            return
+    raise OperationTimeout(
+        f"{mode_name(vehicle, base_mode, custom_mode)} was accepted, and the vehicle stays in {vehicle.mode.latest}"
+    )
+
+
+async def _request(vehicle: Vehicle, order: Order, custom_mode: int) -> None:
     try:
         await vehicle.command(DO_SET_MODE, *order, component_id=0)
     except CommandRejected as error:
         if error.result != RESULT_UNSUPPORTED:
             raise
-        vehicle.send(SetMode(vehicle.system_id, base_mode, custom_mode))
-    await vehicle.telemetry.mode.wait_until(
-        lambda mode: mode.custom_mode == custom_mode,
-        timeout=MODE_IS_TOLD_S,
-        description=f"mode {mode_name(vehicle, base_mode, custom_mode)}",
+        vehicle.send(SetMode(vehicle.system_id, order[0], custom_mode))
+
+
+def _is_in(vehicle: Vehicle, custom_mode: int) -> bool:
+    mode = vehicle.telemetry.mode.latest
+    return mode is not None and mode.custom_mode == custom_mode
+
+
+def _refused(vehicle: Vehicle, result: int, since: float) -> CommandRejected:
+    return CommandRejected(
+        f"MAV_CMD_DO_SET_MODE was refused: {result_name(result)}",
+        command=DO_SET_MODE,
+        result=result,
+        reasons=vehicle.texts_since(since),
     )

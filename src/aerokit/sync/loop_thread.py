@@ -103,7 +103,7 @@ class LoopThread:
         return self.run(call)
 
     def call_soon(self, function: Callable[P, object], /, *args: P.args, **kwargs: P.kwargs) -> None:
-        """Have a function that does not wait called on the loop's thread, after those asked for before; from any thread.
+        """Have a function that does not wait called on the loop, after those asked for before; from any thread.
 
         Nobody waits for it or hears what it raises: it must not raise.
 
