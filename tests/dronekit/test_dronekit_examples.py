@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -11,11 +12,14 @@ from pathlib import Path
 import pytest
 from served_copter import served_copter
 
+import aerokit.dronekit as dronekit
 from aerokit.dronekit.alias import uninstall
 from aerokit.dronekit.runner import run_script
 
 ROOT = Path(__file__).parent.parent.parent
 EXAMPLES = ROOT / "examples" / "dronekit"
+PAGE = (ROOT / "docs" / "from-dronekit.md").read_text(encoding="utf-8")
+BLOCKS = re.findall(r"^```python\n(.*?)^```$", PAGE, re.DOTALL | re.MULTILINE)
 RECORDING = ROOT / "tests" / "recordings" / "ardupilot-copter.tlog"
 
 EXPECTED: dict[str, tuple[float, list[str], list[str]]] = {
@@ -105,3 +109,11 @@ def test_example_as_a_program() -> None:
         )
     assert (done.returncode, done.stderr) == (0, "")
     assert "mode: STABILIZE" in done.stdout
+
+
+@pytest.mark.parametrize("block", BLOCKS)
+def test_block_of_the_page(block: str) -> None:
+    """What docs/from-dronekit.md says about moving over."""
+    with served_copter(speedup=50) as address, dronekit.connect(address) as vehicle:
+        exec(compile(block, "docs/from-dronekit.md", "exec"), {"vehicle": vehicle})
+        assert vehicle.armed
