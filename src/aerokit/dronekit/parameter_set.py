@@ -17,6 +17,8 @@ __all__ = ["number_of", "set_parameter"]
 
 TRY_S = 1.0
 """How long one attempt waits, unless the link is slower."""
+LAST_TRY = 0.5
+"""The share of that for the answer to the last one."""
 ROUND_TRIPS = 3
 ALMOST = 0.01
 """ArduPilot adds it before it cuts off the fraction."""
@@ -44,7 +46,7 @@ async def set_parameter(aio: AsyncVehicle, name: str, value: float, retries: int
     PARAM_SET is sent ``retries`` + 1 times, and as many seconds are waited.
     """
     access, names = aio.parameters._access, aio.parameters._names
-    patience_s = max(retries, 1) * _try_s(aio)
+    patience_s = (retries + LAST_TRY) * _try_s(aio)
     try:
         found = (await names.find([name], patience_s))[name]
         if not isinstance(found, Found):

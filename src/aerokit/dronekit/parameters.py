@@ -204,8 +204,9 @@ class Parameters(MutableMapping[str, float], HasObservers):
         if not isinstance(name, str):
             return None
         name = name.upper()
+        is_settled = self._is_settled  # before looking: the list may come meanwhile
         known = self._values.find(name)
-        if known is None and waits and _is_possible(name) and not self._is_settled:
+        if known is None and waits and not is_settled and _is_possible(name):
             self._vehicle._run(self._wait_for, name)
             known = self._values.find(name)
         return known
