@@ -31,10 +31,10 @@ def turn(vehicle: Vehicle, heading: float, timeout: float = 20.0) -> None:
     )
     vehicle.send_mavlink(message)
 
-    def points_there() -> bool:
-        return abs((vehicle.heading - heading + 180) % 360 - 180) < 5
+    def off() -> float:
+        return float(abs((vehicle.heading - heading + 180) % 360 - 180))
 
-    vehicle.wait_for(points_there, timeout=timeout, errmsg=f"does not turn to {heading:g} degrees")
+    vehicle.wait_for(lambda: off() < 5, timeout=timeout, errmsg=f"does not turn to {heading:g} degrees")
     print(f"heading {vehicle.heading}")
 
 
