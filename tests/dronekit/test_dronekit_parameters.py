@@ -91,6 +91,7 @@ def test_the_faces_of_a_mapping(vehicle: dronekit.Vehicle) -> None:
     assert 5 not in parameters  # type: ignore[comparison-overlap]
     assert isinstance(parameters["THR_MIN"], float)
     assert parameters.setdefault("FOO", 9) == 1.0
+    assert vehicle._params_map == expected
 
 
 def test_get_takes_no_default_as_its_second_argument(vehicle: dronekit.Vehicle) -> None:

@@ -113,6 +113,10 @@ class Vehicle(FlightMethods, Maintenance, Readiness):
         return self._commands
 
     @property
+    def _params_map(self) -> dict[str, float]:
+        return self._parameters._values.copy()
+
+    @property
     def _wploader(self) -> WaypointLoader:
         return WaypointLoader(self._commands)
 
