@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from pymavlink import mavutil
 from served_copter import served_copter
 
 import aerokit.dronekit as dronekit
@@ -21,6 +22,16 @@ EXAMPLES = ROOT / "examples" / "dronekit"
 PAGE = (ROOT / "docs" / "from-dronekit.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"^```python\n(.*?)^```$", PAGE, re.DOTALL | re.MULTILINE)
 RECORDING = ROOT / "tests" / "recordings" / "ardupilot-copter.tlog"
+
+
+@pytest.fixture(autouse=True)
+def pymavlink_as_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reading a recording of MAVLink 2 makes pymavlink change its dialect and the environment, for everybody."""
+    monkeypatch.setattr(mavutil, "mavlink", mavutil.mavlink)
+    monkeypatch.setattr(mavutil, "current_dialect", mavutil.current_dialect)
+    monkeypatch.setenv("MAVLINK20", "")
+    monkeypatch.delenv("MAVLINK20")
+
 
 EXPECTED: dict[str, tuple[float, list[str], list[str]]] = {
     "hello": (20, [], ["firmware: APM:Copter-4.7.0", "mode: STABILIZE", "can be armed: True"]),

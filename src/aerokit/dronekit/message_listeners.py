@@ -76,7 +76,7 @@ class MessageListeners:
     def _attach_soon(self) -> None:
         if self._is_started:
             with contextlib.suppress(AerokitError):  # the connection is closed: nothing will come
-                self._handler.orders.post(self._attach)
+                self._handler.loop.call_soon(self._attach)
 
     def _attach(self) -> None:
         """Hear what is listened to: everything, or the messages of these names."""
