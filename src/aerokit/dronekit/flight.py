@@ -419,7 +419,7 @@ def checked_place(location: LocationGlobal | LocationGlobalRelative) -> tuple[in
         if not is_good:
             allowed = "a number of metres" if limit == math.inf else f"-{limit:g} to {limit:g} degrees"
             raise LocalProtocolError(f"location.{name} = {value!r} is not allowed: {allowed}")
-    return round(location.lat * 1e7), round(location.lon * 1e7), float(location.alt)  # type: ignore[operator, arg-type]
+    return round(location.lat * 1e7), round(location.lon * 1e7), float(location.alt)
 
 
 def _check_speed(name: str, speed: float | None) -> None:

@@ -61,9 +61,13 @@ class ListenerThread:
                 called.set()
 
         self.post(call_and_tell)
-        while not called.wait(0.2):  # in slices: Ctrl-C is noticed between them on every system
-            if self._is_stopped:
-                return
+        while not called.wait(0.2) and not self.is_stopped:  # in slices, for Ctrl-C on every system
+            pass
+
+    @property
+    def is_stopped(self) -> bool:
+        """Whether nothing is called any more."""
+        return self._is_stopped
 
     @property
     def is_current(self) -> bool:
