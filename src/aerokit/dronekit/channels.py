@@ -27,7 +27,7 @@ FIRST_VALUES = attrgetter(*(f"chan{number}_raw" for number in NUMBERS[:FEWEST]))
 MISSING: Any = object()
 
 
-class _ChannelDict(dict[str, Any]):
+class _ChannelDict(dict[Any, Any]):
     """Channels by number, as a text or an integer, with the methods that dictionaries had in Python 2."""
 
     def __getitem__(self, channel: str | int) -> Any:
@@ -220,7 +220,7 @@ class ChannelsOverride(_ChannelDict):
                 raise KeyError(str(channel))
             self._change({channel: None})
 
-    def __ior__(self, other: Any) -> ChannelsOverride:  # type: ignore[override, misc]
+    def __ior__(self, other: Any) -> ChannelsOverride:  # type: ignore[misc]
         self.update(other)
         return self
 

@@ -12,12 +12,14 @@ from aerokit.dronekit.gimbal_attitude import from_device, from_orientation, from
 from aerokit.dronekit.values import LocationGlobal, LocationGlobalRelative
 from aerokit.errors import CommandRejected, CommandTimeout, LocalProtocolError
 from aerokit.mavlink.messages import (
+    CommandAck,
     GimbalDeviceAttitudeStatus,
     MountConfigure,
     MountControl,
     MountOrientation,
     MountStatus,
 )
+from aerokit.protocols.command import command_long
 
 if TYPE_CHECKING:
     from aerokit.dronekit.gimbal_attitude import Angles
@@ -28,6 +30,7 @@ __all__ = ["Gimbal"]
 
 DO_GIMBAL_MANAGER_PITCHYAW, DO_GIMBAL_MANAGER_CONFIGURE, DO_MOUNT_CONTROL = 1000, 1001, 205
 DO_SET_ROI_LOCATION, DO_SET_ROI_NONE, DO_SET_ROI = 195, 197, 201
+ORDERS = frozenset({DO_GIMBAL_MANAGER_PITCHYAW, DO_MOUNT_CONTROL, DO_SET_ROI_LOCATION})
 LOCKED = 4 | 8 | 16
 """GIMBAL_MANAGER_FLAGS: roll and pitch from the horizon, yaw from north."""
 MAVLINK_TARGETING, RC_TARGETING = 2, 3
@@ -49,7 +52,9 @@ class Gimbal:
         self._vehicle = vehicle
         self._angles: Angles = (None, None, None)
         self._source: tuple[int, int] | None = None
-        self._has_control = False
+        self._unknown: set[int] = set()
+        self._must_claim = self._has_claimed = False
+        vehicle._on(CommandAck, self._on_ack)
         vehicle._on_any_component(GimbalDeviceAttitudeStatus, self._on_device)
         vehicle._on_any_component(MountStatus, self._on_status)
         vehicle._on_any_component(MountOrientation, self._on_orientation)
@@ -158,44 +163,59 @@ class Gimbal:
 
     # -------------------------------------------------------------------------------- orders
 
+    def _on_ack(self, ack: CommandAck) -> None:
+        """Of orders that replace each other quickly none may live to see its answer: what it says is kept here."""
+        if ack.command in ORDERS:
+            if ack.result in (UNSUPPORTED, LONG_ONLY):
+                self._unknown.add(ack.command)
+            else:
+                self._unknown.discard(ack.command)
+        if ack.command == DO_GIMBAL_MANAGER_PITCHYAW:
+            self._must_claim = ack.result == DENIED
+
     async def _rotate(self, aio: AsyncVehicle, pitch: float, roll: float, yaw: float) -> None:
-        if roll:  # the gimbal manager's command has none
+        if roll or DO_GIMBAL_MANAGER_PITCHYAW in self._unknown:  # the gimbal manager's command has no roll
             await self._control_mount(aio, pitch, roll, yaw)
             return
+        self._claim(aio)
         params = (pitch, yaw, math.nan, math.nan, LOCKED)
         try:
-            await self._take_control_for(aio, *params)
+            await aio.command(DO_GIMBAL_MANAGER_PITCHYAW, *params)
         except CommandRejected as error:
-            if error.result != UNSUPPORTED:
+            if error.result == UNSUPPORTED:
+                await self._control_mount(aio, pitch, roll, yaw)
+            elif error.result == DENIED and self._claim(aio):
+                await aio.command(DO_GIMBAL_MANAGER_PITCHYAW, *params)
+            else:
                 raise
-            await self._control_mount(aio, pitch, roll, yaw)
 
-    async def _take_control_for(self, aio: AsyncVehicle, *params: float) -> None:
-        """A gimbal manager may obey only who has said that it is in control."""
-        try:
-            await aio.command(DO_GIMBAL_MANAGER_PITCHYAW, *params)
-        except CommandRejected as error:
-            if error.result != DENIED:
-                raise
-            ids = (aio.connection.source_system, aio.connection.source_component)
-            await aio.command(DO_GIMBAL_MANAGER_CONFIGURE, *ids)
-            self._has_control = True
-            await aio.command(DO_GIMBAL_MANAGER_PITCHYAW, *params)
+    def _claim(self, aio: AsyncVehicle) -> bool:
+        """Say that we are in control, if the gimbal manager has denied us something; whether that was so."""
+        if not self._must_claim:
+            return False
+        self._must_claim, self._has_claimed = False, True
+        own = (aio.connection.source_system, aio.connection.source_component)
+        aio.send(command_long(aio.system_id, AUTOPILOT, DO_GIMBAL_MANAGER_CONFIGURE, own))
+        return True
 
     async def _control_mount(self, aio: AsyncVehicle, pitch: float, roll: float, yaw: float) -> None:
         relative = math.remainder(yaw - (self._heading() or 0.0), 360.0)
-        try:
-            await aio.command(DO_MOUNT_CONTROL, pitch, roll, relative, 0, 0, 0, MAVLINK_TARGETING)
-        except CommandRejected as error:
-            if error.result != UNSUPPORTED:
-                raise
-            self._configure_mount(aio, MAVLINK_TARGETING)
+        if not await self._command_mount(aio, pitch, roll, relative, 0, 0, 0, MAVLINK_TARGETING):
             a, b, c = (round(angle * 100) for angle in (pitch, roll, yaw))
             aio.send(MountControl(aio.system_id, AUTOPILOT, a, b, c, 0))
 
-    def _configure_mount(self, aio: AsyncVehicle, mode: int) -> None:
-        """As firmware wants it that is older than the commands; nothing answers."""
-        aio.send(MountConfigure(aio.system_id, AUTOPILOT, mode, 1, 1, 1))
+    async def _command_mount(self, aio: AsyncVehicle, *params: float) -> bool:
+        """DO_MOUNT_CONTROL; False for firmware that is older, and was told the mode by a message without an answer."""
+        if DO_MOUNT_CONTROL not in self._unknown:
+            try:
+                await aio.command(DO_MOUNT_CONTROL, *params)
+            except CommandRejected as error:
+                if error.result != UNSUPPORTED:
+                    raise
+            else:
+                return True
+        aio.send(MountConfigure(aio.system_id, AUTOPILOT, int(params[-1]), 1, 1, 1))
+        return False
 
     async def _look_at(
         self, aio: AsyncVehicle, is_absolute: bool, latitude: int, longitude: int, altitude: float
@@ -205,24 +225,24 @@ class Gimbal:
             isinstance(aio.autopilot, Px4) and not is_absolute
         ):  # it takes every altitude for one above the sea
             frame, altitude = GLOBAL_INT, altitude + await _home_altitude(aio)
-        try:
-            await aio.command_int(DO_SET_ROI_LOCATION, frame=frame, x=latitude, y=longitude, z=altitude)
-        except (CommandRejected, CommandTimeout) as error:
-            if isinstance(error, CommandRejected) and error.result not in (UNSUPPORTED, LONG_ONLY):
-                raise
-            if frame == GLOBAL_INT:
-                altitude -= await _home_altitude(aio)
-            await aio.command(DO_SET_ROI, 0, 0, 0, 0, latitude * 1e-7, longitude * 1e-7, altitude)
+        if DO_SET_ROI_LOCATION not in self._unknown:
+            try:
+                await aio.command_int(DO_SET_ROI_LOCATION, frame=frame, x=latitude, y=longitude, z=altitude)
+            except CommandTimeout:
+                pass  # very old firmware knows no COMMAND_INT, and says nothing
+            except CommandRejected as error:
+                if error.result not in (UNSUPPORTED, LONG_ONLY):
+                    raise
+            else:
+                return
+        if frame == GLOBAL_INT:
+            altitude -= await _home_altitude(aio)
+        await aio.command(DO_SET_ROI, 0, 0, 0, 0, latitude * 1e-7, longitude * 1e-7, altitude)
 
     async def _release(self, aio: AsyncVehicle) -> None:
-        try:
-            await aio.command(DO_MOUNT_CONTROL, 0, 0, 0, 0, 0, 0, RC_TARGETING)
-        except CommandRejected as error:
-            if error.result != UNSUPPORTED:
-                raise
-            self._configure_mount(aio, RC_TARGETING)
-        if self._has_control:
-            self._has_control = False
+        await self._command_mount(aio, 0, 0, 0, 0, 0, 0, RC_TARGETING)
+        if self._has_claimed:
+            self._has_claimed = False
             await aio.command(DO_GIMBAL_MANAGER_CONFIGURE, RELEASE, RELEASE)
 
 

@@ -1,0 +1,252 @@
+"""``vehicle.channels`` and their overrides."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+from dronekit_stage import Stage, on_stage
+from flight_controller import message_of
+
+from aerokit import dronekit
+from aerokit.dronekit.channels import Channels
+
+IGNORED, RELEASED = 0xFFFF, 0xFFFE
+VALUES = {f"chan{number}_raw": 1000 + number for number in range(1, 19)}
+FIRST_VALUES = {f"chan{number}_raw": 1000 + number for number in range(1, 9)}
+TOLD = {str(number): 1000 + number for number in range(1, 9)}
+
+
+@pytest.fixture
+def stage() -> Iterator[Stage]:
+    with on_stage(dronekit, connect={"rate": None}) as each:
+        yield each
+
+
+@pytest.fixture
+def channels(stage: Stage) -> Channels:
+    each: Channels = stage.vehicle.channels
+    return each
+
+
+def sent(stage: Stage, action: Callable[[], object]) -> list[tuple[int, ...]]:
+    """Each RC_CHANNELS_OVERRIDE that comes of it, without the zeros at its end."""
+    messages = []
+    for frame in stage.sent_by(action, "RC_CHANNELS_OVERRIDE"):
+        assert frame.target == (1, 0)
+        values = [getattr(frame, f"chan{number}_raw") for number in range(1, 19)]
+        while values and values[-1] == 0:
+            values.pop()
+        messages.append(tuple(values))
+    return messages
+
+
+# ------------------------------------------------------------------------------------ channels
+
+
+def test_there_are_eight_before_the_first_message(channels: Channels) -> None:
+    assert channels == {str(number): None for number in range(1, 9)}
+    assert len(channels) == channels.count == 8
+
+
+def test_rc_channels_fills_them_and_tells(stage: Stage, channels: Channels) -> None:
+    events = stage.listen("channels")
+    stage.tell("RC_CHANNELS", chancount=16, **{**VALUES, "chan3_raw": 0, "chan8_raw": IGNORED})
+    assert channels == {**TOLD, "3": 0, "8": None}
+    assert [name for _, name, _ in events] == ["channels"]
+
+
+def test_rc_channels_raw_of_another_port_makes_them_sixteen(stage: Stage, channels: Channels) -> None:
+    stage.tell("RC_CHANNELS_RAW", port=0, **FIRST_VALUES)
+    assert channels == TOLD
+    stage.tell("RC_CHANNELS_RAW", port=1, **{**FIRST_VALUES, "chan1_raw": 1900})
+    assert len(channels) == 16
+    assert channels[9] == channels["9"] == 1900
+    assert channels["1"] == 1001
+    stage.tell("RC_CHANNELS_RAW", port=2, **FIRST_VALUES)
+    assert len(channels) == 16
+
+
+def test_more_channels_are_read_when_they_are_asked_for(stage: Stage, channels: Channels) -> None:
+    channels.count = 18
+    assert channels.get("18", 0) is None
+    stage.tell("RC_CHANNELS", chancount=18, **VALUES)
+    assert channels["18"] == 1018
+    channels.count = 8
+    assert channels == TOLD
+    for count in (7, 19):
+        with pytest.raises(ValueError, match="8 to 18"):
+            channels.count = count
+
+
+def test_numbers_are_texts_or_integers(channels: Channels) -> None:
+    assert channels[1] is None
+    assert 8 in channels
+    assert "8" in channels
+    assert channels.has_key(8)
+    assert 9 not in channels
+    assert channels.get(9, 5) == 5
+    with pytest.raises(KeyError, match="9"):
+        channels["9"]
+
+
+def test_they_have_the_methods_of_python_2(channels: Channels) -> None:
+    assert list(channels.iterkeys()) == list(channels.viewkeys()) == list(channels)
+    assert list(channels.itervalues()) == list(channels.viewvalues()) == [None] * 8
+    assert dict(channels.iteritems()) == dict(channels.viewitems()) == channels.copy() == channels
+    assert Channels.fromkeys("ab", 1) == {"a": 1, "b": 1}
+
+
+def test_they_are_the_vehicles_to_change(channels: Channels) -> None:
+    changes: tuple[Callable[[Any], object], ...] = (
+        lambda each: each.__setitem__("1", 1),
+        lambda each: each.__delitem__("1"),
+        lambda each: each.__ior__({"1": 1}),
+        lambda each: each.update({"1": 1}),
+        lambda each: each.setdefault("1", 1),
+        lambda each: each.pop("1"),
+        lambda each: each.popitem(),
+        lambda each: each.clear(),
+    )
+    for change in changes:
+        with pytest.raises(TypeError, match="is not supported on Channels object"):
+            change(channels)
+    assert len(channels) == 8
+
+
+def test_readers_see_all_values_of_one_message(stage: Stage, channels: Channels) -> None:
+    torn, ended = [], threading.Event()
+
+    def read() -> None:
+        while not ended.is_set():
+            for values in (set(channels.values()), {value for _, value in channels.items()}):
+                if len(values) != 1:
+                    torn.append(values)
+
+    reader = threading.Thread(target=read)
+    reader.start()
+    for value in range(1000, 1100):
+        stage.fc.send(message_of("RC_CHANNELS", **dict.fromkeys(VALUES, value)))
+    stage.settle()
+    ended.set()
+    reader.join()
+    assert not torn
+
+
+# ----------------------------------------------------------------------------------- overrides
+
+
+def test_each_change_is_sent(stage: Stage, channels: Channels) -> None:
+    overrides = channels.overrides
+    assert sent(stage, lambda: overrides.__setitem__("2", 200)) == [(0, 200)]
+    assert sent(stage, lambda: overrides.__setitem__(3, 1500)) == [(0, 200, 1500)]
+    assert sent(stage, lambda: overrides.__delitem__("3")) == [(0, 200)]
+    assert sent(stage, lambda: overrides.__setitem__("2", None)) == [()]
+    assert sent(stage, lambda: overrides.__setitem__("2", 0)) == [()]
+    assert sent(stage, lambda: setattr(channels, "overrides", {"5": None, 3: 500})) == [(0, 0, 500)]
+    assert channels.overrides is overrides
+    assert overrides == {"3": 500}
+    assert sent(stage, lambda: setattr(channels, "overrides", {})) == [()]
+    assert overrides == {}
+
+
+def test_the_methods_of_a_dictionary_send(stage: Stage, channels: Channels) -> None:
+    overrides = channels.overrides
+    assert sent(stage, lambda: overrides.update({"1": 1100}, **{"2": 1200})) == [(1100, 1200)]
+    assert sent(stage, lambda: overrides.setdefault(3, 1300)) == [(1100, 1200, 1300)]
+    assert sent(stage, lambda: overrides.setdefault("3", 1400)) == []
+    assert sent(stage, lambda: overrides.pop(2)) == [(1100, 0, 1300)]
+    assert sent(stage, lambda: overrides.pop("2", None)) == []
+    assert sent(stage, lambda: overrides.popitem()) == [(1100,)]
+    assert sent(stage, lambda: overrides.__ior__({4: 1400})) == [(1100, 0, 0, 1400)]
+    assert sent(stage, overrides.clear) == [()]
+    with pytest.raises(KeyError):
+        overrides.pop("2")
+    with pytest.raises(KeyError):
+        overrides.popitem()
+
+
+def test_overrides_count_what_is_overridden(channels: Channels) -> None:
+    overrides = channels.overrides
+    assert not overrides
+    assert len(overrides) == 0
+    overrides["3"] = 1500
+    assert len(overrides) == 1
+    assert 3 in overrides
+    assert "3" in overrides
+    assert overrides.get(3) == overrides[3] == overrides["3"] == 1500
+    assert str(overrides) == "{'3': 1500}"
+    assert overrides.has_key("3")
+    with pytest.raises(KeyError, match="2"):
+        overrides["2"]
+
+
+WRONG: tuple[tuple[dict[str, Any], type[Exception], str], ...] = (
+    ({"9": 900}, KeyError, "Invalid channel index 9"),
+    ({"0": 900}, KeyError, "Invalid channel index 0"),
+    ({"x": 900}, ValueError, "'x'"),
+    ({"2": 1200, "3": 70000}, ValueError, "channel 3 = 70000 is not allowed"),
+    ({"3": -1}, ValueError, "channel 3 = -1"),
+    ({"3": 1500.5}, ValueError, "channel 3 = 1500.5"),
+    ({"3": float("nan")}, ValueError, "channel 3 = nan"),
+    ({"3": "1500"}, ValueError, "channel 3 = '1500'"),
+)
+
+
+def test_what_is_wrong_changes_nothing(stage: Stage, channels: Channels) -> None:
+    channels.overrides["1"] = 1100
+    stage.reached()
+
+    def order() -> None:
+        for change in (channels.overrides.update, channels.overrides._replace):
+            for wrong, kind, text in WRONG:
+                with pytest.raises(kind, match=text):
+                    change(wrong)
+
+    assert sent(stage, order) == []
+    assert channels.overrides == {"1": 1100}
+    assert sent(stage, lambda: channels.overrides.__setitem__("2", 1200)) == [(1100, 1200)]
+
+
+def test_a_channel_that_is_not_overridden_cannot_be_deleted(stage: Stage, channels: Channels) -> None:
+    def order() -> None:
+        with pytest.raises(KeyError, match="3"):
+            del channels.overrides["3"]
+
+    assert sent(stage, order) == []
+
+
+def test_channels_above_eight_are_left_alone_until_they_were_overridden(
+    stage: Stage, channels: Channels
+) -> None:
+    channels.count = 18
+    overrides = channels.overrides
+    assert sent(stage, lambda: overrides.__setitem__("10", 1900)) == [(*(0,) * 9, 1900)]
+    assert sent(stage, lambda: overrides.__delitem__("10")) == [(*(0,) * 9, RELEASED)]
+    assert sent(stage, lambda: overrides.__setitem__(1, 1100)) == [(1100, *(0,) * 8, RELEASED)]
+    assert sent(stage, lambda: overrides.__setitem__(18, 1200)) == [
+        (1100, *(0,) * 8, RELEASED, *(0,) * 7, 1200)
+    ]
+
+
+def test_mavlink_1_has_eight_channels_to_override() -> None:
+    with on_stage(dronekit, {"version": 1}, {"rate": None}, _knows_only_mavlink_1) as stage:
+        channels = stage.vehicle.channels
+        assert sent(stage, lambda: channels.overrides.__setitem__("2", 200)) == [(0, 200)]
+        channels.count = 16
+        with pytest.raises(dronekit.APIException, match="MAVLink 1"):
+            channels.overrides["9"] = 1500
+        assert channels.overrides == {"2": 200}
+
+
+def _knows_only_mavlink_1(controller: Any) -> None:
+    controller.capabilities &= ~8192
+
+
+def test_after_closing_nothing_can_be_overridden(stage: Stage, channels: Channels) -> None:
+    stage.vehicle.close()
+    with pytest.raises(dronekit.APIException):
+        channels.overrides["1"] = 1500
+    assert channels.overrides == {}
