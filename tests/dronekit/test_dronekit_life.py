@@ -296,3 +296,20 @@ def test_as_a_context_manager(address: str) -> None:
     with dronekit.connect(address) as vehicle:
         assert vehicle.mode.name == "STABILIZE"
     assert own_threads() == threads
+
+
+def test_a_link_that_is_reset_comes_back(vehicle: dronekit.Vehicle, caplog: pytest.LogCaptureFixture) -> None:
+    connection = vehicle._handler.connection
+    vehicle._handler.reset()
+    eventually(lambda: "is back" in caplog.text or connection.counts(1)[0] == 0 or connection.link.is_away)
+    told: list[str] = []
+    eventually(lambda: not connection.link.is_away)
+    vehicle.on_message("ATTITUDE")(lambda _, name, message: told.append(name))
+    eventually(lambda: told)
+    vehicle.wait_for_mode("ALT_HOLD", timeout=LIMIT_S)
+    vehicle.wait_for_mode("STABILIZE", timeout=LIMIT_S)
+
+
+def test_which_modes_there_are(vehicle: dronekit.Vehicle) -> None:
+    assert vehicle._is_mode_available(5)
+    assert not vehicle._is_mode_available(222)

@@ -388,3 +388,24 @@ def test_closed_after_its_loop() -> None:
     loop.run_until_complete(asyncio.sleep(0))
     loop.close()
     link.close()
+
+
+async def test_a_link_that_is_opened_again_on_purpose() -> None:
+    device, heard = Device(), Told()
+    link = ReconnectingLink(device.plug)
+    link.reopen()  # it is not open yet
+    await link.open(heard)
+    link.reopen()
+    link.reopen()
+    assert link.is_away
+    await anyio.sleep(0.3)
+    device.plugs[0].hear(b"too late")
+    device.plugs[1].hear(b"hello")
+    link.close()
+    await link.wait_closed()
+    assert len(device.plugs) == 2
+    assert heard.told == [
+        "away: device was closed to be opened again",
+        "back after 0.2 s",
+        "hello",
+    ]

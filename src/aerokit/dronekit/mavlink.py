@@ -18,6 +18,7 @@ from aerokit.dronekit.exceptions import APIException
 from aerokit.dronekit.listener_thread import ListenerThread
 from aerokit.dronekit.orders import Orders
 from aerokit.errors import AerokitError, ConnectionClosed, LinkOpenError
+from aerokit.links.reconnecting import ReconnectingLink
 
 if TYPE_CHECKING:
     from aerokit.dronekit.master import Master
@@ -157,6 +158,12 @@ class MAVConnection:
     def start(self) -> None:
         """Nothing is left to do: reception and heartbeat run since the connection was made."""
         self.connection.raise_if_ended()
+
+    def reset(self) -> None:
+        """Close the link and open it again."""
+        link = self.connection.link
+        if isinstance(link, ReconnectingLink):
+            self.loop.call_soon(link.reopen)
 
     def stop_threads(self) -> None:
         """As :meth:`close`."""

@@ -19,6 +19,7 @@ from aerokit.dronekit.link_watch import watch_link
 from aerokit.dronekit.locations import Locations
 from aerokit.dronekit.maintenance import Maintenance
 from aerokit.dronekit.message_listeners import MessageListener, MessageListeners
+from aerokit.dronekit.modes import mode_name
 from aerokit.dronekit.parameters import Parameters
 from aerokit.dronekit.pymavlink_messages import sendable
 from aerokit.dronekit.readiness import Readiness
@@ -254,6 +255,9 @@ class Vehicle(FlightMethods, Maintenance, Readiness):
     @property
     def _master(self) -> Master:
         return self._handler.master
+
+    def _is_mode_available(self, mode_code: int, base_mode: int = 0) -> bool:
+        return not mode_name(self.aio, base_mode or 1, mode_code).endswith(f" {mode_code}")
 
     @property
     def _target_system(self) -> int:

@@ -107,6 +107,12 @@ class ReconnectingLink(Link):
         """See `Link.has_peer`."""
         return self._is_up and self._link.has_peer(peer)
 
+    def reopen(self) -> None:
+        """Close the present link and open it again, as if it had been lost; nothing happens while it is away."""
+        if self._ears is not None and self._is_up:
+            self._link.close()
+            self._lost(self._ears, LinkLost(f"{self.address} was closed to be opened again"))
+
     def close(self) -> None:
         """See `Link.close`."""
         if not self._is_closed:
