@@ -119,9 +119,9 @@ class Maintenance:
 
 def _tune_text(tune: str | bytes) -> str:
     try:
-        text = tune.encode("ascii") if isinstance(tune, str) else bytes(tune)
+        text = tune.encode() if isinstance(tune, str) else tune
         notes = text.rstrip(b"\0").decode("ascii")
-    except (UnicodeError, TypeError):
+    except (UnicodeError, AttributeError):
         raise LocalProtocolError(f"tune = {tune!r} is not allowed: a text of ASCII characters") from None
     if "\0" in notes or len(notes) > sum(TUNE_SIZES):
         raise LocalProtocolError(

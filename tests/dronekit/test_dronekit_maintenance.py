@@ -1,0 +1,142 @@
+"""Calibrations, tunes, reboots and the request of capabilities: what is sent, and what is told of a refusal."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+from dronekit_stage import Stage, on_stage
+from flight_controller import FlightController
+
+from aerokit import dronekit
+
+CALIBRATION, MAG_CALIBRATION, REBOOT, CAPABILITIES = 241, 42424, 246, 520
+FAILED, IN_PROGRESS = 4, 5
+
+
+@pytest.fixture
+def stage() -> Iterator[Stage]:
+    with on_stage(dronekit, connect={"rate": None}) as each:
+        yield each
+
+
+def test_each_calibration_is_a_command(stage: Stage) -> None:
+    vehicle = stage.vehicle
+    orders: tuple[tuple[Callable[[], object], tuple[int, ...]], ...] = (
+        (vehicle.send_calibrate_gyro, (CALIBRATION, 1, 0, 0, 0, 0, 0, 0)),
+        (vehicle.send_calibrate_barometer, (CALIBRATION, 0, 0, 1, 0, 0, 0, 0)),
+        (vehicle.send_calibrate_vehicle_level, (CALIBRATION, 0, 0, 0, 0, 2, 0, 0)),
+        (vehicle.send_calibrate_accelerometer, (CALIBRATION, 0, 0, 0, 0, 1, 0, 0)),
+        (lambda: vehicle.send_calibrate_accelerometer(simple=True), (CALIBRATION, 0, 0, 0, 0, 4, 0, 0)),
+        (vehicle.send_calibrate_magnetometer, (MAG_CALIBRATION, 0, 1, 1, 0, 0, 0, 0)),
+    )
+    for order, expected in orders:
+        assert stage.commands_of(order) == [expected]
+
+
+def test_px4_calibrates_its_compasses_by_another_command() -> None:
+    with on_stage(dronekit, {"autopilot": 12}, {"rate": None}) as stage:
+        sent = stage.commands_of(stage.vehicle.send_calibrate_magnetometer)
+        assert sent == [(CALIBRATION, 0, 1, 0, 0, 0, 0, 0)]
+
+
+def test_a_refused_calibration_is_a_warning_with_the_reason(stage: Stage) -> None:
+    stage.fc.results[CALIBRATION] = FAILED
+    stage.fc.reasons[CALIBRATION] = "Disarm to allow calibration"
+    with stage.logged() as lines:
+        stage.vehicle.send_calibrate_gyro()
+        stage.vehicle._handler.orders.wait(10.0)
+    assert [line for line in lines if "FAILED" in line and "Disarm to allow calibration" in line]
+
+
+def test_a_long_calibration_is_sent_once(stage: Stage) -> None:
+    stage.fc.results[CALIBRATION] = IN_PROGRESS
+    since = stage.fc.mark()
+    with stage.logged() as lines:
+        stage.vehicle.send_calibrate_gyro()
+        stage.fc.wait_for_command(CALIBRATION, since=since)
+        stage.settle()
+        stage.tell("COMMAND_ACK", command=CALIBRATION, result=0)
+        stage.vehicle._handler.orders.wait(10.0)
+    assert len(stage.fc.commands(CALIBRATION, since=since)) == 1
+    assert not [line for line in lines if line.startswith("WARNING")]
+
+
+def test_reboot(stage: Stage) -> None:
+    assert stage.commands_of(stage.vehicle.reboot) == [(REBOOT, 1, 0, 0, 0, 0, 0, 0)]
+
+
+def test_the_request_of_capabilities_has_the_arguments_of_a_message_listener(stage: Stage) -> None:
+    vehicle = stage.vehicle
+    stage.reached()  # connecting asks for them, too
+    for request in (vehicle.send_capabilities_request, vehicle.send_capabilties_request):
+        since = stage.fc.mark()
+        request(vehicle, "HEARTBEAT", None)
+        stage.reached()
+        (sent,) = stage.fc.commands(CAPABILITIES, since=since)
+        assert (sent.target, sent.param1) == ((1, 0), 1)
+
+
+# ---------------------------------------------------------------------------------------- tunes
+
+
+def played(stage: Stage, tune: str | bytes) -> tuple[str, str]:
+    (sent,) = stage.sent_by(lambda: stage.vehicle.play_tune(tune), "PLAY_TUNE")
+    assert sent.target == (1, 0)
+    return sent.tune, sent.tune2
+
+
+def test_a_tune_is_text_or_bytes(stage: Stage) -> None:
+    assert played(stage, "AAAA") == ("AAAA", "")
+    assert played(stage, b"MFT240L8 O4aO5dc\0") == ("MFT240L8 O4aO5dc", "")
+
+
+def test_a_long_tune_has_two_parts(stage: Stage) -> None:
+    tune = "abcdefghij" * 23
+    assert played(stage, tune) == (tune[:30], tune[30:])
+
+
+def test_what_is_no_tune_is_not_sent(stage: Stage) -> None:
+    wrong: tuple[tuple[Any, str], ...] = (
+        ("A" * 231, "231 characters"),
+        ("ä", "ASCII"),
+        (b"\xe4", "ASCII"),
+        ("A\0B", "NUL"),
+        (5, "ASCII"),
+        (None, "ASCII"),
+    )
+
+    def play() -> None:
+        for tune, text in wrong:
+            with pytest.raises(ValueError, match=text):
+                stage.vehicle.play_tune(tune)
+
+    assert stage.sent_by(play, "PLAY_TUNE") == []
+
+
+def test_mavlink_1_has_no_tunes() -> None:
+    def prepare(controller: FlightController) -> None:
+        controller.capabilities &= ~8192
+
+    with on_stage(dronekit, {"version": 1}, {"rate": None}, prepare) as stage:
+        stage.reached()
+        with pytest.raises(dronekit.APIException, match="MAVLink 2"):
+            stage.vehicle.play_tune("A")
+
+
+def test_after_closing_everything_raises(stage: Stage) -> None:
+    vehicle = stage.vehicle
+    vehicle.close()
+    for order in (
+        vehicle.send_calibrate_gyro,
+        vehicle.send_calibrate_magnetometer,
+        vehicle.send_calibrate_vehicle_level,
+        vehicle.send_calibrate_barometer,
+        vehicle.send_calibrate_accelerometer,
+        vehicle.reboot,
+        lambda: vehicle.play_tune("A"),
+        lambda: vehicle.send_capabilities_request(vehicle, "HEARTBEAT", None),
+    ):
+        with pytest.raises(dronekit.APIException):
+            order()
