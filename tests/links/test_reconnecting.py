@@ -406,6 +406,6 @@ async def test_a_link_that_is_opened_again_on_purpose() -> None:
     assert len(device.plugs) == 2
     assert heard.told == [
         "away: device was closed to be opened again",
-        "back after 0.2 s",
+        "back after 0.3 s",
         "hello",
     ]
