@@ -355,12 +355,9 @@ def row_31_channels_are_read(stage: Stage) -> Any:
 # --------------------------------------------------------------------------------------- gimbal
 
 
-@scenario((4, [(201, 1, -35.1, 149.2, 10.0)]), controller={"mode": 4})
-def roi(stage: Stage) -> Any:
-    place = stage.dronekit.LocationGlobalRelative(-35.1, 149.2, 10)
-    sent = stage.sent_by(
-        lambda: stage.vehicle.gimbal.target_location(place), "COMMAND_LONG", "MOUNT_CONFIGURE"
-    )
-    (mode,) = [frame.mount_mode for frame in sent if frame.name == "MOUNT_CONFIGURE"]
-    commands = [frame for frame in sent if frame.name == "COMMAND_LONG" and frame.command == 201]
-    return mode, [(201, frame.target[1], *(round(p, 4) for p in frame.params[4:])) for frame in commands]
+@scenario([(201, -35.1, 149.2, 10.0)], controller={"mode": 4})
+def region_of_interest_of_old_firmware(stage: Stage) -> Any:
+    stage.fc.results[195] = 3  # DO_SET_ROI_LOCATION, which came later
+    stage.vehicle.gimbal.target_location(stage.dronekit.LocationGlobalRelative(-35.1, 149.2, 10))
+    sent = stage.fc.wait_for_command(201)
+    return [(sent.command, *(round(p, 4) for p in sent.params[4:]))]

@@ -23,19 +23,19 @@ RELATIVE = "LocationGlobalRelative:lat=-35.363261,lon=149.16523,alt=10.0"
 
 @scenario(
     {
-        "heartbeat": (6, 8, 0, 0),
+        "heartbeat": (6, 8, 0),
         "source": (255, 0),
         "stream": (1, 0, 4, 1),
         "version": (520, 1.0),
         "parameters": 1,
     },
-    controller={"version": 1},
+    is_slow=True,
 )
 def row_01_frames_of_a_connect(stage: Stage) -> Any:
     heartbeat, stream = stage.fc.wait_for("HEARTBEAT"), stage.fc.wait_for("REQUEST_DATA_STREAM")
     version = stage.fc.wait_for_command(520)
     return {
-        "heartbeat": (heartbeat.type, heartbeat.autopilot, heartbeat.base_mode, heartbeat.system_status),
+        "heartbeat": (heartbeat.type, heartbeat.autopilot, heartbeat.base_mode),
         "source": (heartbeat.system, heartbeat.component),
         "stream": (stream.target[0], stream.req_stream_id, stream.req_message_rate, stream.start_stop),
         "version": (version.command, version.param1),
@@ -43,14 +43,14 @@ def row_01_frames_of_a_connect(stage: Stage) -> Any:
     }
 
 
-@scenario([], connect={"rate": None})
+@scenario([], connect={"rate": None}, is_slow=True)
 def row_02_no_rate_asks_for_no_streams(stage: Stage) -> Any:
     stage.fc.wait_for("HEARTBEAT")
     stage.reached()
     return stage.fc.received("REQUEST_DATA_STREAM")
 
 
-@scenario((10, [(42, 7)]), connect={"rate": 10, "source_system": 42, "source_component": 7})
+@scenario((10, [(42, 7)]), connect={"rate": 10, "source_system": 42, "source_component": 7}, is_slow=True)
 def row_02_rate_and_source(stage: Stage) -> Any:
     stream = stage.fc.wait_for("REQUEST_DATA_STREAM")
     stage.fc.wait_for("HEARTBEAT")
@@ -62,8 +62,8 @@ def row_02_rate_and_source(stage: Stage) -> Any:
 
 @scenario(("GUIDED", True, True, False, "VehicleMode:GUIDED"))
 def row_06_mode(stage: Stage) -> Any:
-    stage.beat(custom_mode=4)
     stage.fc.custom_mode = 4
+    stage.beat()
     mode, other = stage.vehicle.mode, stage.dronekit.VehicleMode("GUIDED")
     return mode.name, mode == "GUIDED", mode == other, mode != "GUIDED", str(mode)
 
@@ -212,17 +212,19 @@ RAW = {f"chan{number}_raw": 1400 + 100 * number for number in range(1, 9)}
     (
         dict.fromkeys(map(str, range(1, 9))),
         {str(number): 1400 + 100 * number for number in range(1, 9)},
-        8,
-        True,
-        "KeyError: '9'",
+        (8, True, "KeyError: '9'"),
+        (16, 1500, True, 2),
     ),
     controller={"version": 1},
 )
 def row_28_channels(stage: Stage) -> Any:
-    channels = stage.vehicle.channels
+    channels, events = stage.vehicle.channels, stage.listen("channels")
     before = dict(channels)
     stage.tell("RC_CHANNELS_RAW", port=0, **RAW)
-    return before, dict(channels), len(channels), channels[1] == channels["1"], caught(lambda: channels["9"])
+    eight = dict(channels)
+    seen = len(channels), channels[1] == channels["1"], caught(lambda: channels["9"])
+    stage.tell("RC_CHANNELS_RAW", port=1, **RAW)
+    return before, eight, seen, (len(channels), channels[9], channels[9] == channels["9"], len(events))
 
 
 @scenario(
@@ -252,7 +254,7 @@ def rangefinder(stage: Stage) -> Any:
     return str(stage.vehicle.rangefinder), [(name, value) for _, name, value in events]
 
 
-@scenario(["home_location", "home_location"])
+@scenario(["home_location", "home_location"], prepare=lambda fc: setattr(fc, "home", None))
 def home_is_told_each_time(stage: Stage) -> Any:
     events = stage.listen("home_location")
     for _ in range(2):

@@ -30,6 +30,10 @@ __all__ = [
 ]
 
 PATIENCE_S = 10.0
+ALWAYS = ("PING", "HEARTBEAT", "REQUEST_DATA_STREAM", "PARAM_REQUEST_READ")
+"""Goes on by itself, whatever the program does."""
+QUIET = 3
+"""Round trips without anything new after which nothing more comes of what was done."""
 
 
 class Stage:
@@ -46,14 +50,25 @@ class Stage:
         """Wait until everything that the flight controller has sent is taken in, and all listeners have heard of it."""
         number = next(self._numbers)
         with self._saw:
-            for _ in range(int(PATIENCE_S)):  # datagrams get lost
+            for _ in range(int(PATIENCE_S / 0.1)):  # datagrams get lost
                 self.fc.tell("DEBUG", ind=7, time_boot_ms=number)
-                if self._saw.wait_for(lambda: number in self._seen, 1.0):
+                if self._saw.wait_for(lambda: number in self._seen, 0.1):
                     return
         raise AssertionError("the vehicle's listeners heard nothing")
 
     def reached(self) -> None:
-        """Wait until everything that the program has sent has come to the flight controller."""
+        """Wait until everything that the program has sent has come to the flight controller, and what follows of it.
+
+        Answers to what has come may have more sent: of two equal commands the second may wait for the first's answer.
+        """
+        count, quiet = -1, 0
+        while quiet < QUIET:
+            self._round_trip()
+            before, count = count, len([each for each in self.fc.received() if each.name not in ALWAYS])
+            quiet = quiet + 1 if count == before else 0
+
+    def _round_trip(self) -> None:
+        self.settle()
         number = next(self._numbers)
         self.vehicle.send_mavlink(self.vehicle.message_factory.ping_encode(0, number, 0, 0))
         self.fc.wait_for("PING", lambda frame: frame.seq == number)

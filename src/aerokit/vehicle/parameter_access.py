@@ -176,9 +176,10 @@ class ParameterAccess:
             patience_s=patience_s,
             on_progress=on_progress,
         )
+        since = self.store.updates
         with self._attended():
             table = await transfers.run(exchange)
-        self.store.replace(self._with_known_defaults(table), since=self.store.updates)
+        self.store.replace(self._with_known_defaults(table), since=since)
 
     # ------------------------------------------------------------------------------- some of them
 
