@@ -18,7 +18,7 @@ ABOVE_HOME = mavutil.mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT
 
 
 def item(command: int, lat: float, lon: float, altitude: float) -> Command:
-    return Command(0, 0, 0, ABOVE_HOME, command, 0, 0, 0, 0, 0, 0, lat, lon, altitude)
+    return Command(0, 0, 0, ABOVE_HOME, command, 0, 1, 0, 0, 0, 0, lat, lon, altitude)
 
 
 def download(vehicle: Vehicle) -> None:
@@ -39,22 +39,22 @@ def upload_square(vehicle: Vehicle, home: LocationGlobal, side: float, altitude:
     commands.upload()
 
 
-def arm(vehicle: Vehicle) -> None:
+def arm(vehicle: Vehicle, mode: str) -> None:
     while not vehicle.is_armable:
         time.sleep(POLL_S)
-    vehicle.mode = VehicleMode("GUIDED")
+    vehicle.mode = VehicleMode(mode)
     vehicle.armed = True
     while not vehicle.armed:
         time.sleep(POLL_S)
 
 
-def fly_mission(vehicle: Vehicle, altitude: float) -> None:
-    """ArduCopter wants to be in the air before a mission in AUTO begins, unless AUTO_OPTIONS allows it."""
+def fly_mission(vehicle: Vehicle, mode: str, altitude: float) -> None:
+    """ArduCopter wants to be in the air before a mission begins, unless AUTO_OPTIONS allows it to take off so."""
     vehicle.simple_takeoff(altitude)
     while vehicle.location.global_relative_frame.alt < altitude * 0.9:
         time.sleep(POLL_S)
     vehicle.commands.next = 1
-    vehicle.mode = VehicleMode("AUTO")
+    vehicle.mode = VehicleMode(mode)
     shown = 0
     while vehicle.armed:
         if vehicle.commands.next != shown:
@@ -68,6 +68,7 @@ def main() -> None:
     parser.add_argument("--connect", metavar="ADDRESS", default="udp:127.0.0.1:14550")
     parser.add_argument("--side", type=float, default=40.0, help="metres")
     parser.add_argument("--altitude", type=float, default=10.0, help="metres above home")
+    parser.add_argument("--px4", action="store_true", help="for the names of its modes")
     options = parser.parse_args()
 
     vehicle = connect(options.connect, wait_ready=True)
@@ -81,8 +82,8 @@ def main() -> None:
         print(
             f"{command.seq}: command {command.command} at {command.x:.6f}, {command.y:.6f}, {command.z:g} m"
         )
-    arm(vehicle)
-    fly_mission(vehicle, options.altitude)
+    arm(vehicle, "LOITER" if options.px4 else "GUIDED")
+    fly_mission(vehicle, "MISSION" if options.px4 else "AUTO", options.altitude)
     print("landed")
     vehicle.close()
 

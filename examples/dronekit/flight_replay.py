@@ -39,7 +39,7 @@ def upload(vehicle: Vehicle, track: list[LocationGlobalRelative]) -> None:
     commands.clear()
     for place in track:
         commands.add(
-            Command(0, 0, 0, ABOVE_HOME, WAYPOINT, 0, 0, 0, 0, 0, 0, place.lat, place.lon, place.alt)
+            Command(0, 0, 0, ABOVE_HOME, WAYPOINT, 0, 1, 0, 0, 0, 0, place.lat, place.lon, place.alt)
         )
     commands.upload()
 
@@ -50,6 +50,7 @@ def main() -> None:
     parser.add_argument("--connect", metavar="ADDRESS", default="udp:127.0.0.1:14550")
     parser.add_argument("--spacing", type=float, default=5.0, help="metres between waypoints")
     parser.add_argument("--farthest", type=float, default=1000.0, help="metres from here to its beginning")
+    parser.add_argument("--px4", action="store_true", help="for the names of its modes")
     options = parser.parse_args()
 
     track = track_of(options.recording, options.spacing, lowest=2.0)
@@ -63,11 +64,11 @@ def main() -> None:
     upload(vehicle, track)
 
     vehicle.wait_for_armable(timeout=60)
-    vehicle.wait_for_mode("GUIDED", timeout=10)
+    vehicle.wait_for_mode("LOITER" if options.px4 else "GUIDED", timeout=10)
     vehicle.arm(timeout=10)
     vehicle.wait_simple_takeoff(track[0].alt, epsilon=0.5, timeout=60)
     vehicle.commands.next = 1
-    vehicle.mode = VehicleMode("AUTO")
+    vehicle.mode = VehicleMode("MISSION" if options.px4 else "AUTO")
     last = track[-1]
     while distance(vehicle.location.global_relative_frame, last) > 2.0:
         print(f"to waypoint {vehicle.commands.next}, {vehicle.location.global_relative_frame}")

@@ -11,6 +11,8 @@ from collections.abc import Callable
 from dronekit import LocationGlobalRelative, VehicleMode, connect
 
 POLL_S = 0.2
+MODES = ("GUIDED", "LOITER", "TAKEOFF")
+"""In which an ArduPilot, or a PX4, goes where it is told."""
 METRES_PER_DEGREE = 111_320.0
 Position = Callable[[], LocationGlobalRelative]
 
@@ -40,12 +42,13 @@ def main() -> None:
     parser.add_argument("--altitude", type=float, default=10.0, help="metres above home")
     parser.add_argument("--walking-speed", type=float, default=1.5, help="metres per second")
     parser.add_argument("--seconds", type=float, default=30.0)
+    parser.add_argument("--mode", default="GUIDED", help="in which it is told where to go (PX4: LOITER)")
     options = parser.parse_args()
 
     vehicle = connect(options.connect, wait_ready=True)
     leader = connect(options.leader, wait_ready=["location"]) if options.leader else None
     vehicle.wait_for_armable(timeout=60)
-    vehicle.wait_for_mode("GUIDED", timeout=10)
+    vehicle.wait_for_mode(options.mode, timeout=10)
     vehicle.arm(timeout=10)
     vehicle.wait_simple_takeoff(options.altitude, epsilon=0.5, timeout=60)
 
@@ -55,7 +58,7 @@ def main() -> None:
         location = leader.location
         where = lambda: location.global_relative_frame  # noqa: E731
     end = time.monotonic() + options.seconds
-    while time.monotonic() < end and vehicle.mode == "GUIDED":  # a pilot who changes the mode has it back
+    while time.monotonic() < end and vehicle.mode.name in MODES:  # a pilot who changes the mode has it back
         place = where()
         vehicle.simple_goto(LocationGlobalRelative(place.lat, place.lon, options.altitude))
         print(f"{distance(vehicle.location.global_relative_frame, place):.0f} m behind")

@@ -10,6 +10,8 @@ import time
 from dronekit import LocationGlobalRelative, Vehicle, VehicleMode, connect
 
 POLL_S = 0.2
+MODES = ("GUIDED", "LOITER", "TAKEOFF")
+"""In which an ArduPilot, or a PX4, goes where it is told."""
 METRES_PER_DEGREE = 111_320.0
 
 
@@ -26,11 +28,11 @@ def distance(one: LocationGlobalRelative, other: LocationGlobalRelative) -> floa
     return math.hypot(north, east)
 
 
-def arm_and_take_off(vehicle: Vehicle, altitude: float) -> None:
+def arm_and_take_off(vehicle: Vehicle, mode: str, altitude: float) -> None:
     while not vehicle.is_armable:
         time.sleep(POLL_S)
-    vehicle.mode = VehicleMode("GUIDED")
-    while vehicle.mode != "GUIDED":
+    vehicle.mode = VehicleMode(mode)
+    while vehicle.mode != mode:
         time.sleep(POLL_S)
     vehicle.armed = True
     while not vehicle.armed:
@@ -44,7 +46,7 @@ def arm_and_take_off(vehicle: Vehicle, altitude: float) -> None:
 def go_to(vehicle: Vehicle, place: LocationGlobalRelative, speed: float) -> None:
     """Return when it is there, or when somebody else has taken over."""
     vehicle.simple_goto(place, groundspeed=speed)
-    while vehicle.mode == "GUIDED":
+    while vehicle.mode.name in MODES:
         left = distance(vehicle.location.global_relative_frame, place)
         if left < 1.0:
             print("there")
@@ -57,10 +59,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Fly to two places in GUIDED mode.")
     parser.add_argument("--connect", metavar="ADDRESS", default="udp:127.0.0.1:14550")
     parser.add_argument("--altitude", type=float, default=10.0, help="metres above home")
+    parser.add_argument("--mode", default="GUIDED", help="in which it is told where to go (PX4: LOITER)")
     options = parser.parse_args()
 
     vehicle = connect(options.connect, wait_ready=True)
-    arm_and_take_off(vehicle, options.altitude)
+    arm_and_take_off(vehicle, options.mode, options.altitude)
     start = vehicle.location.global_relative_frame
     go_to(vehicle, offset(start, north=30, east=0), speed=5)
     go_to(vehicle, offset(start, north=30, east=30), speed=10)
