@@ -1,4 +1,4 @@
-"""Sessions: tests (each Python that is there), lint, types, docs, bench, bench_transfers, badlinks, demo.
+"""Sessions: tests (each Python that is there), lint, types, docs, bench and bench_…, badlinks, demo.
 
 `nox -l` lists them.
 """
@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import shutil
+from pathlib import Path
 
 import nox
 
@@ -64,6 +65,23 @@ def bench_transfers(session: nox.Session) -> None:
     """Measure transfers over bad radios beside pymavlink, MAVSDK and DroneKit; an hour. Writes bench-transfers.json."""
     session.install("-e", ".", "mavsdk>=4", "dronekit==2.9.2", "future")
     session.run("python", "benchmarks/transfers.py", *session.posargs)
+
+
+@nox.session
+def bench_dronekit(session: nox.Session) -> None:
+    """Run DroneKit programs on aerokit, DroneKit 2.9.2 and dronekit2, half an hour. Writes bench-dronekit.json."""
+    session.install("-e", ".[fast]")
+    pythons = {}
+    for name, packages in {
+        "dronekit": ("dronekit==2.9.2", "future"),
+        "dronekit2": ("dronekit2==3.0.0",),
+    }.items():
+        folder = Path(session.create_tmp()) / name  # both are imported by the same name
+        session.run("python", "-m", "venv", str(folder))
+        pythons[name] = str(folder / "bin" / "python")
+        session.run(pythons[name], "-m", "pip", "install", "-q", "fastcrc", *packages, external=True)
+    env = {f"AEROKIT_{name.upper()}_PYTHON": python for name, python in pythons.items()}
+    session.run("python", "benchmarks/dronekit_compare.py", *session.posargs, env=env)
 
 
 @nox.session

@@ -1,0 +1,196 @@
+"""One script for DroneKit, dronekit2 and aerokit's ``aerokit.dronekit``: the client of ``dronekit_compare.py``.
+
+    python benchmarks/client_classic.py MODULE '{"task": "cpu", "address": "udpin:127.0.0.1:14550"}'
+
+MODULE is ``dronekit`` or ``aerokit.dronekit``. It says ``connecting`` and ``connected`` at these moments; its last
+line is what it found, as JSON.
+"""
+
+from __future__ import annotations
+
+import collections
+import collections.abc
+import importlib
+import json
+import logging
+import os
+import statistics
+import sys
+import time
+import timeit
+from collections.abc import Callable
+from typing import Any
+
+__all__ = ["READS"]
+
+REPEATS = 7
+READS = (
+    "armed", "mode", "mode.name", "system_status", "system_status.state", "attitude", "attitude.roll", "velocity",
+    "heading", "airspeed", "groundspeed", "gps_0", "gps_0.fix_type", "battery", "battery.voltage", "location",
+    "location.global_frame", "location.global_relative_frame", "location.global_relative_frame.alt",
+    "location.local_frame", "is_armable", "ekf_ok", "last_heartbeat", "rangefinder", "channels", "gimbal",
+)  # fmt: skip
+"""The attributes that are read."""
+USUAL = (
+    "mode", "armed", "attitude", "location.global_relative_frame", "heading", "battery", "gps_0",
+)  # fmt: skip
+"""What the usual program listens to, besides the message HEARTBEAT."""
+
+Found = dict[str, Any]
+
+
+def main(arguments: list[str]) -> None:
+    """Do one task and print what came of it."""
+    module, options = arguments[0], json.loads(arguments[1])
+    began_at = time.perf_counter()
+    collections.MutableMapping = collections.abc.MutableMapping  # type: ignore[attr-defined]  # for DroneKit
+    dronekit = importlib.import_module(module)
+    imported_s = time.perf_counter() - began_at
+    logging.disable(logging.CRITICAL)
+    found = TASKS[options.pop("task")](dronekit, **options)
+    print(json.dumps({**found, "import_s": imported_s}), flush=True)
+    os._exit(0)  # DroneKit may leave threads behind that do not end
+
+
+# --------------------------------------------------------------------------------------- the tasks
+
+
+def connect_ready(dronekit: Any, address: str) -> Found:
+    """``connect(wait_ready=True)``: how long it takes."""
+    print("connecting", flush=True)
+    cpu, began_at = time.process_time(), time.perf_counter()
+    vehicle = dronekit.connect(address, wait_ready=True, timeout=120)
+    seconds = time.perf_counter() - began_at
+    return {"seconds": seconds, "cpu": time.process_time() - cpu, "parameters": len(vehicle.parameters)}
+
+
+def cpu(dronekit: Any, address: str, listeners: str, settle_s: float, window_s: float) -> Found:
+    """Processor time of this process, all its threads, while messages come in, and how many came."""
+    vehicle = _connected(dronekit, address)
+    calls = LISTENERS[listeners](vehicle)
+    _say_connected()
+    time.sleep(settle_s)
+    received, called, used, began_at = (
+        _received(vehicle),
+        len(calls),
+        time.process_time(),
+        time.perf_counter(),
+    )
+    time.sleep(window_s)
+    used, seconds = time.process_time() - used, time.perf_counter() - began_at
+    return {
+        "cpu_s": used, "seconds": seconds, "received": _received(vehicle) - received, "called": len(calls) - called,
+    }  # fmt: skip
+
+
+def latency(dronekit: Any, address: str, settle_s: float, window_s: float) -> Found:
+    """When listeners were called, by the system's monotonic clock in ns, and with the value of which round."""
+    from dronekit_traffic import keys_of
+
+    vehicle = _connected(dronekit, address)
+    noted: list[tuple[int, str, Any]] = []
+    clock = time.monotonic_ns
+
+    def note(_: Any, name: str, value: Any) -> None:
+        noted.append((clock(), name, value))
+
+    _listen_as_usual(vehicle, note, note)
+    _say_connected()
+    time.sleep(settle_s)
+    began_at = len(noted)
+    time.sleep(window_s)
+    keyed = [(at, name, keys_of(name, value)) for at, name, value in noted[began_at:]]
+    return {"noted": [each for each in keyed if each[2] is not None]}
+
+
+def reads(dronekit: Any, address: str, names: list[str], settle_s: float) -> Found:
+    """Nanoseconds that reading each attribute takes while messages come in."""
+    vehicle = _connected(dronekit, address)
+    _say_connected()
+    vehicle.wait_ready("gps_0", "armed", "mode", "attitude", timeout=30)
+    time.sleep(settle_s)
+    return {"ns": {name: _nanoseconds(f"vehicle.{name}", vehicle) for name in names}}
+
+
+def only_import(dronekit: Any) -> Found:
+    """Nothing: the time of the import is told in any case."""
+    return {}
+
+
+TASKS: dict[str, Callable[..., Found]] = {
+    "connect": connect_ready, "cpu": cpu, "latency": latency, "reads": reads, "import": only_import,
+}  # fmt: skip
+
+
+# --------------------------------------------------------------------------------------- listeners
+
+
+def _no_listeners(vehicle: Any) -> list[None]:
+    return []
+
+
+def _usual_listeners(vehicle: Any) -> list[None]:
+    calls: list[None] = []
+
+    def note(_: Any, name: str, value: Any) -> None:
+        calls.append(None)
+
+    _listen_as_usual(vehicle, note, note)
+    return calls
+
+
+def _every_message(vehicle: Any) -> list[None]:
+    calls: list[None] = []
+
+    def note(_: Any, name: str, message: Any) -> None:
+        calls.append(None)
+
+    vehicle.add_message_listener("*", note)
+    return calls
+
+
+LISTENERS: dict[str, Callable[[Any], list[None]]] = {
+    "none": _no_listeners, "usual": _usual_listeners, "every_message": _every_message,
+}  # fmt: skip
+
+
+def _listen_as_usual(
+    vehicle: Any, on_attribute: Callable[[Any, str, Any], None], on_message: Callable[[Any, str, Any], None]
+) -> None:
+    vehicle.on_message("HEARTBEAT")(on_message)
+    for name in USUAL:
+        vehicle.on_attribute(name)(on_attribute)
+
+
+# ------------------------------------------------------------------------------------------ helpers
+
+
+def _connected(dronekit: Any, address: str) -> Any:
+    print("connecting", flush=True)
+    return dronekit.connect(address, wait_ready=["mode"], rate=None)
+
+
+def _say_connected() -> None:
+    print("connected", flush=True)
+
+
+def _received(vehicle: Any) -> int:
+    """Frames received so far: counted by the libraries themselves, since not all of them make messages of all."""
+    if hasattr(vehicle, "aio"):
+        return sum(
+            source.received
+            for statistics_ in vehicle.aio.connection.statistics()
+            for source in statistics_.sources.values()
+        )
+    return int(vehicle._master.mav.total_packets_received)
+
+
+def _nanoseconds(expression: str, vehicle: Any) -> float:
+    timer = timeit.Timer(expression, globals={"vehicle": vehicle})
+    number, _ = timer.autorange()
+    number = max(1, number // 4)
+    return statistics.median(timer.repeat(REPEATS, number)) / number * 1e9
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,65 @@
+"""DroneKit programs on aerokit beside DroneKit 2.9.2 itself and dronekit2 3.0: one script, one vehicle, in turns.
+
+    python benchmarks/dronekit_compare.py                    # everything, half an hour; writes bench-dronekit.json
+    python benchmarks/dronekit_compare.py cpu latency        # these parts only: cpu, reads, latency, connect, import
+    python benchmarks/dronekit_compare.py --quick            # a moment of each: does it run? The figures mean little
+
+Each measurement has a client process (``client_classic.py``) and a vehicle process (``dronekit_vehicle.py``) of its
+own. AEROKIT_DRONEKIT_PYTHON and AEROKIT_DRONEKIT2_PYTHON name the interpreters that have the peers, which cannot be
+installed together; a peer that is not installed is left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import table
+from dronekit_runs import LIBRARIES, Library, installed
+from dronekit_tasks import Plan, connect_rows, cpu_rows, import_rows, latency_rows, read_rows
+from table import Row
+
+__all__ = ["main"]
+
+PARTS: dict[str, Callable[[Sequence[Library], Plan], list[Row]]] = {
+    "cpu": cpu_rows,
+    "reads": read_rows,
+    "latency": latency_rows,
+    "connect": connect_rows,
+    "import": import_rows,
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure what was asked for, print it, write it."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("parts", nargs="*", metavar="PART", help=", ".join(PARTS))
+    parser.add_argument("--only", default="", metavar="TEXT", help="only cases with this in their name")
+    parser.add_argument("--rounds", type=int, default=5, help="so many turns of each")
+    parser.add_argument(
+        "--peer", action="append", metavar="NAME", help="dronekit, dronekit2; both by default"
+    )
+    parser.add_argument("--quick", action="store_true", help="a moment of each: does it run?")
+    parser.add_argument("--output", type=Path, default=Path("bench-dronekit.json"))
+    options = parser.parse_args(arguments)
+    if not set(options.parts) <= set(PARTS):
+        parser.error(f"the parts are {', '.join(PARTS)}")
+    wanted = ["aerokit", *(options.peer or ("dronekit", "dronekit2"))]
+    libraries = [each for each in LIBRARIES if each.name in wanted and installed(each)]
+    plan = Plan(1 if options.quick else options.rounds, options.quick, options.only)
+    rows: list[Row] = []
+    for part in options.parts or PARTS:
+        rows += PARTS[part](libraries, plan)
+    print(table.printed(rows))
+    for name in sorted(set(wanted) - {each.name for each in libraries}):
+        print(f"{name}: left out, it is not installed")
+    missed = [each["name"] for each in rows if table.is_missed(each)]
+    print(f"MISSED: {', '.join(missed)}" if missed else "every aim is met")
+    table.write(rows, options.output)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,158 @@
+"""The socket of the scripted vehicle: datagrams or a stream, with a delay each way and a limit of bandwidth."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import socket
+import time
+from collections import deque
+from collections.abc import Iterator
+from typing import Any
+
+from pymavlink.dialects.v20 import ardupilotmega
+
+__all__ = ["Link", "make_link"]
+
+HOST = "127.0.0.1"
+MOST_UNSENT = 65536
+
+
+class Link:
+    """Bytes out, messages in."""
+
+    is_stream = False
+
+    def __init__(self, delay: float, bandwidth: float) -> None:
+        self.socket = socket.socket()
+        self._delay, self._bandwidth = delay, bandwidth
+        self._free_at = 0.0
+        self._leaving: deque[tuple[float, bytes]] = deque()
+        self._coming: deque[tuple[float, Any]] = deque()
+        names: Any = ardupilotmega
+        self._parser = names.MAVLink(None)
+        self._parser.robust_parsing = True
+
+    @property
+    def is_writable(self) -> bool:
+        """Whether more may be sent at once."""
+        return not self.wants_to_write
+
+    @property
+    def wants_to_write(self) -> bool:
+        """Whether something waits until the other side takes it."""
+        return False
+
+    def wait_for_peer(self) -> None:
+        """Until there is somebody to send to."""
+
+    def send(self, data: bytes) -> None:
+        """Send it, when the link lets it through."""
+        if not self._delay and not self._bandwidth:
+            self._write(data)
+            return
+        begins = max(time.monotonic(), self._free_at)
+        self._free_at = begins + (len(data) / self._bandwidth if self._bandwidth else 0.0)
+        self._leaving.append((self._free_at + self._delay, data))
+
+    def release_due(self) -> float:
+        """Let out what has been under way for long enough; when the next is due."""
+        now = time.monotonic()
+        while self._leaving and self._leaving[0][0] <= now:
+            self._write(self._leaving.popleft()[1])
+        return min(
+            self._leaving[0][0] if self._leaving else math.inf,
+            self._coming[0][0] if self._coming else math.inf,
+        )
+
+    def read(self) -> None:
+        """Take what has come; it is received after its delay."""
+        data = self._read()
+        for message in self._parser.parse_buffer(data) or ():
+            self._coming.append((time.monotonic() + self._delay, message))
+
+    def received(self) -> Iterator[Any]:
+        """The messages that have arrived by now (pymavlink's)."""
+        while self._coming and self._coming[0][0] <= time.monotonic():
+            yield self._coming.popleft()[1]
+
+    def _write(self, data: bytes) -> None:
+        raise NotImplementedError
+
+    def _read(self) -> bytes:
+        raise NotImplementedError
+
+
+class UdpLink(Link):
+    """Sends to a port of this machine, from one of its own."""
+
+    def __init__(self, port: int, delay: float, bandwidth: float) -> None:
+        super().__init__(delay, bandwidth)
+        self.socket.close()
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.bind((HOST, 0))
+        self._peer = (HOST, port)
+
+    def _write(self, data: bytes) -> None:
+        with contextlib.suppress(ConnectionError):  # nobody listens yet
+            self.socket.sendto(data, self._peer)
+
+    def _read(self) -> bytes:
+        try:
+            return self.socket.recvfrom(4096)[0]
+        except ConnectionError:
+            return b""
+
+
+class TcpLink(Link):
+    """Serves one client."""
+
+    is_stream = True
+
+    def __init__(self, port: int, delay: float, bandwidth: float) -> None:
+        super().__init__(delay, bandwidth)
+        self._server = self.socket
+        self._server.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        self._server.bind((HOST, port))
+        self._server.listen()
+        self._unsent = b""
+
+    def wait_for_peer(self) -> None:
+        self.socket, _ = self._server.accept()
+        self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self.socket.setblocking(False)
+
+    @property
+    def wants_to_write(self) -> bool:
+        return bool(self._unsent)
+
+    def release_due(self) -> float:
+        if self._unsent:
+            self._write(b"")
+        return super().release_due()
+
+    def _write(self, data: bytes) -> None:
+        if len(self._unsent) < MOST_UNSENT:
+            self._unsent += data
+        try:
+            self._unsent = self._unsent[self.socket.send(self._unsent) :]
+        except BlockingIOError:
+            return
+        except ConnectionError:
+            raise SystemExit from None
+
+    def _read(self) -> bytes:
+        try:
+            data = self.socket.recv(65536)
+        except BlockingIOError:
+            return b""
+        except ConnectionError:
+            raise SystemExit from None
+        if not data:
+            raise SystemExit
+        return data
+
+
+def make_link(transport: str, port: int, delay: float, bandwidth: float) -> Link:
+    """``udp`` sends to the port, ``tcp`` serves it."""
+    return UdpLink(port, delay, bandwidth) if transport == "udp" else TcpLink(port, delay, bandwidth)

@@ -1,0 +1,134 @@
+"""One run: a vehicle process, a client process with one of the libraries, and what the client found."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+__all__ = ["LIBRARIES", "Library", "installed", "run"]
+
+HERE = Path(__file__).resolve().parent
+LIMIT_S = 180.0
+
+
+@dataclass(frozen=True)
+class Library:
+    """Who is measured: its name, the module to import, the interpreter that has it."""
+
+    name: str
+    title: str
+    module: str
+    python: str
+
+
+LIBRARIES = (
+    Library("aerokit", "aerokit", "aerokit.dronekit", sys.executable),
+    Library(
+        "dronekit", "DroneKit 2.9.2", "dronekit", os.environ.get("AEROKIT_DRONEKIT_PYTHON", sys.executable)
+    ),
+    Library(
+        "dronekit2", "dronekit2 3.0", "dronekit", os.environ.get("AEROKIT_DRONEKIT2_PYTHON", sys.executable)
+    ),
+)
+
+
+def installed(library: Library) -> bool:
+    """Whether its interpreter has it: both peers are imported by the same name."""
+    if library.name == "aerokit":
+        return True
+    code = f"import importlib.metadata; importlib.metadata.version({library.name!r})"
+    return subprocess.run([library.python, "-c", code], capture_output=True).returncode == 0
+
+
+def run(
+    library: Library,
+    vehicle: dict[str, Any] | None,
+    task: dict[str, Any],
+    *,
+    rate: str | None = None,
+) -> dict[str, Any]:
+    """Do a task with a library, against such a vehicle; ``rate`` is what it streams once the client is connected.
+
+    Returns what the client found, and ``stamps`` of the vehicle when it was to stream. RuntimeError when it failed.
+    """
+    if vehicle is None:
+        with _client(library, task) as client:
+            return _found(client, None, None)
+    port = _free_port()
+    scheme = "udpin" if vehicle.get("transport", "udp") == "udp" else "tcp"
+    with _vehicle({**vehicle, "port": port}) as server:
+        with _client(library, {**task, "address": f"{scheme}:127.0.0.1:{port}"}) as client:
+            found = _found(client, server, rate)
+        if task["task"] == "latency":
+            _say(server, "stamps")
+            found["stamps"] = json.loads(_line(server))
+        return found
+
+
+def _found(
+    client: subprocess.Popen[str], server: subprocess.Popen[str] | None, rate: str | None
+) -> dict[str, Any]:
+    """What the client says at its end; the vehicle is told where it stands."""
+    while True:
+        line = _line(client).strip()
+        if line == "connecting" and server is not None:
+            _say(server, "go")
+        elif line == "connected" and server is not None:
+            if rate is not None:
+                _say(server, f"rate {rate}")
+        elif line.startswith("{"):
+            found: dict[str, Any] = json.loads(line)
+            return found
+
+
+@contextmanager
+def _client(library: Library, task: dict[str, Any]) -> Iterator[subprocess.Popen[str]]:
+    command = [library.python, str(HERE / "client_classic.py"), library.module, json.dumps(task)]
+    with _process(command) as process:
+        yield process
+
+
+@contextmanager
+def _vehicle(options: dict[str, Any]) -> Iterator[subprocess.Popen[str]]:
+    with _process([sys.executable, str(HERE / "dronekit_vehicle.py"), json.dumps(options)]) as process:
+        if _line(process).strip() != "ready":
+            raise RuntimeError("the scripted vehicle did not start")
+        yield process
+
+
+@contextmanager
+def _process(command: list[str]) -> Iterator[subprocess.Popen[str]]:
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def _say(process: subprocess.Popen[str], line: str) -> None:
+    assert process.stdin is not None
+    process.stdin.write(f"{line}\n")
+    process.stdin.flush()
+
+
+def _line(process: subprocess.Popen[str]) -> str:
+    assert process.stdout is not None
+    line = process.stdout.readline()
+    if not line:
+        raise RuntimeError(f"{process.args!r} ended without a result")
+    return line
+
+
+def _free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])

@@ -1,0 +1,143 @@
+"""What a vehicle of ``dronekit_vehicle.py`` says: the messages of ArduCopter's streams in their proportions.
+
+Asked for all streams at one rate, ArduCopter 4.7 sends each of these messages at that rate, in this order, and a
+HEARTBEAT each second, which is each fourth round at the usual 4 Hz (in a recorded flight: 24 kinds, 1,206 of each, 127
+heartbeats at 10 Hz). Fields have numbers in them, so that MAVLink 2 cuts nothing off. Every round has a number, which
+attribute listeners can read from attitude, position, GPS and battery.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from fastcrc import crc16
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+__all__ = ["ROUNDS", "Numbering", "heartbeat", "keys_of", "packed", "rounds"]
+
+ROUNDS = 1024
+"""After so many it begins anew."""
+HEARTBEAT_EVERY = 4
+KINDS = (
+    "SYS_STATUS", "POWER_STATUS", "MEMINFO", "MISSION_CURRENT", "GPS_RAW_INT", "NAV_CONTROLLER_OUTPUT",
+    "GLOBAL_POSITION_INT", "LOCAL_POSITION_NED", "SERVO_OUTPUT_RAW", "RC_CHANNELS", "RAW_IMU", "SCALED_IMU2",
+    "SCALED_IMU3", "SCALED_PRESSURE", "ATTITUDE", "AHRS2", "VFR_HUD", "AHRS", "SYSTEM_TIME", "WIND", "TERRAIN_REPORT",
+    "BATTERY_STATUS", "EKF_STATUS_REPORT", "VIBRATION",
+)  # fmt: skip
+ONLY_IN_VERSION = {1: ("RC_CHANNELS_RAW",), 2: ("ESC_TELEMETRY_1_TO_4",)}
+ARMED_IN_GUIDED = {
+    "type": 2, "autopilot": 3, "base_mode": 217, "custom_mode": 4, "system_status": 4, "mavlink_version": 3,
+}  # fmt: skip
+LATITUDE, LONGITUDE = -353632610, 1491652299
+ANGLE_STEP = 2.0**-12
+"""Of the roll angle from one round to the next: no 32-bit float rounds it."""
+FULL_MV, CURRENT_CA, LEVEL = 10000, 1500, 87
+
+Frame = tuple[bytes, str, int]
+"""Its bytes (numbered later), the name of its message, the number of its round."""
+
+
+def rounds(version: int) -> list[Frame]:
+    """Everything once; MAVLink 1 or 2."""
+    kinds = KINDS + ONLY_IN_VERSION[version]
+    frames: list[Frame] = []
+    for number in range(ROUNDS):
+        if number % HEARTBEAT_EVERY == 0:
+            frames.append((heartbeat(version), "HEARTBEAT", number))
+        frames += [(packed(kind, version, **_values(kind, number)), kind, number) for kind in kinds]
+    return frames
+
+
+def keys_of(name: str, value: Any) -> int | None:
+    """The number of the round that an attribute's value came in; None when it does not tell."""
+    number: float
+    if name == "attitude":
+        number = value.roll / ANGLE_STEP
+    elif name == "location.global_relative_frame":
+        number = value.lat * 1e7 - LATITUDE
+    elif name == "gps_0":
+        number = value.eph
+    elif name == "battery":
+        number = value.voltage * 1000 - FULL_MV
+    else:
+        return None
+    return round(number)
+
+
+def heartbeat(version: int) -> bytes:
+    """A quadrotor of ArduPilot, armed, in GUIDED."""
+    return packed("HEARTBEAT", version, **ARMED_IN_GUIDED)
+
+
+def packed(kind: str, version: int, **values: Any) -> bytes:
+    """A message of system 1, component 1; fields that are not given have some number."""
+    names: Any = dialect
+    message_class = getattr(names, f"MAVLink_{kind.lower()}_message")
+    lengths = dict(zip(message_class.ordered_fieldnames, message_class.array_lengths, strict=True))
+    fields = {
+        name: values.get(name, _anything(kind_of, lengths[name]))
+        for name, kind_of in zip(message_class.fieldnames, message_class.fieldtypes, strict=True)
+    }
+    mav: Any = names.MAVLink(None, srcSystem=1, srcComponent=1)
+    return bytes(message_class(**fields).pack(mav, force_mavlink1=version == 1))
+
+
+class Numbering:
+    """Gives frames their sequence numbers, and so their checksums, when they are sent."""
+
+    def __init__(self) -> None:
+        self._next = 0
+
+    def numbered(self, frame: bytes) -> bytes:
+        """The frame with the next number."""
+        raw = bytearray(frame)
+        is_second = raw[0] == 0xFD
+        raw[4 if is_second else 2] = self._next
+        self._next = (self._next + 1) & 0xFF
+        message_id = int.from_bytes(raw[7:10], "little") if is_second else raw[5]
+        checksum = crc16.mcrf4xx(bytes(raw[1:-2]) + _extra(message_id))
+        raw[-2:] = checksum.to_bytes(2, "little")
+        return bytes(raw)
+
+
+_extras: dict[int, bytes] = {}
+
+
+def _extra(message_id: int) -> bytes:
+    if message_id not in _extras:
+        _extras[message_id] = bytes([dialect.mavlink_map[message_id].crc_extra])
+    return _extras[message_id]
+
+
+def _anything(kind: str, length: int) -> Any:
+    if kind == "char":
+        return b"text"
+    number: float = 1.25 if kind in ("float", "double") else 101
+    return [number] * length if length else number
+
+
+def _values(kind: str, number: int) -> dict[str, Any]:
+    """What a round has of its own: a flight in a circle, and its number where listeners see it."""
+    turn = math.tau * number / ROUNDS
+    values: dict[str, dict[str, Any]] = {
+        "ATTITUDE": {"roll": number * ANGLE_STEP, "pitch": math.sin(turn) / 4, "yaw": turn - math.pi},
+        "GLOBAL_POSITION_INT": {
+            "lat": LATITUDE + number, "lon": LONGITUDE + number, "alt": 604_000 + number,
+            "relative_alt": 20_000 + number,
+            "vx": number, "vy": -number, "vz": 3, "hdg": 35 * number % 36_000,
+        },
+        "VFR_HUD": {"heading": number % 360, "groundspeed": number / 100, "airspeed": number / 90, "alt": 20.0},
+        "GPS_RAW_INT": {"fix_type": 6, "eph": number, "satellites_visible": 10, "lat": LATITUDE, "lon": LONGITUDE},
+        "SYS_STATUS": {
+            "voltage_battery": FULL_MV + number, "current_battery": CURRENT_CA, "battery_remaining": LEVEL,
+            "load": number,
+        },
+        "EKF_STATUS_REPORT": {"flags": 831},
+        "BATTERY_STATUS": {"voltages": [FULL_MV + number, *[65535] * 9], "battery_remaining": LEVEL, "id": 0},
+        "RC_CHANNELS": {"chancount": 16, "chan1_raw": 1500 + number % 100},
+        "RC_CHANNELS_RAW": {"port": 0, "chan1_raw": 1500 + number % 100},
+        "SERVO_OUTPUT_RAW": {"port": 0, "servo1_raw": 1500 + number % 100},
+        "MISSION_CURRENT": {"seq": 0},
+    }  # fmt: skip
+    return values.get(kind, {})

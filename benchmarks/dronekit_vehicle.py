@@ -1,0 +1,191 @@
+"""A scripted vehicle in a process of its own, which all three libraries of ``dronekit_compare.py`` talk to.
+
+    python benchmarks/dronekit_vehicle.py '{"transport": "udp", "port": 14550, "version": 2}'
+
+It is nobody's: frames are packed and read by pymavlink, and sent from a blocking loop. It says ``ready``, and begins
+when a client has connected, over UDP when it gets a line ``go``. It takes more lines: ``rate 500`` (messages a second;
+``rate 500 evenly``: not in bursts; ``rate max``: as fast as it can) and ``stamps``, answered by a line of JSON: name
+of the message, number of its round, CLOCK_MONOTONIC in ns when it was sent. It ends when it is terminated.
+"""
+
+from __future__ import annotations
+
+import heapq
+import json
+import math
+import select
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import count
+from typing import Any
+
+from dronekit_link import make_link
+from dronekit_pace import bursts, wait_until
+from dronekit_services import Services
+from dronekit_traffic import Numbering, heartbeat, rounds
+
+__all__ = ["Options", "Vehicle"]
+
+STREAM_KINDS_AT_ONCE = 25
+PIECE = 1400
+"""Bytes in one go where a stream of bytes is sent as fast as possible."""
+AT_ONCE = 16
+"""So many datagrams are sent in a row before anything else is looked at."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """What it is like."""
+
+    transport: str = "udp"
+    port: int = 14550
+    version: int = 2
+    rate: float = 0.0
+    """Messages a second that it streams by itself; 0: what it is asked for by REQUEST_DATA_STREAM."""
+    parameters: int = 20
+    list_rate: float = 1400.0
+    """Parameters a second."""
+    has_ftp: bool = False
+    file_rate: float = 46_000.0
+    """Bytes a second of a file that is read by MAVFTP."""
+    heartbeat_after: float = 0.0
+    """Seconds from its beginning to its first heartbeat; the next ones come each second."""
+    bandwidth: float = 0.0
+    """Bytes a second of the link; 0: no limit."""
+    delay: float = 0.0
+    """Seconds each way."""
+
+
+class Vehicle:
+    """Heartbeats, streams and answers, each at its time."""
+
+    def __init__(self, options: Options) -> None:
+        self.options = options
+        self.link = make_link(options.transport, options.port, options.delay, options.bandwidth)
+        self.stamps: list[tuple[str, int, int]] = []
+        self._numbering = Numbering()
+        self._services = Services(self)
+        self._frames = rounds(options.version)
+        self._position = 0
+        self._rate = options.rate
+        self._streams = 0
+        self._due: list[tuple[float, int, Callable[[], None]]] = []
+        self._order = count()
+        self._lines = open(0, "rb", buffering=0)  # noqa: SIM115 - select sees nothing that a buffer has
+
+    def run(self) -> None:
+        """Live until the process is ended; a line on standard output says that it has begun."""
+        print("ready", flush=True)
+        if not self.link.is_stream:
+            self._lines.readline()  # "go": somebody listens now
+        self.link.wait_for_peer()
+        self.at(time.monotonic() + self.options.heartbeat_after, self._send_heartbeats)
+        self.set_rate(self._rate)
+        while True:
+            self._do_what_is_due()
+            if self._rate == math.inf:
+                self._send_much()
+            self._wait()
+
+    # ------------------------------------------------------------------------- for its services
+
+    def at(self, when: float, function: Callable[[], None]) -> None:
+        """Have a function called at a time of ``time.monotonic``."""
+        heapq.heappush(self._due, (when, next(self._order), function))
+
+    def send(self, frame: bytes) -> None:
+        """Number it and send it."""
+        self.link.send(self._numbering.numbered(frame))
+
+    def stream(self, hertz: float) -> None:
+        """Send every message of the streams so many times a second."""
+        if self.options.rate == 0:
+            self.set_rate(hertz * STREAM_KINDS_AT_ONCE)
+
+    def set_rate(self, rate: float, *, evenly: bool = False) -> None:
+        """Stream so many messages a second from now on, in ArduCopter's bursts or one by one."""
+        self._rate = rate
+        self._streams += 1
+        if 0 < rate < math.inf:
+            self._stream_from(time.monotonic(), self._streams, bursts(rate, evenly=evenly))
+
+    # ------------------------------------------------------------------------------- inside
+
+    def _stream_from(self, when: float, stream: int, pace: Iterator[tuple[float, list[float]]]) -> None:
+        if stream == self._streams:
+            period, offsets = next(pace)
+            begin = time.monotonic()
+            for offset in offsets:
+                wait_until(begin + offset)
+                self._send_next()
+            self.at(when + period, lambda: self._stream_from(when + period, stream, pace))
+
+    def _send_next(self) -> None:
+        raw, kind, number = self._frames[self._position]
+        self._position = (self._position + 1) % len(self._frames)
+        if kind == "HEARTBEAT" and self.options.rate == 0:
+            return  # they come each second, whatever the streams
+        numbered = self._numbering.numbered(raw)
+        if self._rate < math.inf:
+            self.stamps.append((kind, number, time.monotonic_ns()))
+        self.link.send(numbered)
+
+    def _send_much(self) -> None:
+        """As much as goes out now."""
+        if not self.link.is_stream:
+            for _ in range(AT_ONCE):
+                self._send_next()
+        elif self.link.is_writable:
+            piece = b""
+            while len(piece) < PIECE:
+                piece += self._numbering.numbered(self._frames[self._position][0])
+                self._position = (self._position + 1) % len(self._frames)
+            self.link.send(piece)
+
+    def _send_heartbeats(self) -> None:
+        if self.options.rate == 0:
+            self.send(heartbeat(self.options.version))
+            self.at(time.monotonic() + 1.0, self._send_heartbeats)
+
+    def _do_what_is_due(self) -> None:
+        now = time.monotonic()
+        while self._due and self._due[0][0] <= now:
+            heapq.heappop(self._due)[2]()
+
+    def _wait(self) -> None:
+        """Until something is due or comes in; not at all while as much as possible is sent."""
+        until = self.link.release_due()
+        if self._due:
+            until = min(until, self._due[0][0])
+        is_flat_out = self._rate == math.inf and (not self.link.is_stream or self.link.is_writable)
+        timeout = 0.0 if is_flat_out else max(0.0, min(until - time.monotonic(), 1.0))
+        wanted: list[Any] = [self.link.socket] if self.link.wants_to_write or self._rate == math.inf else []
+        sources: list[Any] = [self.link.socket, self._lines]
+        ready, _, _ = select.select(sources, wanted, [], timeout)
+        if self.link.socket in ready:
+            self.link.read()
+        if self._lines in ready:
+            self._obey(self._lines.readline().decode().split())
+        for message in self.link.received():
+            self._services.receive(message)
+
+    def _obey(self, words: list[str]) -> None:
+        if not words:
+            sys.exit()
+        if words[0] == "rate":
+            self.stamps.clear()
+            self.set_rate(math.inf if words[1] == "max" else float(words[1]), evenly=words[2:] == ["evenly"])
+        if words[0] == "stamps":
+            print(json.dumps(self.stamps), flush=True)
+
+
+def main(arguments: list[str]) -> None:
+    """Serve until the process is ended."""
+    options: dict[str, Any] = json.loads(arguments[0])
+    Vehicle(Options(**options)).run()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
