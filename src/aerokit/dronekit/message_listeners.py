@@ -47,7 +47,7 @@ class MessageListeners:
         present = self._listeners.get(name, ())
         if listener not in present:
             self._listeners[name] = (*present, listener)
-            self._attach_soon()
+            self._attach_now()
 
     def remove(self, name: str, listener: MessageListener) -> None:
         """Call it no more; silent when it does not listen."""
@@ -55,7 +55,7 @@ class MessageListeners:
         if left:
             self._listeners[name] = left
         elif self._listeners.pop(name, None) is not None:
-            self._attach_soon()
+            self._attach_now()
 
     def notify(self, name: str, message: Any) -> None:
         """Call the listeners of a message: those of its name, then those of every message."""
@@ -73,10 +73,11 @@ class MessageListeners:
         self._is_started = True
         self._attach()
 
-    def _attach_soon(self) -> None:
+    def _attach_now(self) -> None:
+        """Wait for it, so that whatever comes once a listener was added is heard."""
         if self._is_started:
             with contextlib.suppress(AerokitError):  # the connection is closed: nothing will come
-                self._handler.loop.call_soon(self._attach)
+                self._handler.loop.call(self._attach)
 
     def _attach(self) -> None:
         """Hear what is listened to: everything, or the messages of these names."""
