@@ -34,6 +34,14 @@ def test_what_confirms_item_2(seqs: tuple[int, ...], is_confirmed: bool) -> None
     assert told(*seqs, wanted=2) is is_confirmed
 
 
+def test_a_vehicle_that_stood_at_the_item_already_may_have_flown_on() -> None:
+    exchange = MissionSetCurrent(1, 1, 2, 2)
+    exchange.start(0.0)
+    exchange.receive(MissionCurrent(3, 20, 3, 0), 0.1)
+    assert exchange.done
+    assert len(exchange.take_outbox()) == 1
+
+
 def test_it_is_sent_again_and_given_up() -> None:
     exchange = MissionSetCurrent(1, 1, 2, patience_s=3.0)
     exchange.start(0.0)

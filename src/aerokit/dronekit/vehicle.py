@@ -212,8 +212,8 @@ class Vehicle(FlightMethods, Maintenance, Readiness):
 
         Args:
             rate: Hz of the data streams to ask for; None asks for none.
-            heartbeat_timeout: seconds to wait for the first heartbeat (0: 30), and after which, in flight, orders
-                and waits raise APIException until heartbeats come again (0: never).
+            heartbeat_timeout: seconds to wait for the first heartbeat (0 or less: 30), and after which, in flight, orders
+                and waits raise APIException until heartbeats come again (0 or less: never).
 
         Raises:
             APIException: no vehicle was heard in time; the text says what was heard instead.
@@ -221,8 +221,8 @@ class Vehicle(FlightMethods, Maintenance, Readiness):
         with self._initializing:
             if self._aio is not None:
                 return
-            self._heartbeat_timeout = heartbeat_timeout or 0.0
-            timeout = heartbeat_timeout or CONNECT_S
+            self._heartbeat_timeout = max(heartbeat_timeout or 0.0, 0.0)
+            timeout = self._heartbeat_timeout or CONNECT_S
             loop = self._handler.loop
             try:
                 held = loop.hold_open(self._found(timeout, rate))

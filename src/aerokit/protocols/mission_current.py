@@ -19,14 +19,19 @@ TOLD_EVERY_S = 1.0
 
 
 class MissionSetCurrent(Transfer[None]):
-    """There is no acknowledgement: PX4 sends MISSION_CURRENT when the item has changed, else at its next turn."""
+    """There is no acknowledgement: PX4 sends MISSION_CURRENT when the item has changed, else at its next turn.
+
+    ``told`` is the item that the vehicle told last: from the item wanted to the one after it, it flies on by itself.
+    """
 
     expects = (MissionCurrent,)
 
-    def __init__(self, target_system: int, target_component: int, seq: int, **options: Any) -> None:
+    def __init__(
+        self, target_system: int, target_component: int, seq: int, told: int | None = None, **options: Any
+    ) -> None:
         super().__init__(target_system, target_component, **options)
         self._seq = seq
-        self._told: int | None = None
+        self._told = told
         self._attempts = 0
 
     def start(self, now: float) -> None:
@@ -58,7 +63,7 @@ class MissionSetCurrent(Transfer[None]):
     def _has_passed(self, seq: int) -> bool:
         """Whether it has gone to our item and run through it: not what flying on from where it was comes to."""
         told = self._told
-        return told is not None and (told < self._seq < seq or self._seq < seq < told)
+        return told is not None and (told <= self._seq < seq or self._seq < seq < told)
 
     def _send(self, now: float) -> None:
         self._attempts += 1

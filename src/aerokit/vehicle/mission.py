@@ -218,8 +218,16 @@ class MissionControl(HeldPlan["Mission"]):
         target = (transfers.system_id, transfers.component_id)
         async with self._context.lock:  # PX4 does not hear it during a transfer
             await transfers.run(
-                MissionSetCurrent(*target, seq, round_trip=transfers.round_trip, patience_s=timeout)
+                MissionSetCurrent(
+                    *target, seq, self._told_seq, round_trip=transfers.round_trip, patience_s=timeout
+                )
             )
+
+    @property
+    def _told_seq(self) -> int | None:
+        """The item in the last MISSION_CURRENT, as counted on the wire."""
+        progress = self._vehicle.telemetry.mission_current.latest
+        return None if progress is None else progress.current
 
     async def _enter(self, mode: Mode, order: Order, timeout: float) -> None:
         vehicle = self._vehicle
