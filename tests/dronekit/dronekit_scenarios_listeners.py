@@ -137,6 +137,7 @@ def message_listeners_after_attributes(stage: Stage) -> Any:
     stage.vehicle.add_message_listener("HEARTBEAT", one)
     stage.vehicle.add_message_listener("HEARTBEAT", one)
     stage.vehicle.on_message(["VFR_HUD", "RANGEFINDER"])(one)
+    stage.reached()
     stage.fc.custom_mode = 4
     stage.beat()
     stage.tell("VFR_HUD", heading=271)
@@ -157,6 +158,7 @@ def message_listener_that_raises(stage: Stage) -> Any:
 
     stage.vehicle.add_message_listener("VFR_HUD", first)
     stage.vehicle.add_message_listener("VFR_HUD", lambda *_: calls.append("second"))
+    stage.reached()
     with stage.logged() as lines:
         stage.tell("VFR_HUD", heading=271)
     return calls, lines
