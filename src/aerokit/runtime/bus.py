@@ -22,9 +22,14 @@ Detach = Callable[[], None]
 """Calling it ends an attachment; calling it again does nothing."""
 
 Sink = Callable[[Any], None]
-"""Takes one message or event; it must be quick and must not await."""
+"""Takes one message, frame or event; it must be quick and must not await."""
 
 EventT = TypeVar("EventT", bound=Event)
+
+_Entry = tuple[bool, Sink]
+"""Whether it takes frames, and who takes it."""
+_Plan = tuple[bool, tuple[_Entry, ...]]
+"""Whether anyone takes the message, and all who take it or its frame."""
 EVERY_SYSTEM = 0
 
 
@@ -37,17 +42,19 @@ class Bus:
     def __init__(self, dialect: Dialect = STANDARD) -> None:
         self.dialect = dialect
         self.wanted: dict[int, int] = {}
-        self._sinks: dict[tuple[int, int], tuple[Sink, ...]] = {}
-        self._plans: dict[int, tuple[Sink, ...]] = {}  # system and message id → all sinks, when needed
+        self._sinks: dict[tuple[int, int], tuple[_Entry, ...]] = {}
+        self._plans: dict[int, _Plan] = {}  # system and message id → all sinks, when needed
         self._event_sinks: dict[type[Event], tuple[Sink, ...]] = {}
 
     def attach(self, message_type: type[Message], sink: Sink, *, system_id: int = EVERY_SYSTEM) -> Detach:
         """Have every ``message_type`` of ``system_id`` (0: of every system) delivered to ``sink``."""
-        key = (system_id, message_type.ID)
-        self._sinks[key] = (*self._sinks.get(key, ()), sink)
-        self._plans.clear()
-        self.wanted[message_type.ID] = self.wanted.get(message_type.ID, 0) + 1
-        return once(lambda: self._detach(key, sink))
+        return self._attach((system_id, message_type.ID), (False, sink))
+
+    def attach_frames(
+        self, message_type: type[Message], sink: Sink, *, system_id: int = EVERY_SYSTEM
+    ) -> Detach:
+        """As :meth:`attach`, for who may never need what is in the message: ``sink`` gets the frame, not decoded."""
+        return self._attach((system_id, message_type.ID), (True, sink))
 
     def attach_event(self, event_type: type[EventT], sink: Callable[[EventT], None]) -> Detach:
         """Have every event of this class and of its subclasses delivered to ``sink``."""
@@ -57,15 +64,13 @@ class Bus:
     def deliver(self, frame: Frame) -> None:
         """Decode the frame if anyone wants it and hand it over; a sink that raises is logged, the others go on."""
         try:
-            sinks = self._plans[frame.system_id << 24 | frame.message_id]
+            is_read, entries = self._plans[frame.system_id << 24 | frame.message_id]
         except KeyError:
-            sinks = self._plan(frame)
-            if not sinks:
-                return
-        message = self.dialect.decode(frame)
-        for sink in sinks:
+            is_read, entries = self._plan(frame)
+        message = self.dialect.decode(frame) if is_read else None
+        for takes_frame, sink in entries:
             try:
-                sink(message)
+                sink(frame if takes_frame else message)
             except Exception:
                 _report(sink)
 
@@ -78,18 +83,25 @@ class Bus:
                 except Exception:
                     _report(sink)
 
-    def _plan(self, frame: Frame) -> tuple[Sink, ...]:
+    def _attach(self, key: tuple[int, int], entry: _Entry) -> Detach:
+        self._sinks[key] = (*self._sinks.get(key, ()), entry)
+        self._plans.clear()
+        self.wanted[key[1]] = self.wanted.get(key[1], 0) + 1
+        return once(lambda: self._detach(key, entry))
+
+    def _plan(self, frame: Frame) -> _Plan:
         """Who gets such a frame: those of its system before those of every system; nobody if it cannot be decoded."""
         system_id, message_id = frame.system_id, frame.message_id
         sinks = self._sinks.get((system_id, message_id), ()) if system_id != EVERY_SYSTEM else ()
         sinks += self._sinks.get((EVERY_SYSTEM, message_id), ())
         if not sinks or self.dialect.get(message_id) is None:
-            return ()
-        self._plans[system_id << 24 | message_id] = sinks
-        return sinks
+            return False, ()
+        plan = any(not takes_frame for takes_frame, _ in sinks), sinks
+        self._plans[system_id << 24 | message_id] = plan
+        return plan
 
-    def _detach(self, key: tuple[int, int], sink: Sink) -> None:
-        _drop(self._sinks, key, sink)
+    def _detach(self, key: tuple[int, int], entry: _Entry) -> None:
+        _drop(self._sinks, key, entry)
         self._plans.clear()
         left = self.wanted[key[1]] - 1
         if left:
@@ -101,7 +113,7 @@ class Bus:
         _drop(self._event_sinks, event_type, sink)
 
 
-def _drop(table: dict[Any, tuple[Sink, ...]], key: object, sink: Sink) -> None:
+def _drop(table: dict[Any, tuple[Any, ...]], key: object, sink: object) -> None:
     """Take one occurrence of the sink out; deliveries under way keep the tuple they began with."""
     left = list(table[key])
     left.remove(sink)

@@ -7,19 +7,33 @@ import logging
 import math
 from collections import deque
 from collections.abc import AsyncIterator, Callable
-from typing import Generic, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 from aerokit.errors import OperationTimeout, StaleValueError, ValueUnknownError
 from aerokit.runtime.endings import raisable
 from aerokit.snapshot import Snapshot
 
-__all__ = ["Changes", "Source", "StateCell"]
+__all__ = ["Changes", "Feed", "Source", "StateCell"]
 
 T = TypeVar("T")
 
 logger = logging.getLogger("aerokit")
 
 _SEEN = 3  # how many of the last distinct values a time-out names
+
+
+class Feed(Protocol):
+    """What works out values only when somebody looks; it calls :meth:`StateCell.set`."""
+
+    @property
+    def pending(self) -> object:
+        """Whether something has come that was not worked out yet."""
+
+    def catch_up(self) -> None:
+        """Work it out now."""
+
+    def watchers_changed(self) -> None:
+        """Somebody begins or ends to wait for values of one of the cells: see :attr:`StateCell.is_watched`."""
 
 
 class Source(Snapshot):
@@ -44,18 +58,29 @@ class StateCell(Generic[T]):
         "_changes",
         "_clock",
         "_closed_by",
+        "_feeds",
+        "_is_followed",
         "_known",
         "_latest",
         "_sinks",
         "_source",
+        "_stamp",
         "_updated_at",
         "name",
         "waits_for",
     )
 
-    def __init__(self, name: str, clock: Callable[[], float], waits_for: str) -> None:
+    def __init__(
+        self,
+        name: str,
+        clock: Callable[[], float],
+        waits_for: str,
+        *,
+        stamp: Callable[[], float] | None = None,
+    ) -> None:
         self.name = name
         self._clock = clock
+        self._stamp = clock if stamp is None else stamp  # the time that a value set now came at
         self.waits_for = waits_for
         """The messages that the value comes from."""
         self._known = False
@@ -65,6 +90,8 @@ class StateCell(Generic[T]):
         self._arrivals = 0
         self._changes = 0
         self._sinks: list[_Sink[T]] = []
+        self._is_followed = False
+        self._feeds: tuple[Feed, ...] = ()
         self._closed_by: BaseException | None = None
 
     # ------------------------------------------------------------------------------ reading
@@ -72,6 +99,7 @@ class StateCell(Generic[T]):
     @property
     def value(self) -> T:
         """The latest value, however old; :class:`ValueUnknownError` before the first."""
+        self._catch_up()
         if not self._known:
             raise ValueUnknownError(f"{self.name} is not known yet: no {self.waits_for} has been received")
         return self._latest  # type: ignore[return-value]
@@ -79,26 +107,31 @@ class StateCell(Generic[T]):
     @property
     def latest(self) -> T | None:
         """The latest value, or None before the first."""
+        self._catch_up()
         return self._latest if self._known else None
 
     @property
     def is_known(self) -> bool:
         """Whether a value has come."""
+        self._catch_up()
         return self._known
 
     @property
     def updated_at(self) -> float:
         """When the latest value came, in seconds of the cell's clock; −inf before the first."""
+        self._catch_up()
         return self._updated_at
 
     @property
     def age(self) -> float:
         """Seconds since the latest value came; inf before the first."""
+        self._catch_up()
         return self._clock() - self._updated_at
 
     @property
     def source(self) -> Source | None:
         """Who sent the latest value, and in which message; None before the first."""
+        self._catch_up()
         return self._source
 
     def fresh(self, within: float) -> T:
@@ -133,7 +166,7 @@ class StateCell(Generic[T]):
         """
         self._raise_if_closed()
         waiter = _Waiter(self, predicate, held_for)
-        self._sinks.append(waiter)
+        self._add(waiter)
         if self._known:
             waiter.receive(self._latest)  # type: ignore[arg-type]
         return await waiter.wait(timeout, description)
@@ -159,7 +192,7 @@ class StateCell(Generic[T]):
         The callback must be quick; what it raises is logged.
         """
         observer = _Observer(self, callback, every_arrival)
-        self._sinks.append(observer)
+        self._add(observer)
         return observer.close
 
     # ------------------------------------------------------------------------------ writing
@@ -171,7 +204,7 @@ class StateCell(Generic[T]):
         self._latest = value
         self._known = True
         self._source = source
-        self._updated_at = self._clock()
+        self._updated_at = self._stamp()
         self._arrivals += 1
         if self._sinks:
             for sink in tuple(self._sinks):
@@ -185,6 +218,15 @@ class StateCell(Generic[T]):
         for sink in tuple(self._sinks):
             sink.forget()
 
+    def feed_from(self, *feeds: Feed) -> None:
+        """Say where values come from that are worked out when somebody looks."""
+        self._feeds = feeds
+
+    @property
+    def is_watched(self) -> bool:
+        """Whether somebody waits for values, observes or follows them, so that each one counts."""
+        return self._is_followed or bool(self._sinks)
+
     def close(self, error: BaseException) -> None:
         """No value will come any more: whoever waits, now or later, gets ``error``. Reading still works."""
         if self._closed_by is None:
@@ -196,8 +238,32 @@ class StateCell(Generic[T]):
         if self._closed_by is not None:
             raise raisable(self._closed_by)
 
+    def _catch_up(self) -> None:
+        for feed in self._feeds:
+            if feed.pending:
+                feed.catch_up()
+
+    def _add(self, sink: _Sink[T]) -> None:
+        self._catch_up()
+        self._sinks.append(sink)
+        self._tell_feeds()
+
+    def _remove(self, sink: _Sink[T]) -> None:
+        self._sinks.remove(sink)
+        self._tell_feeds()
+
+    def _follow(self) -> None:
+        if not self._is_followed:
+            self._catch_up()
+            self._is_followed = True
+            self._tell_feeds()
+
+    def _tell_feeds(self) -> None:
+        for feed in self._feeds:
+            feed.watchers_changed()
+
     def _describe(self) -> str:
-        if not self._known:
+        if not self.is_known:
             return f"{self.name} is not known yet, no {self.waits_for} has been received"
         return f"{self.name} is {self._latest!r}, {self.age:.1f} s old"
 
@@ -213,6 +279,7 @@ class Changes(AsyncIterator[T]):
 
     def __init__(self, cell: StateCell[T], *, every_arrival: bool) -> None:
         self._cell = cell
+        cell._follow()
         self._every_arrival = every_arrival
         self._read_at = self._count() - (1 if cell.is_known else 0)
         self._missed = 0
@@ -239,7 +306,7 @@ class Changes(AsyncIterator[T]):
     async def _next_arrival(self) -> None:
         self._cell._raise_if_closed()
         waiter: _Waiter[T] = _Waiter(self._cell, lambda _: True, 0.0)
-        self._cell._sinks.append(waiter)
+        self._cell._add(waiter)
         await waiter.wait(None, "")
 
 
@@ -291,7 +358,7 @@ class _Waiter(_Sink[T]):
         try:
             value = await self._future
         finally:
-            self._cell._sinks.remove(self)
+            self._cell._remove(self)
             self._stop_hold()
             if timer is not None:
                 timer.cancel()
@@ -376,4 +443,4 @@ class _Observer(_Sink[T]):
 
     def close(self) -> None:
         if self in self._cell._sinks:
-            self._cell._sinks.remove(self)
+            self._cell._remove(self)

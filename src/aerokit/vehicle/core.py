@@ -321,12 +321,16 @@ class VehicleCore:
     # ------------------------------------------------------------------------------ inside
 
     def _attach_telemetry(self) -> None:
+        bus, streams = self.connection.bus, self.telemetry.streams
         for message_id, handler in self.telemetry.handles.items():
-            message_type = self.connection.bus.dialect.get(message_id)
-            if message_type is not None:
-                self._detach.append(
-                    self.connection.bus.attach(message_type, handler, system_id=self.system_id)
-                )
+            message_type = bus.dialect.get(message_id)
+            if message_type is None:
+                continue
+            if message_id in streams:
+                detach = bus.attach_frames(message_type, streams[message_id].take, system_id=self.system_id)
+            else:
+                detach = bus.attach(message_type, handler, system_id=self.system_id)
+            self._detach.append(detach)
         self._detach += [
             self.telemetry.mode.observe(self._on_mode),
             self.telemetry.armed.observe(self._on_armed),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,7 @@ from aerokit.runtime.cells import Source, StateCell
 from aerokit.vehicle import decoding
 from aerokit.vehicle.feeds import FEEDS, MESSAGE_IDS, message_type
 from aerokit.vehicle.status_text import StatusTextAssembler
+from aerokit.vehicle.streamed import STREAMED, StreamedMessage
 from aerokit.vehicle.values import (
     Attitude,
     AutopilotVersion,
@@ -54,9 +56,10 @@ Handler = Callable[[Any, Source], None]
 class Telemetry:
     """All state cells of one vehicle, and what each message does to them.
 
-    Only messages of system ``system_id``, component ``component_id`` (the autopilot) change anything;
-    messages that the program built itself are let through. ``handles`` has the entry point for each message
-    id. ``clock`` gives seconds; without ``autopilot`` the first HEARTBEAT says which it is.
+    Only messages of system ``system_id``, component ``component_id`` (the autopilot) change anything; messages that
+    the program built itself are let through. ``handles`` has the entry point for each message id, ``streams`` those
+    that frames of streamed messages are given to. ``clock`` gives seconds; without ``autopilot`` the first HEARTBEAT
+    says which it is.
     """
 
     def __init__(
@@ -71,15 +74,23 @@ class Telemetry:
         self.autopilot = autopilot or Autopilot(0)
         self._knows_autopilot = autopilot is not None
         self._clock = clock
+        self._lock = threading.RLock()  # any thread may look, and what is looked at is worked out then
+        self._arrived_at: float | None = None
         self._texts = StatusTextAssembler()
         self._base_mode = 0
         self._mode_names: dict[int, str] = {}
         self._cells: dict[str, StateCell[Any]] = {}
         self._make_cells()
         self._handlers = {messages.Heartbeat.ID: self._entry("Heartbeat", self._on_heartbeat)}
+        table = self._table()
         self._handlers.update(
-            {MESSAGE_IDS[name]: self._entry(name, handler) for name, handler in self._table().items()}
+            {MESSAGE_IDS[name]: self._entry(name, handler) for name, handler in table.items()}
         )
+        self._streams = {MESSAGE_IDS[name]: self._streamed(name, table[name]) for name in STREAMED}
+        for cell in self._cells.values():
+            cell.feed_from(
+                *(self._streams[MESSAGE_IDS[name]] for name in STREAMED if cell.name in STREAMED[name])
+            )
 
     def _make_cells(self) -> None:
         """Names are those on ``Vehicle``; each cell's documentation is its value's."""
@@ -157,6 +168,11 @@ class Telemetry:
         """Message id → what takes a message of this kind."""
         return self._handlers
 
+    @property
+    def streams(self) -> Mapping[int, StreamedMessage]:
+        """Message id → what takes frames of this kind: they are worked out when somebody looks at their cells."""
+        return self._streams
+
     def accepts(self, frame: Frame) -> bool:
         """Whether this is the vehicle's own autopilot talking."""
         return frame.system_id == self.system_id and frame.component_id == self.component_id
@@ -173,6 +189,8 @@ class Telemetry:
 
     def forget(self) -> None:
         """Make everything unknown again, as after a reboot; texts are remembered."""
+        for stream in self._streams.values():
+            stream.forget()
         for cell in self._cells.values():
             cell.forget()
 
@@ -211,8 +229,12 @@ class Telemetry:
     # -------------------------------------------------------------------------- the machinery
 
     def _cell(self, name: str, waits_for: str) -> StateCell[Any]:
-        cell = self._cells[name] = StateCell(name, self._clock, waits_for)
+        cell = self._cells[name] = StateCell(name, self._clock, waits_for, stamp=self._time_of_arrival)
         return cell
+
+    def _time_of_arrival(self) -> float:
+        """Of the message that is being worked out."""
+        return self._clock() if self._arrived_at is None else self._arrived_at
 
     def _source(self, class_name: str) -> Source:
         return Source(self.system_id, self.component_id, message_type(class_name).NAME)
@@ -224,9 +246,23 @@ class Telemetry:
         def take(message: Message) -> None:
             frame = message.received_frame
             if frame is None or (frame.system_id == system_id and frame.component_id == component_id):
-                handler(message, source)
+                with self._lock:
+                    handler(message, source)
 
         return take
+
+    def _streamed(self, class_name: str, handler: Handler) -> StreamedMessage:
+        source, decode = self._source(class_name), message_type(class_name).decode_body
+
+        def apply(frame: Frame) -> None:
+            before, self._arrived_at = self._arrived_at, frame.received_at
+            try:
+                handler(decode(frame.body, frame), source)
+            finally:
+                self._arrived_at = before
+
+        cells = [self._cells[name] for name in STREAMED[class_name]]
+        return StreamedMessage(class_name, self.component_id, cells, apply, self._lock)
 
     @staticmethod
     def _simply(cell: StateCell[Any], decode: Callable[[Any], Any]) -> Handler:
@@ -244,7 +280,7 @@ class Telemetry:
         return (
             cell.source is not None
             and cell.source.message != source.message
-            and self._clock() - cell.updated_at < BETTER_SOURCE_S
+            and self._time_of_arrival() - cell.updated_at < BETTER_SOURCE_S
         )
 
     # ------------------------------------------------------------------------- mode and state

@@ -1,0 +1,114 @@
+"""Messages that come in streams: what they say is worked out when somebody looks."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import threading
+    from collections.abc import Callable, Mapping, Sequence
+
+    from aerokit.mavlink.frame import Frame
+    from aerokit.runtime.cells import StateCell
+
+__all__ = ["STREAMED", "StreamedMessage"]
+
+LOOK_S = 5.0
+"""So often, in seconds, they are worked out although nobody looks: a value that a later message does not have any more
+(a position without a fix) is known from before."""
+
+_HEADER_LENGTH = 9
+
+STREAMED: Mapping[str, tuple[str, ...]] = {
+    "SysStatus": ("sensors", "batteries"),
+    "SystemTime": ("system_time",),
+    "GpsRawInt": ("gps",),
+    "Gps2Raw": ("gps",),
+    "Attitude": ("attitude",),
+    "AttitudeQuaternion": ("attitude",),
+    "LocalPositionNed": ("local_position", "velocity"),
+    "GlobalPositionInt": ("heading_deg", "position", "velocity"),
+    "RcChannels": ("rc_channels",),
+    "ServoOutputRaw": ("servo_outputs",),
+    "MissionCurrent": ("mission_current",),
+    "VfrHud": ("ground_speed_m_s", "climb_m_s", "throttle_percent", "air_speed_m_s", "heading_deg"),
+    "DistanceSensor": ("range_finders",),
+    "Rangefinder": ("range_finders",),
+    "BatteryStatus": ("batteries",),
+    "Wind": ("wind",),
+    "WindCov": ("wind",),
+    "EkfStatusReport": ("estimator",),
+    "EstimatorStatus": ("estimator",),
+    "Vibration": ("vibration",),
+}
+"""Name of the message class → names of the cells it may change."""
+
+NUMBER_AT: Mapping[str, int] = {"ServoOutputRaw": 20, "DistanceSensor": 11, "BatteryStatus": 32}
+"""Name of the message class → where in the payload the byte is that says which one of several it speaks of."""
+
+
+class StreamedMessage:
+    """One kind of message of one vehicle's autopilot. It keeps the latest frame, and works it out when it is looked at.
+
+    While one of ``cells`` is watched, each frame is worked out (``apply(frame)``) as it comes. Frames come on the
+    loop's thread; any thread may look. ``lock`` keeps the threads apart.
+    """
+
+    __slots__ = (
+        "_apply",
+        "_cells",
+        "_component_id",
+        "_is_watched",
+        "_lock",
+        "_look_at",
+        "_number_at",
+        "pending",
+    )
+
+    def __init__(
+        self,
+        class_name: str,
+        component_id: int,
+        cells: Sequence[StateCell[object]],
+        apply: Callable[[Frame], None],
+        lock: threading.RLock,
+    ) -> None:
+        self._component_id, self._cells, self._apply, self._lock = component_id, cells, apply, lock
+        number_at = NUMBER_AT.get(class_name)
+        self._number_at = None if number_at is None else number_at + _HEADER_LENGTH
+        self._look_at = -math.inf
+        self._is_watched = False
+        self.pending: dict[int, Frame] = {}
+        """The frames that were not worked out yet, by the number of what they speak of."""
+
+    def take(self, frame: Frame) -> None:
+        """Take a frame of the vehicle's system; only those of its autopilot count."""
+        if frame.component_id != self._component_id:
+            return
+        number_at = self._number_at
+        if number_at is None:
+            self.pending[0] = frame
+        else:
+            self.pending[frame.body[number_at] if len(frame.body) > number_at else 0] = frame
+        if self._is_watched or frame.received_at >= self._look_at:
+            self._look_at = frame.received_at + LOOK_S
+            self.catch_up()
+
+    def catch_up(self) -> None:
+        """Work out what has come."""
+        with self._lock:
+            while self.pending:
+                self._apply(self.pending.popitem()[1])
+
+    def watchers_changed(self) -> None:
+        """Somebody begins or ends to wait for what is in the cells."""
+        self._is_watched = any(cell.is_watched for cell in self._cells)
+        if self.pending:
+            self.catch_up()
+
+    def forget(self) -> None:
+        """What has come does not count any more."""
+        with self._lock:
+            self.pending.clear()
+            self._look_at = -math.inf

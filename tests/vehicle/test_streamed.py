@@ -1,0 +1,181 @@
+"""Streamed messages are worked out when somebody looks, and nobody can tell."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+
+from aerokit.autopilots import autopilot_for
+from aerokit.mavlink import FrameEncoder, Framer, Message, messages
+from aerokit.mavlink.frame import Frame
+from aerokit.vehicle.feeds import MESSAGE_IDS, message_type
+from aerokit.vehicle.streamed import LOOK_S, NUMBER_AT, STREAMED
+from aerokit.vehicle.telemetry import Telemetry
+
+HEARTBEAT = messages.Heartbeat(2, 3, 81, 4, 3)
+CHANNELS: dict[str, int] = {f"chan{number}_raw": 1500 for number in range(1, 19)}
+ANYTHING: dict[str, Message] = {
+    "SysStatus": messages.SysStatus(1, 1, 1, 100, 12000, 100, 90, 0, 0, 0, 0, 0, 0),
+    "SystemTime": messages.SystemTime(1_700_000_000_000_000, 5),
+    "GpsRawInt": messages.GpsRawInt(0, 3, 473977000, 85456000, 0, 100, 100, 0, 0, 10),
+    "Gps2Raw": messages.Gps2Raw(0, 3, 473977000, 85456000, 0, 100, 100, 0, 0, 10, 0, 0),
+    "Attitude": messages.Attitude(0, 0.1, 0.2, 0.3, 0.0, 0.0, 0.0),
+    "AttitudeQuaternion": messages.AttitudeQuaternion(0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+    "LocalPositionNed": messages.LocalPositionNed(0, 1.0, 2.0, 3.0, 0.1, 0.2, 0.3),
+    "GlobalPositionInt": messages.GlobalPositionInt(
+        0, 473977000, 85456000, 498000, 10000, 100, -200, 50, 9000
+    ),
+    "RcChannels": messages.RcChannels(0, 8, **CHANNELS, rssi=200),
+    "ServoOutputRaw": messages.ServoOutputRaw(0, 0, *[1500] * 8),
+    "MissionCurrent": messages.MissionCurrent(2),
+    "VfrHud": messages.VfrHud(3.0, 4.0, 271, 50, 20.0, 0.5),
+    "DistanceSensor": messages.DistanceSensor(0, 10, 5000, 300, 0, 0, 25, 255),
+    "Rangefinder": messages.Rangefinder(3.0, 1.0),
+    "BatteryStatus": messages.BatteryStatus(0, 1, 1, 2500, (12000, *[65535] * 9), 100, 10, 10, 90),
+    "Wind": messages.Wind(10.0, 3.0, 0.0),
+    "WindCov": messages.WindCov(0, 1.0, 2.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+    "EkfStatusReport": messages.EkfStatusReport(831, 0.1, 0.1, 0.1, 0.1, 0.1),
+    "EstimatorStatus": messages.EstimatorStatus(0, 831, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 1.0, 1.0),
+    "Vibration": messages.Vibration(0, 1.0, 1.0, 1.0, 0, 0, 0),
+}
+
+
+class Clock:
+    now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def telemetry(clock: Clock) -> Telemetry:
+    return Telemetry(clock, autopilot=autopilot_for(HEARTBEAT))
+
+
+def frame_of(message: Message, at: float = 0.0, component_id: int = 1) -> Frame:
+    return Framer().receive(FrameEncoder(1, component_id).encode(message), at)[0]
+
+
+def take(telemetry: Telemetry, message: Message, at: float, component_id: int = 1) -> None:
+    telemetry.streams[message.ID].take(frame_of(message, at, component_id))
+
+
+@pytest.mark.parametrize("name", STREAMED)
+def test_the_table_names_every_cell_that_a_message_changes(telemetry: Telemetry, name: str) -> None:
+    telemetry.receive(ANYTHING[name])
+    changed = {cell.name for cell in telemetry.cells.values() if cell.is_known}
+    assert changed == set(STREAMED[name])
+
+
+@pytest.mark.parametrize("name", NUMBER_AT)
+def test_which_one_of_several_is_read_where_it_is(name: str) -> None:
+    field = "port" if name == "ServoOutputRaw" else "id"
+    message = ANYTHING[name]
+    fields = {each.name: getattr(message, each.name) for each in message.FIELDS}
+    body = frame_of(message_type(name)(**{**fields, field: 201})).body
+    assert body[9 + NUMBER_AT[name]] == 201
+
+
+def test_what_nobody_looks_at_waits(telemetry: Telemetry, clock: Clock) -> None:
+    stream = telemetry.streams[MESSAGE_IDS["Attitude"]]
+    take(telemetry, messages.Attitude(0, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0), 100.0)
+    assert not stream.pending, "the first is worked out at once: everybody can see that it is known"
+    take(telemetry, messages.Attitude(0, 0.2, 0.0, 0.0, 0.0, 0.0, 0.0), 100.5)
+    take(telemetry, messages.Attitude(0, 0.3, 0.0, 0.0, 0.0, 0.0, 0.0), 101.0)
+    clock.now = 103.0
+    assert stream.pending
+    assert telemetry.attitude.age == 2.0
+    assert not stream.pending
+    assert telemetry.attitude.updated_at == 101.0
+    assert telemetry.attitude.value.roll_deg == pytest.approx(17.19, abs=0.01)
+
+
+def test_other_components_say_nothing(telemetry: Telemetry) -> None:
+    take(telemetry, ANYTHING["Attitude"], 100.0, component_id=154)
+    assert not telemetry.attitude.is_known
+
+
+def test_whoever_observes_sees_each(telemetry: Telemetry) -> None:
+    take(telemetry, messages.VfrHud(3.0, 4.0, 10, 50, 20.0, 0.5), 100.0)
+    take(telemetry, messages.VfrHud(3.0, 5.0, 10, 50, 20.0, 0.5), 100.1)
+    seen: list[tuple[float | None, float]] = []
+    end = telemetry.ground_speed_m_s.observe(lambda before, after: seen.append((before, after)))
+    for number in range(3):
+        take(telemetry, messages.VfrHud(3.0, 6.0 + number, 10, 50, 20.0, 0.5), 100.2 + number / 10)
+    end()
+    assert seen == [(5.0, 6.0), (6.0, 7.0), (7.0, 8.0)]
+    take(telemetry, messages.VfrHud(3.0, 9.0, 10, 50, 20.0, 0.5), 100.6)
+    assert telemetry.streams[MESSAGE_IDS["VfrHud"]].pending
+    assert telemetry.ground_speed_m_s.value == 9.0
+
+
+def test_two_batteries_wait_side_by_side(telemetry: Telemetry) -> None:
+    for percent in (90, 80):
+        for number in (0, 1):
+            battery = messages.BatteryStatus(
+                number, 1, 1, 2500, (12000, *[65535] * 9), 100, 10, 10, percent - number
+            )
+            take(telemetry, battery, 100.0 + (90 - percent) / 100)
+    assert [each.remaining_percent for each in telemetry.batteries.value] == [80, 79]
+
+
+def test_the_better_of_two_sources_goes_first_whatever_is_looked_at_when(telemetry: Telemetry) -> None:
+    for at in (100.0, 101.0):
+        take(telemetry, ANYTHING["GlobalPositionInt"], at)
+        take(telemetry, ANYTHING["VfrHud"], at + 0.1)
+    assert telemetry.heading_deg.value == 90.0
+    take(telemetry, ANYTHING["VfrHud"], 104.0)
+    assert telemetry.heading_deg.value == 271.0
+
+
+def test_a_position_without_a_fix_leaves_the_one_before(telemetry: Telemetry) -> None:
+    """Also when nobody looked: it is worked out every few seconds."""
+    place, nowhere = ANYTHING["GlobalPositionInt"], messages.GlobalPositionInt(0, 0, 0, 0, 0, 0, 0, 0, 9000)
+    for number in range(50):
+        take(telemetry, place, 100.0 + number / 4)
+    take(telemetry, nowhere, 113.0)
+    position = telemetry.position.value
+    assert position.latitude_deg == pytest.approx(47.3977)
+    assert 112.25 - telemetry.position.updated_at <= LOOK_S
+
+
+def test_a_reboot_forgets_what_waits(telemetry: Telemetry) -> None:
+    take(telemetry, ANYTHING["Wind"], 100.0)
+    take(telemetry, ANYTHING["Wind"], 100.1)
+    telemetry.forget()
+    assert not telemetry.wind.is_known
+    take(telemetry, ANYTHING["Wind"], 100.2)
+    assert telemetry.wind.updated_at == 100.2
+
+
+def test_other_threads_look_while_frames_come(telemetry: Telemetry) -> None:
+    """A value is always one message's, and never older than one seen before."""
+    wrong: list[object] = []
+    ended = threading.Event()
+
+    def look() -> None:
+        last = 0.0
+        while not ended.is_set():
+            cell = telemetry.attitude
+            if cell.is_known:
+                value = cell.value
+                if value.roll_deg != value.pitch_deg or value.roll_deg < last:
+                    wrong.append(value)
+                last = value.roll_deg
+
+    threads = [threading.Thread(target=look) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for number in range(3000):
+        angle = number / 1000
+        take(telemetry, messages.Attitude(0, angle, angle, 0.0, 0.0, 0.0, 0.0), 100.0 + number / 1000)
+    ended.set()
+    for thread in threads:
+        thread.join()
+    assert wrong == []
