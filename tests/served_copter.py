@@ -28,10 +28,12 @@ def served_copter(*addresses: str, speedup: float = SPEEDUP, **options: Any) -> 
 def served(copters: Sequence[SimulatedCopter], *addresses: str, speedup: float = SPEEDUP) -> Iterator[str]:
     """Serve copters on addresses (by default one TCP port); gives the first address, as a client spells it.
 
-    They stay armed on the ground: ten seconds of theirs pass quickly, and this machine may be busy.
+    They stay armed on the ground, and overrides of channels hold for seconds of ours: ten seconds of theirs pass
+    quickly, and this machine may be busy.
     """
     for copter in copters:
         copter.parameters["DISARM_DELAY"] = 0.0
+        copter.parameters["RC_OVERRIDE_TIME"] *= speedup
 
     @asynccontextmanager
     async def serve() -> AsyncIterator[str]:

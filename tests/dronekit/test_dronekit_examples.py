@@ -58,7 +58,7 @@ EXPECTED: dict[str, tuple[float, list[str], list[str]]] = {
     ),
     "channel_overrides": (50, [], ["'3': 1100", "overrides: {'1': 1600, '2': 1400}"]),
     "create_attribute": (50, [], ["first: Vibration: x=", "\nvibration: Vibration: x="]),
-    "gimbal": (50, ["--seconds", "0.05"], ["Gimbal: pitch=None", "pitch -45, yaw 90", "released"]),
+    "gimbal": (50, ["--seconds", "0.05"], ["Gimbal: pitch=-", "pitch -45, yaw 90", "released"]),
     "follow_me": (
         25,
         ["--seconds", "0.6", "--walking-speed", "20", "--altitude", "5"],
@@ -67,6 +67,9 @@ EXPECTED: dict[str, tuple[float, list[str], list[str]]] = {
     "flight_replay": (50, [str(RECORDING)], ["4 waypoints", "to waypoint ", "at the end of the track"]),
 }
 """Example: times real time, its arguments beside the address, what it must print."""
+
+PARAMETERS = {"gimbal": {"MNT1_TYPE": 1.0}}
+"""Of the vehicle, where they are not the usual ones."""
 
 
 @pytest.fixture(autouse=True)
@@ -91,7 +94,7 @@ def test_example_says_dronekit_only(name: str) -> None:
 @pytest.mark.parametrize("name", EXPECTED)
 def test_example(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     speedup, arguments, expected = EXPECTED[name]
-    with served_copter(speedup=speedup) as address:
+    with served_copter(speedup=speedup, parameters=PARAMETERS.get(name)) as address:
         run_script(EXAMPLES / f"{name}.py", [*arguments, "--connect", address])
     told = capsys.readouterr()
     assert told.err == ""

@@ -373,7 +373,7 @@ def test_brake_stops_and_stays_and_loiter_needs_the_throttle_in_the_middle() -> 
     assert speed(copter) == pytest.approx((0.0, 0.0, 0.0), abs=0.02)
     client.send(m.RcChannelsOverride(1, 1, 0xFFFF, 0xFFFF, 1500, 0xFFFF, 0xFFFF, 0xFFFF, 0xFFFF, 0xFFFF))
     set_mode(client, CopterMode.LOITER)
-    client.run(5.0)
+    client.run(2.5)  # an override holds for 3 s
     assert copter.altitude_m == pytest.approx(20.0, abs=0.2)
     client.send(m.RcChannelsOverride(1, 1, 1500, 1250, 0, 1500, 0, 0, 0, 0))  # forward, throttle released
     client.run(3.0)

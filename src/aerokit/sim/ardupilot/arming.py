@@ -39,6 +39,8 @@ class Arming:
         if not copter.is_initialised:
             return ["System not initialised"]
         reasons = list(copter.faults.prearm_failures)
+        if copter.calibrations.of_compasses:
+            reasons.append("Compass calibration running")
         if copter.battery.voltage_v < copter.parameters["BATT_ARM_VOLT"]:
             reasons.append("Battery 1 below minimum arming voltage")
         if copter.failsafes.battery_is_low:

@@ -382,4 +382,4 @@ class Auto(Mode):
     def _look_at(self, item: MissionItem) -> None:
         nowhere = (item.x, item.y, item.z) == (0, 0, 0)
         point = None if nowhere else self.copter.point(int(item.x), int(item.y), item.z, MavFrame.GLOBAL)
-        self.copter.yaw.region_of_interest(None if point is None else point[:2])
+        self.copter.yaw.region_of_interest(point)

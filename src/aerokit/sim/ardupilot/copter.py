@@ -18,15 +18,19 @@ from aerokit.mavlink.enums import (
 from aerokit.sim.ardupilot.arming import Arming
 from aerokit.sim.ardupilot.auto import Auto
 from aerokit.sim.ardupilot.boot import BootTimeline
+from aerokit.sim.ardupilot.buzzer import hear_tunes
+from aerokit.sim.ardupilot.calibration import Calibrations
 from aerokit.sim.ardupilot.copter_commands import copter_commands
 from aerokit.sim.ardupilot.copter_parameters import copter_parameters
 from aerokit.sim.ardupilot.failsafes import Failsafes
+from aerokit.sim.ardupilot.gimbal import Gimbal
 from aerokit.sim.ardupilot.guided import Guided
 from aerokit.sim.ardupilot.mission_run import MissionRun
 from aerokit.sim.ardupilot.mission_server import MissionServer
 from aerokit.sim.ardupilot.modes import AltHold, Brake, Circle, Loiter, Mode, PosHold, Stabilize
 from aerokit.sim.ardupilot.motors import Motors
 from aerokit.sim.ardupilot.navigation import Navigation
+from aerokit.sim.ardupilot.radio import Radio
 from aerokit.sim.ardupilot.requests import Requests
 from aerokit.sim.ardupilot.returning import Land, Rtl, SmartRtl
 from aerokit.sim.ardupilot.setpoints import Setpoints
@@ -58,7 +62,6 @@ _REBOOT_SILENCE_S = 1.5
 _LAND_DETECTOR_S = 1.0
 _TIMESYNC_S = 10.0
 _BEFORE_READY = frozenset({m.Heartbeat.ID, m.AutopilotVersion.ID})
-_RC_AT_REST = (1500, 1500, 1000, 1500, 1800, 1000, 1000, 1800)
 _RELATIVE = frozenset({MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT})
 _TERRAIN = frozenset({MavFrame.GLOBAL_TERRAIN_ALT, MavFrame.GLOBAL_TERRAIN_ALT_INT})
 _ABSOLUTE = frozenset({MavFrame.GLOBAL, MavFrame.GLOBAL_INT})
@@ -82,7 +85,7 @@ class SimulatedCopter(SimulatedVehicle):
     - ``components``: other components on its links (gimbal, camera), heartbeats only
     - ``unix_time_at_boot``: what its GPS clock says at simulated second 0
 
-    Not simulated yet: keeping within a fence, flying to rally points, a gimbal, radio failsafe.
+    Not simulated yet: keeping within a fence, flying to rally points, radio failsafe.
     """
 
     CAPABILITIES: ClassVar[int] = 0xFBEF
@@ -126,8 +129,11 @@ class SimulatedCopter(SimulatedVehicle):
         self.motion.yaw = math.remainder(math.radians(heading_deg), 2 * math.pi)
         self.rangefinder_reach_m = rangefinder_reach_m
         self.unsupported_commands = frozenset(unsupported_commands)
-        self.rc: list[int] = list(_RC_AT_REST)
-        """What the sticks and switches send, 8 channels; the throttle (index 2) rests at 1000."""
+        self.rc = Radio(self)
+        """What it hears of sticks and switches; the throttle (index 2) rests at 1000."""
+        self.tunes = hear_tunes(self)
+        """What PLAY_TUNE had it play."""
+        self.calibrations = Calibrations(self)
         self._boot_text = boot_text
         self._stream_groups = stream_groups
         self._unix_time_at_start = unix_time_at_boot
@@ -151,6 +157,9 @@ class SimulatedCopter(SimulatedVehicle):
         self.navigation = Navigation(self, self._frame)
         self.arming = Arming(self)
         self.failsafes = Failsafes(self)
+        self.gimbal = Gimbal(self)
+        self.calibrations.reset()
+        self.rc.reset()
         self.yaw = AutoYaw(self)
         self._modes = {mode.number: mode(self) for mode in _MODES}
         guided = self._modes[CopterMode.GUIDED]
@@ -172,7 +181,7 @@ class SimulatedCopter(SimulatedVehicle):
         self.on(m.SetMode, self._on_set_mode)
         self.on(m.Timesync, self._on_timesync)
         self.on(m.Ping, self._on_ping)
-        self.on(m.RcChannelsOverride, self._on_rc_override)
+        self.rc.listen()
         self.missions.listen()
 
     # ---------------------------------------------------------------------------------------- state
@@ -387,11 +396,3 @@ class SimulatedCopter(SimulatedVehicle):
     def _on_ping(self, ping: m.Ping, channel: Channel) -> None:
         if ping.target_system == 0:
             self.send(m.Ping(ping.time_usec, ping.seq, *sender_of(ping)), channel)
-
-    def _on_rc_override(self, override: m.RcChannelsOverride, _: Channel) -> None:
-        for index in range(len(self.rc)):
-            value = getattr(override, f"chan{index + 1}_raw")
-            if value == 0:
-                self.rc[index] = _RC_AT_REST[index]
-            elif value != 0xFFFF:
-                self.rc[index] = value

@@ -11,13 +11,13 @@ from aerokit.mavlink.enums import (
     MavFrame,
     MavMissionType,
     MavResult,
-    MavSeverity,
     SpeedType,
 )
 from aerokit.mavlink.messages import AutopilotVersion, MissionCurrent
 from aerokit.sim.ardupilot.auto import Auto
+from aerokit.sim.ardupilot.gimbal_commands import GimbalCommands
 from aerokit.sim.ardupilot.guided import Guided
-from aerokit.sim.commands import Command, CommandHandler, Progress
+from aerokit.sim.commands import Command, CommandHandler
 
 if TYPE_CHECKING:
     from aerokit.sim.ardupilot.copter import SimulatedCopter
@@ -27,7 +27,6 @@ __all__ = ["copter_commands"]
 _FORCE_ARM_OR_DISARM, _FORCE_ARM = 21196.0, 2989.0
 _FORCE_REBOOT = 20190226
 _CHANGE_MODE = 1
-_GYRO_CALIBRATION_S = 1.0
 _ALL_FENCES, _POLYGON_FENCES = 15, 4
 
 
@@ -59,9 +58,10 @@ def copter_commands(copter: SimulatedCopter) -> dict[int, CommandHandler]:
         MavCmd.GET_MESSAGE_INTERVAL: copter.requests.get_interval,
         MavCmd.DO_FENCE_ENABLE: setup.enable_fence,
         MavCmd.RUN_PREARM_CHECKS: setup.run_prearm_checks,
-        MavCmd.PREFLIGHT_CALIBRATION: setup.calibrate,
         MavCmd.PREFLIGHT_REBOOT_SHUTDOWN: setup.reboot,
         MavCmd.DO_SEND_BANNER: setup.send_banner,
+        **copter.calibrations.commands,
+        **GimbalCommands(copter).commands,
     }
     for command in copter.unsupported_commands:
         handlers.pop(command, None)
@@ -186,7 +186,7 @@ class _Flight:
         if point is None:
             return MavResult.DENIED
         nowhere = command.place() == (0, 0) and command.z == 0
-        self._copter.yaw.region_of_interest(None if nowhere else point[:2])
+        self._copter.yaw.region_of_interest(None if nowhere else point)
         return MavResult.ACCEPTED
 
     def look_ahead(self, _: Command) -> int:
@@ -249,21 +249,6 @@ class _Setup:
             return MavResult.TEMPORARILY_REJECTED
         self._copter.arming.report()
         return MavResult.ACCEPTED
-
-    def calibrate(self, command: Command) -> int | Progress:
-        """Gyroscopes and level take a second; the rest is answered at once with what 4.7-dev answers."""
-        copter = self._copter
-        if copter.motors.is_armed:
-            copter.send_text(MavSeverity.NOTICE, "Disarm to allow calibration")
-            return MavResult.FAILED
-        if command.param1 == 1.0 or command.x == 2:
-            return Progress((), _GYRO_CALIBRATION_S)
-        if command.param3 == 1.0:
-            copter.info("Barometer calibration complete")
-            return MavResult.ACCEPTED
-        if command.x == 4:
-            return MavResult.TEMPORARILY_REJECTED
-        return MavResult.ACCEPTED if command.x in (1, 76) or command.param2 == 76.0 else MavResult.UNSUPPORTED
 
     def reboot(self, command: Command) -> int:
         if self._copter.motors.is_armed and command.y != _FORCE_REBOOT:

@@ -10,6 +10,7 @@ from aerokit.mavlink.messages import (
     AvailableModesMonitor,
     Heartbeat,
     MessageInterval,
+    RcChannelsRaw,
     RequestDataStream,
 )
 from aerokit.sim.ardupilot.stream_groups import COPTER_GROUPS, KNOWN_MESSAGES
@@ -50,7 +51,7 @@ class Requests:
             text = f"Requested rate for message ID {message_id} too fast. Increase SCHED_LOOP_RATE"
             self._copter.info(text)
             return MavResult.DENIED
-        command.channel.streams.set_interval(message_id, min(interval, _LONGEST_S), self._copter.now)
+        self._stream(message_id, min(interval, _LONGEST_S), command.channel)
         return MavResult.ACCEPTED
 
     def get_interval(self, command: Command) -> int:
@@ -82,7 +83,7 @@ class Requests:
 
         def send() -> None:
             message = self._copter.build(message_id)
-            if message is not None:
+            if message is not None and (message_id != RcChannelsRaw.ID or channel.version == 1):
                 self._copter.send(message, channel)
 
         self._copter.call_later(0.0, send)
@@ -105,4 +106,9 @@ class Requests:
         for messages in groups.values():
             for message_id in messages:
                 interval = max(1.0 / rate, _SHORTEST_S) if rate > 0 else 0.0
-                channel.streams.set_interval(message_id, interval, self._copter.now)
+                self._stream(message_id, interval, channel)
+
+    def _stream(self, message_id: int, interval: float, channel: Channel) -> None:
+        """RC_CHANNELS_RAW is for MAVLink 1 only, where old displays look for it."""
+        if message_id != RcChannelsRaw.ID or channel.version == 1:
+            channel.streams.set_interval(message_id, interval, self._copter.now)

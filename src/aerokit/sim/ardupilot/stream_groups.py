@@ -24,7 +24,7 @@ COPTER_GROUPS: dict[int, tuple[int, ...]] = {
         m.NavControllerOutput.ID,
         m.PositionTargetGlobalInt.ID,
     ),
-    MavDataStream.RC_CHANNELS: (m.ServoOutputRaw.ID, m.RcChannels.ID),
+    MavDataStream.RC_CHANNELS: (m.ServoOutputRaw.ID, m.RcChannels.ID, m.RcChannelsRaw.ID),
     MavDataStream.RAW_CONTROLLER: (),
     MavDataStream.POSITION: (m.GlobalPositionInt.ID, m.LocalPositionNed.ID),
     MavDataStream.EXTRA1: (m.Attitude.ID, m.Simstate.ID, m.Ahrs2.ID, m.EscTelemetry1To4.ID),
@@ -37,6 +37,7 @@ COPTER_GROUPS: dict[int, tuple[int, ...]] = {
         m.SystemTime.ID,
         m.TerrainReport.ID,
         m.BatteryStatus.ID,
+        m.GimbalDeviceAttitudeStatus.ID,
         m.EkfStatusReport.ID,
         m.Vibration.ID,
     ),
@@ -55,6 +56,8 @@ KNOWN_MESSAGES: frozenset[int] = frozenset(
         m.AutopilotVersion.ID,
         m.AvailableModes.ID,
         m.AvailableModesMonitor.ID,
+        m.GimbalManagerInformation.ID,
+        m.GimbalManagerStatus.ID,
         *(message_id for group in COPTER_GROUPS.values() for message_id in group),
     }
 )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
@@ -127,10 +127,16 @@ def mission_current(copter: SimulatedCopter, seq: int | None = None) -> m.Missio
 
 
 def _rc_channels(copter: SimulatedCopter) -> m.RcChannels:
-    one, two, three, four, five, six, seven, eight = copter.rc
-    return m.RcChannels(
-        copter.time_boot_ms, 8, one, two, three, four, five, six, seven, eight, *(0,) * 10, rssi=255
-    )
+    channels = _by_name(copter.rc.channels)
+    return m.RcChannels(time_boot_ms=copter.time_boot_ms, chancount=len(copter.rc), rssi=255, **channels)
+
+
+def _rc_channels_raw(copter: SimulatedCopter) -> m.RcChannelsRaw:
+    return m.RcChannelsRaw(time_boot_ms=copter.time_boot_ms, port=0, rssi=255, **_by_name(copter.rc))
+
+
+def _by_name(values: Iterable[int]) -> dict[str, int]:
+    return {f"chan{number}_raw": value for number, value in enumerate(values, start=1)}
 
 
 def _servo_output(copter: SimulatedCopter) -> m.ServoOutputRaw:
@@ -181,6 +187,7 @@ STATE_BUILDERS: dict[int, Callable[[SimulatedCopter], Message | None]] = {
     m.SystemTime.ID: _system_time,
     m.MissionCurrent.ID: mission_current,
     m.RcChannels.ID: _rc_channels,
+    m.RcChannelsRaw.ID: _rc_channels_raw,
     m.ServoOutputRaw.ID: _servo_output,
     m.Vibration.ID: _vibration,
     m.EscTelemetry1To4.ID: _esc_telemetry,

@@ -10,6 +10,7 @@ from aerokit.sim.motion import wrap_pi
 
 if TYPE_CHECKING:
     from aerokit.sim.ardupilot.copter import SimulatedCopter
+    from aerokit.sim.ardupilot.navigation import Ned
 
 __all__ = ["AutoYaw"]
 
@@ -65,12 +66,14 @@ class AutoYaw:
         """Keep turning, in radians per second."""
         self._rate, self._apply = rate, self._turn
 
-    def region_of_interest(self, point: tuple[float, float] | None) -> None:
-        """Look at a place (north, east) until the next target; None ends it."""
-        self._roi = point
+    def region_of_interest(self, point: Ned | None) -> None:
+        """Look at a place until the next target; None ends it. A gimbal does so in the vehicle's place."""
+        gimbal = self._copter.gimbal
+        gimbal.look_at(point)
         if point is None:
             self.default()
-        else:
+        elif not gimbal.is_fitted:
+            self._roi = point[:2]
             self._apply = self._look_at_roi
 
     def stop_turning(self) -> None:

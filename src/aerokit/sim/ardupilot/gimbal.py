@@ -1,0 +1,202 @@
+"""A servo gimbal (MNT1_TYPE 1) with three axes on a simulated ArduCopter.
+
+Servos tell nothing: what the vehicle tells is what it has the servos do, at once. Pitch and roll are from the
+horizon, yaw is from the vehicle's nose or from north. With MNT1_TYPE 0 there is none, and orders FAIL.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from aerokit.mavlink.enums import GimbalManagerFlags, MavMountMode, MavResult, MavSeverity
+from aerokit.sim.ardupilot.gimbal_status import gimbal_manager_status
+
+if TYPE_CHECKING:
+    from aerokit.sim.ardupilot.copter import SimulatedCopter
+    from aerokit.sim.ardupilot.navigation import Ned
+
+__all__ = ["Gimbal", "Target"]
+
+DEFAULTS = {
+    "MNT1_DEFLT_MODE": 3.0,
+    "MNT1_ROLL_MIN": -30.0,
+    "MNT1_ROLL_MAX": 30.0,
+    "MNT1_PITCH_MIN": -90.0,
+    "MNT1_PITCH_MAX": 20.0,
+    "MNT1_YAW_MIN": -180.0,
+    "MNT1_YAW_MAX": 180.0,
+}
+"""Of parameters that a small table may be without."""
+_UNTURNED = frozenset({MavMountMode.RETRACT, MavMountMode.NEUTRAL})
+
+
+@dataclass(frozen=True)
+class Target:
+    """Where it is to point: degrees; ``rates`` in degrees per second change them from ``since`` on."""
+
+    roll: float = 0.0
+    pitch: float = 0.0
+    yaw: float = 0.0
+    is_from_north: bool = False
+    rates: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    since: float = 0.0
+
+
+class Gimbal:
+    """Mode, target and who is in control; :attr:`angles` is where it points now."""
+
+    def __init__(self, copter: SimulatedCopter) -> None:
+        self._copter = copter
+        self.mode: int = int(self.setting("MNT1_DEFLT_MODE"))
+        """MAV_MOUNT_MODE."""
+        self.is_yaw_locked = False
+        """Whether the pilot's stick turns it from north."""
+        self.in_control = (0, 0)
+        """System and component id of who has said that he is."""
+        self._target = Target()
+        self._region: Ned | None = None
+
+    @property
+    def is_fitted(self) -> bool:
+        """Whether there is one."""
+        return self._copter.parameters["MNT1_TYPE"] != 0
+
+    def setting(self, name: str) -> float:
+        """A parameter."""
+        parameters = self._copter.parameters
+        return parameters[name] if name in parameters else DEFAULTS[name]
+
+    # ------------------------------------------------------------------------- where it points
+
+    @property
+    def angles(self) -> tuple[float, float, float]:
+        """Roll, pitch, yaw in degrees that the servos are to make, yaw from the nose."""
+        if self.mode in _UNTURNED:
+            return (0.0, 0.0, 0.0)
+        target, motion = self.target, self._copter.motion
+        yaw = self._limited("YAW", self._from_nose(target))
+        lean = (math.degrees(motion.roll), math.degrees(motion.pitch))
+        cos, sin = math.cos(math.radians(-yaw)), math.sin(math.radians(-yaw))
+        roll = target.roll - (lean[0] * cos - lean[1] * sin)
+        pitch = target.pitch - (lean[0] * sin + lean[1] * cos)
+        return self._limited("ROLL", roll), self._limited("PITCH", pitch), yaw
+
+    @property
+    def target(self) -> Target:
+        """What it is to do now."""
+        if self.mode == MavMountMode.RC_TARGETING:  # no stick turns it: all of them are in the middle
+            return Target(self._middle("ROLL"), self._middle("PITCH"), 0.0, self.is_yaw_locked)
+        if self.mode == MavMountMode.GPS_POINT:
+            return self._towards(self._region)
+        if self.mode == MavMountMode.HOME_LOCATION:
+            return self._towards(self._copter.navigation.home)
+        return self._moved(self._target)
+
+    def _moved(self, target: Target) -> Target:
+        if not any(target.rates):
+            return target
+        seconds = self._copter.now - target.since
+        roll = self._limited("ROLL", target.roll + target.rates[0] * seconds)
+        pitch = self._limited("PITCH", target.pitch + target.rates[1] * seconds)
+        yaw = target.yaw + target.rates[2] * seconds
+        yaw = math.remainder(yaw, 360.0) if target.is_from_north else self._limited("YAW", yaw)
+        return replace(target, roll=roll, pitch=pitch, yaw=yaw)
+
+    def _towards(self, place: Ned | None) -> Target:
+        """Of a place that is not known, or without a position, it stays as it was."""
+        motion = self._copter.motion
+        if place is not None and self._copter.navigation.has_position:
+            north, east, down = place[0] - motion.north, place[1] - motion.east, place[2] - motion.down
+            pitch = math.degrees(math.atan2(-down, math.hypot(north, east)))
+            self._target = Target(0.0, pitch, math.degrees(math.atan2(east, north)), True)
+        return self._target
+
+    def _from_nose(self, target: Target) -> float:
+        if not target.is_from_north:
+            return target.yaw
+        return math.remainder(target.yaw - math.degrees(self._copter.motion.yaw), 360.0)
+
+    def _limited(self, axis: str, angle: float) -> float:
+        return max(self.setting(f"MNT1_{axis}_MIN"), min(self.setting(f"MNT1_{axis}_MAX"), angle))
+
+    def _middle(self, axis: str) -> float:
+        return (self.setting(f"MNT1_{axis}_MIN") + self.setting(f"MNT1_{axis}_MAX")) / 2.0
+
+    # -------------------------------------------------------------------------------- orders
+
+    def set_mode(self, mode: int) -> None:
+        """A MAV_MOUNT_MODE; others are ignored."""
+        if mode in list(MavMountMode):
+            self._target = self.target
+            self.mode = mode
+
+    def point(self, roll: float, pitch: float, yaw: float, *, from_north: bool) -> None:
+        """Turn to these angles, in degrees, as far as it goes."""
+        if not from_north:
+            yaw = self._limited("YAW", yaw - 360.0 if yaw > 180.0 else yaw)
+        self._target = Target(self._limited("ROLL", roll), self._limited("PITCH", pitch), yaw, from_north)
+        self.mode = MavMountMode.MAVLINK_TARGETING
+
+    def turn(self, roll: float, pitch: float, yaw: float, *, from_north: bool) -> None:
+        """Keep turning at these rates, in degrees per second, from where it points."""
+        now = self.target
+        start = self._from_nose(now)
+        if from_north:
+            start = now.yaw if now.is_from_north else start + math.degrees(self._copter.motion.yaw)
+        self._target = Target(now.roll, now.pitch, start, from_north, (roll, pitch, yaw), self._copter.now)
+        self.mode = MavMountMode.MAVLINK_TARGETING
+
+    def look_at(self, place: Ned | None) -> None:
+        """Keep pointing at a place; None ends it."""
+        self._region = place
+        if place is not None:
+            self.set_mode(MavMountMode.GPS_POINT)
+        elif self.mode == MavMountMode.GPS_POINT:
+            self.set_mode(int(self.setting("MNT1_DEFLT_MODE")))
+
+    def set_control(self, sender: tuple[int, int], system: int, component: int) -> bool:
+        """As MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE says it; False for numbers that mean nothing."""
+        if not (-3 <= system <= 255 and -3 <= component <= 255):
+            return False
+        before = self.in_control
+        if system == -2:
+            self.in_control = sender
+        elif system == -3:
+            self.in_control = (0, 0) if before == sender else before
+        elif system != -1:
+            self.in_control = (system, component)
+        if self.in_control != before:
+            self._copter.call_later(0.0, self._tell_control)
+        return True
+
+    def _tell_control(self) -> None:
+        status = gimbal_manager_status(self._copter)
+        if status is not None:
+            self._copter.send(status)
+
+    # ------------------------------------------------------------------------- GIMBAL_MANAGER
+
+    def manage(
+        self, flags: int, angles: tuple[float, float, float], rates: tuple[float, float, float]
+    ) -> int:
+        """Flags (GIMBAL_MANAGER_FLAGS) and either angles or rates, roll, pitch, yaw, the others NaN; a MAV_RESULT."""
+        from_north = bool(flags & GimbalManagerFlags.YAW_LOCK)
+        if flags & GimbalManagerFlags.RETRACT:
+            self.set_mode(MavMountMode.RETRACT)
+        elif flags & GimbalManagerFlags.NEUTRAL:
+            self.set_mode(MavMountMode.NEUTRAL)
+        elif not any(map(math.isnan, angles)):
+            self.point(*angles, from_north=from_north)
+        elif not any(map(math.isnan, rates)):
+            self.turn(*rates, from_north=from_north)
+        elif all(map(math.isnan, (*angles[1:], *rates[1:]))):
+            self.is_yaw_locked = from_north
+        else:
+            return MavResult.FAILED
+        return MavResult.ACCEPTED
+
+    def warn(self) -> None:
+        """Of angles that are none, in hundredths of degrees for example."""
+        self._copter.send_text(MavSeverity.WARNING, "Mount: invalid angle targets")

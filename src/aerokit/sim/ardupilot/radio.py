@@ -1,0 +1,79 @@
+"""The pilot's radio, and what RC_CHANNELS_OVERRIDE puts in its place."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from aerokit.mavlink import messages as m
+from aerokit.sim.vehicle import sender_of
+
+if TYPE_CHECKING:
+    from aerokit.sim.ardupilot.copter import SimulatedCopter
+    from aerokit.sim.channel import Channel
+
+__all__ = ["Radio"]
+
+_AT_REST = (1500, 1500, 1000, 1500, 1800, 1000, 1000, 1800)
+_OVERRIDABLE, _CHANNELS = 16, 18
+_SAME_AS_BEFORE, _RELEASE_UPPER = 0xFFFF, 0xFFFE
+
+
+class Radio:
+    """What the vehicle hears: ``radio[2]`` is the throttle, in microseconds, overridden or not.
+
+    Setting an item moves a stick or switch of the transmitter, of which there are eight.
+    """
+
+    def __init__(self, copter: SimulatedCopter) -> None:
+        self._copter = copter
+        self._sticks: list[int] = list(_AT_REST)
+        self._overrides: dict[int, tuple[int, float]] = {}
+
+    def __len__(self) -> int:
+        return len(self._sticks)
+
+    def __getitem__(self, index: int) -> int:
+        value, since = self._overrides.get(index, (0, -math.inf))
+        if value and self._copter.now - since < self._override_time():
+            return value
+        return self._sticks[index] if index < len(self._sticks) else 0
+
+    def __setitem__(self, index: int, value: int) -> None:
+        self._sticks[index] = value
+
+    def __iter__(self) -> Iterator[int]:
+        return (self[index] for index in range(len(self._sticks)))
+
+    @property
+    def channels(self) -> tuple[int, ...]:
+        """All 18 that RC_CHANNELS has; those that nobody sends are 0."""
+        return tuple(self[index] for index in range(_CHANNELS))
+
+    def listen(self) -> None:
+        """Hear RC_CHANNELS_OVERRIDE."""
+        self._copter.on(m.RcChannelsOverride, self._on_override)
+
+    def reset(self) -> None:
+        """Forget what was overridden, as a reboot does."""
+        self._overrides.clear()
+
+    def _override_time(self) -> float:
+        """Seconds for which an override holds; below 0 means for ever."""
+        seconds = self._copter.parameters["RC_OVERRIDE_TIME"]
+        return math.inf if seconds < 0 else seconds
+
+    def _on_override(self, override: m.RcChannelsOverride, _: Channel) -> None:
+        """Only of the vehicle's own ground station. 0 leaves channels above 8 as they are, and releases the others."""
+        copter = self._copter
+        if sender_of(override)[0] != copter.parameters["MAV_GCS_SYSID"]:
+            return
+        copter.failsafes.ground_station_seen_at = copter.now
+        for index in range(_OVERRIDABLE):
+            value = getattr(override, f"chan{index + 1}_raw")
+            if value == _SAME_AS_BEFORE or (value == 0 and index >= len(self._sticks)):
+                continue
+            if value == _RELEASE_UPPER and index >= len(self._sticks):
+                value = 0
+            self._overrides[index] = (value, copter.now)
