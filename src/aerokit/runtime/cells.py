@@ -33,7 +33,7 @@ class Feed(Protocol):
         """Work it out now."""
 
     def watchers_changed(self) -> None:
-        """Somebody begins or ends to wait for values of one of the cells: see :attr:`StateCell.is_watched`."""
+        """Somebody begins or ends to wait for values of one of the cells (their ``_is_watched``)."""
 
 
 class Source(Snapshot):
@@ -218,12 +218,12 @@ class StateCell(Generic[T]):
         for sink in tuple(self._sinks):
             sink.forget()
 
-    def feed_from(self, *feeds: Feed) -> None:
+    def _feed_from(self, *feeds: Feed) -> None:
         """Say where values come from that are worked out when somebody looks."""
         self._feeds = feeds
 
     @property
-    def is_watched(self) -> bool:
+    def _is_watched(self) -> bool:
         """Whether somebody waits for values, observes or follows them, so that each one counts."""
         return self._is_followed or bool(self._sinks)
 

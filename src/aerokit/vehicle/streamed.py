@@ -103,7 +103,7 @@ class StreamedMessage:
 
     def watchers_changed(self) -> None:
         """Somebody begins or ends to wait for what is in the cells."""
-        self._is_watched = any(cell.is_watched for cell in self._cells)
+        self._is_watched = any(cell._is_watched for cell in self._cells)
         if self.pending:
             self.catch_up()
 

@@ -88,7 +88,7 @@ class Telemetry:
         )
         self._streams = {MESSAGE_IDS[name]: self._streamed(name, table[name]) for name in STREAMED}
         for cell in self._cells.values():
-            cell.feed_from(
+            cell._feed_from(
                 *(self._streams[MESSAGE_IDS[name]] for name in STREAMED if cell.name in STREAMED[name])
             )
 
