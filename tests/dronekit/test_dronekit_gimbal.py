@@ -108,6 +108,8 @@ def test_the_yaw_of_a_gimbal_device_is_from_north(stage: Stage) -> None:
     assert angles(stage) == (-45, 1, 280)
     tell_device(stage, -45, 1, 10, delta_yaw=math.radians(100))
     assert angles(stage) == (-45, 1, 110)
+    tell_device(stage, -45, 1, 10, delta_yaw=0.0)  # as PX4 does, whatever it is
+    assert angles(stage) == (-45, 1, 280)
     tell_device(stage, -45, 1, 10, IN_EARTH_FRAME | YAW_LOCK)
     assert angles(stage) == (-45, 1, 10)
     tell_device(stage, -45, 1, -10, YAW_LOCK)

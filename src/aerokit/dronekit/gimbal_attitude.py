@@ -45,8 +45,9 @@ def from_device(message: GimbalDeviceAttitudeStatus, heading: float | None) -> A
     """
     pitch, roll, yaw = _euler(message.q)
     if _is_from_nose(message.flags):
-        if message.flags & YAW_IN_VEHICLE_FRAME and math.isfinite(message.delta_yaw):
-            yaw += math.degrees(message.delta_yaw)
+        delta = message.delta_yaw if message.flags & YAW_IN_VEHICLE_FRAME else 0.0
+        if delta and math.isfinite(delta):  # 0 is also what PX4 says when it does not know
+            yaw += math.degrees(delta)
         elif heading is not None:
             yaw += heading
         else:
