@@ -299,7 +299,7 @@ def test_as_a_context_manager(address: str) -> None:
 
 
 def test_a_link_that_is_reset_comes_back(vehicle: dronekit.Vehicle, caplog: pytest.LogCaptureFixture) -> None:
-    connection = vehicle._handler.connection
+    connection: Any = vehicle._handler.connection
     vehicle._handler.reset()
     eventually(lambda: "is back" in caplog.text or connection.counts(1)[0] == 0 or connection.link.is_away)
     told: list[str] = []
@@ -313,3 +313,27 @@ def test_a_link_that_is_reset_comes_back(vehicle: dronekit.Vehicle, caplog: pyte
 def test_which_modes_there_are(vehicle: dronekit.Vehicle) -> None:
     assert vehicle._is_mode_available(5)
     assert not vehicle._is_mode_available(222)
+
+
+def test_a_subclass_calls_its_own_things_what_it_likes(address: str) -> None:
+    class Own(dronekit.Vehicle):
+        def __init__(self, *args: Any) -> None:
+            super().__init__(*args)
+            own: Any = self
+            own._heartbeat = own._gps = own._version = own._sync = own._tasks = own._aio = 0
+            own.wind = own.aio = own.sync = "mine"
+
+        def _run(self) -> None: ...
+        def _send(self, message: object) -> None: ...
+        def _order(self) -> None: ...
+        def _on_heartbeat(self) -> None: ...
+        def _on_attitude(self, name: str, message: object) -> None: ...
+        def _tell(self) -> None: ...
+        def _check_link(self) -> None: ...
+
+    with dronekit.connect(address, wait_ready=True, vehicle_class=Own) as vehicle:
+        assert vehicle.wind == vehicle.aio == vehicle.sync == "mine"
+        vehicle.wait_for_mode("ALT_HOLD", timeout=LIMIT_S)
+        assert vehicle.parameters["RTL_ALT"] is not None
+        vehicle.wait_for_mode("STABILIZE", timeout=LIMIT_S)
+        assert vehicle.attitude.pitch is not None

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from aerokit.autopilots.px4 import Px4
 from aerokit.dronekit.modes import mode_name
 from aerokit.dronekit.observers import HasObservers
+from aerokit.dronekit.shadowable import Shadowable
 from aerokit.dronekit.values import (
     Attitude,
     Battery,
@@ -45,48 +46,48 @@ class VehicleAttributes(HasObservers):
     A message is kept by one assignment, so what is read together belongs to one message.
     """
 
-    _aio: AsyncVehicle | None
-    _heartbeat: m.Heartbeat | None = None
+    _dk_aio: AsyncVehicle | None
+    _dk_heartbeat: m.Heartbeat | None = None
     _flightmode: str = "UNKNOWN"
-    _attitude: m.Attitude | None = None
-    _global_position: m.GlobalPositionInt | None = None
-    _vfr_hud: m.VfrHud | None = None
-    _gps: m.GpsRawInt | None = None
-    _sys_status: m.SysStatus | None = None
-    _rangefinder: tuple[float | None, float | None] = (None, None)
-    _has_rangefinder_message = False
-    _ekf_flags: int | None = None
-    _ekf_ok = False
-    _wind: m.Wind | None = None
-    _version: m.AutopilotVersion | None = None
+    _dk_attitude: m.Attitude | None = None
+    _dk_global_position: m.GlobalPositionInt | None = None
+    _dk_vfr_hud: m.VfrHud | None = None
+    _dk_gps: m.GpsRawInt | None = None
+    _dk_sys_status: m.SysStatus | None = None
+    _dk_rangefinder: tuple[float | None, float | None] = (None, None)
+    _dk_has_rangefinder_message = False
+    _dk_ekf_flags: int | None = None
+    _dk_ekf_ok = False
+    _dk_wind: m.Wind | None = None
+    _dk_version: m.AutopilotVersion | None = None
     _home_location: LocationGlobal | None = None
 
-    def _attach_attributes(self) -> None:
+    def _dk_attach_attributes(self) -> None:
         self._ready_attrs: set[str] = set()
-        self._failures: dict[str, APIException] = {}
-        self._became_ready = threading.Condition()
-        self._seekers: dict[str, Callable[[], None]] = {}
-        for message_type, handler in self._handlers().items():
-            self._on(message_type, handler)
+        self._dk_failures: dict[str, APIException] = {}
+        self._dk_became_ready = threading.Condition()
+        self._dk_seekers: dict[str, Callable[[], None]] = {}
+        for message_type, handler in self._dk_handlers().items():
+            self._dk_on(message_type, handler)
 
-    def _on(self, message_type: type[Message], handler: Callable[[Any], None]) -> None:
+    def _dk_on(self, message_type: type[Message], handler: Callable[[Any], None]) -> None:
         raise NotImplementedError
 
-    def _handlers(self) -> dict[type[Message], Callable[[Any], None]]:
+    def _dk_handlers(self) -> dict[type[Message], Callable[[Any], None]]:
         return {
-            m.Heartbeat: self._on_heartbeat,
-            m.GlobalPositionInt: self._on_velocity,
-            m.VfrHud: self._on_vfr_hud,
-            m.Attitude: self._on_attitude,
-            m.SysStatus: self._on_sys_status,
-            m.GpsRawInt: self._on_gps,
-            m.Rangefinder: self._on_rangefinder,
-            m.DistanceSensor: self._on_distance_sensor,
-            m.EkfStatusReport: self._on_ekf_status,
-            m.EstimatorStatus: self._on_ekf_status,
-            m.Wind: self._on_wind,
-            m.HomePosition: self._on_home,
-            m.AutopilotVersion: self._on_version,
+            m.Heartbeat: self._dk_on_heartbeat,
+            m.GlobalPositionInt: self._dk_on_velocity,
+            m.VfrHud: self._dk_on_vfr_hud,
+            m.Attitude: self._dk_on_attitude,
+            m.SysStatus: self._dk_on_sys_status,
+            m.GpsRawInt: self._dk_on_gps,
+            m.Rangefinder: self._dk_on_rangefinder,
+            m.DistanceSensor: self._dk_on_distance_sensor,
+            m.EkfStatusReport: self._dk_on_ekf_status,
+            m.EstimatorStatus: self._dk_on_ekf_status,
+            m.Wind: self._dk_on_wind,
+            m.HomePosition: self._dk_on_home,
+            m.AutopilotVersion: self._dk_on_version,
         }
 
     # ------------------------------------------------------------------------------- reading
@@ -94,7 +95,7 @@ class VehicleAttributes(HasObservers):
     @property
     def system_status(self) -> SystemStatus | Any:
         """HEARTBEAT.system_status by name (``'STANDBY'``, ``'ACTIVE'`` …); None before the first, and if unknown."""
-        heartbeat = self._heartbeat
+        heartbeat = self._dk_heartbeat
         if heartbeat is None or heartbeat.system_status >= len(STATES):
             return None
         return SystemStatus(STATES[heartbeat.system_status])
@@ -102,7 +103,7 @@ class VehicleAttributes(HasObservers):
     @property
     def attitude(self) -> Attitude:
         """Pitch, yaw and roll in radians (ATTITUDE)."""
-        message = self._attitude
+        message = self._dk_attitude
         if message is None:
             return Attitude(None, None, None)
         return Attitude(message.pitch, message.yaw, message.roll)
@@ -110,7 +111,7 @@ class VehicleAttributes(HasObservers):
     @property
     def velocity(self) -> list[float | Any]:
         """``[vx, vy, vz]`` in m/s: north, east, down (GLOBAL_POSITION_INT)."""
-        message = self._global_position
+        message = self._dk_global_position
         if message is None:
             return [None, None, None]
         return [message.vx / 100.0, message.vy / 100.0, message.vz / 100.0]
@@ -118,13 +119,13 @@ class VehicleAttributes(HasObservers):
     @property
     def heading(self) -> int | Any:
         """Where the nose points, 0 to 360 degrees clockwise from north (VFR_HUD)."""
-        message = self._vfr_hud
+        message = self._dk_vfr_hud
         return None if message is None else message.heading
 
     @property
     def gps_0(self) -> GPSInfo:
         """The first GPS receiver (GPS_RAW_INT)."""
-        message = self._gps
+        message = self._dk_gps
         if message is None:
             return GPSInfo(None, None, None, None)
         return GPSInfo(message.eph, message.epv, message.fix_type, message.satellites_visible)
@@ -132,7 +133,7 @@ class VehicleAttributes(HasObservers):
     @property
     def battery(self) -> Battery | Any:
         """Voltage, current and level of the main battery (SYS_STATUS); None before the first."""
-        message = self._sys_status
+        message = self._dk_sys_status
         if message is None:
             return None
         return Battery(message.voltage_battery, message.current_battery, message.battery_remaining)
@@ -140,12 +141,12 @@ class VehicleAttributes(HasObservers):
     @property
     def rangefinder(self) -> Rangefinder:
         """Distance in metres and voltage (RANGEFINDER; of others DISTANCE_SENSOR that looks down)."""
-        return Rangefinder(*self._rangefinder)
+        return Rangefinder(*self._dk_rangefinder)
 
-    @property
+    @Shadowable
     def wind(self) -> Wind:
         """Direction it comes from in degrees and speed in m/s (WIND of ArduPilot)."""
-        message = self._wind
+        message = self._dk_wind
         if message is None:
             return Wind(None, None, None)
         return Wind(message.direction, message.speed, message.speed_z)
@@ -153,7 +154,7 @@ class VehicleAttributes(HasObservers):
     @property
     def ekf_ok(self) -> bool:
         """Whether the estimator can fly: armed, it has an absolute position; disarmed, it has or will have one."""
-        return self._ekf_ok
+        return self._dk_ekf_ok
 
     @property
     def is_armable(self) -> bool:
@@ -161,147 +162,147 @@ class VehicleAttributes(HasObservers):
 
         The vehicle's own arming checks may still refuse: :meth:`Vehicle.arm` tells why.
         """
-        if self._flightmode in NO_MODE or self._heartbeat is None:
+        if self._flightmode in NO_MODE or self._dk_heartbeat is None:
             return False
-        if isinstance(getattr(self._aio, "autopilot", None), Px4):
-            status = self._sys_status
+        if isinstance(getattr(self._dk_aio, "autopilot", None), Px4):
+            status = self._dk_sys_status
             return status is not None and bool(status.onboard_control_sensors_health & PREARM_CHECK)
         fix = self.gps_0.fix_type
-        return fix is not None and fix > 1 and bool((self._ekf_flags or 0) & PRED_POS_HORIZ_ABS)
+        return fix is not None and fix > 1 and bool((self._dk_ekf_flags or 0) & PRED_POS_HORIZ_ABS)
 
     @property
     def version(self) -> Version:
         """The firmware: version and type (AUTOPILOT_VERSION, HEARTBEAT)."""
-        version = self._version
+        version = self._dk_version
         raw = None if version is None else version.flight_sw_version
         return Version(raw, self._autopilot_type, self._vehicle_type)
 
     @property
     def capabilities(self) -> Capabilities:
         """What the autopilot understands (AUTOPILOT_VERSION)."""
-        version = self._version
+        version = self._dk_version
         return Capabilities(None if version is None else version.capabilities)
 
     @property
     def last_heartbeat(self) -> float | Any:
         """Seconds since the autopilot's last HEARTBEAT; None before the first."""
-        return None if self._aio is None else self._aio.heartbeat_age
+        return None if self._dk_aio is None else self._dk_aio.heartbeat_age
 
     @property
     def _autopilot_type(self) -> int | None:
-        return None if self._heartbeat is None else self._heartbeat.autopilot
+        return None if self._dk_heartbeat is None else self._dk_heartbeat.autopilot
 
     @property
     def _vehicle_type(self) -> int | None:
-        return None if self._heartbeat is None else self._heartbeat.type
+        return None if self._dk_heartbeat is None else self._dk_heartbeat.type
 
     @property
     def _armed(self) -> bool:
-        heartbeat = self._heartbeat
+        heartbeat = self._dk_heartbeat
         return heartbeat is not None and bool(heartbeat.base_mode & ARMED)
 
     # ----------------------------------------------------------------------------- receiving
 
-    def _on_heartbeat(self, message: m.Heartbeat) -> None:
-        before, self._heartbeat = self._heartbeat, message
+    def _dk_on_heartbeat(self, message: m.Heartbeat) -> None:
+        before, self._dk_heartbeat = self._dk_heartbeat, message
         if before is None or (before.custom_mode, before.base_mode) != (
             message.custom_mode,
             message.base_mode,
         ):
-            assert self._aio is not None
-            self._flightmode = mode_name(self._aio, message.base_mode, message.custom_mode)
-        self._tell("armed", self._armed, cache=True)
-        self._tell("mode", VehicleMode(self._flightmode), cache=True)
-        self._tell("system_status", self.system_status, cache=True)
-        self._note("last_heartbeat")
+            assert self._dk_aio is not None
+            self._flightmode = mode_name(self._dk_aio, message.base_mode, message.custom_mode)
+        self._dk_tell("armed", self._armed, cache=True)
+        self._dk_tell("mode", VehicleMode(self._flightmode), cache=True)
+        self._dk_tell("system_status", self.system_status, cache=True)
+        self._dk_note("last_heartbeat")
 
-    def _on_velocity(self, message: m.GlobalPositionInt) -> None:
-        self._global_position = message
-        self._announce("velocity")
+    def _dk_on_velocity(self, message: m.GlobalPositionInt) -> None:
+        self._dk_global_position = message
+        self._dk_announce("velocity")
 
-    def _on_vfr_hud(self, message: m.VfrHud) -> None:
-        self._vfr_hud = message
-        self._announce("heading")
-        self._announce("airspeed")
-        self._announce("groundspeed")
+    def _dk_on_vfr_hud(self, message: m.VfrHud) -> None:
+        self._dk_vfr_hud = message
+        self._dk_announce("heading")
+        self._dk_announce("airspeed")
+        self._dk_announce("groundspeed")
 
-    def _on_attitude(self, message: m.Attitude) -> None:
-        self._attitude = message
-        self._announce("attitude")
+    def _dk_on_attitude(self, message: m.Attitude) -> None:
+        self._dk_attitude = message
+        self._dk_announce("attitude")
 
-    def _on_sys_status(self, message: m.SysStatus) -> None:
-        self._sys_status = message
-        self._announce("battery")
+    def _dk_on_sys_status(self, message: m.SysStatus) -> None:
+        self._dk_sys_status = message
+        self._dk_announce("battery")
 
-    def _on_gps(self, message: m.GpsRawInt) -> None:
-        self._gps = message
-        self._announce("gps_0")
+    def _dk_on_gps(self, message: m.GpsRawInt) -> None:
+        self._dk_gps = message
+        self._dk_announce("gps_0")
 
-    def _on_rangefinder(self, message: m.Rangefinder) -> None:
-        self._has_rangefinder_message = True
-        self._rangefinder = (message.distance, message.voltage)
-        self._announce("rangefinder")
+    def _dk_on_rangefinder(self, message: m.Rangefinder) -> None:
+        self._dk_has_rangefinder_message = True
+        self._dk_rangefinder = (message.distance, message.voltage)
+        self._dk_announce("rangefinder")
 
-    def _on_distance_sensor(self, message: m.DistanceSensor) -> None:
-        if message.orientation == LOOKING_DOWN and not self._has_rangefinder_message:
-            self._rangefinder = (message.current_distance / 100.0, None)
-            self._announce("rangefinder")
+    def _dk_on_distance_sensor(self, message: m.DistanceSensor) -> None:
+        if message.orientation == LOOKING_DOWN and not self._dk_has_rangefinder_message:
+            self._dk_rangefinder = (message.current_distance / 100.0, None)
+            self._dk_announce("rangefinder")
 
-    def _on_ekf_status(self, message: m.EkfStatusReport | m.EstimatorStatus) -> None:
-        flags = self._ekf_flags = message.flags
+    def _dk_on_ekf_status(self, message: m.EkfStatusReport | m.EstimatorStatus) -> None:
+        flags = self._dk_ekf_flags = message.flags
         if self._armed:
-            self._ekf_ok = bool(flags & POS_HORIZ_ABS) and not flags & CONST_POS_MODE
+            self._dk_ekf_ok = bool(flags & POS_HORIZ_ABS) and not flags & CONST_POS_MODE
         else:
-            self._ekf_ok = bool(flags & (POS_HORIZ_ABS | PRED_POS_HORIZ_ABS))
-        self._tell("ekf_ok", self._ekf_ok, cache=True)
+            self._dk_ekf_ok = bool(flags & (POS_HORIZ_ABS | PRED_POS_HORIZ_ABS))
+        self._dk_tell("ekf_ok", self._dk_ekf_ok, cache=True)
 
-    def _on_wind(self, message: m.Wind) -> None:
-        self._wind = message
-        self._announce("wind")
+    def _dk_on_wind(self, message: m.Wind) -> None:
+        self._dk_wind = message
+        self._dk_announce("wind")
 
-    def _on_home(self, message: m.HomePosition) -> None:
-        self._set_home(message.latitude / 1.0e7, message.longitude / 1.0e7, message.altitude / 1000.0)
-        self._tell("home_location", self._home_location)
+    def _dk_on_home(self, message: m.HomePosition) -> None:
+        self._dk_set_home(message.latitude / 1.0e7, message.longitude / 1.0e7, message.altitude / 1000.0)
+        self._dk_tell("home_location", self._home_location)
 
-    def _on_version(self, message: m.AutopilotVersion) -> None:
-        self._version = message
-        self._note("version")
-        self._note("capabilities")
-        self._tell("autopilot_version", message.flight_sw_version)
+    def _dk_on_version(self, message: m.AutopilotVersion) -> None:
+        self._dk_version = message
+        self._dk_note("version")
+        self._dk_note("capabilities")
+        self._dk_tell("autopilot_version", message.flight_sw_version)
 
-    def _set_home(self, lat: float, lon: float, alt: float | None) -> None:
+    def _dk_set_home(self, lat: float, lon: float, alt: float | None) -> None:
         """Where home is, in degrees and metres above the sea; from any thread."""
         self._home_location = LocationGlobal(lat, lon, alt)
 
     # ------------------------------------------------------------------------------- telling
 
-    def _announce(self, name: str) -> None:
+    def _dk_announce(self, name: str) -> None:
         """Tell an attribute's value, which is made only when somebody listens."""
         listeners = self._attribute_listeners
         if listeners and (name in listeners or "*" in listeners):
-            self._tell(name, getattr(self, name))
+            self._dk_tell(name, getattr(self, name))
         else:
-            self._note(name)
+            self._dk_note(name)
 
-    def _note(self, attr_name: str) -> None:
+    def _dk_note(self, attr_name: str) -> None:
         if attr_name not in self._ready_attrs:
-            self._mark_ready(attr_name)
+            self._dk_mark_ready(attr_name)
 
-    def _mark_ready(self, name: str) -> None:
+    def _dk_mark_ready(self, name: str) -> None:
         """The attribute has a value: whoever waits for it goes on."""
-        with self._became_ready:
-            self._failures.pop(name, None)
+        with self._dk_became_ready:
+            self._dk_failures.pop(name, None)
             self._ready_attrs.add(name)
-            self._became_ready.notify_all()
+            self._dk_became_ready.notify_all()
 
-    def _unready(self, name: str) -> None:
+    def _dk_unready(self, name: str) -> None:
         """The attribute will get a new value, and is to be waited for."""
-        with self._became_ready:
-            self._failures.pop(name, None)
+        with self._dk_became_ready:
+            self._dk_failures.pop(name, None)
             self._ready_attrs.discard(name)
 
-    def _fail(self, name: str, error: APIException) -> None:
+    def _dk_fail(self, name: str, error: APIException) -> None:
         """The attribute will get no value: whoever waits for it is told why."""
-        with self._became_ready:
-            self._failures[name] = error
-            self._became_ready.notify_all()
+        with self._dk_became_ready:
+            self._dk_failures[name] = error
+            self._dk_became_ready.notify_all()

@@ -101,8 +101,8 @@ class Channels(_ChannelDict):
         self._changing = threading.Lock()
         self._overrides = ChannelsOverride(vehicle)
         self._grow(count)
-        vehicle._on(RcChannels, self._on_channels)
-        vehicle._on(RcChannelsRaw, self._on_raw)
+        vehicle._dk_on(RcChannels, self._on_channels)
+        vehicle._dk_on(RcChannelsRaw, self._on_raw)
 
     @property
     def count(self) -> int:
@@ -185,7 +185,7 @@ class Channels(_ChannelDict):
             numbers = NUMBERS[first : self._count]
             values = (None if value == UNUSED else value for value in heard)
             dict.update(self, dict(zip(numbers, values, strict=False)))  # readers see all of it or nothing
-        self._vehicle._tell("channels", self)
+        self._vehicle._dk_tell("channels", self)
 
     def _grow(self, count: int) -> None:
         self._count = self._overrides._count = count
@@ -293,14 +293,14 @@ class ChannelsOverride(_ChannelDict):
         return checked
 
     def _send(self, active: dict[str, int], given_back: set[str]) -> None:
-        aio = self._vehicle._check_link()
+        aio = self._vehicle._dk_check_link()
         if aio.connection.mavlink_version == 1 and any(int(channel) > FEWEST for channel in active):
             raise APIException("channels above 8 cannot be overridden: this vehicle speaks MAVLink 1")
         values = [active.get(number, 0) for number in NUMBERS]
         for channel in given_back:
             if int(channel) > FEWEST:
                 values[int(channel) - 1] = RELEASE_UPPER
-        self._vehicle._send(RcChannelsOverride(self._vehicle._target_system, 0, *values))
+        self._vehicle._dk_send(RcChannelsOverride(self._vehicle._dk_target_system, 0, *values))
 
 
 def _checked_value(number: int, value: Any) -> int:

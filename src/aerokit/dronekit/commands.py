@@ -49,7 +49,7 @@ class CommandSequence:
         self._download: concurrent.futures.Future[None] | None = None
         self._failure: APIException | None = None
         self._current = CurrentCommand(vehicle)
-        vehicle._mark_ready("commands")
+        vehicle._dk_mark_ready("commands")
 
     # ------------------------------------------------------------------- from and to the vehicle
 
@@ -63,12 +63,12 @@ class CommandSequence:
             APIException: the link is down.
         """
         vehicle = self._vehicle
-        vehicle._check_link()
+        vehicle._dk_check_link()
         with self._lock:
             self._downloads += 1
             self._failure = None
-            vehicle._unready("commands")
-            self._download = vehicle._order("commands.download", self._read, self._downloads)
+            vehicle._dk_unready("commands")
+            self._download = vehicle._dk_order("commands.download", self._read, self._downloads)
 
     def wait_ready(self, **kwargs: Any) -> bool:
         """Wait for the end of the download; arguments and result as of :meth:`Vehicle.wait_ready`.
@@ -100,8 +100,8 @@ class CommandSequence:
                 return
             held = self._held = self._held._replace(is_changed=True)  # until it is known to be there
         vehicle = self._vehicle
-        aio = vehicle._check_link()
-        vehicle._run(aio.mission.upload, mission_of(held.items, aio), timeout=timeout)
+        aio = vehicle._dk_check_link()
+        vehicle._dk_run(aio.mission.upload, mission_of(held.items, aio), timeout=timeout)
         with self._lock:
             self._uploaded = values
             if self._held is held:
@@ -127,7 +127,7 @@ class CommandSequence:
         with self._lock:
             if self._failure is not None:
                 self._failure = None
-                self._vehicle._mark_ready("commands")
+                self._vehicle._dk_mark_ready("commands")
             self._held = Held((), self._held.home, is_changed=True)
 
     def add(self, cmd: Any) -> None:
@@ -144,7 +144,7 @@ class CommandSequence:
         """
         self._settle()
         added = command_from(cmd)
-        cmd.target_system = added.target_system = self._vehicle._target_system
+        cmd.target_system = added.target_system = self._vehicle._dk_target_system
         if self._append(added) == 0:
             self._vehicle._logger.info("the first command is home, as in a waypoint file: %s", added)
 
@@ -195,7 +195,7 @@ class CommandSequence:
 
     async def _read(self, number: int) -> None:
         try:
-            mission = await self._vehicle.aio.mission.download()
+            mission = await self._vehicle._dk_vehicle.mission.download()
         except AerokitError as error:
             self._note_failure(number, error)
             raise
@@ -204,7 +204,7 @@ class CommandSequence:
     def _take(self, number: int, mission: Mission) -> None:
         """On the loop thread: what was downloaded is the sequence from now on."""
         vehicle, home = self._vehicle, mission.home
-        connection = vehicle.aio.connection
+        connection = vehicle._dk_vehicle.connection
         own_ids = connection.source_system, connection.source_component
         items = commands_of(mission.items, own_ids)
         with self._lock:
@@ -213,8 +213,8 @@ class CommandSequence:
             self._held = Held(items, home_command(home, own_ids))
             self._uploaded = values_of(items)
         if home is not None and home.altitude_amsl_m is not None:
-            vehicle._set_home(home.latitude_deg, home.longitude_deg, home.altitude_amsl_m)
-        vehicle._tell("commands", self)
+            vehicle._dk_set_home(home.latitude_deg, home.longitude_deg, home.altitude_amsl_m)
+        vehicle._dk_tell("commands", self)
 
     def _note_failure(self, number: int, error: AerokitError) -> None:
         kind = TimeoutError if isinstance(error, OperationTimeout) else APIException
@@ -223,7 +223,7 @@ class CommandSequence:
         with self._lock:
             if number == self._downloads:
                 self._failure = failure
-                self._vehicle._fail("commands", failure)
+                self._vehicle._dk_fail("commands", failure)
 
     def _settle(self) -> None:
         """Wait until it is known what there is to change."""

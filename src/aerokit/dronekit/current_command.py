@@ -33,7 +33,7 @@ class CurrentCommand:
         self._message: MissionCurrent | None = None
         self._chosen: int | None = None
         """What PX4 was told to fly next and has not gone past."""
-        vehicle._on(MissionCurrent, self._on_current)
+        vehicle._dk_on(MissionCurrent, self._on_current)
 
     @property
     def seq(self) -> int:
@@ -41,7 +41,7 @@ class CurrentCommand:
         message = self._message
         if message is None:
             return 0
-        if self._vehicle.aio.autopilot.home_is_item_0:
+        if self._vehicle._dk_vehicle.autopilot.home_is_item_0:
             return int(message.seq)
         if message.total == NO_MISSION or (self._is_over(message) and message.seq != self._chosen):
             return 0
@@ -56,7 +56,7 @@ class CurrentCommand:
         """
         if not 0 <= operator.index(seq) <= MOST:
             raise LocalProtocolError(f"next = {seq!r} is not allowed, but 0 to {MOST}")
-        self._vehicle._order("commands.next", self._choose, operator.index(seq))
+        self._vehicle._dk_order("commands.next", self._choose, operator.index(seq))
 
     # ------------------------------------------------------------------------------- inside
 
@@ -70,7 +70,7 @@ class CurrentCommand:
         return is_at_an_end and not self._vehicle._armed
 
     async def _choose(self, seq: int) -> None:
-        aio = self._vehicle.aio
+        aio = self._vehicle._dk_vehicle
         if not aio.autopilot.home_is_item_0:
             await aio.mission._set_current_by_message(max(seq - 1, 0), CONFIRMED_S)
             self._chosen = seq - 1

@@ -11,27 +11,22 @@ from typing import TYPE_CHECKING, Any
 from aerokit.autopilots.px4 import Px4
 from aerokit.dronekit.attributes import VehicleAttributes
 from aerokit.dronekit.exceptions import APIException, TimeoutError  # noqa: A004 - DroneKit's name
+from aerokit.dronekit.flight_orders import change_armed, check_speed, checked_place, go_to, refuse, set_home
 from aerokit.dronekit.modes import change_mode, mode_name, mode_order
 from aerokit.dronekit.values import LocationGlobal, LocationGlobalRelative, VehicleMode
-from aerokit.errors import CommandRejected, LocalProtocolError
-from aerokit.mavlink.messages import HomePosition, SetPositionTargetGlobalInt
+from aerokit.errors import CommandRejected
+from aerokit.mavlink.messages import HomePosition
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
-__all__ = ["FlightMethods", "checked_place"]
+__all__ = ["FlightMethods"]
 
-COMPONENT_ARM_DISARM = 400
-NAV_TAKEOFF, DO_CHANGE_SPEED, DO_SET_HOME, DO_REPOSITION = 22, 178, 179, 192
+NAV_TAKEOFF, DO_CHANGE_SPEED = 22, 178
 AIRSPEED, GROUNDSPEED = 0, 1
-GLOBAL, GLOBAL_INT, GLOBAL_RELATIVE_ALT_INT = 0, 5, 6
-POSITION_ONLY = 0x0DF8
-RESULT_UNSUPPORTED = 3
-CHANGE_MODE = 1
 REQUEST_MESSAGE = 512
-ARMED_IS_TOLD_S = 10.0
 HOME_TIMEOUT_S = 10.0
 PX4_FLIES_TO_PLACES_IN = ("LOITER", "TAKEOFF")
 POLL_S = 0.1
@@ -44,12 +39,12 @@ class FlightMethods(VehicleAttributes):
 
     if TYPE_CHECKING:
 
-        def _check_link(self) -> AsyncVehicle: ...
-        def _run(self, function: Callable[..., Awaitable[Any]], *args: Any, **kwargs: Any) -> Any: ...
-        def _order(
+        def _dk_check_link(self) -> AsyncVehicle: ...
+        def _dk_run(self, function: Callable[..., Awaitable[Any]], *args: Any, **kwargs: Any) -> Any: ...
+        def _dk_order(
             self, kind: str, function: Callable[..., Awaitable[object]], *args: Any, **kwargs: Any
         ) -> concurrent.futures.Future[None]: ...
-        def _pause(self, seconds: float) -> None: ...
+        def _dk_pause(self, seconds: float) -> None: ...
 
     # --------------------------------------------------------------------------------- modes
 
@@ -68,12 +63,12 @@ class FlightMethods(VehicleAttributes):
 
     @mode.setter
     def mode(self, value: VehicleMode | str | int) -> None:
-        self._set_mode(value)
+        self._dk_set_mode(value)
 
-    def _set_mode(self, value: VehicleMode | str | int) -> concurrent.futures.Future[None]:
-        aio = self._check_link()
+    def _dk_set_mode(self, value: VehicleMode | str | int) -> concurrent.futures.Future[None]:
+        aio = self._dk_check_link()
         order = mode_order(aio, value.name if isinstance(value, VehicleMode) else value)
-        return self._order("mode", change_mode, aio, order)
+        return self._dk_order("mode", change_mode, aio, order)
 
     def wait_for_mode(self, mode: VehicleMode | str | int, timeout: float | None = None) -> None:
         """Set the mode and wait until the vehicle is in it.
@@ -82,12 +77,12 @@ class FlightMethods(VehicleAttributes):
             TimeoutError: it is not within ``timeout`` seconds, or, sooner, the vehicle has refused it.
             KeyError: this vehicle has no such mode.
         """
-        order = self._set_mode(mode)
-        aio = self._check_link()
+        order = self._dk_set_mode(mode)
+        aio = self._dk_check_link()
         base, main, sub = mode_order(aio, mode.name if isinstance(mode, VehicleMode) else mode)
         custom = main << 16 | sub << 24 if isinstance(aio.autopilot, Px4) else main
         name = mode_name(aio, base, custom)
-        self._wait_for_order(order, lambda: self._flightmode == name, timeout, "failed to set flight mode")
+        self._dk_wait_for_order(order, lambda: self._flightmode == name, timeout, "failed to set flight mode")
 
     # -------------------------------------------------------------------------------- arming
 
@@ -102,13 +97,13 @@ class FlightMethods(VehicleAttributes):
     @armed.setter
     def armed(self, value: bool) -> None:
         if bool(value) != self._armed:
-            self._set_armed(bool(value))
+            self._dk_set_armed(bool(value))
         else:
-            self._check_link()
+            self._dk_check_link()
 
-    def _set_armed(self, value: bool) -> concurrent.futures.Future[None]:
-        aio = self._check_link()
-        return self._order("arm" if value else "disarm", _change_armed, aio, value)
+    def _dk_set_armed(self, value: bool) -> concurrent.futures.Future[None]:
+        aio = self._dk_check_link()
+        return self._dk_order("arm" if value else "disarm", change_armed, aio, value)
 
     def arm(self, wait: bool = True, timeout: float | None = None) -> None:
         """Arm the motors: **propellers may start to turn**; with ``wait`` until HEARTBEAT says armed.
@@ -116,7 +111,7 @@ class FlightMethods(VehicleAttributes):
         Raises:
             TimeoutError: not within ``timeout`` seconds, or, sooner, the vehicle has refused; the text has its reasons.
         """
-        self._change_armed(True, wait, timeout, "failed to arm vehicle")
+        self._dk_change_armed(True, wait, timeout, "failed to arm vehicle")
 
     def disarm(self, wait: bool = True, timeout: float | None = None) -> None:
         """Stop the motors; with ``wait`` until HEARTBEAT says disarmed.
@@ -124,15 +119,15 @@ class FlightMethods(VehicleAttributes):
         Raises:
             TimeoutError: not within ``timeout`` seconds, or, sooner, the vehicle has refused, as it does in the air.
         """
-        self._change_armed(False, wait, timeout, "failed to disarm vehicle")
+        self._dk_change_armed(False, wait, timeout, "failed to disarm vehicle")
 
-    def _change_armed(self, value: bool, wait: bool, timeout: float | None, text: str) -> None:
+    def _dk_change_armed(self, value: bool, wait: bool, timeout: float | None, text: str) -> None:
         if self._armed == value:
-            self._check_link()
+            self._dk_check_link()
             return
-        order = self._set_armed(value)
+        order = self._dk_set_armed(value)
         if wait:
-            self._wait_for_order(order, lambda: self._armed == value, timeout, text)
+            self._dk_wait_for_order(order, lambda: self._armed == value, timeout, text)
 
     # -------------------------------------------------------------------------------- flying
 
@@ -149,15 +144,15 @@ class FlightMethods(VehicleAttributes):
         altitude = float(alt)
         if not math.isfinite(altitude):
             raise ValueError("Altitude was NaN or Infinity. Please provide a real number")
-        aio = self._check_link()
+        aio = self._dk_check_link()
         if isinstance(aio.autopilot, Px4):  # it counts from the sea
-            home = self._known_home().alt
+            home = self._dk_known_home().alt
             plan = aio.autopilot.take_off(altitude, home, is_vtol=aio.is_vtol)
             if plan is None or plan.command is None:
                 raise APIException("this vehicle cannot take off by a command")
-            self._order("takeoff", aio.command, plan.command, *plan.params, component_id=0)
+            self._dk_order("takeoff", aio.command, plan.command, *plan.params, component_id=0)
         else:
-            self._order("takeoff", aio.command, NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude, component_id=0)
+            self._dk_order("takeoff", aio.command, NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude, component_id=0)
 
     def wait_simple_takeoff(
         self, alt: float | None = None, epsilon: float = 0.1, timeout: float | None = None
@@ -186,26 +181,26 @@ class FlightMethods(VehicleAttributes):
         Raises:
             ValueError: it is no such location, or one of its numbers is missing or wrong. Nothing was sent.
         """
-        aio = self._check_link()
-        place = self._relative_place(location)
+        aio = self._dk_check_link()
+        place = self._dk_relative_place(location)
         for name, speed in (("airspeed", airspeed), ("groundspeed", groundspeed)):
-            _check_speed(name, speed)
+            check_speed(name, speed)
         if isinstance(aio.autopilot, Px4) and self._flightmode not in PX4_FLIES_TO_PLACES_IN:
-            self._order("goto", _refuse, f"not in {self._flightmode}: set the mode LOITER first")
+            self._dk_order("goto", refuse, f"not in {self._flightmode}: set the mode LOITER first")
         else:
-            self._order("goto", _go_to, aio, *place)
+            self._dk_order("goto", go_to, aio, *place)
         if airspeed is not None:
             self.airspeed = airspeed
         if groundspeed is not None:
             self.groundspeed = groundspeed
 
-    def _relative_place(self, location: object) -> tuple[int, int, float]:
+    def _dk_relative_place(self, location: object) -> tuple[int, int, float]:
         """Latitude and longitude in 1e-7 degrees, altitude above home."""
         if not isinstance(location, (LocationGlobal, LocationGlobalRelative)):
             raise ValueError("Expecting location to be LocationGlobal or LocationGlobalRelative.")
         latitude, longitude, altitude = checked_place(location)
         if isinstance(location, LocationGlobal):
-            home = self._known_home()
+            home = self._dk_known_home()
             altitude -= home.alt or 0.0
         return latitude, longitude, altitude
 
@@ -217,27 +212,27 @@ class FlightMethods(VehicleAttributes):
 
         Setting it asks for this speed (MAV_CMD_DO_CHANGE_SPEED).
         """
-        message = self._vfr_hud
+        message = self._dk_vfr_hud
         return None if message is None or math.isnan(message.airspeed) else message.airspeed
 
     @airspeed.setter
     def airspeed(self, speed: float) -> None:
-        self._change_speed("airspeed", AIRSPEED, speed)
+        self._dk_change_speed("airspeed", AIRSPEED, speed)
 
     @property
     def groundspeed(self) -> float | Any:
         """Speed over ground in m/s (VFR_HUD). Setting it asks for this speed (MAV_CMD_DO_CHANGE_SPEED)."""
-        message = self._vfr_hud
+        message = self._dk_vfr_hud
         return None if message is None else message.groundspeed
 
     @groundspeed.setter
     def groundspeed(self, speed: float) -> None:
-        self._change_speed("groundspeed", GROUNDSPEED, speed)
+        self._dk_change_speed("groundspeed", GROUNDSPEED, speed)
 
-    def _change_speed(self, name: str, kind: int, speed: float) -> None:
-        _check_speed(name, speed)
-        aio = self._check_link()
-        self._order(name, aio.command, DO_CHANGE_SPEED, kind, float(speed), -1, component_id=0)
+    def _dk_change_speed(self, name: str, kind: int, speed: float) -> None:
+        check_speed(name, speed)
+        aio = self._dk_check_link()
+        self._dk_order(name, aio.command, DO_CHANGE_SPEED, kind, float(speed), -1, component_id=0)
 
     # ---------------------------------------------------------------------------------- home
 
@@ -258,13 +253,13 @@ class FlightMethods(VehicleAttributes):
         if not isinstance(pos, LocationGlobal):
             raise ValueError("Expecting home_location to be set to a LocationGlobal.")
         latitude, longitude, altitude = checked_place(pos)
-        aio = self._check_link()
-        self._order("home", _set_home, aio, latitude, longitude, altitude)
-        self._set_home(pos.lat, pos.lon, altitude)
+        aio = self._dk_check_link()
+        self._dk_order("home", set_home, aio, latitude, longitude, altitude)
+        self._dk_set_home(pos.lat, pos.lon, altitude)
 
-    def _known_home(self) -> LocationGlobal:
+    def _dk_known_home(self) -> LocationGlobal:
         if self._home_location is None:
-            self._run(self._fetch_home)
+            self._dk_run(self._dk_fetch_home)
         home = self.home_location
         if home is None:
             raise APIException(
@@ -272,8 +267,8 @@ class FlightMethods(VehicleAttributes):
             )
         return home
 
-    async def _fetch_home(self) -> None:
-        aio = self._check_link()
+    async def _dk_fetch_home(self) -> None:
+        aio = self._dk_check_link()
         with contextlib.suppress(CommandRejected):
             await aio.command(REQUEST_MESSAGE, HomePosition.ID)
         await aio.telemetry.home.wait_until(lambda _: True, timeout=HOME_TIMEOUT_S, description="home")
@@ -295,10 +290,10 @@ class FlightMethods(VehicleAttributes):
         """
         deadline = math.inf if not timeout else time.monotonic() + timeout
         while not condition():
-            self._check_link()
+            self._dk_check_link()
             if time.monotonic() >= deadline:
                 raise TimeoutError(errmsg)
-            self._pause(min(interval, max(deadline - time.monotonic(), 0.0)))
+            self._dk_pause(min(interval, max(deadline - time.monotonic(), 0.0)))
 
     def wait_for_armable(self, timeout: float | None = None) -> None:
         """Wait until :attr:`is_armable`; TimeoutError after ``timeout`` seconds."""
@@ -315,7 +310,7 @@ class FlightMethods(VehicleAttributes):
 
         def is_there() -> bool:
             nonlocal start
-            now = self._altitude(rel)
+            now = self._dk_altitude(rel)
             if now is None:
                 return False
             start = now if start is None else start
@@ -323,13 +318,13 @@ class FlightMethods(VehicleAttributes):
 
         self.wait_for(is_there, timeout, errmsg="failed to reach specified altitude")
 
-    def _altitude(self, is_relative: bool) -> float | None:
+    def _dk_altitude(self, is_relative: bool) -> float | None:
         location: Any = self.location  # type: ignore[attr-defined]
         frame = location.global_relative_frame if is_relative else location.global_frame
         altitude: float | None = frame.alt
         return altitude
 
-    def _wait_for_order(
+    def _dk_wait_for_order(
         self,
         order: concurrent.futures.Future[None],
         is_done: Callable[[], bool],
@@ -339,89 +334,12 @@ class FlightMethods(VehicleAttributes):
         """Wait for the end of an order; that it failed is known before the time is over."""
         deadline = math.inf if not timeout else time.monotonic() + timeout
         while not is_done():
-            self._check_link()
+            self._dk_check_link()
             if order.done() and order.exception() is not None and not is_done():
                 raise TimeoutError(f"{text}: {order.exception()}") from order.exception()
             if time.monotonic() >= deadline:
                 raise TimeoutError(text)
             if order.done():
-                self._pause(min(POLL_S, max(deadline - time.monotonic(), 0.0)))
+                self._dk_pause(min(POLL_S, max(deadline - time.monotonic(), 0.0)))
             else:
                 concurrent.futures.wait([order], min(POLL_S, max(deadline - time.monotonic(), 0.0)))
-
-
-async def _change_armed(vehicle: AsyncVehicle, value: bool) -> None:
-    await vehicle.command(COMPONENT_ARM_DISARM, float(value), component_id=0)
-    await vehicle.telemetry.armed.wait_until(
-        lambda armed: armed is value, timeout=ARMED_IS_TOLD_S, description="armed" if value else "disarmed"
-    )
-
-
-async def _go_to(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: float) -> None:
-    """DO_REPOSITION, which is answered; and the message for a vehicle that does not know it."""
-    if isinstance(vehicle.autopilot, Px4):
-        home = vehicle.telemetry.home.value.altitude_amsl_m
-        await vehicle.command_int(
-            DO_REPOSITION,
-            *(-1, CHANGE_MODE, 0, math.nan),
-            frame=GLOBAL_INT,
-            x=latitude,
-            y=longitude,
-            z=altitude + home,
-            component_id=0,
-        )
-        return
-    try:
-        await vehicle.command_int(
-            DO_REPOSITION,
-            *(-1, 0, 0, math.nan),
-            frame=GLOBAL_RELATIVE_ALT_INT,
-            x=latitude,
-            y=longitude,
-            z=altitude,
-            component_id=0,
-        )
-    except CommandRejected as error:
-        if error.result != RESULT_UNSUPPORTED:
-            raise
-        target = (vehicle.system_id, 0, GLOBAL_RELATIVE_ALT_INT, POSITION_ONLY)
-        vehicle.send(SetPositionTargetGlobalInt(0, *target, latitude, longitude, altitude, *(0.0,) * 8))
-
-
-async def _set_home(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: float) -> None:
-    try:
-        await vehicle.command_int(
-            DO_SET_HOME, 0, frame=GLOBAL, x=latitude, y=longitude, z=altitude, component_id=0
-        )
-    except CommandRejected as error:
-        if error.result != RESULT_UNSUPPORTED:
-            raise
-        place = (latitude * 1e-7, longitude * 1e-7, altitude)
-        await vehicle.command(DO_SET_HOME, 0, 0, 0, 0, *place, component_id=0)
-
-
-async def _refuse(reason: str) -> None:
-    raise APIException(reason)
-
-
-def checked_place(location: LocationGlobal | LocationGlobalRelative) -> tuple[int, int, float]:
-    """Latitude and longitude in 1e-7 degrees, altitude in metres.
-
-    Raises:
-        LocalProtocolError: a ValueError, which names the number that is missing or wrong.
-    """
-    for name, limit in (("lat", 90.0), ("lon", 180.0), ("alt", math.inf)):
-        value = getattr(location, name)
-        try:
-            is_good = math.isfinite(value) and abs(value) <= limit
-        except TypeError:
-            is_good = False
-        if not is_good:
-            allowed = "a number of metres" if limit == math.inf else f"-{limit:g} to {limit:g} degrees"
-            raise LocalProtocolError(f"location.{name} = {value!r} is not allowed: {allowed}")
-    return round(location.lat * 1e7), round(location.lon * 1e7), float(location.alt)
-
-
-def _check_speed(name: str, speed: float | None) -> None:
-    if speed is not None and not math.isfinite(speed):
-        raise LocalProtocolError(f"{name} = {speed!r} is not allowed: a number of m/s")

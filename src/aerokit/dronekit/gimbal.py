@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from aerokit.autopilots.px4 import Px4
 from aerokit.dronekit.exceptions import APIException
-from aerokit.dronekit.flight import checked_place
+from aerokit.dronekit.flight_orders import checked_place
 from aerokit.dronekit.gimbal_attitude import from_device, from_orientation, from_status
 from aerokit.dronekit.values import LocationGlobal, LocationGlobalRelative
 from aerokit.errors import CommandRejected, CommandTimeout, LocalProtocolError
@@ -54,10 +54,10 @@ class Gimbal:
         self._source: tuple[int, int] | None = None
         self._unknown: set[int] = set()
         self._must_claim = self._has_claimed = False
-        vehicle._on(CommandAck, self._on_ack)
-        vehicle._on_any_component(GimbalDeviceAttitudeStatus, self._on_device)
-        vehicle._on_any_component(MountStatus, self._on_status)
-        vehicle._on_any_component(MountOrientation, self._on_orientation)
+        vehicle._dk_on(CommandAck, self._on_ack)
+        vehicle._dk_on_any_component(GimbalDeviceAttitudeStatus, self._on_device)
+        vehicle._dk_on_any_component(MountStatus, self._on_status)
+        vehicle._dk_on_any_component(MountOrientation, self._on_orientation)
 
     @property
     def pitch(self) -> float | None:
@@ -103,8 +103,8 @@ class Gimbal:
             APIException: the link is down.
         """
         angles = [_checked(name, value) for name, value in (("pitch", pitch), ("roll", roll), ("yaw", yaw))]
-        aio = self._vehicle._check_link()
-        self._vehicle._order("gimbal", self._rotate, aio, *angles)
+        aio = self._vehicle._dk_check_link()
+        self._vehicle._dk_order("gimbal", self._rotate, aio, *angles)
 
     def target_location(self, roi: LocationGlobalRelative | LocationGlobal) -> None:
         """Keep the camera on a place; a copter without a gimbal that turns does so itself. Returns at once.
@@ -118,11 +118,11 @@ class Gimbal:
         if not isinstance(roi, (LocationGlobal, LocationGlobalRelative)):
             raise LocalProtocolError("Expecting roi to be LocationGlobal or LocationGlobalRelative.")
         place = checked_place(roi)
-        aio = self._vehicle._check_link()
+        aio = self._vehicle._dk_check_link()
         if any(place):
-            self._vehicle._order("gimbal", self._look_at, aio, isinstance(roi, LocationGlobal), *place)
+            self._vehicle._dk_order("gimbal", self._look_at, aio, isinstance(roi, LocationGlobal), *place)
         else:
-            self._vehicle._order("gimbal", _look_nowhere, aio)
+            self._vehicle._dk_order("gimbal", _look_nowhere, aio)
 
     def release(self) -> None:
         """Give the gimbal back to the pilot's sticks; returns at once.
@@ -130,7 +130,7 @@ class Gimbal:
         Raises:
             APIException: the link is down.
         """
-        self._vehicle._order("gimbal", self._release, self._vehicle._check_link())
+        self._vehicle._dk_order("gimbal", self._release, self._vehicle._dk_check_link())
 
     # ----------------------------------------------------------------------------- receiving
 
@@ -153,12 +153,12 @@ class Gimbal:
 
     def _tell(self, *, is_mount_status: bool) -> None:
         if is_mount_status:
-            self._vehicle._tell("mount", self.mount_status)
-        self._vehicle._tell("gimbal", self)
+            self._vehicle._dk_tell("mount", self.mount_status)
+        self._vehicle._dk_tell("gimbal", self)
 
     def _heading(self) -> float | None:
         """Degrees clockwise from north in which the vehicle's nose points."""
-        attitude = self._vehicle._attitude
+        attitude = self._vehicle._dk_attitude
         return None if attitude is None else math.degrees(attitude.yaw)
 
     # -------------------------------------------------------------------------------- orders

@@ -28,7 +28,7 @@ async def watch_link(vehicle: Vehicle, aio: AsyncVehicle) -> None:
             is_lost = not is_lost
             _log(vehicle, is_lost)
         if _is_listened_to(vehicle):
-            vehicle._tell("last_heartbeat", age)
+            vehicle._dk_tell("last_heartbeat", age)
             await anyio.sleep(TICK_S)
         else:
             await anyio.sleep(LOOK_S)

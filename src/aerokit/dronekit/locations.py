@@ -24,14 +24,14 @@ class Locations(HasObservers):
     """
 
     def __init__(self, vehicle: Vehicle) -> None:
-        super().__init__(vehicle._listener_thread)
+        super().__init__(vehicle._dk_listener_thread)
         self._vehicle = vehicle
         self._global: tuple[float | None, float | None, float | None] = (None, None, None)
         self._relative: tuple[float | None, float | None, float | None] = (None, None, None)
         self._local: LocalPositionNed | None = None
         self._has_altitude = False
-        vehicle._on(GlobalPositionInt, self._on_global_position)
-        vehicle._on(LocalPositionNed, self._on_local_position)
+        vehicle._dk_on(GlobalPositionInt, self._on_global_position)
+        vehicle._dk_on(LocalPositionNed, self._on_local_position)
 
     @property
     def global_frame(self) -> LocationGlobal:
@@ -62,22 +62,22 @@ class Locations(HasObservers):
         self._has_altitude = self._has_altitude or altitude != 0
         self._relative = (latitude, longitude, message.relative_alt / 1000.0)
         self._global = (latitude, longitude, altitude if self._has_altitude else None)
-        self._announce("global_relative_frame")
+        self._dk_announce("global_relative_frame")
         if self._has_altitude:
-            self._announce("global_frame")
-        self._vehicle._tell("location", self)
+            self._dk_announce("global_frame")
+        self._vehicle._dk_tell("location", self)
 
     def _on_local_position(self, message: LocalPositionNed) -> None:
         self._local = message
-        self._announce("local_frame")
-        self._vehicle._tell("location", self)
+        self._dk_announce("local_frame")
+        self._vehicle._dk_tell("location", self)
 
-    def _announce(self, frame: str) -> None:
+    def _dk_announce(self, frame: str) -> None:
         """Tell those who listen here, then those who listen to the vehicle."""
         vehicle, name = self._vehicle, f"location.{frame}"
         if self._attribute_listeners or vehicle._attribute_listeners:
             value = getattr(self, frame)
-            self._tell(frame, value)
-            vehicle._tell(name, value)
+            self._dk_tell(frame, value)
+            vehicle._dk_tell(name, value)
         else:
-            vehicle._note(name)
+            vehicle._dk_note(name)

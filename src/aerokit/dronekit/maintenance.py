@@ -33,42 +33,42 @@ class Maintenance:
     if TYPE_CHECKING:
 
         @property
-        def _target_system(self) -> int: ...
-        def _check_link(self) -> AsyncVehicle: ...
-        def _order(
+        def _dk_target_system(self) -> int: ...
+        def _dk_check_link(self) -> AsyncVehicle: ...
+        def _dk_order(
             self, kind: str, function: Callable[..., Awaitable[object]], *args: Any, **kwargs: Any
         ) -> concurrent.futures.Future[None]: ...
-        def _send(self, message: Message) -> None: ...
+        def _dk_send(self, message: Message) -> None: ...
 
     # -------------------------------------------------------------------------- calibrations
 
     def send_calibrate_gyro(self) -> None:
         """Calibrate the gyroscopes: keep the vehicle still."""
-        self._calibrate(PREFLIGHT_CALIBRATION, 1)
+        self._dk_calibrate(PREFLIGHT_CALIBRATION, 1)
 
     def send_calibrate_magnetometer(self) -> None:
         """Calibrate the compasses: turn the vehicle about all axes until it says that it is done."""
-        if isinstance(self._check_link().autopilot, ArduPilot):
-            self._calibrate(DO_START_MAG_CAL, 0, 1, 1)  # all compasses; retry; save by itself
+        if isinstance(self._dk_check_link().autopilot, ArduPilot):
+            self._dk_calibrate(DO_START_MAG_CAL, 0, 1, 1)  # all compasses; retry; save by itself
         else:
-            self._calibrate(PREFLIGHT_CALIBRATION, 0, 1)
+            self._dk_calibrate(PREFLIGHT_CALIBRATION, 0, 1)
 
     def send_calibrate_vehicle_level(self) -> None:
         """Take the attitude of this moment for level."""
-        self._calibrate(PREFLIGHT_CALIBRATION, 0, 0, 0, 0, 2)
+        self._dk_calibrate(PREFLIGHT_CALIBRATION, 0, 0, 0, 0, 2)
 
     def send_calibrate_barometer(self) -> None:
         """Take the pressure of this moment for altitude 0."""
-        self._calibrate(PREFLIGHT_CALIBRATION, 0, 0, 1)
+        self._dk_calibrate(PREFLIGHT_CALIBRATION, 0, 0, 1)
 
     def send_calibrate_accelerometer(self, simple: bool = False) -> None:
         """Calibrate the accelerometers: in the six attitudes it asks for by texts, or, ``simple``, standing level."""
-        self._calibrate(PREFLIGHT_CALIBRATION, 0, 0, 0, 0, 4 if simple else 1)
+        self._dk_calibrate(PREFLIGHT_CALIBRATION, 0, 0, 0, 0, 4 if simple else 1)
 
-    def _calibrate(self, command: int, *params: float) -> None:
-        self._order(
+    def _dk_calibrate(self, command: int, *params: float) -> None:
+        self._dk_order(
             "calibration",
-            self._check_link().command,
+            self._dk_check_link().command,
             command,
             *params,
             component_id=0,
@@ -90,16 +90,16 @@ class Maintenance:
             APIException: the link is down, or the vehicle speaks MAVLink 1, which has no such message.
         """
         text = _tune_text(tune)
-        if self._check_link().connection.mavlink_version == 1:
+        if self._dk_check_link().connection.mavlink_version == 1:
             raise APIException("play_tune needs MAVLink 2, which this vehicle does not speak")
         first = TUNE_SIZES[0]
-        self._send(PlayTune(self._target_system, 0, text[:first], text[first:]))
+        self._dk_send(PlayTune(self._dk_target_system, 0, text[:first], text[first:]))
 
     def reboot(self) -> None:
         """Reboot the autopilot. It is away for some seconds, and then boots anew. Refused while it is armed."""
-        self._order(
+        self._dk_order(
             "reboot",
-            self._check_link().command,
+            self._dk_check_link().command,
             PREFLIGHT_REBOOT_SHUTDOWN,
             1,
             component_id=0,
@@ -109,8 +109,8 @@ class Maintenance:
 
     def send_capabilities_request(self, vehicle: Any, name: str, m: Any) -> None:
         """Ask for AUTOPILOT_VERSION once. Has the arguments of a message listener, and uses none of them."""
-        self._check_link()
-        self._send(command_long(self._target_system, 0, REQUEST_AUTOPILOT_CAPABILITIES, (1,)))
+        self._dk_check_link()
+        self._dk_send(command_long(self._dk_target_system, 0, REQUEST_AUTOPILOT_CAPABILITIES, (1,)))
 
     def send_capabilties_request(self, vehicle: Any, name: str, m: Any) -> None:
         """As :meth:`send_capabilities_request`; this spelling was the first."""

@@ -30,7 +30,7 @@ class HasObservers:
     """
 
     def __init__(self, listener_thread: ListenerThread | None = None) -> None:
-        self._listener_thread = listener_thread
+        self._dk_listener_thread = listener_thread
         self._attribute_listeners: dict[str, tuple[AttributeListener, ...]] = {}
         self._attribute_cache: dict[str, Any] = {}
 
@@ -77,42 +77,42 @@ class HasObservers:
 
         Call it from message listeners for attributes of your own. Returns when the listeners have run.
         """
-        if cache and self._is_told(attr_name, value):
+        if cache and self._dk_is_told(attr_name, value):
             return
-        self._note(attr_name)
+        self._dk_note(attr_name)
         if attr_name in self._attribute_listeners or EVERY_NAME in self._attribute_listeners:
-            if self._listener_thread is None:
-                self._deliver(attr_name, value)
+            if self._dk_listener_thread is None:
+                self._dk_deliver(attr_name, value)
             else:
-                self._listener_thread.call(self._deliver, attr_name, value)
+                self._dk_listener_thread.call(self._dk_deliver, attr_name, value)
 
     # ------------------------------------------------------------------------------- inside
 
-    def _tell(self, attr_name: str, value: Any, cache: bool = False) -> None:
+    def _dk_tell(self, attr_name: str, value: Any, cache: bool = False) -> None:
         """As :meth:`notify_attribute_listeners` without waiting, for the loop thread."""
-        if cache and self._is_told(attr_name, value):
+        if cache and self._dk_is_told(attr_name, value):
             return
-        self._note(attr_name)
+        self._dk_note(attr_name)
         listeners = self._attribute_listeners
         if listeners and (attr_name in listeners or EVERY_NAME in listeners):
-            if self._listener_thread is None:
-                self._deliver(attr_name, value)
+            if self._dk_listener_thread is None:
+                self._dk_deliver(attr_name, value)
             elif cache:
-                self._listener_thread.post(self._deliver, attr_name, value)
+                self._dk_listener_thread.post(self._dk_deliver, attr_name, value)
             else:
-                self._listener_thread.offer(self._deliver, attr_name, value)
+                self._dk_listener_thread.offer(self._dk_deliver, attr_name, value)
 
-    def _is_told(self, attr_name: str, value: Any) -> bool:
+    def _dk_is_told(self, attr_name: str, value: Any) -> bool:
         """Whether this was the last value told; if not, it is now."""
         if attr_name in self._attribute_cache and self._attribute_cache[attr_name] == value:
             return True
         self._attribute_cache[attr_name] = value
         return False
 
-    def _note(self, attr_name: str) -> None:
+    def _dk_note(self, attr_name: str) -> None:
         """An attribute has a value: what waits for it is told here."""
 
-    def _deliver(self, attr_name: str, value: Any) -> None:
+    def _dk_deliver(self, attr_name: str, value: Any) -> None:
         """Call the listeners, those that are there by now."""
         for name in (attr_name, EVERY_NAME):
             for listener in self._attribute_listeners.get(name, ()):

@@ -44,7 +44,7 @@ class ParameterReading:
         """Begin the download, unless it is under way or done (loop thread)."""
         if self._ended is None and not self.is_complete:
             self._ended = anyio.Event()
-            self._vehicle._background(self._download)
+            self._vehicle._dk_background(self._download)
 
     def seek(self) -> None:
         """As :meth:`begin`, from any thread; silent when the connection is closed."""
@@ -77,10 +77,10 @@ class ParameterReading:
 
     async def _download(self) -> None:
         try:
-            parameters = self._vehicle.aio.parameters
+            parameters = self._vehicle._dk_vehicle.parameters
             self._take_all(await parameters.download(method=await self._method()))
             self.is_complete = True
-            self._vehicle._tell("parameters", self._vehicle.parameters)
+            self._vehicle._dk_tell("parameters", self._vehicle.parameters)
         except ConnectionClosed:
             return
         except AerokitError as error:
@@ -93,7 +93,7 @@ class ParameterReading:
 
     async def _method(self) -> DownloadMethod:
         """A vehicle that does not say what it can is not waited for long."""
-        version = self._vehicle.aio.telemetry.version
+        version = self._vehicle._dk_vehicle.telemetry.version
         with anyio.move_on_after(VERSION_S):
             await version.wait_until(lambda _: True)
         return "auto" if version.is_known else "list"
@@ -111,7 +111,7 @@ class ParameterReading:
         from aerokit.parameters.renames import other_names
 
         names = (name, *other_names(name))
-        access = self._vehicle.aio.parameters._access
+        access = self._vehicle._dk_vehicle.parameters._access
         try:
             answers = (await access.read(names, PATIENCE_S, are_doubtful=True)).values()
         except AerokitError:

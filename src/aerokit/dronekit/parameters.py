@@ -42,13 +42,13 @@ class Parameters(MutableMapping[str, float], HasObservers):
     """
 
     def __init__(self, vehicle: Vehicle) -> None:
-        HasObservers.__init__(self, vehicle._listener_thread)
+        HasObservers.__init__(self, vehicle._dk_listener_thread)
         self._vehicle = vehicle
         self._values = ParameterValues()
         self._reading = ParameterReading(vehicle, self._take_all)
-        vehicle._on(ParamValue, self._on_value)
-        vehicle._at_start(self._start)
-        vehicle._seekers["parameters"] = self._reading.seek
+        vehicle._dk_on(ParamValue, self._on_value)
+        vehicle._dk_at_start(self._start)
+        vehicle._dk_seekers["parameters"] = self._reading.seek
 
     # ------------------------------------------------------------------------------- reading
 
@@ -170,9 +170,9 @@ class Parameters(MutableMapping[str, float], HasObservers):
             known.warn()
         vehicle = self._vehicle
         if retries <= 0:
-            vehicle._order(f"parameter {own}", set_parameter, vehicle.aio, own, told, 0)
+            vehicle._dk_order(f"parameter {own}", set_parameter, vehicle._dk_vehicle, own, told, 0)
             return False
-        failure = vehicle._run(set_parameter, vehicle.aio, own, told, retries)
+        failure = vehicle._dk_run(set_parameter, vehicle._dk_vehicle, own, told, retries)
         if isinstance(failure, ParameterTimeout):
             vehicle._logger.error("timeout setting parameter %s to %f", name, number)
         elif failure is not None:
@@ -207,7 +207,7 @@ class Parameters(MutableMapping[str, float], HasObservers):
         is_settled = self._is_settled  # before looking: the list may come meanwhile
         known = self._values.find(name)
         if known is None and waits and not is_settled and _is_possible(name):
-            self._vehicle._run(self._wait_for, name)
+            self._vehicle._dk_run(self._wait_for, name)
             known = self._values.find(name)
         return known
 
@@ -216,7 +216,7 @@ class Parameters(MutableMapping[str, float], HasObservers):
         """Whether the vehicle has nothing but what is known: the whole list has come, and is as long as it says."""
         if not self._reading.is_complete:
             return False
-        count = self._vehicle.aio.parameters._access.store.count
+        count = self._vehicle._dk_vehicle.parameters._access.store.count
         return count is None or count <= len(self._values)
 
     async def _wait_for(self, name: str) -> None:
@@ -231,30 +231,30 @@ class Parameters(MutableMapping[str, float], HasObservers):
         return self._values.copy()
 
     def _start(self) -> None:
-        aio = self._vehicle.aio
+        aio = self._vehicle._dk_vehicle
         aio._detach.append(aio.connection.bus.attach_event(ParameterChanged, self._on_changed))
         self._reading.begin()
 
     def _on_value(self, message: ParamValue) -> None:
         """The table underneath has taken it already: there, integers are what they are."""
-        told = self._vehicle.aio.parameters._access.store.get(message.param_id)
+        told = self._vehicle._dk_vehicle.parameters._access.store.get(message.param_id)
         if told is not None:
             self._take(told.name, float(told.value))
 
     def _on_changed(self, event: ParameterChanged) -> None:
         """Also by a download that a program has begun by itself."""
-        if event.system_id == self._vehicle._target_system:
+        if event.system_id == self._vehicle._dk_target_system:
             self._take(event.name, float(event.after))
 
     def _take(self, name: str, value: float) -> None:
         if self._values.take(name, value):
-            self._tell(name.upper(), value, cache=True)
+            self._dk_tell(name.upper(), value, cache=True)
 
     def _take_all(self, table: ParameterTable) -> None:
         news = self._values.replace(table.values_by_name())
         if self._attribute_listeners:
             for name, value in news.items():
-                self._tell(name.upper(), value, cache=True)
+                self._dk_tell(name.upper(), value, cache=True)
         else:
             self._attribute_cache.update(news)
 

@@ -25,11 +25,11 @@ class Readiness:
 
     if TYPE_CHECKING:
         _ready_attrs: set[str]
-        _failures: dict[str, APIException]
-        _became_ready: threading.Condition
-        _seekers: dict[str, Callable[[], None]]
+        _dk_failures: dict[str, APIException]
+        _dk_became_ready: threading.Condition
+        _dk_seekers: dict[str, Callable[[], None]]
 
-        def _check_link(self) -> object: ...
+        def _dk_check_link(self) -> object: ...
 
     def wait_ready(
         self,
@@ -70,28 +70,28 @@ class Readiness:
                 if raise_exception:
                     raise TimeoutError(f"wait_ready experienced a timeout after {timeout} seconds.")
                 return False
-            self._check_link()
-            if (failure := self._failure_of(missing)) is not None:
+            self._dk_check_link()
+            if (failure := self._dk_failure_of(missing)) is not None:
                 if raise_exception:
                     raise type(failure)(str(failure)) from failure.__cause__
                 return False
-            self._seek(missing)
+            self._dk_seek(missing)
             if still_waiting_callback is not None and now >= told_at + still_waiting_interval:
                 told_at = now
                 still_waiting_callback(missing)
-            self._wait_a_little(wanted, deadline - now)
+            self._dk_wait_a_little(wanted, deadline - now)
         return True
 
-    def _seek(self, names: set[str]) -> None:
+    def _dk_seek(self, names: set[str]) -> None:
         """Have what is not coming by itself fetched."""
-        for name in self._seekers.keys() & names:
-            self._seekers[name]()
+        for name in self._dk_seekers.keys() & names:
+            self._dk_seekers[name]()
 
-    def _failure_of(self, names: set[str]) -> APIException | None:
-        return next((self._failures[name] for name in names if name in self._failures), None)
+    def _dk_failure_of(self, names: set[str]) -> APIException | None:
+        return next((self._dk_failures[name] for name in names if name in self._dk_failures), None)
 
-    def _wait_a_little(self, wanted: set[str], at_most_s: float) -> None:
-        with self._became_ready:
+    def _dk_wait_a_little(self, wanted: set[str], at_most_s: float) -> None:
+        with self._dk_became_ready:
             missing = wanted - self._ready_attrs
-            if missing and self._failure_of(missing) is None:
-                self._became_ready.wait(min(LONGEST_WAIT_S, at_most_s))
+            if missing and self._dk_failure_of(missing) is None:
+                self._dk_became_ready.wait(min(LONGEST_WAIT_S, at_most_s))

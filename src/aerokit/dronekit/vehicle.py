@@ -23,6 +23,7 @@ from aerokit.dronekit.modes import mode_name
 from aerokit.dronekit.parameters import Parameters
 from aerokit.dronekit.pymavlink_messages import sendable
 from aerokit.dronekit.readiness import Readiness
+from aerokit.dronekit.shadowable import Shadowable
 from aerokit.dronekit.streams import request_streams
 from aerokit.errors import AerokitError, ConnectFailed, LocalProtocolError, OperationTimeout
 from aerokit.mavlink.messages import CommandLong
@@ -66,16 +67,16 @@ class Vehicle(FlightMethods, Maintenance, Readiness):
         self._handler = handler
         self._logger = logging.getLogger("dronekit")
         self._autopilot_logger = logging.getLogger("autopilot")
-        self._aio: AsyncVehicle | None = None
-        self._sync: sync.Vehicle | None = None
+        self._dk_aio: AsyncVehicle | None = None
+        self._dk_sync: sync.Vehicle | None = None
         self._heartbeat_timeout: float = 0.0
-        self._message_handlers: list[tuple[type[Message], Callable[[Any], None], bool]] = []
-        self._starters: list[Callable[[], None]] = []
-        self._initializing = threading.Lock()
-        self._tasks: Background | None = None
+        self._dk_message_handlers: list[tuple[type[Message], Callable[[Any], None], bool]] = []
+        self._dk_starters: list[Callable[[], None]] = []
+        self._dk_initializing = threading.Lock()
+        self._dk_tasks: Background | None = None
         self._message_listeners = MessageListeners(self, handler)
         self._location = Locations(self)
-        self._attach_attributes()
+        self._dk_attach_attributes()
         self._channels = Channels(self, 8)
         self._gimbal = Gimbal(self)
         self._parameters = Parameters(self)
@@ -125,7 +126,7 @@ class Vehicle(FlightMethods, Maintenance, Readiness):
         """As ``commands.upload()``."""
         self._commands.upload()
 
-    @property
+    @Shadowable
     def aio(self) -> AsyncVehicle:
         """The asynchronous vehicle (:class:`aerokit.Vehicle`) underneath, for coroutines on its own loop.
 
@@ -135,11 +136,9 @@ class Vehicle(FlightMethods, Maintenance, Readiness):
         Raises:
             APIException: the vehicle is not connected.
         """
-        if self._aio is None:
-            raise APIException("the vehicle is not connected yet: call initialize()")
-        return self._aio
+        return self._dk_vehicle
 
-    @property
+    @Shadowable
     def sync(self) -> sync.Vehicle:
         """The blocking twin of the new API (:class:`aerokit.sync.Vehicle`) on the same connection.
 
@@ -148,9 +147,9 @@ class Vehicle(FlightMethods, Maintenance, Readiness):
         Raises:
             APIException: the vehicle is not connected.
         """
-        if self._sync is None:
+        if self._dk_sync is None:
             raise APIException("the vehicle is not connected yet: call initialize()")
-        return self._sync
+        return self._dk_sync
 
     def run(self, function: Callable[..., Awaitable[Any]], /, *args: Any, **kwargs: Any) -> Any:
         """Await a coroutine function on the vehicle's loop: ``vehicle.run(survey, vehicle.aio)``; Ctrl-C cancels it.
@@ -202,8 +201,8 @@ class Vehicle(FlightMethods, Maintenance, Readiness):
             LocalProtocolError: a ValueError; a field is wrong. Nothing was sent.
             APIException: the link is down.
         """
-        self._check_link()
-        self._handler.send(sendable(message, self._target_system), to=self._target_system)
+        self._dk_check_link()
+        self._handler.send(sendable(message, self._dk_target_system), to=self._dk_target_system)
 
     # ---------------------------------------------------------------------------- life cycle
 
@@ -212,22 +211,22 @@ class Vehicle(FlightMethods, Maintenance, Readiness):
 
         Args:
             rate: Hz of the data streams to ask for; None asks for none.
-            heartbeat_timeout: seconds to wait for the first heartbeat (0 or less: 30), and after which, in flight, orders
-                and waits raise APIException until heartbeats come again (0 or less: never).
+            heartbeat_timeout: seconds to wait for the first heartbeat (0 or less: 30), and after which, in flight,
+                orders and waits raise APIException until heartbeats come again (0 or less: never).
 
         Raises:
             APIException: no vehicle was heard in time; the text says what was heard instead.
         """
-        with self._initializing:
-            if self._aio is not None:
+        with self._dk_initializing:
+            if self._dk_aio is not None:
                 return
             self._heartbeat_timeout = max(heartbeat_timeout or 0.0, 0.0)
             timeout = self._heartbeat_timeout or CONNECT_S
             loop = self._handler.loop
             try:
-                held = loop.hold_open(self._found(timeout, rate))
-                self._sync = sync.Vehicle(loop, held, owns_loop=False)
-                self._wait_until_booted(timeout)
+                held = loop.hold_open(self._dk_found(timeout, rate))
+                self._dk_sync = sync.Vehicle(loop, held, owns_loop=False)
+                self._dk_wait_until_booted(timeout)
             except ConnectFailed as error:
                 raise APIException(f"Timeout in initializing connection. {error}") from error
             except AerokitError as error:
@@ -257,30 +256,37 @@ class Vehicle(FlightMethods, Maintenance, Readiness):
         return self._handler.master
 
     def _is_mode_available(self, mode_code: int, base_mode: int = 0) -> bool:
-        return not mode_name(self.aio, base_mode or 1, mode_code).endswith(f" {mode_code}")
+        return not mode_name(self._dk_vehicle, base_mode or 1, mode_code).endswith(f" {mode_code}")
 
     @property
-    def _target_system(self) -> int:
+    def _dk_target_system(self) -> int:
         return self._handler.target_system
 
     # -------------------------------------------------------------------- for the other parts
+    # `_dk_`: names that no subclass in the classic style takes for its own things.
 
-    def _on(self, message_type: type[Message], handler: Callable[[Any], None]) -> None:
-        self._message_handlers.append((message_type, handler, True))
+    @property
+    def _dk_vehicle(self) -> AsyncVehicle:
+        if self._dk_aio is None:
+            raise APIException("the vehicle is not connected yet: call initialize()")
+        return self._dk_aio
 
-    def _on_any_component(self, message_type: type[Message], handler: Callable[[Any], None]) -> None:
-        self._message_handlers.append((message_type, handler, False))
+    def _dk_on(self, message_type: type[Message], handler: Callable[[Any], None]) -> None:
+        self._dk_message_handlers.append((message_type, handler, True))
 
-    def _at_start(self, function: Callable[[], None]) -> None:
-        self._starters.append(function)
+    def _dk_on_any_component(self, message_type: type[Message], handler: Callable[[Any], None]) -> None:
+        self._dk_message_handlers.append((message_type, handler, False))
 
-    def _background(self, function: Callable[[], Awaitable[None]]) -> None:
-        if self._tasks is not None:
-            self._tasks.start(function, f"dronekit {getattr(function, '__name__', 'task')}")
+    def _dk_at_start(self, function: Callable[[], None]) -> None:
+        self._dk_starters.append(function)
 
-    def _check_link(self) -> AsyncVehicle:
+    def _dk_background(self, function: Callable[[], Awaitable[None]]) -> None:
+        if self._dk_tasks is not None:
+            self._dk_tasks.start(function, f"dronekit {getattr(function, '__name__', 'task')}")
+
+    def _dk_check_link(self) -> AsyncVehicle:
         """The asynchronous vehicle, if it can be talked to."""
-        aio = self.aio
+        aio = self._dk_vehicle
         if self._handler.is_closed:
             raise APIException("the vehicle was closed")
         try:
@@ -292,8 +298,8 @@ class Vehicle(FlightMethods, Maintenance, Readiness):
             raise APIException(f"no heartbeat of the vehicle for {age:.0f} s")
         return aio
 
-    def _run(self, function: Callable[..., Awaitable[Any]], *args: Any, **kwargs: Any) -> Any:
-        self._check_link()
+    def _dk_run(self, function: Callable[..., Awaitable[Any]], *args: Any, **kwargs: Any) -> Any:
+        self._dk_check_link()
         try:
             return self._handler.loop.run(function, *args, **kwargs)
         except LocalProtocolError:
@@ -303,71 +309,71 @@ class Vehicle(FlightMethods, Maintenance, Readiness):
         except AerokitError as error:
             raise APIException(str(error)) from error
 
-    def _order(
+    def _dk_order(
         self, kind: str, function: Callable[..., Awaitable[object]], *args: Any, **kwargs: Any
     ) -> concurrent.futures.Future[None]:
-        self._check_link()
+        self._dk_check_link()
         try:
             return self._handler.orders.give(kind, function, *args, **kwargs)
         except AerokitError as error:
             raise APIException(str(error)) from error
 
-    def _send(self, message: Message) -> None:
-        self._check_link()
+    def _dk_send(self, message: Message) -> None:
+        self._dk_check_link()
         self._handler.send(message)
 
-    def _pause(self, seconds: float) -> None:
+    def _dk_pause(self, seconds: float) -> None:
         """Sleep, unless the vehicle is closed meanwhile."""
         self._handler.wait_closed(seconds)
 
     # ------------------------------------------------------------------------------- inside
 
     @asynccontextmanager
-    async def _found(self, timeout: float, rate: float | None) -> AsyncIterator[AsyncVehicle]:
+    async def _dk_found(self, timeout: float, rate: float | None) -> AsyncIterator[AsyncVehicle]:
         connection = self._handler.connection
         async with connect_async(connection, timeout=timeout, rates={}) as aio:
-            self._tasks = Background(connection.fail)
+            self._dk_tasks = Background(connection.fail)
             try:
-                self._begin(aio, rate)
+                self._dk_begin(aio, rate)
                 yield aio
             finally:
-                await self._tasks.aclose()
+                await self._dk_tasks.aclose()
 
-    def _begin(self, aio: AsyncVehicle, rate: float | None) -> None:
+    def _dk_begin(self, aio: AsyncVehicle, rate: float | None) -> None:
         """On the loop, in the turn in which the vehicle was found."""
-        self._aio = aio
+        self._dk_aio = aio
         self._handler.target_system = aio.system_id
         self._handler.master.vehicle = self
-        for message_type, handler, only_autopilot in self._message_handlers:
+        for message_type, handler, only_autopilot in self._dk_message_handlers:
             take = _only_of(aio.component_id, handler) if only_autopilot else handler
             aio._detach.append(aio.connection.bus.attach(message_type, take, system_id=aio.system_id))
-        aio._detach.append(aio.telemetry.status_text.observe(self._on_status_text, every_arrival=True))
+        aio._detach.append(aio.telemetry.status_text.observe(self._dk_on_status_text, every_arrival=True))
         first = aio.connection.heard.get((aio.system_id, aio.component_id))
         if first is not None:
             self._handler.follow_version(first)
-            self._on_heartbeat(first)
+            self._dk_on_heartbeat(first)
         self._message_listeners.start()
         if rate is not None:
-            self._background(lambda: request_streams(aio, rate))
-        self._background(lambda: self._request_capabilities(aio))
-        self._background(lambda: watch_link(self, aio))
-        for starter in self._starters:
+            self._dk_background(lambda: request_streams(aio, rate))
+        self._dk_background(lambda: self._dk_request_capabilities(aio))
+        self._dk_background(lambda: watch_link(self, aio))
+        for starter in self._dk_starters:
             starter()
 
-    def _on_heartbeat(self, message: Any) -> None:
+    def _dk_on_heartbeat(self, message: Any) -> None:
         self._handler.follow_version(message)
-        super()._on_heartbeat(message)
+        super()._dk_on_heartbeat(message)
 
-    def _on_version(self, message: Any) -> None:
+    def _dk_on_version(self, message: Any) -> None:
         self._handler.knows_mavlink_2 = bool(message.capabilities & MAVLINK_2)
-        super()._on_version(message)
+        super()._dk_on_version(message)
 
-    def _on_status_text(self, before: StatusText | None, text: StatusText) -> None:
+    def _dk_on_status_text(self, before: StatusText | None, text: StatusText) -> None:
         level = LEVELS[min(text.severity, len(LEVELS) - 1)]
         if self._autopilot_logger.isEnabledFor(level):
             self._handler.listener_thread.post(self._autopilot_logger.log, level, "%s", text.text.strip())
 
-    async def _request_capabilities(self, aio: AsyncVehicle) -> None:
+    async def _dk_request_capabilities(self, aio: AsyncVehicle) -> None:
         """As old firmware wants to be asked, with each heartbeat until there is an answer."""
         for _ in range(5):
             if aio.telemetry.version.is_known:
@@ -375,7 +381,7 @@ class Vehicle(FlightMethods, Maintenance, Readiness):
             aio.send(CommandLong(aio.system_id, 0, REQUEST_AUTOPILOT_CAPABILITIES, 0, 1, *(0.0,) * 6))
             await anyio.sleep(1.0)
 
-    def _wait_until_booted(self, timeout: float) -> None:
+    def _dk_wait_until_booted(self, timeout: float) -> None:
         try:
             self.wait_for(lambda: self._flightmode not in (None, "INITIALISING", "MAV"), timeout)
         except TimeoutError:

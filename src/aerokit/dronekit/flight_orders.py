@@ -1,0 +1,105 @@
+"""What is sent to make a vehicle move, and what is refused before anything is sent."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from aerokit.autopilots.px4 import Px4
+from aerokit.dronekit.exceptions import APIException
+from aerokit.errors import CommandRejected, LocalProtocolError
+from aerokit.mavlink.messages import SetPositionTargetGlobalInt
+
+if TYPE_CHECKING:
+    from aerokit.dronekit.values import LocationGlobal, LocationGlobalRelative
+    from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
+
+__all__ = ["change_armed", "check_speed", "checked_place", "go_to", "refuse", "set_home"]
+
+COMPONENT_ARM_DISARM, DO_SET_HOME, DO_REPOSITION = 400, 179, 192
+GLOBAL, GLOBAL_INT, GLOBAL_RELATIVE_ALT_INT = 0, 5, 6
+POSITION_ONLY = 0x0DF8
+RESULT_UNSUPPORTED = 3
+CHANGE_MODE = 1
+ARMED_IS_TOLD_S = 10.0
+
+
+async def change_armed(vehicle: AsyncVehicle, value: bool) -> None:
+    """Arm or disarm, and wait until HEARTBEAT says so."""
+    await vehicle.command(COMPONENT_ARM_DISARM, float(value), component_id=0)
+    await vehicle.telemetry.armed.wait_until(
+        lambda armed: armed is value, timeout=ARMED_IS_TOLD_S, description="armed" if value else "disarmed"
+    )
+
+
+async def go_to(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: float) -> None:
+    """DO_REPOSITION, which is answered; and the message for a vehicle that does not know it."""
+    if isinstance(vehicle.autopilot, Px4):
+        home = vehicle.telemetry.home.value.altitude_amsl_m
+        await vehicle.command_int(
+            DO_REPOSITION,
+            *(-1, CHANGE_MODE, 0, math.nan),
+            frame=GLOBAL_INT,
+            x=latitude,
+            y=longitude,
+            z=altitude + home,
+            component_id=0,
+        )
+        return
+    try:
+        await vehicle.command_int(
+            DO_REPOSITION,
+            *(-1, 0, 0, math.nan),
+            frame=GLOBAL_RELATIVE_ALT_INT,
+            x=latitude,
+            y=longitude,
+            z=altitude,
+            component_id=0,
+        )
+    except CommandRejected as error:
+        if error.result != RESULT_UNSUPPORTED:
+            raise
+        target = (vehicle.system_id, 0, GLOBAL_RELATIVE_ALT_INT, POSITION_ONLY)
+        vehicle.send(SetPositionTargetGlobalInt(0, *target, latitude, longitude, altitude, *(0.0,) * 8))
+
+
+async def set_home(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: float) -> None:
+    """DO_SET_HOME by COMMAND_INT, or COMMAND_LONG where that is not known; 1e-7 degrees, metres above the sea."""
+    try:
+        await vehicle.command_int(
+            DO_SET_HOME, 0, frame=GLOBAL, x=latitude, y=longitude, z=altitude, component_id=0
+        )
+    except CommandRejected as error:
+        if error.result != RESULT_UNSUPPORTED:
+            raise
+        place = (latitude * 1e-7, longitude * 1e-7, altitude)
+        await vehicle.command(DO_SET_HOME, 0, 0, 0, 0, *place, component_id=0)
+
+
+async def refuse(reason: str) -> None:
+    """An order that is not sent: the reason is logged as a refusal of the vehicle would be."""
+    raise APIException(reason)
+
+
+def checked_place(location: LocationGlobal | LocationGlobalRelative) -> tuple[int, int, float]:
+    """Latitude and longitude in 1e-7 degrees, altitude in metres.
+
+    Raises:
+        LocalProtocolError: a ValueError, which names the number that is missing or wrong.
+    """
+    for name, limit in (("lat", 90.0), ("lon", 180.0), ("alt", math.inf)):
+        value = getattr(location, name)
+        try:
+            is_good = math.isfinite(value) and abs(value) <= limit
+        except TypeError:
+            is_good = False
+        if not is_good:
+            allowed = "a number of metres" if limit == math.inf else f"-{limit:g} to {limit:g} degrees"
+            raise LocalProtocolError(f"location.{name} = {value!r} is not allowed: {allowed}")
+    return round(location.lat * 1e7), round(location.lon * 1e7), float(location.alt)
+
+
+def check_speed(name: str, speed: float | None) -> None:
+    """LocalProtocolError, a ValueError, unless it is a number of m/s or None."""
+    if speed is not None and not math.isfinite(speed):
+        raise LocalProtocolError(f"{name} = {speed!r} is not allowed: a number of m/s")
