@@ -15,6 +15,7 @@ from aerokit.vehicle.checks import check_seconds
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Sequence
 
+    from aerokit.mavlink.frame import Frame
     from aerokit.missions.item import MissionItem
     from aerokit.position import Position
     from aerokit.protocols.transfer import OnProgress
@@ -29,6 +30,8 @@ PlanMethod = Literal["auto", "ftp", "items"]
 METHODS = ("auto", "ftp", "items")
 FRESH_IDS_S = 2.5
 """MISSION_CURRENT comes at 1 Hz."""
+IDS_AT = (6, 10, 14)
+"""Where in its payload ``mission_id``, ``fence_id`` and ``rally_points_id`` are: the dialect does not have them yet."""
 
 
 class HeldPlan(Generic[PlanT]):
@@ -197,10 +200,11 @@ class PlanContext:
         self.lock = asyncio.Lock()
         self.memories = (PlanMemory(), PlanMemory(), PlanMemory())
         """By MAV_MISSION_TYPE."""
-        self._ids: tuple[int, ...] = (0, 0, 0)
-        self._ids_at = -math.inf
+        self._current: Frame | None = None
         bus = vehicle.connection.bus
-        vehicle._detach.append(bus.attach(MissionCurrent, self._note_ids, system_id=vehicle.system_id))
+        vehicle._detach.append(
+            bus.attach_frames(MissionCurrent, self._note_current, system_id=vehicle.system_id)
+        )
 
     def now(self) -> float:
         """Seconds on the loop's clock."""
@@ -224,8 +228,11 @@ class PlanContext:
 
     def id_of(self, mission_type: int, since: float) -> int:
         """What a MISSION_CURRENT that came lately, and after ``since``, calls the plan; 0 where it does not."""
-        is_fresh = self._ids_at > since and self.now() - self._ids_at <= FRESH_IDS_S
-        return self._ids[mission_type] if is_fresh else 0
+        frame = self._current
+        if frame is None or frame.received_at <= since or self.now() - frame.received_at > FRESH_IDS_S:
+            return 0
+        at = IDS_AT[mission_type]
+        return int.from_bytes(frame.payload[at : at + 4], "little")
 
     async def is_called(self, mission_type: int, opaque_id: int) -> bool:
         """Whether MISSION_CURRENT, waited for, calls the plan so."""
@@ -243,9 +250,6 @@ class PlanContext:
             detach()
         return told.is_set()
 
-    def _note_ids(self, message: MissionCurrent) -> None:
-        """``mission_id``, ``fence_id``, ``rally_points_id``: extensions that are not in the dialect yet."""
-        frame = message.received_frame
-        if frame is not None and self.vehicle.telemetry.accepts(frame):
-            self._ids = tuple(int.from_bytes(frame.payload[at : at + 4], "little") for at in (6, 10, 14))
-            self._ids_at = self.now()
+    def _note_current(self, frame: Frame) -> None:
+        if self.vehicle.telemetry.accepts(frame):
+            self._current = frame

@@ -13,7 +13,7 @@ from aerokit.runtime.events import LinkReport, VehicleBack, VehicleRebooted, Veh
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from aerokit.mavlink.message import Message
+    from aerokit.mavlink.frame import Frame
     from aerokit.runtime.bus import Detach
     from aerokit.runtime.connection import Connection
 
@@ -53,8 +53,13 @@ class VehicleWatch:
         self._expects_reboot = False
         attach = connection.bus.attach
         self._detach: list[Detach] = [attach(Heartbeat, self._on_heartbeat, system_id=system_id)]
-        for message_type in (SystemTime, Attitude, GlobalPositionInt):
-            self._detach.append(attach(message_type, self._on_boot_time, system_id=system_id))
+        attach_frames = connection.bus.attach_frames
+        for message_type, take in (
+            (Attitude, self._on_boot_time),
+            (GlobalPositionInt, self._on_boot_time),
+            (SystemTime, self._on_system_time),
+        ):
+            self._detach.append(attach_frames(message_type, take, system_id=system_id))
         self._detach.append(attach(Timesync, self._on_timesync, system_id=system_id))
 
     def close(self) -> None:
@@ -78,32 +83,38 @@ class VehicleWatch:
         frame = heartbeat.received_frame
         if frame is None or frame.component_id != self._component_id:
             return
-        now = self._connection.now()
+        now = frame.received_at
         silent_for, self.last_heartbeat_at = now - self.last_heartbeat_at, now
         if self.is_silent:
             self.is_silent = False
             self._connection.bus.publish(VehicleBack(now, self._system_id, silent_for))
 
-    def _on_boot_time(self, message: SystemTime | Attitude | GlobalPositionInt) -> None:
-        self._note_time(message, "time_boot_ms", message.time_boot_ms)
+    def _on_boot_time(self, frame: Frame) -> None:
+        """``time_boot_ms`` is the payload's beginning."""
+        if frame.component_id == self._component_id:
+            self._note_time(frame, "time_boot_ms", int.from_bytes(frame.body[9:13], "little"))
+
+    def _on_system_time(self, frame: Frame) -> None:
+        """``time_boot_ms`` comes after ``time_unix_usec``."""
+        if frame.component_id == self._component_id:
+            self._note_time(frame, "time_boot_ms", int.from_bytes(frame.body[17:21], "little"))
 
     def _on_timesync(self, message: Timesync) -> None:
         """Answers to our own questions come also from a vehicle that streams nothing (yet)."""
-        if message.tc1 != 0:
-            self._note_time(message, "TIMESYNC", message.tc1 // 1_000_000)
-
-    def _note_time(self, message: Message, clock: str, milliseconds: int) -> None:
         frame = message.received_frame
-        if frame is None or frame.component_id != self._component_id:
-            return
-        now = self._connection.now()
+        if message.tc1 != 0 and frame is not None and frame.component_id == self._component_id:
+            self._note_time(frame, "TIMESYNC", message.tc1 // 1_000_000)
+
+    def _note_time(self, frame: Frame, clock: str, milliseconds: int) -> None:
+        now = frame.received_at
         before, then = self._times.get(clock, (milliseconds, now))
         late = 1000 * (now - then) - (milliseconds - before)
         if self._expects_reboot and late > LATE_MS:
             self._has_rebooted(clock, milliseconds)
         elif milliseconds + REBOOT_STEP_MS >= before:
             self._times[clock] = (milliseconds, now)
-            self._candidates.pop(clock, None)
+            if self._candidates:
+                self._candidates.pop(clock, None)
         elif self._is_confirmed(clock, milliseconds):
             self._has_rebooted(clock, milliseconds)
 
