@@ -77,6 +77,7 @@ class SimulatedCopter(SimulatedVehicle):
     - ``boot_text``: the plain text that a serial or TCP port gives before the first frame
     - ``version``: goes into AUTOPILOT_VERSION and the banner; ``parameters``: values other than the defaults,
       ``parameter_count``: fewer than all 1,349, for quick tests; ``parameter_errors``: it says PARAM_ERROR
+      MNT1_TYPE 1 fits a gimbal with three axes
     - ``logs``: what flights have left; ``link_bytes_per_s``: see `Storage`
     - ``battery_percent``: charge at the start; ``battery_capacity_mah``: the size of the pack
     - ``wind``: constant wind and gusts; ``rangefinder_reach_m``: 0 means that there is no range finder
