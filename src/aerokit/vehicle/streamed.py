@@ -86,14 +86,17 @@ class StreamedMessage:
         """Take a frame of the vehicle's system; only those of its autopilot count."""
         if frame.component_id != self._component_id:
             return
+        if self._is_watched or frame.received_at >= self._look_at:
+            self._look_at = frame.received_at + LOOK_S
+            with self._lock:  # never left to another thread: who waits for it is told on this one
+                self.catch_up()
+                self._apply(frame)
+            return
         number_at = self._number_at
         if number_at is None:
             self.pending[0] = frame
         else:
             self.pending[frame.body[number_at] if len(frame.body) > number_at else 0] = frame
-        if self._is_watched or frame.received_at >= self._look_at:
-            self._look_at = frame.received_at + LOOK_S
-            self.catch_up()
 
     def catch_up(self) -> None:
         """Work out what has come."""
