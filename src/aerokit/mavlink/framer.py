@@ -65,8 +65,8 @@ class Framer:
 
         Never raises, whatever the bytes.
         """
-        # The loop is long and repeats `_examine` on purpose: it runs for every frame on the air. What is not an
-        # unsigned frame of MAVLink 2 whose message is known takes the slow path.
+        # The loop is long and repeats `_examine` on purpose: it runs for every frame on the air. What is neither an
+        # unsigned frame of MAVLink 2 whose message is known nor a good one of MAVLink 1 takes the slow path.
         if type(data) is not bytes:
             data = bytes(data)
         size = len(data)
@@ -80,17 +80,20 @@ class Framer:
         while begin < size:
             try:
                 magic, length, flags, sequence, key, message_id = _HEADER_V2(data, begin)
-                message_id &= 0xFFFFFF
-                upto = begin + 10 + length
-                end = upto + 2
-                body = data[begin + 1 : upto]
-                (checksum,) = _CHECKSUM(data, upto)
-                good = x25(body + extras[message_id]) == checksum and magic == MAGIC_V2 and not flags
+                if good := magic == MAGIC_V2 and not flags:
+                    message_id &= 0xFFFFFF
+                    upto = begin + 10 + length
+                    end = upto + 2
+                    body = data[begin + 1 : upto]
+                    (checksum,) = _CHECKSUM(data, upto)
+                    good = x25(body + extras[message_id]) == checksum
             except (StructError, KeyError):
                 good, body = False, b""
                 end = sequence = key = message_id = checksum = 0
             if not good:
-                found = self._search(data, begin)
+                found = self._examine(data, begin)[2] if data[begin] == MAGIC_V1 else None
+                if found is None:
+                    found = self._search(data, begin)
                 if self._unknown:
                     frames += [Frame.parse(raw, now) for raw in self._unknown]
                     self._unknown.clear()
