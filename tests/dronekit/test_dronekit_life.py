@@ -19,6 +19,7 @@ from served_copter import served_copter
 
 import aerokit.dronekit as dronekit
 from aerokit.dronekit import mavlink
+from aerokit.dronekit import vehicle as vehicle_module
 from aerokit.mavlink.messages import GlobalPositionInt
 
 LIMIT_S = 20.0
@@ -337,3 +338,11 @@ def test_a_subclass_calls_its_own_things_what_it_likes(address: str) -> None:
         assert vehicle.parameters["RTL_ALT"] is not None
         vehicle.wait_for_mode("STABILIZE", timeout=LIMIT_S)
         assert vehicle.attitude.pitch is not None
+
+
+def test_connecting_waits_for_the_first_values(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(vehicle_module, "FIRST_VALUES_S", LIMIT_S)
+    with dronekit.connect(address) as vehicle:
+        assert vehicle.location.global_relative_frame.alt is not None
+        assert vehicle.attitude.yaw is not None
+        assert vehicle.battery.voltage is not None

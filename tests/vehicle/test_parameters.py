@@ -15,6 +15,7 @@ from flight_harness import Flight, Px4Flight, open_flight, open_px4
 from aerokit import events, messages
 from aerokit.errors import (
     FileError,
+    FileTimeout,
     LocalProtocolError,
     NotSupported,
     OperationTimeout,
@@ -107,6 +108,19 @@ async def test_without_mavftp_the_list_is_taken() -> None:
         assert len(await flight.vehicle.parameters.download()) == 120
         assert len(flight.wire.all(messages.ParamRequestList)) == 1
         assert not flight.wire.all(messages.FileTransferProtocol)
+
+
+async def test_where_mavftp_is_swallowed_the_list_is_taken_soon() -> None:
+    simulated = copter()
+    async with open_flight(simulated) as flight:
+        await flight.vehicle.version.wait_until(lambda _: True)
+        simulated.faults.no_ftp = True  # it has told before that it has it
+        began = anyio.current_time()
+        assert len(await flight.vehicle.parameters.download()) == 120
+        assert anyio.current_time() - began < 5
+        assert flight.wire.all(messages.FileTransferProtocol)
+        with pytest.raises(FileTimeout):
+            await flight.vehicle.parameters.download(method="ftp", refresh=True)
 
 
 async def test_a_vehicle_without_the_file_is_asked_for_it_once_until_it_reboots() -> None:

@@ -21,6 +21,7 @@ from aerokit.dronekit.maintenance import Maintenance
 from aerokit.dronekit.message_listeners import MessageListener, MessageListeners
 from aerokit.dronekit.modes import mode_name
 from aerokit.dronekit.parameters import Parameters
+from aerokit.dronekit.privates import VehiclePrivates
 from aerokit.dronekit.pymavlink_messages import sendable
 from aerokit.dronekit.readiness import Readiness
 from aerokit.dronekit.shadowable import Shadowable
@@ -48,13 +49,16 @@ __all__ = ["Vehicle"]
 REQUEST_AUTOPILOT_CAPABILITIES = 520
 MAVLINK_2 = 8192
 """Bit of AUTOPILOT_VERSION.capabilities."""
+FIRST_VALUES = ("attitude", "location.global_relative_frame", "heading", "gps_0", "battery")
+FIRST_VALUES_S = 1.0
+"""So long they are waited for: programs that read them as soon as they are connected expect values."""
 CONNECT_S = 30.0
 """How long a vehicle is waited for when the program sets no limit."""
 LEVELS = (logging.CRITICAL,) * 3 + (logging.ERROR, logging.WARNING, logging.INFO, logging.INFO, logging.DEBUG)
 """MAV_SEVERITY → level of the logger ``autopilot``."""
 
 
-class Vehicle(FlightMethods, Maintenance, Readiness):
+class Vehicle(FlightMethods, Maintenance, Readiness, VehiclePrivates):
     """A vehicle: attributes to read and to listen to, orders, parameters, missions.
 
     Made by :func:`connect`, or of a subclass by ``connect(…, vehicle_class=…)``: the subclass passes on the one
@@ -69,7 +73,7 @@ class Vehicle(FlightMethods, Maintenance, Readiness):
         self._autopilot_logger = logging.getLogger("autopilot")
         self._dk_aio: AsyncVehicle | None = None
         self._dk_sync: sync.Vehicle | None = None
-        self._heartbeat_timeout: float = 0.0
+        self._dk_heartbeat_limit: float = 0.0
         self._dk_message_handlers: list[tuple[type[Message], Callable[[Any], None], bool]] = []
         self._dk_starters: list[Callable[[], None]] = []
         self._dk_initializing = threading.Lock()
@@ -220,13 +224,15 @@ class Vehicle(FlightMethods, Maintenance, Readiness):
         with self._dk_initializing:
             if self._dk_aio is not None:
                 return
-            self._heartbeat_timeout = max(heartbeat_timeout or 0.0, 0.0)
-            timeout = self._heartbeat_timeout or CONNECT_S
+            self._dk_heartbeat_limit = max(heartbeat_timeout or 0.0, 0.0)
+            timeout = self._dk_heartbeat_limit or CONNECT_S
             loop = self._handler.loop
             try:
                 held = loop.hold_open(self._dk_found(timeout, rate))
                 self._dk_sync = sync.Vehicle(loop, held, owns_loop=False)
                 self._dk_wait_until_booted(timeout)
+                if rate is not None:
+                    Readiness.wait_ready(self, *FIRST_VALUES, timeout=FIRST_VALUES_S, raise_exception=False)
             except ConnectFailed as error:
                 raise APIException(f"Timeout in initializing connection. {error}") from error
             except AerokitError as error:
@@ -294,7 +300,7 @@ class Vehicle(FlightMethods, Maintenance, Readiness):
         except AerokitError as error:
             raise APIException(str(error)) from error
         age = aio.heartbeat_age
-        if self._heartbeat_timeout and age > self._heartbeat_timeout:
+        if self._dk_heartbeat_limit and age > self._dk_heartbeat_limit:
             raise APIException(f"no heartbeat of the vehicle for {age:.0f} s")
         return aio
 

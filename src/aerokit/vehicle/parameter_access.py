@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 from contextlib import contextmanager, nullcontext
 from typing import TYPE_CHECKING, Literal
@@ -15,7 +16,7 @@ from aerokit.errors import (
     NotSupported,
     RemoteProtocolError,
 )
-from aerokit.mavlink.messages import ParamValue
+from aerokit.mavlink.messages import FileTransferProtocol, ParamValue
 from aerokit.parameters import Parameter, ParameterTable
 from aerokit.parameters.parameter import same_value
 from aerokit.parameters.px4_hash import HASH_NAME
@@ -40,6 +41,8 @@ CacheChoice = bool | str | os.PathLike[str]
 
 CAPABILITY_FTP = 0x20
 NO_SESSIONS_AVAILABLE = 4
+FIRST_ANSWER_S, FIRST_ATTEMPTS = 2.0, 3
+"""Silent for so long, and for so many sendings, MAVFTP is not there, whatever the vehicle says."""
 ANSWER_S = 0.1
 SET_MESSAGE_INTERVAL, AS_BEFORE = 511, 0
 ECHOES_S = 3.0
@@ -116,7 +119,8 @@ class ParameterAccess:
     ) -> None:
         if method == "ftp" or (method == "auto" and await self.has_pack()):
             try:
-                await self._download_pack(patience_s, on_progress)
+                with nullcontext() if method == "ftp" else self._unless_silent():
+                    await self._download_pack(patience_s, on_progress)
                 return
             except (FileError, FileTimeout, NotSupported, RemoteProtocolError) as error:
                 if method == "ftp":
@@ -126,6 +130,27 @@ class ParameterAccess:
                 )
                 self._has_pack = None if is_for_now else False
         await self._download_list(patience_s, on_progress)
+
+    @contextmanager
+    def _unless_silent(self) -> Iterator[None]:
+        """FileTimeout soon when MAVFTP is not answered at all: relays drop it, and there is another way."""
+        connection, round_trip = self._transfers.connection, self._transfers.round_trip
+        at_most_s = max(FIRST_ANSWER_S, FIRST_ATTEMPTS * round_trip.timeout_s())
+        heard: list[object] = []
+        detach = connection.bus.attach(
+            FileTransferProtocol, heard.append, system_id=self._transfers.system_id
+        )
+        with anyio.CancelScope() as scope:
+            timer = asyncio.get_running_loop().call_later(
+                at_most_s, lambda: None if heard else scope.cancel()
+            )
+            try:
+                yield
+            finally:
+                timer.cancel()
+                detach()
+        if scope.cancelled_caught:
+            raise FileTimeout(f"MAVFTP was not answered within {at_most_s:.1f} s")
 
     async def has_pack(self) -> bool:
         """Whether the vehicle seems to give ``@PARAM/param.pck``: it has MAVFTP, and did not refuse it."""
