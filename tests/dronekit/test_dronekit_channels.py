@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import pytest
@@ -183,13 +184,40 @@ def test_overrides_count_what_is_overridden(channels: Channels) -> None:
         overrides["2"]
 
 
+@dataclass(frozen=True)
+class Int64:
+    """As numpy's: no int, but can be used as one."""
+
+    value: int
+
+    def __round__(self) -> Int64:
+        return self
+
+    def __int__(self) -> int:
+        return self.value
+
+    def __le__(self, other: int) -> bool:
+        return self.value <= other
+
+    def __ge__(self, other: int) -> bool:
+        return self.value >= other
+
+
+def test_what_controllers_and_numpy_work_out_is_rounded(stage: Stage, channels: Channels) -> None:
+    def override() -> None:
+        channels.overrides = {"1": 1523.7, "2": Int64(1400), "3": 1500.0}
+
+    assert sent(stage, override) == [(1524, 1400, 1500)]
+    assert channels.overrides == {"1": 1524, "2": 1400, "3": 1500}
+
+
 WRONG: tuple[tuple[dict[str, Any], type[Exception], str], ...] = (
     ({"9": 900}, KeyError, "Invalid channel index 9"),
     ({"0": 900}, KeyError, "Invalid channel index 0"),
     ({"x": 900}, ValueError, "'x'"),
     ({"2": 1200, "3": 70000}, ValueError, "channel 3 = 70000 is not allowed"),
     ({"3": -1}, ValueError, "channel 3 = -1"),
-    ({"3": 1500.5}, ValueError, "channel 3 = 1500.5"),
+    ({"3": float("inf")}, ValueError, "channel 3 = inf"),
     ({"3": float("nan")}, ValueError, "channel 3 = nan"),
     ({"3": "1500"}, ValueError, "channel 3 = '1500'"),
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections.abc import ItemsView, Iterable, Iterator, KeysView, Mapping, ValuesView
 from operator import attrgetter
@@ -311,8 +312,10 @@ def _checked_value(number: int, value: Any) -> int:
     """
     if value is None:
         return 0
-    if isinstance(value, (int, float)) and 0 <= value <= UNUSED and value == int(value):
-        return int(value)
+    with contextlib.suppress(TypeError, ValueError, OverflowError):
+        microseconds = round(value)  # numpy's numbers too, and what a controller works out
+        if 0 <= microseconds <= UNUSED:
+            return int(microseconds)
     raise LocalProtocolError(
-        f"channel {number} = {value!r} is not allowed: whole microseconds, 1000 to 2000 as a rule; None gives it back"
+        f"channel {number} = {value!r} is not allowed: microseconds, 1000 to 2000 as a rule; None gives it back"
     )

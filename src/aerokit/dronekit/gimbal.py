@@ -9,6 +9,7 @@ from aerokit.autopilots.px4 import Px4
 from aerokit.dronekit.exceptions import APIException
 from aerokit.dronekit.flight_orders import checked_place
 from aerokit.dronekit.gimbal_attitude import from_device, from_orientation, from_status
+from aerokit.dronekit.privates import GimbalPrivates
 from aerokit.dronekit.values import LocationGlobal, LocationGlobalRelative
 from aerokit.errors import CommandRejected, CommandTimeout, LocalProtocolError
 from aerokit.mavlink.messages import (
@@ -41,7 +42,7 @@ AUTOPILOT = 1
 HOME_TIMEOUT_S = 10.0
 
 
-class Gimbal:
+class Gimbal(GimbalPrivates):
     """The first gimbal: where it points, and orders to it.
 
     :attr:`pitch`, :attr:`roll` and :attr:`yaw` are None until the vehicle has told of a gimbal. Orders return at once;

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from aerokit.dronekit.observers import HasObservers
+from aerokit.dronekit.privates import LocationPrivates
 from aerokit.dronekit.values import LocationGlobal, LocationGlobalRelative, LocationLocal
 from aerokit.mavlink.messages import GlobalPositionInt, LocalPositionNed
 from aerokit.vehicle.decoding import place
@@ -17,7 +18,7 @@ __all__ = ["Locations"]
 UNKNOWN = (None, None)
 
 
-class Locations(HasObservers):
+class Locations(HasObservers, LocationPrivates):
     """The vehicle's location in global, global relative and local frames; each of them can be listened to.
 
     Listeners get this object as their first argument. The three numbers of a location belong to one message.

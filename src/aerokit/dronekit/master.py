@@ -53,6 +53,16 @@ class Master:
         return self._heard()[0]
 
     @property
+    def source_system(self) -> int:
+        """Our own system id."""
+        return self._connection.connection.source_system
+
+    @property
+    def source_component(self) -> int:
+        """Our own component id."""
+        return self._connection.connection.source_component
+
+    @property
     def address(self) -> str:
         """The connection string."""
         return self._connection.connection.link.address

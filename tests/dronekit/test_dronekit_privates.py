@@ -1,0 +1,79 @@
+"""DroneKit's private names that programs read."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+from dronekit_stage import Stage, on_stage
+
+from aerokit import dronekit
+
+SPEEDS = {"rollspeed": 0.125, "pitchspeed": 0.25, "yawspeed": 0.5}
+UNKNOWN = ("_yawspeed", "_heading", "_voltage", "_vx", "_fix_type", "_rngfnd_distance", "_mount_pitch")
+
+
+@pytest.fixture
+def stage() -> Iterator[Stage]:
+    with on_stage(dronekit, connect={"rate": None}) as each:
+        yield each
+
+
+def test_state(stage: Stage) -> None:
+    vehicle = stage.vehicle
+    assert [getattr(vehicle, name) for name in UNKNOWN] == [None] * len(UNKNOWN)
+    stage.tell("ATTITUDE", roll=1.0, pitch=2.0, yaw=3.0, **SPEEDS)
+    stage.tell("VFR_HUD", airspeed=4.0, groundspeed=5.0, heading=271)
+    stage.tell("SYS_STATUS", voltage_battery=12587, current_battery=150, battery_remaining=80)
+    stage.tell("GPS_RAW_INT", fix_type=3, eph=121, epv=200, satellites_visible=10)
+    stage.tell(
+        "GLOBAL_POSITION_INT",
+        lat=-35 * 10**7,
+        lon=149 * 10**7,
+        alt=584000,
+        relative_alt=1500,
+        vx=10,
+        vy=-20,
+        vz=30,
+    )
+    assert (vehicle._roll, vehicle._pitch, vehicle._yaw) == (1, 2, 3)
+    assert (vehicle._rollspeed, vehicle._pitchspeed, vehicle._yawspeed) == tuple(SPEEDS.values())
+    assert (vehicle._airspeed, vehicle._groundspeed, vehicle._heading) == (4, 5, 271)
+    assert (vehicle._voltage, vehicle._current, vehicle._level) == (12587, 150, 80)
+    assert (vehicle._fix_type, vehicle._eph, vehicle._epv, vehicle._satellites_visible) == (3, 121, 200, 10)
+    assert [vehicle._vx, vehicle._vy, vehicle._vz] == vehicle.velocity == [0.1, -0.2, 0.3]
+    location = vehicle.location
+    assert (location._lat, location._lon, location._alt, location._relative_alt) == (-35, 149, 584, 1.5)
+    assert location._north is vehicle.gimbal._pitch is None
+
+
+def test_the_link_is_watched(stage: Stage) -> None:
+    """``if vehicle._heartbeat_timeout: land()``: a flag, whatever the limit is."""
+    vehicle = stage.vehicle
+    assert vehicle._heartbeat_timeout is False
+    assert vehicle._heartbeat_started is True
+    assert vehicle._heartbeat_system == 1
+    assert 0 <= dronekit.time.monotonic() - vehicle._heartbeat_lastreceived < 5
+    assert 0 <= vehicle._last_heartbeat < 5
+
+
+def test_transfers(stage: Stage) -> None:
+    vehicle = stage.vehicle
+    vehicle.wait_ready("parameters")
+    assert vehicle._params_count == len(vehicle._params_map) > 0
+    assert vehicle._params_loaded is True
+    vehicle.commands._vehicle._current_waypoint = 2  # written by programs; means nothing
+    assert vehicle._current_waypoint == 2
+    assert vehicle._mode_mapping["GUIDED"] == 4
+    assert vehicle._mode_mapping_bynumber[4] == "GUIDED"
+
+
+def test_own_ids(stage: Stage) -> None:
+    assert (stage.vehicle._master.source_system, stage.vehicle._master.source_component) == (255, 0)
+
+
+def test_a_subclass_may_have_its_own(stage: Stage) -> None:
+    stage.vehicle._yaw = "mine"
+    stage.tell("ATTITUDE", yaw=3.0)
+    assert stage.vehicle._yaw == "mine"
+    assert stage.vehicle.attitude.yaw == 3
