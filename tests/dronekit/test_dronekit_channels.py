@@ -204,8 +204,10 @@ class Int64:
 
 
 def test_what_controllers_and_numpy_work_out_is_rounded(stage: Stage, channels: Channels) -> None:
+    numbers: dict[str, Any] = {"1": 1523.7, "2": Int64(1400), "3": 1500.0}
+
     def override() -> None:
-        channels.overrides = {"1": 1523.7, "2": Int64(1400), "3": 1500.0}
+        channels.overrides = numbers
 
     assert sent(stage, override) == [(1524, 1400, 1500)]
     assert channels.overrides == {"1": 1524, "2": 1400, "3": 1500}

@@ -134,7 +134,7 @@ class Channels(_ChannelDict):
         return self._overrides
 
     @overrides.setter
-    def overrides(self, overrides: Mapping[Any, int | None]) -> None:
+    def overrides(self, overrides: Mapping[Any, float | None]) -> None:
         self._overrides._replace(overrides)
 
     # ------------------------------------------------------------------------- not for programs
@@ -212,7 +212,7 @@ class ChannelsOverride(_ChannelDict):
         self._given_back: set[str] = set()
         self._changing = threading.RLock()
 
-    def __setitem__(self, channel: str | int, value: int | None) -> None:
+    def __setitem__(self, channel: str | int, value: float | None) -> None:
         self._change({channel: value})
 
     def __delitem__(self, channel: str | int) -> None:
@@ -265,11 +265,11 @@ class ChannelsOverride(_ChannelDict):
 
     # ------------------------------------------------------------------------------- inside
 
-    def _replace(self, overrides: Mapping[Any, int | None]) -> None:
+    def _replace(self, overrides: Mapping[Any, float | None]) -> None:
         with self._changing:
             self._become(self._checked(overrides))
 
-    def _change(self, changes: Mapping[Any, int | None]) -> None:
+    def _change(self, changes: Mapping[Any, float | None]) -> None:
         with self._changing:
             self._become({**self.copy(), **self._checked(changes)})
 
@@ -283,7 +283,7 @@ class ChannelsOverride(_ChannelDict):
         dict.update(self, active)
         self._given_back = given_back
 
-    def _checked(self, overrides: Mapping[Any, int | None]) -> dict[str, int]:
+    def _checked(self, overrides: Mapping[Any, float | None]) -> dict[str, int]:
         """By number as a text; 0 gives a channel back."""
         checked: dict[str, int] = {}
         for channel, value in overrides.items():
