@@ -82,7 +82,7 @@ def row_20_listener_that_raises(stage: Stage) -> Any:
 
     stage.vehicle.add_attribute_listener("heading", first)
     stage.vehicle.add_attribute_listener("heading", lambda _, name, value: calls.append(f"second {value}"))
-    with stage.logged() as lines:
+    with stage.logged(having="heading") as lines:
         stage.tell("VFR_HUD", heading=271)
         stage.tell("VFR_HUD", heading=5)
     return calls, lines
@@ -159,7 +159,7 @@ def message_listener_that_raises(stage: Stage) -> Any:
     stage.vehicle.add_message_listener("VFR_HUD", first)
     stage.vehicle.add_message_listener("VFR_HUD", lambda *_: calls.append("second"))
     stage.reached()
-    with stage.logged() as lines:
+    with stage.logged(having="VFR_HUD") as lines:
         stage.tell("VFR_HUD", heading=271)
     return calls, lines
 
@@ -188,7 +188,7 @@ def listener_of_several_names(stage: Stage) -> Any:
     return events
 
 
-@scenario(True)
+@scenario(True, is_slow=True)
 def last_heartbeat(stage: Stage) -> Any:
     ages: list[float] = []
     enough = threading.Event()
@@ -213,7 +213,8 @@ def last_heartbeat(stage: Stage) -> Any:
         "ValueError: wait_ready expects one or more string arguments.",
         "True",
         ["nosuch"],
-    )
+    ),
+    is_slow=True,
 )
 def row_39_wait_ready(stage: Stage) -> Any:
     missing: list[str] = []
@@ -235,7 +236,7 @@ def row_39_wait_ready(stage: Stage) -> Any:
     )
 
 
-@scenario("TimeoutError: wait_ready experienced a timeout after 0.4 seconds. attitude,gps_0")
+@scenario("TimeoutError: wait_ready experienced a timeout after 0.4 seconds. attitude,gps_0", is_slow=True)
 def wait_ready_names_of_true(stage: Stage) -> Any:
     missing: set[str] = set()
     stage.vehicle.wait_ready("parameters", "armed", "mode")
@@ -247,24 +248,21 @@ def wait_ready_names_of_true(stage: Stage) -> Any:
     return f"{text} {','.join(sorted(missing))}"
 
 
-TEXTS = ("zero", "one", "two", "three", "four", "five", "six", "seven")
-
-
 @scenario(
     [
-        "CRITICAL zero",
-        "CRITICAL one",
-        "CRITICAL two",
-        "ERROR three",
-        "WARNING four",
-        "INFO five",
-        "INFO six",
-        "DEBUG seven",
+        "CRITICAL text 0",
+        "CRITICAL text 1",
+        "CRITICAL text 2",
+        "ERROR text 3",
+        "WARNING text 4",
+        "INFO text 5",
+        "INFO text 6",
+        "DEBUG text 7",
     ]
 )
 def status_texts(stage: Stage) -> Any:
-    with stage.logged("autopilot") as lines:
-        for severity, text in enumerate(TEXTS):
-            stage.fc.tell("STATUSTEXT", severity=severity, text=f" {text}  ".encode())
+    with stage.logged("autopilot", having="text") as lines:
+        for severity in range(8):
+            stage.fc.tell("STATUSTEXT", severity=severity, text=f" text {severity}  ".encode())
         stage.settle()
     return lines

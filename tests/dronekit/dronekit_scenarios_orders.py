@@ -46,7 +46,9 @@ def row_05_unknown_mode(stage: Stage) -> Any:
     return *texts, sent
 
 
-@scenario(("TimeoutError: failed to set flight mode", [(176, 1, 3, 0, 0, 0, 0, 0)], "None", "AUTO"))
+@scenario(
+    ("TimeoutError: failed to set flight mode", [(176, 1, 3, 0, 0, 0, 0, 0)], "None", "AUTO"), is_slow=True
+)
 def row_09_wait_for_mode(stage: Stage) -> Any:
     stage.fc.results[176] = 4
     text = ""
@@ -76,7 +78,7 @@ def row_07_armed(stage: Stage) -> Any:
     return tuple([frame[:2] for frame in frames] for frames in seen)
 
 
-@scenario(("TimeoutError: failed to arm vehicle", [(400, 1)]))
+@scenario(("TimeoutError: failed to arm vehicle", [(400, 1)]), is_slow=True)
 def row_08_arm_refused(stage: Stage) -> Any:
     stage.fc.results[400] = 4
     stage.fc.reasons[400] = "PreArm: Compass not healthy"
@@ -206,7 +208,8 @@ def row_14_setting_home(stage: Stage) -> Any:
         "None",
         "TimeoutError: failed to reach specified altitude",
         ["None", "None", "None"],
-    )
+    ),
+    is_slow=True,
 )
 def waiting(stage: Stage) -> Any:
     vehicle = stage.vehicle
@@ -222,7 +225,7 @@ def waiting(stage: Stage) -> Any:
     return late, done, low, at_altitude
 
 
-@scenario("TimeoutError")
+@scenario("TimeoutError", is_slow=True)
 def wait_for_armable(stage: Stage) -> Any:
     text = caught(lambda: stage.vehicle.wait_for_armable(timeout=0.3))
     stage.fc.tell("GPS_RAW_INT", fix_type=3)
@@ -355,7 +358,7 @@ def row_31_channels_are_read(stage: Stage) -> Any:
 # --------------------------------------------------------------------------------------- gimbal
 
 
-@scenario([(201, -35.1, 149.2, 10.0)], controller={"mode": 4})
+@scenario([(201, -35.1, 149.2, 10.0)], controller={"mode": 4}, is_slow=True)
 def region_of_interest_of_old_firmware(stage: Stage) -> Any:
     stage.fc.results[195] = 3  # DO_SET_ROI_LOCATION, which came later
     stage.vehicle.gimbal.target_location(stage.dronekit.LocationGlobalRelative(-35.1, 149.2, 10))

@@ -113,11 +113,16 @@ class Stage:
         return events
 
     @contextlib.contextmanager
-    def logged(self, name: str = "dronekit") -> Iterator[list[str]]:
-        """What is logged meanwhile: ``LEVEL text``."""
+    def logged(self, name: str = "dronekit", *, having: str = "") -> Iterator[list[str]]:
+        """What is logged meanwhile, ``LEVEL text``, of what has this text: other vehicles use the same logger."""
         lines: list[str] = []
         handler = logging.Handler()
-        handler.emit = lambda record: lines.append(f"{record.levelname} {record.getMessage()}")  # type: ignore[method-assign]
+
+        def emit(record: logging.LogRecord) -> None:
+            if having in (text := record.getMessage()):
+                lines.append(f"{record.levelname} {text}")
+
+        handler.emit = emit  # type: ignore[method-assign]
         logger = logging.getLogger(name)
         level = logger.level
         logger.addHandler(handler)

@@ -25,6 +25,7 @@ CUSTOM_MODE = 1
 PX4 = 12
 ACCEPTED, UNSUPPORTED = 0, 3
 DO_SET_MODE, ARM_DISARM, REQUEST_MESSAGE, REQUEST_VERSION, GET_HOME = 176, 400, 512, 520, 410
+SET_HOME = 179
 HOUSEKEEPING = (511, REQUEST_MESSAGE, REQUEST_VERSION, GET_HOME)
 """Commands that ask for information and change nothing: no scenario is about them, unless it says so."""
 PATIENCE_S = 10.0
@@ -83,7 +84,7 @@ class FlightController:
         port: int | None = None,
     ) -> None:
         self.version = version
-        self.source = (1, 1)
+        self.source: tuple[int, int] = (1, 1)
         self.vehicle_type, self.autopilot = vehicle_type, autopilot
         self.base_mode, self.custom_mode, self.system_status = CUSTOM_MODE, mode, 3
         self.heartbeat_s = heartbeat_s
@@ -326,6 +327,8 @@ class FlightController:
             self.tell_version()
         elif frame.command == GET_HOME or (frame.command == REQUEST_MESSAGE and number == 242):
             return self._tell_home()
+        elif frame.command == SET_HOME:
+            self._set_home(frame)
         elif frame.command == REQUEST_MESSAGE:
             return UNSUPPORTED
         return ACCEPTED
@@ -338,6 +341,12 @@ class FlightController:
         """Send AUTOPILOT_VERSION."""
         usual = {"capabilities": self.capabilities, "flight_sw_version": self.flight_sw_version}
         self.tell("AUTOPILOT_VERSION", **{**usual, **fields})
+
+    def _set_home(self, frame: Received) -> None:
+        scale = 1 if frame.name == "COMMAND_INT" else 1e7
+        x, y, z = frame.params[4:]
+        self.home = round(x * scale), round(y * scale), round(z * 1000)
+        self._tell_home()
 
     def _tell_home(self) -> int:
         if self.home is None:

@@ -1,0 +1,492 @@
+"""DroneKit's API reference, entry by entry: names, arguments, defaults, what the text promises, its examples."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import logging
+import operator
+import textwrap
+from collections.abc import Iterator
+from functools import reduce
+from typing import Any
+
+import pytest
+from dronekit_reference import ATTRIBUTES, EXAMPLES, MODULE_NAMES, OTHER_NAMES, SIGNATURES, SUBCLASSES
+from dronekit_scenarios_orders import HOME
+from dronekit_scenarios_state import POSITION
+from dronekit_stage import Stage, caught, on_stage
+from flight_controller import FlightController, message_of
+
+import aerokit.dronekit as dronekit
+
+PULSES = {f"chan{number}_raw": 1000 + number for number in range(1, 9)}
+
+for each in OTHER_NAMES:
+    importlib.import_module(f"aerokit.dronekit.{each}")
+
+
+def found(path: str) -> Any:
+    return reduce(getattr, path.split("."), dronekit)
+
+
+def answer_streams(fc: FlightController) -> None:
+    """What a vehicle streams, at once, when it is asked for streams."""
+    fc.missions.items = [HOME]
+
+    def stream(_: Any) -> None:
+        fc.tell("GPS_RAW_INT", fix_type=3, satellites_visible=10, eph=121, epv=65535)
+        fc.tell("ATTITUDE", roll=0.25, pitch=0.5, yaw=-0.5)
+        fc.tell("VFR_HUD", airspeed=3, groundspeed=4, heading=271)
+        fc.send(message_of("GLOBAL_POSITION_INT", **POSITION))
+        fc.tell("LOCAL_POSITION_NED", x=3, y=4, z=-12)
+        fc.tell("SYS_STATUS", voltage_battery=12587, current_battery=150, battery_remaining=77)
+        fc.tell("RANGEFINDER", distance=0.5, voltage=0.25)
+        fc.send(message_of("RC_CHANNELS", chancount=8, **PULSES))
+        fc.tell("MOUNT_STATUS", pointing_a=-4500, pointing_b=100, pointing_c=9000)
+        fc.tell("EKF_STATUS_REPORT", flags=831)
+
+    fc.answers["REQUEST_DATA_STREAM"] = stream
+
+
+@pytest.fixture(scope="module")
+def told() -> Iterator[Stage]:
+    """A vehicle that has told everything; tests only read it."""
+    with on_stage(dronekit, {"mode": 4}, {"wait_ready": True, "timeout": 10}, answer_streams) as stage:
+        stage.vehicle.wait_ready("ekf_ok", "capabilities", timeout=10)
+        stage.settle()
+        yield stage
+
+
+@pytest.fixture
+def stage() -> Iterator[Stage]:
+    with on_stage(dronekit, {"mode": 4}, {"wait_ready": True, "timeout": 10}, answer_streams) as each:
+        each.settle()
+        yield each
+
+
+# ---------------------------------------------------------------------------------------- names
+
+
+@pytest.mark.parametrize("name", MODULE_NAMES)
+def test_module_has(name: str) -> None:
+    assert getattr(dronekit, name) is not None
+
+
+@pytest.mark.parametrize(
+    ("module", "name"), [(module, name) for module in OTHER_NAMES for name in OTHER_NAMES[module]]
+)
+def test_other_modules_have(module: str, name: str) -> None:
+    assert found(f"{module}.{name}") is not None
+
+
+def test_star_import_gives_the_public_names() -> None:
+    for module in ("aerokit.dronekit", "aerokit.dronekit.lib"):
+        names: dict[str, Any] = {}
+        exec(f"from {module} import *", names)
+        missing = [name for name in MODULE_NAMES if name not in names]
+        assert missing == []
+
+
+@pytest.mark.parametrize(("name", "base"), SUBCLASSES)
+def test_subclasses(name: str, base: str) -> None:
+    assert issubclass(found(name), found(base))
+
+
+def test_exceptions() -> None:
+    assert str(dronekit.APIException("why")) == "why"
+    assert issubclass(dronekit.APIException, Exception)
+    assert issubclass(dronekit.TimeoutError, TimeoutError)
+    assert found("lib.APIException") is found("mavlink.APIException") is dronekit.APIException
+
+
+def test_pymavlink_is_reexported() -> None:
+    import pymavlink.mavutil
+    import pymavlink.mavwp
+
+    assert dronekit.mavutil is pymavlink.mavutil
+    assert dronekit.mavwp is pymavlink.mavwp
+    assert dronekit.ardupilotmega.MAVLink_mission_item_message is not None
+    assert isinstance("text", dronekit.basestring)
+
+
+# ----------------------------------------------------------------------------------- signatures
+
+
+@pytest.mark.parametrize("path", SIGNATURES)
+def test_signature(path: str) -> None:
+    """Everybody's calls work: the same arguments in the same order, with the same defaults."""
+    wanted = SIGNATURES[path]
+    if path in ("APIException", "Command"):  # of Exception, of pymavlink
+        found(path)(*[1] * len(wanted))
+        return
+    own = [
+        each
+        for name, each in inspect.signature(found(path)).parameters.items()
+        if name != "self" and each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)
+    ]
+    by_position = [each for each in own if each.kind is not each.KEYWORD_ONLY]
+    assert [each.name for each in by_position[: len(wanted)]] == list(wanted)
+    assert all(each.default is not each.empty for each in own[len(wanted) :])
+    for each in by_position[: len(wanted)]:
+        default = ... if each.default is each.empty else getattr(each.default, "__name__", each.default)
+        assert default == wanted[each.name], each.name
+
+
+@pytest.mark.parametrize("name", ["add_attribute_listener", "remove_attribute_listener"])
+def test_signature_of_parameter_listeners(name: str) -> None:
+    inspect.signature(getattr(dronekit.Parameters, name)).bind(None, "thr_min", print)
+
+
+def test_signature_of_wait_ready() -> None:
+    options = {
+        "timeout": 1,
+        "raise_exception": False,
+        "still_waiting_callback": None,
+        "still_waiting_interval": 1,
+    }
+    signature = inspect.signature(dronekit.Vehicle.wait_ready)
+    signature.bind(None)
+    signature.bind(None, True)
+    signature.bind(None, "mode", "armed", **options)
+    inspect.signature(dronekit.Parameters.wait_ready).bind(None, **options)
+    inspect.signature(dronekit.CommandSequence.wait_ready).bind(None, **options)
+
+
+@pytest.mark.parametrize(
+    ("owner", "name"), [(owner, name) for owner in ATTRIBUTES for name in ATTRIBUTES[owner].split()]
+)
+def test_attribute(told: Stage, owner: str, name: str) -> None:
+    vehicle = told.vehicle
+    objects = {
+        "Attitude": vehicle.attitude,
+        "Battery": vehicle.battery,
+        "Channels": vehicle.channels,
+        "CommandSequence": vehicle.commands,
+        "GPSInfo": vehicle.gps_0,
+        "Gimbal": vehicle.gimbal,
+        "LocationGlobal": vehicle.location.global_frame,
+        "LocationGlobalRelative": vehicle.location.global_relative_frame,
+        "LocationLocal": vehicle.location.local_frame,
+        "Locations": vehicle.location,
+        "Rangefinder": vehicle.rangefinder,
+        "SystemStatus": vehicle.system_status,
+        "Vehicle": vehicle,
+        "VehicleMode": vehicle.mode,
+        "Version": vehicle.version,
+    }
+    assert isinstance(objects[owner], found(owner))
+    assert getattr(objects[owner], name) is not None
+
+
+# --------------------------------------------------------------------------------------- values
+
+
+def test_values_of_a_vehicle(told: Stage) -> None:
+    vehicle = told.vehicle
+    assert str(vehicle.attitude) == "Attitude:pitch=0.5,yaw=-0.5,roll=0.25"
+    assert str(vehicle.battery) == "Battery:voltage=12.587,current=1.5,level=77"
+    assert str(vehicle.gps_0) == "GPSInfo:fix=3,num_sat=10"
+    assert str(vehicle.rangefinder) == "Rangefinder: distance=0.5, voltage=0.25"
+    assert str(vehicle.system_status) == "SystemStatus:STANDBY"
+    assert str(vehicle.mode) == "VehicleMode:GUIDED"
+    assert str(vehicle.version) == "APM:Copter-4.5.3"
+    assert str(vehicle.gimbal) == "Gimbal: pitch=-45.0, roll=1.0, yaw=90.0"
+    assert vehicle.mount_status == [-45.0, 90.0, 1.0]
+    assert vehicle.velocity == [0.1, -0.2, 0.3]
+    assert (vehicle.airspeed, vehicle.groundspeed, vehicle.heading) == (3.0, 4.0, 271)
+    assert (vehicle.armed, vehicle.is_armable, vehicle.ekf_ok) == (False, True, True)
+    assert vehicle.location.local_frame.distance_home() == 13.0
+    assert vehicle.channels == {str(number): 1000 + number for number in range(1, 9)}
+    assert vehicle.channels.count == 8
+    assert 0 <= vehicle.last_heartbeat < 10
+
+
+def test_capabilities(told: Stage) -> None:
+    names = (
+        *("mission_float", "param_float", "mission_int", "command_int", "param_union", "ftp"),
+        *(
+            "set_attitude_target",
+            "set_attitude_target_local_ned",
+            "set_altitude_target_global_int",
+            "terrain",
+        ),
+        *("set_actuator_target", "flight_termination", "compass_calibration"),
+    )
+    for bit, name in enumerate(names):
+        one = dronekit.Capabilities(1 << bit)
+        assert [each for each in names if getattr(one, each)] == [name]
+        assert getattr(one, name) is True
+    assert told.vehicle.capabilities.mission_int is True
+    assert told.vehicle.capabilities.ftp is False
+
+
+def test_version_numbers() -> None:
+    rc = dronekit.Version(0x030300D7, 3, 2)
+    assert (rc.major, rc.minor, rc.patch, rc.release) == (3, 3, 0, 0xD7)
+    assert (rc.release_type(), rc.release_version(), rc.is_stable()) == ("rc", 23, False)
+    assert dronekit.Version(0x030302FF, 3, 2).is_stable()
+
+
+def test_equality_of_modes_and_states() -> None:
+    for kind in (dronekit.VehicleMode, dronekit.SystemStatus):
+        one = kind("ACTIVE")
+        assert one == kind("ACTIVE")
+        assert one == "ACTIVE"
+        assert one == one
+        assert one != kind("OTHER")
+        assert one != "OTHER"
+        assert one != None  # noqa: E711
+
+
+@pytest.mark.parametrize("kind", [dronekit.LocationGlobal, dronekit.LocationGlobalRelative])
+def test_places_are_compared_by_identity_and_change(kind: Any) -> None:
+    one = kind(1.0, 2.0)
+    one.alt = 3.0
+    assert (one.lat, one.lon, one.alt, one.local_frame, one.global_frame) == (1.0, 2.0, 3.0, None, None)
+
+
+# -------------------------------------------------------------------------------- mapping methods
+
+
+def test_channels_are_a_dictionary_to_read(told: Stage) -> None:
+    channels = told.vehicle.channels
+    whole = {str(number): 1000 + number for number in range(1, 9)}
+    assert dict in type(channels).__mro__
+    assert channels.copy() == whole
+    assert (channels.get("1"), channels.get("99"), channels.get("99", 7)) == (1001, None, 7)
+    assert (channels.has_key("1"), channels.has_key("99")) == (True, False)
+    assert (
+        list(channels.items())
+        == list(channels.iteritems())
+        == list(channels.viewitems())
+        == list(whole.items())
+    )
+    assert list(channels.keys()) == list(channels.iterkeys()) == list(channels.viewkeys()) == list(whole)
+    assert list(channels.values()) == list(channels.itervalues()) == list(channels.viewvalues())
+    assert list(channels.values()) == list(whole.values())
+    assert channels.fromkeys(["1", "2"], 5) == {"1": 5, "2": 5}
+    assert str(channels) == str(whole)
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments"),
+    [
+        ("__setitem__", ("1", 5)),
+        ("__delitem__", ("1",)),
+        ("clear", ()),
+        ("pop", ("1",)),
+        ("popitem", ()),
+        ("setdefault", ("77", 5)),
+        ("update", ({"1": 5},)),
+    ],
+)
+def test_channels_are_not_written(told: Stage, name: str, arguments: tuple[Any, ...]) -> None:
+    before = dict(told.vehicle.channels)
+    with pytest.raises(TypeError):
+        getattr(told.vehicle.channels, name)(*arguments)
+    assert dict(told.vehicle.channels) == before
+
+
+def test_overrides_are_a_dictionary(stage: Stage) -> None:
+    channels = stage.vehicle.channels
+    channels.overrides = {"1": 1100, 2: 1200}
+    overrides = channels.overrides
+    assert dict in type(overrides).__mro__
+    assert type(overrides) is dronekit.ChannelsOverride
+    assert overrides.copy() == overrides == {"1": 1100, "2": 1200}
+    assert (overrides.get("1"), overrides.get("3"), overrides.get("3", 7)) == (1100, None, 7)
+    assert (overrides.has_key("1"), overrides.has_key("3"), "2" in overrides) == (True, False, True)
+    assert list(overrides.iteritems()) == list(overrides.viewitems()) == [("1", 1100), ("2", 1200)]
+    assert list(overrides.iterkeys()) == list(overrides.viewkeys()) == ["1", "2"]
+    assert list(overrides.itervalues()) == list(overrides.viewvalues()) == [1100, 1200]
+    assert overrides.setdefault("3", 1300) == 1300
+    assert overrides.setdefault("3", 1400) == 1300
+    overrides.update({"4": 1400}, **{"5": 1500})
+    assert (overrides.pop("5"), overrides.pop("5", 9)) == (1500, 9)
+    assert caught(lambda: overrides.pop("5")) == "KeyError: '5'"
+    assert overrides.popitem() == ("4", 1400)
+    assert dict(overrides.fromkeys(["1"], 5)) == {"1": 5}
+    overrides.clear()
+    assert dict(channels.overrides) == {}
+    assert caught(overrides.popitem).startswith("KeyError")
+
+
+def test_parameters_are_a_mapping(stage: Stage) -> None:
+    parameters = stage.vehicle.parameters
+    whole = {"BAR": 2.5, "FOO": 1.0, "THR_MIN": 130.0}
+    assert dict(parameters) == whole
+    assert (
+        sorted(parameters.keys())
+        == sorted(parameters.iterkeys())
+        == sorted(parameters.viewkeys())
+        == sorted(whole)
+    )
+    assert sorted(parameters.items()) == sorted(parameters.iteritems()) == sorted(parameters.viewitems())
+    assert sorted(parameters.values()) == sorted(parameters.itervalues()) == sorted(parameters.viewvalues())
+    assert sorted(parameters.values()) == sorted(whole.values())
+    assert (parameters.has_key("foo"), parameters.has_key("NOPE")) == (True, False)
+    assert parameters.setdefault("FOO", 9) == 1.0
+    parameters.update({"FOO": 4}, BAR=5)
+    assert (parameters["FOO"], parameters["BAR"]) == (4.0, 5.0)
+    for remove in (lambda: parameters.pop("FOO"), parameters.popitem, parameters.clear):
+        assert caught(remove) == "APIException: Cannot delete value from parameters list."
+    assert parameters.pop("NOPE", 7) == 7
+    assert parameters.wait_ready() is None
+
+
+# --------------------------------------------------------------------------------- other classes
+
+
+def test_command_is_a_mission_item() -> None:
+    command = dronekit.Command(0, 0, 0, 3, 16, 0, 0, 1, 2, 3, 4, -34.25, 149.5, 30)
+    assert (command.frame, command.command, command.x, command.y, command.z) == (3, 16, -34.25, 149.5, 30)
+    assert (command.param1, command.param2, command.param3, command.param4) == (1, 2, 3, 4)
+    assert (command.seq, command.current, command.autocontinue, command.target_system) == (0, 0, 0, 0)
+    assert command.get_type() == "MISSION_ITEM"
+    assert command.format_attr("z") == 30
+    assert str(command).startswith(
+        "MISSION_ITEM {target_system : 0, target_component : 0, seq : 0, frame : 3, "
+    )
+    command.z = 40
+    assert command.z == 40
+
+
+def test_observers_of_ones_own() -> None:
+    class Mine(dronekit.HasObservers):
+        pass
+
+    mine, calls = Mine(), []
+
+    @mine.on_attribute("size")
+    def listener(source: Any, name: str, value: Any) -> None:
+        calls.append((source is mine, name, value))
+
+    for value in (1, 1, 2):
+        mine.notify_attribute_listeners("size", value, cache=True)
+    assert calls == [(True, "size", 1), (True, "size", 2)]
+
+
+def test_printers_of_errors(capsys: pytest.CaptureFixture[str]) -> None:
+    dronekit.util.errprinter("one", 2)
+    dronekit.util.logger("three")
+    printed: list[str] = []
+    handler = dronekit.ErrprinterHandler(printed.append)
+    handler.emit(logging.LogRecord("autopilot", logging.INFO, "", 0, "text %d", (4,), None))
+    assert capsys.readouterr().err.split("\n") == ["one 2", "three", ""]
+    assert printed == ["text 4"]
+
+
+def test_still_waiting_callback_logs(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.DEBUG, "dronekit"):
+        dronekit.default_still_waiting_callback(["a", "b"])
+    assert caplog.record_tuples == [("dronekit", logging.DEBUG, "Still waiting for data from vehicle: a,b")]
+
+
+def test_listeners_of_locations_get_the_locations(stage: Stage) -> None:
+    events = stage.listen("global_frame", "*", to=stage.vehicle.location)
+    stage.tell("GLOBAL_POSITION_INT", **POSITION)
+    names = ["global_relative_frame", "global_frame", "global_frame"]
+    assert [(source, name) for source, name, _ in events] == [("Locations", name) for name in names]
+
+
+# --------------------------------------------------------------------------------- its examples
+
+
+def test_connecting_by_a_bare_address() -> None:
+    with FlightController() as fc:
+        answer_streams(fc)
+        names: dict[str, Any] = {}
+        address = fc.address.removeprefix("udpin:")
+        exec(
+            f"from aerokit.dronekit import connect\nvehicle = connect({address!r}, wait_ready=True)",
+            names,
+        )
+        with names["vehicle"] as vehicle:
+            assert vehicle.attitude.pitch == 0.5
+
+
+PRINTED = {
+    "overrides": [" Channel overrides: {'3': 500, '2': 200}", " Ch2 override: 200"],
+    "command": ["16"],
+    "mission": ["LocationGlobal:lat=-35.363261,lon=149.16523,alt=584.0", "1"],
+    "gimbal": [],
+    "location": [
+        "Global Location: LocationGlobal:lat=-35.363261,lon=149.16523,alt=584.0",
+        "Global Location (relative altitude): LocationGlobalRelative:lat=-35.363261,lon=149.16523,alt=10.0",
+        "Local Location: LocationLocal:north=3.0,east=4.0,down=-12.0",
+        "Altitude (global frame): 584.0",
+        "Altitude (global relative frame): 10.0",
+        "Altitude (NED frame): -12.0",
+    ],
+    "location listeners": [
+        " global_frame: LocationGlobal:lat=-35.363261,lon=149.16523,alt=584.0",
+        " Global: LocationGlobal:lat=-35.363261,lon=149.16523,alt=584.0",
+        " Global: LocationGlobal:lat=-35.363261,lon=149.16523,alt=584.0",
+        " GlobalRelative: LocationGlobalRelative:lat=-35.363261,lon=149.16523,alt=10.0",
+        " Local: LocationLocal:north=3.0,east=4.0,down=-12.0",
+    ],
+    "attitude listener": ["attitude attribute is: Attitude:pitch=0.5,yaw=0.0,roll=0.0"],
+    "parameters": [
+        "Param: 130.0",
+        " PARAMETER CALLBACK: THR_MIN changed to: 100.0",
+        " PARAMETER CALLBACK: THR_MIN changed to: 100.0",
+        " PARAMETER CALLBACK: THR_MIN changed to: 110.0",
+    ],
+    "logging": [],
+    "message listeners": ["HEARTBEAT 4", "decorated HEARTBEAT"],
+    "armed": ["Armed: False", "Armed: True"],
+    "channels": [
+        "Channel values from RC Tx: {'1': 1001, '2': 1002, '3': 1003, '4': 1004, '5': 1005, '6': 1006, "
+        "'7': 1007, '8': 1008}",
+        " Ch1: 1001",
+        " Ch2: 1002",
+    ],
+    "heartbeat": ["True"],
+    "messages": [],
+    "modes": ["LOITER"],
+    "mode listener": ["Vehicle Mode VehicleMode:AUTO"],
+    "goto": [],
+    "ready": ["ready"],
+}
+
+SENT = {
+    "gimbal": ("COMMAND_LONG", lambda frame: frame.command == 205),
+    "goto": ("COMMAND_INT", lambda frame: frame.command == 192 and round(frame.z) == 30 - 584),
+    "messages": (
+        "COMMAND_LONG",
+        lambda frame: frame.command == 115 and frame.param1 == 90 and frame.target == (1, 0),
+    ),
+    "mission": ("MISSION_ITEM_INT", lambda frame: frame.x == -343641140),
+    "overrides": ("RC_CHANNELS_OVERRIDE", lambda frame: frame.chan3_raw == 500),
+}
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_example(stage: Stage, name: str) -> None:
+    lines: list[str] = []
+    fc = stage.fc
+    fc.heartbeat_s = None
+    stage.settle()
+    names: dict[str, Any] = {
+        "vehicle": stage.vehicle,
+        "print": lambda *values: lines.append(" ".join(map(str, values))),
+        "settle": stage.settle,
+        "fence": stage.reached,
+        "beat": stage.beat,
+        "move": lambda: stage.tell("GLOBAL_POSITION_INT", **POSITION),
+        "tilt": lambda: stage.tell("ATTITUDE", pitch=0.5),
+    }
+    exec("from aerokit.dronekit import *", names)
+    program = textwrap.dedent(EXAMPLES[name])
+    with stage.logged(having="Exception") as logged:
+        exec(compile(program, name, "exec"), names)
+        stage.settle()
+    assert lines == PRINTED[name]
+    assert logged == []
+    if name in SENT:
+        fc.wait_for(*SENT[name])
+
+
+def test_every_example_is_expected() -> None:
+    assert operator.eq(set(EXAMPLES), set(PRINTED))
