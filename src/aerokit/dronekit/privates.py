@@ -34,6 +34,11 @@ def _read(function: Callable[[Any], Any]) -> Shadowable[Any]:
     return Shadowable(function)
 
 
+def _heard_at(vehicle: Vehicle) -> float:
+    age = vehicle.last_heartbeat
+    return 0.0 if age is None else time.monotonic() - age
+
+
 class VehiclePrivates:
     """What DroneKit's vehicle keeps, to read. A program that assigns one has its own value from there on."""
 
@@ -66,11 +71,7 @@ class VehiclePrivates:
     _heartbeat_timeout = _read(lambda vehicle: (vehicle.last_heartbeat or 0.0) >= SILENCE_S)
     """Whether the link is silent: a flag, not a number of seconds."""
 
-    @_read
-    def _heartbeat_lastreceived(vehicle: Vehicle) -> float:  # noqa: N805 - a getter
-        age = vehicle.last_heartbeat
-        return 0.0 if age is None else time.monotonic() - age
-
+    _heartbeat_lastreceived = _read(_heard_at)
     _params_loaded = _read(lambda vehicle: "parameters" in vehicle._ready_attrs)
     _params_count = _read(lambda vehicle: len(vehicle.parameters) if vehicle._params_loaded else -1)
     """How many there are, -1 while that is not known."""
