@@ -11,8 +11,16 @@ from typing import TYPE_CHECKING, Any
 from aerokit.autopilots.px4 import Px4
 from aerokit.dronekit.attributes import VehicleAttributes
 from aerokit.dronekit.exceptions import APIException, TimeoutError  # noqa: A004 - DroneKit's name
-from aerokit.dronekit.flight_orders import change_armed, check_speed, checked_place, go_to, refuse, set_home
-from aerokit.dronekit.modes import change_mode, mode_name, mode_order
+from aerokit.dronekit.flight_orders import (
+    change_armed,
+    check_speed,
+    checked_place,
+    go_to,
+    refuse,
+    set_home,
+    take_off,
+)
+from aerokit.dronekit.modes import change_mode, mode_name, mode_order, told_as
 from aerokit.dronekit.values import LocationGlobal, LocationGlobalRelative, VehicleMode
 from aerokit.errors import CommandRejected
 from aerokit.mavlink.messages import HomePosition
@@ -20,6 +28,7 @@ from aerokit.mavlink.messages import HomePosition
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
+    from aerokit.dronekit.mavlink import MAVConnection
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
 __all__ = ["FlightMethods"]
@@ -28,6 +37,7 @@ NAV_TAKEOFF, DO_CHANGE_SPEED = 22, 178
 AIRSPEED, GROUNDSPEED = 0, 1
 REQUEST_MESSAGE = 512
 HOME_TIMEOUT_S = 10.0
+PX4_TAKEOFF, PX4_LOITER = 4 << 16 | 2 << 24, 4 << 16 | 3 << 24
 PX4_FLIES_TO_PLACES_IN = ("LOITER", "TAKEOFF")
 POLL_S = 0.1
 
@@ -37,7 +47,10 @@ class FlightMethods(VehicleAttributes):
     refusal becomes a warning of the logger ``dronekit``. The ``wait_…`` methods, :meth:`arm` and :meth:`disarm` wait.
     """
 
+    _dk_arming: tuple[bool, concurrent.futures.Future[None]] | None = None
+
     if TYPE_CHECKING:
+        _handler: MAVConnection
 
         def _dk_check_link(self) -> AsyncVehicle: ...
         def _dk_run(self, function: Callable[..., Awaitable[Any]], *args: Any, **kwargs: Any) -> Any: ...
@@ -68,7 +81,8 @@ class FlightMethods(VehicleAttributes):
     def _dk_set_mode(self, value: VehicleMode | str | int) -> concurrent.futures.Future[None]:
         aio = self._dk_check_link()
         order = mode_order(aio, value.name if isinstance(value, VehicleMode) else value)
-        return self._dk_order("mode", change_mode, aio, order)
+        standing = self._handler.given.order("mode", "motion", mode=told_as(aio, order))
+        return self._dk_order("mode", change_mode, aio, order, standing)
 
     def wait_for_mode(self, mode: VehicleMode | str | int, timeout: float | None = None) -> None:
         """Set the mode and wait until the vehicle is in it.
@@ -79,16 +93,16 @@ class FlightMethods(VehicleAttributes):
         """
         order = self._dk_set_mode(mode)
         aio = self._dk_check_link()
-        base, main, sub = mode_order(aio, mode.name if isinstance(mode, VehicleMode) else mode)
-        custom = main << 16 | sub << 24 if isinstance(aio.autopilot, Px4) else main
-        name = mode_name(aio, base, custom)
+        wanted = mode_order(aio, mode.name if isinstance(mode, VehicleMode) else mode)
+        name = mode_name(aio, wanted[0], told_as(aio, wanted))
         self._dk_wait_for_order(order, lambda: self._flightmode == name, timeout, "failed to set flight mode")
 
     # -------------------------------------------------------------------------------- arming
 
     @property
     def armed(self) -> bool:
-        """Whether the motors are armed, by HEARTBEAT. Setting it sends the order, if it is another value than told.
+        """Whether the motors are armed, by HEARTBEAT. Setting it sends the order, if it is another value than told, or
+        than ordered a moment before.
 
         **Propellers may start to turn.** :meth:`arm` waits, and tells why the vehicle refuses.
         """
@@ -96,14 +110,22 @@ class FlightMethods(VehicleAttributes):
 
     @armed.setter
     def armed(self, value: bool) -> None:
-        if bool(value) != self._armed:
+        if bool(value) != self._armed or self._dk_is_changing_to(not value):
             self._dk_set_armed(bool(value))
         else:
             self._dk_check_link()
 
     def _dk_set_armed(self, value: bool) -> concurrent.futures.Future[None]:
         aio = self._dk_check_link()
-        return self._dk_order("arm" if value else "disarm", change_armed, aio, value)
+        overruled = () if value else ("motion",)
+        standing = self._handler.given.order("arm", *overruled, armed=value)
+        order = self._dk_order("arm" if value else "disarm", change_armed, aio, standing, value)
+        self._dk_arming = value, order
+        return order
+
+    def _dk_is_changing_to(self, value: bool) -> bool:
+        """Whether an order to arm or disarm has not ended yet."""
+        return self._dk_arming is not None and self._dk_arming[0] == value and not self._dk_arming[1].done()
 
     def arm(self, wait: bool = True, timeout: float | None = None) -> None:
         """Arm the motors: **propellers may start to turn**; with ``wait`` until HEARTBEAT says armed.
@@ -122,12 +144,17 @@ class FlightMethods(VehicleAttributes):
         self._dk_change_armed(False, wait, timeout, "failed to disarm vehicle")
 
     def _dk_change_armed(self, value: bool, wait: bool, timeout: float | None, text: str) -> None:
-        if self._armed == value:
+        is_overruling = self._dk_is_changing_to(not value)
+        if self._armed == value and not is_overruling:
             self._dk_check_link()
             return
         order = self._dk_set_armed(value)
         if wait:
-            self._dk_wait_for_order(order, lambda: self._armed == value, timeout, text)
+
+            def is_done() -> bool:
+                return self._armed == value and (order.done() or not is_overruling)
+
+            self._dk_wait_for_order(order, is_done, timeout, text)
 
     # -------------------------------------------------------------------------------- flying
 
@@ -150,9 +177,11 @@ class FlightMethods(VehicleAttributes):
             plan = aio.autopilot.take_off(altitude, home, is_vtol=aio.is_vtol)
             if plan is None or plan.command is None:
                 raise APIException("this vehicle cannot take off by a command")
-            self._dk_order("takeoff", aio.command, plan.command, *plan.params, component_id=0)
+            standing = self._handler.given.order("motion", mode=PX4_TAKEOFF)
+            self._dk_order("takeoff", take_off, aio, standing, plan.command, *plan.params)
         else:
-            self._dk_order("takeoff", aio.command, NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude, component_id=0)
+            standing = self._handler.given.order("motion")
+            self._dk_order("takeoff", take_off, aio, standing, NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude)
 
     def wait_simple_takeoff(
         self, alt: float | None = None, epsilon: float = 0.1, timeout: float | None = None
@@ -182,26 +211,29 @@ class FlightMethods(VehicleAttributes):
             ValueError: it is no such location, or one of its numbers is missing or wrong. Nothing was sent.
         """
         aio = self._dk_check_link()
-        place = self._dk_relative_place(location)
+        is_px4 = isinstance(aio.autopilot, Px4)
+        place = self._dk_place(location, is_relative=not is_px4)
         for name, speed in (("airspeed", airspeed), ("groundspeed", groundspeed)):
             check_speed(name, speed)
-        if isinstance(aio.autopilot, Px4) and self._flightmode not in PX4_FLIES_TO_PLACES_IN:
+        standing = self._handler.given.order("motion", mode=PX4_LOITER if is_px4 else None)
+        if is_px4 and self._flightmode not in PX4_FLIES_TO_PLACES_IN:
             self._dk_order("goto", refuse, f"not in {self._flightmode}: set the mode LOITER first")
         else:
-            self._dk_order("goto", go_to, aio, *place)
+            self._dk_order("goto", go_to, aio, standing, *place)
         if airspeed is not None:
             self.airspeed = airspeed
         if groundspeed is not None:
             self.groundspeed = groundspeed
 
-    def _dk_relative_place(self, location: object) -> tuple[int, int, float]:
-        """Latitude and longitude in 1e-7 degrees, altitude above home."""
+    def _dk_place(self, location: object, *, is_relative: bool) -> tuple[int, int, float]:
+        """Latitude and longitude in 1e-7 degrees, altitude above home or above the sea."""
         if not isinstance(location, (LocationGlobal, LocationGlobalRelative)):
             raise ValueError("Expecting location to be LocationGlobal or LocationGlobalRelative.")
         latitude, longitude, altitude = checked_place(location)
-        if isinstance(location, LocationGlobal):
-            home = self._dk_known_home()
-            altitude -= home.alt or 0.0
+        if is_relative and isinstance(location, LocationGlobal):
+            altitude -= self._dk_known_home().alt or 0.0
+        elif not is_relative and not isinstance(location, LocationGlobal):
+            altitude += self._dk_known_home().alt or 0.0
         return latitude, longitude, altitude
 
     # -------------------------------------------------------------------------------- speeds

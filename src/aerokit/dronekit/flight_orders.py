@@ -7,14 +7,16 @@ from typing import TYPE_CHECKING
 
 from aerokit.autopilots.px4 import Px4
 from aerokit.dronekit.exceptions import APIException
+from aerokit.dronekit.standing import send_while_standing
 from aerokit.errors import CommandRejected, LocalProtocolError
 from aerokit.mavlink.messages import SetPositionTargetGlobalInt
 
 if TYPE_CHECKING:
+    from aerokit.dronekit.standing import Standing
     from aerokit.dronekit.values import LocationGlobal, LocationGlobalRelative
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
-__all__ = ["change_armed", "check_speed", "checked_place", "go_to", "refuse", "set_home"]
+__all__ = ["change_armed", "check_speed", "checked_place", "go_to", "refuse", "set_home", "take_off"]
 
 COMPONENT_ARM_DISARM, DO_SET_HOME, DO_REPOSITION = 400, 179, 192
 GLOBAL, GLOBAL_INT, GLOBAL_RELATIVE_ALT_INT = 0, 5, 6
@@ -24,39 +26,48 @@ CHANGE_MODE = 1
 ARMED_IS_TOLD_S = 10.0
 
 
-async def change_armed(vehicle: AsyncVehicle, value: bool) -> None:
+async def change_armed(vehicle: AsyncVehicle, standing: Standing, value: bool) -> None:
     """Arm or disarm, and wait until HEARTBEAT says so."""
-    await vehicle.command(COMPONENT_ARM_DISARM, float(value), component_id=0)
-    await vehicle.telemetry.armed.wait_until(
-        lambda armed: armed is value, timeout=ARMED_IS_TOLD_S, description="armed" if value else "disarmed"
-    )
-
-
-async def go_to(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: float) -> None:
-    """DO_REPOSITION, which is answered; and the message for a vehicle that does not know it."""
-    if isinstance(vehicle.autopilot, Px4):
-        home = vehicle.telemetry.home.value.altitude_amsl_m
-        await vehicle.command_int(
-            DO_REPOSITION,
-            *(-1, CHANGE_MODE, 0, math.nan),
-            frame=GLOBAL_INT,
-            x=latitude,
-            y=longitude,
-            z=altitude + home,
-            component_id=0,
+    with standing.watching(vehicle):
+        send = vehicle._commands.send_long
+        await send_while_standing(vehicle, standing, send, COMPONENT_ARM_DISARM, float(value))
+        await vehicle.telemetry.armed.wait_until(
+            lambda armed: armed is value or standing.is_done,
+            timeout=ARMED_IS_TOLD_S,
+            description="armed" if value else "disarmed",
         )
-        return
+
+
+async def take_off(vehicle: AsyncVehicle, standing: Standing, command: int, *params: float) -> None:
+    """Send the command to take off."""
+    with standing.watching(vehicle):
+        await send_while_standing(vehicle, standing, vehicle._commands.send_long, command, *params)
+
+
+async def go_to(
+    vehicle: AsyncVehicle, standing: Standing, latitude: int, longitude: int, altitude: float
+) -> None:
+    """DO_REPOSITION, which is answered; and the message for a vehicle that does not know it.
+
+    The altitude is above home, with PX4 above the sea.
+    """
+    is_px4 = isinstance(vehicle.autopilot, Px4)
     try:
-        await vehicle.command_int(
-            DO_REPOSITION,
-            *(-1, 0, 0, math.nan),
-            frame=GLOBAL_RELATIVE_ALT_INT,
-            x=latitude,
-            y=longitude,
-            z=altitude,
-            component_id=0,
-        )
+        with standing.watching(vehicle):
+            await send_while_standing(
+                vehicle,
+                standing,
+                vehicle._commands.send_int,
+                DO_REPOSITION,
+                *(-1, CHANGE_MODE if is_px4 else 0, 0, math.nan),
+                frame=GLOBAL_INT if is_px4 else GLOBAL_RELATIVE_ALT_INT,
+                x=latitude,
+                y=longitude,
+                z=altitude,
+            )
     except CommandRejected as error:
+        if is_px4:
+            raise
         if error.result != RESULT_UNSUPPORTED:
             raise
         target = (vehicle.system_id, 0, GLOBAL_RELATIVE_ALT_INT, POSITION_ONLY)

@@ -17,6 +17,7 @@ from aerokit import sync
 from aerokit.dronekit.exceptions import APIException
 from aerokit.dronekit.listener_thread import ListenerThread
 from aerokit.dronekit.orders import Orders
+from aerokit.dronekit.standing import Given
 from aerokit.errors import AerokitError, ConnectionClosed, LinkOpenError
 from aerokit.links.reconnecting import ReconnectingLink
 
@@ -70,6 +71,8 @@ class MAVConnection:
         """The event loop's thread."""
         self.orders = Orders(self.loop)
         """What was ordered without waiting."""
+        self.given = Given()
+        """Which order is the newest."""
         self._is_closed = threading.Event()
         self._closing = threading.Lock()
         self._detach: list[Detach] = []
@@ -103,6 +106,7 @@ class MAVConnection:
         message.encode()  # so that what is wrong with it is told to who made it
         try:
             self.connection.raise_if_ended()
+            self.given.note(message)
             self.orders.post(self._send, message, to)
         except AerokitError as error:
             raise APIException(str(error)) from error

@@ -8,14 +8,16 @@ import anyio
 from pymavlink import mavutil
 
 from aerokit.autopilots.px4 import Px4
+from aerokit.dronekit.standing import send_while_standing
 from aerokit.errors import CommandRejected, LocalProtocolError, OperationTimeout
 from aerokit.mavlink.messages import SetMode
 from aerokit.protocols.command import result_name
 
 if TYPE_CHECKING:
+    from aerokit.dronekit.standing import Standing
     from aerokit.vehicle.vehicle import Vehicle
 
-__all__ = ["change_mode", "mode_name", "mode_order"]
+__all__ = ["change_mode", "mode_name", "mode_order", "told_as"]
 
 DO_SET_MODE = 176
 RESULT_UNSUPPORTED = 3
@@ -69,35 +71,44 @@ def _custom_mode(vehicle: Vehicle, mode: str) -> int:
         raise KeyError(mode) from None
 
 
-async def change_mode(vehicle: Vehicle, order: Order) -> None:
+def told_as(vehicle: Vehicle, order: Order) -> int:
+    """HEARTBEAT.custom_mode of what is asked for."""
+    _, main_mode, sub_mode = order
+    return main_mode << 16 | sub_mode << 24 if isinstance(vehicle.autopilot, Px4) else main_mode
+
+
+async def change_mode(vehicle: Vehicle, order: Order, standing: Standing) -> None:
     """Send MAV_CMD_DO_SET_MODE, or SET_MODE to a vehicle that does not know it, and wait until HEARTBEAT tells it.
 
-    Asked again where the vehicle says that it is too early, as PX4 does while it checks a mission just uploaded.
+    Asked again where the vehicle says that it is too early, as PX4 does while it checks a mission just uploaded, and as
+    long as the order stands.
 
     Raises:
         CommandRejected: the vehicle refused.
-        OperationTimeout: it accepted and stays in another mode.
+        OperationTimeout: it did not answer, or it accepted and stays in another mode.
     """
-    for attempts_left in reversed(range(ATTEMPTS)):
-        try:
-            await _change_mode(vehicle, order)
-        except CommandRejected as error:
-            if error.result != RESULT_TEMPORARILY_REJECTED or not attempts_left:
-                raise
-            await anyio.sleep(ASK_AGAIN_S)
-        else:
-            return
+    with standing.watching(vehicle):
+        for attempts_left in reversed(range(ATTEMPTS)):
+            try:
+                await _change_mode(vehicle, order, standing)
+            except CommandRejected as error:
+                if error.result != RESULT_TEMPORARILY_REJECTED or not attempts_left:
+                    raise
+                await anyio.sleep(ASK_AGAIN_S)
+                if not standing.holds():
+                    raise
+            else:
+                return
 
 
-async def _change_mode(vehicle: Vehicle, order: Order) -> None:
+async def _change_mode(vehicle: Vehicle, order: Order, standing: Standing) -> None:
     """PX4 acks twice: the first ack is always ACCEPTED, the second one may take it back."""
-    base_mode, main_mode, sub_mode = order
-    custom_mode = main_mode << 16 | sub_mode << 24 if isinstance(vehicle.autopilot, Px4) else main_mode
+    base_mode, custom_mode = order[0], told_as(vehicle, order)
     started = vehicle.connection.now()
     with vehicle._refusals_of(DO_SET_MODE) as refusals:
-        await _request(vehicle, order, custom_mode)
+        await _request(vehicle, order, standing)
         with anyio.move_on_after(MODE_IS_TOLD_S):
-            while not _is_in(vehicle, custom_mode):
+            while not (standing.is_done or _is_in(vehicle, custom_mode)):
                 if refusals:
                     raise _refused(vehicle, refusals[-1].result, started)
                 await anyio.sleep(LOOK_S)
@@ -107,13 +118,13 @@ async def _change_mode(vehicle: Vehicle, order: Order) -> None:
     )
 
 
-async def _request(vehicle: Vehicle, order: Order, custom_mode: int) -> None:
+async def _request(vehicle: Vehicle, order: Order, standing: Standing) -> None:
     try:
-        await vehicle.command(DO_SET_MODE, *order, component_id=0)
+        await send_while_standing(vehicle, standing, vehicle._commands.send_long, DO_SET_MODE, *order)
     except CommandRejected as error:
         if error.result != RESULT_UNSUPPORTED:
             raise
-        vehicle.send(SetMode(vehicle.system_id, order[0], custom_mode))
+        vehicle.send(SetMode(vehicle.system_id, order[0], told_as(vehicle, order)))
 
 
 def _is_in(vehicle: Vehicle, custom_mode: int) -> bool:

@@ -18,6 +18,9 @@ __all__ = ["Orders"]
 
 logger = logging.getLogger("dronekit")
 
+REPLACES = {"disarm": "arm"}
+"""Kinds that are one: the newer replaces the older."""
+
 Work = Callable[..., Awaitable[object]]
 
 
@@ -73,14 +76,15 @@ class Orders:
     def _begin(
         self, kind: str, work: Callable[[], Awaitable[None]], future: concurrent.futures.Future[None]
     ) -> None:
-        before = self._tasks.get(kind)
+        place = REPLACES.get(kind, kind)
+        before = self._tasks.get(place)
         if before is not None:
             before.cancel()
         if not future.set_running_or_notify_cancel():
             return
         task = asyncio.get_running_loop().create_task(_run(work, future, kind), name=f"dronekit {kind}")
-        self._tasks[kind] = task
-        task.add_done_callback(lambda ended: self._end(kind, ended, future))
+        self._tasks[place] = task
+        task.add_done_callback(lambda ended: self._end(place, ended, future))
 
     def _end(self, kind: str, task: asyncio.Task[None], future: concurrent.futures.Future[None]) -> None:
         if self._tasks.get(kind) is task:

@@ -78,7 +78,7 @@ class CommandExchange(Exchange[CommandAck]):
     and is reported to ``on_progress`` (0–100, None when the vehicle does not say). An ack for another ground station
     is not ours, nor is one of another component than the target; nor are the first ``answers_before_ours``: those to
     an earlier command of the same number that was abandoned. If they do not come after all, the command is sent
-    again, and then every ack counts.
+    again, and then every ack counts. It is sent again only while ``may_repeat()``, which is asked each time.
 
     Raises from ``result()``:
         CommandRejected: any other result; the vehicle's reasons are added by those who see its status texts.
@@ -98,6 +98,7 @@ class CommandExchange(Exchange[CommandAck]):
         progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
         answers_before_ours: int = 0,
+        may_repeat: Callable[[], bool] | None = None,
     ) -> None:
         super().__init__()
         if attempts < 1:
@@ -110,6 +111,7 @@ class CommandExchange(Exchange[CommandAck]):
         self._attempts, self._attempt_timeout = attempts, attempt_timeout
         self._progress_timeout, self._on_progress = progress_timeout, on_progress
         self._answers_before_ours = answers_before_ours
+        self._may_repeat = may_repeat
         self._sent = 0
         self._answers = 0
         self._started = 0.0
@@ -144,7 +146,8 @@ class CommandExchange(Exchange[CommandAck]):
         """Send again, or give up after the last attempt or when a command in progress has gone silent."""
         if self.done or self.deadline is None or now < self.deadline:
             return
-        if self._in_progress or self._sent >= self._attempts:
+        is_last = self._in_progress or self._sent >= self._attempts
+        if is_last or (self._may_repeat is not None and not self._may_repeat()):
             self._fail(CommandTimeout(self._timeout_text(now)))
         else:
             self._send(now)

@@ -22,6 +22,7 @@ __all__ = ["CommandSender"]
 IN_PROGRESS = 5
 ROUND_TRIPS = 2
 """Nothing is sent again before so many measured round trips: the answer is still under way."""
+LONGEST_ATTEMPT_S = 5.0
 UNDER_WAY_S = 2.0
 """An answer that has not come by then was lost."""
 
@@ -73,11 +74,12 @@ class CommandSender:
         attempt_timeout: float = 1.0,
         progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
+        may_repeat: Callable[[], bool] | None = None,
     ) -> CommandAck:
         """Send a COMMAND_LONG with param1 to param7 and return its ACCEPTED ack; see :meth:`Vehicle.command`."""
         target = self._component_id if component_id is None else component_id
         message = command_long(self._system_id, target, command, params)
-        return await self._run(message, attempts, attempt_timeout, progress_timeout, on_progress)
+        return await self._run(message, attempts, attempt_timeout, progress_timeout, on_progress, may_repeat)
 
     async def send_int(
         self,
@@ -92,11 +94,12 @@ class CommandSender:
         attempt_timeout: float = 1.0,
         progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
+        may_repeat: Callable[[], bool] | None = None,
     ) -> CommandAck:
         """Send a COMMAND_INT with param1 to param4, x, y, z and return its ACCEPTED ack."""
         target = self._component_id if component_id is None else component_id
         message = command_int(self._system_id, target, command, params, frame=frame, x=x, y=y, z=z)
-        return await self._run(message, attempts, attempt_timeout, progress_timeout, on_progress)
+        return await self._run(message, attempts, attempt_timeout, progress_timeout, on_progress, may_repeat)
 
     def send_unconfirmed(self, command: int, *params: float) -> None:
         """Send a COMMAND_LONG once and do not wait: for ends of blocks, which must not await."""
@@ -122,6 +125,7 @@ class CommandSender:
         attempt_timeout: float,
         progress_timeout: float,
         on_progress: Callable[[int | None], None] | None,
+        may_repeat: Callable[[], bool] | None,
     ) -> CommandAck:
         key = (
             message.target_component or self._component_id,
@@ -135,10 +139,11 @@ class CommandSender:
                 own_system=self._connection.source_system,
                 own_component=self._connection.source_component,
                 attempts=attempts,
-                attempt_timeout=max(attempt_timeout, ROUND_TRIPS * (self._round_trip_s() or 0.0)),
+                attempt_timeout=max(attempt_timeout, self._answers_within_s()),
                 progress_timeout=progress_timeout,
                 on_progress=on_progress,
                 answers_before_ours=self._take_answers_under_way(key),
+                may_repeat=may_repeat,
             )
             run = self._runs[key] = ExchangeRun(self._connection, exchange)
             try:
@@ -148,6 +153,10 @@ class CommandSender:
             finally:
                 del self._runs[key]
                 self._expect_answers(key, exchange.answers_to_come)
+
+    def _answers_within_s(self) -> float:
+        """A stalled link that comes back has a round trip of all the time it was away: that is no reason to wait."""
+        return min(ROUND_TRIPS * (self._round_trip_s() or 0.0), LONGEST_ATTEMPT_S)
 
     def _expect_answers(self, key: _Key, count: int) -> None:
         """Remember that answers may come which nobody waits for."""

@@ -30,7 +30,7 @@ from aerokit.vehicle.transfers import Transfers
 from aerokit.vehicle.watch import LinkWatch, VehicleWatch
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Awaitable, Callable, Iterator
 
     from aerokit.runtime.bus import Detach, Sink
     from aerokit.runtime.connection import Connection
@@ -129,21 +129,16 @@ class VehicleCore:
             CommandRejected: any other result; ``reasons`` has the status texts seen meanwhile.
             CommandTimeout: no ack; the text names attempts, seconds, the last heartbeat and the loss.
         """
-        self._before_command(command)
-        started = self.connection.now()
-        try:
-            return await self._commands.send_long(
-                command,
-                *params,
-                component_id=component_id,
-                attempts=attempts,
-                attempt_timeout=attempt_timeout,
-                progress_timeout=progress_timeout,
-                on_progress=on_progress,
-            )
-        except CommandRejected as error:
-            await self._settle()
-            raise self._explained(error, started) from None
+        return await self._answered(
+            self._commands.send_long,
+            command,
+            *params,
+            component_id=component_id,
+            attempts=attempts,
+            attempt_timeout=attempt_timeout,
+            progress_timeout=progress_timeout,
+            on_progress=on_progress,
+        )
 
     async def command_int(
         self,
@@ -164,25 +159,20 @@ class VehicleCore:
         ``x`` and ``y`` are latitude and longitude in 1e-7 degrees, or 1e-4 m in local frames; ``z`` metres. The rest
         is as for :meth:`command`.
         """
-        self._before_command(command)
-        started = self.connection.now()
-        try:
-            return await self._commands.send_int(
-                command,
-                *params,
-                frame=frame,
-                x=x,
-                y=y,
-                z=z,
-                component_id=component_id,
-                attempts=attempts,
-                attempt_timeout=attempt_timeout,
-                progress_timeout=progress_timeout,
-                on_progress=on_progress,
-            )
-        except CommandRejected as error:
-            await self._settle()
-            raise self._explained(error, started) from None
+        return await self._answered(
+            self._commands.send_int,
+            command,
+            *params,
+            frame=frame,
+            x=x,
+            y=y,
+            z=z,
+            component_id=component_id,
+            attempts=attempts,
+            attempt_timeout=attempt_timeout,
+            progress_timeout=progress_timeout,
+            on_progress=on_progress,
+        )
 
     def send(self, message: Message) -> None:
         """Send one message as it is, once; never blocks. Its ``target_system`` is yours to set.
@@ -341,6 +331,18 @@ class VehicleCore:
             self.connection.bus.attach_event(LinkRestored, lambda _: self._rates.ask_again()),
             self.connection.on_end(self._on_end),
         ]
+
+    async def _answered(
+        self, send: Callable[..., Awaitable[CommandAck]], command: int, *params: float, **options: Any
+    ) -> CommandAck:
+        """What the commands of the program itself have in common; ``send`` is one of the command sender's."""
+        self._before_command(command)
+        started = self.connection.now()
+        try:
+            return await send(command, *params, **options)
+        except CommandRejected as error:
+            await self._settle()
+            raise self._explained(error, started) from None
 
     def _before_command(self, command: int) -> None:
         """Any command is about to be sent by the program itself."""
