@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from aerokit.autopilots.px4 import Px4
 from aerokit.dronekit.modes import mode_name
 from aerokit.dronekit.observers import HasObservers
+from aerokit.dronekit.reception import Latest, Stream
 from aerokit.dronekit.shadowable import Shadowable
 from aerokit.dronekit.values import (
     Attitude,
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from aerokit.dronekit.exceptions import APIException
+    from aerokit.dronekit.locations import Locations
     from aerokit.mavlink.message import Message
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
@@ -36,6 +38,7 @@ STATES = ("UNINIT", "BOOT", "CALIBRATING", "STANDBY", "ACTIVE", "CRITICAL", "EME
 POS_HORIZ_ABS, CONST_POS_MODE, PRED_POS_HORIZ_ABS = 16, 128, 512
 """Flags of EKF_STATUS_REPORT and of ESTIMATOR_STATUS, which agree in these."""
 PREARM_CHECK = 1 << 28
+PLACES = (m.GlobalPositionInt, m.LocalPositionNed)
 LOOKING_DOWN = 25
 NO_MODE = (None, "INITIALISING", "MAV")
 
@@ -47,20 +50,26 @@ class VehicleAttributes(HasObservers):
     """
 
     _dk_aio: AsyncVehicle | None
+    _location: Locations
     _dk_heartbeat: m.Heartbeat | None = None
     _flightmode: str = "UNKNOWN"
-    _dk_attitude: m.Attitude | None = None
-    _dk_global_position: m.GlobalPositionInt | None = None
-    _dk_vfr_hud: m.VfrHud | None = None
-    _dk_gps: m.GpsRawInt | None = None
-    _dk_sys_status: m.SysStatus | None = None
+    _dk_attitude = Latest(m.Attitude)
+    _dk_global_position = Latest(m.GlobalPositionInt)
+    _dk_local_position = Latest(m.LocalPositionNed)
+    _dk_vfr_hud = Latest(m.VfrHud)
+    _dk_gps = Latest(m.GpsRawInt)
+    _dk_sys_status = Latest(m.SysStatus)
     _dk_rangefinder: tuple[float | None, float | None] = (None, None)
     _dk_has_rangefinder_message = False
     _dk_ekf_flags: int | None = None
     _dk_ekf_ok = False
-    _dk_wind: m.Wind | None = None
+    _dk_wind = Latest(m.Wind)
     _dk_version: m.AutopilotVersion | None = None
     _home_location: LocationGlobal | None = None
+
+    def _dk_make_streams(self) -> None:
+        self._dk_streams = {kind.message_type: Stream(self, kind, names) for kind, names in STREAMS}
+        self._dk_reviewing = threading.Lock()
 
     def _dk_attach_attributes(self) -> None:
         self._ready_attrs: set[str] = set()
@@ -76,16 +85,16 @@ class VehicleAttributes(HasObservers):
     def _dk_handlers(self) -> dict[type[Message], Callable[[Any], None]]:
         return {
             m.Heartbeat: self._dk_on_heartbeat,
-            m.GlobalPositionInt: self._dk_on_velocity,
+            m.GlobalPositionInt: lambda _: self._dk_announce("velocity"),
             m.VfrHud: self._dk_on_vfr_hud,
-            m.Attitude: self._dk_on_attitude,
-            m.SysStatus: self._dk_on_sys_status,
-            m.GpsRawInt: self._dk_on_gps,
+            m.Attitude: lambda _: self._dk_announce("attitude"),
+            m.SysStatus: lambda _: self._dk_announce("battery"),
+            m.GpsRawInt: lambda _: self._dk_announce("gps_0"),
             m.Rangefinder: self._dk_on_rangefinder,
             m.DistanceSensor: self._dk_on_distance_sensor,
             m.EkfStatusReport: self._dk_on_ekf_status,
             m.EstimatorStatus: self._dk_on_ekf_status,
-            m.Wind: self._dk_on_wind,
+            m.Wind: lambda _: self._dk_announce("wind"),
             m.HomePosition: self._dk_on_home,
             m.AutopilotVersion: self._dk_on_version,
         }
@@ -216,27 +225,10 @@ class VehicleAttributes(HasObservers):
         self._dk_tell("system_status", self.system_status, cache=True)
         self._dk_note("last_heartbeat")
 
-    def _dk_on_velocity(self, message: m.GlobalPositionInt) -> None:
-        self._dk_global_position = message
-        self._dk_announce("velocity")
-
     def _dk_on_vfr_hud(self, message: m.VfrHud) -> None:
-        self._dk_vfr_hud = message
         self._dk_announce("heading")
         self._dk_announce("airspeed")
         self._dk_announce("groundspeed")
-
-    def _dk_on_attitude(self, message: m.Attitude) -> None:
-        self._dk_attitude = message
-        self._dk_announce("attitude")
-
-    def _dk_on_sys_status(self, message: m.SysStatus) -> None:
-        self._dk_sys_status = message
-        self._dk_announce("battery")
-
-    def _dk_on_gps(self, message: m.GpsRawInt) -> None:
-        self._dk_gps = message
-        self._dk_announce("gps_0")
 
     def _dk_on_rangefinder(self, message: m.Rangefinder) -> None:
         self._dk_has_rangefinder_message = True
@@ -256,10 +248,6 @@ class VehicleAttributes(HasObservers):
             self._dk_ekf_ok = bool(flags & (POS_HORIZ_ABS | PRED_POS_HORIZ_ABS))
         self._dk_tell("ekf_ok", self._dk_ekf_ok, cache=True)
 
-    def _dk_on_wind(self, message: m.Wind) -> None:
-        self._dk_wind = message
-        self._dk_announce("wind")
-
     def _dk_on_home(self, message: m.HomePosition) -> None:
         self._dk_set_home(message.latitude / 1.0e7, message.longitude / 1.0e7, message.altitude / 1000.0)
         self._dk_tell("home_location", self._home_location)
@@ -275,6 +263,13 @@ class VehicleAttributes(HasObservers):
         self._home_location = LocationGlobal(lat, lon, alt)
 
     # ------------------------------------------------------------------------------- telling
+
+    def _dk_review(self) -> None:
+        """Messages are looked at when they come only as long as somebody listens; from any thread."""
+        with self._dk_reviewing:
+            listened, heeds_places = self._attribute_listeners, bool(self._location._attribute_listeners)
+            for message_type, stream in self._dk_streams.items():
+                stream.review(self._ready_attrs, listened, heeds_places and message_type in PLACES)
 
     def _dk_announce(self, name: str) -> None:
         """Tell an attribute's value, which is made only when somebody listens."""
@@ -294,15 +289,32 @@ class VehicleAttributes(HasObservers):
             self._dk_failures.pop(name, None)
             self._ready_attrs.add(name)
             self._dk_became_ready.notify_all()
+        self._dk_review()
 
     def _dk_unready(self, name: str) -> None:
         """The attribute will get a new value, and is to be waited for."""
         with self._dk_became_ready:
             self._dk_failures.pop(name, None)
             self._ready_attrs.discard(name)
+        self._dk_review()
 
     def _dk_fail(self, name: str, error: APIException) -> None:
         """The attribute will get no value: whoever waits for it is told why."""
         with self._dk_became_ready:
             self._dk_failures[name] = error
             self._dk_became_ready.notify_all()
+
+
+STREAMS: tuple[tuple[Latest[Any], tuple[str, ...]], ...] = (
+    (VehicleAttributes._dk_attitude, ("attitude",)),
+    (
+        VehicleAttributes._dk_global_position,
+        ("location.global_relative_frame", "location.global_frame", "location", "velocity"),
+    ),
+    (VehicleAttributes._dk_local_position, ("location.local_frame", "location")),
+    (VehicleAttributes._dk_vfr_hud, ("heading", "airspeed", "groundspeed")),
+    (VehicleAttributes._dk_gps, ("gps_0",)),
+    (VehicleAttributes._dk_sys_status, ("battery",)),
+    (VehicleAttributes._dk_wind, ("wind",)),
+)
+"""The messages that come in streams, and what they tell of."""

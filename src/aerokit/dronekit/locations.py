@@ -27,9 +27,6 @@ class Locations(HasObservers, LocationPrivates):
     def __init__(self, vehicle: Vehicle) -> None:
         super().__init__(vehicle._dk_listener_thread)
         self._vehicle = vehicle
-        self._global: tuple[float | None, float | None, float | None] = (None, None, None)
-        self._relative: tuple[float | None, float | None, float | None] = (None, None, None)
-        self._local: LocalPositionNed | None = None
         self._has_altitude = False
         vehicle._dk_on(GlobalPositionInt, self._on_global_position)
         vehicle._dk_on(LocalPositionNed, self._on_local_position)
@@ -40,17 +37,24 @@ class Locations(HasObservers, LocationPrivates):
 
         A new object each time. Latitude and longitude are None without a fix, the altitude is None until one is known.
         """
-        return LocationGlobal(*self._global)
+        message = self._vehicle._dk_global_position
+        if message is None:
+            return LocationGlobal(None, None, None)
+        altitude = message.alt / 1000.0
+        return LocationGlobal(*_place_of(message), altitude if altitude or self._has_altitude else None)
 
     @property
     def global_relative_frame(self) -> LocationGlobalRelative:
         """Latitude, longitude in degrees and altitude above home in metres (GLOBAL_POSITION_INT)."""
-        return LocationGlobalRelative(*self._relative)
+        message = self._vehicle._dk_global_position
+        if message is None:
+            return LocationGlobalRelative(None, None, None)
+        return LocationGlobalRelative(*_place_of(message), message.relative_alt / 1000.0)
 
     @property
     def local_frame(self) -> LocationLocal:
         """Metres north, east and down from the estimator's origin (LOCAL_POSITION_NED)."""
-        message = self._local
+        message = self._vehicle._dk_local_position
         if message is None:
             return LocationLocal(None, None, None)
         return LocationLocal(message.x, message.y, message.z)
@@ -58,27 +62,31 @@ class Locations(HasObservers, LocationPrivates):
     # ------------------------------------------------------------------------------- inside
 
     def _on_global_position(self, message: GlobalPositionInt) -> None:
-        latitude, longitude = place(message.lat, message.lon) or UNKNOWN
-        altitude = message.alt / 1000.0
-        self._has_altitude = self._has_altitude or altitude != 0
-        self._relative = (latitude, longitude, message.relative_alt / 1000.0)
-        self._global = (latitude, longitude, altitude if self._has_altitude else None)
+        self._vehicle._dk_global_position = message
+        self._has_altitude = self._has_altitude or message.alt != 0
         self._dk_announce("global_relative_frame")
         if self._has_altitude:
             self._dk_announce("global_frame")
         self._vehicle._dk_tell("location", self)
 
     def _on_local_position(self, message: LocalPositionNed) -> None:
-        self._local = message
         self._dk_announce("local_frame")
         self._vehicle._dk_tell("location", self)
 
     def _dk_announce(self, frame: str) -> None:
         """Tell those who listen here, then those who listen to the vehicle."""
         vehicle, name = self._vehicle, f"location.{frame}"
-        if self._attribute_listeners or vehicle._attribute_listeners:
+        listened = vehicle._attribute_listeners
+        if self._attribute_listeners or name in listened or "*" in listened:
             value = getattr(self, frame)
             self._dk_tell(frame, value)
             vehicle._dk_tell(name, value)
         else:
             vehicle._dk_note(name)
+
+    def _dk_review(self) -> None:
+        self._vehicle._dk_review()
+
+
+def _place_of(message: GlobalPositionInt) -> tuple[float | None, float | None]:
+    return place(message.lat, message.lon) or UNKNOWN

@@ -44,6 +44,7 @@ class HasObservers:
         present = self._attribute_listeners.get(attr_name, ())
         if observer not in present:
             self._attribute_listeners[attr_name] = (*present, observer)
+            self._dk_review()
 
     def remove_attribute_listener(self, attr_name: str, observer: AttributeListener) -> None:
         """Call it no more. Silent when nobody listens to the name.
@@ -61,6 +62,7 @@ class HasObservers:
             self._attribute_listeners[attr_name] = left
         else:
             del self._attribute_listeners[attr_name]
+        self._dk_review()
 
     def on_attribute(self, name: str | list[str] | tuple[str, ...]) -> Callable[[ListenerT], ListenerT]:
         """Decorate a listener with the name, or the list of names, it listens to. It cannot be removed by name then."""
@@ -108,6 +110,9 @@ class HasObservers:
             return True
         self._attribute_cache[attr_name] = value
         return False
+
+    def _dk_review(self) -> None:
+        """Who listens to what has changed."""
 
     def _dk_note(self, attr_name: str) -> None:
         """An attribute has a value: what waits for it is told here."""

@@ -79,6 +79,7 @@ class Vehicle(FlightMethods, Maintenance, Readiness, VehiclePrivates):
         self._dk_initializing = threading.Lock()
         self._dk_tasks: Background | None = None
         self._message_listeners = MessageListeners(self, handler)
+        self._dk_make_streams()
         self._location = Locations(self)
         self._dk_attach_attributes()
         self._channels = Channels(self, 8)
@@ -278,7 +279,11 @@ class Vehicle(FlightMethods, Maintenance, Readiness, VehiclePrivates):
         return self._dk_aio
 
     def _dk_on(self, message_type: type[Message], handler: Callable[[Any], None]) -> None:
-        self._dk_message_handlers.append((message_type, handler, True))
+        stream = self._dk_streams.get(message_type)
+        if stream is None:
+            self._dk_message_handlers.append((message_type, handler, True))
+        else:
+            stream.add(handler)
 
     def _dk_on_any_component(self, message_type: type[Message], handler: Callable[[Any], None]) -> None:
         self._dk_message_handlers.append((message_type, handler, False))
@@ -350,6 +355,10 @@ class Vehicle(FlightMethods, Maintenance, Readiness, VehiclePrivates):
         self._dk_aio = aio
         self._handler.target_system = aio.system_id
         self._handler.master.vehicle = self
+        for message_type, stream in self._dk_streams.items():
+            stream.begin(aio.component_id)
+            detach = aio.connection.bus.attach_frames(message_type, stream.take, system_id=aio.system_id)
+            aio._detach.append(detach)
         for message_type, handler, only_autopilot in self._dk_message_handlers:
             take = _only_of(aio.component_id, handler) if only_autopilot else handler
             aio._detach.append(aio.connection.bus.attach(message_type, take, system_id=aio.system_id))
