@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import threading
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -246,3 +248,51 @@ def test_a_blocked_listener_keeps_nobody_from_telling(thread: ListenerThread) ->
     may_go_on.set()
     emptied(thread)
     assert seen == list(range(10))
+
+
+def test_telling_listeners_never_waits_for_what_waits_for_it() -> None:
+    threads, met = (ListenerThread("one"), ListenerThread("two")), threading.Barrier(2)
+    ended: list[str] = []
+
+    def meet_and_call(other: ListenerThread) -> None:
+        met.wait(LIMIT_S)
+        other.call(ended.append, "called")  # both wait for the other one, if they wait
+
+    one, two = threads
+    callers = [
+        threading.Thread(target=each.call, args=(meet_and_call, other))
+        for each, other in ((one, two), (two, one))
+    ]
+    for each in callers:
+        each.start()
+    for each in callers:
+        each.join(LIMIT_S)
+        assert not each.is_alive()
+
+    async def tell() -> None:
+        one.call(ended.append, "from a coroutine")
+
+    one.post(time.sleep, 0.05)
+    asyncio.run(tell())
+    for each in threads:
+        each.call(lambda: None)
+        each.stop()
+        each.join()
+    assert ended == ["called", "called", "from a coroutine"]
+
+
+def test_listeners_added_from_many_threads_are_all_there() -> None:
+    observed = HasObservers()
+    start = threading.Barrier(4)
+
+    def add() -> None:
+        start.wait(LIMIT_S)
+        for _ in range(200):
+            observed.add_attribute_listener("x", lambda *_: None)
+
+    adders = [threading.Thread(target=add) for _ in range(4)]
+    for each in adders:
+        each.start()
+    for each in adders:
+        each.join(LIMIT_S)
+    assert len(observed._attribute_listeners["x"]) == 800

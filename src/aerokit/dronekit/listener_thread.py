@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import logging
 import queue
 import threading
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -14,7 +17,7 @@ logger = logging.getLogger("dronekit")
 
 MOST_WAITING = 10_000
 """What a listener that does not come back lets wait at most; values that come again and again are dropped then."""
-JOIN_S = 2.0
+JOIN_S = CALL_S = 2.0
 
 
 class ListenerThread:
@@ -48,9 +51,16 @@ class ListenerThread:
         self._dropped += 1
 
     def call(self, function: Callable[..., object], *args: Any) -> None:
-        """Have it called, and wait until it was: at once on this thread itself and when the thread has ended."""
+        """Have it called, and wait until it was: at once on this thread itself and when the thread has ended.
+
+        Not waited for on the threads of event loops and of other listeners, which callbacks may be waiting for, and for
+        two seconds at most elsewhere: the caller may hold what a callback wants.
+        """
         if self.is_current or self._is_stopped:
             function(*args)
+            return
+        if _must_not_wait():
+            self.post(function, *args)
             return
         called = threading.Event()
 
@@ -61,8 +71,10 @@ class ListenerThread:
                 called.set()
 
         self.post(call_and_tell)
+        end = time.monotonic() + CALL_S
         while not called.wait(0.2) and not self.is_stopped:  # in slices, for Ctrl-C on every system
-            pass
+            if time.monotonic() > end:
+                break
 
     @property
     def is_stopped(self) -> bool:
@@ -93,7 +105,7 @@ class ListenerThread:
     def _start(self) -> None:
         with self._lock:
             if self._thread is None and not self._is_stopped:
-                thread = threading.Thread(target=self._run, name=self._name, daemon=True)
+                thread = _Thread(target=self._run, name=self._name, daemon=True)
                 try:
                     thread.start()
                 except RuntimeError:  # the interpreter is ending: there is nobody left to be called
@@ -110,6 +122,19 @@ class ListenerThread:
                 function(*args)
             except BaseException:  # sys.exit() in a callback would end the callbacks, and nothing else
                 logger.exception("Exception in a callback")
+
+
+class _Thread(threading.Thread):
+    """One on which callbacks run."""
+
+
+def _must_not_wait() -> bool:
+    if isinstance(threading.current_thread(), _Thread):
+        return True
+    with contextlib.suppress(RuntimeError):
+        asyncio.get_running_loop()
+        return True
+    return False
 
 
 def _nothing() -> None:

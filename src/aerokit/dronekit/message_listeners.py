@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import threading
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -39,22 +40,28 @@ class MessageListeners:
         self._owner, self._handler = owner, handler
         self._listeners: dict[str, tuple[MessageListener, ...]] = {}
         self._detach: dict[str, Detach] = {}
+        self._lock = threading.Lock()
         self._is_started = False
 
     def add(self, name: str, listener: MessageListener) -> None:
         """Have it called for every message of this name, or for every message (``'*'``); not twice."""
         name = str(name)
-        present = self._listeners.get(name, ())
-        if listener not in present:
+        with self._lock:
+            present = self._listeners.get(name, ())
+            if listener in present:
+                return
             self._listeners[name] = (*present, listener)
-            self._attach_now()
+        self._attach_now()
 
     def remove(self, name: str, listener: MessageListener) -> None:
         """Call it no more; silent when it does not listen."""
-        left = tuple(each for each in self._listeners.get(name, ()) if each != listener)
-        if left:
-            self._listeners[name] = left
-        elif self._listeners.pop(name, None) is not None:
+        with self._lock:
+            left = tuple(each for each in self._listeners.get(name, ()) if each != listener)
+            if left:
+                self._listeners[name] = left
+                return
+            was_there = self._listeners.pop(name, None) is not None
+        if was_there:
             self._attach_now()
 
     def notify(self, name: str, message: Any) -> None:
@@ -75,7 +82,10 @@ class MessageListeners:
 
     def _attach_now(self) -> None:
         """Wait for it, so that whatever comes once a listener was added is heard."""
-        if self._is_started:
+        if self._handler.loop.is_current:
+            if self._is_started:
+                self._attach()
+        elif self._is_started:
             with contextlib.suppress(AerokitError):  # the connection is closed: nothing will come
                 self._handler.loop.call(self._attach)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -19,6 +20,9 @@ AttributeListener = Callable[[Any, str, Any], object]
 ListenerT = TypeVar("ListenerT", bound=AttributeListener)
 
 EVERY_NAME = "*"
+
+_changing = threading.Lock()
+"""Held while listeners are added and removed."""
 
 
 class HasObservers:
@@ -41,10 +45,12 @@ class HasObservers:
         they change. ``'*'`` is every name. A listener that is there already is not added again; names are not checked,
         since programs tell of attributes of their own.
         """
-        present = self._attribute_listeners.get(attr_name, ())
-        if observer not in present:
+        with _changing:
+            present = self._attribute_listeners.get(attr_name, ())
+            if observer in present:
+                return
             self._attribute_listeners[attr_name] = (*present, observer)
-            self._dk_review()
+        self._dk_review()
 
     def remove_attribute_listener(self, attr_name: str, observer: AttributeListener) -> None:
         """Call it no more. Silent when nobody listens to the name.
@@ -52,16 +58,17 @@ class HasObservers:
         Raises:
             ValueError: others listen to the name, but this one does not.
         """
-        present = self._attribute_listeners.get(attr_name)
-        if present is None:
-            return
-        if observer not in present:
-            raise ValueError(f"{observer!r} does not listen to {attr_name!r}")
-        left = tuple(each for each in present if each != observer)
-        if left:
-            self._attribute_listeners[attr_name] = left
-        else:
-            del self._attribute_listeners[attr_name]
+        with _changing:
+            present = self._attribute_listeners.get(attr_name)
+            if present is None:
+                return
+            if observer not in present:
+                raise ValueError(f"{observer!r} does not listen to {attr_name!r}")
+            left = tuple(each for each in present if each != observer)
+            if left:
+                self._attribute_listeners[attr_name] = left
+            else:
+                del self._attribute_listeners[attr_name]
         self._dk_review()
 
     def on_attribute(self, name: str | list[str] | tuple[str, ...]) -> Callable[[ListenerT], ListenerT]:
