@@ -76,6 +76,8 @@ def read_rest(process: subprocess.Popen[str]) -> str:
         ["sim", "--home", "91,0,0"],
         ["sim", "--home", "47.4,8.5"],
         ["sim", "--home", "47.4,8.5,nan"],
+        ["sim", "--parameter", "MNT1_TYPE"],
+        ["sim", "--parameter", "MNT1_TYPE=servo"],
     ],
     ids=" ".join,
 )
@@ -215,12 +217,20 @@ def in_the_air(address: str, directory: Path, *, side_m: float = 30) -> Iterator
 # ---------------------------------------------------------------------------------------- sim
 
 
+def test_sim_refuses_a_parameter_that_the_vehicle_has_not(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["sim", "--parameter", "NO_SUCH=1"]) == 2
+    assert "NO_SUCH" in capsys.readouterr().err
+
+
 @posix_only
 def test_sim_serves_until_ctrl_c() -> None:
-    with program("sim", "tcpin:127.0.0.1:0", "--system-id", "9", "--speedup", "20") as process:
+    with program(
+        "sim", "tcpin:127.0.0.1:0", "--system-id", "9", "--speedup", "20", "--parameter", "rtl_alt=2000"
+    ) as process:
         address = read_until(process, "aerokit demo --connect").split()[-1]
         with aerokit.sync.connect(address) as vehicle:
             assert vehicle.system_id == 9
+            assert vehicle.parameters.get("RTL_ALT") == 2000
         process.send_signal(signal.SIGINT)
         assert read_rest(process) == "stopped\n"
         assert process.returncode == 0

@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING
 from aerokit import geo
 from aerokit.errors import LocalProtocolError
 from aerokit.links import parse_address
+from aerokit.parameters import check_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = ["address", "directory", "home", "number", "system_id", "writable_file"]
+__all__ = ["address", "directory", "home", "number", "parameter", "system_id", "writable_file"]
 
 
 def address(text: str) -> str:
@@ -39,6 +40,15 @@ def number(low: float, high: float) -> Callable[[str], float]:
         return value
 
     return parse
+
+
+def parameter(text: str) -> tuple[str, float]:
+    """``NAME=VALUE``."""
+    name, _, value = text.partition("=")
+    try:
+        return check_name(name.upper()), float(value)
+    except ValueError:
+        raise ArgumentTypeError(f"{text!r} is not NAME=VALUE, a parameter and a number") from None
 
 
 def system_id(text: str) -> int:

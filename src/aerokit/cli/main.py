@@ -8,7 +8,7 @@ import os
 import sys
 from typing import TYPE_CHECKING
 
-from aerokit.cli.arguments import address, home, number, system_id, writable_file
+from aerokit.cli.arguments import address, home, number, parameter, system_id, writable_file
 from aerokit.cli.files import add_files
 from aerokit.cli.logs import add_logs
 from aerokit.cli.mission import add_mission
@@ -146,6 +146,15 @@ def _add_sim(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         help="degrees and metres above the sea (47.397742,8.545594,488)",
     )
     sim.add_argument("--seed", type=int, default=0, help="of its noise (0)")
+    sim.add_argument(
+        "--parameter",
+        action="append",
+        type=parameter,
+        default=[],
+        dest="parameters",
+        metavar="NAME=VALUE",
+        help="other than its default, several times if need be: MNT1_TYPE=1 fits a gimbal to the copter",
+    )
 
 
 def _add_vehicle(command: argparse.ArgumentParser) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import sys
 from typing import TYPE_CHECKING
 
 from aerokit.cli.interrupt import on_interrupt
@@ -20,9 +21,18 @@ CLIENTS_USE = {"tcpin": "tcp", "udpout": "udpin", "udpbcast": "udpin", "udpin": 
 
 async def run_sim(options: argparse.Namespace) -> int:
     """Serve it until interrupted."""
-    vehicle = simulated_vehicle(
-        options.vehicle, system_id=options.system_id, home=options.home, seed=options.seed, boot_text=True
-    )
+    try:
+        vehicle = simulated_vehicle(
+            options.vehicle,
+            system_id=options.system_id,
+            home=options.home,
+            seed=options.seed,
+            boot_text=True,
+            parameters=dict(options.parameters),
+        )
+    except KeyError as error:
+        print(f"the simulated {options.vehicle} has no parameter {error}", file=sys.stderr)
+        return 2
     stop = asyncio.Event()
     with on_interrupt(stop.set):
         async with open_simulator(vehicle, *options.addresses, speedup=options.speedup) as simulator:

@@ -22,10 +22,13 @@ def simulated_vehicle(
     home: tuple[float, float, float] = HOME,
     seed: int = 0,
     boot_text: bool = False,
+    parameters: dict[str, float] | None = None,
 ) -> SimulatedVehicle:
     """An ArduCopter ("copter") or a PX4 quadrotor ("px4"), just switched on."""
     from aerokit.sim import SimulatedCopter, SimulatedPx4
 
     if name == "px4":
-        return SimulatedPx4(system_id=system_id, home=home, seed=seed)
-    return SimulatedCopter(system_id=system_id, home=home, seed=seed, boot_text=boot_text)
+        return SimulatedPx4(system_id=system_id, home=home, seed=seed, parameters=parameters)
+    return SimulatedCopter(
+        system_id=system_id, home=home, seed=seed, boot_text=boot_text, parameters=parameters
+    )
