@@ -263,11 +263,11 @@ def test_telling_listeners_never_waits_for_what_waits_for_it() -> None:
         threading.Thread(target=each.call, args=(meet_and_call, other))
         for each, other in ((one, two), (two, one))
     ]
-    for each in callers:
-        each.start()
-    for each in callers:
-        each.join(LIMIT_S)
-        assert not each.is_alive()
+    for caller in callers:
+        caller.start()
+    for caller in callers:
+        caller.join(LIMIT_S)
+        assert not caller.is_alive()
 
     async def tell() -> None:
         one.call(ended.append, "from a coroutine")

@@ -43,6 +43,8 @@ def until(condition: Callable[[], object]) -> None:
         pytest.param((1, 191), {"type": 18, "autopilot": 8}, id="companion"),
         pytest.param((1, 191), {"type": 18, "autopilot": 0}, id="companion that says it is an autopilot"),
         pytest.param((2, 1), {"type": 2, "autopilot": 3}, id="another copter"),
+        pytest.param((1, 1), {"type": 6, "autopilot": 8}, id="ground station that took the autopilot's ids"),
+        pytest.param((1, 1), {"type": 18, "autopilot": 8}, id="companion that took the autopilot's ids"),
         pytest.param((51, 68), {"type": 6, "autopilot": 8}, id="radio"),
     ],
 )

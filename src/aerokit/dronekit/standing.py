@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit.errors import CommandTimeout
 from aerokit.mavlink.messages import Heartbeat
+from aerokit.runtime.diagnosis import is_autopilot
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterator
@@ -117,12 +118,12 @@ class Standing:
     def watching(self, vehicle: Vehicle) -> Iterator[None]:
         """Look at the vehicle's heartbeats for the time of the block (loop thread)."""
         latest = vehicle.connection.heard.get((vehicle.system_id, vehicle.component_id))
-        if latest is not None:
+        if latest is not None and is_autopilot(latest):
             self._told = _state(latest)
 
         def take(heartbeat: Heartbeat) -> None:
             frame = heartbeat.received_frame
-            if frame is not None and frame.component_id == vehicle.component_id:
+            if frame is not None and frame.component_id == vehicle.component_id and is_autopilot(heartbeat):
                 self._take(*_state(heartbeat))
 
         detach = vehicle.connection.bus.attach(Heartbeat, take, system_id=vehicle.system_id)

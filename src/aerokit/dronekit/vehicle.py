@@ -29,6 +29,7 @@ from aerokit.dronekit.streams import request_streams
 from aerokit.errors import AerokitError, ConnectFailed, LocalProtocolError, OperationTimeout
 from aerokit.mavlink.messages import CommandLong
 from aerokit.runtime.background import Background
+from aerokit.runtime.diagnosis import is_autopilot
 from aerokit.vehicle.connect import connect as connect_async
 
 if TYPE_CHECKING:
@@ -376,6 +377,8 @@ class Vehicle(FlightMethods, Maintenance, Readiness, VehiclePrivates):
             starter()
 
     def _dk_on_heartbeat(self, message: Any) -> None:
+        if not is_autopilot(message):  # a ground station or a companion that took the autopilot's ids
+            return
         self._handler.follow_version(message)
         super()._dk_on_heartbeat(message)
 

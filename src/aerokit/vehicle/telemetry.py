@@ -11,6 +11,7 @@ from aerokit.autopilots import DEFAULT_RATES_HZ, Autopilot, autopilot_for, is_ar
 from aerokit.mavlink import messages
 from aerokit.mavlink.enums import MavLandedState, MavProtocolCapability, MavState, MavVtolState
 from aerokit.runtime.cells import Source, StateCell
+from aerokit.runtime.diagnosis import is_autopilot
 from aerokit.vehicle import decoding
 from aerokit.vehicle.feeds import FEEDS, MESSAGE_IDS, message_type
 from aerokit.vehicle.status_text import StatusTextAssembler
@@ -286,6 +287,8 @@ class Telemetry:
     # ------------------------------------------------------------------------- mode and state
 
     def _on_heartbeat(self, message: messages.Heartbeat, source: Source) -> None:
+        if not is_autopilot(message):  # a ground station or a companion that took the autopilot's ids
+            return
         if not self._knows_autopilot:
             self._learn_autopilot(message)
         self._base_mode = message.base_mode
