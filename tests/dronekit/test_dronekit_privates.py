@@ -77,3 +77,10 @@ def test_a_subclass_may_have_its_own(stage: Stage) -> None:
     stage.tell("ATTITUDE", yaw=3.0)
     assert stage.vehicle._yaw == "mine"
     assert stage.vehicle.attitude.yaw == 3
+
+
+def test_types_are_written_by_programs(stage: Stage) -> None:
+    """DroneKit's own tests do, with those of a ground station."""
+    stage.vehicle._vehicle_type, stage.vehicle._autopilot_type = 6, 8
+    assert stage.vehicle._is_mode_available(0) in (True, False)
+    assert str(stage.vehicle.version).startswith("UnknownAutoPilotUnknownVehicleType6-")

@@ -197,11 +197,11 @@ class VehicleAttributes(HasObservers):
         """Seconds since the autopilot's last HEARTBEAT; None before the first."""
         return None if self._dk_aio is None else self._dk_aio.heartbeat_age
 
-    @property
+    @Shadowable
     def _autopilot_type(self) -> int | None:
         return None if self._dk_heartbeat is None else self._dk_heartbeat.autopilot
 
-    @property
+    @Shadowable
     def _vehicle_type(self) -> int | None:
         return None if self._dk_heartbeat is None else self._dk_heartbeat.type
 
