@@ -34,6 +34,10 @@ def track_of(path: str, spacing: float, lowest: float) -> list[LocationGlobalRel
     return track
 
 
+def here(vehicle: Vehicle) -> LocationGlobalRelative:
+    return vehicle.location.global_relative_frame
+
+
 def upload(vehicle: Vehicle, track: list[LocationGlobalRelative]) -> None:
     commands = vehicle.commands
     commands.clear()
@@ -57,7 +61,7 @@ def main() -> None:
     if not track:
         raise SystemExit("nothing flies in this recording")
     vehicle = connect(options.connect, wait_ready=True)
-    way = distance(vehicle.location.global_relative_frame, track[0])
+    way = distance(here(vehicle), track[0])
     if way > options.farthest:
         raise SystemExit(f"the flight began {way:.0f} m from here")
     print(f"{len(track)} waypoints")
@@ -69,9 +73,8 @@ def main() -> None:
     vehicle.wait_simple_takeoff(track[0].alt, epsilon=0.5, timeout=60)
     vehicle.commands.next = 1
     vehicle.mode = VehicleMode("MISSION" if options.px4 else "AUTO")
-    last = track[-1]
-    while distance(vehicle.location.global_relative_frame, last) > 2.0:
-        print(f"to waypoint {vehicle.commands.next}, {vehicle.location.global_relative_frame}")
+    while vehicle.commands.next < len(track) or distance(here(vehicle), track[-1]) > 2.0:
+        print(f"to waypoint {vehicle.commands.next}, {here(vehicle)}")
         time.sleep(POLL_S)
     print("at the end of the track")
     vehicle.mode = VehicleMode("RTL")

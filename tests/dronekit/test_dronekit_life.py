@@ -332,7 +332,8 @@ def test_a_subclass_calls_its_own_things_what_it_likes(address: str) -> None:
         def _tell(self) -> None: ...
         def _check_link(self) -> None: ...
 
-    with dronekit.connect(address, wait_ready=True, vehicle_class=Own) as vehicle:
+    with dronekit.connect(address, wait_ready=True, vehicle_class=Own) as connected:
+        vehicle: Any = connected
         assert vehicle.wind == vehicle.aio == vehicle.sync == "mine"
         vehicle.wait_for_mode("ALT_HOLD", timeout=LIMIT_S)
         assert vehicle.parameters["RTL_ALT"] is not None
@@ -346,3 +347,22 @@ def test_connecting_waits_for_the_first_values(address: str, monkeypatch: pytest
         assert vehicle.location.global_relative_frame.alt is not None
         assert vehicle.attitude.yaw is not None
         assert vehicle.battery.voltage is not None
+
+
+@pytest.mark.parametrize("wrong", [None, 14550, b"udp:127.0.0.1:14550"])
+def test_what_is_no_connection_string(wrong: Any) -> None:
+    with pytest.raises(ValueError, match="is no connection string"):
+        dronekit.connect(wrong)
+
+
+def test_errors_say_what_is_missing(vehicle: dronekit.Vehicle) -> None:
+    with pytest.raises(dronekit.TimeoutError) as waited:
+        vehicle.wait_ready("mode", "batery", timeout=0.01)
+    assert str(waited.value) == "wait_ready experienced a timeout after 0.01 seconds."
+    assert str(waited.value.__cause__) == "never told: batery"
+    with pytest.raises(KeyError) as wrong:
+        vehicle.mode = dronekit.VehicleMode("GIUDED")
+    assert wrong.value.args == ("GIUDED",)
+    assert "GUIDED" in str(wrong.value.__cause__)
+    with pytest.raises(dronekit.TimeoutError, match=r"within 0\.01 s"):
+        vehicle.wait_for(lambda: False, timeout=0.01)

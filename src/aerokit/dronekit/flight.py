@@ -324,7 +324,7 @@ class FlightMethods(VehicleAttributes):
         while not condition():
             self._dk_check_link()
             if time.monotonic() >= deadline:
-                raise TimeoutError(errmsg)
+                raise TimeoutError(errmsg or f"what was waited for was not true within {timeout:g} s")
             self._dk_pause(min(interval, max(deadline - time.monotonic(), 0.0)))
 
     def wait_for_armable(self, timeout: float | None = None) -> None:

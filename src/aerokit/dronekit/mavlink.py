@@ -18,7 +18,8 @@ from aerokit.dronekit.exceptions import APIException
 from aerokit.dronekit.listener_thread import ListenerThread
 from aerokit.dronekit.orders import Orders
 from aerokit.dronekit.standing import Given
-from aerokit.errors import AerokitError, ConnectionClosed, LinkOpenError
+from aerokit.errors import AerokitError, ConnectionClosed, LinkOpenError, LocalProtocolError
+from aerokit.links.address import ACCEPTED_FORMS
 from aerokit.links.reconnecting import ReconnectingLink
 
 if TYPE_CHECKING:
@@ -285,6 +286,8 @@ def connections_made() -> Iterator[list[MAVConnection]]:
 
 def _open(ip: str, baud: int, source_system: int, source_component: int) -> sync.Connection:
     """Open it; what refuses at first may be a simulator that the program has just started."""
+    if not isinstance(ip, str):
+        raise LocalProtocolError(f"ip = {ip!r} is no connection string; accepted are\n{ACCEPTED_FORMS}")
     for attempt in range(ATTEMPTS):
         try:
             return sync.open_connection(

@@ -67,7 +67,9 @@ def mode_order(vehicle: Vehicle, mode: str | int) -> Order:
 def _custom_mode(vehicle: Vehicle, mode: str) -> int:
     try:
         return vehicle.autopilot.find_mode(mode, vehicle.telemetry.mode_names).custom_mode
-    except (LocalProtocolError, AttributeError, TypeError):
+    except LocalProtocolError as error:  # it lists the modes there are
+        raise KeyError(mode) from error
+    except (AttributeError, TypeError):
         raise KeyError(mode) from None
 
 

@@ -68,7 +68,8 @@ class Readiness:
             now = time.monotonic()
             if now >= deadline:
                 if raise_exception:
-                    raise TimeoutError(f"wait_ready experienced a timeout after {timeout} seconds.")
+                    error = TimeoutError(f"wait_ready experienced a timeout after {timeout} seconds.")
+                    raise error from LookupError(f"never told: {', '.join(sorted(missing))}")
                 return False
             self._dk_check_link()
             if (failure := self._dk_failure_of(missing)) is not None:
