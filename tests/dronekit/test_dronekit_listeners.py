@@ -92,7 +92,12 @@ def test_what_waits_behind_a_stuck_listener_is_bounded(
     monkeypatch.setattr(listener_thread, "MOST_WAITING", 5)
     may_go_on, seen = threading.Event(), list[object]()
     is_stuck = threading.Event()
-    thread.post(lambda: (is_stuck.set(), may_go_on.wait(LIMIT_S)))
+
+    def be_stuck() -> None:
+        is_stuck.set()
+        may_go_on.wait(LIMIT_S)
+
+    thread.post(be_stuck)
     assert is_stuck.wait(LIMIT_S)
     for number in range(20):
         thread.offer(seen.append, number)

@@ -110,6 +110,6 @@ def _is_at(cmd: Command, home: LocationGlobal | None) -> bool:
         return False
     try:
         away = max(abs(cmd.x - home.lat), abs(cmd.y - home.lon) * math.cos(math.radians(home.lat)))
-        return away <= AT_HOME_DEG and abs(cmd.z - home.alt) <= AT_HOME_M
+        return bool(away <= AT_HOME_DEG and abs(cmd.z - home.alt) <= AT_HOME_M)
     except TypeError:  # no numbers: told when it is uploaded
         return False
