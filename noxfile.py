@@ -1,4 +1,4 @@
-"""Sessions: tests (each Python that is there), lint, types, docs, bench and bench_…, badlinks, demo.
+"""Sessions: tests (each Python that is there), lint, types, docs, bench and bench_…, badlinks, dronekit, demo.
 
 `nox -l` lists them.
 """
@@ -89,6 +89,14 @@ def badlinks(session: nox.Session) -> None:
     """Judge every transfer over bad radios, 200 seeds of each, and print the table; half an hour and more."""
     session.install("-e", ".[test]")
     session.run("python", "tests/badlink/survey.py", *session.posargs, env={"PYTHONPATH": "tests"})
+
+
+@nox.session(name="dronekit")
+def dronekit_itself(session: nox.Session) -> None:
+    """Have DroneKit 2.9.2 itself play the scenarios of its behaviour that the tests hold aerokit.dronekit to."""
+    session.install("-e", ".[test]", "dronekit==2.9.2", "future")
+    python = {"AEROKIT_DRONEKIT_PYTHON": f"{session.bin}/python"}
+    session.run("pytest", "-q", "tests/dronekit/test_dronekit_behaviour.py", *session.posargs, env=python)
 
 
 @nox.session

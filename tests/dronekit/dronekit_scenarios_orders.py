@@ -193,10 +193,11 @@ def row_14_setting_home(stage: Stage) -> Any:
     x, y, z = sent.params[4:]
     scale = 1e7 if sent.name == "COMMAND_INT" else 1
     home = stage.vehicle.home_location
+    home.lat, home.lon, home.alt = round(home.lat, 4), round(home.lon, 4), round(home.alt)
     relative = stage.dronekit.LocationGlobalRelative(1, 2, 3)
     return (
         [(sent.command, sent.param1, round(x / scale, 4), round(y / scale, 4), z)],
-        str(home).replace("600.0", "600"),
+        str(home),
         home is stage.vehicle.home_location,
         caught(stage.assign("home_location", relative)),
     )

@@ -29,6 +29,7 @@ RELATIVE = "LocationGlobalRelative:lat=-35.363261,lon=149.16523,alt=10.0"
         "version": (520, 1.0),
         "parameters": 1,
     },
+    connect={"rate": 4},
     is_slow=True,
 )
 def row_01_frames_of_a_connect(stage: Stage) -> Any:
@@ -43,7 +44,7 @@ def row_01_frames_of_a_connect(stage: Stage) -> Any:
     }
 
 
-@scenario([], connect={"rate": None}, is_slow=True)
+@scenario([], is_slow=True)
 def row_02_no_rate_asks_for_no_streams(stage: Stage) -> Any:
     stage.fc.wait_for("HEARTBEAT")
     stage.reached()

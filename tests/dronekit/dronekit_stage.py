@@ -179,10 +179,13 @@ def on_stage(
     connect: dict[str, Any] | None = None,
     prepare: Callable[[FlightController], object] = lambda _: None,
 ) -> Iterator[Stage]:
-    """Start a flight controller, connect to it, and close both in the end."""
+    """Start a flight controller, connect to it, and close both in the end.
+
+    Streams are not asked for unless ``connect`` says so: what streams is waited for a moment, and here nothing does.
+    """
     with FlightController(**(controller or {})) as fc:
         prepare(fc)
-        vehicle = dronekit.connect(fc.address, **(connect or {}))
+        vehicle = dronekit.connect(fc.address, **{"rate": None, **(connect or {})})
         try:
             yield Stage(dronekit, fc, vehicle)
         finally:

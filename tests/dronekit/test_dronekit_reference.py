@@ -20,6 +20,7 @@ from flight_controller import FlightController, message_of
 
 import aerokit.dronekit as dronekit
 
+READY = {"rate": 4, "wait_ready": True, "timeout": 10}
 PULSES = {f"chan{number}_raw": 1000 + number for number in range(1, 9)}
 
 for each in OTHER_NAMES:
@@ -52,7 +53,7 @@ def answer_streams(fc: FlightController) -> None:
 @pytest.fixture(scope="module")
 def told() -> Iterator[Stage]:
     """A vehicle that has told everything; tests only read it."""
-    with on_stage(dronekit, {"mode": 4}, {"wait_ready": True, "timeout": 10}, answer_streams) as stage:
+    with on_stage(dronekit, {"mode": 4}, READY, answer_streams) as stage:
         stage.vehicle.wait_ready("ekf_ok", "capabilities", timeout=10)
         stage.settle()
         yield stage
@@ -60,7 +61,7 @@ def told() -> Iterator[Stage]:
 
 @pytest.fixture
 def stage() -> Iterator[Stage]:
-    with on_stage(dronekit, {"mode": 4}, {"wait_ready": True, "timeout": 10}, answer_streams) as each:
+    with on_stage(dronekit, {"mode": 4}, READY, answer_streams) as each:
         each.settle()
         yield each
 

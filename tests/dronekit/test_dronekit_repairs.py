@@ -165,6 +165,11 @@ def test_lost_orders_are_repeated(copter: Stage) -> None:
 # -------------------------------------------------------------------------------- connecting
 
 
+def tell_streams(fc: FlightController) -> None:
+    for name in ("ATTITUDE", "GLOBAL_POSITION_INT", "VFR_HUD", "GPS_RAW_INT", "SYS_STATUS"):
+        fc.tell(name)
+
+
 @pytest.mark.parametrize("address", ["udpin:127.0.0.1:0", "udpin:127.0.0.1"])
 def test_connecting_to_nobody_ends_and_leaves_nothing(address: str) -> None:
     before = threading.active_count()
@@ -186,9 +191,9 @@ def test_connecting_to_a_vehicle_without_parameters_returns() -> None:
 @pytest.mark.parametrize("names", ["mode", ["mode", "armed"], ("attitude",)])
 def test_wait_ready_of_connect_takes_names(names: Any) -> None:
     def prepare(fc: FlightController) -> None:
-        fc.answers["REQUEST_DATA_STREAM"] = lambda _: fc.tell("ATTITUDE", roll=0.5)
+        fc.answers["REQUEST_DATA_STREAM"] = lambda _: tell_streams(fc)
 
-    with on_stage(dronekit, {}, {"wait_ready": names, "timeout": 10}, prepare) as stage:
+    with on_stage(dronekit, {}, {"rate": 4, "wait_ready": names, "timeout": 10}, prepare) as stage:
         assert stage.vehicle.wait_ready(*([names] if isinstance(names, str) else names), timeout=1)
 
 
@@ -197,6 +202,7 @@ def test_wait_ready_of_connect_has_its_timeout() -> None:
     with FlightController() as fc, pytest.raises(dronekit.TimeoutError, match=r"after 0\.3 seconds"):
         dronekit.connect(
             fc.address,
+            rate=None,
             wait_ready=["nosuch", "mode"],
             timeout=0.3,
             still_waiting_callback=missing.update,
@@ -234,6 +240,7 @@ def test_subclass_with_attributes_of_its_own() -> None:
 
 def test_initializing_later() -> None:
     with FlightController(mode=5) as fc:
+        fc.answers["REQUEST_DATA_STREAM"] = lambda _: tell_streams(fc)
         vehicle = dronekit.connect(fc.address, _initialize=False)
         assert (vehicle.armed, vehicle.is_armable, vehicle.system_status) == (False, False, None)
         vehicle.initialize(rate=7, heartbeat_timeout=10)
@@ -246,7 +253,10 @@ def test_initializing_later() -> None:
 
 
 def test_a_link_that_is_lost_comes_back() -> None:
-    with on_stage(dronekit, {"link": "tcp", "mode": 4}) as stage:
+    def prepare(fc: FlightController) -> None:
+        fc.answers["REQUEST_DATA_STREAM"] = lambda _: tell_streams(fc)
+
+    with on_stage(dronekit, {"link": "tcp", "mode": 4}, {"rate": 4}, prepare) as stage:
         streams = len(stage.fc.received("REQUEST_DATA_STREAM"))
         stage.fc.drop()
         stage.fc.custom_mode = 5
@@ -257,7 +267,7 @@ def test_a_link_that_is_lost_comes_back() -> None:
 
 def test_closing_delivers_what_was_ordered() -> None:
     with FlightController(mode=4) as fc:
-        vehicle = dronekit.connect(fc.address)
+        vehicle = dronekit.connect(fc.address, rate=None)
         vehicle.mode = "RTL"
         vehicle.close()
         vehicle.close()
