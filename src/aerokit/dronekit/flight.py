@@ -166,9 +166,11 @@ class FlightMethods(VehicleAttributes):
         Raises:
             ValueError: the altitude is not a finite number.
         """
-        if alt is None:
-            return
-        altitude = float(alt)
+        if alt is not None:
+            self._dk_take_off(float(alt))
+
+    def _dk_take_off(self, altitude: float) -> concurrent.futures.Future[None]:
+        """Altitude above home in metres."""
         if not math.isfinite(altitude):
             raise ValueError("Altitude was NaN or Infinity. Please provide a real number")
         aio = self._dk_check_link()
@@ -178,18 +180,23 @@ class FlightMethods(VehicleAttributes):
             if plan is None or plan.command is None:
                 raise APIException("this vehicle cannot take off by a command")
             standing = self._handler.given.order("motion", mode=PX4_TAKEOFF)
-            self._dk_order("takeoff", take_off, aio, standing, plan.command, *plan.params)
-        else:
-            standing = self._handler.given.order("motion")
-            self._dk_order("takeoff", take_off, aio, standing, NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude)
+            return self._dk_order("takeoff", take_off, aio, standing, plan.command, *plan.params)
+        standing = self._handler.given.order("motion")
+        return self._dk_order("takeoff", take_off, aio, standing, NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude)
 
     def wait_simple_takeoff(
         self, alt: float | None = None, epsilon: float = 0.1, timeout: float | None = None
     ) -> None:
-        """:meth:`simple_takeoff`, then :meth:`wait_for_alt`."""
-        self.simple_takeoff(alt)
+        """:meth:`simple_takeoff`, then wait as :meth:`wait_for_alt` does.
+
+        Raises:
+            ValueError: the altitude is not a finite number.
+            TimeoutError: not within ``timeout`` seconds, or, sooner, the vehicle has refused.
+        """
         if alt is not None:
-            self.wait_for_alt(float(alt), epsilon, timeout=timeout)
+            order = self._dk_take_off(float(alt))
+            is_there = self._dk_passes(float(alt), epsilon, is_relative=True)
+            self._dk_wait_for_order(order, is_there, timeout, "failed to reach specified altitude")
 
     def simple_goto(
         self,
@@ -338,17 +345,22 @@ class FlightMethods(VehicleAttributes):
 
         ``rel``: above home, otherwise above the sea. TimeoutError after ``timeout`` seconds.
         """
+        is_there = self._dk_passes(alt, epsilon, is_relative=rel)
+        self.wait_for(is_there, timeout, errmsg="failed to reach specified altitude")
+
+    def _dk_passes(self, alt: float, epsilon: float, *, is_relative: bool) -> Callable[[], bool]:
+        """Whether the vehicle is at an altitude, or has passed it since this was asked first."""
         start: float | None = None
 
         def is_there() -> bool:
             nonlocal start
-            now = self._dk_altitude(rel)
+            now = self._dk_altitude(is_relative)
             if now is None:
                 return False
             start = now if start is None else start
             return abs(now - alt) <= epsilon or (start < alt <= now) or (now <= alt < start)
 
-        self.wait_for(is_there, timeout, errmsg="failed to reach specified altitude")
+        return is_there
 
     def _dk_altitude(self, is_relative: bool) -> float | None:
         location: Any = self.location  # type: ignore[attr-defined]

@@ -9,7 +9,7 @@ import threading
 from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any
 
-from aerokit.errors import ConnectionClosed
+from aerokit.errors import CommandRejected, ConnectionClosed
 
 if TYPE_CHECKING:
     from aerokit.sync.loop_thread import LoopThread
@@ -35,6 +35,8 @@ class Orders:
         self._tasks: dict[str, asyncio.Task[None]] = {}
         self._pending: set[concurrent.futures.Future[None]] = set()
         self._lock = threading.Lock()
+        self.describe: Callable[[], str] | None = None
+        """What to say of the vehicle when it has refused an order."""
 
     def give(self, kind: str, function: Work, *args: Any, **kwargs: Any) -> concurrent.futures.Future[None]:
         """Start it; what it sends first goes out in the order of these calls. Never blocks; from any thread.
@@ -82,7 +84,7 @@ class Orders:
             before.cancel()
         if not future.set_running_or_notify_cancel():
             return
-        task = asyncio.get_running_loop().create_task(_run(work, future, kind), name=f"dronekit {kind}")
+        task = asyncio.get_running_loop().create_task(self._run(work, future, kind), name=f"dronekit {kind}")
         self._tasks[place] = task
         task.add_done_callback(lambda ended: self._end(place, ended, future))
 
@@ -94,6 +96,24 @@ class Orders:
                 ConnectionClosed(f"{kind}: a newer order replaced it, or the connection was closed")
             )
 
+    async def _run(
+        self, work: Callable[[], Awaitable[None]], future: concurrent.futures.Future[None], kind: str
+    ) -> None:
+        try:
+            await work()
+        except Exception as error:
+            if not isinstance(error, ConnectionClosed):
+                logger.warning("%s: %s%s", kind, error, self._state_at(error))
+            future.set_exception(error)
+        else:
+            future.set_result(None)
+
+    def _state_at(self, error: Exception) -> str:
+        """Most refusals are for not being armed, or for the mode: which the vehicle does not say."""
+        if self.describe is None or not isinstance(error, CommandRejected):
+            return ""
+        return f" ({self.describe()})"
+
     def _call_next(self, function: Callable[..., object], *args: Any) -> None:
         """In the turn in which tasks begun before take their first step."""
         asyncio.get_running_loop().call_soon(function, *args)
@@ -101,16 +121,3 @@ class Orders:
     def _forget(self, future: concurrent.futures.Future[None]) -> None:
         with self._lock:
             self._pending.discard(future)
-
-
-async def _run(
-    work: Callable[[], Awaitable[None]], future: concurrent.futures.Future[None], kind: str
-) -> None:
-    try:
-        await work()
-    except Exception as error:
-        if not isinstance(error, ConnectionClosed):
-            logger.warning("%s: %s", kind, error)
-        future.set_exception(error)
-    else:
-        future.set_result(None)

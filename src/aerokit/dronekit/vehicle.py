@@ -356,6 +356,7 @@ class Vehicle(FlightMethods, Maintenance, Readiness, VehiclePrivates):
         self._dk_aio = aio
         self._handler.target_system = aio.system_id
         self._handler.master.vehicle = self
+        self._handler.orders.describe = self._dk_describe
         for message_type, stream in self._dk_streams.items():
             stream.begin(aio.component_id)
             detach = aio.connection.bus.attach_frames(message_type, stream.take, system_id=aio.system_id)
@@ -398,6 +399,9 @@ class Vehicle(FlightMethods, Maintenance, Readiness, VehiclePrivates):
                 return
             aio.send(CommandLong(aio.system_id, 0, REQUEST_AUTOPILOT_CAPABILITIES, 0, 1, *(0.0,) * 6))
             await anyio.sleep(1.0)
+
+    def _dk_describe(self) -> str:
+        return f"the vehicle is {'armed' if self._armed else 'disarmed'}, in {self._flightmode}"
 
     def _dk_wait_until_booted(self, timeout: float) -> None:
         try:
