@@ -7,11 +7,11 @@ import atexit
 import concurrent.futures
 import contextlib
 import functools
+import os
 import threading
 from typing import TYPE_CHECKING, Any, Generic, ParamSpec, TypeVar
 
 import anyio
-from anyio.from_thread import BlockingPortal
 
 from aerokit.errors import BusyError, ConnectionClosed
 
@@ -35,14 +35,14 @@ class LoopThread:
     """One asyncio loop on one thread. The thread does not keep the interpreter alive; at its exit it is closed."""
 
     def __init__(self) -> None:
-        started: concurrent.futures.Future[tuple[BlockingPortal, asyncio.AbstractEventLoop]]
+        started: concurrent.futures.Future[tuple[_Calls, asyncio.AbstractEventLoop]]
         started = concurrent.futures.Future()
         self._thread = threading.Thread(target=_run, args=(started,), name="aerokit loop", daemon=True)
         self._thread.start()
-        self._portal, self._loop = started.result()
+        self._calls, self._loop = started.result()
         self._is_closed = False
-        self._lock = threading.Lock()
-        self._stopping: asyncio.Task[None] | None = None
+        self._process = os.getpid()
+        self._lock = threading.Lock()  # nothing waits while it is held: the loop's thread takes it, too
         atexit.register(self.close)
 
     def run(self, function: Callable[P, Awaitable[T]], /, *args: P.args, **kwargs: P.kwargs) -> T:
@@ -111,8 +111,7 @@ class LoopThread:
             ConnectionClosed: the loop was closed.
         """
         with self._lock:
-            if self._is_closed:
-                raise ConnectionClosed("the connection was closed")
+            self._check()
             self._loop.call_soon_threadsafe(functools.partial(function, *args, **kwargs))
 
     def hold_open(self, context: AbstractAsyncContextManager[T]) -> Held[T]:
@@ -125,13 +124,12 @@ class LoopThread:
             if self._is_closed:
                 return
             self._is_closed = True
+            if self._process == os.getpid():
+                with contextlib.suppress(RuntimeError):  # it has stopped by itself
+                    self._loop.call_soon_threadsafe(self._calls.end.set)
         atexit.unregister(self.close)
-        if self.is_current:
-            self._stopping = asyncio.get_running_loop().create_task(self._portal.stop(True))
-            return
-        with contextlib.suppress(RuntimeError):  # it has stopped by itself
-            self._portal.start_task_soon(self._portal.stop, True)
-        self._thread.join(CLOSE_S)
+        if not self.is_current:
+            self._thread.join(CLOSE_S)
 
     @property
     def is_current(self) -> bool:
@@ -150,10 +148,19 @@ class LoopThread:
                 "a blocking call on the loop's own thread would wait for itself: predicates and callbacks run there;"
                 " call it from another thread"
             )
+        future: concurrent.futures.Future[T] = concurrent.futures.Future()
         with self._lock:
-            if self._is_closed:
-                raise ConnectionClosed("the connection was closed")
-            return self._portal.start_task_soon(function)
+            self._check()
+            self._loop.call_soon_threadsafe(self._calls.begin, function, future)
+        return future
+
+    def _check(self) -> None:
+        if self._is_closed:
+            raise ConnectionClosed("the connection was closed")
+        if self._process != os.getpid():
+            raise ConnectionClosed(
+                "the connection belongs to the process that opened it, and not to its children"
+            )
 
 
 class Held(Generic[T]):
@@ -192,12 +199,63 @@ class Held(Generic[T]):
         return self._opened.result()
 
 
-def _run(started: concurrent.futures.Future[tuple[BlockingPortal, asyncio.AbstractEventLoop]]) -> None:
+class _Calls:
+    """What runs on the loop for other threads, until the end."""
+
+    def __init__(self) -> None:
+        self.end = asyncio.Event()
+        self._tasks: dict[asyncio.Task[None], anyio.CancelScope] = {}
+
+    def begin(self, function: Callable[[], Awaitable[T]], future: concurrent.futures.Future[T]) -> None:
+        """Await it in a task; the future is told what comes of it, and cancels it."""
+        scope = anyio.CancelScope()
+        task = asyncio.get_running_loop().create_task(_live(function, future, scope))
+        self._tasks[task] = scope
+        task.add_done_callback(self._tasks.pop)
+
+    async def live(self) -> None:
+        """Wait for the end, and then for that of everything that was begun."""
+        await self.end.wait()
+        while self._tasks:
+            for scope in self._tasks.values():
+                scope.cancel()
+            await asyncio.wait(tuple(self._tasks))
+
+
+async def _live(
+    function: Callable[[], Awaitable[T]], future: concurrent.futures.Future[T], scope: anyio.CancelScope
+) -> None:
+    loop = asyncio.get_running_loop()
+
+    def cancel_with(ended: concurrent.futures.Future[T]) -> None:
+        if ended.cancelled():
+            with contextlib.suppress(RuntimeError):  # the loop is closed
+                loop.call_soon_threadsafe(scope.cancel)
+
+    future.add_done_callback(cancel_with)
+    with scope:
+        try:
+            result = await function()
+        except asyncio.CancelledError:
+            future.cancel()
+            raise
+        except BaseException as error:  # sys.exit() too: it is the caller's, and not the loop's
+            _tell(future.set_exception, error)
+        else:
+            _tell(future.set_result, result)
+
+
+def _tell(setter: Callable[[T], None], value: T) -> None:
+    with contextlib.suppress(concurrent.futures.InvalidStateError):  # it was cancelled just then
+        setter(value)
+
+
+def _run(started: concurrent.futures.Future[tuple[_Calls, asyncio.AbstractEventLoop]]) -> None:
     """What the thread does."""
 
     async def main() -> None:
-        async with BlockingPortal() as portal:
-            started.set_result((portal, asyncio.get_running_loop()))
-            await portal.sleep_until_stopped()
+        calls = _Calls()
+        started.set_result((calls, asyncio.get_running_loop()))
+        await calls.live()
 
     anyio.run(main)
