@@ -164,6 +164,15 @@ def message_listener_that_raises(stage: Stage) -> Any:
     return calls, lines
 
 
+@scenario(["one X 1", "every X 1"])
+def message_listeners_told_by_the_program(stage: Stage) -> Any:
+    calls: list[str] = []
+    stage.vehicle.add_message_listener("*", lambda _, name, value: calls.append(f"every {name} {value}"))
+    stage.vehicle.add_message_listener("X", lambda _, name, value: calls.append(f"one {name} {value}"))
+    stage.vehicle.notify_message_listeners("X", 1)
+    return [call for call in calls if " X " in call]
+
+
 @scenario((["a 1", "a 1", "b 1", "b 2"], True))
 def own_attributes(stage: Stage) -> Any:
     events = stage.listen("a", "b")

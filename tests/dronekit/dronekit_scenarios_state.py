@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from operator import attrgetter
 from typing import Any
 
 from dronekit_stage import Stage, caught, scenario
@@ -59,6 +60,36 @@ def row_02_rate_and_source(stage: Stage) -> Any:
 
 
 # --------------------------------------------------------------------------------------- values
+
+
+@scenario(
+    {
+        "armed": "False",
+        "is_armable": "False",
+        "ekf_ok": "False",
+        "velocity": "[None, None, None]",
+        "attitude": "Attitude:pitch=None,yaw=None,roll=None",
+        "heading": "None",
+        "airspeed": "None",
+        "groundspeed": "None",
+        "gps_0": "GPSInfo:fix=None,num_sat=None",
+        "battery": "None",
+        "rangefinder": "Rangefinder: distance=None, voltage=None",
+        "gimbal": "Gimbal: pitch=None, roll=None, yaw=None",
+        "mount_status": "[None, None, None]",
+        "channels": str(dict.fromkeys(map(str, range(1, 9)))),
+        "home_location": "None",
+        "location.global_frame": "LocationGlobal:lat=None,lon=None,alt=None",
+        "location.global_relative_frame": "LocationGlobalRelative:lat=None,lon=None,alt=None",
+        "location.local_frame": "LocationLocal:north=None,east=None,down=None",
+    },
+    prepare=lambda fc: setattr(fc, "home", None),
+)
+def attributes_before_there_is_data(stage: Stage) -> Any:
+    names = "armed is_armable ekf_ok velocity attitude heading airspeed groundspeed gps_0 battery rangefinder gimbal"
+    frames = "location.global_frame location.global_relative_frame location.local_frame"
+    every = [*names.split(), "mount_status", "channels", "home_location", *frames.split()]
+    return {name: str(attrgetter(name)(stage.vehicle)) for name in every}
 
 
 @scenario(("GUIDED", True, True, False, "VehicleMode:GUIDED"))
@@ -278,3 +309,25 @@ def system_status(stage: Stage) -> Any:
         status = stage.vehicle.system_status
         seen.append((status and status.state, status and str(status)))
     return seen
+
+
+@scenario([("gimbal", "Gimbal: pitch=-45.0, roll=1.0, yaw=90.0")], controller={"version": 2}, is_kept=False)
+def mount_orientation(stage: Stage) -> Any:
+    """Of MAVLink 2 only, under which DroneKit is not played."""
+    events = stage.listen("mount", "gimbal")
+    stage.tell("MOUNT_ORIENTATION", pitch=-45, roll=1, yaw=90, yaw_absolute=90)
+    return [(name, value) for _, name, value in events]
+
+
+@scenario([])
+def messages_that_tell_nothing(stage: Stage) -> Any:
+    stage.settle()
+    events = stage.listen("*")
+    stage.fc.tell("STATUSTEXT", severity=6, text=b"hello")
+    stage.fc.tell("COMMAND_ACK", command=31000, result=0)
+    stage.fc.tell("MISSION_ACK", type=0)
+    stage.fc.tell("MISSION_CURRENT", seq=3)
+    stage.fc.beat()
+    stage.settle()
+    told_anyway = ("autopilot_version", "home_location", "parameters")  # asked for when the program connected
+    return [name for _, name, _ in events if name not in told_anyway]

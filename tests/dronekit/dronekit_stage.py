@@ -10,6 +10,7 @@ import itertools
 import json
 import logging
 import threading
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
@@ -27,6 +28,7 @@ __all__ = [
     "plain",
     "play",
     "scenario",
+    "until",
 ]
 
 PATIENCE_S = 10.0
@@ -210,6 +212,14 @@ def caught(action: Callable[[], object]) -> str:
 def plain(value: Any) -> str:
     """A value as text."""
     return "Locations" if type(value).__name__ == "Locations" else str(value)
+
+
+def until(condition: Callable[[], object]) -> None:
+    """Wait until something holds that nothing tells of."""
+    deadline = time.monotonic() + 30
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
 
 
 def as_json(value: Any) -> Any:

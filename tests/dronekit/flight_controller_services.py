@@ -78,7 +78,7 @@ class ParameterService:
         if self.is_silent:
             return
         lost, self.lost_once = self.lost_once, set()
-        for name in self.values:
+        for name in list(self.values):
             if name not in lost:
                 self.tell(name)
 

@@ -11,7 +11,6 @@ import json
 import logging
 import os
 import subprocess
-import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
@@ -21,7 +20,7 @@ from typing import Any
 import pytest
 from dronekit_scenarios import SCENARIOS, Scenario
 from dronekit_scenarios_orders import HOME, places
-from dronekit_stage import Stage, as_json, caught, on_stage, play
+from dronekit_stage import Stage, as_json, caught, on_stage, play, until
 from flight_controller import FlightController
 
 import aerokit.dronekit as dronekit
@@ -260,13 +259,6 @@ def silence() -> dict[str, Any]:
         stage.commands_of(stage.assign("mode", "LOITER"))
         stage.settle()
         return {"told": lines, "raised": raised, "oldest": max(ages) > 5.5, "mode": vehicle.mode.name}
-
-
-def until(condition: Callable[[], object]) -> None:
-    deadline = time.monotonic() + 30
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
 
 
 def test_row_40_silence(waiting: dict[str, Future[Any]]) -> None:

@@ -5,23 +5,17 @@ from __future__ import annotations
 import importlib
 import inspect
 import logging
-import operator
-import textwrap
 from collections.abc import Iterator
 from functools import reduce
 from typing import Any
 
 import pytest
-from dronekit_reference import ATTRIBUTES, EXAMPLES, MODULE_NAMES, OTHER_NAMES, SIGNATURES, SUBCLASSES
-from dronekit_scenarios_orders import HOME
+from dronekit_reference import ATTRIBUTES, MODULE_NAMES, OTHER_NAMES, SIGNATURES, SUBCLASSES
 from dronekit_scenarios_state import POSITION
 from dronekit_stage import Stage, caught, on_stage
-from flight_controller import FlightController, message_of
+from dronekit_streams import READY, answer_streams
 
 import aerokit.dronekit as dronekit
-
-READY = {"rate": 4, "wait_ready": True, "timeout": 10}
-PULSES = {f"chan{number}_raw": 1000 + number for number in range(1, 9)}
 
 for each in OTHER_NAMES:
     importlib.import_module(f"aerokit.dronekit.{each}")
@@ -29,25 +23,6 @@ for each in OTHER_NAMES:
 
 def found(path: str) -> Any:
     return reduce(getattr, path.split("."), dronekit)
-
-
-def answer_streams(fc: FlightController) -> None:
-    """What a vehicle streams, at once, when it is asked for streams."""
-    fc.missions.items = [HOME]
-
-    def stream(_: Any) -> None:
-        fc.tell("GPS_RAW_INT", fix_type=3, satellites_visible=10, eph=121, epv=65535)
-        fc.tell("ATTITUDE", roll=0.25, pitch=0.5, yaw=-0.5)
-        fc.tell("VFR_HUD", airspeed=3, groundspeed=4, heading=271)
-        fc.send(message_of("GLOBAL_POSITION_INT", **POSITION))
-        fc.tell("LOCAL_POSITION_NED", x=3, y=4, z=-12)
-        fc.tell("SYS_STATUS", voltage_battery=12587, current_battery=150, battery_remaining=77)
-        fc.tell("RANGEFINDER", distance=0.5, voltage=0.25)
-        fc.send(message_of("RC_CHANNELS", chancount=8, **PULSES))
-        fc.tell("MOUNT_STATUS", pointing_a=-4500, pointing_b=100, pointing_c=9000)
-        fc.tell("EKF_STATUS_REPORT", flags=831)
-
-    fc.answers["REQUEST_DATA_STREAM"] = stream
 
 
 @pytest.fixture(scope="module")
@@ -389,105 +364,3 @@ def test_listeners_of_locations_get_the_locations(stage: Stage) -> None:
     stage.tell("GLOBAL_POSITION_INT", **POSITION)
     names = ["global_relative_frame", "global_frame", "global_frame"]
     assert [(source, name) for source, name, _ in events] == [("Locations", name) for name in names]
-
-
-# --------------------------------------------------------------------------------- its examples
-
-
-def test_connecting_by_a_bare_address() -> None:
-    with FlightController() as fc:
-        answer_streams(fc)
-        names: dict[str, Any] = {}
-        address = fc.address.removeprefix("udpin:")
-        exec(
-            f"from aerokit.dronekit import connect\nvehicle = connect({address!r}, wait_ready=True)",
-            names,
-        )
-        with names["vehicle"] as vehicle:
-            assert vehicle.attitude.pitch == 0.5
-
-
-PRINTED = {
-    "overrides": [" Channel overrides: {'3': 500, '2': 200}", " Ch2 override: 200"],
-    "command": ["16"],
-    "mission": ["LocationGlobal:lat=-35.363261,lon=149.16523,alt=584.0", "1"],
-    "gimbal": [],
-    "location": [
-        "Global Location: LocationGlobal:lat=-35.363261,lon=149.16523,alt=584.0",
-        "Global Location (relative altitude): LocationGlobalRelative:lat=-35.363261,lon=149.16523,alt=10.0",
-        "Local Location: LocationLocal:north=3.0,east=4.0,down=-12.0",
-        "Altitude (global frame): 584.0",
-        "Altitude (global relative frame): 10.0",
-        "Altitude (NED frame): -12.0",
-    ],
-    "location listeners": [
-        " global_frame: LocationGlobal:lat=-35.363261,lon=149.16523,alt=584.0",
-        " Global: LocationGlobal:lat=-35.363261,lon=149.16523,alt=584.0",
-        " Global: LocationGlobal:lat=-35.363261,lon=149.16523,alt=584.0",
-        " GlobalRelative: LocationGlobalRelative:lat=-35.363261,lon=149.16523,alt=10.0",
-        " Local: LocationLocal:north=3.0,east=4.0,down=-12.0",
-    ],
-    "attitude listener": ["attitude attribute is: Attitude:pitch=0.5,yaw=0.0,roll=0.0"],
-    "parameters": [
-        "Param: 130.0",
-        " PARAMETER CALLBACK: THR_MIN changed to: 100.0",
-        " PARAMETER CALLBACK: THR_MIN changed to: 100.0",
-        " PARAMETER CALLBACK: THR_MIN changed to: 110.0",
-    ],
-    "logging": [],
-    "message listeners": ["HEARTBEAT 4", "decorated HEARTBEAT"],
-    "armed": ["Armed: False", "Armed: True"],
-    "channels": [
-        "Channel values from RC Tx: {'1': 1001, '2': 1002, '3': 1003, '4': 1004, '5': 1005, '6': 1006, "
-        "'7': 1007, '8': 1008}",
-        " Ch1: 1001",
-        " Ch2: 1002",
-    ],
-    "heartbeat": ["True"],
-    "messages": [],
-    "modes": ["LOITER"],
-    "mode listener": ["Vehicle Mode VehicleMode:AUTO"],
-    "goto": [],
-    "ready": ["ready"],
-}
-
-SENT = {
-    "gimbal": ("COMMAND_LONG", lambda frame: frame.command == 205),
-    "goto": ("COMMAND_INT", lambda frame: frame.command == 192 and round(frame.z) == 30 - 584),
-    "messages": (
-        "COMMAND_LONG",
-        lambda frame: frame.command == 115 and frame.param1 == 90 and frame.target == (1, 0),
-    ),
-    "mission": ("MISSION_ITEM_INT", lambda frame: frame.x == -343641140),
-    "overrides": ("RC_CHANNELS_OVERRIDE", lambda frame: frame.chan3_raw == 500),
-}
-
-
-@pytest.mark.parametrize("name", EXAMPLES)
-def test_example(stage: Stage, name: str) -> None:
-    lines: list[str] = []
-    fc = stage.fc
-    fc.heartbeat_s = None
-    stage.settle()
-    names: dict[str, Any] = {
-        "vehicle": stage.vehicle,
-        "print": lambda *values: lines.append(" ".join(map(str, values))),
-        "settle": stage.settle,
-        "fence": stage.reached,
-        "beat": stage.beat,
-        "move": lambda: stage.tell("GLOBAL_POSITION_INT", **POSITION),
-        "tilt": lambda: stage.tell("ATTITUDE", pitch=0.5),
-    }
-    exec("from aerokit.dronekit import *", names)
-    program = textwrap.dedent(EXAMPLES[name])
-    with stage.logged(having="Exception") as logged:
-        exec(compile(program, name, "exec"), names)
-        stage.settle()
-    assert lines == PRINTED[name]
-    assert logged == []
-    if name in SENT:
-        fc.wait_for(*SENT[name])
-
-
-def test_every_example_is_expected() -> None:
-    assert operator.eq(set(EXAMPLES), set(PRINTED))

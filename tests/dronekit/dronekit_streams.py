@@ -1,0 +1,33 @@
+"""A flight controller that streams one of everything as soon as it is asked for streams."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from dronekit_scenarios_orders import HOME
+from dronekit_scenarios_state import POSITION
+from flight_controller import FlightController, message_of
+
+__all__ = ["READY", "answer_streams"]
+
+READY = {"rate": 4, "wait_ready": True, "timeout": 10}
+PULSES = {f"chan{number}_raw": 1000 + number for number in range(1, 9)}
+
+
+def answer_streams(fc: FlightController) -> None:
+    """What a vehicle streams, at once, when it is asked for streams."""
+    fc.missions.items = [HOME]
+
+    def stream(_: Any) -> None:
+        fc.tell("GPS_RAW_INT", fix_type=3, satellites_visible=10, eph=121, epv=65535)
+        fc.tell("ATTITUDE", roll=0.25, pitch=0.5, yaw=-0.5)
+        fc.tell("VFR_HUD", airspeed=3, groundspeed=4, heading=271)
+        fc.send(message_of("GLOBAL_POSITION_INT", **POSITION))
+        fc.tell("LOCAL_POSITION_NED", x=3, y=4, z=-12)
+        fc.tell("SYS_STATUS", voltage_battery=12587, current_battery=150, battery_remaining=77)
+        fc.tell("RANGEFINDER", distance=0.5, voltage=0.25)
+        fc.send(message_of("RC_CHANNELS", chancount=8, **PULSES))
+        fc.tell("MOUNT_STATUS", pointing_a=-4500, pointing_b=100, pointing_c=9000)
+        fc.tell("EKF_STATUS_REPORT", flags=831)
+
+    fc.answers["REQUEST_DATA_STREAM"] = stream
