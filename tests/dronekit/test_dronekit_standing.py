@@ -111,6 +111,21 @@ def test_disarm_waits_for_the_answer_when_arming_is_under_way(
     assert [each.param1 for each in copter.commands()] == [1, 0]
 
 
+@pytest.mark.parametrize("wait", ["arm", "wait_for_mode"])
+def test_what_is_not_waited_for_any_more_is_not_ordered_again(
+    copter: FlightController, vehicle: dronekit.Vehicle, wait: str
+) -> None:
+    lose_answers(copter, ARM, SET_MODE, does=False)
+    orders: dict[str, Any] = {
+        "arm": vehicle.arm,
+        "wait_for_mode": lambda timeout: vehicle.wait_for_mode("AUTO", timeout),
+    }
+    with pytest.raises(dronekit.TimeoutError):
+        orders[wait](timeout=0.05)
+    wait_for(lambda: not vehicle._handler.orders._pending)
+    assert len(copter.commands()) == 1
+
+
 # ------------------------------------------------------------------------------------------ the rules
 
 

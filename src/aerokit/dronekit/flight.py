@@ -375,7 +375,23 @@ class FlightMethods(VehicleAttributes):
         timeout: float | None,
         text: str,
     ) -> None:
-        """Wait for the end of an order; that it failed is known before the time is over."""
+        """Wait for the end of an order; that it failed is known before the time is over.
+
+        A program that stops waiting takes it for failed: it is not sent again then.
+        """
+        try:
+            self._dk_await_order(order, is_done, timeout, text)
+        except BaseException:
+            self._handler.orders.withdraw(order)
+            raise
+
+    def _dk_await_order(
+        self,
+        order: concurrent.futures.Future[None],
+        is_done: Callable[[], bool],
+        timeout: float | None,
+        text: str,
+    ) -> None:
         deadline = math.inf if not timeout else time.monotonic() + timeout
         while not is_done():
             self._dk_check_link()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import concurrent.futures
+import contextlib
 import logging
 import threading
 from collections.abc import Awaitable, Callable
@@ -33,6 +34,7 @@ class Orders:
     def __init__(self, loop: LoopThread) -> None:
         self._loop = loop
         self._tasks: dict[str, asyncio.Task[None]] = {}
+        self._running: dict[concurrent.futures.Future[None], asyncio.Task[None]] = {}
         self._pending: set[concurrent.futures.Future[None]] = set()
         self._lock = threading.Lock()
         self.describe: Callable[[], str] | None = None
@@ -58,6 +60,11 @@ class Orders:
             future.cancel()
             raise
         return future
+
+    def withdraw(self, order: concurrent.futures.Future[None]) -> None:
+        """What :meth:`give` returned is not wanted any more: it is not sent again. Never blocks; from any thread."""
+        with contextlib.suppress(ConnectionClosed):
+            self._loop.call_soon(self._withdraw, order)
 
     def post(self, function: Callable[..., object], *args: Any) -> None:
         """Call a function that neither waits nor raises on the loop; in order with other calls and :meth:`give`."""
@@ -85,15 +92,23 @@ class Orders:
         if not future.set_running_or_notify_cancel():
             return
         task = asyncio.get_running_loop().create_task(self._run(work, future, kind), name=f"dronekit {kind}")
-        self._tasks[place] = task
+        self._tasks[place] = self._running[future] = task
         task.add_done_callback(lambda ended: self._end(place, ended, future))
 
+    def _withdraw(self, order: concurrent.futures.Future[None]) -> None:
+        task = self._running.get(order)
+        if task is not None:
+            task.cancel()
+
     def _end(self, kind: str, task: asyncio.Task[None], future: concurrent.futures.Future[None]) -> None:
+        self._running.pop(future, None)
         if self._tasks.get(kind) is task:
             del self._tasks[kind]
         if not future.done():  # it was cancelled before its first step, or while it waited
             future.set_exception(
-                ConnectionClosed(f"{kind}: a newer order replaced it, or the connection was closed")
+                ConnectionClosed(
+                    f"{kind}: a newer order replaced it, it was withdrawn, or the connection was closed"
+                )
             )
 
     async def _run(
