@@ -18,11 +18,11 @@ from aerokit.dronekit.gimbal import Gimbal
 from aerokit.dronekit.link_watch import watch_link
 from aerokit.dronekit.locations import Locations
 from aerokit.dronekit.maintenance import Maintenance
-from aerokit.dronekit.message_listeners import MessageListener, MessageListeners
+from aerokit.dronekit.message_listeners import MessageListeners
+from aerokit.dronekit.message_methods import MessageMethods
 from aerokit.dronekit.modes import mode_name
 from aerokit.dronekit.parameters import Parameters
 from aerokit.dronekit.privates import VehiclePrivates
-from aerokit.dronekit.pymavlink_messages import sendable
 from aerokit.dronekit.readiness import Readiness
 from aerokit.dronekit.shadowable import Shadowable
 from aerokit.dronekit.streams import request_streams
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
     from typing_extensions import Self
 
-    from aerokit.dronekit.master import Master, MessageFactory
+    from aerokit.dronekit.master import Master
     from aerokit.dronekit.mavlink import MAVConnection
     from aerokit.mavlink.message import Message
     from aerokit.vehicle.values import StatusText
@@ -59,7 +59,7 @@ LEVELS = (logging.CRITICAL,) * 3 + (logging.ERROR, logging.WARNING, logging.INFO
 """MAV_SEVERITY → level of the logger ``autopilot``."""
 
 
-class Vehicle(FlightMethods, Maintenance, Readiness, VehiclePrivates):
+class Vehicle(FlightMethods, MessageMethods, Maintenance, Readiness, VehiclePrivates):
     """A vehicle: attributes to read and to listen to, orders, parameters, missions.
 
     Made by :func:`connect`, or of a subclass by ``connect(…, vehicle_class=…)``: the subclass passes on the one
@@ -163,52 +163,6 @@ class Vehicle(FlightMethods, Maintenance, Readiness, VehiclePrivates):
         What it raises comes out as it is.
         """
         return self._handler.loop.run(function, *args, **kwargs)
-
-    # ------------------------------------------------------------------------------ messages
-
-    def add_message_listener(self, name: str, fn: MessageListener) -> None:
-        """Have ``fn(vehicle, name, message)`` called for every message of this name (``'*'``: every message).
-
-        Messages are objects of pymavlink. Attributes hold what the message says by the time it is called.
-        """
-        self._message_listeners.add(name, fn)
-
-    def remove_message_listener(self, name: str, fn: MessageListener) -> None:
-        """Call it no more; silent when it does not listen."""
-        self._message_listeners.remove(name, fn)
-
-    def on_message(
-        self, name: str | list[str] | tuple[str, ...]
-    ) -> Callable[[MessageListener], MessageListener]:
-        """Decorate a message listener with the name, or the list of names, of messages it listens to."""
-
-        def decorate(fn: MessageListener) -> MessageListener:
-            for each in (name,) if isinstance(name, str) else name:
-                self.add_message_listener(each, fn)
-            return fn
-
-        return decorate
-
-    def notify_message_listeners(self, name: str, msg: Any) -> None:
-        """Call the listeners of a message, as if it had come; returns when they have run."""
-        self._handler.listener_thread.call(self._message_listeners.notify, name, msg)
-
-    @property
-    def message_factory(self) -> MessageFactory:
-        """Makes pymavlink messages: ``vehicle.message_factory.command_long_encode(…)``, for :meth:`send_mavlink`."""
-        return self._handler.master.mav
-
-    def send_mavlink(self, message: Any) -> None:
-        """Send a message made by :attr:`message_factory`, by pymavlink or of ``aerokit.messages``, once.
-
-        ``target_system`` becomes this vehicle's, in the message itself; ``target_component`` stays. Never blocks.
-
-        Raises:
-            LocalProtocolError: a ValueError; a field is wrong. Nothing was sent.
-            APIException: the link is down.
-        """
-        self._dk_check_link()
-        self._handler.send(sendable(message, self._dk_target_system), to=self._dk_target_system)
 
     # ---------------------------------------------------------------------------- life cycle
 
