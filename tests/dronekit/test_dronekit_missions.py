@@ -14,6 +14,7 @@ from served_copter import served_copter
 
 from aerokit.dronekit.commands import CommandSequence
 from aerokit.dronekit.connect import connect
+from aerokit.dronekit.values import LocationGlobal
 from aerokit.dronekit.vehicle import Vehicle
 from aerokit.errors import LocalProtocolError
 
@@ -261,3 +262,25 @@ def test_a_long_mission_goes_to_the_simulated_copter_and_back() -> None:
         assert cmds.wait_ready(timeout=LIMIT_S)
         assert [each.seq for each in cmds if each.z == 77] == [51]
         assert str(vehicle.home_location).startswith("LocationGlobal:lat=-35.36326")
+
+
+def test_a_vehicle_that_takes_floats_holds_places_as_exactly_as_they_are() -> None:
+    with connected(HOME, FIRST, version=1) as (controller, vehicle):
+        controller.capabilities, controller.missions.asks_int = 1, False
+        for latitude, longitude in ((-34.3, 149.1662345), (47.3977419, -178.545594)):
+            vehicle.commands.clear()
+            vehicle.commands.add(waypoint(latitude, y=longitude))
+            vehicle.commands.upload(timeout=LIMIT_S)
+        assert not controller.received("MISSION_ITEM_INT")
+        vehicle.commands.download()
+        vehicle.commands.wait_ready()
+        assert vehicle.commands[0].x == pytest.approx(47.3977419, abs=4e-6)
+
+
+def test_a_home_that_the_vehicle_refuses_is_not_its_home() -> None:
+    with connected(HOME, FIRST) as (controller, vehicle):
+        vehicle.wait_ready("home_location", timeout=LIMIT_S)
+        before = str(vehicle.home_location)
+        controller.results[179] = 4
+        vehicle.home_location = LocationGlobal(10, 20, 30)
+        vehicle.wait_for(lambda: str(vehicle.home_location) == before, timeout=LIMIT_S, interval=0.01)

@@ -224,3 +224,11 @@ def test_any_two_items_can_be_compared(one: MissionItem, other: MissionItem, sto
     assert all(" instead of " in text for text in texts)
     if storage is not Storage.ANY:  # what passes for one autopilot passes for any
         assert len(item_differences(one, other, Storage.ANY)) <= len(item_differences(one, other, storage))
+
+
+def test_places_in_32_bit_floats() -> None:
+    sent = waypoint(-34.3, 149.1662345, altitude_relative_m=30)
+    came = back(sent, x=round(f32(-34.3) * 1e7), y=round(f32(149.1662345) * 1e7))
+    assert item_differences(sent, came)
+    assert not item_differences(sent, came, single_precision=True)
+    assert item_differences(sent, sent.replace(y=sent.y + 500), single_precision=True)

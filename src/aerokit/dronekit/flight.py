@@ -22,7 +22,7 @@ from aerokit.dronekit.flight_orders import (
 )
 from aerokit.dronekit.modes import change_mode, mode_name, mode_order, told_as
 from aerokit.dronekit.values import LocationGlobal, LocationGlobalRelative, VehicleMode
-from aerokit.errors import CommandRejected
+from aerokit.errors import CommandRejected, OperationTimeout
 from aerokit.mavlink.messages import HomePosition
 
 if TYPE_CHECKING:
@@ -293,8 +293,14 @@ class FlightMethods(VehicleAttributes):
             raise ValueError("Expecting home_location to be set to a LocationGlobal.")
         latitude, longitude, altitude = checked_place(pos)
         aio = self._dk_check_link()
-        self._dk_order("home", set_home, aio, latitude, longitude, altitude)
-        self._dk_set_home(pos.lat, pos.lon, altitude)
+        order = self._dk_order("home", set_home, aio, latitude, longitude, altitude)
+        self._home_location = LocationGlobal(pos.lat, pos.lon, altitude)
+        order.add_done_callback(self._dk_home_is_set)
+
+    def _dk_home_is_set(self, order: concurrent.futures.Future[None]) -> None:
+        """A place that the vehicle refused is not its home: what it told last is."""
+        if not order.cancelled() and isinstance(order.exception(), (CommandRejected, OperationTimeout)):
+            self._home_location = self._dk_told_home
 
     def _dk_known_home(self) -> LocationGlobal:
         if self._home_location is None:

@@ -179,6 +179,7 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, Readiness, VehiclePriv
         """
         with self._dk_initializing:
             if self._dk_aio is not None:
+                self._dk_wait_until_booted(timeout=max(heartbeat_timeout or 0.0, 0.0) or CONNECT_S)
                 return
             self._dk_heartbeat_limit = max(heartbeat_timeout or 0.0, 0.0)
             timeout = self._dk_heartbeat_limit or CONNECT_S

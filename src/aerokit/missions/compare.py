@@ -60,25 +60,34 @@ def changed_items(
 
 
 def item_differences(
-    wanted: MissionItem, found: MissionItem, storage: Storage = Storage.ANY
+    wanted: MissionItem,
+    found: MissionItem,
+    storage: Storage = Storage.ANY,
+    *,
+    single_precision: bool = False,
 ) -> tuple[str, ...]:
-    """One text for each field in which they differ: ``"z is 20.0 instead of 30.0"``."""
+    """One text for each field in which they differ: ``"z is 20.0 instead of 30.0"``.
+
+    ``single_precision``: places went through 32-bit floats (MISSION_ITEM), which are up to 1.7 m apart.
+    """
     if wanted.command != found.command:
         return (f"the command is {found.name} instead of {wanted.name}",)
     return tuple(
         f"{field} is {getattr(found, field)!r} instead of {getattr(wanted, field)!r}"
-        for field in _different_fields(wanted, found, storage)
+        for field in _different_fields(wanted, found, storage, single_precision)
     )
 
 
-def _different_fields(wanted: MissionItem, found: MissionItem, storage: Storage) -> Iterator[str]:
+def _different_fields(
+    wanted: MissionItem, found: MissionItem, storage: Storage, single_precision: bool
+) -> Iterator[str]:
     if not _frames_alike(wanted, found, storage):
         yield "frame"
     for field in ("param1", "param2", "param3", "param4"):
         if not _same_number(wanted, found, field, storage):
             yield field
     for field in ("x", "y"):
-        if not _same_place(wanted, found, field, storage):
+        if not _same_place(wanted, found, field, storage, single_precision):
             yield field
     if not _same_altitude(wanted, found, storage):
         yield "z"
@@ -113,13 +122,21 @@ def _same_number(wanted: MissionItem, found: MissionItem, field: str, storage: S
     return any(_close(one, other) for one in kept(wanted, field, storage))
 
 
-def _same_place(wanted: MissionItem, found: MissionItem, field: str, storage: Storage) -> bool:
+def _same_place(
+    wanted: MissionItem, found: MissionItem, field: str, storage: Storage, single_precision: bool
+) -> bool:
     value, other = getattr(wanted, field), getattr(found, field)
-    if xy_scale(wanted.command, wanted.frame) != 1:
-        return bool(abs(value - other) <= 1)
+    scale = xy_scale(wanted.command, wanted.frame)
+    if scale != 1:
+        return bool(abs(value - other) <= 1 + (_float_step(value / scale) * scale if single_precision else 0))
     if has_place(wanted.command):  # a place in the frame MISSION: no number of its own
         return bool(value == other)
     return value == other or any(_close(one, other) for one in kept(wanted, field, storage))
+
+
+def _float_step(value: float) -> float:
+    """How far the 32-bit floats around a number are apart."""
+    return math.ldexp(1.0, math.frexp(value)[1] - 24)
 
 
 def _same_altitude(wanted: MissionItem, found: MissionItem, storage: Storage) -> bool:

@@ -43,6 +43,8 @@ class PlanChannel:
         self._path = PACKED_NAMES[mission_type]
         self._has_changed = False
         """Whether something of ours may be among what the vehicle holds."""
+        self.is_single_precision = False
+        """Whether places go through 32-bit floats: the vehicle knows no MISSION_ITEM_INT."""
 
     # ------------------------------------------------------------------------------- one by one
 
@@ -76,7 +78,7 @@ class PlanChannel:
                 *self._target,
                 window=self._context.autopilot.mission_download_window,
                 only=only,
-                gives_int=await self._has(MavProtocolCapability.MISSION_INT),
+                gives_int=await self._knows_int(),
                 **self._wire_options,
             )
         )
@@ -134,6 +136,11 @@ class PlanChannel:
         capabilities = await self._context.transfers.capabilities()
         return by_default if capabilities is None else bool(capabilities & capability)
 
+    async def _knows_int(self) -> bool:
+        knows = await self._has(MavProtocolCapability.MISSION_INT)
+        self.is_single_precision = not knows
+        return knows
+
     async def _upload(
         self, items: Sequence[MissionItem], *, window: int, first: int | None = None
     ) -> MissionUpload:
@@ -142,7 +149,7 @@ class PlanChannel:
             items,
             first=first,
             window=window,
-            takes_int=await self._has(MavProtocolCapability.MISSION_INT),
+            takes_int=await self._knows_int(),
             **self._wire_options,
         )
 

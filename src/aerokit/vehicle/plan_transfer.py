@@ -250,7 +250,9 @@ class PlanTransfer(Generic[PlanT]):
         for seq in sorted(wanted.keys() & found.keys()):
             if seq >= self._offset:
                 item, other = shift_jumps([wanted[seq], found[seq]], -self._offset)
-                texts = item_differences(item, other, self._storage)
+                texts = item_differences(
+                    item, other, self._storage, single_precision=self._channel.is_single_precision
+                )
                 differences += [f"item {seq - self._offset} ({item.name}): {text}" for text in texts]
         if differences:
             self._fail(tuple(differences))
