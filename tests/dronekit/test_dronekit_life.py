@@ -371,7 +371,7 @@ def test_errors_say_what_is_missing(vehicle: dronekit.Vehicle) -> None:
 def test_refusals_say_in_which_state_the_vehicle_is(
     vehicle: dronekit.Vehicle, caplog: pytest.LogCaptureFixture
 ) -> None:
-    with pytest.raises(dronekit.TimeoutError, match="failed to reach specified altitude: .*NAV_TAKEOFF"):
+    with pytest.raises(dronekit.TimeoutError, match=r"failed to reach specified altitude: .*NAV_TAKEOFF"):
         vehicle.wait_simple_takeoff(10, timeout=LIMIT_S)
     assert "takeoff: " in caplog.text
     assert "(the vehicle is disarmed, in STABILIZE)" in caplog.text

@@ -66,6 +66,7 @@ class VehicleAttributes(HasObservers):
     _dk_wind = Latest(m.Wind)
     _dk_version: m.AutopilotVersion | None = None
     _home_location: LocationGlobal | None = None
+    _dk_told_home: LocationGlobal | None = None
 
     def _dk_make_streams(self) -> None:
         self._dk_streams = {kind.message_type: Stream(self, kind, names) for kind, names in STREAMS}
@@ -259,8 +260,8 @@ class VehicleAttributes(HasObservers):
         self._dk_tell("autopilot_version", message.flight_sw_version)
 
     def _dk_set_home(self, lat: float, lon: float, alt: float | None) -> None:
-        """Where home is, in degrees and metres above the sea; from any thread."""
-        self._home_location = LocationGlobal(lat, lon, alt)
+        """Where home is as the vehicle told it, in degrees and metres above the sea; from any thread."""
+        self._home_location = self._dk_told_home = LocationGlobal(lat, lon, alt)
 
     # ------------------------------------------------------------------------------- telling
 
@@ -273,11 +274,11 @@ class VehicleAttributes(HasObservers):
 
     def _dk_announce(self, name: str) -> None:
         """Tell an attribute's value, which is made only when somebody listens."""
+        if name not in self._ready_attrs:
+            self._dk_mark_ready(name)
         listeners = self._attribute_listeners
-        if listeners and (name in listeners or "*" in listeners):
-            self._dk_tell(name, getattr(self, name))
-        else:
-            self._dk_note(name)
+        if name in listeners or "*" in listeners:
+            self._dk_offer(name, getattr(self, name))
 
     def _dk_note(self, attr_name: str) -> None:
         if attr_name not in self._ready_attrs:

@@ -64,18 +64,18 @@ class Locations(HasObservers, LocationPrivates):
     def _on_global_position(self, message: GlobalPositionInt) -> None:
         self._vehicle._dk_global_position = message
         self._has_altitude = self._has_altitude or message.alt != 0
-        self._dk_announce("global_relative_frame")
+        self._dk_announce("global_relative_frame", "location.global_relative_frame")
         if self._has_altitude:
-            self._dk_announce("global_frame")
-        self._vehicle._dk_tell("location", self)
+            self._dk_announce("global_frame", "location.global_frame")
+        self._vehicle._dk_announce("location")
 
     def _on_local_position(self, message: LocalPositionNed) -> None:
-        self._dk_announce("local_frame")
-        self._vehicle._dk_tell("location", self)
+        self._dk_announce("local_frame", "location.local_frame")
+        self._vehicle._dk_announce("location")
 
-    def _dk_announce(self, frame: str) -> None:
-        """Tell those who listen here, then those who listen to the vehicle."""
-        vehicle, name = self._vehicle, f"location.{frame}"
+    def _dk_announce(self, frame: str, name: str) -> None:
+        """Tell those who listen here, then those who listen to the vehicle, which has another name for it."""
+        vehicle = self._vehicle
         listened = vehicle._attribute_listeners
         if self._attribute_listeners or name in listened or "*" in listened:
             value = getattr(self, frame)

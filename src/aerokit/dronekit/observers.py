@@ -104,12 +104,17 @@ class HasObservers:
         self._dk_note(attr_name)
         listeners = self._attribute_listeners
         if listeners and (attr_name in listeners or EVERY_NAME in listeners):
-            if self._dk_listener_thread is None:
-                self._dk_deliver(attr_name, value)
-            elif cache:
+            if cache and self._dk_listener_thread is not None:
                 self._dk_listener_thread.post(self._dk_deliver, attr_name, value)
             else:
-                self._dk_listener_thread.offer(self._dk_deliver, attr_name, value)
+                self._dk_offer(attr_name, value)
+
+    def _dk_offer(self, attr_name: str, value: Any) -> None:
+        """Have the listeners told of what comes again and again."""
+        if self._dk_listener_thread is None:
+            self._dk_deliver(attr_name, value)
+        else:
+            self._dk_listener_thread.offer(self._dk_deliver, attr_name, value)
 
     def _dk_is_told(self, attr_name: str, value: Any) -> bool:
         """Whether this was the last value told; if not, it is now."""
