@@ -64,7 +64,9 @@ def change_a_parameter(vehicle: Vehicle, name: str) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description="Print the state of a vehicle.")
     parser.add_argument("--connect", metavar="ADDRESS", default="udp:127.0.0.1:14550")
-    parser.add_argument("--parameter", default="RTL_LOIT_TIME", help="one to change and to put back")
+    parser.add_argument(
+        "--parameter", default="RTL_LOIT_TIME", help="one to change and restore; PX4: RTL_RETURN_ALT"
+    )
     parser.add_argument("--seconds", type=float, default=3.0, help="how long to listen")
     options = parser.parse_args()
 

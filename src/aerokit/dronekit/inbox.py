@@ -89,7 +89,11 @@ class Inbox(Mapping[str, Any]):
         with self._came:
             is_first, self._started = self._started is None, self._started or time.monotonic()
         if is_first:
-            self._connection.loop.call_soon(self._connection._tap, self._take)
+            loop, tap = self._connection.loop, self._connection._tap
+            if loop.is_current:
+                tap(self._take)
+            else:
+                loop.call(tap, self._take)  # which waits: what comes after the first question is kept
 
     def _waits(self) -> bool:
         is_young = self._started is not None and time.monotonic() < self._started + FIRST_S

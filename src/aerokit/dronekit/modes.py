@@ -51,11 +51,11 @@ def mode_order(vehicle: Vehicle, mode: str | int) -> Order:
         KeyError: the vehicle has no such mode.
     """
     if isinstance(vehicle.autopilot, Px4):
+        if not isinstance(mode, str):
+            raise KeyError(mode)
         known = mavutil.px4_map.get(mode)
         if known is not None:
             return int(known[0]), int(known[1]), int(known[2])
-        if not isinstance(mode, str):
-            raise KeyError(mode)
         custom_mode = _custom_mode(vehicle, mode)
         return CUSTOM_MODE_ENABLED, custom_mode >> 16 & 0xFF, custom_mode >> 24 & 0xFF
     if isinstance(mode, int):

@@ -76,7 +76,8 @@ class Framer:
             size = len(data)
         extras, sources, wanted = self._extras, self._sources, self.wanted
         frames: list[Frame] = []
-        begin = 0
+        begin = end = checksum = 0
+        body = b""
         while begin < size:
             try:
                 magic, length, flags, sequence, key, message_id = _HEADER_V2(data, begin)

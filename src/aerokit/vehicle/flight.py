@@ -46,7 +46,7 @@ class FlightActions(TravelActions):
         check_seconds("timeout", timeout)
         plan = self._take_off_plan(altitude_m)
         if not self.is_armed:
-            raise OperationRejected("take_off: the vehicle is not armed: await arm() first; nothing was sent")
+            raise OperationRejected("take_off: the vehicle is not armed: arm() comes first; nothing was sent")
         if self.telemetry.landed_state.latest == LANDED_IN_AIR:
             raise OperationRejected(
                 "take_off: the vehicle flies already: go_to() climbs too; nothing was sent"

@@ -103,7 +103,7 @@ class MissionControl(HeldPlan["Mission"]):
         mode = vehicle._mode_for("mission.start", "mission")
         if not vehicle.is_armed:
             raise OperationRejected(
-                "mission.start: the vehicle is not armed: await arm() first; nothing was sent"
+                "mission.start: the vehicle is not armed: arm() comes first; nothing was sent"
             )
         order = self._order = vehicle._new_order(mode)
         self._is_paused = False
