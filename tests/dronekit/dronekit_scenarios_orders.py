@@ -55,12 +55,12 @@ def row_09_wait_for_mode(stage: Stage) -> Any:
 
     def order() -> None:
         nonlocal text
-        text = caught(lambda: stage.vehicle.wait_for_mode("AUTO", timeout=0.3))
+        text = caught(lambda: stage.vehicle.wait_for_mode("AUTO", timeout=2))
 
     sent = stage.commands_of(order)
     del stage.fc.results[176]
     return (
-        text[:40],
+        text[:39],
         sent,
         caught(lambda: stage.vehicle.wait_for_mode("AUTO", timeout=5)),
         stage.vehicle.mode.name,
@@ -86,7 +86,7 @@ def row_08_arm_refused(stage: Stage) -> Any:
 
     def order() -> None:
         nonlocal text
-        text = caught(lambda: stage.vehicle.arm(timeout=0.3))
+        text = caught(lambda: stage.vehicle.arm(timeout=2))
 
     sent = stage.commands_of(order)
     return text[:35], [frame[:2] for frame in sent]

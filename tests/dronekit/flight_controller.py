@@ -107,7 +107,7 @@ class FlightController:
         self.accepts_streams = False
         self._log: list[Received] = []
         self._came = threading.Condition()
-        self._sending = threading.Lock()
+        self._sending = threading.RLock()
         self._encoders: dict[tuple[int, int], Any] = {}
         self._parser = _new_parser()
         self._is_closed = False
@@ -121,15 +121,16 @@ class FlightController:
 
     def beat(self, **fields: Any) -> None:
         """Send a heartbeat now; fields are those it differs in."""
-        usual = {
-            "type": self.vehicle_type,
-            "autopilot": self.autopilot,
-            "base_mode": self.base_mode,
-            "custom_mode": self.custom_mode,
-            "system_status": self.system_status,
-            "mavlink_version": 3,
-        }
-        self.tell("HEARTBEAT", **{**usual, **fields})
+        with self._sending:  # none with older values comes after it
+            usual = {
+                "type": self.vehicle_type,
+                "autopilot": self.autopilot,
+                "base_mode": self.base_mode,
+                "custom_mode": self.custom_mode,
+                "system_status": self.system_status,
+                "mavlink_version": 3,
+            }
+            self.tell("HEARTBEAT", **{**usual, **fields})
 
     def tell(
         self, name: str, *, source: tuple[int, int] | None = None, version: int = 0, **fields: Any

@@ -42,9 +42,13 @@ def waypoint(latitude: float = -35.5, frame: int = 3, command: int = 16, **field
 
 
 @contextmanager
-def connected(*items: Item, **options: Any) -> Iterator[tuple[FlightController, Vehicle]]:
+def connected(
+    *items: Item, capabilities: int | None = None, **options: Any
+) -> Iterator[tuple[FlightController, Vehicle]]:
     """A vehicle that holds these items, home included."""
     with FlightController(heartbeat_s=0.02, **options) as controller:
+        if capabilities is not None:
+            controller.capabilities = capabilities
         controller.missions.items = list(items)
         controller.missions.has_home = controller.autopilot == 3
         with connect(controller.address, rate=None) as vehicle:

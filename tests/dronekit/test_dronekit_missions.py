@@ -265,8 +265,8 @@ def test_a_long_mission_goes_to_the_simulated_copter_and_back() -> None:
 
 
 def test_a_vehicle_that_takes_floats_holds_places_as_exactly_as_they_are() -> None:
-    with connected(HOME, FIRST, version=1) as (controller, vehicle):
-        controller.capabilities, controller.missions.asks_int = 1, False
+    with connected(HOME, FIRST, version=1, capabilities=1) as (controller, vehicle):
+        controller.missions.asks_int = False
         for latitude, longitude in ((-34.3, 149.1662345), (47.3977419, -178.545594)):
             vehicle.commands.clear()
             vehicle.commands.add(waypoint(latitude, y=longitude))

@@ -20,7 +20,7 @@ from aerokit.runtime.background import Background
 from aerokit.runtime.bus import Bus, once
 from aerokit.runtime.deadlines import Deadlines
 from aerokit.runtime.endings import raisable
-from aerokit.runtime.events import Event, HeardTwice, LinkClosed, LinkInterrupted, LinkRestored
+from aerokit.runtime.events import Event, HeardTwice, LinkClosed, LinkInterrupted, LinkRestored, LoopBlocked
 from aerokit.runtime.loop_watch import watch_loop
 from aerokit.runtime.recording import Recording
 from aerokit.runtime.routes import Routes
@@ -94,6 +94,7 @@ class Connection:
         self._taps: tuple[Tap, ...] = ()
         self._enders: list[Callable[[Exception], None]] = []
         self._background = Background(self.fail)
+        self._watches_loop = False
         self._error: Exception | None = None
         self.bus.attach(Heartbeat, _ignore)  # routes and diagnosis need every heartbeat
 
@@ -307,7 +308,6 @@ class Connection:
 
     def _start(self) -> None:
         self._background.start(self._send_heartbeats, "aerokit heartbeat")
-        self._background.start(self._watch_loop, "aerokit loop watch")
 
     async def _watch_loop(self) -> None:
         await watch_loop(self)
@@ -357,6 +357,9 @@ class Connection:
     def _attach(self, item: type[Any], sink: Sink, system_id: int) -> Detach:
         if issubclass(item, Message):
             return self.bus.attach(item, sink, system_id=system_id)
+        if issubclass(LoopBlocked, item) and not self._watches_loop:
+            self._watches_loop = True  # ten wake-ups a second, only for who wants to know
+            self._background.start(self._watch_loop, "aerokit loop watch")
         return self.bus.attach_event(item, _only(system_id, sink) if system_id else sink)
 
     def _new_framer(self, peer: Peer) -> Framer:

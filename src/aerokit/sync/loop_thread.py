@@ -7,7 +7,6 @@ import atexit
 import concurrent.futures
 import contextlib
 import functools
-import importlib.util
 import os
 import threading
 from typing import TYPE_CHECKING, Any, Generic, ParamSpec, TypeVar
@@ -259,4 +258,4 @@ def _run(started: concurrent.futures.Future[tuple[_Calls, asyncio.AbstractEventL
         started.set_result((calls, asyncio.get_running_loop()))
         await calls.live()
 
-    anyio.run(main, backend_options={"use_uvloop": importlib.util.find_spec("uvloop") is not None})
+    anyio.run(main)
