@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import table
-from dronekit_runs import LIBRARIES, Library, installed
+from dronekit_runs import LIBRARIES, Library, compile_aerokit, installed
 from dronekit_tasks import Plan, connect_rows, cpu_rows, import_rows, latency_rows, read_rows
 from table import Row
 
@@ -50,6 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     libraries = [each for each in LIBRARIES if each.name in wanted and installed(each)]
     plan = Plan(1 if options.quick else options.rounds, options.quick, options.only)
     rows: list[Row] = []
+    compile_aerokit()
     for part in options.parts or PARTS:
         rows += PARTS[part](libraries, plan)
     print(table.printed(rows))

@@ -100,12 +100,13 @@ def connect(
         TimeoutError: ``wait_ready`` was not satisfied in time. Whatever fails, nothing stays open.
     """
     from aerokit.dronekit.mavlink import MAVConnection
-    from aerokit.dronekit.vehicle import Vehicle
 
     handler = MAVConnection(
         ip, baud=baud, source_system=source_system, source_component=source_component, use_native=use_native
     )
     try:
+        from aerokit.dronekit.vehicle import Vehicle  # the link hears meanwhile: this takes a while
+
         vehicle: Vehicle | VehicleT = Vehicle(handler) if vehicle_class is None else vehicle_class(handler)
         if status_printer is not None:
             _print_texts(handler, status_printer)

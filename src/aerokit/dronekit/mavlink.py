@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator
 from contextvars import ContextVar
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
-from aerokit import sync
 from aerokit.dronekit.exceptions import APIException
 from aerokit.dronekit.listener_thread import ListenerThread
 from aerokit.dronekit.orders import Orders
@@ -21,6 +20,7 @@ from aerokit.dronekit.standing import Given
 from aerokit.errors import AerokitError, ConnectionClosed, LinkOpenError, LocalProtocolError
 from aerokit.links.address import ACCEPTED_FORMS
 from aerokit.links.reconnecting import ReconnectingLink
+from aerokit.sync.connection import open_connection
 
 if TYPE_CHECKING:
     from aerokit.dronekit.master import Master
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.runtime.bus import Detach
     from aerokit.runtime.connection import Connection
+    from aerokit.sync.connection import Connection as SyncConnection
 
 __all__ = ["MAVConnection", "MAVWriter", "mavudpin_multi"]
 
@@ -288,13 +289,13 @@ def connections_made() -> Iterator[list[MAVConnection]]:
         _made.reset(token)
 
 
-def _open(ip: str, baud: int, source_system: int, source_component: int) -> sync.Connection:
+def _open(ip: str, baud: int, source_system: int, source_component: int) -> SyncConnection:
     """Open it; what refuses at first may be a simulator that the program has just started."""
     if not isinstance(ip, str):
         raise LocalProtocolError(f"ip = {ip!r} is no connection string; accepted are\n{ACCEPTED_FORMS}")
     for attempt in range(ATTEMPTS):
         try:
-            return sync.open_connection(
+            return open_connection(
                 ip, baud=baud, source_system=source_system, source_component=source_component, reconnect=True
             )
         except LinkOpenError as error:

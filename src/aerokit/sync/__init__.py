@@ -22,11 +22,15 @@ place. Exceptions come through as they are. Any thread may call; functions that 
 
 from __future__ import annotations
 
-from aerokit.sync.cells import StateCell
-from aerokit.sync.connection import Connection, open_connection
-from aerokit.sync.guided import Guided, SetpointStream
-from aerokit.sync.subscription import Subscription
-from aerokit.sync.vehicle import Vehicle, connect
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from aerokit.sync.cells import StateCell
+    from aerokit.sync.connection import Connection, open_connection
+    from aerokit.sync.guided import Guided, SetpointStream
+    from aerokit.sync.subscription import Subscription
+    from aerokit.sync.vehicle import Vehicle, connect
 
 __all__ = [
     "Connection",
@@ -38,3 +42,25 @@ __all__ = [
     "connect",
     "open_connection",
 ]
+
+_HOMES = {
+    "Connection": "connection",
+    "Guided": "guided",
+    "SetpointStream": "guided",
+    "StateCell": "cells",
+    "Subscription": "subscription",
+    "Vehicle": "vehicle",
+    "connect": "vehicle",
+    "open_connection": "connection",
+}
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = globals()[name] = getattr(import_module(f"aerokit.sync.{_HOMES[name]}"), name)
+    return value
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *__all__]
