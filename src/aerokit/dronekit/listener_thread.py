@@ -19,8 +19,6 @@ MOST_WAITING = 10_000
 """What a listener that does not come back lets wait at most; values that come again and again are dropped then."""
 JOIN_S = CALL_S = 2.0
 
-_Call = tuple[Callable[..., object], tuple[Any, ...]]
-
 
 class ListenerThread:
     """Calls functions in the order in which they were posted. The thread starts with the first of them.
@@ -30,12 +28,7 @@ class ListenerThread:
 
     def __init__(self, name: str = "dronekit listeners") -> None:
         self._name = name
-        self._calls: queue.SimpleQueue[list[_Call]] = queue.SimpleQueue()
-        self._gathered: list[_Call] = []
-        self._gathering = threading.RLock()  # a signal handler may post, too
-        self._gatherer: int | None = None
-        self._soon: Callable[[Callable[[], None]], object] | None = None
-        self._posted = self._taken = 0
+        self._calls: queue.SimpleQueue[tuple[Callable[..., object], tuple[Any, ...]]] = queue.SimpleQueue()
         self._thread: threading.Thread | None = None
         self._lock = threading.Lock()
         self._is_stopped = False
@@ -43,19 +36,14 @@ class ListenerThread:
 
     def post(self, function: Callable[..., object], *args: Any) -> None:
         """Have ``function(*args)`` called; from any thread, never blocks. Nothing happens once it is stopped."""
-        if self._is_stopped:
-            return
-        self._posted += 1
-        with self._gathering:
-            self._gathered.append((function, args))
-            if self._soon is None or threading.get_ident() != self._gatherer:
-                self._pass_on()
-            elif len(self._gathered) == 1:
-                self._soon(self._pass_on)
+        if self._thread is None:
+            self._start()
+        if not self._is_stopped:
+            self._calls.put((function, args))
 
     def offer(self, function: Callable[..., object], *args: Any) -> None:
         """As :meth:`post`, for what comes again anyway: dropped while 10,000 others wait."""
-        if self._posted - self._taken < MOST_WAITING:
+        if self._calls.qsize() < MOST_WAITING:
             self.post(function, *args)
             return
         if not self._dropped:
@@ -88,13 +76,6 @@ class ListenerThread:
             if time.monotonic() > end:
                 break
 
-    def gather(self, call_soon: Callable[[Callable[[], None]], object]) -> None:
-        """Let what this thread posts in one turn of its loop come together: one waking-up for all of it.
-
-        ``call_soon(function)`` has a function called in the loop's next turn.
-        """
-        self._soon, self._gatherer = call_soon, threading.get_ident()
-
     @property
     def is_stopped(self) -> bool:
         """Whether nothing is called any more."""
@@ -114,7 +95,7 @@ class ListenerThread:
         """Call nothing more. Idempotent; never blocks."""
         with self._lock:
             self._is_stopped = True
-        self._calls.put([])
+        self._calls.put((_nothing, ()))
 
     def join(self) -> None:
         """Wait until the thread has ended, at most two seconds: a callback may be stuck in the program's own code."""
@@ -132,26 +113,15 @@ class ListenerThread:
                 else:
                     self._thread = thread
 
-    def _pass_on(self) -> None:
-        with self._gathering:
-            if self._gathered:
-                gathered, self._gathered = self._gathered, []
-                if self._thread is None:
-                    self._start()
-                self._calls.put(gathered)
-
     def _run(self) -> None:
         while True:
-            for function, args in self._calls.get():
-                if self._is_stopped:
-                    return
-                self._taken += 1
-                try:
-                    function(*args)
-                except BaseException:  # sys.exit() in a callback would end the callbacks, and nothing else
-                    logger.exception("Exception in a callback")
+            function, args = self._calls.get()
             if self._is_stopped:
                 return
+            try:
+                function(*args)
+            except BaseException:  # sys.exit() in a callback would end the callbacks, and nothing else
+                logger.exception("Exception in a callback")
 
 
 class _Thread(threading.Thread):
@@ -165,3 +135,7 @@ def _must_not_wait() -> bool:
         asyncio.get_running_loop()
         return True
     return False
+
+
+def _nothing() -> None:
+    pass

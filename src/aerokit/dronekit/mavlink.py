@@ -71,7 +71,6 @@ class MAVConnection:
         self._sync = _open(ip, baud, source_system, source_component)
         self.loop = self._sync._loop
         """The event loop's thread."""
-        self.loop.call_soon(self._gather)
         self.orders = Orders(self.loop)
         """What was ordered without waiting."""
         self.given = Given()
@@ -226,9 +225,6 @@ class MAVConnection:
         return queue.Queue()
 
     # ------------------------------------------------------------------------------- inside
-
-    def _gather(self) -> None:
-        self.listener_thread.gather(asyncio.get_running_loop().call_soon)
 
     def _tap(self, sink: Callable[[Frame, Peer], None]) -> None:
         self._detach.append(self.connection.tap(sink))
