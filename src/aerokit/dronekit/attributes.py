@@ -177,8 +177,8 @@ class VehicleAttributes(HasObservers):
         if isinstance(getattr(self._dk_aio, "autopilot", None), Px4):
             status = self._dk_sys_status
             return status is not None and bool(status.onboard_control_sensors_health & PREARM_CHECK)
-        fix = self.gps_0.fix_type
-        return fix is not None and fix > 1 and bool((self._dk_ekf_flags or 0) & PRED_POS_HORIZ_ABS)
+        gps = self._dk_gps
+        return gps is not None and gps.fix_type > 1 and bool((self._dk_ekf_flags or 0) & PRED_POS_HORIZ_ABS)
 
     @property
     def version(self) -> Version:

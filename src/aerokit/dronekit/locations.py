@@ -16,6 +16,11 @@ if TYPE_CHECKING:
 __all__ = ["Locations"]
 
 UNKNOWN = (None, None)
+HELD = "_dk_global_position held"
+"""Where a vehicle keeps the frame or message of its global position."""
+
+_Numbers = tuple[object, "float | None", "float | None", "float | None", "float | None"]
+"""What they were worked out of, latitude and longitude in degrees, metres above the sea and above home."""
 
 
 class Locations(HasObservers, LocationPrivates):
@@ -28,6 +33,7 @@ class Locations(HasObservers, LocationPrivates):
         super().__init__(vehicle._dk_listener_thread)
         self._vehicle = vehicle
         self._has_altitude = False
+        self._dk_numbers: _Numbers = (None, None, None, None, None)
         vehicle._dk_on(GlobalPositionInt, self._on_global_position)
         vehicle._dk_on(LocalPositionNed, self._on_local_position)
 
@@ -37,19 +43,14 @@ class Locations(HasObservers, LocationPrivates):
 
         A new object each time. Latitude and longitude are None without a fix, the altitude is None until one is known.
         """
-        message = self._vehicle._dk_global_position
-        if message is None:
-            return LocationGlobal(None, None, None)
-        altitude = message.alt / 1000.0
-        return LocationGlobal(*_place_of(message), altitude if altitude or self._has_altitude else None)
+        _, lat, lon, altitude, _ = self._dk_global_numbers()
+        return LocationGlobal(lat, lon, altitude if altitude or self._has_altitude else None)
 
     @property
     def global_relative_frame(self) -> LocationGlobalRelative:
         """Latitude, longitude in degrees and altitude above home in metres (GLOBAL_POSITION_INT)."""
-        message = self._vehicle._dk_global_position
-        if message is None:
-            return LocationGlobalRelative(None, None, None)
-        return LocationGlobalRelative(*_place_of(message), message.relative_alt / 1000.0)
+        _, lat, lon, _, relative = self._dk_global_numbers()
+        return LocationGlobalRelative(lat, lon, relative)
 
     @property
     def local_frame(self) -> LocationLocal:
@@ -60,6 +61,18 @@ class Locations(HasObservers, LocationPrivates):
         return LocationLocal(message.x, message.y, message.z)
 
     # ------------------------------------------------------------------------------- inside
+
+    def _dk_global_numbers(self) -> _Numbers:
+        """Of the latest GLOBAL_POSITION_INT, worked out when it is read first; all from one message."""
+        held = self._vehicle.__dict__.get(HELD)
+        numbers = self._dk_numbers
+        if numbers[0] is not held:
+            message = self._vehicle._dk_global_position  # may be a later one by now
+            assert message is not None
+            lat, lon = place(message.lat, message.lon) or UNKNOWN
+            numbers = held, lat, lon, message.alt / 1000.0, message.relative_alt / 1000.0
+            self._dk_numbers = numbers
+        return numbers
 
     def _on_global_position(self, message: GlobalPositionInt) -> None:
         self._vehicle._dk_global_position = message
@@ -86,7 +99,3 @@ class Locations(HasObservers, LocationPrivates):
 
     def _dk_review(self) -> None:
         self._vehicle._dk_review()
-
-
-def _place_of(message: GlobalPositionInt) -> tuple[float | None, float | None]:
-    return place(message.lat, message.lon) or UNKNOWN
