@@ -232,7 +232,7 @@ async def test_what_cannot_be_started(opened: Any) -> None:
         mission = flight.vehicle.mission
         await mission.upload(short_mission(flight))
         flight.wire.forget()
-        with pytest.raises(OperationRejected, match=r"not armed: await arm\(\) first; nothing was sent"):
+        with pytest.raises(OperationRejected, match=r"not armed: arm\(\) comes first; nothing was sent"):
             await mission.start()
         with pytest.raises(OperationRejected, match="not armed"):
             await mission.resume()
