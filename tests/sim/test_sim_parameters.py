@@ -23,6 +23,7 @@ from aerokit.parameters import (
 from aerokit.parameters.px4_hash import px4_hash
 from aerokit.sim import SimulatedCopter, SimulatedPx4
 from aerokit.sim.ardupilot.copter_parameters import copter_parameters
+from aerokit.sim.ardupilot.parameter_tables import KINDS, parameters_of
 from aerokit.sim.ardupilot.parameter_server import rounded
 from aerokit.sim.file_tree import FileFault
 from aerokit.sim.parameter_pack_file import packed_parameters
@@ -71,6 +72,19 @@ def test_the_tables_are_those_of_the_firmwares() -> None:
     copter = copter_parameters()
     assert sum(copter.default(name) != copter[name] for name in copter) == 41
     assert all(math.isfinite(copter[name]) for name in copter)
+
+
+def test_each_ardupilot_firmware_has_a_table() -> None:
+    tables = {kind: parameters_of(kind) for kind in KINDS}
+    assert {kind: len(table) for kind, table in tables.items()} == {
+        "copter": 1349, "plane": 1401, "rover": 1235, "sub": 1386,
+    }  # fmt: skip
+    for table in tables.values():
+        assert all(math.isfinite(table[name]) and math.isfinite(table.default(name)) for name in table)
+    assert [tables[kind]["MAV_SYSID"] for kind in KINDS] == [1, 1, 1, 1]
+    assert {len(parameters_of(kind, 100)) for kind in KINDS} == {100}
+    tables["plane"]["BATT2_MONITOR"] = 4
+    assert len(tables["plane"]) == 1415
 
 
 def test_switching_a_feature_on_changes_the_count() -> None:
