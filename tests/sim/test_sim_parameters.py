@@ -23,8 +23,8 @@ from aerokit.parameters import (
 from aerokit.parameters.px4_hash import px4_hash
 from aerokit.sim import SimulatedCopter, SimulatedPx4
 from aerokit.sim.ardupilot.copter_parameters import copter_parameters
-from aerokit.sim.ardupilot.parameter_tables import KINDS, parameters_of
 from aerokit.sim.ardupilot.parameter_server import rounded
+from aerokit.sim.ardupilot.parameter_tables import KINDS, parameters_of
 from aerokit.sim.file_tree import FileFault
 from aerokit.sim.parameter_pack_file import packed_parameters
 from aerokit.sim.px4.parameter_server import parameter_hash
