@@ -27,7 +27,7 @@ _KINDS: dict[str, tuple[str, str, dict[str, Any]]] = {
 
 
 def kind_names() -> tuple[str, ...]:
-    """What `simulated` takes: "copter", "px4" …"""
+    """What `simulated` takes, such as "copter" and "px4"."""
     return tuple(name for name in _KINDS if _find(name) is not None)
 
 
