@@ -39,7 +39,8 @@ class Faults:
     - ``silent``: the radio is out; nothing gets through in either direction, the vehicle flies on
     - ``prearm_failures``: reasons that the arming checks give besides the real ones ("Compass not healthy")
     - ``drop_outgoing``, ``drop_incoming``: this many of the next frames are lost (they count down)
-    - ``loss``: share of the outgoing frames that is lost at random, 0 to 1, the same for the same seed
+    - ``loss``, ``loss_incoming``: share of the outgoing and of the incoming frames that is lost at random, 0 to 1, the
+      same for the same seed
     - ``motor_failed``: a motor stands still; the vehicle cannot hold its height and comes down
     - ``no_ftp``: FILE_TRANSFER_PROTOCOL is neither answered nor among the capabilities
     - ``parameter_limits``: name → lowest and highest value; what is set is clamped to them without a word
@@ -55,6 +56,7 @@ class Faults:
     drop_outgoing: int = 0
     drop_incoming: int = 0
     loss: float = 0.0
+    loss_incoming: float = 0.0
     motor_failed: bool = False
     no_ftp: bool = False
     parameter_limits: dict[str, tuple[float, float]] = field(default_factory=dict)

@@ -282,6 +282,8 @@ class SimulatedVehicle:
         if self.faults.drop_incoming > 0:
             self.faults.drop_incoming -= 1
             return
+        if self.faults.loss_incoming > 0.0 and self.rng.random() < self.faults.loss_incoming:
+            return
         handler(message, channel)
 
     def _is_lost(self, message: Message) -> bool:
