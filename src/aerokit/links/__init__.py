@@ -13,6 +13,7 @@ from .create import create_link
 from .link import Link, Peer, Receiver
 from .memory import MemoryLink, memory_link_pair
 from .reconnecting import Interruptible, ReconnectingLink
+from .pty import PtyLink
 from .replay import Replay
 from .serial import SerialLink
 from .tcp import TcpConnect, TcpListen
@@ -31,6 +32,7 @@ __all__ = [
     "LinkAddress",
     "MemoryLink",
     "Peer",
+    "PtyLink",
     "Receiver",
     "ReconnectingLink",
     "Replay",

@@ -13,7 +13,7 @@ from aerokit.snapshot import Snapshot
 
 __all__ = ["ACCEPTED_FORMS", "LinkAddress", "LinkKind", "host_and_port", "parse_address"]
 
-LinkKind = Literal["udpin", "udpout", "udpbcast", "tcp", "tcpin", "serial", "replay"]
+LinkKind = Literal["udpin", "udpout", "udpbcast", "tcp", "tcpin", "serial", "replay", "pty"]
 
 ACCEPTED_FORMS = """\
   127.0.0.1:14550  udp:0.0.0.0:14550  udpin:0.0.0.0:14550  udp://:14550   listen for UDP
@@ -24,6 +24,7 @@ ACCEPTED_FORMS = """\
   /dev/ttyACM0  /dev/ttyUSB0,57600  COM14  COM14,115200                   serial port, with its baud rate
   serial:///dev/ttyUSB0:57600  serial://COM3:57600?rtscts=1               the same, with flow control
   flight.tlog  replay:flight.tlog?speed=2  file:///logs/flight.tlog       replay a recording
+  pty  pty:/tmp/ttyV0                                                     a pseudo-terminal, and a name for it
   an IPv6 address stands in brackets: udpin:[::1]:14550"""
 """What an address may look like, for error messages and help texts."""
 
@@ -41,7 +42,7 @@ class LinkAddress(Snapshot):
     baud: int | None = None
     """Bits per second; None when the string does not say."""
     path: str = ""
-    """File of a recording."""
+    """File of a recording; of a pseudo-terminal the symbolic link to its other end, "" for none."""
     options: tuple[tuple[str, str], ...] = ()
     """The rest, sorted.
 
@@ -62,6 +63,8 @@ class LinkAddress(Snapshot):
             return f"serial://{_quote_device(self.device)}{baud}"
         if self.kind == "replay":
             return f"replay:{'//' if self.path.startswith('//') else ''}{_quote(self.path)}"
+        if self.kind == "pty":
+            return f"pty:{self.path}" if self.path else "pty"
         return f"{self.kind}:{host_and_port(self.host, self.port)}"
 
 
@@ -131,6 +134,8 @@ class _Parser:
             self.fail("it is empty")
         if "\0" in text:
             self.fail("it has a NUL character in it")
+        if text.lower() == "pty" or text.lower().startswith("pty:"):
+            return LinkAddress("pty", path=text[len("pty:") :])
         scheme, rest = self.split_scheme(text)
         if scheme in _SCHEMES:
             return self.with_scheme(scheme, rest)

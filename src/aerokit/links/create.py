@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from .address import LinkAddress, parse_address
 from .link import Link
+from .pty import PtyLink
 from .replay import Replay
 from .serial import SerialLink
 from .tcp import CONNECT_TIMEOUT_S, TcpConnect, TcpListen
@@ -23,6 +24,8 @@ def create_link(address: str | LinkAddress, *, baud: int = 57600) -> Link:
         return SerialLink(where.device, where.baud or baud, rtscts=where.option("rtscts") == "1")
     if where.kind == "replay":
         return Replay(where.path, float(where.option("speed") or 1.0))
+    if where.kind == "pty":
+        return PtyLink(where.path)
     if where.kind == "tcp":
         timeout = float(where.option("timeout") or CONNECT_TIMEOUT_S)
         return TcpConnect(where.host, where.port, connect_timeout_s=timeout)

@@ -26,6 +26,8 @@ _SHORTEST_WAIT_S = 0.001
 class SimulatorServer:
     """Vehicles that live as long as an ``async with`` block; every vehicle is on every link.
 
+    ``vehicles_on`` says for each link, in the order of the links, which vehicles are on it instead.
+
     It runs on the loop's own clock by timers alone: no task, no thread. ``speedup`` 10 makes ten simulated
     seconds of a real one. What the loop missed because something blocked it is caught up. Leaving the block
     closes the links.
@@ -39,11 +41,15 @@ class SimulatorServer:
         links: Link | Iterable[Link],
         *,
         speedup: float = 1.0,
+        vehicles_on: Sequence[Sequence[SimulatedVehicle]] | None = None,
     ) -> None:
         if not speedup > 0:
             raise LocalProtocolError(f"speedup = {speedup!r} must be above 0")
         self.vehicles = (vehicles,) if isinstance(vehicles, SimulatedVehicle) else tuple(vehicles)
         self._links = (links,) if isinstance(links, Link) else tuple(links)
+        self._vehicles_on = [self.vehicles] * len(self._links) if vehicles_on is None else list(vehicles_on)
+        if len(self._vehicles_on) != len(self._links):
+            raise LocalProtocolError(f"vehicles_on is for {len(self._vehicles_on)} links of {len(self._links)}")
         self._speedup = speedup
         self._loop: asyncio.AbstractEventLoop | None = None
         self._started_at = 0.0
@@ -71,8 +77,9 @@ class SimulatorServer:
         self._loop = asyncio.get_running_loop()
         self._started_at = self._loop.time()
         async with AsyncExitStack() as opening:
-            for number, link in enumerate(self._links):
-                port = _Port(self, link, _channels(self.vehicles, number))
+            connected: set[int] = set()
+            for link, vehicles in zip(self._links, self._vehicles_on, strict=True):
+                port = _Port(self, link, vehicles, _channels(vehicles, connected))
                 opening.push_async_callback(port.close)
                 await link.open(port)
                 self._ports.append(port)
@@ -107,12 +114,12 @@ class SimulatorServer:
         self._flush()
         self._schedule()
 
-    def hear(self, data: bytes, peer: Peer, channels: Sequence[Channel]) -> None:
+    def hear(self, data: bytes, peer: Peer, port: _Port) -> None:
         """Bytes came in on a link."""
         if self._loop is None:
             return
         now = self.now
-        for vehicle, channel in zip(self.vehicles, channels, strict=True):
+        for vehicle, channel in zip(port.vehicles, port.channels, strict=True):
             vehicle.receive(data, max(now, vehicle.now), peer, channel)
         self._flush()
         self._schedule()
@@ -139,16 +146,22 @@ class SimulatorServer:
 
 
 class _Port:
-    """One link and the vehicles' channels on it."""
+    """One link, the vehicles on it, and their channels there."""
 
-    def __init__(self, server: SimulatorServer, link: Link, channels: Sequence[Channel]) -> None:
+    def __init__(
+        self,
+        server: SimulatorServer,
+        link: Link,
+        vehicles: Sequence[SimulatedVehicle],
+        channels: Sequence[Channel],
+    ) -> None:
         self._server = server
         self.link = link
-        self.channels = channels
+        self.vehicles, self.channels = vehicles, channels
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
         """See `Receiver`."""
-        self._server.hear(data, peer, self.channels)
+        self._server.hear(data, peer, self)
 
     def link_lost(self, error: LinkLost) -> None:
         """The client has gone; the vehicles fly on, as vehicles do."""
@@ -159,8 +172,14 @@ class _Port:
         await self.link.wait_closed()
 
 
-def _channels(vehicles: Iterable[SimulatedVehicle], number: int) -> list[Channel]:
-    return [vehicle.channels[0] if number == 0 else vehicle.open_channel() for vehicle in vehicles]
+def _channels(vehicles: Iterable[SimulatedVehicle], connected: set[int]) -> list[Channel]:
+    """A channel of each vehicle: its first one on the first of its links, a new one on every other."""
+    channels = []
+    for vehicle in vehicles:
+        is_first = id(vehicle) not in connected
+        connected.add(id(vehicle))
+        channels.append(vehicle.channels[0] if is_first else vehicle.open_channel())
+    return channels
 
 
 @asynccontextmanager
