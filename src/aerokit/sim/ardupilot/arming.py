@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from aerokit.mavlink.enums import GpsFixType, MavSeverity
 
 if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.copter import SimulatedCopter
+    from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 
 __all__ = ["Arming"]
 
@@ -20,34 +20,34 @@ _STICK_CENTRE, _STICK_LOW, _DEADZONE = 1500, 1050, 100
 class Arming:
     """Runs the checks once a second, reports failures every 30 s while disarmed, arms and disarms."""
 
-    def __init__(self, copter: SimulatedCopter) -> None:
-        self._copter = copter
+    def __init__(self, vehicle: ArduPilotVehicle) -> None:
+        self._vehicle = vehicle
         self.passes = False
         """What SYS_STATUS says of the pre-arm checks."""
         self._reported_at = -math.inf
 
     def start(self) -> None:
         """Begin the periodic checks."""
-        self._reported_at = self._copter.now
-        self._copter.every(_CHECK_PERIOD_S, self._check)
+        self._reported_at = self._vehicle.now
+        self._vehicle.every(_CHECK_PERIOD_S, self._check)
 
     # --------------------------------------------------------------------------------------- checks
 
     def reasons(self) -> list[str]:
         """Why it cannot be armed now, as the firmware words it; empty when it can."""
-        copter, nav = self._copter, self._copter.navigation
-        if not copter.is_initialised:
+        vehicle, nav = self._vehicle, self._vehicle.navigation
+        if not vehicle.is_initialised:
             return ["System not initialised"]
-        reasons = list(copter.faults.prearm_failures)
-        if copter.calibrations.of_compasses:
+        reasons = list(vehicle.faults.prearm_failures)
+        if vehicle.calibrations.of_compasses:
             reasons.append("Compass calibration running")
-        if copter.battery.voltage_v < copter.parameters["BATT_ARM_VOLT"]:
+        if vehicle.battery.voltage_v < vehicle.parameters["BATT_ARM_VOLT"]:
             reasons.append("Battery 1 below minimum arming voltage")
-        if copter.failsafes.battery_is_low:
+        if vehicle.failsafes.battery_is_low:
             reasons.append("Battery failsafe")
-        if copter.mode.needs_mission and not copter.mission.is_present:
+        if vehicle.mode.needs_mission and not vehicle.mission.is_present:
             reasons.append("Mode requires mission")
-        if copter.mode.needs_position and (reason := self._gps_reason()):
+        if vehicle.mode.needs_position and (reason := self._gps_reason()):
             return [*reasons, reason]
         if nav.flags is None or not nav.has_attitude:
             return [
@@ -59,38 +59,38 @@ class Arming:
         return reasons + self._mandatory_reasons()
 
     def _gps_reason(self) -> str | None:
-        nav = self._copter.navigation
+        nav = self._vehicle.navigation
         if nav.fix_type < GpsFixType.TYPE_3D_FIX:
             return "GPS 1: Bad fix" if nav.is_gps_detected else "GPS 1: not healthy"
         return "AHRS: waiting for home" if nav.home is None else None
 
     def _mandatory_reasons(self) -> list[str]:
         """What even a forced arming insists on."""
-        copter, nav = self._copter, self._copter.navigation
+        vehicle, nav = self._vehicle, self._vehicle.navigation
         reasons = []
-        if copter.mode.needs_position and not (nav.has_position and not copter.failsafes.estimator):
+        if vehicle.mode.needs_position and not (nav.has_position and not vehicle.failsafes.estimator):
             reasons.append("Need Position Estimate")
-        if not copter.mode.has_manual_throttle and not nav.has_altitude:
+        if not vehicle.mode.has_manual_throttle and not nav.has_altitude:
             reasons.append("Need Alt Estimate")
         return reasons
 
     def _final_reasons(self) -> list[str]:
-        copter, mode = self._copter, self._copter.mode
+        vehicle, mode = self._vehicle, self._vehicle.mode
         if not mode.can_arm:
             return [f"{mode.name} mode not armable"]
         high = _STICK_LOW if mode.has_manual_throttle else _STICK_CENTRE + _DEADZONE
-        if not mode.arms_with_raised_throttle and copter.rc[2] > high:
+        if not mode.arms_with_raised_throttle and vehicle.rc[2] > high:
             return ["Throttle too high"]
         return []
 
     def _check(self) -> None:
-        if self._copter.motors.is_armed:
+        if self._vehicle.motors.is_armed:
             self.passes = True
             return
         reasons = self.reasons()
         self.passes = not reasons
-        if self._copter.now - self._reported_at >= _REPORT_PERIOD_S:
-            self._reported_at = self._copter.now
+        if self._vehicle.now - self._reported_at >= _REPORT_PERIOD_S:
+            self._reported_at = self._vehicle.now
             self._say("PreArm", reasons)
 
     def report(self) -> None:
@@ -101,39 +101,39 @@ class Arming:
 
     def _say(self, prefix: str, reasons: list[str]) -> None:
         for reason in reasons:
-            self._copter.send_text(MavSeverity.CRITICAL, f"{prefix}: {reason}")
+            self._vehicle.send_text(MavSeverity.CRITICAL, f"{prefix}: {reason}")
 
     # ------------------------------------------------------------------------------- arm and disarm
 
     def arm(self, *, force: bool = False) -> bool:
         """Arm if the checks allow it; says why not."""
-        copter = self._copter
+        vehicle = self._vehicle
         reasons = self._mandatory_reasons() if force else self.reasons()
         if not reasons and not force:
             reasons = self._final_reasons()
-        if not copter.is_initialised:
+        if not vehicle.is_initialised:
             reasons = ["System not initialised"]
         if reasons:
             self._say("Arm", reasons)
             return False
-        if copter.navigation.home is not None and not copter.navigation.home_is_locked:
-            motion = copter.motion
-            copter.navigation.set_home((motion.north, motion.east, motion.down), lock=False)
-        copter.info("Arming motors")
-        copter.motors.set_armed(True, copter.now)
-        copter.mode.enter(force=False)
-        copter.set_ticking(True)
+        if vehicle.navigation.home is not None and not vehicle.navigation.home_is_locked:
+            motion = vehicle.motion
+            vehicle.navigation.set_home((motion.north, motion.east, motion.down), lock=False)
+        vehicle.info("Arming motors")
+        vehicle.motors.set_armed(True, vehicle.now)
+        vehicle.mode.enter(force=False)
+        vehicle.set_ticking(True)
         return True
 
     def disarm(self, *, force: bool = True) -> bool:
         """Stop the motors; without ``force`` not in the air."""
-        copter = self._copter
-        if not copter.motors.is_armed:
+        vehicle = self._vehicle
+        if not vehicle.motors.is_armed:
             return True
-        if not force and not copter.is_landed:
+        if not force and not vehicle.is_landed:
             return False
-        copter.info("Disarming motors")
-        copter.motors.set_armed(False, copter.now)
-        copter.mission.reset()
-        copter.call_later(0.0, copter.auto.disarmed)
+        vehicle.info("Disarming motors")
+        vehicle.motors.set_armed(False, vehicle.now)
+        vehicle.mission.reset()
+        vehicle.call_later(0.0, vehicle.auto.disarmed)
         return True

@@ -1,4 +1,4 @@
-"""Calibrations of a simulated ArduCopter's sensors: how long they take, what they say, what they forbid."""
+"""Calibrations of a simulated ArduPilot's sensors: how long they take, what they say, what they forbid."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from aerokit.mavlink.enums import MavCmd, MavResult, MavSeverity
 from aerokit.sim.commands import Progress
 
 if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.copter import SimulatedCopter
+    from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
     from aerokit.sim.commands import Command, CommandHandler
 
 __all__ = ["Calibrations"]
@@ -23,8 +23,8 @@ _ACCELEROMETERS, _TRIM, _ACCELEROMETERS_SIMPLE = 1, 2, 4
 class Calibrations:
     """PREFLIGHT_CALIBRATION answers when it is done; that of the compasses runs until it is cancelled or rebooted."""
 
-    def __init__(self, copter: SimulatedCopter) -> None:
-        self._copter = copter
+    def __init__(self, vehicle: ArduPilotVehicle) -> None:
+        self._vehicle = vehicle
         self.of_compasses = False
         """Whether one is running: the vehicle cannot be armed."""
         self._accelerometers_at = -math.inf
@@ -43,42 +43,44 @@ class Calibrations:
         }
 
     def _calibrate(self, command: Command) -> int | Progress:
-        copter = self._copter
-        if copter.motors.is_armed:
-            copter.send_text(MavSeverity.NOTICE, "Disarm to allow calibration")
+        vehicle = self._vehicle
+        if vehicle.motors.is_armed:
+            vehicle.send_text(MavSeverity.NOTICE, "Disarm to allow calibration")
             return MavResult.FAILED
         if command.param1 == 1.0:
-            copter.info("Initialising ArduPilot")
+            vehicle.info("Initialising ArduPilot")
             return Progress((), _GYROS_S)
         if command.param3 == 1.0:
-            copter.info("Updating barometer calibration")
-            copter.info("Barometer calibration complete")
+            vehicle.info("Updating barometer calibration")
+            vehicle.info("Barometer calibration complete")
             return MavResult.ACCEPTED
         return self._calibrate_accelerometers(command)
 
     def _calibrate_accelerometers(self, command: Command) -> int | Progress:
-        copter = self._copter
+        vehicle = self._vehicle
         if command.x == _ACCELEROMETERS:
-            copter.info("Initialising ArduPilot")
+            vehicle.info("Initialising ArduPilot")
             return Progress((), _GYROS_S, finish=self._ask_for_level)
         if command.x == _TRIM:
-            copter.info("Initialising ArduPilot")
-            return Progress((), _TRIM_S, finish=lambda: copter.info("Trim OK: roll=0.00 pitch=0.00 yaw=0.00"))
+            vehicle.info("Initialising ArduPilot")
+            return Progress(
+                (), _TRIM_S, finish=lambda: vehicle.info("Trim OK: roll=0.00 pitch=0.00 yaw=0.00")
+            )
         if command.x == _ACCELEROMETERS_SIMPLE:
-            if copter.now - self._accelerometers_at < _ACCELEROMETERS_AGAIN_S:
+            if vehicle.now - self._accelerometers_at < _ACCELEROMETERS_AGAIN_S:
                 return MavResult.TEMPORARILY_REJECTED
-            self._accelerometers_at = copter.now
-            copter.info("Initialising ArduPilot")
+            self._accelerometers_at = vehicle.now
+            vehicle.info("Initialising ArduPilot")
             return Progress((), _ACCELEROMETERS_S)
         is_forced = _FORCED in (command.x, command.param2)
         return MavResult.ACCEPTED if is_forced else MavResult.UNSUPPORTED
 
     def _ask_for_level(self) -> None:
-        self._copter.send_text(MavSeverity.CRITICAL, "Place vehicle level and press any key.")
+        self._vehicle.send_text(MavSeverity.CRITICAL, "Place vehicle level and press any key.")
 
     def _start_compasses(self, command: Command) -> int:
-        if self._copter.motors.is_armed:
-            self._copter.send_text(MavSeverity.NOTICE, "Disarm to allow compass calibration")
+        if self._vehicle.motors.is_armed:
+            self._vehicle.send_text(MavSeverity.NOTICE, "Disarm to allow compass calibration")
             return MavResult.FAILED
         if not 0 <= command.param1 <= 255:
             return MavResult.FAILED

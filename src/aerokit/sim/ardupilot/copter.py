@@ -3,371 +3,88 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Sequence
 from typing import TYPE_CHECKING, ClassVar
 
-from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import (
-    CopterMode,
-    MavFrame,
-    MavModeFlag,
-    MavProtocolCapability,
-    MavResult,
-    MavSeverity,
-)
-from aerokit.sim.ardupilot.arming import Arming
+from aerokit.mavlink.enums import CopterMode, MavModeFlag, MavType
 from aerokit.sim.ardupilot.auto import Auto
-from aerokit.sim.ardupilot.boot import BootTimeline
-from aerokit.sim.ardupilot.buzzer import hear_tunes
-from aerokit.sim.ardupilot.calibration import Calibrations
 from aerokit.sim.ardupilot.copter_commands import copter_commands
-from aerokit.sim.ardupilot.copter_parameters import copter_parameters
-from aerokit.sim.ardupilot.failsafes import Failsafes
-from aerokit.sim.ardupilot.gimbal import Gimbal
 from aerokit.sim.ardupilot.guided import Guided
-from aerokit.sim.ardupilot.mission_run import MissionRun
-from aerokit.sim.ardupilot.mission_server import MissionServer
 from aerokit.sim.ardupilot.modes import AltHold, Brake, Circle, Loiter, Mode, PosHold, Stabilize
-from aerokit.sim.ardupilot.motors import Motors
-from aerokit.sim.ardupilot.navigation import Navigation
-from aerokit.sim.ardupilot.radio import Radio
-from aerokit.sim.ardupilot.requests import Requests
 from aerokit.sim.ardupilot.returning import Land, Rtl, SmartRtl
 from aerokit.sim.ardupilot.setpoints import Setpoints
-from aerokit.sim.ardupilot.storage import DEFAULT_LOGS, Storage
-from aerokit.sim.ardupilot.telemetry import BUILDERS
-from aerokit.sim.ardupilot.telemetry_position import global_origin, home_position
-from aerokit.sim.ardupilot.telemetry_state import heartbeat
+from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 from aerokit.sim.ardupilot.yaw import AutoYaw
-from aerokit.sim.battery import Battery
-from aerokit.sim.commands import CommandServer
-from aerokit.sim.local_frame import GlobalPoint, LocalFrame
-from aerokit.sim.motion import Motion, Wind
-from aerokit.sim.vehicle import ExtraComponent, SimulatedVehicle, sender_of
 
 if TYPE_CHECKING:
-    from aerokit.mavlink.message import Message
-    from aerokit.sim.ardupilot.ftp import ArduPilotFtp
-    from aerokit.sim.ardupilot.navigation import Ned
-    from aerokit.sim.channel import Channel
-    from aerokit.sim.file_tree import FileTree
-    from aerokit.sim.logs import SimulatedLog
+    from aerokit.sim.ardupilot.parameter_tables import Kind
+    from aerokit.sim.commands import CommandHandler
 
 __all__ = ["SimulatedCopter"]
 
-_MODES: tuple[type[Mode], ...] = (
-    Auto, Stabilize, AltHold, Circle, Loiter, Guided, Land, Rtl, PosHold, Brake, SmartRtl,
-)  # fmt: skip
-_REBOOT_SILENCE_S = 1.5
 _LAND_DETECTOR_S = 1.0
-_TIMESYNC_S = 10.0
-_BEFORE_READY = frozenset({m.Heartbeat.ID, m.AutopilotVersion.ID})
-_RELATIVE = frozenset({MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT})
-_TERRAIN = frozenset({MavFrame.GLOBAL_TERRAIN_ALT, MavFrame.GLOBAL_TERRAIN_ALT_INT})
-_ABSOLUTE = frozenset({MavFrame.GLOBAL, MavFrame.GLOBAL_INT})
-_RELEASES = {"dev": 0, "alpha": 64, "beta": 128, "rc": 192, "official": 255}
+_BASE = MavModeFlag.STABILIZE_ENABLED | MavModeFlag.MANUAL_INPUT_ENABLED | MavModeFlag.CUSTOM_MODE_ENABLED
+_GUIDED_MODES = frozenset(
+    {"GUIDED", "LOITER", "POSHOLD", "CIRCLE", "BRAKE", "RTL", "SMARTRTL", "LAND", "AUTO"}
+)
 
 
-class SimulatedCopter(SimulatedVehicle):
+class SimulatedCopter(ArduPilotVehicle):
     """Speaks and behaves as ArduCopter does where a client can see it; flies as `Motion` does.
 
-    - ``home``: where it is switched on: latitude, longitude (degrees), altitude AMSL (m);
-      ``heading_deg``: where its nose points then
-    - ``boot_time_s``: seconds until the estimator has a position; the real one needs 41.5, 0 is ready at once
-    - ``boot_text``: the plain text that a serial or TCP port gives before the first frame
-    - ``version``: goes into AUTOPILOT_VERSION and the banner; ``parameters``: values other than the defaults,
-      ``parameter_count``: fewer than all 1,349, for quick tests; ``parameter_errors``: it says PARAM_ERROR
-      MNT1_TYPE 1 fits a gimbal with three axes
-    - ``logs``: what flights have left; ``link_bytes_per_s``: see `Storage`
-    - ``battery_percent``: charge at the start; ``battery_capacity_mah``: the size of the pack
-    - ``wind``: constant wind and gusts; ``rangefinder_reach_m``: 0 means that there is no range finder
-    - ``unsupported_commands``: MAV_CMDs that this firmware does not know (SET_MESSAGE_INTERVAL if it is old);
-      ``stream_groups`` False: it does not know REQUEST_DATA_STREAM
-    - ``components``: other components on its links (gimbal, camera), heartbeats only
-    - ``unix_time_at_boot``: what its GPS clock says at simulated second 0
+    Its arguments are those of `ArduPilotVehicle`. It has 1,349 parameters; MNT1_TYPE 1 fits a gimbal with three
+    axes.
 
     Not simulated yet: keeping within a fence, flying to rally points, radio failsafe.
     """
 
+    KIND: ClassVar[Kind] = "copter"
+    FIRMWARE: ClassVar[str] = "ArduCopter"
+    FRAME: ClassVar[str | None] = "Frame: QUAD/PLUS"
+    MAV_TYPE: ClassVar[int] = MavType.QUADROTOR
     CAPABILITIES: ClassVar[int] = 0xFBEF
-    GIT_HASH: ClassVar[bytes] = b"5ae20c17"
+    MODES: ClassVar[tuple[type[Mode], ...]] = (
+        Auto, Stabilize, AltHold, Circle, Loiter, Guided, Land, Rtl, PosHold, Brake, SmartRtl,
+    )  # fmt: skip
 
-    def __init__(
-        self,
-        *,
-        system_id: int = 1,
-        home: tuple[float, float, float] = (-35.3632610, 149.1652299, 584.09),
-        heading_deg: float = 353.0,
-        seed: int = 0,
-        boot_time_s: float = 5.0,
-        boot_text: bool = False,
-        version: str = "4.7.0-dev",
-        parameters: dict[str, float] | None = None,
-        parameter_count: int | None = None,
-        parameter_errors: bool = False,
-        logs: Sequence[SimulatedLog] = DEFAULT_LOGS,
-        link_bytes_per_s: float | None = None,
-        battery_percent: float = 100.0,
-        battery_capacity_mah: float = 3300.0,
-        wind: Wind | None = None,
-        rangefinder_reach_m: float = 0.0,
-        unsupported_commands: Collection[int] = (),
-        stream_groups: bool = True,
-        components: Iterable[ExtraComponent] = (),
-        unix_time_at_boot: float = 1_790_000_000.0,
-    ) -> None:
-        self.parameters = copter_parameters(parameter_count)
-        """By name; change them as a test needs it. They survive a reboot."""
-        self.parameters["MAV_SYSID"] = system_id
-        for name, value in (parameters or {}).items():
-            self.parameters[name] = value
-        super().__init__(system_id=system_id, component_id=1, seed=seed, components=components)
-        self.timeline = BootTimeline.scaled(boot_time_s)
-        self.version = version
-        self.uid = bytes([0xA0, system_id]) + bytes(16)
-        self.battery = Battery(battery_capacity_mah, percent=battery_percent)
-        self.motion = Motion(self.rng, wind=wind)
-        self.motion.yaw = math.remainder(math.radians(heading_deg), 2 * math.pi)
-        self.rangefinder_reach_m = rangefinder_reach_m
-        self.unsupported_commands = frozenset(unsupported_commands)
-        self.rc = Radio(self)
-        """What it hears of sticks and switches; the throttle (index 2) rests at 1000."""
-        self.tunes = hear_tunes(self)
-        """What PLAY_TUNE had it play."""
-        self.calibrations = Calibrations(self)
-        self._boot_text = boot_text
-        self._stream_groups = stream_groups
-        self._unix_time_at_start = unix_time_at_boot
-        self._frame = LocalFrame(GlobalPoint(round(home[0] * 1e7), round(home[1] * 1e7), home[2]))
-        self.missions = MissionServer(self)
-        self.is_fence_enabled = False
-        """As DO_FENCE_ENABLE has left it."""
-        """Mission, fence and rally points; they survive a reboot."""
-        self._reset()
-        self._listen()
-        self.storage = Storage(
-            self, logs, parameter_errors=parameter_errors, link_bytes_per_s=link_bytes_per_s
-        )
-        """Files, logs, and the servers of them and of the parameters."""
+    def make_commands(self) -> dict[int, CommandHandler]:
+        """See `copter_commands`."""
+        return copter_commands(self)
 
-    def _reset(self) -> None:
-        """What a power cycle makes new."""
-        self.is_initialised = self.has_left_boot = False
-        self.is_landed = self.motion.is_on_ground
-        self.motors = Motors()
-        self.navigation = Navigation(self, self._frame)
-        self.arming = Arming(self)
-        self.failsafes = Failsafes(self)
-        self.gimbal = Gimbal(self)
-        self.calibrations.reset()
-        self.rc.reset()
+    def hear_setpoints(self) -> None:
+        """See `Setpoints`."""
+        Setpoints(self)
+
+    def reset_controllers(self) -> None:
+        """Where it points its nose, and the land detector."""
         self.yaw = AutoYaw(self)
-        self._modes = {mode.number: mode(self) for mode in _MODES}
-        guided = self._modes[CopterMode.GUIDED]
-        assert isinstance(guided, Guided)
-        self.guided = guided
-        auto = self._modes[CopterMode.AUTO]
-        assert isinstance(auto, Auto)
-        self.auto = auto
-        self.mission = MissionRun(self, auto)
-        self.missions.reset()
-        self.mode: Mode = self._modes[int(self.parameters["INITIAL_MODE"])]
         self._still_since = math.nan
 
-    def _listen(self) -> None:
-        self.requests = Requests(self, stream_groups=self._stream_groups)
-        CommandServer(self, copter_commands(self))
-        Setpoints(self)
-        self.on(m.Heartbeat, self._on_heartbeat)
-        self.on(m.SetMode, self._on_set_mode)
-        self.on(m.Timesync, self._on_timesync)
-        self.on(m.Ping, self._on_ping)
-        self.rc.listen()
-        self.missions.listen()
-
-    # ---------------------------------------------------------------------------------------- state
+    @property
+    def guided(self) -> Guided:
+        """GUIDED."""
+        mode = self._modes[CopterMode.GUIDED]
+        assert isinstance(mode, Guided)
+        return mode
 
     @property
-    def files(self) -> FileTree:
-        """What is on its card, and what it makes up when it is read; it survives a reboot."""
-        return self.storage.files
+    def auto(self) -> Auto:
+        """AUTO."""
+        mode = self._modes[CopterMode.AUTO]
+        assert isinstance(mode, Auto)
+        return mode
 
     @property
-    def capabilities(self) -> int:
-        """MAV_PROTOCOL_CAPABILITYs, for AUTOPILOT_VERSION."""
-        return self.CAPABILITIES & ~MavProtocolCapability.FTP if self.faults.no_ftp else self.CAPABILITIES
+    def base_mode(self) -> int:
+        """GUIDED counts as guided also on the ground, the others when armed."""
+        base, name = int(_BASE), self.mode.name
+        if not self.has_left_boot:
+            return base | MavModeFlag.GUIDED_ENABLED
+        if name in _GUIDED_MODES and (self.motors.is_armed or name == "GUIDED"):
+            base |= MavModeFlag.GUIDED_ENABLED
+        return base | MavModeFlag.SAFETY_ARMED if self.motors.is_armed else base
 
-    @property
-    def ftp(self) -> ArduPilotFtp:
-        """The server of the files."""
-        return self.storage.ftp
-
-    @property
-    def is_armed(self) -> bool:
-        """Whether the motors are armed."""
-        return self.motors.is_armed
-
-    @property
-    def altitude_m(self) -> float:
-        """Metres above home."""
-        return self.navigation.altitude_above_home
-
-    @property
-    def unix_time(self) -> float:
-        """What the GPS says the time is."""
-        return self._unix_time_at_start + self.now
-
-    @property
-    def version_number(self) -> int:
-        """As AUTOPILOT_VERSION packs it."""
-        numbers, _, release = self.version.partition("-")
-        major, minor, patch = (int(part) for part in (*numbers.split("."), "0", "0")[:3])
-        return major << 24 | minor << 16 | patch << 8 | _RELEASES.get(release or "official", 0)
-
-    # ------------------------------------------------------------------------------ boot and reboot
-
-    def boot(self) -> None:
-        """Say what a booting ArduCopter says, when it says it."""
-        line, later = self.timeline, self.call_later
-        self.storage.restart()
-        if self._boot_text:
-            for channel in self.channels:
-                channel.write(
-                    f"\r\n\r\nInit ArduCopter V{self.version} ({self.GIT_HASH.decode()})\r\n".encode()
-                )
-                channel.write(b"\r\nFree RAM: 524288\r\nBooting 0/0\r\n")
-        later(line.first_text, lambda: self.info("Calibrating barometer"))
-        later(line.heartbeat, self.send_banner)
-        later(line.barometers, lambda: self.info("Barometer 1 calibration complete"))
-        later(line.barometers, lambda: self.info("Barometer 2 calibration complete"))
-        later(line.ready, self._become_ready)
-        self.navigation.start()
-
-    def _become_ready(self) -> None:
-        self.is_initialised = True
-        self.info("ArduPilot Ready")
-        self.info("AHRS: DCM active")
-        self.arming.start()
-        self.failsafes.start()
-        self.call_later(0.25 * self.timeline.ready, self._leave_boot)
-
-    def _leave_boot(self) -> None:
-        self.has_left_boot = True
-
-    def start_channel(self, channel: Channel) -> None:
-        """Heartbeats and time synchronisation; everything else waits to be asked."""
-        first = self.booted_at + self.timeline.heartbeat
-        channel.streams.set_interval(m.Heartbeat.ID, 1.0, max(self.now, first))
-        channel.streams.set_interval(m.Timesync.ID, _TIMESYNC_S, max(self.now, self.booted_at + _TIMESYNC_S))
-
-    def send_banner(self) -> None:
-        """Firmware, hash and frame as texts."""
-        self.info(f"ArduCopter V{self.version} ({self.GIT_HASH.decode()})")
-        self.info(self.uid.hex()[:32])
-        self.info("Frame: QUAD/PLUS")
-
-    def restart(self) -> None:
-        """Reboot now: silence, then the whole boot again; stream rates and estimates are forgotten."""
-        self.parameters["STAT_BOOTCNT"] += 1
-        if not self.motion.is_on_ground:
-            self.motion.down = self.motion.ground_down
-        self.motion.settle()
-        self._reset()
-        self.reboot(_REBOOT_SILENCE_S)
-
-    def send_text(self, severity: int, text: str) -> None:
-        """Queue a text: as in the firmware, what explains a refusal leaves after the acknowledgement."""
-        if self.is_initialised:
-            self.call_later(0.0, lambda: super(SimulatedCopter, self).send_text(severity, text))
-        else:
-            super().send_text(severity, text)
-
-    # ---------------------------------------------------------------------------------------- modes
-
-    def set_mode(self, number: int) -> bool:
-        """Change the mode if the vehicle may; says why not. A change is told by a heartbeat at once."""
-        if number == self.mode.number:
-            return True
-        mode = self._modes.get(number)
-        if mode is None:
-            self.send_text(MavSeverity.WARNING, f"No such mode {number}")
-            return False
-        armed = self.motors.is_armed
-        reason = None
-        if (
-            armed
-            and mode.needs_position
-            and not (self.navigation.has_position and not self.failsafes.estimator)
-        ):
-            reason = "requires position"
-        elif not mode.enter(force=not armed):
-            reason = "init failed"
-        if reason is not None:
-            self.send_text(MavSeverity.WARNING, f"Mode change to {mode.name} failed: {reason}")
-            return False
-        self.mode.leave()
-        self.mode = mode
-        self.call_later(0.0, lambda: self.send(heartbeat(self)))
-        return True
-
-    def set_mode_from(self, base_mode: int, custom_mode: int) -> int:
-        """DO_SET_MODE and SET_MODE: only custom modes; the MAV_RESULT. SET_MODE does not tell it."""
-        if not base_mode & MavModeFlag.CUSTOM_MODE_ENABLED:
-            return MavResult.DENIED
-        return MavResult.ACCEPTED if self.set_mode(custom_mode) else MavResult.FAILED
-
-    def available_modes(self) -> list[m.AvailableModes]:
-        """AVAILABLE_MODES, as ArduPilot numbers and names them."""
-        modes = list(self._modes.values())
-        return [
-            m.AvailableModes(len(modes), index, 0, mode.number, 0, mode.name)
-            for index, mode in enumerate(modes, start=1)
-        ]
-
-    def point(self, latitude_e7: int, longitude_e7: int, altitude: float, frame: int) -> Ned | None:
-        """A place on the globe in the world's frame; None when it is none, or the frame is unknown."""
-        valid = abs(latitude_e7) <= 900_000_000 and abs(longitude_e7) <= 1_800_000_000
-        if not valid or not math.isfinite(altitude):
-            return None
-        north, east = self._frame.to_local(latitude_e7, longitude_e7)
-        if frame in _RELATIVE:
-            home = self.navigation.home
-            return (north, east, (self.motion.ground_down if home is None else home[2]) - altitude)
-        if frame in _TERRAIN:
-            return (north, east, self.motion.ground_down - altitude)
-        return (north, east, self._frame.origin.altitude_m - altitude) if frame in _ABSOLUTE else None
-
-    def send_home(self, channel: Channel | None = None) -> None:
-        """GPS_GLOBAL_ORIGIN and HOME_POSITION, as far as they are known."""
-        for message in (global_origin(self), home_position(self)):
-            if message is not None:
-                self.send(message, channel)
-
-    # --------------------------------------------------------------------------------------- flying
-
-    def build(self, message_id: int) -> Message | None:
-        """What is to be streamed now."""
-        if message_id == m.Timesync.ID:
-            return m.Timesync(0, int(self.uptime * 1e9) + self.system_id)
-        if message_id == m.AvailableModesMonitor.ID:
-            return m.AvailableModesMonitor(0)
-        if not self.is_initialised and message_id not in _BEFORE_READY:
-            return None
-        builder = BUILDERS.get(message_id)
-        return None if builder is None else builder(self)
-
-    def tick(self, dt: float) -> None:
-        """Mode, motors, motion, land detector, battery."""
-        if self.motors.is_armed:
-            self.mode.update(dt)
-        self.motors.update(self.now, dt, self.motion, landed=self.is_landed)
-        if not self.is_landed:
-            self._fly(dt)
-        self.battery.drain(self.motors.current_a, dt)
-        if not self.motors.is_armed and self.is_landed and self.motors.is_idle:
-            self.set_ticking(False)
-
-    def _fly(self, dt: float) -> None:
+    def move(self, dt: float) -> None:
+        """Motion and land detector."""
         motion = self.motion
         was_on_ground = motion.is_on_ground
         motion.step(dt, powered=self.motors.is_armed and not self.faults.motor_failed)
@@ -380,20 +97,3 @@ class SimulatedCopter(SimulatedVehicle):
         elif self.now - self._still_since >= _LAND_DETECTOR_S or not self.motors.is_armed:
             self.is_landed, self._still_since = True, math.nan
             motion.settle()
-
-    # -------------------------------------------------------------------------------- other messages
-
-    def _on_set_mode(self, request: m.SetMode, _: Channel) -> None:
-        self.set_mode_from(request.base_mode, request.custom_mode)
-
-    def _on_heartbeat(self, message: m.Heartbeat, _: Channel) -> None:
-        if sender_of(message)[0] == self.parameters["MAV_GCS_SYSID"]:
-            self.failsafes.ground_station_seen_at = self.now
-
-    def _on_timesync(self, request: m.Timesync, channel: Channel) -> None:
-        if request.tc1 == 0:
-            self.send(m.Timesync(int(self.uptime * 1e9), request.ts1), channel)
-
-    def _on_ping(self, ping: m.Ping, channel: Channel) -> None:
-        if ping.target_system == 0:
-            self.send(m.Ping(ping.time_usec, ping.seq, *sender_of(ping)), channel)

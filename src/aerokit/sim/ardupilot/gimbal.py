@@ -1,4 +1,4 @@
-"""A servo gimbal (MNT1_TYPE 1) with three axes on a simulated ArduCopter.
+"""A servo gimbal (MNT1_TYPE 1) with three axes on a simulated ArduPilot.
 
 Servos tell nothing: what the vehicle tells is what it has the servos do, at once. Pitch and roll are from the
 horizon, yaw is from the vehicle's nose or from north. With MNT1_TYPE 0 there is none, and orders FAIL.
@@ -14,8 +14,8 @@ from aerokit.mavlink.enums import GimbalManagerFlags, MavMountMode, MavResult, M
 from aerokit.sim.ardupilot.gimbal_status import gimbal_manager_status
 
 if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.copter import SimulatedCopter
     from aerokit.sim.ardupilot.navigation import Ned
+    from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 
 __all__ = ["Gimbal", "Target"]
 
@@ -47,8 +47,8 @@ class Target:
 class Gimbal:
     """Mode, target and who is in control; :attr:`angles` is where it points now."""
 
-    def __init__(self, copter: SimulatedCopter) -> None:
-        self._copter = copter
+    def __init__(self, vehicle: ArduPilotVehicle) -> None:
+        self._vehicle = vehicle
         self.mode: int = int(self.setting("MNT1_DEFLT_MODE"))
         """MAV_MOUNT_MODE."""
         self.is_yaw_locked = False
@@ -61,11 +61,11 @@ class Gimbal:
     @property
     def is_fitted(self) -> bool:
         """Whether there is one."""
-        return self._copter.parameters["MNT1_TYPE"] != 0
+        return self._vehicle.parameters["MNT1_TYPE"] != 0
 
     def setting(self, name: str) -> float:
         """A parameter."""
-        parameters = self._copter.parameters
+        parameters = self._vehicle.parameters
         return parameters[name] if name in parameters else DEFAULTS[name]
 
     # ------------------------------------------------------------------------- where it points
@@ -75,7 +75,7 @@ class Gimbal:
         """Roll, pitch, yaw in degrees that the servos are to make, yaw from the nose."""
         if self.mode in _UNTURNED:
             return (0.0, 0.0, 0.0)
-        target, motion = self.target, self._copter.motion
+        target, motion = self.target, self._vehicle.motion
         yaw = self._limited("YAW", self._from_nose(target))
         lean = (math.degrees(motion.roll), math.degrees(motion.pitch))
         cos, sin = math.cos(math.radians(-yaw)), math.sin(math.radians(-yaw))
@@ -91,13 +91,13 @@ class Gimbal:
         if self.mode == MavMountMode.GPS_POINT:
             return self._towards(self._region)
         if self.mode == MavMountMode.HOME_LOCATION:
-            return self._towards(self._copter.navigation.home)
+            return self._towards(self._vehicle.navigation.home)
         return self._moved(self._target)
 
     def _moved(self, target: Target) -> Target:
         if not any(target.rates):
             return target
-        seconds = self._copter.now - target.since
+        seconds = self._vehicle.now - target.since
         roll = self._limited("ROLL", target.roll + target.rates[0] * seconds)
         pitch = self._limited("PITCH", target.pitch + target.rates[1] * seconds)
         yaw = target.yaw + target.rates[2] * seconds
@@ -106,8 +106,8 @@ class Gimbal:
 
     def _towards(self, place: Ned | None) -> Target:
         """Of a place that is not known, or without a position, it stays as it was."""
-        motion = self._copter.motion
-        if place is not None and self._copter.navigation.has_position:
+        motion = self._vehicle.motion
+        if place is not None and self._vehicle.navigation.has_position:
             north, east, down = place[0] - motion.north, place[1] - motion.east, place[2] - motion.down
             pitch = math.degrees(math.atan2(-down, math.hypot(north, east)))
             self._target = Target(0.0, pitch, math.degrees(math.atan2(east, north)), True)
@@ -116,7 +116,7 @@ class Gimbal:
     def _from_nose(self, target: Target) -> float:
         if not target.is_from_north:
             return target.yaw
-        return math.remainder(target.yaw - math.degrees(self._copter.motion.yaw), 360.0)
+        return math.remainder(target.yaw - math.degrees(self._vehicle.motion.yaw), 360.0)
 
     def _limited(self, axis: str, angle: float) -> float:
         return max(self.setting(f"MNT1_{axis}_MIN"), min(self.setting(f"MNT1_{axis}_MAX"), angle))
@@ -144,8 +144,8 @@ class Gimbal:
         now = self.target
         start = self._from_nose(now)
         if from_north:
-            start = now.yaw if now.is_from_north else start + math.degrees(self._copter.motion.yaw)
-        self._target = Target(now.roll, now.pitch, start, from_north, (roll, pitch, yaw), self._copter.now)
+            start = now.yaw if now.is_from_north else start + math.degrees(self._vehicle.motion.yaw)
+        self._target = Target(now.roll, now.pitch, start, from_north, (roll, pitch, yaw), self._vehicle.now)
         self.mode = MavMountMode.MAVLINK_TARGETING
 
     def look_at(self, place: Ned | None) -> None:
@@ -168,13 +168,13 @@ class Gimbal:
         elif system != -1:
             self.in_control = (system, component)
         if self.in_control != before:
-            self._copter.call_later(0.0, self._tell_control)
+            self._vehicle.call_later(0.0, self._tell_control)
         return True
 
     def _tell_control(self) -> None:
-        status = gimbal_manager_status(self._copter)
+        status = gimbal_manager_status(self._vehicle)
         if status is not None:
-            self._copter.send(status)
+            self._vehicle.send(status)
 
     # ------------------------------------------------------------------------- GIMBAL_MANAGER
 
@@ -199,4 +199,4 @@ class Gimbal:
 
     def warn(self) -> None:
         """Of angles that are none, in hundredths of degrees for example."""
-        self._copter.send_text(MavSeverity.WARNING, "Mount: invalid angle targets")
+        self._vehicle.send_text(MavSeverity.WARNING, "Mount: invalid angle targets")

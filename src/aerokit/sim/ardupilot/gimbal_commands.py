@@ -1,4 +1,4 @@
-"""The commands and messages that order the gimbal of a simulated ArduCopter about."""
+"""The commands and messages that order the gimbal of a simulated ArduPilot about."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from aerokit.mavlink.enums import MavCmd, MavFrame, MavMountMode, MavResult
 from aerokit.sim.rotations import euler_from_quaternion
 
 if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.copter import SimulatedCopter
     from aerokit.sim.ardupilot.gimbal import Gimbal
+    from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
     from aerokit.sim.channel import Channel
     from aerokit.sim.commands import Command, CommandHandler
 
@@ -25,10 +25,10 @@ _JUST_A_MODE = frozenset(
 class GimbalCommands:
     """DO_MOUNT_CONFIGURE, DO_MOUNT_CONTROL and the gimbal manager's commands and messages."""
 
-    def __init__(self, copter: SimulatedCopter) -> None:
-        self._copter = copter
-        copter.on(m.GimbalManagerSetAttitude, self._on_attitude)
-        copter.on(m.GimbalManagerSetPitchyaw, self._on_pitch_and_yaw)
+    def __init__(self, vehicle: ArduPilotVehicle) -> None:
+        self._vehicle = vehicle
+        vehicle.on(m.GimbalManagerSetAttitude, self._on_attitude)
+        vehicle.on(m.GimbalManagerSetPitchyaw, self._on_pitch_and_yaw)
 
     @property
     def commands(self) -> dict[int, CommandHandler]:
@@ -42,7 +42,7 @@ class GimbalCommands:
 
     def _gimbal(self, device_id: float = 0) -> Gimbal | None:
         """The first one is number 1; 0 means it, too."""
-        gimbal = self._copter.gimbal
+        gimbal = self._vehicle.gimbal
         return gimbal if gimbal.is_fitted and int(device_id) in (0, 1) else None
 
     def _configure_mount(self, command: Command) -> int:
@@ -63,7 +63,7 @@ class GimbalCommands:
             return self._point_mount(gimbal, command.param1, command.param2, command.param3)
         if mode == MavMountMode.GPS_POINT and (command.x or command.y or not command.param1):
             place = (int(command.x), int(command.y), float(int(command.param4)))
-            gimbal.look_at(self._copter.point(*place, MavFrame.GLOBAL_RELATIVE_ALT))
+            gimbal.look_at(self._vehicle.point(*place, MavFrame.GLOBAL_RELATIVE_ALT))
             return MavResult.ACCEPTED
         return MavResult.FAILED
 

@@ -1,4 +1,4 @@
-"""What a simulated ArduCopter says of its gimbal."""
+"""What a simulated ArduPilot says of its gimbal."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from aerokit.sim.rotations import quaternion_from_euler
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
-    from aerokit.sim.ardupilot.copter import SimulatedCopter
     from aerokit.sim.ardupilot.gimbal import Gimbal
+    from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 
 __all__ = ["GIMBAL_BUILDERS", "gimbal_manager_status"]
 
@@ -29,15 +29,15 @@ _CAPABILITIES = (
 _FROM_NORTH = frozenset({MavMountMode.GPS_POINT, MavMountMode.SYSID_TARGET, MavMountMode.HOME_LOCATION})
 
 
-def _attitude_status(copter: SimulatedCopter) -> m.GimbalDeviceAttitudeStatus | None:
-    gimbal = copter.gimbal
+def _attitude_status(vehicle: ArduPilotVehicle) -> m.GimbalDeviceAttitudeStatus | None:
+    gimbal = vehicle.gimbal
     if not gimbal.is_fitted:
         return None
     roll, pitch, yaw = map(math.radians, gimbal.angles)
     return m.GimbalDeviceAttitudeStatus(
         0,
         0,
-        copter.time_boot_ms,
+        vehicle.time_boot_ms,
         _device_flags(gimbal),
         quaternion_from_euler(roll, pitch, yaw),
         math.nan,
@@ -64,8 +64,8 @@ def _device_flags(gimbal: Gimbal) -> int:
     return flags
 
 
-def _manager_information(copter: SimulatedCopter) -> m.GimbalManagerInformation | None:
-    gimbal = copter.gimbal
+def _manager_information(vehicle: ArduPilotVehicle) -> m.GimbalManagerInformation | None:
+    gimbal = vehicle.gimbal
     if not gimbal.is_fitted:
         return None
     limits = (
@@ -73,22 +73,22 @@ def _manager_information(copter: SimulatedCopter) -> m.GimbalManagerInformation 
         for axis in ("ROLL", "PITCH", "YAW")
         for end in ("MIN", "MAX")
     )
-    return m.GimbalManagerInformation(copter.time_boot_ms, _CAPABILITIES, _DEVICE_ID, *limits)
+    return m.GimbalManagerInformation(vehicle.time_boot_ms, _CAPABILITIES, _DEVICE_ID, *limits)
 
 
-def gimbal_manager_status(copter: SimulatedCopter) -> m.GimbalManagerStatus | None:
+def gimbal_manager_status(vehicle: ArduPilotVehicle) -> m.GimbalManagerStatus | None:
     """GIMBAL_MANAGER_STATUS: who is in control."""
-    gimbal = copter.gimbal
+    gimbal = vehicle.gimbal
     if not gimbal.is_fitted:
         return None
     flags = GimbalManagerFlags.ROLL_LOCK | GimbalManagerFlags.PITCH_LOCK
     if gimbal.is_yaw_locked:
         flags |= GimbalManagerFlags.YAW_LOCK
     system, component = gimbal.in_control
-    return m.GimbalManagerStatus(copter.time_boot_ms, flags, _DEVICE_ID, system, component, 0, 0)
+    return m.GimbalManagerStatus(vehicle.time_boot_ms, flags, _DEVICE_ID, system, component, 0, 0)
 
 
-GIMBAL_BUILDERS: dict[int, Callable[[SimulatedCopter], Message | None]] = {
+GIMBAL_BUILDERS: dict[int, Callable[[ArduPilotVehicle], Message | None]] = {
     m.GimbalDeviceAttitudeStatus.ID: _attitude_status,
     m.GimbalManagerInformation.ID: _manager_information,
     m.GimbalManagerStatus.ID: gimbal_manager_status,

@@ -14,7 +14,7 @@ from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.mission_items import COMMAND_NAMES
 
 if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.copter import SimulatedCopter
+    from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 
 __all__ = ["MissionFlyer", "MissionRun", "is_navigation"]
 
@@ -82,9 +82,9 @@ def is_navigation(item: MissionItem) -> bool:
 class MissionRun:
     """The position in the mission. An index counts home, so 1 is the first command and 0 means none."""
 
-    def __init__(self, copter: SimulatedCopter, flyer: MissionFlyer) -> None:
-        self._copter, self._flyer = copter, flyer
-        self._list = copter.missions.commands
+    def __init__(self, vehicle: ArduPilotVehicle, flyer: MissionFlyer) -> None:
+        self._vehicle, self._flyer = vehicle, flyer
+        self._list = vehicle.missions.commands
         self._state = MissionState.NOT_STARTED
         self.nav_index = 0
         """The navigation command that runs, or is to be resumed."""
@@ -108,7 +108,7 @@ class MissionRun:
     @property
     def is_being_flown(self) -> bool:
         """Running with the motors armed: the mission cannot be cleared."""
-        return self.is_running and self._copter.motors.is_armed
+        return self.is_running and self._vehicle.motors.is_armed
 
     @property
     def state(self) -> int:
@@ -147,7 +147,7 @@ class MissionRun:
 
     @property
     def _restarts(self) -> bool:
-        return self._copter.parameters["MIS_RESTART"] == 1
+        return self._vehicle.parameters["MIS_RESTART"] == 1
 
     # -------------------------------------------------------------------------------------- directing
 
@@ -260,7 +260,7 @@ class MissionRun:
     def _begin(self, index: int, item: MissionItem) -> bool:
         name = COMMAND_NAMES.get(item.command, "?")
         target = f" {item.param1:.0f}" if item.command in _WITH_TARGET else ""
-        self._copter.info(f"Mission: {index} {name}{target}")
+        self._vehicle.info(f"Mission: {index} {name}{target}")
         return item.command in _DONE_AT_ONCE or self._flyer.start_command(index, item)
 
     def _is_complete(self, index: int, item: MissionItem) -> bool:
@@ -309,5 +309,5 @@ class MissionRun:
         if counts:
             self._jumps[index] = done + 1
             of = "unlimited" if times == _FOREVER else str(times)
-            self._copter.info(f"Mission: {index} Jump {done + 1}/{of}")
+            self._vehicle.info(f"Mission: {index} Jump {done + 1}/{of}")
         return True

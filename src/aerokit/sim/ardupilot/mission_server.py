@@ -23,7 +23,7 @@ from aerokit.sim.vehicle import sender_of
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
-    from aerokit.sim.ardupilot.copter import SimulatedCopter
+    from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
     from aerokit.sim.channel import Channel
 
 __all__ = ["MissionServer"]
@@ -53,9 +53,9 @@ class _Upload:
 class MissionServer:
     """Mission, fence and rally points: kept here, sent and received here."""
 
-    def __init__(self, copter: SimulatedCopter) -> None:
-        self._copter = copter
-        self.commands = CommandList(_COMMANDS_IN_MEMORY, self._home, lambda: copter.mission.is_being_flown)
+    def __init__(self, vehicle: ArduPilotVehicle) -> None:
+        self._vehicle = vehicle
+        self.commands = CommandList(_COMMANDS_IN_MEMORY, self._home, lambda: vehicle.mission.is_being_flown)
         """The mission, for its execution."""
         self.fence = FenceList()
         self.rally = RallyList(_RALLY_POINTS_IN_MEMORY)
@@ -69,7 +69,7 @@ class MissionServer:
 
     def listen(self) -> None:
         """Hear the protocol's messages."""
-        on = self._copter.on
+        on = self._vehicle.on
         on(m.MissionRequestList, self._on_request_list)
         on(m.MissionRequestInt, self._on_request_int)
         on(m.MissionRequest, self._on_request)
@@ -116,10 +116,10 @@ class MissionServer:
         self._uploads.clear()
 
     def _home(self) -> MissionItem:
-        home = self._copter.navigation.home
+        home = self._vehicle.navigation.home
         if home is None:
             return MissionItem(MavCmd.NAV_WAYPOINT, MavFrame.GLOBAL)
-        place = self._copter.navigation.frame.to_global(*home)
+        place = self._vehicle.navigation.frame.to_global(*home)
         altitude = float32(round(place.altitude_m * 100) * float32(0.01))
         return MissionItem(
             MavCmd.NAV_WAYPOINT, MavFrame.GLOBAL, x=place.latitude_e7, y=place.longitude_e7, z=altitude
@@ -128,10 +128,10 @@ class MissionServer:
     # ---------------------------------------------------------------------------------------- answers
 
     def _warn(self, text: str) -> None:
-        self._copter.send_text(MavSeverity.WARNING, text)
+        self._vehicle.send_text(MavSeverity.WARNING, text)
 
     def _acknowledge(self, message: Message, result: int, mission_type: int, channel: Channel) -> None:
-        self._copter.send(m.MissionAck(*sender_of(message), result, mission_type), channel)
+        self._vehicle.send(m.MissionAck(*sender_of(message), result, mission_type), channel)
 
     def _find(self, message: Message, mission_type: int, channel: Channel) -> ItemList | None:
         """The list of that type, if it can be talked about on this channel; else the refusal is sent."""
@@ -145,7 +145,7 @@ class MissionServer:
 
     def _capacity(self, items: ItemList) -> int:
         """The mission's memory is known only once the vehicle is initialised."""
-        return 0 if items is self.commands and not self._copter.is_initialised else items.capacity
+        return 0 if items is self.commands and not self._vehicle.is_initialised else items.capacity
 
     # --------------------------------------------------------------------------------------- download
 
@@ -157,7 +157,7 @@ class MissionServer:
         if mission_type in self._uploads:
             self._acknowledge(request, _R.DENIED, mission_type, channel)
             return
-        self._copter.send(m.MissionCount(*sender_of(request), items.count, mission_type), channel)
+        self._vehicle.send(m.MissionCount(*sender_of(request), items.count, mission_type), channel)
 
     def _on_request_int(self, request: m.MissionRequestInt, channel: Channel) -> None:
         mission_type = request.mission_type
@@ -170,7 +170,7 @@ class MissionServer:
         to = sender_of(request)
         if isinstance(item, int):
             if item == _R.INVALID_SEQUENCE:
-                self._copter.send(m.MissionCount(*to, items.count, mission_type), channel)
+                self._vehicle.send(m.MissionCount(*to, items.count, mission_type), channel)
             self._acknowledge(request, item, mission_type, channel)
             return
         current = self._is_current(item, mission_type)
@@ -182,7 +182,7 @@ class MissionServer:
             mission_type=mission_type,
             current=current,
         )
-        self._copter.send(message, channel)
+        self._vehicle.send(message, channel)
 
     def _on_request(self, request: m.MissionRequest, channel: Channel) -> None:
         mission_type = request.mission_type
@@ -200,11 +200,11 @@ class MissionServer:
             self._warn("got MISSION_REQUEST; use MISSION_REQUEST_INT!")
         current = int(self._is_current(item, mission_type))
         to = sender_of(request)
-        self._copter.send(item_message_float(item, place, request.seq, to, mission_type, current), channel)
+        self._vehicle.send(item_message_float(item, place, request.seq, to, mission_type, current), channel)
 
     def _is_current(self, item: MissionItem, mission_type: int) -> bool:
         """As in the firmware, which compares the item's command with the number of the current item."""
-        return mission_type == MavMissionType.MISSION and item.command == self._copter.mission.nav_index
+        return mission_type == MavMissionType.MISSION and item.command == self._vehicle.mission.nav_index
 
     # ----------------------------------------------------------------------------------------- upload
 
@@ -252,7 +252,7 @@ class MissionServer:
     def _upload(
         self, items: ItemList, message: Message, mission_type: int, channel: Channel, first: int, last: int
     ) -> _Upload:
-        now = self._copter.now
+        now = self._vehicle.now
         return _Upload(items, mission_type, sender_of(message), channel, first, last, now, now)
 
     def _start(self, upload: _Upload) -> None:
@@ -266,25 +266,25 @@ class MissionServer:
         upload.items.abandon()
 
     def _ask(self, upload: _Upload) -> None:
-        upload.asked_at = self._copter.now
-        if self._copter.is_initialised:
+        upload.asked_at = self._vehicle.now
+        if self._vehicle.is_initialised:
             request = m.MissionRequest(*upload.partner, upload.next, upload.mission_type)
-            self._copter.send(request, upload.channel)
+            self._vehicle.send(request, upload.channel)
 
     def _watch(self, upload: _Upload) -> None:
         """Ask again and give up at the right time; one timer for each upload."""
         due = min(upload.asked_at + _ASK_AGAIN_S, upload.received_at + _GIVE_UP_S)
-        self._copter.call_at(due, lambda: self._check(upload))
+        self._vehicle.call_at(due, lambda: self._check(upload))
 
     def _check(self, upload: _Upload) -> None:
         if self._uploads.get(upload.mission_type) is not upload:
             return
-        now = self._copter.now
+        now = self._vehicle.now
         if now >= upload.received_at + _GIVE_UP_S:
             self._end(upload)
             self._warn(f"{upload.items.name} upload timeout")
             ack = m.MissionAck(*upload.partner, _R.OPERATION_CANCELLED, upload.mission_type)
-            self._copter.send(ack, upload.channel)
+            self._vehicle.send(ack, upload.channel)
             return
         if now >= upload.asked_at + _ASK_AGAIN_S:
             self._ask(upload)
@@ -326,7 +326,7 @@ class MissionServer:
             refuse(result)
             self._end(upload)
         else:
-            upload.received_at = self._copter.now
+            upload.received_at = self._vehicle.now
             upload.next += 1
             if upload.next > upload.last:
                 self._complete(upload)
@@ -336,8 +336,8 @@ class MissionServer:
     def _complete(self, upload: _Upload) -> None:
         result = upload.items.finish(self._warn)
         if upload.items is self.commands:
-            self._copter.info("Flight plan received")
-        self._copter.send(m.MissionAck(*upload.partner, result, upload.mission_type), upload.channel)
+            self._vehicle.info("Flight plan received")
+        self._vehicle.send(m.MissionAck(*upload.partner, result, upload.mission_type), upload.channel)
         self._end(upload)
 
     def _on_clear_all(self, request: m.MissionClearAll, channel: Channel) -> None:
@@ -351,13 +351,13 @@ class MissionServer:
 
     def _on_set_current(self, request: m.MissionSetCurrent, channel: Channel) -> None:
         """Answered with the number that was asked for, also when another one is flown."""
-        if self._copter.mission.set_current(request.seq):
-            self._copter.send(mission_current(self._copter, request.seq), channel)
+        if self._vehicle.mission.set_current(request.seq):
+            self._vehicle.send(mission_current(self._vehicle, request.seq), channel)
 
     def _clear(self, items: ItemList) -> bool:
         done = items.clear()
         if done and items is self.commands:
-            self._copter.mission.clear()
+            self._vehicle.mission.clear()
         return done
 
     def _guide(self, item: MissionItem, current: int) -> int:
@@ -367,11 +367,11 @@ class MissionServer:
             return kept
         if current == _ALTITUDE_CHANGE:
             return _R.ACCEPTED
-        copter = self._copter
-        point = copter.point(int(kept.x), int(kept.y), kept.z, kept.frame)
-        if copter.mode is not copter.guided or kept.command != MavCmd.NAV_WAYPOINT or point is None:
+        vehicle = self._vehicle
+        point = vehicle.point(int(kept.x), int(kept.y), kept.z, kept.frame)
+        if vehicle.mode is not vehicle.guided or kept.command != MavCmd.NAV_WAYPOINT or point is None:
             return _R.ERROR
-        copter.guided.go_to(point)
+        vehicle.guided.go_to(point)
         return _R.ACCEPTED
 
 

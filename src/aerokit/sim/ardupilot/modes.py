@@ -9,9 +9,10 @@ AUTOROTATE, TURTLE.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import CopterMode
+from aerokit.sim.ardupilot.mode import VehicleMode
 
 if TYPE_CHECKING:
     from aerokit.sim.ardupilot.copter import SimulatedCopter
@@ -26,49 +27,11 @@ _LOITER_SPEED_M_S = 12.5
 _STABILIZE_CLIMB_M_S = 6.0
 
 
-class Mode:
-    """What a mode can be asked; the defaults are "no" and "nothing"."""
-
-    number: ClassVar[int]
-    name: ClassVar[str]
-    needs_position: ClassVar[bool] = True
-    needs_mission: ClassVar[bool] = False
-    has_manual_throttle: ClassVar[bool] = False
-    can_arm: bool = True
-    arms_with_raised_throttle: ClassVar[bool] = False
-    can_change_speed: ClassVar[bool] = False
-    is_landing: bool = False
-    is_taking_off: bool = False
+class Mode(VehicleMode):
+    """A mode of a copter."""
 
     def __init__(self, copter: SimulatedCopter) -> None:
         self.copter = copter
-
-    def enter(self, *, force: bool) -> bool:
-        """Start; False refuses. ``force`` when the vehicle is disarmed and anything goes."""
-        return True
-
-    def leave(self) -> None:
-        """Another mode takes over."""
-
-    def update(self, dt: float) -> None:
-        """Tell motors and motion what to do for the next ``dt`` seconds."""
-
-    def take_off(self, altitude_m: float, *, must_navigate: bool) -> bool:
-        """Climb to metres above home; False when this mode does not take off by command."""
-        return False
-
-    def pause(self) -> bool:
-        """Stop where it is; False when there is nothing to pause."""
-        return False
-
-    def resume(self) -> bool:
-        """Go on after `pause`."""
-        return False
-
-    @property
-    def destination(self) -> Ned | None:
-        """Where it is flying to."""
-        return None
 
     def stay(self) -> None:
         """Keep still; on the ground the motors idle."""

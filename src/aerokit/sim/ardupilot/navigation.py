@@ -10,7 +10,7 @@ from aerokit.mavlink.enums import GpsFixType
 from aerokit.sim.local_frame import GlobalPoint, LocalFrame
 
 if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.copter import SimulatedCopter
+    from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 
 __all__ = ["Navigation"]
 
@@ -39,8 +39,8 @@ class Navigation:
     ``home`` are points of it, None until they are known.
     """
 
-    def __init__(self, copter: SimulatedCopter, frame: LocalFrame) -> None:
-        self._copter = copter
+    def __init__(self, vehicle: ArduPilotVehicle, frame: LocalFrame) -> None:
+        self._vehicle = vehicle
         self.frame = frame
         self.flags: int | None = None
         """EKF_STATUS_FLAGS; None while there is no estimator to ask."""
@@ -54,8 +54,8 @@ class Navigation:
 
     def start(self) -> None:
         """Follow the boot timeline from now on."""
-        copter, line = self._copter, self._copter.timeline
-        later = copter.call_later
+        vehicle, line = self._vehicle, self._vehicle.timeline
+        later = vehicle.call_later
         later(
             line.ready + 0.5 * (line.estimator_active - line.ready),
             lambda: self._set_flags(Ekf.UNINITIALIZED),
@@ -91,14 +91,14 @@ class Navigation:
         """Where the vehicle believes to be; None before the first fix."""
         if self.fix_type < GpsFixType.TYPE_3D_FIX and self.origin is None:
             return None
-        motion = self._copter.motion
+        motion = self._vehicle.motion
         return self.frame.to_global(motion.north, motion.east, motion.down)
 
     @property
     def altitude_above_home(self) -> float:
         """Metres above home, or above the ground it was switched on while home is unknown."""
-        reference = self._copter.motion.ground_down if self.home is None else self.home[2]
-        return reference - self._copter.motion.down
+        reference = self._vehicle.motion.ground_down if self.home is None else self.home[2]
+        return reference - self._vehicle.motion.down
 
     def local(self, point: Ned) -> Ned:
         """A point of the world, relative to the estimator's origin."""
@@ -113,8 +113,8 @@ class Navigation:
     def set_home(self, point: Ned, *, lock: bool) -> None:
         """Make a point home and tell everybody."""
         self.home, self.home_is_locked = point, self.home_is_locked or lock
-        self._copter.missions.commands.add_home()
-        self._copter.call_later(0.0, self._copter.send_home)
+        self._vehicle.missions.commands.add_home()
+        self._vehicle.call_later(0.0, self._vehicle.send_home)
 
     # ------------------------------------------------------------------------------------- timeline
 
@@ -123,12 +123,12 @@ class Navigation:
 
     def _say_cores(self, text: str) -> None:
         for core in (0, 1):
-            self._copter.info(f"EKF3 IMU{core} {text}")
+            self._vehicle.info(f"EKF3 IMU{core} {text}")
 
     def _activate(self) -> None:
         self.flags = 0
         self._say_cores("initialised")
-        self._copter.info("AHRS: EKF3 active")
+        self._vehicle.info("AHRS: EKF3 active")
 
     def _align(self) -> None:
         self.flags = _ATTITUDE_ONLY
@@ -136,32 +136,32 @@ class Navigation:
 
     def _detect_gps(self) -> None:
         self.is_gps_detected, self.fix_type = True, GpsFixType.NO_FIX
-        self._copter.info("GPS 1: probing for u-blox at 230400 baud")
-        self._copter.info("GPS 1: detected u-blox")
+        self._vehicle.info("GPS 1: probing for u-blox at 230400 baud")
+        self._vehicle.info("GPS 1: detected u-blox")
 
     def _get_fix(self) -> None:
-        if not self._copter.faults.gps_lost:
+        if not self._vehicle.faults.gps_lost:
             self.fix_type = GpsFixType.RTK_FIXED
-        self._copter.every(_CHECK_S, self._watch_gps)
+        self._vehicle.every(_CHECK_S, self._watch_gps)
 
     def _set_origin(self) -> None:
         if self.fix_type < GpsFixType.TYPE_3D_FIX:
-            self._copter.call_later(1.0, self._set_origin)
+            self._vehicle.call_later(1.0, self._set_origin)
             return
-        motion = self._copter.motion
+        motion = self._vehicle.motion
         self.origin = (motion.north, motion.east, motion.down)
         self.home = self.origin
-        self._copter.missions.commands.add_home()
-        self._copter.send_home()
+        self._vehicle.missions.commands.add_home()
+        self._vehicle.send_home()
         self._say_cores("origin set")
-        self._copter.info(f"Field Elevation Set: {self.frame.origin.altitude_m - motion.down:.0f}m")
+        self._vehicle.info(f"Field Elevation Set: {self.frame.origin.altitude_m - motion.down:.0f}m")
 
     def _become_healthy(self) -> None:
         self.is_healthy = True
 
     def _use_gps(self) -> None:
         if self.origin is None or self.fix_type < GpsFixType.TYPE_3D_FIX:
-            self._copter.call_later(1.0, self._use_gps)
+            self._vehicle.call_later(1.0, self._use_gps)
             return
         self.flags = _WITH_POSITION
         self._say_cores("is using GPS")
@@ -169,7 +169,7 @@ class Navigation:
     # ----------------------------------------------------------------------------------- losing GPS
 
     def _watch_gps(self) -> None:
-        now, lost = self._copter.now, self._copter.faults.gps_lost
+        now, lost = self._vehicle.now, self._vehicle.faults.gps_lost
         if lost and math.isnan(self._lost_at):
             self._lost_at, self.fix_type = now, GpsFixType.NO_FIX
         elif lost and self.has_position and now - self._lost_at >= _GIVE_UP_S:

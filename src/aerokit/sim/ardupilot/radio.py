@@ -10,7 +10,7 @@ from aerokit.mavlink import messages as m
 from aerokit.sim.vehicle import sender_of
 
 if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.copter import SimulatedCopter
+    from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
     from aerokit.sim.channel import Channel
 
 __all__ = ["Radio"]
@@ -26,8 +26,8 @@ class Radio:
     Setting an item moves a stick or switch of the transmitter, of which there are eight.
     """
 
-    def __init__(self, copter: SimulatedCopter) -> None:
-        self._copter = copter
+    def __init__(self, vehicle: ArduPilotVehicle) -> None:
+        self._vehicle = vehicle
         self._sticks: list[int] = list(_AT_REST)
         self._overrides: dict[int, tuple[int, float]] = {}
 
@@ -36,7 +36,7 @@ class Radio:
 
     def __getitem__(self, index: int) -> int:
         value, since = self._overrides.get(index, (0, -math.inf))
-        if value and self._copter.now - since < self._override_time():
+        if value and self._vehicle.now - since < self._override_time():
             return value
         return self._sticks[index] if index < len(self._sticks) else 0
 
@@ -53,7 +53,7 @@ class Radio:
 
     def listen(self) -> None:
         """Hear RC_CHANNELS_OVERRIDE."""
-        self._copter.on(m.RcChannelsOverride, self._on_override)
+        self._vehicle.on(m.RcChannelsOverride, self._on_override)
 
     def reset(self) -> None:
         """Forget what was overridden, as a reboot does."""
@@ -61,19 +61,19 @@ class Radio:
 
     def _override_time(self) -> float:
         """Seconds for which an override holds; below 0 means for ever."""
-        seconds = self._copter.parameters["RC_OVERRIDE_TIME"]
+        seconds = self._vehicle.parameters["RC_OVERRIDE_TIME"]
         return math.inf if seconds < 0 else seconds
 
     def _on_override(self, override: m.RcChannelsOverride, _: Channel) -> None:
         """Only of the vehicle's own ground station. 0 leaves channels above 8 as they are, and releases the others."""
-        copter = self._copter
-        if sender_of(override)[0] != copter.parameters["MAV_GCS_SYSID"]:
+        vehicle = self._vehicle
+        if sender_of(override)[0] != vehicle.parameters["MAV_GCS_SYSID"]:
             return
-        copter.failsafes.ground_station_seen_at = copter.now
+        vehicle.failsafes.ground_station_seen_at = vehicle.now
         for index in range(_OVERRIDABLE):
             value = getattr(override, f"chan{index + 1}_raw")
             if value == _SAME_AS_BEFORE or (value == 0 and index >= len(self._sticks)):
                 continue
             if value == _RELEASE_UPPER and index >= len(self._sticks):
                 value = 0
-            self._overrides[index] = (value, copter.now)
+            self._overrides[index] = (value, vehicle.now)

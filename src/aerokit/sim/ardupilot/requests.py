@@ -13,10 +13,10 @@ from aerokit.mavlink.messages import (
     RcChannelsRaw,
     RequestDataStream,
 )
-from aerokit.sim.ardupilot.stream_groups import COPTER_GROUPS, KNOWN_MESSAGES
+from aerokit.sim.ardupilot.stream_groups import KNOWN_MESSAGES
 
 if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.copter import SimulatedCopter
+    from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
     from aerokit.sim.channel import Channel
     from aerokit.sim.commands import Command
 
@@ -29,10 +29,10 @@ _LARGEST_IN_MESSAGE_INTERVAL = 1 << 16
 class Requests:
     """SET_MESSAGE_INTERVAL, GET_MESSAGE_INTERVAL, REQUEST_MESSAGE and REQUEST_DATA_STREAM."""
 
-    def __init__(self, copter: SimulatedCopter, *, stream_groups: bool = True) -> None:
-        self._copter = copter
+    def __init__(self, vehicle: ArduPilotVehicle, *, stream_groups: bool = True) -> None:
+        self._vehicle = vehicle
         if stream_groups:
-            copter.on(RequestDataStream, self._on_group)
+            vehicle.on(RequestDataStream, self._on_group)
 
     def set_interval(self, command: Command) -> int:
         """Interval in microseconds; -1 is off, 0 the default (off, but for the heartbeat)."""
@@ -40,7 +40,7 @@ class Requests:
         if command.param3 != 0.0:
             return MavResult.DENIED
         if message_id not in KNOWN_MESSAGES:
-            self._copter.info(f"No ap_message for mavlink id ({message_id})")
+            self._vehicle.info(f"No ap_message for mavlink id ({message_id})")
             return MavResult.DENIED
         if interval_us < -1:
             return MavResult.DENIED
@@ -49,7 +49,7 @@ class Requests:
             interval = 1.0
         if 0.0 < interval < _SHORTEST_S:
             text = f"Requested rate for message ID {message_id} too fast. Increase SCHED_LOOP_RATE"
-            self._copter.info(text)
+            self._vehicle.info(text)
             return MavResult.DENIED
         self._stream(message_id, min(interval, _LONGEST_S), command.channel)
         return MavResult.ACCEPTED
@@ -62,7 +62,7 @@ class Requests:
         known = message_id in KNOWN_MESSAGES
         interval_us = round(channel.streams.interval(message_id) * 1e6) or -1
         if message_id < _LARGEST_IN_MESSAGE_INTERVAL:
-            self._copter.send(MessageInterval(message_id, interval_us if known else 0), channel)
+            self._vehicle.send(MessageInterval(message_id, interval_us if known else 0), channel)
         return MavResult.ACCEPTED if known else MavResult.FAILED
 
     def request_message(self, command: Command) -> int:
@@ -82,27 +82,27 @@ class Requests:
         """Send it after what is being answered now."""
 
         def send() -> None:
-            message = self._copter.build(message_id)
+            message = self._vehicle.build(message_id)
             if message is not None and (message_id != RcChannelsRaw.ID or channel.version == 1):
-                self._copter.send(message, channel)
+                self._vehicle.send(message, channel)
 
-        self._copter.call_later(0.0, send)
+        self._vehicle.call_later(0.0, send)
 
     def _send_modes(self, index: int, channel: Channel) -> None:
         """One mode by its index from 1, or all for 0; from then on AVAILABLE_MODES_MONITOR every 5 s."""
-        copter = self._copter
-        modes = copter.available_modes()
+        vehicle = self._vehicle
+        modes = vehicle.available_modes()
         wanted = modes if index == 0 else modes[index - 1 : index]
         for message in wanted:
-            copter.call_later(0.0, lambda message=message: copter.send(message, channel))  # type: ignore[misc]
-        channel.streams.set_interval(AvailableModesMonitor.ID, 5.0, copter.now)
+            vehicle.call_later(0.0, lambda message=message: vehicle.send(message, channel))  # type: ignore[misc]
+        channel.streams.set_interval(AvailableModesMonitor.ID, 5.0, vehicle.now)
 
     def _on_group(self, request: RequestDataStream, channel: Channel) -> None:
         if request.start_stop not in (0, 1):
             return
         rate = request.req_message_rate if request.start_stop else 0
-        wanted = request.req_stream_id
-        groups = COPTER_GROUPS if wanted == MavDataStream.ALL else {wanted: COPTER_GROUPS.get(wanted, ())}
+        wanted, all_groups = request.req_stream_id, self._vehicle.STREAM_GROUPS
+        groups = all_groups if wanted == MavDataStream.ALL else {wanted: all_groups.get(wanted, ())}
         for messages in groups.values():
             for message_id in messages:
                 interval = max(1.0 / rate, _SHORTEST_S) if rate > 0 else 0.0
@@ -111,4 +111,4 @@ class Requests:
     def _stream(self, message_id: int, interval: float, channel: Channel) -> None:
         """RC_CHANNELS_RAW is for MAVLink 1 only, where old displays look for it."""
         if message_id != RcChannelsRaw.ID or channel.version == 1:
-            channel.streams.set_interval(message_id, interval, self._copter.now)
+            channel.streams.set_interval(message_id, interval, self._vehicle.now)

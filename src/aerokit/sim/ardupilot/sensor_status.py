@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from aerokit.mavlink.enums import MavSysStatusSensor as Sensor
 
 if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.copter import SimulatedCopter
+    from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 
 __all__ = ["sensor_status"]
 
@@ -33,28 +33,28 @@ _PRESENT = _ALWAYS | _CONTROL | _PREARM | _AHRS | _LOGGING | Sensor.MAV_SYS_STAT
 _QUIETLY_HEALTHY = Sensor.MAV_SYS_STATUS_GEOFENCE | Sensor.PROXIMITY | _LOGGING
 
 
-def sensor_status(copter: SimulatedCopter) -> tuple[int, int, int]:
+def sensor_status(vehicle: ArduPilotVehicle) -> tuple[int, int, int]:
     """Present, enabled and healthy, as integers."""
-    nav = copter.navigation
+    nav = vehicle.navigation
     present, enabled, health = int(_PRESENT), int(_ALWAYS | _PREARM), int(_ALWAYS | _QUIETLY_HEALTHY)
     if nav.is_gps_detected:
         present |= Sensor.GPS
         enabled |= Sensor.GPS
-        if not copter.faults.gps_lost:
+        if not vehicle.faults.gps_lost:
             health |= Sensor.GPS
     if nav.is_healthy:
         enabled |= _AHRS
         health |= _AHRS
-    if copter.motors.is_armed:
+    if vehicle.motors.is_armed:
         enabled |= _LOGGING
-    if not copter.mode.has_manual_throttle and (copter.motors.is_armed or copter.mode.name == "GUIDED"):
+    if not vehicle.mode.has_manual_throttle and (vehicle.motors.is_armed or vehicle.mode.name == "GUIDED"):
         enabled |= _CONTROL
         health |= _CONTROL
-    if copter.arming.passes:
+    if vehicle.arming.passes:
         health |= _PREARM
-    if copter.faults.motor_failed:
+    if vehicle.faults.motor_failed:
         health &= ~Sensor.PROPULSION
-    if copter.rangefinder_reach_m > 0.0:
+    if vehicle.rangefinder_reach_m > 0.0:
         for_it = Sensor.LASER_POSITION
         present, enabled, health = present | for_it, enabled | for_it, health | for_it
     return int(present), int(enabled), int(health)

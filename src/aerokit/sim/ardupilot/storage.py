@@ -13,7 +13,7 @@ from aerokit.sim.mission_files import MissionMount
 from aerokit.sim.parameter_pack_file import ParameterPackMount
 
 if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.copter import SimulatedCopter
+    from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 
 __all__ = ["DEFAULT_LOGS", "LOG_FOLDER", "Storage"]
 
@@ -41,25 +41,25 @@ class Storage:
 
     def __init__(
         self,
-        copter: SimulatedCopter,
+        vehicle: ArduPilotVehicle,
         logs: Sequence[SimulatedLog],
         *,
         parameter_errors: bool,
         link_bytes_per_s: float | None,
     ) -> None:
-        self._copter = copter
+        self._vehicle = vehicle
         self.files = FileTree()
         self._put_logs(logs)
         self.files.mounts["@SYS"] = TextMount(_SYSTEM_TEXTS)
-        self.files.mounts["@PARAM"] = ParameterPackMount(copter.parameters, self._apply)
-        self.files.mounts["@MISSION"] = MissionMount(copter.missions)
-        banner = copter.send_banner
+        self.files.mounts["@PARAM"] = ParameterPackMount(vehicle.parameters, self._apply)
+        self.files.mounts["@MISSION"] = MissionMount(vehicle.missions)
+        banner = vehicle.send_banner
         self.parameters = ArduPilotParameterServer(
-            copter, copter.parameters, errors=parameter_errors, send_banner=banner
+            vehicle, vehicle.parameters, errors=parameter_errors, send_banner=banner
         )
-        self.ftp = ArduPilotFtp(copter, self.files, send_banner=banner)
+        self.ftp = ArduPilotFtp(vehicle, self.files, send_banner=banner)
         self.logs = ArduPilotLogServer(
-            copter, logs, is_armed=lambda: copter.is_armed, erase_files=self._erase_logs
+            vehicle, logs, is_armed=lambda: vehicle.is_armed, erase_files=self._erase_logs
         )
         if link_bytes_per_s is not None:
             self.parameters.list_rate_hz = _PARAMETERS_SHARE * link_bytes_per_s / _PARAM_VALUE_FRAME
@@ -84,6 +84,6 @@ class Storage:
 
     def _apply(self, name: str, value: float) -> None:
         """One parameter of an uploaded file."""
-        parameters = self._copter.parameters
-        if name not in self._copter.faults.read_only_parameters:
+        parameters = self._vehicle.parameters
+        if name not in self._vehicle.faults.read_only_parameters:
             parameters[name] = rounded(self.parameters.clamped(name, value), parameters.type(name))

@@ -1,4 +1,4 @@
-"""What a simulated ArduCopter says of its attitude, speed and inertial sensors."""
+"""What a simulated ArduPilot says of its attitude, speed and inertial sensors."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from aerokit.sim.rotations import quaternion_from_euler
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
-    from aerokit.sim.ardupilot.copter import SimulatedCopter
+    from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 
 __all__ = ["ATTITUDE_BUILDERS"]
 
 
-def _attitude(copter: SimulatedCopter) -> m.Attitude:
-    motion = copter.motion
+def _attitude(vehicle: ArduPilotVehicle) -> m.Attitude:
+    motion = vehicle.motion
     return m.Attitude(
-        copter.time_boot_ms,
+        vehicle.time_boot_ms,
         motion.roll,
         motion.pitch,
         motion.yaw,
@@ -30,36 +30,38 @@ def _attitude(copter: SimulatedCopter) -> m.Attitude:
     )
 
 
-def _attitude_quaternion(copter: SimulatedCopter) -> m.AttitudeQuaternion | None:
-    if not copter.navigation.has_attitude:
+def _attitude_quaternion(vehicle: ArduPilotVehicle) -> m.AttitudeQuaternion | None:
+    if not vehicle.navigation.has_attitude:
         return None
-    motion = copter.motion
+    motion = vehicle.motion
     q = quaternion_from_euler(motion.roll, motion.pitch, motion.yaw)
-    return m.AttitudeQuaternion(copter.time_boot_ms, *q, motion.roll_rate, motion.pitch_rate, motion.yaw_rate)
+    return m.AttitudeQuaternion(
+        vehicle.time_boot_ms, *q, motion.roll_rate, motion.pitch_rate, motion.yaw_rate
+    )
 
 
-def _attitude_target(copter: SimulatedCopter) -> m.AttitudeTarget:
-    motion = copter.motion
+def _attitude_target(vehicle: ArduPilotVehicle) -> m.AttitudeTarget:
+    motion = vehicle.motion
     q = quaternion_from_euler(motion.roll, motion.pitch, motion.yaw)
-    return m.AttitudeTarget(copter.time_boot_ms, 0, q, 0.0, 0.0, motion.yaw_rate, copter.motors.throttle)
+    return m.AttitudeTarget(vehicle.time_boot_ms, 0, q, 0.0, 0.0, motion.yaw_rate, vehicle.motors.throttle)
 
 
-def _ahrs(copter: SimulatedCopter) -> m.Ahrs:
-    error = 0.01 if copter.navigation.has_attitude else 1.0
+def _ahrs(vehicle: ArduPilotVehicle) -> m.Ahrs:
+    error = 0.01 if vehicle.navigation.has_attitude else 1.0
     return m.Ahrs(0.0, 0.0, 0.0, 0.0, 0.0, error, error)
 
 
-def _ahrs2(copter: SimulatedCopter) -> m.Ahrs2:
-    motion, place = copter.motion, copter.navigation.position
+def _ahrs2(vehicle: ArduPilotVehicle) -> m.Ahrs2:
+    motion, place = vehicle.motion, vehicle.navigation.position
     lat, lon, alt = (
         (0, 0, 0.0) if place is None else (place.latitude_e7, place.longitude_e7, place.altitude_m)
     )
     return m.Ahrs2(motion.roll, motion.pitch, motion.yaw, alt, lat, lon)
 
 
-def _simstate(copter: SimulatedCopter) -> m.Simstate:
-    motion = copter.motion
-    place = copter.navigation.frame.to_global(motion.north, motion.east, motion.down)
+def _simstate(vehicle: ArduPilotVehicle) -> m.Simstate:
+    motion = vehicle.motion
+    place = vehicle.navigation.frame.to_global(motion.north, motion.east, motion.down)
     return m.Simstate(
         motion.roll,
         motion.pitch,
@@ -75,13 +77,13 @@ def _simstate(copter: SimulatedCopter) -> m.Simstate:
     )
 
 
-def _vfr_hud(copter: SimulatedCopter) -> m.VfrHud:
-    motion, place = copter.motion, copter.navigation.position
+def _vfr_hud(vehicle: ArduPilotVehicle) -> m.VfrHud:
+    motion, place = vehicle.motion, vehicle.navigation.position
     return m.VfrHud(
-        motion.airspeed_m_s if copter.navigation.has_position else 0.0,
+        motion.airspeed_m_s if vehicle.navigation.has_position else 0.0,
         motion.ground_speed_m_s,
         int(math.degrees(motion.yaw) % 360.0),
-        round(copter.motors.throttle * 100),
+        round(vehicle.motors.throttle * 100),
         0.0 if place is None else place.altitude_m,
         -motion.velocity_down,
     )
@@ -90,17 +92,17 @@ def _vfr_hud(copter: SimulatedCopter) -> m.VfrHud:
 Three = tuple[int, int, int]
 
 
-def _acceleration(copter: SimulatedCopter) -> Three:
+def _acceleration(vehicle: ArduPilotVehicle) -> Three:
     """In mG."""
-    motion = copter.motion
-    lift = -GRAVITY_M_S2 + (0.0 if copter.is_landed else motion.acceleration_down)
+    motion = vehicle.motion
+    lift = -GRAVITY_M_S2 + (0.0 if vehicle.is_landed else motion.acceleration_down)
     x, y = 1000 * math.sin(motion.pitch), -1000 * math.sin(motion.roll)
     return (_int16(x), _int16(y), _int16(lift / GRAVITY_M_S2 * 1000))
 
 
-def _rates(copter: SimulatedCopter) -> Three:
+def _rates(vehicle: ArduPilotVehicle) -> Three:
     """In mrad/s."""
-    motion = copter.motion
+    motion = vehicle.motion
     return (
         _int16(motion.roll_rate * 1000),
         _int16(motion.pitch_rate * 1000),
@@ -108,9 +110,9 @@ def _rates(copter: SimulatedCopter) -> Three:
     )
 
 
-def _field(copter: SimulatedCopter) -> Three:
+def _field(vehicle: ArduPilotVehicle) -> Three:
     """In mG (milligauss)."""
-    yaw = copter.motion.yaw
+    yaw = vehicle.motion.yaw
     return (_int16(230 * math.cos(yaw)), _int16(-230 * math.sin(yaw)), -530)
 
 
@@ -118,41 +120,45 @@ def _int16(value: float) -> int:
     return max(-32768, min(32767, round(value)))
 
 
-def _raw_imu(copter: SimulatedCopter) -> m.RawImu:
-    return m.RawImu(copter.time_boot_us, *_acceleration(copter), *_rates(copter), *_field(copter), 0, 3500)
+def _raw_imu(vehicle: ArduPilotVehicle) -> m.RawImu:
+    return m.RawImu(
+        vehicle.time_boot_us, *_acceleration(vehicle), *_rates(vehicle), *_field(vehicle), 0, 3500
+    )
 
 
-def _scaled_imu2(copter: SimulatedCopter) -> m.ScaledImu2:
-    return m.ScaledImu2(copter.time_boot_ms, *_acceleration(copter), *_rates(copter), *_field(copter), 3500)
+def _scaled_imu2(vehicle: ArduPilotVehicle) -> m.ScaledImu2:
+    return m.ScaledImu2(
+        vehicle.time_boot_ms, *_acceleration(vehicle), *_rates(vehicle), *_field(vehicle), 3500
+    )
 
 
-def _scaled_imu3(copter: SimulatedCopter) -> m.ScaledImu3:
-    return m.ScaledImu3(copter.time_boot_ms, 0, 0, 0, 0, 0, 0, *_field(copter))
+def _scaled_imu3(vehicle: ArduPilotVehicle) -> m.ScaledImu3:
+    return m.ScaledImu3(vehicle.time_boot_ms, 0, 0, 0, 0, 0, 0, *_field(vehicle))
 
 
-def _pressure_hpa(copter: SimulatedCopter) -> float:
-    altitude = copter.navigation.frame.origin.altitude_m - copter.motion.down
+def _pressure_hpa(vehicle: ArduPilotVehicle) -> float:
+    altitude = vehicle.navigation.frame.origin.altitude_m - vehicle.motion.down
     return float(1013.25 * (1 - 2.25577e-5 * altitude) ** 5.25588)
 
 
-def _scaled_pressure(copter: SimulatedCopter) -> m.ScaledPressure:
-    return m.ScaledPressure(copter.time_boot_ms, _pressure_hpa(copter), 0.0, 2800, 0)
+def _scaled_pressure(vehicle: ArduPilotVehicle) -> m.ScaledPressure:
+    return m.ScaledPressure(vehicle.time_boot_ms, _pressure_hpa(vehicle), 0.0, 2800, 0)
 
 
-def _scaled_pressure2(copter: SimulatedCopter) -> m.ScaledPressure2:
-    return m.ScaledPressure2(copter.time_boot_ms, _pressure_hpa(copter), 0.0, 2800, 0)
+def _scaled_pressure2(vehicle: ArduPilotVehicle) -> m.ScaledPressure2:
+    return m.ScaledPressure2(vehicle.time_boot_ms, _pressure_hpa(vehicle), 0.0, 2800, 0)
 
 
-def _wind(copter: SimulatedCopter) -> m.Wind | None:
-    if not copter.navigation.has_position:
+def _wind(vehicle: ArduPilotVehicle) -> m.Wind | None:
+    if not vehicle.navigation.has_position:
         return None
-    wind = copter.motion.wind
+    wind = vehicle.motion.wind
     speed = math.hypot(wind.north_m_s, wind.east_m_s)
     comes_from = math.degrees(math.atan2(-wind.east_m_s, -wind.north_m_s))
     return m.Wind(comes_from, speed, 0.0)
 
 
-ATTITUDE_BUILDERS: dict[int, Callable[[SimulatedCopter], Message | None]] = {
+ATTITUDE_BUILDERS: dict[int, Callable[[ArduPilotVehicle], Message | None]] = {
     m.Attitude.ID: _attitude,
     m.AttitudeQuaternion.ID: _attitude_quaternion,
     m.AttitudeTarget.ID: _attitude_target,

@@ -1,4 +1,4 @@
-"""What a simulated ArduCopter says of where it is and where it goes.
+"""What a simulated ArduPilot says of where it is and where it goes.
 
 Unknown values look as they do on the real vehicle: latitude and longitude 0 before the first fix, no
 LOCAL_POSITION_NED before the estimator uses GPS, no HOME_POSITION without a home.
@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import EkfStatusFlags, GpsFixType
 from aerokit.mavlink.enums import PositionTargetTypemask as Mask
+from aerokit.sim.ardupilot.guided import Guided
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
-    from aerokit.sim.ardupilot.copter import SimulatedCopter
     from aerokit.sim.ardupilot.navigation import Ned
+    from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 
 __all__ = ["POSITION_BUILDERS", "global_origin", "home_position"]
 
@@ -27,15 +28,15 @@ _POSITION_ONLY = (
 ) | (Mask.YAW_IGNORE | Mask.YAW_RATE_IGNORE)
 
 
-def _global_position(copter: SimulatedCopter) -> m.GlobalPositionInt:
-    motion, nav = copter.motion, copter.navigation
+def _global_position(vehicle: ArduPilotVehicle) -> m.GlobalPositionInt:
+    motion, nav = vehicle.motion, vehicle.navigation
     place = nav.position
     relative = round(nav.altitude_above_home * 1000)
     heading = round(math.degrees(motion.yaw) % 360.0 * 100) % 36000 if nav.has_attitude else 0
     if place is None:
-        return m.GlobalPositionInt(copter.time_boot_ms, 0, 0, 0, relative, 0, 0, 0, heading)
+        return m.GlobalPositionInt(vehicle.time_boot_ms, 0, 0, 0, relative, 0, 0, 0, heading)
     return m.GlobalPositionInt(
-        copter.time_boot_ms,
+        vehicle.time_boot_ms,
         place.latitude_e7,
         place.longitude_e7,
         round(place.altitude_m * 1000),
@@ -47,13 +48,13 @@ def _global_position(copter: SimulatedCopter) -> m.GlobalPositionInt:
     )
 
 
-def _local_position(copter: SimulatedCopter) -> m.LocalPositionNed | None:
-    motion, nav = copter.motion, copter.navigation
+def _local_position(vehicle: ArduPilotVehicle) -> m.LocalPositionNed | None:
+    motion, nav = vehicle.motion, vehicle.navigation
     if not nav.has_position:
         return None
     north, east, down = nav.local((motion.north, motion.east, motion.down))
     return m.LocalPositionNed(
-        copter.time_boot_ms,
+        vehicle.time_boot_ms,
         north,
         east,
         down,
@@ -63,8 +64,8 @@ def _local_position(copter: SimulatedCopter) -> m.LocalPositionNed | None:
     )
 
 
-def _gps_raw(copter: SimulatedCopter) -> m.GpsRawInt:
-    motion, nav = copter.motion, copter.navigation
+def _gps_raw(vehicle: ArduPilotVehicle) -> m.GpsRawInt:
+    motion, nav = vehicle.motion, vehicle.navigation
     if not nav.is_gps_detected:
         return m.GpsRawInt(0, GpsFixType.NO_GPS, 0, 0, 0, 65535, 65535, 0, 0, 0)
     if nav.fix_type < GpsFixType.TYPE_3D_FIX:
@@ -75,7 +76,7 @@ def _gps_raw(copter: SimulatedCopter) -> m.GpsRawInt:
         round(math.degrees(math.atan2(motion.velocity_east, motion.velocity_north)) % 360.0 * 100) % 36000
     )
     return m.GpsRawInt(
-        copter.time_boot_us,
+        vehicle.time_boot_us,
         nav.fix_type,
         place.latitude_e7,
         place.longitude_e7,
@@ -91,21 +92,21 @@ def _gps_raw(copter: SimulatedCopter) -> m.GpsRawInt:
     )
 
 
-def _ekf_status(copter: SimulatedCopter) -> m.EkfStatusReport | None:
-    flags = copter.navigation.flags
+def _ekf_status(vehicle: ArduPilotVehicle) -> m.EkfStatusReport | None:
+    flags = vehicle.navigation.flags
     if flags is None:
         return None
     size = 0.02 if flags & EkfStatusFlags.POS_HORIZ_ABS else 0.0
     return m.EkfStatusReport(flags, size, size, size / 2, size, 0.0, 0.0)
 
 
-def home_position(copter: SimulatedCopter) -> m.HomePosition | None:
+def home_position(vehicle: ArduPilotVehicle) -> m.HomePosition | None:
     """HOME_POSITION; None without a home. ArduPilot's quaternion is NaN."""
-    home = copter.navigation.home
+    home = vehicle.navigation.home
     if home is None:
         return None
-    place = copter.navigation.frame.to_global(*home)
-    local = copter.navigation.local(home)
+    place = vehicle.navigation.frame.to_global(*home)
+    local = vehicle.navigation.local(home)
     return m.HomePosition(
         place.latitude_e7,
         place.longitude_e7,
@@ -115,28 +116,28 @@ def home_position(copter: SimulatedCopter) -> m.HomePosition | None:
         0.0,
         0.0,
         0.0,
-        copter.time_boot_us,
+        vehicle.time_boot_us,
     )
 
 
-def global_origin(copter: SimulatedCopter) -> m.GpsGlobalOrigin | None:
+def global_origin(vehicle: ArduPilotVehicle) -> m.GpsGlobalOrigin | None:
     """GPS_GLOBAL_ORIGIN; None before the estimator has one."""
-    origin = copter.navigation.origin
+    origin = vehicle.navigation.origin
     if origin is None:
         return None
-    place = copter.navigation.frame.to_global(*origin)
+    place = vehicle.navigation.frame.to_global(*origin)
     return m.GpsGlobalOrigin(
-        place.latitude_e7, place.longitude_e7, round(place.altitude_m * 1000), copter.time_boot_us
+        place.latitude_e7, place.longitude_e7, round(place.altitude_m * 1000), vehicle.time_boot_us
     )
 
 
-def _target_global(copter: SimulatedCopter) -> m.PositionTargetGlobalInt | None:
-    target = copter.mode.destination
-    if target is None or not copter.motors.is_armed:
+def _target_global(vehicle: ArduPilotVehicle) -> m.PositionTargetGlobalInt | None:
+    target = vehicle.mode.destination
+    if target is None or not vehicle.motors.is_armed:
         return None
-    place = copter.navigation.frame.to_global(*target)
+    place = vehicle.navigation.frame.to_global(*target)
     return m.PositionTargetGlobalInt(
-        copter.time_boot_ms,
+        vehicle.time_boot_ms,
         0,
         _POSITION_ONLY | 0xF000,
         place.latitude_e7,
@@ -146,55 +147,56 @@ def _target_global(copter: SimulatedCopter) -> m.PositionTargetGlobalInt | None:
     )
 
 
-def _target_local(copter: SimulatedCopter) -> m.PositionTargetLocalNed | None:
-    if copter.mode is not copter.guided:
+def _target_local(vehicle: ArduPilotVehicle) -> m.PositionTargetLocalNed | None:
+    guided = vehicle.mode
+    if not isinstance(guided, Guided):
         return None
-    target = copter.guided.destination
+    target = guided.destination
     if target is None:
         mask = Mask.X_IGNORE | Mask.Y_IGNORE | Mask.Z_IGNORE | Mask.YAW_IGNORE | Mask.YAW_RATE_IGNORE
-        velocity, acceleration = copter.guided.velocity, copter.guided.acceleration
+        velocity, acceleration = guided.velocity, guided.acceleration
         return m.PositionTargetLocalNed(
-            copter.time_boot_ms, 1, mask, 0.0, 0.0, 0.0, *velocity, *acceleration, 0.0, 0.0
+            vehicle.time_boot_ms, 1, mask, 0.0, 0.0, 0.0, *velocity, *acceleration, 0.0, 0.0
         )
-    local = copter.navigation.local(target)
-    return m.PositionTargetLocalNed(copter.time_boot_ms, 1, _POSITION_ONLY, *local, *(0.0,) * 8)
+    local = vehicle.navigation.local(target)
+    return m.PositionTargetLocalNed(vehicle.time_boot_ms, 1, _POSITION_ONLY, *local, *(0.0,) * 8)
 
 
-def _nav_controller(copter: SimulatedCopter) -> m.NavControllerOutput:
-    motion, target = copter.motion, copter.mode.destination
+def _nav_controller(vehicle: ArduPilotVehicle) -> m.NavControllerOutput:
+    motion, target = vehicle.motion, vehicle.mode.destination
     roll, pitch, yaw = (math.degrees(angle) for angle in (motion.roll, motion.pitch, motion.yaw))
-    bearing, distance, altitude_error = _to_target(copter, target)
+    bearing, distance, altitude_error = _to_target(vehicle, target)
     return m.NavControllerOutput(roll, pitch, round(yaw), bearing, distance, altitude_error, 0.0, 0.0)
 
 
-def _to_target(copter: SimulatedCopter, target: Ned | None) -> tuple[int, int, float]:
+def _to_target(vehicle: ArduPilotVehicle, target: Ned | None) -> tuple[int, int, float]:
     if target is None:
         return 0, 0, 0.0
-    motion = copter.motion
+    motion = vehicle.motion
     north, east = target[0] - motion.north, target[1] - motion.east
     bearing = round(math.degrees(math.atan2(east, north)) % 360.0) % 360
     return bearing, min(65535, int(math.hypot(north, east))), motion.down - target[2]
 
 
-def _terrain_report(copter: SimulatedCopter) -> m.TerrainReport:
-    place = copter.navigation.position
+def _terrain_report(vehicle: ArduPilotVehicle) -> m.TerrainReport:
+    place = vehicle.navigation.position
     if place is None:
         return m.TerrainReport(0, 0, 100, 0.0, 0.0, 56, 0)
     return m.TerrainReport(place.latitude_e7, place.longitude_e7, 0, 0.0, place.altitude_m, 504, 0)
 
 
-def _rangefinder(copter: SimulatedCopter) -> m.Rangefinder | None:
-    distance = _height_below(copter)
+def _rangefinder(vehicle: ArduPilotVehicle) -> m.Rangefinder | None:
+    distance = _height_below(vehicle)
     return None if distance is None else m.Rangefinder(distance, 0.0)
 
 
-def _distance_sensor(copter: SimulatedCopter) -> m.DistanceSensor | None:
-    distance = _height_below(copter)
+def _distance_sensor(vehicle: ArduPilotVehicle) -> m.DistanceSensor | None:
+    distance = _height_below(vehicle)
     if distance is None:
         return None
-    reach = round(copter.rangefinder_reach_m * 100)
+    reach = round(vehicle.rangefinder_reach_m * 100)
     return m.DistanceSensor(
-        copter.time_boot_ms,
+        vehicle.time_boot_ms,
         20,
         reach,
         min(reach + 10, round(distance * 100)),
@@ -206,13 +208,13 @@ def _distance_sensor(copter: SimulatedCopter) -> m.DistanceSensor | None:
     )
 
 
-def _height_below(copter: SimulatedCopter) -> float | None:
-    if copter.rangefinder_reach_m <= 0.0:
+def _height_below(vehicle: ArduPilotVehicle) -> float | None:
+    if vehicle.rangefinder_reach_m <= 0.0:
         return None
-    return copter.motion.ground_down - copter.motion.down + 0.2
+    return vehicle.motion.ground_down - vehicle.motion.down + 0.2
 
 
-POSITION_BUILDERS: dict[int, Callable[[SimulatedCopter], Message | None]] = {
+POSITION_BUILDERS: dict[int, Callable[[ArduPilotVehicle], Message | None]] = {
     m.GlobalPositionInt.ID: _global_position,
     m.LocalPositionNed.ID: _local_position,
     m.GpsRawInt.ID: _gps_raw,

@@ -1,4 +1,4 @@
-"""What a simulated ArduCopter says of its state: heartbeat, health, battery, channels, version."""
+"""What a simulated ArduPilot says of its state: heartbeat, health, battery, channels, version."""
 
 from __future__ import annotations
 
@@ -11,54 +11,36 @@ from aerokit.mavlink.enums import (
     MavAutopilot,
     MavBatteryChargeState,
     MavLandedState,
-    MavModeFlag,
     MavState,
-    MavType,
 )
 from aerokit.sim.ardupilot.sensor_status import sensor_status
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
-    from aerokit.sim.ardupilot.copter import SimulatedCopter
+    from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 
 __all__ = ["STATE_BUILDERS", "heartbeat", "mission_current"]
 
 _UNKNOWN_CELL = 0xFFFF
-_GUIDED_MODES = frozenset(
-    {"GUIDED", "LOITER", "POSHOLD", "CIRCLE", "BRAKE", "RTL", "SMARTRTL", "LAND", "AUTO"}
-)
 
 
-def heartbeat(copter: SimulatedCopter) -> m.Heartbeat:
+def heartbeat(vehicle: ArduPilotVehicle) -> m.Heartbeat:
     """HEARTBEAT; BOOT until half a second after the vehicle is initialised."""
-    base = MavModeFlag.STABILIZE_ENABLED | MavModeFlag.MANUAL_INPUT_ENABLED | MavModeFlag.CUSTOM_MODE_ENABLED
-    if not copter.has_left_boot:
-        return m.Heartbeat(
-            MavType.QUADROTOR,
-            MavAutopilot.ARDUPILOTMEGA,
-            base | MavModeFlag.GUIDED_ENABLED,
-            copter.mode.number,
-            MavState.BOOT,
-            3,
-        )
-    if copter.mode.name in _GUIDED_MODES and (copter.motors.is_armed or copter.mode.name == "GUIDED"):
-        base |= MavModeFlag.GUIDED_ENABLED
-    if copter.motors.is_armed:
-        base |= MavModeFlag.SAFETY_ARMED
+    state = _state(vehicle) if vehicle.has_left_boot else MavState.BOOT
     return m.Heartbeat(
-        MavType.QUADROTOR, MavAutopilot.ARDUPILOTMEGA, base, copter.mode.number, _state(copter), 3
+        vehicle.MAV_TYPE, MavAutopilot.ARDUPILOTMEGA, vehicle.base_mode, vehicle.mode.number, state, 3
     )
 
 
-def _state(copter: SimulatedCopter) -> int:
-    if copter.failsafes.is_any_active:
+def _state(vehicle: ArduPilotVehicle) -> int:
+    if vehicle.failsafes.is_any_active:
         return MavState.CRITICAL
-    return MavState.STANDBY if copter.is_landed else MavState.ACTIVE
+    return MavState.STANDBY if vehicle.is_landed else MavState.ACTIVE
 
 
-def _sys_status(copter: SimulatedCopter) -> m.SysStatus:
-    present, enabled, health = sensor_status(copter)
-    battery = copter.battery
+def _sys_status(vehicle: ArduPilotVehicle) -> m.SysStatus:
+    present, enabled, health = sensor_status(vehicle)
+    battery = vehicle.battery
     return m.SysStatus(
         present,
         enabled,
@@ -76,21 +58,21 @@ def _sys_status(copter: SimulatedCopter) -> m.SysStatus:
     )
 
 
-def _extended_sys_state(copter: SimulatedCopter) -> m.ExtendedSysState:
+def _extended_sys_state(vehicle: ArduPilotVehicle) -> m.ExtendedSysState:
     state = MavLandedState.IN_AIR
-    if copter.is_landed:
+    if vehicle.is_landed:
         state = MavLandedState.ON_GROUND
-    elif copter.mode.is_landing:
+    elif vehicle.mode.is_landing:
         state = MavLandedState.LANDING
-    elif copter.mode.is_taking_off:
+    elif vehicle.mode.is_taking_off:
         state = MavLandedState.TAKEOFF
     return m.ExtendedSysState(0, state)
 
 
-def _battery_status(copter: SimulatedCopter) -> m.BatteryStatus:
-    battery = copter.battery
+def _battery_status(vehicle: ArduPilotVehicle) -> m.BatteryStatus:
+    battery = vehicle.battery
     voltages = (round(battery.voltage_v * 1000), *(_UNKNOWN_CELL,) * 9)
-    low = copter.failsafes.battery_is_low
+    low = vehicle.failsafes.battery_is_low
     return m.BatteryStatus(
         0,
         0,
@@ -106,78 +88,78 @@ def _battery_status(copter: SimulatedCopter) -> m.BatteryStatus:
     )
 
 
-def _power_status(copter: SimulatedCopter) -> m.PowerStatus:
+def _power_status(vehicle: ArduPilotVehicle) -> m.PowerStatus:
     return m.PowerStatus(5000, 0, 0)
 
 
-def _meminfo(copter: SimulatedCopter) -> m.Meminfo:
+def _meminfo(vehicle: ArduPilotVehicle) -> m.Meminfo:
     return m.Meminfo(0, 65535, 524288)
 
 
-def _system_time(copter: SimulatedCopter) -> m.SystemTime:
-    unix = round(copter.unix_time * 1e6) if copter.navigation.fix_type >= GpsFixType.TYPE_3D_FIX else 0
-    return m.SystemTime(unix, copter.time_boot_ms)
+def _system_time(vehicle: ArduPilotVehicle) -> m.SystemTime:
+    unix = round(vehicle.unix_time * 1e6) if vehicle.navigation.fix_type >= GpsFixType.TYPE_3D_FIX else 0
+    return m.SystemTime(unix, vehicle.time_boot_ms)
 
 
-def mission_current(copter: SimulatedCopter, seq: int | None = None) -> m.MissionCurrent:
+def mission_current(vehicle: ArduPilotVehicle, seq: int | None = None) -> m.MissionCurrent:
     """MISSION_CURRENT; ``seq`` says another number than that of the command that is flown."""
-    run = copter.mission
+    run = vehicle.mission
     seq = run.nav_index if seq is None else seq
-    return m.MissionCurrent(seq, run.count, run.state, int(copter.mode.needs_mission))
+    return m.MissionCurrent(seq, run.count, run.state, int(vehicle.mode.needs_mission))
 
 
-def _rc_channels(copter: SimulatedCopter) -> m.RcChannels:
-    channels = _by_name(copter.rc.channels)
-    return m.RcChannels(time_boot_ms=copter.time_boot_ms, chancount=len(copter.rc), rssi=255, **channels)
+def _rc_channels(vehicle: ArduPilotVehicle) -> m.RcChannels:
+    channels = _by_name(vehicle.rc.channels)
+    return m.RcChannels(time_boot_ms=vehicle.time_boot_ms, chancount=len(vehicle.rc), rssi=255, **channels)
 
 
-def _rc_channels_raw(copter: SimulatedCopter) -> m.RcChannelsRaw:
-    return m.RcChannelsRaw(time_boot_ms=copter.time_boot_ms, port=0, rssi=255, **_by_name(copter.rc))
+def _rc_channels_raw(vehicle: ArduPilotVehicle) -> m.RcChannelsRaw:
+    return m.RcChannelsRaw(time_boot_ms=vehicle.time_boot_ms, port=0, rssi=255, **_by_name(vehicle.rc))
 
 
 def _by_name(values: Iterable[int]) -> dict[str, int]:
     return {f"chan{number}_raw": value for number, value in enumerate(values, start=1)}
 
 
-def _servo_output(copter: SimulatedCopter) -> m.ServoOutputRaw:
-    pwm = copter.motors.pwm
-    return m.ServoOutputRaw(copter.time_boot_us, 0, pwm, pwm, pwm, pwm, 0, 0, 0, 0)
+def _servo_output(vehicle: ArduPilotVehicle) -> m.ServoOutputRaw:
+    pwm = vehicle.motors.pwm
+    return m.ServoOutputRaw(vehicle.time_boot_us, 0, pwm, pwm, pwm, pwm, 0, 0, 0, 0)
 
 
-def _vibration(copter: SimulatedCopter) -> m.Vibration:
-    size = 0.003 + 0.3 * copter.motors.throttle
-    x, y, z = (abs(copter.rng.gauss(0.0, size)) for _ in range(3))
-    return m.Vibration(copter.time_boot_us, x, y, z, 0, 0, 0)
+def _vibration(vehicle: ArduPilotVehicle) -> m.Vibration:
+    size = 0.003 + 0.3 * vehicle.motors.throttle
+    x, y, z = (abs(vehicle.rng.gauss(0.0, size)) for _ in range(3))
+    return m.Vibration(vehicle.time_boot_us, x, y, z, 0, 0, 0)
 
 
-def _esc_telemetry(copter: SimulatedCopter) -> m.EscTelemetry1To4:
-    current = round(copter.battery.current_a * 25)
-    rpm = round(copter.motors.throttle * 15000)
-    count = int(copter.uptime * 100) & 0xFFFF
-    voltage = round(copter.battery.voltage_v * 100)
+def _esc_telemetry(vehicle: ArduPilotVehicle) -> m.EscTelemetry1To4:
+    current = round(vehicle.battery.current_a * 25)
+    rpm = round(vehicle.motors.throttle * 15000)
+    count = int(vehicle.uptime * 100) & 0xFFFF
+    voltage = round(vehicle.battery.voltage_v * 100)
     return m.EscTelemetry1To4(
         bytes([32] * 4), (voltage,) * 4, (current,) * 4, (0,) * 4, (rpm,) * 4, (count,) * 4
     )
 
 
-def _autopilot_version(copter: SimulatedCopter) -> m.AutopilotVersion:
+def _autopilot_version(vehicle: ArduPilotVehicle) -> m.AutopilotVersion:
     return m.AutopilotVersion(
-        copter.capabilities,
-        copter.version_number,
+        vehicle.capabilities,
+        vehicle.version_number,
         0,
         0,
         0,
-        copter.GIT_HASH,
+        vehicle.GIT_HASH,
         bytes(8),
         bytes(8),
         0,
         0,
         0,
-        copter.uid,
+        vehicle.uid,
     )
 
 
-STATE_BUILDERS: dict[int, Callable[[SimulatedCopter], Message | None]] = {
+STATE_BUILDERS: dict[int, Callable[[ArduPilotVehicle], Message | None]] = {
     m.Heartbeat.ID: heartbeat,
     m.SysStatus.ID: _sys_status,
     m.ExtendedSysState.ID: _extended_sys_state,

@@ -1,0 +1,80 @@
+"""What a flight mode of any simulated ArduPilot can be asked; each kind of vehicle has modes of its own."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar, Protocol
+
+if TYPE_CHECKING:
+    from aerokit.missions import MissionItem
+    from aerokit.sim.ardupilot.navigation import Ned
+
+__all__ = ["AutoMode", "VehicleMode"]
+
+
+class VehicleMode:
+    """One object per vehicle and mode; the answers here are "no" and "nothing"."""
+
+    number: ClassVar[int]
+    name: ClassVar[str]
+    needs_position: ClassVar[bool] = True
+    needs_mission: ClassVar[bool] = False
+    has_manual_throttle: ClassVar[bool] = False
+    can_arm: bool = True
+    arms_with_raised_throttle: ClassVar[bool] = False
+    can_change_speed: ClassVar[bool] = False
+    is_landing: bool = False
+    is_taking_off: bool = False
+
+    def enter(self, *, force: bool) -> bool:
+        """Start; False refuses. ``force`` when the vehicle is disarmed and anything goes."""
+        return True
+
+    def leave(self) -> None:
+        """Another mode takes over."""
+
+    def update(self, dt: float) -> None:
+        """Tell motors and motion what to do for the next ``dt`` seconds."""
+
+    def take_off(self, altitude_m: float, *, must_navigate: bool) -> bool:
+        """Climb to metres above home; False when this mode does not take off by command."""
+        return False
+
+    def pause(self) -> bool:
+        """Stop where it is; False when there is nothing to pause."""
+        return False
+
+    def resume(self) -> bool:
+        """Go on after `pause`."""
+        return False
+
+    def go_to(self, position: Ned) -> None:
+        """Go to a point of the world and stay there; only the guided mode can."""
+        raise NotImplementedError
+
+    @property
+    def destination(self) -> Ned | None:
+        """Where it is going to."""
+        return None
+
+
+class AutoMode(Protocol):
+    """The mode that carries the mission out; it is one of the vehicle's modes. See `MissionFlyer`."""
+
+    may_lift_off: bool
+    is_paused: bool
+
+    def disarmed(self) -> None:
+        """The motors have stopped."""
+        ...
+
+    def start_command(self, index: int, item: MissionItem) -> bool:
+        """Begin a command; False when it cannot be done."""
+        ...
+
+    def is_complete(self, index: int, item: MissionItem) -> bool:
+        """Whether a command is done."""
+        ...
+
+    def end_mission(self) -> None:
+        """There is nothing more to do."""
+        ...
