@@ -127,11 +127,15 @@ class _Flight:
         if int(command.param2) != 1:
             return MavResult.UNSUPPORTED
         result = self._change(HOLD)
-        if result == MavResult.ACCEPTED:
+        if result != MavResult.ACCEPTED:
+            return result
+        if self._px4.failsafes.fence.allows(self._destination(command)):
             self._go_to(command)
+        else:
+            self._px4.send_text(MavSeverity.CRITICAL, "Reposition is outside geofence")
         return result
 
-    def _go_to(self, command: Command) -> None:
+    def _destination(self, command: Command) -> tuple[float, float, float]:
         px4, motion = self._px4, self._px4.motion
         north, east, down = motion.north, motion.east, motion.down
         keeps_place = 0x7FFFFFFF in (command.x, command.y) or not math.isfinite(command.x + command.y)
@@ -139,7 +143,11 @@ class _Flight:
             north, east = px4.frame.to_local(*command.place())
         if math.isfinite(command.z):
             down = px4.frame.origin.altitude_m - command.z
-        px4.flight.target = (north, east, down)
+        return (north, east, down)
+
+    def _go_to(self, command: Command) -> None:
+        px4 = self._px4
+        px4.flight.target = self._destination(command)
         px4.flight.heading = command.param4 if math.isfinite(command.param4) else None
         if command.param1 > 0:
             px4.flight.speed_m_s = command.param1

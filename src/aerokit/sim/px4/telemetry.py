@@ -11,7 +11,6 @@ from aerokit.mavlink.enums import (
     EstimatorStatusFlags,
     GpsFixType,
     MavAutopilot,
-    MavBatteryChargeState,
     MavBatteryFunction,
     MavBatteryType,
     MavLandedState,
@@ -106,7 +105,7 @@ def _battery_status(px4: SimulatedPx4) -> m.BatteryStatus:
         -1,
         int(battery.percent),
         0,
-        MavBatteryChargeState.OK,
+        px4.failsafes.battery_state,
     )
 
 

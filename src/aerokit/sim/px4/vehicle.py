@@ -13,6 +13,7 @@ from aerokit.sim.commands import Command, CommandServer
 from aerokit.sim.local_frame import GlobalPoint, LocalFrame
 from aerokit.sim.motion import GRAVITY_M_S2, Motion, MotionLimits, Wind
 from aerokit.sim.px4.commands import px4_commands
+from aerokit.sim.px4.failsafes import WITHOUT_TAB, Failsafes
 from aerokit.sim.px4.flight import Flight
 from aerokit.sim.px4.mission import Mission
 from aerokit.sim.px4.mission_server import MissionServer
@@ -58,9 +59,9 @@ class SimulatedPx4(SimulatedVehicle):
     Simulated: arming and its denial, modes with their double acknowledgement, take-off to an AMSL altitude, hold,
     reposition, land, return, offboard with its time-out and failsafe, streams without being asked, heartbeats only
     once a second, chunked texts with a tab at the end, bytewise parameters with _HASH_CHECK, commands of its own to
-    component 0, pings to everybody.
-    Not simulated: keeping within a fence, flying to rally points, the events interface, sticks (POSITION and the
-    manual modes stay where they are), battery and data-link failsafes, estimator failures other than a lost GPS.
+    component 0, pings to everybody, the failsafes of battery, ground station, manual control and geofence.
+    Not simulated: flying to rally points, the events interface, sticks (POSITION and the
+    manual modes stay where they are), estimator failures other than a lost GPS.
 
     - ``home``: latitude, longitude (degrees), altitude AMSL (m); ``heading_deg``: where its nose points
     - ``boot_time_s``: seconds until it can be armed
@@ -138,6 +139,7 @@ class SimulatedPx4(SimulatedVehicle):
         self._failsafe_at = math.nan
         self.flight = Flight(self)
         self.mission = Mission(self)
+        self.failsafes = Failsafes(self)
         self.missions.reset()
 
     def _listen(self) -> None:
@@ -147,6 +149,7 @@ class SimulatedPx4(SimulatedVehicle):
         self.on(m.Timesync, self._on_timesync)
         self.on(m.Ping, self._on_ping)
         self.missions.listen()
+        self.failsafes.listen()
 
     # ----------------------------------------------------------------------------------------- state
 
@@ -194,18 +197,18 @@ class SimulatedPx4(SimulatedVehicle):
         return self.version.startswith("1.16")
 
     def reasons(self) -> list[str]:
-        """Why it cannot be armed."""
+        """Why it cannot be armed, as the texts that tell it."""
         reasons = list(self.faults.prearm_failures)
         if not self.is_ready:
             reasons.append("heading estimate not stable")
         if not self.has_position and self.mode not in _WITHOUT_POSITION:
             reasons.append("No valid position estimate")
-        return reasons
+        return [f"Preflight Fail: {reason}" for reason in reasons] + self.failsafes.arming_reasons()
 
     def report_reasons(self) -> None:
         """Say what fails."""
         for reason in self.reasons():
-            self.send_text(MavSeverity.CRITICAL, f"Preflight Fail: {reason}")
+            self.send_text(MavSeverity.CRITICAL, reason)
 
     def next_ping(self) -> int:
         """Sequence number of the next PING."""
@@ -219,6 +222,8 @@ class SimulatedPx4(SimulatedVehicle):
         self.storage.restart()
         self.call_later(0.3 * self._boot_time_s, self._warn_while_booting)
         self.mission.start()
+        self.failsafes.listen()
+        self.failsafes.start()
         self.call_later(self._boot_time_s, self._become_ready)
 
     def _warn_while_booting(self) -> None:
@@ -251,9 +256,10 @@ class SimulatedPx4(SimulatedVehicle):
         return None if builder is None else builder(self)
 
     def send_text(self, severity: int, text: str) -> None:
-        """Every text has an id, ends in a tab, and leaves after what is being answered."""
+        """Every text has an id, nearly every one ends in a tab; it leaves after what is being answered."""
+        text = text if text in WITHOUT_TAB else text + "\t"
         number, self._next_text_id = self._next_text_id, (self._next_text_id + 1) & 0xFFFF
-        self.call_later(0.0, lambda: self.send_chunks(severity, text + "\t", number))
+        self.call_later(0.0, lambda: self.send_chunks(severity, text, number))
 
     # ------------------------------------------------------------------------------ arming and modes
 
@@ -272,6 +278,7 @@ class SimulatedPx4(SimulatedVehicle):
         if not self.home_is_set_by_hand:
             self.home = (self.motion.north, self.motion.east, self.motion.down)
         self.info("Armed by external command")
+        self.failsafes.armed()
         if self.mode == MISSION:
             self.mission.enter()
         self.set_ticking(True)
@@ -299,6 +306,7 @@ class SimulatedPx4(SimulatedVehicle):
             self._mode_after_landing = mode
         self.is_in_failsafe, self._failsafe_at = False, math.nan
         self.intended_mode = mode
+        self.failsafes.take_over()
         if mode == self.mode == MISSION:
             self.mission.enter()
         elif mode == self.mode:

@@ -1,0 +1,257 @@
+"""The failsafes of a simulated PX4: battery, ground station, manual control, geofence.
+
+https://docs.px4.io/main/en/config/safety.html. The worst of what fails decides. Before it returns or lands it holds
+for COM_FAIL_ACT_T seconds; whoever chooses a mode meanwhile, or later, takes over, until something else fails.
+Simulated: warnings, HOLD, RETURN, LAND, and the motors' stop for the two severest actions.
+Not simulated: the events in which PX4 tells the cause, deferring, terminating with parachutes, prediction of breaches.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import IntEnum
+from typing import TYPE_CHECKING
+
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import MavBatteryChargeState, MavSeverity, MavType
+from aerokit.sim.px4.fence import OUTSIDE, TOO_FAR, TOO_HIGH, Fence
+from aerokit.sim.px4.modes import HOLD, LAND, MISSION, OFFBOARD, RTL, Px4Mode
+
+if TYPE_CHECKING:
+    from aerokit.sim.channel import Channel
+    from aerokit.sim.px4.vehicle import SimulatedPx4
+
+__all__ = ["WITHOUT_TAB", "FailsafeAction", "Failsafes"]
+
+_INTERVAL_S = 0.2
+_NO_MANUAL_CONTROL = 4
+_NO_STATION = "Preflight Fail: No connection to the GCS"
+
+
+WITHOUT_TAB = frozenset((_NO_STATION, TOO_FAR, TOO_HIGH, OUTSIDE))
+"""The few texts that do not end in a tab."""
+
+
+class FailsafeAction(IntEnum):
+    """What a failsafe does, from the mildest to the severest."""
+
+    NONE = 0
+    WARN = 1
+    HOLD = 2
+    RETURN = 3
+    LAND = 4
+    DISARM = 5
+
+
+_A = FailsafeAction
+_LINK_ACTIONS = {1: _A.HOLD, 2: _A.RETURN, 3: _A.LAND, 5: _A.DISARM, 6: _A.DISARM}
+_FENCE_ACTIONS = {1: _A.WARN, 2: _A.HOLD, 3: _A.RETURN, 4: _A.DISARM, 5: _A.LAND}
+_MODES: dict[FailsafeAction, Px4Mode] = {_A.HOLD: HOLD, _A.RETURN: RTL, _A.LAND: LAND}
+_BATTERY_TEXTS = {
+    MavBatteryChargeState.LOW: (MavSeverity.CRITICAL, "Low battery"),
+    MavBatteryChargeState.CRITICAL: (MavSeverity.CRITICAL, "Critical battery"),
+    MavBatteryChargeState.EMERGENCY: (MavSeverity.EMERGENCY, "Emergency battery level"),
+}
+
+
+class Failsafes:
+    """What watches over the flight. `check` runs five times a second while the vehicle is on."""
+
+    def __init__(self, px4: SimulatedPx4) -> None:
+        self._px4 = px4
+        self.fence = Fence(px4)
+        self.action = _A.NONE
+        """What is being done now."""
+        self.battery_state = MavBatteryChargeState.OK
+        """MAV_BATTERY_CHARGE_STATE; while armed it only gets worse."""
+        self.has_station = False
+        """Whether a ground station is heard; False before the first."""
+        self._station_at = self._sticks_at = -math.inf
+        self._had_sticks = False
+        self._battery_at_arming = MavBatteryChargeState.OK
+        self._battery_told = MavBatteryChargeState.OK
+        self._breaches: list[str] = []
+        self._active: dict[str, FailsafeAction] = {}
+        self._failing: frozenset[str] = frozenset()
+        self._holds_until = -math.inf
+        self._is_taken_over = False
+
+    def listen(self) -> None:
+        """Hear ground stations and sticks."""
+        self._px4.on(m.Heartbeat, self._on_heartbeat)
+        self._px4.on(m.ManualControl, self._on_manual_control)
+
+    def start(self) -> None:
+        """A boot."""
+        self._px4.every(_INTERVAL_S, self.check)
+
+    # ----------------------------------------------------------------------------------------- links
+
+    def _on_heartbeat(self, beat: m.Heartbeat, _: Channel) -> None:
+        if beat.type != MavType.GCS:
+            return
+        if not self.has_station and math.isfinite(self._station_at):
+            self._px4.info("GCS connection regained")
+        self.has_station, self._station_at = True, self._px4.now
+
+    def _on_manual_control(self, _: m.ManualControl, __: Channel) -> None:
+        self._sticks_at, self._had_sticks = self._px4.now, True
+
+    @property
+    def has_sticks(self) -> bool:
+        """Whether MANUAL_CONTROL keeps coming."""
+        return self._px4.now - self._sticks_at <= self._px4.parameters["COM_RC_LOSS_T"]
+
+    def _watch_station(self) -> None:
+        patience = self._px4.parameters["COM_DL_LOSS_T"]
+        if self.has_station and self._px4.now - self._station_at > patience:
+            self.has_station = False
+            self._px4.info("Connection to ground station lost")
+            if round(self._px4.parameters["NAV_DLL_ACT"]):
+                self._px4.send_text(MavSeverity.WARNING, _NO_STATION)
+
+    # --------------------------------------------------------------------------------------- battery
+
+    def _watch_battery(self) -> None:
+        state = self._battery_level()
+        self.battery_state = max(state, self.battery_state) if self._px4.is_armed else state
+        if self.battery_state > self._battery_told and self._px4.is_armed:
+            self._px4.send_text(*_BATTERY_TEXTS[self.battery_state])
+        self._battery_told = self.battery_state
+
+    def _battery_level(self) -> MavBatteryChargeState:
+        limits, share = self._px4.parameters, self._px4.battery.percent / 100.0
+        if share < limits["BAT_EMERGEN_THR"]:
+            return MavBatteryChargeState.EMERGENCY
+        if share < limits["BAT_CRIT_THR"]:
+            return MavBatteryChargeState.CRITICAL
+        return MavBatteryChargeState.LOW if share < limits["BAT_LOW_THR"] else MavBatteryChargeState.OK
+
+    def _battery_action(self) -> FailsafeAction:
+        """COM_LOW_BAT_ACT: 0 warns, 2 lands, 3 returns and lands in an emergency."""
+        state, action = self.battery_state, round(self._px4.parameters["COM_LOW_BAT_ACT"])
+        if state == MavBatteryChargeState.OK:
+            return _A.NONE
+        if state == MavBatteryChargeState.LOW or state <= self._battery_at_arming or action not in (2, 3):
+            return _A.WARN
+        lands = action == 2 or state == MavBatteryChargeState.EMERGENCY
+        return _A.LAND if lands else _A.RETURN
+
+    # ----------------------------------------------------------------------------------- what fails
+
+    def arming_reasons(self) -> list[str]:
+        """The texts of what keeps it from being armed."""
+        reasons = list(self.fence.breaches)
+        level = self._battery_level()
+        if level >= MavBatteryChargeState.CRITICAL:
+            reasons.append(_BATTERY_TEXTS[level][1])
+        if round(self._px4.parameters["NAV_DLL_ACT"]) and not self.has_station:
+            reasons.append(_NO_STATION)
+        return reasons
+
+    def armed(self) -> None:
+        """The vehicle was armed: what is missing now is not missed later."""
+        self._had_sticks = self.has_sticks
+        self._battery_at_arming = self._battery_told = self.battery_state = self._battery_level()
+        self._forget()
+
+    def _forget(self) -> None:
+        self.action, self._is_taken_over, self._holds_until = _A.NONE, False, -math.inf
+        self._active, self._breaches, self._failing = {}, [], frozenset()
+
+    def _failures(self) -> dict[str, FailsafeAction]:
+        found = {
+            "battery": self._battery_action(),
+            "station": self._station_action(),
+            "sticks": self._sticks_action(),
+            "fence": self._fence_action(),
+        }
+        return {cause: action for cause, action in found.items() if action}
+
+    def _station_action(self) -> FailsafeAction:
+        if self.has_station or self._px4.intended_mode == LAND or self._is_excepted("COM_DLL_EXCEPT"):
+            return _A.NONE
+        return _LINK_ACTIONS.get(round(self._px4.parameters["NAV_DLL_ACT"]), _A.NONE)
+
+    def _sticks_action(self) -> FailsafeAction:
+        """Lost is only what was there since arming."""
+        source = round(self._px4.parameters["COM_RC_IN_MODE"])
+        is_lost = self._had_sticks and not self.has_sticks and source != _NO_MANUAL_CONTROL
+        if not is_lost or self._is_excepted("COM_RCL_EXCEPT"):
+            return _A.NONE
+        return _LINK_ACTIONS.get(round(self._px4.parameters["NAV_RCL_ACT"]), _A.NONE)
+
+    def _is_excepted(self, parameter: str) -> bool:
+        """Whether the mode's bit is set: 1 mission, 2 hold and the other automatic modes, 4 offboard."""
+        mode = self._px4.intended_mode
+        bit = {MISSION: 1, OFFBOARD: 4}.get(mode, 2 if mode[0] == 4 else 0)
+        return bool(round(self._px4.parameters[parameter]) & bit)
+
+    def _fence_action(self) -> FailsafeAction:
+        breaches = self.fence.breaches
+        for text in breaches:
+            if text not in self._breaches:
+                self._px4.send_text(MavSeverity.CRITICAL, text)
+        self._breaches = breaches
+        return _FENCE_ACTIONS.get(round(self._px4.parameters["GF_ACTION"]), _A.WARN) if breaches else _A.NONE
+
+    # ------------------------------------------------------------------------------------ what is done
+
+    def check(self) -> None:
+        """Look at everything, and do what is to be done."""
+        self._watch_station()
+        self._watch_battery()
+        if not self._px4.is_armed:
+            self._forget()
+            return
+        self._update(self._failures())
+        self._do(self._chosen())
+
+    def _update(self, failing: dict[str, FailsafeAction]) -> None:
+        """A new failure starts the delay and ends a takeover; what acts stays until a mode is chosen."""
+        for cause, action in failing.items():
+            if cause not in self._active and action >= _A.HOLD:
+                self._is_taken_over = False
+            worse = action > self._active.get(cause, _A.WARN)
+            if worse and self.action <= _A.HOLD and self._holds_until < self._px4.now:
+                self._holds_until = self._px4.now + self._px4.parameters["COM_FAIL_ACT_T"]
+        kept = {cause: action for cause, action in self._active.items() if action >= _A.HOLD}
+        self._active, self._failing = {**kept, **failing}, frozenset(failing)
+
+    def _chosen(self) -> FailsafeAction:
+        worst = max(self._active.values(), default=_A.NONE)
+        intended = self._px4.intended_mode
+        if self._is_taken_over and worst < _A.DISARM:
+            return min(worst, _A.WARN)
+        if worst == _A.RETURN and intended in (LAND, RTL):
+            return _A.WARN
+        if worst in (_A.RETURN, _A.LAND) and self.action <= _A.HOLD and self._px4.now < self._holds_until:
+            return _A.HOLD
+        return worst
+
+    def _do(self, action: FailsafeAction) -> None:
+        if action == self.action:
+            return
+        px4, previous, self.action = self._px4, self.action, action
+        px4.is_in_failsafe = action > _A.WARN
+        if action > max(previous, _A.WARN):
+            self._tell(action)
+        if action == _A.DISARM:
+            px4.disarm("failsafe", force=True)
+        elif action in _MODES:
+            px4.switch_to(_MODES[action])
+        elif previous > _A.WARN:
+            px4.switch_to(px4.intended_mode)
+
+    def _tell(self, action: FailsafeAction) -> None:
+        left = self._holds_until - self._px4.now
+        waits = action == _A.HOLD and max(self._active.values()) > _A.HOLD
+        text = f"Failsafe activated: entering Hold for {left:.0f} seconds" if waits else "Failsafe activated"
+        self._px4.send_text(MavSeverity.CRITICAL, text)
+
+    def take_over(self) -> None:
+        """Somebody has chosen a mode."""
+        self._active = {cause: action for cause, action in self._active.items() if cause in self._failing}
+        if self.action > _A.WARN:
+            self._is_taken_over = bool(self._active)
+            self.action, self._holds_until = _A.WARN, -math.inf
