@@ -1,0 +1,153 @@
+"""The same seed and the same calls give the same bytes, of every kind of vehicle, however time is cut into steps."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+from dataclasses import dataclass
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import aerokit.sim
+from aerokit.errors import LinkLost
+from aerokit.links import Peer
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.enums import MavCmd, MavDataStream
+from aerokit.mavlink.message import Message
+from aerokit.sim import SimulatedCopter, SimulatedPx4, SimulatedVehicle, Wind, simulated_link
+from aerokit.testing import run_virtual
+
+KINDS = [
+    kind
+    for _, kind in inspect.getmembers(aerokit.sim, inspect.isclass)
+    if issubclass(kind, SimulatedVehicle) and kind is not SimulatedVehicle
+]
+END_S = 6.0
+FORCE = 21196.0
+
+
+def command(number: int, *params: float) -> m.CommandLong:
+    one, two, three, four, five, six, seven = (*params, *(0.0,) * (7 - len(params)))
+    return m.CommandLong(1, 1, number, 0, one, two, three, four, five, six, seven)
+
+
+HEARTBEAT = m.Heartbeat(6, 8, 0, 0, 4, 3)
+STREAMS = m.RequestDataStream(1, 1, MavDataStream.ALL, 4, 1)
+ARM = command(MavCmd.COMPONENT_ARM_DISARM, 1.0, FORCE)
+TAKE_OFF = command(MavCmd.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 10.0)
+CALLS: tuple[Message, ...] = (
+    HEARTBEAT,
+    STREAMS,
+    ARM,
+    TAKE_OFF,
+    command(MavCmd.SET_MESSAGE_INTERVAL, m.Attitude.ID, 20_000.0),
+    command(MavCmd.DO_SET_MODE, 1.0, 4.0),
+    command(MavCmd.NAV_LAND),
+    command(MavCmd.NAV_RETURN_TO_LAUNCH),
+    command(MavCmd.COMPONENT_ARM_DISARM, 0.0, FORCE),
+    command(MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, 1.0),
+    m.ParamRequestRead(1, 1, "", 3),
+    m.MissionRequestList(1, 1),
+    m.Timesync(0, 7),
+    m.SetPositionTargetLocalNed(0, 1, 1, 1, 0xDC7, 0, 0, 0, 3.0, -2.0, -0.5, 0, 0, 0, 0, 0),
+)
+"""What a client might say; not every kind understands all of it."""
+
+instants = st.floats(0.0, END_S)
+scripts = st.lists(st.tuples(instants, st.sampled_from(CALLS)), max_size=8).map(
+    lambda calls: sorted(calls, key=lambda call: call[0])
+)
+
+
+@dataclass(frozen=True)
+class Said:
+    """What two channels of a vehicle gave in a run."""
+
+    first: bytes
+    second: bytes
+
+
+def fly(
+    kind: type[SimulatedVehicle], calls: list[tuple[float, Message]], cuts: list[float], *, seed: int = 5
+) -> Said:
+    """The bytes of a run in which a tenth of the frames is lost; ``cuts`` are when it is stepped needlessly."""
+    vehicle = made(kind, seed)
+    vehicle.faults.loss = 0.1
+    second, encoder = vehicle.open_channel(), FrameEncoder(255, 190)
+    vehicle.step(0.0)
+    first = b""
+    for when, message in sorted(
+        [*calls, *((cut, None) for cut in cuts), (END_S, None)], key=lambda each: each[0]
+    ):
+        if message is None:
+            vehicle.step(when)
+        else:
+            vehicle.receive(encoder.encode(message), when)
+        first += vehicle.take_outbox()
+    return Said(first, second.take_outbox())
+
+
+def made(kind: type[SimulatedVehicle], seed: int) -> SimulatedVehicle:
+    """One that has booted after a second, if its kind can be told so."""
+    wanted: dict[str, object] = {
+        "boot_time_s": 1.0,
+        "wind": Wind(3.0, 1.0, gusts_m_s=1.0),
+        "parameter_count": 20,
+    }
+    known = inspect.signature(kind).parameters
+    options: Any = {name: value for name, value in wanted.items() if name in known}
+    return kind(seed=seed, **options)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@settings(max_examples=8, deadline=None, suppress_health_check=list(HealthCheck))
+@given(calls=scripts, cuts=st.lists(instants, max_size=30))
+def test_steps_may_be_cut_at_will(
+    kind: type[SimulatedVehicle], calls: list[tuple[float, Message]], cuts: list[float]
+) -> None:
+    assert fly(kind, calls, []) == fly(kind, calls, cuts)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_same_seed_says_the_same_and_another_one_does_not(kind: type[SimulatedVehicle]) -> None:
+    calls: list[tuple[float, Message]] = [(2.0, STREAMS), (3.0, ARM), (3.1, TAKE_OFF)]
+    assert fly(kind, calls, []) == fly(kind, calls, [])
+    assert fly(kind, calls, []) != fly(kind, calls, [], seed=6)
+
+
+class Ears:
+    """Keeps what came and when."""
+
+    def __init__(self) -> None:
+        self.heard: list[tuple[float, bytes]] = []
+
+    def bytes_received(self, data: bytes, peer: Peer) -> None:
+        self.heard.append((asyncio.get_running_loop().time(), data))
+
+    def link_lost(self, error: LinkLost) -> None:
+        """It is closed by its owner."""
+
+
+async def serve(seed: int) -> list[tuple[float, bytes]]:
+    """Ten seconds of a copter and a PX4 on one link, asked for streams and told to fly."""
+    copter = SimulatedCopter(boot_time_s=1.0, seed=seed, parameter_count=20)
+    px4 = SimulatedPx4(system_id=2, boot_time_s=1.0, seed=seed, parameter_count=20, wind=Wind(gusts_m_s=1.0))
+    ears, encoder = Ears(), FrameEncoder(255, 190)
+    async with simulated_link([copter, px4], latency_s=0.01) as link:
+        await link.open(ears)
+        await asyncio.sleep(2.0)
+        for message in (STREAMS, ARM, TAKE_OFF):
+            link.write(encoder.encode(message))
+        await asyncio.sleep(8.0)
+    return ears.heard
+
+
+def test_a_server_says_the_same_at_the_same_times() -> None:
+    first = run_virtual(serve(1))
+    assert first == run_virtual(serve(1))
+    assert first != run_virtual(serve(2))
+    assert first[-1][0] > 9.0
