@@ -8,14 +8,28 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from aerokit import geo
-from aerokit.errors import LocalProtocolError
+from aerokit.cli.places import place_of
+from aerokit.errors import AerokitError, LocalProtocolError
 from aerokit.links import parse_address
 from aerokit.parameters import check_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = ["address", "directory", "home", "number", "parameter", "system_id", "writable_file"]
+__all__ = [
+    "address",
+    "address_or_form",
+    "count",
+    "directory",
+    "home",
+    "number",
+    "parameter",
+    "picture",
+    "system_id",
+    "vehicle_kind",
+    "wind",
+    "writable_file",
+]
 
 
 def address(text: str) -> str:
@@ -25,6 +39,53 @@ def address(text: str) -> str:
     except LocalProtocolError as error:
         raise ArgumentTypeError(str(error)) from None
     return text
+
+
+def address_or_form(text: str) -> str:
+    """A connection string, or a form of one for several vehicles."""
+    address(place_of(text, 0, 1))
+    return text
+
+
+def vehicle_kind(text: str) -> str:
+    """A kind of simulated vehicle."""
+    from aerokit.sim.kinds import kind_class
+
+    try:
+        kind_class(text)
+    except LocalProtocolError as error:
+        raise ArgumentTypeError(str(error)) from None
+    return text
+
+
+def count(text: str) -> int:
+    """How many vehicles."""
+    if not (text.isascii() and text.isdigit() and 1 <= int(text) <= 250):
+        raise ArgumentTypeError(f"{text!r} is not a number of vehicles: 1 to 250")
+    return int(text)
+
+
+def wind(text: str) -> tuple[float, ...]:
+    """North, east, and perhaps gusts."""
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        values = ()
+    within = all(abs(value) <= 50 for value in values) and min(values[2:], default=0) >= 0
+    if len(values) not in (2, 3) or not within:
+        raise ArgumentTypeError(f"{text!r} is not NORTH,EAST or NORTH,EAST,GUSTS in m/s, up to 50")
+    return values
+
+
+def picture(text: str) -> str:
+    """A path of a picture."""
+    from aerokit.sim.track import check_picture
+
+    try:
+        check_picture(text)
+    except AerokitError as error:
+        raise ArgumentTypeError(str(error)) from None
+    return writable_file(text)
 
 
 def number(low: float, high: float) -> Callable[[str], float]:

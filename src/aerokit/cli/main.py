@@ -8,12 +8,25 @@ import os
 import sys
 from typing import TYPE_CHECKING
 
-from aerokit.cli.arguments import address, home, number, parameter, system_id, writable_file
+from aerokit.cli.arguments import (
+    address,
+    address_or_form,
+    count,
+    home,
+    number,
+    parameter,
+    picture,
+    system_id,
+    vehicle_kind,
+    wind,
+    writable_file,
+)
 from aerokit.cli.files import add_files
 from aerokit.cli.logs import add_logs
 from aerokit.cli.mission import add_mission
 from aerokit.cli.params import add_params
-from aerokit.cli.vehicles import HOME, NAMES
+from aerokit.cli.places import EACH_ITS_OWN
+from aerokit.cli.vehicles import HOME
 from aerokit.errors import AerokitError, LocalProtocolError
 
 if TYPE_CHECKING:
@@ -123,29 +136,41 @@ def _add_sim(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
 
         return await run_sim(options)
 
-    text = "Simulate a vehicle for other programs, until interrupted."
-    sim = commands.add_parser("sim", help="simulate a vehicle", description=text)
+    text = "Simulate vehicles for other programs, until interrupted."
+    sim = commands.add_parser("sim", help="simulate vehicles", description=text)
     sim.set_defaults(run=run)
     _add_vehicle(sim)
     sim.add_argument(
         "addresses",
         nargs="*",
-        type=address,
-        default=["tcpin:127.0.0.1:5760"],
+        type=address_or_form,
+        default=[EACH_ITS_OWN],
         metavar="ADDRESS",
-        help="where to serve it, one or several: tcpin:127.0.0.1:5760 (the default), udpout:127.0.0.1:14550,"
-        " udpin:0.0.0.0:14550, /dev/ttyUSB0,57600",
+        help="where to serve them, one or several: udpout:127.0.0.1:14550, udpin:0.0.0.0:14550, tcpin:0.0.0.0:5760,"
+        " /dev/ttyUSB0,57600, pty (a pseudo-terminal), pty:/tmp/ttyV0. All vehicles are on each address; but a form"
+        " gives each its own: pty:/tmp/ttyV{n}, udpout:127.0.0.1:{14550+n}; n counts from 0, id is the system id"
+        f" ({EACH_ITS_OWN})",
     )
+    sim.add_argument("--count", type=count, default=1, metavar="N", help="so many, 1 to 250 (1)")
     sim.add_argument("--speedup", type=number(0.1, 100), default=1.0, metavar="X", help="times real time (1)")
-    sim.add_argument("--system-id", type=system_id, default=1, metavar="ID", help="MAVLink system id (1)")
+    sim.add_argument(
+        "--system-id", type=system_id, default=1, metavar="ID", help="MAVLink system id of the first (1)"
+    )
     sim.add_argument(
         "--home",
         type=home,
         default=HOME,
         metavar="LAT,LON,ALT",
-        help="degrees and metres above the sea (47.397742,8.545594,488)",
+        help="of the first, degrees and metres above the sea (47.397742,8.545594,488)",
     )
-    sim.add_argument("--seed", type=int, default=0, help="of its noise (0)")
+    sim.add_argument(
+        "--spacing", type=number(0, 1000), default=5.0, metavar="M", help="metres between them, eastwards (5)"
+    )
+    sim.add_argument("--seed", type=int, default=0, help="of the noise of the first (0)")
+    _add_sim_conditions(sim)
+
+
+def _add_sim_conditions(sim: argparse.ArgumentParser) -> None:
     sim.add_argument(
         "--parameter",
         action="append",
@@ -155,12 +180,35 @@ def _add_sim(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         metavar="NAME=VALUE",
         help="other than its default, several times if need be: MNT1_TYPE=1 fits a gimbal to the copter",
     )
+    sim.add_argument(
+        "--wind",
+        type=wind,
+        metavar="NORTH,EAST[,GUSTS]",
+        help="where the air goes in m/s, and how much it changes (no wind); --wind=-3,0 for the first below 0",
+    )
+    sim.add_argument("--battery", type=number(0, 100), metavar="PERCENT", help="charge at the start (100)")
+    sim.add_argument(
+        "--boot-time", type=number(0, 600), metavar="S", help="simulated seconds until it is ready to arm"
+    )
+    sim.add_argument(
+        "--duration",
+        type=number(0.1, 1e6),
+        metavar="S",
+        help="simulated seconds, then it ends (until Ctrl-C)",
+    )
+    sim.add_argument(
+        "--picture",
+        type=picture,
+        metavar="FILE",
+        help="of the true tracks, at the end: .svg, or .png with matplotlib",
+    )
 
 
 def _add_vehicle(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--vehicle",
-        choices=NAMES,
+        type=vehicle_kind,
         default="copter",
-        help="simulated: an ArduCopter (copter) or a PX4 quadrotor (px4)",
+        metavar="KIND",
+        help="simulated: copter, plane, rover, sub (ArduPilot), px4, px4_plane (copter)",
     )

@@ -1,34 +1,81 @@
-"""The simulated vehicles that the command line knows by name."""
+"""The simulated vehicles that the command line makes."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import inspect
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from aerokit.sim import SimulatedVehicle
 
-__all__ = ["HOME", "NAMES", "simulated_vehicle"]
+__all__ = ["HOME", "simulated_fleet", "simulated_vehicle"]
 
-NAMES = ("copter", "px4")
-"""What --vehicle takes."""
 HOME = (47.397742, 8.545594, 488.0)
 """Where they stand unless told otherwise: latitude, longitude, metres above the sea."""
 
 
 def simulated_vehicle(
+    name: str, *, home: tuple[float, float, float] = HOME, **options: Any
+) -> SimulatedVehicle:
+    """A vehicle of a kind of `aerokit.sim.kinds`, just switched on; ``options`` are its class's.
+
+    LocalProtocolError when it has no such option or parameter. ``boot_text`` is for those that have one.
+    """
+    from aerokit.errors import LocalProtocolError
+    from aerokit.sim.kinds import kind_class, simulated
+
+    taken = _options_of(kind_class(name))
+    if "boot_text" not in taken:
+        options.pop("boot_text", None)
+    for option in options:
+        if option not in taken:
+            raise LocalProtocolError(f"the simulated {name} has no {option}")
+    try:
+        return simulated(name, home=home, **options)
+    except KeyError as error:
+        raise LocalProtocolError(f"the simulated {name} has no parameter {error}") from error
+
+
+def simulated_fleet(
     name: str,
+    count: int,
     *,
     system_id: int = 1,
     home: tuple[float, float, float] = HOME,
+    spacing_m: float = 5.0,
     seed: int = 0,
-    boot_text: bool = False,
-    parameters: dict[str, float] | None = None,
-) -> SimulatedVehicle:
-    """An ArduCopter ("copter") or a PX4 quadrotor ("px4"), just switched on."""
-    from aerokit.sim import SimulatedCopter, SimulatedPx4
+    **options: Any,
+) -> list[SimulatedVehicle]:
+    """Vehicles side by side from ``home`` eastwards; system ids and seeds count up."""
+    from aerokit.errors import LocalProtocolError
+    from aerokit.sim.local_frame import GlobalPoint, LocalFrame
 
-    if name == "px4":
-        return SimulatedPx4(system_id=system_id, home=home, seed=seed, parameters=parameters)
-    return SimulatedCopter(
-        system_id=system_id, home=home, seed=seed, boot_text=boot_text, parameters=parameters
-    )
+    if system_id + count - 1 > 255:
+        raise LocalProtocolError(
+            f"{count} vehicles from system id {system_id} on: the last would be above 255"
+        )
+    frame = LocalFrame(GlobalPoint(round(home[0] * 1e7), round(home[1] * 1e7), home[2]))
+    places = [frame.to_global(0.0, number * spacing_m, 0.0) for number in range(count)]
+    return [
+        simulated_vehicle(
+            name,
+            home=(place.latitude_e7 / 1e7, place.longitude_e7 / 1e7, home[2]),
+            system_id=system_id + number,
+            seed=seed + number,
+            **options,
+        )
+        for number, place in enumerate(places)
+    ]
+
+
+def _options_of(kind: type) -> set[str]:
+    """What its constructor takes, with what it passes on to those of its bases."""
+    names: set[str] = set()
+    for cls in kind.__mro__:
+        if "__init__" not in vars(cls):
+            continue
+        parameters = inspect.signature(vars(cls)["__init__"]).parameters.values()
+        names |= {parameter.name for parameter in parameters}
+        if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
+            break
+    return names

@@ -47,9 +47,11 @@ class SimulatorServer:
             raise LocalProtocolError(f"speedup = {speedup!r} must be above 0")
         self.vehicles = (vehicles,) if isinstance(vehicles, SimulatedVehicle) else tuple(vehicles)
         self._links = (links,) if isinstance(links, Link) else tuple(links)
-        self._vehicles_on = [self.vehicles] * len(self._links) if vehicles_on is None else list(vehicles_on)
-        if len(self._vehicles_on) != len(self._links):
-            raise LocalProtocolError(f"vehicles_on is for {len(self._vehicles_on)} links of {len(self._links)}")
+        self.vehicles_on = [self.vehicles] * len(self._links) if vehicles_on is None else list(vehicles_on)
+        if len(self.vehicles_on) != len(self._links):
+            raise LocalProtocolError(
+                f"vehicles_on is for {len(self.vehicles_on)} links of {len(self._links)}"
+            )
         self._speedup = speedup
         self._loop: asyncio.AbstractEventLoop | None = None
         self._started_at = 0.0
@@ -78,7 +80,7 @@ class SimulatorServer:
         self._started_at = self._loop.time()
         async with AsyncExitStack() as opening:
             connected: set[int] = set()
-            for link, vehicles in zip(self._links, self._vehicles_on, strict=True):
+            for link, vehicles in zip(self._links, self.vehicles_on, strict=True):
                 port = _Port(self, link, vehicles, _channels(vehicles, connected))
                 opening.push_async_callback(port.close)
                 await link.open(port)

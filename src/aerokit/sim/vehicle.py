@@ -71,6 +71,7 @@ class SimulatedVehicle:
         self._ticks_done = 0
         self._text_id = 0
         self._is_on = False
+        self._at_power_on: list[Callable[[], None]] = []
         self.channels: list[Channel] = []
         self._channel = self.open_channel()
 
@@ -153,6 +154,14 @@ class SimulatedVehicle:
         self.boot()
         for channel in self.channels:
             self.start_channel(channel)
+        for action in self._at_power_on:
+            action()
+
+    def when_powered_on(self, action: Callable[[], None]) -> None:
+        """Do something at every start, after a reboot too; at once when it is on already."""
+        self._at_power_on.append(action)
+        if self._is_on:
+            action()
 
     def reboot(self, silence_s: float) -> None:
         """Go silent at once, forget rates and timers, and boot anew after ``silence_s`` seconds."""

@@ -1,0 +1,118 @@
+"""True tracks of simulated vehicles, and their pictures."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+from simulated_client import flying_copter, ready_copter
+
+from aerokit.errors import AerokitError, LocalProtocolError
+from aerokit.sim import SimulatedPx4
+from aerokit.sim.track import Track, TrackPoint, check_picture, draw_svg, record_track, save_picture
+
+SVG = "{http://www.w3.org/2000/svg}"
+
+
+def flown_track() -> Track:
+    copter, client = ready_copter()
+    track = record_track(copter, interval_s=0.5)
+    client.run(2.0)
+    copter.motion.north, copter.motion.east, copter.motion.down = 30.0, 40.0, -12.0
+    client.run(0.5)
+    return track
+
+
+def test_a_track_is_where_the_vehicle_was() -> None:
+    track = flown_track()
+    assert track.name == "system 1"
+    assert [point.time_s for point in track.points[:4]] == pytest.approx([3.0, 3.5, 4.0, 4.5])
+    north, east, up = track.local()[-1]
+    assert (north, east) == pytest.approx((30, 40), abs=1.0)
+    assert 11 < up < 12.5
+    assert track.length_m == pytest.approx(51.4, abs=2.0)
+
+
+def test_recording_changes_no_byte() -> None:
+    def told(*, recorded: bool) -> list[object]:
+        copter, client = flying_copter()
+        if recorded:
+            record_track(copter)
+        client.run(3.0)
+        return [(time, message) for time, message in client.heard]
+
+    assert told(recorded=True) == told(recorded=False)
+
+
+def test_a_reboot_does_not_end_a_track() -> None:
+    copter, client = ready_copter()
+    track = record_track(copter)
+    copter.restart()
+    client.run(4.0)
+    assert track.points[-1].time_s > 6.5
+
+
+def test_every_autopilot_has_a_track() -> None:
+    px4 = SimulatedPx4()
+    px4.step(0.0)
+    track = record_track(px4)
+    px4.step(1.0)
+    assert len(track.points) == 6
+
+
+def test_an_interval_must_be_above_0() -> None:
+    with pytest.raises(LocalProtocolError, match="interval_s"):
+        record_track(SimulatedPx4(), interval_s=0)
+
+
+# ------------------------------------------------------------------------------------------- pictures
+
+
+def test_the_svg_has_a_line_for_each_vehicle_above_and_in_profile() -> None:
+    tracks = [flown_track(), flown_track()]
+    tracks[1].name = "system <2>"
+    root = ElementTree.fromstring(draw_svg(tracks))
+    lines = root.findall(f"{SVG}polyline")
+    assert len(lines) == 4
+    assert {line.get("stroke") for line in lines} == {"#1f77b4", "#d62728"}
+    assert [text.text for text in root.iter(f"{SVG}text")][-2:] == ["system 1", "system <2>"]
+    for line in lines:
+        for place in (line.get("points") or "").split():
+            x, y = (float(number) for number in place.split(","))
+            assert 0 <= x <= 800
+            assert 0 <= y <= 680
+
+
+def test_a_hundred_metres_north_is_as_long_as_a_hundred_metres_east() -> None:
+    track = flown_track()
+    first = track.points[0]
+    north = TrackPoint(1.0, first.latitude_deg + 100 / 111318.845, first.longitude_deg, 0.0)
+    track.points[:] = [first, north]
+    line = next(ElementTree.fromstring(draw_svg([track])).iter(f"{SVG}polyline"))
+    (x1, y1), (x2, y2) = (map(float, place.split(",")) for place in (line.get("points") or "").split())
+    assert x1 == pytest.approx(x2, abs=0.2)
+    assert y1 - y2 == pytest.approx(460 / 1.1, abs=1)
+
+
+def test_a_picture_of_nothing(tmp_path: Path) -> None:
+    save_picture([], tmp_path / "empty.svg")
+    assert ElementTree.parse(tmp_path / "empty.svg").getroot().tag == f"{SVG}svg"
+
+
+def test_other_names_are_refused() -> None:
+    with pytest.raises(LocalProtocolError, match=r"\.svg or \.png"):
+        check_picture("track.jpeg")
+
+
+def test_png_without_matplotlib_says_what_to_install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(AerokitError, match=r"aerokit\[pictures\]"):
+        save_picture([], tmp_path / "track.png")
+
+
+def test_png(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    save_picture([flown_track()], tmp_path / "track.png")
+    assert (tmp_path / "track.png").read_bytes().startswith(b"\x89PNG")

@@ -1,0 +1,186 @@
+"""``aerokit sim``: fleets, forms of addresses, pseudo-terminals, the picture at the end."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from aerokit.cli import main
+from aerokit.cli.places import EACH_ITS_OWN, each_with_its_own, place_of
+from aerokit.cli.vehicles import HOME, simulated_fleet
+from aerokit.errors import LinkLost, LinkOpenError
+from aerokit.links import Peer, PtyLink, parse_address
+from aerokit.sim import SimulatedCopter, SimulatedPx4
+from aerokit.sim.track import true_place
+
+posix_only = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
+
+
+# ---------------------------------------------------------------------------------------- addresses
+
+
+@pytest.mark.parametrize(
+    ("form", "first", "third"),
+    [
+        (EACH_ITS_OWN, "tcpin:127.0.0.1:5760", "tcpin:127.0.0.1:5780"),
+        ("udpout:127.0.0.1:{14550+n}", "udpout:127.0.0.1:14550", "udpout:127.0.0.1:14552"),
+        ("pty:/tmp/ttyV{n}", "pty:/tmp/ttyV0", "pty:/tmp/ttyV2"),
+        ("udpin:0.0.0.0:145{id}", "udpin:0.0.0.0:1457", "udpin:0.0.0.0:1459"),
+    ],
+)
+def test_a_form_gives_each_vehicle_an_address(form: str, first: str, third: str) -> None:
+    assert each_with_its_own(form)
+    assert (place_of(form, 0, 7), place_of(form, 2, 9)) == (first, third)
+
+
+def test_any_other_address_is_for_all() -> None:
+    assert not each_with_its_own("udpout:127.0.0.1:14550")
+    assert place_of("udpout:127.0.0.1:14550", 3, 4) == "udpout:127.0.0.1:14550"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--count", "0"],
+        ["--count", "251"],
+        ["tcpin:127.0.0.1:{99999+n}"],
+        ["--wind", "3"],
+        ["--wind", "1,2,-3"],
+        ["--wind", "strong"],
+        ["--battery", "120"],
+        ["--picture", "track.gif"],
+        ["--picture", "/no/such/directory/track.svg"],
+        ["--vehicle", "submarine"],
+    ],
+    ids=" ".join,
+)
+def test_wrong_arguments_of_sim(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as exit_:
+        main(["sim", *arguments])
+    assert exit_.value.code == 2
+    assert "error: " in capsys.readouterr().err
+
+
+def test_system_ids_end_at_255(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["sim", "--count", "10", "--system-id", "250"]) == 2
+    assert "above 255" in capsys.readouterr().err
+
+
+# ------------------------------------------------------------------------------------------- fleets
+
+
+def test_a_fleet_stands_side_by_side() -> None:
+    fleet = simulated_fleet("px4", 3, system_id=4, spacing_m=10.0, battery_percent=50.0)
+    assert [vehicle.system_id for vehicle in fleet] == [4, 5, 6]
+    places = [true_place(vehicle) for vehicle in fleet]
+    assert {place.latitude_e7 for place in places} == {round(HOME[0] * 1e7)}
+    east = [place.longitude_e7 - places[0].longitude_e7 for place in places]
+    assert east == pytest.approx([0, 1327, 2654], abs=1)  # 1 m is 132.7 times 1e-7 degrees there
+    assert all(isinstance(vehicle, SimulatedPx4) and vehicle.battery.percent == 50 for vehicle in fleet)
+
+
+def test_what_a_kind_has_not_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["sim", "--vehicle", "px4", "--parameter", "RTL_ALT=3000"]) == 2
+    assert "the simulated px4 has no parameter 'RTL_ALT'" in capsys.readouterr().err
+
+
+def test_options_reach_the_vehicle() -> None:
+    (copter,) = simulated_fleet("copter", 1, boot_text=True, boot_time_s=0.0, parameters={"RTL_ALT": 2000.0})
+    assert isinstance(copter, SimulatedCopter)
+    assert copter.parameters["RTL_ALT"] == 2000
+    assert copter.timeline.ready == 0
+
+
+def test_sim_ends_after_its_duration_with_a_picture(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    picture = tmp_path / "track.svg"
+    addresses = ["udpout:127.0.0.1:{45550+n}", "tcpin:127.0.0.1:0"]
+    arguments = ["--count", "2", "--speedup", "100", "--duration", "5", "--picture", str(picture)]
+    assert main(["sim", *addresses, *arguments]) == 0
+    told = capsys.readouterr().out.splitlines()
+    assert told[0].startswith("system 1 on udpout:127.0.0.1:45550")
+    assert told[1].startswith("system 2 on udpout:127.0.0.1:45551")
+    assert told[2].startswith("systems 1 to 2 on tcpin:127.0.0.1:")
+    assert told[3] == "try: aerokit demo --connect udpin:127.0.0.1:45550"
+    assert told[4:] == ["stopped", f"track in {picture}"]
+    assert picture.read_text().count("<polyline") == 4
+
+
+@posix_only
+def test_sim_tells_the_name_of_the_other_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    port = tmp_path / "ttyV0"
+    assert main(["sim", f"pty:{port}", "--speedup", "100", "--duration", "1"]) == 0
+    assert f"try: aerokit demo --connect {port}\n" in capsys.readouterr().out
+    assert not os.path.lexists(port)
+
+
+# --------------------------------------------------------------------------------- pseudo-terminals
+
+
+class Heard:
+    """The receiver of a test."""
+
+    def __init__(self) -> None:
+        self.data = b""
+        self.came = asyncio.Event()
+
+    def bytes_received(self, data: bytes, peer: Peer) -> None:
+        self.data += data
+        self.came.set()
+
+    def link_lost(self, error: LinkLost) -> None:
+        raise error
+
+
+def test_addresses_of_pseudo_terminals() -> None:
+    assert str(parse_address("pty")) == "pty"
+    assert parse_address("pty:/tmp/ttyV0").path == "/tmp/ttyV0"
+    assert str(parse_address("pty:/tmp/ttyV0")) == "pty:/tmp/ttyV0"
+
+
+@posix_only
+def test_bytes_go_through_a_pseudo_terminal_unchanged() -> None:
+    async def both_ways() -> None:
+        link, heard = PtyLink(), Heard()
+        await link.open(heard)
+        other = os.open(link.address.removeprefix("pty:"), os.O_RDWR | os.O_NOCTTY)
+        every_byte = bytes(range(256))
+        os.write(other, every_byte)
+        while len(heard.data) < 256:
+            heard.came.clear()
+            await heard.came.wait()
+        link.write(every_byte)
+        assert (heard.data, os.read(other, 1000)) == (every_byte, every_byte)
+        os.close(other)
+        link.close()
+        await link.wait_closed()
+
+    asyncio.run(both_ways())
+
+
+@posix_only
+def test_what_nobody_reads_is_dropped_and_files_are_left_alone(tmp_path: Path) -> None:
+    taken, dead = tmp_path / "taken", tmp_path / "dead"
+    taken.write_text("precious")
+    dead.symlink_to("/dev/pts/no-such")
+
+    async def run() -> None:
+        with pytest.raises(LinkOpenError, match="exists"):
+            await PtyLink(str(taken)).open(Heard())
+        link = PtyLink(str(dead))
+        await link.open(Heard())
+        for _ in range(100):
+            link.write(bytes(1000))
+        assert link.dropped_writes > 10
+        link.close()
+        link.write(b"late")
+        await link.wait_closed()
+
+    asyncio.run(run())
+    assert taken.read_text() == "precious"
+    assert not os.path.lexists(dead)
