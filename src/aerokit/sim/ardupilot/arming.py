@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from aerokit.mavlink.enums import GpsFixType, MavSeverity
 
@@ -19,6 +19,9 @@ _STICK_CENTRE, _STICK_LOW, _DEADZONE = 1500, 1050, 100
 
 class Arming:
     """Runs the checks once a second, reports failures every 30 s while disarmed, arms and disarms."""
+
+    ARMED_TEXT: ClassVar[str] = "Arming motors"
+    DISARMED_TEXT: ClassVar[str] = "Disarming motors"
 
     def __init__(self, vehicle: ArduPilotVehicle) -> None:
         self._vehicle = vehicle
@@ -119,7 +122,7 @@ class Arming:
         if vehicle.navigation.home is not None and not vehicle.navigation.home_is_locked:
             motion = vehicle.motion
             vehicle.navigation.set_home((motion.north, motion.east, motion.down), lock=False)
-        vehicle.info("Arming motors")
+        vehicle.info(self.ARMED_TEXT)
         vehicle.motors.set_armed(True, vehicle.now)
         vehicle.mode.enter(force=False)
         vehicle.set_ticking(True)
@@ -132,7 +135,7 @@ class Arming:
             return True
         if not force and not vehicle.is_landed:
             return False
-        vehicle.info("Disarming motors")
+        vehicle.info(self.DISARMED_TEXT)
         vehicle.motors.set_armed(False, vehicle.now)
         vehicle.mission.reset()
         vehicle.call_later(0.0, vehicle.auto.disarmed)
