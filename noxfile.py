@@ -1,4 +1,4 @@
-"""Sessions: tests (each Python that is there), lint, types, docs, bench and bench_…, badlinks, dronekit, demo.
+"""Sessions: tests (each Python that is there), lint, types, docs, bench and bench_…, badlinks, dronekit, clients, demo.
 
 `nox -l` lists them.
 """
@@ -85,6 +85,13 @@ def bench_dronekit(session: nox.Session) -> None:
 
 
 @nox.session
+def bench_scale(session: nox.Session) -> None:
+    """Measure a hundred simulated vehicles with clients, and flights on virtual time. Writes bench-scale.json."""
+    session.install("-e", ".")
+    session.run("python", "benchmarks/scale.py", *session.posargs)
+
+
+@nox.session
 def badlinks(session: nox.Session) -> None:
     """Judge every transfer over bad radios, 200 seeds of each, and print the table; half an hour and more."""
     session.install("-e", ".[test]")
@@ -97,6 +104,13 @@ def dronekit_itself(session: nox.Session) -> None:
     session.install("-e", ".[test]", "dronekit==2.9.2", "future")
     python = {"AEROKIT_DRONEKIT_PYTHON": f"{session.bin}/python"}
     session.run("pytest", "-q", "tests/dronekit/test_dronekit_behaviour.py", *session.posargs, env=python)
+
+
+@nox.session
+def clients(session: nox.Session) -> None:
+    """Let MAVProxy, MAVSDK and pymavlink fly the simulated vehicles, and print the table; three minutes."""
+    session.install("-e", ".", "MAVProxy", "mavsdk>=4", "pymavlink", "future")
+    session.run("python", "tests/clients/run.py", *session.posargs)
 
 
 @nox.session

@@ -1,0 +1,35 @@
+"""The benchmark of many simulated vehicles runs and writes what it promises; the figures are no matter for a test."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+
+
+def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "benchmarks/scale.py", *arguments]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+
+
+def test_every_row_has_a_figure_and_its_aim(tmp_path: Path) -> None:
+    path = tmp_path / "scale.json"
+    done = run("--quick", "--output", str(path))
+    assert done.returncode == 0, done.stderr
+    rows = {row["name"]: row for row in json.loads(path.read_text())}
+    assert list(rows) == ["copter_hundred", "px4_hundred", "copter_flight", "px4_flight"]
+    for row in rows.values():
+        assert row["aerokit"] > 0
+        assert row["ratio"] > 0
+        assert row["aim"] == 1.0
+        assert row["note"] in done.stdout
+    assert rows["copter_hundred"]["vehicles"] <= rows["copter_hundred"]["aerokit"]
+
+
+def test_a_wrong_name_is_refused() -> None:
+    wrong = run("copter")
+    assert wrong.returncode == 2
+    assert "copter_hundred, px4_hundred" in wrong.stderr
