@@ -163,7 +163,7 @@ class ArduPilotVehicle(SimulatedVehicle):
         self.reset_controllers()
         self.mission = MissionRun(self, self.auto)
         self.missions.reset()
-        self.mode: VehicleMode = self._modes[int(self.parameters["INITIAL_MODE"])]
+        self.mode: VehicleMode = self._modes[self.first_mode]
 
     def _listen(self) -> None:
         self.requests = Requests(self, stream_groups=self._stream_groups)
