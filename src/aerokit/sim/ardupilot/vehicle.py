@@ -215,6 +215,11 @@ class ArduPilotVehicle(SimulatedVehicle):
         raise NotImplementedError
 
     @property
+    def first_mode(self) -> int:
+        """The number of the mode in which it wakes up."""
+        return int(self.parameters["INITIAL_MODE"])
+
+    @property
     def base_mode(self) -> int:
         """MAV_MODE_FLAGs of its heartbeat."""
         raise NotImplementedError
