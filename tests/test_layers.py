@@ -18,9 +18,9 @@ FLOORS = [
     {"protocols"},
     {"runtime", "sim"},
     {"vehicle"},
-    {"sync", "testing"},
+    {"sync"},
     {"dronekit"},
-    {"cli"},
+    {"testing", "cli"},
 ]
 ALLOWED_BESIDE = {("sim", "autopilots"), ("sim", "links")}
 REEXPORTED = {"messages": "mavlink", "enums": "mavlink", "events": "runtime", "__version__": "errors"}

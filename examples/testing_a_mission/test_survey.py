@@ -1,0 +1,71 @@
+"""The tests of survey.py: no drone, no firmware, and next to no waiting. Run `pytest` in this folder."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+from survey import ALTITUDE_M, SIDE_M, BatteryTooLow, corners, hop_classic, survey, survey_blocking
+
+if TYPE_CHECKING:
+    from types import ModuleType
+
+    from aerokit import sync
+    from aerokit.testing import Fleet, Flight, ServedFlight, Track
+
+
+def assert_surveyed(track: Track) -> None:
+    for corner in corners(track.home):
+        track.assert_passed(corner, within_m=3)
+    track.assert_reached_altitude(ALTITUDE_M)
+    track.assert_stayed_within(1.5 * SIDE_M)
+    track.assert_landed_near(within_m=2)
+
+
+async def test_the_field_is_surveyed(flight: Flight) -> None:
+    await survey(flight.vehicle)
+    assert_surveyed(flight.track)
+    flight.track.assert_disarmed_at_end()
+
+
+@pytest.mark.simulated("px4", seed=4)
+def test_px4_surveys_it_too(flight: Flight) -> None:
+    flight.run(lambda flight: survey(flight.vehicle))  # for tests without async
+    assert_surveyed(flight.track)
+
+
+@pytest.mark.simulated(battery_percent=30)
+async def test_nothing_moves_with_a_low_battery(flight: Flight) -> None:
+    with pytest.raises(BatteryTooLow, match="30 %"):
+        await survey(flight.vehicle)
+    flight.track.assert_stayed_below(0.1)
+
+
+async def test_wind_and_a_bad_radio_do_not_matter(flight: Flight) -> None:
+    flight.faults.set_wind(east_m_s=6, gusts_m_s=1)
+    flight.faults.drop_packets(0.2)
+    flight.faults.go_silent(for_s=8, after_s=25)
+    await survey(flight.vehicle)
+    assert_surveyed(flight.track)
+
+
+@pytest.mark.simulated("copter", count=2)
+async def test_each_of_a_fleet(fleet: Fleet) -> None:
+    for flight in fleet:
+        await survey(flight.vehicle)
+        assert_surveyed(flight.track)
+
+
+@pytest.mark.simulated("copter", speedup=30)
+def test_the_blocking_program(blocking_vehicle: sync.Vehicle, served_flight: ServedFlight) -> None:
+    survey_blocking(blocking_vehicle)
+    assert_surveyed(served_flight.track)
+
+
+@pytest.mark.simulated("copter", speedup=30)
+def test_the_classic_program(
+    dronekit: ModuleType, dronekit_address: str, served_flight: ServedFlight
+) -> None:
+    hop_classic(dronekit_address)
+    served_flight.track.assert_reached_altitude(ALTITUDE_M)
+    served_flight.track.assert_modes("GUIDED", "LAND")

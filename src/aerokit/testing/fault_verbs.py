@@ -1,0 +1,110 @@
+"""`FaultInjector`: what goes wrong with a simulated vehicle, in readable verbs, at once or at a simulated second."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from aerokit.errors import LocalProtocolError
+from aerokit.sim.faults import Faults
+from aerokit.sim.motion import Wind
+
+__all__ = ["FaultInjector"]
+
+Schedule = Callable[[Callable[[], None], float], None]
+"""Does something after so many simulated seconds; 0 is at once."""
+
+
+class FaultInjector:
+    """Every verb acts at once, or ``after_s`` simulated seconds from now, and, where it says so, for ``for_s``.
+
+    Before the flight is opened, seconds count from its opening. Raises LocalProtocolError for times and shares
+    that make no sense. What is planned happens even if the vehicle reboots meanwhile.
+    """
+
+    def __init__(self, vehicle: Any, schedule: Schedule) -> None:
+        self._vehicle = vehicle
+        self._schedule = schedule
+
+    @property
+    def all(self) -> Faults:
+        """Everything that can go wrong, such as refused commands; see `aerokit.sim.Faults`."""
+        faults: Faults = self._vehicle.faults
+        return faults
+
+    def lose_gps(self, *, after_s: float = 0.0, for_s: float | None = None) -> None:
+        """No GPS fix any more; the estimator gives its position up seconds later."""
+        self._set("gps_lost", True, False, after_s, for_s)
+
+    def fail_motor(self, *, after_s: float = 0.0) -> None:
+        """A motor stands still: it comes down."""
+        self._set("motor_failed", True, False, after_s, None)
+
+    def drop_packets(self, share: float, *, after_s: float = 0.0, for_s: float | None = None) -> None:
+        """Lose this share of the packets, 0 to 1, in both directions; the same ones for the same seed."""
+        if not 0.0 <= share <= 1.0:
+            raise LocalProtocolError(f"share = {share!r} is not allowed: 0 to 1")
+        self._set("loss", share, 0.0, after_s, for_s)
+        self._set("loss_incoming", share, 0.0, after_s, for_s)
+
+    def go_silent(self, for_s: float | None = None, *, after_s: float = 0.0) -> None:
+        """The radio is out: nothing gets through in either direction, the vehicle flies on. None is for ever."""
+        self._set("silent", True, False, after_s, for_s)
+
+    def hang(self, for_s: float | None = None, *, after_s: float = 0.0) -> None:
+        """The autopilot neither hears, moves nor sends. None is for ever."""
+        self._set("frozen", True, False, after_s, for_s)
+
+    def fail_prearm(self, reason: str, *, after_s: float = 0.0, for_s: float | None = None) -> None:
+        """Its arming checks give this reason besides the real ones."""
+        reasons = self.all.prearm_failures
+        self._plan(partial(reasons.append, reason), after_s)
+        if for_s is not None:
+            self._plan(partial(reasons.remove, reason), after_s + _duration(for_s))
+
+    def reboot(self, *, after_s: float = 0.0) -> None:
+        """It reboots, in the air as on the ground."""
+        self._plan(self._vehicle.restart, after_s)
+
+    def set_wind(
+        self, *, north_m_s: float = 0.0, east_m_s: float = 0.0, gusts_m_s: float = 0.0, after_s: float = 0.0
+    ) -> None:
+        """Where the air goes from now on, in m/s; gusts as their standard deviation."""
+        wind = Wind(north_m_s, east_m_s, gusts_m_s)
+        self._plan(partial(setattr, self._vehicle.motion, "wind", wind), after_s)
+
+    def set_battery(self, percent: float, *, after_s: float = 0.0) -> None:
+        """So much charge is left, 0 to 100; it is drained from there."""
+        if not 0.0 <= percent <= 100.0:
+            raise LocalProtocolError(f"percent = {percent!r} is not allowed: 0 to 100")
+        self._plan(partial(setattr, self._vehicle.battery, "percent", percent), after_s)
+
+    def end(self, *, after_s: float = 0.0) -> None:
+        """Everything that a vehicle can recover from is well again: GPS, radio, motor, processor."""
+        for name, value in (
+            ("gps_lost", False),
+            ("motor_failed", False),
+            ("silent", False),
+            ("frozen", False),
+        ):
+            self._set(name, value, value, after_s, None)
+        self.drop_packets(0.0, after_s=after_s)
+
+    def _set(self, name: str, value: object, well: object, after_s: float, for_s: float | None) -> None:
+        end_s = None if for_s is None else after_s + _duration(for_s)
+        self._plan(partial(setattr, self.all, name, value), after_s)
+        if end_s is not None:
+            self._plan(partial(setattr, self.all, name, well), end_s)
+
+    def _plan(self, action: Callable[[], None], after_s: float) -> None:
+        if not (math.isfinite(after_s) and after_s >= 0.0):
+            raise LocalProtocolError(f"after_s = {after_s!r} must be 0 or more seconds")
+        self._schedule(action, after_s)
+
+
+def _duration(for_s: float) -> float:
+    if not for_s > 0.0:
+        raise LocalProtocolError(f"for_s = {for_s!r} must be above 0 seconds")
+    return for_s

@@ -1,0 +1,205 @@
+"""`Flight`: a simulated vehicle, the program's vehicle on it, what may go wrong, and what was flown.
+
+```python
+async with open_flight("copter", seed=3) as flight:
+    flight.faults.lose_gps(after_s=20)
+    await my_mission(flight.vehicle)
+flight.track.assert_landed_near(within_m=3)
+```
+
+On virtual time (`run_virtual`, or the fixtures of the pytest plugin) a flight takes a fraction of a second.
+"""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager
+from typing import TYPE_CHECKING, Any, TypeVar, overload
+
+import aerokit
+from aerokit.errors import LocalProtocolError
+from aerokit.links import memory_link_pair
+from aerokit.sim.kinds import simulated
+from aerokit.sim.server import SimulatorServer
+from aerokit.testing.clock import run_virtual
+from aerokit.testing.fault_verbs import FaultInjector
+from aerokit.testing.stage import Stagehand
+
+if TYPE_CHECKING:
+    from aerokit.links import Link
+    from aerokit.testing.track import Track
+
+__all__ = ["Fleet", "Flight", "open_fleet", "open_flight", "repeated"]
+
+T = TypeVar("T")
+_BOOT_TIME_S = 1.0
+
+
+class Flight:
+    """One simulated vehicle in a test. Faults can be planned before it is opened; the track stays afterwards."""
+
+    def __init__(self, fleet: Fleet, number: int) -> None:
+        self._fleet = fleet
+        self.simulated: Any = fleet._vehicles[number]
+        """The simulated vehicle, such as `aerokit.sim.SimulatedCopter`: its battery, parameters, motion …"""
+        self.track: Track = fleet._stagehand.tracks[number]
+        """Where it truly was."""
+        self.faults = FaultInjector(self.simulated, fleet._schedule)
+        """What goes wrong with it."""
+        self._vehicle: aerokit.Vehicle | None = None
+
+    @property
+    def vehicle(self) -> aerokit.Vehicle:
+        """The program's vehicle, connected; RuntimeError when the flight is not open."""
+        if self._vehicle is None:
+            self._fleet._check_open()
+            raise RuntimeError("nobody connected: this flight was opened with connect=False; use flight.link")
+        return self._vehicle
+
+    @property
+    def link(self) -> Link:
+        """For programs that connect by themselves, in the place of an address; needs ``connect=False``."""
+        return self._fleet.link
+
+    def run(self, main: Callable[[Flight], Awaitable[T]]) -> T:
+        """Open the flight, await ``main(flight)`` on virtual time, close it: for a test without ``async``."""
+
+        async def fly() -> T:
+            async with self._fleet.open():
+                return await main(self)
+
+        return run_virtual(fly())
+
+
+class Fleet(Sequence[Flight]):
+    """Simulated vehicles on one link, with system ids 1, 2, 3 …; a sequence of `Flight`. It is opened once."""
+
+    def __init__(self, *kinds: str, connect: bool = True, latency_s: float = 0.0, **options: Any) -> None:
+        options.setdefault("boot_time_s", _BOOT_TIME_S)
+        first_id, seed = options.pop("system_id", 1), options.pop("seed", 0)
+        self._vehicles = [
+            simulated(kind, system_id=first_id + number, seed=seed + number, **options)
+            for number, kind in enumerate(kinds)
+        ]
+        self._stagehand = Stagehand(self._vehicles)
+        self._connect, self._latency_s = connect, latency_s
+        self._server: SimulatorServer | None = None
+        self._link: Link | None = None
+        self._was_opened = False
+        self._flights = [Flight(self, number) for number in range(len(kinds))]
+
+    def __len__(self) -> int:
+        return len(self._flights)
+
+    @overload
+    def __getitem__(self, index: int) -> Flight: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[Flight]: ...
+    def __getitem__(self, index: int | slice) -> Flight | list[Flight]:
+        return self._flights[index]
+
+    @property
+    def vehicles(self) -> list[aerokit.Vehicle]:
+        """The program's vehicles, connected."""
+        return [flight.vehicle for flight in self._flights]
+
+    @property
+    def link(self) -> Link:
+        """The program's end of the link, to be opened by it; needs ``connect=False``."""
+        self._check_open()
+        if self._connect:
+            raise RuntimeError(
+                "this link is in use: open the flight with connect=False to connect by yourself"
+            )
+        assert self._link is not None
+        return self._link
+
+    def run(self, main: Callable[[Fleet], Awaitable[T]]) -> T:
+        """Open the fleet, await ``main(fleet)`` on virtual time, close it: for a test without ``async``."""
+
+        async def fly() -> T:
+            async with self.open():
+                return await main(self)
+
+        return run_virtual(fly())
+
+    @asynccontextmanager
+    async def open(self) -> AsyncIterator[Fleet]:
+        """Switch everybody on, and connect; when the block is left, nothing but the tracks is left.
+
+        Raises RuntimeError the second time.
+        """
+        if self._was_opened:
+            raise RuntimeError("this flight was opened before: each test has its own")
+        self._was_opened = True
+        near, far = memory_link_pair(latency_s=self._latency_s)
+        async with AsyncExitStack() as stack:
+            self._link = near
+            self._server = await stack.enter_async_context(
+                SimulatorServer([self._stagehand, *self._vehicles], far)
+            )
+            stack.callback(self._close)
+            self._stagehand.follow(self._catch_up)
+            if self._connect:
+                await self._connect_all(near, stack)
+            yield self
+
+    async def _connect_all(self, link: Link, stack: AsyncExitStack) -> None:
+        connection = await stack.enter_async_context(aerokit.open_connection(link))
+        for flight in self._flights:
+            flight._vehicle = await stack.enter_async_context(
+                aerokit.connect(connection, system_id=flight.simulated.system_id)
+            )
+
+    def _close(self) -> None:
+        self._catch_up()
+        self._stagehand.follow(None)
+        self._server = self._link = None
+        for flight in self._flights:
+            flight._vehicle = None
+
+    def _catch_up(self) -> None:
+        assert self._server is not None
+        self._server.wake()
+        self._stagehand.record()
+
+    def _check_open(self) -> None:
+        if self._server is None:
+            raise RuntimeError(
+                "this flight is not open: use it in an `async def` test, or in a `def` test by flight.run(main)"
+            )
+
+    def _schedule(self, action: Callable[[], None], after_s: float) -> None:
+        if self._server is not None:
+            self._server.wake()
+        self._stagehand.do(action, after_s=after_s)
+        if self._server is not None:
+            self._server.wake()
+
+
+@asynccontextmanager
+async def open_flight(kind: str = "copter", **options: Any) -> AsyncIterator[Flight]:
+    """A vehicle of a kind ("copter", "plane", "rover", "sub", "px4", "px4_plane"), connected.
+
+    ``connect=False`` leaves connecting to the program, by ``flight.link``; ``latency_s`` passes on the way in
+    both directions. Other options are those of the simulated vehicle: ``seed``, ``home``, ``parameters``,
+    ``battery_percent`` … Raises LocalProtocolError for a kind that does not exist.
+    """
+    fleet = Fleet(kind, **options)
+    async with fleet.open():
+        yield fleet._flights[0]
+
+
+def open_fleet(*kinds: str, count: int | None = None, **options: Any) -> AbstractAsyncContextManager[Fleet]:
+    """Vehicles of these kinds, or ``count`` of one kind, on one link, as `open_flight` opens one."""
+    return Fleet(*repeated(kinds, count), **options).open()
+
+
+def repeated(kinds: Sequence[str], count: int | None) -> Sequence[str]:
+    """The kinds, or one kind so many times; LocalProtocolError for what makes no sense."""
+    kinds = kinds or ("copter",)
+    if count is None:
+        return kinds
+    if len(kinds) != 1 or count < 1:
+        raise LocalProtocolError(f"count = {count!r} goes with one kind, and is 1 or more")
+    return list(kinds) * count

@@ -1,0 +1,262 @@
+"""`Track`: where a simulated vehicle truly was, and assertions on it that say what was flown instead.
+
+```python
+track.assert_reached_altitude(20)
+track.assert_passed(bridge, within_m=5)
+track.assert_stayed_within(300)
+track.assert_landed_near(within_m=3)
+```
+
+Altitudes are metres above home; home is where the vehicle was switched on. Times are simulated seconds.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import overload
+
+from aerokit import geo
+from aerokit.position import Position
+
+__all__ = ["Track", "TrackPoint"]
+
+_ON_GROUND_M = 0.3
+
+
+@dataclass(frozen=True)
+class TrackPoint:
+    """Where the vehicle was at one instant, whatever its estimator thought."""
+
+    time_s: float
+    """Simulated seconds."""
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float
+    """Above home."""
+    armed: bool
+    mode: str
+    """As the autopilot names it."""
+
+    @property
+    def position(self) -> Position:
+        """The place, for `Position.distance_to` and the like."""
+        return Position(self.latitude_deg, self.longitude_deg, altitude_relative_m=self.altitude_m)
+
+    def __str__(self) -> str:
+        place = f"{self.latitude_deg:.6f}, {self.longitude_deg:.6f}"
+        armed = "armed" if self.armed else "disarmed"
+        return f"at {self.time_s:.1f} s: {place}, {self.altitude_m:.1f} m above home, {armed}, {self.mode}"
+
+
+class Track(Sequence[TrackPoint]):
+    """What was flown, ten points a second; it grows while the vehicle lives.
+
+    Assertions raise AssertionError; a track without a point fails them all.
+    """
+
+    def __init__(self, home: Position, points: Sequence[TrackPoint] = ()) -> None:
+        self.home = home
+        """Where it was switched on."""
+        self._points = list(points)
+        self._catch_up: Callable[[], None] | None = None
+
+    def __len__(self) -> int:
+        return len(self._until_now())
+
+    def __iter__(self) -> Iterator[TrackPoint]:
+        return iter(tuple(self._until_now()))
+
+    @overload
+    def __getitem__(self, index: int) -> TrackPoint: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[TrackPoint]: ...
+    def __getitem__(self, index: int | slice) -> TrackPoint | list[TrackPoint]:
+        return self._until_now()[index]
+
+    def append(self, point: TrackPoint) -> None:
+        """Add the next point, in the place of the last one if it is of the same time."""
+        if self._points and self._points[-1].time_s >= point.time_s:
+            self._points.pop()
+        self._points.append(point)
+
+    def follow(self, catch_up: Callable[[], None] | None) -> None:
+        """Call this before the track is read: it appends what happened up to now. None: nothing more happens."""
+        self._catch_up = catch_up
+
+    def _until_now(self) -> list[TrackPoint]:
+        if self._catch_up is not None:
+            self._catch_up()
+        return self._points
+
+    # --------------------------------------------------------------------------------- what was flown
+
+    @property
+    def end(self) -> TrackPoint:
+        """The latest point; AssertionError without any."""
+        points = self._until_now()
+        assert points, "nothing was recorded: was the flight opened?"
+        return points[-1]
+
+    @property
+    def max_altitude_m(self) -> float:
+        """The highest that it was above home."""
+        return self._highest().altitude_m
+
+    @property
+    def max_distance_m(self) -> float:
+        """The farthest that it was from home, along the ground."""
+        return self._farthest(self.home)[0]
+
+    @property
+    def modes(self) -> list[str]:
+        """The modes in their order, each change once."""
+        modes: list[str] = []
+        for point in self:
+            if not modes or modes[-1] != point.mode:
+                modes.append(point.mode)
+        return modes
+
+    @property
+    def armed_s(self) -> float:
+        """For how many simulated seconds it was armed."""
+        return sum(after.time_s - before.time_s for before, after in pairwise(self) if before.armed)
+
+    def nearest_m(self, place: Position) -> float:
+        """How near it came to a place: along the ground, or in space if the place has an altitude above home."""
+        return self._nearest(place)[0]
+
+    # ------------------------------------------------------------------------------------- assertions
+
+    def assert_reached_altitude(self, altitude_m: float, *, within_m: float = 1.0) -> None:
+        """It was at least ``altitude_m - within_m`` metres above home once."""
+        highest = self._highest()
+        reached = highest.altitude_m >= altitude_m - within_m
+        assert reached, f"it did not reach {altitude_m:g} m: the highest point was {highest}"
+
+    def assert_stayed_below(self, altitude_m: float) -> None:
+        """It never was more than ``altitude_m`` metres above home."""
+        highest = self._highest()
+        assert highest.altitude_m <= altitude_m, f"it rose above {altitude_m:g} m: {highest}"
+
+    def assert_passed(self, place: Position, *, within_m: float = 2.0) -> None:
+        """It came this near to a place; in space if the place has an ``altitude_relative_m``."""
+        distance, point = self._nearest(place)
+        assert distance <= within_m, (
+            f"it did not pass within {within_m:g} m of {_text(place)}: the nearest was {distance:.1f} m, {point}"
+        )
+
+    def assert_stayed_within(self, radius_m: float, *, of: Position | None = None) -> None:
+        """It was never farther than this from home, or from a place, along the ground."""
+        centre = self.home if of is None else of
+        distance, point = self._farthest(centre)
+        name = "home" if of is None else _text(of)
+        assert distance <= radius_m, (
+            f"it left the {radius_m:g} m around {name}: {distance:.1f} m away {point}"
+        )
+
+    def assert_stayed_inside(self, polygon: Sequence[Position]) -> None:
+        """It never left a polygon of three places or more; the last is connected with the first."""
+        assert len(polygon) >= 3, f"a polygon has three places or more, not {len(polygon)}"
+        _ = self.end
+        plane = _plane(self.home)
+        corners = [plane(corner) for corner in polygon]
+        outside = [point for point in self if not _is_inside(plane(point), corners)]
+        assert not outside, (
+            f"it left the polygon, {len(outside)} of {len(self)} points are outside; first {outside[0]}"
+        )
+
+    def assert_landed_near(self, place: Position | None = None, *, within_m: float = 2.0) -> None:
+        """It flew, and at the end it stands on the ground near home, or near a place."""
+        end, target = self.end, self.home if place is None else place
+        assert self.max_altitude_m > _ON_GROUND_M, f"it never took off: it ended {end}"
+        assert abs(end.altitude_m) <= _ON_GROUND_M, f"it is not on the ground: it ended {end}"
+        distance = target.distance_to(end.position)
+        name = "home" if place is None else _text(place)
+        assert distance <= within_m, (
+            f"it landed {distance:.1f} m from {name}, not within {within_m:g} m: {end}"
+        )
+
+    def assert_armed_at_end(self) -> None:
+        """Its motors were armed at the end."""
+        assert self.end.armed, f"it ended disarmed, {self.end}"
+
+    def assert_disarmed_at_end(self) -> None:
+        """Its motors were disarmed at the end."""
+        assert not self.end.armed, f"it ended armed, {self.end}"
+
+    def assert_modes(self, *names: str) -> None:
+        """It went through these modes in this order; there may have been others between them."""
+        modes = iter(self.modes)
+        for name in names:
+            assert name in modes, (
+                f"{name} is missing in {' → '.join(names)}: the modes were {' → '.join(self.modes)}"
+            )
+
+    # -------------------------------------------------------------------------------------------------
+
+    def _highest(self) -> TrackPoint:
+        _ = self.end
+        return max(self, key=lambda point: point.altitude_m)
+
+    def _farthest(self, centre: Position) -> tuple[float, TrackPoint]:
+        _ = self.end
+        plane = _plane(centre)
+        point = max(self, key=lambda point: math.hypot(*plane(point)))
+        return math.hypot(*plane(point)), point
+
+    def _nearest(self, place: Position) -> tuple[float, TrackPoint]:
+        _ = self.end
+        plane, altitude = _plane(place), place.altitude_relative_m
+        nearest, point, before = math.inf, self._points[0], None
+        for candidate in self:
+            up = 0.0 if altitude is None else candidate.altitude_m - altitude
+            here = (*plane(candidate), up)
+            distance = _distance_of_origin(here if before is None else before, here)
+            if distance < nearest:
+                nearest, point = distance, candidate
+            before = here
+        return nearest, point
+
+
+def _text(place: Position) -> str:
+    above = place.altitude_relative_m
+    height = "" if above is None else f" at {above:.1f} m above home"
+    return f"{place.latitude_deg:.6f}, {place.longitude_deg:.6f}{height}"
+
+
+def _plane(origin: Position) -> Callable[[Position | TrackPoint], tuple[float, float]]:
+    """Metres north and east of a place, on a plane that touches the ellipsoid there."""
+    latitude, longitude = origin.latitude_deg, origin.longitude_deg
+    per_latitude = geo.distance_m(latitude - 0.005, longitude, latitude + 0.005, longitude) * 100
+    per_longitude = geo.distance_m(latitude, longitude - 0.005, latitude, longitude + 0.005) * 100
+
+    def place(point: Position | TrackPoint) -> tuple[float, float]:
+        north = (point.latitude_deg - latitude) * per_latitude
+        return north, geo.wrap_longitude(point.longitude_deg - longitude) * per_longitude
+
+    return place
+
+
+def _distance_of_origin(start: tuple[float, float, float], end: tuple[float, float, float]) -> float:
+    """From the origin to the line between two points."""
+    way = [b - a for a, b in zip(start, end, strict=True)]
+    square = sum(part * part for part in way)
+    share = 0.0 if square == 0.0 else -sum(a * part for a, part in zip(start, way, strict=True)) / square
+    share = max(0.0, min(1.0, share))
+    return math.hypot(*(a + share * part for a, part in zip(start, way, strict=True)))
+
+
+def _is_inside(point: tuple[float, float], corners: Sequence[tuple[float, float]]) -> bool:
+    """By counting the edges that a line to the east crosses."""
+    north, east = point
+    inside, (last_north, last_east) = False, corners[-1]
+    for corner_north, corner_east in corners:
+        if (corner_north > north) != (last_north > north):
+            share = (north - last_north) / (corner_north - last_north)
+            if east < last_east + share * (corner_east - last_east):
+                inside = not inside
+        last_north, last_east = corner_north, corner_east
+    return inside

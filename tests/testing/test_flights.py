@@ -1,0 +1,148 @@
+"""Flights without pytest's fixtures: faults at once and at a simulated second, tracks that are up to date."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import anyio
+import pytest
+
+from aerokit import messages
+from aerokit.errors import CommandRejected, LocalProtocolError
+from aerokit.testing import Flight, open_fleet, open_flight, run_virtual, serve_flight
+
+pytestmark = pytest.mark.anyio
+
+
+async def take_off(flight: Flight, altitude_m: float = 10.0) -> None:
+    await flight.vehicle.wait_ready()
+    await flight.vehicle.set_mode("GUIDED")
+    await flight.vehicle.arm()
+    await flight.vehicle.take_off(altitude_m)
+
+
+async def test_faults_come_and_go_at_their_second() -> None:
+    async with open_flight() as flight:
+        await flight.vehicle.wait_ready()
+        flight.faults.lose_gps(after_s=2, for_s=3)
+        seen = []
+        for _ in range(6):
+            seen.append(flight.faults.all.gps_lost)
+            await anyio.sleep(1.001)
+        assert seen == [False, False, True, True, True, False]
+
+
+async def test_what_was_planned_happens_though_the_vehicle_hangs_or_reboots() -> None:
+    async with open_flight() as flight:
+        await flight.vehicle.wait_ready()
+        flight.faults.hang(for_s=4)
+        flight.faults.reboot(after_s=8)
+        flight.faults.go_silent(for_s=8, after_s=7)
+        await anyio.sleep(5)
+        assert flight.faults.all.frozen is False
+        await anyio.sleep(5)
+        assert vars(flight.faults.all)["silent"]
+        assert flight.simulated.uptime < 2.0
+        await anyio.sleep(6)
+        assert not flight.faults.all.silent
+        await flight.vehicle.wait_ready()
+
+
+async def test_a_failed_motor_is_in_the_track_at_once() -> None:
+    async with open_flight() as flight:
+        await take_off(flight)
+        before = flight.track.end
+        flight.faults.fail_motor()
+        flight.faults.set_wind(north_m_s=5)
+        await anyio.sleep(5)
+        assert before.altitude_m > 9
+        assert flight.track.end.time_s == pytest.approx(before.time_s + 5, abs=0.05)
+        assert flight.track.end.altitude_m < 0.3
+        assert flight.simulated.motion.wind.north_m_s == 5
+    flight.track.assert_reached_altitude(10)
+
+
+async def test_low_battery_and_failing_checks() -> None:
+    async with open_flight() as flight:
+        await flight.vehicle.wait_ready()
+        flight.faults.set_battery(12)
+        await flight.vehicle.batteries.wait_until(
+            lambda packs: (packs[0].remaining_percent or 99) <= 12, timeout=10
+        )
+        flight.faults.fail_prearm("Gyros still settling", for_s=5)
+        with pytest.raises(CommandRejected, match="Gyros still settling"):
+            await flight.vehicle.arm()
+        await anyio.sleep(6)
+        assert flight.faults.all.prearm_failures == []
+
+
+def packets_through(seed: int) -> tuple[int, int]:
+    async def main() -> tuple[int, int]:
+        async with open_flight(seed=seed) as flight:
+            flight.faults.drop_packets(0.2)
+            heard = 0
+
+            def count(*_: Any) -> None:
+                nonlocal heard
+                heard += 1
+
+            flight.simulated.on(messages.Heartbeat, count)
+            with flight.vehicle.subscribe(messages.Heartbeat, capacity=200) as heartbeats:
+                await anyio.sleep(100)
+                told = 0
+                while heartbeats.get_nowait() is not None:
+                    told += 1
+            return heard, told
+
+    return run_virtual(main())
+
+
+@pytest.mark.parametrize("seed", [1])
+def test_dropped_packets_go_missing_both_ways_and_are_the_same_for_the_same_seed(seed: int) -> None:
+    first = packets_through(seed)
+    assert packets_through(seed) == first
+    assert all(60 < number < 95 for number in first)
+
+
+async def test_end_makes_everything_well() -> None:
+    async with open_flight() as flight:
+        flight.faults.drop_packets(1.0)
+        flight.faults.lose_gps()
+        flight.faults.end(after_s=3)
+        await flight.vehicle.wait_ready()
+        assert flight.simulated.now > 3
+
+
+async def test_mistakes() -> None:
+    async with open_flight(connect=False) as flight:
+        wrongs: list[Callable[[], None]] = [
+            lambda: flight.faults.drop_packets(20),
+            lambda: flight.faults.set_battery(-1),
+            lambda: flight.faults.lose_gps(after_s=-1),
+            lambda: flight.faults.go_silent(for_s=0),
+        ]
+        for wrong in wrongs:
+            with pytest.raises(LocalProtocolError):
+                wrong()
+        assert not flight.faults.all.gps_lost
+    with pytest.raises(RuntimeError, match="is not open"):
+        _ = flight.vehicle
+    with pytest.raises(LocalProtocolError, match="one kind"):
+        open_fleet("copter", "px4", count=2)
+
+
+async def test_a_fleet_flies_side_by_side() -> None:
+    async with open_fleet(count=2) as fleet, anyio.create_task_group() as group:
+        for number, flight in enumerate(fleet):
+            group.start_soon(take_off, flight, 10.0 + 10 * number)
+    assert [round(flight.track.max_altitude_m, -1) for flight in fleet] == [10, 20]
+
+
+def test_a_served_flight_is_recorded() -> None:
+    with serve_flight("px4", speedup=50) as flight:
+        flight.faults.set_battery(50)
+        assert flight.address.startswith("tcp:127.0.0.1:")
+        assert flight.simulated.battery.percent == 50
+        assert flight.track.end.armed is False
+    assert len(flight.track) >= 1

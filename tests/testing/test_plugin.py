@@ -1,0 +1,178 @@
+"""The pytest plugin in projects of its users, each in a folder of its own."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+pytest_plugins = ["pytester"]
+
+ASYNC = """
+import pytest
+
+async def go(vehicle):
+    await vehicle.wait_ready()
+    if vehicle.autopilot.firmware == "ArduPilot":
+        await vehicle.set_mode("GUIDED")
+    await vehicle.arm()
+    await vehicle.take_off(10)
+    await vehicle.land()
+    await vehicle.armed.wait_until(lambda armed: not armed, timeout=30)
+
+@pytest.mark.simulated({kind!r}, seed=2)
+async def test_async(flight):
+    await go(flight.vehicle)
+    flight.track.assert_reached_altitude(10)
+    flight.track.assert_landed_near(within_m=2)
+    flight.track.assert_disarmed_at_end()
+
+@pytest.mark.simulated({kind!r})
+def test_plain(flight):
+    flight.run(lambda flight: go(flight.vehicle))
+    flight.track.assert_reached_altitude(10)
+"""
+
+
+def run(pytester: pytest.Pytester, source: str, *arguments: str) -> pytest.RunResult:
+    pytester.makepyfile(source)
+    plugin = ("-p", "no:aerokit", "-p", "aerokit.testing.plugin")  # whether it is installed as such or not
+    return pytester.runpytest_inprocess(
+        *plugin, "-p", "no:xdist", "-p", "no:cacheprovider", "-W", "error", *arguments
+    )
+
+
+@pytest.mark.parametrize("kind", ["copter", "px4"])
+def test_flights_need_no_async_plugin(pytester: pytest.Pytester, kind: str) -> None:
+    run(pytester, ASYNC.format(kind=kind), "-p", "no:anyio").assert_outcomes(passed=2)
+
+
+def test_flights_share_the_loop_of_anyios_plugin(pytester: pytest.Pytester) -> None:
+    source = """
+    import asyncio, pytest
+    from aerokit.testing import VIRTUAL_BACKEND
+
+    @pytest.fixture
+    def anyio_backend():
+        return VIRTUAL_BACKEND
+
+    @pytest.fixture
+    async def loop(anyio_backend):
+        yield asyncio.get_running_loop()
+
+    @pytest.mark.anyio
+    async def test_it(flight, loop):
+        assert asyncio.get_running_loop() is loop
+        await flight.vehicle.wait_ready()
+    """
+    run(pytester, source).assert_outcomes(passed=1)
+
+
+def test_a_fleet(pytester: pytest.Pytester) -> None:
+    source = """
+    import pytest
+
+    @pytest.mark.simulated("copter", count=3)
+    async def test_three(fleet):
+        for vehicle in fleet.vehicles:
+            await vehicle.wait_ready()
+        await fleet[1].vehicle.arm()
+        assert [each.simulated.is_armed for each in fleet] == [False, True, False]
+        assert [each.system_id for each in fleet.vehicles] == [1, 2, 3]
+
+    @pytest.mark.simulated("copter", "px4")
+    def test_mixed(fleet):
+        async def main(fleet):
+            return [vehicle.autopilot.firmware for vehicle in fleet.vehicles]
+        assert len(set(fleet.run(main))) == 2
+    """
+    run(pytester, source).assert_outcomes(passed=2)
+
+
+def test_programs_that_connect_by_themselves(pytester: pytest.Pytester) -> None:
+    source = """
+    import aerokit, pytest
+
+    @pytest.mark.simulated(connect=False)
+    async def test_it(flight):
+        async with aerokit.connect(flight.link) as vehicle:
+            await vehicle.wait_ready()
+        with pytest.raises(RuntimeError, match="connect=False"):
+            flight.vehicle
+    """
+    run(pytester, source).assert_outcomes(passed=1)
+
+
+def test_blocking_and_classic(pytester: pytest.Pytester) -> None:
+    source = """
+    import pytest
+
+    def test_blocking(blocking_vehicle, served_flight):
+        blocking_vehicle.wait_ready()
+        served_flight.faults.fail_prearm("Compass not healthy")
+        with pytest.raises(Exception, match="Compass not healthy"):
+            blocking_vehicle.arm()
+        served_flight.track.assert_disarmed_at_end()
+
+    def test_classic(dronekit, dronekit_address):
+        import dronekit as same
+        assert same is dronekit
+        vehicle = dronekit.connect(dronekit_address, wait_ready=["armed"])
+        assert vehicle.armed is False
+        vehicle.close()
+
+    def test_afterwards_the_name_is_free():
+        import sys
+        assert "dronekit" not in sys.modules
+    """
+    run(pytester, source).assert_outcomes(passed=3)
+
+
+def test_mistakes_are_explained(pytester: pytest.Pytester) -> None:
+    source = """
+    import pytest
+
+    @pytest.mark.simulated("balloon")
+    def test_kind(flight): ...
+
+    @pytest.mark.simulated(count=2)
+    def test_count(flight): ...
+
+    def test_not_open(flight):
+        flight.vehicle
+    """
+    result = run(pytester, source)
+    result.assert_outcomes(errors=2, failed=1)
+    told = result.stdout.str()
+    for text in ("'balloon' is not one of: copter", "use the fixture `fleet`", "flight.run(main)"):
+        assert text in told
+
+
+def test_other_projects_are_not_disturbed(pytester: pytest.Pytester) -> None:
+    source = """
+    import pytest, sys
+
+    @pytest.fixture
+    def flight():
+        return "AF 447"
+
+    def test_own_fixture(flight):
+        assert flight == "AF 447"
+
+    @pytest.mark.anyio
+    async def test_async(flight):
+        assert flight == "AF 447"
+    """
+    run(pytester, source, "-k", "not trio").assert_outcomes(passed=2)
+
+
+def test_importing_it_is_cheap() -> None:
+    program = (
+        "import sys, pytest; before = set(sys.modules); import aerokit.testing.plugin;"
+        " print(*set(sys.modules) - before)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    own = {name for name in done.stdout.split() if name.startswith("aerokit")}
+    assert own == {"aerokit", "aerokit.testing", "aerokit.testing.plugin"}
+    assert "asyncio" not in done.stdout.split()

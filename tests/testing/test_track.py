@@ -1,0 +1,91 @@
+"""What a track says of a flight, and what its assertions say of another one than was expected."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+from aerokit import Position
+from aerokit.testing import Track, TrackPoint
+
+HOME = Position(47.0, 8.0, 400.0)
+GROUND = Position(47.0, 8.0, altitude_relative_m=0.0)
+
+
+def at(
+    time_s: float, north_m: float, east_m: float, altitude_m: float, mode: str = "AUTO", *, armed: bool = True
+) -> TrackPoint:
+    place = HOME.offset(north_m=north_m, east_m=east_m)
+    return TrackPoint(time_s, place.latitude_deg, place.longitude_deg, altitude_m, armed, mode)
+
+
+@pytest.fixture
+def track() -> Track:
+    """100 m to the north at 20 m, and back to a place 5 m east of home."""
+    return Track(
+        HOME,
+        [
+            at(0, 0, 0, 0, "STABILIZE", armed=False),
+            at(5, 0, 0, 20),
+            at(15, 100, 0, 20),
+            at(25, 0, 5, 20, "RTL"),
+            at(40, 0, 5, 0.0, "RTL", armed=False),
+        ],
+    )
+
+
+def test_what_was_flown(track: Track) -> None:
+    assert track.max_altitude_m == 20
+    assert track.max_distance_m == pytest.approx(100, abs=0.01)
+    assert track.modes == ["STABILIZE", "AUTO", "RTL"]
+    assert track.armed_s == 35
+    assert track.end.time_s == 40
+    assert track.nearest_m(HOME.offset(north_m=50, east_m=7)) == pytest.approx(
+        4.5, abs=0.01
+    )  # between two points
+    assert track.nearest_m(GROUND.offset(north_m=50, up_m=30)) == pytest.approx(10, abs=0.01)
+    assert len(track[1:3]) == 2
+
+
+def test_what_is_true_passes(track: Track) -> None:
+    track.assert_reached_altitude(20)
+    track.assert_stayed_below(20)
+    track.assert_passed(GROUND.offset(north_m=100, up_m=20), within_m=1)
+    track.assert_stayed_within(101)
+    track.assert_stayed_inside([HOME.offset(north_m=n, east_m=e) for n, e in ((-9, -9), (120, 0), (-9, 20))])
+    track.assert_landed_near(within_m=6)
+    track.assert_landed_near(HOME.offset(east_m=5), within_m=0.1)
+    track.assert_disarmed_at_end()
+    track.assert_modes("AUTO", "RTL")
+
+
+SQUARE = [HOME.offset(north_m=n, east_m=e) for n, e in ((-9, -9), (50, -9), (50, 20), (-9, 20))]
+WRONG: dict[str, Callable[[Track], None]] = {
+    r"did not reach 30 m: the highest point was at 5\.0 s: .*, 20\.0 m above home, armed, AUTO": (
+        lambda track: track.assert_reached_altitude(30)
+    ),
+    "rose above 19 m: at 5.0 s": lambda track: track.assert_stayed_below(19),
+    r"within 5 m of .*: the nearest was 100\.0 m, at 15\.0 s": (
+        lambda track: track.assert_passed(HOME.offset(north_m=200), within_m=5)
+    ),
+    r"left the 50 m around home: 100\.0 m away at 15\.0 s": lambda track: track.assert_stayed_within(50),
+    r"1 of 5 points are outside; first at 15\.0 s": lambda track: track.assert_stayed_inside(SQUARE),
+    r"landed 5\.0 m from home, not within 2 m": lambda track: track.assert_landed_near(),
+    "ended disarmed, at 40.0 s": lambda track: track.assert_armed_at_end(),
+    "AUTO is missing in RTL → AUTO → RTL: the modes were STABILIZE → AUTO → RTL": (
+        lambda track: track.assert_modes("RTL", "AUTO", "RTL")
+    ),
+    "not on the ground: it ended at 25.0 s": (
+        lambda track: Track(track.home, track[:-1]).assert_landed_near(within_m=9)
+    ),
+    "never took off": lambda track: Track(track.home, track[:1]).assert_landed_near(),
+    "nothing was recorded": lambda track: Track(track.home).assert_stayed_below(10),
+    "three places": lambda track: track.assert_stayed_inside(SQUARE[:2]),
+}
+
+
+@pytest.mark.parametrize("text", WRONG)
+def test_what_is_wrong_says_what_was_flown(track: Track, text: str) -> None:
+    with pytest.raises(AssertionError, match=text):
+        WRONG[text](track)
