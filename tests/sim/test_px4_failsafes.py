@@ -62,7 +62,7 @@ def test_the_battery_warns_returns_and_lands() -> None:
     station.run(1.0)
     assert station.texts == ["Low battery\t"]
     assert px4.mode == HOLD
-    assert not px4.is_in_failsafe
+    assert station.last(m.Heartbeat).system_status == MavState.ACTIVE
     px4.battery.percent = 6.9
     station.run(1.0)
     assert station.texts[1:] == ["Critical battery\t", "Failsafe activated: entering Hold for 5 seconds\t"]

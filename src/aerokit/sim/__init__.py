@@ -18,7 +18,7 @@ from aerokit.sim.ardupilot import BootTimeline, SimulatedCopter
 from aerokit.sim.faults import CommandFault, Faults
 from aerokit.sim.logs import SimulatedLog
 from aerokit.sim.motion import Wind
-from aerokit.sim.px4 import SimulatedPx4
+from aerokit.sim.px4 import SimulatedPx4, SimulatedPx4Plane
 from aerokit.sim.server import SimulatorServer, open_simulator, simulated_link
 from aerokit.sim.vehicle import ExtraComponent, SimulatedVehicle
 
@@ -30,6 +30,7 @@ __all__ = [
     "SimulatedCopter",
     "SimulatedLog",
     "SimulatedPx4",
+    "SimulatedPx4Plane",
     "SimulatedVehicle",
     "SimulatorServer",
     "Wind",

@@ -99,7 +99,9 @@ class _Flight:
             px4 = self._px4
             down = px4.frame.origin.altitude_m - command.z
             if not math.isfinite(command.z):
-                down = px4.home[2] - px4.parameters["MIS_TAKEOFF_ALT"]
+                altitude = px4.parameters["MIS_TAKEOFF_ALT"]
+                down = px4.home[2] - altitude
+                px4.info(f"Using default takeoff altitude: {altitude:.1f} m")
             px4.flight.target = (px4.motion.north, px4.motion.east, down)
         return result
 
@@ -154,7 +156,7 @@ class _Flight:
 
     def change_speed(self, command: Command) -> int:
         if command.param2 > 0:
-            self._px4.flight.speed_m_s = min(command.param2, self._px4.parameters["MPC_XY_VEL_MAX"])
+            self._px4.flight.speed_m_s = min(command.param2, self._px4.flight.top_speed_m_s)
         return MavResult.ACCEPTED
 
     def set_home(self, command: Command) -> int:

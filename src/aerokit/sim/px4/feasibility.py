@@ -28,6 +28,7 @@ _WITH_PLACE = (
 _STORED_ONLY = (_C.CONDITION_DELAY, _C.CONDITION_DISTANCE, _C.NAV_FENCE_RETURN_POINT)
 """Commands that can be sent to it and that no mission may have."""
 _FAR_M = 10_000.0
+_NEEDS_LANDING = 2
 
 
 def rejection(px4: SimulatedPx4, items: Sequence[MissionItem]) -> str | None:
@@ -44,7 +45,15 @@ def rejection(px4: SimulatedPx4, items: Sequence[MissionItem]) -> str | None:
             if has_place:
                 return "takeoff not first waypoint item"
         has_place = has_place or item.command in _WITH_PLACE
-    return _landing_problem(items)
+    return _missing_landing(px4, items) or _landing_problem(items)
+
+
+def _missing_landing(px4: SimulatedPx4, items: Sequence[MissionItem]) -> str | None:
+    """MIS_TKO_LAND_REQ 2, as an aeroplane has it."""
+    needs = round(px4.parameters["MIS_TKO_LAND_REQ"]) == _NEEDS_LANDING
+    if needs and items and not any(item.command in _LANDINGS for item in items):
+        return "Landing waypoint/pattern required."
+    return None
 
 
 def _height(px4: SimulatedPx4, item: MissionItem) -> float:

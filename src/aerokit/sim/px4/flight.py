@@ -34,9 +34,19 @@ class Flight:
         self._phase = ""
         self._ramp_from = 0.0
 
+    @property
+    def cruise_speed_m_s(self) -> float:
+        """How fast a mode begins."""
+        return self._vehicle.parameters["MPC_XY_CRUISE"]
+
+    @property
+    def top_speed_m_s(self) -> float:
+        """How fast it may be told to fly."""
+        return self._vehicle.parameters["MPC_XY_VEL_MAX"]
+
     def enter(self, mode: Px4Mode) -> None:
         """A mode begins."""
-        self.speed_m_s = self._vehicle.parameters["MPC_XY_CRUISE"]
+        self.speed_m_s = self.cruise_speed_m_s
         self.heading = None
         self._phase = "climb"
         self.stay_here()

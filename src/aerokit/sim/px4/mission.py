@@ -172,7 +172,7 @@ class Mission:
     def _do(self, item: MissionItem) -> None:
         px4 = self._px4
         if item.command == _C.DO_CHANGE_SPEED and item.param2 > 0:
-            px4.flight.speed_m_s = min(item.param2, px4.parameters["MPC_XY_VEL_MAX"])
+            px4.flight.speed_m_s = min(item.param2, px4.flight.top_speed_m_s)
         elif item.command == _C.NAV_RETURN_TO_LAUNCH:
             px4.call_later(0.0, self._return)
 

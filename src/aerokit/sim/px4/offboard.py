@@ -49,6 +49,11 @@ class Offboard:
         return self._vehicle.now - self.updated_at <= self._vehicle.parameters["COM_OF_LOSS_T"]
 
     @property
+    def position(self) -> Ned:
+        """Where the set-point leads; NaN for what it does not say."""
+        return self._position
+
+    @property
     def wants_up(self) -> bool:
         """Whether the set-point leaves the ground."""
         if self._attitude is not None:

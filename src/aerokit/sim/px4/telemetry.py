@@ -16,7 +16,6 @@ from aerokit.mavlink.enums import (
     MavLandedState,
     MavModeFlag,
     MavState,
-    MavType,
 )
 from aerokit.sim.missions import INVALID_INDEX
 from aerokit.sim.px4.mission_messages import CurrentWithIds
@@ -54,7 +53,7 @@ def _heartbeat(px4: SimulatedPx4) -> m.Heartbeat:
         state = MavState.CRITICAL
     if not px4.is_ready:
         state = MavState.UNINIT
-    return m.Heartbeat(MavType.QUADROTOR, MavAutopilot.PX4, base, custom_mode(px4.mode), state, 3)
+    return m.Heartbeat(px4.VEHICLE_TYPE, MavAutopilot.PX4, base, custom_mode(px4.mode), state, 3)
 
 
 def _sys_status(px4: SimulatedPx4) -> m.SysStatus:
@@ -163,7 +162,9 @@ def _vfr_hud(px4: SimulatedPx4) -> m.VfrHud:
     o = px4.motion
     heading = int(math.degrees(o.yaw) % 360.0)
     amsl = px4.frame.origin.altitude_m - o.down
-    return m.VfrHud(math.nan, o.ground_speed_m_s, heading, round(px4.throttle * 100), amsl, -o.velocity_down)
+    return m.VfrHud(
+        px4.airspeed_m_s, o.ground_speed_m_s, heading, round(px4.throttle * 100), amsl, -o.velocity_down
+    )
 
 
 def _gps_raw(px4: SimulatedPx4) -> m.GpsRawInt:

@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable, Sequence
 from typing import TYPE_CHECKING, ClassVar
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavCmd, MavProtocolCapability, MavResult, MavSeverity
+from aerokit.mavlink.enums import MavCmd, MavProtocolCapability, MavResult, MavSeverity, MavType
 from aerokit.sim.battery import Battery
 from aerokit.sim.commands import Command, CommandServer
 from aerokit.sim.local_frame import GlobalPoint, LocalFrame
@@ -73,6 +73,8 @@ class SimulatedPx4(SimulatedVehicle):
     """
 
     CAPABILITIES: ClassVar[int] = 0xE8FF
+    VEHICLE_TYPE: ClassVar[int] = MavType.QUADROTOR
+    PARAMETER_TABLE: ClassVar[str] = "quadrotor"
 
     def __init__(
         self,
@@ -95,7 +97,7 @@ class SimulatedPx4(SimulatedVehicle):
         components: Iterable[ExtraComponent] = (),
         unix_time_at_boot: float = 1_790_000_000.0,
     ) -> None:
-        self.parameters = px4_parameters(parameter_count)
+        self.parameters = px4_parameters(parameter_count, self.PARAMETER_TABLE)
         """By name; they survive a reboot."""
         self.parameters["MAV_SYS_ID"] = system_id
         for name, value in (parameters or {}).items():
@@ -103,10 +105,7 @@ class SimulatedPx4(SimulatedVehicle):
         super().__init__(system_id=system_id, component_id=1, seed=seed, components=components)
         self.frame = LocalFrame(GlobalPoint(round(home[0] * 1e7), round(home[1] * 1e7), home[2]))
         self.battery = Battery(5000.0, cells=4, percent=battery_percent)
-        limits = MotionLimits(
-            acceleration_m_s2=3.0, vertical_acceleration_m_s2=3.0, lean_rad=math.radians(45)
-        )
-        self.motion = Motion(self.rng, limits, wind)
+        self.motion = self._make_motion(wind)
         self.motion.yaw = math.remainder(math.radians(heading_deg), 2 * math.pi)
         self.version = version
         self.unsupported_commands = frozenset(unsupported_commands)
@@ -123,6 +122,18 @@ class SimulatedPx4(SimulatedVehicle):
         self.storage = Storage(self, logs, parameter_file=parameter_file, link_bytes_per_s=link_bytes_per_s)
         """Files, logs, and the servers of them and of the parameters."""
 
+    def _make_motion(self, wind: Wind | None) -> Motion:
+        limits = MotionLimits(
+            acceleration_m_s2=3.0, vertical_acceleration_m_s2=3.0, lean_rad=math.radians(45)
+        )
+        return Motion(self.rng, limits, wind)
+
+    def _make_flight(self) -> Flight:
+        return Flight(self)
+
+    def _make_mission(self) -> Mission:
+        return Mission(self)
+
     def _reset(self) -> None:
         self.is_ready = self.is_armed = False
         self.is_landed = True
@@ -137,8 +148,8 @@ class SimulatedPx4(SimulatedVehicle):
         self._landed_at = math.nan
         self._has_flown = False
         self._failsafe_at = math.nan
-        self.flight = Flight(self)
-        self.mission = Mission(self)
+        self.flight = self._make_flight()
+        self.mission = self._make_mission()
         self.failsafes = Failsafes(self)
         self.missions.reset()
 
@@ -172,6 +183,11 @@ class SimulatedPx4(SimulatedVehicle):
     def altitude_m(self) -> float:
         """Metres above home."""
         return self.home[2] - self.motion.down
+
+    @property
+    def airspeed_m_s(self) -> float:
+        """What an airspeed sensor says; NaN without one."""
+        return math.nan
 
     @property
     def has_position(self) -> bool:
@@ -348,13 +364,20 @@ class SimulatedPx4(SimulatedVehicle):
         if self.is_armed:
             self._check_offboard()
             self.flight.update()
-        if not self.is_landed:
+        if self._moves():
             self.motion.step(dt, powered=self.is_armed and not self.faults.motor_failed)
+        if not self.is_landed:
             self._detect_landing()
         self._disarm_by_itself()
         self._run_motors(dt)
         if not self.is_armed and self.is_landed:
             self.set_ticking(False)
+
+    def _moves(self) -> bool:
+        return not self.is_landed
+
+    def _is_down(self) -> bool:
+        return self.motion.is_on_ground
 
     def _run_motors(self, dt: float) -> None:
         self.throttle = 0.0
@@ -365,7 +388,7 @@ class SimulatedPx4(SimulatedVehicle):
         self.battery.drain(self.throttle * _AMPERES_AT_FULL, dt)
 
     def _detect_landing(self) -> None:
-        if not self.motion.is_on_ground or self.flight.lifts_off:
+        if not self._is_down() or self.flight.lifts_off:
             self._touched_at = math.nan
         elif math.isnan(self._touched_at):
             self._touched_at = self.now

@@ -1,0 +1,164 @@
+"""How a simulated PX4 aeroplane flies in each of its modes: climbing out, circling, gliding down, rolling out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from aerokit.sim.fixed_wing import FixedWing
+from aerokit.sim.px4.flight import Flight
+from aerokit.sim.px4.modes import LAND, MISSION, OFFBOARD, RTL, TAKEOFF, Px4Mode
+
+if TYPE_CHECKING:
+    from aerokit.sim.px4.plane import SimulatedPx4Plane
+
+__all__ = ["PlaneFlight"]
+
+_FLARE_M = 3.0
+_AHEAD_S = 2.5
+_FLARE_SINK_M_S = 0.5
+_HEIGHT_REACHED_M = 10.0
+
+
+class PlaneFlight(Flight):
+    """The navigator of an aeroplane. ``target`` is the middle of a circle, or the end of a straight line."""
+
+    def __init__(self, plane: SimulatedPx4Plane, motion: FixedWing) -> None:
+        super().__init__(plane)
+        self._motion = motion
+        self.radius_m = 0.0
+        """Of the circle; negative is anticlockwise."""
+        self.course = 0.0
+        """The climb-out's direction, in radians."""
+        self._plane = plane
+
+    @property
+    def cruise_speed_m_s(self) -> float:
+        """FW_AIRSPD_TRIM."""
+        return self._plane.parameters["FW_AIRSPD_TRIM"]
+
+    @property
+    def top_speed_m_s(self) -> float:
+        """FW_AIRSPD_MAX."""
+        return self._plane.parameters["FW_AIRSPD_MAX"]
+
+    @property
+    def is_rolling(self) -> bool:
+        """Whether it is on its take-off run."""
+        return (
+            self.lifts_off
+            and self._plane.now - self._plane.armed_at >= self._plane.parameters["RWTO_RAMP_TIME"]
+        )
+
+    def enter(self, mode: Px4Mode) -> None:
+        """A mode begins."""
+        self.radius_m = self._plane.parameters["NAV_LOITER_RAD"]
+        self.course = self._motion.yaw
+        super().enter(mode)
+
+    def update(self) -> None:
+        """Tell the motion what to do until the next tick."""
+        plane = self._plane
+        mode, mission = plane.mode, plane.mission
+        self.lifts_off = mode == TAKEOFF or (mode == MISSION and mission.wants_up)
+        if plane.is_landed and not self.is_rolling:
+            return
+        if plane.is_landed and not self._motion.is_on_ground:
+            plane.leave_ground()
+        if mode == TAKEOFF:
+            self._take_off()
+        elif mode == LAND:
+            self.circle_down()
+        elif mode == RTL:
+            self._return()
+        elif mode == MISSION:
+            mission.update()
+        elif mode == OFFBOARD and math.isfinite(sum(plane.offboard.position)):
+            self.target = plane.offboard.position
+            self.circle()
+        else:
+            self.circle()
+
+    def go(self) -> None:
+        """Circle around the target."""
+        self.circle()
+
+    def circle(self) -> None:
+        """Around the target, at its height."""
+        self._motion.circle(*self.target, radius=self.radius_m, airspeed=self.speed_m_s)
+
+    def fly_straight(self) -> None:
+        """Towards the target, and over it."""
+        self._motion.fly_to(*self.target, airspeed=self.speed_m_s)
+
+    def climb_out(self) -> None:
+        """Straight on, upwards."""
+        climb = self._plane.parameters["FW_T_CLMB_MAX"]
+        self._motion.head(self.course, self.speed_m_s, climb)
+
+    def _take_off(self) -> None:
+        """The middle of the circle is where the height was reached."""
+        self.climb_out()
+        if self._motion.down > self.target[2]:
+            return
+        place = (self._motion.north, self._motion.east, self.target[2])
+        self._plane.switch_to_hold()
+        self.target = place
+
+    def circle_down(self) -> None:
+        """Sink in circles, wings level at last."""
+        sink = self._plane.parameters["FW_T_SINK_MIN"]
+        self.target = (*self.target[:2], self._motion.down + sink * _AHEAD_S)
+        self._touch_down(self.circle)
+
+    def descend(self) -> None:
+        """Along the glide path (FW_LND_ANG) to the target on the ground."""
+        self._touch_down(self._glide)
+
+    def _touch_down(self, approach: Callable[[], None]) -> None:
+        motion = self._motion
+        height = motion.ground_down - motion.down
+        if motion.is_on_ground:
+            motion.roll_out()
+        elif height < _FLARE_M:
+            motion.head(motion.yaw, self._plane.parameters["FW_AIRSPD_MIN"], -_FLARE_SINK_M_S)
+        else:
+            approach()
+
+    def _glide(self) -> None:
+        motion = self._motion
+        away = math.hypot(self.target[0] - motion.north, self.target[1] - motion.east)
+        height = away * math.tan(math.radians(self._plane.parameters["FW_LND_ANG"]))
+        climb = min(0.0, motion.climb_to(motion.ground_down - height))
+        course = math.atan2(self.target[1] - motion.east, self.target[0] - motion.north)
+        motion.head(course, self._plane.parameters["FW_AIRSPD_MIN"] * 1.3, climb)
+
+    # ---------------------------------------------------------------------------------------- return
+
+    def _return(self) -> None:
+        """Climb where it is, fly home, circle down to RTL_DESCEND_ALT; land only if RTL_LAND_DELAY is not negative."""
+        motion, plane = self._motion, self._plane
+        if self._phase == "land":
+            self.circle_down()
+            return
+        self.circle()
+        if abs(motion.down - self.target[2]) > _HEIGHT_REACHED_M or not self._is_near():
+            return
+        if self._phase == "climb":
+            self._phase, self.target = "return", (*plane.home[:2], self.target[2])
+        elif self._phase == "return":
+            descend = plane.parameters["RTL_DESCEND_ALT"]
+            self.radius_m = plane.parameters["RTL_LOITER_RAD"]
+            self._phase, self.target = (
+                "loiter",
+                (*plane.home[:2], max(self.target[2], plane.home[2] - descend)),
+            )
+        elif self._phase == "loiter":
+            self._phase = "done" if plane.parameters["RTL_LAND_DELAY"] < 0 else "land"
+            done = self._phase == "done"
+            plane.info("RTL: completed, loitering" if done else "RTL: land at destination")
+
+    def _is_near(self) -> bool:
+        away = math.hypot(self.target[0] - self._motion.north, self.target[1] - self._motion.east)
+        return away <= abs(self.radius_m) + self._plane.parameters["NAV_ACC_RAD"]
