@@ -1,0 +1,205 @@
+"""What a recording (.tlog) tells of one vehicle: what it streamed and when, and how it answered to whom."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, BinaryIO
+
+from aerokit.errors import LocalProtocolError
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.dialect import STANDARD
+from aerokit.mavlink.enums import MavAutopilot, MavMissionResult, MavType
+from aerokit.mavlink.framer import Framer
+from aerokit.mavlink.tlog import read_tlog
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from os import PathLike
+
+    from aerokit.mavlink.frame import Frame
+    from aerokit.mavlink.message import Message
+
+__all__ = ["LONGEST_GAP_S", "Answer", "FlightRecording", "Plan"]
+
+LONGEST_GAP_S = 60.0
+"""A longer silence in a recording is cut to this: it is a pause between flights, or the clock was set."""
+
+_ITEMS = (m.MissionItemInt, m.MissionItem)
+_COMMANDS = (m.CommandLong, m.CommandInt)
+_ANSWERS = frozenset(
+    kind.ID
+    for kind in (
+        m.CommandAck, m.CommandLong, m.CommandInt, m.ParamValue, m.ParamError, m.MissionCount, m.MissionItem,
+        m.MissionItemInt, m.MissionRequest, m.MissionRequestInt, m.MissionAck, m.FileTransferProtocol, m.LogEntry,
+        m.LogData, m.Timesync, m.Ping,
+    )
+)  # fmt: skip
+"""Said to somebody who asked then, and may not ask now."""
+_REQUESTS = frozenset(
+    kind.ID
+    for kind in (*_COMMANDS, *_ITEMS, m.ParamSet, m.MissionCount, m.MissionClearAll)
+)  # fmt: skip
+
+
+@dataclass
+class Answer:
+    """How one command was answered: one or several acknowledgements."""
+
+    params: tuple[float, ...]
+    """Params 1 to 4 of the command; empty when only the acknowledgement was recorded."""
+    asked_at: float
+    acks: list[tuple[float, m.CommandAck]] = field(default_factory=list)
+    """Seconds after the command, and what came."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What was on the vehicle from a moment on."""
+
+    since: float
+    mission_type: int
+    items: tuple[m.MissionItemInt | m.MissionItem, ...]
+
+
+class FlightRecording:
+    """A recording, read. Times are seconds since its first message of the vehicle, long silences cut.
+
+    ``system_id`` None takes the first autopilot that says HEARTBEAT. LocalProtocolError when there is none,
+    OSError when the file cannot be read.
+    """
+
+    def __init__(self, source: str | PathLike[str] | BinaryIO, system_id: int | None = None) -> None:
+        frames = _frames(source)
+        self.system_id, self.component_id = _autopilot(frames, system_id)
+        self.stream: list[tuple[float, Frame]] = []
+        """What it said unasked, in order."""
+        self.answers: dict[int, list[Answer]] = {}
+        """MAV_CMD → how it was answered, in order."""
+        self.parameters: list[tuple[float, m.ParamValue]] = []
+        """Every value that was told."""
+        self.has_parameter_errors = False
+        """Whether it says PARAM_ERROR where others are silent."""
+        self.settable: set[str] = set()
+        """Parameters that it was seen to take a value for."""
+        self.plans: list[Plan] = []
+        self.uploads: dict[int, list[int]] = {}
+        """MAV_MISSION_TYPE → MAV_MISSION_RESULTs of uploads."""
+        self.clears: dict[int, list[int]] = {}
+        """The same of MISSION_CLEAR_ALL."""
+        self.asks_by_int = True
+        """Whether it asks for items by MISSION_REQUEST_INT, or by MISSION_REQUEST."""
+        self.duration_s = 0.0
+        self._sets: dict[str, float] = {}
+        self._incoming: dict[int, dict[int, m.MissionItemInt | m.MissionItem]] = {}
+        self._outgoing: dict[int, tuple[int, dict[int, m.MissionItemInt | m.MissionItem]]] = {}
+        self._clearing: set[int] = set()
+        self._read(frames)
+
+    def _read(self, frames: list[tuple[float, Frame]]) -> None:
+        now, last = 0.0, None
+        for stamp, frame in frames:
+            is_own = frame.system_id == self.system_id
+            if last is None and not is_own:
+                continue
+            now += 0.0 if last is None else min(max(stamp - last, 0.0), LONGEST_GAP_S)
+            last = stamp
+            if not is_own:
+                if frame.message_id in _REQUESTS:
+                    self._note_request(STANDARD.decode(frame), now)
+            elif frame.message_id in _ANSWERS:
+                self._note_answer(STANDARD.decode(frame), now)
+            else:
+                self.stream.append((now, frame))
+        self.duration_s = now
+        self.answers = {
+            command: heard
+            for command, answers in self.answers.items()
+            if (heard := [answer for answer in answers if answer.acks])
+        }
+
+    def _note_request(self, message: Message, now: float) -> None:
+        if isinstance(message, _COMMANDS):
+            again = isinstance(message, m.CommandLong) and message.confirmation > 0
+            answers = self.answers.setdefault(message.command, [])
+            if not (again and answers):
+                params = (message.param1, message.param2, message.param3, message.param4)
+                answers.append(Answer(params, now))
+        elif isinstance(message, m.ParamSet):
+            self._sets[message.param_id] = message.param_value
+        elif isinstance(message, m.MissionCount):
+            self._incoming[message.mission_type] = {}
+        elif isinstance(message, _ITEMS):
+            self._incoming.setdefault(message.mission_type, {})[message.seq] = message
+        elif isinstance(message, m.MissionClearAll):
+            self._clearing.add(message.mission_type)
+
+    def _note_answer(self, message: Message, now: float) -> None:
+        note: dict[type[Message], Callable[..., None]] = {
+            m.CommandAck: self._note_ack,
+            m.ParamValue: self._note_value,
+            m.MissionCount: self._note_count,
+            m.MissionItem: self._note_item,
+            m.MissionItemInt: self._note_item,
+            m.MissionAck: self._note_mission_ack,
+        }
+        if type(message) in note:
+            note[type(message)](message, now)
+        elif isinstance(message, m.ParamError):
+            self.has_parameter_errors = True
+        elif isinstance(message, m.MissionRequest):
+            self.asks_by_int = False
+
+    def _note_ack(self, ack: m.CommandAck, now: float) -> None:
+        answers = self.answers.setdefault(ack.command, [])
+        if not answers:
+            answers.append(Answer((), now))
+        answers[-1].acks.append((now - answers[-1].asked_at, ack))
+
+    def _note_value(self, value: m.ParamValue, now: float) -> None:
+        self.parameters.append((now, value))
+        if self._sets.pop(value.param_id, None) == value.param_value:
+            self.settable.add(value.param_id)
+
+    def _note_count(self, count: m.MissionCount, now: float) -> None:
+        self._outgoing[count.mission_type] = (count.count, {})
+        if count.count == 0:
+            self.plans.append(Plan(now, count.mission_type, ()))
+
+    def _note_item(self, item: m.MissionItemInt | m.MissionItem, now: float) -> None:
+        count, items = self._outgoing.get(item.mission_type, (0, {}))
+        items[item.seq] = item
+        if count and len(items) == count:
+            del self._outgoing[item.mission_type]
+            self._note_plan(item.mission_type, items, now)
+
+    def _note_mission_ack(self, ack: m.MissionAck, now: float) -> None:
+        if ack.mission_type in self._incoming:
+            items = self._incoming.pop(ack.mission_type)
+            self.uploads.setdefault(ack.mission_type, []).append(ack.type)
+            if ack.type == MavMissionResult.ACCEPTED:
+                self._note_plan(ack.mission_type, items, now)
+        elif ack.mission_type in self._clearing:
+            self._clearing.discard(ack.mission_type)
+            self.clears.setdefault(ack.mission_type, []).append(ack.type)
+
+    def _note_plan(
+        self, mission_type: int, items: dict[int, m.MissionItemInt | m.MissionItem], now: float
+    ) -> None:
+        self.plans.append(Plan(now, mission_type, tuple(items[seq] for seq in sorted(items))))
+
+
+def _frames(source: str | PathLike[str] | BinaryIO) -> list[tuple[float, Frame]]:
+    framer = Framer()
+    return [(stamp, frame) for stamp, raw in read_tlog(source) for frame in framer.receive(raw, stamp)]
+
+
+def _autopilot(frames: list[tuple[float, Frame]], system_id: int | None) -> tuple[int, int]:
+    for _, frame in frames:
+        if frame.message_id != m.Heartbeat.ID or system_id not in (None, frame.system_id):
+            continue
+        heartbeat = STANDARD.decode(frame)
+        assert isinstance(heartbeat, m.Heartbeat)
+        if heartbeat.autopilot != MavAutopilot.INVALID and heartbeat.type != MavType.GCS:
+            return frame.system_id, frame.component_id
+    which = "no vehicle" if system_id is None else f"no vehicle with system id {system_id}"
+    raise LocalProtocolError(f"the recording has {which} in it: no heartbeat of an autopilot")
