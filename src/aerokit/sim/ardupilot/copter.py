@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, ClassVar
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, ClassVar
 
-from aerokit.mavlink.enums import CopterMode, MavModeFlag, MavType
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import CopterMode, MavModeFlag, MavSeverity, MavType
 from aerokit.sim.ardupilot.auto import Auto
+from aerokit.sim.ardupilot.copter_arming import CopterArming
 from aerokit.sim.ardupilot.copter_commands import copter_commands
+from aerokit.sim.ardupilot.copter_failsafes import CopterFailsafes
+from aerokit.sim.ardupilot.fence import Fence, fence_status
 from aerokit.sim.ardupilot.guided import Guided
 from aerokit.sim.ardupilot.modes import AltHold, Brake, Circle, Loiter, Mode, PosHold, Stabilize
 from aerokit.sim.ardupilot.returning import Land, Rtl, SmartRtl
 from aerokit.sim.ardupilot.setpoints import Setpoints
+from aerokit.sim.ardupilot.telemetry import BUILDERS
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 from aerokit.sim.ardupilot.yaw import AutoYaw
 
 if TYPE_CHECKING:
+    from aerokit.mavlink.message import Message
     from aerokit.sim.ardupilot.parameter_tables import Kind
     from aerokit.sim.commands import CommandHandler
 
@@ -34,7 +41,7 @@ class SimulatedCopter(ArduPilotVehicle):
     Its arguments are those of `ArduPilotVehicle`. It has 1,349 parameters; MNT1_TYPE 1 fits a gimbal with three
     axes.
 
-    Not simulated yet: keeping within a fence, flying to rally points, radio failsafe.
+    Not simulated yet: slowing down before a fence, flying to rally points, terrain failsafe.
     """
 
     KIND: ClassVar[Kind] = "copter"
@@ -45,6 +52,19 @@ class SimulatedCopter(ArduPilotVehicle):
     MODES: ClassVar[tuple[type[Mode], ...]] = (
         Auto, Stabilize, AltHold, Circle, Loiter, Guided, Land, Rtl, PosHold, Brake, SmartRtl,
     )  # fmt: skip
+
+    BUILDERS: ClassVar[Mapping[int, Callable[[Any], Message | None]]] = {
+        **BUILDERS,
+        m.FenceStatus.ID: fence_status,
+    }
+
+    def make_arming(self) -> CopterArming:
+        """See `CopterArming`."""
+        return CopterArming(self)
+
+    def make_failsafes(self) -> CopterFailsafes:
+        """See `CopterFailsafes`."""
+        return CopterFailsafes(self)
 
     def make_commands(self) -> dict[int, CommandHandler]:
         """See `copter_commands`."""
@@ -58,6 +78,29 @@ class SimulatedCopter(ArduPilotVehicle):
         """Where it points its nose, and the land detector."""
         self.yaw = AutoYaw(self)
         self._still_since = math.nan
+        self.fence = Fence(self)
+
+    @property
+    def copter_failsafes(self) -> CopterFailsafes:
+        """Its failsafes."""
+        assert isinstance(self.failsafes, CopterFailsafes)
+        return self.failsafes
+
+    @property
+    def fence_health(self) -> tuple[bool, bool, bool]:
+        """Whether the fence is configured, enforced, and kept, for SYS_STATUS."""
+        return self.fence.health
+
+    def set_mode(self, number: int) -> bool:
+        """Change the mode if the vehicle may; says why not. A change is told by a heartbeat at once."""
+        before, wanted = self.mode, self._modes.get(number)
+        if wanted is not None and wanted is not before and self.fence.holds_mode():
+            self.send_text(MavSeverity.WARNING, f"Mode change to {wanted.name} failed: in fence recovery")
+            return False
+        done = super().set_mode(number)
+        if self.mode is not before:
+            self.fence.mode_changed()
+        return done
 
     @property
     def guided(self) -> Guided:

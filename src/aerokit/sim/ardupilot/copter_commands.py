@@ -9,12 +9,12 @@ from aerokit.mavlink.enums import (
     CopterMode,
     MavCmd,
     MavFrame,
-    MavMissionType,
     MavResult,
     SpeedType,
 )
 from aerokit.mavlink.messages import AutopilotVersion, MissionCurrent
 from aerokit.sim.ardupilot.auto import Auto
+from aerokit.sim.ardupilot.camera import camera_commands
 from aerokit.sim.ardupilot.gimbal_commands import GimbalCommands
 from aerokit.sim.ardupilot.guided import Guided
 from aerokit.sim.commands import Command, CommandHandler
@@ -27,7 +27,6 @@ __all__ = ["copter_commands"]
 _FORCE_ARM_OR_DISARM, _FORCE_ARM = 21196.0, 2989.0
 _FORCE_REBOOT = 20190226
 _CHANGE_MODE = 1
-_ALL_FENCES, _POLYGON_FENCES = 15, 4
 
 
 def copter_commands(copter: SimulatedCopter) -> dict[int, CommandHandler]:
@@ -56,12 +55,13 @@ def copter_commands(copter: SimulatedCopter) -> dict[int, CommandHandler]:
         MavCmd.REQUEST_MESSAGE: copter.requests.request_message,
         MavCmd.SET_MESSAGE_INTERVAL: copter.requests.set_interval,
         MavCmd.GET_MESSAGE_INTERVAL: copter.requests.get_interval,
-        MavCmd.DO_FENCE_ENABLE: setup.enable_fence,
+        MavCmd.DO_FENCE_ENABLE: lambda command: copter.fence.command(command),
         MavCmd.RUN_PREARM_CHECKS: setup.run_prearm_checks,
         MavCmd.PREFLIGHT_REBOOT_SHUTDOWN: setup.reboot,
         MavCmd.DO_SEND_BANNER: setup.send_banner,
         **copter.calibrations.commands,
         **GimbalCommands(copter).commands,
+        **camera_commands(copter),
     }
     for command in copter.unsupported_commands:
         handlers.pop(command, None)
@@ -137,6 +137,8 @@ class _Flight:
         if point is None:
             return MavResult.DENIED
         if copter.mode is not copter.guided and not copter.set_mode(CopterMode.GUIDED):
+            return MavResult.FAILED
+        if not copter.fence.contains(point):
             return MavResult.FAILED
         copter.guided.go_to(point)
         copter.yaw.default()
@@ -226,16 +228,6 @@ class _Setup:
         if self._copter.navigation.home is None:
             return MavResult.FAILED
         self._copter.send_home(command.channel)
-        return MavResult.ACCEPTED
-
-    def enable_fence(self, command: Command) -> int:
-        """Nothing keeps the simulated copter inside; what a client sees of the switch is there."""
-        kinds = int(self._copter.parameters["FENCE_TYPE"]) & (int(command.param2) or _ALL_FENCES)
-        if not self._copter.missions.items(MavMissionType.FENCE):
-            kinds &= ~_POLYGON_FENCES
-        if command.param1 not in (0.0, 1.0, 2.0) or (command.param1 == 1.0 and not kinds):
-            return MavResult.FAILED
-        self._copter.is_fence_enabled = command.param1 == 1.0
         return MavResult.ACCEPTED
 
     def request_capabilities(self, command: Command) -> int:

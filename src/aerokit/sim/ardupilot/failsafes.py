@@ -29,6 +29,8 @@ class Failsafes:
         self.battery_is_low = False
         self.ground_station = False
         self.estimator = False
+        self.radio = False
+        """Whether the pilot's radio counts as lost."""
         self.ground_station_seen_at = math.nan
         """When the last heartbeat of the ground station MAV_GCS_SYSID came."""
         self._low_since = math.nan

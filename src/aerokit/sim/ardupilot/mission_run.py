@@ -261,6 +261,7 @@ class MissionRun:
         name = COMMAND_NAMES.get(item.command, "?")
         target = f" {item.param1:.0f}" if item.command in _WITH_TARGET else ""
         self._vehicle.info(f"Mission: {index} {name}{target}")
+        self._vehicle.camera.run(item)
         return item.command in _DONE_AT_ONCE or self._flyer.start_command(index, item)
 
     def _is_complete(self, index: int, item: MissionItem) -> bool:

@@ -51,6 +51,20 @@ class Radio:
         """All 18 that RC_CHANNELS has; those that nobody sends are 0."""
         return tuple(self[index] for index in range(_CHANNELS))
 
+    @property
+    def is_heard(self) -> bool:
+        """Whether there are pulses: of the transmitter, or of RC_CHANNELS_OVERRIDE in its place."""
+        vehicle = self._vehicle
+        failed = "SIM_RC_FAIL" in vehicle.parameters and vehicle.parameters["SIM_RC_FAIL"] == 1.0
+        if not (vehicle.faults.rc_lost or failed):
+            return True
+        limit = vehicle.now - self._override_time()
+        return any(value and since > limit for value, since in self._overrides.values())
+
+    def release_overrides(self) -> None:
+        """Forget what was overridden, as a lost ground station makes the vehicle do."""
+        self._overrides.clear()
+
     def listen(self) -> None:
         """Hear RC_CHANNELS_OVERRIDE."""
         self._vehicle.on(m.RcChannelsOverride, self._on_override)

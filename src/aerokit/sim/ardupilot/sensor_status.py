@@ -11,6 +11,7 @@ if TYPE_CHECKING:
 
 __all__ = ["sensor_status"]
 
+_FENCE = Sensor.MAV_SYS_STATUS_GEOFENCE
 _PREARM = Sensor.MAV_SYS_STATUS_PREARM_CHECK
 _AHRS = Sensor.MAV_SYS_STATUS_AHRS
 _LOGGING = Sensor.MAV_SYS_STATUS_LOGGING
@@ -52,8 +53,19 @@ def sensor_status(vehicle: ArduPilotVehicle) -> tuple[int, int, int]:
         health |= _CONTROL
     if vehicle.arming.passes:
         health |= _PREARM
+    if vehicle.failsafes.radio:
+        health &= ~Sensor.RC_RECEIVER
+    if vehicle.failsafes.battery_is_low:
+        health &= ~Sensor.BATTERY
     if vehicle.faults.motor_failed:
         health &= ~Sensor.PROPULSION
+    is_present, is_enforced, is_kept = vehicle.fence_health
+    if not is_present:
+        present &= ~_FENCE
+    if is_enforced:
+        enabled |= _FENCE
+    if not is_kept:
+        health &= ~_FENCE
     if vehicle.rangefinder_reach_m > 0.0:
         for_it = Sensor.LASER_POSITION
         present, enabled, health = present | for_it, enabled | for_it, health | for_it

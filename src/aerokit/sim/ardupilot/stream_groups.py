@@ -22,6 +22,7 @@ COPTER_GROUPS: dict[int, tuple[int, ...]] = {
         m.MissionCurrent.ID,
         m.GpsRawInt.ID,
         m.NavControllerOutput.ID,
+        m.FenceStatus.ID,
         m.PositionTargetGlobalInt.ID,
     ),
     MavDataStream.RC_CHANNELS: (m.ServoOutputRaw.ID, m.RcChannels.ID, m.RcChannelsRaw.ID),
@@ -58,6 +59,11 @@ KNOWN_MESSAGES: frozenset[int] = frozenset(
         m.AvailableModesMonitor.ID,
         m.GimbalManagerInformation.ID,
         m.GimbalManagerStatus.ID,
+        m.ParamValue.ID,
+        m.CameraInformation.ID,
+        m.CameraSettings.ID,
+        m.CameraCaptureStatus.ID,
+        m.CameraFeedback.ID,
         *(message_id for group in COPTER_GROUPS.values() for message_id in group),
     }
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from aerokit.sim.ardupilot.camera import CAMERA_BUILDERS
 from aerokit.sim.ardupilot.gimbal_status import GIMBAL_BUILDERS
 from aerokit.sim.ardupilot.telemetry_attitude import ATTITUDE_BUILDERS
 from aerokit.sim.ardupilot.telemetry_position import POSITION_BUILDERS
@@ -9,5 +10,5 @@ from aerokit.sim.ardupilot.telemetry_state import STATE_BUILDERS
 
 __all__ = ["BUILDERS"]
 
-BUILDERS = {**STATE_BUILDERS, **ATTITUDE_BUILDERS, **POSITION_BUILDERS, **GIMBAL_BUILDERS}
+BUILDERS = {**STATE_BUILDERS, **ATTITUDE_BUILDERS, **POSITION_BUILDERS, **GIMBAL_BUILDERS, **CAMERA_BUILDERS}
 """Message id → function that makes such a message of the copter's present state, or None."""

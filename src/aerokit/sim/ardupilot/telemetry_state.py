@@ -123,7 +123,7 @@ def _by_name(values: Iterable[int]) -> dict[str, int]:
 
 def _servo_output(vehicle: ArduPilotVehicle) -> m.ServoOutputRaw:
     pwm = vehicle.motors.pwm
-    return m.ServoOutputRaw(vehicle.time_boot_us, 0, pwm, pwm, pwm, pwm, 0, 0, 0, 0)
+    return m.ServoOutputRaw(vehicle.time_boot_us & 0xFFFFFFFF, 0, pwm, pwm, pwm, pwm, 0, 0, 0, 0)
 
 
 def _vibration(vehicle: ArduPilotVehicle) -> m.Vibration:

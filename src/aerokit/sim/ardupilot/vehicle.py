@@ -12,6 +12,7 @@ from aerokit.sim.ardupilot.arming import Arming
 from aerokit.sim.ardupilot.boot import BootTimeline
 from aerokit.sim.ardupilot.buzzer import hear_tunes
 from aerokit.sim.ardupilot.calibration import Calibrations
+from aerokit.sim.ardupilot.camera import Camera
 from aerokit.sim.ardupilot.failsafes import Failsafes
 from aerokit.sim.ardupilot.gimbal import Gimbal
 from aerokit.sim.ardupilot.mission_run import MissionRun
@@ -136,8 +137,6 @@ class ArduPilotVehicle(SimulatedVehicle):
         self._frame = LocalFrame(GlobalPoint(round(home[0] * 1e7), round(home[1] * 1e7), home[2]))
         self.missions = MissionServer(self)
         """Mission, fence and rally points; they survive a reboot."""
-        self.is_fence_enabled = False
-        """As DO_FENCE_ENABLE has left it."""
         self._reset()
         self._listen()
         self.storage = Storage(
@@ -154,6 +153,7 @@ class ArduPilotVehicle(SimulatedVehicle):
         self.arming = self.make_arming()
         self.failsafes = self.make_failsafes()
         self.gimbal = Gimbal(self)
+        self.camera = Camera(self)
         self.calibrations.reset()
         self.rc.reset()
         self._modes: dict[int, VehicleMode] = {}
@@ -244,6 +244,16 @@ class ArduPilotVehicle(SimulatedVehicle):
     def ftp(self) -> ArduPilotFtp:
         """The server of the files."""
         return self.storage.ftp
+
+    @property
+    def frame(self) -> LocalFrame:
+        """The world: metres north and east of where it was switched on."""
+        return self._frame
+
+    @property
+    def fence_health(self) -> tuple[bool, bool, bool]:
+        """Whether the fence is configured, enforced, and kept, for SYS_STATUS."""
+        return (True, False, True)
 
     @property
     def is_armed(self) -> bool:

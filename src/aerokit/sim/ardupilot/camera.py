@@ -1,0 +1,250 @@
+"""The camera that an ArduPilot owns: a shutter on an output, as CAM1_TYPE 1 fits one, and its captures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import CameraFeedbackFlags, MavCmd, MavResult
+
+if TYPE_CHECKING:
+    from aerokit.mavlink.message import Message
+    from aerokit.missions import MissionItem
+    from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
+    from aerokit.sim.commands import Command, CommandHandler
+
+__all__ = ["CAMERA_BUILDERS", "Camera", "camera_commands"]
+
+_PERIOD_S = 0.02
+_IDLE, _INTERVAL_SET = 0, 2
+_FOR_EVER = -1
+
+
+class Camera:
+    """Takes pictures at once, by time or by distance; each is told by CAMERA_FEEDBACK on every link.
+
+    It speaks as the autopilot (component 1), and like the firmware it sends no CAMERA_IMAGE_CAPTURED and no
+    heartbeat of its own. It is there while the parameter CAM1_TYPE is not 0.
+    """
+
+    def __init__(self, vehicle: ArduPilotVehicle) -> None:
+        self._vehicle = vehicle
+        self.image_count = 0
+        """Pictures since power on."""
+        self.interval_s = 0.0
+        """Between the pictures of a series."""
+        self.remaining = 0
+        """Pictures of a series that are still to be taken; -1 is without end."""
+        self.trigger_distance_m = 0.0
+        """A picture whenever the vehicle has moved so far; 0 is off."""
+        self._taken_at = -math.inf
+        self._taken_where: tuple[float, float] | None = None
+        self._ticks = False
+        self.feedback = m.CameraFeedback(0, 0, 0, 0, 0, 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0)
+        """Of the latest picture; zeros before the first."""
+
+    @property
+    def is_fitted(self) -> bool:
+        """Whether there is one."""
+        return int(self._vehicle.parameters["CAM1_TYPE"]) != 0
+
+    def take(self) -> bool:
+        """Take a picture now; False without a camera."""
+        if not self.is_fitted:
+            return False
+        motion = self._vehicle.motion
+        self.image_count += 1
+        self._taken_at, self._taken_where = self._vehicle.now, (motion.north, motion.east)
+        self.feedback = _feedback(self._vehicle)
+        self._vehicle.send(self.feedback)
+        return True
+
+    def take_series(self, interval_s: float, count: int) -> bool:
+        """A picture every ``interval_s`` seconds, the first at once; ``count`` -1 goes on until `stop`."""
+        if not self.is_fitted:
+            return False
+        self.interval_s, self.remaining = interval_s, count
+        self._watch()
+        return True
+
+    def stop(self) -> None:
+        """End a series."""
+        self.interval_s, self.remaining = 0.0, 0
+
+    def trigger_by_distance(self, metres: float) -> None:
+        """A picture every so many metres; 0 ends it."""
+        self.trigger_distance_m, self._taken_where = metres, None
+        self._watch()
+
+    def _watch(self) -> None:
+        """Look 50 times a second while there is something to wait for."""
+        if not self._ticks and (self.remaining or self.trigger_distance_m > 0):
+            self._ticks = True
+            self._vehicle.call_later(_PERIOD_S, self._update)
+
+    def _update(self) -> None:
+        self._ticks = False
+        if self.remaining:
+            if self._vehicle.now - self._taken_at > self.interval_s and self.take() and self.remaining > 0:
+                self.remaining -= 1
+        elif self.trigger_distance_m > 0.0:
+            self._check_distance()
+        self._watch()
+
+    def _check_distance(self) -> None:
+        motion = self._vehicle.motion
+        here = (motion.north, motion.east)
+        if self._taken_where is None:
+            self._taken_where = here
+        elif math.dist(here, self._taken_where) >= self.trigger_distance_m:
+            self.take()
+
+    def run(self, item: MissionItem) -> None:
+        """Carry out a mission command, if it is one for cameras."""
+        if item.command == MavCmd.DO_DIGICAM_CONTROL and item.x == 1:
+            self.take()
+        elif item.command == MavCmd.DO_SET_CAM_TRIGG_DIST:
+            self.trigger_by_distance(item.param1)
+            if item.param3 == 1.0:
+                self.take()
+        elif item.command == MavCmd.IMAGE_START_CAPTURE:
+            self._start(item.param2, item.param3)
+        elif item.command == MavCmd.IMAGE_STOP_CAPTURE:
+            self.stop()
+
+    def _start(self, interval_s: float, count: float) -> bool:
+        if count == 1.0 or (interval_s == 0.0 and count == 0.0):
+            return self.take()
+        return self.take_series(interval_s, int(count) or _FOR_EVER)
+
+    # ------------------------------------------------------------------------------------- commands
+
+    def start_capture(self, command: Command) -> int:
+        """MAV_CMD_IMAGE_START_CAPTURE; param1 is the camera, 0 for all."""
+        if command.param1 < 0.0:
+            return MavResult.UNSUPPORTED
+        if command.param1 > 1.0:
+            return MavResult.FAILED
+        return MavResult.ACCEPTED if self._start(command.param2, command.param3) else MavResult.FAILED
+
+    def stop_capture(self, command: Command) -> int:
+        """MAV_CMD_IMAGE_STOP_CAPTURE."""
+        known = command.param1 == 0.0 or (command.param1 == 1.0 and self.is_fitted)
+        if known:
+            self.stop()
+        return MavResult.ACCEPTED if known else MavResult.UNSUPPORTED
+
+    def control(self, command: Command) -> int:
+        """MAV_CMD_DO_DIGICAM_CONTROL: param5 1 takes a picture; accepted whether or not there is a camera."""
+        if command.x == 1:
+            self.take()
+        return MavResult.ACCEPTED
+
+    def set_trigger_distance(self, command: Command) -> int:
+        """MAV_CMD_DO_SET_CAM_TRIGG_DIST; param3 1 takes a picture at once, too."""
+        self.trigger_by_distance(command.param1)
+        if command.param3 == 1.0:
+            self.take()
+        return MavResult.ACCEPTED
+
+    def zoom(self, command: Command) -> int:
+        """MAV_CMD_SET_CAMERA_ZOOM: continuous or in percent; nothing is seen of it."""
+        known = self.is_fitted and command.param1 in (1.0, 2.0)
+        return MavResult.ACCEPTED if known else MavResult.UNSUPPORTED
+
+    def focus(self) -> int:
+        """MAV_CMD_SET_CAMERA_FOCUS: the lens has none."""
+        return MavResult.UNSUPPORTED if self.is_fitted else MavResult.FAILED
+
+
+def camera_commands(vehicle: ArduPilotVehicle) -> dict[int, CommandHandler]:
+    """MAV_CMD → handler. Such a camera has neither focus nor video."""
+    return {
+        MavCmd.IMAGE_START_CAPTURE: lambda command: vehicle.camera.start_capture(command),
+        MavCmd.IMAGE_STOP_CAPTURE: lambda command: vehicle.camera.stop_capture(command),
+        MavCmd.DO_DIGICAM_CONTROL: lambda command: vehicle.camera.control(command),
+        MavCmd.DO_DIGICAM_CONFIGURE: lambda _: MavResult.ACCEPTED,
+        MavCmd.DO_SET_CAM_TRIGG_DIST: lambda command: vehicle.camera.set_trigger_distance(command),
+        MavCmd.SET_CAMERA_ZOOM: lambda command: vehicle.camera.zoom(command),
+        MavCmd.SET_CAMERA_FOCUS: lambda _: vehicle.camera.focus(),
+        MavCmd.VIDEO_START_CAPTURE: lambda _: MavResult.FAILED,
+        MavCmd.VIDEO_STOP_CAPTURE: lambda _: MavResult.FAILED,
+    }
+
+
+def _feedback(vehicle: ArduPilotVehicle) -> m.CameraFeedback:
+    motion, nav = vehicle.motion, vehicle.navigation
+    place = vehicle.frame.to_global(motion.north, motion.east, motion.down)
+    return m.CameraFeedback(
+        time_usec=round(vehicle.unix_time * 1e6),
+        target_system=0,
+        cam_idx=0,
+        img_idx=vehicle.camera.image_count,
+        lat=place.latitude_e7,
+        lng=place.longitude_e7,
+        alt_msl=place.altitude_m,
+        alt_rel=nav.altitude_above_home,
+        roll=math.degrees(motion.roll),
+        pitch=math.degrees(motion.pitch),
+        yaw=math.degrees(motion.yaw) % 360.0,
+        foc_len=0.0,
+        flags=CameraFeedbackFlags.PHOTO,
+        completed_captures=0,
+    )
+
+
+def _last_feedback(vehicle: ArduPilotVehicle) -> m.CameraFeedback | None:
+    return vehicle.camera.feedback if vehicle.camera.is_fitted else None
+
+
+def _information(vehicle: ArduPilotVehicle) -> m.CameraInformation | None:
+    if not vehicle.camera.is_fitted:
+        return None
+    return m.CameraInformation(
+        time_boot_ms=vehicle.time_boot_ms,
+        vendor_name=bytes(32),
+        model_name=bytes(32),
+        firmware_version=0,
+        focal_length=0.0,
+        sensor_size_h=0.0,
+        sensor_size_v=0.0,
+        resolution_h=0,
+        resolution_v=0,
+        lens_id=0,
+        flags=0,
+        cam_definition_version=0,
+        cam_definition_uri="",
+        gimbal_device_id=1 if vehicle.gimbal.is_fitted else 0,
+    )
+
+
+def _settings(vehicle: ArduPilotVehicle) -> m.CameraSettings | None:
+    if not vehicle.camera.is_fitted:
+        return None
+    return m.CameraSettings(vehicle.time_boot_ms, 0, math.nan, math.nan)
+
+
+def _capture_status(vehicle: ArduPilotVehicle) -> m.CameraCaptureStatus | None:
+    camera = vehicle.camera
+    if not camera.is_fitted:
+        return None
+    return m.CameraCaptureStatus(
+        time_boot_ms=vehicle.time_boot_ms,
+        image_status=_INTERVAL_SET if camera.remaining > 0 else _IDLE,
+        video_status=0,
+        image_interval=camera.interval_s,
+        recording_time_ms=0,
+        available_capacity=math.nan,
+        image_count=camera.image_count,
+    )
+
+
+CAMERA_BUILDERS: dict[int, Callable[[ArduPilotVehicle], Message | None]] = {
+    m.CameraInformation.ID: _information,
+    m.CameraSettings.ID: _settings,
+    m.CameraCaptureStatus.ID: _capture_status,
+    m.CameraFeedback.ID: _last_feedback,
+}
+"""Message id → what to send now, or None."""
