@@ -55,6 +55,11 @@ class Channel:
         if data:
             self._outbox.append(data)
 
+    @property
+    def has_output(self) -> bool:
+        """Whether something waits to be sent."""
+        return bool(self._outbox)
+
     def take_outbox(self) -> bytes:
         """Everything that waits to be sent, in order; whole frames only."""
         if not self._outbox:
