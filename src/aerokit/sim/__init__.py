@@ -14,7 +14,7 @@ async with simulated_link(copter) as link, aerokit.connect(link) as vehicle:
 
 from __future__ import annotations
 
-from aerokit.sim.ardupilot import BootTimeline, SimulatedCopter
+from aerokit.sim.ardupilot import BootTimeline, SimulatedCopter, SimulatedRover, SimulatedSub
 from aerokit.sim.faults import CommandFault, Faults
 from aerokit.sim.logs import SimulatedLog
 from aerokit.sim.motion import Wind
@@ -31,6 +31,8 @@ __all__ = [
     "SimulatedLog",
     "SimulatedPx4",
     "SimulatedPx4Plane",
+    "SimulatedRover",
+    "SimulatedSub",
     "SimulatedVehicle",
     "SimulatorServer",
     "Wind",

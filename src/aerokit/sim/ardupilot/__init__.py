@@ -4,5 +4,7 @@ from __future__ import annotations
 
 from aerokit.sim.ardupilot.boot import BootTimeline
 from aerokit.sim.ardupilot.copter import SimulatedCopter
+from aerokit.sim.ardupilot.rover import SimulatedRover
+from aerokit.sim.ardupilot.sub import SimulatedSub
 
-__all__ = ["BootTimeline", "SimulatedCopter"]
+__all__ = ["BootTimeline", "SimulatedCopter", "SimulatedRover", "SimulatedSub"]

@@ -1,0 +1,212 @@
+"""AUTO of rovers and submarines: waypoints one after the other, waiting, speed, home, jumps.
+
+Not simulated, and skipped: circles, regions of interest, guided by script.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from aerokit.mavlink.enums import MavCmd, MavSeverity, SpeedType
+from aerokit.mavlink.messages import MissionItemReached
+from aerokit.missions import MissionItem
+from aerokit.sim.ardupilot.mode import VehicleMode
+
+if TYPE_CHECKING:
+    from aerokit.sim.ardupilot.level_vehicle import LevelVehicle
+    from aerokit.sim.ardupilot.navigation import Ned
+
+__all__ = ["LevelAuto"]
+
+_C = MavCmd
+_WAYS = frozenset({_C.NAV_WAYPOINT, _C.NAV_LOITER_UNLIM, _C.NAV_LOITER_TIME})
+_HOME = _C.NAV_RETURN_TO_LAUNCH
+_IN_PASSING = frozenset(
+    {_C.DO_SET_ROI, _C.DO_SET_ROI_LOCATION, _C.DO_SET_ROI_NONE, _C.DO_FENCE_ENABLE, _C.DO_GUIDED_LIMITS}
+)
+_KNOWN = (
+    _WAYS
+    | {_HOME, _C.NAV_DELAY, _C.CONDITION_DELAY, _C.CONDITION_DISTANCE, _C.DO_CHANGE_SPEED, _C.DO_SET_HOME}
+    | _IN_PASSING
+)
+
+
+class LevelAuto(VehicleMode):
+    """Goes where the mission leads; a subclass says how it moves and what it says on arrival."""
+
+    needs_mission = True
+    can_change_speed = True
+
+    def __init__(self, vehicle: LevelVehicle) -> None:
+        self.vehicle = vehicle
+        self.speed = 0.0
+        """In m/s."""
+        self.may_lift_off = False
+        self.is_paused = False
+        self._place: Ned | None = None
+        self._stops = True
+        self._is_waiting = False
+        self._reached_at: float | None = None
+        self._wait_until = 0.0
+
+    # ----------------------------------------------------------------------------- what a kind says
+
+    def default_speed(self) -> float:
+        """In m/s, as parameters say it."""
+        raise NotImplementedError
+
+    def refuse(self) -> None:
+        """There is no mission."""
+
+    def travel(self, place: Ned, *, stops: bool) -> None:
+        """Go on towards a point for one tick."""
+        raise NotImplementedError
+
+    def has_arrived(self, place: Ned) -> bool:
+        """Whether it is at the point."""
+        raise NotImplementedError
+
+    def stay(self) -> None:
+        """Stay where it is for one tick."""
+        raise NotImplementedError
+
+    def reached_text(self, index: int, seconds: float) -> str:
+        """What it says at a waypoint."""
+        raise NotImplementedError
+
+    def finish(self) -> None:
+        """The mission is over."""
+
+    # ---------------------------------------------------------------------------------------- mode
+
+    @property
+    def destination(self) -> Ned | None:
+        """Where it is going."""
+        return self._place
+
+    def enter(self, *, force: bool) -> bool:
+        """A mission is needed."""
+        if self.vehicle.mode is self:
+            return True
+        if not self.vehicle.mission.is_present:
+            self.refuse()
+            return False
+        self.speed, self._place, self._is_waiting = self.default_speed(), None, True
+        self.vehicle.call_later(0.0, self._start_if_waiting)
+        return True
+
+    def leave(self) -> None:
+        """The mission stops where it is."""
+        self._is_waiting = False
+        self.vehicle.mission.stop()
+
+    def disarmed(self) -> None:
+        """A mission that was not over begins once more, and waits."""
+        if self.vehicle.mode is self:
+            self.vehicle.mission.update()
+
+    def _start_if_waiting(self) -> None:
+        if self._is_waiting and self.vehicle.mode is self and self.vehicle.navigation.origin is not None:
+            self._is_waiting = False
+            self.vehicle.mission.start_or_resume()
+
+    def update(self, dt: float) -> None:
+        """Mission, then motion."""
+        self._start_if_waiting()
+        if not self._is_waiting:
+            self.vehicle.mission.update()
+        if self.vehicle.mode is not self:
+            return
+        if self._place is None:
+            self.stay()
+        else:
+            self.travel(self._place, stops=self._stops)
+
+    # ---------------------------------------------------------------------------------- MissionFlyer
+
+    def start_command(self, index: int, item: MissionItem) -> bool:
+        """See `MissionFlyer`."""
+        command = item.command
+        if command not in _KNOWN:
+            return False
+        if command in _WAYS or command == _HOME:
+            self._go(item)
+        elif command in (_C.NAV_DELAY, _C.CONDITION_DELAY):
+            self._wait_until = self.vehicle.now + max(0.0, item.param1)
+        elif command == _C.DO_CHANGE_SPEED:
+            self._change_speed(item)
+        elif command == _C.DO_SET_HOME:
+            self._set_home(item)
+        if command == _C.NAV_DELAY:
+            self._place = None
+            self.vehicle.info(f"Delaying {int(item.param1)} sec")
+        return True
+
+    def is_complete(self, index: int, item: MissionItem) -> bool:
+        """See `MissionFlyer`; everybody is told."""
+        if self.vehicle.mode is not self or not self._is_done(index, item):
+            return False
+        self.vehicle.call_later(0.0, lambda: self.vehicle.send(MissionItemReached(index)))
+        return True
+
+    def end_mission(self) -> None:
+        """Stay there."""
+        self._place = None
+        self.finish()
+
+    def _is_done(self, index: int, item: MissionItem) -> bool:
+        command, now = item.command, self.vehicle.now
+        if command in _WAYS:
+            return self._has_stayed(index, item) and command != _C.NAV_LOITER_UNLIM
+        if command == _HOME:
+            return self._place is None or self.has_arrived(self._place)
+        if command in (_C.NAV_DELAY, _C.CONDITION_DELAY):
+            return now >= self._wait_until
+        if command == _C.CONDITION_DISTANCE:
+            return self._distance() < item.param1
+        if command not in _KNOWN:
+            self.vehicle.send_text(MavSeverity.WARNING, f"Skipping invalid cmd #{command}")
+        return True
+
+    def _has_stayed(self, index: int, item: MissionItem) -> bool:
+        if self._place is None or (self._reached_at is None and not self.has_arrived(self._place)):
+            return False
+        now = self.vehicle.now
+        if self._reached_at is None:
+            self._reached_at = now
+            self.vehicle.info(self.reached_text(index, item.param1))
+        return now - self._reached_at >= max(0.0, item.param1)
+
+    def _distance(self) -> float:
+        if self._place is None:
+            return 0.0
+        motion = self.vehicle.motion
+        return math.hypot(self._place[0] - motion.north, self._place[1] - motion.east)
+
+    # -------------------------------------------------------------------------------------- commands
+
+    def _go(self, item: MissionItem) -> None:
+        vehicle, motion = self.vehicle, self.vehicle.motion
+        here: Ned = self._place or (motion.north, motion.east, motion.down)
+        self._reached_at = None
+        if item.command == _HOME:
+            self._place, self._stops = vehicle.navigation.home or here, True
+            return
+        point = vehicle.point(int(item.x), int(item.y), item.z, item.frame)
+        north, east = here[:2] if point is None or (item.x, item.y) == (0, 0) else point[:2]
+        self._place = (north, east, here[2] if point is None or item.z == 0 else point[2])
+        following = next(vehicle.mission.navigation_from(vehicle.mission.nav_index + 1), None)
+        self._stops = item.param1 > 0 or following is None or following[1].command not in _WAYS
+
+    def _change_speed(self, item: MissionItem) -> None:
+        if item.param1 in (SpeedType.AIRSPEED, SpeedType.GROUNDSPEED) and item.param2 > 0:
+            self.speed = item.param2
+
+    def _set_home(self, item: MissionItem) -> None:
+        motion = self.vehicle.motion
+        point: Ned | None = (motion.north, motion.east, motion.down)
+        if item.param1 != 1 and (item.x, item.y, item.z) != (0, 0, 0):
+            point = self.vehicle.point(int(item.x), int(item.y), item.z, item.frame)
+        if point is not None:
+            self.vehicle.navigation.set_home(point, lock=False)

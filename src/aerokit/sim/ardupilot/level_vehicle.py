@@ -1,0 +1,177 @@
+"""What simulated rovers and submarines have in common: no take-off, no landing, targets and missions on the level."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, ClassVar, cast
+
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import MavCmd, MavResult, MavSeverity, SpeedType
+from aerokit.sim.ardupilot.copter_commands import copter_commands
+from aerokit.sim.ardupilot.failsafes import Failsafes
+from aerokit.sim.ardupilot.targets import Targets
+from aerokit.sim.ardupilot.telemetry import BUILDERS
+from aerokit.sim.ardupilot.telemetry_state import heartbeat
+from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from aerokit.mavlink.message import Message
+    from aerokit.sim.ardupilot.copter import SimulatedCopter
+    from aerokit.sim.ardupilot.mode import VehicleMode
+    from aerokit.sim.commands import Command, CommandHandler
+
+__all__ = ["LevelFailsafes", "LevelVehicle"]
+
+_CHANGE_MODE = 1
+_STICK_MIDDLE = 1500
+_SHARED = frozenset(
+    {
+        MavCmd.COMPONENT_ARM_DISARM,
+        MavCmd.DO_SET_MODE,
+        MavCmd.DO_SET_MISSION_CURRENT,
+        MavCmd.DO_FLIGHTTERMINATION,
+        MavCmd.DO_SET_HOME,
+        MavCmd.GET_HOME_POSITION,
+        MavCmd.REQUEST_AUTOPILOT_CAPABILITIES,
+        MavCmd.REQUEST_MESSAGE,
+        MavCmd.SET_MESSAGE_INTERVAL,
+        MavCmd.GET_MESSAGE_INTERVAL,
+        MavCmd.DO_FENCE_ENABLE,
+        MavCmd.RUN_PREARM_CHECKS,
+        MavCmd.PREFLIGHT_REBOOT_SHUTDOWN,
+        MavCmd.DO_SEND_BANNER,
+        MavCmd.PREFLIGHT_CALIBRATION,
+        MavCmd.DO_START_MAG_CAL,
+        MavCmd.DO_ACCEPT_MAG_CAL,
+        MavCmd.DO_CANCEL_MAG_CAL,
+    }
+)
+
+
+class LevelFailsafes(Failsafes):
+    """Battery and ground station; there is nothing that disarms an idle one."""
+
+    def _check_idling(self) -> None:
+        pass
+
+    def _check_estimator(self) -> None:
+        pass
+
+
+class LevelVehicle(ArduPilotVehicle):
+    """Its arguments are those of `ArduPilotVehicle`."""
+
+    BUILDERS: ClassVar[Mapping[int, Callable[[Any], Message | None]]] = {
+        **BUILDERS,
+        m.ExtendedSysState.ID: lambda _: m.ExtendedSysState(0, 0),
+    }
+
+    # ----------------------------------------------------------------------------- what a kind says
+
+    def refusal(self, mode: VehicleMode) -> str:
+        """What it says when it does not go into a mode."""
+        raise NotImplementedError
+
+    def own_commands(self) -> dict[int, CommandHandler]:
+        """Commands beside those of every ArduPilot."""
+        return {}
+
+    @property
+    def is_at_rest(self) -> bool:
+        """Whether nothing moves while it is disarmed."""
+        raise NotImplementedError
+
+    # -------------------------------------------------------------------------------------- vehicle
+
+    def make_failsafes(self) -> Failsafes:
+        """See `LevelFailsafes`."""
+        return LevelFailsafes(self)
+
+    def hear_setpoints(self) -> None:
+        """See `Targets`."""
+        Targets(self, cast("Any", self.guided))
+
+    def reset_controllers(self) -> None:
+        """The throttle stick rests in the middle."""
+        self.rc[2] = _STICK_MIDDLE
+
+    def set_mode(self, number: int) -> bool:
+        """Change the mode if the vehicle may; says why not. A change is told by a heartbeat at once."""
+        if number == self.mode.number:
+            return True
+        mode = self._modes.get(number)
+        if mode is None:
+            self.send_text(MavSeverity.WARNING, f"No such mode {number}")
+            return False
+        armed = self.motors.is_armed
+        lost = armed and mode.needs_position and not self.navigation.has_position
+        if lost or not mode.enter(force=not armed):
+            self.send_text(MavSeverity.WARNING, self.refusal(mode))
+            return False
+        self.mode.leave()
+        self.mode = mode
+        self.call_later(0.0, lambda: self.send(heartbeat(self)))
+        return True
+
+    def tick(self, dt: float) -> None:
+        """Mode, motors, motion, battery."""
+        if self.motors.is_armed:
+            self.mode.update(dt)
+        self.motors.update(self.now, dt, self.motion, landed=False)
+        self.move(dt)
+        self.battery.drain(self.motors.current_a, dt)
+        if not self.motors.is_armed and self.is_at_rest:
+            self.set_ticking(False)
+
+    def move(self, dt: float) -> None:
+        """Motion."""
+        self.motion.step(dt, powered=self.motors.is_armed and not self.faults.motor_failed)
+
+    # ------------------------------------------------------------------------------------- commands
+
+    def make_commands(self) -> dict[int, CommandHandler]:
+        """MAV_CMD → handler."""
+        shared = copter_commands(cast("SimulatedCopter", self))
+        handlers = {number: handler for number, handler in shared.items() if number in _SHARED}
+        handlers |= {
+            MavCmd.MISSION_START: self._start_mission,
+            MavCmd.DO_REPOSITION: self._reposition,
+            MavCmd.DO_CHANGE_SPEED: self._change_speed,
+        }
+        handlers |= self.own_commands()
+        return {n: each for n, each in handlers.items() if n not in self.unsupported_commands}
+
+    def change_to(self, mode: int) -> int:
+        """The MAV_RESULT of a command that stands for a mode."""
+        return MavResult.ACCEPTED if self.set_mode(mode) else MavResult.FAILED
+
+    def _start_mission(self, command: Command) -> int:
+        if command.param1 or command.param2:
+            return MavResult.DENIED
+        result = self.change_to(cast("VehicleMode", self.auto).number)
+        if result == MavResult.ACCEPTED and not self.mission.is_running:
+            self.mission.start_or_resume()
+        return result
+
+    def _reposition(self, command: Command) -> int:
+        """Only as COMMAND_INT: ArduPilot knows no frame for it in COMMAND_LONG."""
+        if command.is_long:
+            return MavResult.UNSUPPORTED
+        guided = self.guided
+        if self.mode is not guided and not int(command.param2) & _CHANGE_MODE:
+            return MavResult.DENIED
+        point = self.point(*command.place(), command.z, command.altitude_frame)
+        if point is None:
+            return MavResult.DENIED
+        if not self.set_mode(guided.number):
+            return MavResult.FAILED
+        self.guided.go_to(point)
+        return MavResult.ACCEPTED
+
+    def _change_speed(self, command: Command) -> int:
+        kinds = (SpeedType.AIRSPEED, SpeedType.GROUNDSPEED)
+        if not self.mode.can_change_speed or command.param1 not in kinds or not command.param2 > 0:
+            return MavResult.FAILED
+        cast("Any", self.mode).speed = command.param2
+        return MavResult.ACCEPTED

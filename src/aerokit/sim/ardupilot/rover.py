@@ -1,0 +1,210 @@
+"""`SimulatedRover`: an ArduRover 4.7 car without sockets, threads or a clock of its own."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import MavCmd, MavModeFlag, MavSeverity, MavType, RoverMode
+from aerokit.sim.ardupilot.arming import Arming
+from aerokit.sim.ardupilot.level_vehicle import LevelFailsafes, LevelVehicle
+from aerokit.sim.ardupilot.motors import Motors
+from aerokit.sim.ardupilot.rover_modes import ROVER_MODES, RoverAuto, RoverGuided
+from aerokit.sim.ground_motion import GroundLimits, GroundMotion
+from aerokit.sim.motion import wrap_pi
+
+if TYPE_CHECKING:
+    from aerokit.mavlink.message import Message
+    from aerokit.sim.ardupilot.mode import VehicleMode
+    from aerokit.sim.ardupilot.parameter_tables import Kind
+    from aerokit.sim.commands import CommandHandler
+    from aerokit.sim.motion import Motion, Wind
+
+__all__ = ["SimulatedRover"]
+
+_GUIDED_MODES = frozenset({"LOIT", "CIRC", "AUTO", "RTL", "SRTL", "GUID"})
+_MANUAL_INPUT = frozenset({"MANU", "ACRO", "STER"})
+_ARRIVED_M, _STANDING_M_S = 0.3, 0.1
+_AMPERES_AT_FULL = 16.0
+_MIDDLE_PWM = 1500
+
+
+class _Motors(Motors):
+    """One motor that drives the wheels."""
+
+    @property
+    def current_a(self) -> float:
+        return abs(self.throttle) * _AMPERES_AT_FULL
+
+    def update(self, now: float, dt: float, motion: Motion, *, landed: bool) -> None:
+        assert isinstance(motion, GroundMotion)
+        self.throttle = max(-1.0, min(1.0, motion.speed_m_s / motion.wheels.top_speed_m_s / 2.0))
+        if not self.is_armed:
+            self.throttle = 0.0
+
+
+class _Arming(Arming):
+    ARMED_TEXT = "Throttle armed"
+    DISARMED_TEXT = "Throttle disarmed"
+
+    def reasons(self) -> list[str]:
+        """Some modes cannot be armed in, which is said also before anybody tries."""
+        return super().reasons() + ([] if self._vehicle.mode.can_arm else ["Mode not armable"])
+
+    def _final_reasons(self) -> list[str]:
+        return []
+
+    def disarm(self, *, force: bool = True) -> bool:
+        """At any time; where it is disarmed is home, unless somebody has set it."""
+        vehicle, was_armed = self._vehicle, self._vehicle.motors.is_armed
+        super().disarm(force=True)
+        if was_armed and vehicle.navigation.home is not None and not vehicle.navigation.home_is_locked:
+            motion = vehicle.motion
+            vehicle.navigation.set_home((motion.north, motion.east, motion.down), lock=False)
+        return True
+
+
+class _Failsafes(LevelFailsafes):
+    """FS_ACTION: nothing (0), RTL (1), HOLD (2), SMART_RTL (3, 4), disarm (5).
+
+    BATT_FS_LOW_ACT is not simulated: that the battery is low is told only.
+    """
+
+    def _act(self, name: str, mode: int | None) -> None:
+        vehicle = self._vehicle
+        if name != "GCS" or not vehicle.motors.is_armed or vehicle.mode.name in ("RTL", "HOLD"):
+            return
+        vehicle.send_text(MavSeverity.WARNING, f"{name} Failsafe")
+        action = int(vehicle.parameters["FS_ACTION"])
+        modes = {1: RoverMode.RTL, 2: RoverMode.HOLD, 3: RoverMode.SMART_RTL, 4: RoverMode.SMART_RTL}
+        if action in modes and not vehicle.set_mode(modes[action]):
+            vehicle.set_mode(RoverMode.HOLD)
+        elif action == 5:
+            vehicle.arming.disarm()
+
+
+def _vfr_hud(rover: SimulatedRover) -> m.VfrHud:
+    motion, place = rover.motion, rover.navigation.position
+    heading = int(math.degrees(motion.yaw) % 360.0)
+    throttle = round(abs(rover.motors.throttle) * 100)
+    altitude = 0.0 if place is None else place.altitude_m
+    return m.VfrHud(0.0, motion.ground_speed_m_s, heading, throttle, altitude, 0.0)
+
+
+def _servo_output(rover: SimulatedRover) -> m.ServoOutputRaw:
+    """Steering is output 1, the motor output 3."""
+    most = rover.motion.wheels.turn_rate_rad_s
+    steering = _MIDDLE_PWM + round(500 * rover.motion.yaw_rate / most)
+    throttle = _MIDDLE_PWM + round(500 * rover.motors.throttle)
+    return m.ServoOutputRaw(rover.time_boot_us, 0, steering, 0, throttle, 0, 0, 0, 0, 0)
+
+
+class SimulatedRover(LevelVehicle):
+    """Speaks and behaves as ArduRover does where a client can see it; drives as `GroundMotion` does.
+
+    Its arguments are those of `ArduPilotVehicle`. It has 1,235 parameters. Simulated: MANUAL, ACRO, STEERING and
+    SIMPLE by the sticks, HOLD, LOITER and CIRCLE (standing), AUTO, GUIDED, RTL and SMART_RTL (straight home).
+    Take-off and landing are unknown commands.
+
+    Not simulated yet: boats, driving in circles, keeping within a fence, actions of the battery failsafe.
+    """
+
+    KIND: ClassVar[Kind] = "rover"
+    FIRMWARE: ClassVar[str] = "ArduRover"
+    MAV_TYPE: ClassVar[int] = MavType.GROUND_ROVER
+    CAPABILITIES: ClassVar[int] = 0xF1EF
+    MODES: ClassVar[tuple[Callable[[Any], VehicleMode], ...]] = ROVER_MODES
+    BUILDERS: ClassVar[Mapping[int, Callable[[Any], Message | None]]] = {
+        **LevelVehicle.BUILDERS,
+        m.VfrHud.ID: _vfr_hud,
+        m.ServoOutputRaw.ID: _servo_output,
+    }
+
+    motion: GroundMotion
+
+    def make_motion(self, wind: Wind | None) -> GroundMotion:
+        """Limits as the parameters have them now; wind is only told, it moves nothing."""
+        parameters = self.parameters
+        limits = GroundLimits(
+            acceleration_m_s2=parameters["ATC_ACCEL_MAX"] or 1.0,
+            top_speed_m_s=self.top_speed,
+            turn_rate_rad_s=math.radians(parameters["ATC_STR_RAT_MAX"] or 120.0),
+            turn_radius_m=parameters["TURN_RADIUS"] or 0.9,
+            sideways_m_s2=9.81 * (parameters["ATC_TURN_MAX_G"] or 0.6),
+        )
+        return GroundMotion(self.rng, limits, wind)
+
+    def make_motors(self) -> Motors:
+        """One motor."""
+        return _Motors()
+
+    def make_arming(self) -> Arming:
+        """Without throttle check."""
+        return _Arming(self)
+
+    def make_failsafes(self) -> LevelFailsafes:
+        """FS_ACTION."""
+        return _Failsafes(self)
+
+    @property
+    def top_speed(self) -> float:
+        """In m/s: SPEED_MAX, or what CRUISE_SPEED at CRUISE_THROTTLE leads to."""
+        parameters = self.parameters
+        return parameters["SPEED_MAX"] or 100.0 * parameters["CRUISE_SPEED"] / parameters["CRUISE_THROTTLE"]
+
+    @property
+    def is_landed(self) -> bool:
+        """What STANDBY in the heartbeat means here: HOLD."""
+        return self.mode.number == RoverMode.HOLD
+
+    @is_landed.setter
+    def is_landed(self, _: bool) -> None:
+        """It is always on the ground."""
+
+    @property
+    def guided(self) -> RoverGuided:
+        """GUIDED."""
+        mode = self._modes[RoverMode.GUIDED]
+        assert isinstance(mode, RoverGuided)
+        return mode
+
+    @property
+    def auto(self) -> RoverAuto:
+        """AUTO."""
+        mode = self._modes[RoverMode.AUTO]
+        assert isinstance(mode, RoverAuto)
+        return mode
+
+    @property
+    def base_mode(self) -> int:
+        """Sticks in the modes that have them, guided in those that drive by themselves."""
+        base, name = int(MavModeFlag.CUSTOM_MODE_ENABLED), self.mode.name
+        if name in _MANUAL_INPUT:
+            base |= MavModeFlag.MANUAL_INPUT_ENABLED
+        if name in _GUIDED_MODES:
+            base |= MavModeFlag.GUIDED_ENABLED
+        return base | MavModeFlag.SAFETY_ARMED if self.motors.is_armed else base
+
+    @property
+    def is_at_rest(self) -> bool:
+        """Whether it stands."""
+        return abs(self.motion.speed_m_s) < 0.01
+
+    def refusal(self, mode: VehicleMode) -> str:
+        """The same for every mode."""
+        return "Flight mode change failed"
+
+    def own_commands(self) -> dict[int, CommandHandler]:
+        """Of the commands that stand for a mode only the way home is known."""
+        return {MavCmd.NAV_RETURN_TO_LAUNCH: lambda _: self.change_to(RoverMode.RTL)}
+
+    def has_arrived(self, place: tuple[float, float, float]) -> bool:
+        """At a place where it is to stop, or past it."""
+        motion = self.motion
+        north, east = place[0] - motion.north, place[1] - motion.east
+        away = math.hypot(north, east)
+        behind = abs(wrap_pi(math.atan2(east, north) - motion.yaw)) > math.pi / 2
+        near = self.parameters["WP_RADIUS"] / 2.0
+        return away <= _ARRIVED_M or (behind and away <= near and motion.ground_speed_m_s > _STANDING_M_S)

@@ -1,0 +1,129 @@
+"""How a simulated rover moves: it drives where its nose points, on level ground.
+
+What it does: limits of speed, acceleration and turn rate; a turning circle, so that it cannot turn where it
+stands; slower in curves; the slowing down before a place where it is to stop. What it does not: slipping, slopes,
+suspension, wind.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from dataclasses import dataclass
+
+from aerokit.sim.motion import Motion, Wind, approach_speed, wrap_pi
+
+__all__ = ["GroundLimits", "GroundMotion"]
+
+_SPEED_TIME_CONSTANT_S = 0.3
+_HEADING_GAIN_PER_S = 2.0
+_SLOW_M_S = 1.0
+_BESIDE_RAD = math.pi / 2
+
+
+@dataclass
+class GroundLimits:
+    """What wheels and steering allow."""
+
+    acceleration_m_s2: float = 1.0
+    top_speed_m_s: float = 10.0
+    turn_rate_rad_s: float = math.radians(120.0)
+    turn_radius_m: float = 0.9
+    sideways_m_s2: float = 5.9
+
+
+class GroundMotion(Motion):
+    """One of `drive`, `head`, `drive_to` and `stop` says what to do next; it keeps the rest of `Motion`'s names."""
+
+    def __init__(
+        self, rng: random.Random, wheels: GroundLimits | None = None, wind: Wind | None = None
+    ) -> None:
+        super().__init__(rng, wind=wind)
+        self.wheels = wheels if wheels is not None else GroundLimits()
+        self.speed_m_s = 0.0
+        """Forwards; negative is backwards."""
+        self._wanted_speed = 0.0
+        self._rate = 0.0
+        self._heading: float | None = None
+
+    # ------------------------------------------------------------------------------------ what to do
+
+    def stop(self) -> None:
+        """Brake and stand."""
+        self.drive(0.0, 0.0)
+
+    def drive(self, speed: float, turn_rate: float) -> None:
+        """Speed in m/s (negative: backwards) and turn rate in rad/s."""
+        self._wanted_speed, self._rate, self._heading = speed, turn_rate, None
+
+    def head(self, speed: float, heading: float) -> None:
+        """Drive at this speed towards this heading in radians."""
+        self._wanted_speed, self._rate, self._heading = speed, 0.0, heading
+
+    def drive_to(
+        self, north: float, east: float, *, speed: float, stops: bool = True, backwards: bool = False
+    ) -> None:
+        """Towards a point with at most this speed in m/s; ``stops``: brake so that it stands there."""
+        north, east = north - self.north, east - self.east
+        distance = math.hypot(north, east)
+        if stops:
+            speed = min(speed, approach_speed(distance, 1.0, self.wheels.acceleration_m_s2))
+        course = math.atan2(east, north)
+        if backwards:
+            self.head(-speed, course + math.pi)
+            return
+        off = abs(wrap_pi(course - self.yaw))
+        self.head(min(speed, _SLOW_M_S) if off > _BESIDE_RAD else speed, course)
+
+    # ------------------------------------------------------------------------------------- and do it
+
+    @property
+    def airspeed_m_s(self) -> float:
+        """A rover has no pitot tube: always 0."""
+        return 0.0
+
+    def step(self, dt: float, *, powered: bool = True) -> None:
+        """Drive on by ``dt`` seconds; without power it rolls out."""
+        rate = self._turn_rate()
+        self._accelerate(self._curve_speed(rate) if powered else 0.0, dt)
+        middle = self.yaw + 0.5 * rate * dt
+        self.yaw, self.yaw_rate = wrap_pi(self.yaw + rate * dt), rate
+        north, east = self.speed_m_s * math.cos(middle), self.speed_m_s * math.sin(middle)
+        self.acceleration_north = (north - self.velocity_north) / dt
+        self.acceleration_east = (east - self.velocity_east) / dt
+        self.velocity_north, self.velocity_east = north, east
+        self.north += north * dt
+        self.east += east * dt
+
+    def settle(self) -> None:
+        """Stand."""
+        super().settle()
+        self.speed_m_s = 0.0
+        self.stop()
+
+    @property
+    def is_standing(self) -> bool:
+        """Whether the wheels do not turn."""
+        return abs(self.speed_m_s) < 0.01 and self._wanted_speed == 0.0
+
+    def _turn_rate(self) -> float:
+        wheels, rate = self.wheels, self._rate
+        if self._heading is not None:
+            rate = _HEADING_GAIN_PER_S * wrap_pi(self._heading - self.yaw)
+        most = min(wheels.turn_rate_rad_s, abs(self.speed_m_s) / wheels.turn_radius_m)
+        return max(-most, min(most, rate))
+
+    def _curve_speed(self, rate: float) -> float:
+        """The wanted speed, less in a curve."""
+        most = self.wheels.top_speed_m_s
+        if rate:
+            most = min(most, max(_SLOW_M_S, self.wheels.sideways_m_s2 / abs(rate)))
+        return max(-most, min(most, self._wanted_speed))
+
+    def _accelerate(self, wanted: float, dt: float) -> None:
+        change = (wanted - self.speed_m_s) * min(1.0, dt / _SPEED_TIME_CONSTANT_S)
+        most = self.wheels.acceleration_m_s2 * dt
+        braking = abs(wanted) < abs(self.speed_m_s)
+        if braking:
+            most *= 2.0
+        self.speed_m_s += max(-most, min(most, change))
