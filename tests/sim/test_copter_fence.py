@@ -77,7 +77,7 @@ def test_actions(action: int, mode: int) -> None:
 
 
 def test_report_only() -> None:
-    copter, client = flying_copter(parameters={**ENABLED, "FENCE_ACTION": 0.0, "FENCE_ALT_MAX": 5.0})
+    copter, _ = flying_copter(parameters={**ENABLED, "FENCE_ACTION": 0.0, "FENCE_ALT_MAX": 5.0})
     assert copter.mode.number == CopterMode.GUIDED
     assert copter.fence.breached == 1
     assert copter.fence.health == (True, False, False)
@@ -184,7 +184,7 @@ def test_switching_it_by_command() -> None:
 
 
 def test_it_is_switched_on_with_the_motors() -> None:
-    copter, client = ready_copter(parameters={"FENCE_AUTOENABLE": 3.0})
+    _, client = ready_copter(parameters={"FENCE_AUTOENABLE": 3.0})
     assert set_mode(client, CopterMode.GUIDED) == MavResult.ACCEPTED
     assert client.command(ARM, 1) == MavResult.ACCEPTED
     client.run(0.1)

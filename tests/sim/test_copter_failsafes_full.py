@@ -1,0 +1,196 @@
+"""ArduCopter's failsafes of radio, ground station and battery: each action, each option, each text."""
+
+from __future__ import annotations
+
+import pytest
+from simulated_client import Client, flying_copter, ready_copter, set_mode
+
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult, MavState
+from aerokit.mavlink.enums import MavSysStatusSensor as Sensor
+from aerokit.sim import SimulatedCopter
+
+
+def healthy(client: Client, bit: int) -> bool:
+    client.command(MavCmd.REQUEST_MESSAGE, m.SysStatus.ID)
+    client.run(0.1)
+    return bool(client.last(m.SysStatus).onboard_control_sensors_health & bit)
+
+
+@pytest.mark.parametrize(
+    ("action", "mode"),
+    [
+        (1, CopterMode.RTL),
+        (3, CopterMode.SMART_RTL),
+        (4, CopterMode.SMART_RTL),
+        (5, CopterMode.LAND),
+        (6, CopterMode.RTL),
+        (7, CopterMode.BRAKE),
+    ],
+)
+def test_a_lost_radio_does_what_is_configured(action: int, mode: int) -> None:
+    copter, client = flying_copter(parameters={"FS_THR_ENABLE": float(action)})
+    copter.faults.rc_lost = True
+    client.run(2.0)
+    assert copter.mode.number == mode
+    assert client.texts[0] == "Radio Failsafe"
+    assert client.last(m.Heartbeat).system_status == MavState.CRITICAL
+    assert not healthy(client, Sensor.RC_RECEIVER)
+
+
+def test_a_radio_that_comes_back_changes_no_mode() -> None:
+    copter, client = flying_copter()
+    copter.parameters["SIM_RC_FAIL"] = 1.0
+    client.run(2.0)
+    copter.parameters["SIM_RC_FAIL"] = 0.0
+    client.run(1.0)
+    assert client.texts == ["Radio Failsafe", "Radio Failsafe Cleared"]
+    assert copter.mode.number == CopterMode.RTL
+    assert healthy(client, Sensor.RC_RECEIVER)
+
+
+def test_a_low_throttle_is_a_lost_radio() -> None:
+    copter, client = flying_copter()
+    copter.rc[2] = 950
+    client.run(1.0)
+    assert copter.mode.number == CopterMode.RTL
+
+
+def test_without_the_failsafe_nothing_happens() -> None:
+    copter, client = flying_copter(parameters={"FS_THR_ENABLE": 0.0})
+    copter.faults.rc_lost = True
+    client.run(3.0)
+    assert copter.mode.number == CopterMode.GUIDED
+    assert client.texts == []
+
+
+def test_overrides_stand_in_for_the_radio() -> None:
+    copter, client = flying_copter()
+    for _ in range(6):
+        client.send(m.RcChannelsOverride(1, 1, 1500, 1500, 1500, 1500, 0, 0, 0, 0))
+        copter.faults.rc_lost = True
+        client.run(0.5)
+    assert copter.mode.number == CopterMode.GUIDED
+
+
+def test_guided_may_go_on_without_a_radio() -> None:
+    copter, client = flying_copter(parameters={"FS_OPTIONS": 4.0})
+    copter.faults.rc_lost = True
+    client.run(2.0)
+    assert client.texts == ["Radio Failsafe - Continuing Guided Mode"]
+    assert copter.mode.number == CopterMode.GUIDED
+
+
+def test_a_landing_may_go_on_without_a_radio() -> None:
+    copter, client = flying_copter(parameters={"FS_OPTIONS": 8.0})
+    assert set_mode(client, CopterMode.LAND) == MavResult.ACCEPTED
+    copter.faults.rc_lost = True
+    client.run(2.0)
+    assert client.texts == ["Radio Failsafe - Continuing Landing"]
+    assert copter.mode.number == CopterMode.LAND
+
+
+def test_without_a_radio_it_is_not_armed() -> None:
+    copter, client = ready_copter()
+    copter.faults.rc_lost = True
+    client.run(2.0)
+    assert client.texts == ["Radio Failsafe - Disarming"]
+    client.forget()
+    assert client.command(MavCmd.COMPONENT_ARM_DISARM, 1) == MavResult.FAILED
+    assert client.texts == ["Arm: Radio failsafe on"]
+
+
+def lose_ground_station(options: float, mode: int) -> tuple[SimulatedCopter, Client]:
+    copter, client = flying_copter(parameters={"FS_GCS_ENABLE": 1.0, "FS_OPTIONS": options})
+    copter.rc[2] = 1500
+    assert set_mode(client, mode) == MavResult.ACCEPTED
+    client.send(m.Heartbeat(6, 8, 0, 0, 4, 3))
+    client.run(5.5)
+    return copter, client
+
+
+def test_a_lost_ground_station_sends_it_home() -> None:
+    copter, client = lose_ground_station(16.0, CopterMode.GUIDED)
+    assert client.texts == ["GCS Failsafe"]
+    assert copter.mode.number == CopterMode.RTL
+    client.send(m.Heartbeat(6, 8, 0, 0, 4, 3))
+    client.run(0.5)
+    assert client.texts[-1] == "GCS Failsafe Cleared"
+
+
+def test_a_pilot_needs_no_ground_station() -> None:
+    copter, client = lose_ground_station(16.0, CopterMode.LOITER)
+    assert client.texts == ["GCS Failsafe - Continuing Pilot Control"]
+    assert copter.mode.number == CopterMode.LOITER
+
+
+def test_an_unarmed_vehicle_says_so_and_is_not_armed() -> None:
+    copter, client = ready_copter(parameters={"FS_GCS_ENABLE": 1.0})
+    client.send(m.Heartbeat(6, 8, 0, 0, 4, 3))
+    client.run(6.0)
+    assert client.texts == ["GCS Failsafe"]
+    assert copter.arming.reasons() == ["GCS failsafe on"]
+
+
+BATTERY = {"BATT_FS_LOW_ACT": 2.0, "BATT_FS_CRT_ACT": 1.0, "BATT_CRT_VOLT": 9.5, "BATT_LOW_TIMER": 2.0}
+
+
+def test_low_and_then_critical() -> None:
+    copter, client = flying_copter(parameters=BATTERY)
+    copter.battery.percent = 10.0
+    client.run(3.0)
+    assert copter.mode.number == CopterMode.RTL
+    assert client.texts[0].startswith("Battery 1 is low 9.8")
+    assert client.texts[1] == "Battery Failsafe"
+    client.forget()
+    copter.battery.percent = 2.0
+    client.run(3.0)
+    assert copter.mode.number == CopterMode.LAND
+    assert client.texts[0].startswith("Battery 1 is critical 9.")
+    assert not healthy(client, Sensor.BATTERY)
+
+
+def test_a_lesser_action_does_not_follow_a_graver_one() -> None:
+    copter, client = flying_copter(parameters={**BATTERY, "BATT_FS_LOW_ACT": 1.0, "BATT_FS_CRT_ACT": 2.0})
+    copter.battery.percent = 10.0
+    client.run(3.0)
+    copter.battery.percent = 2.0
+    client.run(3.0)
+    assert copter.mode.number == CopterMode.LAND
+    assert client.texts.count("Battery Failsafe") == 1
+
+
+def test_a_dip_is_no_failsafe_and_charge_needs_no_patience() -> None:
+    copter, client = flying_copter(parameters={**BATTERY, "BATT_LOW_TIMER": 10.0})
+    copter.battery.percent = 10.0
+    client.run(3.0)
+    copter.battery.percent = 90.0
+    client.run(8.0)
+    assert client.texts == []
+    copter.parameters["BATT_LOW_MAH"] = 3290.0
+    client.run(0.5)
+    assert client.texts[1] == "Battery Failsafe"
+
+
+def test_the_motors_may_be_stopped() -> None:
+    copter, client = flying_copter(parameters={**BATTERY, "BATT_FS_LOW_ACT": 5.0})
+    copter.battery.percent = 10.0
+    client.run(3.0)
+    assert not copter.is_armed
+
+
+def test_on_the_ground_it_is_disarmed_first() -> None:
+    copter, client = ready_copter(parameters={**BATTERY, "DISARM_DELAY": 0.0})
+    assert set_mode(client, CopterMode.GUIDED) == MavResult.ACCEPTED
+    assert client.command(MavCmd.COMPONENT_ARM_DISARM, 1) == MavResult.ACCEPTED
+    client.forget()
+    copter.battery.percent = 10.0
+    client.run(3.0)
+    assert client.texts[1:] == ["Disarming motors", "Battery Failsafe - Disarming"]
+
+
+def test_low_on_the_ground_is_only_not_armed() -> None:
+    copter, client = ready_copter(battery_percent=10.0)
+    client.run(15.0)
+    assert client.texts == []
+    assert copter.arming.reasons() == ["Battery 1 low voltage failsafe"]
