@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from aerokit.sim.ardupilot.boot import BootTimeline
 from aerokit.sim.ardupilot.copter import SimulatedCopter
+from aerokit.sim.ardupilot.plane import SimulatedPlane
 from aerokit.sim.ardupilot.rover import SimulatedRover
 from aerokit.sim.ardupilot.sub import SimulatedSub
 
-__all__ = ["BootTimeline", "SimulatedCopter", "SimulatedRover", "SimulatedSub"]
+__all__ = ["BootTimeline", "SimulatedCopter", "SimulatedPlane", "SimulatedRover", "SimulatedSub"]

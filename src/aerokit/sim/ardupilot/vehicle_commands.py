@@ -1,0 +1,133 @@
+"""The commands (MAV_CMD) that each simulated ArduPilot knows, with the real one's conditions and results."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from aerokit.mavlink.enums import MavCmd, MavFrame, MavResult
+from aerokit.mavlink.messages import AutopilotVersion, MissionCurrent
+from aerokit.sim.ardupilot.gimbal_commands import GimbalCommands
+from aerokit.sim.commands import Command, CommandHandler
+
+if TYPE_CHECKING:
+    from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
+
+__all__ = ["common_commands"]
+
+_FORCE_ARM_OR_DISARM, _FORCE_ARM = 21196.0, 2989.0
+_FORCE_REBOOT = 20190226
+
+
+def common_commands(vehicle: ArduPilotVehicle) -> dict[int, CommandHandler]:
+    """MAV_CMD → handler; each kind of vehicle adds its own, and drops what is to be unsupported."""
+    state, setup = _State(vehicle), _Setup(vehicle)
+    return {
+        MavCmd.COMPONENT_ARM_DISARM: state.arm_or_disarm,
+        MavCmd.DO_SET_MODE: state.set_mode,
+        MavCmd.DO_SET_MISSION_CURRENT: state.set_mission_current,
+        MavCmd.DO_FLIGHTTERMINATION: state.terminate,
+        MavCmd.DO_SET_HOME: setup.set_home,
+        MavCmd.GET_HOME_POSITION: setup.get_home,
+        MavCmd.REQUEST_AUTOPILOT_CAPABILITIES: setup.request_capabilities,
+        MavCmd.REQUEST_MESSAGE: vehicle.requests.request_message,
+        MavCmd.SET_MESSAGE_INTERVAL: vehicle.requests.set_interval,
+        MavCmd.GET_MESSAGE_INTERVAL: vehicle.requests.get_interval,
+        MavCmd.RUN_PREARM_CHECKS: setup.run_prearm_checks,
+        MavCmd.PREFLIGHT_REBOOT_SHUTDOWN: setup.reboot,
+        MavCmd.DO_SEND_BANNER: setup.send_banner,
+        **vehicle.calibrations.commands,
+        **GimbalCommands(vehicle).commands,
+    }
+
+
+class _State:
+    """Arming, modes, the place in the mission."""
+
+    def __init__(self, vehicle: ArduPilotVehicle) -> None:
+        self._vehicle = vehicle
+
+    def arm_or_disarm(self, command: Command) -> int:
+        if command.param1 == 1.0:
+            if self._vehicle.motors.is_armed:
+                return MavResult.ACCEPTED
+            done = self._vehicle.arming.arm(force=command.param2 in (_FORCE_ARM, _FORCE_ARM_OR_DISARM))
+        elif command.param1 == 0.0:
+            done = self._vehicle.arming.disarm(force=command.param2 == _FORCE_ARM_OR_DISARM)
+        else:
+            return MavResult.UNSUPPORTED
+        return MavResult.ACCEPTED if done else MavResult.FAILED
+
+    def set_mode(self, command: Command) -> int:
+        return self._vehicle.set_mode_from(int(command.param1), int(command.param2))
+
+    def set_mission_current(self, command: Command) -> int:
+        vehicle, resets = self._vehicle, command.param2 == 1.0
+        if not 0 <= command.param1 < vehicle.missions.commands.count:
+            return MavResult.DENIED
+        if resets:
+            vehicle.mission.reset()
+        if not vehicle.mission.set_current(int(command.param1)):
+            return MavResult.FAILED
+        if resets:
+            vehicle.mission.start_or_resume()
+        vehicle.requests.send_soon(MissionCurrent.ID, command.channel)
+        return MavResult.ACCEPTED
+
+    def terminate(self, command: Command) -> int:
+        if command.param1 <= 0.5:
+            return MavResult.FAILED
+        self._vehicle.arming.disarm()
+        return MavResult.ACCEPTED
+
+
+class _Setup:
+    """Commands that ask for or change settings."""
+
+    def __init__(self, vehicle: ArduPilotVehicle) -> None:
+        self._vehicle = vehicle
+
+    def set_home(self, command: Command) -> int:
+        nav, motion = self._vehicle.navigation, self._vehicle.motion
+        if command.param1 == 1.0 or command.place() == (0, 0):
+            if not nav.has_position:
+                return MavResult.FAILED
+            nav.set_home((motion.north, motion.east, motion.down), lock=True)
+            return MavResult.ACCEPTED
+        if command.param1 != 0.0 or nav.origin is None:
+            return MavResult.FAILED
+        frame = MavFrame.GLOBAL if command.is_long else command.altitude_frame
+        point = self._vehicle.point(*command.place(), command.z, frame)
+        if point is None:
+            return MavResult.DENIED
+        nav.set_home(point, lock=True)
+        return MavResult.ACCEPTED
+
+    def get_home(self, command: Command) -> int:
+        if self._vehicle.navigation.home is None:
+            return MavResult.FAILED
+        self._vehicle.send_home(command.channel)
+        return MavResult.ACCEPTED
+
+    def request_capabilities(self, command: Command) -> int:
+        if command.param1 != 1.0:
+            return MavResult.FAILED
+        self._vehicle.requests.send_soon(AutopilotVersion.ID, command.channel)
+        return MavResult.ACCEPTED
+
+    def run_prearm_checks(self, _: Command) -> int:
+        if self._vehicle.motors.is_armed:
+            return MavResult.TEMPORARILY_REJECTED
+        self._vehicle.arming.report()
+        return MavResult.ACCEPTED
+
+    def reboot(self, command: Command) -> int:
+        if self._vehicle.motors.is_armed and command.y != _FORCE_REBOOT:
+            return MavResult.FAILED
+        if command.param1 not in (1.0, 3.0):
+            return MavResult.UNSUPPORTED
+        self._vehicle.call_later(0.1, self._vehicle.restart)  # the answer still goes out
+        return MavResult.ACCEPTED
+
+    def send_banner(self, _: Command) -> int:
+        self._vehicle.send_banner()
+        return MavResult.ACCEPTED
