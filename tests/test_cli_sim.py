@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from recorded import SHORT
 
 from aerokit.cli import main
 from aerokit.cli.places import EACH_ITS_OWN, each_with_its_own, place_of
@@ -117,6 +118,15 @@ def test_sim_tells_the_name_of_the_other_end(tmp_path: Path, capsys: pytest.Capt
     assert main(["sim", f"pty:{port}", "--speedup", "100", "--duration", "1"]) == 0
     assert f"try: aerokit demo --connect {port}\n" in capsys.readouterr().out
     assert not os.path.lexists(port)
+
+
+def test_a_recording_is_served(capsys: pytest.CaptureFixture[str]) -> None:
+    path = str(SHORT / "px4-quad.tlog")
+    arguments = ["udpout:127.0.0.1:45560", "--speedup", "100", "--duration", "20", "--vehicle", path]
+    assert main(["sim", *arguments]) == 0
+    assert "system 1 on udpout:" in capsys.readouterr().out
+    assert main(["sim", *arguments, "--count", "2"]) == 2
+    assert main(["sim", *arguments, "--picture", "track.svg"]) == 2
 
 
 # --------------------------------------------------------------------------------- pseudo-terminals

@@ -48,8 +48,11 @@ def address_or_form(text: str) -> str:
 
 
 def vehicle_kind(text: str) -> str:
-    """A kind of simulated vehicle."""
+    """A kind of simulated vehicle, or a recording of one."""
     from aerokit.sim.kinds import kind_class
+
+    if text.endswith(".tlog") and Path(text).is_file():
+        return text
 
     try:
         kind_class(text)

@@ -210,5 +210,5 @@ def _add_vehicle(command: argparse.ArgumentParser) -> None:
         type=vehicle_kind,
         default="copter",
         metavar="KIND",
-        help="simulated: copter, plane, rover, sub (ArduPilot), px4, px4_plane (copter)",
+        help="simulated: copter, plane, rover, sub (ArduPilot), px4, px4_plane; or a recording, flight.tlog (copter)",
     )

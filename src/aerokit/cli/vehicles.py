@@ -46,10 +46,15 @@ def simulated_fleet(
     seed: int = 0,
     **options: Any,
 ) -> list[SimulatedVehicle]:
-    """Vehicles side by side from ``home`` eastwards; system ids and seeds count up."""
+    """Vehicles side by side from ``home`` eastwards; system ids and seeds count up.
+
+    The name of a .tlog file gives the one vehicle of that recording, to which nothing else applies.
+    """
     from aerokit.errors import LocalProtocolError
     from aerokit.sim.local_frame import GlobalPoint, LocalFrame
 
+    if name.endswith(".tlog"):
+        return [_recorded(name, count)]
     if system_id + count - 1 > 255:
         raise LocalProtocolError(
             f"{count} vehicles from system id {system_id} on: the last would be above 255"
@@ -66,6 +71,15 @@ def simulated_fleet(
         )
         for number, place in enumerate(places)
     ]
+
+
+def _recorded(path: str, count: int) -> SimulatedVehicle:
+    from aerokit.errors import LocalProtocolError
+    from aerokit.sim.recorded import RecordedVehicle
+
+    if count != 1:
+        raise LocalProtocolError(f"{path} is one vehicle; count = {count}")
+    return RecordedVehicle(path)
 
 
 def _options_of(kind: type) -> set[str]:

@@ -14,11 +14,12 @@ async with simulated_link(copter) as link, aerokit.connect(link) as vehicle:
 
 from __future__ import annotations
 
-from aerokit.sim.ardupilot import BootTimeline, SimulatedCopter, SimulatedRover, SimulatedSub
+from aerokit.sim.ardupilot import BootTimeline, SimulatedCopter, SimulatedPlane, SimulatedRover, SimulatedSub
 from aerokit.sim.faults import CommandFault, Faults
 from aerokit.sim.logs import SimulatedLog
 from aerokit.sim.motion import Wind
 from aerokit.sim.px4 import SimulatedPx4, SimulatedPx4Plane
+from aerokit.sim.recorded import RecordedVehicle
 from aerokit.sim.server import SimulatorServer, open_simulator, simulated_link
 from aerokit.sim.vehicle import ExtraComponent, SimulatedVehicle
 
@@ -27,8 +28,10 @@ __all__ = [
     "CommandFault",
     "ExtraComponent",
     "Faults",
+    "RecordedVehicle",
     "SimulatedCopter",
     "SimulatedLog",
+    "SimulatedPlane",
     "SimulatedPx4",
     "SimulatedPx4Plane",
     "SimulatedRover",
