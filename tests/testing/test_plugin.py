@@ -39,7 +39,7 @@ def run(pytester: pytest.Pytester, source: str, *arguments: str) -> pytest.RunRe
     pytester.makepyfile(source)
     plugin = ("-p", "no:aerokit", "-p", "aerokit.testing.plugin")  # whether it is installed as such or not
     return pytester.runpytest_inprocess(
-        *plugin, "-p", "no:xdist", "-p", "no:cacheprovider", "-W", "error", *arguments
+        *plugin, "-p", "no:xdist", "-p", "no:cacheprovider", "--assert=plain", "-W", "error", *arguments
     )
 
 

@@ -70,22 +70,18 @@ class Stagehand(SimulatedVehicle):
 
 def new_track(vehicle: Any) -> Track:
     """An empty track of a vehicle that stands where it was switched on."""
-    origin = _frame(vehicle).origin
+    origin = vehicle.frame.origin
     home = Position(origin.latitude_e7 * 1e-7, origin.longitude_e7 * 1e-7, origin.altitude_m)
     return Track(home)
 
 
 def true_point(vehicle: Any) -> TrackPoint:
     """Where a simulated vehicle truly is."""
-    frame, motion = _frame(vehicle), vehicle.motion
+    frame, motion = vehicle.frame, vehicle.motion
     place = frame.to_global(motion.north, motion.east, motion.down)
     above = place.altitude_m - frame.origin.altitude_m
     armed, mode = vehicle.is_armed, _mode_name(vehicle.mode)
     return TrackPoint(vehicle.now, place.latitude_e7 * 1e-7, place.longitude_e7 * 1e-7, above, armed, mode)
-
-
-def _frame(vehicle: Any) -> Any:
-    return vehicle.frame if hasattr(vehicle, "frame") else vehicle._frame
 
 
 def _mode_name(mode: Any) -> str:
