@@ -96,6 +96,20 @@ def test_who_chooses_a_mode_takes_over_until_it_gets_worse() -> None:
     assert not px4.is_in_failsafe
 
 
+def test_fresh_set_points_do_not_end_another_failsafe() -> None:
+    px4, station = flying(COM_FAIL_ACT_T=1.0)
+    px4.battery.percent = 100.0
+    for step in range(20):
+        station.send(m.SetPositionTargetLocalNed(0, 1, 1, 1, 0b110111000111, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0))
+        if step == 2:
+            station.command(MavCmd.DO_SET_MODE, 1, 6, 0)
+        elif step == 5:
+            assert px4.mode == (6, 0)
+            px4.battery.percent = 6.0
+        station.run(0.2)
+    assert px4.mode == RTL
+
+
 def test_an_empty_battery_cannot_be_armed() -> None:
     px4 = SimulatedPx4(boot_time_s=1.0, battery_percent=6.0, parameter_count=150)
     station = Station(px4)

@@ -85,6 +85,11 @@ class Failsafes:
         """A boot."""
         self._px4.every(_INTERVAL_S, self.check)
 
+    @property
+    def acts(self) -> bool:
+        """Whether it does more than warn."""
+        return self.action > _A.WARN
+
     # ----------------------------------------------------------------------------------------- links
 
     def _on_heartbeat(self, beat: m.Heartbeat, _: Channel) -> None:

@@ -147,7 +147,6 @@ class SimulatedPx4(SimulatedVehicle):
         self._touched_at = math.nan
         self._landed_at = math.nan
         self._has_flown = False
-        self._failsafe_at = math.nan
         self.flight = self._make_flight()
         self.mission = self._make_mission()
         self.failsafes = Failsafes(self)
@@ -309,7 +308,7 @@ class SimulatedPx4(SimulatedVehicle):
             return False
         self.is_armed, self.throttle = False, 0.0
         self.info(f"Disarmed by {by}")
-        self.is_in_failsafe, self._failsafe_at = False, math.nan
+        self.is_in_failsafe = False
         if self.mode in _NOT_AFTER_LANDING:
             self.switch_to(self._mode_after_landing)
         return True
@@ -320,7 +319,7 @@ class SimulatedPx4(SimulatedVehicle):
             return False
         if mode not in _NOT_AFTER_LANDING:
             self._mode_after_landing = mode
-        self.is_in_failsafe, self._failsafe_at = False, math.nan
+        self.is_in_failsafe = False
         self.intended_mode = mode
         self.failsafes.take_over()
         if mode == self.mode == MISSION:
@@ -362,7 +361,7 @@ class SimulatedPx4(SimulatedVehicle):
     def tick(self, dt: float) -> None:
         """Mode, motion, land detector, battery, failsafe."""
         if self.is_armed:
-            self._check_offboard()
+            self.offboard.watch()
             self.flight.update()
         if self._moves():
             self.motion.step(dt, powered=self.is_armed and not self.faults.motor_failed)
@@ -405,21 +404,6 @@ class SimulatedPx4(SimulatedVehicle):
             self.disarm("landing")
         elif not self._has_flown and 0 < self.parameters["COM_DISARM_PRFLT"] <= self.now - self.armed_at:
             self.disarm("auto preflight disarming")
-
-    def _check_offboard(self) -> None:
-        """Set-points stopped: hold for COM_FAIL_ACT_T, then the action of the version."""
-        if self.intended_mode != OFFBOARD or (self.offboard.is_fresh and not self.is_in_failsafe):
-            return
-        delay = self.parameters["COM_FAIL_ACT_T"]
-        if not self.is_in_failsafe:
-            self.is_in_failsafe, self._failsafe_at = True, self.now
-            self.send_text(MavSeverity.CRITICAL, f"Failsafe activated: entering Hold for {delay:.0f} seconds")
-            self.switch_to(HOLD)
-        elif self.offboard.is_fresh and self.mode == HOLD:
-            self.is_in_failsafe, self._failsafe_at = False, math.nan
-            self.switch_to(OFFBOARD)
-        elif self.mode == HOLD and self.now - self._failsafe_at >= delay:
-            self.switch_to(POSITION if self.version.startswith("1.16") else RTL)
 
     # -------------------------------------------------------------------------------- other messages
 
