@@ -146,7 +146,7 @@ def test_low_and_then_critical() -> None:
     copter.battery.percent = 2.0
     client.run(3.0)
     assert copter.mode.number == CopterMode.LAND
-    assert client.texts[0].startswith("Battery 1 is critical 9.")
+    assert client.texts[0].startswith("Battery 1 is critical 8.")
     assert not healthy(client, Sensor.BATTERY)
 
 
