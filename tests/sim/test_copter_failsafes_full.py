@@ -6,7 +6,7 @@ import pytest
 from simulated_client import Client, flying_copter, ready_copter, set_mode
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult, MavState
+from aerokit.mavlink.enums import CopterMode, MavBatteryChargeState, MavCmd, MavResult, MavState
 from aerokit.mavlink.enums import MavSysStatusSensor as Sensor
 from aerokit.sim import SimulatedCopter
 
@@ -148,6 +148,9 @@ def test_low_and_then_critical() -> None:
     assert copter.mode.number == CopterMode.LAND
     assert client.texts[0].startswith("Battery 1 is critical 8.")
     assert not healthy(client, Sensor.BATTERY)
+    client.command(MavCmd.REQUEST_MESSAGE, m.BatteryStatus.ID)
+    client.run(0.1)
+    assert client.last(m.BatteryStatus).charge_state == MavBatteryChargeState.CRITICAL
 
 
 def test_a_lesser_action_does_not_follow_a_graver_one() -> None:

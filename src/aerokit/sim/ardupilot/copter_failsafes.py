@@ -165,6 +165,7 @@ class CopterFailsafes(Failsafes):
         if level <= self.battery_level:
             return
         self.battery_level, self.battery_is_low = level, True
+        self.battery_is_critical = level == _CRITICAL
         battery, word = copter.battery, "low" if level == _LOW else "critical"
         self._say(f"Battery 1 is {word} {battery.voltage_v:.2f}V used {battery.consumed_mah:.0f} mAh")
         action = int(copter.parameters["BATT_FS_LOW_ACT" if level == _LOW else "BATT_FS_CRT_ACT"])

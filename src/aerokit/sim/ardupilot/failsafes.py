@@ -26,7 +26,7 @@ class Failsafes:
 
     def __init__(self, vehicle: ArduPilotVehicle) -> None:
         self._vehicle = vehicle
-        self.battery_is_low = False
+        self.battery_is_low = self.battery_is_critical = False
         self.ground_station = False
         self.estimator = False
         self.radio = False

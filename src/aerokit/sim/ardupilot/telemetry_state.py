@@ -72,7 +72,9 @@ def _extended_sys_state(vehicle: ArduPilotVehicle) -> m.ExtendedSysState:
 def _battery_status(vehicle: ArduPilotVehicle) -> m.BatteryStatus:
     battery = vehicle.battery
     voltages = (round(battery.voltage_v * 1000), *(_UNKNOWN_CELL,) * 9)
-    low = vehicle.failsafes.battery_is_low
+    charge = MavBatteryChargeState.LOW if vehicle.failsafes.battery_is_low else MavBatteryChargeState.OK
+    if vehicle.failsafes.battery_is_critical:
+        charge = MavBatteryChargeState.CRITICAL
     return m.BatteryStatus(
         0,
         0,
@@ -84,7 +86,7 @@ def _battery_status(vehicle: ArduPilotVehicle) -> m.BatteryStatus:
         round(battery.consumed_wh * 36),
         int(battery.percent),
         0,
-        MavBatteryChargeState.LOW if low else MavBatteryChargeState.OK,
+        charge,
     )
 
 
