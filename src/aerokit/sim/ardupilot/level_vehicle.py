@@ -6,18 +6,17 @@ from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavResult, MavSeverity, SpeedType
-from aerokit.sim.ardupilot.copter_commands import copter_commands
 from aerokit.sim.ardupilot.failsafes import Failsafes
 from aerokit.sim.ardupilot.targets import Targets
 from aerokit.sim.ardupilot.telemetry import BUILDERS
 from aerokit.sim.ardupilot.telemetry_state import heartbeat
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
+from aerokit.sim.ardupilot.vehicle_commands import common_commands
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from aerokit.mavlink.message import Message
-    from aerokit.sim.ardupilot.copter import SimulatedCopter
     from aerokit.sim.ardupilot.mode import VehicleMode
     from aerokit.sim.commands import Command, CommandHandler
 
@@ -25,28 +24,6 @@ __all__ = ["LevelFailsafes", "LevelVehicle"]
 
 _CHANGE_MODE = 1
 _STICK_MIDDLE = 1500
-_SHARED = frozenset(
-    {
-        MavCmd.COMPONENT_ARM_DISARM,
-        MavCmd.DO_SET_MODE,
-        MavCmd.DO_SET_MISSION_CURRENT,
-        MavCmd.DO_FLIGHTTERMINATION,
-        MavCmd.DO_SET_HOME,
-        MavCmd.GET_HOME_POSITION,
-        MavCmd.REQUEST_AUTOPILOT_CAPABILITIES,
-        MavCmd.REQUEST_MESSAGE,
-        MavCmd.SET_MESSAGE_INTERVAL,
-        MavCmd.GET_MESSAGE_INTERVAL,
-        MavCmd.DO_FENCE_ENABLE,
-        MavCmd.RUN_PREARM_CHECKS,
-        MavCmd.PREFLIGHT_REBOOT_SHUTDOWN,
-        MavCmd.DO_SEND_BANNER,
-        MavCmd.PREFLIGHT_CALIBRATION,
-        MavCmd.DO_START_MAG_CAL,
-        MavCmd.DO_ACCEPT_MAG_CAL,
-        MavCmd.DO_CANCEL_MAG_CAL,
-    }
-)
 
 
 class LevelFailsafes(Failsafes):
@@ -132,8 +109,7 @@ class LevelVehicle(ArduPilotVehicle):
 
     def make_commands(self) -> dict[int, CommandHandler]:
         """MAV_CMD → handler."""
-        shared = copter_commands(cast("SimulatedCopter", self))
-        handlers = {number: handler for number, handler in shared.items() if number in _SHARED}
+        handlers = common_commands(self)
         handlers |= {
             MavCmd.MISSION_START: self._start_mission,
             MavCmd.DO_REPOSITION: self._reposition,
