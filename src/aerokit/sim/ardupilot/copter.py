@@ -14,7 +14,7 @@ from aerokit.sim.ardupilot.copter_commands import copter_commands
 from aerokit.sim.ardupilot.copter_failsafes import CopterFailsafes
 from aerokit.sim.ardupilot.fence import Fence, fence_status
 from aerokit.sim.ardupilot.guided import Guided
-from aerokit.sim.ardupilot.modes import AltHold, Brake, Circle, Loiter, Mode, PosHold, Stabilize
+from aerokit.sim.ardupilot.modes import AltHold, Brake, Circle, Loiter, PosHold, Stabilize
 from aerokit.sim.ardupilot.returning import Land, Rtl, SmartRtl
 from aerokit.sim.ardupilot.setpoints import Setpoints
 from aerokit.sim.ardupilot.telemetry import BUILDERS
@@ -49,7 +49,7 @@ class SimulatedCopter(ArduPilotVehicle):
     FRAME: ClassVar[str | None] = "Frame: QUAD/PLUS"
     MAV_TYPE: ClassVar[int] = MavType.QUADROTOR
     CAPABILITIES: ClassVar[int] = 0xFBEF
-    MODES: ClassVar[tuple[type[Mode], ...]] = (
+    MODES = (
         Auto, Stabilize, AltHold, Circle, Loiter, Guided, Land, Rtl, PosHold, Brake, SmartRtl,
     )  # fmt: skip
 

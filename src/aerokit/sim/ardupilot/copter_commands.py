@@ -12,11 +12,10 @@ from aerokit.mavlink.enums import (
     MavResult,
     SpeedType,
 )
-from aerokit.mavlink.messages import AutopilotVersion, MissionCurrent
 from aerokit.sim.ardupilot.auto import Auto
 from aerokit.sim.ardupilot.camera import camera_commands
-from aerokit.sim.ardupilot.gimbal_commands import GimbalCommands
 from aerokit.sim.ardupilot.guided import Guided
+from aerokit.sim.ardupilot.vehicle_commands import common_commands
 from aerokit.sim.commands import Command, CommandHandler
 
 if TYPE_CHECKING:
@@ -24,23 +23,19 @@ if TYPE_CHECKING:
 
 __all__ = ["copter_commands"]
 
-_FORCE_ARM_OR_DISARM, _FORCE_ARM = 21196.0, 2989.0
-_FORCE_REBOOT = 20190226
 _CHANGE_MODE = 1
 
 
 def copter_commands(copter: SimulatedCopter) -> dict[int, CommandHandler]:
     """MAV_CMD → handler."""
-    flight, setup = _Flight(copter), _Setup(copter)
+    flight = _Flight(copter)
     handlers: dict[int, CommandHandler] = {
-        MavCmd.COMPONENT_ARM_DISARM: flight.arm_or_disarm,
-        MavCmd.DO_SET_MODE: flight.set_mode,
+        **common_commands(copter),
         MavCmd.NAV_TAKEOFF: flight.take_off,
         MavCmd.NAV_LAND: lambda _: flight.change_to(CopterMode.LAND),
         MavCmd.NAV_RETURN_TO_LAUNCH: lambda _: flight.change_to(CopterMode.RTL),
         MavCmd.NAV_LOITER_UNLIM: lambda _: flight.change_to(CopterMode.LOITER),
         MavCmd.MISSION_START: flight.start_mission,
-        MavCmd.DO_SET_MISSION_CURRENT: flight.set_mission_current,
         MavCmd.DO_REPOSITION: flight.reposition,
         MavCmd.DO_CHANGE_SPEED: flight.change_speed,
         MavCmd.CONDITION_YAW: flight.turn,
@@ -48,19 +43,7 @@ def copter_commands(copter: SimulatedCopter) -> dict[int, CommandHandler]:
         MavCmd.DO_SET_ROI: flight.look_at,
         MavCmd.DO_SET_ROI_LOCATION: flight.look_at,
         MavCmd.DO_SET_ROI_NONE: flight.look_ahead,
-        MavCmd.DO_FLIGHTTERMINATION: flight.terminate,
-        MavCmd.DO_SET_HOME: setup.set_home,
-        MavCmd.GET_HOME_POSITION: setup.get_home,
-        MavCmd.REQUEST_AUTOPILOT_CAPABILITIES: setup.request_capabilities,
-        MavCmd.REQUEST_MESSAGE: copter.requests.request_message,
-        MavCmd.SET_MESSAGE_INTERVAL: copter.requests.set_interval,
-        MavCmd.GET_MESSAGE_INTERVAL: copter.requests.get_interval,
         MavCmd.DO_FENCE_ENABLE: lambda command: copter.fence.command(command),
-        MavCmd.RUN_PREARM_CHECKS: setup.run_prearm_checks,
-        MavCmd.PREFLIGHT_REBOOT_SHUTDOWN: setup.reboot,
-        MavCmd.DO_SEND_BANNER: setup.send_banner,
-        **copter.calibrations.commands,
-        **GimbalCommands(copter).commands,
         **camera_commands(copter),
     }
     for command in copter.unsupported_commands:
@@ -73,20 +56,6 @@ class _Flight:
 
     def __init__(self, copter: SimulatedCopter) -> None:
         self._copter = copter
-
-    def arm_or_disarm(self, command: Command) -> int:
-        if command.param1 == 1.0:
-            if self._copter.motors.is_armed:
-                return MavResult.ACCEPTED
-            done = self._copter.arming.arm(force=command.param2 in (_FORCE_ARM, _FORCE_ARM_OR_DISARM))
-        elif command.param1 == 0.0:
-            done = self._copter.arming.disarm(force=command.param2 == _FORCE_ARM_OR_DISARM)
-        else:
-            return MavResult.UNSUPPORTED
-        return MavResult.ACCEPTED if done else MavResult.FAILED
-
-    def set_mode(self, command: Command) -> int:
-        return self._copter.set_mode_from(int(command.param1), int(command.param2))
 
     def change_to(self, mode: int) -> int:
         return MavResult.ACCEPTED if self._copter.set_mode(mode) else MavResult.FAILED
@@ -111,19 +80,6 @@ class _Flight:
             if not self._copter.mission.is_running:
                 self._copter.mission.start_or_resume()
         return result
-
-    def set_mission_current(self, command: Command) -> int:
-        copter, resets = self._copter, command.param2 == 1.0
-        if not 0 <= command.param1 < copter.missions.commands.count:
-            return MavResult.DENIED
-        if resets:
-            copter.mission.reset()
-        if not copter.mission.set_current(int(command.param1)):
-            return MavResult.FAILED
-        if resets:
-            copter.mission.start_or_resume()
-        copter.requests.send_soon(MissionCurrent.ID, command.channel)
-        return MavResult.ACCEPTED
 
     def reposition(self, command: Command) -> int:
         """Only as COMMAND_INT: ArduPilot knows no frame for it in COMMAND_LONG."""
@@ -193,63 +149,4 @@ class _Flight:
 
     def look_ahead(self, _: Command) -> int:
         self._copter.yaw.region_of_interest(None)
-        return MavResult.ACCEPTED
-
-    def terminate(self, command: Command) -> int:
-        if command.param1 <= 0.5:
-            return MavResult.FAILED
-        self._copter.arming.disarm()
-        return MavResult.ACCEPTED
-
-
-class _Setup:
-    """Commands that ask for or change settings."""
-
-    def __init__(self, copter: SimulatedCopter) -> None:
-        self._copter = copter
-
-    def set_home(self, command: Command) -> int:
-        nav, motion = self._copter.navigation, self._copter.motion
-        if command.param1 == 1.0 or command.place() == (0, 0):
-            if not nav.has_position:
-                return MavResult.FAILED
-            nav.set_home((motion.north, motion.east, motion.down), lock=True)
-            return MavResult.ACCEPTED
-        if command.param1 != 0.0 or nav.origin is None:
-            return MavResult.FAILED
-        frame = MavFrame.GLOBAL if command.is_long else command.altitude_frame
-        point = self._copter.point(*command.place(), command.z, frame)
-        if point is None:
-            return MavResult.DENIED
-        nav.set_home(point, lock=True)
-        return MavResult.ACCEPTED
-
-    def get_home(self, command: Command) -> int:
-        if self._copter.navigation.home is None:
-            return MavResult.FAILED
-        self._copter.send_home(command.channel)
-        return MavResult.ACCEPTED
-
-    def request_capabilities(self, command: Command) -> int:
-        if command.param1 != 1.0:
-            return MavResult.FAILED
-        self._copter.requests.send_soon(AutopilotVersion.ID, command.channel)
-        return MavResult.ACCEPTED
-
-    def run_prearm_checks(self, _: Command) -> int:
-        if self._copter.motors.is_armed:
-            return MavResult.TEMPORARILY_REJECTED
-        self._copter.arming.report()
-        return MavResult.ACCEPTED
-
-    def reboot(self, command: Command) -> int:
-        if self._copter.motors.is_armed and command.y != _FORCE_REBOOT:
-            return MavResult.FAILED
-        if command.param1 not in (1.0, 3.0):
-            return MavResult.UNSUPPORTED
-        self._copter.call_later(0.1, self._copter.restart)  # the answer still goes out
-        return MavResult.ACCEPTED
-
-    def send_banner(self, _: Command) -> int:
-        self._copter.send_banner()
         return MavResult.ACCEPTED

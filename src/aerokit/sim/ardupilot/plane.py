@@ -50,7 +50,7 @@ class SimulatedPlane(ArduPilotVehicle):
     FIRMWARE: ClassVar[str] = "ArduPlane"
     MAV_TYPE: ClassVar[int] = MavType.FIXED_WING
     CAPABILITIES: ClassVar[int] = 0xF36F
-    MODES: ClassVar[tuple[type[PlaneModeBase], ...]] = (
+    MODES = (
         Manual, Circle, Stabilize, FlyByWireA, FlyByWireB, Cruise, Auto, Rtl, Loiter, TakeOff, Guided, Autoland,
     )  # fmt: skip
 
