@@ -50,10 +50,14 @@ def rejection(px4: SimulatedPx4, items: Sequence[MissionItem]) -> str | None:
 
 def _missing_landing(px4: SimulatedPx4, items: Sequence[MissionItem]) -> str | None:
     """MIS_TKO_LAND_REQ 2, as an aeroplane has it."""
-    needs = round(px4.parameters["MIS_TKO_LAND_REQ"]) == _NEEDS_LANDING
-    if needs and items and not any(item.command in _LANDINGS for item in items):
+    known = "MIS_TKO_LAND_REQ" in px4.parameters  # not in the multicopter's table
+    if known and round(px4.parameters["MIS_TKO_LAND_REQ"]) == _NEEDS_LANDING and _has_no_landing(items):
         return "Landing waypoint/pattern required."
     return None
+
+
+def _has_no_landing(items: Sequence[MissionItem]) -> bool:
+    return bool(items) and not any(item.command in _LANDINGS for item in items)
 
 
 def _height(px4: SimulatedPx4, item: MissionItem) -> float:
