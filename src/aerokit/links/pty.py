@@ -27,7 +27,7 @@ class PtyLink(BaseLink):
     def __init__(self, path: str = "") -> None:
         super().__init__(f"pty:{path}" if path else "pty")
         self._path = path
-        self._ends: tuple[int, ...] = ()
+        self._ends: tuple[int, int] | tuple[()] = ()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._linked = False
 
@@ -47,7 +47,9 @@ class PtyLink(BaseLink):
         import tty
 
         self._loop = asyncio.get_running_loop()
-        self._ends = ours, theirs = os.openpty()  # both stay open: else ours fails while nobody has theirs open
+        ours, theirs = self._ends = (
+            os.openpty()
+        )  # theirs stays open: else ours fails while nobody has it open
         tty.setraw(theirs)
         os.set_blocking(ours, False)
         name = os.ttyname(theirs)
