@@ -24,7 +24,8 @@ from aerokit.testing import run_virtual
 KINDS = [
     kind
     for _, kind in inspect.getmembers(aerokit.sim, inspect.isclass)
-    if issubclass(kind, SimulatedVehicle) and kind is not SimulatedVehicle
+    if issubclass(kind, SimulatedVehicle)
+    and {"seed", "boot_time_s"} <= set(inspect.signature(kind).parameters)
 ]
 END_S = 6.0
 FORCE = 21196.0
