@@ -27,7 +27,7 @@ class PtyLink(BaseLink):
     def __init__(self, path: str = "") -> None:
         super().__init__(f"pty:{path}" if path else "pty")
         self._path = path
-        self._ends: tuple[int, int] | tuple[()] = ()
+        self._ends: tuple[int, ...] = ()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._linked = False
 
