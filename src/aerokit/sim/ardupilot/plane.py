@@ -108,11 +108,11 @@ class SimulatedPlane(ArduPilotVehicle):
 
     @property
     def base_mode(self) -> int:
-        """As the mode has it."""
+        """As the mode has it; the radio is heard."""
         mode = self.mode
         flags = int(mode.flags) if isinstance(mode, PlaneModeBase) else 0
         armed = MavModeFlag.SAFETY_ARMED if self.motors.is_armed else 0
-        return flags | MavModeFlag.CUSTOM_MODE_ENABLED | armed
+        return flags | MavModeFlag.MANUAL_INPUT_ENABLED | MavModeFlag.CUSTOM_MODE_ENABLED | armed
 
     @property
     def cruise_m_s(self) -> float:
