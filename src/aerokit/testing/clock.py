@@ -34,7 +34,6 @@ The rules:
 from __future__ import annotations
 
 import asyncio
-import math
 import selectors
 import threading
 from collections.abc import Callable, Coroutine, Mapping
@@ -88,16 +87,6 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
             await super().shutdown_default_executor()
         finally:
             self._outside_calls -= 1
-
-    def quiet_until(self) -> float:
-        """Before which time nothing else will run; now when something waits already or may come from outside.
-
-        For who runs something of its own by timers, and need not wake the loop for steps that nobody can see.
-        """
-        if self._ready or self._outside_calls or len(self._selector_map()) != self._own_sources:  # type: ignore[attr-defined]
-            return self._now
-        timers: list[asyncio.TimerHandle] = self._scheduled  # type: ignore[attr-defined]
-        return timers[0].when() if timers else math.inf
 
     def wait_for_events(self, poll: Callable[[float], list[Any]], timeout: float | None) -> list[Any]:
         """What the selector does instead of waiting ``timeout`` virtual seconds (None: for ever)."""
