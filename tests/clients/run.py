@@ -3,6 +3,7 @@
 ``python run.py [--speedup 3] [--client pymavlink …] [--kind copter …]``; ends with 1 when one of them failed.
 """
 
+# ruff: noqa: T201
 from __future__ import annotations
 
 import argparse
@@ -48,12 +49,14 @@ def play(client: str, kind: str, speedup: float) -> tuple[list[str], str]:
         try:
             done = subprocess.run(
                 command, cwd=folder, timeout=LONGEST_S, check=False, text=True, stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+                capture_output=True,
             )  # fmt: skip
         except subprocess.TimeoutExpired as error:
             output = error.stdout or b""
             return _steps(output.decode() if isinstance(output, bytes) else output), f"over {LONGEST_S} s"
-    return _steps(done.stdout), "" if done.returncode == 0 else done.stderr[-2000:] or f"exit {done.returncode}"
+    return _steps(done.stdout), "" if done.returncode == 0 else done.stderr[
+        -2000:
+    ] or f"exit {done.returncode}"
 
 
 def _steps(output: str) -> list[str]:
@@ -80,7 +83,9 @@ def main() -> int:
             print(f"{name}\t{kind}\t{'passed' if is_good else 'FAILED'}\t{took:.0f} s\t{words}", flush=True)
             if not is_good:
                 print(error or "not every step was done", flush=True)
-    print(f"{len(arguments.client or CLIENTS) * len(arguments.kind or KINDS) - failed} passed, {failed} failed")
+    print(
+        f"{len(arguments.client or CLIENTS) * len(arguments.kind or KINDS) - failed} passed, {failed} failed"
+    )
     return 1 if failed else 0
 
 

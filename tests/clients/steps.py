@@ -4,6 +4,7 @@ A client is started as ``python with_….py KIND PORT`` and listens on the UDP p
 that is done and ends with 0 when all are.
 """
 
+# ruff: noqa: T201
 from __future__ import annotations
 
 import sys

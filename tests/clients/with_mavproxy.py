@@ -54,7 +54,9 @@ class Console:
         return self.text[self._seen :]
 
     def wait(self, pattern: str, timeout: float = 60.0) -> re.Match[str]:
-        wait_for(lambda: re.search(pattern, self.answer) is not None, f"{pattern} in {self.text[-1500:]}", timeout)
+        wait_for(
+            lambda: re.search(pattern, self.answer) is not None, f"{pattern} in {self.text[-1500:]}", timeout
+        )
         found = re.search(pattern, self.answer)
         assert found is not None
         return found

@@ -75,14 +75,19 @@ async def fly(kind: str, port: int) -> None:
     assert [each.x for each in back[1:]] == [each.x for each in items[1:]], back
     steps.done("download", len(back))
 
-    if kind == "px4":  # of ArduPilot, real or not, MAVSDK learns no more of its health than that home is known
+    await telemetry.set_rate_position(5.0)  # ArduPilot streams no position unasked, and MAVSDK does not ask
+    if (
+        kind == "px4"
+    ):  # of ArduPilot, real or not, MAVSDK learns no more of its health than that home is known
         await until(telemetry.subscribe_health_all_ok(), bool)
     await insist(lambda: action.set_takeoff_altitude(ALTITUDE_M))
     await insist(action.arm)
     await until(telemetry.subscribe_armed(), bool)
     steps.done("arm")
     await insist(action.takeoff)
-    there = await until(telemetry.subscribe_position(), lambda each: each.relative_altitude_m > ALTITUDE_M - 1)
+    there = await until(
+        telemetry.subscribe_position(), lambda each: each.relative_altitude_m > ALTITUDE_M - 1
+    )
     steps.done("take off", f"{there.relative_altitude_m:.1f} m")
     await insist(raw.start_mission)
     await until(telemetry.subscribe_position(), near_the_end(kind))

@@ -98,7 +98,9 @@ def download(client: Client) -> int:
     assert count == len(items), count
     for number in range(count):
         link.mav.mission_request_int_send(link.target_system, 1, number, M.MAV_MISSION_TYPE_MISSION)
-        got = client.wait("MISSION_ITEM_INT", until=lambda each, number=number: each.seq == number, timeout=10)
+        got = client.wait(
+            "MISSION_ITEM_INT", until=lambda each, number=number: each.seq == number, timeout=10
+        )
         assert got.command == items[number].command, got
         if number:
             assert abs(got.x - items[number].latitude * 1e7) <= 1, got
@@ -113,7 +115,9 @@ def take_off(client: Client) -> None:
         return
     here = client.wait("GLOBAL_POSITION_INT")
     nan = float("nan")
-    client.insist(M.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, nan, here.lat / 1e7, here.lon / 1e7, here.alt / 1000 + ALTITUDE_M)
+    client.insist(
+        M.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, nan, here.lat / 1e7, here.lon / 1e7, here.alt / 1000 + ALTITUDE_M
+    )
 
 
 def fly(client: Client) -> None:
