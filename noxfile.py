@@ -110,7 +110,7 @@ def dronekit_itself(session: nox.Session) -> None:
 def clients(session: nox.Session) -> None:
     """Let MAVProxy, MAVSDK and pymavlink fly the simulated vehicles, and print the table; three minutes."""
     session.install("-e", ".", "MAVProxy", "mavsdk>=4", "pymavlink", "future")
-    session.run("python", "tests/clients/run.py", *session.posargs)
+    session.run("python", "tests/clients/fly.py", *session.posargs)
 
 
 @nox.session

@@ -48,6 +48,8 @@ def loop_threads() -> list[threading.Thread]:
 @pytest.fixture(autouse=True)
 def _no_thread_is_left() -> Iterator[None]:
     yield
+    for thread in loop_threads():
+        thread.join(10.0)  # closed by another thread a moment ago
     assert not loop_threads()
 
 

@@ -22,6 +22,7 @@ T = TypeVar("T")
 
 async def insist(action: Callable[[], Awaitable[T]]) -> T:
     """Until the vehicle is ready for it."""
+    refusal: MavsdkError | None = None
     for _ in range(60):
         try:
             return await action()

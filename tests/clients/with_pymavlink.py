@@ -13,7 +13,7 @@ os.environ["MAVLINK20"] = "1"
 from pymavlink import mavutil
 from steps import ALTITUDE_M, PARAMETERS, Steps, mission
 
-M = mavutil.mavlink
+M: Any = mavutil.mavlink
 
 
 class Client:

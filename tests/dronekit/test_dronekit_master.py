@@ -188,8 +188,11 @@ def connection() -> Iterator[MAVConnection]:
 
 
 @pytest.fixture
-def connected(connection: MAVConnection, request: pytest.FixtureRequest) -> Iterator[tuple[Master, Vehicle]]:
+def connected(
+    connection: MAVConnection, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[tuple[Master, Vehicle]]:
     """With a vehicle that was heard: a copter with ArduPilot, if the test does not want another one."""
+    monkeypatch.setattr(mavutil, "mavlink", v20)  # whatever dialect other programs of this process have set
     kind = getattr(request, "param", (2, 3))
     assert connection.master.target_component == 0
     assert connection.master.mode_mapping() is None

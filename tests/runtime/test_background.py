@@ -118,7 +118,10 @@ async def test_what_such_work_raises_comes_out_and_is_the_cause_of_a_cancellatio
     with pytest.raises(asyncio.CancelledError) as cancelled:
         await task
     raised: BaseException | None = cancelled.value
-    if sys.version_info < (3, 11):  # there, who awaits the task gets another CancelledError, and this one behind it
+    if sys.version_info < (
+        3,
+        11,
+    ):  # there, who awaits the task gets another CancelledError, and this one behind it
         raised = cancelled.value.__context__
     assert raised is not None
     assert isinstance(raised.__cause__, ValueError)

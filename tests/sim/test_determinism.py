@@ -105,7 +105,9 @@ def made(kind: type[SimulatedVehicle], seed: int) -> SimulatedVehicle:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@settings(max_examples=8, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(
+    max_examples=8, deadline=None, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large]
+)
 @given(calls=scripts, cuts=st.lists(instants, max_size=30))
 def test_steps_may_be_cut_at_will(
     kind: type[SimulatedVehicle], calls: list[tuple[float, Message]], cuts: list[float]

@@ -12,8 +12,8 @@ from .address import ACCEPTED_FORMS, LinkAddress, parse_address
 from .create import create_link
 from .link import Link, Peer, Receiver
 from .memory import MemoryLink, memory_link_pair
-from .reconnecting import Interruptible, ReconnectingLink
 from .pty import PtyLink
+from .reconnecting import Interruptible, ReconnectingLink
 from .replay import Replay
 from .serial import SerialLink
 from .tcp import TcpConnect, TcpListen

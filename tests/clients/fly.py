@@ -1,6 +1,6 @@
 """Let clients that know nothing of aerokit fly the simulated vehicles, each in a process of its own; print a table.
 
-``python run.py [--speedup 3] [--client pymavlink …] [--kind copter …]``; ends with 1 when one of them failed.
+``python fly.py [--speedup 3] [--client pymavlink …] [--kind copter …]``; ends with 1 when one of them failed.
 """
 
 # ruff: noqa: T201
