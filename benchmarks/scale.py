@@ -114,9 +114,9 @@ class _Watched(SimulatorServer):
         super()._run(now)
         self.spent_s += time.thread_time() - started
 
-    def hear(self, *arguments: Any) -> None:
+    def hear(self, data: bytes, peer: Any, port: Any) -> None:
         started = time.thread_time()
-        super().hear(*arguments)
+        super().hear(data, peer, port)
         self.spent_s += time.thread_time() - started
 
 
