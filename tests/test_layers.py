@@ -10,7 +10,7 @@ import pytest
 SOURCE = Path(__file__).parent.parent / "src" / "aerokit"
 
 FLOORS = [
-    {"errors", "snapshot", "whole_file"},
+    {"errors", "lazy", "snapshot", "whole_file"},
     {"geo"},
     {"position"},
     {"mavlink"},

@@ -16,8 +16,9 @@ asyncio.run(main())
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import TYPE_CHECKING
+
+from aerokit.lazy import lazy_names
 
 if TYPE_CHECKING:
     from aerokit import errors, events
@@ -78,14 +79,4 @@ _HOMES = {
     "open_connection": "aerokit.runtime.opening",
 }
 
-
-def __getattr__(name: str) -> object:
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    home = import_module(_HOMES[name])
-    value = globals()[name] = getattr(home, name, home)  # the name in its module, or the module
-    return value
-
-
-def __dir__() -> list[str]:
-    return [*globals(), *__all__]
+__getattr__, __dir__ = lazy_names(__name__, _HOMES, __all__)

@@ -11,6 +11,7 @@ import pytest
 import aerokit
 from aerokit import Position
 from aerokit.errors import CommandRejected
+from aerokit.events import StatusTextReceived
 from aerokit.mavlink.enums import MavCmd, MavResult, MavType, PlaneMode
 from aerokit.mavlink.messages import Heartbeat
 from aerokit.missions import Mission, MissionItem
@@ -133,3 +134,11 @@ async def test_flies_a_mission_and_lands() -> None:
         assert not plane.is_armed
         assert abs(plane.wing.east) < 20.0
         assert abs(plane.wing.north) < 60.0
+
+
+async def test_says_when_its_throttle_is_armed() -> None:
+    async with flown(SimulatedPlane(boot_time_s=1.0)) as vehicle:
+        with vehicle.subscribe(StatusTextReceived, capacity=10) as texts:
+            await vehicle.arm()
+            await vehicle.disarm()
+            assert [(await anext(texts)).text for _ in range(2)] == ["Throttle armed", "Throttle disarmed"]

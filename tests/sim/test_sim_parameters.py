@@ -22,7 +22,6 @@ from aerokit.parameters import (
 )
 from aerokit.parameters.px4_hash import px4_hash
 from aerokit.sim import SimulatedCopter, SimulatedPx4
-from aerokit.sim.ardupilot.copter_parameters import copter_parameters
 from aerokit.sim.ardupilot.parameter_server import rounded
 from aerokit.sim.ardupilot.parameter_tables import KINDS, parameters_of
 from aerokit.sim.file_tree import FileFault
@@ -66,10 +65,10 @@ def bits_of(message: m.ParamValue) -> int:
 
 
 def test_the_tables_are_those_of_the_firmwares() -> None:
-    assert (len(copter_parameters()), len(px4_parameters())) == (1349, 889)
-    assert len(copter_parameters(100)) == 100
+    assert (len(parameters_of("copter")), len(px4_parameters())) == (1349, 889)
+    assert len(parameters_of("copter", 100)) == 100
     assert px4_parameters().names == tuple(sorted(px4_parameters().names))
-    copter = copter_parameters()
+    copter = parameters_of("copter")
     assert sum(copter.default(name) != copter[name] for name in copter) == 41
     assert all(math.isfinite(copter[name]) for name in copter)
 
@@ -88,7 +87,7 @@ def test_each_ardupilot_firmware_has_a_table() -> None:
 
 
 def test_switching_a_feature_on_changes_the_count() -> None:
-    copter = copter_parameters()
+    copter = parameters_of("copter")
     assert copter["BATT2_CAPACITY"] == 3300, "there by name at any time"
     assert "BATT2_CAPACITY" not in copter.names
     copter["BATT2_MONITOR"] = 4
@@ -184,7 +183,7 @@ def test_faults_clamp_protect_and_mute() -> None:
 
 @pytest.mark.parametrize("block", [239, 80, 100, 17])
 def test_the_pack_is_what_the_firmware_packs(block: int) -> None:
-    parameters = copter_parameters()
+    parameters = parameters_of("copter")
     rows = [parameters.row(name) for name in parameters.names]
     for whole in (False, True):
         packed = packed_parameters(rows, len(rows), block, with_defaults=True, whole_defaults=whole)

@@ -21,12 +21,11 @@ from __future__ import annotations
 
 import collections
 import copy
-import importlib
 import logging
 import math
 import struct
 import time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from aerokit.dronekit import monotonic, util
 from aerokit.dronekit.alias import install
@@ -47,6 +46,7 @@ from aerokit.dronekit.values import (
     Wind,
 )
 from aerokit.dronekit.version import Capabilities, Version
+from aerokit.lazy import lazy_names
 
 if TYPE_CHECKING:
     from pymavlink import mavwp
@@ -120,14 +120,4 @@ _LATER = {
 }
 """Where a name is from that is imported when a program first uses it: what is behind them takes most of the time."""
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _LATER:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module = importlib.import_module(_LATER[name])
-    value = globals()[name] = module if name.islower() else getattr(module, name)
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+__getattr__, __dir__ = lazy_names(__name__, _LATER, __all__)

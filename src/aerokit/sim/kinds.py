@@ -1,7 +1,4 @@
-"""The kinds of simulated vehicles by name, for command lines, fixtures and configuration files.
-
-A kind whose class this installation does not have is not among `kind_names`.
-"""
+"""The kinds of simulated vehicles by name, for command lines, fixtures and configuration files."""
 
 from __future__ import annotations
 
@@ -15,27 +12,28 @@ if TYPE_CHECKING:
 
 __all__ = ["kind_class", "kind_names", "simulated"]
 
-_KINDS: dict[str, tuple[str, str, dict[str, Any]]] = {
-    "copter": ("aerokit.sim.ardupilot", "SimulatedCopter", {}),
-    "plane": ("aerokit.sim.ardupilot", "SimulatedPlane", {}),
-    "rover": ("aerokit.sim.ardupilot", "SimulatedRover", {}),
-    "sub": ("aerokit.sim.ardupilot", "SimulatedSub", {}),
-    "px4": ("aerokit.sim.px4", "SimulatedPx4", {}),
-    "px4_plane": ("aerokit.sim.px4", "SimulatedPx4Plane", {}),
+_KINDS = {
+    "copter": ("aerokit.sim.ardupilot", "SimulatedCopter"),
+    "plane": ("aerokit.sim.ardupilot", "SimulatedPlane"),
+    "rover": ("aerokit.sim.ardupilot", "SimulatedRover"),
+    "sub": ("aerokit.sim.ardupilot", "SimulatedSub"),
+    "px4": ("aerokit.sim.px4", "SimulatedPx4"),
+    "px4_plane": ("aerokit.sim.px4", "SimulatedPx4Plane"),
 }
-"""Name → module, class, and what the class is told besides."""
+"""Name → module and class; imported when it is asked for."""
 
 
 def kind_names() -> tuple[str, ...]:
     """What `simulated` takes, such as "copter" and "px4"."""
-    return tuple(name for name in _KINDS if _find(name) is not None)
+    return tuple(_KINDS)
 
 
 def kind_class(name: str) -> type[SimulatedVehicle]:
     """The class of a kind; LocalProtocolError lists the kinds when there is none of that name."""
-    found = _find(name)
-    if found is None:
-        raise LocalProtocolError(f"vehicle = {name!r} is not one of: {', '.join(kind_names())}")
+    if name not in _KINDS:
+        raise LocalProtocolError(f"vehicle = {name!r} is not one of: {', '.join(_KINDS)}")
+    module, class_name = _KINDS[name]
+    found: type[SimulatedVehicle] = getattr(import_module(module), class_name)
     return found
 
 
@@ -44,12 +42,4 @@ def simulated(name: str, **options: Any) -> SimulatedVehicle:
 
     LocalProtocolError when there is no such kind, TypeError when its class has no such option.
     """
-    return kind_class(name)(**{**_KINDS[name][2], **options})
-
-
-def _find(name: str) -> type[SimulatedVehicle] | None:
-    if name not in _KINDS:
-        return None
-    module, class_name, _ = _KINDS[name]
-    found: type[SimulatedVehicle] | None = getattr(import_module(module), class_name, None)
-    return found
+    return kind_class(name)(**options)

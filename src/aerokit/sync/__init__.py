@@ -22,8 +22,9 @@ place. Exceptions come through as they are. Any thread may call; functions that 
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import TYPE_CHECKING
+
+from aerokit.lazy import lazy_names
 
 if TYPE_CHECKING:
     from aerokit.sync.cells import StateCell
@@ -44,23 +45,14 @@ __all__ = [
 ]
 
 _HOMES = {
-    "Connection": "connection",
-    "Guided": "guided",
-    "SetpointStream": "guided",
-    "StateCell": "cells",
-    "Subscription": "subscription",
-    "Vehicle": "vehicle",
-    "connect": "vehicle",
-    "open_connection": "connection",
+    "Connection": "aerokit.sync.connection",
+    "Guided": "aerokit.sync.guided",
+    "SetpointStream": "aerokit.sync.guided",
+    "StateCell": "aerokit.sync.cells",
+    "Subscription": "aerokit.sync.subscription",
+    "Vehicle": "aerokit.sync.vehicle",
+    "connect": "aerokit.sync.vehicle",
+    "open_connection": "aerokit.sync.connection",
 }
 
-
-def __getattr__(name: str) -> object:
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = globals()[name] = getattr(import_module(f"aerokit.sync.{_HOMES[name]}"), name)
-    return value
-
-
-def __dir__() -> list[str]:
-    return [*globals(), *__all__]
+__getattr__, __dir__ = lazy_names(__name__, _HOMES, __all__)

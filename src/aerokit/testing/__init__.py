@@ -6,8 +6,9 @@ An event loop on virtual time (`run_virtual`), simulated vehicles with faults an
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import TYPE_CHECKING
+
+from aerokit.lazy import lazy_names
 
 if TYPE_CHECKING:
     from .clock import VIRTUAL_BACKEND, DeadlockError, VirtualClockLoop, run_virtual
@@ -34,28 +35,19 @@ __all__ = [
 
 # Imported when first asked for: pytest imports this package with its plugin in every project.
 _HOMES = {
-    "VIRTUAL_BACKEND": "clock",
-    "DeadlockError": "clock",
-    "FaultInjector": "fault_verbs",
-    "Fleet": "flights",
-    "Flight": "flights",
-    "ServedFlight": "served",
-    "Track": "track",
-    "TrackPoint": "track",
-    "VirtualClockLoop": "clock",
-    "open_fleet": "flights",
-    "open_flight": "flights",
-    "run_virtual": "clock",
-    "serve_flight": "served",
+    "VIRTUAL_BACKEND": "aerokit.testing.clock",
+    "DeadlockError": "aerokit.testing.clock",
+    "FaultInjector": "aerokit.testing.fault_verbs",
+    "Fleet": "aerokit.testing.flights",
+    "Flight": "aerokit.testing.flights",
+    "ServedFlight": "aerokit.testing.served",
+    "Track": "aerokit.testing.track",
+    "TrackPoint": "aerokit.testing.track",
+    "VirtualClockLoop": "aerokit.testing.clock",
+    "open_fleet": "aerokit.testing.flights",
+    "open_flight": "aerokit.testing.flights",
+    "run_virtual": "aerokit.testing.clock",
+    "serve_flight": "aerokit.testing.served",
 }
 
-
-def __getattr__(name: str) -> object:
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = globals()[name] = getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
-    return value
-
-
-def __dir__() -> list[str]:
-    return [*globals(), *__all__]
+__getattr__, __dir__ = lazy_names(__name__, _HOMES, __all__)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import CopterMode, MavModeFlag, MavSeverity, MavType
+from aerokit.mavlink.enums import MavModeFlag, MavSeverity, MavType
 from aerokit.sim.ardupilot.auto import Auto
 from aerokit.sim.ardupilot.copter_arming import CopterArming
 from aerokit.sim.ardupilot.copter_commands import copter_commands
@@ -105,16 +105,12 @@ class SimulatedCopter(ArduPilotVehicle):
     @property
     def guided(self) -> Guided:
         """GUIDED."""
-        mode = self._modes[CopterMode.GUIDED]
-        assert isinstance(mode, Guided)
-        return mode
+        return self.mode_of(Guided)
 
     @property
     def auto(self) -> Auto:
         """AUTO."""
-        mode = self._modes[CopterMode.AUTO]
-        assert isinstance(mode, Auto)
-        return mode
+        return self.mode_of(Auto)
 
     @property
     def base_mode(self) -> int:

@@ -29,12 +29,12 @@ _CHANGE_MODE = 1
 def copter_commands(copter: SimulatedCopter) -> dict[int, CommandHandler]:
     """MAV_CMD → handler."""
     flight = _Flight(copter)
-    handlers: dict[int, CommandHandler] = {
+    return {
         **common_commands(copter),
         MavCmd.NAV_TAKEOFF: flight.take_off,
-        MavCmd.NAV_LAND: lambda _: flight.change_to(CopterMode.LAND),
-        MavCmd.NAV_RETURN_TO_LAUNCH: lambda _: flight.change_to(CopterMode.RTL),
-        MavCmd.NAV_LOITER_UNLIM: lambda _: flight.change_to(CopterMode.LOITER),
+        MavCmd.NAV_LAND: lambda _: copter.change_to(CopterMode.LAND),
+        MavCmd.NAV_RETURN_TO_LAUNCH: lambda _: copter.change_to(CopterMode.RTL),
+        MavCmd.NAV_LOITER_UNLIM: lambda _: copter.change_to(CopterMode.LOITER),
         MavCmd.MISSION_START: flight.start_mission,
         MavCmd.DO_REPOSITION: flight.reposition,
         MavCmd.DO_CHANGE_SPEED: flight.change_speed,
@@ -46,9 +46,6 @@ def copter_commands(copter: SimulatedCopter) -> dict[int, CommandHandler]:
         MavCmd.DO_FENCE_ENABLE: lambda command: copter.fence.command(command),
         **camera_commands(copter),
     }
-    for command in copter.unsupported_commands:
-        handlers.pop(command, None)
-    return handlers
 
 
 class _Flight:
@@ -56,9 +53,6 @@ class _Flight:
 
     def __init__(self, copter: SimulatedCopter) -> None:
         self._copter = copter
-
-    def change_to(self, mode: int) -> int:
-        return MavResult.ACCEPTED if self._copter.set_mode(mode) else MavResult.FAILED
 
     def take_off(self, command: Command) -> int:
         copter = self._copter
@@ -74,7 +68,7 @@ class _Flight:
         """From the present place in the mission; on the ground this is what lets a take-off begin."""
         if command.param1 or command.param2:
             return MavResult.DENIED
-        result = self.change_to(CopterMode.AUTO)
+        result = self._copter.change_to(CopterMode.AUTO)
         if result == MavResult.ACCEPTED:
             self._copter.auto.may_lift_off = self._copter.is_armed
             if not self._copter.mission.is_running:

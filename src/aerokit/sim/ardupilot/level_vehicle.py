@@ -5,11 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavCmd, MavResult, MavSeverity, SpeedType
+from aerokit.mavlink.enums import MavCmd, MavResult, SpeedType
 from aerokit.sim.ardupilot.failsafes import Failsafes
 from aerokit.sim.ardupilot.targets import Targets
 from aerokit.sim.ardupilot.telemetry import BUILDERS
-from aerokit.sim.ardupilot.telemetry_state import heartbeat
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 from aerokit.sim.ardupilot.vehicle_commands import common_commands
 
@@ -46,10 +45,6 @@ class LevelVehicle(ArduPilotVehicle):
 
     # ----------------------------------------------------------------------------- what a kind says
 
-    def refusal(self, mode: VehicleMode) -> str:
-        """What it says when it does not go into a mode."""
-        raise NotImplementedError
-
     def own_commands(self) -> dict[int, CommandHandler]:
         """Commands beside those of every ArduPilot."""
         return {}
@@ -73,24 +68,6 @@ class LevelVehicle(ArduPilotVehicle):
         """The throttle stick rests in the middle."""
         self.rc[2] = _STICK_MIDDLE
 
-    def set_mode(self, number: int) -> bool:
-        """Change the mode if the vehicle may; says why not. A change is told by a heartbeat at once."""
-        if number == self.mode.number:
-            return True
-        mode = self._modes.get(number)
-        if mode is None:
-            self.send_text(MavSeverity.WARNING, f"No such mode {number}")
-            return False
-        armed = self.motors.is_armed
-        lost = armed and mode.needs_position and not self.navigation.has_position
-        if lost or not mode.enter(force=not armed):
-            self.send_text(MavSeverity.WARNING, self.refusal(mode))
-            return False
-        self.mode.leave()
-        self.mode = mode
-        self.call_later(0.0, lambda: self.send(heartbeat(self)))
-        return True
-
     def tick(self, dt: float) -> None:
         """Mode, motors, motion, battery."""
         if self.motors.is_armed:
@@ -109,18 +86,13 @@ class LevelVehicle(ArduPilotVehicle):
 
     def make_commands(self) -> dict[int, CommandHandler]:
         """MAV_CMD → handler."""
-        handlers = common_commands(self)
-        handlers |= {
+        return {
+            **common_commands(self),
             MavCmd.MISSION_START: self._start_mission,
             MavCmd.DO_REPOSITION: self._reposition,
             MavCmd.DO_CHANGE_SPEED: self._change_speed,
+            **self.own_commands(),
         }
-        handlers |= self.own_commands()
-        return {n: each for n, each in handlers.items() if n not in self.unsupported_commands}
-
-    def change_to(self, mode: int) -> int:
-        """The MAV_RESULT of a command that stands for a mode."""
-        return MavResult.ACCEPTED if self.set_mode(mode) else MavResult.FAILED
 
     def _start_mission(self, command: Command) -> int:
         if command.param1 or command.param2:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from aerokit.mavlink.enums import MavModeFlag, MavType, PlaneMode
+from aerokit.mavlink.enums import MavModeFlag, MavType
 from aerokit.sim.ardupilot.arming import Arming
 from aerokit.sim.ardupilot.failsafes import Failsafes
 from aerokit.sim.ardupilot.motors import Motors
@@ -95,16 +95,12 @@ class SimulatedPlane(ArduPilotVehicle):
     @property
     def guided(self) -> Guided:
         """GUIDED."""
-        mode = self._modes[PlaneMode.GUIDED]
-        assert isinstance(mode, Guided)
-        return mode
+        return self.mode_of(Guided)
 
     @property
     def auto(self) -> Auto:
         """AUTO."""
-        mode = self._modes[PlaneMode.AUTO]
-        assert isinstance(mode, Auto)
-        return mode
+        return self.mode_of(Auto)
 
     @property
     def base_mode(self) -> int:
@@ -149,8 +145,8 @@ class SimulatedPlane(ArduPilotVehicle):
 class PlaneArming(Arming):
     """An aeroplane's words."""
 
-    armed_text = "Throttle armed"
-    disarmed_text = "Throttle disarmed"
+    ARMED_TEXT = "Throttle armed"
+    DISARMED_TEXT = "Throttle disarmed"
 
 
 class _Engine(Motors):

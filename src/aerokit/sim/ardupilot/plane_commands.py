@@ -20,18 +20,15 @@ _CHANGE_MODE = 1
 def plane_commands(plane: SimulatedPlane) -> dict[int, CommandHandler]:
     """MAV_CMD → handler. NAV_TAKEOFF is for aeroplanes with lifting rotors; there is no command to land."""
     flight = _Flight(plane)
-    handlers: dict[int, CommandHandler] = {
+    return {
         **common_commands(plane),
         MavCmd.NAV_TAKEOFF: lambda _: MavResult.FAILED,
-        MavCmd.NAV_RETURN_TO_LAUNCH: lambda _: flight.change_to(PlaneMode.RTL),
-        MavCmd.NAV_LOITER_UNLIM: lambda _: flight.change_to(PlaneMode.LOITER),
+        MavCmd.NAV_RETURN_TO_LAUNCH: lambda _: plane.change_to(PlaneMode.RTL),
+        MavCmd.NAV_LOITER_UNLIM: lambda _: plane.change_to(PlaneMode.LOITER),
         MavCmd.MISSION_START: flight.start_mission,
         MavCmd.DO_REPOSITION: flight.reposition,
         MavCmd.DO_CHANGE_SPEED: flight.change_speed,
     }
-    for command in plane.unsupported_commands:
-        handlers.pop(command, None)
-    return handlers
 
 
 class _Flight:
@@ -40,13 +37,10 @@ class _Flight:
     def __init__(self, plane: SimulatedPlane) -> None:
         self._plane = plane
 
-    def change_to(self, mode: int) -> int:
-        return MavResult.ACCEPTED if self._plane.set_mode(mode) else MavResult.FAILED
-
     def start_mission(self, command: Command) -> int:
         if command.param1 or command.param2:
             return MavResult.DENIED
-        return self.change_to(PlaneMode.AUTO)
+        return self._plane.change_to(PlaneMode.AUTO)
 
     def reposition(self, command: Command) -> int:
         """Only as COMMAND_INT; param 3 is the radius of the circle, param 4 not 0 is anticlockwise."""

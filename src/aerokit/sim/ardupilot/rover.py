@@ -166,16 +166,12 @@ class SimulatedRover(LevelVehicle):
     @property
     def guided(self) -> RoverGuided:
         """GUIDED."""
-        mode = self._modes[RoverMode.GUIDED]
-        assert isinstance(mode, RoverGuided)
-        return mode
+        return self.mode_of(RoverGuided)
 
     @property
     def auto(self) -> RoverAuto:
         """AUTO."""
-        mode = self._modes[RoverMode.AUTO]
-        assert isinstance(mode, RoverAuto)
-        return mode
+        return self.mode_of(RoverAuto)
 
     @property
     def base_mode(self) -> int:
@@ -192,7 +188,7 @@ class SimulatedRover(LevelVehicle):
         """Whether it stands."""
         return abs(self.motion.speed_m_s) < 0.01
 
-    def refusal(self, mode: VehicleMode) -> str:
+    def refusal(self, mode: VehicleMode, reason: str) -> str:
         """The same for every mode."""
         return "Flight mode change failed"
 

@@ -144,16 +144,12 @@ class SimulatedSub(LevelVehicle):
     @property
     def guided(self) -> SubGuided:
         """GUIDED."""
-        mode = self._modes[SubMode.GUIDED]
-        assert isinstance(mode, SubGuided)
-        return mode
+        return self.mode_of(SubGuided)
 
     @property
     def auto(self) -> SubAuto:
         """AUTO."""
-        mode = self._modes[SubMode.AUTO]
-        assert isinstance(mode, SubAuto)
-        return mode
+        return self.mode_of(SubAuto)
 
     @property
     def base_mode(self) -> int:
@@ -178,9 +174,9 @@ class SimulatedSub(LevelVehicle):
         """In m/s, of a full stick."""
         return self.parameters["PILOT_SPEED_UP"] / 100.0
 
-    def refusal(self, mode: VehicleMode) -> str:
+    def refusal(self, mode: VehicleMode, reason: str) -> str:
         """Why a mode is not entered."""
-        if self.motors.is_armed and mode.needs_position and not self.navigation.has_position:
+        if reason == "requires position":
             return f"Mode change failed: {mode.name} requires position"
         return f"Flight mode change failed {mode.name}"
 

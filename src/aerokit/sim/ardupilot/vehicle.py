@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavFrame, MavModeFlag, MavProtocolCapability, MavResult, MavSeverity
+from aerokit.mavlink.enums import MavFrame, MavModeFlag, MavResult, MavSeverity
 from aerokit.sim.ardupilot.arming import Arming
 from aerokit.sim.ardupilot.boot import BootTimeline
 from aerokit.sim.ardupilot.buzzer import hear_tunes
@@ -27,11 +27,11 @@ from aerokit.sim.ardupilot.stream_groups import COPTER_GROUPS
 from aerokit.sim.ardupilot.telemetry import BUILDERS
 from aerokit.sim.ardupilot.telemetry_position import global_origin, home_position
 from aerokit.sim.ardupilot.telemetry_state import heartbeat
+from aerokit.sim.autopilot import SimulatedAutopilot
 from aerokit.sim.battery import Battery
-from aerokit.sim.commands import CommandHandler, CommandServer
 from aerokit.sim.local_frame import GlobalPoint, LocalFrame
 from aerokit.sim.motion import Motion, Wind
-from aerokit.sim.vehicle import ExtraComponent, SimulatedVehicle, sender_of
+from aerokit.sim.vehicle import ExtraComponent, sender_of
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from aerokit.sim.ardupilot.mode import AutoMode, VehicleMode
     from aerokit.sim.ardupilot.navigation import Ned
     from aerokit.sim.channel import Channel
-    from aerokit.sim.file_tree import FileTree
+    from aerokit.sim.commands import CommandHandler
     from aerokit.sim.logs import SimulatedLog
 
 __all__ = ["ArduPilotVehicle"]
@@ -50,10 +50,10 @@ _BEFORE_READY = frozenset({m.Heartbeat.ID, m.AutopilotVersion.ID})
 _RELATIVE = frozenset({MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT})
 _TERRAIN = frozenset({MavFrame.GLOBAL_TERRAIN_ALT, MavFrame.GLOBAL_TERRAIN_ALT_INT})
 _ABSOLUTE = frozenset({MavFrame.GLOBAL, MavFrame.GLOBAL_INT})
-_RELEASES = {"dev": 0, "alpha": 64, "beta": 128, "rc": 192, "official": 255}
+ModeT = TypeVar("ModeT", bound="VehicleMode")
 
 
-class ArduPilotVehicle(SimulatedVehicle):
+class ArduPilotVehicle(SimulatedAutopilot):
     """A subclass says what sets its kind apart: the class attributes, the ``make_…`` methods, commands, motion.
 
     - ``home``: where it is switched on: latitude, longitude (degrees), altitude AMSL (m);
@@ -78,8 +78,6 @@ class ArduPilotVehicle(SimulatedVehicle):
     FRAME: ClassVar[str | None] = None
     """What the banner says of the frame."""
     MAV_TYPE: ClassVar[int]
-    CAPABILITIES: ClassVar[int]
-    """MAV_PROTOCOL_CAPABILITYs."""
     GIT_HASH: ClassVar[bytes] = b"5ae20c17"
     MODES: ClassVar[tuple[Callable[[Any], VehicleMode], ...]]
     """Classes of the modes, in the order in which they are listed."""
@@ -87,6 +85,9 @@ class ArduPilotVehicle(SimulatedVehicle):
     """Message id → what to send now."""
     STREAM_GROUPS: ClassVar[Mapping[int, tuple[int, ...]]] = COPTER_GROUPS
     """MAV_DATA_STREAM → message ids."""
+
+    storage: Storage
+    """Files, logs, and the servers of them and of the parameters."""
 
     def __init__(
         self,
@@ -117,15 +118,20 @@ class ArduPilotVehicle(SimulatedVehicle):
         self.parameters["MAV_SYSID"] = system_id
         for name, value in (parameters or {}).items():
             self.parameters[name] = value
-        super().__init__(system_id=system_id, component_id=1, seed=seed, components=components)
+        super().__init__(
+            system_id=system_id,
+            seed=seed,
+            components=components,
+            version=version,
+            unsupported_commands=unsupported_commands,
+            unix_time_at_boot=unix_time_at_boot,
+        )
         self.timeline = BootTimeline.scaled(boot_time_s)
-        self.version = version
         self.uid = bytes([0xA0, system_id]) + bytes(16)
         self.battery = Battery(battery_capacity_mah, percent=battery_percent)
         self.motion = self.make_motion(wind)
         self.motion.yaw = math.remainder(math.radians(heading_deg), 2 * math.pi)
         self.rangefinder_reach_m = rangefinder_reach_m
-        self.unsupported_commands = frozenset(unsupported_commands)
         self.rc = Radio(self)
         """What it hears of sticks and switches; the throttle (index 2) rests at 1000."""
         self.tunes = hear_tunes(self)
@@ -133,7 +139,6 @@ class ArduPilotVehicle(SimulatedVehicle):
         self.calibrations = Calibrations(self)
         self._boot_text = boot_text
         self._stream_groups = stream_groups
-        self._unix_time_at_start = unix_time_at_boot
         self._frame = LocalFrame(GlobalPoint(round(home[0] * 1e7), round(home[1] * 1e7), home[2]))
         self.missions = MissionServer(self)
         """Mission, fence and rally points; they survive a reboot."""
@@ -142,7 +147,6 @@ class ArduPilotVehicle(SimulatedVehicle):
         self.storage = Storage(
             self, logs, parameter_errors=parameter_errors, link_bytes_per_s=link_bytes_per_s
         )
-        """Files, logs, and the servers of them and of the parameters."""
 
     def _reset(self) -> None:
         """What a power cycle makes new."""
@@ -167,12 +171,11 @@ class ArduPilotVehicle(SimulatedVehicle):
 
     def _listen(self) -> None:
         self.requests = Requests(self, stream_groups=self._stream_groups)
-        CommandServer(self, self.make_commands())
+        self.serve_commands(self.make_commands())
         self.hear_setpoints()
         self.on(m.Heartbeat, self._on_heartbeat)
         self.on(m.SetMode, self._on_set_mode)
-        self.on(m.Timesync, self._on_timesync)
-        self.on(m.Ping, self._on_ping)
+        self.listen_to_clocks()
         self.rc.listen()
         self.missions.listen()
 
@@ -204,6 +207,10 @@ class ArduPilotVehicle(SimulatedVehicle):
     def reset_controllers(self) -> None:
         """What a power cycle makes new of its own; the modes are there already."""
 
+    def refusal(self, mode: VehicleMode, reason: str) -> str:
+        """What it says when it does not go into a mode."""
+        return f"Mode change to {mode.name} failed: {reason}"
+
     @property
     def guided(self) -> VehicleMode:
         """Its mode for targets of a program."""
@@ -231,16 +238,6 @@ class ArduPilotVehicle(SimulatedVehicle):
     # ---------------------------------------------------------------------------------------- state
 
     @property
-    def files(self) -> FileTree:
-        """What is on its card, and what it makes up when it is read; it survives a reboot."""
-        return self.storage.files
-
-    @property
-    def capabilities(self) -> int:
-        """MAV_PROTOCOL_CAPABILITYs, for AUTOPILOT_VERSION."""
-        return self.CAPABILITIES & ~MavProtocolCapability.FTP if self.faults.no_ftp else self.CAPABILITIES
-
-    @property
     def ftp(self) -> ArduPilotFtp:
         """The server of the files."""
         return self.storage.ftp
@@ -264,18 +261,6 @@ class ArduPilotVehicle(SimulatedVehicle):
     def altitude_m(self) -> float:
         """Metres above home."""
         return self.navigation.altitude_above_home
-
-    @property
-    def unix_time(self) -> float:
-        """What the GPS says the time is."""
-        return self._unix_time_at_start + self.now
-
-    @property
-    def version_number(self) -> int:
-        """As AUTOPILOT_VERSION packs it."""
-        numbers, _, release = self.version.partition("-")
-        major, minor, patch = (int(part) for part in (*numbers.split("."), "0", "0")[:3])
-        return major << 24 | minor << 16 | patch << 8 | _RELEASES.get(release or "official", 0)
 
     # ------------------------------------------------------------------------------ boot and reboot
 
@@ -357,7 +342,7 @@ class ArduPilotVehicle(SimulatedVehicle):
         elif not mode.enter(force=not armed):
             reason = "init failed"
         if reason is not None:
-            self.send_text(MavSeverity.WARNING, f"Mode change to {mode.name} failed: {reason}")
+            self.send_text(MavSeverity.WARNING, self.refusal(mode, reason))
             return False
         self.mode.leave()
         self.mode = mode
@@ -368,7 +353,17 @@ class ArduPilotVehicle(SimulatedVehicle):
         """DO_SET_MODE and SET_MODE: only custom modes; the MAV_RESULT. SET_MODE does not tell it."""
         if not base_mode & MavModeFlag.CUSTOM_MODE_ENABLED:
             return MavResult.DENIED
-        return MavResult.ACCEPTED if self.set_mode(custom_mode) else MavResult.FAILED
+        return self.change_to(custom_mode)
+
+    def change_to(self, number: int) -> int:
+        """`set_mode` for a command: the MAV_RESULT."""
+        return MavResult.ACCEPTED if self.set_mode(number) else MavResult.FAILED
+
+    def mode_of(self, kind: type[ModeT]) -> ModeT:
+        """Its mode of this class."""
+        mode = self._modes[kind.number]
+        assert isinstance(mode, kind)
+        return mode
 
     def available_modes(self) -> list[m.AvailableModes]:
         """AVAILABLE_MODES, as ArduPilot numbers and names them."""
@@ -429,11 +424,3 @@ class ArduPilotVehicle(SimulatedVehicle):
     def _on_heartbeat(self, message: m.Heartbeat, _: Channel) -> None:
         if sender_of(message)[0] == self.parameters["MAV_GCS_SYSID"]:
             self.failsafes.ground_station_seen_at = self.now
-
-    def _on_timesync(self, request: m.Timesync, channel: Channel) -> None:
-        if request.tc1 == 0:
-            self.send(m.Timesync(int(self.uptime * 1e9), request.ts1), channel)
-
-    def _on_ping(self, ping: m.Ping, channel: Channel) -> None:
-        if ping.target_system == 0:
-            self.send(m.Ping(ping.time_usec, ping.seq, *sender_of(ping)), channel)

@@ -23,7 +23,7 @@ _AUTOTUNE_PERCENTS = (0, 20, 40, 60, 80, 95)
 def px4_commands(px4: SimulatedPx4) -> dict[int, CommandHandler]:
     """MAV_CMD → handler."""
     flight, link = _Flight(px4), _Requests(px4)
-    handlers: dict[int, CommandHandler] = {
+    return {
         MavCmd.COMPONENT_ARM_DISARM: flight.arm_or_disarm,
         MavCmd.DO_SET_MODE: flight.set_mode,
         MavCmd.NAV_TAKEOFF: flight.take_off,
@@ -43,9 +43,6 @@ def px4_commands(px4: SimulatedPx4) -> dict[int, CommandHandler]:
         MavCmd.REQUEST_AUTOPILOT_CAPABILITIES: lambda c: link.send_now(AutopilotVersion.ID, c),
         MavCmd.GET_HOME_POSITION: lambda c: link.send_now(HomePosition.ID, c),
     }
-    for command in px4.unsupported_commands:
-        handlers.pop(command, None)
-    return handlers
 
 
 class _Flight:

@@ -7,9 +7,10 @@ from collections.abc import Collection, Iterable, Sequence
 from typing import TYPE_CHECKING, ClassVar
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavCmd, MavProtocolCapability, MavResult, MavSeverity, MavType
+from aerokit.mavlink.enums import MavCmd, MavResult, MavSeverity, MavType
+from aerokit.sim.autopilot import SimulatedAutopilot
 from aerokit.sim.battery import Battery
-from aerokit.sim.commands import Command, CommandServer
+from aerokit.sim.commands import Command
 from aerokit.sim.local_frame import GlobalPoint, LocalFrame
 from aerokit.sim.motion import GRAVITY_M_S2, Motion, MotionLimits, Wind
 from aerokit.sim.px4.commands import px4_commands
@@ -33,12 +34,11 @@ from aerokit.sim.px4.offboard import Offboard
 from aerokit.sim.px4.parameters import px4_parameters
 from aerokit.sim.px4.storage import DEFAULT_LOGS, Storage
 from aerokit.sim.px4.telemetry import BUILDERS, DEFAULT_RATES_HZ, FAST_MESSAGES
-from aerokit.sim.vehicle import ExtraComponent, SimulatedVehicle, sender_of
+from aerokit.sim.vehicle import ExtraComponent, sender_of
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.sim.channel import Channel
-    from aerokit.sim.file_tree import FileTree
     from aerokit.sim.logs import SimulatedLog
     from aerokit.sim.px4.ftp import Px4Ftp
 
@@ -53,7 +53,7 @@ _WITHOUT_POSITION = frozenset({(1, 0), (2, 0), (5, 0), (7, 0), LAND})
 _NOT_AFTER_LANDING = frozenset({TAKEOFF, LAND, RTL})
 
 
-class SimulatedPx4(SimulatedVehicle):
+class SimulatedPx4(SimulatedAutopilot):
     """Speaks as PX4 v1.16/v1.17 does where a client can see it; flies as `Motion` does.
 
     Simulated: arming and its denial, modes with their double acknowledgement, take-off to an AMSL altitude, hold,
@@ -75,6 +75,9 @@ class SimulatedPx4(SimulatedVehicle):
     CAPABILITIES: ClassVar[int] = 0xE8FF
     VEHICLE_TYPE: ClassVar[int] = MavType.QUADROTOR
     PARAMETER_TABLE: ClassVar[str] = "quadrotor"
+
+    storage: Storage
+    """Files, logs, and the servers of them and of the parameters."""
 
     def __init__(
         self,
@@ -102,16 +105,20 @@ class SimulatedPx4(SimulatedVehicle):
         self.parameters["MAV_SYS_ID"] = system_id
         for name, value in (parameters or {}).items():
             self.parameters[name] = value
-        super().__init__(system_id=system_id, component_id=1, seed=seed, components=components)
+        super().__init__(
+            system_id=system_id,
+            seed=seed,
+            components=components,
+            version=version,
+            unsupported_commands=unsupported_commands,
+            unix_time_at_boot=unix_time_at_boot,
+        )
         self.frame = LocalFrame(GlobalPoint(round(home[0] * 1e7), round(home[1] * 1e7), home[2]))
         self.battery = Battery(5000.0, cells=4, percent=battery_percent)
         self.motion = self._make_motion(wind)
         self.motion.yaw = math.remainder(math.radians(heading_deg), 2 * math.pi)
-        self.version = version
-        self.unsupported_commands = frozenset(unsupported_commands)
         self._boot_time_s = boot_time_s
         self._fast_rate_hz = fast_rate_hz
-        self._unix_time_at_start = unix_time_at_boot
         self._next_text_id = 0
         self._pings = 0
         self.home = (0.0, 0.0, 0.0)
@@ -120,7 +127,6 @@ class SimulatedPx4(SimulatedVehicle):
         self._reset()
         self._listen()
         self.storage = Storage(self, logs, parameter_file=parameter_file, link_bytes_per_s=link_bytes_per_s)
-        """Files, logs, and the servers of them and of the parameters."""
 
     def _make_motion(self, wind: Wind | None) -> Motion:
         limits = MotionLimits(
@@ -154,24 +160,13 @@ class SimulatedPx4(SimulatedVehicle):
 
     def _listen(self) -> None:
         self.offboard = Offboard(self)
-        self.commands = CommandServer(self, px4_commands(self))
+        self.commands = self.serve_commands(px4_commands(self))
         self.on(m.SetMode, self._on_set_mode)
-        self.on(m.Timesync, self._on_timesync)
-        self.on(m.Ping, self._on_ping)
+        self.listen_to_clocks()
         self.missions.listen()
         self.failsafes.listen()
 
     # ----------------------------------------------------------------------------------------- state
-
-    @property
-    def files(self) -> FileTree:
-        """What is on its card; it survives a reboot."""
-        return self.storage.files
-
-    @property
-    def capabilities(self) -> int:
-        """MAV_PROTOCOL_CAPABILITYs, for AUTOPILOT_VERSION."""
-        return self.CAPABILITIES & ~MavProtocolCapability.FTP if self.faults.no_ftp else self.CAPABILITIES
 
     @property
     def ftp(self) -> Px4Ftp:
@@ -192,19 +187,6 @@ class SimulatedPx4(SimulatedVehicle):
     def has_position(self) -> bool:
         """Whether the estimator has a global position."""
         return self.uptime >= 0.5 * self._boot_time_s and not self.faults.gps_lost
-
-    @property
-    def unix_time(self) -> float:
-        """What the GPS says the time is."""
-        return self._unix_time_at_start + self.now
-
-    @property
-    def version_number(self) -> int:
-        """As AUTOPILOT_VERSION packs it."""
-        numbers, _, release = self.version.partition("-")
-        major, minor, patch = (int(part) for part in (*numbers.split("."), "0", "0")[:3])
-        kinds = {"dev": 0, "alpha": 64, "beta": 128, "rc": 192, "": 255}
-        return major << 24 | minor << 16 | patch << 8 | kinds.get(release, 0)
 
     @property
     def accepts_unknown_modes(self) -> bool:
@@ -414,11 +396,3 @@ class SimulatedPx4(SimulatedVehicle):
         )
         known = (main, sub) in KNOWN and self.change_mode((main, sub))
         self.commands.answer(command, MavResult.ACCEPTED if known else MavResult.TEMPORARILY_REJECTED)
-
-    def _on_timesync(self, request: m.Timesync, channel: Channel) -> None:
-        if request.tc1 == 0:
-            self.send(m.Timesync(int(self.uptime * 1e9), request.ts1), channel)
-
-    def _on_ping(self, ping: m.Ping, channel: Channel) -> None:
-        if ping.target_system == 0:
-            self.send(m.Ping(ping.time_usec, ping.seq, *sender_of(ping)), channel)

@@ -1,0 +1,92 @@
+"""What simulated autopilots of every make have in common: version, files, clock, commands."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+from typing import TYPE_CHECKING, ClassVar, Protocol
+
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import MavProtocolCapability
+from aerokit.sim.commands import CommandHandler, CommandServer
+from aerokit.sim.vehicle import ExtraComponent, SimulatedVehicle, sender_of
+
+if TYPE_CHECKING:
+    from aerokit.sim.channel import Channel
+    from aerokit.sim.file_tree import FileTree
+
+__all__ = ["SimulatedAutopilot"]
+
+_RELEASES = {"dev": 0, "alpha": 64, "beta": 128, "rc": 192, "": 255, "official": 255}
+"""FIRMWARE_VERSION_TYPE, by what stands behind the version's dash."""
+
+
+class _Storage(Protocol):
+    files: FileTree
+
+
+class SimulatedAutopilot(SimulatedVehicle):
+    """A vehicle whose firmware has a version, a card with files, a clock, and commands.
+
+    - ``version``: as "4.7.0-dev" or "1.16.0"; ``unix_time_at_boot``: what its GPS clock says at simulated second 0
+    - ``unsupported_commands``: MAV_CMDs that this firmware does not know
+    """
+
+    CAPABILITIES: ClassVar[int]
+    """MAV_PROTOCOL_CAPABILITYs."""
+
+    storage: _Storage
+
+    def __init__(
+        self,
+        *,
+        system_id: int,
+        seed: int,
+        components: Iterable[ExtraComponent],
+        version: str,
+        unsupported_commands: Collection[int],
+        unix_time_at_boot: float,
+    ) -> None:
+        super().__init__(system_id=system_id, component_id=1, seed=seed, components=components)
+        self.version = version
+        self.unsupported_commands = frozenset(unsupported_commands)
+        self._unix_time_at_start = unix_time_at_boot
+
+    @property
+    def capabilities(self) -> int:
+        """MAV_PROTOCOL_CAPABILITYs, for AUTOPILOT_VERSION."""
+        return self.CAPABILITIES & ~MavProtocolCapability.FTP if self.faults.no_ftp else self.CAPABILITIES
+
+    @property
+    def files(self) -> FileTree:
+        """What is on its card, and what it makes up when it is read; it survives a reboot."""
+        return self.storage.files
+
+    @property
+    def unix_time(self) -> float:
+        """What the GPS says the time is."""
+        return self._unix_time_at_start + self.now
+
+    @property
+    def version_number(self) -> int:
+        """As AUTOPILOT_VERSION packs it."""
+        numbers, _, release = self.version.partition("-")
+        major, minor, patch = (int(part) for part in (*numbers.split("."), "0", "0")[:3])
+        return major << 24 | minor << 16 | patch << 8 | _RELEASES.get(release, 0)
+
+    def listen_to_clocks(self) -> None:
+        """Answer TIMESYNC, and PINGs to everybody."""
+        self.on(m.Timesync, self._on_timesync)
+        self.on(m.Ping, self._on_ping)
+
+    def serve_commands(self, handlers: Mapping[int, CommandHandler]) -> CommandServer:
+        """Answer these MAV_CMDs, but for those that are to be unknown."""
+        known = {number: each for number, each in handlers.items() if number not in self.unsupported_commands}
+        return CommandServer(self, known)
+
+    def _on_timesync(self, request: m.Timesync, channel: Channel) -> None:
+        if request.tc1 == 0:
+            self.send(m.Timesync(int(self.uptime * 1e9), request.ts1), channel)
+
+    def _on_ping(self, ping: m.Ping, channel: Channel) -> None:
+        if ping.target_system == 0:
+            self.send(m.Ping(ping.time_usec, ping.seq, *sender_of(ping)), channel)
