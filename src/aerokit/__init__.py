@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from aerokit import errors, events
     from aerokit.mavlink import enums, messages
     from aerokit.mavlink.dialect import Dialect
+    from aerokit.mavlink.signing import Signing, SigningKey
     from aerokit.position import Position
     from aerokit.runtime.connection import Connection
     from aerokit.runtime.opening import open_connection
@@ -49,6 +50,8 @@ __all__ = [
     "LocalPositionSetpoint",
     "Position",
     "PositionSetpoint",
+    "Signing",
+    "SigningKey",
     "Vehicle",
     "VelocitySetpoint",
     "connect",
@@ -69,6 +72,8 @@ _HOMES = {
     "LocalPositionSetpoint": "aerokit.vehicle.setpoints",
     "Position": "aerokit.position",
     "PositionSetpoint": "aerokit.vehicle.setpoints",
+    "Signing": "aerokit.mavlink.signing",
+    "SigningKey": "aerokit.mavlink.signing",
     "Vehicle": "aerokit.vehicle.vehicle",
     "VelocitySetpoint": "aerokit.vehicle.setpoints",
     "connect": "aerokit.vehicle.connect",

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from struct import Struct
+from typing import TYPE_CHECKING
 
 from aerokit.errors import LocalProtocolError
 from aerokit.mavlink.checksum import x25
-from aerokit.mavlink.frame import MAGIC_V1, MAGIC_V2
+from aerokit.mavlink.frame import MAGIC_V1, MAGIC_V2, SIGNED
 from aerokit.mavlink.message import Message
+
+if TYPE_CHECKING:
+    from aerokit.mavlink.signing import Signing
 
 __all__ = ["FrameEncoder"]
 
@@ -35,6 +39,8 @@ class FrameEncoder:
         self.component_id = int(component_id)
         self.sequence = 0
         """The sequence number of the next frame, 0..255."""
+        self.signing: Signing | None = None
+        """Signs the frames of MAVLink 2; None: they are not signed. MAVLink 1 has no signatures."""
         self._version = 2
         self.version = version
 
@@ -49,17 +55,20 @@ class FrameEncoder:
             raise LocalProtocolError(f"version = {version!r} must be 1 or 2")
         self._version = int(version)
 
-    def encode(self, message: Message) -> bytes:
+    def encode(self, message: Message, now: float = 0.0) -> bytes:
         """The whole frame. LocalProtocolError names a field that does not fit; the sequence number is not used then.
 
         MAVLink 2 drops zeros from the end of the payload, MAVLink 1 all extension fields; it has no ids above 255.
+        ``now`` is seconds since 1970, for the time stamp of a signature.
         """
+        signing = self.signing if self._version == 2 else None
         payload = message.encode()
         if self._version == 2:
             payload = payload.rstrip(b"\0") or payload[:1]  # the standard never cuts the first byte
             low, high = message.ID & 0xFFFF, message.ID >> 16
             source = self.system_id, self.component_id
-            frame = _HEADER_V2(MAGIC_V2, len(payload), 0, 0, self.sequence, *source, low, high) + payload
+            flags = 0 if signing is None else SIGNED
+            frame = _HEADER_V2(MAGIC_V2, len(payload), flags, 0, self.sequence, *source, low, high) + payload
         else:
             if message.ID > 255:
                 raise LocalProtocolError(f"{message.NAME} has id {message.ID}, MAVLink 1 has none above 255")
@@ -68,4 +77,5 @@ class FrameEncoder:
             frame = bytes((MAGIC_V1, len(payload), self.sequence, *source, message.ID)) + payload
         self.sequence = (self.sequence + 1) & 0xFF
         crc = x25(frame[1:] + bytes((message.CRC_EXTRA,)))
-        return frame + crc.to_bytes(2, "little")
+        frame += crc.to_bytes(2, "little")
+        return frame if signing is None else frame + signing.sign(frame, now)

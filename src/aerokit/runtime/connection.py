@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import anyio
@@ -24,6 +25,7 @@ from aerokit.runtime.events import Event, HeardTwice, LinkClosed, LinkInterrupte
 from aerokit.runtime.loop_watch import watch_loop
 from aerokit.runtime.recording import Recording
 from aerokit.runtime.routes import Routes
+from aerokit.runtime.signatures import SignatureGate, check_signing
 from aerokit.runtime.subscription import Overflow, Subscription
 
 if TYPE_CHECKING:
@@ -32,6 +34,7 @@ if TYPE_CHECKING:
 
     from aerokit.links.link import Peer
     from aerokit.mavlink.dialect import Dialect
+    from aerokit.mavlink.signing import Signing
     from aerokit.mavlink.statistics import FramerStatistics
     from aerokit.runtime.bus import Detach, Sink
 
@@ -67,6 +70,7 @@ class Connection:
         source_component: int = MAV_COMP_ID_MISSIONPLANNER,
         dialect: Dialect = STANDARD,
         mavlink_version: int = 2,
+        signing: Signing | None = None,
     ) -> None:
         if not 1 <= source_system <= 255:
             raise LocalProtocolError(f"source_system = {source_system} is not allowed: 1 to 255")
@@ -87,7 +91,10 @@ class Connection:
         self.deadlines = Deadlines()
         """What has to happen at a time, as long as the connection is open."""
         self._clock = asyncio.get_running_loop().time
+        self._wall_at_0 = time.time() - self._clock()
         self._encoder = FrameEncoder(source_system, source_component, version=mavlink_version)
+        self._gate = SignatureGate(self._encoder, self.unix_time, self.bus.publish)
+        self.signing = signing
         self._framers: dict[Peer, Framer] = {}
         self._routes = Routes(link.has_peer, self._heard_twice)
         self._recording: Recording | None = None
@@ -112,12 +119,14 @@ class Connection:
             ConnectionClosed, LinkLost: the connection has ended.
         """
         self.raise_if_ended()
-        self._write(self._encoder.encode(message), message, to)
+        now = 0.0 if self._encoder.signing is None else self.unix_time()
+        self._write(self._encoder.encode(message, now), message, to)
 
     def write_raw(self, data: bytes) -> None:
         """Write one whole frame of somebody else as it is, for programs that forward; never blocks.
 
-        It goes where :meth:`send` would send its message: where its target was last heard, or to every peer.
+        It goes where :meth:`send` would send its message: where its target was last heard, or to every peer. Its
+        signature, or that it has none, stays as it is.
 
         Raises:
             LocalProtocolError: this is not exactly one MAVLink frame; nothing was sent.
@@ -143,7 +152,21 @@ class Connection:
     @mavlink_version.setter
     def mavlink_version(self, version: int) -> None:
         _check_version(version)
+        check_signing(self.signing, version)
         self._encoder.version = version
+
+    @property
+    def signing(self) -> Signing | None:
+        """What signs the frames that we send and checks those that we receive; None: neither.
+
+        It has the time stamp to keep (``signing.timestamp``) and counts refused frames (``signing.refused``). May be
+        set while the connection is open; LocalProtocolError while we send MAVLink 1, which has no signatures.
+        """
+        return self._encoder.signing
+
+    @signing.setter
+    def signing(self, signing: Signing | None) -> None:
+        self._gate.use(signing)
 
     def subscribe(
         self,
@@ -219,6 +242,14 @@ class Connection:
         """Seconds on the event loop's clock, the one that all ages and deadlines are measured on."""
         return self._clock()
 
+    def unix_time(self) -> float:
+        """Seconds since 1970, as the system had them at the beginning, gone on by :meth:`now`: nobody sets it back."""
+        return self._wall_at_0 + self._clock()
+
+    def describe_signatures(self, system_id: int = 0, component_id: int = 0) -> str:
+        """What signatures keep from us, or us from this component, for error texts; empty when nothing."""
+        return self._gate.describe(self.heard.get((system_id, component_id)))
+
     def statistics(self) -> Iterator[FramerStatistics]:
         """The counters of every peer heard so far."""
         return (framer.statistics for framer in self._framers.values())
@@ -275,7 +306,10 @@ class Connection:
             framer = self._framers.get(peer)
             if framer is None:
                 framer = self._new_framer(peer)
-            for frame in framer.receive(data, self._clock()):
+            frames = framer.receive(data, self._clock())
+            if not self._gate.is_open:
+                frames = self._gate.admitted(frames)
+            for frame in frames:
                 if self._error is not None:  # a sink has closed it
                     return
                 if self._recording is not None:

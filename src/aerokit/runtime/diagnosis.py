@@ -39,6 +39,7 @@ class _Diagnosis:
     def __init__(self, connection: Connection, wanted_system: int | None) -> None:
         self._wanted = wanted_system
         self._heard = connection.heard
+        self._signatures = connection.describe_signatures()
         statistics = list(connection.statistics())
         self._bytes = sum(each.bytes for each in statistics)
         self._frames = sum(each.frames for each in statistics)
@@ -72,6 +73,8 @@ class _Diagnosis:
 
     def _without_heartbeats(self) -> str:
         heard = f"{self._frames} frames were heard"
+        if self._signatures:
+            return f"{heard}; {self._signatures}"
         if not any(self._systems):
             return f"{heard}, all of system id 0, which is nobody's: give the vehicle an id of 1 to 255"
         return f"{heard}, but no HEARTBEAT among them"

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 __all__ = [
     "ArmedChanged",
     "Event",
+    "FrameRefused",
     "HeardTwice",
     "LandedStateChanged",
     "LinkClosed",
@@ -73,6 +74,16 @@ class HeardTwice(Event):
     """
 
     component_id: int
+
+
+class FrameRefused(Event):
+    """A frame was not let in, because it carries no good signature of our key. Told once for each reason.
+
+    ``connection.signing.refused`` counts them all.
+    """
+
+    component_id: int
+    reason: str
 
 
 class ModeChanged(Event):

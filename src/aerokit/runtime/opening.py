@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
     from aerokit.links.link import Link
     from aerokit.mavlink.dialect import Dialect
+    from aerokit.mavlink.signing import Signing
 
 __all__ = ["open_connection"]
 
@@ -34,6 +35,7 @@ async def open_connection(
     baud: int = 57600,
     dialect: Dialect = STANDARD,
     mavlink_version: int = 2,
+    signing: Signing | None = None,
     record: str | os.PathLike[str] | None = None,
     reconnect: bool = False,
 ) -> AsyncIterator[Connection]:
@@ -50,6 +52,8 @@ async def open_connection(
         baud: of a serial link whose address names none, bits per second, above 0.
         dialect: the messages that are understood.
         mavlink_version: of what we send, 1 or 2; both are understood.
+        signing: signs everything we send; what is not signed with its key is refused (docs/signing.md). None: what we
+            send is not signed, and signatures are not checked.
         record: a ``.tlog`` file for everything received and sent, messages of unknown dialects too; an existing file
             is replaced. A disk that is full ends the recording, not the connection.
         reconnect: whether a link that is lost, a device unplugged for example, is opened again until it is back,
@@ -70,6 +74,7 @@ async def open_connection(
         source_component=source_component,
         dialect=dialect,
         mavlink_version=mavlink_version,
+        signing=signing,
     )
     try:
         if record is not None:

@@ -7,15 +7,20 @@ import os
 import time
 
 from aerokit.errors import LinkOpenError
+from aerokit.mavlink.frame import MAGIC_V2
 from aerokit.mavlink.tlog import TlogWriter
 
 __all__ = ["Recording"]
 
 logger = logging.getLogger("aerokit")
 
+SETUP_SIGNING = (256).to_bytes(3, "little")
+
 
 class Recording:
     """A ``.tlog`` of one connection, begun anew: a file of that name is replaced.
+
+    Everything is kept as it is, signatures too, but SETUP_SIGNING is left out: it holds the key.
 
     ``now`` is the time on the clock that :meth:`write` is given times of. The stamps are the wall clock's at the
     beginning and go on by the other one: setting the clock during a flight, as a companion computer does when it
@@ -36,7 +41,7 @@ class Recording:
 
     def write(self, raw: bytes, at: float) -> None:
         """Add one frame that was sent or received at this time; never raises."""
-        if self._writer is not None:
+        if self._writer is not None and not (raw[0] == MAGIC_V2 and raw[7:10] == SETUP_SIGNING):
             try:
                 self._writer.write(raw, self._wall_at_0 + at)
             except OSError as error:

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from aerokit.links.link import Link
     from aerokit.mavlink.dialect import Dialect
     from aerokit.mavlink.message import Message
+    from aerokit.mavlink.signing import Signing
     from aerokit.runtime.connection import Connection as AsyncConnection
     from aerokit.runtime.events import Event
     from aerokit.runtime.subscription import Overflow
@@ -37,6 +38,7 @@ def open_connection(
     baud: int = 57600,
     dialect: Dialect = STANDARD,
     mavlink_version: int = 2,
+    signing: Signing | None = None,
     record: str | os.PathLike[str] | None = None,
     reconnect: bool = False,
 ) -> Connection:
@@ -54,6 +56,7 @@ def open_connection(
                 baud=baud,
                 dialect=dialect,
                 mavlink_version=mavlink_version,
+                signing=signing,
                 record=record,
                 reconnect=reconnect,
             )
@@ -90,6 +93,11 @@ class Connection:
             self._loop,
             self.aio.subscribe(*types, system_id=system_id, capacity=capacity, overflow=overflow),
         )
+
+    @property
+    def signing(self) -> Signing | None:
+        """What signs the frames that we send and checks those that we receive; None: neither."""
+        return self.aio.signing
 
     @property
     def is_open(self) -> bool:

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from aerokit.mavlink.dialect import Dialect
     from aerokit.mavlink.message import Message
     from aerokit.mavlink.messages import CommandAck
+    from aerokit.mavlink.signing import Signing
     from aerokit.runtime.events import Event
     from aerokit.runtime.subscription import Overflow
     from aerokit.sync.loop_thread import Held
@@ -55,6 +56,7 @@ def connect(
     baud: int = 57600,
     dialect: Dialect = STANDARD,
     mavlink_version: int = 2,
+    signing: Signing | None = None,
     record: str | os.PathLike[str] | None = None,
     reconnect: bool = False,
 ) -> Vehicle:
@@ -76,6 +78,7 @@ def connect(
                 baud=baud,
                 dialect=dialect,
                 mavlink_version=mavlink_version,
+                signing=signing,
                 record=record,
                 reconnect=reconnect,
             )
@@ -231,6 +234,10 @@ class Vehicle(VehicleState):
     def reboot(self, *, force: bool = False, timeout: float = 60.0) -> None:
         """Reboot the autopilot and wait until it is back; see :meth:`aerokit.Vehicle.reboot`."""
         self._loop.run(self.aio.reboot, force=force, timeout=timeout)
+
+    def setup_signing(self, signing: Signing | None, *, timeout: float = 5.0) -> None:
+        """Give the vehicle a key, **in clear**, or take it away; see :meth:`aerokit.Vehicle.setup_signing`."""
+        self._loop.run(self.aio.setup_signing, signing, timeout=timeout)
 
     # ---------------------------------------------------------------- commands and messages
 

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from aerokit.mavlink.dialect import Dialect
     from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.message import Message
+    from aerokit.mavlink.signing import Signing
 
 __all__ = ["connect"]
 
@@ -49,6 +50,7 @@ async def connect(
     baud: int = 57600,
     dialect: Dialect = STANDARD,
     mavlink_version: int = 2,
+    signing: Signing | None = None,
     record: str | os.PathLike[str] | None = None,
     reconnect: bool = False,
 ) -> AsyncIterator[Vehicle]:
@@ -70,6 +72,7 @@ async def connect(
         baud: of a serial link whose address names none.
         dialect: the messages that are understood.
         mavlink_version: of what we send, 1 or 2.
+        signing: signs everything we send; what is not signed with its key is refused (docs/signing.md). None: neither.
         record: a ``.tlog`` file for everything received and sent; an existing file is replaced.
         reconnect: whether a link that is lost is opened again until it is back, instead of ending the connection.
 
@@ -86,6 +89,10 @@ async def connect(
             raise LocalProtocolError(
                 "record = … is not allowed here: the connection is open; use its record()"
             )
+        if signing is not None:
+            raise LocalProtocolError(
+                "signing = … is not allowed here: the connection is open; set its attribute signing"
+            )
         if reconnect:
             raise LocalProtocolError(
                 "reconnect = True is not allowed here: the connection is open; say it to open_connection"
@@ -101,6 +108,7 @@ async def connect(
             baud=baud,
             dialect=dialect,
             mavlink_version=mavlink_version,
+            signing=signing,
             record=record,
             reconnect=reconnect,
         ) as connection,

@@ -300,6 +300,8 @@ class VehicleCore:
             if received + lost
             else "nothing heard"
         )
+        if signatures := self.connection.describe_signatures(self.system_id, self.component_id):
+            loss = f"{loss}, {signatures}"
         texts = self.texts_since(self.connection.now() - 10.0)
         said = f", it said: {'; '.join(texts[-3:])}" if texts else ""
         return f"last heartbeat {self.heartbeat_age:.1f} s ago, {loss}{said}"

@@ -16,12 +16,14 @@ from aerokit.vehicle.mission import MissionControl
 from aerokit.vehicle.parameters import Parameters
 from aerokit.vehicle.plans import PlanContext
 from aerokit.vehicle.rally import RallyControl
+from aerokit.vehicle.signing import set_up_signing
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from aerokit.mavlink.message import Message
     from aerokit.mavlink.messages import Heartbeat
+    from aerokit.mavlink.signing import Signing
     from aerokit.runtime.connection import Connection
 
 __all__ = ["Vehicle"]
@@ -62,6 +64,25 @@ class Vehicle(FlightActions):
 
     def __repr__(self) -> str:
         return f"<Vehicle {self.system_id}/{self.component_id} {self.autopilot.firmware}, {self.describe_link()}>"
+
+    async def setup_signing(self, signing: Signing | None, *, timeout: float = 5.0) -> None:
+        """Give the vehicle a key (SETUP_SIGNING), and sign and check with it from then on; None takes the key away.
+
+        **The key travels in clear**: do this over a cable or a link that nobody listens to. Returns when the
+        vehicle's frames are signed with the key (None: when they are not signed any more); until then what was in use
+        remains in use. All on this connection need the key then, or ``signing.allow_unsigned``. Cancelled, the vehicle
+        may have taken the key all the same. See docs/signing.md.
+
+        Args:
+            signing: the key, as for ``connect(signing=…)``.
+            timeout: seconds until the vehicle uses it.
+
+        Raises:
+            NotSupported: we or the vehicle speak MAVLink 1, which has no signatures. Nothing was sent.
+            OperationRejected: it is armed, or not known to be disarmed. Nothing was sent.
+            OperationTimeout: it went on as before; the text has what it said.
+        """
+        await set_up_signing(self, signing, timeout)
 
     # ------------------------------------------------------------------------------ inside
 

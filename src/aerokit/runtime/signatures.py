@@ -1,0 +1,129 @@
+"""``SignatureGate``: what signs the frames of a connection, and which of the received ones are let in."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from aerokit.errors import LocalProtocolError
+from aerokit.mavlink.frame import SIGNED
+from aerokit.runtime.events import FrameRefused
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from aerokit.mavlink.encoder import FrameEncoder
+    from aerokit.mavlink.frame import Frame
+    from aerokit.mavlink.messages import Heartbeat
+    from aerokit.mavlink.signing import Refusal, Signing
+    from aerokit.runtime.events import Event
+
+__all__ = ["SignatureGate", "check_signing"]
+
+logger = logging.getLogger("aerokit")
+
+
+class SignatureGate:
+    """Lets in what the encoder's ``signing`` accepts, everything while that is None.
+
+    The first refusal for each reason is told, by a warning in the log and an event.
+
+    ``unix_time`` gives seconds since 1970; ``publish`` tells the event.
+    """
+
+    def __init__(
+        self, encoder: FrameEncoder, unix_time: Callable[[], float], publish: Callable[[Event], object]
+    ) -> None:
+        self._encoder, self._unix_time, self._publish = encoder, unix_time, publish
+        self._told: set[Refusal] = set()
+        self._handover: _Handover | None = None
+        self.is_open = True
+        """Whether everything is let in without looking at it."""
+
+    def use(self, signing: Signing | None) -> None:
+        """Sign and check with this from now on; None: neither. LocalProtocolError while we send MAVLink 1."""
+        check_signing(signing, self._encoder.version)
+        self._encoder.signing = signing
+        self._update()
+
+    def admitted(self, frames: list[Frame]) -> list[Frame]:
+        """Those of these frames that are let in."""
+        return [frame for frame in frames if self._admits(frame)]
+
+    @contextmanager
+    def handing_over(
+        self, signing: Signing | None, system_id: int, component_id: int
+    ) -> Iterator[asyncio.Event]:
+        """For the time of the block, change to ``signing`` with the first frame of the component that shows it has.
+
+        The event is set then. Frames are signed and checked as before until that.
+        """
+        check_signing(signing, self._encoder.version)
+        taken = asyncio.Event()
+        self._handover = _Handover(signing, (system_id, component_id), taken)
+        self._update()
+        try:
+            yield taken
+        finally:
+            self._handover = None
+            self._update()
+
+    def _update(self) -> None:
+        self.is_open = self._encoder.signing is None and self._handover is None
+
+    def _admits(self, frame: Frame) -> bool:
+        handover = self._handover
+        if handover is not None and handover.is_shown_by(frame):
+            self._handover = None
+            self.use(handover.signing)
+            handover.taken.set()
+        signing = self._encoder.signing
+        if signing is None:
+            return True
+        refusal = signing.check(frame, self._unix_time())
+        if refusal is not None and refusal not in self._told:
+            self._told.add(refusal)
+            self._tell(frame, signing, refusal)
+        return refusal is None
+
+    def _tell(self, frame: Frame, signing: Signing, refusal: Refusal) -> None:
+        source = frame.system_id, frame.component_id
+        logger.warning(
+            "a frame of %d/%d was refused: %s (%r); more such frames are only counted",
+            *source,
+            refusal.value,
+            signing.key,
+        )
+        self._publish(FrameRefused(frame.received_at, *source, refusal.value))
+
+    def describe(self, heartbeat: Heartbeat | None) -> str:
+        """What keeps us and the sender of this heartbeat apart, for error texts; empty when nothing does."""
+        signing = self._encoder.signing
+        if signing is not None:
+            refused = "; ".join(f"{n}: {why.value}" for why, n in signing.refused.items() if n)
+            return f"frames were refused ({refused}) by {signing.key!r}" if refused else ""
+        frame = None if heartbeat is None else heartbeat.received_frame
+        is_signed = frame is not None and frame.incompat_flags & SIGNED
+        return "its frames are signed and ours are not (signing=…)" if is_signed else ""
+
+
+class _Handover:
+    """A component is being given another key, or none."""
+
+    def __init__(self, signing: Signing | None, source: tuple[int, int], taken: asyncio.Event) -> None:
+        self.signing, self.taken = signing, taken
+        self._source = source
+
+    def is_shown_by(self, frame: Frame) -> bool:
+        """Whether this frame shows that the component has the key; for None: that it has none."""
+        if (frame.system_id, frame.component_id) != self._source:
+            return False
+        return not frame.incompat_flags if self.signing is None else self.signing.has_signed(frame)
+
+
+def check_signing(signing: Signing | None, mavlink_version: int) -> None:
+    """Raise LocalProtocolError when this version has no signatures."""
+    if signing is not None and mavlink_version == 1:
+        raise LocalProtocolError("signing needs MAVLink 2: mavlink_version = 1 has no signatures")

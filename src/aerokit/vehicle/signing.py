@@ -1,0 +1,60 @@
+"""Gives a vehicle a key for signing, or takes it away: SETUP_SIGNING, which is not acknowledged."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import anyio
+
+from aerokit.errors import NotSupported, OperationRejected, OperationTimeout
+from aerokit.mavlink.messages import SetupSigning
+from aerokit.vehicle.checks import check_seconds
+
+if TYPE_CHECKING:
+    from aerokit.mavlink.signing import Signing
+    from aerokit.vehicle.vehicle import Vehicle
+
+__all__ = ["set_up_signing"]
+
+SEND_AGAIN_S = 1.0
+"""A heartbeat comes each second, and shows whether the key was taken."""
+NO_KEY = bytes(32)
+
+
+async def set_up_signing(vehicle: Vehicle, signing: Signing | None, timeout: float) -> None:
+    """See :meth:`aerokit.Vehicle.setup_signing`."""
+    check_seconds("timeout", timeout)
+    _check_vehicle(vehicle)
+    connection, started = vehicle.connection, vehicle.connection.now()
+    with connection._gate.handing_over(signing, vehicle.system_id, vehicle.component_id) as taken:
+        with anyio.move_on_after(timeout):
+            while not taken.is_set():
+                vehicle.send(_message(vehicle, signing))
+                with anyio.move_on_after(SEND_AGAIN_S):
+                    await taken.wait()
+                connection.raise_if_ended()
+        if taken.is_set():
+            return
+    texts = "; ".join(vehicle.texts_since(started)) or "it said nothing about it"
+    wanted = "without a signature" if signing is None else f"signed with {signing.key!r}"
+    raise OperationTimeout(
+        f"setup_signing: no frame {wanted} came within {timeout:g} s; {texts}; {vehicle.describe_link()}"
+    )
+
+
+def _check_vehicle(vehicle: Vehicle) -> None:
+    heard = vehicle.connection.heard.get((vehicle.system_id, vehicle.component_id))
+    frame = None if heard is None else heard.received_frame
+    if vehicle.connection.mavlink_version == 1 or (frame is not None and frame.version == 1):
+        whose = "our" if vehicle.connection.mavlink_version == 1 else "the vehicle's"
+        raise NotSupported(f"setup_signing: {whose} frames are MAVLink 1, which has no signatures")
+    if not vehicle.is_surely_disarmed:
+        state = "armed" if vehicle.is_armed else "not known to be disarmed"
+        raise OperationRejected(f"setup_signing: the vehicle is {state}; nothing was sent")
+
+
+def _message(vehicle: Vehicle, signing: Signing | None) -> SetupSigning:
+    if signing is None:
+        return SetupSigning(vehicle.system_id, vehicle.component_id, NO_KEY, 0)
+    stamp = signing.timestamp_now(vehicle.connection.unix_time())
+    return SetupSigning(vehicle.system_id, vehicle.component_id, signing.key.secret, stamp)

@@ -1,0 +1,240 @@
+"""Signatures: golden bytes, both ways with pymavlink, and what a receiver must refuse."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from typing import Any
+
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+from pymavlink.dialects.v20 import ardupilotmega as peer
+
+from aerokit.errors import LocalProtocolError
+from aerokit.mavlink import Frame, FrameEncoder, Framer
+from aerokit.mavlink.messages import Heartbeat, ParamValue, RadioStatus
+from aerokit.mavlink.signing import Refusal, Signing, SigningKey, timestamp_at
+
+KEY = SigningKey.from_passphrase("a long secret")
+OTHER = SigningKey(bytes(range(32)))
+HEARTBEAT = Heartbeat(2, 3, 81, 0, 4)
+NOW = 1_790_000_000.0
+STAMP = 36_992_960_000_000
+"""``NOW`` as a time stamp."""
+GOLDEN = bytes.fromhex("fd09010007ffbe000000000000000203510403749c0500703d18a521409a061af9bb")
+"""HEARTBEAT as 255/190, number 7, link 5, at `NOW`, with `KEY`: made by pymavlink 2.4."""
+
+
+def signed(signing: Signing, *, system_id: int = 1, now: float = 0.0, sequence: int = 0) -> bytes:
+    encoder = FrameEncoder(system_id, 1)
+    encoder.signing, encoder.sequence = signing, sequence
+    return encoder.encode(HEARTBEAT, now)
+
+
+def framed(raw: bytes) -> Frame:
+    (frame,) = Framer().receive(raw)
+    return frame
+
+
+def pymavlink(key: SigningKey = KEY, *, link_id: int = 0, timestamp: int = 0) -> Any:
+    mav = peer.MAVLink(io.BytesIO(), srcSystem=255, srcComponent=190)
+    mav.signing.secret_key = key.secret
+    mav.signing.sign_outgoing = True
+    mav.signing.link_id = link_id
+    mav.signing.timestamp = timestamp
+    return mav
+
+
+# ------------------------------------------------------------------------------------------- keys
+
+
+def test_a_passphrase_is_hashed_as_ground_stations_do() -> None:
+    assert KEY.secret == hashlib.sha256(b"a long secret").digest()
+    assert SigningKey.from_text(" a long secret\n") == KEY
+    assert SigningKey.from_text(KEY.secret.hex().upper()) == KEY
+    assert SigningKey.from_text("x" * 64) == SigningKey.from_passphrase("x" * 64)
+    assert KEY != OTHER
+    assert len({KEY, SigningKey.from_passphrase("a long secret")}) == 1
+
+
+@pytest.mark.parametrize("secret", [b"", bytes(31), bytes(32), bytes(33), "a" * 32])
+def test_what_is_no_key_is_refused(secret: Any) -> None:
+    with pytest.raises(LocalProtocolError, match="key"):
+        SigningKey(secret)
+
+
+def test_no_text_shows_the_key() -> None:
+    signing = Signing(KEY)
+    for text in (repr(KEY), str(KEY), repr(signing), f"{signing}"):
+        assert KEY.fingerprint in text
+        assert KEY.secret.hex()[:8] not in text
+        assert "secret" not in text
+    assert OTHER.fingerprint != KEY.fingerprint
+
+
+@pytest.mark.parametrize(
+    "options", [{"link_id": -1}, {"link_id": 256}, {"timestamp": -1}, {"timestamp": 1 << 48}]
+)
+def test_options_out_of_range(options: Any) -> None:
+    with pytest.raises(LocalProtocolError, match=next(iter(options))):
+        Signing(KEY, **options)
+
+
+# ------------------------------------------------------------------------- golden bytes, both ways
+
+
+def test_golden_bytes() -> None:
+    assert timestamp_at(NOW) == STAMP
+    encoder = FrameEncoder(255, 190)
+    encoder.sequence = 7
+    encoder.signing = Signing(KEY, link_id=5)
+    assert encoder.encode(HEARTBEAT, NOW) == GOLDEN
+
+
+def test_pymavlink_makes_the_same_bytes() -> None:
+    mav = pymavlink(link_id=5, timestamp=STAMP)
+    mav.seq = 7
+    message = mav.heartbeat_encode(2, 3, 81, 0, 4)
+    assert message.pack(mav) == GOLDEN
+
+
+def test_pymavlink_accepts_what_we_sign_and_we_what_it_signs() -> None:
+    mav = pymavlink(timestamp=STAMP)
+    signing = Signing(KEY)
+    for number in range(5):
+        raw = signed(signing, now=NOW, sequence=number)
+        assert mav.parse_char(raw).get_signed()
+        theirs = mav.param_value_encode(b"NAME", 1.0, 9, 10, number).pack(mav)
+        assert signing.check(framed(theirs), NOW) is None
+
+
+def test_pymavlink_refuses_another_key() -> None:
+    mav = pymavlink(timestamp=STAMP)
+    with pytest.raises(peer.MAVError, match="signature"):
+        mav.parse_char(signed(Signing(OTHER), now=NOW))
+
+
+def test_version_1_is_not_signed() -> None:
+    encoder = FrameEncoder(1, 1, version=1)
+    encoder.signing = Signing(KEY)
+    frame = framed(encoder.encode(HEARTBEAT))
+    assert (frame.version, frame.signature) == (1, b"")
+    assert Signing(KEY).check(frame) is Refusal.UNSIGNED
+
+
+# ------------------------------------------------------------------------------------ time stamps
+
+
+@given(st.lists(st.floats(0, 4e9), max_size=20))
+@example([NOW, 0.0, NOW - 100, NOW + 1, NOW])
+def test_time_stamps_always_rise(clock: list[float]) -> None:
+    signing = Signing(KEY)
+    stamps = [int.from_bytes(signing.sign(b"frame", now)[1:7], "little") for now in clock]
+    assert stamps == sorted(set(stamps))
+    assert all(stamp >= timestamp_at(now) for stamp, now in zip(stamps, clock, strict=True))
+    assert signing.timestamp == (stamps[-1] + 1 if stamps else 0)
+
+
+def test_a_time_stamp_that_was_kept_is_later_than_a_clock_that_was_not() -> None:
+    before = Signing(KEY)
+    signed(before, now=NOW)
+    after = Signing(KEY, timestamp=before.timestamp)
+    listener = Signing(KEY)
+    assert listener.accepts(framed(signed(before, now=NOW + 1)))
+    assert listener.check(framed(signed(after, now=0.0))) is Refusal.REPLAYED
+    after = Signing(KEY, timestamp=before.timestamp)
+    assert listener.accepts(framed(signed(after, now=0.0)))
+
+
+def test_what_was_heard_moves_our_time_stamps_on() -> None:
+    ahead, listener = Signing(KEY, timestamp=STAMP), Signing(KEY)
+    assert listener.accepts(framed(signed(ahead)), NOW - 1000)
+    assert listener.timestamp == STAMP
+    assert framed(signed(listener)).signature[1:7] == STAMP.to_bytes(6, "little")
+
+
+def test_an_end_of_all_time_stamps() -> None:
+    signing = Signing(KEY, timestamp=(1 << 48) - 1)
+    signed(signing)
+    with pytest.raises(LocalProtocolError, match="used up"):
+        signed(signing)
+
+
+# --------------------------------------------------------------------------------------- refusals
+
+
+@given(st.integers(0, 8 * len(GOLDEN) - 1))
+def test_any_flipped_bit_is_refused(bit: int) -> None:
+    raw = bytearray(GOLDEN)
+    raw[bit // 8] ^= 1 << bit % 8
+    listener = Signing(KEY)
+    assert not any(listener.accepts(frame) for frame in Framer().receive(bytes(raw)))
+    # a sender who knows the format can make the checksum right, but not the signature
+    if 1 <= bit // 8 < len(GOLDEN) and raw[0] == 0xFD and raw[1] == GOLDEN[1] and raw[2] == 1:
+        assert listener.check(Frame.parse(bytes(raw))) is Refusal.WRONG_SIGNATURE
+    assert listener.accepts(framed(GOLDEN))
+
+
+@given(st.lists(st.integers(0, 9), min_size=1, max_size=40))
+def test_each_frame_of_a_sender_once_and_in_order(order: list[int]) -> None:
+    sender, listener = Signing(KEY), Signing(KEY)
+    frames = [framed(signed(sender, sequence=number)) for number in range(10)]
+    newest = -1
+    for number in order:
+        expected = None if number > newest else Refusal.REPLAYED
+        assert listener.check(frames[number]) is expected
+        newest = max(newest, number)
+    assert listener.refused[Refusal.REPLAYED] == listener.frames_refused
+
+
+def test_senders_and_links_have_time_stamps_of_their_own() -> None:
+    listener = Signing(KEY)
+    assert listener.accepts(framed(signed(Signing(KEY, timestamp=100))))
+    assert listener.accepts(framed(signed(Signing(KEY, timestamp=50, link_id=1))))
+    assert listener.accepts(framed(signed(Signing(KEY, timestamp=50), system_id=2)))
+    assert listener.check(framed(signed(Signing(KEY, timestamp=50)))) is Refusal.REPLAYED
+
+
+@pytest.mark.parametrize(("behind", "expected"), [(6_000_000, None), (6_000_001, Refusal.TOO_OLD)])
+def test_a_new_sender_may_be_a_minute_behind(behind: int, expected: Refusal | None) -> None:
+    frame = framed(signed(Signing(KEY, timestamp=STAMP - behind)))
+    assert Signing(KEY).check(frame, NOW) is expected
+    assert Signing(KEY, timestamp=STAMP).check(frame) is expected
+
+
+def test_what_another_link_has_heard_cannot_be_played_on_this_one() -> None:
+    first = Signing(KEY)
+    second = first.for_link(1)
+    frame = framed(signed(Signing(KEY)))
+    assert first.accepts(frame)
+    assert second.check(frame) is Refusal.REPLAYED
+    assert (first.link_id, second.link_id, second.key) == (0, 1, KEY)
+
+
+def test_unsigned_frames() -> None:
+    plain = framed(FrameEncoder(1, 1).encode(HEARTBEAT))
+    radio = framed(FrameEncoder(51, 68).encode(RadioStatus(1, 2, 3, 4, 5, 6, 7)))
+    signing = Signing(KEY)
+    assert signing.check(plain) is Refusal.UNSIGNED
+    assert signing.accepts(radio)
+    trusting = Signing(KEY, allow_unsigned=lambda frame: frame.component_id == 1)
+    assert trusting.accepts(plain)
+    assert trusting.accepts(framed(signed(Signing(OTHER))))
+    assert trusting.check(framed(FrameEncoder(1, 2).encode(HEARTBEAT))) is Refusal.UNSIGNED
+    assert trusting.refused == {**dict.fromkeys(Refusal, 0), Refusal.UNSIGNED: 1}
+
+
+def test_a_wrong_signature_moves_no_time_stamp() -> None:
+    listener = Signing(KEY)
+    assert not listener.accepts(framed(signed(Signing(OTHER, timestamp=STAMP))))
+    assert listener.timestamp == 0
+    assert listener.accepts(framed(signed(Signing(KEY))))
+
+
+def test_a_trimmed_payload_is_signed_as_it_is_on_the_wire() -> None:
+    encoder = FrameEncoder(1, 1)
+    encoder.signing = Signing(KEY)
+    frame = framed(encoder.encode(ParamValue("", 0.0, 0, 0, 0)))
+    assert len(frame.payload) == 1
+    assert Signing(KEY).accepts(frame)
