@@ -15,21 +15,26 @@ async with simulated_link(copter) as link, aerokit.connect(link) as vehicle:
 from __future__ import annotations
 
 from aerokit.sim.ardupilot import BootTimeline, SimulatedCopter, SimulatedPlane, SimulatedRover, SimulatedSub
+from aerokit.sim.components import SimulatedCamera, SimulatedComponent, SimulatedGimbal
 from aerokit.sim.faults import CommandFault, Faults
 from aerokit.sim.logs import SimulatedLog
 from aerokit.sim.motion import Wind
 from aerokit.sim.px4 import SimulatedPx4, SimulatedPx4Plane
 from aerokit.sim.recorded import RecordedVehicle
 from aerokit.sim.server import SimulatorServer, open_simulator, simulated_link
-from aerokit.sim.vehicle import ExtraComponent, SimulatedVehicle
+from aerokit.sim.vehicle import Component, ExtraComponent, SimulatedVehicle
 
 __all__ = [
     "BootTimeline",
     "CommandFault",
+    "Component",
     "ExtraComponent",
     "Faults",
     "RecordedVehicle",
+    "SimulatedCamera",
+    "SimulatedComponent",
     "SimulatedCopter",
+    "SimulatedGimbal",
     "SimulatedLog",
     "SimulatedPlane",
     "SimulatedPx4",

@@ -7,17 +7,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Protocol
 
 from aerokit.mavlink.enums import MavFrame, MavResult, MavSeverity
 from aerokit.mavlink.messages import CommandAck, CommandInt, CommandLong
 from aerokit.sim.faults import CommandFault
-from aerokit.sim.vehicle import SimulatedVehicle, sender_of
+from aerokit.sim.vehicle import sender_of
 
 if TYPE_CHECKING:
+    from aerokit.mavlink.message import Message
     from aerokit.sim.channel import Channel
+    from aerokit.sim.faults import Faults
 
-__all__ = ["Command", "CommandServer", "Progress"]
+__all__ = ["Command", "CommandServer", "Commanded", "Progress"]
 
 
 @dataclass(frozen=True)
@@ -70,6 +72,28 @@ class Progress:
 CommandHandler = Callable[[Command], "int | Progress | None"]
 
 
+class Commanded(Protocol):
+    """Who takes commands: a vehicle, or another component."""
+
+    faults: Faults
+
+    def on(self, message_class: type[Message], handler: Callable[[Any, Channel], None]) -> None:
+        """Hear such messages."""
+        ...
+
+    def send(self, message: Message, channel: Channel | None = None) -> None:
+        """Send on one channel, or on all."""
+        ...
+
+    def send_text(self, severity: int, text: str) -> None:
+        """Send a STATUSTEXT."""
+        ...
+
+    def call_later(self, delay: float, action: Callable[[], None]) -> None:
+        """Do something after ``delay`` seconds."""
+        ...
+
+
 class CommandServer:
     """Finds the handler of a command, lets faults meddle, and answers to who asked.
 
@@ -77,7 +101,7 @@ class CommandServer:
     out before the acknowledgement. An unknown command is UNSUPPORTED.
     """
 
-    def __init__(self, vehicle: SimulatedVehicle, handlers: dict[int, CommandHandler]) -> None:
+    def __init__(self, vehicle: Commanded, handlers: dict[int, CommandHandler]) -> None:
         self._vehicle = vehicle
         self._handlers = handlers
         vehicle.on(CommandLong, self._on_long)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from aerokit.mavlink.message import Message
     from aerokit.sim.channel import Channel
-    from aerokit.sim.vehicle import ExtraComponent
+    from aerokit.sim.vehicle import Component
 
 __all__ = ["RecordedVehicle"]
 
@@ -54,7 +54,7 @@ class RecordedVehicle(SimulatedVehicle):
         start_s: float = 0.0,
         repeat: bool = False,
         seed: int = 0,
-        components: Iterable[ExtraComponent] = (),
+        components: Iterable[Component] = (),
     ) -> None:
         self.recording = FlightRecording(recording, system_id)
         super().__init__(

@@ -12,7 +12,7 @@ import random
 from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass
 from heapq import heappop, heappush
-from typing import Any
+from typing import Any, Protocol
 
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.enums import MavAutopilot, MavModeFlag, MavSeverity, MavState, MavType
@@ -21,7 +21,7 @@ from aerokit.mavlink.messages import Heartbeat, Statustext
 from aerokit.sim.channel import Channel
 from aerokit.sim.faults import Faults
 
-__all__ = ["ExtraComponent", "SimulatedVehicle", "sender_of"]
+__all__ = ["Component", "ExtraComponent", "SimulatedVehicle", "sender_of"]
 
 TICK_S = 0.02
 """Motion, modes and failsafes run at 50 Hz while anything moves."""
@@ -30,9 +30,22 @@ _TEXT_SIZE = 50
 Handler = Callable[[Any, Channel], None]
 
 
+class Component(Protocol):
+    """Another MAVLink component on this vehicle's links: `ExtraComponent`, or a device of `aerokit.sim.components`."""
+
+    @property
+    def component_id(self) -> int:
+        """Its MAV_COMPONENT."""
+        ...
+
+    def join(self, vehicle: SimulatedVehicle) -> None:
+        """Called once by the vehicle that it is given to."""
+        ...
+
+
 @dataclass(frozen=True)
 class ExtraComponent:
-    """Another MAVLink component that shows up on this vehicle's links with a heartbeat once a second."""
+    """A component that shows up with a heartbeat once a second, and says and hears nothing else."""
 
     component_id: int
     type: int = MavType.GIMBAL
@@ -43,6 +56,15 @@ class ExtraComponent:
     custom_mode: int = 0
     system_status: int = MavState.ACTIVE
 
+    def join(self, vehicle: SimulatedVehicle) -> None:
+        """Send heartbeats from the vehicle's next start on."""
+        heartbeat = Heartbeat(
+            self.type, self.autopilot, self.base_mode, self.custom_mode, self.system_status, 3
+        )
+        system_id = vehicle.system_id if self.system_id is None else self.system_id
+        sender = (system_id, self.component_id)
+        vehicle.when_powered_on(lambda: vehicle.every(1.0, lambda: vehicle.send(heartbeat, sender=sender)))
+
 
 class SimulatedVehicle:
     """The sans-IO frame of a vehicle; a subclass says what it hears, what it streams and how it moves.
@@ -52,7 +74,7 @@ class SimulatedVehicle:
     """
 
     def __init__(
-        self, *, system_id: int, component_id: int, seed: int, components: Iterable[ExtraComponent]
+        self, *, system_id: int, component_id: int, seed: int, components: Iterable[Component]
     ) -> None:
         self.system_id = system_id
         self.component_id = component_id
@@ -65,6 +87,7 @@ class SimulatedVehicle:
         self.components = tuple(components)
         self.handlers: dict[int, Handler] = {}
         """Message id → what is done with such a message."""
+        self._overheard: dict[int, list[Handler]] = {}
         self._timers: list[tuple[float, int, Callable[[], None]]] = []
         self._timer_count = 0
         self._ticks_from = math.inf
@@ -74,6 +97,8 @@ class SimulatedVehicle:
         self._at_power_on: list[Callable[[], None]] = []
         self.channels: list[Channel] = []
         self._channel = self.open_channel()
+        for component in self.components:
+            component.join(self)
 
     # ---------------------------------------------------------------------------- bytes, time, bytes
 
@@ -149,8 +174,6 @@ class SimulatedVehicle:
     def power_on(self) -> None:
         """Start booting now."""
         self.booted_at, self._is_on = self.now, True
-        for component in self.components:
-            self.every(1.0, lambda component=component: self._send_component(component))  # type: ignore[misc]
         self.boot()
         for channel in self.channels:
             self.start_channel(channel)
@@ -250,6 +273,11 @@ class SimulatedVehicle:
         """Hear such messages from now on, when they are for this vehicle."""
         self.handlers[message_class.ID] = handler
 
+    def overhear(self, message_class: type[Message], handler: Handler) -> None:
+        """Hear such messages whoever they are for, besides what the vehicle does with them."""
+        self._overheard.setdefault(message_class.ID, []).append(handler)
+        self.handlers.setdefault(message_class.ID, _do_nothing)
+
     def is_for_me(self, message: Message) -> bool:
         """Whether a message is addressed to this component or to everybody."""
         system, component = getattr(message, "target_system", 0), getattr(message, "target_component", 0)
@@ -286,6 +314,8 @@ class SimulatedVehicle:
     def _handle(self, message_id: int, frame: Any, channel: Channel) -> None:
         handler = self.handlers.get(message_id)
         message = STANDARD.decode(frame)
+        for overhear in self._overheard.get(message_id, ()):
+            overhear(message, channel)
         if handler is None or not self.is_for_me(message):
             return
         if self.faults.drop_incoming > 0:
@@ -304,17 +334,9 @@ class SimulatedVehicle:
             return True
         return faults.loss > 0.0 and self.rng.random() < faults.loss
 
-    def _send_component(self, component: ExtraComponent) -> None:
-        heartbeat = Heartbeat(
-            component.type,
-            component.autopilot,
-            component.base_mode,
-            component.custom_mode,
-            component.system_status,
-            3,
-        )
-        system_id = self.system_id if component.system_id is None else component.system_id
-        self.send(heartbeat, sender=(system_id, component.component_id))
+
+def _do_nothing(_message: Message, _channel: Channel) -> None:
+    pass
 
 
 def sender_of(message: Message) -> tuple[int, int]:

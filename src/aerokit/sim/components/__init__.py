@@ -1,0 +1,14 @@
+"""Devices with a component id of their own that are put beside any simulated vehicle: cameras and gimbals.
+
+```python
+copter = SimulatedCopter(components=[SimulatedCamera(), SimulatedGimbal()])
+```
+"""
+
+from __future__ import annotations
+
+from aerokit.sim.components.camera import SimulatedCamera
+from aerokit.sim.components.component import SimulatedComponent
+from aerokit.sim.components.gimbal import SimulatedGimbal
+
+__all__ = ["SimulatedCamera", "SimulatedComponent", "SimulatedGimbal"]

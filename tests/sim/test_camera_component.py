@@ -1,0 +1,318 @@
+"""A camera of its own beside a vehicle: what it says, takes, keeps and refuses."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from component_client import ComponentClient, copter_with, settled, source
+
+from aerokit.errors import LocalProtocolError
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import (
+    CameraCapFlags,
+    CameraMode,
+    MavCmd,
+    MavResult,
+    MavType,
+    VideoStreamStatusFlags,
+)
+from aerokit.sim import ExtraComponent, SimulatedCamera, SimulatedCopter, SimulatedPx4, SimulatedVehicle
+
+CAMERA = 100
+START, STOP = MavCmd.IMAGE_START_CAPTURE, MavCmd.IMAGE_STOP_CAPTURE
+DONE, DENIED, BUSY = [MavResult.ACCEPTED], [MavResult.DENIED], [MavResult.TEMPORARILY_REJECTED]
+FAILED, UNSUPPORTED = [MavResult.FAILED], [MavResult.UNSUPPORTED]
+
+
+def fitted(**options: object) -> tuple[SimulatedCamera, ComponentClient]:
+    camera = SimulatedCamera(**options)  # type: ignore[arg-type]
+    _, client = copter_with(camera)
+    return camera, client
+
+
+def test_it_has_a_heartbeat_of_its_own() -> None:
+    _, client = fitted()
+    client.run(3.0)
+    heartbeats = client.said_by(CAMERA, m.Heartbeat)
+    assert [heartbeat.type for heartbeat in heartbeats] == [MavType.CAMERA] * 3
+    assert len(client.said_by(1, m.Heartbeat)) == 3
+
+
+def test_it_tells_what_it_is() -> None:
+    camera, client = fitted(model="Eye", resolution=(640, 480), streams=["rtsp://127.0.0.1/a"])
+    (information,) = client.request(CAMERA, m.CameraInformation)
+    assert information.model_name.rstrip(b"\0") == b"Eye"
+    assert (information.resolution_h, information.resolution_v) == (640, 480)
+    assert information.flags == camera.capabilities
+    assert information.flags & CameraCapFlags.HAS_VIDEO_STREAM
+    (settings,) = client.request(CAMERA, m.CameraSettings)
+    assert (settings.mode_id, settings.zoomLevel) == (CameraMode.IMAGE, 0.0)
+    (card,) = client.request(CAMERA, m.StorageInformation)
+    assert (card.storage_count, card.total_capacity, card.used_capacity) == (1, 8192.0, 0.0)
+    assert client.ask(CAMERA, MavCmd.REQUEST_MESSAGE, m.StorageInformation.ID, 2) == FAILED
+    assert client.ask(CAMERA, MavCmd.REQUEST_MESSAGE, m.Attitude.ID) == DENIED
+
+
+def test_a_program_of_old_asks_differently() -> None:
+    _, client = fitted(streams=["rtsp://127.0.0.1/a"])
+    for command, kind in (
+        (MavCmd.REQUEST_CAMERA_INFORMATION, m.CameraInformation),
+        (MavCmd.REQUEST_CAMERA_SETTINGS, m.CameraSettings),
+        (MavCmd.REQUEST_STORAGE_INFORMATION, m.StorageInformation),
+        (MavCmd.REQUEST_CAMERA_CAPTURE_STATUS, m.CameraCaptureStatus),
+        (MavCmd.REQUEST_VIDEO_STREAM_INFORMATION, m.VideoStreamInformation),
+    ):
+        assert client.ask(CAMERA, command, 1) == DONE
+        assert client.all(kind), kind
+
+
+def test_a_picture_is_there_a_moment_later() -> None:
+    camera, client = fitted()
+    copter = client.vehicle
+    assert isinstance(copter, SimulatedCopter)
+    assert client.ask(CAMERA, START, 0, 0, 1) == DONE
+    (status,) = client.request(CAMERA, m.CameraCaptureStatus)
+    assert (status.image_status, status.image_count) == (1, 0)
+    client.run(0.3)
+    (image,) = client.all(m.CameraImageCaptured)
+    place = copter.frame.to_global(copter.motion.north, copter.motion.east, copter.motion.down)
+    assert (image.image_index, image.capture_result) == (0, 1)
+    assert (image.lat, image.lon) == (place.latitude_e7, place.longitude_e7)
+    assert image.alt == pytest.approx(place.altitude_m * 1000, abs=1)
+    assert image.q[0] == pytest.approx(math.cos(copter.motion.yaw / 2), abs=0.01)
+    assert client.last(m.CameraCaptureStatus).image_count == camera.image_count == 1
+    assert source(image) == (1, CAMERA)
+
+
+def test_the_same_order_again_takes_no_second_picture() -> None:
+    camera, client = fitted()
+    for number, count in ((1, 1), (1, 1), (2, 2)):
+        assert client.ask(CAMERA, START, 0, 0, 1, number) == DONE
+        client.run(0.3)
+        assert camera.image_count == count
+
+
+def test_a_series_ends_by_itself() -> None:
+    camera, client = fitted()
+    assert client.ask(CAMERA, START, 0, 1.0, 3) == DONE
+    assert client.ask(CAMERA, START, 0, 0, 1) == BUSY
+    client.run(1.5)
+    (status,) = client.request(CAMERA, m.CameraCaptureStatus)
+    assert (status.image_status, status.image_interval, status.image_count) == (2, 1.0, 2)
+    client.run(3.0)
+    assert [image.image_index for image in client.all(m.CameraImageCaptured)] == [0, 1, 2]
+    (status,) = client.request(CAMERA, m.CameraCaptureStatus)
+    assert (status.image_status, camera.image_count) == (0, 3)
+
+
+def test_an_endless_series_is_stopped() -> None:
+    camera, client = fitted()
+    client.ask(CAMERA, START, 0, 0.5, 0)
+    client.run(2.3)
+    assert client.ask(CAMERA, STOP) == DONE
+    client.run(3.0)
+    assert camera.image_count == 5
+
+
+def test_pictures_that_were_not_heard_are_asked_for() -> None:
+    """The client counts: the index of each picture is one more than that of the last."""
+    camera, client = fitted()
+    client.ask(CAMERA, START, 0, 1.0, 6)
+    client.run(0.9)
+    camera.faults.silent = True
+    client.run(3.0)
+    camera.faults.silent = False
+    client.run(3.0)
+    heard = {image.image_index for image in client.all(m.CameraImageCaptured)}
+    (status,) = client.request(CAMERA, m.CameraCaptureStatus)
+    missing = set(range(status.image_count)) - heard
+    assert missing == {1, 2, 3}
+    (again,) = client.request(CAMERA, m.CameraImageCaptured, 2)
+    assert again.image_index == 2
+    two = client.request(CAMERA, m.CameraImageCaptured, 1, 3)
+    assert [image.image_index for image in two] == [1, 2, 3]
+    assert len(client.request(CAMERA, m.CameraImageCaptured, 4, -1)) == 2
+    assert len(client.request(CAMERA, m.CameraImageCaptured, -1)) == 6
+    assert client.ask(CAMERA, MavCmd.REQUEST_MESSAGE, m.CameraImageCaptured.ID, 6) == FAILED
+
+
+def test_a_full_card_takes_no_more() -> None:
+    camera, client = fitted(capacity_mib=12.0)
+    client.ask(CAMERA, START, 0, 0.5, 0)
+    client.run(4.0)
+    assert [image.capture_result for image in client.all(m.CameraImageCaptured)] == [1, 1, 0]
+    assert client.ask(CAMERA, START, 0, 0, 1) == FAILED
+    (card,) = client.request(CAMERA, m.StorageInformation)
+    assert (card.used_capacity, card.available_capacity) == (10.0, 2.0)
+    camera.card.is_inserted = False
+    (card,) = client.request(CAMERA, m.StorageInformation)
+    assert (card.status, card.available_capacity) == (0, 0.0)
+
+
+def test_formatting_takes_its_time() -> None:
+    camera, client = fitted()
+    client.ask(CAMERA, START, 0, 0, 1)
+    client.run(1.0)
+    client.forget()
+    client.ask(CAMERA, MavCmd.STORAGE_FORMAT, 1, 1, 1)
+    client.run(3.0)
+    acks = [(ack.result, ack.progress) for ack in client.all(m.CommandAck)]
+    assert acks == [
+        *((MavResult.IN_PROGRESS, percent) for percent in (0, 25, 50, 75)),
+        (MavResult.ACCEPTED, 0),
+    ]
+    assert (camera.card.used_mib, camera.image_count) == (0.0, 0)
+
+
+def test_a_video_is_taken_in_its_mode() -> None:
+    camera, client = fitted()
+    assert client.ask(CAMERA, MavCmd.VIDEO_START_CAPTURE) == DENIED
+    assert client.ask(CAMERA, MavCmd.SET_CAMERA_MODE, 0, CameraMode.VIDEO) == DONE
+    assert client.last(m.CameraSettings).mode_id == CameraMode.VIDEO
+    assert client.ask(CAMERA, START, 0, 0, 1) == DENIED
+    assert client.ask(CAMERA, MavCmd.VIDEO_START_CAPTURE, 0, 1.0) == DONE
+    assert client.ask(CAMERA, MavCmd.VIDEO_START_CAPTURE) == BUSY
+    assert client.ask(CAMERA, MavCmd.SET_CAMERA_MODE, 0, CameraMode.IMAGE) == BUSY
+    client.run(3.5)
+    told = client.all(m.CameraCaptureStatus)
+    assert [(status.video_status, status.recording_time_ms) for status in told] == [
+        (1, 0), (1, 1000), (1, 2000), (1, 3000),
+    ]  # fmt: skip
+    assert client.ask(CAMERA, MavCmd.VIDEO_STOP_CAPTURE) == DONE
+    assert client.last(m.CameraCaptureStatus).video_status == 0
+    assert camera.card.used_mib == pytest.approx(35.0)
+
+
+def test_zoom_and_focus_are_told() -> None:
+    _, client = fitted()
+    assert client.ask(CAMERA, MavCmd.SET_CAMERA_ZOOM, 2, 40.0) == DONE
+    assert client.ask(CAMERA, MavCmd.SET_CAMERA_ZOOM, 0, 1.0) == DONE
+    assert client.ask(CAMERA, MavCmd.SET_CAMERA_FOCUS, 2, 70.0) == DONE
+    settings = client.last(m.CameraSettings)
+    assert (settings.zoomLevel, settings.focusLevel) == (50.0, 70.0)
+    assert client.ask(CAMERA, MavCmd.SET_CAMERA_ZOOM, 2, 140.0) == DENIED
+    assert client.ask(CAMERA, MavCmd.RESET_CAMERA_SETTINGS, 1) == DONE
+    assert client.last(m.CameraSettings).zoomLevel == 0.0
+
+
+def test_one_without_a_lens_or_a_video_says_so() -> None:
+    _, client = fitted(capabilities=CameraCapFlags.CAPTURE_IMAGE)
+    assert client.ask(CAMERA, MavCmd.SET_CAMERA_ZOOM, 2, 40.0) == UNSUPPORTED
+    assert client.ask(CAMERA, MavCmd.VIDEO_START_CAPTURE) == UNSUPPORTED
+    assert client.ask(CAMERA, MavCmd.SET_CAMERA_MODE, 0, 0) == UNSUPPORTED
+    assert client.ask(CAMERA, MavCmd.VIDEO_START_STREAMING) == UNSUPPORTED
+    assert math.isnan(client.request(CAMERA, m.CameraSettings)[0].zoomLevel)
+
+
+def test_video_streams_are_listed_and_switched() -> None:
+    _, client = fitted(streams=["rtsp://10.0.0.1/main", "udp://10.0.0.1:5600"])
+    streams = client.request(CAMERA, m.VideoStreamInformation, 0)
+    assert [(each.stream_id, each.count) for each in streams] == [(1, 2), (2, 2)]
+    assert client.request(CAMERA, m.VideoStreamInformation, 2)[0].uri == "udp://10.0.0.1:5600"
+    assert client.ask(CAMERA, MavCmd.VIDEO_STOP_STREAMING, 2) == DONE
+    flags = [status.flags for status in client.request(CAMERA, m.VideoStreamStatus, 0)]
+    assert flags == [VideoStreamStatusFlags.RUNNING, 0]
+    assert client.ask(CAMERA, MavCmd.VIDEO_START_STREAMING, 3) == DENIED
+
+
+def test_its_messages_have_rates_of_their_own() -> None:
+    _, client = fitted()
+    interval = MavCmd.SET_MESSAGE_INTERVAL
+    assert client.ask(CAMERA, interval, m.CameraCaptureStatus.ID, 500_000) == DONE
+    client.ask(CAMERA, MavCmd.GET_MESSAGE_INTERVAL, m.CameraCaptureStatus.ID)
+    assert client.last(m.MessageInterval).interval_us == 500_000
+    client.run(2.2)
+    assert len(client.all(m.CameraCaptureStatus)) == 5
+    assert client.ask(CAMERA, interval, m.CameraCaptureStatus.ID, -1) == DONE
+    client.forget()
+    client.run(2.0)
+    assert not client.all(m.CameraCaptureStatus)
+    assert client.ask(CAMERA, interval, m.Attitude.ID, 500_000) == DENIED
+
+
+# ----------------------------------------------------------------------------------- several of them
+
+
+def test_commands_reach_whom_they_are_for() -> None:
+    """One camera, both cameras, everybody; nobody answers for a component that is not there."""
+    one, two = SimulatedCamera(100), SimulatedCamera(101)
+    _, client = copter_with(one, two, ExtraComponent(102))
+    assert client.ask(101, START, 0, 0, 1) == DONE
+    client.run(0.3)
+    assert (one.image_count, two.image_count) == (0, 1)
+    assert [source(image) for image in client.all(m.CameraImageCaptured)] == [(1, 101)]
+    assert client.ask(102, START, 0, 0, 1) == []
+    client.forget()
+    client.ask(0, START, 0, 0, 1)
+    client.run(0.3)
+    assert (one.image_count, two.image_count) == (1, 2)
+    assert {source(ack) for ack in client.all(m.CommandAck)} == {(1, 1), (1, 100), (1, 101)}
+
+
+def test_a_broadcast_that_it_does_not_know_is_left_to_the_autopilot() -> None:
+    _, client = fitted()
+    assert client.ask(0, MavCmd.RUN_PREARM_CHECKS) == DONE
+    assert client.ask(CAMERA, MavCmd.RUN_PREARM_CHECKS) == UNSUPPORTED
+    assert client.ask(1, MavCmd.STORAGE_FORMAT, 1) == UNSUPPORTED
+
+
+def test_a_camera_that_is_a_system_of_its_own() -> None:
+    camera = SimulatedCamera(100, system_id=42)
+    _, client = copter_with(camera)
+    client.run(2.0)
+    assert client.said_by(100, m.Heartbeat, system=42)
+    assert client.ask(100, START, 0, 0, 1) == []
+    assert client.ask(100, START, 0, 0, 1, system=42) == DONE
+
+
+def test_faults_are_its_own() -> None:
+    camera, client = fitted()
+    camera.faults.refuse(START, MavResult.TEMPORARILY_REJECTED, "card is slow", times=1)
+    assert client.ask(CAMERA, START, 0, 0, 1) == BUSY
+    assert client.texts == ["card is slow"]
+    assert source(client.last(m.Statustext)) == (1, CAMERA)
+    camera.faults.silent = True
+    client.forget()
+    assert client.ask(CAMERA, START, 0, 0, 1) == []
+    client.run(3.0)
+    assert not client.said_by(CAMERA, m.Heartbeat)
+    assert client.said_by(1, m.Heartbeat)
+    camera.faults.silent = False
+    camera.faults.drop_incoming = 1
+    assert client.ask(CAMERA, START, 0, 0, 1) == []
+    assert client.ask(CAMERA, START, 0, 0, 1) == DONE
+
+
+def test_a_reboot_of_the_vehicle_ends_a_series_and_keeps_the_pictures() -> None:
+    camera, client = fitted()
+    client.ask(CAMERA, START, 0, 0.5, 0)
+    client.run(1.3)
+    taken = camera.image_count
+    assert taken == 3
+    client.ask(1, MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, 1)
+    client.run(6.0)
+    assert camera.image_count == taken
+    assert client.ask(CAMERA, START, 0, 0, 1) == DONE
+    client.forget()
+    client.run(2.05)
+    assert len(client.said_by(CAMERA, m.Heartbeat)) == 2
+
+
+@pytest.mark.parametrize("make", [SimulatedPx4, SimulatedCopter])
+def test_it_fits_on_any_vehicle(make: type[SimulatedVehicle]) -> None:
+    camera = SimulatedCamera()
+    vehicle = make(components=[camera])  # type: ignore[call-arg]
+    client = settled(vehicle)
+    assert client.ask(CAMERA, START, 0, 0, 1) == DONE
+    client.run(0.3)
+    assert client.last(m.CameraImageCaptured).lat == pytest.approx(vehicle.frame.origin.latitude_e7, abs=50)  # type: ignore[attr-defined]
+
+
+def test_it_belongs_to_one_vehicle() -> None:
+    camera = SimulatedCamera()
+    with pytest.raises(LocalProtocolError):
+        _ = camera.system_id
+    SimulatedCopter(components=[camera])  # type: ignore[list-item]
+    with pytest.raises(LocalProtocolError):
+        SimulatedCopter(components=[camera])  # type: ignore[list-item]
