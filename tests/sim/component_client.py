@@ -9,7 +9,7 @@ from simulated_client import Client
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd
 from aerokit.mavlink.message import Message
-from aerokit.sim import SimulatedCopter, SimulatedVehicle
+from aerokit.sim import Component, SimulatedCopter, SimulatedVehicle
 
 M = TypeVar("M", bound=Message)
 
@@ -40,7 +40,7 @@ def source(message: Message) -> tuple[int, int]:
     return (frame.system_id, frame.component_id)
 
 
-def copter_with(*components: object, **options: object) -> tuple[SimulatedCopter, ComponentClient]:
+def copter_with(*components: Component, **options: object) -> tuple[SimulatedCopter, ComponentClient]:
     """Booted, with these devices."""
     copter = SimulatedCopter(boot_time_s=0.0, components=components, **options)  # type: ignore[arg-type]
     return copter, settled(copter)

@@ -313,6 +313,6 @@ def test_it_belongs_to_one_vehicle() -> None:
     camera = SimulatedCamera()
     with pytest.raises(LocalProtocolError):
         _ = camera.system_id
-    SimulatedCopter(components=[camera])  # type: ignore[list-item]
+    SimulatedCopter(components=[camera])
     with pytest.raises(LocalProtocolError):
-        SimulatedCopter(components=[camera])  # type: ignore[list-item]
+        SimulatedCopter(components=[camera])

@@ -154,10 +154,8 @@ def test_it_looks_at_a_place() -> None:
     copter = client.vehicle
     assert isinstance(copter, SimulatedCopter)
     place = copter.frame.to_global(0.0, 100.0, 0.0)
-    numbers = {"x": place.latitude_e7, "y": place.longitude_e7, "z": 100.0}
-    order = m.CommandInt(
-        1, GIMBAL, MavFrame.GLOBAL_RELATIVE_ALT, MavCmd.DO_SET_ROI_LOCATION, 0, 0, 0, 0, 0, 0, **numbers
-    )
+    frame, where = MavFrame.GLOBAL_RELATIVE_ALT, (place.latitude_e7, place.longitude_e7)
+    order = m.CommandInt(1, GIMBAL, frame, MavCmd.DO_SET_ROI_LOCATION, 0, 0, 0, 0, 0, 0, *where, 100.0)
     client.send(order)
     assert client.last(m.CommandAck).result == MavResult.ACCEPTED
     client.run(4.0)

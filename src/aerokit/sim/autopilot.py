@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, ClassVar, Protocol
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavProtocolCapability
 from aerokit.sim.commands import CommandHandler, CommandServer
-from aerokit.sim.vehicle import ExtraComponent, SimulatedVehicle, sender_of
+from aerokit.sim.vehicle import Component, SimulatedVehicle, sender_of
 
 if TYPE_CHECKING:
     from aerokit.sim.channel import Channel
@@ -41,7 +41,7 @@ class SimulatedAutopilot(SimulatedVehicle):
         *,
         system_id: int,
         seed: int,
-        components: Iterable[ExtraComponent],
+        components: Iterable[Component],
         version: str,
         unsupported_commands: Collection[int],
         unix_time_at_boot: float,

@@ -31,7 +31,7 @@ from aerokit.sim.autopilot import SimulatedAutopilot
 from aerokit.sim.battery import Battery
 from aerokit.sim.local_frame import GlobalPoint, LocalFrame
 from aerokit.sim.motion import Motion, Wind
-from aerokit.sim.vehicle import ExtraComponent, sender_of
+from aerokit.sim.vehicle import Component, sender_of
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
@@ -67,7 +67,7 @@ class ArduPilotVehicle(SimulatedAutopilot):
     - ``wind``: constant wind and gusts; ``rangefinder_reach_m``: 0 means that there is no range finder
     - ``unsupported_commands``: MAV_CMDs that this firmware does not know (SET_MESSAGE_INTERVAL if it is old);
       ``stream_groups`` False: it does not know REQUEST_DATA_STREAM
-    - ``components``: other components on its links (gimbal, camera), heartbeats only
+    - ``components``: other components on its links: `SimulatedCamera`, `SimulatedGimbal`, or only heartbeats
     - ``unix_time_at_boot``: what its GPS clock says at simulated second 0
     """
 
@@ -110,7 +110,7 @@ class ArduPilotVehicle(SimulatedAutopilot):
         rangefinder_reach_m: float = 0.0,
         unsupported_commands: Collection[int] = (),
         stream_groups: bool = True,
-        components: Iterable[ExtraComponent] = (),
+        components: Iterable[Component] = (),
         unix_time_at_boot: float = 1_790_000_000.0,
     ) -> None:
         self.parameters = parameters_of(self.KIND, parameter_count)

@@ -34,7 +34,7 @@ from aerokit.sim.px4.offboard import Offboard
 from aerokit.sim.px4.parameters import px4_parameters
 from aerokit.sim.px4.storage import DEFAULT_LOGS, Storage
 from aerokit.sim.px4.telemetry import BUILDERS, DEFAULT_RATES_HZ, FAST_MESSAGES
-from aerokit.sim.vehicle import ExtraComponent, sender_of
+from aerokit.sim.vehicle import Component, sender_of
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
@@ -97,7 +97,7 @@ class SimulatedPx4(SimulatedAutopilot):
         wind: Wind | None = None,
         fast_rate_hz: float = 50.0,
         unsupported_commands: Collection[int] = (),
-        components: Iterable[ExtraComponent] = (),
+        components: Iterable[Component] = (),
         unix_time_at_boot: float = 1_790_000_000.0,
     ) -> None:
         self.parameters = px4_parameters(parameter_count, self.PARAMETER_TABLE)
