@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from aerokit.dronekit.attributes import VehicleAttributes
 from aerokit.dronekit.observers import HasObservers
 from aerokit.dronekit.privates import LocationPrivates
 from aerokit.dronekit.values import LocationGlobal, LocationGlobalRelative, LocationLocal
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
 __all__ = ["Locations"]
 
 UNKNOWN = (None, None)
-HELD = "_dk_global_position held"
+HELD = VehicleAttributes._dk_global_position.key
 """Where a vehicle keeps the frame or message of its global position."""
 
 _Numbers = tuple[object, "float | None", "float | None", "float | None", "float | None"]
