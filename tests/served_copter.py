@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from anyio.from_thread import start_blocking_portal
 
 from aerokit.sim import SimulatedCopter, open_simulator
+from aerokit.sim.patience import wait_longer
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Sequence
@@ -28,12 +29,9 @@ def served_copter(*addresses: str, speedup: float = SPEEDUP, **options: Any) -> 
 def served(copters: Sequence[SimulatedCopter], *addresses: str, speedup: float = SPEEDUP) -> Iterator[str]:
     """Serve copters on addresses (by default one TCP port); gives the first address, as a client spells it.
 
-    They stay armed on the ground, and overrides of channels hold for seconds of ours: ten seconds of theirs pass
-    quickly, and this machine may be busy.
+    They wait for us by our clock: ten seconds of theirs pass quickly, and this machine may be busy.
     """
-    for copter in copters:
-        copter.parameters["DISARM_DELAY"] = 0.0
-        copter.parameters["RC_OVERRIDE_TIME"] *= speedup
+    wait_longer(copters, speedup)
 
     @asynccontextmanager
     async def serve() -> AsyncIterator[str]:

@@ -11,6 +11,7 @@ from aerokit.cli.places import each_with_its_own, place_of
 from aerokit.cli.vehicles import simulated_fleet
 from aerokit.links import create_link
 from aerokit.sim import SimulatedVehicle, SimulatorServer, Wind
+from aerokit.sim.patience import wait_longer
 
 if TYPE_CHECKING:
     import argparse
@@ -27,6 +28,7 @@ CLIENTS_USE = {"tcpin": "tcp", "udpout": "udpin", "udpbcast": "udpin", "udpin": 
 async def run_sim(options: argparse.Namespace) -> int:
     """Serve them until interrupted, or for as long as was asked."""
     vehicles = _fleet(options)
+    wait_longer(vehicles, options.speedup, leave=dict(options.parameters))
     tracks = _tracks(vehicles, options.picture)
     server = _server(vehicles, options.addresses, options.speedup)
     stop = asyncio.Event()

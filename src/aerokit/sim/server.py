@@ -22,6 +22,8 @@ __all__ = ["SimulatorServer", "open_simulator", "simulated_link"]
 _SHORTEST_WAIT_S = 0.001
 """Of the loop's time, for many vehicles or when they run faster than it: several ticks are then done in one go."""
 _MANY = 10
+_LONGEST_LATENESS_S = 0.25
+"""Of the loop's time; faster than real time, what it was late beyond that does not pass for the vehicles."""
 
 
 class SimulatorServer:
@@ -30,8 +32,9 @@ class SimulatorServer:
     ``vehicles_on`` says for each link, in the order of the links, which vehicles are on it instead.
 
     It runs on the loop's own clock by timers alone: no task, no thread. ``speedup`` 10 makes ten simulated
-    seconds of a real one. What the loop missed because something blocked it is caught up. Leaving the block
-    closes the links.
+    seconds of a real one. What the loop missed because something blocked it is caught up in real time. Faster, all
+    but a quarter of a second of it is left out: a client that had no chance to speak is not taken for a silent one.
+    Leaving the block closes the links.
 
     Raises LinkOpenError when a link cannot be opened; nothing is left behind then.
     """
@@ -62,7 +65,7 @@ class SimulatorServer:
         self._now_at_start = max((vehicle.now for vehicle in self.vehicles), default=0.0)
         self._ports: list[_Port] = []
         self._timer: asyncio.TimerHandle | None = None
-        self._timer_due = 0.0
+        self._timer_due = self._timer_at = 0.0
         self._exit = AsyncExitStack()
 
     @property
@@ -108,10 +111,12 @@ class SimulatorServer:
     def wake(self) -> None:
         """Let everything happen that is due; call it after a fault or a value was changed by hand."""
         if self._loop is not None:
+            self._leave_out_lateness()
             self._dues = [vehicle.next_due for vehicle in self.vehicles]
             self._run(self.now)
 
     def _on_timer(self) -> None:
+        self._leave_out_lateness()
         self._timer = None
         self._run(max(self.now, self._timer_due))  # a timer may fire a hair early
 
@@ -131,6 +136,7 @@ class SimulatorServer:
         """Bytes came in on a link."""
         if self._loop is None:
             return
+        self._leave_out_lateness()
         now = self.now
         for vehicle, channel in zip(port.vehicles, port.channels, strict=True):
             vehicle.receive(data, max(now, vehicle.now), peer, channel)
@@ -157,7 +163,17 @@ class SimulatorServer:
         when = self._started_at + (due - self._now_at_start) / self._speedup
         if self._shortest_wait_s:
             when = max(when, loop.time() + self._shortest_wait_s)
-        self._timer_due, self._timer = due, loop.call_at(when, self._on_timer)
+        self._timer_due, self._timer_at = due, when
+        self._timer = loop.call_at(when, self._on_timer)
+
+    def _leave_out_lateness(self) -> None:
+        """The timer should have come before now; in real time nothing is left out."""
+        if self._loop is None or self._timer is None or self._speedup == 1.0:
+            return
+        late = self._loop.time() - self._timer_at - _LONGEST_LATENESS_S
+        if late > 0:
+            self._started_at += late
+            self._timer_at += late
 
 
 class _Port:

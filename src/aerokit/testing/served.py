@@ -7,6 +7,7 @@ from contextlib import asynccontextmanager, contextmanager
 from typing import TYPE_CHECKING, Any
 
 from aerokit.sim.kinds import simulated
+from aerokit.sim.patience import wait_longer
 from aerokit.sim.server import SimulatorServer, open_simulator
 from aerokit.testing.fault_verbs import FaultInjector
 from aerokit.testing.stage import Stagehand
@@ -56,15 +57,15 @@ def serve_flight(
 ) -> Iterator[ServedFlight]:
     """Serve a vehicle of a kind on an address while the block runs; ``options`` are those of the vehicle.
 
-    ArduPilot's DISARM_DELAY is off (it would be a second) and RC_OVERRIDE_TIME ``speedup`` times as long, unless
-    ``parameters`` says otherwise: a program needs its real time between arming and taking off.
+    It waits ``speedup`` times as long for what the program sends by its own clock, unless ``parameters`` says
+    otherwise: see `aerokit.sim.patience.wait_longer`.
     Raises LocalProtocolError for a wrong kind or address, LinkOpenError for one that cannot be opened.
     """
     from anyio.from_thread import start_blocking_portal
 
     options.setdefault("boot_time_s", 1.0)
     vehicle: Any = simulated(kind, **options)
-    _allow_for_speed(vehicle.parameters, options.get("parameters") or {}, speedup)
+    wait_longer([vehicle], speedup, leave=options.get("parameters") or ())
     hand = Stagehand([vehicle])
 
     @asynccontextmanager
@@ -78,10 +79,3 @@ def serve_flight(
         finally:
             portal.call(hand.record)
             hand.follow(None)
-
-
-def _allow_for_speed(parameters: Any, chosen: dict[str, float], speedup: float) -> None:
-    if "DISARM_DELAY" in parameters and "DISARM_DELAY" not in chosen:
-        parameters["DISARM_DELAY"] = 0.0
-    if "RC_OVERRIDE_TIME" in parameters and "RC_OVERRIDE_TIME" not in chosen:
-        parameters["RC_OVERRIDE_TIME"] *= speedup

@@ -15,6 +15,8 @@ PREFLIGHT_REBOOT_SHUTDOWN = 246
 COMPONENT_ARM_DISARM = 400
 FORCE = 21196
 FORCE_REBOOT = 20190226
+LOOK_S = 0.1
+"""So often it is looked whether a vehicle is back."""
 
 
 class ArmingActions(ModeActions):
@@ -109,11 +111,21 @@ class ArmingActions(ModeActions):
             state = "armed" if self.is_armed else "not known to be disarmed"
             raise OperationRejected(f"reboot: the vehicle is {state}; nothing was sent")
         reboots = self._watch.reboots
+        self._link_watch.ask()  # its time before
         await self._explained_command(PREFLIGHT_REBOOT_SHUTDOWN, 1, *(0.0,) * 4, FORCE_REBOOT if force else 0)
         self._watch.expect_reboot()
         with anyio.move_on_after(timeout):
-            while self._watch.reboots == reboots:
-                self.connection.raise_if_ended()
-                await anyio.sleep(0.1)
+            await self._await_reboot(reboots)
             return
         raise OperationTimeout(f"reboot: not back within {timeout:g} s; {self.describe_link()}")
+
+    async def _await_reboot(self, reboots: int) -> None:
+        """Asks for its time, often at first: a fast simulation is soon older than it was before."""
+        accepted_at = ask_at = self.connection.now()
+        while self._watch.reboots == reboots:
+            self.connection.raise_if_ended()
+            now = self.connection.now()
+            if now >= ask_at:
+                self._link_watch.ask()
+                ask_at = now + LOOK_S + (now - accepted_at) / 10
+            await anyio.sleep(LOOK_S)

@@ -80,7 +80,9 @@ class VehicleCore:
             connection, self._commands, system_id, component_id, self.autopilot.stream_groups
         )
         self._watch = VehicleWatch(connection, system_id, component_id, self._on_reboot)
-        self._link_watch = LinkWatch(connection, system_id, component_id, self._on_link_report)
+        self._link_watch = LinkWatch(
+            connection, system_id, component_id, self._on_link_report, self._watch.note_answer
+        )
         self._background = Background(connection.fail)
         self._transfers = Transfers(
             connection,

@@ -105,6 +105,7 @@ class MessageRates:
         self._streams: dict[int, _Stream] = {}
         self._dirty = asyncio.Event()
         self._legacy = False
+        self._times_forgotten = 0
 
     @property
     def uses_data_streams(self) -> bool:
@@ -143,6 +144,7 @@ class MessageRates:
         for stream in self._streams.values():
             stream.asked_hz, stream.refused, stream.patience_s = None, False, ASK_AGAIN_S
             stream.failures, stream.not_before = 0, -math.inf
+        self._times_forgotten += 1
         self._dirty.set()
 
     async def run(self) -> None:
@@ -192,6 +194,7 @@ class MessageRates:
     async def _ask_by_command(self, stream: _Stream) -> None:
         hz = stream.wanted_hz
         interval_us = 0.0 if hz == AUTOPILOT_DEFAULT else 1e6 / hz
+        times_forgotten = self._times_forgotten
         try:
             await self._commands.send_long(
                 SET_MESSAGE_INTERVAL, stream.message_type.ID, interval_us, attempts=1
@@ -202,8 +205,9 @@ class MessageRates:
                 return
             self._was_refused(stream, error)
         except CommandTimeout:
-            stream.failures += 1
-            stream.not_before = self._connection.now() + min(2.0**stream.failures, ASK_AGAIN_LONGEST_S)
+            if times_forgotten == self._times_forgotten:  # a reboot swallowed the others
+                stream.failures += 1
+                stream.not_before = self._connection.now() + min(2.0**stream.failures, ASK_AGAIN_LONGEST_S)
             return
         stream.failures = 0
         stream.was_asked(self._connection.now(), hz)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from typing import TYPE_CHECKING
 
@@ -29,7 +30,7 @@ LATE_MS = 2000
 """Once the vehicle has accepted to reboot: it boots for longer than this, and no message is so late."""
 REPORT_PERIOD_S = 1.0
 TIMESYNC_PERIOD_S = 2.0
-QUESTIONS = 16
+QUESTIONS = 64
 """So many questions may be under way; what is older is taken for lost."""
 
 
@@ -51,6 +52,7 @@ class VehicleWatch:
         self._times: dict[str, tuple[int, float]] = {}
         self._candidates: dict[str, tuple[int, float]] = {}
         self._expects_reboot = False
+        self._last_answer = (-math.inf, 0)
         attach = connection.bus.attach
         self._detach: list[Detach] = [attach(Heartbeat, self._on_heartbeat, system_id=system_id)]
         attach_frames = connection.bus.attach_frames
@@ -70,6 +72,19 @@ class VehicleWatch:
     def expect_reboot(self) -> None:
         """The vehicle has accepted to reboot; it is noticed even if it had just booted before."""
         self._expects_reboot = True
+
+    def note_answer(self, asked_at: float, milliseconds: int) -> None:
+        """The vehicle's time since boot, as told in answer to a question of ours.
+
+        Asked after another answer had come, it tells an earlier time only if it has rebooted: that needs no patience,
+        and holds however fast a simulation runs.
+        """
+        before_at, before = self._last_answer
+        if asked_at <= before_at:
+            return
+        self._last_answer = (self._connection.now(), milliseconds)
+        if milliseconds < before:
+            self._has_rebooted("TIMESYNC", milliseconds)
 
     def check(self) -> None:
         """Publish VehicleSilent when heartbeats have stopped; called once a second."""
@@ -130,7 +145,7 @@ class VehicleWatch:
     def _has_rebooted(self, clock: str, milliseconds: int) -> None:
         now = self._connection.now()
         self._times, self._candidates = {clock: (milliseconds, now)}, {}
-        self._expects_reboot = False
+        self._expects_reboot, self._last_answer = False, (now, 0)
         self.reboots += 1
         self._on_reboot()
         self._connection.bus.publish(VehicleRebooted(now, self._system_id))
@@ -148,9 +163,10 @@ class LinkWatch:
         system_id: int,
         component_id: int,
         on_report: Callable[[LinkReport], None],
+        on_answer: Callable[[float, int], None],
     ) -> None:
         self._connection, self._system_id, self._component_id = connection, system_id, component_id
-        self._on_report = on_report
+        self._on_report, self._on_answer = on_report, on_answer
         self._round_trip_s: float | None = None
         self._asked: deque[int] = deque(maxlen=QUESTIONS)
         self._ask_at = connection.now()
@@ -168,27 +184,31 @@ class LinkWatch:
 
     async def run(self, on_tick: Callable[[], None]) -> None:
         """Report once a second until cancelled or the connection ends; ``on_tick`` is called as often."""
-        self._ask()
+        self.ask()
         self._ask_at = self._connection.now()  # once more with the first report
         while self._connection.is_open:
             await anyio.sleep(REPORT_PERIOD_S)
             if self._connection.is_open:
-                self._ask()
+                if self._connection.now() >= self._ask_at:
+                    self.ask()
                 self._report()
                 on_tick()
 
-    def _ask(self) -> None:
+    def ask(self) -> None:
+        """Ask for the vehicle's time now, besides every two seconds."""
         now = self._connection.now()
-        if now >= self._ask_at:
-            self._ask_at = now + TIMESYNC_PERIOD_S
-            self._asked.append(int(now * 1e9))
-            self._connection.send(Timesync(0, self._asked[-1]), to=self._system_id)
+        self._ask_at = now + TIMESYNC_PERIOD_S
+        self._asked.append(int(now * 1e9))
+        self._connection.send(Timesync(0, self._asked[-1]), to=self._system_id)
 
     def _on_timesync(self, message: Timesync) -> None:
         """Take the answer to our question; questions of the vehicle and answers to others are not ours."""
         if message.tc1 != 0 and message.ts1 in self._asked:
             self._asked.remove(message.ts1)
             self._round_trip_s = self._connection.now() - message.ts1 / 1e9
+            frame = message.received_frame
+            if frame is not None and frame.component_id == self._component_id:
+                self._on_answer(message.ts1 / 1e9, message.tc1 // 1_000_000)
 
     def _report(self) -> None:
         at, (received, lost), total = count = self._count()

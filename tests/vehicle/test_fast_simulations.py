@@ -1,0 +1,100 @@
+"""A vehicle that lives twenty and forty times as fast as we do: reboots are noticed, it waits for us, it never leaps."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+import anyio
+import pytest
+from flight_harness import block_loop
+
+from aerokit import Vehicle, VelocitySetpoint, connect
+from aerokit import messages as m
+from aerokit.errors import SetpointStreamStopped
+from aerokit.runtime.events import VehicleRebooted
+from aerokit.sim import SimulatedCopter, SimulatedPx4, SimulatedVehicle, simulated_link
+from aerokit.sim.patience import wait_longer
+
+pytestmark = pytest.mark.anyio
+
+KINDS = {"copter": SimulatedCopter, "px4": SimulatedPx4}
+
+
+@asynccontextmanager
+async def served(vehicle: SimulatedVehicle, speedup: float) -> AsyncIterator[Vehicle]:
+    async with simulated_link(vehicle, speedup=speedup, latency_s=0.002) as link, connect(link) as client:
+        await client.wait_ready()
+        yield client
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("speedup", [1.0, 10.0, 40.0])
+async def test_a_reboot_is_noticed_before_the_vehicle_is_older_than_it_was(kind: str, speedup: float) -> None:
+    simulated = KINDS[kind](boot_time_s=1.0)
+    async with served(simulated, speedup) as vehicle:
+        await anyio.sleep(0.3)  # its first time was told, and is long ago
+        with vehicle.subscribe(VehicleRebooted, capacity=5) as events:
+            await vehicle.reboot(timeout=10.0)
+            assert simulated.uptime < 12.0
+            await vehicle.wait_ready(timeout=3.0)
+            await anyio.sleep(1.0)
+            assert len([event for event in iter(events.get_nowait, None)]) == 1
+
+
+async def test_what_was_asked_of_a_rebooting_vehicle_is_asked_again_at_once() -> None:
+    """A request that went down with it does not count as one that it does not obey."""
+    async with served(SimulatedCopter(boot_time_s=0.0), 20.0) as vehicle, anyio.create_task_group() as tasks:
+        tasks.start_soon(vehicle.reboot)
+        await anyio.sleep(0.05)  # it is off
+        with vehicle.subscribe(m.ScaledImu2, rate_hz=10.0) as asked_meanwhile:
+            await asked_meanwhile.get(timeout=2.0)
+
+
+async def test_px4_twenty_times_as_fast_obeys_set_points_that_come_ten_times_a_second() -> None:
+    for is_patient in (True, False):
+        px4 = SimulatedPx4(boot_time_s=1.0)
+        if is_patient:
+            wait_longer([px4], 20.0)
+        async with served(px4, 20.0) as vehicle:
+            await vehicle.arm()
+            await vehicle.take_off(10)
+            stream = vehicle.guided.velocity()
+            if is_patient:
+                async with stream:
+                    await stream.fly(VelocitySetpoint(north_m_s=1), 2.0)
+                assert px4.motion.north > 15
+            else:
+                with pytest.raises(SetpointStreamStopped, match="left OFFBOARD for LOITER"):
+                    async with stream:
+                        await stream.fly(VelocitySetpoint(north_m_s=1), 2.0)
+
+
+async def test_a_vehicle_waits_longer_for_its_clients() -> None:
+    copter, px4 = SimulatedCopter(), SimulatedPx4()
+    wait_longer([copter, px4], 10.0, leave=["GUID_TIMEOUT"])
+    names = ("FS_GCS_TIMEOUT", "GUID_TIMEOUT", "DISARM_DELAY", "RC_OVERRIDE_TIME")
+    assert [copter.parameters[name] for name in names] == [50.0, 3.0, 0.0, 30.0]
+    assert [px4.parameters[name] for name in ("COM_DL_LOSS_T", "COM_OF_LOSS_T", "COM_RC_LOSS_T")] == [
+        100.0,
+        10.0,
+        5.0,
+    ]
+
+
+async def test_in_real_time_and_slower_nothing_is_changed() -> None:
+    copter = SimulatedCopter()
+    wait_longer([copter], 0.5)
+    assert (copter.parameters["DISARM_DELAY"], copter.parameters["GUID_TIMEOUT"]) == (10.0, 3.0)
+
+
+@pytest.mark.parametrize(("speedup", "passed"), [(1.0, 3.0), (20.0, 5.0)])
+async def test_time_in_which_the_program_was_blocked(speedup: float, passed: float) -> None:
+    """In real time it is caught up; faster, all but a quarter of a second of it is left out."""
+    copter = SimulatedCopter(boot_time_s=0.0)
+    async with simulated_link(copter, speedup=speedup):
+        await anyio.sleep(1.0)
+        before = copter.now
+        block_loop(3.0)
+        await anyio.sleep(0.001)
+        assert copter.now - before == pytest.approx(passed, abs=1.2)
