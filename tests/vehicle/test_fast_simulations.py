@@ -1,4 +1,4 @@
-"""A vehicle that lives twenty and forty times as fast as we do: reboots are noticed, it waits for us, it never leaps."""
+"""A vehicle that lives up to forty times as fast as we do: its reboots are noticed, it waits for us, it never leaps."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ async def test_a_reboot_is_noticed_before_the_vehicle_is_older_than_it_was(kind:
             assert simulated.uptime < 12.0
             await vehicle.wait_ready(timeout=3.0)
             await anyio.sleep(1.0)
-            assert len([event for event in iter(events.get_nowait, None)]) == 1
+            assert len(list(iter(events.get_nowait, None))) == 1
 
 
 async def test_what_was_asked_of_a_rebooting_vehicle_is_asked_again_at_once() -> None:
