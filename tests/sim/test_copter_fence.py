@@ -188,10 +188,10 @@ def test_it_is_switched_on_with_the_motors() -> None:
     assert set_mode(client, CopterMode.GUIDED) == MavResult.ACCEPTED
     assert client.command(ARM, 1) == MavResult.ACCEPTED
     client.run(0.1)
-    assert client.texts[-1] == "Max Alt, Circle and Polygon fences auto-enabled"
+    assert client.texts[-2:] == ["Max Alt, Circle and Polygon fences auto-enabled", "Arming motors"]
     assert client.command(ARM, 0) == MavResult.ACCEPTED
     client.run(0.1)
-    assert client.texts[-1] == "Max Alt, Circle and Polygon fences auto-disabled"
+    assert client.texts[-2:] == ["Max Alt, Circle and Polygon fences auto-disabled", "Disarming motors"]
 
 
 def test_status_is_streamed_only_while_the_fence_is_on() -> None:

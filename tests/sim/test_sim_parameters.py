@@ -165,7 +165,7 @@ def test_the_development_version_says_nothing_and_the_released_one_an_error() ->
 
 
 def test_faults_clamp_protect_and_mute() -> None:
-    copter, client = a_copter(parameter_count=80, parameter_errors=True)
+    copter, client = a_copter(parameter_count=100, parameter_errors=True)
     copter.faults.parameter_limits["RTL_ALT"] = (300.0, 8000.0)
     assert told(client, m.ParamSet(1, 1, "RTL_ALT", 10.0, REAL))[0].param_value == 300.0
     copter.faults.read_only_parameters.add("RTL_ALT")
@@ -174,7 +174,7 @@ def test_faults_clamp_protect_and_mute() -> None:
     assert "Param write denied (RTL_ALT)" in client.texts
     copter.faults.mute_parameters.add("RTL_ALT")
     names = [value.param_id for value in told(client, m.ParamRequestList(1, 1), 1.0)]
-    assert len(names) == 79
+    assert len(names) == 99
     assert "RTL_ALT" not in names
 
 

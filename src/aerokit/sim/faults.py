@@ -34,7 +34,8 @@ class Faults:
     """Everything is off at first. Change attributes at any time; they act from the next message or step on.
 
     - ``gps_lost``: no GPS fix any more; after ten seconds the estimator gives its position up
-    - ``rc_lost``: the pilot's transmitter is off; ArduCopter acts on it as FS_THR_ENABLE says
+    - ``rc_lost``: the pilot's transmitter is off; what follows is up to the failsafes of the kind
+    - ``leak``: there is water in the hull of a submarine
     - ``heartbeats_stopped``: every stream goes on, heartbeats do not
     - ``frozen``: the autopilot hangs; it neither hears, moves nor sends until it is False again
     - ``silent``: the radio is out; nothing gets through in either direction, the vehicle flies on
@@ -51,6 +52,7 @@ class Faults:
 
     gps_lost: bool = False
     rc_lost: bool = False
+    leak: bool = False
     heartbeats_stopped: bool = False
     frozen: bool = False
     silent: bool = False

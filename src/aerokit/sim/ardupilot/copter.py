@@ -3,26 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
-from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavModeFlag, MavSeverity, MavType
+from aerokit.mavlink.enums import MavModeFlag, MavType
 from aerokit.sim.ardupilot.auto import Auto
 from aerokit.sim.ardupilot.copter_arming import CopterArming
 from aerokit.sim.ardupilot.copter_commands import copter_commands
 from aerokit.sim.ardupilot.copter_failsafes import CopterFailsafes
-from aerokit.sim.ardupilot.fence import Fence, fence_status
+from aerokit.sim.ardupilot.copter_fence import CopterFence
 from aerokit.sim.ardupilot.guided import Guided
 from aerokit.sim.ardupilot.modes import AltHold, Brake, Circle, Loiter, PosHold, Stabilize
 from aerokit.sim.ardupilot.returning import Land, Rtl, SmartRtl
 from aerokit.sim.ardupilot.setpoints import Setpoints
-from aerokit.sim.ardupilot.telemetry import BUILDERS
+from aerokit.sim.ardupilot.smart_path import SmartPath
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 from aerokit.sim.ardupilot.yaw import AutoYaw
 
 if TYPE_CHECKING:
-    from aerokit.mavlink.message import Message
     from aerokit.sim.ardupilot.parameter_tables import Kind
     from aerokit.sim.commands import CommandHandler
 
@@ -41,7 +38,7 @@ class SimulatedCopter(ArduPilotVehicle):
     Its arguments are those of `ArduPilotVehicle`. It has 1,349 parameters; MNT1_TYPE 1 fits a gimbal with three
     axes.
 
-    Not simulated yet: slowing down before a fence, flying to rally points, terrain failsafe.
+    Not simulated yet: slowing down before a fence, terrain failsafe.
     """
 
     KIND: ClassVar[Kind] = "copter"
@@ -53,11 +50,6 @@ class SimulatedCopter(ArduPilotVehicle):
         Auto, Stabilize, AltHold, Circle, Loiter, Guided, Land, Rtl, PosHold, Brake, SmartRtl,
     )  # fmt: skip
 
-    BUILDERS: ClassVar[Mapping[int, Callable[[Any], Message | None]]] = {
-        **BUILDERS,
-        m.FenceStatus.ID: fence_status,
-    }
-
     def make_arming(self) -> CopterArming:
         """See `CopterArming`."""
         return CopterArming(self)
@@ -65,6 +57,10 @@ class SimulatedCopter(ArduPilotVehicle):
     def make_failsafes(self) -> CopterFailsafes:
         """See `CopterFailsafes`."""
         return CopterFailsafes(self)
+
+    def make_fence(self) -> CopterFence:
+        """See `CopterFence`."""
+        return CopterFence(self)
 
     def make_commands(self) -> dict[int, CommandHandler]:
         """See `copter_commands`."""
@@ -75,32 +71,14 @@ class SimulatedCopter(ArduPilotVehicle):
         Setpoints(self)
 
     def reset_controllers(self) -> None:
-        """Where it points its nose, and the land detector."""
+        """Where it points its nose, the land detector, and the way back of SMART_RTL."""
         self.yaw = AutoYaw(self)
         self._still_since = math.nan
-        self.fence = Fence(self)
+        self.path = SmartPath(self, only_armed=True)
 
-    @property
-    def copter_failsafes(self) -> CopterFailsafes:
-        """Its failsafes."""
-        assert isinstance(self.failsafes, CopterFailsafes)
-        return self.failsafes
-
-    @property
-    def fence_health(self) -> tuple[bool, bool, bool]:
-        """Whether the fence is configured, enforced, and kept, for SYS_STATUS."""
-        return self.fence.health
-
-    def set_mode(self, number: int) -> bool:
-        """Change the mode if the vehicle may; says why not. A change is told by a heartbeat at once."""
-        before, wanted = self.mode, self._modes.get(number)
-        if wanted is not None and wanted is not before and self.fence.holds_mode():
-            self.send_text(MavSeverity.WARNING, f"Mode change to {wanted.name} failed: in fence recovery")
-            return False
-        done = super().set_mode(number)
-        if self.mode is not before:
-            self.fence.mode_changed()
-        return done
+    def _become_ready(self) -> None:
+        super()._become_ready()
+        self.path.start()
 
     @property
     def guided(self) -> Guided:

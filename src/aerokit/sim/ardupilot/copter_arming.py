@@ -1,8 +1,9 @@
-"""What ArduCopter checks before arming besides what every ArduPilot does: radio, ground station, battery, fence."""
+"""What ArduCopter checks before arming."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, ClassVar
 
 from aerokit.sim.ardupilot.arming import Arming
 
@@ -11,50 +12,58 @@ if TYPE_CHECKING:
 
 __all__ = ["CopterArming"]
 
-_BATTERY_LEVELS = (("LOW", "low"), ("CRT", "critical"))
+_STICK_CENTRE, _STICK_LOW, _DEADZONE = 1500, 1050, 100
 
 
 class CopterArming(Arming):
-    """The fence may be switched on and off with the motors (FENCE_AUTOENABLE)."""
+    """A position is needed only in the modes that fly by it, and a throttle that is low or in the middle."""
+
+    ARMED_TEXT: ClassVar[str] = "Arming motors"
+    DISARMED_TEXT: ClassVar[str] = "Disarming motors"
 
     def __init__(self, copter: SimulatedCopter) -> None:
         super().__init__(copter)
         self._copter = copter
 
-    def reasons(self) -> list[str]:
-        """Why it cannot be armed now, as the firmware words it; empty when it can."""
-        copter = self._copter
-        reasons = super().reasons()
-        if not copter.is_initialised:
+    def ahrs_reasons(self) -> Sequence[str]:
+        """Comes after GPS, which says it first."""
+        return ()
+
+    def position_reasons(self) -> Sequence[str]:
+        """GPS and estimator; then even what a forced arming insists on."""
+        if self._copter.mode.needs_position and (reasons := self.gps_reasons()):
             return reasons
-        if copter.failsafes.radio:
-            reasons.append("Radio failsafe on")
-        if copter.failsafes.ground_station:
-            reasons.append("GCS failsafe on")
-        of_battery = None if any(r.startswith("Battery 1") for r in reasons) else self._battery_reason()
-        reasons += [r for r in (of_battery, copter.fence.reason_not_to_arm()) if r is not None]
+        return super().ahrs_reasons() or self.mandatory_reasons()
+
+    def own_reasons(self) -> list[str]:
+        """Ground station, and a battery that was low before."""
+        failsafes = self._copter.failsafes
+        reasons = ["GCS failsafe on"] if failsafes.ground_station else []
+        return [*reasons, "Battery failsafe"] if failsafes.battery_is_low else reasons
+
+    def mandatory_reasons(self) -> list[str]:
+        """What the mode needs of the estimator."""
+        copter, nav = self._copter, self._copter.navigation
+        reasons = []
+        if copter.mode.needs_position and not (nav.has_position and not copter.failsafes.estimator):
+            reasons.append("Need Position Estimate")
+        if not copter.mode.has_manual_throttle and not nav.has_altitude:
+            reasons.append("Need Alt Estimate")
         return reasons
 
-    def _battery_reason(self) -> str | None:
-        for name, word in _BATTERY_LEVELS:
-            for is_below, what in zip(
-                self._copter.copter_failsafes.battery_is_below(name), ("voltage", "capacity"), strict=True
-            ):
-                if is_below:
-                    return f"Battery 1 {word} {what} failsafe"
-        return None
-
     def arm(self, *, force: bool = False) -> bool:
-        """Arm if the checks allow it; says why not."""
+        """The way back begins here."""
         done = super().arm(force=force)
         if done:
-            self._copter.fence.armed()
+            self._copter.path.begin()
         return done
 
-    def disarm(self, *, force: bool = True) -> bool:
-        """Stop the motors; without ``force`` not in the air."""
-        was_armed = self._copter.is_armed
-        done = super().disarm(force=force)
-        if done and was_armed:
-            self._copter.fence.disarmed()
-        return done
+    def final_reasons(self) -> list[str]:
+        """Mode and throttle."""
+        mode = self._copter.mode
+        if not mode.can_arm:
+            return [f"{mode.name} mode not armable"]
+        high = _STICK_LOW if mode.has_manual_throttle else _STICK_CENTRE + _DEADZONE
+        if not mode.arms_with_raised_throttle and self._copter.rc[2] > high:
+            return ["Throttle too high"]
+        return []

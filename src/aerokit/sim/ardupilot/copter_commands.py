@@ -43,7 +43,6 @@ def copter_commands(copter: SimulatedCopter) -> dict[int, CommandHandler]:
         MavCmd.DO_SET_ROI: flight.look_at,
         MavCmd.DO_SET_ROI_LOCATION: flight.look_at,
         MavCmd.DO_SET_ROI_NONE: flight.look_ahead,
-        MavCmd.DO_FENCE_ENABLE: lambda command: copter.fence.command(command),
         **camera_commands(copter),
     }
 

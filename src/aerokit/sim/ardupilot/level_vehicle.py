@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavResult, SpeedType
-from aerokit.sim.ardupilot.failsafes import Failsafes
 from aerokit.sim.ardupilot.targets import Targets
 from aerokit.sim.ardupilot.telemetry import BUILDERS
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
@@ -19,20 +18,10 @@ if TYPE_CHECKING:
     from aerokit.sim.ardupilot.mode import VehicleMode
     from aerokit.sim.commands import Command, CommandHandler
 
-__all__ = ["LevelFailsafes", "LevelVehicle"]
+__all__ = ["LevelVehicle"]
 
 _CHANGE_MODE = 1
 _STICK_MIDDLE = 1500
-
-
-class LevelFailsafes(Failsafes):
-    """Battery and ground station; there is nothing that disarms an idle one."""
-
-    def _check_idling(self) -> None:
-        pass
-
-    def _check_estimator(self) -> None:
-        pass
 
 
 class LevelVehicle(ArduPilotVehicle):
@@ -55,10 +44,6 @@ class LevelVehicle(ArduPilotVehicle):
         raise NotImplementedError
 
     # -------------------------------------------------------------------------------------- vehicle
-
-    def make_failsafes(self) -> Failsafes:
-        """See `LevelFailsafes`."""
-        return LevelFailsafes(self)
 
     def hear_setpoints(self) -> None:
         """See `Targets`."""

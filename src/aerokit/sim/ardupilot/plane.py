@@ -6,11 +6,12 @@ import math
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from aerokit.mavlink.enums import MavModeFlag, MavType
-from aerokit.sim.ardupilot.arming import Arming
-from aerokit.sim.ardupilot.failsafes import Failsafes
 from aerokit.sim.ardupilot.motors import Motors
+from aerokit.sim.ardupilot.plane_arming import PlaneArming
 from aerokit.sim.ardupilot.plane_auto import Auto
 from aerokit.sim.ardupilot.plane_commands import plane_commands
+from aerokit.sim.ardupilot.plane_failsafes import PlaneFailsafes
+from aerokit.sim.ardupilot.plane_fence import PlaneFence
 from aerokit.sim.ardupilot.plane_modes import (
     Autoland,
     Circle,
@@ -43,7 +44,7 @@ class SimulatedPlane(ArduPilotVehicle):
     """Speaks and behaves as ArduPlane does where a client can see it; flies as `FixedWing` does.
 
     Its arguments are those of `ArduPilotVehicle`. It starts on a runway along its heading. Not simulated: lifting
-    rotors, fence, rally points, failsafes other than that of the idle throttle.
+    rotors, parachutes.
     """
 
     KIND: ClassVar[Kind] = "plane"
@@ -74,13 +75,17 @@ class SimulatedPlane(ArduPilotVehicle):
         """One engine."""
         return _Engine()
 
-    def make_arming(self) -> Arming:
+    def make_arming(self) -> PlaneArming:
         """See `PlaneArming`."""
         return PlaneArming(self)
 
-    def make_failsafes(self) -> Failsafes:
-        """None of a copter's."""
-        return _PlaneFailsafes(self)
+    def make_failsafes(self) -> PlaneFailsafes:
+        """See `PlaneFailsafes`."""
+        return PlaneFailsafes(self)
+
+    def make_fence(self) -> PlaneFence:
+        """See `PlaneFence`."""
+        return PlaneFence(self)
 
     def make_commands(self) -> dict[int, CommandHandler]:
         """See `plane_commands`."""
@@ -142,13 +147,6 @@ class SimulatedPlane(ArduPilotVehicle):
             wing.settle()
 
 
-class PlaneArming(Arming):
-    """An aeroplane's words."""
-
-    ARMED_TEXT = "Throttle armed"
-    DISARMED_TEXT = "Throttle disarmed"
-
-
 class _Engine(Motors):
     """Its throttle is what the aeroplane needs."""
 
@@ -161,10 +159,3 @@ class _Engine(Motors):
         """Follow the motion."""
         self.throttle = motion.throttle if self.is_armed and not landed else 0.0
         self.spool = self.throttle
-
-
-class _PlaneFailsafes(Failsafes):
-    """Nothing yet: ArduPlane's are others than a copter's."""
-
-    def _check(self) -> None:
-        pass

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from aerokit.mavlink.enums import MavModeFlag, MavSeverity, PlaneMode
 from aerokit.sim.ardupilot.mode import VehicleMode
 from aerokit.sim.ardupilot.plane_landing import Landing
+from aerokit.sim.ardupilot.rally import best_return_place
 
 if TYPE_CHECKING:
     from aerokit.sim.ardupilot.navigation import Ned
@@ -99,14 +100,14 @@ class FlyByWireA(Piloted):
     """Bank and pitch by stick."""
 
     number = PlaneMode.FLY_BY_WIRE_A
-    name = "FBWA"
+    name = "FLY_BY_WIRE_A"
 
 
 class FlyByWireB(PlaneModeBase):
     """Bank by stick, height and speed held."""
 
     number = PlaneMode.FLY_BY_WIRE_B
-    name = "FBWB"
+    name = "FLY_BY_WIRE_B"
 
     def __init__(self, plane: SimulatedPlane) -> None:
         super().__init__(plane)
@@ -159,7 +160,6 @@ class Circle(PlaneModeBase):
 
     number = PlaneMode.CIRCLE
     name = "CIRCLE"
-    can_arm = False
     flags = _NAVIGATES
 
     def enter(self, *, force: bool) -> bool:
@@ -238,20 +238,21 @@ class Guided(NavigatingMode):
 
 
 class Rtl(NavigatingMode):
-    """Home at RTL_ALTITUDE, to circle there with RTL_RADIUS."""
+    """Home at RTL_ALTITUDE, or to a rally point, to circle there with RTL_RADIUS."""
 
     number = PlaneMode.RTL
     name = "RTL"
     can_arm = False
 
     def enter(self, *, force: bool) -> bool:
-        """To home, at RTL_ALTITUDE above it; below 0 at the present height."""
+        """To home, at RTL_ALTITUDE above it (below 0 at the present height), or to a rally point at its height."""
         super().enter(force=force)
         plane = self.plane
         home = plane.navigation.home or (0.0, 0.0, plane.wing.ground_down)
         height = plane.parameters["RTL_ALTITUDE"]
         self.radius = plane.parameters["RTL_RADIUS"]
-        self._place = (home[0], home[1], plane.wing.down if height < 0 else home[2] - height)
+        down = plane.wing.down if height < 0 else home[2] - height
+        self._place = best_return_place(plane, (home[0], home[1], down))
         return True
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import CopterMode
 from aerokit.sim.ardupilot.modes import Mode
+from aerokit.sim.ardupilot.rally import best_return_place
 
 if TYPE_CHECKING:
     from aerokit.sim.ardupilot.copter import SimulatedCopter
@@ -16,6 +17,7 @@ __all__ = ["Land", "Rtl", "SmartRtl", "sink"]
 
 _RTL_LOWEST_M = 2.0
 _ARRIVED_M = 0.5
+_SMART_RTL_HIGHER_M = 2.0
 
 
 class Land(Mode):
@@ -58,7 +60,7 @@ def sink(copter: SimulatedCopter) -> None:
 
 
 class Rtl(Mode):
-    """Climbs to RTL_ALT (less when it is close to home), flies home, waits RTL_LOIT_TIME and lands."""
+    """Climbs to RTL_ALT (less when it is close), flies home or to a rally point, waits RTL_LOIT_TIME and lands."""
 
     number = CopterMode.RTL
     name = "RTL"
@@ -70,6 +72,7 @@ class Rtl(Mode):
         self._phase = "climb"
         self._altitude_down = 0.0
         self._waiting_since = 0.0
+        self._place: Ned = (0.0, 0.0, 0.0)
         self.speed = 0.0
 
     def enter(self, *, force: bool) -> bool:
@@ -77,10 +80,11 @@ class Rtl(Mode):
         self._phase, self.is_landing = "climb", False
         parameters = self.copter.parameters
         self.speed = (parameters["RTL_SPEED"] or parameters["WPNAV_SPEED"]) / 100.0
-        north, east, down = self._home()
-        self._altitude_down = down - self.return_altitude(
-            math.hypot(north - self.copter.motion.north, east - self.copter.motion.east)
-        )
+        copter, home = self.copter, self._home()
+        self._place = best_return_place(copter, home, is_allowed=copter.fence.contains)
+        north, east, down = self._place
+        distance = math.hypot(north - copter.motion.north, east - copter.motion.east)
+        self._altitude_down = min(down, home[2] - self.return_altitude(distance))
         self.copter.yaw.default(returning=True)
         return True
 
@@ -95,8 +99,8 @@ class Rtl(Mode):
 
     @property
     def destination(self) -> Ned | None:
-        """Home, at the height of the present phase."""
-        north, east, down = self._home()
+        """Where it returns to, at the height of the present phase."""
+        north, east, down = self._place
         if self._phase == "climb":
             return (self.copter.motion.north, self.copter.motion.east, self._altitude_down)
         return (north, east, down if self._phase == "land" else self._altitude_down)
@@ -135,13 +139,56 @@ class Rtl(Mode):
         return (0.0, 0.0, self.copter.motion.ground_down) if home is None else home
 
 
-class SmartRtl(Rtl):
-    """Straight home at the present height; the recorded path of the real mode is not simulated."""
+class SmartRtl(Mode):
+    """Back on the path it has come on, without its loops; above the beginning it lands. See `SmartPath`."""
 
     number = CopterMode.SMART_RTL
     name = "SMARTRTL"
-    can_change_speed = False
+    can_arm = False
+    returns_on_path = True
 
-    def return_altitude(self, distance: float) -> float:
-        """As high as it is."""
-        return max(self.copter.navigation.altitude_above_home, _RTL_LOWEST_M)
+    def __init__(self, copter: SimulatedCopter) -> None:
+        super().__init__(copter)
+        self._way: list[Ned] = []
+
+    def enter(self, *, force: bool) -> bool:
+        """Refused while there is no path."""
+        if not self.copter.path.is_active:
+            return False
+        self._way, self.is_landing = self.copter.path.take_all(), False
+        if self._way:
+            north, east, down = self._way[-1]
+            self._way[-1] = (north, east, down - _SMART_RTL_HIGHER_M)
+        self.copter.yaw.default(returning=True)
+        return True
+
+    def leave(self) -> None:
+        """What it has not reached is still the way back."""
+        if self._way:
+            north, east, down = self._way[-1]
+            self.copter.path.put_back([*self._way[:-1], (north, east, down + _SMART_RTL_HIGHER_M)])
+
+    @property
+    def destination(self) -> Ned | None:
+        """The next point of the path."""
+        return self._way[0] if self._way else None
+
+    def update(self, dt: float) -> None:
+        """Fly to the next point, or land."""
+        copter = self.copter
+        if copter.is_landed or not self._way:
+            self.is_landing = True
+            descend(copter)
+            return
+        copter.motors.wanted = True
+        target, limits = self._way[0], copter.parameters
+        copter.motion.seek_position(
+            *target,
+            speed=limits["WPNAV_SPEED"] / 100,
+            climb=limits["WPNAV_SPEED_UP"] / 100,
+            descent=limits["WPNAV_SPEED_DN"] / 100,
+        )
+        copter.yaw.update()
+        near = _ARRIVED_M if len(self._way) == 1 else limits["WPNAV_RADIUS"] / 100
+        if math.dist(target, (copter.motion.north, copter.motion.east, copter.motion.down)) < near:
+            del self._way[0]

@@ -7,11 +7,14 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavCmd, MavModeFlag, MavSeverity, MavType, RoverMode
-from aerokit.sim.ardupilot.arming import Arming
-from aerokit.sim.ardupilot.level_vehicle import LevelFailsafes, LevelVehicle
+from aerokit.mavlink.enums import MavCmd, MavModeFlag, MavType, RoverMode
+from aerokit.sim.ardupilot.level_vehicle import LevelVehicle
 from aerokit.sim.ardupilot.motors import Motors
+from aerokit.sim.ardupilot.rover_arming import RoverArming
+from aerokit.sim.ardupilot.rover_failsafes import RoverFailsafes
+from aerokit.sim.ardupilot.rover_fence import RoverFence
 from aerokit.sim.ardupilot.rover_modes import ROVER_MODES, RoverAuto, RoverGuided
+from aerokit.sim.ardupilot.smart_path import SmartPath
 from aerokit.sim.ground_motion import GroundLimits, GroundMotion
 from aerokit.sim.motion import wrap_pi
 
@@ -45,46 +48,6 @@ class _Motors(Motors):
             self.throttle = 0.0
 
 
-class _Arming(Arming):
-    ARMED_TEXT = "Throttle armed"
-    DISARMED_TEXT = "Throttle disarmed"
-
-    def reasons(self) -> list[str]:
-        """Some modes cannot be armed in, which is said also before anybody tries."""
-        return super().reasons() + ([] if self._vehicle.mode.can_arm else ["Mode not armable"])
-
-    def _final_reasons(self) -> list[str]:
-        return []
-
-    def disarm(self, *, force: bool = True) -> bool:
-        """At any time; where it is disarmed is home, unless somebody has set it."""
-        vehicle, was_armed = self._vehicle, self._vehicle.motors.is_armed
-        super().disarm(force=True)
-        if was_armed and vehicle.navigation.home is not None and not vehicle.navigation.home_is_locked:
-            motion = vehicle.motion
-            vehicle.navigation.set_home((motion.north, motion.east, motion.down), lock=False)
-        return True
-
-
-class _Failsafes(LevelFailsafes):
-    """FS_ACTION: nothing (0), RTL (1), HOLD (2), SMART_RTL (3, 4), disarm (5).
-
-    BATT_FS_LOW_ACT is not simulated: that the battery is low is told only.
-    """
-
-    def _act(self, name: str, mode: int | None) -> None:
-        vehicle = self._vehicle
-        if name != "GCS" or not vehicle.motors.is_armed or vehicle.mode.name in ("RTL", "HOLD"):
-            return
-        vehicle.send_text(MavSeverity.WARNING, f"{name} Failsafe")
-        action = int(vehicle.parameters["FS_ACTION"])
-        modes = {1: RoverMode.RTL, 2: RoverMode.HOLD, 3: RoverMode.SMART_RTL, 4: RoverMode.SMART_RTL}
-        if action in modes and not vehicle.set_mode(modes[action]):
-            vehicle.set_mode(RoverMode.HOLD)
-        elif action == 5:
-            vehicle.arming.disarm()
-
-
 def _vfr_hud(rover: SimulatedRover) -> m.VfrHud:
     motion, place = rover.motion, rover.navigation.position
     heading = int(math.degrees(motion.yaw) % 360.0)
@@ -105,10 +68,10 @@ class SimulatedRover(LevelVehicle):
     """Speaks and behaves as ArduRover does where a client can see it; drives as `GroundMotion` does.
 
     Its arguments are those of `ArduPilotVehicle`. It has 1,235 parameters. Simulated: MANUAL, ACRO, STEERING and
-    SIMPLE by the sticks, HOLD, LOITER and CIRCLE (standing), AUTO, GUIDED, RTL and SMART_RTL (straight home).
-    Take-off and landing are unknown commands.
+    SIMPLE by the sticks, HOLD, LOITER and CIRCLE (standing), AUTO, GUIDED, RTL and SMART_RTL. Take-off and landing
+    are unknown commands.
 
-    Not simulated yet: boats, driving in circles, keeping within a fence, actions of the battery failsafe.
+    Not simulated yet: boats, driving in circles, slowing down before a fence.
     """
 
     KIND: ClassVar[Kind] = "rover"
@@ -140,13 +103,26 @@ class SimulatedRover(LevelVehicle):
         """One motor."""
         return _Motors()
 
-    def make_arming(self) -> Arming:
-        """Without throttle check."""
-        return _Arming(self)
+    def make_arming(self) -> RoverArming:
+        """See `RoverArming`."""
+        return RoverArming(self)
 
-    def make_failsafes(self) -> LevelFailsafes:
-        """FS_ACTION."""
-        return _Failsafes(self)
+    def make_failsafes(self) -> RoverFailsafes:
+        """See `RoverFailsafes`."""
+        return RoverFailsafes(self)
+
+    def make_fence(self) -> RoverFence:
+        """See `RoverFence`."""
+        return RoverFence(self)
+
+    def reset_controllers(self) -> None:
+        """The throttle stick rests in the middle, and the way back of SMART_RTL is forgotten."""
+        super().reset_controllers()
+        self.path = SmartPath(self, only_armed=False)
+
+    def _become_ready(self) -> None:
+        super()._become_ready()
+        self.path.start()
 
     @property
     def top_speed(self) -> float:

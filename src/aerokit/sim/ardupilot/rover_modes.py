@@ -9,6 +9,7 @@ from aerokit.mavlink.enums import MavSeverity, RoverMode
 from aerokit.mavlink.messages import MissionItemReached
 from aerokit.sim.ardupilot.level_auto import LevelAuto
 from aerokit.sim.ardupilot.mode import VehicleMode
+from aerokit.sim.ardupilot.rally import best_return_place
 from aerokit.sim.ardupilot.targets import Target
 
 if TYPE_CHECKING:
@@ -113,7 +114,7 @@ class _Dock(_Refused):
 
 
 class _Rtl(_Mode):
-    """Straight home with RTL_SPEED, or WP_SPEED; there it stands and stays armed."""
+    """Straight home or to a rally point with RTL_SPEED, or WP_SPEED; there it stands and stays armed."""
 
     number = RoverMode.RTL
     name = "RTL"
@@ -123,35 +124,59 @@ class _Rtl(_Mode):
     def __init__(self, rover: SimulatedRover) -> None:
         super().__init__(rover)
         self.speed = 0.0
-        self._is_there = False
+        self._way: list[Ned] = []
+        """Where it has to go, one after the other."""
 
     def enter(self, *, force: bool) -> bool:
-        if self.rover.navigation.home is None:
+        rover, home = self.rover, self.rover.navigation.home
+        if home is None:
             return False
-        parameters = self.rover.parameters
-        self.speed, self._is_there = parameters["RTL_SPEED"] or parameters["WP_SPEED"], False
+        self._set_out([best_return_place(rover, home, is_allowed=rover.fence.contains)])
         return True
+
+    def _set_out(self, way: list[Ned]) -> None:
+        self._way, self._is_there = way, False
+        self.speed = self.rover.parameters["RTL_SPEED"] or self.rover.parameters["WP_SPEED"]
 
     @property
     def destination(self) -> Ned | None:
-        return self.rover.navigation.home
+        return self._way[0] if self._way else None
 
     def update(self, dt: float) -> None:
-        home = self.rover.navigation.home
-        if home is None or self._is_there:
+        if not self._way:
             self.rover.motion.stop()
-        elif self.rover.has_arrived(home):
-            self._is_there = True
-            self.rover.info("Reached destination")
+            if not self._is_there:
+                self._is_there = True
+                self.rover.info("Reached destination")
+        elif self._has_reached(self._way[0]):
+            del self._way[0]
         else:
-            self.rover.motion.drive_to(home[0], home[1], speed=self.speed)
+            north, east, _ = self._way[0]
+            self.rover.motion.drive_to(north, east, speed=self.speed, stops=len(self._way) == 1)
+
+    def _has_reached(self, place: Ned) -> bool:
+        motion, on_the_way = self.rover.motion, len(self._way) > 1
+        near = (
+            math.hypot(place[0] - motion.north, place[1] - motion.east) <= self.rover.parameters["WP_RADIUS"]
+        )
+        return near if on_the_way else self.rover.has_arrived(place)
 
 
 class _SmartRtl(_Rtl):
-    """Straight home; the recorded path of the real mode is not simulated."""
+    """Back on the path it has come on, without its loops; refused while there is none. See `SmartPath`."""
 
     number = RoverMode.SMART_RTL
     name = "SRTL"
+    returns_on_path = True
+
+    def enter(self, *, force: bool) -> bool:
+        if not self.rover.path.is_active:
+            return False
+        self._set_out(self.rover.path.take_all())
+        return True
+
+    def leave(self) -> None:
+        self.rover.path.put_back(self._way)
 
 
 class RoverAuto(LevelAuto):

@@ -53,13 +53,13 @@ def sensor_status(vehicle: ArduPilotVehicle) -> tuple[int, int, int]:
         health |= _CONTROL
     if vehicle.arming.passes:
         health |= _PREARM
-    if vehicle.failsafes.radio:
+    if not vehicle.failsafes.hears_radio:
         health &= ~Sensor.RC_RECEIVER
     if vehicle.failsafes.battery_is_low:
         health &= ~Sensor.BATTERY
     if vehicle.faults.motor_failed:
         health &= ~Sensor.PROPULSION
-    is_present, is_enforced, is_kept = vehicle.fence_health
+    is_present, is_enforced, is_kept = vehicle.fence.health
     if not is_present:
         present &= ~_FENCE
     if is_enforced:

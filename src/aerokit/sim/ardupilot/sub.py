@@ -7,10 +7,11 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavCmd, MavModeFlag, MavResult, MavSeverity, MavType, SubMode
-from aerokit.sim.ardupilot.arming import Arming
-from aerokit.sim.ardupilot.level_vehicle import LevelFailsafes, LevelVehicle
+from aerokit.mavlink.enums import MavCmd, MavModeFlag, MavResult, MavType, SubMode
+from aerokit.sim.ardupilot.level_vehicle import LevelVehicle
 from aerokit.sim.ardupilot.motors import Motors
+from aerokit.sim.ardupilot.sub_arming import SubArming
+from aerokit.sim.ardupilot.sub_failsafes import SubFailsafes
 from aerokit.sim.ardupilot.sub_modes import SUB_MODES, SubAuto, SubGuided
 from aerokit.sim.underwater_motion import UnderwaterMotion
 
@@ -29,7 +30,6 @@ _BASE = MavModeFlag.CUSTOM_MODE_ENABLED | MavModeFlag.STABILIZE_ENABLED | MavMod
 _HOLDING_THROTTLE, _PER_CLIMB = 0.45, 0.44
 _AMPERES_AT_FULL = 26.3
 _LOOK_AHEAD_M = 1.0
-_DISARM, _HOLD, _SURFACE = 2, 3, 4
 _STICKS = 6
 
 
@@ -45,38 +45,6 @@ class _Motors(Motors):
         self.throttle = max(0.0, min(1.0, climb)) if self.is_armed else 0.0
 
 
-class _Arming(Arming):
-    """In the modes that need no position also before the estimator has one."""
-
-    def reasons(self) -> list[str]:
-        vehicle = self._vehicle
-        if vehicle.mode.needs_position or not vehicle.navigation.has_attitude:
-            return super().reasons()
-        return [*vehicle.faults.prearm_failures, *self._mandatory_reasons()]
-
-    def _final_reasons(self) -> list[str]:
-        return []
-
-    def disarm(self, *, force: bool = True) -> bool:
-        return super().disarm(force=True)
-
-
-class _Failsafes(LevelFailsafes):
-    """FS_GCS_ENABLE: told only (1), disarm (2), hold the depth (3), surface (4)."""
-
-    def _act(self, name: str, mode: int | None) -> None:
-        vehicle = self._vehicle
-        if name != "GCS":
-            return
-        ground_station = int(vehicle.parameters["MAV_GCS_SYSID"])
-        vehicle.send_text(MavSeverity.WARNING, f"MYGCS: {ground_station}, heartbeat lost")
-        action = int(vehicle.parameters["FS_GCS_ENABLE"])
-        modes = {_HOLD: SubMode.ALT_HOLD, _SURFACE: SubMode.SURFACE}
-        wanted = modes.get(action, vehicle.mode.number)
-        if vehicle.motors.is_armed and (action == _DISARM or not vehicle.set_mode(wanted)):
-            vehicle.arming.disarm()
-
-
 def _servo_output(sub: SimulatedSub) -> m.ServoOutputRaw:
     """Six thrusters; the last two are the vertical ones."""
     up = 1500 - round(400 * (sub.motors.throttle - 0.5)) if sub.motors.is_armed else 1500
@@ -90,8 +58,8 @@ class SimulatedSub(LevelVehicle):
     It has 1,386 parameters. Simulated: MANUAL, STABILIZE, ACRO, ALT_HOLD and POSHOLD by the sticks, GUIDED, AUTO and
     SURFACE; it can be armed without a position in the modes that need none. Take-off is an unknown command.
 
-    Not simulated yet: CIRCLE, SURFTRAK and MOTORDETECT (they hold still), leaks, pressure and temperature inside, the
-    pilot's failsafe, currents. Waking up after a reboot it is at the surface.
+    Not simulated yet: CIRCLE, SURFTRAK and MOTORDETECT (they hold still), currents. Waking up after a
+    reboot it is at the surface.
     """
 
     KIND: ClassVar[Kind] = "sub"
@@ -105,6 +73,9 @@ class SimulatedSub(LevelVehicle):
     }
 
     motion: UnderwaterMotion
+    hull_pressure_pa: float = 101_325.0
+    """What the sensors inside measure."""
+    hull_temperature_c: float = 28.0
 
     def make_motion(self, wind: Wind | None) -> UnderwaterMotion:
         """SIM_BUOYANCY 1 lifts it with 0.1 m/s; wind does not reach it."""
@@ -114,13 +85,13 @@ class SimulatedSub(LevelVehicle):
         """Thrusters."""
         return _Motors()
 
-    def make_arming(self) -> Arming:
-        """Without throttle check."""
-        return _Arming(self)
+    def make_arming(self) -> SubArming:
+        """See `SubArming`."""
+        return SubArming(self)
 
-    def make_failsafes(self) -> LevelFailsafes:
-        """FS_GCS_ENABLE."""
-        return _Failsafes(self)
+    def make_failsafes(self) -> SubFailsafes:
+        """See `SubFailsafes`."""
+        return SubFailsafes(self)
 
     def reset_controllers(self) -> None:
         """All sticks rest in the middle."""

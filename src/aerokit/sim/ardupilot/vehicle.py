@@ -14,6 +14,7 @@ from aerokit.sim.ardupilot.buzzer import hear_tunes
 from aerokit.sim.ardupilot.calibration import Calibrations
 from aerokit.sim.ardupilot.camera import Camera
 from aerokit.sim.ardupilot.failsafes import Failsafes
+from aerokit.sim.ardupilot.fence import Fence
 from aerokit.sim.ardupilot.gimbal import Gimbal
 from aerokit.sim.ardupilot.mission_run import MissionRun
 from aerokit.sim.ardupilot.mission_server import MissionServer
@@ -156,6 +157,7 @@ class ArduPilotVehicle(SimulatedAutopilot):
         self.navigation = Navigation(self, self._frame)
         self.arming = self.make_arming()
         self.failsafes = self.make_failsafes()
+        self.fence = self.make_fence()
         self.gimbal = Gimbal(self)
         self.camera = Camera(self)
         self.calibrations.reset()
@@ -195,7 +197,11 @@ class ArduPilotVehicle(SimulatedAutopilot):
 
     def make_failsafes(self) -> Failsafes:
         """What it does by itself."""
-        return Failsafes(self)
+        raise NotImplementedError
+
+    def make_fence(self) -> Fence:
+        """Where it may be."""
+        return Fence(self)
 
     def make_commands(self) -> dict[int, CommandHandler]:
         """MAV_CMD → handler."""
@@ -246,11 +252,6 @@ class ArduPilotVehicle(SimulatedAutopilot):
     def frame(self) -> LocalFrame:
         """The world: metres north and east of where it was switched on."""
         return self._frame
-
-    @property
-    def fence_health(self) -> tuple[bool, bool, bool]:
-        """Whether the fence is configured, enforced, and kept, for SYS_STATUS."""
-        return (True, False, True)
 
     @property
     def is_armed(self) -> bool:
@@ -331,6 +332,9 @@ class ArduPilotVehicle(SimulatedAutopilot):
         if mode is None:
             self.send_text(MavSeverity.WARNING, f"No such mode {number}")
             return False
+        if (denied := self.fence.refusal(mode)) is not None:
+            self.send_text(*denied)
+            return False
         armed = self.motors.is_armed
         reason = None
         if (
@@ -346,6 +350,7 @@ class ArduPilotVehicle(SimulatedAutopilot):
             return False
         self.mode.leave()
         self.mode = mode
+        self.fence.mode_changed()
         self.call_later(0.0, lambda: self.send(heartbeat(self)))
         return True
 

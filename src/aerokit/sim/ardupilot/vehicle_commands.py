@@ -33,6 +33,7 @@ def common_commands(vehicle: ArduPilotVehicle) -> dict[int, CommandHandler]:
         MavCmd.SET_MESSAGE_INTERVAL: vehicle.requests.set_interval,
         MavCmd.GET_MESSAGE_INTERVAL: vehicle.requests.get_interval,
         MavCmd.RUN_PREARM_CHECKS: setup.run_prearm_checks,
+        MavCmd.DO_FENCE_ENABLE: lambda command: vehicle.fence.command(command),
         MavCmd.PREFLIGHT_REBOOT_SHUTDOWN: setup.reboot,
         MavCmd.DO_SEND_BANNER: setup.send_banner,
         **vehicle.calibrations.commands,
