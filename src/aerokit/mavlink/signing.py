@@ -29,7 +29,6 @@ ALWAYS_UNSIGNED = frozenset((109, 166))
 _HASH_LENGTH = 6
 
 AllowUnsigned = Callable[[Frame], bool]
-_Stream = tuple[int, int, int]
 
 
 def timestamp_at(unix_time_s: float) -> int:
@@ -150,14 +149,15 @@ class Signing:
         self.refused: dict[Refusal, int] = dict.fromkeys(Refusal, 0)
         """How many frames were refused, for each reason."""
         self._keyed = sha256(key.secret)
-        self._streams: dict[_Stream, int] = {}
+        self.streams: dict[tuple[int, int, int], int] = {}
+        """The last time stamp of each (system id, component id, link id); all links with the key share it."""
 
     def for_link(self, link_id: int) -> Signing:
         """The same key on another link (0–255): what was played on one of them cannot be played again on the other."""
         other = Signing(
             self.key, link_id=link_id, timestamp=self.timestamp, allow_unsigned=self.allow_unsigned
         )
-        other._streams = self._streams
+        other.streams = self.streams
         return other
 
     def timestamp_now(self, now: float = 0.0) -> int:
@@ -209,13 +209,13 @@ class Signing:
         signature = frame.raw[-SIGNATURE_LENGTH:]
         stamp = int.from_bytes(signature[1:7], "little")
         stream = (frame.system_id, frame.component_id, signature[0])
-        last = self._streams.get(stream)
+        last = self.streams.get(stream)
         if last is None:
             if stamp + ONE_MINUTE < self.timestamp_now(now):
                 return Refusal.TOO_OLD
         elif stamp <= last:
             return Refusal.REPLAYED
-        self._streams[stream] = stamp
+        self.streams[stream] = stamp
         self.timestamp = max(self.timestamp, stamp)
         return None
 

@@ -7,12 +7,15 @@ from typing import TYPE_CHECKING, ClassVar, Protocol
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavProtocolCapability
+from aerokit.mavlink.signing import timestamp_at
 from aerokit.sim.commands import CommandHandler, CommandServer
 from aerokit.sim.vehicle import Component, SimulatedVehicle, sender_of
 
 if TYPE_CHECKING:
+    from aerokit.mavlink.signing import SigningKey
     from aerokit.sim.channel import Channel
     from aerokit.sim.file_tree import FileTree
+    from aerokit.sim.signing import VehicleSigning
 
 __all__ = ["SimulatedAutopilot"]
 
@@ -29,12 +32,15 @@ class SimulatedAutopilot(SimulatedVehicle):
 
     - ``version``: as "4.7.0-dev" or "1.16.0"; ``unix_time_at_boot``: what its GPS clock says at simulated second 0
     - ``unsupported_commands``: MAV_CMDs that this firmware does not know
+    - ``signing_key``: was set up before; None: its frames are not signed, until SETUP_SIGNING
     """
 
     CAPABILITIES: ClassVar[int]
     """MAV_PROTOCOL_CAPABILITYs."""
 
     storage: _Storage
+    signing: VehicleSigning
+    """The key for signing that it was given; it survives a reboot."""
 
     def __init__(
         self,
@@ -45,11 +51,24 @@ class SimulatedAutopilot(SimulatedVehicle):
         version: str,
         unsupported_commands: Collection[int],
         unix_time_at_boot: float,
+        signing_key: SigningKey | None,
     ) -> None:
         super().__init__(system_id=system_id, component_id=1, seed=seed, components=components)
         self.version = version
         self.unsupported_commands = frozenset(unsupported_commands)
         self._unix_time_at_start = unix_time_at_boot
+        self.signing = self.make_signing(signing_key, timestamp_at(unix_time_at_boot))
+
+    def make_signing(self, key: SigningKey | None, timestamp: int) -> VehicleSigning:
+        """What this firmware does with keys; this one and its time stamp are stored already."""
+        raise NotImplementedError
+
+    def open_channel(self, *, version: int = 2) -> Channel:
+        """Another port with its own stream rates; ``version`` is the MAVLink version it speaks."""
+        channel = super().open_channel(version=version)
+        if len(self.channels) > 1:  # the first one is there before anything else
+            self.signing.start(channel)
+        return channel
 
     @property
     def capabilities(self) -> int:

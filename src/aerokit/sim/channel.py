@@ -12,6 +12,7 @@ from aerokit.sim.streams import Streams
 if TYPE_CHECKING:
     from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.message import Message
+    from aerokit.mavlink.signing import Signing
 
 __all__ = ["Channel"]
 
@@ -31,6 +32,14 @@ class Channel:
         self._framers: dict[Hashable, Framer] = {}
         self._encoders: dict[tuple[int, int], FrameEncoder] = {}
         self._outbox: list[bytes] = []
+        self.signing: Signing | None = None
+        """What signs its frames and checks what it hears; see `sign_with`."""
+
+    def sign_with(self, signing: Signing | None) -> None:
+        """Sign and check with this from now on; None: neither."""
+        self.signing = signing
+        for encoder in self._encoders.values():
+            encoder.signing = signing
 
     def frames(self, data: bytes, now: float, peer: Hashable = None) -> list[Frame]:
         """What the bytes of one peer hold that the vehicle understands."""
@@ -38,7 +47,8 @@ class Channel:
         if framer is None:
             framer = self._framers[peer] = Framer()
             framer.wanted = self._wanted
-        return framer.receive(data, now)
+        frames = framer.receive(data, now)
+        return frames if self.signing is None else [each for each in frames if self.signing.accepts(each)]
 
     def encode(self, message: Message, sender: tuple[int, int] | None = None) -> bytes:
         """A frame with the sending component's next sequence number; empty when MAVLink 1 has none."""
@@ -48,6 +58,7 @@ class Channel:
         encoder = self._encoders.get(sender)
         if encoder is None:
             encoder = self._encoders[sender] = FrameEncoder(*sender, version=self.version)
+            encoder.signing = self.signing
         return encoder.encode(message)
 
     def write(self, data: bytes) -> None:

@@ -19,6 +19,9 @@ __all__ = ["set_up_signing"]
 SEND_AGAIN_S = 1.0
 """A heartbeat comes each second, and shows whether the key was taken."""
 NO_KEY = bytes(32)
+A_SECOND = 100_000
+"""The vehicle begins with a time stamp that is surely not before that of the frame which brings it: going back, its
+frames would be taken for replayed ones."""
 
 
 async def set_up_signing(vehicle: Vehicle, signing: Signing | None, timeout: float) -> None:
@@ -56,5 +59,5 @@ def _check_vehicle(vehicle: Vehicle) -> None:
 def _message(vehicle: Vehicle, signing: Signing | None) -> SetupSigning:
     if signing is None:
         return SetupSigning(vehicle.system_id, vehicle.component_id, NO_KEY, 0)
-    stamp = signing.timestamp_now(vehicle.connection.unix_time())
+    stamp = signing.timestamp_now(vehicle.connection.unix_time()) + A_SECOND
     return SetupSigning(vehicle.system_id, vehicle.component_id, signing.key.secret, stamp)

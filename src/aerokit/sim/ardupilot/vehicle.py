@@ -23,6 +23,7 @@ from aerokit.sim.ardupilot.navigation import Navigation
 from aerokit.sim.ardupilot.parameter_tables import Kind, parameters_of
 from aerokit.sim.ardupilot.radio import Radio
 from aerokit.sim.ardupilot.requests import Requests
+from aerokit.sim.ardupilot.signing import ArduPilotSigning
 from aerokit.sim.ardupilot.storage import DEFAULT_LOGS, Storage
 from aerokit.sim.ardupilot.stream_groups import COPTER_GROUPS
 from aerokit.sim.ardupilot.telemetry import BUILDERS
@@ -36,6 +37,7 @@ from aerokit.sim.vehicle import Component, sender_of
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
+    from aerokit.mavlink.signing import SigningKey
     from aerokit.sim.ardupilot.ftp import ArduPilotFtp
     from aerokit.sim.ardupilot.mode import AutoMode, VehicleMode
     from aerokit.sim.ardupilot.navigation import Ned
@@ -70,6 +72,7 @@ class ArduPilotVehicle(SimulatedAutopilot):
       ``stream_groups`` False: it does not know REQUEST_DATA_STREAM
     - ``components``: other components on its links: `SimulatedCamera`, `SimulatedGimbal`, or only heartbeats
     - ``unix_time_at_boot``: what its GPS clock says at simulated second 0
+    - ``signing_key``: see `ArduPilotSigning`
     """
 
     KIND: ClassVar[Kind]
@@ -89,6 +92,8 @@ class ArduPilotVehicle(SimulatedAutopilot):
 
     storage: Storage
     """Files, logs, and the servers of them and of the parameters."""
+    signing: ArduPilotSigning
+    """The key for signing that it was given; it survives a reboot."""
 
     def __init__(
         self,
@@ -113,6 +118,7 @@ class ArduPilotVehicle(SimulatedAutopilot):
         stream_groups: bool = True,
         components: Iterable[Component] = (),
         unix_time_at_boot: float = 1_790_000_000.0,
+        signing_key: SigningKey | None = None,
     ) -> None:
         self.parameters = parameters_of(self.KIND, parameter_count)
         """By name; change them as a test needs it. They survive a reboot."""
@@ -126,6 +132,7 @@ class ArduPilotVehicle(SimulatedAutopilot):
             version=version,
             unsupported_commands=unsupported_commands,
             unix_time_at_boot=unix_time_at_boot,
+            signing_key=signing_key,
         )
         self.timeline = BootTimeline.scaled(boot_time_s)
         self.uid = bytes([0xA0, system_id]) + bytes(16)
@@ -170,6 +177,10 @@ class ArduPilotVehicle(SimulatedAutopilot):
         self.mission = MissionRun(self, self.auto)
         self.missions.reset()
         self.mode: VehicleMode = self._modes[self.first_mode]
+
+    def make_signing(self, key: SigningKey | None, timestamp: int) -> ArduPilotSigning:
+        """Keeps the key."""
+        return ArduPilotSigning(self, key, timestamp)
 
     def _listen(self) -> None:
         self.requests = Requests(self, stream_groups=self._stream_groups)

@@ -32,12 +32,14 @@ from aerokit.sim.px4.modes import (
 )
 from aerokit.sim.px4.offboard import Offboard
 from aerokit.sim.px4.parameters import px4_parameters
+from aerokit.sim.px4.signing import Px4Signing
 from aerokit.sim.px4.storage import DEFAULT_LOGS, Storage
 from aerokit.sim.px4.telemetry import BUILDERS, DEFAULT_RATES_HZ, FAST_MESSAGES
 from aerokit.sim.vehicle import Component, sender_of
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
+    from aerokit.mavlink.signing import SigningKey
     from aerokit.sim.channel import Channel
     from aerokit.sim.logs import SimulatedLog
     from aerokit.sim.px4.ftp import Px4Ftp
@@ -70,6 +72,7 @@ class SimulatedPx4(SimulatedAutopilot):
     - ``fast_rate_hz``: rate of attitude, position and targets
     - ``parameters``: values other than the defaults; ``parameter_count``: fewer than all 889, for quick tests;
       ``parameter_file``, ``link_bytes_per_s``: see `Storage`; ``logs``: what flights have left
+    - ``signing_key``: see `Px4Signing`
     """
 
     CAPABILITIES: ClassVar[int] = 0xE8FF
@@ -99,6 +102,7 @@ class SimulatedPx4(SimulatedAutopilot):
         unsupported_commands: Collection[int] = (),
         components: Iterable[Component] = (),
         unix_time_at_boot: float = 1_790_000_000.0,
+        signing_key: SigningKey | None = None,
     ) -> None:
         self.parameters = px4_parameters(parameter_count, self.PARAMETER_TABLE)
         """By name; they survive a reboot."""
@@ -112,6 +116,7 @@ class SimulatedPx4(SimulatedAutopilot):
             version=version,
             unsupported_commands=unsupported_commands,
             unix_time_at_boot=unix_time_at_boot,
+            signing_key=signing_key,
         )
         self.frame = LocalFrame(GlobalPoint(round(home[0] * 1e7), round(home[1] * 1e7), home[2]))
         self.battery = Battery(5000.0, cells=4, percent=battery_percent)
@@ -157,6 +162,10 @@ class SimulatedPx4(SimulatedAutopilot):
         self.mission = self._make_mission()
         self.failsafes = Failsafes(self)
         self.missions.reset()
+
+    def make_signing(self, key: SigningKey | None, timestamp: int) -> Px4Signing:
+        """Keeps the key."""
+        return Px4Signing(self, key, timestamp)
 
     def _listen(self) -> None:
         self.offboard = Offboard(self)
@@ -254,7 +263,7 @@ class SimulatedPx4(SimulatedAutopilot):
 
     def send_text(self, severity: int, text: str) -> None:
         """Every text has an id, nearly every one ends in a tab; it leaves after what is being answered."""
-        text = text if text in WITHOUT_TAB else text + "\t"
+        text = text if text in WITHOUT_TAB or text.startswith("MAVLink signing") else text + "\t"
         number, self._next_text_id = self._next_text_id, (self._next_text_id + 1) & 0xFFFF
         self.call_later(0.0, lambda: self.send_chunks(severity, text, number))
 

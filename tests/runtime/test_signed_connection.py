@@ -1,0 +1,303 @@
+"""Connections that sign: with simulated vehicles, in virtual time."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import anyio
+import pytest
+
+from aerokit import Signing, SigningKey, Vehicle, connect, events, open_connection
+from aerokit.errors import (
+    CommandTimeout,
+    ConnectFailed,
+    LocalProtocolError,
+    NotSupported,
+    OperationRejected,
+    OperationTimeout,
+)
+from aerokit.links import memory_link_pair
+from aerokit.mavlink import Frame, FrameEncoder, Framer, Message, read_tlog
+from aerokit.mavlink.messages import Attitude, Heartbeat, RadioStatus, SetupSigning
+from aerokit.mavlink.signing import Refusal
+from aerokit.runtime.connection import Connection
+from aerokit.sim import SimulatedCopter, SimulatedPx4, SimulatedVehicle, simulated_link
+from aerokit.vehicle.connect import connect as connect_vehicle
+
+pytestmark = pytest.mark.anyio
+
+KEY = SigningKey.from_passphrase("right")
+WRONG = SigningKey.from_passphrase("wrong")
+
+
+def radio_copter(**options: Any) -> SimulatedCopter:
+    """Its only link is a radio."""
+    copter = SimulatedCopter(boot_time_s=0.0, **options)
+    copter.signing.trusts_first_port = False
+    return copter
+
+
+@asynccontextmanager
+async def connected(vehicle: SimulatedVehicle, **options: Any) -> AsyncIterator[Vehicle]:
+    async with simulated_link(vehicle) as link, connect(link, rates={}, **options) as client:
+        yield client
+
+
+def lenient(key: SigningKey) -> Signing:
+    return Signing(key, allow_unsigned=lambda frame: True)
+
+
+# ------------------------------------------------------------------------------- vehicle and client
+
+
+@pytest.mark.parametrize("make", [radio_copter, SimulatedPx4])
+async def test_a_key_is_set_up_used_and_taken_away(make: Any) -> None:
+    simulated = make()
+    async with connected(simulated) as vehicle:
+        await vehicle.wait_ready()
+        signing = Signing(KEY)
+        await vehicle.setup_signing(signing)
+        assert simulated.signing.key == KEY
+        assert vehicle.connection.signing is signing
+        await vehicle.arm()
+        await vehicle.disarm()
+        heartbeat = await vehicle.message(Heartbeat).wait_until(lambda _: True)
+        assert heartbeat.received_frame is not None
+        assert signing.has_signed(heartbeat.received_frame)
+        await vehicle.setup_signing(None)
+        assert [simulated.signing.key, vehicle.connection.signing] == [None, None]
+        await vehicle.arm()
+        assert signing.frames_refused == 0
+
+
+async def test_a_whole_flight_signed() -> None:
+    signing = Signing(KEY)
+    copter = radio_copter(signing_key=KEY, parameter_count=200)
+    async with connected(copter, signing=signing) as vehicle:
+        await vehicle.wait_ready()
+        await vehicle.parameters.download()
+        await vehicle.arm()
+        await vehicle.take_off(5)
+        await vehicle.land()
+        assert vehicle.connection.counts(1)[1] == 0
+    assert signing.refused[Refusal.UNSIGNED] == signing.refused[Refusal.WRONG_SIGNATURE] == 0
+
+
+async def test_a_vehicle_with_a_key_does_not_hear_who_has_none() -> None:
+    async with connected(radio_copter(signing_key=KEY)) as vehicle:
+        with pytest.raises(CommandTimeout, match="its frames are signed and ours are not"):
+            await vehicle.command(512, 148)
+        vehicle.connection.signing = lenient(WRONG)
+        with pytest.raises(CommandTimeout):
+            await vehicle.command(512, 148)
+        vehicle.connection.signing = Signing(KEY)
+        await vehicle.command(512, 148)
+
+
+@pytest.mark.parametrize(("vehicle_key", "why"), [(None, "is not signed"), (WRONG, "another key")])
+async def test_a_vehicle_without_the_key_is_not_found(
+    vehicle_key: SigningKey | None, why: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    signing = Signing(KEY)
+    with caplog.at_level(logging.WARNING, "aerokit"), pytest.raises(ConnectFailed) as failure:
+        async with connected(radio_copter(signing_key=vehicle_key), signing=signing, timeout=5.0):
+            pass
+    assert why in str(failure.value)
+    assert KEY.fingerprint in str(failure.value)
+    assert KEY.secret.hex() not in str(failure.value)
+    assert signing.frames_refused >= 3
+    (record,) = caplog.records
+    assert why in record.getMessage()
+    assert KEY.fingerprint in record.getMessage()
+
+
+async def test_allow_unsigned_is_the_programs_choice() -> None:
+    signing = Signing(KEY, allow_unsigned=lambda frame: frame.message_id == Heartbeat.ID)
+    async with connected(radio_copter(), signing=signing) as vehicle:
+        await anyio.sleep(3)
+        assert vehicle.heartbeat_age < 1.5
+        with pytest.raises(CommandTimeout, match=r"frames were refused .*it is not signed"):
+            await vehicle.command(512, 148)
+
+
+async def test_setup_is_refused_beforehand_and_by_the_vehicle() -> None:
+    copter = radio_copter()
+    async with connected(copter) as vehicle:
+        await vehicle.wait_ready()
+        vehicle.connection.mavlink_version = 1
+        with pytest.raises(NotSupported, match="MAVLink 1"):
+            await vehicle.setup_signing(Signing(KEY))
+        with pytest.raises(LocalProtocolError, match="mavlink_version = 1"):
+            vehicle.connection.signing = Signing(KEY)
+        vehicle.connection.mavlink_version = 2
+        await vehicle.arm()
+        with pytest.raises(OperationRejected, match="armed; nothing was sent"):
+            await vehicle.setup_signing(Signing(KEY))
+        await vehicle.disarm()
+        with pytest.raises(LocalProtocolError, match="timeout"):
+            await vehicle.setup_signing(Signing(KEY), timeout=0)
+        assert copter.signing.key is None
+        copter.signing.may_change = lambda: False  # type: ignore[method-assign]
+        with pytest.raises(OperationTimeout, match=KEY.fingerprint):
+            await vehicle.setup_signing(Signing(KEY))
+        assert vehicle.connection.signing is None
+        await vehicle.arm()
+
+
+async def test_setup_over_a_lossy_link() -> None:
+    copter = radio_copter(seed=3)
+    async with connected(copter) as vehicle:
+        await vehicle.wait_ready()
+        copter.faults.drop_incoming = 2
+        await vehicle.setup_signing(Signing(KEY), timeout=20)
+        await vehicle.setup_signing(Signing(WRONG), timeout=20)  # signed with the old one on its way there
+        assert copter.signing.key == WRONG
+
+
+async def test_a_reboot_is_no_replay() -> None:
+    signing = Signing(KEY)
+    copter = radio_copter(signing_key=KEY)
+    async with connected(copter, signing=signing) as vehicle:
+        await anyio.sleep(31)  # the vehicle stores its time stamp every 30 seconds
+        await vehicle.reboot()
+        await vehicle.wait_ready()
+    assert signing.refused[Refusal.REPLAYED] == 0
+
+
+async def test_the_kept_time_stamp_is_what_the_next_run_begins_with() -> None:
+    first = Signing(KEY, timestamp=1 << 47)
+    async with connected(radio_copter(signing_key=KEY), signing=first) as vehicle:
+        await vehicle.command(512, 148)
+    kept = first.timestamp
+    assert kept > 1 << 47
+    copter = radio_copter(signing_key=KEY)
+    copter.signing.timestamp = kept
+    async with connected(copter, signing=Signing(KEY, timestamp=kept)) as vehicle:
+        await vehicle.command(512, 148)
+
+
+# ------------------------------------------------------------------------------------ the connection
+
+
+class Far:
+    """The other end of a link in memory: sends what it is told to, keeps what comes."""
+
+    def __init__(self) -> None:
+        self.link, self._own = memory_link_pair()
+        self.framer = Framer()
+        self.framer.keep_unknown = True
+        self.frames: list[Frame] = []
+
+    async def open(self) -> None:
+        await self._own.open(self)
+
+    def bytes_received(self, data: bytes, peer: object) -> None:
+        self.frames += self.framer.receive(data)
+
+    def link_lost(self, error: Exception) -> None:
+        """Not looked at."""
+
+    async def say(self, *raws: bytes) -> None:
+        for raw in raws:
+            self._own.write(raw)
+        await anyio.sleep(0.01)
+
+
+@asynccontextmanager
+async def with_far(**options: Any) -> AsyncIterator[tuple[Connection, Far]]:
+    far = Far()
+    await far.open()
+    async with open_connection(far.link, **options) as connection:
+        yield connection, far
+
+
+def raw(message: Message, signing: Signing | None = None, system_id: int = 1) -> bytes:
+    encoder = FrameEncoder(system_id, 1)
+    encoder.signing = signing
+    return encoder.encode(message, 1.9e9)
+
+
+HEARTBEAT = Heartbeat(2, 3, 81, 0, 3)
+ATTITUDE = Attitude(0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+async def test_refused_frames_go_nowhere_and_are_told_once_for_each_reason(tmp_path: Path) -> None:
+    path = tmp_path / "log.tlog"
+    signing, good = Signing(KEY), raw(HEARTBEAT, Signing(KEY))
+    tapped: list[int] = []
+    async with with_far(signing=signing, record=path) as (connection, far):
+        with (
+            connection.subscribe(events.FrameRefused, capacity=9) as refused,
+            connection.subscribe(Heartbeat, Attitude, capacity=9) as heard,
+        ):
+            connection.tap(lambda frame, _: tapped.append(frame.system_id))
+            bad = raw(ATTITUDE, system_id=7), raw(ATTITUDE, Signing(WRONG), 8), good
+            await far.say(good, *bad, *bad, raw(RadioStatus(0, 0, 0, 0, 0, 0, 0), system_id=51))
+            told = [await refused.get() for _ in range(3)]
+            assert (await heard.get()) == HEARTBEAT
+            assert refused.missed == heard.missed == 0
+        assert [(each.system_id, each.reason) for each in told] == [
+            (7, Refusal.UNSIGNED.value),
+            (8, Refusal.WRONG_SIGNATURE.value),
+            (1, Refusal.REPLAYED.value),
+        ]
+        assert tapped == [1, 51]
+        assert list(connection.heard) == [(1, 1)]
+    assert signing.refused == {**dict.fromkeys(Refusal, 2), Refusal.TOO_OLD: 0}
+    received = [each for _, each in read_tlog(path) if each[5] != 255]
+    assert received[0] == good
+    assert len(received) == 2
+
+
+async def test_what_is_forwarded_and_recorded_keeps_its_signature_but_no_key_is_recorded(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "log.tlog"
+    theirs = raw(ATTITUDE, Signing(WRONG), 9)
+    async with with_far(signing=Signing(KEY), record=path) as (connection, far):
+        connection.write_raw(theirs)
+        connection.send(SetupSigning(1, 1, KEY.secret, 5))
+        connection.write_raw(raw(SetupSigning(1, 1, KEY.secret, 6)))
+        await anyio.sleep(0.01)
+        assert [frame.message_id for frame in far.frames].count(SetupSigning.ID) == 2
+        assert theirs in [frame.raw for frame in far.frames]
+    recorded = [each for _, each in read_tlog(path)]
+    assert theirs in recorded
+    assert KEY.secret not in path.read_bytes()
+    assert all(Signing(KEY).has_signed(Frame.parse(each)) for each in recorded if each[5] == 255)
+
+
+async def test_an_unknown_message_is_checked_too() -> None:
+    signing, seen = Signing(KEY), []
+    header = bytes((0xFD, 3, 1, 0, 0, 1, 1)) + (16_000_000).to_bytes(3, "little")
+    frame = header + b"abc\x11\x22"
+    async with with_far(signing=signing) as (connection, far):
+        connection.tap(lambda frame, _: seen.append(frame.message_id))
+        await far.say(frame + Signing(KEY).sign(frame, 1.9e9), frame + Signing(WRONG).sign(frame, 2e9))
+    assert seen == [16_000_000]
+    assert signing.refused[Refusal.WRONG_SIGNATURE] == 1
+
+
+async def test_an_open_connection_has_its_signing() -> None:
+    async with with_far() as (connection, _):
+        with pytest.raises(LocalProtocolError, match="signing"):
+            async with connect_vehicle(connection, signing=Signing(KEY)):
+                pass
+    with pytest.raises(LocalProtocolError, match="mavlink_version = 1"):
+        async with with_far(signing=Signing(KEY), mavlink_version=1):
+            pass
+
+
+async def test_time_stamps_go_on_with_the_clock_of_the_connection() -> None:
+    signing = Signing(KEY)
+    async with with_far(signing=signing) as (_, far):
+        await anyio.sleep(0.5)
+        before = signing.timestamp
+        await anyio.sleep(60)
+        assert signing.timestamp - before == pytest.approx(60 * 100_000, abs=110_000)
+        stamps = [int.from_bytes(frame.signature[1:7], "little") for frame in far.frames]
+        assert stamps == sorted(set(stamps))
