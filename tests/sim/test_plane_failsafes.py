@@ -1,0 +1,244 @@
+"""ArduPlane's failsafes: radio (short and long), ground station, battery; each action, each text."""
+
+from __future__ import annotations
+
+import pytest
+from simulated_client import set_mode
+from vehicles import (
+    BATTERY,
+    CRITICAL,
+    GROUND_STATION,
+    LOW,
+    drain,
+    flying_plane,
+    healthy,
+    lose_ground_station,
+    ready_plane,
+)
+
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import MavResult, MavState, PlaneMode
+from aerokit.mavlink.enums import MavSysStatusSensor as Sensor
+from aerokit.missions import MissionItem
+
+HEARTBEAT = {"FS_GCS_ENABL": 1.0}
+
+
+# ------------------------------------------------------------------------------------------- short
+
+
+def test_a_pilot_without_a_radio_circles_and_then_returns() -> None:
+    plane, client = flying_plane(PlaneMode.FLY_BY_WIRE_A)
+    plane.faults.rc_lost = True
+    client.run(1.15)
+    assert client.texts == []
+    client.run(0.25)
+    assert client.texts == ["Throttle failsafe on", "RC Short Failsafe: switched to CIRCLE"]
+    assert not healthy(client, Sensor.RC_RECEIVER)
+    client.run(1.0)
+    assert client.last(m.Heartbeat).system_status == MavState.CRITICAL
+    client.run(3.5)
+    assert plane.mode.number == PlaneMode.CIRCLE, "FS_LONG_TIMEOUT counts from the short failsafe"
+    client.run(1.0)
+    assert client.texts[2:] == ["RC Long Failsafe On: RTL"]
+
+
+def test_a_radio_that_comes_back_soon_gives_the_mode_back() -> None:
+    plane, client = flying_plane(PlaneMode.FLY_BY_WIRE_A)
+    plane.faults.rc_lost = True
+    client.run(2.0)
+    client.forget()
+    plane.faults.rc_lost = False
+    client.run(1.5)
+    assert client.texts == [
+        "Throttle failsafe off",
+        "Short Failsafe Cleared",
+        "Flight mode FLY_BY_WIRE_A restored",
+    ]
+    assert plane.mode.number == PlaneMode.FLY_BY_WIRE_A
+    assert client.last(m.Heartbeat).system_status == MavState.ACTIVE
+    assert healthy(client, Sensor.RC_RECEIVER)
+
+
+def test_a_radio_that_comes_back_late_changes_no_mode() -> None:
+    plane, client = flying_plane(PlaneMode.CRUISE)
+    plane.faults.rc_lost = True
+    client.run(7.0)
+    client.forget()
+    plane.faults.rc_lost = False
+    client.run(1.0)
+    assert client.texts == ["Throttle failsafe off", "RC Long Failsafe Cleared"]
+    assert plane.mode.number == PlaneMode.RTL
+
+
+@pytest.mark.parametrize(
+    ("action", "mode", "then"),
+    [
+        (0, PlaneMode.LOITER, PlaneMode.LOITER),
+        (1, PlaneMode.LOITER, PlaneMode.CIRCLE),
+        (2, PlaneMode.GUIDED, PlaneMode.FLY_BY_WIRE_A),
+        (4, PlaneMode.GUIDED, PlaneMode.FLY_BY_WIRE_B),
+        (1, PlaneMode.RTL, PlaneMode.RTL),
+        (2, PlaneMode.MANUAL, PlaneMode.FLY_BY_WIRE_A),
+    ],
+)
+def test_the_short_action_is_configured(action: int, mode: int, then: int) -> None:
+    plane, client = flying_plane(mode, FS_SHORT_ACTN=float(action))
+    plane.faults.rc_lost = True
+    client.run(2.0)
+    assert plane.mode.number == then
+    switched = f"RC Short Failsafe: switched to {plane.mode.name}"
+    assert client.texts[1] == (switched if mode != then else "RC Short Failsafe On")
+
+
+def test_without_the_short_one_the_long_one_counts_from_the_last_pulse() -> None:
+    plane, client = flying_plane(FS_SHORT_ACTN=3.0)
+    plane.faults.rc_lost = True
+    client.run(4.9)
+    assert client.texts == ["Throttle failsafe on"]
+    client.run(0.4)
+    assert client.texts[1:] == ["RC Long Failsafe On: RTL"]
+
+
+def test_a_low_throttle_is_a_lost_radio() -> None:
+    plane, client = flying_plane()
+    plane.rc[2] = 940
+    client.run(0.5)
+    assert client.texts == ["Throttle failsafe on", "RC Short Failsafe On"]
+
+
+@pytest.mark.parametrize("enabled", [0.0, 2.0])
+def test_without_the_throttle_failsafe_only_sys_status_knows(enabled: float) -> None:
+    plane, client = flying_plane(THR_FAILSAFE=enabled)
+    plane.faults.rc_lost = True
+    client.run(8.0)
+    assert client.texts == []
+    assert plane.mode.number == PlaneMode.LOITER
+    assert not healthy(client, Sensor.RC_RECEIVER)
+
+
+# -------------------------------------------------------------------------------------------- long
+
+
+@pytest.mark.parametrize(
+    ("action", "mode", "then"),
+    [
+        (0, PlaneMode.GUIDED, PlaneMode.GUIDED),
+        (1, PlaneMode.GUIDED, PlaneMode.RTL),
+        (2, PlaneMode.LOITER, PlaneMode.FLY_BY_WIRE_A),
+        (5, PlaneMode.LOITER, PlaneMode.AUTOLAND),
+        (5, PlaneMode.RTL, PlaneMode.AUTOLAND),
+        (1, PlaneMode.AUTOLAND, PlaneMode.AUTOLAND),
+    ],
+)
+def test_the_long_action_is_configured(action: int, mode: int, then: int) -> None:
+    plane, client = flying_plane(mode, FS_SHORT_ACTN=3.0, FS_LONG_ACTN=float(action), **HEARTBEAT)
+    lose_ground_station(client, 5.5)
+    assert plane.mode.number == then
+    landing = mode == PlaneMode.AUTOLAND
+    assert client.texts == ([] if landing else [f"GCS Failsafe On: {plane.mode.name}"])
+
+
+def test_the_long_one_waits_for_the_end_of_a_take_off() -> None:
+    plane, client = ready_plane(**HEARTBEAT)
+    assert set_mode(client, PlaneMode.TAKEOFF) == MavResult.ACCEPTED
+    plane.arming.arm()
+    client.run(1.0)
+    client.forget()
+    lose_ground_station(client, 5.5)
+    assert plane.mode.is_taking_off
+    assert client.texts == ["GCS Failsafe On: TAKEOFF"]
+    client.run_until(lambda: plane.mode.number != PlaneMode.TAKEOFF)
+    assert plane.mode.number == PlaneMode.RTL
+    assert plane.altitude_m > 40.0
+
+
+# ---------------------------------------------------------------------------------- ground station
+
+
+def test_a_ground_station_that_comes_back_is_told() -> None:
+    plane, client = flying_plane(**HEARTBEAT)
+    lose_ground_station(client, 4.9)
+    assert client.texts == []
+    client.run(1.6)
+    assert client.texts == ["GCS Failsafe On: RTL"]
+    assert client.last(m.Heartbeat).system_status == MavState.CRITICAL
+    client.send(GROUND_STATION)
+    client.run(1.5)
+    assert client.texts[1:] == ["GCS Failsafe Off"]
+    assert plane.mode.number == PlaneMode.RTL
+    assert client.last(m.Heartbeat).system_status == MavState.ACTIVE
+
+
+def test_a_ground_station_that_was_never_heard_is_not_missed() -> None:
+    plane, client = flying_plane(**HEARTBEAT)
+    client.run(8.0)
+    assert plane.mode.number == PlaneMode.LOITER
+
+
+def test_the_ground_station_may_matter_only_in_auto() -> None:
+    plane, client = flying_plane(FS_GCS_ENABL=3.0)
+    lose_ground_station(client, 8.0)
+    assert (client.texts, plane.mode.number) == ([], PlaneMode.LOITER)
+
+
+def test_it_acts_disarmed_too_and_is_not_armed_then() -> None:
+    plane, client = ready_plane()
+    plane.faults.rc_lost = True
+    client.run(4.0)
+    assert plane.mode.number == PlaneMode.CIRCLE
+    assert client.texts == [
+        "Throttle failsafe on",
+        "RC Short Failsafe: switched to CIRCLE",
+        "PreArm: Radio failsafe on",
+    ]
+    assert not plane.arming.arm()
+    client.run(0.1)
+    assert client.texts[-1] == "Arm: Radio failsafe on"
+
+
+# ----------------------------------------------------------------------------------------- battery
+
+
+def test_a_low_battery_returns_and_a_critical_one_finds_no_landing() -> None:
+    plane, client = flying_plane(**BATTERY, BATT_FS_LOW_ACT=1.0, BATT_FS_CRT_ACT=2.0)
+    drain(plane, client, LOW)
+    assert plane.mode.number == PlaneMode.RTL
+    assert client.texts[0].startswith("Battery 1 is low 10.")
+    assert client.last(m.Heartbeat).system_status == MavState.CRITICAL
+    assert not healthy(client, Sensor.BATTERY)
+    assert set_mode(client, PlaneMode.LOITER) == MavResult.ACCEPTED
+    client.forget()
+    drain(plane, client, CRITICAL)
+    assert client.texts[0].startswith("Battery 1 is critical 9.")
+    assert client.texts[1:] == ["Unable to start landing sequence"]
+    assert plane.mode.number == PlaneMode.RTL
+
+
+def test_a_lesser_action_does_not_follow_a_graver_one() -> None:
+    plane, client = flying_plane(**BATTERY, BATT_FS_LOW_ACT=2.0, BATT_FS_CRT_ACT=1.0)
+    drain(plane, client, LOW)
+    assert set_mode(client, PlaneMode.LOITER) == MavResult.ACCEPTED
+    drain(plane, client, CRITICAL)
+    assert plane.mode.number == PlaneMode.LOITER
+
+
+@pytest.mark.parametrize(
+    ("action", "then"), [(0, PlaneMode.LOITER), (7, PlaneMode.AUTOLAND), (3, PlaneMode.LOITER)]
+)
+def test_what_else_a_low_battery_does(action: int, then: int) -> None:
+    plane, client = flying_plane(**BATTERY, BATT_FS_LOW_ACT=float(action))
+    drain(plane, client, LOW)
+    assert plane.mode.number == then
+    assert plane.is_armed
+
+
+def test_a_low_battery_lands_where_the_mission_says() -> None:
+    plane, client = flying_plane(**BATTERY, BATT_FS_LOW_ACT=2.0)
+    place = plane.frame.to_global(1500.0, 0.0, 0.0)
+    x, y = place.latitude_e7, place.longitude_e7
+    way = [MissionItem(command, 3, x=x, y=y, z=40.0) for command in (16, 16, 189, 16)]
+    plane.missions.replace(0, way)
+    drain(plane, client, LOW)
+    assert plane.mode.number == PlaneMode.AUTO
+    assert plane.mission.nav_index == 3
