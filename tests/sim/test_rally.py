@@ -61,7 +61,8 @@ def test_a_plane_circles_above_it_at_its_height() -> None:
 
 
 def test_a_copter_lands_there_unless_the_fence_forbids_it() -> None:
-    copter, client = flying_copter(parameters={"RTL_LOIT_TIME": 0.0, "RTL_ALT": 1200.0, "FENCE_RADIUS": 50.0})
+    parameters = {"RTL_LOIT_TIME": 0.0, "RTL_ALT": 1200.0, "FENCE_RADIUS": 50.0, "RALLY_INCL_HOME": 0.0}
+    copter, client = flying_copter(parameters=parameters)
     rally_points(copter, (25.0, 10.0, 15.0), (-5.0, 0.0, 200.0))
     copter.parameters["FENCE_ENABLE"] = 1.0
     client.run(0.2)

@@ -32,7 +32,7 @@ def ready_plane(**parameters: float) -> tuple[SimulatedPlane, Client]:
     return plane, ready(plane)
 
 
-def flying_plane(mode: int = PlaneMode.LOITER, **parameters: float) -> tuple[SimulatedPlane, Client]:
+def flying_plane(mode: int = PlaneMode.LOITER, /, **parameters: float) -> tuple[SimulatedPlane, Client]:
     """50 m above the ground in a mode."""
     plane, client = ready_plane(**parameters)
     arm(client, PlaneMode.TAKEOFF)
@@ -51,7 +51,7 @@ def ready_rover(**parameters: float) -> tuple[SimulatedRover, Client]:
 
 
 def driving_rover(
-    north: float = 200.0, east: float = 0.0, **parameters: float
+    north: float = 200.0, east: float = 0.0, /, **parameters: float
 ) -> tuple[SimulatedRover, Client]:
     """In GUIDED on the way to a place."""
     rover, client = ready_rover(**parameters)
@@ -67,7 +67,7 @@ def ready_sub(**parameters: float) -> tuple[SimulatedSub, Client]:
     return sub, ready(sub)
 
 
-def armed_sub(mode: int = SubMode.ALT_HOLD, **parameters: float) -> tuple[SimulatedSub, Client]:
+def armed_sub(mode: int = SubMode.ALT_HOLD, /, **parameters: float) -> tuple[SimulatedSub, Client]:
     """Five metres deep."""
     sub, client = ready_sub(**parameters)
     sub.motion.down = 5.0

@@ -55,6 +55,8 @@ class SimulatedPlane(ArduPilotVehicle):
         Manual, Circle, Stabilize, FlyByWireA, FlyByWireB, Cruise, Auto, Rtl, Loiter, TakeOff, Guided, Autoland,
     )  # fmt: skip
 
+    fence: PlaneFence
+
     def make_motion(self, wind: Wind | None) -> Motion:
         """An aeroplane within the limits of the parameters."""
         self.wing = FixedWing(self.rng, wind=wind)
