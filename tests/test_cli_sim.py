@@ -16,7 +16,7 @@ from aerokit.cli.vehicles import HOME, simulated_fleet
 from aerokit.errors import LinkLost, LinkOpenError
 from aerokit.links import Peer, PtyLink, parse_address
 from aerokit.sim import SimulatedCopter, SimulatedPx4
-from aerokit.sim.track import true_place
+from aerokit.sim.track import true_point
 
 posix_only = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
 
@@ -77,9 +77,9 @@ def test_system_ids_end_at_255(capsys: pytest.CaptureFixture[str]) -> None:
 def test_a_fleet_stands_side_by_side() -> None:
     fleet = simulated_fleet("px4", 3, system_id=4, spacing_m=10.0, battery_percent=50.0)
     assert [vehicle.system_id for vehicle in fleet] == [4, 5, 6]
-    places = [true_place(vehicle) for vehicle in fleet]
-    assert {place.latitude_e7 for place in places} == {round(HOME[0] * 1e7)}
-    east = [place.longitude_e7 - places[0].longitude_e7 for place in places]
+    places = [true_point(vehicle) for vehicle in fleet]
+    assert [place.latitude_deg for place in places] == pytest.approx([HOME[0]] * 3)
+    east = [(place.longitude_deg - places[0].longitude_deg) * 1e7 for place in places]
     assert east == pytest.approx([0, 1327, 2654], abs=1)  # 1 m is 132.7 times 1e-7 degrees there
     assert all(isinstance(vehicle, SimulatedPx4) and vehicle.battery.percent == 50 for vehicle in fleet)
 

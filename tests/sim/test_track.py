@@ -10,8 +10,9 @@ import pytest
 from simulated_client import flying_copter, ready_copter
 
 from aerokit.errors import AerokitError, LocalProtocolError
-from aerokit.sim import SimulatedPx4
-from aerokit.sim.track import Track, TrackPoint, check_picture, draw_svg, record_track, save_picture
+from aerokit.sim import SimulatedPx4, SimulatedVehicle
+from aerokit.sim.picture import check_picture, draw_svg, save_picture
+from aerokit.sim.track import Track, TrackPoint, record_track
 
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -28,7 +29,7 @@ def flown_track() -> Track:
 def test_a_track_is_where_the_vehicle_was() -> None:
     track = flown_track()
     assert track.name == "system 1"
-    assert [point.time_s for point in track.points[:4]] == pytest.approx([3.0, 3.5, 4.0, 4.5])
+    assert [point.time_s for point in track[:4]] == pytest.approx([3.0, 3.5, 4.0, 4.5])
     north, east, up = track.local()[-1]
     assert (north, east) == pytest.approx((30, 40), abs=1.0)
     assert 11 < up < 12.5
@@ -51,7 +52,7 @@ def test_a_reboot_does_not_end_a_track() -> None:
     track = record_track(copter)
     copter.restart()
     client.run(4.0)
-    assert track.points[-1].time_s > 6.5
+    assert track.end.time_s > 6.5
 
 
 def test_every_autopilot_has_a_track() -> None:
@@ -59,7 +60,23 @@ def test_every_autopilot_has_a_track() -> None:
     px4.step(0.0)
     track = record_track(px4)
     px4.step(1.0)
-    assert len(track.points) == 6
+    assert len(track) == 11
+    assert track.end.mode == "HOLD"
+
+
+def test_what_is_nowhere_has_no_track() -> None:
+    nowhere = SimulatedVehicle(system_id=1, component_id=1, seed=0, components=())
+    with pytest.raises(LocalProtocolError, match="no true place"):
+        record_track(nowhere)
+
+
+def test_speed_and_battery_are_in_the_track() -> None:
+    copter, client = flying_copter()
+    track = record_track(copter)
+    copter.motion.velocity_north = 8.0
+    client.run(3.0)
+    assert 7.0 < track.max_speed_m_s < 8.0
+    assert 0.05 < track.battery_used_percent < 2.0
 
 
 def test_an_interval_must_be_above_0() -> None:
@@ -87,10 +104,11 @@ def test_the_svg_has_a_line_for_each_vehicle_above_and_in_profile() -> None:
 
 def test_a_hundred_metres_north_is_as_long_as_a_hundred_metres_east() -> None:
     track = flown_track()
-    first = track.points[0]
-    north = TrackPoint(1.0, first.latitude_deg + 100 / 111318.845, first.longitude_deg, 0.0)
-    track.points[:] = [first, north]
-    line = next(ElementTree.fromstring(draw_svg([track])).iter(f"{SVG}polyline"))
+    first, place = track[0], track.home.offset(north_m=100)
+    north = TrackPoint(9.0, place.latitude_deg, place.longitude_deg, 0.0, first.armed, first.mode)
+    line = next(
+        ElementTree.fromstring(draw_svg([Track(track.home, [first, north])])).iter(f"{SVG}polyline")
+    )
     (x1, y1), (x2, y2) = (map(float, place.split(",")) for place in (line.get("points") or "").split())
     assert x1 == pytest.approx(x2, abs=0.2)
     assert y1 - y2 == pytest.approx(460 / 1.1, abs=1)
@@ -106,13 +124,17 @@ def test_other_names_are_refused() -> None:
         check_picture("track.jpeg")
 
 
-def test_png_without_matplotlib_says_what_to_install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+def test_png_without_pillow_says_what_to_install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setitem(sys.modules, "PIL.Image", None)
     with pytest.raises(AerokitError, match=r"aerokit\[pictures\]"):
         save_picture([], tmp_path / "track.png")
 
 
-def test_png(tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
-    save_picture([flown_track()], tmp_path / "track.png")
-    assert (tmp_path / "track.png").read_bytes().startswith(b"\x89PNG")
+def test_a_png_shows_the_same(tmp_path: Path) -> None:
+    from PIL import Image
+
+    flown_track().save(tmp_path / "track.png")
+    with Image.open(tmp_path / "track.png") as picture:
+        assert picture.size == (800, 680)
+        colours = {colour for _, colour in picture.convert("RGB").getcolors(1 << 20) or ()}
+    assert {(255, 255, 255), (0x1F, 0x77, 0xB4), (0xDD, 0xDD, 0xDD)} <= colours

@@ -82,7 +82,7 @@ def wind(text: str) -> tuple[float, ...]:
 
 def picture(text: str) -> str:
     """A path of a picture."""
-    from aerokit.sim.track import check_picture
+    from aerokit.sim.picture import check_picture
 
     try:
         check_picture(text)

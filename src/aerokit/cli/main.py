@@ -200,7 +200,7 @@ def _add_sim_conditions(sim: argparse.ArgumentParser) -> None:
         "--picture",
         type=picture,
         metavar="FILE",
-        help="of the true tracks, at the end: .svg, or .png with matplotlib",
+        help="of the true tracks, at the end: .svg, or .png with Pillow",
     )
 
 

@@ -39,7 +39,7 @@ async def run_sim(options: argparse.Namespace) -> int:
                 await asyncio.wait_for(stop.wait(), options.duration and options.duration / options.speedup)
     print("stopped")
     if options.picture is not None:
-        from aerokit.sim.track import save_picture
+        from aerokit.sim.picture import save_picture
 
         save_picture(tracks, options.picture)
         print(f"track in {options.picture}")
@@ -68,7 +68,8 @@ def _fleet(options: argparse.Namespace) -> list[SimulatedVehicle]:
 def _tracks(vehicles: Sequence[SimulatedVehicle], picture: str | None) -> list[Track]:
     if picture is None:
         return []
-    from aerokit.sim.track import check_picture, record_track
+    from aerokit.sim.picture import check_picture
+    from aerokit.sim.track import record_track
 
     check_picture(picture)
     return [record_track(vehicle) for vehicle in vehicles]

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import sys
 from collections.abc import AsyncIterator, Iterable, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager
 from types import TracebackType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from aerokit.errors import BusyError, LinkLost, LocalProtocolError
 from aerokit.links import Link, MemoryLink, Peer, create_link, memory_link_pair
@@ -35,6 +36,9 @@ class SimulatorServer:
     seconds of a real one. What the loop missed because something blocked it is caught up in real time. Faster, all
     but a quarter of a second of it is left out: a client that had no chance to speak is not taken for a silent one.
     Leaving the block closes the links.
+
+    What a vehicle raises, by a mistake of its own or of somebody's callback, ends the block at once: the links
+    are closed, the task that runs the block is cancelled, and the block raises it.
 
     Raises LinkOpenError when a link cannot be opened; nothing is left behind then.
     """
@@ -67,6 +71,12 @@ class SimulatorServer:
         self._timer: asyncio.TimerHandle | None = None
         self._timer_due = self._timer_at = 0.0
         self._exit = AsyncExitStack()
+        self._owner: asyncio.Task[object] | None = (
+            None  # runs the block; it may have ended before, in a fixture
+        )
+        self._cancels_owner = False
+        self.failure: Exception | None = None
+        """What a vehicle raised; nothing has happened since."""
 
     @property
     def addresses(self) -> tuple[str, ...]:
@@ -83,42 +93,85 @@ class SimulatorServer:
     async def __aenter__(self) -> Self:
         if self._loop is not None:
             raise BusyError("this SimulatorServer was started before")
-        self._loop = asyncio.get_running_loop()
+        self._loop, self._owner = asyncio.get_running_loop(), asyncio.current_task()
         self._started_at = self._loop.time()
-        async with AsyncExitStack() as opening:
-            connected: set[int] = set()
-            for link, vehicles in zip(self._links, self.vehicles_on, strict=True):
-                port = _Port(self, link, vehicles, _channels(vehicles, connected))
-                opening.push_async_callback(port.close)
-                await link.open(port)
-                self._ports.append(port)
-            self._exit = opening.pop_all()
-        self._run(self.now)
+        try:
+            async with AsyncExitStack() as opening:
+                await self._open_links(opening)
+                self._run(self.now)
+                self._exit = opening.pop_all()
+        except BaseException as error:
+            self._end(error)
+            raise
         return self
+
+    async def _open_links(self, opening: AsyncExitStack) -> None:
+        connected: set[int] = set()
+        for link, vehicles in zip(self._links, self.vehicles_on, strict=True):
+            port = _Port(self, link, vehicles, _channels(vehicles, connected))
+            opening.push_async_callback(port.close)
+            await link.open(port)
+            self._ports.append(port)
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        if self._timer is not None:
-            self._timer.cancel()
-        self._timer = None
-        self._loop = None
-        self._ports.clear()
+        self._stop()
         await self._exit.aclose()
+        self._end(error)
+
+    def _end(self, error: BaseException | None) -> None:
+        """Raise what a vehicle raised in the place of what it caused."""
+        self._stop()
+        owner: asyncio.Task[Any] | None = self._owner
+        self._owner = None
+        if self._cancels_owner and owner is not None and owner is asyncio.current_task():
+            _take_cancellation_back(owner)
+        if self.failure is not None and self.failure is not error:
+            raise self.failure from self.failure.__cause__
 
     # -------------------------------------------------------------------------------------- running
 
     def wake(self) -> None:
-        """Let everything happen that is due; call it after a fault or a value was changed by hand."""
-        if self._loop is not None:
-            self._leave_out_lateness()
+        """Let everything happen that is due; call it after a fault or a value was changed by hand.
+
+        Raises what a vehicle raises, now or before.
+        """
+        if self.failure is not None:
+            raise self.failure
+        if self._loop is None:
+            return
+        self._leave_out_lateness()
+        try:
             self._dues = [vehicle.next_due for vehicle in self.vehicles]
             self._run(self.now)
+        except Exception as error:
+            self._fail(error)
+            raise
 
     def _on_timer(self) -> None:
         self._leave_out_lateness()
         self._timer = None
-        self._run(max(self.now, self._timer_due))  # a timer may fire a hair early
+        try:
+            self._run(max(self.now, self._timer_due))  # a timer may fire a hair early
+        except Exception as error:
+            self._fail(error)
+
+    def _fail(self, error: Exception) -> None:
+        """Whoever waits for a vehicle is told at once; on the loop's own stack nobody would hear of it."""
+        self.failure = error
+        self._stop()
+        for link in self._links:
+            link.close()
+        owner = self._owner
+        if owner is not None and not owner.done() and owner is not asyncio.current_task():
+            self._cancels_owner = owner.cancel()
+
+    def _stop(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer = self._loop = None
+        self._ports.clear()
 
     def _run(self, now: float) -> None:
         self._step(now)
@@ -138,11 +191,14 @@ class SimulatorServer:
             return
         self._leave_out_lateness()
         now = self.now
-        for vehicle, channel in zip(port.vehicles, port.channels, strict=True):
-            vehicle.receive(data, max(now, vehicle.now), peer, channel)
-            self._dues[self._numbers[id(vehicle)]] = vehicle.next_due
-        self._flush()
-        self._schedule()
+        try:
+            for vehicle, channel in zip(port.vehicles, port.channels, strict=True):
+                vehicle.receive(data, max(now, vehicle.now), peer, channel)
+                self._dues[self._numbers[id(vehicle)]] = vehicle.next_due
+            self._flush()
+            self._schedule()
+        except Exception as error:
+            self._fail(error)
 
     def _flush(self) -> None:
         for port in self._ports:
@@ -201,6 +257,11 @@ class _Port:
         """Close the link and wait until it is gone."""
         self.link.close()
         await self.link.wait_closed()
+
+
+def _take_cancellation_back(task: asyncio.Task[Any]) -> None:
+    if sys.version_info >= (3, 11):
+        task.uncancel()
 
 
 def _channels(vehicles: Iterable[SimulatedVehicle], connected: set[int]) -> list[Channel]:

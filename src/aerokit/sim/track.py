@@ -1,90 +1,311 @@
-"""Where simulated vehicles truly were, whatever they said, and a picture of it.
+"""`Track`: where a simulated vehicle truly was, whatever it said; its picture, and assertions that tell what was flown.
 
-A track is recorded in simulated time by timers of the vehicle itself; neither its bytes nor its noise change by that.
+```python
+track = record_track(copter)
+...
+track.save("flight.svg")
+track.assert_reached_altitude(20)
+track.assert_passed(bridge, within_m=5)
+track.assert_landed_near(within_m=3)
+```
+
+Altitudes are metres above home; home is where the vehicle was switched on. Times are simulated seconds.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
-from html import escape
-from importlib import import_module
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from bisect import bisect_right
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, overload
 
-from aerokit.errors import AerokitError, LocalProtocolError
-from aerokit.sim.local_frame import GlobalPoint, LocalFrame
+from aerokit import geo
+from aerokit.autopilots import autopilot_for
+from aerokit.errors import LocalProtocolError
+from aerokit.mavlink.messages import Heartbeat
+from aerokit.position import Position
+from aerokit.sim.ardupilot.fence_zones import Polygon
 
 if TYPE_CHECKING:
     from os import PathLike
 
     from aerokit.sim.vehicle import SimulatedVehicle
 
-__all__ = ["Track", "TrackPoint", "check_picture", "draw_svg", "record_track", "save_picture", "true_place"]
+__all__ = ["Track", "TrackPoint", "least_distance_m", "record_track", "true_point"]
 
-_COLOURS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#17becf", "#8c564b", "#e377c2")
-_WIDTH, _MAP_HEIGHT, _PROFILE_HEIGHT, _MARGIN = 800, 520, 160, 60
+_ON_GROUND_M = 0.3
 
 
-class TrackPoint(NamedTuple):
-    """One moment of a flight."""
+@dataclass(frozen=True)
+class TrackPoint:
+    """Where the vehicle was at one instant, whatever its estimator thought."""
 
     time_s: float
     """Simulated seconds."""
     latitude_deg: float
     longitude_deg: float
     altitude_m: float
-    """Above the place where the vehicle was created; below it is negative."""
+    """Above home."""
+    armed: bool
+    mode: str
+    """Its name, as a client has it."""
+    speed_m_s: float = 0.0
+    """Over the ground."""
+    battery_percent: float = 100.0
+
+    @property
+    def position(self) -> Position:
+        """The place, for `Position.distance_to` and the like."""
+        return Position(self.latitude_deg, self.longitude_deg, altitude_relative_m=self.altitude_m)
+
+    def __str__(self) -> str:
+        place = f"{self.latitude_deg:.6f}, {self.longitude_deg:.6f}"
+        armed = "armed" if self.armed else "disarmed"
+        return f"at {self.time_s:.1f} s: {place}, {self.altitude_m:.1f} m above home, {armed}, {self.mode}"
 
 
-@dataclass
-class Track:
-    """Where one vehicle was, oldest first."""
+class Track(Sequence[TrackPoint]):
+    """What was flown, oldest first; it grows while the vehicle lives.
 
-    name: str
-    origin: GlobalPoint
-    points: list[TrackPoint] = field(default_factory=list)
+    Assertions raise AssertionError; a track without a point fails them all.
+    """
 
-    def local(self, origin: GlobalPoint | None = None) -> list[tuple[float, float, float]]:
-        """Metres north, east and up of an origin, without one of the vehicle's own; up is always of its own."""
-        frame = LocalFrame(self.origin if origin is None else origin)
-        places = (
-            (round(p.latitude_deg * 1e7), round(p.longitude_deg * 1e7), p.altitude_m) for p in self.points
-        )
-        return [(*frame.to_local(latitude, longitude), up) for latitude, longitude, up in places]
+    def __init__(self, home: Position, points: Sequence[TrackPoint] = (), *, name: str = "track") -> None:
+        self.home = home
+        """Where it was switched on."""
+        self.name = name
+        """In the legend of a picture."""
+        self._points = list(points)
+        self._catch_up: Callable[[], None] | None = None
+
+    def __len__(self) -> int:
+        return len(self._until_now())
+
+    def __iter__(self) -> Iterator[TrackPoint]:
+        return iter(tuple(self._until_now()))
+
+    @overload
+    def __getitem__(self, index: int) -> TrackPoint: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[TrackPoint]: ...
+    def __getitem__(self, index: int | slice) -> TrackPoint | list[TrackPoint]:
+        return self._until_now()[index]
+
+    def append(self, point: TrackPoint) -> None:
+        """Add the next point, in the place of the last one if it is of the same time."""
+        if self._points and self._points[-1].time_s >= point.time_s:
+            self._points.pop()
+        self._points.append(point)
+
+    def follow(self, catch_up: Callable[[], None] | None) -> None:
+        """Call this before the track is read: it appends what happened up to now. None: nothing more happens."""
+        self._catch_up = catch_up
+
+    def _until_now(self) -> list[TrackPoint]:
+        if self._catch_up is not None:
+            self._catch_up()
+        return self._points
+
+    # --------------------------------------------------------------------------------- what was flown
+
+    @property
+    def end(self) -> TrackPoint:
+        """The latest point; AssertionError without any."""
+        points = self._until_now()
+        assert points, "nothing was recorded: was the flight opened?"
+        return points[-1]
+
+    @property
+    def max_altitude_m(self) -> float:
+        """The highest that it was above home."""
+        return self._highest().altitude_m
+
+    @property
+    def max_distance_m(self) -> float:
+        """The farthest that it was from home, along the ground."""
+        return self._farthest(self.home)[0]
+
+    @property
+    def modes(self) -> list[str]:
+        """The modes in their order, each change once."""
+        modes: list[str] = []
+        for point in self:
+            if not modes or modes[-1] != point.mode:
+                modes.append(point.mode)
+        return modes
+
+    @property
+    def armed_s(self) -> float:
+        """For how many simulated seconds it was armed."""
+        return sum(after.time_s - before.time_s for before, after in pairwise(self) if before.armed)
+
+    @property
+    def max_speed_m_s(self) -> float:
+        """The fastest that it was over the ground."""
+        return self._fastest().speed_m_s
+
+    @property
+    def battery_used_percent(self) -> float:
+        """Of a full battery; below 0 if it was charged."""
+        return self[0].battery_percent - self.end.battery_percent if self else 0.0
 
     @property
     def length_m(self) -> float:
         """The way that was covered, climbs included."""
-        places = self.local()
-        return sum(math.dist(one, other) for one, other in itertools.pairwise(places))
+        return sum(math.dist(one, other) for one, other in pairwise(self.local()))
+
+    def local(self, origin: Position | None = None) -> list[tuple[float, float, float]]:
+        """Metres north and east of a place, of home without one, and up from its own home."""
+        plane = _plane(self.home if origin is None else origin)
+        return [(*plane(point), point.altitude_m) for point in self]
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Draw it: an .svg file, or a .png one; see `aerokit.sim.picture.save_picture`."""
+        from aerokit.sim.picture import save_picture
+
+        save_picture([self], path)
+
+    def nearest_m(self, place: Position) -> float:
+        """How near it came to a place: along the ground, or in space if the place has an altitude above home."""
+        return self._nearest(place)[0]
+
+    # ------------------------------------------------------------------------------------- assertions
+
+    def assert_reached_altitude(self, altitude_m: float, *, within_m: float = 1.0) -> None:
+        """It was at least ``altitude_m - within_m`` metres above home once."""
+        highest = self._highest()
+        reached = highest.altitude_m >= altitude_m - within_m
+        assert reached, f"it did not reach {altitude_m:g} m: the highest point was {highest}"
+
+    def assert_stayed_below(self, altitude_m: float) -> None:
+        """It never was more than ``altitude_m`` metres above home."""
+        highest = self._highest()
+        assert highest.altitude_m <= altitude_m, f"it rose above {altitude_m:g} m: {highest}"
+
+    def assert_passed(self, place: Position, *, within_m: float = 2.0) -> None:
+        """It came this near to a place; in space if the place has an ``altitude_relative_m``."""
+        distance, point = self._nearest(place)
+        assert distance <= within_m, (
+            f"it did not pass within {within_m:g} m of {_text(place)}: the nearest was {distance:.1f} m, {point}"
+        )
+
+    def assert_stayed_within(self, radius_m: float, *, of: Position | None = None) -> None:
+        """It was never farther than this from home, or from a place, along the ground."""
+        centre = self.home if of is None else of
+        distance, point = self._farthest(centre)
+        name = "home" if of is None else _text(of)
+        assert distance <= radius_m, (
+            f"it left the {radius_m:g} m around {name}: {distance:.1f} m away {point}"
+        )
+
+    def assert_stayed_inside(self, polygon: Sequence[Position]) -> None:
+        """It never left a polygon of three places or more; the last is connected with the first."""
+        assert len(polygon) >= 3, f"a polygon has three places or more, not {len(polygon)}"
+        _ = self.end
+        plane = _plane(self.home)
+        border = Polygon([plane(corner) for corner in polygon])
+        outside = [point for point in self if border.outside_m(plane(point)) > 0]
+        assert not outside, (
+            f"it left the polygon, {len(outside)} of {len(self)} points are outside; first {outside[0]}"
+        )
+
+    def assert_stayed_slower_than(self, speed_m_s: float) -> None:
+        """It never was faster than this over the ground."""
+        fastest = self._fastest()
+        assert fastest.speed_m_s <= speed_m_s, (
+            f"it was faster than {speed_m_s:g} m/s: {fastest.speed_m_s:.1f} m/s {fastest}"
+        )
+
+    def assert_landed_near(self, place: Position | None = None, *, within_m: float = 2.0) -> None:
+        """It flew, and at the end it stands on the ground near home, or near a place."""
+        end, target = self.end, self.home if place is None else place
+        assert self.max_altitude_m > _ON_GROUND_M, f"it never took off: it ended {end}"
+        assert abs(end.altitude_m) <= _ON_GROUND_M, f"it is not on the ground: it ended {end}"
+        distance = target.distance_to(end.position)
+        name = "home" if place is None else _text(place)
+        assert distance <= within_m, (
+            f"it landed {distance:.1f} m from {name}, not within {within_m:g} m: {end}"
+        )
+
+    def assert_armed_at_end(self) -> None:
+        """Its motors were armed at the end."""
+        assert self.end.armed, f"it ended disarmed, {self.end}"
+
+    def assert_disarmed_at_end(self) -> None:
+        """Its motors were disarmed at the end."""
+        assert not self.end.armed, f"it ended armed, {self.end}"
+
+    def assert_modes(self, *names: str) -> None:
+        """It went through these modes in this order; there may have been others between them."""
+        modes = iter(self.modes)
+        for name in names:
+            assert name in modes, (
+                f"{name} is missing in {' → '.join(names)}: the modes were {' → '.join(self.modes)}"
+            )
+
+    # -------------------------------------------------------------------------------------------------
+
+    def _highest(self) -> TrackPoint:
+        _ = self.end
+        return max(self, key=lambda point: point.altitude_m)
+
+    def _fastest(self) -> TrackPoint:
+        _ = self.end
+        return max(self, key=lambda point: point.speed_m_s)
+
+    def _farthest(self, centre: Position) -> tuple[float, TrackPoint]:
+        _ = self.end
+        plane = _plane(centre)
+        point = max(self, key=lambda point: math.hypot(*plane(point)))
+        return math.hypot(*plane(point)), point
+
+    def _nearest(self, place: Position) -> tuple[float, TrackPoint]:
+        _ = self.end
+        plane, altitude = _plane(place), place.altitude_relative_m
+        nearest, point, before = math.inf, self._points[0], None
+        for candidate in self:
+            up = 0.0 if altitude is None else candidate.altitude_m - altitude
+            here = (*plane(candidate), up)
+            distance = _distance_of_origin(here if before is None else before, here)
+            if distance < nearest:
+                nearest, point = distance, candidate
+            before = here
+        return nearest, point
 
 
-def true_place(vehicle: SimulatedVehicle) -> GlobalPoint:
-    """Where a vehicle really is; LocalProtocolError for one that has no such place."""
-    frame, motion = _frame(vehicle), getattr(vehicle, "motion", None)
-    if frame is None or motion is None:
-        raise LocalProtocolError(f"{type(vehicle).__name__} has no true place")
-    return frame.to_global(motion.north, motion.east, motion.down)
+def true_point(vehicle: SimulatedVehicle) -> TrackPoint:
+    """Where a vehicle really is now, and how it is; LocalProtocolError for one that has no such place."""
+    flown: Any = _flown(vehicle)
+    frame, motion = flown.frame, flown.motion
+    place = frame.to_global(motion.north, motion.east, motion.down)
+    return TrackPoint(
+        vehicle.now,
+        place.latitude_e7 * 1e-7,
+        place.longitude_e7 * 1e-7,
+        place.altitude_m - frame.origin.altitude_m,
+        flown.is_armed,
+        _mode_name(vehicle),
+        math.hypot(motion.velocity_north, motion.velocity_east),
+        flown.battery.percent,
+    )
 
 
-def record_track(vehicle: SimulatedVehicle, *, interval_s: float = 0.2) -> Track:
-    """Note from now on where a vehicle is, every ``interval_s`` simulated seconds; reboots do not end it."""
+def record_track(vehicle: SimulatedVehicle, *, interval_s: float = 0.1) -> Track:
+    """Note from now on where a vehicle is, every ``interval_s`` simulated seconds; reboots do not end it.
+
+    The vehicle's own timers do it; neither its bytes nor its noise change by that. Raises LocalProtocolError for a
+    vehicle that has no true place, and for an interval that is not above 0.
+    """
     if not interval_s > 0:
         raise LocalProtocolError(f"interval_s = {interval_s!r} must be above 0")
-    frame = _frame(vehicle)
-    if frame is None:
-        raise LocalProtocolError(f"{type(vehicle).__name__} has no true place")
-    track = Track(f"system {vehicle.system_id}", frame.origin)
+    origin = _flown(vehicle).frame.origin
+    home = Position(origin.latitude_e7 * 1e-7, origin.longitude_e7 * 1e-7, origin.altitude_m)
+    track = Track(home, name=f"system {vehicle.system_id}")
 
     def note() -> None:
-        place = true_place(vehicle)
-        height = place.altitude_m - frame.origin.altitude_m
-        track.points.append(
-            TrackPoint(vehicle.now, place.latitude_e7 / 1e7, place.longitude_e7 / 1e7, height)
-        )
+        track.append(true_point(vehicle))
 
     def begin() -> None:
         note()
@@ -94,181 +315,71 @@ def record_track(vehicle: SimulatedVehicle, *, interval_s: float = 0.2) -> Track
     return track
 
 
-def check_picture(path: str | PathLike[str]) -> None:
-    """LocalProtocolError when this is no name of a picture; AerokitError when what draws it is not installed."""
-    suffix = Path(path).suffix.lower()
-    if suffix not in (".svg", ".png"):
-        raise LocalProtocolError(f"{str(path)!r} is no picture: its name must end in .svg or .png")
-    if suffix == ".png":
-        _pyplot_figure()
-
-
-def save_picture(tracks: Iterable[Track], path: str | PathLike[str]) -> None:
-    """Draw tracks from above, and their heights over time: an .svg file, or a .png one (with matplotlib).
-
-    Raises what `check_picture` raises, and OSError when the file cannot be written.
+def least_distance_m(one: Track, other: Track) -> tuple[float, float]:
+    """How near two vehicles came to each other, in space, and at which simulated second; (infinity, 0) if they never
+    lived at the same time.
     """
-    check_picture(path)
-    tracks = list(tracks)
-    if Path(path).suffix.lower() == ".svg":
-        Path(path).write_text(draw_svg(tracks), encoding="utf-8")
-    else:
-        _draw_png(tracks, path)
-
-
-def draw_svg(tracks: Sequence[Track]) -> str:
-    """The picture as the text of an SVG file: north is up, metres from the first vehicle's start."""
-    drawn = [track for track in tracks if track.points]
-    height = _MAP_HEIGHT + _PROFILE_HEIGHT
-    lines = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="{_WIDTH}" height="{height}"'
-        ' font-family="sans-serif" font-size="12">',
-        f'<rect width="{_WIDTH}" height="{height}" fill="white"/>',
+    ups = one.home.altitude_amsl_m or 0.0, other.home.altitude_amsl_m or 0.0
+    way = [
+        (point.time_s, (north, east, up + ups[1]))
+        for point, (north, east, up) in zip(other, other.local(one.home), strict=True)
     ]
-    if drawn:
-        lines += _map(drawn) + _profile(drawn) + _legend(drawn)
-    return "\n".join([*lines, "</svg>\n"])
+    times = [time for time, _ in way]
+    nearest = math.inf, 0.0
+    for point, (north, east, up) in zip(one, one.local(), strict=True):
+        index = bisect_right(times, point.time_s)
+        if index == 0 or (index == len(way) and times[-1] < point.time_s):
+            continue
+        there = _between(way[index - 1], way[min(index, len(way) - 1)], point.time_s)
+        nearest = min(nearest, (math.dist((north, east, up + ups[0]), there), point.time_s))
+    return nearest
 
 
-# ----------------------------------------------------------------------------------------- the drawing
+Moment = tuple[float, tuple[float, float, float]]
 
 
-class _Axes:
-    """From values to places in a rectangle of the picture, with some air around them."""
-
-    def __init__(
-        self, xs: Sequence[float], ys: Sequence[float], top: float, height: float, *, square: bool
-    ) -> None:
-        self.left, self.top, self.width, self.height = _MARGIN, top, _WIDTH - 2 * _MARGIN, height
-        self.x_range, self.y_range = _with_air(xs), _with_air(ys)
-        if square:
-            scale = max(_span(self.x_range) / self.width, _span(self.y_range) / self.height)
-            self.x_range = _widened(self.x_range, scale * self.width)
-            self.y_range = _widened(self.y_range, scale * self.height)
-
-    def place(self, x: float, y: float) -> tuple[float, float]:
-        right = (x - self.x_range[0]) / _span(self.x_range) * self.width
-        up = (y - self.y_range[0]) / _span(self.y_range) * self.height
-        return self.left + right, self.top + self.height - up
-
-    def line(self, xs: Sequence[float], ys: Sequence[float], colour: str) -> str:
-        places = (self.place(x, y) for x, y in zip(xs, ys, strict=True))
-        points = " ".join(f"{x:.1f},{y:.1f}" for x, y in places)
-        return f'<polyline points="{points}" fill="none" stroke="{colour}" stroke-width="1.5"/>'
-
-    def grid(self, x_unit: str, y_unit: str) -> list[str]:
-        lines = []
-        for value in _ticks(self.x_range, 6):
-            x, _ = self.place(value, 0.0)
-            lines.append(_grey(x, self.top, x, self.top + self.height))
-            lines.append(_text(x, self.top + self.height + 15, f"{value:g} {x_unit}", "middle"))
-        for value in _ticks(self.y_range, 5 if self.height > 200 else 3):
-            _, y = self.place(0.0, value)
-            lines.append(_grey(self.left, y, self.left + self.width, y))
-            lines.append(_text(self.left - 5, y + 4, f"{value:g} {y_unit}", "end"))
-        return lines
+def _between(before: Moment, after: Moment, time_s: float) -> tuple[float, float, float]:
+    span = after[0] - before[0]
+    share = (time_s - before[0]) / span if span > 0 else 0.0
+    north, east, up = (a + share * (b - a) for a, b in zip(before[1], after[1], strict=True))
+    return north, east, up
 
 
-def _map(tracks: Sequence[Track]) -> list[str]:
-    paths = [track.local(tracks[0].origin) for track in tracks]
-    norths = [north for path in paths for north, _, _ in path]
-    easts = [east for path in paths for _, east, _ in path]
-    axes = _Axes(easts, norths, 30, _MAP_HEIGHT - 60, square=True)
-    lines = axes.grid("m", "m")
-    for path, colour in zip(paths, _colours(len(paths)), strict=True):
-        lines.append(axes.line([east for _, east, _ in path], [north for north, _, _ in path], colour))
-        x, y = axes.place(path[0][1], path[0][0])
-        lines.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" fill="{colour}"/>')
-    return lines
+def _flown(vehicle: Any) -> Any:
+    if getattr(vehicle, "frame", None) is None or getattr(vehicle, "motion", None) is None:
+        raise LocalProtocolError(f"{type(vehicle).__name__} has no true place")
+    return vehicle
 
 
-def _profile(tracks: Sequence[Track]) -> list[str]:
-    times = [point.time_s for track in tracks for point in track.points]
-    heights = [point.altitude_m for track in tracks for point in track.points]
-    axes = _Axes(times, heights, _MAP_HEIGHT, _PROFILE_HEIGHT - 40, square=False)
-    lines = axes.grid("s", "m up")
-    for track, colour in zip(tracks, _colours(len(tracks)), strict=True):
-        points = track.points
-        lines.append(axes.line([p.time_s for p in points], [p.altitude_m for p in points], colour))
-    return lines
+def _mode_name(vehicle: SimulatedVehicle) -> str:
+    heartbeat = vehicle.build(Heartbeat.ID)
+    assert isinstance(heartbeat, Heartbeat)
+    return autopilot_for(heartbeat).mode_of(heartbeat).name
 
 
-def _legend(tracks: Sequence[Track]) -> list[str]:
-    return [
-        f'<g fill="{colour}">{_text(_MARGIN + 90 * number, 18, track.name, "start")}</g>'
-        for number, (track, colour) in enumerate(zip(tracks, _colours(len(tracks)), strict=True))
-        if number < 8
-    ]
+def _text(place: Position) -> str:
+    above = place.altitude_relative_m
+    height = "" if above is None else f" at {above:.1f} m above home"
+    return f"{place.latitude_deg:.6f}, {place.longitude_deg:.6f}{height}"
 
 
-def _colours(count: int) -> list[str]:
-    return [_COLOURS[number % len(_COLOURS)] for number in range(count)]
+def _plane(origin: Position) -> Callable[[Position | TrackPoint], tuple[float, float]]:
+    """Metres north and east of a place, on a plane that touches the ellipsoid there."""
+    latitude, longitude = origin.latitude_deg, origin.longitude_deg
+    per_latitude = geo.distance_m(latitude - 0.005, longitude, latitude + 0.005, longitude) * 100
+    per_longitude = geo.distance_m(latitude, longitude - 0.005, latitude, longitude + 0.005) * 100
+
+    def place(point: Position | TrackPoint) -> tuple[float, float]:
+        north = (point.latitude_deg - latitude) * per_latitude
+        return north, geo.wrap_longitude(point.longitude_deg - longitude) * per_longitude
+
+    return place
 
 
-def _grey(x1: float, y1: float, x2: float, y2: float) -> str:
-    return f'<line x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}" stroke="#dddddd"/>'
-
-
-def _text(x: float, y: float, text: str, anchor: str) -> str:
-    return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{escape(text)}</text>'
-
-
-def _with_air(values: Sequence[float]) -> tuple[float, float]:
-    low, high = min(values), max(values)
-    return _widened((low, high), max(1.1 * (high - low), 2.0))
-
-
-def _widened(bounds: tuple[float, float], span: float) -> tuple[float, float]:
-    middle = (bounds[0] + bounds[1]) / 2
-    return middle - span / 2, middle + span / 2
-
-
-def _span(bounds: tuple[float, float]) -> float:
-    return bounds[1] - bounds[0]
-
-
-def _ticks(bounds: tuple[float, float], about: int) -> list[float]:
-    """Round numbers in a range, ``about`` so many."""
-    rough = _span(bounds) / about
-    size: float = 10.0 ** math.floor(math.log10(rough))
-    step = next(factor * size for factor in (1.0, 2.0, 5.0, 10.0) if factor * size >= rough)
-    first = math.ceil(bounds[0] / step)
-    return [round(number * step, 6) for number in range(first, math.floor(bounds[1] / step) + 1)]
-
-
-# ------------------------------------------------------------------------------------------ matplotlib
-
-
-def _pyplot_figure() -> Any:
-    """The Figure of matplotlib, which needs neither a screen nor pyplot's global state."""
-    try:
-        return import_module("matplotlib.figure").Figure
-    except ImportError:
-        raise AerokitError(
-            "a .png needs matplotlib: pip install aerokit[pictures], or ask for an .svg"
-        ) from None
-
-
-def _draw_png(tracks: Sequence[Track], path: str | PathLike[str]) -> None:
-    figure = _pyplot_figure()(figsize=(8, 7))
-    above, profile = figure.subplots(2, 1, height_ratios=(3, 1))
-    drawn = [track for track in tracks if track.points]
-    for track, colour in zip(drawn, _colours(len(drawn)), strict=True):
-        path_ = track.local(drawn[0].origin)
-        above.plot([east for _, east, _ in path_], [north for north, _, _ in path_], colour, label=track.name)
-        above.plot(path_[0][1], path_[0][0], "o", color=colour)
-        profile.plot([p.time_s for p in track.points], [p.altitude_m for p in track.points], colour)
-    above.set(xlabel="metres east", ylabel="metres north", aspect="equal", adjustable="datalim")
-    profile.set(xlabel="simulated seconds", ylabel="metres up")
-    for axes in (above, profile):
-        axes.grid(visible=True, color="#dddddd")
-    if drawn:
-        above.legend()
-    figure.savefig(path, format="png")
-
-
-def _frame(vehicle: SimulatedVehicle) -> LocalFrame | None:
-    frame = getattr(vehicle, "frame", None)
-    if frame is None:
-        frame = getattr(getattr(vehicle, "navigation", None), "frame", None)
-    return frame if isinstance(frame, LocalFrame) else None
+def _distance_of_origin(start: tuple[float, float, float], end: tuple[float, float, float]) -> float:
+    """From the origin to the line between two points."""
+    way = [b - a for a, b in zip(start, end, strict=True)]
+    square = sum(part * part for part in way)
+    share = 0.0 if square == 0.0 else -sum(a * part for a, part in zip(start, way, strict=True)) / square
+    share = max(0.0, min(1.0, share))
+    return math.hypot(*(a + share * part for a, part in zip(start, way, strict=True)))

@@ -12,7 +12,7 @@ import random
 from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass
 from heapq import heappop, heappush
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.enums import MavAutopilot, MavModeFlag, MavSeverity, MavState, MavType
@@ -20,6 +20,9 @@ from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import Heartbeat, Statustext
 from aerokit.sim.channel import Channel
 from aerokit.sim.faults import Faults
+
+if TYPE_CHECKING:
+    from aerokit.sim.journal import Journal
 
 __all__ = ["Component", "ExtraComponent", "SimulatedVehicle", "sender_of"]
 
@@ -85,6 +88,8 @@ class SimulatedVehicle:
         self.booted_at = math.nan
         """When it was switched on or last rebooted."""
         self.components = tuple(components)
+        self.journal: Journal | None = None
+        """What it hears and says is written down here if somebody wants it."""
         self.handlers: dict[int, Handler] = {}
         """Message id → what is done with such a message."""
         self._overheard: dict[int, list[Handler]] = {}
@@ -296,6 +301,7 @@ class SimulatedVehicle:
         """Send a STATUSTEXT on every channel; a text of more than 50 characters goes out in chunks."""
         text = text.encode("ascii", "replace").decode()
         if len(text) <= _TEXT_SIZE:
+            self._note_text(severity, text)
             self.send(Statustext(severity, text, 0, 0))
             return
         self._text_id = self._text_id % 0xFFFF + 1
@@ -303,6 +309,7 @@ class SimulatedVehicle:
 
     def send_chunks(self, severity: int, text: str, text_id: int) -> None:
         """Send STATUSTEXTs of one id; only a chunk that is not full ends the text."""
+        self._note_text(severity, text)
         for number in range(len(text) // _TEXT_SIZE + 1):
             chunk = text[number * _TEXT_SIZE : (number + 1) * _TEXT_SIZE]
             self.send(Statustext(severity, chunk, text_id, number))
@@ -323,7 +330,13 @@ class SimulatedVehicle:
             return
         if self.faults.loss_incoming > 0.0 and self.rng.random() < self.faults.loss_incoming:
             return
+        if self.journal is not None:
+            self.journal.heard(self.now, message)
         handler(message, channel)
+
+    def _note_text(self, severity: int, text: str) -> None:
+        if self.journal is not None:
+            self.journal.said(self.now, severity, text)
 
     def _is_lost(self, message: Message) -> bool:
         faults = self.faults

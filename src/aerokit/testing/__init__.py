@@ -11,11 +11,13 @@ from typing import TYPE_CHECKING
 from aerokit.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from aerokit.sim.journal import Journal
+    from aerokit.sim.track import Track, TrackPoint
+
     from .clock import VIRTUAL_BACKEND, DeadlockError, VirtualClockLoop, run_virtual
     from .fault_verbs import FaultInjector
     from .flights import Fleet, Flight, open_fleet, open_flight
     from .served import ServedFlight, serve_flight
-    from .track import Track, TrackPoint
 
 __all__ = [
     "VIRTUAL_BACKEND",
@@ -23,6 +25,7 @@ __all__ = [
     "FaultInjector",
     "Fleet",
     "Flight",
+    "Journal",
     "ServedFlight",
     "Track",
     "TrackPoint",
@@ -35,14 +38,15 @@ __all__ = [
 
 # Imported when first asked for: pytest imports this package with its plugin in every project.
 _HOMES = {
+    "Journal": "aerokit.sim.journal",
+    "Track": "aerokit.sim.track",
+    "TrackPoint": "aerokit.sim.track",
     "VIRTUAL_BACKEND": "aerokit.testing.clock",
     "DeadlockError": "aerokit.testing.clock",
     "FaultInjector": "aerokit.testing.fault_verbs",
     "Fleet": "aerokit.testing.flights",
     "Flight": "aerokit.testing.flights",
     "ServedFlight": "aerokit.testing.served",
-    "Track": "aerokit.testing.track",
-    "TrackPoint": "aerokit.testing.track",
     "VirtualClockLoop": "aerokit.testing.clock",
     "open_fleet": "aerokit.testing.flights",
     "open_flight": "aerokit.testing.flights",

@@ -10,11 +10,14 @@ from typing import Any
 from aerokit.errors import LocalProtocolError
 from aerokit.sim.faults import Faults
 from aerokit.sim.motion import Wind
+from aerokit.sim.track import TrackPoint, true_point
+from aerokit.testing.stage import Stagehand
 
 __all__ = ["FaultInjector"]
 
-Schedule = Callable[[Callable[[], None], float], None]
-"""Does something after so many simulated seconds; 0 is at once."""
+
+OnStage = Callable[[Callable[[Stagehand], None]], None]
+"""Lets a stagehand plan something, as of now."""
 
 
 class FaultInjector:
@@ -24,9 +27,23 @@ class FaultInjector:
     that make no sense. What is planned happens even if the vehicle reboots meanwhile.
     """
 
-    def __init__(self, vehicle: Any, schedule: Schedule) -> None:
+    def __init__(self, vehicle: Any, on_stage: OnStage) -> None:
         self._vehicle = vehicle
-        self._schedule = schedule
+        self._on_stage = on_stage
+
+    def when(self, condition: Callable[[TrackPoint], bool]) -> FaultInjector:
+        """The same verbs, acting once this is true of where the vehicle is; seconds count from there.
+
+        It is asked ten times a simulated second: ``faults.when(lambda here: here.altitude_m > 15).lose_gps()``.
+        """
+
+        def is_true() -> bool:
+            return condition(true_point(self._vehicle))
+
+        def wait(use: Callable[[Stagehand], None]) -> None:
+            self._on_stage(lambda hand: hand.do_when(is_true, partial(use, hand)))
+
+        return FaultInjector(self._vehicle, wait)
 
     @property
     def all(self) -> Faults:
@@ -37,6 +54,10 @@ class FaultInjector:
     def lose_gps(self, *, after_s: float = 0.0, for_s: float | None = None) -> None:
         """No GPS fix any more; the estimator gives its position up seconds later."""
         self._set("gps_lost", True, False, after_s, for_s)
+
+    def lose_rc(self, *, after_s: float = 0.0, for_s: float | None = None) -> None:
+        """The pilot's transmitter is off."""
+        self._set("rc_lost", True, False, after_s, for_s)
 
     def fail_motor(self, *, after_s: float = 0.0) -> None:
         """A motor stands still: it comes down."""
@@ -82,14 +103,9 @@ class FaultInjector:
         self._plan(partial(setattr, self._vehicle.battery, "percent", percent), after_s)
 
     def end(self, *, after_s: float = 0.0) -> None:
-        """Everything that a vehicle can recover from is well again: GPS, radio, motor, processor."""
-        for name, value in (
-            ("gps_lost", False),
-            ("motor_failed", False),
-            ("silent", False),
-            ("frozen", False),
-        ):
-            self._set(name, value, value, after_s, None)
+        """Everything that a vehicle can recover from is well again: GPS, radios, motor, processor."""
+        for name in ("gps_lost", "rc_lost", "motor_failed", "silent", "frozen"):
+            self._set(name, False, False, after_s, None)
         self.drop_packets(0.0, after_s=after_s)
 
     def _set(self, name: str, value: object, well: object, after_s: float, for_s: float | None) -> None:
@@ -101,7 +117,7 @@ class FaultInjector:
     def _plan(self, action: Callable[[], None], after_s: float) -> None:
         if not (math.isfinite(after_s) and after_s >= 0.0):
             raise LocalProtocolError(f"after_s = {after_s!r} must be 0 or more seconds")
-        self._schedule(action, after_s)
+        self._on_stage(lambda hand: hand.do(action, after_s=after_s))
 
 
 def _duration(for_s: float) -> float:

@@ -12,22 +12,29 @@ On virtual time (`run_virtual`, or the fixtures of the pytest plugin) a flight t
 
 from __future__ import annotations
 
+import math
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager
+from itertools import combinations
 from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 import aerokit
 from aerokit.errors import LocalProtocolError
 from aerokit.links import memory_link_pair
 from aerokit.sim.kinds import simulated
+from aerokit.sim.picture import save_picture
 from aerokit.sim.server import SimulatorServer
+from aerokit.sim.track import least_distance_m
 from aerokit.testing.clock import run_virtual
 from aerokit.testing.fault_verbs import FaultInjector
 from aerokit.testing.stage import Stagehand
 
 if TYPE_CHECKING:
+    from os import PathLike
+
     from aerokit.links import Link
-    from aerokit.testing.track import Track
+    from aerokit.sim.journal import Journal
+    from aerokit.sim.track import Track
 
 __all__ = ["Fleet", "Flight", "open_fleet", "open_flight", "repeated"]
 
@@ -44,7 +51,9 @@ class Flight:
         """The simulated vehicle, such as `aerokit.sim.SimulatedCopter`: its battery, parameters, motion …"""
         self.track: Track = fleet._stagehand.tracks[number]
         """Where it truly was."""
-        self.faults = FaultInjector(self.simulated, fleet._schedule)
+        self.journal: Journal = fleet._stagehand.journals[number]
+        """What it said, and the orders that it heard."""
+        self.faults = FaultInjector(self.simulated, fleet._on_stage)
         """What goes wrong with it."""
         self._vehicle: aerokit.Vehicle | None = None
 
@@ -104,6 +113,29 @@ class Fleet(Sequence[Flight]):
         return [flight.vehicle for flight in self._flights]
 
     @property
+    def least_distance_m(self) -> float:
+        """The nearest that any two of them came to each other, in space; infinity for less than two."""
+        return self._nearest()[0]
+
+    def assert_stayed_apart(self, distance_m: float) -> None:
+        """No two of them came nearer to each other than this, in space."""
+        nearest, time_s, names = self._nearest()
+        assert nearest >= distance_m, (
+            f"{names} came nearer than {distance_m:g} m: {nearest:.1f} m at {time_s:.1f} s"
+        )
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Draw the tracks of all of them in one picture; see `aerokit.sim.picture.save_picture`."""
+        save_picture([flight.track for flight in self], path)
+
+    def _nearest(self) -> tuple[float, float, str]:
+        pairs = [
+            (*least_distance_m(one.track, other.track), f"{one.track.name} and {other.track.name}")
+            for one, other in combinations(self, 2)
+        ]
+        return min(pairs, default=(math.inf, 0.0, ""))
+
+    @property
     def link(self) -> Link:
         """The program's end of the link, to be opened by it; needs ``connect=False``."""
         self._check_open()
@@ -152,27 +184,29 @@ class Fleet(Sequence[Flight]):
             )
 
     def _close(self) -> None:
-        self._catch_up()
-        self._stagehand.follow(None)
-        self._server = self._link = None
-        for flight in self._flights:
-            flight._vehicle = None
+        try:
+            self._catch_up()
+        finally:
+            self._stagehand.follow(None)
+            self._server = self._link = None
+            for flight in self._flights:
+                flight._vehicle = None
 
     def _catch_up(self) -> None:
-        assert self._server is not None
-        self._server.wake()
-        self._stagehand.record()
+        if self._server is not None:
+            self._server.wake()
+            self._stagehand.record()
 
     def _check_open(self) -> None:
         if self._server is None:
             raise RuntimeError(
-                "this flight is not open: use it in an `async def` test, or in a `def` test by flight.run(main)"
+                "this flight is not open: it opens when an `async def` test begins; in a `def` test use"
+                " flight.run(main), in a fixture `async with open_flight()`"
             )
 
-    def _schedule(self, action: Callable[[], None], after_s: float) -> None:
-        if self._server is not None:
-            self._server.wake()
-        self._stagehand.do(action, after_s=after_s)
+    def _on_stage(self, plan: Callable[[Stagehand], None]) -> None:
+        self._catch_up()
+        plan(self._stagehand)
         if self._server is not None:
             self._server.wake()
 

@@ -10,6 +10,7 @@ A test that uses none of them is not touched, and nothing of aerokit is imported
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import inspect
 from collections.abc import Callable, Generator, Iterator
@@ -30,12 +31,25 @@ __all__ = [
     "dronekit_address",
     "fleet",
     "flight",
+    "pytest_addoption",
     "pytest_configure",
     "pytest_pyfunc_call",
+    "pytest_runtest_call",
+    "pytest_runtest_makereport",
     "served_flight",
 ]
 
-_MARKER = "simulated"
+_MARKER, _PICTURES = "simulated", "--flight-pictures"
+_OPENED = "_aerokit_opened"
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the option for pictures."""
+    parser.getgroup("aerokit").addoption(
+        _PICTURES,
+        metavar="DIR",
+        help="draw what was flown in each test that fails, as an .svg in this directory",
+    )
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -72,10 +86,10 @@ def fleet(request: pytest.FixtureRequest) -> Fleet:
 @pytest.fixture
 def served_flight(request: pytest.FixtureRequest) -> Iterator[ServedFlight]:
     """One simulated vehicle on a socket, ten times as fast as real time unless the marker says otherwise."""
-    from aerokit.testing.served import serve_flight
+    from aerokit.testing.served import hosted_flight
 
     kinds, options = _wanted(request)
-    with serve_flight(*kinds, **options) as served:
+    with hosted_flight(*kinds, **options) as served:
         yield served
 
 
@@ -110,18 +124,37 @@ def dronekit() -> Iterator[ModuleType]:
 
 
 @pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, object]:
+    """Open ``flight`` and ``fleet`` before pytest-asyncio takes the test, if that is what its marker says."""
+    fleets = _fleets(item)
+    if not fleets or item.get_closest_marker("asyncio") is None:
+        return (yield)
+    assert isinstance(item, pytest.Function)
+    with _replaced(item, _only_on_virtual_time(_opened(item.obj, fleets))):
+        return (yield)
+
+
+@pytest.hookimpl(wrapper=True)
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> Generator[None, object, object]:
-    """Open ``flight`` and ``fleet`` around an ``async def`` test; without an async plugin, run it as well."""
-    fleets = _fleets(pyfuncitem)
-    if not fleets or not inspect.iscoroutinefunction(pyfuncitem.obj):
+    """Open ``flight`` and ``fleet`` around an ``async def`` test; without an async plugin, run it as well.
+
+    Let a test of a served vehicle fail at once when the vehicle does.
+    """
+    with _replaced(pyfuncitem, _as_it_runs(pyfuncitem)), _failing_at_once(pyfuncitem):
         return (yield)
-    test = pyfuncitem.obj
-    opened = _opened(test, fleets)
-    pyfuncitem.obj = opened if "anyio_backend" in pyfuncitem.fixturenames else _on_virtual_time(opened)
-    try:
-        return (yield)
-    finally:
-        pyfuncitem.obj = test
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Say what was flown when a test has failed."""
+    report = yield
+    flown = _flown(item) if report.when == "call" and report.failed else []
+    if flown:
+        from aerokit.testing.failure import what_was_flown
+
+        directory = item.config.getoption(_PICTURES)
+        report.sections.append(("what was flown", what_was_flown(flown, item.nodeid, directory)))
+    return report
 
 
 def _wanted(request: pytest.FixtureRequest) -> tuple[tuple[str, ...], dict[str, Any]]:
@@ -129,14 +162,27 @@ def _wanted(request: pytest.FixtureRequest) -> tuple[tuple[str, ...], dict[str, 
     return (marker.args or ("copter",), dict(marker.kwargs)) if marker else (("copter",), {})
 
 
-def _fleets(item: pytest.Function) -> list[Fleet]:
-    found = [item.funcargs[name] for name in ("flight", "fleet") if name in item.funcargs]
-    if not found:
-        return []
-    from aerokit.testing.flights import Fleet, Flight
+def _flown(item: pytest.Item) -> list[Any]:
+    """The fixtures of a test that fly; a project may have others of these names."""
+    funcargs = getattr(item, "funcargs", None) or {}
+    found = [funcargs[name] for name in ("flight", "fleet", "served_flight") if name in funcargs]
+    return [each for each in found if type(each).__module__.startswith("aerokit.testing.")]
 
-    fleets = [each._fleet if isinstance(each, Flight) else each for each in found]
-    return [each for each in fleets if isinstance(each, Fleet)]  # a project may have fixtures of these names
+
+def _fleets(item: pytest.Item) -> list[Fleet]:
+    return [getattr(each, "_fleet", each) for each in _flown(item) if hasattr(each, "run")]
+
+
+def _as_it_runs(item: pytest.Function) -> Callable[..., Any]:
+    fleets = _fleets(item)
+    test: Callable[..., Any] = item.obj
+    opened = getattr(test, _OPENED, None)
+    if opened is not None:  # pytest-asyncio's, which runs it on a loop of its own
+        return _on_virtual_time(opened, instead_of=None if inspect.iscoroutinefunction(test) else test)
+    if not fleets or not inspect.iscoroutinefunction(test):
+        return test
+    opened = _opened(test, fleets)
+    return opened if "anyio_backend" in item.fixturenames else _on_virtual_time(opened)
 
 
 def _opened(test: Callable[..., Any], fleets: list[Fleet]) -> Callable[..., Any]:
@@ -152,11 +198,50 @@ def _opened(test: Callable[..., Any], fleets: list[Fleet]) -> Callable[..., Any]
     return opened
 
 
-def _on_virtual_time(test: Callable[..., Any]) -> Callable[..., None]:
+class _AnotherLoop(Exception):
+    """This loop is not on virtual time."""
+
+
+def _only_on_virtual_time(opened: Callable[..., Any]) -> Callable[..., Any]:
+    @functools.wraps(opened)
+    async def run(**arguments: Any) -> None:
+        import asyncio
+
+        from aerokit.testing.clock import VirtualClockLoop
+
+        if not isinstance(asyncio.get_running_loop(), VirtualClockLoop):
+            raise _AnotherLoop
+        await opened(**arguments)
+
+    setattr(run, _OPENED, opened)  # stays on what pytest-asyncio makes of it
+    return run
+
+
+def _on_virtual_time(
+    test: Callable[..., Any], *, instead_of: Callable[..., Any] | None = None
+) -> Callable[..., None]:
     @functools.wraps(test)
     def run(**arguments: Any) -> None:
         from aerokit.testing.clock import run_virtual
 
+        if instead_of is not None:
+            with contextlib.suppress(_AnotherLoop):
+                instead_of(**arguments)
+                return
         run_virtual(test(**arguments))
 
     return run
+
+
+@contextlib.contextmanager
+def _replaced(item: pytest.Function, test: Callable[..., Any]) -> Iterator[None]:
+    before, item.obj = item.obj, test
+    try:
+        yield
+    finally:
+        item.obj = before
+
+
+def _failing_at_once(item: pytest.Function) -> contextlib.AbstractContextManager[None]:
+    served = [each for each in _flown(item) if hasattr(each, "failing_at_once")]
+    return served[0].failing_at_once() if served else contextlib.nullcontext()

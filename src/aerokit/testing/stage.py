@@ -1,25 +1,25 @@
-"""What stands beside simulated vehicles in a test: an agenda in simulated time, and the recorder of true tracks."""
+"""What stands beside simulated vehicles in a test: an agenda in simulated time, their tracks and journals."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from aerokit.position import Position
-from aerokit.sim.px4.modes import KNOWN
+from aerokit.sim.journal import Journal
+from aerokit.sim.track import record_track, true_point
 from aerokit.sim.vehicle import SimulatedVehicle
-from aerokit.testing.track import Track, TrackPoint
 
 if TYPE_CHECKING:
     from aerokit.sim.channel import Channel
 
-__all__ = ["Stagehand", "new_track", "true_point"]
+__all__ = ["Stagehand"]
 
-_INTERVAL_S = 0.1
+_LOOK_S = 0.1
+"""How often conditions are looked at, in simulated seconds."""
 
 
 class Stagehand(SimulatedVehicle):
-    """On the links with the vehicles, but dumb: it does what is planned at its simulated second and records tracks.
+    """On the links with the vehicles, but dumb: it does what is planned at its simulated second.
 
     A timer of a vehicle is forgotten when the vehicle reboots and late when it hangs; one of these is not. Give it
     to the server before the vehicles: it steps them to the instant of what it does.
@@ -28,8 +28,12 @@ class Stagehand(SimulatedVehicle):
     def __init__(self, vehicles: Sequence[Any]) -> None:
         super().__init__(system_id=0, component_id=0, seed=0, components=())
         self._vehicles = vehicles
-        self.tracks = [new_track(vehicle) for vehicle in vehicles]
+        self.tracks = [record_track(vehicle) for vehicle in vehicles]
         """Of each vehicle, in their order."""
+        self.journals = [Journal() for _ in vehicles]
+        """The same."""
+        for vehicle, journal in zip(vehicles, self.journals, strict=True):
+            vehicle.journal = journal
 
     def step(self, now: float) -> None:
         """See `SimulatedVehicle`."""
@@ -43,19 +47,8 @@ class Stagehand(SimulatedVehicle):
         """It has no ears."""
         self.step(now)
 
-    def record(self) -> None:
-        """Write down where everybody is now."""
-        for vehicle, track in zip(self._vehicles, self.tracks, strict=True):
-            track.append(true_point(vehicle))
-
-    def follow(self, catch_up: Callable[[], None] | None) -> None:
-        """See `Track.follow`."""
-        for track in self.tracks:
-            track.follow(catch_up)
-
     def boot(self) -> None:
-        """Begin to record."""
-        self.every(_INTERVAL_S, self.record, first=0.0)
+        """It is there at once."""
 
     def start_channel(self, channel: Channel) -> None:
         """It sends nothing."""
@@ -67,23 +60,19 @@ class Stagehand(SimulatedVehicle):
         else:
             action()
 
+    def do_when(self, condition: Callable[[], bool], action: Callable[[], None]) -> None:
+        """Do it as soon as the condition holds, looked at ten times a simulated second; once."""
+        if condition():
+            action()
+        else:
+            self.call_later(_LOOK_S, lambda: self.do_when(condition, action))
 
-def new_track(vehicle: Any) -> Track:
-    """An empty track of a vehicle that stands where it was switched on."""
-    origin = vehicle.frame.origin
-    home = Position(origin.latitude_e7 * 1e-7, origin.longitude_e7 * 1e-7, origin.altitude_m)
-    return Track(home)
+    def record(self) -> None:
+        """Write down where everybody is now, besides what the tracks note by themselves."""
+        for vehicle, track in zip(self._vehicles, self.tracks, strict=True):
+            track.append(true_point(vehicle))
 
-
-def true_point(vehicle: Any) -> TrackPoint:
-    """Where a simulated vehicle truly is."""
-    frame, motion = vehicle.frame, vehicle.motion
-    place = frame.to_global(motion.north, motion.east, motion.down)
-    above = place.altitude_m - frame.origin.altitude_m
-    armed, mode = vehicle.is_armed, _mode_name(vehicle.mode)
-    return TrackPoint(vehicle.now, place.latitude_e7 * 1e-7, place.longitude_e7 * 1e-7, above, armed, mode)
-
-
-def _mode_name(mode: Any) -> str:
-    name = KNOWN.get(mode) if isinstance(mode, tuple) else getattr(mode, "name", None)
-    return str(mode) if name is None else name
+    def follow(self, catch_up: Callable[[], None] | None) -> None:
+        """See `Track.follow`."""
+        for track in self.tracks:
+            track.follow(catch_up)

@@ -1,0 +1,237 @@
+"""Pictures of tracks: from above, and the heights over time; as SVG, and as PNG with Pillow."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from html import escape
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from aerokit.errors import AerokitError, LocalProtocolError
+
+if TYPE_CHECKING:
+    from os import PathLike
+
+    from aerokit.sim.track import Track
+
+__all__ = ["check_picture", "draw_svg", "save_picture"]
+
+_COLOURS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#17becf", "#8c564b", "#e377c2")
+_GREY = "#dddddd"
+_WIDTH, _MAP_HEIGHT, _PROFILE_HEIGHT, _MARGIN = 800, 520, 160, 60
+_HEIGHT = _MAP_HEIGHT + _PROFILE_HEIGHT
+_FONT_SIZE = 12
+_MOST_NAMES = 8
+
+
+def check_picture(path: str | PathLike[str]) -> None:
+    """LocalProtocolError when this is no name of a picture; AerokitError when what draws it is not installed."""
+    suffix = Path(path).suffix.lower()
+    if suffix not in (".svg", ".png"):
+        raise LocalProtocolError(f"{str(path)!r} is no picture: its name must end in .svg or .png")
+    if suffix == ".png":
+        _pillow("Image")
+
+
+def save_picture(tracks: Iterable[Track], path: str | PathLike[str]) -> None:
+    """Draw tracks from above, and their heights over time: an .svg file, or a .png one (with Pillow).
+
+    Raises what `check_picture` raises, and OSError when the file cannot be written.
+    """
+    check_picture(path)
+    tracks = list(tracks)
+    if Path(path).suffix.lower() == ".svg":
+        Path(path).write_text(draw_svg(tracks), encoding="utf-8")
+    else:
+        _save_png(_shapes(tracks), path)
+
+
+def draw_svg(tracks: Sequence[Track]) -> str:
+    """The picture as the text of an SVG file: north is up, metres from the first vehicle's home."""
+    lines = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{_WIDTH}" height="{_HEIGHT}"'
+        f' font-family="sans-serif" font-size="{_FONT_SIZE}">',
+        f'<rect width="{_WIDTH}" height="{_HEIGHT}" fill="white"/>',
+        *(shape.svg() for shape in _shapes(tracks)),
+    ]
+    return "\n".join([*lines, "</svg>\n"])
+
+
+# ------------------------------------------------------------------------------------------- shapes
+
+
+@dataclass(frozen=True)
+class _Line:
+    places: Sequence[tuple[float, float]]
+    colour: str
+
+    def svg(self) -> str:
+        points = " ".join(f"{x:.1f},{y:.1f}" for x, y in self.places)
+        return f'<polyline points="{points}" fill="none" stroke="{self.colour}" stroke-width="1.5"/>'
+
+    def draw(self, image: Any, scale: int, font: Any) -> None:
+        image.line([(x * scale, y * scale) for x, y in self.places], self.colour, round(1.5 * scale), "curve")
+
+
+@dataclass(frozen=True)
+class _GridLine:
+    start: tuple[float, float]
+    end: tuple[float, float]
+
+    def svg(self) -> str:
+        (x1, y1), (x2, y2) = self.start, self.end
+        return f'<line x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}" stroke="{_GREY}"/>'
+
+    def draw(self, image: Any, scale: int, font: Any) -> None:
+        image.line([number * scale for number in (*self.start, *self.end)], _GREY, scale)
+
+
+@dataclass(frozen=True)
+class _Dot:
+    x: float
+    y: float
+    colour: str
+    radius: float = 4
+
+    def svg(self) -> str:
+        return f'<circle cx="{self.x:.1f}" cy="{self.y:.1f}" r="{self.radius:g}" fill="{self.colour}"/>'
+
+    def draw(self, image: Any, scale: int, font: Any) -> None:
+        image.circle((self.x * scale, self.y * scale), self.radius * scale, self.colour)
+
+
+@dataclass(frozen=True)
+class _Text:
+    x: float
+    y: float
+    text: str
+    anchor: str
+    colour: str = "black"
+
+    def svg(self) -> str:
+        place = f'x="{self.x:.1f}" y="{self.y:.1f}" text-anchor="{self.anchor}"'
+        return f'<text {place} fill="{self.colour}">{escape(self.text)}</text>'
+
+    def draw(self, image: Any, scale: int, font: Any) -> None:
+        anchor = {"start": "ls", "middle": "ms", "end": "rs"}[self.anchor]
+        image.text((self.x * scale, self.y * scale), self.text, self.colour, font, anchor=anchor)
+
+
+_Shape = _Line | _GridLine | _Dot | _Text
+
+
+def _shapes(tracks: Sequence[Track]) -> list[_Shape]:
+    drawn = [track for track in tracks if track]
+    return _map(drawn) + _profile(drawn) + _legend(drawn) if drawn else []
+
+
+class _Axes:
+    """From values to places in a rectangle of the picture, with some air around them."""
+
+    def __init__(
+        self, xs: Sequence[float], ys: Sequence[float], top: float, height: float, *, square: bool
+    ) -> None:
+        self.left, self.top, self.width, self.height = _MARGIN, top, _WIDTH - 2 * _MARGIN, height
+        self.x_range, self.y_range = _with_air(xs), _with_air(ys)
+        if square:
+            scale = max(_span(self.x_range) / self.width, _span(self.y_range) / self.height)
+            self.x_range = _widened(self.x_range, scale * self.width)
+            self.y_range = _widened(self.y_range, scale * self.height)
+
+    def place(self, x: float, y: float) -> tuple[float, float]:
+        right = (x - self.x_range[0]) / _span(self.x_range) * self.width
+        up = (y - self.y_range[0]) / _span(self.y_range) * self.height
+        return self.left + right, self.top + self.height - up
+
+    def grid(self, x_unit: str, y_unit: str) -> list[_Shape]:
+        shapes: list[_Shape] = []
+        bottom, right = self.top + self.height, self.left + self.width
+        for value in _ticks(self.x_range, 6):
+            x, _ = self.place(value, 0.0)
+            shapes.append(_GridLine((x, self.top), (x, bottom)))
+            shapes.append(_Text(x, bottom + 15, f"{value:g} {x_unit}", "middle"))
+        for value in _ticks(self.y_range, 5 if self.height > 200 else 3):
+            _, y = self.place(0.0, value)
+            shapes.append(_GridLine((self.left, y), (right, y)))
+            shapes.append(_Text(self.left - 5, y + 4, f"{value:g} {y_unit}", "end"))
+        return shapes
+
+
+def _map(tracks: Sequence[Track]) -> list[_Shape]:
+    paths = [[(east, north) for north, east, _ in track.local(tracks[0].home)] for track in tracks]
+    easts, norths = zip(*(place for path in paths for place in path), strict=True)
+    axes = _Axes(easts, norths, 30, _MAP_HEIGHT - 60, square=True)
+    shapes = axes.grid("m", "m")
+    for path, colour in zip(paths, _colours(len(paths)), strict=True):
+        places = [axes.place(east, north) for east, north in path]
+        shapes += [_Line(places, colour), _Dot(*places[0], colour)]
+    return shapes
+
+
+def _profile(tracks: Sequence[Track]) -> list[_Shape]:
+    paths = [[(point.time_s, point.altitude_m) for point in track] for track in tracks]
+    times, heights = zip(*(place for path in paths for place in path), strict=True)
+    axes = _Axes(times, heights, _MAP_HEIGHT, _PROFILE_HEIGHT - 40, square=False)
+    shapes = axes.grid("s", "m up")
+    for path, colour in zip(paths, _colours(len(paths)), strict=True):
+        shapes.append(_Line([axes.place(time, height) for time, height in path], colour))
+    return shapes
+
+
+def _legend(tracks: Sequence[Track]) -> list[_Shape]:
+    named = list(zip(tracks, _colours(len(tracks)), strict=True))[:_MOST_NAMES]
+    return [
+        _Text(_MARGIN + 90 * number, 18, track.name, "start", colour)
+        for number, (track, colour) in enumerate(named)
+    ]
+
+
+def _colours(count: int) -> list[str]:
+    return [_COLOURS[number % len(_COLOURS)] for number in range(count)]
+
+
+def _with_air(values: Sequence[float]) -> tuple[float, float]:
+    low, high = min(values), max(values)
+    return _widened((low, high), max(1.1 * (high - low), 2.0))
+
+
+def _widened(bounds: tuple[float, float], span: float) -> tuple[float, float]:
+    middle = (bounds[0] + bounds[1]) / 2
+    return middle - span / 2, middle + span / 2
+
+
+def _span(bounds: tuple[float, float]) -> float:
+    return bounds[1] - bounds[0]
+
+
+def _ticks(bounds: tuple[float, float], about: int) -> list[float]:
+    """Round numbers in a range, ``about`` so many."""
+    rough = _span(bounds) / about
+    size: float = 10.0 ** math.floor(math.log10(rough))
+    step = next(factor * size for factor in (1.0, 2.0, 5.0, 10.0) if factor * size >= rough)
+    first = math.ceil(bounds[0] / step)
+    return [round(number * step, 6) for number in range(first, math.floor(bounds[1] / step) + 1)]
+
+
+# ---------------------------------------------------------------------------------------------- PNG
+
+
+def _save_png(shapes: Sequence[_Shape], path: str | PathLike[str]) -> None:
+    """Drawn at twice the size, so that lines are smooth when it is scaled down."""
+    scale = 2
+    image = _pillow("Image").new("RGB", (_WIDTH * scale, _HEIGHT * scale), "white")
+    drawing = _pillow("ImageDraw").Draw(image)
+    font = _pillow("ImageFont").load_default(_FONT_SIZE * scale)
+    for shape in shapes:
+        shape.draw(drawing, scale, font)
+    image.resize((_WIDTH, _HEIGHT), reducing_gap=None).save(path, "PNG")
+
+
+def _pillow(module: str) -> Any:
+    try:
+        return import_module(f"PIL.{module}")
+    except ImportError:
+        raise AerokitError("a .png needs Pillow: pip install aerokit[pictures], or ask for an .svg") from None
