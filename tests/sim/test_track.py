@@ -61,7 +61,7 @@ def test_every_autopilot_has_a_track() -> None:
     track = record_track(px4)
     px4.step(1.0)
     assert len(track) == 11
-    assert track.end.mode == "HOLD"
+    assert track.end.mode == "LOITER"
 
 
 def test_what_is_nowhere_has_no_track() -> None:
@@ -106,9 +106,7 @@ def test_a_hundred_metres_north_is_as_long_as_a_hundred_metres_east() -> None:
     track = flown_track()
     first, place = track[0], track.home.offset(north_m=100)
     north = TrackPoint(9.0, place.latitude_deg, place.longitude_deg, 0.0, first.armed, first.mode)
-    line = next(
-        ElementTree.fromstring(draw_svg([Track(track.home, [first, north])])).iter(f"{SVG}polyline")
-    )
+    line = next(ElementTree.fromstring(draw_svg([Track(track.home, [first, north])])).iter(f"{SVG}polyline"))
     (x1, y1), (x2, y2) = (map(float, place.split(",")) for place in (line.get("points") or "").split())
     assert x1 == pytest.approx(x2, abs=0.2)
     assert y1 - y2 == pytest.approx(460 / 1.1, abs=1)

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import pytest
 
 from aerokit import Position
+from aerokit.sim.track import least_distance_m
 from aerokit.testing import Track, TrackPoint
 
 HOME = Position(47.0, 8.0, 400.0)
@@ -14,10 +15,20 @@ GROUND = Position(47.0, 8.0, altitude_relative_m=0.0)
 
 
 def at(
-    time_s: float, north_m: float, east_m: float, altitude_m: float, mode: str = "AUTO", *, armed: bool = True
+    time_s: float,
+    north_m: float,
+    east_m: float,
+    altitude_m: float,
+    mode: str = "AUTO",
+    speed_m_s: float = 0.0,
+    *,
+    armed: bool = True,
 ) -> TrackPoint:
     place = HOME.offset(north_m=north_m, east_m=east_m)
-    return TrackPoint(time_s, place.latitude_deg, place.longitude_deg, altitude_m, armed, mode)
+    battery = 100 - time_s / 4
+    return TrackPoint(
+        time_s, place.latitude_deg, place.longitude_deg, altitude_m, armed, mode, speed_m_s, battery
+    )
 
 
 @pytest.fixture
@@ -28,7 +39,7 @@ def track() -> Track:
         [
             at(0, 0, 0, 0, "STABILIZE", armed=False),
             at(5, 0, 0, 20),
-            at(15, 100, 0, 20),
+            at(15, 100, 0, 20, speed_m_s=10),
             at(25, 0, 5, 20, "RTL"),
             at(40, 0, 5, 0.0, "RTL", armed=False),
         ],
@@ -41,6 +52,10 @@ def test_what_was_flown(track: Track) -> None:
     assert track.modes == ["STABILIZE", "AUTO", "RTL"]
     assert track.armed_s == 35
     assert track.end.time_s == 40
+    assert track.max_speed_m_s == 10
+    assert track.battery_used_percent == 10
+    assert track.length_m == pytest.approx(20 + 100 + 100.1 + 20, abs=0.1)
+    assert track.local()[2] == pytest.approx((100, 0, 20), abs=0.01)
     assert track.nearest_m(HOME.offset(north_m=50, east_m=7)) == pytest.approx(
         4.5, abs=0.01
     )  # between two points
@@ -58,6 +73,15 @@ def test_what_is_true_passes(track: Track) -> None:
     track.assert_landed_near(HOME.offset(east_m=5), within_m=0.1)
     track.assert_disarmed_at_end()
     track.assert_modes("AUTO", "RTL")
+    track.assert_stayed_slower_than(10)
+
+
+def test_how_near_two_came_to_each_other_at_the_same_time(track: Track) -> None:
+    other = Track(HOME.offset(up_m=5), [at(9, 50, 0, 20), at(11, 50, 20, 20)])
+    distance, time_s = least_distance_m(other, track)
+    assert distance == pytest.approx(11.2, abs=0.1)  # 10 m before the place, and 5 m below
+    assert time_s == 9
+    assert least_distance_m(track, Track(HOME, [at(50, 0, 0, 0)]))[0] == float("inf")
 
 
 SQUARE = [HOME.offset(north_m=n, east_m=e) for n, e in ((-9, -9), (50, -9), (50, 20), (-9, 20))]
@@ -72,6 +96,7 @@ WRONG: dict[str, Callable[[Track], None]] = {
     r"left the 50 m around home: 100\.0 m away at 15\.0 s": lambda track: track.assert_stayed_within(50),
     r"1 of 5 points are outside; first at 15\.0 s": lambda track: track.assert_stayed_inside(SQUARE),
     r"landed 5\.0 m from home, not within 2 m": lambda track: track.assert_landed_near(),
+    r"faster than 9 m/s: 10\.0 m/s at 15\.0 s": lambda track: track.assert_stayed_slower_than(9),
     "ended disarmed, at 40.0 s": lambda track: track.assert_armed_at_end(),
     "AUTO is missing in RTL → AUTO → RTL: the modes were STABILIZE → AUTO → RTL": (
         lambda track: track.assert_modes("RTL", "AUTO", "RTL")

@@ -38,8 +38,18 @@ def test_plain(flight):
 def run(pytester: pytest.Pytester, source: str, *arguments: str) -> pytest.RunResult:
     pytester.makepyfile(source)
     plugin = ("-p", "no:aerokit", "-p", "aerokit.testing.plugin")  # whether it is installed as such or not
+    asyncio = () if "pytest_asyncio" in arguments else ("-p", "no:asyncio")
     return pytester.runpytest_inprocess(
-        *plugin, "-p", "no:xdist", "-p", "no:cacheprovider", "--assert=plain", "-W", "error", *arguments
+        *plugin,
+        *asyncio,
+        "-p",
+        "no:xdist",
+        "-p",
+        "no:cacheprovider",
+        "--assert=plain",
+        "-W",
+        "error",
+        *arguments,
     )
 
 
@@ -67,6 +77,117 @@ def test_flights_share_the_loop_of_anyios_plugin(pytester: pytest.Pytester) -> N
         await flight.vehicle.wait_ready()
     """
     run(pytester, source).assert_outcomes(passed=1)
+
+
+PYTEST_ASYNCIO = """
+import asyncio, pytest, pytest_asyncio
+from aerokit.testing import VirtualClockLoop
+
+@pytest_asyncio.fixture
+async def number():
+    await asyncio.sleep(0)
+    yield 5
+
+@pytest.mark.asyncio
+@pytest.mark.simulated("px4")
+async def test_one(flight, number):
+    assert isinstance(asyncio.get_running_loop(), VirtualClockLoop)
+    await flight.vehicle.wait_ready()
+    assert number == 5
+
+class TestSeveral:
+    @pytest.mark.asyncio
+    async def test_fleet(self, fleet):
+        for vehicle in fleet.vehicles:
+            await vehicle.wait_ready()
+
+async def test_without_its_marker(flight):
+    await flight.vehicle.wait_ready()
+
+@pytest.mark.asyncio
+async def test_that_does_not_fly():
+    assert not isinstance(asyncio.get_running_loop(), VirtualClockLoop)
+
+@pytest.mark.asyncio
+async def test_that_fails(flight):
+    await flight.vehicle.wait_ready()
+    flight.track.assert_reached_altitude(5)
+"""
+
+
+@pytest.mark.parametrize("mode", ["auto", "strict"])
+def test_tests_of_pytest_asyncio_fly_on_virtual_time(pytester: pytest.Pytester, mode: str) -> None:
+    pytest.importorskip("pytest_asyncio")
+    options = ("-p", "pytest_asyncio", "-o", "asyncio_default_fixture_loop_scope=function")
+    result = run(pytester, PYTEST_ASYNCIO, *options, f"--asyncio-mode={mode}")
+    result.assert_outcomes(passed=4, failed=1)
+    assert "it did not reach 5 m" in result.stdout.str()
+
+
+def test_a_failure_tells_what_was_flown(pytester: pytest.Pytester) -> None:
+    source = """
+    import pytest
+
+    @pytest.mark.parametrize("path", ["a/b"])
+    async def test_it(flight, path):
+        await flight.vehicle.wait_ready()
+        assert False
+
+    def test_served(served_flight):
+        assert False
+
+    def test_nothing(fleet):
+        assert False
+    """
+    result = run(pytester, source, "--flight-pictures", "pictures/of failures")
+    result.assert_outcomes(failed=3)
+    result.stdout.fnmatch_lines(
+        [
+            "*- what was flown -*",
+            "system 1: STABILIZE, armed for 0.0 s, up to 0.0 m high and 0.0 m away",
+            "  ended at *, disarmed, STABILIZE",
+            "  said at * INFO 'EKF3 IMU0 is using GPS'",
+            "track in pictures*test_a_failure_tells_what_was_flown.py-test_it-a-b.svg",
+        ]
+    )
+    result.stdout.fnmatch_lines(["system 2: not switched on"])
+    assert len(list((pytester.path / "pictures" / "of failures").glob("*.svg"))) == 3
+
+
+def test_a_mistake_in_a_simulated_vehicle_fails_the_test(pytester: pytest.Pytester) -> None:
+    source = """
+    import pytest, time
+    from aerokit import messages
+
+    def make_a_mistake(*_):
+        raise LookupError("mine")
+
+    async def test_async(flight):
+        flight.simulated.on(messages.CommandLong, make_a_mistake)
+        await flight.vehicle.wait_ready()
+        await flight.vehicle.arm()
+
+    def test_blocking(blocking_vehicle, served_flight):
+        blocking_vehicle.wait_ready()
+        served_flight.simulated.on(messages.CommandLong, make_a_mistake)
+        blocking_vehicle.arm()
+
+    def test_classic(dronekit, dronekit_address, served_flight):
+        vehicle = dronekit.connect(dronekit_address, wait_ready=["armed"])
+        served_flight.simulated.on(messages.CommandLong, make_a_mistake)
+        try:
+            vehicle.armed = True
+            while not vehicle.armed:
+                time.sleep(1)
+        finally:
+            vehicle.close()
+
+    def test_afterwards(blocking_vehicle):
+        assert blocking_vehicle.armed.value is False
+    """
+    result = run(pytester, source, "-p", "no:logging")
+    result.assert_outcomes(failed=3, passed=1)
+    assert result.stdout.str().count("E       LookupError: mine") == 3
 
 
 def test_a_fleet(pytester: pytest.Pytester) -> None:

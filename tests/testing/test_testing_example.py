@@ -16,7 +16,7 @@ def test_the_example_passes(pytester: pytest.Pytester) -> None:
     for file in PROJECT.glob("*.py"):
         shutil.copy(file, pytester.path)
     result = pytester.runpytest_subprocess(
-        "-p", "no:aerokit", "-p", "aerokit.testing.plugin", "-p", "no:xdist", "-p", "no:anyio",
+        "-p", "no:aerokit", "-p", "aerokit.testing.plugin", "-p", "no:xdist", "-p", "no:anyio", "-p", "no:asyncio",
         "-p", "no:cacheprovider", "-W", "error", "--durations", "0",
     )  # fmt: skip
     result.assert_outcomes(passed=7)

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
-__all__ = ["GlobalPoint", "LocalFrame"]
+from aerokit.errors import LocalProtocolError
+
+__all__ = ["GlobalPoint", "LocalFrame", "true_place"]
 
 _METRES_PER_DEGREE_E7 = (
     0.011131884502145034  # ArduPilot's LOCATION_SCALING_FACTOR: the same sphere, the same rounding
@@ -44,3 +47,12 @@ class LocalFrame:
             (latitude_e7 - self.origin.latitude_e7) * _METRES_PER_DEGREE_E7,
             (longitude_e7 - self.origin.longitude_e7) * self._east_scale,
         )
+
+
+def true_place(vehicle: Any) -> GlobalPoint:
+    """Where a simulated vehicle really is, whatever it says; LocalProtocolError for one that is nowhere."""
+    frame, motion = getattr(vehicle, "frame", None), getattr(vehicle, "motion", None)
+    if frame is None or motion is None:
+        raise LocalProtocolError(f"{type(vehicle).__name__} has no true place")
+    place: GlobalPoint = frame.to_global(motion.north, motion.east, motion.down)
+    return place

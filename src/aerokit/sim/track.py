@@ -19,7 +19,7 @@ from bisect import bisect_right
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any, cast, overload
 
 from aerokit import geo
 from aerokit.autopilots import autopilot_for
@@ -27,6 +27,7 @@ from aerokit.errors import LocalProtocolError
 from aerokit.mavlink.messages import Heartbeat
 from aerokit.position import Position
 from aerokit.sim.ardupilot.fence_zones import Polygon
+from aerokit.sim.local_frame import true_place
 
 if TYPE_CHECKING:
     from os import PathLike
@@ -277,17 +278,15 @@ class Track(Sequence[TrackPoint]):
 
 def true_point(vehicle: SimulatedVehicle) -> TrackPoint:
     """Where a vehicle really is now, and how it is; LocalProtocolError for one that has no such place."""
-    flown: Any = _flown(vehicle)
-    frame, motion = flown.frame, flown.motion
-    place = frame.to_global(motion.north, motion.east, motion.down)
+    place, flown = true_place(vehicle), cast("Any", vehicle)
     return TrackPoint(
         vehicle.now,
         place.latitude_e7 * 1e-7,
         place.longitude_e7 * 1e-7,
-        place.altitude_m - frame.origin.altitude_m,
+        place.altitude_m - flown.frame.origin.altitude_m,
         flown.is_armed,
         _mode_name(vehicle),
-        math.hypot(motion.velocity_north, motion.velocity_east),
+        math.hypot(flown.motion.velocity_north, flown.motion.velocity_east),
         flown.battery.percent,
     )
 
@@ -300,7 +299,8 @@ def record_track(vehicle: SimulatedVehicle, *, interval_s: float = 0.1) -> Track
     """
     if not interval_s > 0:
         raise LocalProtocolError(f"interval_s = {interval_s!r} must be above 0")
-    origin = _flown(vehicle).frame.origin
+    true_place(vehicle)
+    origin = cast("Any", vehicle).frame.origin
     home = Position(origin.latitude_e7 * 1e-7, origin.longitude_e7 * 1e-7, origin.altitude_m)
     track = Track(home, name=f"system {vehicle.system_id}")
 
@@ -343,12 +343,6 @@ def _between(before: Moment, after: Moment, time_s: float) -> tuple[float, float
     share = (time_s - before[0]) / span if span > 0 else 0.0
     north, east, up = (a + share * (b - a) for a, b in zip(before[1], after[1], strict=True))
     return north, east, up
-
-
-def _flown(vehicle: Any) -> Any:
-    if getattr(vehicle, "frame", None) is None or getattr(vehicle, "motion", None) is None:
-        raise LocalProtocolError(f"{type(vehicle).__name__} has no true place")
-    return vehicle
 
 
 def _mode_name(vehicle: SimulatedVehicle) -> str:

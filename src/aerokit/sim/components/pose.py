@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 from aerokit.errors import LocalProtocolError
-from aerokit.sim.track import true_place
+from aerokit.sim.local_frame import true_place
 
 if TYPE_CHECKING:
     from aerokit.sim.local_frame import GlobalPoint
