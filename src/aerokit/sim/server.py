@@ -71,9 +71,7 @@ class SimulatorServer:
         self._timer: asyncio.TimerHandle | None = None
         self._timer_due = self._timer_at = 0.0
         self._exit = AsyncExitStack()
-        self._owner: asyncio.Task[object] | None = (
-            None  # runs the block; it may have ended before, in a fixture
-        )
+        self._owner: asyncio.Task[Any] | None = None  # runs the block; a fixture's may have ended before
         self._cancels_owner = False
         self.failure: Exception | None = None
         """What a vehicle raised; nothing has happened since."""
@@ -123,8 +121,7 @@ class SimulatorServer:
     def _end(self, error: BaseException | None) -> None:
         """Raise what a vehicle raised in the place of what it caused."""
         self._stop()
-        owner: asyncio.Task[Any] | None = self._owner
-        self._owner = None
+        owner, self._owner = self._owner, None
         if self._cancels_owner and owner is not None and owner is asyncio.current_task():
             _take_cancellation_back(owner)
         if self.failure is not None and self.failure is not error:
