@@ -69,8 +69,8 @@ def test_it_climbs_out_and_circles_where_it_arrived() -> None:
     client.command(MavCmd.COMPONENT_ARM_DISARM, 1)
     client.run_until(lambda: plane.mode == HOLD, 60.0)
     assert client.texts == [
-        "Using default takeoff altitude: 25.0 m\t",
         "Armed by external command\t",
+        "Using default takeoff altitude: 25.0 m\t",
         "Takeoff detected\t",
     ]
     north, east, _ = plane.flight.target

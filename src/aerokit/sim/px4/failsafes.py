@@ -14,22 +14,17 @@ from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavBatteryChargeState, MavSeverity, MavType
-from aerokit.sim.px4.fence import OUTSIDE, TOO_FAR, TOO_HIGH, Fence
-from aerokit.sim.px4.modes import HOLD, LAND, MISSION, OFFBOARD, RTL, Px4Mode
+from aerokit.sim.px4.fence import Fence
+from aerokit.sim.px4.modes import HOLD, LAND, MISSION, OFFBOARD, ORBIT, RTL, Px4Mode
+from aerokit.sim.px4.texts import NO_STATION
 
 if TYPE_CHECKING:
     from aerokit.sim.channel import Channel
     from aerokit.sim.px4.vehicle import SimulatedPx4
 
-__all__ = ["WITHOUT_TAB", "FailsafeAction", "Failsafes"]
+__all__ = ["FailsafeAction", "Failsafes"]
 
 _INTERVAL_S = 0.2
-_NO_MANUAL_CONTROL = 4
-_NO_STATION = "Preflight Fail: No connection to the GCS"
-
-
-WITHOUT_TAB = frozenset((_NO_STATION, TOO_FAR, TOO_HIGH, OUTSIDE))
-"""The few texts that do not end in a tab."""
 
 
 class FailsafeAction(IntEnum):
@@ -66,7 +61,7 @@ class Failsafes:
         """MAV_BATTERY_CHARGE_STATE; while armed it only gets worse."""
         self.has_station = False
         """Whether a ground station is heard; False before the first."""
-        self._station_at = self._sticks_at = -math.inf
+        self._station_at = -math.inf
         self._had_sticks = False
         self._battery_at_arming = MavBatteryChargeState.OK
         self._battery_told = MavBatteryChargeState.OK
@@ -77,9 +72,8 @@ class Failsafes:
         self._is_taken_over = False
 
     def listen(self) -> None:
-        """Hear ground stations and sticks."""
+        """Hear ground stations."""
         self._px4.on(m.Heartbeat, self._on_heartbeat)
-        self._px4.on(m.ManualControl, self._on_manual_control)
 
     def start(self) -> None:
         """A boot."""
@@ -99,21 +93,13 @@ class Failsafes:
             self._px4.info("GCS connection regained")
         self.has_station, self._station_at = True, self._px4.now
 
-    def _on_manual_control(self, _: m.ManualControl, __: Channel) -> None:
-        self._sticks_at, self._had_sticks = self._px4.now, True
-
-    @property
-    def has_sticks(self) -> bool:
-        """Whether MANUAL_CONTROL keeps coming."""
-        return self._px4.now - self._sticks_at <= self._px4.parameters["COM_RC_LOSS_T"]
-
     def _watch_station(self) -> None:
         patience = self._px4.parameters["COM_DL_LOSS_T"]
         if self.has_station and self._px4.now - self._station_at > patience:
             self.has_station = False
             self._px4.info("Connection to ground station lost")
             if round(self._px4.parameters["NAV_DLL_ACT"]):
-                self._px4.send_text(MavSeverity.WARNING, _NO_STATION)
+                self._px4.send_text(MavSeverity.WARNING, NO_STATION)
 
     # --------------------------------------------------------------------------------------- battery
 
@@ -151,12 +137,12 @@ class Failsafes:
         if level >= MavBatteryChargeState.CRITICAL:
             reasons.append(_BATTERY_TEXTS[level][1])
         if round(self._px4.parameters["NAV_DLL_ACT"]) and not self.has_station:
-            reasons.append(_NO_STATION)
+            reasons.append(NO_STATION)
         return reasons
 
     def armed(self) -> None:
         """The vehicle was armed: what is missing now is not missed later."""
-        self._had_sticks = self.has_sticks
+        self._had_sticks = self._px4.sticks.are_fresh
         self._battery_at_arming = self._battery_told = self.battery_state = self._battery_level()
         self._forget()
 
@@ -180,11 +166,22 @@ class Failsafes:
 
     def _sticks_action(self) -> FailsafeAction:
         """Lost is only what was there since arming."""
-        source = round(self._px4.parameters["COM_RC_IN_MODE"])
-        is_lost = self._had_sticks and not self.has_sticks and source != _NO_MANUAL_CONTROL
-        if not is_lost or self._is_excepted("COM_RCL_EXCEPT"):
+        sticks = self._px4.sticks
+        self._had_sticks = self._had_sticks or sticks.are_fresh
+        if (
+            not self._had_sticks
+            or sticks.are_fresh
+            or not sticks.are_wanted
+            or self._is_excepted("COM_RCL_EXCEPT")
+        ):
             return _A.NONE
         return _LINK_ACTIONS.get(round(self._px4.parameters["NAV_RCL_ACT"]), _A.NONE)
+
+    def may_be_taken_over(self, moved: float) -> bool:
+        """Whether sticks that were moved so far (2 is from end to end) end the present mode."""
+        values, mode = self._px4.parameters, self._px4.mode
+        bit = 1 if mode[0] == 4 or mode == ORBIT else 2 if mode == OFFBOARD else 0
+        return bool(round(values["COM_RC_OVERRIDE"]) & bit) and moved * 100 >= values["COM_RC_STICK_OV"]
 
     def _is_excepted(self, parameter: str) -> bool:
         """Whether the mode's bit is set: 1 mission, 2 hold and the other automatic modes, 4 offboard."""
@@ -242,7 +239,7 @@ class Failsafes:
         if action > max(previous, _A.WARN):
             self._tell(action)
         if action == _A.DISARM:
-            px4.disarm("failsafe", force=True)
+            px4.arming.disarm("failsafe", force=True)
         elif action in _MODES:
             px4.switch_to(_MODES[action])
         elif previous > _A.WARN:

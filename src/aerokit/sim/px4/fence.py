@@ -7,16 +7,14 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import MavCmd, MavMissionType
+from aerokit.sim.px4.texts import OUTSIDE, TOO_FAR, TOO_HIGH
 
 if TYPE_CHECKING:
     from aerokit.missions import MissionItem
     from aerokit.sim.px4.vehicle import SimulatedPx4
 
-__all__ = ["OUTSIDE", "TOO_FAR", "TOO_HIGH", "Fence"]
+__all__ = ["Fence"]
 
-TOO_FAR = "Geofence: exceeding maximum distance to Home"
-TOO_HIGH = "Geofence: exceeding maximum altitude above Home"
-OUTSIDE = "Geofence: approaching or outside geofence"
 
 _C = MavCmd
 _POLYGONS = {_C.NAV_FENCE_POLYGON_VERTEX_INCLUSION: True, _C.NAV_FENCE_POLYGON_VERTEX_EXCLUSION: False}

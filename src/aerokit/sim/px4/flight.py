@@ -6,7 +6,22 @@ import math
 from typing import TYPE_CHECKING
 
 from aerokit.sim.motion import approach_speed
-from aerokit.sim.px4.modes import HOLD, LAND, MISSION, OFFBOARD, RTL, TAKEOFF, Px4Mode
+from aerokit.sim.px4.manual_flight import ManualFlight
+from aerokit.sim.px4.modes import (
+    HOLD,
+    LAND,
+    MISSION,
+    OFFBOARD,
+    ORBIT,
+    PRECISION_LAND,
+    RTL,
+    STICK_MODES,
+    TAKEOFF,
+    TERMINATION,
+    Px4Mode,
+)
+from aerokit.sim.px4.orbit import Orbit
+from aerokit.sim.vehicle import TICK_S
 
 if TYPE_CHECKING:
     from aerokit.sim.px4.vehicle import SimulatedPx4
@@ -31,8 +46,11 @@ class Flight:
         self.speed_m_s = 0.0
         self.lifts_off = False
         """Whether the mode wants to leave the ground."""
+        self.by_hand = ManualFlight(vehicle)
+        self.orbit = Orbit(vehicle)
         self._phase = ""
         self._ramp_from = 0.0
+        self._is_default_height = False
 
     @property
     def cruise_speed_m_s(self) -> float:
@@ -50,7 +68,8 @@ class Flight:
         self.heading = None
         self._phase = "climb"
         self.stay_here()
-        if mode == RTL:
+        self.by_hand.enter()
+        if mode == RTL and self._vehicle.is_armed:
             self._plan_return()
         elif mode == MISSION:
             self._vehicle.mission.enter()
@@ -66,6 +85,7 @@ class Flight:
         mode = vehicle.mode
         self.lifts_off = (
             mode == TAKEOFF
+            or self.by_hand.wants_up
             or (mode == OFFBOARD and vehicle.offboard.wants_up)
             or (mode == MISSION and vehicle.mission.wants_up)
         )
@@ -74,7 +94,7 @@ class Flight:
             return
         if mode == TAKEOFF:
             self._take_off()
-        elif mode == LAND:
+        elif mode in (LAND, PRECISION_LAND):
             self.descend()
         elif mode == RTL:
             self._return()
@@ -82,14 +102,18 @@ class Flight:
             vehicle.offboard.fly()
         elif mode == MISSION:
             vehicle.mission.update()
-        elif mode == HOLD:
-            self.go()
+        elif mode in STICK_MODES:
+            self.by_hand.update(TICK_S)
+        elif mode == ORBIT:
+            self.orbit.update()
+        elif mode == TERMINATION:
+            pass
         else:
-            vehicle.motion.seek_velocity(0.0, 0.0, 0.0)
+            self.go()
 
     def _lift_off(self) -> None:
         vehicle = self._vehicle
-        if self.lifts_off and vehicle.now - vehicle.armed_at >= _SPOOL_UP_S:
+        if self.lifts_off and vehicle.now - vehicle.arming.since >= _SPOOL_UP_S:
             self._ramp_from = vehicle.now
             vehicle.leave_ground()
 
@@ -102,6 +126,22 @@ class Flight:
             target = self.target
             vehicle.switch_to(HOLD)
             self.target = target
+
+    def plan_take_off(self, down: float | None = None) -> None:
+        """Go straight up to ``down``; without it to MIS_TAKEOFF_ALT above home, or no higher than it is already."""
+        vehicle, motion = self._vehicle, self._vehicle.motion
+        self._is_default_height = down is None
+        if down is None:
+            down = min(vehicle.home[2] - vehicle.parameters["MIS_TAKEOFF_ALT"], motion.down)
+        self.target = (motion.north, motion.east, down)
+        if vehicle.is_armed:
+            self.announce_take_off()
+
+    def announce_take_off(self) -> None:
+        """The take-off begins with the arming, or in the air at once."""
+        if self._is_default_height:
+            altitude = self._vehicle.parameters["MIS_TAKEOFF_ALT"]
+            self._vehicle.info(f"Using default takeoff altitude: {altitude:.1f} m")
 
     def go(self) -> None:
         """Towards the target, and stay there."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from aerokit.sim.fixed_wing import FixedWing
 from aerokit.sim.px4.flight import Flight
-from aerokit.sim.px4.modes import LAND, MISSION, OFFBOARD, RTL, TAKEOFF, Px4Mode
+from aerokit.sim.px4.modes import LAND, MISSION, OFFBOARD, RTL, STICK_MODES, TAKEOFF, Px4Mode
 
 if TYPE_CHECKING:
     from aerokit.sim.px4.plane import SimulatedPx4Plane
@@ -48,7 +48,7 @@ class PlaneFlight(Flight):
         """Whether it is on its take-off run."""
         return (
             self.lifts_off
-            and self._plane.now - self._plane.armed_at >= self._plane.parameters["RWTO_RAMP_TIME"]
+            and self._plane.now - self._plane.arming.since >= self._plane.parameters["RWTO_RAMP_TIME"]
         )
 
     def enter(self, mode: Px4Mode) -> None:
@@ -77,8 +77,19 @@ class PlaneFlight(Flight):
         elif mode == OFFBOARD and math.isfinite(sum(plane.offboard.position)):
             self.target = plane.offboard.position
             self.circle()
+        elif mode in STICK_MODES and plane.sticks.are_fresh:
+            self._follow_sticks()
         else:
             self.circle()
+
+    def _follow_sticks(self) -> None:
+        """Bank, climb and airspeed by the sticks, in every mode that is flown by hand; forward is down."""
+        sticks, values = self._plane.sticks, self._plane.parameters
+        climb = -sticks.pitch * values["FW_T_CLMB_MAX" if sticks.pitch < 0 else "FW_T_SINK_MAX"]
+        slowest, fastest = values["FW_AIRSPD_MIN"], values["FW_AIRSPD_MAX"]
+        speed = slowest + (sticks.throttle + 1.0) / 2 * (fastest - slowest)
+        self._motion.bank_and_climb(speed, math.radians(values["FW_R_LIM"]) * sticks.roll, climb)
+        self.stay_here()
 
     def go(self) -> None:
         """Circle around the target."""

@@ -19,19 +19,69 @@ from aerokit.mavlink.enums import (
 )
 from aerokit.sim.missions import INVALID_INDEX
 from aerokit.sim.px4.mission_messages import CurrentWithIds
-from aerokit.sim.px4.modes import KNOWN, LAND, OFFBOARD, TAKEOFF, custom_mode
+from aerokit.sim.px4.modes import (
+    ACRO,
+    ALTITUDE,
+    ALTITUDE_CRUISE,
+    AUTO,
+    EXTERNAL_1,
+    FOLLOW_TARGET,
+    HOLD,
+    KNOWN,
+    LAND,
+    MANUAL,
+    MISSION,
+    OFFBOARD,
+    ORBIT,
+    POSITION,
+    POSITION_SLOW,
+    PRECISION_LAND,
+    RTL,
+    STABILIZED,
+    STANDARD_MODES,
+    TAKEOFF,
+    TERMINATION,
+    VTOL_TAKEOFF,
+    custom_mode,
+)
+from aerokit.sim.px4.telemetry_identity import IDENTITY_BUILDERS
+from aerokit.sim.px4.telemetry_sensors import SENSOR_BUILDERS
+from aerokit.sim.px4.wire_messages import CurrentEventSequence
 from aerokit.sim.rotations import quaternion_from_euler
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.sim.px4.vehicle import SimulatedPx4
 
-__all__ = ["BUILDERS", "DEFAULT_RATES_HZ", "FAST_MESSAGES", "available_modes"]
+__all__ = ["BUILDERS", "available_modes"]
 
 _PRESENT, _ENABLED = 0x0300402F, 0x0301402F
 _HEALTHY, _BOOTING = 0x1320C83F, 0x0320883F
-_GPS_BIT, _PREARM_BIT = 0x20, 0x10000000
-_AUTO = MavModeFlag.AUTO_ENABLED | MavModeFlag.STABILIZE_ENABLED | MavModeFlag.GUIDED_ENABLED
+_GPS_BIT, _RC_BIT, _PREARM_BIT = 0x20, 0x10000, 0x10000000
+_STANDARD = {mode: number for number, mode in STANDARD_MODES.items()}
+"""Mode → MAV_STANDARD_MODE."""
+_LISTED = (
+    MANUAL,
+    ALTITUDE,
+    POSITION,
+    MISSION,
+    HOLD,
+    RTL,
+    POSITION_SLOW,
+    ALTITUDE_CRUISE,
+    ACRO,
+    TERMINATION,
+    OFFBOARD,
+    STABILIZED,
+    TAKEOFF,
+    LAND,
+    FOLLOW_TARGET,
+    PRECISION_LAND,
+    ORBIT,
+    VTOL_TAKEOFF,
+)
+"""In the order of AVAILABLE_MODES; eight modes that a companion may bring follow."""
+_EXTERNAL_MODES = 8
 _F = EstimatorStatusFlags
 _ALL_BUT_STILL = (
     _F.ATTITUDE | _F.VELOCITY_HORIZ | _F.VELOCITY_VERT | _F.POS_HORIZ_REL | _F.POS_HORIZ_ABS | _F.POS_VERT_ABS
@@ -41,30 +91,34 @@ _POSITION_FLAGS = _F.VELOCITY_HORIZ | _F.POS_HORIZ_REL | _F.POS_HORIZ_ABS | _F.P
 
 
 def _heartbeat(px4: SimulatedPx4) -> m.Heartbeat:
-    base = MavModeFlag.CUSTOM_MODE_ENABLED
-    if px4.is_armed:
-        base |= MavModeFlag.SAFETY_ARMED
-    if px4.mode[0] == 4:
-        base |= _AUTO
-    elif px4.mode != OFFBOARD:
-        base |= MavModeFlag.MANUAL_INPUT_ENABLED | MavModeFlag.STABILIZE_ENABLED
-    state = MavState.ACTIVE if px4.is_armed else MavState.STANDBY
+    base = KNOWN[px4.mode].base_mode | (MavModeFlag.SAFETY_ARMED if px4.is_armed else 0)
+    return m.Heartbeat(px4.VEHICLE_TYPE, MavAutopilot.PX4, base, custom_mode(px4.mode), _state(px4), 3)
+
+
+def _state(px4: SimulatedPx4) -> MavState:
+    if px4.arming.is_terminated:
+        return MavState.FLIGHT_TERMINATION
     if px4.is_in_failsafe:
-        state = MavState.CRITICAL
-    if not px4.is_ready:
-        state = MavState.UNINIT
-    return m.Heartbeat(px4.VEHICLE_TYPE, MavAutopilot.PX4, base, custom_mode(px4.mode), state, 3)
+        return MavState.CRITICAL
+    if px4.is_armed:
+        return MavState.ACTIVE
+    if px4.calibration.is_running:
+        return MavState.CALIBRATING
+    return MavState.STANDBY if px4.arming.is_possible else MavState.UNINIT
 
 
 def _sys_status(px4: SimulatedPx4) -> m.SysStatus:
     health = _HEALTHY if px4.is_ready else _BOOTING
-    if px4.reasons():
+    if not px4.is_armed and not px4.arming.is_possible:
         health &= ~_PREARM_BIT
     if px4.faults.gps_lost:
         health &= ~_GPS_BIT
     voltage = round(px4.battery.voltage_v * 1000)
     percent = int(px4.battery.percent)
-    return m.SysStatus(_PRESENT, _ENABLED, health, 120, voltage, -100, percent, 0, 0, 0, 0, 0, 0)
+    present, enabled = _PRESENT, _ENABLED
+    if px4.sticks.are_fresh:
+        health |= _RC_BIT
+    return m.SysStatus(present, enabled, health, 120, voltage, -100, percent, 0, 0, 0, 0, 0, 0, 0, 0, 1)
 
 
 def _estimator_status(px4: SimulatedPx4) -> m.EstimatorStatus:
@@ -100,7 +154,7 @@ def _battery_status(px4: SimulatedPx4) -> m.BatteryStatus:
         32767,
         voltages,
         -100,
-        -1,
+        0,
         -1,
         int(battery.percent),
         0,
@@ -210,12 +264,20 @@ def _global_origin(px4: SimulatedPx4) -> m.GpsGlobalOrigin:
 
 
 def _target_local(px4: SimulatedPx4) -> m.PositionTargetLocalNed:
-    return m.PositionTargetLocalNed(px4.time_boot_ms, 1, 0, *px4.flight.target, *(0.0,) * 8)
+    """Nothing but a push towards the ground while disarmed."""
+    yaw, o = px4.motion.yaw, px4.motion
+    if not px4.is_armed:
+        return m.PositionTargetLocalNed(px4.time_boot_ms, 1, 63, *(math.nan,) * 6, 0.0, 0.0, 100.0, yaw, 0.0)
+    velocity = (o.velocity_north, o.velocity_east, o.velocity_down)
+    acceleration = (o.acceleration_north, o.acceleration_east, o.acceleration_down)
+    return m.PositionTargetLocalNed(
+        px4.time_boot_ms, 1, 0, *px4.flight.target, *velocity, *acceleration, yaw, o.yaw_rate
+    )
 
 
 def _servo_output(px4: SimulatedPx4) -> m.ServoOutputRaw:
     pwm = 900 if not px4.is_armed else round(1000 + 1000 * px4.throttle)
-    return m.ServoOutputRaw(px4.time_boot_us, 0, pwm, pwm, pwm, pwm, 900, 900, 900, 900)
+    return m.ServoOutputRaw(px4.time_boot_us, 0, *(pwm,) * 4, *(900,) * 12)
 
 
 def _mission_current(px4: SimulatedPx4) -> m.MissionCurrent:
@@ -234,28 +296,25 @@ def _system_time(px4: SimulatedPx4) -> m.SystemTime:
 
 
 def _current_mode(px4: SimulatedPx4) -> m.CurrentMode:
-    return m.CurrentMode(0, custom_mode(px4.mode), custom_mode(px4.intended_mode))
+    return m.CurrentMode(_STANDARD.get(px4.mode, 0), custom_mode(px4.mode), custom_mode(px4.intended_mode))
 
 
 def _ping(px4: SimulatedPx4) -> m.Ping:
     return m.Ping(px4.time_boot_us, px4.next_ping(), 0, 0)
 
 
-def _autopilot_version(px4: SimulatedPx4) -> m.AutopilotVersion:
-    number, commit = px4.version_number, b"\0\0\0\xfd\xaf\xd6\xde\x59"
-    return m.AutopilotVersion(
-        px4.capabilities, number, number, 101854463, 1, commit, commit, bytes(8), 0, 0, 5283920058631409231
-    )
-
-
-def available_modes(px4: SimulatedPx4) -> list[m.AvailableModes]:
-    """AVAILABLE_MODES: PX4 gives no name to a mode that the standard names (HOLD, RETURN, LAND …)."""
-    standard = {(3, 0): 1, (2, 0): 3, (4, 5): 4, (4, 4): 6, (4, 6): 7, (4, 2): 8}
+def available_modes(_: SimulatedPx4) -> list[m.AvailableModes]:
+    """AVAILABLE_MODES: PX4 gives no name to a mode that the standard names (RETURN, LAND …)."""
+    listed, count = _LISTED, len(_LISTED) + _EXTERNAL_MODES
     messages = []
-    for index, (mode, name) in enumerate(KNOWN.items(), start=1):
-        number = standard.get(mode, 0)
-        text = "" if number else name
-        messages.append(m.AvailableModes(len(KNOWN), index, number, custom_mode(mode), 0, text))
+    for index, mode in enumerate(listed, start=1):
+        number = _STANDARD.get(mode, 0)
+        text = "" if number else KNOWN[mode].name
+        properties = 0 if mode in (ALTITUDE, POSITION) else 3 if mode == TERMINATION else 1
+        messages.append(m.AvailableModes(count, index, number, custom_mode(mode), properties, text))
+    for place in range(_EXTERNAL_MODES):
+        mode, index = (AUTO, EXTERNAL_1[1] + place), len(listed) + 1 + place
+        messages.append(m.AvailableModes(count, index, 0, custom_mode(mode), 2, "(Mode not available)"))
     return messages
 
 
@@ -282,34 +341,8 @@ BUILDERS: dict[int, Callable[[SimulatedPx4], Message | None]] = {
     m.SystemTime.ID: _system_time,
     m.CurrentMode.ID: _current_mode,
     m.Ping.ID: _ping,
-    m.AutopilotVersion.ID: _autopilot_version,
+    CurrentEventSequence.ID: lambda px4: px4.events.current(),
+    **SENSOR_BUILDERS,
+    **IDENTITY_BUILDERS,
 }
 """Message id → what to send now, or None."""
-
-DEFAULT_RATES_HZ: dict[int, float] = {
-    m.Heartbeat.ID: 1.0,
-    m.Altitude.ID: 1.0,
-    m.BatteryStatus.ID: 0.5,
-    m.CurrentMode.ID: 0.5,
-    m.EstimatorStatus.ID: 0.5,
-    m.ExtendedSysState.ID: 1.0,
-    m.GpsRawInt.ID: 5.0,
-    m.GpsGlobalOrigin.ID: 1.0,
-    m.HomePosition.ID: 0.5,
-    m.MissionCurrent.ID: 1.0,
-    m.Ping.ID: 0.1,
-    m.SysStatus.ID: 1.0,
-    m.VfrHud.ID: 4.0,
-    m.Vibration.ID: 0.1,
-}
-
-FAST_MESSAGES = (
-    m.Attitude.ID,
-    m.AttitudeQuaternion.ID,
-    m.AttitudeTarget.ID,
-    m.GlobalPositionInt.ID,
-    m.LocalPositionNed.ID,
-    m.PositionTargetLocalNed.ID,
-    m.ServoOutputRaw.ID,
-)
-"""Sent at 50 Hz in simulation."""

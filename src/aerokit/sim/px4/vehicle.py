@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, ClassVar
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavCmd, MavResult, MavSeverity, MavType
+from aerokit.mavlink.enums import MavCmd, MavType
 from aerokit.sim.autopilot import SimulatedAutopilot
 from aerokit.sim.battery import Battery
 from aerokit.sim.commands import Command
 from aerokit.sim.local_frame import GlobalPoint, LocalFrame
 from aerokit.sim.motion import GRAVITY_M_S2, Motion, MotionLimits, Wind
-from aerokit.sim.px4.commands import px4_commands
-from aerokit.sim.px4.failsafes import WITHOUT_TAB, Failsafes
+from aerokit.sim.px4.arming import Arming
+from aerokit.sim.px4.calibration import Calibration
+from aerokit.sim.px4.commands import px4_commands, set_mode
+from aerokit.sim.px4.events import Events
+from aerokit.sim.px4.failsafes import Failsafes
 from aerokit.sim.px4.flight import Flight
+from aerokit.sim.px4.link_rates import LinkRates
 from aerokit.sim.px4.mission import Mission
 from aerokit.sim.px4.mission_server import MissionServer
 from aerokit.sim.px4.modes import (
@@ -27,14 +32,17 @@ from aerokit.sim.px4.modes import (
     POSITION,
     RTL,
     TAKEOFF,
+    TERMINATION,
     Px4Mode,
     mode_from_custom,
 )
 from aerokit.sim.px4.offboard import Offboard
 from aerokit.sim.px4.parameters import px4_parameters
 from aerokit.sim.px4.signing import Px4Signing
+from aerokit.sim.px4.sticks import Sticks
 from aerokit.sim.px4.storage import DEFAULT_LOGS, Storage
-from aerokit.sim.px4.telemetry import BUILDERS, DEFAULT_RATES_HZ, FAST_MESSAGES
+from aerokit.sim.px4.telemetry import BUILDERS
+from aerokit.sim.px4.texts import on_the_wire
 from aerokit.sim.vehicle import Component, sender_of
 
 if TYPE_CHECKING:
@@ -51,7 +59,6 @@ _REBOOT_SILENCE_S = 1.5
 _LAND_DETECTOR_S = 1.0
 _HOVER_THROTTLE = 0.5
 _AMPERES_AT_FULL = 40.0
-_WITHOUT_POSITION = frozenset({(1, 0), (2, 0), (5, 0), (7, 0), LAND})
 _NOT_AFTER_LANDING = frozenset({TAKEOFF, LAND, RTL})
 
 
@@ -69,7 +76,8 @@ class SimulatedPx4(SimulatedAutopilot):
     - ``boot_time_s``: seconds until it can be armed
     - ``version``: 1.16 accepts unknown modes and falls back to POSITION when offboard set-points stop, 1.17 refuses
       them and returns
-    - ``fast_rate_hz``: rate of attitude, position and targets
+    - ``fast_rate_hz``: rate of attitude, position and targets on links of mode "normal"
+    - ``link_modes``: of the first link, the second …: "normal", "onboard", "config" or "minimal", as MAV_0_MODE says
     - ``parameters``: values other than the defaults; ``parameter_count``: fewer than all 889, for quick tests;
       ``parameter_file``, ``link_bytes_per_s``: see `Storage`; ``logs``: what flights have left
     - ``signing_key``: see `Px4Signing`
@@ -79,6 +87,7 @@ class SimulatedPx4(SimulatedAutopilot):
     VEHICLE_TYPE: ClassVar[int] = MavType.QUADROTOR
     PARAMETER_TABLE: ClassVar[str] = "quadrotor"
 
+    events: Events
     storage: Storage
     """Files, logs, and the servers of them and of the parameters."""
 
@@ -99,6 +108,7 @@ class SimulatedPx4(SimulatedAutopilot):
         battery_percent: float = 100.0,
         wind: Wind | None = None,
         fast_rate_hz: float = 50.0,
+        link_modes: Sequence[str] = ("normal",),
         unsupported_commands: Collection[int] = (),
         components: Iterable[Component] = (),
         unix_time_at_boot: float = 1_790_000_000.0,
@@ -123,7 +133,8 @@ class SimulatedPx4(SimulatedAutopilot):
         self.motion = self._make_motion(wind)
         self.motion.yaw = math.remainder(math.radians(heading_deg), 2 * math.pi)
         self._boot_time_s = boot_time_s
-        self._fast_rate_hz = fast_rate_hz
+        self.rates = LinkRates(link_modes, BUILDERS, fast_rate_hz)
+        self.events = Events(self)
         self._next_text_id = 0
         self._pings = 0
         self.home = (0.0, 0.0, 0.0)
@@ -151,10 +162,10 @@ class SimulatedPx4(SimulatedAutopilot):
         self.mode: Px4Mode = HOLD
         self.intended_mode: Px4Mode = HOLD
         self.is_in_failsafe = False
-        self.armed_at = -math.inf
+        self.arming, self.calibration = Arming(self), Calibration(self)
         self.throttle = 0.0
         self.home_is_set_by_hand = False
-        self._mode_after_landing: Px4Mode = HOLD
+        self.mode_after_landing: Px4Mode = HOLD
         self._touched_at = math.nan
         self._landed_at = math.nan
         self._has_flown = False
@@ -168,7 +179,7 @@ class SimulatedPx4(SimulatedAutopilot):
         return Px4Signing(self, key, timestamp)
 
     def _listen(self) -> None:
-        self.offboard = Offboard(self)
+        self.offboard, self.sticks = Offboard(self), Sticks(self)
         self.commands = self.serve_commands(px4_commands(self))
         self.on(m.SetMode, self._on_set_mode)
         self.listen_to_clocks()
@@ -202,20 +213,6 @@ class SimulatedPx4(SimulatedAutopilot):
         """v1.16 says ACCEPTED to a mode that it does not know."""
         return self.version.startswith("1.16")
 
-    def reasons(self) -> list[str]:
-        """Why it cannot be armed, as the texts that tell it."""
-        reasons = list(self.faults.prearm_failures)
-        if not self.is_ready:
-            reasons.append("heading estimate not stable")
-        if not self.has_position and self.mode not in _WITHOUT_POSITION:
-            reasons.append("No valid position estimate")
-        return [f"Preflight Fail: {reason}" for reason in reasons] + self.failsafes.arming_reasons()
-
-    def report_reasons(self) -> None:
-        """Say what fails."""
-        for reason in self.reasons():
-            self.send_text(MavSeverity.CRITICAL, reason)
-
     def next_ping(self) -> int:
         """Sequence number of the next PING."""
         self._pings += 1
@@ -233,8 +230,8 @@ class SimulatedPx4(SimulatedAutopilot):
         self.call_later(self._boot_time_s, self._become_ready)
 
     def _warn_while_booting(self) -> None:
-        self.info("[logger] ./log/2026-11-21/02_15_51.ulg")
-        self.report_reasons()
+        self.arming.report_reasons()
+        self.arming.start_first_log()
 
     def _become_ready(self) -> None:
         self.is_ready = True
@@ -243,10 +240,7 @@ class SimulatedPx4(SimulatedAutopilot):
     def start_channel(self, channel: Channel) -> None:
         """Everything is streamed without being asked."""
         first = max(self.now, self.booted_at + _FIRST_HEARTBEAT_SHARE * self._boot_time_s)
-        for message_id, rate in DEFAULT_RATES_HZ.items():
-            channel.streams.set_interval(message_id, 1.0 / rate, first)
-        for message_id in FAST_MESSAGES:
-            channel.streams.set_interval(message_id, 1.0 / self._fast_rate_hz, first)
+        self.rates.start(channel, self.channels.index(channel), first)
 
     def restart(self) -> None:
         """Reboot now."""
@@ -262,54 +256,42 @@ class SimulatedPx4(SimulatedAutopilot):
         return None if builder is None else builder(self)
 
     def send_text(self, severity: int, text: str) -> None:
-        """Every text has an id, nearly every one ends in a tab; it leaves after what is being answered."""
-        text = text if text in WITHOUT_TAB or text.startswith("MAVLink signing") else text + "\t"
+        """Every text has an id, most end in a tab; it leaves after what is being answered."""
+        self.call_later(0.0, partial(self.events.tell, text))
+        text = on_the_wire(text)
         number, self._next_text_id = self._next_text_id, (self._next_text_id + 1) & 0xFFFF
         self.call_later(0.0, lambda: self.send_chunks(severity, text, number))
 
     # ------------------------------------------------------------------------------ arming and modes
 
-    def arm(self) -> bool:
-        """Arm if the checks allow it."""
-        if self.is_armed:
-            return True
-        if not self.is_ready and not self.faults.prearm_failures:
-            return False  # without a text, as seen
-        if self.reasons():
-            self.send_text(MavSeverity.CRITICAL, "Arming denied: Resolve system health failures first")
-            self.report_reasons()
-            return False
-        self.is_armed, self.armed_at, self._has_flown = True, self.now, False
-        self._landed_at = math.nan
+    def armed(self) -> None:
+        """It was armed just now."""
+        self.is_armed, self._has_flown, self._landed_at = True, False, math.nan
         if not self.home_is_set_by_hand:
             self.home = (self.motion.north, self.motion.east, self.motion.down)
-        self.info("Armed by external command")
         self.failsafes.armed()
         if self.mode == MISSION:
             self.mission.enter()
+        elif self.mode == TAKEOFF:
+            self.flight.announce_take_off()
         self.set_ticking(True)
-        return True
 
-    def disarm(self, by: str, *, force: bool = False) -> bool:
-        """Stop the motors; in the air only by force."""
-        if not self.is_armed:
-            return True
-        if not self.is_landed and not force:
-            self.send_text(MavSeverity.CRITICAL, "Disarming denied: not landed")
-            return False
-        self.is_armed, self.throttle = False, 0.0
-        self.info(f"Disarmed by {by}")
-        self.is_in_failsafe = False
-        if self.mode in _NOT_AFTER_LANDING:
-            self.switch_to(self._mode_after_landing)
-        return True
+    def disarmed(self) -> None:
+        """It was disarmed just now."""
+        self.is_armed, self.throttle, self.is_in_failsafe = False, 0.0, False
+
+    def terminate(self) -> None:
+        """Stop the motors for good."""
+        self.arming.terminate()
+        self.is_in_failsafe = True
+        self.switch_to(TERMINATION)
 
     def change_mode(self, mode: Px4Mode) -> bool:
         """What a user asks for: anything while disarmed, only what can run while armed; LAND always."""
         if self.is_armed and mode != LAND and not self.can_run(mode):
             return False
         if mode not in _NOT_AFTER_LANDING:
-            self._mode_after_landing = mode
+            self.mode_after_landing = mode
         self.is_in_failsafe = False
         self.intended_mode = mode
         self.failsafes.take_over()
@@ -320,27 +302,26 @@ class SimulatedPx4(SimulatedAutopilot):
         else:
             self.switch_to(mode)
         if mode == TAKEOFF:
-            motion, altitude = self.motion, self.parameters["MIS_TAKEOFF_ALT"]
-            self.flight.target = (motion.north, motion.east, self.home[2] - altitude)
+            self.flight.plan_take_off()
         return True
 
     def can_run(self, mode: Px4Mode) -> bool:
         """Whether the mode has what it needs: sticks, a mission, set-points, a position."""
-        if mode == MISSION and not self.mission.is_valid:
+        traits = KNOWN.get(mode)
+        if traits is None or self.arming.is_terminated or (mode == MISSION and not self.mission.is_valid):
             return False
-        if mode == POSITION or mode not in KNOWN or (mode[0] != 4 and mode != OFFBOARD):
+        if (traits.needs_sticks and not self.sticks.are_fresh) or (
+            mode == OFFBOARD and not self.offboard.is_fresh
+        ):
             return False
-        return self.has_position and (mode != OFFBOARD or self.offboard.is_fresh)
+        return self.has_position or not traits.needs_position
 
     def switch_to(self, mode: Px4Mode) -> None:
         """Change the mode, whoever wants it; only the next heartbeat tells."""
         self.mode = mode
         self.flight.enter(mode)
-        if mode == RTL:
-            zeros = (0.0,) * 7
-            self.send(
-                m.CommandLong(self.system_id, 0, MavCmd.NAV_RETURN_TO_LAUNCH, 0, *zeros)
-            )  # to its own parts
+        if mode == RTL and self.is_armed:  # tells its own parts
+            self.send(m.CommandLong(self.system_id, 0, MavCmd.NAV_RETURN_TO_LAUNCH, 0, *(0.0,) * 7))
 
     # ---------------------------------------------------------------------------------------- flying
 
@@ -349,19 +330,30 @@ class SimulatedPx4(SimulatedAutopilot):
         self.is_landed, self._has_flown, self._touched_at = False, True, math.nan
         self.info("Takeoff detected")
 
+    def sticks_moved(self, size: float) -> None:
+        """Somebody takes the sticks (COM_RC_STICK_OV per cent) in a mode that flies by itself (COM_RC_OVERRIDE)."""
+        if self.is_armed and not self.is_landed and self.failsafes.may_be_taken_over(size):
+            self.info("Pilot took over using sticks")
+            self.change_mode(POSITION)
+
     def tick(self, dt: float) -> None:
         """Mode, motion, land detector, battery, failsafe."""
         if self.is_armed:
             self.offboard.watch()
             self.flight.update()
         if self._moves():
-            self.motion.step(dt, powered=self.is_armed and not self.faults.motor_failed)
+            self.motion.step(dt, powered=self.has_power)
         if not self.is_landed:
             self._detect_landing()
         self._disarm_by_itself()
         self._run_motors(dt)
         if not self.is_armed and self.is_landed:
             self.set_ticking(False)
+
+    @property
+    def has_power(self) -> bool:
+        """Whether the motors turn."""
+        return self.is_armed and not self.faults.motor_failed and not self.arming.is_terminated
 
     def _moves(self) -> bool:
         return not self.is_landed
@@ -378,7 +370,7 @@ class SimulatedPx4(SimulatedAutopilot):
         self.battery.drain(self.throttle * _AMPERES_AT_FULL, dt)
 
     def _detect_landing(self) -> None:
-        if not self._is_down() or self.flight.lifts_off:
+        if not self._is_down() or self.flight.lifts_off or self.arming.is_terminated:
             self._touched_at = math.nan
         elif math.isnan(self._touched_at):
             self._touched_at = self.now
@@ -392,9 +384,9 @@ class SimulatedPx4(SimulatedAutopilot):
         if not self.is_armed or not self.is_landed or self.flight.lifts_off:
             return
         if self._has_flown and self.now - self._landed_at >= self.parameters["COM_DISARM_LAND"]:
-            self.disarm("landing")
-        elif not self._has_flown and 0 < self.parameters["COM_DISARM_PRFLT"] <= self.now - self.armed_at:
-            self.disarm("auto preflight disarming")
+            self.arming.disarm("landing")
+        elif not self._has_flown and 0 < self.parameters["COM_DISARM_PRFLT"] <= self.now - self.arming.since:
+            self.arming.disarm("auto preflight disarming")
 
     # -------------------------------------------------------------------------------- other messages
 
@@ -403,5 +395,4 @@ class SimulatedPx4(SimulatedAutopilot):
         command = Command(
             MavCmd.DO_SET_MODE, request.base_mode, main, sub, 0, 0, 0, 0, None, channel, sender_of(request)
         )
-        known = (main, sub) in KNOWN and self.change_mode((main, sub))
-        self.commands.answer(command, MavResult.ACCEPTED if known else MavResult.TEMPORARILY_REJECTED)
+        self.commands.answer(command, set_mode(self, request.base_mode, (main, sub)))

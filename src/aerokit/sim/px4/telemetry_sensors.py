@@ -1,0 +1,218 @@
+"""What a simulated PX4 says of its sensors, motors and sticks, on request or on links that have it in their rates."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from aerokit.mavlink import messages as m
+from aerokit.sim.motion import GRAVITY_M_S2
+from aerokit.sim.px4.modes import ORBIT
+from aerokit.sim.px4.wire_messages import LinkNodeStatus, TimeEstimateToTarget
+from aerokit.sim.rotations import quaternion_from_euler
+
+if TYPE_CHECKING:
+    from aerokit.mavlink.message import Message
+    from aerokit.sim.px4.vehicle import SimulatedPx4
+
+__all__ = ["SENSOR_BUILDERS"]
+
+_SEA_LEVEL_HPA, _SEA_LEVEL_C, _LAPSE_C_PER_M = 1013.25, 15.0, 0.0065
+_RANGE_FINDER_CM = (0, 10_000)
+_FIELD_GAUSS = (0.215, 0.0, 0.426)
+_IMU_FIELDS = 7167
+_COVARIANCE = tuple([math.nan] * 21)
+_UNUSED_CHANNEL = 65535
+_OUTPUTS = 16
+_DISARMED_US = 900
+_LANDED, _IN_AIR = 1, 2
+_CLIMB_M_S, _DESCENT_M_S = 3.0, 0.7
+
+
+def _height(px4: SimulatedPx4) -> float:
+    return px4.frame.origin.altitude_m - px4.motion.down
+
+
+def _pressure_hpa(px4: SimulatedPx4) -> float:
+    return float(_SEA_LEVEL_HPA * (1.0 - 2.25577e-5 * _height(px4)) ** 5.25588)
+
+
+def _scaled_pressure(px4: SimulatedPx4) -> m.ScaledPressure:
+    temperature = _SEA_LEVEL_C - _LAPSE_C_PER_M * _height(px4)
+    return m.ScaledPressure(px4.time_boot_ms, _pressure_hpa(px4), 0.0, round(temperature * 100), 0)
+
+
+def _distance_sensor(px4: SimulatedPx4) -> m.DistanceSensor:
+    height = px4.motion.ground_down - px4.motion.down
+    distance = min(_RANGE_FINDER_CM[1], max(0, round(height * 100)))
+    return m.DistanceSensor(px4.time_boot_ms, *_RANGE_FINDER_CM, distance, 0, 0, 25, 0)
+
+
+def _body(px4: SimulatedPx4) -> tuple[float, float, float]:
+    """What the accelerometer feels, in m/s² forward, right, down."""
+    o = px4.motion
+    north, east, down = o.acceleration_north, o.acceleration_east, o.acceleration_down - GRAVITY_M_S2
+    cos_yaw, sin_yaw = math.cos(o.yaw), math.sin(o.yaw)
+    forward, right = north * cos_yaw + east * sin_yaw, east * cos_yaw - north * sin_yaw
+    return (
+        forward * math.cos(o.pitch) - down * math.sin(o.pitch),
+        right * math.cos(o.roll) + down * math.sin(o.roll),
+        down * math.cos(o.roll) * math.cos(o.pitch),
+    )
+
+
+def _field(px4: SimulatedPx4) -> tuple[float, float, float]:
+    north, _, down = _FIELD_GAUSS
+    return (north * math.cos(px4.motion.yaw), -north * math.sin(px4.motion.yaw), down)
+
+
+def _highres_imu(px4: SimulatedPx4) -> m.HighresImu:
+    o, height = px4.motion, _height(px4)
+    rates = (o.roll_rate, o.pitch_rate, o.yaw_rate)
+    pressure = _pressure_hpa(px4)
+    return m.HighresImu(
+        px4.time_boot_us, *_body(px4), *rates, *_field(px4), pressure, 0.0, height, _SEA_LEVEL_C, _IMU_FIELDS
+    )
+
+
+def _scaled_imu(px4: SimulatedPx4) -> m.ScaledImu:
+    o = px4.motion
+    force_x, force_y, force_z = (round(part / GRAVITY_M_S2 * 1000) for part in _body(px4))
+    rate_x, rate_y, rate_z = (round(rate * 1000) for rate in (o.roll_rate, o.pitch_rate, o.yaw_rate))
+    field_x, field_y, field_z = (round(part * 1000) for part in _field(px4))
+    time = px4.time_boot_ms
+    return m.ScaledImu(
+        time, force_x, force_y, force_z, rate_x, rate_y, rate_z, field_x, field_y, field_z, temperature=1500
+    )
+
+
+def _odometry(px4: SimulatedPx4) -> m.Odometry:
+    o = px4.motion
+    q = quaternion_from_euler(o.roll, o.pitch, o.yaw)
+    velocity = (o.velocity_north, o.velocity_east, o.velocity_down)
+    rates = (o.roll_rate, o.pitch_rate, o.yaw_rate)
+    return m.Odometry(
+        px4.time_boot_us,
+        1,
+        1,
+        o.north,
+        o.east,
+        o.down,
+        q,
+        *velocity,
+        *rates,
+        _COVARIANCE,
+        _COVARIANCE,
+        0,
+        8,
+        0,
+    )
+
+
+def _rc_channels(px4: SimulatedPx4) -> m.RcChannels | None:
+    """Only while RC_CHANNELS_OVERRIDE comes: there is no receiver."""
+    if not px4.sticks.has_channels:
+        return None
+    channels = px4.sticks.channels
+    used = 8 if not any(channels[8:]) else len(channels)
+    pulses = {f"chan{number}_raw": pulse for number, pulse in enumerate(channels[:used], start=1)}
+    unused = {f"chan{number}_raw": _UNUSED_CHANNEL for number in range(used + 1, len(channels) + 1)}
+    return m.RcChannels(time_boot_ms=px4.time_boot_ms, chancount=used, rssi=100, **pulses, **unused)
+
+
+def _manual_control(px4: SimulatedPx4) -> m.ManualControl:
+    sticks = px4.sticks
+    throttle = round((sticks.throttle + 1) * 500)
+    pitch, roll, yaw = (round(axis * 1000) for axis in (sticks.pitch, sticks.roll, sticks.yaw))
+    return m.ManualControl(px4.system_id, pitch, roll, throttle, yaw, 0)
+
+
+def _timesync(px4: SimulatedPx4) -> m.Timesync:
+    return m.Timesync(0, int(px4.uptime * 1e9))
+
+
+def _actuator_outputs(px4: SimulatedPx4) -> m.ActuatorOutputStatus:
+    pulse = _DISARMED_US if not px4.is_armed else round(1000 + 1000 * px4.throttle)
+    outputs = (*(float(pulse),) * 4, *(float(_DISARMED_US),) * (_OUTPUTS - 4))
+    return m.ActuatorOutputStatus(px4.time_boot_us, _OUTPUTS, outputs)
+
+
+def _state_for_gimbal(px4: SimulatedPx4) -> m.AutopilotStateForGimbalDevice:
+    o = px4.motion
+    q = quaternion_from_euler(o.roll, o.pitch, o.yaw)
+    velocity = (o.velocity_north, o.velocity_east, o.velocity_down)
+    landed = _LANDED if px4.is_landed else _IN_AIR
+    return m.AutopilotStateForGimbalDevice(
+        0,
+        0,
+        px4.time_boot_us,
+        q,
+        0,
+        *velocity,
+        0,
+        o.yaw_rate,
+        1023 if px4.is_landed else 895,
+        landed,
+        o.yaw_rate,
+    )
+
+
+def _position_target_global(px4: SimulatedPx4) -> m.PositionTargetGlobalInt | None:
+    """Only while armed."""
+    if not px4.is_armed or not px4.has_position:
+        return None
+    place, o = px4.frame.to_global(*px4.flight.target), px4.motion
+    velocity = (o.velocity_north, o.velocity_east, o.velocity_down)
+    return m.PositionTargetGlobalInt(
+        px4.time_boot_ms,
+        5,
+        0,
+        place.latitude_e7,
+        place.longitude_e7,
+        place.altitude_m,
+        *velocity,
+        0.0,
+        0.0,
+        0.0,
+        o.yaw,
+        o.yaw_rate,
+    )
+
+
+def _orbit_status(px4: SimulatedPx4) -> m.OrbitExecutionStatus | None:
+    return px4.flight.orbit.status() if px4.mode == ORBIT else None
+
+
+def _time_estimate(px4: SimulatedPx4) -> TimeEstimateToTarget:
+    """Only the return is estimated: up or down to its height, back, down."""
+    if px4.is_landed:
+        return TimeEstimateToTarget.of(-1, -1, -1, -1, -1)
+    motion, flight = px4.motion, px4.flight
+    height = max(px4.parameters["RTL_RETURN_ALT"], px4.altitude_m)
+    away = math.hypot(motion.north - px4.home[0], motion.east - px4.home[1])
+    seconds = (height - px4.altitude_m) / _CLIMB_M_S + away / flight.cruise_speed_m_s + height / _DESCENT_M_S
+    return TimeEstimateToTarget.of(round(seconds), -1, -1, -1, -1)
+
+
+def _link_status(px4: SimulatedPx4) -> LinkNodeStatus:
+    return LinkNodeStatus.of(px4.time_boot_us, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
+
+
+SENSOR_BUILDERS: dict[int, Callable[[SimulatedPx4], Message | None]] = {
+    LinkNodeStatus.ID: _link_status,
+    m.ScaledImu.ID: _scaled_imu,
+    m.ScaledPressure.ID: _scaled_pressure,
+    m.RcChannels.ID: _rc_channels,
+    m.ManualControl.ID: _manual_control,
+    m.PositionTargetGlobalInt.ID: _position_target_global,
+    m.HighresImu.ID: _highres_imu,
+    m.Timesync.ID: _timesync,
+    m.DistanceSensor.ID: _distance_sensor,
+    m.AutopilotStateForGimbalDevice.ID: _state_for_gimbal,
+    m.Odometry.ID: _odometry,
+    m.OrbitExecutionStatus.ID: _orbit_status,
+    m.ActuatorOutputStatus.ID: _actuator_outputs,
+    TimeEstimateToTarget.ID: _time_estimate,
+}
+"""Message id → what to send now, or None."""
