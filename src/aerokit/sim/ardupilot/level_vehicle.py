@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from typing import TYPE_CHECKING, Any, cast
 
-from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavResult, SpeedType
 from aerokit.sim.ardupilot.targets import Targets
-from aerokit.sim.ardupilot.telemetry import BUILDERS
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 from aerokit.sim.ardupilot.vehicle_commands import common_commands
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
-    from aerokit.mavlink.message import Message
     from aerokit.sim.ardupilot.mode import VehicleMode
     from aerokit.sim.commands import Command, CommandHandler
 
@@ -26,11 +21,6 @@ _STICK_MIDDLE = 1500
 
 class LevelVehicle(ArduPilotVehicle):
     """Its arguments are those of `ArduPilotVehicle`."""
-
-    BUILDERS: ClassVar[Mapping[int, Callable[[Any], Message | None]]] = {
-        **BUILDERS,
-        m.ExtendedSysState.ID: lambda _: m.ExtendedSysState(0, 0),
-    }
 
     # ----------------------------------------------------------------------------- what a kind says
 

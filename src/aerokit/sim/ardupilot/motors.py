@@ -22,6 +22,9 @@ class Motors:
     def __init__(self) -> None:
         self.is_armed = False
         self.armed_at = -math.inf
+        self.disarmed_at = -math.inf
+        self.may_turn = False
+        """Whether the arming delay is over."""
         self.wanted = False
         self.spool = 0.0
         self.throttle = 0.0
@@ -44,20 +47,23 @@ class Motors:
 
     @property
     def pwm(self) -> int:
-        """What SERVO_OUTPUT_RAW shows for each."""
-        if not self.is_armed:
+        """What SERVO_OUTPUT_RAW shows for each; they begin to turn when the arming delay is over."""
+        if not (self.is_armed and self.may_turn):
             return _STOPPED_PWM
         return round(_IDLE_PWM + 20 * self.spool + self.throttle * (_FULL_PWM - _IDLE_PWM) * 1.3)
 
     def set_armed(self, armed: bool, now: float) -> None:
         """Arm or stop them."""
-        self.is_armed, self.armed_at = armed, now
+        if self.is_armed and not armed:
+            self.disarmed_at = now
+        self.is_armed, self.armed_at, self.may_turn = armed, now, False
         self.spool = self.throttle = 0.0
         self.wanted = False
 
     def update(self, now: float, dt: float, motion: Motion, *, landed: bool) -> None:
         """Follow what is wanted."""
-        if self.is_armed and self.wanted and now - self.armed_at >= _ARMING_DELAY_S:
+        self.may_turn = self.is_armed and now - self.armed_at >= _ARMING_DELAY_S
+        if self.may_turn and self.wanted:
             self.spool = min(1.0, self.spool + dt / _SPOOL_UP_S)
         else:
             self.spool = max(0.0, self.spool - dt / _SPOOL_DOWN_S)

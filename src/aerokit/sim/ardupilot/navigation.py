@@ -128,7 +128,8 @@ class Navigation:
     def _activate(self) -> None:
         self.flags = 0
         self._say_cores("initialised")
-        self._vehicle.info("AHRS: EKF3 active")
+        if self._vehicle.timeline.estimator_leads_early:
+            self._vehicle.info("AHRS: EKF3 active")
 
     def _align(self) -> None:
         self.flags = _ATTITUDE_ONLY
@@ -142,6 +143,8 @@ class Navigation:
     def _get_fix(self) -> None:
         if not self._vehicle.faults.gps_lost:
             self.fix_type = GpsFixType.RTK_FIXED
+            if not self._vehicle.timeline.estimator_leads_early:
+                self._set_first_home()
         self._vehicle.every(_CHECK_S, self._watch_gps)
 
     def _set_origin(self) -> None:
@@ -150,11 +153,17 @@ class Navigation:
             return
         motion = self._vehicle.motion
         self.origin = (motion.north, motion.east, motion.down)
-        self.home = self.origin
+        if not self.home_is_locked:
+            self._set_first_home()
+        self._say_cores("origin set")
+        if self._vehicle.KIND != "sub":
+            self._vehicle.info(f"Field Elevation Set: {self.frame.origin.altitude_m - motion.down:.0f}m")
+
+    def _set_first_home(self) -> None:
+        motion = self._vehicle.motion
+        self.home = (motion.north, motion.east, motion.down)
         self._vehicle.missions.commands.add_home()
         self._vehicle.send_home()
-        self._say_cores("origin set")
-        self._vehicle.info(f"Field Elevation Set: {self.frame.origin.altitude_m - motion.down:.0f}m")
 
     def _become_healthy(self) -> None:
         self.is_healthy = True
@@ -165,6 +174,8 @@ class Navigation:
             return
         self.flags = _WITH_POSITION
         self._say_cores("is using GPS")
+        if not self._vehicle.timeline.estimator_leads_early:
+            self._vehicle.info("AHRS: EKF3 active")
 
     # ----------------------------------------------------------------------------------- losing GPS
 

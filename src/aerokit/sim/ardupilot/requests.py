@@ -10,10 +10,14 @@ from aerokit.mavlink.messages import (
     AvailableModesMonitor,
     Heartbeat,
     MessageInterval,
+    NamedValueFloat,
     RcChannelsRaw,
     RequestDataStream,
+    TerrainRequest,
 )
-from aerokit.sim.ardupilot.stream_groups import KNOWN_MESSAGES
+from aerokit.sim.ardupilot.stream_groups import KNOWN_MESSAGES, RATE_PARAMETERS, STREAM_GROUPS
+from aerokit.sim.ardupilot.telemetry_extra import DISPLAY_VALUES
+from aerokit.sim.parameter_server import UNCOUNTED
 
 if TYPE_CHECKING:
     from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
@@ -24,13 +28,22 @@ __all__ = ["Requests"]
 
 _SHORTEST_S, _LONGEST_S = 0.0025 / 0.8, 60.0
 _LARGEST_IN_MESSAGE_INTERVAL = 1 << 16
+_TERRAIN_REQUEST_S = 2.0
 
 
 class Requests:
-    """SET_MESSAGE_INTERVAL, GET_MESSAGE_INTERVAL, REQUEST_MESSAGE and REQUEST_DATA_STREAM."""
+    """SET_MESSAGE_INTERVAL, GET_MESSAGE_INTERVAL, REQUEST_MESSAGE and REQUEST_DATA_STREAM.
+
+    The rates of the streams are parameters of the port (MAV1_EXTRA1 and so on), read at the start; REQUEST_DATA_STREAM
+    changes them. Only a plane saves and announces that, the others forget it in a reboot.
+    """
 
     def __init__(self, vehicle: ArduPilotVehicle, *, stream_groups: bool = True) -> None:
         self._vehicle = vehicle
+        self._known = KNOWN_MESSAGES[vehicle.KIND]
+        self._groups = STREAM_GROUPS[vehicle.KIND]
+        self._saved: dict[str, tuple[float, int]] = {}
+        """Name of a rate → its saved value, and that which stands in for it until the next reboot."""
         if stream_groups:
             vehicle.on(RequestDataStream, self._on_group)
 
@@ -39,7 +52,7 @@ class Requests:
         message_id, interval_us = int(command.param1), int(command.param2)
         if command.param3 != 0.0:
             return MavResult.DENIED
-        if message_id not in KNOWN_MESSAGES:
+        if message_id not in self._known:
             self._vehicle.info(f"No ap_message for mavlink id ({message_id})")
             return MavResult.DENIED
         if interval_us < -1:
@@ -51,7 +64,7 @@ class Requests:
             text = f"Requested rate for message ID {message_id} too fast. Increase SCHED_LOOP_RATE"
             self._vehicle.info(text)
             return MavResult.DENIED
-        self._stream(message_id, min(interval, _LONGEST_S), command.channel)
+        self._stream(message_id, min(interval, _LONGEST_S), command.channel, self._vehicle.now)
         return MavResult.ACCEPTED
 
     def get_interval(self, command: Command) -> int:
@@ -59,7 +72,7 @@ class Requests:
         return self._send_interval(int(command.param1), command.channel)
 
     def _send_interval(self, message_id: int, channel: Channel) -> int:
-        known = message_id in KNOWN_MESSAGES
+        known = message_id in self._known
         interval_us = round(channel.streams.interval(message_id) * 1e6) or -1
         if message_id < _LARGEST_IN_MESSAGE_INTERVAL:
             self._vehicle.send(MessageInterval(message_id, interval_us if known else 0), channel)
@@ -70,7 +83,7 @@ class Requests:
         message_id = int(command.param1)
         if message_id == MessageInterval.ID:
             return self._send_interval(int(command.param2), command.channel)
-        if message_id not in KNOWN_MESSAGES:
+        if message_id not in self._known:
             return MavResult.FAILED
         if message_id == AvailableModes.ID:
             self._send_modes(int(command.param2), command.channel)
@@ -101,14 +114,54 @@ class Requests:
         if request.start_stop not in (0, 1):
             return
         rate = request.req_message_rate if request.start_stop else 0
-        wanted, all_groups = request.req_stream_id, self._vehicle.STREAM_GROUPS
-        groups = all_groups if wanted == MavDataStream.ALL else {wanted: all_groups.get(wanted, ())}
-        for messages in groups.values():
-            for message_id in messages:
-                interval = max(1.0 / rate, _SHORTEST_S) if rate > 0 else 0.0
-                self._stream(message_id, interval, channel)
+        wanted = request.req_stream_id
+        for stream in self._groups if wanted == MavDataStream.ALL else (wanted,):
+            if stream in self._groups:
+                self._stream_group(stream, rate, channel, self._vehicle.now)
+                self._remember(f"{self._prefix(channel)}{RATE_PARAMETERS[stream]}", rate)
+        if wanted == MavDataStream.ALL:
+            self._remember(f"{self._prefix(channel)}ADSB", rate)
 
-    def _stream(self, message_id: int, interval: float, channel: Channel) -> None:
+    def start_channel(self, channel: Channel, first: float) -> None:
+        """Stream on a port what its parameters say, from the second ``first`` on."""
+        parameters = self._vehicle.parameters
+        for stream, ending in RATE_PARAMETERS.items():
+            name = f"{self._prefix(channel)}{ending}"
+            if name in parameters and parameters[name] > 0:
+                self._stream_group(stream, parameters[name], channel, first)
+
+    def _prefix(self, channel: Channel) -> str:
+        return f"MAV{self._vehicle.channels.index(channel) + 1}_"
+
+    def restart(self) -> None:
+        """Go back to the rates that are saved, as a reboot does."""
+        parameters = self._vehicle.parameters
+        for name, (saved, present) in self._saved.items():
+            if parameters[name] == present:
+                parameters[name] = saved
+        self._saved.clear()
+
+    def _remember(self, name: str, rate: int) -> None:
+        vehicle, parameters = self._vehicle, self._vehicle.parameters
+        if name not in parameters or parameters[name] == rate:
+            return
+        if vehicle.KIND != "plane":
+            self._saved[name] = (self._saved.get(name, (parameters[name], rate))[0], rate)
+        parameters[name] = rate
+        if vehicle.KIND == "plane":
+            vehicle.storage.parameters.send(name, UNCOUNTED, None)
+
+    def _stream_group(self, stream: int, rate: float, channel: Channel, first: float) -> None:
+        interval = max(1.0 / rate, _SHORTEST_S) if rate > 0 else 0.0
+        for message_id in self._groups[stream]:
+            pace = interval
+            if message_id == TerrainRequest.ID and rate > 0:
+                pace = max(interval, _TERRAIN_REQUEST_S)
+            elif message_id == NamedValueFloat.ID:
+                pace = interval / len(DISPLAY_VALUES)
+            self._stream(message_id, pace, channel, first)
+
+    def _stream(self, message_id: int, interval: float, channel: Channel, first: float) -> None:
         """RC_CHANNELS_RAW is for MAVLink 1 only, where old displays look for it."""
         if message_id != RcChannelsRaw.ID or channel.version == 1:
-            channel.streams.set_interval(message_id, interval, self._vehicle.now)
+            channel.streams.set_interval(message_id, interval, first)

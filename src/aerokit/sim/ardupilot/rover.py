@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavModeFlag, MavType, RoverMode
 from aerokit.sim.ardupilot.level_vehicle import LevelVehicle
 from aerokit.sim.ardupilot.motors import Motors
@@ -19,7 +18,6 @@ from aerokit.sim.ground_motion import GroundLimits, GroundMotion
 from aerokit.sim.motion import wrap_pi
 
 if TYPE_CHECKING:
-    from aerokit.mavlink.message import Message
     from aerokit.sim.ardupilot.mode import VehicleMode
     from aerokit.sim.ardupilot.parameter_tables import Kind
     from aerokit.sim.commands import CommandHandler
@@ -48,22 +46,6 @@ class _Motors(Motors):
             self.throttle = 0.0
 
 
-def _vfr_hud(rover: SimulatedRover) -> m.VfrHud:
-    motion, place = rover.motion, rover.navigation.position
-    heading = int(math.degrees(motion.yaw) % 360.0)
-    throttle = round(abs(rover.motors.throttle) * 100)
-    altitude = 0.0 if place is None else place.altitude_m
-    return m.VfrHud(0.0, motion.ground_speed_m_s, heading, throttle, altitude, 0.0)
-
-
-def _servo_output(rover: SimulatedRover) -> m.ServoOutputRaw:
-    """Steering is output 1, the motor output 3."""
-    most = rover.motion.wheels.turn_rate_rad_s
-    steering = _MIDDLE_PWM + round(500 * rover.motion.yaw_rate / most)
-    throttle = _MIDDLE_PWM + round(500 * rover.motors.throttle)
-    return m.ServoOutputRaw(rover.time_boot_us, 0, steering, 0, throttle, 0, 0, 0, 0, 0)
-
-
 class SimulatedRover(LevelVehicle):
     """Speaks and behaves as ArduRover does where a client can see it; drives as `GroundMotion` does.
 
@@ -79,11 +61,6 @@ class SimulatedRover(LevelVehicle):
     MAV_TYPE: ClassVar[int] = MavType.GROUND_ROVER
     CAPABILITIES: ClassVar[int] = 0xF1EF
     MODES: ClassVar[tuple[Callable[[Any], VehicleMode], ...]] = ROVER_MODES
-    BUILDERS: ClassVar[Mapping[int, Callable[[Any], Message | None]]] = {
-        **LevelVehicle.BUILDERS,
-        m.VfrHud.ID: _vfr_hud,
-        m.ServoOutputRaw.ID: _servo_output,
-    }
 
     motion: GroundMotion
 

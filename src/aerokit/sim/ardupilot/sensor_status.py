@@ -1,12 +1,15 @@
-"""The three bit masks of SYS_STATUS as ArduCopter fills them."""
+"""The three bit masks of SYS_STATUS as each ArduPilot fills them."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from aerokit.mavlink.enums import CopterMode, PlaneMode, RoverMode, SubMode
 from aerokit.mavlink.enums import MavSysStatusSensor as Sensor
 
 if TYPE_CHECKING:
+    from aerokit.sim.ardupilot.parameter_tables import Kind
     from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 
 __all__ = ["sensor_status"]
@@ -15,58 +18,126 @@ _FENCE = Sensor.MAV_SYS_STATUS_GEOFENCE
 _PREARM = Sensor.MAV_SYS_STATUS_PREARM_CHECK
 _AHRS = Sensor.MAV_SYS_STATUS_AHRS
 _LOGGING = Sensor.MAV_SYS_STATUS_LOGGING
-_ALWAYS = (
+_TERRAIN = Sensor.MAV_SYS_STATUS_TERRAIN
+_RATE, _ATTITUDE, _YAW = Sensor.ANGULAR_RATE_CONTROL, Sensor.ATTITUDE_STABILIZATION, Sensor.YAW_POSITION
+_HEIGHT, _PLACE = Sensor.Z_ALTITUDE_CONTROL, Sensor.XY_POSITION_CONTROL
+_BODY = (
     Sensor.SENSOR_3D_GYRO
     | Sensor.SENSOR_3D_ACCEL
     | Sensor.SENSOR_3D_MAG
     | Sensor.ABSOLUTE_PRESSURE
-    | Sensor.ANGULAR_RATE_CONTROL
-    | Sensor.ATTITUDE_STABILIZATION
-    | Sensor.YAW_POSITION
     | Sensor.MOTOR_OUTPUTS
     | Sensor.RC_RECEIVER
-    | Sensor.MAV_SYS_STATUS_TERRAIN
     | Sensor.BATTERY
-    | Sensor.PROPULSION
 )
-_CONTROL = Sensor.Z_ALTITUDE_CONTROL | Sensor.XY_POSITION_CONTROL
-_PRESENT = _ALWAYS | _CONTROL | _PREARM | _AHRS | _LOGGING | Sensor.MAV_SYS_STATUS_GEOFENCE
-_QUIETLY_HEALTHY = Sensor.MAV_SYS_STATUS_GEOFENCE | Sensor.PROXIMITY | _LOGGING
+_KEEPS_LOGGING_S = 15.0
+"""The log goes on for so long after disarming."""
+
+
+@dataclass(frozen=True)
+class _Suite:
+    """What a kind has beside the GPS, and how it reports it."""
+
+    working: int
+    """Present, enabled and healthy from the start."""
+    control: int
+    """Kinds of control that it has."""
+    always: int = 0
+    """Of those the ones that are enabled in every mode."""
+    quietly_healthy: int = 0
+    """Healthy, though neither present nor enabled."""
+    unhealthy: int = 0
+    """Present and enabled, and not healthy."""
+
+
+_SUITES: dict[Kind, _Suite] = {
+    "copter": _Suite(
+        _BODY | _TERRAIN | Sensor.PROPULSION,
+        _RATE | _ATTITUDE | _YAW | _HEIGHT | _PLACE,
+        always=_RATE | _ATTITUDE | _YAW,
+        quietly_healthy=Sensor.PROXIMITY,
+    ),
+    "plane": _Suite(
+        _BODY | Sensor.DIFFERENTIAL_PRESSURE, _RATE | _ATTITUDE | _YAW | _HEIGHT | _PLACE, unhealthy=_TERRAIN
+    ),
+    "rover": _Suite(_BODY, _RATE | _ATTITUDE | _YAW | _PLACE, quietly_healthy=Sensor.LASER_POSITION),
+    "sub": _Suite(
+        _BODY | Sensor.LASER_POSITION,
+        _RATE | _ATTITUDE | _YAW | _HEIGHT | _PLACE,
+        always=_RATE | _ATTITUDE | _YAW,
+    ),
+}
+
+_LESS_CONTROL: dict[Kind, dict[int, int]] = {
+    "copter": {
+        CopterMode.STABILIZE: _HEIGHT | _PLACE,
+        CopterMode.ACRO: _HEIGHT | _PLACE,
+        CopterMode.ALT_HOLD: _PLACE,
+    },
+    "plane": {
+        PlaneMode.MANUAL: _RATE | _ATTITUDE | _YAW | _HEIGHT | _PLACE,
+        PlaneMode.ACRO: _ATTITUDE | _YAW | _HEIGHT | _PLACE,
+        PlaneMode.STABILIZE: _YAW | _HEIGHT | _PLACE,
+        PlaneMode.TRAINING: _RATE | _ATTITUDE | _YAW | _HEIGHT | _PLACE,
+        PlaneMode.FLY_BY_WIRE_A: _YAW | _HEIGHT | _PLACE,
+        PlaneMode.AUTOTUNE: _YAW | _HEIGHT | _PLACE,
+        PlaneMode.FLY_BY_WIRE_B: _YAW | _HEIGHT | _PLACE,
+        PlaneMode.CRUISE: _YAW | _HEIGHT | _PLACE,
+    },
+    "rover": {
+        RoverMode.MANUAL: _RATE | _ATTITUDE | _YAW | _PLACE,
+        RoverMode.HOLD: _RATE | _ATTITUDE | _YAW | _PLACE,
+        RoverMode.ACRO: _YAW | _PLACE,
+        RoverMode.STEERING: _YAW | _PLACE,
+        RoverMode.SIMPLE: _YAW | _PLACE,
+    },
+    "sub": {
+        SubMode.MANUAL: _HEIGHT | _PLACE,
+        SubMode.STABILIZE: _HEIGHT | _PLACE,
+        SubMode.ACRO: _HEIGHT | _PLACE,
+        SubMode.MOTORDETECT: _HEIGHT | _PLACE,
+        SubMode.SURFTRAK: _HEIGHT | _PLACE,
+    },
+}
+"""Mode → what it does not control of what the kind can."""
 
 
 def sensor_status(vehicle: ArduPilotVehicle) -> tuple[int, int, int]:
     """Present, enabled and healthy, as integers."""
-    nav = vehicle.navigation
-    present, enabled, health = int(_PRESENT), int(_ALWAYS | _PREARM), int(_ALWAYS | _QUIETLY_HEALTHY)
+    suite, nav = _SUITES[vehicle.KIND], vehicle.navigation
+    present = int(suite.working | suite.control | suite.unhealthy | _PREARM | _AHRS | _LOGGING)
+    enabled = int(suite.working | suite.unhealthy | _PREARM)
+    health = int(suite.working | suite.quietly_healthy | _LOGGING)
+    controls = suite.always | suite.control & ~_LESS_CONTROL[vehicle.KIND].get(vehicle.mode.number, 0)
+    enabled, health = enabled | controls, health | controls
     if nav.is_gps_detected:
-        present |= Sensor.GPS
-        enabled |= Sensor.GPS
-        if not vehicle.faults.gps_lost:
-            health |= Sensor.GPS
+        present, enabled = present | Sensor.GPS, enabled | Sensor.GPS
+        health |= 0 if vehicle.faults.gps_lost else Sensor.GPS
     if nav.is_healthy:
         enabled |= _AHRS
-        health |= _AHRS
-    if vehicle.motors.is_armed:
+        health |= _AHRS if vehicle.timeline.estimator_leads_early or nav.has_position else 0
+    if vehicle.motors.is_armed or vehicle.now - vehicle.motors.disarmed_at < _KEEPS_LOGGING_S:
         enabled |= _LOGGING
-    if not vehicle.mode.has_manual_throttle and (vehicle.motors.is_armed or vehicle.mode.name == "GUIDED"):
-        enabled |= _CONTROL
-        health |= _CONTROL
-    if vehicle.arming.passes:
-        health |= _PREARM
+    if vehicle.rangefinder_reach_m > 0.0:
+        for_it = Sensor.LASER_POSITION
+        present, enabled, health = present | for_it, enabled | for_it, health | for_it
+    present, enabled, health = _with_fence(vehicle, present, enabled, health)
+    return present, enabled, _without_failures(vehicle, health)
+
+
+def _with_fence(vehicle: ArduPilotVehicle, present: int, enabled: int, health: int) -> tuple[int, int, int]:
+    is_present, is_enforced, is_kept = vehicle.fence.health
+    present |= _FENCE if is_present else 0
+    enabled |= _FENCE if is_enforced else 0
+    return present, enabled, health | (_FENCE if is_kept else 0)
+
+
+def _without_failures(vehicle: ArduPilotVehicle, health: int) -> int:
+    health |= _PREARM if vehicle.arming.passes else 0
     if not vehicle.failsafes.hears_radio:
         health &= ~Sensor.RC_RECEIVER
     if vehicle.failsafes.battery_is_low:
         health &= ~Sensor.BATTERY
     if vehicle.faults.motor_failed:
         health &= ~Sensor.PROPULSION
-    is_present, is_enforced, is_kept = vehicle.fence.health
-    if not is_present:
-        present &= ~_FENCE
-    if is_enforced:
-        enabled |= _FENCE
-    if not is_kept:
-        health &= ~_FENCE
-    if vehicle.rangefinder_reach_m > 0.0:
-        for_it = Sensor.LASER_POSITION
-        present, enabled, health = present | for_it, enabled | for_it, health | for_it
-    return int(present), int(enabled), int(health)
+    return health

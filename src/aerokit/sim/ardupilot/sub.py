@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from itertools import cycle
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavModeFlag, MavResult, MavType, SubMode
 from aerokit.sim.ardupilot.level_vehicle import LevelVehicle
 from aerokit.sim.ardupilot.motors import Motors
 from aerokit.sim.ardupilot.sub_arming import SubArming
 from aerokit.sim.ardupilot.sub_failsafes import SubFailsafes
 from aerokit.sim.ardupilot.sub_modes import SUB_MODES, SubAuto, SubGuided
+from aerokit.sim.ardupilot.telemetry_extra import DISPLAY_VALUES
 from aerokit.sim.underwater_motion import UnderwaterMotion
 
 if TYPE_CHECKING:
-    from aerokit.mavlink.message import Message
     from aerokit.sim.ardupilot.mode import VehicleMode
     from aerokit.sim.ardupilot.navigation import Ned
     from aerokit.sim.ardupilot.parameter_tables import Kind
@@ -45,12 +45,6 @@ class _Motors(Motors):
         self.throttle = max(0.0, min(1.0, climb)) if self.is_armed else 0.0
 
 
-def _servo_output(sub: SimulatedSub) -> m.ServoOutputRaw:
-    """Six thrusters; the last two are the vertical ones."""
-    up = 1500 - round(400 * (sub.motors.throttle - 0.5)) if sub.motors.is_armed else 1500
-    return m.ServoOutputRaw(sub.time_boot_us, 0, 1500, 1500, 1500, 1500, up, up, 0, 1500)
-
-
 class SimulatedSub(LevelVehicle):
     """Speaks and behaves as ArduSub does where a client can see it; moves as `UnderwaterMotion` does.
 
@@ -67,10 +61,6 @@ class SimulatedSub(LevelVehicle):
     MAV_TYPE: ClassVar[int] = MavType.SUBMARINE
     CAPABILITIES: ClassVar[int] = 0xF9E7
     MODES: ClassVar[tuple[Callable[[Any], VehicleMode], ...]] = SUB_MODES
-    BUILDERS: ClassVar[Mapping[int, Callable[[Any], Message | None]]] = {
-        **LevelVehicle.BUILDERS,
-        m.ServoOutputRaw.ID: _servo_output,
-    }
 
     motion: UnderwaterMotion
     hull_pressure_pa: float = 101_325.0
@@ -95,6 +85,8 @@ class SimulatedSub(LevelVehicle):
 
     def reset_controllers(self) -> None:
         """All sticks rest in the middle."""
+        self.display_names = cycle(DISPLAY_VALUES)
+        """Which of `DISPLAY_VALUES` is told next."""
         for index in range(_STICKS):
             self.rc[index] = 1500
 

@@ -126,6 +126,34 @@ def _raw_imu(vehicle: ArduPilotVehicle) -> m.RawImu:
     )
 
 
+def _scaled(numbers: Three, factor: float) -> tuple[float, float, float]:
+    x, y, z = numbers
+    return (x * factor, y * factor, z * factor)
+
+
+def _scaled_imu(vehicle: ArduPilotVehicle) -> m.ScaledImu:
+    return m.ScaledImu(
+        vehicle.time_boot_ms, *_acceleration(vehicle), *_rates(vehicle), *_field(vehicle), 3500
+    )
+
+
+def _highres_imu(vehicle: ArduPilotVehicle) -> m.HighresImu:
+    pressure, motion = _pressure_hpa(vehicle), vehicle.motion
+    return m.HighresImu(
+        vehicle.time_boot_us,
+        *_scaled(_acceleration(vehicle), GRAVITY_M_S2 / 1000.0),
+        motion.roll_rate,
+        motion.pitch_rate,
+        motion.yaw_rate,
+        *_scaled(_field(vehicle), 1000.0),
+        pressure,
+        0.0,
+        vehicle.navigation.frame.origin.altitude_m - motion.down,
+        28.0,
+        8191,
+    )
+
+
 def _scaled_imu2(vehicle: ArduPilotVehicle) -> m.ScaledImu2:
     return m.ScaledImu2(
         vehicle.time_boot_ms, *_acceleration(vehicle), *_rates(vehicle), *_field(vehicle), 3500
@@ -167,7 +195,9 @@ ATTITUDE_BUILDERS: dict[int, Callable[[ArduPilotVehicle], Message | None]] = {
     m.Simstate.ID: _simstate,
     m.VfrHud.ID: _vfr_hud,
     m.RawImu.ID: _raw_imu,
+    m.ScaledImu.ID: _scaled_imu,
     m.ScaledImu2.ID: _scaled_imu2,
+    m.HighresImu.ID: _highres_imu,
     m.ScaledImu3.ID: _scaled_imu3,
     m.ScaledPressure.ID: _scaled_pressure,
     m.ScaledPressure2.ID: _scaled_pressure2,

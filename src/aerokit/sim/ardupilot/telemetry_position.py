@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import EkfStatusFlags, GpsFixType
+from aerokit.mavlink.enums import EkfStatusFlags, GpsFixType, PlaneMode
 from aerokit.mavlink.enums import PositionTargetTypemask as Mask
 from aerokit.sim.ardupilot.guided import Guided
 
@@ -162,7 +162,17 @@ def _target_local(vehicle: ArduPilotVehicle) -> m.PositionTargetLocalNed | None:
     return m.PositionTargetLocalNed(vehicle.time_boot_ms, 1, _POSITION_ONLY, *local, *(0.0,) * 8)
 
 
-def _nav_controller(vehicle: ArduPilotVehicle) -> m.NavControllerOutput:
+def _is_led(vehicle: ArduPilotVehicle) -> bool:
+    """Whether there is somewhere to go; a plane has that in every mode but MANUAL, a rover in few."""
+    if vehicle.KIND == "plane":
+        return vehicle.mode.number != PlaneMode.MANUAL
+    mode = vehicle.mode
+    return vehicle.KIND != "rover" or (mode.needs_position and not mode.has_manual_throttle)
+
+
+def _nav_controller(vehicle: ArduPilotVehicle) -> m.NavControllerOutput | None:
+    if not _is_led(vehicle):
+        return None
     motion, target = vehicle.motion, vehicle.mode.destination
     roll, pitch, yaw = (math.degrees(angle) for angle in (motion.roll, motion.pitch, motion.yaw))
     bearing, distance, altitude_error = _to_target(vehicle, target)

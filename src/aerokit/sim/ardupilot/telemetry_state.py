@@ -123,11 +123,6 @@ def _by_name(values: Iterable[int]) -> dict[str, int]:
     return {f"chan{number}_raw": value for number, value in enumerate(values, start=1)}
 
 
-def _servo_output(vehicle: ArduPilotVehicle) -> m.ServoOutputRaw:
-    pwm = vehicle.motors.pwm
-    return m.ServoOutputRaw(vehicle.time_boot_us & 0xFFFFFFFF, 0, pwm, pwm, pwm, pwm, 0, 0, 0, 0)
-
-
 def _vibration(vehicle: ArduPilotVehicle) -> m.Vibration:
     size = 0.003 + 0.3 * vehicle.motors.throttle
     x, y, z = (abs(vehicle.rng.gauss(0.0, size)) for _ in range(3))
@@ -172,7 +167,6 @@ STATE_BUILDERS: dict[int, Callable[[ArduPilotVehicle], Message | None]] = {
     m.MissionCurrent.ID: mission_current,
     m.RcChannels.ID: _rc_channels,
     m.RcChannelsRaw.ID: _rc_channels_raw,
-    m.ServoOutputRaw.ID: _servo_output,
     m.Vibration.ID: _vibration,
     m.EscTelemetry1To4.ID: _esc_telemetry,
     m.AutopilotVersion.ID: _autopilot_version,

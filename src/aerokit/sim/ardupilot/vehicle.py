@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavFrame, MavModeFlag, MavResult, MavSeverity
 from aerokit.sim.ardupilot.arming import Arming
-from aerokit.sim.ardupilot.boot import BootTimeline
+from aerokit.sim.ardupilot.boot import BOOT_TEXTS, BOOT_TIMELINES
 from aerokit.sim.ardupilot.buzzer import hear_tunes
 from aerokit.sim.ardupilot.calibration import Calibrations
 from aerokit.sim.ardupilot.camera import Camera
@@ -25,7 +26,6 @@ from aerokit.sim.ardupilot.radio import Radio
 from aerokit.sim.ardupilot.requests import Requests
 from aerokit.sim.ardupilot.signing import ArduPilotSigning
 from aerokit.sim.ardupilot.storage import DEFAULT_LOGS, Storage
-from aerokit.sim.ardupilot.stream_groups import COPTER_GROUPS
 from aerokit.sim.ardupilot.telemetry import BUILDERS
 from aerokit.sim.ardupilot.telemetry_position import global_origin, home_position
 from aerokit.sim.ardupilot.telemetry_state import heartbeat
@@ -85,10 +85,6 @@ class ArduPilotVehicle(SimulatedAutopilot):
     GIT_HASH: ClassVar[bytes] = b"5ae20c17"
     MODES: ClassVar[tuple[Callable[[Any], VehicleMode], ...]]
     """Classes of the modes, in the order in which they are listed."""
-    BUILDERS: ClassVar[Mapping[int, Callable[[Any], Message | None]]] = BUILDERS
-    """Message id → what to send now."""
-    STREAM_GROUPS: ClassVar[Mapping[int, tuple[int, ...]]] = COPTER_GROUPS
-    """MAV_DATA_STREAM → message ids."""
 
     storage: Storage
     """Files, logs, and the servers of them and of the parameters."""
@@ -134,7 +130,7 @@ class ArduPilotVehicle(SimulatedAutopilot):
             unix_time_at_boot=unix_time_at_boot,
             signing_key=signing_key,
         )
-        self.timeline = BootTimeline.scaled(boot_time_s)
+        self.timeline = BOOT_TIMELINES[self.KIND].scaled(boot_time_s)
         self.uid = bytes([0xA0, system_id]) + bytes(16)
         self.battery = Battery(battery_capacity_mah, percent=battery_percent)
         self.motion = self.make_motion(wind)
@@ -280,16 +276,15 @@ class ArduPilotVehicle(SimulatedAutopilot):
         """Say what a booting vehicle says, when it says it."""
         line, later = self.timeline, self.call_later
         self.storage.restart()
+        self.requests.restart()
         if self._boot_text:
             for channel in self.channels:
                 channel.write(
                     f"\r\n\r\nInit {self.FIRMWARE} V{self.version} ({self.GIT_HASH.decode()})\r\n".encode()
                 )
                 channel.write(b"\r\nFree RAM: 524288\r\nBooting 0/0\r\n")
-        later(line.first_text, lambda: self.info("Calibrating barometer"))
-        later(line.heartbeat, self.send_banner)
-        later(line.barometers, lambda: self.info("Barometer 1 calibration complete"))
-        later(line.barometers, lambda: self.info("Barometer 2 calibration complete"))
+        for seconds, severity, text in BOOT_TEXTS[self.KIND]:
+            later(seconds * line.factor, partial(self.send_text, severity, text))
         later(line.ready, self._become_ready)
         self.navigation.start()
 
@@ -305,10 +300,11 @@ class ArduPilotVehicle(SimulatedAutopilot):
         self.has_left_boot = True
 
     def start_channel(self, channel: Channel) -> None:
-        """Heartbeats and time synchronisation; everything else waits to be asked."""
-        first = self.booted_at + self.timeline.heartbeat
+        """Heartbeats, time synchronisation, and what the port's parameters (MAV1_EXTRA1 …) say."""
+        first, ready = self.booted_at + self.timeline.heartbeat, self.booted_at + self.timeline.ready
         channel.streams.set_interval(m.Heartbeat.ID, 1.0, max(self.now, first))
         channel.streams.set_interval(m.Timesync.ID, _TIMESYNC_S, max(self.now, self.booted_at + _TIMESYNC_S))
+        self.requests.start_channel(channel, max(self.now, ready))
 
     def send_banner(self) -> None:
         """Firmware, hash and frame as texts."""
@@ -418,7 +414,7 @@ class ArduPilotVehicle(SimulatedAutopilot):
             return m.AvailableModesMonitor(0)
         if not self.is_initialised and message_id not in _BEFORE_READY:
             return None
-        builder = self.BUILDERS.get(message_id)
+        builder = BUILDERS[self.KIND].get(message_id)
         return None if builder is None else builder(self)
 
     def tick(self, dt: float) -> None:

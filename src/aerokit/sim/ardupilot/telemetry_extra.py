@@ -1,0 +1,221 @@
+"""Messages of simulated ArduPilots that are in no stream, and those that only some kinds send."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import GpsFixType, MavAutopilot
+from aerokit.sim.motion import GRAVITY_M_S2
+from aerokit.sim.rotations import quaternion_from_euler
+
+if TYPE_CHECKING:
+    from aerokit.mavlink.message import Message
+    from aerokit.sim.ardupilot.plane import SimulatedPlane
+    from aerokit.sim.ardupilot.rover import SimulatedRover
+    from aerokit.sim.ardupilot.sub import SimulatedSub
+    from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
+
+__all__ = [
+    "DISPLAY_VALUES",
+    "EXTRA_BUILDERS",
+    "airspeed",
+    "angles_of_flow",
+    "display_value",
+    "no_landed_state",
+    "outside_pressure",
+    "rover_hud",
+    "scaled_channels",
+    "terrain_request",
+]
+
+Builders = Mapping[int, Callable[[Any], "Message | None"]]
+
+_NOTHING_REACHED = 0xFFFF
+_NO_TEMPERATURE = 32767
+_AIR_DENSITY = 1.225
+_GRID_M, _GRID_CORNER = 100, (0.0115, 0.0104)
+_ALL_FIELDS = 8191
+
+
+def _hwstatus(_: ArduPilotVehicle) -> m.Hwstatus:
+    return m.Hwstatus(5000, 0)
+
+
+def _reached(_: ArduPilotVehicle) -> m.MissionItemReached:
+    return m.MissionItemReached(_NOTHING_REACHED)
+
+
+def _relays(vehicle: ArduPilotVehicle) -> m.RelayStatus:
+    return m.RelayStatus(vehicle.time_boot_ms, 0, 3 if vehicle.KIND == "rover" else 1)
+
+
+def _flight(vehicle: ArduPilotVehicle) -> m.FlightInformation:
+    return m.FlightInformation(vehicle.time_boot_ms, 0, 0, 0)
+
+
+def _quaternion(vehicle: ArduPilotVehicle) -> tuple[float, float, float, float]:
+    motion = vehicle.motion
+    return quaternion_from_euler(motion.roll, motion.pitch, motion.yaw)
+
+
+def _for_gimbal(vehicle: ArduPilotVehicle) -> m.AutopilotStateForGimbalDevice:
+    motion, flags = vehicle.motion, vehicle.navigation.flags
+    return m.AutopilotStateForGimbalDevice(
+        vehicle.system_id,
+        0,
+        vehicle.time_boot_us,
+        _quaternion(vehicle),
+        0,
+        motion.velocity_north,
+        motion.velocity_east,
+        motion.velocity_down,
+        0,
+        0.0,
+        0 if flags is None else flags,
+        0,
+        motion.yaw_rate,
+    )
+
+
+def _sim_state(vehicle: ArduPilotVehicle) -> m.SimState:
+    motion = vehicle.motion
+    place = vehicle.navigation.frame.to_global(motion.north, motion.east, motion.down)
+    return m.SimState(
+        *_quaternion(vehicle),
+        motion.roll,
+        motion.pitch,
+        motion.yaw,
+        0.0,
+        0.0,
+        -GRAVITY_M_S2,
+        motion.roll_rate,
+        motion.pitch_rate,
+        motion.yaw_rate,
+        float(place.latitude_e7),
+        float(place.longitude_e7),
+        place.altitude_m,
+        0.0,
+        0.0,
+        motion.velocity_north,
+        motion.velocity_east,
+        motion.velocity_down,
+        place.latitude_e7,
+        place.longitude_e7,
+    )
+
+
+def _high_latency(vehicle: ArduPilotVehicle) -> m.HighLatency2 | None:
+    motion, place = vehicle.motion, vehicle.navigation.position
+    flies = vehicle.KIND in ("copter", "plane")
+    altitude = 0 if place is None else int(place.altitude_m)
+    return m.HighLatency2(
+        timestamp=vehicle.time_boot_ms,
+        type=vehicle.MAV_TYPE,
+        autopilot=MavAutopilot.ARDUPILOTMEGA,
+        custom_mode=vehicle.mode.number,
+        latitude=0 if place is None else place.latitude_e7,
+        longitude=0 if place is None else place.longitude_e7,
+        altitude=altitude,
+        target_altitude=altitude if flies else 0,
+        heading=int(math.degrees(motion.yaw) % 360.0 / 2.0),
+        target_heading=0,
+        target_distance=0,
+        throttle=round(abs(vehicle.motors.throttle) * 100),
+        airspeed=min(255, round(motion.airspeed_m_s * 5.0)) if flies else 0,
+        airspeed_sp=0,
+        groundspeed=min(255, round(motion.ground_speed_m_s * 5.0)),
+        windspeed=0,
+        wind_heading=0,
+        eph=0,
+        epv=0,
+        temperature_air=-128,
+        climb_rate=max(-128, min(127, round(-motion.velocity_down * 10.0))),
+        battery=int(vehicle.battery.percent),
+        wp_num=vehicle.mission.nav_index,
+        failure_flags=0 if vehicle.navigation.fix_type >= GpsFixType.TYPE_3D_FIX else 1,
+        custom0=vehicle.base_mode,
+        custom1=0,
+        custom2=0,
+    )
+
+
+EXTRA_BUILDERS: Builders = {
+    m.Hwstatus.ID: _hwstatus,
+    m.MissionItemReached.ID: _reached,
+    m.RelayStatus.ID: _relays,
+    m.FlightInformation.ID: _flight,
+    m.AutopilotStateForGimbalDevice.ID: _for_gimbal,
+    m.SimState.ID: _sim_state,
+    m.HighLatency2.ID: _high_latency,
+}
+"""Message id → what every kind sends when it is asked for it."""
+
+
+def airspeed(plane: SimulatedPlane) -> m.Airspeed:
+    """Of the pitot tube."""
+    speed = plane.motion.airspeed_m_s
+    return m.Airspeed(0, speed, _NO_TEMPERATURE, 0.5 * _AIR_DENSITY * speed * speed / 100.0, 2)
+
+
+def angles_of_flow(plane: SimulatedPlane) -> m.AoaSsa:
+    """Angle of attack and side slip in degrees; zeros on the ground."""
+    motion = plane.motion
+    slope = math.atan2(-motion.velocity_down, max(motion.airspeed_m_s, 1.0))
+    attack = 0.0 if plane.is_landed else math.degrees(motion.pitch - slope)
+    return m.AoaSsa(plane.time_boot_us, attack, 0.0)
+
+
+def terrain_request(vehicle: ArduPilotVehicle) -> m.TerrainRequest | None:
+    """It has no terrain at all: the whole block around it is missing."""
+    place = vehicle.navigation.position
+    if place is None:
+        return None
+    south, west = (round(1e7 * degrees) for degrees in _GRID_CORNER)
+    return m.TerrainRequest(place.latitude_e7 - south, place.longitude_e7 - west, _GRID_M, (1 << 56) - 1)
+
+
+DISPLAY_VALUES: dict[str, float] = {
+    "CamTilt": 0.5,
+    "CamPan": 0.5,
+    "TetherTrn": 0.0,
+    "Lights1": 0.5,
+    "Lights2": 0.5,
+    "PilotGain": 0.5,
+    "InputHold": 0.0,
+    "RollPitch": 0.0,
+    "RFTarget": -0.01,
+}
+"""What ArduSub tells a pilot's display in each round of EXTENDED_STATUS."""
+
+
+def display_value(sub: SimulatedSub) -> m.NamedValueFloat:
+    """The next of `DISPLAY_VALUES`."""
+    name = next(sub.display_names)
+    return m.NamedValueFloat(sub.time_boot_ms, name, DISPLAY_VALUES[name])
+
+
+def outside_pressure(sub: SimulatedSub) -> m.ScaledPressure3:
+    """The third barometer, a thermometer only."""
+    return m.ScaledPressure3(sub.time_boot_ms, 0.0, 0.0, 3620, 0)
+
+
+def scaled_channels(rover: ArduPilotVehicle) -> m.RcChannelsScaled:
+    """All zeros, whatever the sticks do."""
+    return m.RcChannelsScaled(rover.time_boot_ms, 0, 0, 0, 0, 0, 0, 0, 0, 0, 255)
+
+
+def rover_hud(rover: SimulatedRover) -> m.VfrHud:
+    """Without airspeed and climb; the throttle is positive also backwards."""
+    motion, place = rover.motion, rover.navigation.position
+    heading = int(math.degrees(motion.yaw) % 360.0)
+    throttle = round(abs(rover.motors.throttle) * 100)
+    altitude = 0.0 if place is None else place.altitude_m
+    return m.VfrHud(0.0, motion.ground_speed_m_s, heading, throttle, altitude, 0.0)
+
+
+def no_landed_state(_: ArduPilotVehicle) -> m.ExtendedSysState:
+    """Neither on the ground nor in the air, as far as it tells."""
+    return m.ExtendedSysState(0, 0)
