@@ -12,12 +12,10 @@ from aerokit.mavlink.enums import CopterMode, GpsFixType, MavCmd, MavDataStream,
 from aerokit.mavlink.message import Message
 from aerokit.sim import BootTimeline, SimulatedCopter
 
-REAL_TIME_S = BootTimeline.position_good
+REAL_TIME_S = BootTimeline().position_good
 REAL_EKF_FLAGS = [1024, 0, 167, 831]
 REAL_TEXTS = [
     "Calibrating barometer",
-    "ArduCopter V4.7.0-dev (",
-    "Frame: QUAD/PLUS",
     "Barometer 1 calibration complete",
     "Barometer 2 calibration complete",
     "ArduPilot Ready",

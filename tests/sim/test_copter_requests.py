@@ -14,9 +14,9 @@ STREAMED_BY_A_REAL_COPTER = {
     "NAV_CONTROLLER_OUTPUT",
     "POSITION_TARGET_GLOBAL_INT", "POWER_STATUS", "RAW_IMU", "RC_CHANNELS", "SCALED_IMU2", "SCALED_IMU3",
     "SCALED_PRESSURE", "SCALED_PRESSURE2", "SERVO_OUTPUT_RAW", "SIMSTATE", "SYSTEM_TIME", "SYS_STATUS",
-    "TERRAIN_REPORT", "VFR_HUD", "VIBRATION", "WIND",
+    "TERRAIN_REPORT", "TERRAIN_REQUEST", "VFR_HUD", "VIBRATION", "WIND",
 }  # fmt: skip
-"""With REQUEST_DATA_STREAM ALL, in GUIDED with a target; but for TERRAIN_REQUEST, which is not simulated."""
+"""With REQUEST_DATA_STREAM ALL, in GUIDED with a target."""
 
 
 def interval(client: Client, message_id: int, microseconds: float) -> int | None:

@@ -22,7 +22,7 @@ from aerokit.errors import (
 )
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.runtime.events import VehicleRebooted
-from aerokit.sim import ExtraComponent, SimulatedCopter
+from aerokit.sim import BootTimeline, ExtraComponent, SimulatedCopter
 
 pytestmark = pytest.mark.anyio
 
@@ -267,7 +267,7 @@ async def test_reboot_is_noticed_without_any_stream() -> None:
 async def test_state_of_before_the_reboot_is_unknown_after_it() -> None:
     async with open_flight(SimulatedCopter(boot_time_s=0.0)) as flight:
         await flight.vehicle.wait_ready()
-        flight.copter.timeline = flight.copter.timeline.scaled(60.0)
+        flight.copter.timeline = BootTimeline().scaled(60.0)
         await anyio.sleep(5.0)
         vehicle = flight.vehicle
         assert (vehicle.position.is_known, vehicle.home.is_known, vehicle.armed.is_known) == (

@@ -30,19 +30,30 @@ _BASE = MavModeFlag.CUSTOM_MODE_ENABLED | MavModeFlag.STABILIZE_ENABLED | MavMod
 _HOLDING_THROTTLE, _PER_CLIMB = 0.45, 0.44
 _AMPERES_AT_FULL = 26.3
 _LOOK_AHEAD_M = 1.0
-_STICKS = 6
+_STICKS, _THROTTLE = 6, 2
 
 
 class _Motors(Motors):
-    """The thrusters that hold the depth; without a thrust to the sides."""
+    """The thrusters that hold the depth, or follow the stick; 0.5 is no thrust at all."""
+
+    def __init__(self, sub: SimulatedSub) -> None:
+        super().__init__()
+        self._sub = sub
 
     @property
     def current_a(self) -> float:
-        return float(self.throttle**2.7) * _AMPERES_AT_FULL
+        thrust = abs(2.0 * self.throttle - 1.0) if self._follows_stick else self.throttle
+        return float(thrust**2.7) * _AMPERES_AT_FULL
+
+    @property
+    def _follows_stick(self) -> bool:
+        return self._sub.mode.has_manual_throttle
 
     def update(self, now: float, dt: float, motion: Motion, *, landed: bool) -> None:
-        climb = _HOLDING_THROTTLE - _PER_CLIMB * motion.velocity_down
-        self.throttle = max(0.0, min(1.0, climb)) if self.is_armed else 0.0
+        wanted = _HOLDING_THROTTLE - _PER_CLIMB * motion.velocity_down
+        if self._follows_stick:
+            wanted = (self._sub.rc[_THROTTLE] - 1000) / 1000.0
+        self.throttle = max(0.0, min(1.0, wanted)) if self.is_armed else 0.0
 
 
 class SimulatedSub(LevelVehicle):
@@ -73,7 +84,7 @@ class SimulatedSub(LevelVehicle):
 
     def make_motors(self) -> Motors:
         """Thrusters."""
-        return _Motors()
+        return _Motors(self)
 
     def make_arming(self) -> SubArming:
         """See `SubArming`."""

@@ -1,0 +1,336 @@
+"""What each simulated ArduPilot says by itself and when it is asked, beside recordings of the real ones (4.7-dev)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import pytest
+from simulated_client import Client, set_mode
+
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import CopterMode, MavCmd, MavDataStream, MavResult, PlaneMode, RoverMode, SubMode
+from aerokit.sim import SimulatedCopter, SimulatedPlane, SimulatedRover, SimulatedSub
+from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
+
+CLASSES: dict[str, type[ArduPilotVehicle]] = {
+    "copter": SimulatedCopter,
+    "plane": SimulatedPlane,
+    "rover": SimulatedRover,
+    "sub": SimulatedSub,
+}
+every_kind = pytest.mark.parametrize("kind", CLASSES)
+
+IN_ALL_STREAMS = {
+    "SYS_STATUS", "SYSTEM_TIME", "GPS_RAW_INT", "RAW_IMU", "SCALED_PRESSURE", "ATTITUDE", "LOCAL_POSITION_NED",
+    "GLOBAL_POSITION_INT", "SERVO_OUTPUT_RAW", "MISSION_CURRENT", "RC_CHANNELS", "VFR_HUD", "SCALED_IMU2",
+    "POWER_STATUS", "SCALED_IMU3", "SCALED_PRESSURE2", "BATTERY_STATUS", "MEMINFO", "AHRS", "SIMSTATE", "AHRS2",
+    "EKF_STATUS_REPORT", "VIBRATION",
+}  # fmt: skip
+FLYING = {"WIND", "TERRAIN_REPORT", "TERRAIN_REQUEST", "ESC_TELEMETRY_1_TO_4"}
+OWN_STREAMS = {
+    "copter": FLYING | {"NAV_CONTROLLER_OUTPUT"},
+    "plane": FLYING | {"AIRSPEED", "AOA_SSA"},
+    "rover": {"RC_CHANNELS_SCALED"},
+    "sub": {
+        "NAV_CONTROLLER_OUTPUT",
+        "TERRAIN_REPORT",
+        "SCALED_PRESSURE3",
+        "NAMED_VALUE_FLOAT",
+        "GIMBAL_DEVICE_ATTITUDE_STATUS",
+    },
+}  # fmt: skip
+"""Disarmed, in the mode in which it wakes up. The real sub has a range finder in addition."""
+
+
+def booted(kind: str, **options: object) -> tuple[ArduPilotVehicle, Client]:
+    vehicle = CLASSES[kind](boot_time_s=0.0, **options)  # type: ignore[arg-type]
+    client = Client(vehicle)
+    client.run(3.0)
+    client.forget()
+    return vehicle, client
+
+
+def all_streams(client: Client, rate: int) -> None:
+    client.send(m.RequestDataStream(1, 1, MavDataStream.ALL, rate, 1))
+
+
+# --------------------------------------------------------------------------------------- streams
+
+
+@every_kind
+def test_all_streams_are_the_messages_of_the_recorded_one(kind: str) -> None:
+    _, client = booted(kind)
+    all_streams(client, 4)
+    client.run(3.0)
+    said = {message.NAME for _, message in client.heard}
+    assert said - {"HEARTBEAT", "PARAM_VALUE"} == IN_ALL_STREAMS | OWN_STREAMS[kind]
+
+
+@pytest.mark.parametrize(
+    ("kind", "rates"),
+    [
+        ("copter", {}),
+        ("plane", {m.Attitude: 1, m.SysStatus: 1, m.VfrHud: 1, m.Airspeed: 1}),
+        ("rover", {m.Attitude: 1, m.SysStatus: 1, m.VfrHud: 1, m.RcChannelsScaled: 1}),
+        ("sub", {m.Attitude: 10, m.SysStatus: 2, m.VfrHud: 10, m.SystemTime: 3, m.NamedValueFloat: 18}),
+    ],
+)
+def test_it_streams_by_itself_what_its_parameters_say(kind: str, rates: dict[type, int]) -> None:
+    _, client = booted(kind)
+    client.run(4.0)
+    counts = {each: len(client.all(each)) / 4.0 for each in rates}
+    assert counts == pytest.approx(rates, abs=0.5)
+    if not rates:
+        assert {message.NAME for _, message in client.heard} == {"HEARTBEAT"}
+
+
+def test_a_plane_keeps_the_rates_that_it_was_asked_for_and_says_so() -> None:
+    plane, client = booted("plane")
+    client.send(m.RequestDataStream(1, 1, MavDataStream.EXTRA1, 5, 1))
+    client.run(0.1)
+    told = client.last(m.ParamValue)
+    assert (told.param_id, told.param_value, told.param_index) == ("MAV1_EXTRA1", 5.0, 0xFFFF)
+    assert client.command(MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, 1) == MavResult.ACCEPTED
+    client.run(3.0)
+    client.forget()
+    client.run(2.0)
+    assert len(client.all(m.Attitude)) == pytest.approx(10, abs=1)
+    assert plane.parameters["MAV1_EXTRA1"] == 5.0
+
+
+@pytest.mark.parametrize("kind", ["copter", "rover", "sub"])
+def test_the_others_forget_them_in_a_reboot(kind: str) -> None:
+    vehicle, client = booted(kind)
+    before = vehicle.parameters["MAV1_EXTRA1"]
+    client.send(m.RequestDataStream(1, 1, MavDataStream.EXTRA1, 25, 1))
+    client.run(0.1)
+    assert vehicle.parameters["MAV1_EXTRA1"] == 25.0
+    assert client.all(m.ParamValue) == []
+    assert client.command(MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, 1) == MavResult.ACCEPTED
+    client.run(3.0)
+    client.forget()
+    client.run(2.0)
+    assert vehicle.parameters["MAV1_EXTRA1"] == before
+    assert len(client.all(m.Attitude)) == pytest.approx(2 * before, abs=1)
+
+
+# --------------------------------------------------------------------------------------- by its id
+
+
+@every_kind
+def test_it_knows_more_messages_than_it_has(kind: str) -> None:
+    _, client = booted(kind)
+    own: set[int] = {"copter": set(), "plane": {195, 11020}, "rover": {34, 11038}, "sub": set()}[kind]
+    for message_id in (*own, 124, 128, 180, 225, 9005, 10008):
+        assert client.command(MavCmd.REQUEST_MESSAGE, message_id) == MavResult.ACCEPTED
+        assert client.command(MavCmd.SET_MESSAGE_INTERVAL, message_id, 1e6) == MavResult.ACCEPTED
+    for message_id in {3, 111, 230, 251, 300, 331, 410, 436, 34, 195, 11020, 11038} - own:
+        assert client.command(MavCmd.REQUEST_MESSAGE, message_id) == MavResult.FAILED
+        assert client.command(MavCmd.SET_MESSAGE_INTERVAL, message_id, 1e6) == MavResult.DENIED
+
+
+@every_kind
+def test_what_is_in_no_stream_comes_when_it_is_asked_for(kind: str) -> None:
+    vehicle, client = booted(kind)
+    for wanted in (
+        m.Hwstatus, m.ScaledImu, m.HighresImu, m.SimState, m.HighLatency2, m.FlightInformation, m.RelayStatus,
+        m.AutopilotStateForGimbalDevice, m.MissionItemReached, m.AttitudeQuaternion, m.ExtendedSysState,
+    ):  # fmt: skip
+        assert client.command(MavCmd.REQUEST_MESSAGE, wanted.ID) == MavResult.ACCEPTED
+        client.run(0.05)
+        assert client.all(wanted), wanted
+    assert client.last(m.MissionItemReached).seq == 0xFFFF
+    assert client.last(m.HighLatency2).custom_mode == vehicle.mode.number
+    assert client.last(m.ExtendedSysState).landed_state == (1 if kind in ("copter", "plane") else 0)
+
+
+# ---------------------------------------------------------------------------------------- sensors
+
+
+@dataclass(frozen=True)
+class Sensors:
+    present: int
+    enabled: int
+    health: int
+
+
+WAKING_UP = {
+    "copter": Sensors(0x5371FC2F, 0x52619C2F, 0x57719C2F),
+    "plane": Sensors(0x1361FC3F, 0x1261803F, 0x1331803F),
+    "rover": Sensors(0x1331DC2F, 0x1221802F, 0x1331812F),
+    "sub": Sensors(0x1331FD2F, 0x12219D2F, 0x13319D2F),
+}
+IN_MODES: dict[str, dict[int, tuple[int, int]]] = {
+    "copter": {
+        CopterMode.ALT_HOLD: (0x5261BC2F, 0x5771BC2F),
+        CopterMode.GUIDED: (0x5261FC2F, 0x5771FC2F),
+        CopterMode.LOITER: (0x5261FC2F, 0x5771FC2F),
+    },
+    "plane": {
+        PlaneMode.STABILIZE: (0x12618C3F, 0x13318C3F),
+        PlaneMode.FLY_BY_WIRE_A: (0x12618C3F, 0x13318C3F),
+        PlaneMode.CIRCLE: (0x1261FC3F, 0x1331FC3F),
+        PlaneMode.LOITER: (0x1261FC3F, 0x1331FC3F),
+    },
+    "rover": {
+        RoverMode.ACRO: (0x12218C2F, 0x13318D2F),
+        RoverMode.HOLD: (0x1221802F, 0x1331812F),
+        RoverMode.LOITER: (0x1221DC2F, 0x1331DD2F),
+    },
+    "sub": {
+        SubMode.STABILIZE: (0x12219D2F, 0x13319D2F),
+        SubMode.ALT_HOLD: (0x1221FD2F, 0x1331FD2F),
+        SubMode.POSHOLD: (0x1221FD2F, 0x1331FD2F),
+    },
+}
+"""Mode → enabled and healthy."""
+
+
+def sensors(client: Client) -> Sensors:
+    client.command(MavCmd.REQUEST_MESSAGE, m.SysStatus.ID)
+    client.run(0.05)
+    told = client.last(m.SysStatus)
+    return Sensors(
+        told.onboard_control_sensors_present,
+        told.onboard_control_sensors_enabled,
+        told.onboard_control_sensors_health,
+    )
+
+
+@every_kind
+def test_sensors_when_it_has_booted_and_in_its_modes(kind: str) -> None:
+    _, client = booted(kind)
+    assert sensors(client) == WAKING_UP[kind]
+    for mode, (enabled, health) in IN_MODES[kind].items():
+        assert set_mode(client, mode) == MavResult.ACCEPTED
+        assert sensors(client) == Sensors(WAKING_UP[kind].present, enabled, health), mode
+
+
+def test_the_log_runs_until_fifteen_seconds_after_disarming() -> None:
+    logging = 1 << 24
+    _, client = booted("rover")
+    assert not sensors(client).enabled & logging
+    assert client.command(MavCmd.COMPONENT_ARM_DISARM, 1, 2989) == MavResult.ACCEPTED
+    assert sensors(client).enabled & logging
+    assert client.command(MavCmd.COMPONENT_ARM_DISARM, 0, 21196) == MavResult.ACCEPTED
+    client.run(14.0)
+    assert sensors(client).enabled & logging
+    client.run(1.5)
+    assert not sensors(client).enabled & logging
+
+
+# ---------------------------------------------------------------------------------------- outputs
+
+
+def outputs(client: Client, *sticks: int) -> tuple[int, ...]:
+    """Sticks from channel 1 on; 0 leaves one alone."""
+    client.send(
+        m.RcChannelsOverride(1, 1, *(stick or 0xFFFF for stick in sticks), *(0xFFFF,) * (8 - len(sticks)))
+    )
+    client.run(0.1)
+    client.command(MavCmd.REQUEST_MESSAGE, m.ServoOutputRaw.ID)
+    client.run(0.05)
+    told = client.last(m.ServoOutputRaw)
+    return tuple(getattr(told, f"servo{number}_raw") for number in range(1, 11))
+
+
+def arm(client: Client) -> None:
+    assert client.command(MavCmd.COMPONENT_ARM_DISARM, 1, 2989) == MavResult.ACCEPTED
+
+
+def test_a_copters_motors_stand_until_the_arming_delay_is_over() -> None:
+    _, client = booted("copter")
+    assert outputs(client)[:5] == (1000, 1000, 1000, 1000, 0)
+    arm(client)
+    client.run(1.0)
+    assert outputs(client)[:4] == (1000,) * 4
+    client.run(1.5)
+    assert outputs(client)[:4] == (1100,) * 4
+
+
+def test_a_planes_sticks_move_its_surfaces_also_when_it_is_disarmed() -> None:
+    _, client = booted("plane")
+    assert outputs(client)[:5] == (1500, 1500, 1000, 1500, 0)
+    assert outputs(client, 1000, 1300, 1900, 1900)[:4] == (1100, 1340, 1000, 1820)
+    arm(client)
+    assert outputs(client, 1500, 1500, 1900, 1500)[:4] == (1500, 1500, 1900, 1500)
+
+
+def test_a_rovers_steering_is_heard_also_when_it_is_disarmed() -> None:
+    _, client = booted("rover")
+    assert outputs(client)[:5] == (1500, 0, 1500, 0, 0)
+    assert outputs(client, 1300)[0] == 1320
+    assert outputs(client, 1900)[0] == 1893
+    assert outputs(client, 1500, 0, 1900)[2] == 1500
+
+
+def test_a_subs_thrusters_stand_when_it_is_disarmed() -> None:
+    _, client = booted("sub")
+    still = (1500, 1500, 1500, 1500, 1500, 1500, 0, 1500, 1500, 1500)
+    assert outputs(client, 1900, 1900, 1900, 1900, 1900, 1900) == still
+    arm(client)
+    middle = (1500,) * 6
+    assert outputs(client, *middle[:3], 1300, 1500, 1500)[:4] == (1340, 1660, 1660, 1340)
+    assert outputs(client, *middle[:4], 1300, 1500)[:4] == (1660, 1660, 1340, 1340)
+    assert outputs(client, *middle[:5], 1300)[:4] == (1340, 1660, 1340, 1660)
+    assert outputs(client, 1500, 1300, *middle[2:])[4:6] == (1340, 1660)
+
+
+# ------------------------------------------------------------------------------------------- boot
+
+
+BOOT_TEXTS = {
+    "plane": [
+        "Ground start", "Skipping INS calibration", "Calibrating barometer", "RCInput: decoding UDP (Pulses)",
+        "Barometer 1 calibration complete", "Barometer 2 calibration complete", "Airspeed 1 calibration started",
+        "ArduPilot Ready", "AHRS: DCM active", "Throttle failsafe off", "Airspeed 1 calibrated",
+        "GPS 1: probing for u-blox at 230400 baud", "GPS 1: detected u-blox",
+        "EKF2 IMU0 MAG0 initial yaw alignment complete", "EKF2 IMU1 MAG0 initial yaw alignment complete",
+        "EKF3 IMU0 initialised", "EKF3 IMU1 initialised", "EKF3 IMU0 tilt alignment complete",
+        "EKF3 IMU1 tilt alignment complete", "EKF3 IMU0 MAG0 initial yaw alignment complete",
+        "EKF3 IMU1 MAG0 initial yaw alignment complete", "EKF2 IMU0 tilt alignment complete",
+        "EKF2 IMU1 tilt alignment complete", "EKF2 IMU0 origin set", "EKF2 IMU1 origin set",
+        "EKF3 IMU0 origin set", "EKF3 IMU1 origin set", "Field Elevation Set: 584m", "EKF3 IMU0 is using GPS",
+        "EKF3 IMU1 is using GPS", "AHRS: EKF3 active", "EKF2 IMU0 is using GPS", "EKF2 IMU1 is using GPS",
+    ],
+    "rover": [
+        "Calibrating barometer", "Barometer 1 calibration complete", "Barometer 2 calibration complete",
+        "Beginning INS calibration. Do not move vehicle", "INS: alloc 6144 bytes for ISB (free=524288)",
+        "ArduPilot Ready", "AHRS: DCM active", "RCInput: decoding UDP (Pulses)", "EKF3 IMU0 initialised",
+        "EKF3 IMU1 initialised", "EKF3 IMU0 tilt alignment complete", "EKF3 IMU1 tilt alignment complete",
+        "EKF3 IMU0 MAG0 initial yaw alignment complete", "EKF3 IMU1 MAG0 initial yaw alignment complete",
+        "GPS 1: probing for u-blox at 230400 baud", "GPS 1: detected u-blox", "EKF3 IMU0 origin set",
+        "EKF3 IMU1 origin set", "Field Elevation Set: 584m", "EKF3 IMU0 is using GPS", "EKF3 IMU1 is using GPS",
+        "AHRS: EKF3 active",
+    ],
+    "sub": [
+        "Calibrating barometer", "Barometer 1 calibration complete", "Barometer 2 calibration complete",
+        "ArduPilot Ready", "AHRS: DCM active", "RCInput: decoding UDP (Pulses)", "EKF3 IMU0 initialised",
+        "EKF3 IMU1 initialised", "AHRS: EKF3 active", "EKF3 IMU0 tilt alignment complete",
+        "EKF3 IMU1 tilt alignment complete", "EKF3 IMU0 MAG0 initial yaw alignment complete",
+        "EKF3 IMU1 MAG0 initial yaw alignment complete", "GPS 1: probing for u-blox at 230400 baud",
+        "GPS 1: detected u-blox", "EKF3 IMU0 origin set", "EKF3 IMU1 origin set", "EKF3 IMU0 is using GPS",
+        "EKF3 IMU1 is using GPS",
+    ],
+}  # fmt: skip
+POSITION_AT = {"plane": 20.15, "rover": 42.05, "sub": 41.0}
+
+
+@pytest.mark.parametrize("kind", BOOT_TEXTS)
+def test_boot_as_the_real_one_does(kind: str) -> None:
+    real_time = POSITION_AT[kind]
+    client = Client(CLASSES[kind](boot_time_s=real_time))
+    all_streams(client, 0)
+    client.send(m.RequestDataStream(1, 1, MavDataStream.EXTRA3, 4, 1))
+    client.run(46.0)
+    assert [text for text in client.texts if not text.startswith(("PreArm", "MYGCS"))] == BOOT_TEXTS[kind]
+    flags = dict.fromkeys(report.flags for report in client.all(m.EkfStatusReport))
+    assert list(flags) == [1024, 0, 167, 831]
+    first = next(
+        now
+        for now, message in client.heard
+        if isinstance(message, m.EkfStatusReport) and message.flags == 831
+    )
+    assert first == pytest.approx(real_time, abs=0.3)
+    home = next(now for now, message in client.heard if isinstance(message, m.HomePosition))
+    assert home == pytest.approx(19.2 if kind == "sub" else 9.5, abs=0.6)
