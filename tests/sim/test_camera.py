@@ -51,6 +51,8 @@ def test_a_picture_is_told_with_where_it_was_taken() -> None:
     assert (picture.lat, picture.lng) == pytest.approx((place.latitude_e7, place.longitude_e7), abs=20)
     assert picture.alt_rel == pytest.approx(10.0, abs=0.5)
     assert 0.0 <= picture.yaw < 360.0
+    assert client.command(MavCmd.IMAGE_START_CAPTURE, 1, 0, 1) == MavResult.FAILED  # the shutter is open
+    client.run(0.2)
     assert client.command(MavCmd.DO_DIGICAM_CONTROL, 0, 0, 0, 0, 1) == MavResult.ACCEPTED
     assert client.last(m.CameraFeedback).img_idx == 2
 
@@ -97,11 +99,15 @@ def test_by_distance() -> None:
 
 
 def test_commands_of_a_mission() -> None:
-    copter, _ = fitted()
-    copter.camera.run(MissionItem(MavCmd.DO_DIGICAM_CONTROL, 2, x=1))
-    copter.camera.run(MissionItem(MavCmd.DO_SET_CAM_TRIGG_DIST, 2, 20.0, 0.0, 1.0))
-    copter.camera.run(MissionItem(MavCmd.IMAGE_START_CAPTURE, 2, 0.0, 0.0, 1.0))
-    copter.camera.run(MissionItem(MavCmd.NAV_WAYPOINT, 2))
+    copter, client = fitted()
+    for item in (
+        MissionItem(MavCmd.DO_DIGICAM_CONTROL, 2, x=1),
+        MissionItem(MavCmd.DO_SET_CAM_TRIGG_DIST, 2, 20.0, 0.0, 1.0),
+        MissionItem(MavCmd.IMAGE_START_CAPTURE, 2, 0.0, 0.0, 1.0),
+        MissionItem(MavCmd.NAV_WAYPOINT, 2),
+    ):
+        copter.camera.run(item)
+        client.run(0.2)
     assert copter.camera.image_count == 3
     assert copter.camera.trigger_distance_m == 20.0
 

@@ -177,7 +177,7 @@ def test_calibration_takes_time_and_needs_to_be_disarmed() -> None:
 def test_unknown_commands_are_unsupported() -> None:
     _, client = ready_copter()
     assert client.command(31010) == MavResult.UNSUPPORTED
-    assert client.command(MavCmd.DO_WINCH) == MavResult.UNSUPPORTED
+    assert client.command(MavCmd.DO_SET_REVERSE) == MavResult.UNSUPPORTED
 
 
 def test_time_synchronisation_and_ping_are_answered() -> None:

@@ -67,6 +67,10 @@ class Parameters:
     def __getitem__(self, name: str) -> float:
         return self.row(name).value
 
+    def get(self, name: str, default: float) -> float:
+        """The value; the default when this table is without it."""
+        return self[name] if name in self else default  # noqa: SIM401 - this is `get`
+
     def __setitem__(self, name: str, value: float) -> None:
         """Raises KeyError for an unknown name."""
         row = self.row(name)

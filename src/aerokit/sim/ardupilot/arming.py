@@ -83,7 +83,7 @@ class Arming:
     def common_reasons(self) -> list[str]:
         """What every kind checks, in the order of the firmware."""
         found = list(self._vehicle.faults.prearm_failures)
-        if self._vehicle.calibrations.of_compasses:
+        if self._vehicle.calibrations.compasses.is_running:
             found.append("Compass calibration running")
         for check, look in self._looks():
             if check is None or self.is_checked(check):

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavResult, MavSeverity
+from aerokit.sim.ardupilot.accelerometer_calibration import AccelerometerCalibration
+from aerokit.sim.ardupilot.compass_calibration import CompassCalibration
 from aerokit.sim.commands import Progress
 
 if TYPE_CHECKING:
+    from aerokit.mavlink.message import Message
     from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
     from aerokit.sim.commands import Command, CommandHandler
 
-__all__ = ["Calibrations"]
+__all__ = ["CALIBRATION_BUILDERS", "Calibrations"]
 
 _GYROS_S, _TRIM_S, _ACCELEROMETERS_S = 0.5, 1.0, 1.0
 _ACCELEROMETERS_AGAIN_S = 5.0
@@ -21,25 +26,29 @@ _ACCELEROMETERS, _TRIM, _ACCELEROMETERS_SIMPLE = 1, 2, 4
 
 
 class Calibrations:
-    """PREFLIGHT_CALIBRATION answers when it is done; that of the compasses runs until it is cancelled or rebooted."""
+    """PREFLIGHT_CALIBRATION answers when it is done, or when the first position is asked for.
+
+    ``compasses`` and ``accelerometers`` are the two that somebody has to turn the vehicle for.
+    """
 
     def __init__(self, vehicle: ArduPilotVehicle) -> None:
         self._vehicle = vehicle
-        self.of_compasses = False
-        """Whether one is running: the vehicle cannot be armed."""
+        self.compasses = CompassCalibration(vehicle)
+        self.accelerometers = AccelerometerCalibration(vehicle)
         self._accelerometers_at = -math.inf
 
     def reset(self) -> None:
         """Give up what is running, as a reboot does."""
-        self.of_compasses = False
+        self.compasses.reset()
+        self.accelerometers.reset()
 
     @property
     def commands(self) -> dict[int, CommandHandler]:
         """MAV_CMD → handler."""
         return {
             MavCmd.PREFLIGHT_CALIBRATION: self._calibrate,
-            MavCmd.DO_START_MAG_CAL: self._start_compasses,
-            MavCmd.DO_CANCEL_MAG_CAL: self._cancel_compasses,
+            MavCmd.ACCELCAL_VEHICLE_POS: self.accelerometers.take,
+            **self.compasses.commands,
         }
 
     def _calibrate(self, command: Command) -> int | Progress:
@@ -60,7 +69,7 @@ class Calibrations:
         vehicle = self._vehicle
         if command.x == _ACCELEROMETERS:
             vehicle.info("Initialising ArduPilot")
-            return Progress((), _GYROS_S, finish=self._ask_for_level)
+            return Progress((), _GYROS_S, finish=self.accelerometers.start)
         if command.x == _TRIM:
             vehicle.info("Initialising ArduPilot")
             return Progress(
@@ -75,20 +84,9 @@ class Calibrations:
         is_forced = _FORCED in (command.x, command.param2)
         return MavResult.ACCEPTED if is_forced else MavResult.UNSUPPORTED
 
-    def _ask_for_level(self) -> None:
-        self._vehicle.send_text(MavSeverity.CRITICAL, "Place vehicle level and press any key.")
 
-    def _start_compasses(self, command: Command) -> int:
-        if self._vehicle.motors.is_armed:
-            self._vehicle.send_text(MavSeverity.NOTICE, "Disarm to allow compass calibration")
-            return MavResult.FAILED
-        if not 0 <= command.param1 <= 255:
-            return MavResult.FAILED
-        self.of_compasses = True
-        return MavResult.ACCEPTED
-
-    def _cancel_compasses(self, command: Command) -> int:
-        if not 0 <= command.param1 <= 255:
-            return MavResult.FAILED
-        self.of_compasses = False
-        return MavResult.ACCEPTED
+CALIBRATION_BUILDERS: dict[int, Callable[[ArduPilotVehicle], Message | None]] = {
+    m.MagCalProgress.ID: lambda vehicle: vehicle.calibrations.compasses.progress(),
+    m.MagCalReport.ID: lambda vehicle: vehicle.calibrations.compasses.report(),
+}
+"""Message id → what to send now, or None."""

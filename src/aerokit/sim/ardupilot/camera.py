@@ -7,7 +7,8 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import CameraFeedbackFlags, MavCmd, MavResult
+from aerokit.mavlink.enums import CameraFeedbackFlags, MavCmd, MavResult, SetFocusType
+from aerokit.sim.rotations import quaternion_from_euler
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
@@ -17,7 +18,8 @@ if TYPE_CHECKING:
 
 __all__ = ["CAMERA_BUILDERS", "Camera", "camera_commands"]
 
-_PERIOD_S = 0.02
+_PERIOD_S, _SHUTTER_S = 0.02, 0.1
+_UNKNOWN_PLACE = 2**31 - 1
 _IDLE, _INTERVAL_SET = 0, 2
 _FOR_EVER = -1
 
@@ -50,9 +52,13 @@ class Camera:
         """Whether there is one."""
         return int(self._vehicle.parameters["CAM1_TYPE"]) != 0
 
+    @property
+    def _shutter_s(self) -> float:
+        return self._vehicle.parameters.get("CAM1_DURATION", _SHUTTER_S)
+
     def take(self) -> bool:
-        """Take a picture now; False without a camera."""
-        if not self.is_fitted:
+        """Take a picture now; False without a camera, or while the shutter is still open for the last one."""
+        if not self.is_fitted or self._vehicle.now - self._taken_at < self._shutter_s:
             return False
         motion = self._vehicle.motion
         self.image_count += 1
@@ -154,13 +160,19 @@ class Camera:
         known = self.is_fitted and command.param1 in (1.0, 2.0)
         return MavResult.ACCEPTED if known else MavResult.UNSUPPORTED
 
-    def focus(self) -> int:
-        """MAV_CMD_SET_CAMERA_FOCUS: the lens has none."""
-        return MavResult.UNSUPPORTED if self.is_fitted else MavResult.FAILED
+    def focus(self, command: Command) -> int:
+        """MAV_CMD_SET_CAMERA_FOCUS: continuous or in percent; such a lens does not focus by itself."""
+        kind = int(command.param1)
+        if kind in (SetFocusType.STEP, SetFocusType.METERS) or kind not in list(SetFocusType):
+            return MavResult.DENIED
+        if not self.is_fitted:
+            return MavResult.FAILED
+        by_itself = kind not in (SetFocusType.CONTINUOUS, SetFocusType.RANGE)
+        return MavResult.UNSUPPORTED if by_itself else MavResult.ACCEPTED
 
 
 def camera_commands(vehicle: ArduPilotVehicle) -> dict[int, CommandHandler]:
-    """MAV_CMD → handler. Such a camera has neither focus nor video."""
+    """MAV_CMD → handler. Such a camera takes no video and has one lens."""
     return {
         MavCmd.IMAGE_START_CAPTURE: lambda command: vehicle.camera.start_capture(command),
         MavCmd.IMAGE_STOP_CAPTURE: lambda command: vehicle.camera.stop_capture(command),
@@ -168,7 +180,8 @@ def camera_commands(vehicle: ArduPilotVehicle) -> dict[int, CommandHandler]:
         MavCmd.DO_DIGICAM_CONFIGURE: lambda _: MavResult.ACCEPTED,
         MavCmd.DO_SET_CAM_TRIGG_DIST: lambda command: vehicle.camera.set_trigger_distance(command),
         MavCmd.SET_CAMERA_ZOOM: lambda command: vehicle.camera.zoom(command),
-        MavCmd.SET_CAMERA_FOCUS: lambda _: vehicle.camera.focus(),
+        MavCmd.SET_CAMERA_FOCUS: lambda command: vehicle.camera.focus(command),
+        MavCmd.SET_CAMERA_SOURCE: lambda _: MavResult.DENIED,
         MavCmd.VIDEO_START_CAPTURE: lambda _: MavResult.FAILED,
         MavCmd.VIDEO_STOP_CAPTURE: lambda _: MavResult.FAILED,
     }
@@ -241,10 +254,32 @@ def _capture_status(vehicle: ArduPilotVehicle) -> m.CameraCaptureStatus | None:
     )
 
 
+def _video_stream(vehicle: ArduPilotVehicle) -> m.VideoStreamInformation | None:
+    """One that is none."""
+    if not vehicle.camera.is_fitted:
+        return None
+    return m.VideoStreamInformation(0, 0, 0, 0, 0.0, 0, 0, 0, 0, 0, "", "")
+
+
+def _field_of_view(vehicle: ArduPilotVehicle) -> m.CameraFovStatus | None:
+    """Where the camera is when the vehicle knows, and how it lies; nobody knows what it sees."""
+    if not vehicle.camera.is_fitted:
+        return None
+    motion, nowhere = vehicle.motion, (_UNKNOWN_PLACE,) * 3
+    place = vehicle.navigation.position if vehicle.navigation.has_position else None
+    here = (
+        nowhere if place is None else (place.latitude_e7, place.longitude_e7, round(place.altitude_m * 1000))
+    )
+    q = quaternion_from_euler(motion.roll, motion.pitch, motion.yaw)
+    return m.CameraFovStatus(vehicle.time_boot_ms, *here, *nowhere, q, math.nan, math.nan)
+
+
 CAMERA_BUILDERS: dict[int, Callable[[ArduPilotVehicle], Message | None]] = {
     m.CameraInformation.ID: _information,
     m.CameraSettings.ID: _settings,
     m.CameraCaptureStatus.ID: _capture_status,
     m.CameraFeedback.ID: _last_feedback,
+    m.VideoStreamInformation.ID: _video_stream,
+    m.CameraFovStatus.ID: _field_of_view,
 }
 """Message id → what to send now, or None."""

@@ -20,6 +20,7 @@ from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 from aerokit.sim.ardupilot.yaw import AutoYaw
 
 if TYPE_CHECKING:
+    from aerokit.sim.ardupilot.navigation import Ned
     from aerokit.sim.ardupilot.parameter_tables import Kind
     from aerokit.sim.commands import CommandHandler
 
@@ -79,6 +80,10 @@ class SimulatedCopter(ArduPilotVehicle):
     def _become_ready(self) -> None:
         super()._become_ready()
         self.path.start()
+
+    def look_at(self, place: Ned | None) -> None:
+        """See `AutoYaw.region_of_interest`."""
+        self.yaw.region_of_interest(place)
 
     @property
     def guided(self) -> Guided:

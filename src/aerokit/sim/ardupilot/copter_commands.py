@@ -13,7 +13,6 @@ from aerokit.mavlink.enums import (
     SpeedType,
 )
 from aerokit.sim.ardupilot.auto import Auto
-from aerokit.sim.ardupilot.camera import camera_commands
 from aerokit.sim.ardupilot.guided import Guided
 from aerokit.sim.ardupilot.vehicle_commands import common_commands
 from aerokit.sim.commands import Command, CommandHandler
@@ -32,7 +31,9 @@ def copter_commands(copter: SimulatedCopter) -> dict[int, CommandHandler]:
     return {
         **common_commands(copter),
         MavCmd.NAV_TAKEOFF: flight.take_off,
+        MavCmd.NAV_VTOL_TAKEOFF: flight.take_off,
         MavCmd.NAV_LAND: lambda _: copter.change_to(CopterMode.LAND),
+        MavCmd.NAV_VTOL_LAND: lambda _: copter.change_to(CopterMode.LAND),
         MavCmd.NAV_RETURN_TO_LAUNCH: lambda _: copter.change_to(CopterMode.RTL),
         MavCmd.NAV_LOITER_UNLIM: lambda _: copter.change_to(CopterMode.LOITER),
         MavCmd.MISSION_START: flight.start_mission,
@@ -40,10 +41,6 @@ def copter_commands(copter: SimulatedCopter) -> dict[int, CommandHandler]:
         MavCmd.DO_CHANGE_SPEED: flight.change_speed,
         MavCmd.CONDITION_YAW: flight.turn,
         MavCmd.DO_PAUSE_CONTINUE: flight.pause_or_continue,
-        MavCmd.DO_SET_ROI: flight.look_at,
-        MavCmd.DO_SET_ROI_LOCATION: flight.look_at,
-        MavCmd.DO_SET_ROI_NONE: flight.look_ahead,
-        **camera_commands(copter),
     }
 
 
@@ -131,15 +128,3 @@ class _Flight:
             return MavResult.ACCEPTED
         copter.info("Failed to pause" if pause else "Failed to resume")
         return MavResult.FAILED
-
-    def look_at(self, command: Command) -> int:
-        point = self._copter.point(*command.place(), command.z, command.altitude_frame)
-        if point is None:
-            return MavResult.DENIED
-        nowhere = command.place() == (0, 0) and command.z == 0
-        self._copter.yaw.region_of_interest(None if nowhere else point)
-        return MavResult.ACCEPTED
-
-    def look_ahead(self, _: Command) -> int:
-        self._copter.yaw.region_of_interest(None)
-        return MavResult.ACCEPTED

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, cast
 
 from aerokit.mavlink.enums import MavCmd, MavResult, SpeedType
-from aerokit.sim.ardupilot.targets import Targets
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 from aerokit.sim.ardupilot.vehicle_commands import common_commands
 
@@ -34,10 +33,6 @@ class LevelVehicle(ArduPilotVehicle):
         raise NotImplementedError
 
     # -------------------------------------------------------------------------------------- vehicle
-
-    def hear_setpoints(self) -> None:
-        """See `Targets`."""
-        Targets(self, cast("Any", self.guided))
 
     def reset_controllers(self) -> None:
         """The throttle stick rests in the middle."""

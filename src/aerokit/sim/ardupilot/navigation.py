@@ -116,6 +116,20 @@ class Navigation:
         self._vehicle.missions.commands.add_home()
         self._vehicle.call_later(0.0, self._vehicle.send_home)
 
+    def set_origin(self, point: Ned) -> bool:
+        """Make a point the estimator's origin; False when it has one, or is not there yet."""
+        if self.origin is not None or not self._vehicle.is_initialised:
+            return False
+        self.origin = point
+        self._tell_origin()
+        return True
+
+    def _tell_origin(self) -> None:
+        assert self.origin is not None
+        self._say_cores("origin set")
+        if self._vehicle.KIND != "sub":
+            self._vehicle.info(f"Field Elevation Set: {self.frame.origin.altitude_m - self.origin[2]:.0f}m")
+
     # ------------------------------------------------------------------------------------- timeline
 
     def _set_flags(self, flags: int) -> None:
@@ -151,13 +165,12 @@ class Navigation:
         if self.fix_type < GpsFixType.TYPE_3D_FIX:
             self._vehicle.call_later(1.0, self._set_origin)
             return
-        motion = self._vehicle.motion
-        self.origin = (motion.north, motion.east, motion.down)
+        if self.origin is None:
+            motion = self._vehicle.motion
+            self.origin = (motion.north, motion.east, motion.down)
+            self._tell_origin()
         if not self.home_is_locked:
             self._set_first_home()
-        self._say_cores("origin set")
-        if self._vehicle.KIND != "sub":
-            self._vehicle.info(f"Field Elevation Set: {self.frame.origin.altitude_m - motion.down:.0f}m")
 
     def _set_first_home(self) -> None:
         motion = self._vehicle.motion

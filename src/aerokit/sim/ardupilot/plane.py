@@ -12,13 +12,13 @@ from aerokit.sim.ardupilot.plane_auto import Auto
 from aerokit.sim.ardupilot.plane_commands import plane_commands
 from aerokit.sim.ardupilot.plane_failsafes import PlaneFailsafes
 from aerokit.sim.ardupilot.plane_fence import PlaneFence
+from aerokit.sim.ardupilot.plane_guided import Guided, PlaneSetpoints
 from aerokit.sim.ardupilot.plane_modes import (
     Autoland,
     Circle,
     Cruise,
     FlyByWireA,
     FlyByWireB,
-    Guided,
     Loiter,
     Manual,
     PlaneModeBase,
@@ -50,6 +50,7 @@ class SimulatedPlane(ArduPilotVehicle):
     KIND: ClassVar[Kind] = "plane"
     FIRMWARE: ClassVar[str] = "ArduPlane"
     MAV_TYPE: ClassVar[int] = MavType.FIXED_WING
+    HOME_NEEDS_ORIGIN: ClassVar[bool] = False
     CAPABILITIES: ClassVar[int] = 0xF36F
     MODES = (
         Manual, Circle, Stabilize, FlyByWireA, FlyByWireB, Cruise, Auto, Rtl, Loiter, TakeOff, Guided, Autoland,
@@ -92,6 +93,10 @@ class SimulatedPlane(ArduPilotVehicle):
     def make_commands(self) -> dict[int, CommandHandler]:
         """See `plane_commands`."""
         return plane_commands(self)
+
+    def hear_setpoints(self) -> None:
+        """See `PlaneSetpoints`."""
+        PlaneSetpoints(self)
 
     def reset_controllers(self) -> None:
         """Forget the take-off."""

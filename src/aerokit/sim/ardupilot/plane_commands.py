@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import MavCmd, MavResult, PlaneMode, SpeedType
+from aerokit.sim.ardupilot.plane_guided import guided_commands
 from aerokit.sim.ardupilot.plane_modes import NavigatingMode
 from aerokit.sim.ardupilot.vehicle_commands import common_commands
 
@@ -28,6 +29,7 @@ def plane_commands(plane: SimulatedPlane) -> dict[int, CommandHandler]:
         MavCmd.MISSION_START: flight.start_mission,
         MavCmd.DO_REPOSITION: flight.reposition,
         MavCmd.DO_CHANGE_SPEED: flight.change_speed,
+        **guided_commands(plane),
     }
 
 

@@ -24,7 +24,6 @@ __all__ = [
     "Cruise",
     "FlyByWireA",
     "FlyByWireB",
-    "Guided",
     "Loiter",
     "Manual",
     "NavigatingMode",
@@ -223,18 +222,6 @@ class Loiter(NavigatingMode):
 
     number = PlaneMode.LOITER
     name = "LOITER"
-
-
-class Guided(NavigatingMode):
-    """Circles around the place it was sent to; where it was switched on until then."""
-
-    number = PlaneMode.GUIDED
-    name = "GUIDED"
-    can_change_speed = True
-
-    def go_to(self, position: Ned) -> None:
-        """Fly to a point of the world and circle there."""
-        self._place = position
 
 
 class Rtl(NavigatingMode):

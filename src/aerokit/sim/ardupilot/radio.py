@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
@@ -60,6 +60,11 @@ class Radio:
             return True
         limit = vehicle.now - self._override_time()
         return any(value and since > limit for value, since in self._overrides.values())
+
+    def override(self, pulses: Mapping[int, int]) -> None:
+        """Put these in the place of channels, from 0, as long as RC_OVERRIDE_TIME says; 0 gives one back."""
+        for index, value in pulses.items():
+            self._overrides[index] = (value, self._vehicle.now)
 
     def release_overrides(self) -> None:
         """Forget what was overridden, as a lost ground station makes the vehicle do."""

@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from aerokit.mavlink.enums import MavCmd, MavModeFlag, MavType, RoverMode
 from aerokit.sim.ardupilot.level_vehicle import LevelVehicle
+from aerokit.sim.ardupilot.manual_control import LevelJoystick
 from aerokit.sim.ardupilot.motors import Motors
 from aerokit.sim.ardupilot.rover_arming import RoverArming
 from aerokit.sim.ardupilot.rover_failsafes import RoverFailsafes
 from aerokit.sim.ardupilot.rover_fence import RoverFence
 from aerokit.sim.ardupilot.rover_modes import ROVER_MODES, RoverAuto, RoverGuided
 from aerokit.sim.ardupilot.smart_path import SmartPath
+from aerokit.sim.ardupilot.targets import RoverTargets
 from aerokit.sim.ground_motion import GroundLimits, GroundMotion
 from aerokit.sim.motion import wrap_pi
 
@@ -59,6 +61,8 @@ class SimulatedRover(LevelVehicle):
     KIND: ClassVar[Kind] = "rover"
     FIRMWARE: ClassVar[str] = "ArduRover"
     MAV_TYPE: ClassVar[int] = MavType.GROUND_ROVER
+    HOME_NEEDS_ORIGIN: ClassVar[bool] = False
+    TELLS_HOME: ClassVar[bool] = True
     CAPABILITIES: ClassVar[int] = 0xF1EF
     MODES: ClassVar[tuple[Callable[[Any], VehicleMode], ...]] = ROVER_MODES
 
@@ -100,6 +104,14 @@ class SimulatedRover(LevelVehicle):
     def _become_ready(self) -> None:
         super()._become_ready()
         self.path.start()
+
+    def hear_setpoints(self) -> None:
+        """See `RoverTargets`."""
+        RoverTargets(self, self.guided)
+
+    def make_joystick(self) -> LevelJoystick:
+        """Two axes."""
+        return LevelJoystick(self)
 
     @property
     def top_speed(self) -> float:

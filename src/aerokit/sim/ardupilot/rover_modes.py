@@ -21,7 +21,6 @@ __all__ = ["ROVER_MODES", "RoverAuto", "RoverGuided"]
 _MIDDLE, _RANGE = 1500.0, 500.0
 _FULL_STEERING_RAD_S = math.radians(90.0)
 _STANDING_M = 0.5
-_TARGET_PATIENCE_S = 3.0
 
 
 class _Mode(VehicleMode):
@@ -284,17 +283,17 @@ class RoverGuided(_Mode):
             self.rover.motion.drive_to(place[0], place[1], speed=self.speed)
 
     def _is_stale(self) -> bool:
-        if self.rover.now - self._target_at <= _TARGET_PATIENCE_S:
+        if self._target is None or self.rover.now - self._target_at <= self._target.patience_s:
             return False
         self._target = None
         self.rover.send_text(MavSeverity.WARNING, "target not received last 3secs, stopping")
         return True
 
     def _follow(self, target: Target) -> None:
-        assert target.velocity is not None
-        north, east, _ = target.velocity
-        speed, motion = math.hypot(north, east), self.rover.motion
-        speed = -speed if target.backwards else speed
+        north, east, _ = target.velocity or (0.0, 0.0, 0.0)
+        parameters, motion = self.rover.parameters, self.rover.motion
+        fastest = parameters["WP_SPEED"] or parameters["CRUISE_SPEED"]
+        speed = min(fastest, math.hypot(north, east)) * (-1.0 if target.backwards else 1.0)
         if target.yaw_rate is not None:
             motion.drive(speed, target.yaw_rate)
         elif speed == 0.0:

@@ -44,6 +44,8 @@ _COMMON: Groups = {
         m.SystemTime.ID,
         m.BatteryStatus.ID,
         m.GimbalDeviceAttitudeStatus.ID,
+        m.MagCalReport.ID,
+        m.MagCalProgress.ID,
         m.EkfStatusReport.ID,
         m.Vibration.ID,
     ),

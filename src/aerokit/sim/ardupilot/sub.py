@@ -7,12 +7,14 @@ from collections.abc import Callable
 from itertools import cycle
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from aerokit.mavlink.enums import MavCmd, MavModeFlag, MavResult, MavType, SubMode
+from aerokit.mavlink.enums import MavCmd, MavModeFlag, MavResult, MavType, SpeedType, SubMode
 from aerokit.sim.ardupilot.level_vehicle import LevelVehicle
+from aerokit.sim.ardupilot.manual_control import SubJoystick
 from aerokit.sim.ardupilot.motors import Motors
 from aerokit.sim.ardupilot.sub_arming import SubArming
 from aerokit.sim.ardupilot.sub_failsafes import SubFailsafes
 from aerokit.sim.ardupilot.sub_modes import SUB_MODES, SubAuto, SubGuided
+from aerokit.sim.ardupilot.targets import SubTargets
 from aerokit.sim.ardupilot.telemetry_extra import DISPLAY_VALUES
 from aerokit.sim.underwater_motion import UnderwaterMotion
 
@@ -94,6 +96,14 @@ class SimulatedSub(LevelVehicle):
         """See `SubFailsafes`."""
         return SubFailsafes(self)
 
+    def hear_setpoints(self) -> None:
+        """See `SubTargets`."""
+        SubTargets(self, self.guided)
+
+    def make_joystick(self) -> SubJoystick:
+        """Six axes."""
+        return SubJoystick(self)
+
     def reset_controllers(self) -> None:
         """All sticks rest in the middle."""
         self.display_names = cycle(DISPLAY_VALUES)
@@ -157,6 +167,7 @@ class SimulatedSub(LevelVehicle):
     def own_commands(self) -> dict[int, CommandHandler]:
         """LAND is the surface, LOITER_UNLIM holds the place; there is no way home by command."""
         return {
+            MavCmd.DO_CHANGE_SPEED: self._change_speed_at_any_time,
             MavCmd.NAV_LAND: lambda _: self.change_to(SubMode.SURFACE),
             MavCmd.NAV_LOITER_UNLIM: lambda _: self.change_to(SubMode.POSHOLD),
             MavCmd.CONDITION_YAW: self._turn,
@@ -184,9 +195,19 @@ class SimulatedSub(LevelVehicle):
     def _below(self, place: Ned) -> Ned:
         return (place[0], place[1], max(place[2], self.motion.ground_down))
 
+    def _change_speed_at_any_time(self, command: Command) -> int:
+        """Also in modes that have no use for it."""
+        if not command.param2 > 0:
+            return MavResult.DENIED
+        if command.param1 not in (SpeedType.AIRSPEED, SpeedType.GROUNDSPEED):
+            return MavResult.FAILED
+        if isinstance(self.mode, SubGuided | SubAuto):
+            self.mode.speed = command.param2
+        return MavResult.ACCEPTED
+
     def _turn(self, command: Command) -> int:
         angle, relative = command.param1, command.param4
-        if not 0.0 <= angle <= 360.0 or relative not in (0.0, 1.0) or self.mode is not self.guided:
+        if not 0.0 <= angle <= 360.0 or relative not in (0.0, 1.0):
             return MavResult.FAILED
         heading = math.radians(angle)
         if relative:

@@ -20,7 +20,6 @@ __all__ = ["SUB_MODES", "SubAuto", "SubGuided"]
 _MIDDLE, _RANGE, _DEADZONE = 1500.0, 500.0, 0.06
 _FULL_STICK_M_S = 1.0
 _FULL_STICK_TURN_RAD_S = math.radians(90.0)
-_TARGET_PATIENCE_S = 3.0
 _THROTTLE, _YAW, _FORWARD, _LATERAL = 2, 3, 4, 5
 
 
@@ -200,7 +199,7 @@ class SubGuided(_Mode):
     def update(self, dt: float) -> None:
         """Move."""
         motion, target = self.sub.motion, self._target
-        fresh = target is not None and self.sub.now - self._target_at <= _TARGET_PATIENCE_S
+        fresh = target is not None and self.sub.now - self._target_at <= target.patience_s
         if self._place is not None:
             self.sub.travel(self._place, self.speed, looks_ahead=False)
         elif target is not None and target.velocity is not None and fresh:

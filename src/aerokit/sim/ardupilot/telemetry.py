@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from aerokit.mavlink import messages as m
 from aerokit.sim.ardupilot import servo_outputs as outputs
 from aerokit.sim.ardupilot import telemetry_extra as extra
+from aerokit.sim.ardupilot.calibration import CALIBRATION_BUILDERS
 from aerokit.sim.ardupilot.camera import CAMERA_BUILDERS
 from aerokit.sim.ardupilot.fence import fence_status
 from aerokit.sim.ardupilot.gimbal_status import GIMBAL_BUILDERS
@@ -32,6 +33,7 @@ _ALL = {
     **CAMERA_BUILDERS,
     **extra.EXTRA_BUILDERS,
     m.FenceStatus.ID: fence_status,
+    **CALIBRATION_BUILDERS,
 }
 _FLYING = (m.Wind.ID, m.TerrainReport.ID, m.EscTelemetry1To4.ID)
 _COPTER_TARGETS = (m.AttitudeTarget.ID, m.PositionTargetLocalNed.ID)

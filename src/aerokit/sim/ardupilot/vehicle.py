@@ -17,6 +17,7 @@ from aerokit.sim.ardupilot.camera import Camera
 from aerokit.sim.ardupilot.failsafes import Failsafes
 from aerokit.sim.ardupilot.fence import Fence
 from aerokit.sim.ardupilot.gimbal import Gimbal
+from aerokit.sim.ardupilot.manual_control import Joystick
 from aerokit.sim.ardupilot.mission_run import MissionRun
 from aerokit.sim.ardupilot.mission_server import MissionServer
 from aerokit.sim.ardupilot.motors import Motors
@@ -91,6 +92,11 @@ class ArduPilotVehicle(SimulatedAutopilot):
     signing: ArduPilotSigning
     """The key for signing that it was given; it survives a reboot."""
 
+    HOME_NEEDS_ORIGIN: ClassVar[bool] = True
+    """Whether home cannot be set before the estimator has an origin."""
+    TELLS_HOME: ClassVar[bool] = False
+    """Whether a text says where home was set."""
+
     def __init__(
         self,
         *,
@@ -140,7 +146,7 @@ class ArduPilotVehicle(SimulatedAutopilot):
         """What it hears of sticks and switches; the throttle (index 2) rests at 1000."""
         self.tunes = hear_tunes(self)
         """What PLAY_TUNE had it play."""
-        self.calibrations = Calibrations(self)
+        self.calibrations: Calibrations = Calibrations(self)
         self._boot_text = boot_text
         self._stream_groups = stream_groups
         self._frame = LocalFrame(GlobalPoint(round(home[0] * 1e7), round(home[1] * 1e7), home[2]))
@@ -186,6 +192,7 @@ class ArduPilotVehicle(SimulatedAutopilot):
         self.on(m.SetMode, self._on_set_mode)
         self.listen_to_clocks()
         self.rc.listen()
+        self.make_joystick()
         self.missions.listen()
 
     # ------------------------------------------------------------------- what a kind of vehicle says
@@ -216,6 +223,14 @@ class ArduPilotVehicle(SimulatedAutopilot):
 
     def hear_setpoints(self) -> None:
         """Hear the messages that steer it."""
+
+    def make_joystick(self) -> Joystick:
+        """What hears MANUAL_CONTROL."""
+        return Joystick(self)
+
+    def look_at(self, place: Ned | None) -> None:
+        """Point the gimbal, if there is one, at a place; None ends it."""
+        self.gimbal.look_at(place)
 
     def reset_controllers(self) -> None:
         """What a power cycle makes new of its own; the modes are there already."""

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from aerokit.mavlink.enums import MavCmd, MavFrame, MavResult
+from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.mavlink.messages import AutopilotVersion, MissionCurrent
+from aerokit.sim.ardupilot.camera import camera_commands
+from aerokit.sim.ardupilot.equipment import equipment_commands
 from aerokit.sim.ardupilot.gimbal_commands import GimbalCommands
+from aerokit.sim.ardupilot.home_and_origin import HomeAndOrigin
+from aerokit.sim.ardupilot.region_of_interest import RegionOfInterest
 from aerokit.sim.commands import Command, CommandHandler
 
 if TYPE_CHECKING:
@@ -26,8 +30,6 @@ def common_commands(vehicle: ArduPilotVehicle) -> dict[int, CommandHandler]:
         MavCmd.DO_SET_MODE: state.set_mode,
         MavCmd.DO_SET_MISSION_CURRENT: state.set_mission_current,
         MavCmd.DO_FLIGHTTERMINATION: state.terminate,
-        MavCmd.DO_SET_HOME: setup.set_home,
-        MavCmd.GET_HOME_POSITION: setup.get_home,
         MavCmd.REQUEST_AUTOPILOT_CAPABILITIES: setup.request_capabilities,
         MavCmd.REQUEST_MESSAGE: vehicle.requests.request_message,
         MavCmd.SET_MESSAGE_INTERVAL: vehicle.requests.set_interval,
@@ -38,6 +40,10 @@ def common_commands(vehicle: ArduPilotVehicle) -> dict[int, CommandHandler]:
         MavCmd.DO_SEND_BANNER: setup.send_banner,
         **vehicle.calibrations.commands,
         **GimbalCommands(vehicle).commands,
+        **HomeAndOrigin(vehicle).commands,
+        **RegionOfInterest(vehicle).commands,
+        **camera_commands(vehicle),
+        **equipment_commands(vehicle),
     }
 
 
@@ -86,28 +92,6 @@ class _Setup:
 
     def __init__(self, vehicle: ArduPilotVehicle) -> None:
         self._vehicle = vehicle
-
-    def set_home(self, command: Command) -> int:
-        nav, motion = self._vehicle.navigation, self._vehicle.motion
-        if command.param1 == 1.0 or command.place() == (0, 0):
-            if not nav.has_position:
-                return MavResult.FAILED
-            nav.set_home((motion.north, motion.east, motion.down), lock=True)
-            return MavResult.ACCEPTED
-        if command.param1 != 0.0 or nav.origin is None:
-            return MavResult.FAILED
-        frame = MavFrame.GLOBAL if command.is_long else command.altitude_frame
-        point = self._vehicle.point(*command.place(), command.z, frame)
-        if point is None:
-            return MavResult.DENIED
-        nav.set_home(point, lock=True)
-        return MavResult.ACCEPTED
-
-    def get_home(self, command: Command) -> int:
-        if self._vehicle.navigation.home is None:
-            return MavResult.FAILED
-        self._vehicle.send_home(command.channel)
-        return MavResult.ACCEPTED
 
     def request_capabilities(self, command: Command) -> int:
         if command.param1 != 1.0:

@@ -1,0 +1,43 @@
+"""MAV_CMD_DO_SET_ROI and its siblings: what the gimbal looks at, or a copter that has none."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from aerokit.mavlink.enums import MavCmd, MavResult
+
+if TYPE_CHECKING:
+    from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
+    from aerokit.sim.commands import Command, CommandHandler
+
+__all__ = ["RegionOfInterest"]
+
+
+class RegionOfInterest:
+    """Accepted with or without a gimbal. Another vehicle as the target (…_SYSID) is accepted, and not followed."""
+
+    def __init__(self, vehicle: ArduPilotVehicle) -> None:
+        self._vehicle = vehicle
+
+    @property
+    def commands(self) -> dict[int, CommandHandler]:
+        """MAV_CMD → handler."""
+        return {
+            MavCmd.DO_SET_ROI: self._look_at,
+            MavCmd.DO_SET_ROI_LOCATION: self._look_at,
+            MavCmd.DO_SET_ROI_NONE: self._look_ahead,
+            MavCmd.DO_SET_ROI_SYSID: lambda _: MavResult.ACCEPTED,
+        }
+
+    def _look_at(self, command: Command) -> int:
+        """No latitude, no longitude and no altitude means nothing any more."""
+        point = self._vehicle.point(*command.place(), command.z, command.altitude_frame)
+        if point is None:
+            return MavResult.DENIED
+        nowhere = command.place() == (0, 0) and command.z == 0
+        self._vehicle.look_at(None if nowhere else point)
+        return MavResult.ACCEPTED
+
+    def _look_ahead(self, _: Command) -> int:
+        self._vehicle.look_at(None)
+        return MavResult.ACCEPTED
