@@ -1,7 +1,8 @@
-"""The vehicle that `test_any_vehicle` flies: simulated, at an address, or a binary that is started for it."""
+"""The vehicle that `test_any_…` try and fly: simulated, at an address, or a binary that is started for it."""
 
 from __future__ import annotations
 
+import os
 import socket
 import subprocess
 import tempfile
@@ -11,55 +12,73 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from vehicle_kinds import KINDS, Kind
 
-from aerokit.sim import SimulatedCopter, SimulatedPx4, open_simulator
+from aerokit import Vehicle, connect
+from aerokit.links import Link
+from aerokit.sim import SimulatedVehicle, open_simulator, simulated_link
+from aerokit.sim.kinds import simulated
+from aerokit.sim.patience import wait_longer
 
-__all__ = ["Choice", "served"]
+__all__ = ["Choice", "connected", "ready"]
 
-SPEEDUP_SIM, SPEEDUP_BINARY = 10.0, 5.0
-HOME = "47.397742,8.545594,488,0"
+SPEEDUP_BINARY = 5.0
+LATENCY_S = 0.005
+INSTANCE = int(os.environ.get("AEROKIT_TEST_INSTANCE", "95"))
+"""Of a binary; ArduPilot reckons its ports from it."""
 
 
 @dataclass(frozen=True)
 class Choice:
-    """What the options say; ``speedup`` is how much faster than real time it is."""
+    """What the options say; ``speedup`` is how much faster than real time it is, 1 in virtual time."""
 
     vehicle: str
-    kind: str
+    kind: Kind
     speedup: float
+    is_virtual: bool
 
     @classmethod
-    def from_options(cls, config: pytest.Config) -> Choice:
+    def from_options(cls, config: pytest.Config) -> list[Choice]:
         """Raises UsageError for an address without ``--i-know-it-flies``."""
-        vehicle, kind = str(config.getoption("--vehicle")), str(config.getoption("--vehicle-kind"))
-        default = 1.0
+        vehicle, name = str(config.getoption("--vehicle")), config.getoption("--vehicle-kind")
+        speedup = config.getoption("--vehicle-speedup")
         if vehicle == "sim":
-            default = SPEEDUP_SIM
-        elif Path(vehicle).is_file():
-            default = SPEEDUP_BINARY
-            kind = "px4" if "px4" in Path(vehicle).name else kind
-        elif not config.getoption("--i-know-it-flies"):
+            kinds = KINDS.values() if name is None else [KINDS[name]]
+            return [cls(vehicle, kind, speedup or 1.0, speedup is None) for kind in kinds]
+        if Path(vehicle).is_file():
+            by_name = next((k for k in KINDS.values() if k.firmware == Path(vehicle).name), KINDS["copter"])
+            return [cls(vehicle, by_name if name is None else KINDS[name], speedup or SPEEDUP_BINARY, False)]
+        if not config.getoption("--i-know-it-flies"):
             raise pytest.UsageError(
                 f"{vehicle} may be a real vehicle: motors will turn and it will fly; add --i-know-it-flies"
             )
-        return cls(vehicle, kind, float(config.getoption("--vehicle-speedup") or default))
+        return [cls(vehicle, KINDS[name or "copter"], speedup or 1.0, False)]
 
-    @property
-    def is_simulated_here(self) -> bool:
-        return self.vehicle == "sim"
-
-    def seconds(self, simulated: float) -> float:
+    def seconds(self, simulated_s: float) -> float:
         """As a deadline by our clock, with room for a busy machine."""
-        return simulated / self.speedup + 20.0
+        return simulated_s / self.speedup + (0.0 if self.is_virtual else 20.0)
 
 
-def served(choice: Choice) -> AbstractAsyncContextManager[str]:
-    """The vehicle runs; gives the address to connect to."""
-    if choice.is_simulated_here:
+@asynccontextmanager
+async def connected(choice: Choice) -> AsyncIterator[Vehicle]:
+    """It was switched on just now, unless it is at an address."""
+    async with _served(choice) as address, connect(address, timeout=30) as vehicle:
+        yield vehicle
+
+
+@asynccontextmanager
+async def ready(choice: Choice) -> AsyncIterator[Vehicle]:
+    """Ready to be armed."""
+    async with connected(choice) as vehicle:
+        await vehicle.wait_ready(timeout=choice.seconds(120))
+        yield vehicle
+
+
+def _served(choice: Choice) -> AbstractAsyncContextManager[str | Link]:
+    """The vehicle runs; gives what to connect to."""
+    if choice.vehicle == "sim":
         return _simulated(choice)
-    if Path(choice.vehicle).is_file():
-        return _binary(choice)
-    return _given(choice.vehicle)
+    return _binary(choice) if Path(choice.vehicle).is_file() else _given(choice.vehicle)
 
 
 @asynccontextmanager
@@ -68,18 +87,30 @@ async def _given(address: str) -> AsyncIterator[str]:
 
 
 @asynccontextmanager
-async def _simulated(choice: Choice) -> AsyncIterator[str]:
-    vehicle = SimulatedPx4() if choice.kind == "px4" else SimulatedCopter()
+async def _simulated(choice: Choice) -> AsyncIterator[str | Link]:
+    vehicle = _patient(choice)
+    if choice.is_virtual:
+        async with simulated_link(vehicle, latency_s=LATENCY_S) as link:
+            yield link
+        return
     async with open_simulator(vehicle, "udpin:127.0.0.1:0", speedup=choice.speedup) as simulator:
         yield simulator.addresses[0].replace("udpin", "udpout")
+
+
+def _patient(choice: Choice) -> SimulatedVehicle:
+    latitude, longitude, altitude, heading = choice.kind.home
+    vehicle = simulated(choice.kind.name, home=(latitude, longitude, altitude), heading_deg=heading)
+    wait_longer([vehicle], choice.speedup)
+    return vehicle
 
 
 @asynccontextmanager
 async def _binary(choice: Choice) -> AsyncIterator[str]:
     """It is started in an empty directory, and ended afterwards."""
-    with tempfile.TemporaryDirectory() as folder:
-        port = 14545 if choice.kind == "px4" else _free_port()
-        command, environment = _px4(choice) if choice.kind == "px4" else _ardupilot(choice, port)
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        is_px4 = not choice.kind.is_ardupilot
+        port = 14540 + min(INSTANCE, 9) if is_px4 else _free_port()
+        command, environment = _px4(choice) if is_px4 else _ardupilot(choice, port, Path(folder))
         with subprocess.Popen(  # noqa: ASYNC220 - it takes milliseconds
             command, cwd=folder, env=environment, stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
@@ -90,22 +121,41 @@ async def _binary(choice: Choice) -> AsyncIterator[str]:
                 process.terminate()
 
 
-def _ardupilot(choice: Choice, port: int) -> tuple[list[str], dict[str, str]]:
-    binary = Path(choice.vehicle).resolve()
-    command = [str(binary), "--model", "+", "--speedup", f"{choice.speedup:g}", "--home", HOME, "-I50"]
+def _ardupilot(choice: Choice, port: int, folder: Path) -> tuple[list[str], dict[str, str]]:
+    """It waits for us as long as a simulated one does that is as fast."""
+    binary, kind = Path(choice.vehicle).resolve(), choice.kind
+    files = [folder / "patience.parm"]
+    files[0].write_text("".join(f"{name} {value:g}\n" for name, value in _longer(choice).items()))
     source = next((each for each in binary.parents if (each / "Tools/autotest").is_dir()), None)
     if source is not None:
-        command += ["--defaults", str(source / "Tools/autotest/default_params/copter.parm")]
+        files.insert(0, source / "Tools/autotest" / kind.defaults)
+    command = [str(binary), "--model", kind.model, "--speedup", f"{choice.speedup:g}", f"-I{INSTANCE}"]
+    command += ["--home", ",".join(map(str, kind.home)), "--defaults", ",".join(map(str, files))]
     return [*command, "--serial0", f"udpclient:127.0.0.1:{port}"], {}
 
 
+def _longer(choice: Choice) -> dict[str, float]:
+    usual, patient = (simulated(choice.kind.name) for _ in range(2))
+    wait_longer([patient], choice.speedup)
+    before, after = usual.parameters, patient.parameters  # type: ignore[attr-defined]
+    return {name: after[name] for name in after if after[name] != before[name]}
+
+
 def _px4(choice: Choice) -> tuple[list[str], dict[str, str]]:
-    """Instance 5 speaks to 127.0.0.1:14545; its data is beside the folder of the binary."""
+    """It speaks to 127.0.0.1:14540 and following; its data is beside the folder of the binary."""
     binary = Path(choice.vehicle).resolve()
-    environment = {"PX4_SIM_MODEL": "sihsim_quadx", "PATH": "/usr/bin:/bin"}
+    environment = {"PX4_SIM_MODEL": choice.kind.model, "PATH": "/usr/bin:/bin"}
     if choice.speedup != 1.0:
         environment["PX4_SIM_SPEED_FACTOR"] = f"{choice.speedup:g}"
-    return [str(binary), "-d", "-i", "5", "-w", ".", str(binary.parents[1] / "etc")], environment
+    return [
+        str(binary),
+        "-d",
+        "-i",
+        f"{min(INSTANCE, 9)}",
+        "-w",
+        ".",
+        str(binary.parents[1] / "etc"),
+    ], environment
 
 
 def _free_port() -> int:

@@ -6,6 +6,8 @@ import importlib.util
 from typing import Any
 
 import pytest
+from any_vehicle import Choice
+from vehicle_kinds import KINDS
 
 LOOPS = [
     pytest.param(("asyncio", {}), id="asyncio"),
@@ -20,15 +22,27 @@ LOOPS = [
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    group = parser.getgroup("aerokit", "which vehicle tests/integration/test_any_vehicle.py flies")
+    group = parser.getgroup("aerokit", "which vehicle tests/integration/test_any_*.py try and fly")
     group.addoption(
-        "--vehicle", default="sim", help="sim, an address, or the path of an arducopter or px4 binary"
+        "--vehicle",
+        default="sim",
+        help="sim, an address, or the path of an arducopter, arduplane, ardurover, ardusub or px4 binary",
     )
     group.addoption(
-        "--vehicle-kind", default="copter", choices=("copter", "px4"), help="which firmware it is"
+        "--vehicle-kind", choices=KINDS, help="which firmware; without it, all of sim, copter at an address"
     )
-    group.addoption("--vehicle-speedup", type=float, default=None, help="of sim (10) and of a binary (5)")
+    group.addoption(
+        "--vehicle-speedup",
+        type=float,
+        help="of a binary (5); sim is then served on UDP, not in virtual time",
+    )
     group.addoption("--i-know-it-flies", action="store_true", help="needed for an address: motors will turn")
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    if "choice" in metafunc.fixturenames:
+        choices = Choice.from_options(metafunc.config)
+        metafunc.parametrize("choice", choices, ids=[choice.kind.name for choice in choices])
 
 
 @pytest.fixture(params=LOOPS)

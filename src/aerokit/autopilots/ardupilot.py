@@ -198,6 +198,7 @@ class ArduRover(ArduPilot):
     """Rovers and boats."""
 
     firmware = "Rover"
+    stays_on_the_ground = True
     modes = ardupilot_modes.ROVER
     purposes: ClassVar[Mapping[str, str]] = {
         "hold": "HOLD",
@@ -229,6 +230,7 @@ class ArduSub(ArduPilot):
         "mission": "AUTO",
     }
     setpoints = SetpointRules(acceleration=False)
+    landing_ends_in = "ALT_HOLD"  # at the surface
     reposition = Reposition(relative_altitude=True, yaw=False, speed=False, armed_only=False)
     condition_yaw = True
     changes_speed = True

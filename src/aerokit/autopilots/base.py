@@ -163,6 +163,10 @@ class Autopilot:
     wind_message = "WIND_COV"
     stream_groups: ClassVar[Mapping[int, int]] = {}
     """Message id → MAV_DATA_STREAM, for firmware that knows no MAV_CMD_SET_MESSAGE_INTERVAL."""
+    stays_on_the_ground = False
+    """Whether it drives or swims on the surface: altitudes mean nothing to it."""
+    landing_ends_in: ClassVar[str | None] = None
+    """The mode that it goes to by itself when its mode for landing is done; None: it stays there."""
     unarmable_modes: frozenset[str] = frozenset()
     """Modes in which the autopilot refuses to arm."""
 

@@ -118,6 +118,7 @@ class Px4(Autopilot):
 
     def __init__(self, vehicle_type: int) -> None:
         super().__init__(vehicle_type)
+        self.stays_on_the_ground = vehicle_type in (GROUND_ROVER, SURFACE_BOAT)
         self.lands_after_return = not self._stays_down and vehicle_type != FIXED_WING
         if vehicle_type == FIXED_WING:
             self.arrival_radius_m = 120.0  # it circles at NAV_LOITER_RAD, 80 m by default

@@ -100,7 +100,8 @@ class FlightActions(TravelActions):
         """
         check_seconds("timeout", timeout, none_is_allowed=True)
         mode = self._mode_for("land", "land")
-        order = self._new_order(mode)
+        ends_in = self.autopilot.landing_ends_in
+        order = self._new_order(mode, *(() if ends_in is None else (self.autopilot.modes.find(ends_in),)))
         await self._change_mode(mode, told_since=order.given_at)
         await self._await_ground("land", order, timeout)
 
@@ -124,7 +125,8 @@ class FlightActions(TravelActions):
 
         def is_down() -> bool:
             is_disarmed = self.is_surely_disarmed and armed.updated_at > order.given_at
-            return is_disarmed or (landed.latest == LANDED_ON_GROUND and landed.updated_at > order.given_at)
+            is_landed = landed.latest == LANDED_ON_GROUND and landed.updated_at > order.given_at
+            return is_disarmed or is_landed or self.mode_name == self.autopilot.landing_ends_in
 
         with self._streaming("landed_state"):
             await await_progress(

@@ -155,7 +155,7 @@ class TravelActions(ArmingActions):
             if resend is not None and self.connection.now() - sent_at >= RESEND_S:
                 sent_at = self.connection.now()
                 self.connection.send(resend)
-            return self._knows_position_since(started) and self.distance_to(target) <= near_m
+            return self._knows_position_since(started) and self._way_left(target) <= near_m
 
         with self._streaming("position"):
             await await_progress(
@@ -163,7 +163,7 @@ class TravelActions(ArmingActions):
                 f"go_to({target.latitude_deg:.7f}, {target.longitude_deg:.7f})",
                 is_done=is_there,
                 trouble=trouble,
-                describe=lambda: f"it is {self.distance_to(target):.1f} m away",
+                describe=lambda: f"it is {self._way_left(target):.1f} m away",
                 timeout=timeout,
                 held_for=0.5,
             )
@@ -273,6 +273,12 @@ class TravelActions(ArmingActions):
             here.latitude_deg, here.longitude_deg, target.latitude_deg, target.longitude_deg
         )
         return math.hypot(along, self._altitude_difference(here, target))
+
+    def _way_left(self, target: Position) -> float:
+        """Along the ground for a vehicle that stays on it; the altitude it tells may count from anywhere."""
+        if self.autopilot.stays_on_the_ground:
+            return self.distance_to(Position(target.latitude_deg, target.longitude_deg))
+        return self.distance_to(target)
 
     @staticmethod
     def _altitude_difference(here: Position, target: Position) -> float:

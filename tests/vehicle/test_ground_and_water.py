@@ -1,0 +1,50 @@
+"""What differs for vehicles that do not fly: a rover's altitude means nothing, a submarine lands at the surface."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+import pytest
+
+from aerokit import Position, Vehicle, connect
+from aerokit.sim import SimulatedRover, SimulatedSub, SimulatedVehicle, simulated_link
+
+pytestmark = pytest.mark.anyio
+
+DO_SET_HOME = 179
+
+
+@asynccontextmanager
+async def guided(simulated: SimulatedVehicle) -> AsyncIterator[Vehicle]:
+    async with simulated_link(simulated) as link, connect(link) as vehicle:
+        await vehicle.wait_ready()
+        await vehicle.set_mode("GUIDED")
+        await vehicle.arm()
+        yield vehicle
+
+
+async def test_a_rover_arrives_although_its_home_is_at_sea_level() -> None:
+    """As a real one's: its home was set before it knew its altitude."""
+    async with guided(SimulatedRover(boot_time_s=1.0)) as vehicle:
+        here = vehicle.position.value
+        place = {"x": round(here.latitude_deg * 1e7), "y": round(here.longitude_deg * 1e7), "z": 0.0}
+        await vehicle.command_int(DO_SET_HOME, frame=0, **place)
+        there = here.offset(north_m=15)
+        await vehicle.position.wait_until(lambda p: p.altitude_relative_m > 100, timeout=5)
+        await vehicle.go_to(
+            Position(there.latitude_deg, there.longitude_deg, altitude_relative_m=0), timeout=60
+        )
+        assert here.distance_to(vehicle.position.value) > 10
+
+
+async def test_a_submarine_has_landed_when_it_is_at_the_surface() -> None:
+    async with guided(SimulatedSub(boot_time_s=1.0)) as vehicle:
+        here = vehicle.position.value
+        await vehicle.go_to(
+            Position(here.latitude_deg, here.longitude_deg, altitude_relative_m=-5), timeout=120
+        )
+        await vehicle.land(timeout=120)
+        assert vehicle.mode_name == "ALT_HOLD"
+        assert abs(vehicle.position.value.altitude_relative_m or 9.0) < 1.5
+        assert vehicle.is_armed
