@@ -53,7 +53,9 @@ async def test_by_orders(choice: Choice) -> None:
                 await vehicle.disarm()
         assert vehicle.is_armed
         there = Position(*place(here, kind.travel_m, 0.0), altitude_relative_m=kind.altitude_m)
-        await vehicle.go_to(there, speed_m_s=kind.speed_m_s, timeout=choice.seconds(180))
+        await vehicle.go_to(
+            there, speed_m_s=kind.speed_m_s, tolerance_m=kind.near_m, timeout=choice.seconds(240)
+        )
         assert vehicle.distance_to(there) < kind.near_m
         if kind.turns:
             await vehicle.set_heading(90, timeout=choice.seconds(60))
