@@ -6,8 +6,19 @@ import math
 from datetime import datetime, timezone
 from typing import TYPE_CHECKING
 
-from aerokit.mavlink.enums import MavSeverity
-from aerokit.sim.px4.modes import ALTITUDE, KNOWN, LAND, POSITION, POSITION_SLOW, RTL, STICK_MODES, TAKEOFF
+from aerokit.mavlink.enums import MavCmd, MavComponent, MavSeverity
+from aerokit.mavlink.messages import CommandLong
+from aerokit.sim.px4.modes import (
+    ALTITUDE,
+    KNOWN,
+    LAND,
+    POSITION,
+    POSITION_SLOW,
+    PRECISION_LAND,
+    RTL,
+    STICK_MODES,
+    TAKEOFF,
+)
 
 if TYPE_CHECKING:
     from aerokit.sim.px4.vehicle import SimulatedPx4
@@ -16,7 +27,7 @@ __all__ = ["Arming"]
 
 _LOW_THROTTLE, _CENTRE_THROTTLE = -0.8, 0.2
 _CLIMB_MODES = frozenset({ALTITUDE, POSITION, POSITION_SLOW})
-_LEFT_AFTER_DISARMING = frozenset({TAKEOFF, LAND, RTL})
+_LEFT_AFTER_DISARMING = frozenset({TAKEOFF, LAND, PRECISION_LAND, RTL})
 
 
 class Arming:
@@ -62,7 +73,7 @@ class Arming:
 
     # ----------------------------------------------------------------------------------------- doing
 
-    def arm(self) -> bool:
+    def arm(self, by: str = "external command") -> bool:
         """Arm if the checks allow it."""
         px4 = self._px4
         if px4.is_armed:
@@ -80,7 +91,7 @@ class Arming:
             px4.send_text(MavSeverity.CRITICAL, "Arming denied: throttle not in safe position")
             return False
         self.since = px4.now
-        px4.info("Armed by external command")
+        px4.info(f"Armed by {by}")
         px4.armed()
         self._start_log()
         return True
@@ -109,10 +120,12 @@ class Arming:
         return True
 
     def terminate(self) -> None:
-        """Stop the motors for good, wherever it is."""
-        self.is_terminated = True
-        self._px4.send_text(MavSeverity.CRITICAL, "Failsafe activated")
-        self._px4.send_text(MavSeverity.CRITICAL, "Preflight Fail: Flight termination active")
+        """Stop the motors for good, wherever it is, and call for the parachute."""
+        px4, self.is_terminated = self._px4, True
+        px4.is_in_failsafe = True
+        px4.send_text(MavSeverity.CRITICAL, "Failsafe activated")
+        px4.send_text(MavSeverity.CRITICAL, "Preflight Fail: Flight termination active")
+        px4.send(CommandLong(px4.system_id, MavComponent.PARACHUTE, MavCmd.DO_PARACHUTE, 0, 2.0, *(0.0,) * 6))
 
     # ------------------------------------------------------------------------------------------- log
 

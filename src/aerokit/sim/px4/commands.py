@@ -147,7 +147,7 @@ class _Flight:
         if not -1 <= command.param1 < px4.mission.count:
             return MavResult.DENIED
         result = self._change(MISSION)
-        if result == MavResult.ACCEPTED and not px4.arming.arm():
+        if result == MavResult.ACCEPTED and not px4.arming.arm("mission start"):
             return MavResult.TEMPORARILY_REJECTED
         return result
 

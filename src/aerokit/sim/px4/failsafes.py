@@ -2,8 +2,8 @@
 
 https://docs.px4.io/main/en/config/safety.html. The worst of what fails decides. Before it returns or lands it holds
 for COM_FAIL_ACT_T seconds; whoever chooses a mode meanwhile, or later, takes over, until something else fails.
-Simulated: warnings, HOLD, RETURN, LAND, and the motors' stop for the two severest actions.
-Not simulated: the events in which PX4 tells the cause, deferring, terminating with parachutes, prediction of breaches.
+Simulated: warnings, HOLD, RETURN, LAND, disarming and flight termination.
+Not simulated: the events in which PX4 tells the cause, deferring, parachutes, prediction of breaches (GF_PREDICT).
 """
 
 from __future__ import annotations
@@ -36,11 +36,12 @@ class FailsafeAction(IntEnum):
     RETURN = 3
     LAND = 4
     DISARM = 5
+    TERMINATE = 6
 
 
 _A = FailsafeAction
-_LINK_ACTIONS = {1: _A.HOLD, 2: _A.RETURN, 3: _A.LAND, 5: _A.DISARM, 6: _A.DISARM}
-_FENCE_ACTIONS = {1: _A.WARN, 2: _A.HOLD, 3: _A.RETURN, 4: _A.DISARM, 5: _A.LAND}
+_LINK_ACTIONS = {1: _A.HOLD, 2: _A.RETURN, 3: _A.LAND, 5: _A.TERMINATE, 6: _A.DISARM}
+_FENCE_ACTIONS = {1: _A.WARN, 2: _A.HOLD, 3: _A.RETURN, 4: _A.TERMINATE, 5: _A.LAND}
 _MODES: dict[FailsafeAction, Px4Mode] = {_A.HOLD: HOLD, _A.RETURN: RTL, _A.LAND: LAND}
 _BATTERY_TEXTS = {
     MavBatteryChargeState.LOW: (MavSeverity.CRITICAL, "Low battery"),
@@ -200,7 +201,9 @@ class Failsafes:
     # ------------------------------------------------------------------------------------ what is done
 
     def check(self) -> None:
-        """Look at everything, and do what is to be done."""
+        """Look at everything, and do what is to be done; a terminated flight is beyond that."""
+        if self._px4.arming.is_terminated:
+            return
         self._watch_station()
         self._watch_battery()
         if not self._px4.is_armed:
@@ -236,10 +239,12 @@ class Failsafes:
             return
         px4, previous, self.action = self._px4, self.action, action
         px4.is_in_failsafe = action > _A.WARN
-        if action > max(previous, _A.WARN):
+        if max(previous, _A.WARN) < action < _A.TERMINATE:
             self._tell(action)
         if action == _A.DISARM:
             px4.arming.disarm("failsafe", force=True)
+        elif action == _A.TERMINATE:
+            px4.arming.terminate()
         elif action in _MODES:
             px4.switch_to(_MODES[action])
         elif previous > _A.WARN:

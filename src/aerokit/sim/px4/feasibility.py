@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from aerokit.mavlink.enums import MavCmd, MavFrame
+from aerokit.mavlink.enums import MavCmd, MavFrame, MavType
 
 if TYPE_CHECKING:
     from aerokit.missions import MissionItem
@@ -27,12 +27,14 @@ _WITH_PLACE = (
 )
 _STORED_ONLY = (_C.CONDITION_DELAY, _C.CONDITION_DISTANCE, _C.NAV_FENCE_RETURN_POINT)
 """Commands that can be sent to it and that no mission may have."""
+_VTOL = (_C.NAV_VTOL_TAKEOFF, _C.NAV_VTOL_LAND)
 _FAR_M = 10_000.0
-_NEEDS_LANDING = 2
 
 
 def rejection(px4: SimulatedPx4, items: Sequence[MissionItem]) -> str | None:
-    """Why such a mission cannot be flown; None when it can. Gliding, VTOL and geofence checks are not simulated."""
+    """Why such a mission cannot be flown; None when it can. Gliding and geofence checks are not simulated."""
+    if px4.VEHICLE_TYPE == MavType.QUADROTOR and any(item.command in _VTOL for item in items):
+        return "Mission contains VTOL items but vehicle is not a VTOL"
     has_place = False
     for number, item in enumerate(items, start=1):
         if item.command in _STORED_ONLY:
@@ -49,15 +51,20 @@ def rejection(px4: SimulatedPx4, items: Sequence[MissionItem]) -> str | None:
 
 
 def _missing_landing(px4: SimulatedPx4, items: Sequence[MissionItem]) -> str | None:
-    """MIS_TKO_LAND_REQ 2, as an aeroplane has it."""
-    known = "MIS_TKO_LAND_REQ" in px4.parameters  # not in the multicopter's table
-    if known and round(px4.parameters["MIS_TKO_LAND_REQ"]) == _NEEDS_LANDING and _has_no_landing(items):
+    """MIS_TKO_LAND_REQ: 1 demands a take-off, 2 a landing, 3 both, 4 both or none; an aeroplane has 2."""
+    if "MIS_TKO_LAND_REQ" not in px4.parameters or not items:  # not in the multicopter's table
+        return None
+    takes_off, lands = (any(item.command in kind for item in items) for kind in (_TAKE_OFFS, _LANDINGS))
+    required = round(px4.parameters["MIS_TKO_LAND_REQ"])
+    if required == 1 and not takes_off:
+        return "Takeoff waypoint required."
+    if required == 2 and not lands:
         return "Landing waypoint/pattern required."
+    if required == 3 and not (takes_off and lands):
+        return "Takeoff or Landing item missing."
+    if required == 4 and takes_off != lands:
+        return f"Add {'Landing' if takes_off else 'Takeoff'} item or remove {'Takeoff' if takes_off else 'Landing'}."
     return None
-
-
-def _has_no_landing(items: Sequence[MissionItem]) -> bool:
-    return bool(items) and not any(item.command in _LANDINGS for item in items)
 
 
 def _height(px4: SimulatedPx4, item: MissionItem) -> float:

@@ -135,7 +135,7 @@ class Flight:
             down = min(vehicle.home[2] - vehicle.parameters["MIS_TAKEOFF_ALT"], motion.down)
         self.target = (motion.north, motion.east, down)
         if vehicle.is_armed:
-            self.announce_take_off()
+            vehicle.call_later(0.0, self.announce_take_off)
 
     def announce_take_off(self) -> None:
         """The take-off begins with the arming, or in the air at once."""
@@ -174,7 +174,8 @@ class Flight:
             height = max(vehicle.parameters["RTL_DESCEND_ALT"], vehicle.altitude_m)
         self.target = (north, east, min(down, vehicle.home[2] - height))
         amsl = vehicle.frame.origin.altitude_m - self.target[2]
-        vehicle.info(f"RTL: start return at {amsl:.0f} m ({height:.0f} m above destination)")
+        text = f"RTL: start return at {amsl:.0f} m ({height:.0f} m above destination)"
+        vehicle.call_later(0.0, lambda: vehicle.info(text))  # behind the text of the command that wants it
 
     def _return(self) -> None:
         vehicle, motion = self._vehicle, self._vehicle.motion

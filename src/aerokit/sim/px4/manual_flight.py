@@ -35,11 +35,13 @@ class ManualFlight:
         self._place: tuple[float, float] | None = None
         self._down: float | None = None
         self._thrust_velocity = 0.0
+        self._turn_rate_rad_s = px4.motion.limits.turn_rate_rad_s
 
     def enter(self) -> None:
         """A mode begins: nothing is held yet."""
         self._place = self._down = None
         self._thrust_velocity = self._px4.motion.velocity_down
+        self._px4.motion.limits.turn_rate_rad_s = self._turn_rate_rad_s
 
     @property
     def wants_up(self) -> bool:
@@ -54,8 +56,9 @@ class ManualFlight:
     def update(self, dt: float) -> None:
         """Tell the motion what to do until the next tick."""
         px4, sticks = self._px4, self._px4.sticks
-        rate = math.radians(px4.parameters["MPC_MAN_Y_MAX"]) * curved(sticks.yaw, _EXPO, _DEAD_ZONE)
-        px4.motion.turn(rate)
+        fastest = math.radians(px4.parameters["MPC_MAN_Y_MAX"])
+        px4.motion.limits.turn_rate_rad_s = fastest
+        px4.motion.turn(fastest * curved(sticks.yaw, _EXPO, _DEAD_ZONE))
         if px4.mode in _HOLDS_PLACE:
             self._fly_velocity()
             return

@@ -91,7 +91,8 @@ _POSITION_FLAGS = _F.VELOCITY_HORIZ | _F.POS_HORIZ_REL | _F.POS_HORIZ_ABS | _F.P
 
 
 def _heartbeat(px4: SimulatedPx4) -> m.Heartbeat:
-    base = KNOWN[px4.mode].base_mode | (MavModeFlag.SAFETY_ARMED if px4.is_armed else 0)
+    mode = TERMINATION if px4.arming.is_terminated else px4.mode
+    base = KNOWN[mode].base_mode | (MavModeFlag.SAFETY_ARMED if px4.is_armed else 0)
     return m.Heartbeat(px4.VEHICLE_TYPE, MavAutopilot.PX4, base, custom_mode(px4.mode), _state(px4), 3)
 
 

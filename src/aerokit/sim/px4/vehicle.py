@@ -30,6 +30,7 @@ from aerokit.sim.px4.modes import (
     MISSION,
     OFFBOARD,
     POSITION,
+    PRECISION_LAND,
     RTL,
     TAKEOFF,
     TERMINATION,
@@ -59,7 +60,7 @@ _REBOOT_SILENCE_S = 1.5
 _LAND_DETECTOR_S = 1.0
 _HOVER_THROTTLE = 0.5
 _AMPERES_AT_FULL = 40.0
-_NOT_AFTER_LANDING = frozenset({TAKEOFF, LAND, RTL})
+_NOT_AFTER_LANDING = frozenset({TAKEOFF, LAND, PRECISION_LAND, RTL})
 
 
 class SimulatedPx4(SimulatedAutopilot):
@@ -283,7 +284,6 @@ class SimulatedPx4(SimulatedAutopilot):
     def terminate(self) -> None:
         """Stop the motors for good."""
         self.arming.terminate()
-        self.is_in_failsafe = True
         self.switch_to(TERMINATION)
 
     def change_mode(self, mode: Px4Mode) -> bool:

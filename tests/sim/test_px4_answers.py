@@ -1,0 +1,277 @@
+"""What a simulated PX4 answers, beside what real firmware (v1.17-alpha) was seen to answer."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+
+import pytest
+from simulated_client import Client
+
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import MavCmd, MavResult, MavState
+from aerokit.missions import MissionItem
+from aerokit.sim import SimulatedPx4
+from aerokit.sim.px4.wire_messages import CurrentEventSequence, Event, LinkNodeStatus
+
+NAN = math.nan
+ARM = MavCmd.COMPONENT_ARM_DISARM
+HOLD, ORBIT, PRECISION_LAND, TERMINATION = (4, 3), (3, 1), (4, 9), (10, 0)
+
+
+def ready(**options: object) -> tuple[SimulatedPx4, Client]:
+    px4 = SimulatedPx4(fast_rate_hz=2.0, boot_time_s=1.0, parameter_count=100, **options)  # type: ignore[arg-type]
+    client = Client(px4)
+    client.run(2.0)
+    client.forget()
+    return px4, client
+
+
+def flying() -> tuple[SimulatedPx4, Client]:
+    px4, client = ready()
+    client.command(MavCmd.NAV_TAKEOFF, 0, 0, 0, NAN, NAN, NAN, 499.4)
+    client.command(ARM, 1)
+    client.run_until(lambda: px4.mode == HOLD, 40.0)
+    client.forget()
+    return px4, client
+
+
+# ------------------------------------------------------------------------------------------ commands
+
+
+@pytest.mark.parametrize(
+    ("command", "param1", "result"),
+    [
+        (MavCmd.DO_SET_ROI_LOCATION, 0, MavResult.ACCEPTED),
+        (MavCmd.DO_SET_ROI_NONE, 0, MavResult.ACCEPTED),
+        (MavCmd.DO_LAND_START, 0, 6),
+        (MavCmd.DO_GRIPPER, 0, MavResult.IN_PROGRESS),
+        (MavCmd.DO_MOTOR_TEST, 0, MavResult.UNSUPPORTED),
+        (MavCmd.CONTROL_HIGH_LATENCY, 0, MavResult.FAILED),
+        (MavCmd.DO_FLIGHTTERMINATION, 1, MavResult.DENIED),
+        (MavCmd.DO_AUTOTUNE_ENABLE, 0, MavResult.DENIED),
+        (MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, 0, MavResult.ACCEPTED),
+        (MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, 2, MavResult.DENIED),
+        (MavCmd.DO_SET_STANDARD_MODE, 3, MavResult.FAILED),
+        (MavCmd.DO_SET_STANDARD_MODE, 6, MavResult.ACCEPTED),
+    ],
+)
+def test_results(command: int, param1: float, result: int) -> None:
+    _, client = ready()
+    assert client.command(command, param1) == result
+
+
+@pytest.mark.parametrize(
+    "command",
+    [MavCmd.DO_GIMBAL_MANAGER_PITCHYAW, MavCmd.SET_CAMERA_MODE, MavCmd.ACTUATOR_TEST, MavCmd.NAV_DELAY],
+)
+def test_nobody_answers_for_parts_that_do_not_run(command: int) -> None:
+    _, client = ready()
+    assert client.command(command) is None
+    client.run(2.0)
+    assert client.all(m.CommandAck) == []
+
+
+def test_an_arming_param_that_is_neither_is_told_and_not_answered() -> None:
+    _, client = ready()
+    assert client.command(ARM, 2) is None
+    assert client.texts == ["Unsupported ARM_DISARM param: 2.000\t"]
+
+
+def test_some_modes_cannot_be_armed_in() -> None:
+    _, client = ready()
+    for main, sub in ((4, 5), (4, 6), (4, 8), (4, 4), (6, 0)):
+        client.command(MavCmd.DO_SET_MODE, 1, main, sub)
+        client.run(1.1)
+        assert client.last(m.Heartbeat).system_status == MavState.UNINIT
+        assert client.command(ARM, 1) == MavResult.TEMPORARILY_REJECTED
+    client.command(MavCmd.DO_SET_MODE, 1, *HOLD)
+    client.run(1.1)
+    assert client.last(m.Heartbeat).system_status == MavState.STANDBY
+    assert client.command(ARM, 1) == MavResult.ACCEPTED
+
+
+def test_every_arming_but_the_first_begins_a_log() -> None:
+    _, client = ready(unix_time_at_boot=1_790_000_000.0)
+    for logs in (0, 1):
+        client.forget()
+        client.command(ARM, 1)
+        assert sum(text.startswith("[logger] ./log/2026-09-21/14_13_2") for text in client.texts) == logs
+        client.command(ARM, 0)
+
+
+def test_orbit() -> None:
+    px4, client = flying()
+    there = px4.frame.to_global(0.0, 0.0, 0.0)
+    place = (there.latitude_e7 / 1e7, there.longitude_e7 / 1e7, 501.4)
+    client.command(MavCmd.DO_ORBIT, 1500, 4, 0, NAN, *place)
+    assert (px4.mode, client.texts) == (HOLD, ["Orbit radius limit exceeded\t"])
+    assert client.command(MavCmd.DO_ORBIT, 15, 4, 0, NAN, *place) == MavResult.ACCEPTED
+    client.run(30.0)
+    assert px4.mode == ORBIT
+    assert math.hypot(px4.motion.north, px4.motion.east) == pytest.approx(15.0, abs=1.5)
+    assert px4.motion.ground_speed_m_s == pytest.approx(4.0, abs=0.5)
+    assert client.last(m.OrbitExecutionStatus).radius == 15.0
+    assert client.last(m.Heartbeat).base_mode == 145
+
+
+def test_precision_landing_lands() -> None:
+    px4, client = flying()
+    assert client.command(MavCmd.NAV_LAND_LOCAL) == MavResult.ACCEPTED
+    assert px4.mode == PRECISION_LAND
+    client.run_until(lambda: not px4.is_armed, 40.0)
+    assert px4.mode == HOLD
+
+
+def test_a_terminated_flight_falls_and_is_over() -> None:
+    px4, client = flying()
+    assert client.command(MavCmd.DO_FLIGHTTERMINATION, 1) == MavResult.ACCEPTED
+    client.run(6.0)
+    assert client.last(m.Heartbeat).system_status == MavState.FLIGHT_TERMINATION
+    assert (px4.mode, px4.is_armed) == (TERMINATION, True)
+    assert px4.altitude_m == pytest.approx(0.0)
+    assert client.command(ARM, 0) == MavResult.TEMPORARILY_REJECTED
+    client.command(MavCmd.DO_SET_MODE, 1, *HOLD)
+    assert client.texts[-1] == "Switching to Hold is currently not available\t"
+
+
+def test_a_take_off_never_leads_down() -> None:
+    px4, client = flying()
+    client.command(MavCmd.NAV_TAKEOFF, 0, 0, 0, NAN, NAN, NAN, 493.4)
+    assert client.texts == ["Already higher than takeoff altitude\t"]
+    client.run(3.0)
+    assert px4.altitude_m == pytest.approx(10.0, abs=0.6)
+
+
+def test_calibration_by_hand_waits_until_it_is_cancelled() -> None:
+    _, client = ready()
+    assert client.command(MavCmd.PREFLIGHT_CALIBRATION, 0, 1) == MavResult.ACCEPTED
+    client.run(6.0)
+    assert client.texts[0] == "[cal] calibration started: 2 mag"
+    assert client.texts[-1] == "[cal] Rotate vehicle"
+    assert client.last(m.Heartbeat).system_status == MavState.CALIBRATING
+    assert client.command(ARM, 1) == MavResult.TEMPORARILY_REJECTED
+    assert client.texts[-1] == "Arming denied: calibrating\t"
+    assert client.command(MavCmd.PREFLIGHT_CALIBRATION) == MavResult.ACCEPTED
+    assert client.texts[-1] == "[cal] calibration cancelled"
+    assert client.command(ARM, 1) == MavResult.ACCEPTED
+
+
+def test_a_mission_for_other_vehicles_is_rejected() -> None:
+    px4, client = ready()
+    px4.missions.replace(0, [MissionItem(MavCmd.NAV_VTOL_TAKEOFF, 3, x=473977432, y=85455939, z=10.0)])
+    assert client.command(MavCmd.MISSION_START) == MavResult.DENIED
+    assert "not a VTOL" in "".join(client.texts)
+
+
+# -------------------------------------------------------------------------------------------- links
+
+
+@pytest.mark.parametrize(
+    ("mode", "attitude_hz", "status_hz", "imu_hz"),
+    [("normal", 2, 1, 0), ("onboard", 100, 5, 50), ("config", 50, 1, 50), ("minimal", 10, 0.1, 0)],
+)
+def test_rates_follow_the_mode_of_the_link(
+    mode: str, attitude_hz: float, status_hz: float, imu_hz: float
+) -> None:
+    _, client = ready(link_modes=[mode])
+    client.run(10.0)
+    seen = Counter(type(message) for _, message in client.heard)
+    assert seen[m.Attitude] == pytest.approx(attitude_hz * 10, abs=2)
+    assert seen[m.SysStatus] == pytest.approx(status_hz * 10, abs=1)
+    assert seen[m.HighresImu] == pytest.approx(imu_hz * 10, abs=2)
+    assert seen[m.Heartbeat] == seen[m.MissionCurrent] == 10
+
+
+def test_a_second_link_has_the_last_mode() -> None:
+    px4 = SimulatedPx4(boot_time_s=1.0, parameter_count=100, link_modes=("minimal", "onboard"))
+    other = px4.open_channel()
+    px4.step(0.0)
+    px4.step(5.0)
+    assert len(other.take_outbox()) > 10 * len(px4.take_outbox())
+    with pytest.raises(ValueError, match="link_modes"):
+        SimulatedPx4(link_modes=("fast",))
+
+
+def interval(client: Client, message_id: int) -> int:
+    client.command(MavCmd.GET_MESSAGE_INTERVAL, message_id)
+    return client.last(m.MessageInterval).interval_us
+
+
+def test_intervals_are_told_as_the_real_one_tells_them() -> None:
+    _, client = ready()
+    assert interval(client, m.Heartbeat.ID) == 1_000_000
+    assert interval(client, m.SysStatus.ID) == 1_000_000
+    assert interval(client, m.HighresImu.ID) == -1
+    assert interval(client, m.MissionCurrent.ID) == -1
+    assert interval(client, 31_999) == -1
+    assert client.command(MavCmd.SET_MESSAGE_INTERVAL, m.Heartbeat.ID, 1e6) == MavResult.FAILED
+    assert client.command(MavCmd.SET_MESSAGE_INTERVAL, m.MissionCurrent.ID, 1e6) == MavResult.FAILED
+    assert client.command(MavCmd.SET_MESSAGE_INTERVAL, m.HighresImu.ID, 1e5) == MavResult.ACCEPTED
+    client.forget()
+    client.run(2.0)
+    assert len(client.all(m.HighresImu)) == pytest.approx(20, abs=1)
+    client.command(MavCmd.SET_MESSAGE_INTERVAL, m.Attitude.ID, 0)
+    assert interval(client, m.Attitude.ID) == 66_666, "the link's own rate, not the simulator's"
+    client.command(MavCmd.REQUEST_MESSAGE, m.StorageInformation.ID)
+    assert interval(client, m.StorageInformation.ID) == 0, "what was asked for once"
+
+
+REQUESTED = (
+    m.ScaledImu,
+    m.ScaledPressure,
+    m.ManualControl,
+    m.Timesync,
+    m.DistanceSensor,
+    m.Odometry,
+    m.ActuatorOutputStatus,
+    m.AutopilotStateForGimbalDevice,
+    m.StorageInformation,
+    m.FlightInformation,
+    m.MagCalReport,
+    m.OpenDroneIdBasicId,
+    m.OpenDroneIdLocation,
+    m.OpenDroneIdSystem,
+    m.CurrentMode,
+)
+
+
+@pytest.mark.parametrize("kind", REQUESTED)
+def test_messages_on_request(kind: type[m.Heartbeat]) -> None:
+    _, client = ready()
+    assert client.command(MavCmd.REQUEST_MESSAGE, kind.ID) == MavResult.ACCEPTED
+    assert isinstance(client.heard[0][1], kind)
+    client.last(kind).encode()
+
+
+def test_what_only_others_can_send_is_denied() -> None:
+    _, client = ready()
+    for kind in (m.MissionCurrent, m.ParamValue, m.GimbalManagerInformation, m.RcChannels):
+        assert client.command(MavCmd.REQUEST_MESSAGE, kind.ID) == MavResult.DENIED
+    assert client.command(MavCmd.REQUEST_MESSAGE, m.HighLatency2.ID) == MavResult.DENIED
+    assert client.last(m.HighLatency2).custom_mode == 772, "sent all the same"
+
+
+def test_the_modes_are_listed_with_places_for_modes_of_others() -> None:
+    _, client = ready()
+    client.command(MavCmd.REQUEST_MESSAGE, m.AvailableModes.ID, 0)
+    modes = client.all(m.AvailableModes)
+    assert len(modes) == 26
+    assert [mode.mode_name for mode in modes[-8:]] == ["(Mode not available)"] * 8
+    assert {mode.standard_mode for mode in modes} == {0, 1, 2, 4, 5, 6, 7, 8}
+    assert client.command(MavCmd.REQUEST_MESSAGE, m.AvailableModes.ID, 99) == MavResult.DENIED
+
+
+def test_events_are_counted_from_just_before_the_overflow() -> None:
+    px4, client = ready()
+    before = px4.build(CurrentEventSequence.ID)
+    assert before is not None
+    assert before.encode() == (65525).to_bytes(2, "little") + b"\0"
+    client.command(ARM, 1)
+    now = px4.build(CurrentEventSequence.ID)
+    assert now is not None
+    assert now.encode() == (65526).to_bytes(2, "little") + b"\0"
+    assert len(Event.of(1, 2, 3, 0, 0, 4, b"").encode()) == Event.LENGTH
+    status = px4.build(LinkNodeStatus.ID)
+    assert status is not None
+    assert len(status.encode()) == LinkNodeStatus.LENGTH
