@@ -58,7 +58,9 @@ async def fly(kind: str, port: int) -> None:
     steps = Steps()
     mavsdk = Mavsdk(Configuration.create_with_component_type(ComponentType.GROUND_STATION))
     await mavsdk.add_any_connection(f"udpin://127.0.0.1:{port}")
-    system = await mavsdk.first_autopilot(timeout_s=30.0)
+    system = None
+    while system is None:  # until LONGEST_S of fly.py
+        system = await mavsdk.first_autopilot(timeout_s=30.0)
     steps.done("connect")
     param, raw = ParamAsync(system), MissionRawAsync(system)
     action, telemetry = ActionAsync(system), TelemetryAsync(system)

@@ -56,7 +56,7 @@ async def test_by_orders(choice: Choice) -> None:
         await vehicle.go_to(
             there, speed_m_s=kind.speed_m_s, tolerance_m=kind.near_m, timeout=choice.seconds(240)
         )
-        assert vehicle.distance_to(there) < kind.near_m
+        assert vehicle.distance_to(Position(*place(here, kind.travel_m, 0.0))) < kind.near_m
         if kind.turns:
             await vehicle.set_heading(90, timeout=choice.seconds(60))
             assert vehicle.heading_deg.value == pytest.approx(90, abs=10)

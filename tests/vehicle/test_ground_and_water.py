@@ -28,10 +28,10 @@ async def test_a_rover_arrives_although_its_home_is_at_sea_level() -> None:
     """As a real one's: its home was set before it knew its altitude."""
     async with guided(SimulatedRover(boot_time_s=1.0)) as vehicle:
         here = vehicle.position.value
-        place = {"x": round(here.latitude_deg * 1e7), "y": round(here.longitude_deg * 1e7), "z": 0.0}
-        await vehicle.command_int(DO_SET_HOME, frame=0, **place)
+        x, y = round(here.latitude_deg * 1e7), round(here.longitude_deg * 1e7)
+        await vehicle.command_int(DO_SET_HOME, frame=0, x=x, y=y, z=0.0)
         there = here.offset(north_m=15)
-        await vehicle.position.wait_until(lambda p: p.altitude_relative_m > 100, timeout=5)
+        await vehicle.position.wait_until(lambda p: (p.altitude_relative_m or 0.0) > 100, timeout=5)
         await vehicle.go_to(
             Position(there.latitude_deg, there.longitude_deg, altitude_relative_m=0), timeout=60
         )
@@ -48,3 +48,11 @@ async def test_a_submarine_has_landed_when_it_is_at_the_surface() -> None:
         assert vehicle.mode_name == "ALT_HOLD"
         assert abs(vehicle.position.value.altitude_relative_m or 9.0) < 1.5
         assert vehicle.is_armed
+
+
+async def test_a_submarine_at_the_surface_has_landed_at_once() -> None:
+    """SURFACE is over before a heartbeat tells it."""
+    async with guided(SimulatedSub(boot_time_s=1.0)) as vehicle:
+        await vehicle.set_mode("MANUAL")
+        await vehicle.land(timeout=5)
+        assert vehicle.mode_name == "ALT_HOLD"

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 __all__ = ["FlightActions"]
 
 LANDED_ON_GROUND, LANDED_IN_AIR = 1, 2
+MODE_TIMEOUT_S = 6.0
 
 
 class FlightActions(TravelActions):
@@ -100,9 +101,13 @@ class FlightActions(TravelActions):
         """
         check_seconds("timeout", timeout, none_is_allowed=True)
         mode = self._mode_for("land", "land")
-        ends_in = self.autopilot.landing_ends_in
-        order = self._new_order(mode, *(() if ends_in is None else (self.autopilot.modes.find(ends_in),)))
-        await self._change_mode(mode, told_since=order.given_at)
+        if self.autopilot.landing_ends_in is None:
+            order = self._new_order(mode)
+            await self._change_mode(mode, told_since=order.given_at)
+        else:
+            order = self._new_order(mode, self.autopilot.modes.find(self.autopilot.landing_ends_in))
+            with self._changing_mode():
+                await self._request_mode(mode, MODE_TIMEOUT_S)  # it may be over before HEARTBEAT tells it
         await self._await_ground("land", order, timeout)
 
     async def return_to_launch(self, *, timeout: float | None = 600.0) -> None:
@@ -121,12 +126,14 @@ class FlightActions(TravelActions):
 
     async def _await_ground(self, what: str, order: Order, timeout: float | None) -> None:
         """Only what was told after the order counts: a state that had gone stale would end a landing in the air."""
-        armed, landed = self.telemetry.armed, self.telemetry.landed_state
+        armed, landed, mode = self.telemetry.armed, self.telemetry.landed_state, self.telemetry.mode
+        accepted_at = self.connection.now()
 
         def is_down() -> bool:
             is_disarmed = self.is_surely_disarmed and armed.updated_at > order.given_at
             is_landed = landed.latest == LANDED_ON_GROUND and landed.updated_at > order.given_at
-            return is_disarmed or is_landed or self.mode_name == self.autopilot.landing_ends_in
+            is_over = self.mode_name == self.autopilot.landing_ends_in and mode.updated_at > accepted_at
+            return is_disarmed or is_landed or is_over
 
         with self._streaming("landed_state"):
             await await_progress(
