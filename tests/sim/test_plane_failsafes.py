@@ -17,7 +17,7 @@ from vehicles import (
 )
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavResult, MavState, PlaneMode
+from aerokit.mavlink.enums import MavCmd, MavResult, MavState, PlaneMode
 from aerokit.mavlink.enums import MavSysStatusSensor as Sensor
 from aerokit.missions import MissionItem
 
@@ -102,7 +102,7 @@ def test_without_the_short_one_the_long_one_counts_from_the_last_pulse() -> None
 
 def test_a_low_throttle_is_a_lost_radio() -> None:
     plane, client = flying_plane()
-    plane.rc[2] = 940
+    plane.parameters["SIM_RC_FAIL"] = 2.0
     client.run(0.5)
     assert client.texts == ["Throttle failsafe on", "RC Short Failsafe On"]
 
@@ -242,3 +242,13 @@ def test_a_low_battery_lands_where_the_mission_says() -> None:
     drain(plane, client, LOW)
     assert plane.mode.number == PlaneMode.AUTO
     assert plane.mission.nav_index == 3
+
+
+def test_a_flight_is_not_terminated() -> None:
+    plane, client = flying_plane(**BATTERY, BATT_FS_LOW_ACT=3.0)
+    assert client.command(MavCmd.DO_FLIGHTTERMINATION, 1) == MavResult.FAILED
+    assert client.texts == ["AFS not enabled, can't terminate the vehicle"]
+    plane.parameters["AFS_ENABLE"] = 1.0
+    drain(plane, client, LOW)
+    assert client.texts[-1] == "Unable to terminate, termination is not configured"
+    assert plane.is_armed

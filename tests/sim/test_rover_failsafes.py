@@ -17,7 +17,7 @@ from vehicles import (
 )
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavResult, MavState, RoverMode
+from aerokit.mavlink.enums import MavCmd, MavResult, MavState, RoverMode
 from aerokit.mavlink.enums import MavSysStatusSensor as Sensor
 from aerokit.missions import MissionItem
 
@@ -56,6 +56,13 @@ def test_a_lost_radio_may_disarm_it() -> None:
     client.run(2.5)
     assert client.texts == ["Radio Failsafe", "Throttle disarmed"]
     assert not rover.is_armed
+
+
+def test_a_low_battery_may_disarm_it() -> None:
+    rover, client = driving_rover(**BATTERY, BATT_FS_LOW_ACT=5.0)
+    drain(rover, client, LOW)
+    assert client.texts[1:] == ["Throttle disarmed"]
+    assert client.command(MavCmd.DO_FLIGHTTERMINATION, 1) == MavResult.UNSUPPORTED
 
 
 def test_a_low_throttle_is_a_lost_radio_and_a_short_dip_is_none() -> None:

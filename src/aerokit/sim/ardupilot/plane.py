@@ -57,6 +57,7 @@ class SimulatedPlane(ArduPilotVehicle):
     )  # fmt: skip
 
     fence: PlaneFence
+    failsafes: PlaneFailsafes
 
     def make_motion(self, wind: Wind | None) -> Motion:
         """An aeroplane within the limits of the parameters."""

@@ -30,6 +30,7 @@ def plane_commands(plane: SimulatedPlane) -> dict[int, CommandHandler]:
         MavCmd.DO_REPOSITION: flight.reposition,
         MavCmd.DO_CHANGE_SPEED: flight.change_speed,
         **guided_commands(plane),
+        MavCmd.DO_FLIGHTTERMINATION: flight.terminate,
     }
 
 
@@ -38,6 +39,12 @@ class _Flight:
 
     def __init__(self, plane: SimulatedPlane) -> None:
         self._plane = plane
+
+    def terminate(self, command: Command) -> int:
+        """Only with the advanced failsafe, which is not simulated."""
+        if command.param1 > 0.5:
+            self._plane.failsafes.refuse_termination()
+        return MavResult.FAILED
 
     def start_mission(self, command: Command) -> int:
         if command.param1 or command.param2:

@@ -206,12 +206,19 @@ class PlaneFailsafes(Failsafes):
     def act_on_battery(self, action: int) -> None:
         """A landing goes on whatever the battery does."""
         if action == _TERMINATE:
-            self.say("AFS not enabled, can't terminate the vehicle", MavSeverity.INFO)
+            self.refuse_termination()
         elif action in (_LAND, _QLAND, _LOITER_QLAND):
             if not self._is_landing() and not self._land_by_mission():
                 self._return(action)
         elif action in (_BATTERY_RTL, _AUTOLAND_OR_RTL):
             self._return(action)
+
+    def refuse_termination(self) -> None:
+        """Say why the flight is not ended: AFS_ENABLE does not allow it, or nobody has said how (AFS_TERM_ACTION)."""
+        text = "AFS not enabled, can't terminate the vehicle"
+        if self._plane.parameters["AFS_ENABLE"]:
+            text = "Unable to terminate, termination is not configured"
+        self.say(text, MavSeverity.INFO)
 
     def _return(self, action: int) -> None:
         if self._is_landing():

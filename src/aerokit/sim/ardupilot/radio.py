@@ -17,6 +17,9 @@ __all__ = ["Radio"]
 
 _AT_REST = (1500, 1500, 1000, 1500, 1800, 1000, 1000, 1800)
 _OVERRIDABLE, _CHANNELS = 16, 18
+_NO_PULSES, _LOW_THROTTLE = 1, 2
+"""SIM_RC_FAIL."""
+_THROTTLE, _LOW_THROTTLE_PWM = 2, 950
 _SAME_AS_BEFORE, _RELEASE_UPPER = 0xFFFF, 0xFFFE
 
 
@@ -38,6 +41,8 @@ class Radio:
         value, since = self._overrides.get(index, (0, -math.inf))
         if value and self._vehicle.now - since < self._override_time():
             return value
+        if index == _THROTTLE and self._failure == _LOW_THROTTLE:
+            return _LOW_THROTTLE_PWM
         return self._sticks[index] if index < len(self._sticks) else 0
 
     def __setitem__(self, index: int, value: int) -> None:
@@ -55,8 +60,7 @@ class Radio:
     def is_heard(self) -> bool:
         """Whether there are pulses: of the transmitter, or of RC_CHANNELS_OVERRIDE in its place."""
         vehicle = self._vehicle
-        failed = "SIM_RC_FAIL" in vehicle.parameters and vehicle.parameters["SIM_RC_FAIL"] == 1.0
-        if not (vehicle.faults.rc_lost or failed):
+        if not (vehicle.faults.rc_lost or self._failure == _NO_PULSES):
             return True
         limit = vehicle.now - self._override_time()
         return any(value and since > limit for value, since in self._overrides.values())
@@ -65,6 +69,12 @@ class Radio:
         """Put these in the place of channels, from 0, as long as RC_OVERRIDE_TIME says; 0 gives one back."""
         for index, value in pulses.items():
             self._overrides[index] = (value, self._vehicle.now)
+
+    @property
+    def _failure(self) -> float:
+        parameters = self._vehicle.parameters
+        is_there = "SIM_RC_FAIL" in parameters
+        return parameters["SIM_RC_FAIL"] if is_there else 0.0
 
     def release_overrides(self) -> None:
         """Forget what was overridden, as a lost ground station makes the vehicle do."""

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from aerokit.mavlink.enums import MavCmd, MavModeFlag, MavType, RoverMode
+from aerokit.mavlink.enums import MavCmd, MavModeFlag, MavResult, MavType, RoverMode
 from aerokit.sim.ardupilot.level_vehicle import LevelVehicle
 from aerokit.sim.ardupilot.manual_control import LevelJoystick
 from aerokit.sim.ardupilot.motors import Motors
@@ -158,8 +158,11 @@ class SimulatedRover(LevelVehicle):
         return "Flight mode change failed"
 
     def own_commands(self) -> dict[int, CommandHandler]:
-        """Of the commands that stand for a mode only the way home is known."""
-        return {MavCmd.NAV_RETURN_TO_LAUNCH: lambda _: self.change_to(RoverMode.RTL)}
+        """Of the commands that stand for a mode only the way home is known; there is nothing to terminate."""
+        return {
+            MavCmd.NAV_RETURN_TO_LAUNCH: lambda _: self.change_to(RoverMode.RTL),
+            MavCmd.DO_FLIGHTTERMINATION: lambda _: MavResult.UNSUPPORTED,
+        }
 
     def has_arrived(self, place: tuple[float, float, float]) -> bool:
         """At a place where it is to stop, or past it."""

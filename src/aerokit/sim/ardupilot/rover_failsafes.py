@@ -124,11 +124,8 @@ class RoverFailsafes(Failsafes):
             self.change_to(*modes_of_action(action))
 
     def act_on_battery(self, action: int) -> None:
-        """The same actions; to terminate needs a function that is switched off by default."""
-        if action == _TERMINATE:
-            self.say("AFS not enabled, can't terminate the vehicle", MavSeverity.INFO)
-        else:
-            self._act(action)
+        """The same actions."""
+        self._act(action)
 
     # ------------------------------------------------------------------------- estimator and wheels
 
