@@ -158,7 +158,7 @@ def test_a_rover_does_what_is_configured_without_a_word(action: int, mode: int) 
 def test_a_rover_may_only_report() -> None:
     rover, client = leave_the_garden(0)
     assert (client.texts, rover.mode.number) == ([], RoverMode.GUIDED)
-    assert client.all(m.FenceStatus)
+    assert client.last(m.FenceStatus).breach_status == 1
 
 
 def test_a_rover_that_is_stopped_outside_is_not_armed_there() -> None:
@@ -206,5 +206,5 @@ def test_a_submarine_looks_only_while_it_is_armed() -> None:
     sub, client = ready_sub(FENCE_ENABLE=1.0, FENCE_TYPE=2.0, FENCE_RADIUS=3.0, FENCE_MARGIN=1.0)
     sub.motion.north = 10.0
     client.run(1.0)
-    assert not client.all(m.FenceStatus)
+    assert not any(status.breach_status for status in client.all(m.FenceStatus))
     assert math.isclose(sub.fence.beyond_m(2), 7.0, abs_tol=0.1)
