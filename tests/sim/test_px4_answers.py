@@ -275,3 +275,74 @@ def test_events_are_counted_from_just_before_the_overflow() -> None:
     status = px4.build(LinkNodeStatus.ID)
     assert status is not None
     assert len(status.encode()) == LinkNodeStatus.LENGTH
+
+
+# ------------------------------------------------------------------------- set-points, fence, rally
+
+
+def setpoint(frame: int, mask: int) -> m.SetPositionTargetLocalNed:
+    return m.SetPositionTargetLocalNed(0, 1, 1, frame, mask, 0, 0, -5, 0, 0, 0, 0, 0, 0, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("message", "text"),
+    [
+        (setpoint(7, 0b110111111000), "SET_POSITION_TARGET_LOCAL_NED coordinate frame 7 unsupported\t"),
+        (setpoint(8, 0b110111111000), "SET_POSITION_TARGET_LOCAL_NED invalid\t"),
+        (setpoint(1, 0b111111111111), "SET_POSITION_TARGET_LOCAL_NED invalid\t"),
+        (
+            m.SetPositionTargetGlobalInt(0, 1, 1, 3, 0b110111111000, 0, 0, 5.0, 0, 0, 0, 0, 0, 0, 0, 0),
+            "SET_POSITION_TARGET_GLOBAL_INT invalid coordinate frame 3\t",
+        ),
+    ],
+)
+def test_set_points_that_say_nothing_are_told(message: m.SetPositionTargetLocalNed, text: str) -> None:
+    px4, client = ready()
+    client.send(message)
+    assert "".join(client.texts) == text
+    assert not px4.offboard.is_fresh
+
+
+def place(px4: SimulatedPx4, north: float, east: float) -> tuple[int, int]:
+    there = px4.frame.to_global(north, east, 0.0)
+    return there.latitude_e7, there.longitude_e7
+
+
+def put(
+    px4: SimulatedPx4, kind: int, command: int, north: float, east: float, up: float, param1: float = 0.0
+) -> None:
+    x, y = place(px4, north, east)
+    assert px4.missions.replace(kind, [MissionItem(command, 6, param1, x=x, y=y, z=up)]) == 0
+
+
+def test_a_fence_that_home_is_not_in_is_not_looked_at() -> None:
+    px4, client = ready(parameters={"GF_ACTION": 2})
+    put(px4, 1, MavCmd.NAV_FENCE_CIRCLE_INCLUSION, 200.0, 0.0, 0.0, 50.0)
+    client.run(0.1)
+    assert client.texts == ["Geofence invalid, doesn't contain Home position\t"]
+    assert client.command(ARM, 1) == MavResult.ACCEPTED
+
+
+def test_a_mission_beyond_the_fence_is_none() -> None:
+    px4, client = ready(parameters={"GF_ACTION": 2})
+    put(px4, 1, MavCmd.NAV_FENCE_CIRCLE_INCLUSION, 0.0, 0.0, 0.0, 30.0)
+    put(px4, 0, MavCmd.NAV_WAYPOINT, 60.0, 0.0, 10.0)
+    client.run(0.1)
+    assert client.texts == ["Geofence violation for waypoint 1\t"]
+    assert client.command(MavCmd.MISSION_START) == MavResult.DENIED
+
+
+@pytest.mark.parametrize(("kind", "north"), [(0, 30.0), (1, 30.0), (3, 30.0), (4, 0.0)])
+def test_it_returns_to_the_rally_point_that_is_near(kind: int, north: float) -> None:
+    px4, client = flying()
+    px4.parameters["RTL_TYPE"] = kind
+    put(px4, 2, MavCmd.NAV_RALLY_POINT, 30.0, 20.0, 15.0)
+    x, y = place(px4, 40.0, 30.0)
+    client.command(MavCmd.DO_REPOSITION, -1, 1, 0, NAN, x / 1e7, y / 1e7, 499.4)
+    client.run(20.0)
+    client.command(MavCmd.NAV_RETURN_TO_LAUNCH)
+    above_sea = 534 if north else 519
+    client.run(0.1)
+    assert f"RTL: start return at {above_sea} m (30 m above destination)\t" in "".join(client.texts)
+    client.run_until(lambda: not px4.is_armed, 150.0)
+    assert px4.motion.north == pytest.approx(north, abs=1.0)

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from aerokit.missions import MissionItem
     from aerokit.sim.px4.vehicle import SimulatedPx4
 
-__all__ = ["rejection", "warning"]
+__all__ = ["outside_fence", "rejection", "warning"]
 
 _C = MavCmd
 _TAKE_OFFS = (_C.NAV_TAKEOFF, _C.NAV_VTOL_TAKEOFF)
@@ -32,7 +32,7 @@ _FAR_M = 10_000.0
 
 
 def rejection(px4: SimulatedPx4, items: Sequence[MissionItem]) -> str | None:
-    """Why such a mission cannot be flown; None when it can. Gliding and geofence checks are not simulated."""
+    """Why such a mission cannot be flown; None when it can. Gliding is not checked."""
     if px4.VEHICLE_TYPE == MavType.QUADROTOR and any(item.command in _VTOL for item in items):
         return "Mission contains VTOL items but vehicle is not a VTOL"
     has_place = False
@@ -86,6 +86,16 @@ def _landing_problem(items: Sequence[MissionItem]) -> str | None:
         elif item.command == _C.NAV_RETURN_TO_LAUNCH and 0 <= start < index:
             return "land start item before RTL item not possible."
     return "invalid land start." if start > approach else None
+
+
+def outside_fence(px4: SimulatedPx4, items: Sequence[MissionItem]) -> int | None:
+    """The number, from 1 on, of the first item whose place the geofence forbids."""
+    for number, item in enumerate(items, start=1):
+        if item.command in _WITH_PLACE:
+            north, east = px4.frame.to_local(round(item.x), round(item.y))
+            if not px4.failsafes.fence.allows((north, east, px4.home[2] - _height(px4, item))):
+                return number
+    return None
 
 
 def warning(px4: SimulatedPx4, items: Sequence[MissionItem]) -> str | None:

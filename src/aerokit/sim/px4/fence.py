@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
-from aerokit.mavlink.enums import MavCmd, MavMissionType
+from aerokit.mavlink.enums import MavCmd, MavMissionType, MavSeverity
 from aerokit.sim.px4.texts import OUTSIDE, TOO_FAR, TOO_HIGH
 
 if TYPE_CHECKING:
@@ -29,6 +29,14 @@ class Fence:
 
     def __init__(self, px4: SimulatedPx4) -> None:
         self._px4 = px4
+        self._is_valid = True
+
+    def uploaded(self) -> None:
+        """Another list of areas: one that home is not in is told, and not looked at."""
+        home = self._px4.home
+        self._is_valid = self._areas_allow(home[0], home[1])
+        if not self._is_valid:
+            self._px4.send_text(MavSeverity.CRITICAL, "Geofence invalid, doesn't contain Home position")
 
     @property
     def breaches(self) -> list[str]:
@@ -57,8 +65,11 @@ class Fence:
         return found
 
     def _is_inside(self, north: float, east: float) -> bool:
-        if not self._px4.missions.count(MavMissionType.FENCE):
+        if not self._is_valid or not self._px4.missions.count(MavMissionType.FENCE):
             return True
+        return self._areas_allow(north, east)
+
+    def _areas_allow(self, north: float, east: float) -> bool:
         areas = list(self._areas(north, east))
         if any(inside for is_inclusion, inside in areas if not is_inclusion):
             return False

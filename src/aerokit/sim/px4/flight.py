@@ -21,6 +21,7 @@ from aerokit.sim.px4.modes import (
     Px4Mode,
 )
 from aerokit.sim.px4.orbit import Orbit
+from aerokit.sim.px4.rally import return_destination
 from aerokit.sim.vehicle import TICK_S
 
 if TYPE_CHECKING:
@@ -42,6 +43,8 @@ class Flight:
         self._vehicle = vehicle
         self.target: Ned = (0.0, 0.0, 0.0)
         """Where HOLD stays, TAKEOFF and RTL go: north, east, down in the world's frame."""
+        self.destination: Ned = (0.0, 0.0, 0.0)
+        """Where RTL lands: home, or a rally point."""
         self.heading: float | None = None
         self.speed_m_s = 0.0
         self.lifts_off = False
@@ -166,13 +169,18 @@ class Flight:
         vehicle.motion.seek_velocity(0.0, 0.0, slow + (fast - slow) * share)
 
     def _plan_return(self) -> None:
+        """Up to RTL_RETURN_ALT above where it will land, or RTL_DESCEND_ALT if that is near."""
         vehicle = self._vehicle
+        self.destination = return_destination(vehicle)
         north, east, down = vehicle.motion.north, vehicle.motion.east, vehicle.motion.down
-        height = max(vehicle.parameters["RTL_RETURN_ALT"], vehicle.altitude_m)
-        away = math.hypot(north - vehicle.home[0], east - vehicle.home[1])
-        if away < vehicle.parameters["RTL_MIN_DIST"]:
-            height = max(vehicle.parameters["RTL_DESCEND_ALT"], vehicle.altitude_m)
-        self.target = (north, east, min(down, vehicle.home[2] - height))
+        above = self.destination[2] - down
+        height = max(vehicle.parameters["RTL_RETURN_ALT"], above)
+        if (
+            math.hypot(north - self.destination[0], east - self.destination[1])
+            < vehicle.parameters["RTL_MIN_DIST"]
+        ):
+            height = max(vehicle.parameters["RTL_DESCEND_ALT"], above)
+        self.target = (north, east, min(down, self.destination[2] - height))
         amsl = vehicle.frame.origin.altitude_m - self.target[2]
         text = f"RTL: start return at {amsl:.0f} m ({height:.0f} m above destination)"
         vehicle.call_later(0.0, lambda: vehicle.info(text))  # behind the text of the command that wants it
@@ -187,7 +195,7 @@ class Flight:
             return
         if self._phase == "climb":
             self._phase = "return"
-            self.target = (*vehicle.home[:2], self.target[2])
+            self.target = (*self.destination[:2], self.target[2])
         else:
             self._phase = "land"
             vehicle.info("RTL: land at destination")

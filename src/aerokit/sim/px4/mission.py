@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavSeverity, MissionState
 from aerokit.mavlink.messages import MissionItemReached
-from aerokit.sim.px4.feasibility import rejection, warning
+from aerokit.sim.px4.feasibility import outside_fence, rejection, warning
 from aerokit.sim.px4.modes import HOLD, LAND, MISSION, RTL, TAKEOFF
 
 if TYPE_CHECKING:
@@ -119,7 +119,10 @@ class Mission:
         """A rejected mission stays in the vehicle, and is treated as none."""
         items = self._px4.missions.commands
         problem, doubt = rejection(self._px4, items), warning(self._px4, items)
-        self.is_valid = bool(items) and problem is None
+        outside = outside_fence(self._px4, items)
+        self.is_valid = bool(items) and problem is None and outside is None
+        if outside is not None:
+            self._px4.send_text(MavSeverity.CRITICAL, f"Geofence violation for waypoint {outside}")
         if problem is not None:
             self._px4.send_text(MavSeverity.CRITICAL, f"Mission rejected: {problem}")
         if doubt is not None:

@@ -126,6 +126,8 @@ class MissionServer:
         self._items[mission_type], self._ids[mission_type] = items, opaque_id
         if mission_type == MavMissionType.MISSION:
             self._px4.mission.replaced(current)
+        elif mission_type == MavMissionType.FENCE and items:
+            self._px4.failsafes.fence.uploaded()
 
     def item_changed(self, seq: int) -> None:
         """Whoever spoke last on each link gets the item once more, unless a transfer goes on."""

@@ -26,7 +26,8 @@ _NAN3: Ned = (math.nan, math.nan, math.nan)
 _POSITION = (Mask.X_IGNORE, Mask.Y_IGNORE, Mask.Z_IGNORE)
 _VELOCITY = (Mask.VX_IGNORE, Mask.VY_IGNORE, Mask.VZ_IGNORE)
 _ACCELERATION = (Mask.AX_IGNORE, Mask.AY_IGNORE, Mask.AZ_IGNORE)
-_RELATIVE = (MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT)
+_GLOBAL_FRAMES = (MavFrame.GLOBAL_INT, MavFrame.GLOBAL_RELATIVE_ALT_INT, MavFrame.GLOBAL_TERRAIN_ALT_INT)
+"""Where the ground is level, an altitude above it is one above home."""
 _CLIMB_AT_FULL_THRUST_M_S = 5.0
 
 
@@ -66,31 +67,46 @@ class Offboard:
     # --------------------------------------------------------------------------------------- hearing
 
     def _on_local(self, target: SetPositionTargetLocalNed, _: Channel) -> None:
-        if target.coordinate_frame not in (MavFrame.LOCAL_NED, MavFrame.BODY_NED):
+        frame = target.coordinate_frame
+        if frame not in (MavFrame.LOCAL_NED, MavFrame.BODY_NED):
+            self._complain(f"SET_POSITION_TARGET_LOCAL_NED coordinate frame {frame} unsupported")
             return
-        body = target.coordinate_frame == MavFrame.BODY_NED
+        body = frame == MavFrame.BODY_NED
         position = _NAN3 if body else (target.x, target.y, target.z)
-        self._take(target, position, body=body)
+        if not self._take(target, position, body=body):
+            self._complain("SET_POSITION_TARGET_LOCAL_NED invalid")
 
     def _on_global(self, target: SetPositionTargetGlobalInt, _: Channel) -> None:
-        frame = self._vehicle.frame
-        north, east = frame.to_local(target.lat_int, target.lon_int)
-        down = frame.origin.altitude_m - target.alt
-        if target.coordinate_frame in _RELATIVE:
+        if target.coordinate_frame not in _GLOBAL_FRAMES:
+            frame = target.coordinate_frame
+            self._complain(f"SET_POSITION_TARGET_GLOBAL_INT invalid coordinate frame {frame}")
+            return
+        frame_of_home = self._vehicle.frame
+        north, east = frame_of_home.to_local(target.lat_int, target.lon_int)
+        down = frame_of_home.origin.altitude_m - target.alt
+        if target.coordinate_frame != MavFrame.GLOBAL_INT:
             down = self._vehicle.home[2] - target.alt
         self._take(target, (north, east, down), body=False)
 
+    def _complain(self, text: str) -> None:
+        self._vehicle.send_text(MavSeverity.CRITICAL, text)
+
     def _take(
         self, target: SetPositionTargetLocalNed | SetPositionTargetGlobalInt, position: Ned, *, body: bool
-    ) -> None:
+    ) -> bool:
+        """Whether it says anything; a set-point without a position, a velocity or an acceleration is none."""
         mask = target.type_mask
-        self._position = _masked(position, mask, _POSITION)
-        self._velocity = self._rotated(_masked((target.vx, target.vy, target.vz), mask, _VELOCITY), body)
+        position = _masked(position, mask, _POSITION)
+        velocity = _masked((target.vx, target.vy, target.vz), mask, _VELOCITY)
         acceleration = _masked((target.afx, target.afy, target.afz), mask, _ACCELERATION)
-        self._acceleration = self._rotated(acceleration, body)
+        if all(math.isnan(part) for part in (*position, *velocity, *acceleration)):
+            return False
+        self._position = position
+        self._velocity, self._acceleration = self._rotated(velocity, body), self._rotated(acceleration, body)
         self._yaw = math.nan if mask & Mask.YAW_IGNORE else target.yaw
         self._yaw_rate = math.nan if mask & Mask.YAW_RATE_IGNORE else target.yaw_rate
         self._attitude, self.updated_at = None, self._vehicle.now
+        return True
 
     def _rotated(self, vector: Ned, body: bool) -> Ned:
         if not body:

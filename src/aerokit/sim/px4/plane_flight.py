@@ -157,13 +157,13 @@ class PlaneFlight(Flight):
         if abs(motion.down - self.target[2]) > _HEIGHT_REACHED_M or not self._is_near():
             return
         if self._phase == "climb":
-            self._phase, self.target = "return", (*plane.home[:2], self.target[2])
+            self._phase, self.target = "return", (*self.destination[:2], self.target[2])
         elif self._phase == "return":
             descend = plane.parameters["RTL_DESCEND_ALT"]
             self.radius_m = plane.parameters["RTL_LOITER_RAD"]
             self._phase, self.target = (
                 "loiter",
-                (*plane.home[:2], max(self.target[2], plane.home[2] - descend)),
+                (*self.destination[:2], max(self.target[2], self.destination[2] - descend)),
             )
         elif self._phase == "loiter":
             self._phase = "done" if plane.parameters["RTL_LAND_DELAY"] < 0 else "land"
