@@ -266,7 +266,7 @@ def test_a_rovers_steering_is_heard_also_when_it_is_disarmed() -> None:
 
 def test_a_subs_thrusters_stand_when_it_is_disarmed() -> None:
     _, client = booted("sub")
-    still = (1500, 1500, 1500, 1500, 1500, 1500, 0, 1500, 1500, 1500)
+    still = (1500, 1500, 1500, 1500, 1500, 1500, 0, 1500, 0, 1500)
     assert outputs(client, 1900, 1900, 1900, 1900, 1900, 1900) == still
     arm(client)
     middle = (1500,) * 6
@@ -334,3 +334,68 @@ def test_boot_as_the_real_one_does(kind: str) -> None:
     assert first == pytest.approx(real_time, abs=0.3)
     home = next(now for now, message in client.heard if isinstance(message, m.HomePosition))
     assert home == pytest.approx(19.2 if kind == "sub" else 9.5, abs=0.6)
+
+
+# --------------------------------------------------------------------------------------- commands
+
+A, F, D, U = MavResult.ACCEPTED, MavResult.FAILED, MavResult.DENIED, MavResult.UNSUPPORTED
+ANSWERS: dict[tuple[int, ...], tuple[int, int, int, int]] = {
+    (MavCmd.DO_SET_SERVO, 9, 1600): (A, A, A, A),
+    (MavCmd.DO_SET_SERVO, 1, 1600): (F, F, F, F),
+    (MavCmd.DO_SET_SERVO, 99, 1600): (F, F, F, F),
+    (MavCmd.DO_SET_RELAY, 0, 1): (A, A, A, A),
+    (MavCmd.DO_SET_RELAY, 9, 1): (F, F, F, F),
+    (MavCmd.DO_AUX_FUNCTION, 9, 2): (A, A, A, A),
+    (MavCmd.DO_AUX_FUNCTION, 9, 7): (D, D, D, D),
+    (MavCmd.DO_AUX_FUNCTION, 999, 2): (F, F, F, F),
+    (MavCmd.DO_AUX_FUNCTION, 0, 0): (F, F, A, F),
+    (MavCmd.DO_PARACHUTE, 0): (A, A, U, U),
+    (MavCmd.DO_SPRAYER, 1): (A, F, A, F),
+    (MavCmd.DO_GRIPPER, 1): (F, F, F, F),
+    (MavCmd.DO_SET_REVERSE, 1): (U, U, A, U),
+    (MavCmd.DO_FOLLOW, 0): (D, D, D, U),
+    (MavCmd.DO_LAND_START, 0): (F, F, U, U),
+    (MavCmd.DO_VTOL_TRANSITION, 4): (U, F, U, U),
+    (MavCmd.DO_FLIGHTTERMINATION, 0): (F, F, U, F),
+    (MavCmd.SET_EKF_SOURCE_SET, 1): (A, A, A, A),
+    (MavCmd.SET_EKF_SOURCE_SET, 9): (D, D, D, D),
+    (MavCmd.CAN_FORWARD, 0): (A, A, A, A),
+    (MavCmd.PREFLIGHT_STORAGE, 1): (D, D, D, D),
+    (MavCmd.BATTERY_RESET, 1, 50): (A, A, A, A),
+}
+"""Command and parameters → what Copter, Plane, Rover and Sub answered, disarmed."""
+
+
+@every_kind
+def test_commands_are_answered_as_the_real_one_did(kind: str) -> None:
+    vehicle, client = booted(kind)
+    number = list(CLASSES).index(kind)
+    answers = {request: client.command(*request) for request in ANSWERS}
+    assert answers == {request: results[number] for request, results in ANSWERS.items()}
+    assert vehicle.battery.percent == 50.0
+
+
+def test_a_servo_and_a_relay_show_what_they_were_set_to() -> None:
+    _, client = booted("plane")
+    assert client.command(MavCmd.DO_SET_SERVO, 9, 1600) == A
+    assert client.command(MavCmd.DO_SET_SERVO, 1, 1600) == F
+    assert client.command(MavCmd.DO_SET_RELAY, 0, 1) == A
+    assert client.command(MavCmd.REQUEST_MESSAGE, m.RelayStatus.ID) == A
+    assert outputs(client)[:9] == (1500, 1500, 1000, 1500, 0, 0, 0, 0, 1600)
+    assert (client.last(m.RelayStatus).on, client.last(m.RelayStatus).present) == (1, 1)
+    assert "ServoRelayEvent: Channel 1 is already in use" in client.texts
+
+
+def test_a_plane_refuses_modes_for_lifting_rotors_and_returns_without_a_mission() -> None:
+    plane, client = booted("plane")
+    assert set_mode(client, PlaneMode.QLOITER) == F
+    client.run(0.1)
+    assert client.texts[-1] == "Q_ENABLE 0"
+    assert set_mode(client, PlaneMode.AUTOLAND) == F
+    client.run(0.1)
+    assert client.texts[-1] == "Flight mode change failed"
+    assert set_mode(client, PlaneMode.AUTO) == A
+    client.run(0.1)
+    assert plane.mode.number == PlaneMode.RTL
+    assert client.texts[-1] == "Mission complete, changing mode to RTL"
+    assert "FLY_BY_WIRE_A" in {mode.mode_name for mode in plane.available_modes()}

@@ -129,7 +129,9 @@ def test_nothing_is_calibrated_while_armed() -> None:
     assert client.texts == ["Disarm to allow compass calibration"]
 
 
-@pytest.mark.parametrize("end", [(MavCmd.DO_CANCEL_MAG_CAL, 0, 0.1), (MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, 1, 10.0)])
+@pytest.mark.parametrize(
+    "end", [(MavCmd.DO_CANCEL_MAG_CAL, 0, 0.1), (MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, 1, 10.0)]
+)
 def test_a_calibration_of_the_compasses_keeps_it_from_arming(end: tuple[int, int, float]) -> None:
     _, client = ready_copter()
     assert client.command(MavCmd.DO_START_MAG_CAL, 300) == FAILED

@@ -97,11 +97,11 @@ class SimulatedCopter(ArduPilotVehicle):
 
     @property
     def base_mode(self) -> int:
-        """GUIDED counts as guided also on the ground, the others when armed."""
+        """Guided in the modes that know where they are, in RTL when armed only."""
         base, name = int(_BASE), self.mode.name
         if not self.has_left_boot:
             return base | MavModeFlag.GUIDED_ENABLED
-        if name in _GUIDED_MODES and (self.motors.is_armed or name == "GUIDED"):
+        if name in _GUIDED_MODES and (self.motors.is_armed or name != "RTL"):
             base |= MavModeFlag.GUIDED_ENABLED
         return base | MavModeFlag.SAFETY_ARMED if self.motors.is_armed else base
 

@@ -8,10 +8,14 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavMissionResult
 from aerokit.missions import MissionItem
 from aerokit.sim.missions import float32
+
+if TYPE_CHECKING:
+    from aerokit.sim.ardupilot.parameter_tables import Kind
 
 __all__ = ["COMMAND_NAMES", "altitude_frame", "has_location", "is_place", "stored", "whole"]
 
@@ -94,6 +98,9 @@ _LAYOUTS: dict[int, str] = {
     _C.NAV_ATTITUDE_TIME: "tapwh--",
 }
 """Command → how each of params 1 to 4 (and x, y, z where they are no place) is kept; see `_KEEPERS`."""
+
+_OF_A_PLANE: dict[int, str] = {_C.NAV_WAYPOINT: "-BB-", _C.NAV_SPLINE_WAYPOINT: ""}
+"""What it keeps otherwise: the radius within which it arrives and the distance at which it passes; no splines."""
 
 _WITH_LOCATION = frozenset(
     {
@@ -210,13 +217,14 @@ def altitude_frame(frame: int) -> int | None:
     return _GIVEN_BACK.get(frame)
 
 
-def stored(item: MissionItem) -> MissionItem | int:
+def stored(item: MissionItem, kind: Kind = "copter") -> MissionItem | int:
     """The item as it comes back, or the MAV_MISSION_RESULT that refuses it."""
     result = _check_numbers(item)
     if result == MavMissionResult.ACCEPTED and item.command in (0, 1):
         result = MavMissionResult.INVALID
-    layout = _LAYOUTS.get(item.command)
-    if result == MavMissionResult.ACCEPTED and layout is None:
+    layout = _OF_A_PLANE.get(item.command) if kind == "plane" else None
+    layout = _LAYOUTS.get(item.command) if layout is None else layout
+    if result == MavMissionResult.ACCEPTED and not layout:
         result = MavMissionResult.UNSUPPORTED
     if result != MavMissionResult.ACCEPTED:
         return result

@@ -7,12 +7,15 @@ that is neither the old nor the new one. A fence is put together aside and check
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from aerokit.mavlink.enums import MavCmd, MavMissionResult
 from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.mission_items import altitude_frame, is_place, stored
 from aerokit.sim.missions import float32
+
+if TYPE_CHECKING:
+    from aerokit.sim.ardupilot.parameter_tables import Kind
 
 __all__ = ["CommandList", "ItemList", "RallyList"]
 
@@ -71,9 +74,14 @@ class CommandList(ItemList):
     name = "Mission"
 
     def __init__(
-        self, capacity: int, home: Callable[[], MissionItem], is_running: Callable[[], bool]
+        self,
+        capacity: int,
+        home: Callable[[], MissionItem],
+        is_running: Callable[[], bool],
+        kind: Kind = "copter",
     ) -> None:
         super().__init__(capacity)
+        self._kind: Kind = kind
         self._home, self._is_running = home, is_running
         self._commands: list[MissionItem] = []  # [0] only holds home's place
         self.version = 0
@@ -106,7 +114,7 @@ class CommandList(ItemList):
 
     def put(self, seq: int, item: MissionItem, last: int) -> int:
         """Replace or append; item 0 is checked and then ignored, but an empty list gets its home first."""
-        kept = stored(item)
+        kept = stored(item, self._kind)
         if isinstance(kept, int):
             return kept
         if kept.command == MavCmd.DO_JUMP and not self._is_target(kept.param1, last):
@@ -138,7 +146,7 @@ class CommandList(ItemList):
     def write_file(self, items: list[MissionItem], start: int) -> int:
         """Put items one after the other until one cannot be stored."""
         for seq, item in enumerate(items):
-            kept = stored(item)
+            kept = stored(item, self._kind)
             if isinstance(kept, int):
                 return kept
             if kept.command == MavCmd.DO_JUMP and not 0 < kept.param1 < len(items):

@@ -55,7 +55,9 @@ class MissionServer:
 
     def __init__(self, vehicle: ArduPilotVehicle) -> None:
         self._vehicle = vehicle
-        self.commands = CommandList(_COMMANDS_IN_MEMORY, self._home, lambda: vehicle.mission.is_being_flown)
+        self.commands = CommandList(
+            _COMMANDS_IN_MEMORY, self._home, lambda: vehicle.mission.is_being_flown, vehicle.KIND
+        )
         """The mission, for its execution."""
         self.fence = FenceList()
         self.rally = RallyList(_RALLY_POINTS_IN_MEMORY)
@@ -362,7 +364,7 @@ class MissionServer:
 
     def _guide(self, item: MissionItem, current: int) -> int:
         """An item that is no item but a target for GUIDED; `current` says so."""
-        kept = stored(item)
+        kept = stored(item, self._vehicle.KIND)
         if isinstance(kept, int):
             return kept
         if current == _ALTITUDE_CHANGE:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from aerokit.mavlink.enums import MavModeFlag, MavType
+from aerokit.mavlink.enums import MavModeFlag, MavSeverity, MavType, PlaneMode
 from aerokit.sim.ardupilot.motors import Motors
 from aerokit.sim.ardupilot.plane_arming import PlaneArming
 from aerokit.sim.ardupilot.plane_auto import Auto
@@ -30,6 +30,7 @@ from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 from aerokit.sim.fixed_wing import FixedWing
 
 if TYPE_CHECKING:
+    from aerokit.sim.ardupilot.mode import VehicleMode
     from aerokit.sim.ardupilot.parameter_tables import Kind
     from aerokit.sim.commands import CommandHandler
     from aerokit.sim.motion import Motion, Wind
@@ -38,6 +39,7 @@ __all__ = ["SimulatedPlane"]
 
 _FULL_AMPERES = 25.0
 _STANDS_S = 1.0
+_LIFTING_MODES = range(PlaneMode.QSTABILIZE, PlaneMode.QACRO + 1)
 
 
 class SimulatedPlane(ArduPilotVehicle):
@@ -104,6 +106,16 @@ class SimulatedPlane(ArduPilotVehicle):
         self.take_off_yaw: float | None = None
         """Where it has taken off to, in radians; None before."""
         self._rests_since = math.nan
+
+    def unknown_mode(self, number: int) -> tuple[int, str]:
+        """Those for lifting rotors need Q_ENABLE."""
+        if number in _LIFTING_MODES:
+            return MavSeverity.INFO, "Q_ENABLE 0"
+        return super().unknown_mode(number)
+
+    def refusal(self, mode: VehicleMode, reason: str) -> str:
+        """The same for every mode."""
+        return "Flight mode change failed"
 
     @property
     def guided(self) -> Guided:

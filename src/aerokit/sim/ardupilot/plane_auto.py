@@ -77,15 +77,13 @@ class Auto(NavigatingMode):
         return self._does == _LAND
 
     def enter(self, *, force: bool) -> bool:
-        """Goes on with the mission; without one it refuses."""
+        """Goes on with the mission; without one it returns at once."""
         plane = self.plane
         if plane.mode is self and plane.is_armed and plane.mission.is_running:
             return True
-        if not plane.mission.is_present and not force:
-            return False
         super().enter(force=force)
         self._does = _LOITER
-        plane.call_later(0.0, self._begin)
+        plane.call_later(0.0, self._begin if plane.mission.is_present else self._return_at_once)
         return True
 
     def _begin(self) -> None:
@@ -159,6 +157,10 @@ class Auto(NavigatingMode):
     def end_mission(self) -> None:
         """Home; on the ground nothing."""
         if not self.plane.is_landed:
+            self._return_at_once()
+
+    def _return_at_once(self) -> None:
+        if self.plane.mode is self:
             self.plane.info("Mission complete, changing mode to RTL")
             self.plane.set_mode(PlaneMode.RTL)
 

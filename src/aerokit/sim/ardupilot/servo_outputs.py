@@ -28,7 +28,7 @@ _PITCH, _ROLL, _THROTTLE, _YAW, _FORWARD, _LATERAL = range(6)
 def copter_outputs(vehicle: ArduPilotVehicle) -> m.ServoOutputRaw:
     """Four motors, all alike."""
     pwm = vehicle.motors.pwm
-    return m.ServoOutputRaw(vehicle.time_boot_us & 0xFFFFFFFF, 0, pwm, pwm, pwm, pwm, 0, 0, 0, 0)
+    return _message(vehicle, pwm, pwm, pwm, pwm)
 
 
 def plane_outputs(plane: SimulatedPlane) -> m.ServoOutputRaw:
@@ -43,9 +43,7 @@ def plane_outputs(plane: SimulatedPlane) -> m.ServoOutputRaw:
         aileron = _surface(wing.roll_rate / _FULL_ROLL_RATE)
         elevator = _surface(-wing.pitch_rate / _FULL_PITCH_RATE)
         rudder = _surface(wing.roll_rate / _FULL_ROLL_RATE / 2.0)
-    return m.ServoOutputRaw(
-        plane.time_boot_us & 0xFFFFFFFF, 0, aileron, elevator, throttle, rudder, 0, 0, 0, 0
-    )
+    return _message(plane, aileron, elevator, throttle, rudder)
 
 
 def rover_outputs(rover: SimulatedRover) -> m.ServoOutputRaw:
@@ -55,11 +53,11 @@ def rover_outputs(rover: SimulatedRover) -> m.ServoOutputRaw:
     else:
         steering = _MIDDLE + round(_STICK_RANGE * rover.motion.yaw_rate / rover.motion.wheels.turn_rate_rad_s)
     throttle = _MIDDLE + round(_STICK_RANGE * rover.motors.throttle)
-    return m.ServoOutputRaw(rover.time_boot_us & 0xFFFFFFFF, 0, steering, 0, throttle, 0, 0, 0, 0, 0)
+    return _message(rover, steering, 0, throttle)
 
 
 def sub_outputs(sub: SimulatedSub) -> m.ServoOutputRaw:
-    """Four thrusters aslant on the level, two upright, and the camera's two axes on 9 and 10."""
+    """Four thrusters aslant on the level, two upright, and the camera's two axes on 8 and 10."""
     one = two = three = four = left = right = _MIDDLE
     if sub.motors.is_armed:
         yaw, forward, lateral, roll = (_stick(sub.rc[index]) for index in (_YAW, _FORWARD, _LATERAL, _ROLL))
@@ -67,10 +65,14 @@ def sub_outputs(sub: SimulatedSub) -> m.ServoOutputRaw:
         one, two = _surface(yaw - forward + lateral), _surface(-yaw - forward - lateral)
         three, four = _surface(-yaw + forward + lateral), _surface(yaw + forward - lateral)
         left, right = _surface(up + roll), _surface(up - roll)
-    return m.ServoOutputRaw(
-        sub.time_boot_us & 0xFFFFFFFF, 0, one, two, three, four, left, right, 0, _MIDDLE, servo9_raw=_MIDDLE,
-        servo10_raw=_MIDDLE,
-    )  # fmt: skip
+    return _message(sub, one, two, three, four, left, right, 0, _MIDDLE, 0, _MIDDLE)
+
+
+def _message(vehicle: ArduPilotVehicle, *pulses: int) -> m.ServoOutputRaw:
+    outputs = dict(enumerate(pulses, start=1)) | vehicle.accessories.servos
+    first = [outputs.get(number, 0) for number in range(1, 9)]
+    others = {f"servo{number}_raw": outputs.get(number, 0) for number in range(9, 17)}
+    return m.ServoOutputRaw(vehicle.time_boot_us & 0xFFFFFFFF, 0, *first, **others)
 
 
 def _stick(pwm: int) -> float:

@@ -209,6 +209,8 @@ class SimulatedSub(LevelVehicle):
         angle, relative = command.param1, command.param4
         if not 0.0 <= angle <= 360.0 or relative not in (0.0, 1.0):
             return MavResult.FAILED
+        if self.mode is not self.guided:
+            return MavResult.ACCEPTED
         heading = math.radians(angle)
         if relative:
             heading = self.motion.yaw + math.copysign(heading, command.param3 or 1.0)

@@ -49,7 +49,8 @@ def _reached(_: ArduPilotVehicle) -> m.MissionItemReached:
 
 
 def _relays(vehicle: ArduPilotVehicle) -> m.RelayStatus:
-    return m.RelayStatus(vehicle.time_boot_ms, 0, 3 if vehicle.KIND == "rover" else 1)
+    accessories = vehicle.accessories
+    return m.RelayStatus(vehicle.time_boot_ms, accessories.relays, (1 << accessories.relay_count) - 1)
 
 
 def _flight(vehicle: ArduPilotVehicle) -> m.FlightInformation:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavFrame, MavModeFlag, MavResult, MavSeverity
+from aerokit.sim.ardupilot.accessories import Accessories
 from aerokit.sim.ardupilot.arming import Arming
 from aerokit.sim.ardupilot.boot import BOOT_TEXTS, BOOT_TIMELINES
 from aerokit.sim.ardupilot.buzzer import hear_tunes
@@ -165,6 +166,7 @@ class ArduPilotVehicle(SimulatedAutopilot):
         self.motors = self.make_motors()
         self.navigation = Navigation(self, self._frame)
         self.arming = self.make_arming()
+        self.accessories = Accessories(self)
         self.failsafes = self.make_failsafes()
         self.fence = self.make_fence()
         self.gimbal = Gimbal(self)
@@ -234,6 +236,10 @@ class ArduPilotVehicle(SimulatedAutopilot):
 
     def reset_controllers(self) -> None:
         """What a power cycle makes new of its own; the modes are there already."""
+
+    def unknown_mode(self, number: int) -> tuple[int, str]:
+        """Severity and text with which it refuses a mode that it does not have."""
+        return MavSeverity.WARNING, f"No such mode {number}"
 
     def refusal(self, mode: VehicleMode, reason: str) -> str:
         """What it says when it does not go into a mode."""
@@ -352,7 +358,7 @@ class ArduPilotVehicle(SimulatedAutopilot):
             return True
         mode = self._modes.get(number)
         if mode is None:
-            self.send_text(MavSeverity.WARNING, f"No such mode {number}")
+            self.send_text(*self.unknown_mode(number))
             return False
         if (denied := self.fence.refusal(mode)) is not None:
             self.send_text(*denied)

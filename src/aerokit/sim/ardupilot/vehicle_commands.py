@@ -26,6 +26,7 @@ def common_commands(vehicle: ArduPilotVehicle) -> dict[int, CommandHandler]:
     """MAV_CMD → handler; each kind of vehicle adds its own, and drops what is to be unsupported."""
     state, setup = _State(vehicle), _Setup(vehicle)
     return {
+        **equipment_commands(vehicle),
         MavCmd.COMPONENT_ARM_DISARM: state.arm_or_disarm,
         MavCmd.DO_SET_MODE: state.set_mode,
         MavCmd.DO_SET_MISSION_CURRENT: state.set_mission_current,
@@ -43,7 +44,6 @@ def common_commands(vehicle: ArduPilotVehicle) -> dict[int, CommandHandler]:
         **HomeAndOrigin(vehicle).commands,
         **RegionOfInterest(vehicle).commands,
         **camera_commands(vehicle),
-        **equipment_commands(vehicle),
     }
 
 
@@ -81,6 +81,11 @@ class _State:
         return MavResult.ACCEPTED
 
     def terminate(self, command: Command) -> int:
+        if self._vehicle.KIND == "rover":
+            return MavResult.UNSUPPORTED
+        if self._vehicle.KIND == "plane":
+            self._vehicle.info("AFS not enabled, can't terminate the vehicle")
+            return MavResult.FAILED
         if command.param1 <= 0.5:
             return MavResult.FAILED
         self._vehicle.arming.disarm()
