@@ -81,11 +81,6 @@ class _State:
         return MavResult.ACCEPTED
 
     def terminate(self, command: Command) -> int:
-        if self._vehicle.KIND == "rover":
-            return MavResult.UNSUPPORTED
-        if self._vehicle.KIND == "plane":
-            self._vehicle.info("AFS not enabled, can't terminate the vehicle")
-            return MavResult.FAILED
         if command.param1 <= 0.5:
             return MavResult.FAILED
         self._vehicle.arming.disarm()
