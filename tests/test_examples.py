@@ -41,7 +41,7 @@ AS_PROGRAMS: dict[str, list[str]] = {
     "blocking_messages": ["m/s at", "holding in BRAKE"],
 }
 """Example: what it must print, given an address."""
-ON_THEIR_OWN = {"record_and_replay", "web_server"}
+ON_THEIR_OWN = {"record_and_replay", "signed_link", "web_server"}
 
 
 def test_every_example_is_run() -> None:
@@ -76,6 +76,17 @@ def test_record_and_replay(capsys: pytest.CaptureFixture[str], tmp_path: Path) -
     assert recorded == f"recorded in {record}"
     assert live.endswith("attitudes, 0 missed")
     assert 0 < int(replayed.split()[0]) <= int(live.split()[0])
+
+
+def test_signed_link(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    stamp = tmp_path / "stamp.txt"
+    for _ in range(2):
+        before = int(stamp.read_text()) if stamp.exists() else 0
+        run_in_virtual_time("signed_link", "a long passphrase", stamp)
+        assert int(stamp.read_text()) > before
+        told = capsys.readouterr().out
+        for text in ("signs with <SigningKey 0ee99475>", "0 frames were refused", "does not sign any more"):
+            assert text in told
 
 
 def command(name: str, *arguments: str) -> list[str]:

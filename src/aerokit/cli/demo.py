@@ -9,6 +9,7 @@ import anyio
 
 from aerokit.cli.interrupt import on_interrupt
 from aerokit.cli.report import FlightReport
+from aerokit.cli.signing import signing_of
 from aerokit.cli.vehicles import simulated_vehicle
 from aerokit.errors import AerokitError
 from aerokit.vehicle.connect import connect
@@ -43,7 +44,11 @@ async def _connect_and_fly(options: argparse.Namespace, interruptible: _Interrup
     async with _address(options) as address:
         print(f"connecting to {address}", flush=True)
         async with connect(
-            address, system_id=options.system_id, baud=options.baud, record=options.record
+            address,
+            system_id=options.system_id,
+            baud=options.baud,
+            record=options.record,
+            signing=signing_of(options) if options.connect else None,
         ) as vehicle:
             report = FlightReport(vehicle)
             async with report.running():

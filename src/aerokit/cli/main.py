@@ -26,6 +26,7 @@ from aerokit.cli.logs import add_logs
 from aerokit.cli.mission import add_mission
 from aerokit.cli.params import add_params
 from aerokit.cli.places import EACH_ITS_OWN
+from aerokit.cli.signing import ENVIRONMENT, add_signing_key
 from aerokit.cli.vehicles import HOME
 from aerokit.errors import AerokitError, LocalProtocolError
 
@@ -128,6 +129,7 @@ def _add_demo(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     demo.add_argument(
         "--baud", type=int, default=57600, help="of a serial port whose address says none (57600)"
     )
+    add_signing_key(demo, f"of the vehicle of --connect (${ENVIRONMENT})")
 
 
 def _add_sim(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -190,6 +192,7 @@ def _add_sim_conditions(sim: argparse.ArgumentParser) -> None:
     sim.add_argument(
         "--boot-time", type=number(0, 600), metavar="S", help="simulated seconds until it is ready to arm"
     )
+    add_signing_key(sim, "has been set up on them before; ArduPilot's first port needs no signatures")
     sim.add_argument(
         "--duration",
         type=number(0.1, 1e6),

@@ -50,6 +50,7 @@ def _fleet(options: argparse.Namespace) -> list[SimulatedVehicle]:
     given: dict[str, Any] = {
         "battery_percent": options.battery,
         "boot_time_s": options.boot_time,
+        "signing_key": options.signing_key,
         "wind": None if options.wind is None else Wind(*options.wind),
     }
     return simulated_fleet(

@@ -7,6 +7,7 @@ from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING
 
 from aerokit.cli.arguments import address, number, system_id
+from aerokit.cli.signing import ENVIRONMENT, add_signing_key, signing_of
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable
@@ -40,6 +41,7 @@ def vehicle_arguments() -> argparse.ArgumentParser:
         metavar="S",
         help="give up when nothing has come for so many seconds (10)",
     )
+    add_signing_key(group, f"of a vehicle that wants signed messages (${ENVIRONMENT})")
     return parent
 
 
@@ -64,5 +66,11 @@ async def connected(options: argparse.Namespace) -> AsyncIterator[Vehicle]:
     """The vehicle that the arguments name. Nothing but heartbeats is asked of it: the link is for the transfer."""
     from aerokit.vehicle.connect import connect
 
-    async with connect(options.connect, system_id=options.system_id, baud=options.baud, rates={}) as vehicle:
+    async with connect(
+        options.connect,
+        system_id=options.system_id,
+        baud=options.baud,
+        rates={},
+        signing=signing_of(options),
+    ) as vehicle:
         yield vehicle

@@ -66,7 +66,7 @@ class Framer:
         Never raises, whatever the bytes.
         """
         # The loop is long and repeats `_examine` on purpose: it runs for every frame on the air. What is neither an
-        # unsigned frame of MAVLink 2 whose message is known nor a good one of MAVLink 1 takes the slow path.
+        # unsigned frame of MAVLink 2 whose message is known nor another good frame takes the slow path.
         if type(data) is not bytes:
             data = bytes(data)
         size = len(data)
@@ -92,7 +92,7 @@ class Framer:
                 good, body = False, b""
                 end = sequence = key = message_id = checksum = 0
             if not good:
-                found = self._examine(data, begin)[2] if data[begin] == MAGIC_V1 else None
+                found = self._examine(data, begin)[2] if data[begin] in _MAGICS else None
                 if found is None:
                     found = self._search(data, begin)
                 if self._unknown:
