@@ -230,7 +230,9 @@ def test_pymavlink_sets_up_a_key_and_is_understood() -> None:
     mav.signing.secret_key, mav.signing.timestamp = KEY.secret, STAMP + 1
     mav.signing.sign_outgoing = True
     for frame in radio.run(1.0):
-        assert mav.parse_char(frame.raw).get_signed()
+        message = mav.parse_char(frame.raw)
+        assert message is not None
+        assert message.get_signed()
     radio.hear(mav.param_set_encode(1, 1, b"RTL_ALT", 1234.0, 9).pack(mav))
     assert copter.parameters["RTL_ALT"] == 1234.0
 
