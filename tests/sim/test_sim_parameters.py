@@ -65,7 +65,7 @@ def bits_of(message: m.ParamValue) -> int:
 
 
 def test_the_tables_are_those_of_the_firmwares() -> None:
-    assert (len(parameters_of("copter")), len(px4_parameters())) == (1349, 889)
+    assert (len(parameters_of("copter")), len(px4_parameters())) == (1349, 910)
     assert len(parameters_of("copter", 100)) == 100
     assert px4_parameters().names == tuple(sorted(px4_parameters().names))
     copter = parameters_of("copter")
@@ -264,7 +264,7 @@ def test_px4_sends_its_hash_first_and_a_second_request_begins_without() -> None:
     values = client.all(m.ParamValue)
     assert [v.param_id for v in values].count("_HASH_CHECK") == 1
     assert (bits_of(values[0]), values[0].param_index) == (parameter_hash(px4.parameters), 0xFFFF)
-    assert [v.param_index for v in values[-889:]] == list(range(889))
+    assert [v.param_index for v in values[-910:]] == list(range(910))
     assert told(client, m.ParamRequestList(0, 0), 1.0) == []
 
 

@@ -26,7 +26,7 @@ RTL_LOITER_RAD RTL_MIN_DIST RTL_RETURN_ALT RTL_TYPE RWTO_RAMP_TIME SDLOG_MODE SY
 
 
 def px4_parameters(count: int | None = None, table: str = "quadrotor") -> Parameters:
-    """All 889 of a quadrotor, or the 978 of an "airplane", or so many of them; those that are read are always there."""
+    """All 910 of a quadrotor, or the 978 of an "airplane", or so many of them; those that are read are always there."""
     data = pkgutil.get_data(__name__, f"{table}.param.csv")
     assert data is not None
     return Parameters.from_text(data.decode(), used=_USED.split(), count=count)

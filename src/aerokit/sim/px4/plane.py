@@ -29,6 +29,7 @@ class SimulatedPx4Plane(SimulatedPx4):
     circle above home without landing (RTL_LAND_DELAY is -1), lands in circles (LAND) or at the end of a mission on a
     straight glide path, and demands a landing in a mission that is flown from the ground (MIS_TKO_LAND_REQ).
     Armed on the ground it stays armed. It has 978 parameters and an airspeed sensor.
+    By hand it banks, climbs and changes its speed in every mode.
     Not simulated beyond what `SimulatedPx4` leaves out: launching by hand, stalls, aborted landings, figures of eight;
     OFFBOARD circles around a position.
     """

@@ -66,12 +66,14 @@ _NOT_AFTER_LANDING = frozenset({TAKEOFF, LAND, PRECISION_LAND, RTL})
 class SimulatedPx4(SimulatedAutopilot):
     """Speaks as PX4 v1.16/v1.17 does where a client can see it; flies as `Motion` does.
 
-    Simulated: arming and its denial, modes with their double acknowledgement, take-off to an AMSL altitude, hold,
-    reposition, land, return, offboard with its time-out and failsafe, streams without being asked, heartbeats only
-    once a second, chunked texts with a tab at the end, bytewise parameters with _HASH_CHECK, commands of its own to
-    component 0, pings to everybody, the failsafes of battery, ground station, manual control and geofence.
-    Not simulated: flying to rally points, the events interface, sticks (POSITION and the
-    manual modes stay where they are), estimator failures other than a lost GPS.
+    Simulated: arming and its denial, every mode with its double acknowledgement, take-off to an AMSL altitude, hold,
+    reposition, orbit, land, return to home or a rally point, sticks (MANUAL_CONTROL), offboard with its time-out and
+    failsafe, flight termination, calibration, streams without being asked and at the rates of the link's mode, every
+    message that the real one sends on request, heartbeats only once a second, chunked texts with a tab at the end, the
+    events of those texts, bytewise parameters with _HASH_CHECK, commands of its own to component 0, pings to
+    everybody, the failsafes of battery, ground station, manual control and geofence.
+    Not simulated: REQUEST_EVENT, returning by way of a mission (RTL_TYPE 2), estimator failures other than a lost GPS,
+    follow-me, modes of a companion; gimbal and camera are components of their own, and without them nobody answers.
 
     - ``home``: latitude, longitude (degrees), altitude AMSL (m); ``heading_deg``: where its nose points
     - ``boot_time_s``: seconds until it can be armed
@@ -79,7 +81,7 @@ class SimulatedPx4(SimulatedAutopilot):
       them and returns
     - ``fast_rate_hz``: rate of attitude, position and targets on links of mode "normal"
     - ``link_modes``: of the first link, the second …: "normal", "onboard", "config" or "minimal", as MAV_0_MODE says
-    - ``parameters``: values other than the defaults; ``parameter_count``: fewer than all 889, for quick tests;
+    - ``parameters``: values other than the defaults; ``parameter_count``: fewer than all 910, for quick tests;
       ``parameter_file``, ``link_bytes_per_s``: see `Storage`; ``logs``: what flights have left
     - ``signing_key``: see `Px4Signing`
     """
