@@ -137,6 +137,7 @@ class PlaneSetpoints:
             return
         point = plane.point(0, 0, message.alt, message.coordinate_frame)
         if point is None:
+            plane.info(f"Unknown mavlink coordinate frame {message.coordinate_frame}")
             plane.send_text(MavSeverity.WARNING, "Invalid coord frame in SET_POSTION_TARGET_GLOBAL_INT")
         elif not message.type_mask & PositionMask.Z_IGNORE:
             plane.guided.change_altitude(point[2])
@@ -196,10 +197,8 @@ def _change_heading(plane: SimulatedPlane, command: Command) -> int:
 
 
 def _change_target_altitude(plane: SimulatedPlane, command: Command) -> int:
-    """Params: metres, MAV_FRAME. Only as COMMAND_INT; what it changes is the target of GUIDED."""
+    """Params: metres, MAV_FRAME. What it changes is the target of GUIDED."""
     point = plane.point(0, 0, command.param1, int(command.param2))
-    if command.is_long:
-        return MavResult.UNSUPPORTED
     if point is None:
         return MavResult.DENIED
     if plane.mode is plane.guided:

@@ -72,7 +72,7 @@ class Piloted(PlaneModeBase):
             wing.roll_out()
             return
         plane.lift_off()
-        climb = -self.stick(1) * wing.wing.climb_m_s
+        climb = self.stick(1) * wing.wing.climb_m_s  # pulled back is above the middle
         if plane.rc[2] <= _LOW_THROTTLE:
             climb = min(climb, 0.0) - wing.wing.glide_sink_m_s
         wing.bank_and_climb(
@@ -123,7 +123,7 @@ class FlyByWireB(PlaneModeBase):
         if plane.is_landed:
             wing.roll_out()
             return
-        self._down += self.stick(1) * plane.parameters["FBWB_CLIMB_RATE"] * dt
+        self._down -= self.stick(1) * plane.parameters["FBWB_CLIMB_RATE"] * dt
         self.steer(wing.climb_to(self._down))
 
     def steer(self, climb: float) -> None:

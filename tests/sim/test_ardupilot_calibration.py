@@ -1,0 +1,158 @@
+"""Calibrations that somebody turns the vehicle for, and the origin and home that a client sets."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+from simulated_client import Client, ready_copter
+
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import AccelcalVehiclePos, MagCalStatus, MavCmd, MavDataStream, MavResult
+from aerokit.sim.kinds import simulated
+
+ACCEPTED, DENIED, FAILED = MavResult.ACCEPTED, MavResult.DENIED, MavResult.FAILED
+LEVEL_TEXT = "Place vehicle level and press any key."
+
+
+def streaming_copter() -> tuple[Any, Client]:
+    copter, client = ready_copter()
+    client.send(m.RequestDataStream(1, 1, MavDataStream.EXTRA3, 10, 1))
+    return copter, client
+
+
+def test_the_compasses_tell_how_far_they_are() -> None:
+    _, client = streaming_copter()
+    assert client.command(MavCmd.DO_START_MAG_CAL, 0, 1, 0) == ACCEPTED
+    assert client.command(MavCmd.DO_ACCEPT_MAG_CAL, 0) == FAILED
+    client.run(16.0)
+    told = client.all(m.MagCalProgress)
+    assert {progress.compass_id for progress in told} == {0, 1, 2}
+    percents = [progress.completion_pct for progress in told]
+    assert percents == sorted(percents)
+    assert percents[-1] == pytest.approx(50, abs=2)
+    assert told[-1].cal_mask == 7
+    assert not client.all(m.MagCalReport)
+    client.run(20.0)
+    assert {report.cal_status for report in client.all(m.MagCalReport)} == {MagCalStatus.SUCCESS}
+    assert client.command(MavCmd.DO_ACCEPT_MAG_CAL, 0) == ACCEPTED
+    client.forget()
+    client.run(2.0)
+    assert not client.all(m.MagCalReport)
+
+
+def test_compasses_that_nobody_turns_stay_where_they_are() -> None:
+    copter, client = streaming_copter()
+    copter.calibrations.compasses.turns_s = math.inf
+    client.command(MavCmd.DO_START_MAG_CAL, 2)
+    client.run(60.0)
+    assert {(each.compass_id, each.completion_pct) for each in client.all(m.MagCalProgress)} == {(1, 0)}
+    assert client.command(MavCmd.DO_CANCEL_MAG_CAL, 0) == ACCEPTED
+    assert client.command(MavCmd.COMPONENT_ARM_DISARM, 1) == ACCEPTED
+
+
+def asked(client: Client) -> list[float]:
+    return [
+        order.param1 for order in client.all(m.CommandLong) if order.command == MavCmd.ACCELCAL_VEHICLE_POS
+    ]
+
+
+def test_the_accelerometers_ask_for_six_positions() -> None:
+    _, client = ready_copter()
+    client.command(MavCmd.PREFLIGHT_CALIBRATION, 0, 0, 0, 0, 1)
+    client.run(2.1)
+    assert client.texts == ["Initialising ArduPilot", LEVEL_TEXT]
+    assert asked(client) == [1.0, 1.0]
+    assert client.command(MavCmd.ACCELCAL_VEHICLE_POS, 2) == FAILED
+    for position in range(1, 7):
+        assert asked(client)[-1] == position
+        assert client.command(MavCmd.ACCELCAL_VEHICLE_POS, position) == ACCEPTED
+        client.run(1.5)
+    assert client.texts[-1] == "Calibration successful"
+    assert asked(client)[-1] == AccelcalVehiclePos.SUCCESS
+
+
+def test_accelerometers_that_are_held_wrong_fail() -> None:
+    copter, client = ready_copter()
+    copter.calibrations.accelerometers.is_held_wrong = True
+    client.command(MavCmd.PREFLIGHT_CALIBRATION, 0, 0, 0, 0, 1)
+    client.run(1.0)
+    for position in (1, 2):
+        assert client.command(MavCmd.ACCELCAL_VEHICLE_POS, position) == ACCEPTED
+        client.run(2.0)
+    assert client.texts[-1] == "Calibration FAILED"
+    assert asked(client)[-1] == AccelcalVehiclePos.FAILED
+    assert client.command(MavCmd.ACCELCAL_VEHICLE_POS, 3) == FAILED
+
+
+# ------------------------------------------------------------------------------- origin and home
+
+
+def booting(kind: str) -> tuple[Any, Client]:
+    """Ready, without GPS yet."""
+    vehicle = simulated(kind, boot_time_s=41.5)
+    client = Client(vehicle)
+    client.run_until(lambda: vehicle.is_initialised)
+    client.run(0.5)
+    client.forget()
+    return vehicle, client
+
+
+def origin_at(vehicle: Any, metres_up: float) -> m.SetGpsGlobalOrigin:
+    place = vehicle.frame.origin
+    height = round((place.altitude_m + metres_up) * 1000)
+    return m.SetGpsGlobalOrigin(vehicle.system_id, place.latitude_e7 + 1000, place.longitude_e7, height)
+
+
+@pytest.mark.parametrize("kind", ["copter", "plane", "rover", "sub"])
+def test_the_origin_is_set_once_and_before_gps(kind: str) -> None:
+    vehicle, client = booting(kind)
+    client.send(origin_at(vehicle, 12.0))
+    client.run(0.2)
+    (told,) = client.all(m.GpsGlobalOrigin)
+    assert told.latitude == vehicle.frame.origin.latitude_e7 + 1000
+    assert "EKF3 IMU0 origin set" in client.texts
+    client.send(origin_at(vehicle, 30.0))
+    client.run(0.2)
+    assert len(client.all(m.GpsGlobalOrigin)) == 1
+    client.run(40.0)
+    assert client.texts.count("EKF3 IMU0 origin set") == 1
+    assert client.last(m.GpsGlobalOrigin).altitude == told.altitude
+    assert client.last(m.HomePosition).latitude == pytest.approx(vehicle.frame.origin.latitude_e7, abs=50)
+
+
+@pytest.mark.parametrize(
+    ("kind", "result"), [("copter", FAILED), ("plane", ACCEPTED), ("rover", ACCEPTED), ("sub", FAILED)]
+)
+def test_home_before_there_is_an_origin(kind: str, result: int) -> None:
+    _, client = booting(kind)
+    assert client.command(MavCmd.GET_HOME_POSITION) == FAILED
+    assert client.command(MavCmd.DO_SET_HOME, 1) == FAILED
+    assert client.command(MavCmd.DO_SET_HOME, 0, 0, 0, 0, 47.4, 8.5, 500) == result
+    client.run(0.2)
+    homes = [(home.latitude, home.longitude, home.altitude) for home in client.all(m.HomePosition)]
+    wanted = [pytest.approx((474_000_000, 85_000_000, 500_000), abs=20)]  # COMMAND_LONG has floats
+    assert homes == (wanted if result == ACCEPTED else [])
+    assert (kind == "rover") == ("Set HOME to 47.400000 8.500000 at 500.00m" in client.texts)
+
+
+def test_home_that_is_nowhere_is_refused() -> None:
+    _, client = ready_copter()
+    home = MavCmd.DO_SET_HOME
+    assert client.command(home, 1) == ACCEPTED
+    assert client.command_int(home, 3, 0, x=474_000_000, y=85_000_000, z=10.0) == ACCEPTED
+    assert client.command_int(home, 1, 0, x=474_000_000, y=85_000_000, z=10.0) == DENIED
+    assert client.command_int(home, 0, 0, x=2_000_000_000, y=85_000_000, z=10.0) == FAILED
+    assert client.command(home, 2, 0, 0, 0, 47, 8, 0) == FAILED
+    client.run(0.1)
+    assert "Unknown mavlink coordinate frame 1" in client.texts
+
+
+def test_what_is_left_in_the_battery_can_be_told_it() -> None:
+    _, client = ready_copter()
+    assert client.command(MavCmd.BATTERY_RESET, 1, 60) == ACCEPTED
+    assert client.command(MavCmd.BATTERY_RESET, 2, 60) == FAILED
+    client.command(MavCmd.REQUEST_MESSAGE, m.SysStatus.ID)
+    client.run(0.1)
+    assert client.last(m.SysStatus).battery_remaining == 60
