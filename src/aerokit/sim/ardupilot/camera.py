@@ -265,13 +265,20 @@ def _field_of_view(vehicle: ArduPilotVehicle) -> m.CameraFovStatus | None:
     """Where the camera is when the vehicle knows, and how it lies; nobody knows what it sees."""
     if not vehicle.camera.is_fitted:
         return None
-    motion, nowhere = vehicle.motion, (_UNKNOWN_PLACE,) * 3
+    motion = vehicle.motion
     place = vehicle.navigation.position if vehicle.navigation.has_position else None
-    here = (
-        nowhere if place is None else (place.latitude_e7, place.longitude_e7, round(place.altitude_m * 1000))
+    return m.CameraFovStatus(
+        time_boot_ms=vehicle.time_boot_ms,
+        lat_camera=_UNKNOWN_PLACE if place is None else place.latitude_e7,
+        lon_camera=_UNKNOWN_PLACE if place is None else place.longitude_e7,
+        alt_camera=_UNKNOWN_PLACE if place is None else round(place.altitude_m * 1000),
+        lat_image=_UNKNOWN_PLACE,
+        lon_image=_UNKNOWN_PLACE,
+        alt_image=_UNKNOWN_PLACE,
+        q=quaternion_from_euler(motion.roll, motion.pitch, motion.yaw),
+        hfov=math.nan,
+        vfov=math.nan,
     )
-    q = quaternion_from_euler(motion.roll, motion.pitch, motion.yaw)
-    return m.CameraFovStatus(vehicle.time_boot_ms, *here, *nowhere, q, math.nan, math.nan)
 
 
 CAMERA_BUILDERS: dict[int, Callable[[ArduPilotVehicle], Message | None]] = {
