@@ -252,3 +252,12 @@ def test_a_flight_is_not_terminated() -> None:
     drain(plane, client, LOW)
     assert client.texts[-1] == "Unable to terminate, termination is not configured"
     assert plane.is_armed
+
+
+def test_it_returns_even_when_it_does_not_know_where_it_is() -> None:
+    plane, client = flying_plane(**HEARTBEAT)
+    plane.faults.gps_lost = True
+    client.run(11.0)
+    assert not plane.navigation.has_position
+    lose_ground_station(client, 5.5)
+    assert plane.mode.number == PlaneMode.RTL

@@ -42,7 +42,7 @@ _BELOW_M = 2.0
 
 
 class PlaneModeBase(VehicleMode):
-    """A mode of an aeroplane."""
+    """A mode of an aeroplane; it goes into each of them without knowing where it is."""
 
     needs_position = False
     flags: int = MavModeFlag.STABILIZE_ENABLED
@@ -179,7 +179,6 @@ class Circle(PlaneModeBase):
 class NavigatingMode(PlaneModeBase):
     """Flies somewhere by itself, and circles there."""
 
-    needs_position = True
     flags = _NAVIGATES
 
     def __init__(self, plane: SimulatedPlane) -> None:
