@@ -61,15 +61,21 @@ class Console:
         assert found is not None
         return found
 
-    def insist(self, line: str, pattern: str, attempts: int = 30) -> re.Match[str]:
+    def look(self, pattern: str, timeout: float) -> re.Match[str] | None:
+        """What is printed until then."""
+        deadline = time.monotonic() + timeout
+        while time.monotonic() < deadline:
+            if found := re.search(pattern, self.answer):
+                return found
+            time.sleep(0.05)
+        return None
+
+    def insist(self, line: str, pattern: str, attempts: int = 30, patience_s: float = 2.0) -> re.Match[str]:
         """Type it until the vehicle is ready for it."""
         for _ in range(attempts):
             self.type(line)
-            deadline = time.monotonic() + 2.0
-            while time.monotonic() < deadline:
-                if found := re.search(pattern, self.answer):
-                    return found
-                time.sleep(0.05)
+            if found := self.look(pattern, patience_s):
+                return found
         sys.exit(f"{line} did not lead to {pattern}: {self.text[-1500:]}")
 
     def altitude_m(self) -> float:
@@ -98,7 +104,8 @@ def fly(kind: str, console: Console) -> None:
     steps = Steps()
     console.wait(r"Detected vehicle|online system 1|Received \d+ parameters")
     steps.done("connect")
-    received = console.wait(r"Received (\d+) parameters", timeout=90)
+    got_all = r"Received (\d+) parameters"  # it does not ask again when one of its requests timed out
+    received = console.look(got_all, 30.0) or console.insist("param fetch", got_all, 4, 30.0)
     assert int(received[1]) >= PARAMETERS[kind], received[0]
     steps.done("parameters", received[1])
     count = write_mission(kind, Path("flight.txt"))

@@ -23,8 +23,8 @@ __all__ = ["SimulatorServer", "open_simulator", "simulated_link"]
 _SHORTEST_WAIT_S = 0.001
 """Of the loop's time, for many vehicles or when they run faster than it: several ticks are then done in one go."""
 _MANY = 10
-_LONGEST_LATENESS_S = 0.25
-"""Of the loop's time; faster than real time, what it was late beyond that does not pass for the vehicles."""
+_LONGEST_LEAP_S = 0.5
+"""Simulated; what the loop was late beyond that does not pass for the vehicles, unless they are to keep real time."""
 
 
 class SimulatorServer:
@@ -33,8 +33,8 @@ class SimulatorServer:
     ``vehicles_on`` says for each link, in the order of the links, which vehicles are on it instead.
 
     It runs on the loop's own clock by timers alone: no task, no thread. ``speedup`` 10 makes ten simulated
-    seconds of a real one. What the loop missed because something blocked it is caught up in real time. Faster, all
-    but a quarter of a second of it is left out: a client that had no chance to speak is not taken for a silent one.
+    seconds of a real one. What the loop missed because something blocked it is caught up in real time. Otherwise all
+    but half a simulated second of it is left out: a client that had no chance to speak is not taken for a silent one.
     Leaving the block closes the links.
 
     What a vehicle raises, by a mistake of its own or of somebody's callback, ends the block at once: the links
@@ -223,7 +223,7 @@ class SimulatorServer:
         """The timer should have come before now; in real time nothing is left out."""
         if self._loop is None or self._timer is None or self._speedup == 1.0:
             return
-        late = self._loop.time() - self._timer_at - _LONGEST_LATENESS_S
+        late = self._loop.time() - self._timer_at - _LONGEST_LEAP_S / self._speedup
         if late > 0:
             self._started_at += late
             self._timer_at += late
