@@ -123,6 +123,21 @@ def test_precision_landing_lands() -> None:
     assert px4.mode == HOLD
 
 
+def test_disarmed_by_force_while_it_lifts_off_it_lands_and_flies_again() -> None:
+    px4, client = ready()
+    client.command(MavCmd.DO_SET_MODE, 1, 4, 2)
+    client.command(ARM, 1)
+    client.run_until(lambda: not px4.is_landed, 10.0)
+    client.command(ARM, 0, 21196)
+    client.run(3.0)
+    assert px4.is_landed
+    client.forget()
+    client.command(MavCmd.NAV_TAKEOFF, 0, 0, 0, NAN, NAN, NAN, 492.4)
+    client.command(ARM, 1)
+    client.run(6.0)
+    assert client.texts[-1] == "Takeoff detected\t"
+
+
 def test_a_terminated_flight_falls_and_is_over() -> None:
     px4, client = flying()
     assert client.command(MavCmd.DO_FLIGHTTERMINATION, 1) == MavResult.ACCEPTED
@@ -181,6 +196,18 @@ def test_rates_follow_the_mode_of_the_link(
     assert seen[m.SysStatus] == pytest.approx(status_hz * 10, abs=1)
     assert seen[m.HighresImu] == pytest.approx(imu_hz * 10, abs=2)
     assert seen[m.Heartbeat] == seen[m.MissionCurrent] == 10
+
+
+def test_the_origin_is_told_once_on_each_link() -> None:
+    px4 = SimulatedPx4(boot_time_s=1.0, parameter_count=100)
+    client = Client(px4)
+    client.run(10.0)
+    assert len(client.all(m.GpsGlobalOrigin)) == 1
+    other = px4.open_channel()
+    px4.step(client.now + 5.0)
+    kinds = [frame.message_id for frame in client.framer.receive(other.take_outbox(), client.now)]
+    assert kinds.count(m.GpsGlobalOrigin.ID) == 1
+    assert interval(client, m.GpsGlobalOrigin.ID) == 1_000_000, "what it says all the same"
 
 
 def test_a_second_link_has_the_last_mode() -> None:

@@ -58,7 +58,7 @@ class LinkRates:
         self._mode_of[channel], told = mode, {}
         for message_id, rate in self._rates_at_start(mode).items():
             told[message_id] = _interval_us(rate)
-            if rate and message_id in self._built:
+            if rate and message_id in self._built and message_id != m.GpsGlobalOrigin.ID:
                 channel.streams.set_interval(message_id, 1.0 / rate, first)
         self._told[channel] = told
         for message_id, rate in _ALWAYS_HZ.items():

@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.sim.px4.vehicle import SimulatedPx4
 
-__all__ = ["BUILDERS", "available_modes"]
+__all__ = ["BUILDERS", "available_modes", "global_origin"]
 
 _PRESENT, _ENABLED = 0x0300402F, 0x0301402F
 _HEALTHY, _BOOTING = 0x1320C83F, 0x0320883F
@@ -258,7 +258,8 @@ def _home_position(px4: SimulatedPx4) -> m.HomePosition | None:
     )
 
 
-def _global_origin(px4: SimulatedPx4) -> m.GpsGlobalOrigin:
+def global_origin(px4: SimulatedPx4) -> m.GpsGlobalOrigin:
+    """Where the local frame begins."""
     origin = px4.frame.origin
     altitude = round(origin.altitude_m * 1000)
     return m.GpsGlobalOrigin(origin.latitude_e7, origin.longitude_e7, altitude, px4.time_boot_us)
@@ -334,7 +335,7 @@ BUILDERS: dict[int, Callable[[SimulatedPx4], Message | None]] = {
     m.VfrHud.ID: _vfr_hud,
     m.GpsRawInt.ID: _gps_raw,
     m.HomePosition.ID: _home_position,
-    m.GpsGlobalOrigin.ID: _global_origin,
+    m.GpsGlobalOrigin.ID: global_origin,
     m.PositionTargetLocalNed.ID: _target_local,
     m.ServoOutputRaw.ID: _servo_output,
     m.MissionCurrent.ID: _mission_current,

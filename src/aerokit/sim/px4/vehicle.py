@@ -42,7 +42,7 @@ from aerokit.sim.px4.parameters import px4_parameters
 from aerokit.sim.px4.signing import Px4Signing
 from aerokit.sim.px4.sticks import Sticks
 from aerokit.sim.px4.storage import DEFAULT_LOGS, Storage
-from aerokit.sim.px4.telemetry import BUILDERS
+from aerokit.sim.px4.telemetry import BUILDERS, global_origin
 from aerokit.sim.px4.texts import on_the_wire
 from aerokit.sim.vehicle import Component, sender_of
 
@@ -244,6 +244,8 @@ class SimulatedPx4(SimulatedAutopilot):
         """Everything is streamed without being asked."""
         first = max(self.now, self.booted_at + _FIRST_HEARTBEAT_SHARE * self._boot_time_s)
         self.rates.start(channel, self.channels.index(channel), first)
+        known = max(self.now, self.booted_at + self._boot_time_s)
+        self.call_at(known, lambda: self.send(global_origin(self), channel))  # once, and when it changes
 
     def restart(self) -> None:
         """Reboot now."""
@@ -372,7 +374,8 @@ class SimulatedPx4(SimulatedAutopilot):
         self.battery.drain(self.throttle * _AMPERES_AT_FULL, dt)
 
     def _detect_landing(self) -> None:
-        if not self._is_down() or self.flight.lifts_off or self.arming.is_terminated:
+        wants_up = self.is_armed and self.flight.lifts_off
+        if not self._is_down() or wants_up or self.arming.is_terminated:
             self._touched_at = math.nan
         elif math.isnan(self._touched_at):
             self._touched_at = self.now
