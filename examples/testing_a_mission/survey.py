@@ -16,8 +16,8 @@ from aerokit.missions import Mission, return_to_launch, take_off, waypoint
 if TYPE_CHECKING:
     from aerokit import Position, sync
 
-ALTITUDE_M = 15.0
-SIDE_M = 40.0
+ALTITUDE_M = 10.0
+SIDE_M = 20.0
 LEAST_BATTERY_PERCENT = 40.0
 
 

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import anyio
 import pytest
 from survey import ALTITUDE_M, SIDE_M, BatteryTooLow, corners, hop_classic, survey, survey_blocking
+
+from aerokit.mavlink.enums import MavCmd
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -44,16 +47,19 @@ async def test_nothing_moves_with_a_low_battery(flight: Flight) -> None:
 async def test_wind_and_a_bad_radio_do_not_matter(flight: Flight) -> None:
     flight.faults.set_wind(east_m_s=6, gusts_m_s=1)
     flight.faults.drop_packets(0.2)
-    flight.faults.go_silent(for_s=8, after_s=25)
+    flight.faults.go_silent(for_s=8, after_s=15)
     await survey(flight.vehicle)
     assert_surveyed(flight.track)
 
 
 @pytest.mark.simulated("copter", count=2)
 async def test_each_of_a_fleet(fleet: Fleet) -> None:
+    async with anyio.create_task_group() as group:
+        for flight in fleet:
+            group.start_soon(survey, flight.vehicle)
     for flight in fleet:
-        await survey(flight.vehicle)
         assert_surveyed(flight.track)
+        flight.journal.assert_heard(MavCmd.MISSION_START, times=1)
 
 
 @pytest.mark.simulated("copter", speedup=30)

@@ -15,7 +15,8 @@ PROJECT = Path(__file__).parent.parent.parent / "examples" / "testing_a_mission"
 def test_the_example_passes(pytester: pytest.Pytester) -> None:
     for file in PROJECT.glob("*.py"):
         shutil.copy(file, pytester.path)
-    result = pytester.runpytest_subprocess(
+    pytester.syspathinsert()
+    result = pytester.runpytest_inprocess(
         "-p", "no:aerokit", "-p", "aerokit.testing.plugin", "-p", "no:xdist", "-p", "no:anyio", "-p", "no:asyncio",
         "-p", "no:cacheprovider", "-W", "error", "--durations", "0",
     )  # fmt: skip
