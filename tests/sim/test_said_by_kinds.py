@@ -8,8 +8,18 @@ import pytest
 from simulated_client import Client, set_mode
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import CopterMode, MavCmd, MavDataStream, MavResult, PlaneMode, RoverMode, SubMode
+from aerokit.mavlink.enums import (
+    CopterMode,
+    MavCmd,
+    MavDataStream,
+    MavResult,
+    MavState,
+    PlaneMode,
+    RoverMode,
+    SubMode,
+)
 from aerokit.sim import SimulatedCopter, SimulatedPlane, SimulatedRover, SimulatedSub
+from aerokit.sim.ardupilot.telemetry import BUILDERS
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 
 CLASSES: dict[str, type[ArduPilotVehicle]] = {
@@ -142,6 +152,17 @@ def test_what_is_in_no_stream_comes_when_it_is_asked_for(kind: str) -> None:
     assert client.last(m.MissionItemReached).seq == 0xFFFF
     assert client.last(m.HighLatency2).custom_mode == vehicle.mode.number
     assert client.last(m.ExtendedSysState).landed_state == (1 if kind in ("copter", "plane") else 0)
+
+
+@every_kind
+def test_nothing_that_it_can_say_is_out_of_range(kind: str) -> None:
+    vehicle, client = booted(kind)
+    arm(client)
+    client.run(1.0)
+    for message_id in BUILDERS[vehicle.KIND]:
+        client.command(MavCmd.REQUEST_MESSAGE, message_id)
+        client.run(0.05)
+    assert client.last(m.HighLatency2).custom0 == vehicle.base_mode - 256
 
 
 # ---------------------------------------------------------------------------------------- sensors
@@ -324,6 +345,9 @@ def test_boot_as_the_real_one_does(kind: str) -> None:
     client.send(m.RequestDataStream(1, 1, MavDataStream.EXTRA3, 4, 1))
     client.run(46.0)
     assert [text for text in client.texts if not text.startswith(("PreArm", "MYGCS"))] == BOOT_TEXTS[kind]
+    modes = dict.fromkeys((beat.custom_mode, beat.system_status) for beat in client.all(m.Heartbeat))
+    if kind != "sub":
+        assert next(iter(modes)) == (16, MavState.CALIBRATING)
     flags = dict.fromkeys(report.flags for report in client.all(m.EkfStatusReport))
     assert list(flags) == [1024, 0, 167, 831]
     first = next(

@@ -111,7 +111,7 @@ def _sim_state(vehicle: ArduPilotVehicle) -> m.SimState:
 def _high_latency(vehicle: ArduPilotVehicle) -> m.HighLatency2 | None:
     motion, place = vehicle.motion, vehicle.navigation.position
     flies = vehicle.KIND in ("copter", "plane")
-    altitude = 0 if place is None else int(place.altitude_m)
+    altitude = 0 if place is None else max(-32768, min(32767, int(place.altitude_m)))
     return m.HighLatency2(
         timestamp=vehicle.time_boot_ms,
         type=vehicle.MAV_TYPE,
@@ -137,7 +137,7 @@ def _high_latency(vehicle: ArduPilotVehicle) -> m.HighLatency2 | None:
         battery=int(vehicle.battery.percent),
         wp_num=vehicle.mission.nav_index,
         failure_flags=0 if vehicle.navigation.fix_type >= GpsFixType.TYPE_3D_FIX else 1,
-        custom0=vehicle.base_mode,
+        custom0=(vehicle.base_mode ^ 0x80) - 0x80,
         custom1=0,
         custom2=0,
     )

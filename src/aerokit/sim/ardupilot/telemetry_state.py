@@ -11,7 +11,10 @@ from aerokit.mavlink.enums import (
     MavAutopilot,
     MavBatteryChargeState,
     MavLandedState,
+    MavModeFlag,
     MavState,
+    PlaneMode,
+    RoverMode,
 )
 from aerokit.sim.ardupilot.sensor_status import sensor_status
 
@@ -22,10 +25,23 @@ if TYPE_CHECKING:
 __all__ = ["STATE_BUILDERS", "heartbeat", "mission_current"]
 
 _UNKNOWN_CELL = 0xFFFF
+_BOOT_MODE: dict[str, tuple[int, int]] = {
+    "plane": (MavModeFlag.STABILIZE_ENABLED | MavModeFlag.CUSTOM_MODE_ENABLED, PlaneMode.INITIALIZING),
+    "rover": (MavModeFlag.MANUAL_INPUT_ENABLED | MavModeFlag.CUSTOM_MODE_ENABLED, RoverMode.INITIALIZING),
+}
+"""Flags and mode before it is initialised."""
 
 
 def heartbeat(vehicle: ArduPilotVehicle) -> m.Heartbeat:
-    """HEARTBEAT; BOOT until half a second after the vehicle is initialised."""
+    """HEARTBEAT; BOOT until half a second after the vehicle is initialised.
+
+    Plane and Rover boot in a mode of its own, CALIBRATING.
+    """
+    if not vehicle.is_initialised and vehicle.KIND in _BOOT_MODE:
+        base_mode, mode = _BOOT_MODE[vehicle.KIND]
+        return m.Heartbeat(
+            vehicle.MAV_TYPE, MavAutopilot.ARDUPILOTMEGA, base_mode, mode, MavState.CALIBRATING, 3
+        )
     state = _state(vehicle) if vehicle.has_left_boot else MavState.BOOT
     return m.Heartbeat(
         vehicle.MAV_TYPE, MavAutopilot.ARDUPILOTMEGA, vehicle.base_mode, vehicle.mode.number, state, 3
