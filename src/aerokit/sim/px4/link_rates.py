@@ -28,7 +28,7 @@ _FAST_IN_SIMULATION = (
     m.PositionTargetLocalNed.ID,
     m.ServoOutputRaw.ID,
 )
-_STICKS_IN_SIMULATION_HZ = 20.0
+_MORE_IN_SIMULATION_HZ = {m.RcChannels.ID: 20.0, m.OpticalFlowRad.ID: 10.0, m.Statustext.ID: 20.0}
 _EVENT_SEQUENCE_ID = 411
 _ALWAYS_HZ = {m.Heartbeat.ID: 1.0, m.MissionCurrent.ID: 1.0, _EVENT_SEQUENCE_ID: 0.3}
 """On every link, and not to be changed."""
@@ -69,7 +69,7 @@ class LinkRates:
         if mode != "normal":
             return rates
         fast = dict.fromkeys(_FAST_IN_SIMULATION, self._fast_hz)
-        return {**rates, **fast, m.RcChannels.ID: _STICKS_IN_SIMULATION_HZ}
+        return {**rates, **fast, **_MORE_IN_SIMULATION_HZ}
 
     def interval_us(self, channel: Channel, message_id: int) -> int:
         """As MESSAGE_INTERVAL tells it: -1 is off or unknown, 0 whenever there is something new."""
@@ -90,7 +90,7 @@ class LinkRates:
         return MavResult.ACCEPTED
 
     def requested(self, channel: Channel, message_id: int) -> None:
-        """A message was sent once: from now on it counts as one that is sent when it changes."""
+        """A message was asked for once: from now on it counts as one that is sent when it changes."""
         told = self._told.get(channel, {})
         if told.get(message_id) == _OFF:
             told[message_id] = _WHEN_IT_CHANGES

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.sim.px4.telemetry import available_modes
-from aerokit.sim.px4.wire_messages import ProtocolVersion
+from aerokit.sim.px4.wire_messages import CurrentEventSequence, ProtocolVersion
 
 if TYPE_CHECKING:
     from aerokit.sim.commands import Command, CommandHandler
@@ -15,10 +15,8 @@ if TYPE_CHECKING:
 
 __all__ = ["message_requests"]
 
-_NOT_ON_REQUEST = frozenset({m.MissionCurrent.ID})
+_NOT_ON_REQUEST = frozenset({m.MissionCurrent.ID, CurrentEventSequence.ID})
 _NOTHING_BUT_AN_ANSWER = frozenset({m.Heartbeat.ID})
-_REFUSED_AFTERWARDS = frozenset({m.HighLatency2.ID})
-"""Sent, and answered with DENIED."""
 
 
 def message_requests(px4: SimulatedPx4) -> dict[int, CommandHandler]:
@@ -51,13 +49,12 @@ class _Requests:
     def send_now(self, message_id: int, command: Command) -> int:
         """The message goes out before its acknowledgement; DENIED when there is none."""
         message = None if message_id in _NOT_ON_REQUEST else self._px4.build(message_id)
+        self._px4.rates.requested(command.channel, message_id)
         if message is None:
             return MavResult.DENIED
-        if message_id in _NOTHING_BUT_AN_ANSWER:
-            return MavResult.ACCEPTED
-        self._px4.send(message, command.channel)
-        self._px4.rates.requested(command.channel, message_id)
-        return MavResult.DENIED if message_id in _REFUSED_AFTERWARDS else MavResult.ACCEPTED
+        if message_id not in _NOTHING_BUT_AN_ANSWER:
+            self._px4.send(message, command.channel)
+        return MavResult.ACCEPTED
 
     def request_message(self, command: Command) -> int:
         message_id = _number(command.param1)

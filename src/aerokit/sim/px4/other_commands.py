@@ -60,8 +60,8 @@ _SILENT = (
 """Left to a part of the vehicle that does not run here: nobody answers."""
 
 _NO_FIGURE_EIGHT = "Figure 8 command only available for fixed wing and vtol vehicles."
-_GRIPS_FOR_S = 1.0
-_LOG_STOPS_AFTER_S = 0.7
+_GRIPS_FOR_S = 1.3
+_LOG_STOPS_AFTER_S = 2.0
 _UNKNOWN_PROGRESS = 255
 _CANCELLED = 6
 
@@ -73,6 +73,7 @@ def other_commands(px4: SimulatedPx4) -> dict[int, CommandHandler]:
     handlers[_C.DO_LAND_START] = lambda _: _CANCELLED
     handlers[_C.DO_FIGURE_EIGHT] = lambda _: px4.send_text(MavSeverity.CRITICAL, _NO_FIGURE_EIGHT)
     handlers[_C.CONTROL_HIGH_LATENCY] = _with_text(px4)
+    handlers[_C.EXTERNAL_WIND_ESTIMATE] = lambda command: _answer_twice(px4, command)
     handlers[_C.FIXED_MAG_CAL_YAW] = lambda command: _calibrate_by_yaw(px4, command)
     handlers[_C.DO_GRIPPER] = lambda _: Progress((_UNKNOWN_PROGRESS,), _GRIPS_FOR_S)
     handlers[_C.LOGGING_STOP] = lambda _: Progress((), _LOG_STOPS_AFTER_S)
@@ -93,3 +94,9 @@ def _calibrate_by_yaw(px4: SimulatedPx4, command: Command) -> int:
     px4.info(f"Assuming vehicle is facing heading {command.param1:.1f} degrees")
     px4.info("Mag quick calibration finished")
     return MavResult.ACCEPTED
+
+
+def _answer_twice(px4: SimulatedPx4, command: Command) -> int:
+    """The estimator takes it, the commander does not know it."""
+    px4.commands.answer(command, MavResult.ACCEPTED)
+    return MavResult.UNSUPPORTED
