@@ -66,11 +66,12 @@ def test_an_axis_without_a_value_is_given_back() -> None:
     assert pulses(client)[:3] == [1500, 1500, 1750]
 
 
-def test_a_joystick_that_goes_silent_lets_go_after_three_seconds() -> None:
-    _, client = started("rover")
-    fly(client, 0.4, z=500)
+@pytest.mark.parametrize(("kind", "pulse"), [("rover", 1750), ("sub", 1620)])
+def test_a_joystick_that_goes_silent_lets_go_after_three_seconds(kind: str, pulse: int) -> None:
+    _, client = started(kind)
+    fly(client, 0.4, z=500 if kind == "rover" else 800)
     client.run(2.5)
-    assert pulses(client)[2] == 1750
+    assert pulses(client)[2] == pulse
     client.run(0.6)
     assert pulses(client)[2] == 1500
 
