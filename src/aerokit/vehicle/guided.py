@@ -54,7 +54,8 @@ class Guided:
 
     Every stream takes ``rate_hz`` (how often the latest set-point is sent, 2 to 100), ``valid_for_s`` (how long a
     set-point may be resent without a new one) and ``max_lag_s`` (how late the event loop may be). NotSupported is
-    raised for a kind that this type of vehicle does not obey.
+    raised for a kind that this type of vehicle does not obey. Rates and seconds are ours: a simulation that runs ten
+    times as fast, and does not wait longer for it, wants ten times as many set-points.
     """
 
     def __init__(self, vehicle: Vehicle) -> None:
