@@ -22,7 +22,6 @@ from aerokit.sim.px4.modes import (
 )
 from aerokit.sim.px4.orbit import Orbit
 from aerokit.sim.px4.rally import return_destination
-from aerokit.sim.vehicle import TICK_S
 
 if TYPE_CHECKING:
     from aerokit.sim.px4.vehicle import SimulatedPx4
@@ -106,7 +105,7 @@ class Flight:
         elif mode == MISSION:
             vehicle.mission.update()
         elif mode in STICK_MODES:
-            self.by_hand.update(TICK_S)
+            self.by_hand.update()
         elif mode == ORBIT:
             self.orbit.update()
         elif mode == TERMINATION:

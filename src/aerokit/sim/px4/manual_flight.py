@@ -23,6 +23,9 @@ _EXPO, _DEAD_ZONE = 0.6, 0.1
 _SLOW_SHARE = 0.3
 _LIFTS_OFF_ABOVE = 0.05
 _AT_REST_M_S = 0.3
+_THRUST_AHEAD_S = 0.3
+"""The time constant with which the motion follows a velocity."""
+
 _HOLDS_HEIGHT = frozenset({ALTITUDE, ALTITUDE_CRUISE, POSITION, POSITION_SLOW})
 _HOLDS_PLACE = frozenset({POSITION, POSITION_SLOW})
 
@@ -34,13 +37,11 @@ class ManualFlight:
         self._px4 = px4
         self._place: tuple[float, float] | None = None
         self._down: float | None = None
-        self._thrust_velocity = 0.0
         self._turn_rate_rad_s = px4.motion.limits.turn_rate_rad_s
 
     def enter(self) -> None:
         """A mode begins: nothing is held yet."""
         self._place = self._down = None
-        self._thrust_velocity = self._px4.motion.velocity_down
         self._px4.motion.limits.turn_rate_rad_s = self._turn_rate_rad_s
 
     @property
@@ -53,7 +54,7 @@ class ManualFlight:
             return curved(px4.sticks.throttle, _EXPO, _DEAD_ZONE) > _LIFTS_OFF_ABOVE
         return self._thrust > 1.0
 
-    def update(self, dt: float) -> None:
+    def update(self) -> None:
         """Tell the motion what to do until the next tick."""
         px4, sticks = self._px4, self._px4.sticks
         fastest = math.radians(px4.parameters["MPC_MAN_Y_MAX"])
@@ -62,7 +63,7 @@ class ManualFlight:
         if px4.mode in _HOLDS_PLACE:
             self._fly_velocity()
             return
-        down = self._height_velocity() if px4.mode in _HOLDS_HEIGHT else self._velocity_of_thrust(dt)
+        down = self._height_velocity() if px4.mode in _HOLDS_HEIGHT else self._velocity_of_thrust()
         tilt = math.radians(px4.parameters["MPC_MAN_TILT_MAX"])
         px4.motion.seek_attitude(tilt * sticks.roll, -tilt * sticks.pitch, down)
 
@@ -120,9 +121,8 @@ class ManualFlight:
         thrust = hover + (throttle * (1.0 - hover) if throttle > 0 else throttle * (hover - least))
         return thrust / hover
 
-    def _velocity_of_thrust(self, dt: float) -> float:
+    def _velocity_of_thrust(self) -> float:
         """What thrust makes of the vertical speed."""
         motion = self._px4.motion
         lift = self._thrust * math.cos(motion.roll) * math.cos(motion.pitch)
-        self._thrust_velocity = motion.velocity_down + (1.0 - lift) * GRAVITY_M_S2 * max(dt, 0.3)
-        return self._thrust_velocity
+        return motion.velocity_down + (1.0 - lift) * GRAVITY_M_S2 * _THRUST_AHEAD_S

@@ -93,6 +93,8 @@ _POSITION_FLAGS = _F.VELOCITY_HORIZ | _F.POS_HORIZ_REL | _F.POS_HORIZ_ABS | _F.P
 def _heartbeat(px4: SimulatedPx4) -> m.Heartbeat:
     mode = TERMINATION if px4.arming.is_terminated else px4.mode
     base = KNOWN[mode].base_mode | (MavModeFlag.SAFETY_ARMED if px4.is_armed else 0)
+    if mode == OFFBOARD and px4.offboard.is_fresh:
+        base |= MavModeFlag.STABILIZE_ENABLED
     return m.Heartbeat(px4.VEHICLE_TYPE, MavAutopilot.PX4, base, custom_mode(px4.mode), _state(px4), 3)
 
 
@@ -269,7 +271,10 @@ def _target_local(px4: SimulatedPx4) -> m.PositionTargetLocalNed:
     """Nothing but a push towards the ground while disarmed."""
     yaw, o = px4.motion.yaw, px4.motion
     if not px4.is_armed:
-        return m.PositionTargetLocalNed(px4.time_boot_ms, 1, 63, *(math.nan,) * 6, 0.0, 0.0, 100.0, yaw, 0.0)
+        nan = math.nan
+        return m.PositionTargetLocalNed(
+            px4.time_boot_ms, 1, 63, nan, nan, nan, nan, nan, nan, 0.0, 0.0, 100.0, yaw, 0.0
+        )
     velocity = (o.velocity_north, o.velocity_east, o.velocity_down)
     acceleration = (o.acceleration_north, o.acceleration_east, o.acceleration_down)
     return m.PositionTargetLocalNed(
