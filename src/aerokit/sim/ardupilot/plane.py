@@ -173,7 +173,7 @@ class _Engine(Motors):
     @property
     def current_a(self) -> float:
         """What the battery gives."""
-        return 0.08 * self.is_armed + self.throttle * _FULL_AMPERES
+        return self.throttle * _FULL_AMPERES
 
     def update(self, now: float, dt: float, motion: Any, *, landed: bool) -> None:
         """Follow the motion."""

@@ -7,12 +7,13 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import GpsFixType, MavAutopilot
+from aerokit.mavlink.enums import GpsFixType, HlFailureFlag, MavAutopilot
 from aerokit.sim.motion import GRAVITY_M_S2
 from aerokit.sim.rotations import quaternion_from_euler
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
+    from aerokit.sim.ardupilot.parameter_tables import Kind
     from aerokit.sim.ardupilot.plane import SimulatedPlane
     from aerokit.sim.ardupilot.rover import SimulatedRover
     from aerokit.sim.ardupilot.sub import SimulatedSub
@@ -37,7 +38,13 @@ _NOTHING_REACHED = 0xFFFF
 _NO_TEMPERATURE = 32767
 _AIR_DENSITY = 1.225
 _GRID_M, _GRID_CORNER = 100, (0.0115, 0.0104)
-_ALL_FIELDS = 8191
+_ALWAYS_FAILING: dict[Kind, int] = {
+    "copter": HlFailureFlag.DIFFERENTIAL_PRESSURE,
+    "plane": HlFailureFlag.TERRAIN,
+    "rover": HlFailureFlag.DIFFERENTIAL_PRESSURE | HlFailureFlag.TERRAIN,
+    "sub": HlFailureFlag.DIFFERENTIAL_PRESSURE | HlFailureFlag.TERRAIN,
+}
+"""What HIGH_LATENCY2 says of sensors that are not there."""
 
 
 def _hwstatus(_: ArduPilotVehicle) -> m.Hwstatus:
@@ -108,6 +115,11 @@ def _sim_state(vehicle: ArduPilotVehicle) -> m.SimState:
     )
 
 
+def _failures(vehicle: ArduPilotVehicle) -> int:
+    lost = HlFailureFlag.GPS if vehicle.navigation.fix_type < GpsFixType.TYPE_3D_FIX else 0
+    return _ALWAYS_FAILING[vehicle.KIND] | lost
+
+
 def _high_latency(vehicle: ArduPilotVehicle) -> m.HighLatency2 | None:
     motion, place = vehicle.motion, vehicle.navigation.position
     flies = vehicle.KIND in ("copter", "plane")
@@ -136,7 +148,7 @@ def _high_latency(vehicle: ArduPilotVehicle) -> m.HighLatency2 | None:
         climb_rate=max(-128, min(127, round(-motion.velocity_down * 10.0))),
         battery=int(vehicle.battery.percent),
         wp_num=vehicle.mission.nav_index,
-        failure_flags=0 if vehicle.navigation.fix_type >= GpsFixType.TYPE_3D_FIX else 1,
+        failure_flags=_failures(vehicle),
         custom0=(vehicle.base_mode ^ 0x80) - 0x80,
         custom1=0,
         custom2=0,

@@ -192,7 +192,8 @@ def _terrain_report(vehicle: ArduPilotVehicle) -> m.TerrainReport:
     place = vehicle.navigation.position
     if place is None:
         return m.TerrainReport(0, 0, 100, 0.0, 0.0, 56, 0)
-    return m.TerrainReport(place.latitude_e7, place.longitude_e7, 0, 0.0, place.altitude_m, 504, 0)
+    missing = 0 if vehicle.KIND == "sub" else 504
+    return m.TerrainReport(place.latitude_e7, place.longitude_e7, 0, 0.0, place.altitude_m, missing, 0)
 
 
 def _rangefinder(vehicle: ArduPilotVehicle) -> m.Rangefinder | None:

@@ -13,6 +13,7 @@ from aerokit.mavlink.enums import (
     MavLandedState,
     MavModeFlag,
     MavState,
+    MavVtolState,
     PlaneMode,
     RoverMode,
 )
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
 __all__ = ["STATE_BUILDERS", "heartbeat", "mission_current"]
 
 _UNKNOWN_CELL = 0xFFFF
+_MOTORS = {"copter": (0, 1, 2, 3), "plane": (2,)}
+"""Outputs, from 0 on, of the motors that tell how they are."""
 _BOOT_MODE: dict[str, tuple[int, int]] = {
     "plane": (MavModeFlag.STABILIZE_ENABLED | MavModeFlag.CUSTOM_MODE_ENABLED, PlaneMode.INITIALIZING),
     "rover": (MavModeFlag.MANUAL_INPUT_ENABLED | MavModeFlag.CUSTOM_MODE_ENABLED, RoverMode.INITIALIZING),
@@ -82,7 +85,8 @@ def _extended_sys_state(vehicle: ArduPilotVehicle) -> m.ExtendedSysState:
         state = MavLandedState.LANDING
     elif vehicle.mode.is_taking_off:
         state = MavLandedState.TAKEOFF
-    return m.ExtendedSysState(0, state)
+    lifts = MavVtolState.MC if vehicle.KIND == "copter" else MavVtolState.UNDEFINED
+    return m.ExtendedSysState(lifts, state)
 
 
 def _battery_status(vehicle: ArduPilotVehicle) -> m.BatteryStatus:
@@ -150,9 +154,11 @@ def _esc_telemetry(vehicle: ArduPilotVehicle) -> m.EscTelemetry1To4:
     rpm = round(vehicle.motors.throttle * 15000)
     count = int(vehicle.uptime * 100) & 0xFFFF
     voltage = round(vehicle.battery.voltage_v * 100)
-    return m.EscTelemetry1To4(
-        bytes([32] * 4), (voltage,) * 4, (current,) * 4, (0,) * 4, (rpm,) * 4, (count,) * 4
+    there = [int(index in _MOTORS[vehicle.KIND]) for index in range(4)]
+    voltages, currents, rpms, counts = (
+        [value * each for each in there] for value in (voltage, current, rpm, count)
     )
+    return m.EscTelemetry1To4(bytes(32 * each for each in there), voltages, currents, (0,) * 4, rpms, counts)
 
 
 def _autopilot_version(vehicle: ArduPilotVehicle) -> m.AutopilotVersion:
