@@ -25,7 +25,7 @@ def what_was_flown(flown: Iterable[Fleet | Flight | ServedFlight], test: str, di
     flights = _each(flown)
     lines = [line for flight in flights for line in _story(flight)]
     if directory is not None:
-        lines.append(f"track in {_drawn(flights, test, Path(directory))}")
+        lines.append(_picture(flights, test, Path(directory)))
     return "\n".join(lines)
 
 
@@ -52,8 +52,11 @@ def _last(texts: Sequence[SaidText]) -> list[str]:
     return [f"  said at {text}" for text in texts[-_TEXTS:]]
 
 
-def _drawn(flights: Sequence[Flight | ServedFlight], test: str, directory: Path) -> Path:
-    directory.mkdir(parents=True, exist_ok=True)
+def _picture(flights: Sequence[Flight | ServedFlight], test: str, directory: Path) -> str:
     path = directory / (re.sub(r"[^\w.-]+", "-", test).strip("-") + ".svg")
-    save_picture([flight.track for flight in flights], path)
-    return path
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        save_picture([flight.track for flight in flights], path)
+    except OSError as error:  # the failure is to be told all the same
+        return f"no picture: {error}"
+    return f"track in {path}"
