@@ -380,6 +380,7 @@ ANSWERS: dict[tuple[int, ...], tuple[int, int, int, int]] = {
     (MavCmd.DO_FOLLOW, 0): (D, D, D, U),
     (MavCmd.DO_LAND_START, 0): (F, F, U, U),
     (MavCmd.DO_VTOL_TRANSITION, 4): (U, F, U, U),
+    (MavCmd.DO_CHANGE_SPEED, 2, 5): (F, F, D, D),
     (MavCmd.DO_FLIGHTTERMINATION, 0): (F, F, U, F),
     (MavCmd.SET_EKF_SOURCE_SET, 1): (A, A, A, A),
     (MavCmd.SET_EKF_SOURCE_SET, 9): (D, D, D, D),

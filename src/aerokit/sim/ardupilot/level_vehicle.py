@@ -88,6 +88,8 @@ class LevelVehicle(ArduPilotVehicle):
         return MavResult.ACCEPTED
 
     def _change_speed(self, command: Command) -> int:
+        if command.param1 in (SpeedType.CLIMB_SPEED, SpeedType.DESCENT_SPEED):
+            return MavResult.DENIED
         kinds = (SpeedType.AIRSPEED, SpeedType.GROUNDSPEED)
         if not self.mode.can_change_speed or command.param1 not in kinds or not command.param2 > 0:
             return MavResult.FAILED

@@ -197,10 +197,8 @@ class SimulatedSub(LevelVehicle):
 
     def _change_speed_at_any_time(self, command: Command) -> int:
         """Also in modes that have no use for it."""
-        if not command.param2 > 0:
+        if not command.param2 > 0 or command.param1 not in (SpeedType.AIRSPEED, SpeedType.GROUNDSPEED):
             return MavResult.DENIED
-        if command.param1 not in (SpeedType.AIRSPEED, SpeedType.GROUNDSPEED):
-            return MavResult.FAILED
         if isinstance(self.mode, SubGuided | SubAuto):
             self.mode.speed = command.param2
         return MavResult.ACCEPTED
