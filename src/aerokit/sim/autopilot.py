@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
-from typing import TYPE_CHECKING, ClassVar, Protocol
+from typing import TYPE_CHECKING, ClassVar
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavProtocolCapability
@@ -23,10 +23,6 @@ _RELEASES = {"dev": 0, "alpha": 64, "beta": 128, "rc": 192, "": 255, "official":
 """FIRMWARE_VERSION_TYPE, by what stands behind the version's dash."""
 
 
-class _Storage(Protocol):
-    files: FileTree
-
-
 class SimulatedAutopilot(SimulatedVehicle):
     """A vehicle whose firmware has a version, a card with files, a clock, and commands.
 
@@ -38,7 +34,8 @@ class SimulatedAutopilot(SimulatedVehicle):
     CAPABILITIES: ClassVar[int]
     """MAV_PROTOCOL_CAPABILITYs."""
 
-    storage: _Storage
+    files: FileTree
+    """What is on its card, and what it makes up when it is read; it survives a reboot."""
     signing: VehicleSigning
     """The key for signing that it was given; it survives a reboot."""
 
@@ -74,11 +71,6 @@ class SimulatedAutopilot(SimulatedVehicle):
     def capabilities(self) -> int:
         """MAV_PROTOCOL_CAPABILITYs, for AUTOPILOT_VERSION."""
         return self.CAPABILITIES & ~MavProtocolCapability.FTP if self.faults.no_ftp else self.CAPABILITIES
-
-    @property
-    def files(self) -> FileTree:
-        """What is on its card, and what it makes up when it is read; it survives a reboot."""
-        return self.storage.files
 
     @property
     def unix_time(self) -> float:

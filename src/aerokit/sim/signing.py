@@ -31,6 +31,8 @@ class VehicleSigning:
         """The stored key; None: nothing is signed or checked. Call `load` after changing it by hand."""
         self.timestamp = timestamp if key is not None else 0
         """The stored time stamp."""
+        self.trusts_first_port = False
+        """Whether the first port lets everything in, as ArduPilot's does by default. Call `load` after changing it."""
         self._vehicle = vehicle
         self._streams: dict[tuple[int, int, int], int] = {}
         vehicle.on(SetupSigning, self._on_setup)

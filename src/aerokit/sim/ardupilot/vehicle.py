@@ -88,11 +88,6 @@ class ArduPilotVehicle(SimulatedAutopilot):
     MODES: ClassVar[tuple[Callable[[Any], VehicleMode], ...]]
     """Classes of the modes, in the order in which they are listed."""
 
-    storage: Storage
-    """Files, logs, and the servers of them and of the parameters."""
-    signing: ArduPilotSigning
-    """The key for signing that it was given; it survives a reboot."""
-
     HOME_NEEDS_ORIGIN: ClassVar[bool] = True
     """Whether home cannot be set before the estimator has an origin."""
     TELLS_HOME: ClassVar[bool] = False
@@ -158,6 +153,8 @@ class ArduPilotVehicle(SimulatedAutopilot):
         self.storage = Storage(
             self, logs, parameter_errors=parameter_errors, link_bytes_per_s=link_bytes_per_s
         )
+        """Files, logs, and the servers of them and of the parameters."""
+        self.files = self.storage.files
 
     def _reset(self) -> None:
         """What a power cycle makes new."""

@@ -91,8 +91,6 @@ class SimulatedPx4(SimulatedAutopilot):
     PARAMETER_TABLE: ClassVar[str] = "quadrotor"
 
     events: Events
-    storage: Storage
-    """Files, logs, and the servers of them and of the parameters."""
 
     def __init__(
         self,
@@ -146,6 +144,8 @@ class SimulatedPx4(SimulatedAutopilot):
         self._reset()
         self._listen()
         self.storage = Storage(self, logs, parameter_file=parameter_file, link_bytes_per_s=link_bytes_per_s)
+        """Files, logs, and the servers of them and of the parameters."""
+        self.files = self.storage.files
 
     def _make_motion(self, wind: Wind | None) -> Motion:
         limits = MotionLimits(
