@@ -109,9 +109,9 @@ class _Watched(SimulatorServer):
 
     spent_s = 0.0
 
-    def _run(self, now: float) -> None:
+    def _run_on(self, now: float) -> None:
         started = time.thread_time()
-        super()._run(now)
+        super()._run_on(now)
         self.spent_s += time.thread_time() - started
 
     def hear(self, data: bytes, peer: Any, port: Any) -> None:

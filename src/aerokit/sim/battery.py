@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 __all__ = ["Battery"]
 
 _RESTING_CELL_VOLTS = ((0.0, 3.0), (5.0, 3.3), (20.0, 3.6), (50.0, 3.75), (75.0, 3.95), (100.0, 4.2))
+_RESTING_CELL_SLOPES = tuple(
+    (low, volts, (high_volts - volts) / (high - low))
+    for (low, volts), (high, high_volts) in pairwise(_RESTING_CELL_VOLTS)
+)[::-1]
+"""From the full end: percent, volts, volts for each percent above it."""
 
 
 class Battery:
@@ -39,7 +46,8 @@ class Battery:
     @property
     def voltage_v(self) -> float:
         """Voltage under the present load."""
-        return max(0.0, self.cells * self._resting_cell_volts() - self.current_a * self.resistance_ohm)
+        volts = self.cells * self._resting_cell_volts() - self.current_a * self.resistance_ohm
+        return volts if volts > 0.0 else 0.0
 
     def drain(self, current_a: float, dt: float) -> None:
         """Draw a current for ``dt`` seconds."""
@@ -47,14 +55,12 @@ class Battery:
         used_mah = current_a * dt / 3.6
         self.consumed_mah += used_mah
         self.consumed_wh += used_mah * self.voltage_v / 1000.0
-        self._charge_mah = max(0.0, self._charge_mah - used_mah)
+        left_mah = self._charge_mah - used_mah
+        self._charge_mah = left_mah if left_mah > 0.0 else 0.0
 
     def _resting_cell_volts(self) -> float:
-        percent = self.percent
-        low_percent, low_volts = _RESTING_CELL_VOLTS[0]
-        for high_percent, high_volts in _RESTING_CELL_VOLTS[1:]:
-            if percent <= high_percent:
-                share = (percent - low_percent) / (high_percent - low_percent)
-                return low_volts + share * (high_volts - low_volts)
-            low_percent, low_volts = high_percent, high_volts
-        return low_volts
+        percent = 100.0 * self._charge_mah / self.capacity_mah
+        for low_percent, low_volts, volts_per_percent in _RESTING_CELL_SLOPES:
+            if percent >= low_percent:
+                return low_volts + (min(percent, 100.0) - low_percent) * volts_per_percent
+        return _RESTING_CELL_VOLTS[0][1]

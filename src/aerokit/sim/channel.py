@@ -97,8 +97,7 @@ class Channel:
         return datagrams
 
     def reset(self) -> None:
-        """Forget rates, half frames and what was not sent yet, as a reboot does."""
+        """Forget rates, half frames and sequence numbers, as a reboot does; what was said before is on its way."""
         self.streams = Streams()
         self._framers.clear()
         self._encoders.clear()
-        self._outbox.clear()

@@ -109,7 +109,8 @@ class FixedWing(Motion):
 
     def step(self, dt: float, *, powered: bool = True) -> None:
         """Move on by ``dt`` seconds; without power it glides down."""
-        self._blow(dt)
+        if self.wind.gusts_m_s > 0.0:
+            self._blow(dt)
         was_on_ground = self.is_on_ground
         before = (self.velocity_north, self.velocity_east, self.velocity_down)
         if was_on_ground and not self._lifts_off(powered=powered):

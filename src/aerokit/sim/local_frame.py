@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from aerokit.errors import LocalProtocolError
 
@@ -15,8 +14,7 @@ _METRES_PER_DEGREE_E7 = (
 )
 
 
-@dataclass(frozen=True)
-class GlobalPoint:
+class GlobalPoint(NamedTuple):
     """A place on the wire's scale: degrees times 1e7, metres above mean sea level."""
 
     latitude_e7: int

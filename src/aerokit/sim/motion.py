@@ -27,6 +27,13 @@ def wrap_pi(angle: float) -> float:
     return (angle + math.pi) % (2 * math.pi) - math.pi
 
 
+def _within(value: float, limit: float) -> float:
+    """The value, but no further from zero than ``limit``."""
+    if value > limit:
+        return limit
+    return value if value > -limit else -limit
+
+
 def approach_speed(distance: float, gain: float, deceleration: float) -> float:
     """How fast to go towards something ``distance`` metres away and stop there without overshoot."""
     linear = deceleration / (gain * gain)
@@ -140,7 +147,8 @@ class Motion:
 
     def step(self, dt: float, *, powered: bool = True) -> None:
         """Move on by ``dt`` seconds; without power it falls."""
-        self._blow(dt)
+        if self.wind.gusts_m_s > 0.0:
+            self._blow(dt)
         if powered:
             north, east, down = self._commanded_acceleration()
         else:
@@ -161,8 +169,6 @@ class Motion:
         self._wanted_yaw, self._wanted_yaw_rate = None, 0.0
 
     def _blow(self, dt: float) -> None:
-        if self.wind.gusts_m_s <= 0.0:
-            return
         decay, kick = 1.0 - dt / 2.0, self.wind.gusts_m_s * math.sqrt(dt)
         self._gust_north = self._gust_north * decay + self._rng.gauss(0.0, kick)
         self._gust_east = self._gust_east * decay + self._rng.gauss(0.0, kick)
@@ -173,7 +179,7 @@ class Motion:
         down = wanted_down
         if not self._accelerating:
             down = (wanted_down - self.velocity_down) / _VELOCITY_TIME_CONSTANT_S
-        down = max(-limits.vertical_acceleration_m_s2, min(limits.vertical_acceleration_m_s2, down))
+        down = _within(down, limits.vertical_acceleration_m_s2)
         if self._leaning is not None:
             north, east = self._acceleration_from_lean(*self._leaning)
             return north, east, down
@@ -188,8 +194,10 @@ class Motion:
 
     def _acceleration_from_lean(self, roll: float, pitch: float) -> tuple[float, float]:
         lean = self.limits.lean_rad
-        forward = -GRAVITY_M_S2 * math.tan(max(-lean, min(lean, pitch)))
-        right = GRAVITY_M_S2 * math.tan(max(-lean, min(lean, roll)))
+        forward, right = (
+            -GRAVITY_M_S2 * math.tan(_within(pitch, lean)),
+            GRAVITY_M_S2 * math.tan(_within(roll, lean)),
+        )
         cos_yaw, sin_yaw = math.cos(self.yaw), math.sin(self.yaw)
         drag_north, drag_east = self._drag()
         return (
@@ -225,9 +233,9 @@ class Motion:
             north, east = north + drag_north, east + drag_east
             cos_yaw, sin_yaw = math.cos(self.yaw), math.sin(self.yaw)
             limit = self.limits.lean_rad
-            pitch = max(-limit, min(limit, -math.atan2(north * cos_yaw + east * sin_yaw, GRAVITY_M_S2)))
-            roll = max(-limit, min(limit, math.atan2(east * cos_yaw - north * sin_yaw, GRAVITY_M_S2)))
-        share = min(1.0, dt / _LEAN_TIME_CONSTANT_S)
+            pitch = _within(-math.atan2(north * cos_yaw + east * sin_yaw, GRAVITY_M_S2), limit)
+            roll = _within(math.atan2(east * cos_yaw - north * sin_yaw, GRAVITY_M_S2), limit)
+        share = dt / _LEAN_TIME_CONSTANT_S if dt < _LEAN_TIME_CONSTANT_S else 1.0
         roll_step, pitch_step = (roll - self.roll) * share, (pitch - self.pitch) * share
         self.roll += roll_step
         self.pitch += pitch_step
@@ -239,6 +247,7 @@ class Motion:
             rate = self._wanted_yaw_rate
             if self._wanted_yaw is not None:
                 rate = _TURN_GAIN_PER_S * wrap_pi(self._wanted_yaw - self.yaw)
-            rate = max(-self.limits.turn_rate_rad_s, min(self.limits.turn_rate_rad_s, rate))
+            rate = _within(rate, self.limits.turn_rate_rad_s)
         self.yaw_rate = rate
-        self.yaw = wrap_pi(self.yaw + rate * dt)
+        if rate != 0.0:
+            self.yaw = wrap_pi(self.yaw + rate * dt)

@@ -65,7 +65,8 @@ class Parameters:
         return parameters
 
     def __getitem__(self, name: str) -> float:
-        return self.row(name).value
+        row = self._rows[name]
+        return self.row(name).value if isinstance(row, str) else row.value
 
     def get(self, name: str, default: float) -> float:
         """The value; the default when this table is without it."""

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import sys
-from collections.abc import AsyncIterator, Iterable, Sequence
+from collections.abc import AsyncIterator, Callable, Iterable, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -65,6 +66,7 @@ class SimulatorServer:
         self._numbers = {id(vehicle): number for number, vehicle in enumerate(self.vehicles)}
         self._shortest_wait_s = _SHORTEST_WAIT_S if speedup != 1.0 or len(self.vehicles) > _MANY else 0.0
         self._loop: asyncio.AbstractEventLoop | None = None
+        self._jump: Callable[[float], bool] | None = None  # of a loop on virtual time
         self._started_at = 0.0
         self._now_at_start = max((vehicle.now for vehicle in self.vehicles), default=0.0)
         self._ports: list[_Port] = []
@@ -92,6 +94,7 @@ class SimulatorServer:
         if self._loop is not None:
             raise BusyError("this SimulatorServer was started before")
         self._loop, self._owner = asyncio.get_running_loop(), asyncio.current_task()
+        self._jump = getattr(self._loop, "jump", None)
         self._started_at = self._loop.time()
         try:
             async with AsyncExitStack() as opening:
@@ -150,7 +153,7 @@ class SimulatorServer:
         self._leave_out_lateness()
         self._timer = None
         try:
-            self._run(max(self.now, self._timer_due))  # a timer may fire a hair early
+            self._run_on(max(self.now, self._timer_due))  # a timer may fire a hair early
         except Exception as error:
             self._fail(error)
 
@@ -175,6 +178,16 @@ class SimulatorServer:
         self._flush()
         self._schedule()
 
+    def _run_on(self, now: float) -> None:
+        """The same, and on virtual time also what comes next, as long as nothing else happens in between."""
+        self._step(now)
+        while not self._flush() and self._jump is not None:
+            due = min(self._dues)
+            if due == math.inf or not self._jump(self._when(due)):
+                break
+            self._step(max(self.now, due))
+        self._schedule()
+
     def _step(self, now: float) -> None:
         for number, due in enumerate(self._dues):
             if due <= now:
@@ -197,23 +210,27 @@ class SimulatorServer:
         except Exception as error:
             self._fail(error)
 
-    def _flush(self) -> None:
+    def _flush(self) -> bool:
+        """Send what is to be sent; whether there was something."""
+        has_sent = False
         for port in self._ports:
             for channel in port.channels:
                 if channel.has_output:
+                    has_sent = True
                     for datagram in channel.take_datagrams():
                         port.link.write(datagram)
+        return has_sent
 
     def _schedule(self) -> None:
         loop = self._loop
-        due = min(self._dues, default=float("inf"))
-        if loop is None or due == float("inf"):
+        due = min(self._dues, default=math.inf)
+        if loop is None or due == math.inf:
             return
         if self._timer is not None:
             if self._timer_due == due:
                 return
             self._timer.cancel()
-        when = self._started_at + (due - self._now_at_start) / self._speedup
+        when = self._when(due)
         if self._shortest_wait_s:
             when = max(when, loop.time() + self._shortest_wait_s)
         self._timer_due, self._timer_at = due, when
@@ -227,6 +244,10 @@ class SimulatorServer:
         if late > 0:
             self._started_at += late
             self._timer_at += late
+
+    def _when(self, due: float) -> float:
+        """By the loop's clock."""
+        return self._started_at + (due - self._now_at_start) / self._speedup
 
 
 class _Port:

@@ -32,6 +32,7 @@ _LOWEST_TAKE_OFF_M = 1.0
 _STOPS_NOT_BEFORE = frozenset(
     {_C.NAV_WAYPOINT, _C.NAV_LOITER_UNLIM, _C.NAV_LOITER_TIME, _C.NAV_SPLINE_WAYPOINT, _C.NAV_PAYLOAD_PLACE}
 )
+_WAYPOINTS = frozenset({_C.NAV_WAYPOINT, _C.NAV_SPLINE_WAYPOINT, _C.NAV_LOITER_TIME})
 _NOTHING_TO_DO = frozenset(
     {
         _C.DO_FENCE_ENABLE,
@@ -233,10 +234,10 @@ class Auto(Mode):
 
     def _is_done(self, index: int, item: MissionItem) -> bool:
         command, now = item.command, self.copter.now
+        if command in _WAYPOINTS:  # nearly always
+            return self._has_stayed(index, item.param1)
         if command in (_C.NAV_TAKEOFF, _C.NAV_VTOL_TAKEOFF):
             return self._leg.is_complete
-        if command in (_C.NAV_WAYPOINT, _C.NAV_SPLINE_WAYPOINT, _C.NAV_LOITER_TIME):
-            return self._has_stayed(index, item.param1)
         if command in (_C.NAV_LAND, _C.NAV_VTOL_LAND):
             return self._has_landed(index)
         if command in (_C.NAV_LOITER_TURNS, _C.NAV_LOITER_TO_ALT, _C.NAV_RETURN_TO_LAUNCH):

@@ -64,12 +64,14 @@ class Motors:
         """Follow what is wanted."""
         self.may_turn = self.is_armed and now - self.armed_at >= _ARMING_DELAY_S
         if self.may_turn and self.wanted:
-            self.spool = min(1.0, self.spool + dt / _SPOOL_UP_S)
+            if self.spool < 1.0:
+                self.spool = min(1.0, self.spool + dt / _SPOOL_UP_S)
         else:
             self.spool = max(0.0, self.spool - dt / _SPOOL_DOWN_S)
         if landed or not self.is_armed:
             self.throttle = 0.05 * self.spool
             return
         lean = math.cos(motion.roll) * math.cos(motion.pitch)
-        lift = max(0.0, 1.0 - motion.acceleration_down / GRAVITY_M_S2)
-        self.throttle = min(1.0, _HOVER_THROTTLE * lift / max(0.5, lean))
+        lift = 1.0 - motion.acceleration_down / GRAVITY_M_S2
+        throttle = _HOVER_THROTTLE * lift / (lean if lean > 0.5 else 0.5)
+        self.throttle = 0.0 if throttle < 0.0 else throttle if throttle < 1.0 else 1.0

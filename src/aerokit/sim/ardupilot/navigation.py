@@ -14,8 +14,12 @@ if TYPE_CHECKING:
 
 __all__ = ["Navigation"]
 
-_ATTITUDE_ONLY = Ekf.ATTITUDE | Ekf.VELOCITY_HORIZ | Ekf.VELOCITY_VERT | Ekf.POS_VERT_ABS | Ekf.CONST_POS_MODE
-_WITH_POSITION = (
+# plain numbers: the operators of flags are slow, and these are looked at all the time
+_ATTITUDE, _POS_HORIZ_ABS, _POS_VERT_ABS = map(int, (Ekf.ATTITUDE, Ekf.POS_HORIZ_ABS, Ekf.POS_VERT_ABS))
+_ATTITUDE_ONLY = int(
+    Ekf.ATTITUDE | Ekf.VELOCITY_HORIZ | Ekf.VELOCITY_VERT | Ekf.POS_VERT_ABS | Ekf.CONST_POS_MODE
+)
+_WITH_POSITION = int(
     Ekf.ATTITUDE
     | Ekf.VELOCITY_HORIZ
     | Ekf.VELOCITY_VERT
@@ -58,7 +62,7 @@ class Navigation:
         later = vehicle.call_later
         later(
             line.ready + 0.5 * (line.estimator_active - line.ready),
-            lambda: self._set_flags(Ekf.UNINITIALIZED),
+            lambda: self._set_flags(int(Ekf.UNINITIALIZED)),
         )
         later(line.estimator_active, self._activate)
         later(line.tilt_aligned, lambda: self._say_cores("tilt alignment complete"))
@@ -74,17 +78,17 @@ class Navigation:
     @property
     def has_position(self) -> bool:
         """Whether the estimator has a position that is good enough to fly by."""
-        return self.flags is not None and bool(self.flags & Ekf.POS_HORIZ_ABS)
+        return self.flags is not None and self.flags & _POS_HORIZ_ABS != 0
 
     @property
     def has_attitude(self) -> bool:
         """Whether the estimator knows up from down."""
-        return self.flags is not None and bool(self.flags & Ekf.ATTITUDE)
+        return self.flags is not None and self.flags & _ATTITUDE != 0
 
     @property
     def has_altitude(self) -> bool:
         """Whether the estimator has a height."""
-        return self.flags is not None and bool(self.flags & Ekf.POS_VERT_ABS)
+        return self.flags is not None and self.flags & _POS_VERT_ABS != 0
 
     @property
     def position(self) -> GlobalPoint | None:
