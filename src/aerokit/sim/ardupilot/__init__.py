@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from aerokit.sim.ardupilot.boot import BootTimeline
-from aerokit.sim.ardupilot.copter import SimulatedCopter
-from aerokit.sim.ardupilot.plane import SimulatedPlane
-from aerokit.sim.ardupilot.rover import SimulatedRover
-from aerokit.sim.ardupilot.sub import SimulatedSub
+from aerokit.sim.ardupilot.copter.vehicle import SimulatedCopter
+from aerokit.sim.ardupilot.plane.vehicle import SimulatedPlane
+from aerokit.sim.ardupilot.rover.vehicle import SimulatedRover
+from aerokit.sim.ardupilot.sub.vehicle import SimulatedSub
 
 __all__ = ["BootTimeline", "SimulatedCopter", "SimulatedPlane", "SimulatedRover", "SimulatedSub"]

@@ -8,9 +8,9 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import PlaneMode
 
 if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.plane import SimulatedPlane
-    from aerokit.sim.ardupilot.rover import SimulatedRover
-    from aerokit.sim.ardupilot.sub import SimulatedSub
+    from aerokit.sim.ardupilot.plane.vehicle import SimulatedPlane
+    from aerokit.sim.ardupilot.rover.vehicle import SimulatedRover
+    from aerokit.sim.ardupilot.sub.vehicle import SimulatedSub
     from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 
 __all__ = ["copter_outputs", "plane_outputs", "rover_outputs", "sub_outputs"]

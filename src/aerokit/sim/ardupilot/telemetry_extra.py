@@ -14,9 +14,9 @@ from aerokit.sim.rotations import quaternion_from_euler
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.sim.ardupilot.parameter_tables import Kind
-    from aerokit.sim.ardupilot.plane import SimulatedPlane
-    from aerokit.sim.ardupilot.rover import SimulatedRover
-    from aerokit.sim.ardupilot.sub import SimulatedSub
+    from aerokit.sim.ardupilot.plane.vehicle import SimulatedPlane
+    from aerokit.sim.ardupilot.rover.vehicle import SimulatedRover
+    from aerokit.sim.ardupilot.sub.vehicle import SimulatedSub
     from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 
 __all__ = [

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import EkfStatusFlags, GpsFixType, PlaneMode
 from aerokit.mavlink.enums import PositionTargetTypemask as Mask
-from aerokit.sim.ardupilot.guided import Guided
+from aerokit.sim.ardupilot.copter.guided import Guided
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message

@@ -1,0 +1,1 @@
+"""What is ArduCopter's own: its modes, missions, commands, arming, failsafes."""

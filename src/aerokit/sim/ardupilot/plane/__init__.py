@@ -1,0 +1,1 @@
+"""What is ArduPlane's own: its modes, missions, commands, arming, failsafes."""

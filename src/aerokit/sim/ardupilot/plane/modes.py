@@ -1,0 +1,329 @@
+"""ArduPlane's flight modes: what each needs and how it makes the aeroplane fly.
+
+Not simulated, and refused as a firmware without them would: TRAINING, ACRO, AUTOTUNE, AVOID_ADSB, THERMAL and the modes
+of lifting rotors.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from aerokit.mavlink.enums import MavModeFlag, MavSeverity, PlaneMode
+from aerokit.sim.ardupilot.mode import VehicleMode
+from aerokit.sim.ardupilot.plane.landing import Landing
+from aerokit.sim.ardupilot.rally import best_return_place
+
+if TYPE_CHECKING:
+    from aerokit.sim.ardupilot.navigation import Ned
+    from aerokit.sim.ardupilot.plane.vehicle import SimulatedPlane
+
+__all__ = [
+    "Autoland",
+    "Circle",
+    "Cruise",
+    "FlyByWireA",
+    "FlyByWireB",
+    "Loiter",
+    "Manual",
+    "NavigatingMode",
+    "PlaneModeBase",
+    "Rtl",
+    "Stabilize",
+    "TakeOff",
+    "climb_out",
+]
+
+_MID_STICK, _STICK_RANGE, _LOW_THROTTLE = 1500, 500, 1100
+_CIRCLE_BANK_SHARE = 1 / 3
+_TAKE_OFF_DONE_M = 5.0
+_NAVIGATES = MavModeFlag.GUIDED_ENABLED | MavModeFlag.STABILIZE_ENABLED
+_BELOW_M = 2.0
+
+
+class PlaneModeBase(VehicleMode):
+    """A mode of an aeroplane; it goes into each of them without knowing where it is."""
+
+    needs_position = False
+    flags: int = MavModeFlag.STABILIZE_ENABLED
+    """MAV_MODE_FLAGs that HEARTBEAT shows."""
+
+    def __init__(self, plane: SimulatedPlane) -> None:
+        self.plane = plane
+
+    def stick(self, index: int) -> float:
+        """A stick, -1 to 1."""
+        return (self.plane.rc[index] - _MID_STICK) / _STICK_RANGE
+
+    def throttle(self) -> float:
+        """The throttle stick, 0 to 1."""
+        return max(0.0, min(1.0, (self.plane.rc[2] - 1000) / 1000))
+
+
+class Piloted(PlaneModeBase):
+    """The sticks fly: bank, climb and speed; with the throttle down it glides."""
+
+    has_manual_throttle = True
+
+    def update(self, dt: float) -> None:
+        """Follow the sticks."""
+        plane, wing, throttle = self.plane, self.plane.wing, self.throttle()
+        if plane.is_landed and self.plane.rc[2] <= _LOW_THROTTLE:
+            wing.roll_out()
+            return
+        plane.lift_off()
+        climb = self.stick(1) * wing.wing.climb_m_s  # pulled back is above the middle
+        if plane.rc[2] <= _LOW_THROTTLE:
+            climb = min(climb, 0.0) - wing.wing.glide_sink_m_s
+        wing.bank_and_climb(
+            max(throttle * 2 * plane.cruise_m_s, 0.0), self.stick(0) * wing.wing.bank_rad, climb
+        )
+
+
+class Manual(Piloted):
+    """Sticks straight to the rudders; here as `FlyByWireA`."""
+
+    number = PlaneMode.MANUAL
+    name = "MANUAL"
+    flags = MavModeFlag.MANUAL_INPUT_ENABLED | MavModeFlag.STABILIZE_ENABLED
+
+
+class Stabilize(Piloted):
+    """Level when the sticks are let go."""
+
+    number = PlaneMode.STABILIZE
+    name = "STABILIZE"
+
+
+class FlyByWireA(Piloted):
+    """Bank and pitch by stick."""
+
+    number = PlaneMode.FLY_BY_WIRE_A
+    name = "FLY_BY_WIRE_A"
+
+
+class FlyByWireB(PlaneModeBase):
+    """Bank by stick, height and speed held."""
+
+    number = PlaneMode.FLY_BY_WIRE_B
+    name = "FLY_BY_WIRE_B"
+
+    def __init__(self, plane: SimulatedPlane) -> None:
+        super().__init__(plane)
+        self._down = 0.0
+
+    def enter(self, *, force: bool) -> bool:
+        """Keep this height."""
+        self._down = self.plane.wing.down
+        return True
+
+    def update(self, dt: float) -> None:
+        """Turn by stick; the pitch stick moves the height that is kept."""
+        plane, wing = self.plane, self.plane.wing
+        if plane.is_landed:
+            wing.roll_out()
+            return
+        self._down -= self.stick(1) * plane.parameters["FBWB_CLIMB_RATE"] * dt
+        self.steer(wing.climb_to(self._down))
+
+    def steer(self, climb: float) -> None:
+        """Bank as the stick wants it."""
+        wing = self.plane.wing
+        wing.bank_and_climb(self.plane.cruise_m_s, self.stick(0) * wing.wing.bank_rad, climb)
+
+
+class Cruise(FlyByWireB):
+    """As FBWB, and without the stick on the same course over the ground."""
+
+    number = PlaneMode.CRUISE
+    name = "CRUISE"
+
+    def __init__(self, plane: SimulatedPlane) -> None:
+        super().__init__(plane)
+        self._course: float | None = None
+
+    def steer(self, climb: float) -> None:
+        """The course is that when the stick was let go."""
+        wing = self.plane.wing
+        if abs(self.stick(0)) > 0.05:
+            self._course = None
+            super().steer(climb)
+            return
+        if self._course is None:
+            self._course = math.atan2(wing.velocity_east, wing.velocity_north)
+        wing.head(self._course, self.plane.cruise_m_s, climb)
+
+
+class Circle(PlaneModeBase):
+    """Keeps turning gently without GPS, and keeps its height."""
+
+    number = PlaneMode.CIRCLE
+    name = "CIRCLE"
+    flags = _NAVIGATES
+
+    def enter(self, *, force: bool) -> bool:
+        """Keep this height."""
+        self._down = self.plane.wing.down
+        return True
+
+    def update(self, dt: float) -> None:
+        """A third of the bank that is allowed."""
+        wing = self.plane.wing
+        if self.plane.is_landed:
+            wing.roll_out()
+        else:
+            bank = _CIRCLE_BANK_SHARE * wing.wing.bank_rad
+            wing.bank_and_climb(self.plane.cruise_m_s, bank, wing.climb_to(self._down))
+
+
+class NavigatingMode(PlaneModeBase):
+    """Flies somewhere by itself, and circles there."""
+
+    flags = _NAVIGATES
+
+    def __init__(self, plane: SimulatedPlane) -> None:
+        super().__init__(plane)
+        self.speed = 0.0
+        """Airspeed in m/s that was asked for; 0 is AIRSPEED_CRUISE."""
+        self.radius = 0.0
+        """Of the circle in metres; 0 is WP_LOITER_RAD."""
+        self._place: Ned | None = None
+
+    def enter(self, *, force: bool) -> bool:
+        """Circle here."""
+        wing = self.plane.wing
+        self.speed = self.radius = 0.0
+        self._place = (wing.north, wing.east, wing.down)
+        return True
+
+    @property
+    def destination(self) -> Ned | None:
+        """The middle of the circle."""
+        return self._place
+
+    @property
+    def airspeed(self) -> float:
+        """What it flies at."""
+        return self.speed or self.plane.cruise_m_s
+
+    def update(self, dt: float) -> None:
+        """Fly there and circle."""
+        wing = self.plane.wing
+        if self.plane.is_landed or self._place is None:
+            wing.roll_out()
+            return
+        radius = self.radius or self.plane.parameters["WP_LOITER_RAD"]
+        wing.circle(*self._place, radius=radius, airspeed=self.airspeed)
+
+
+class Loiter(NavigatingMode):
+    """Circles where it was switched on."""
+
+    number = PlaneMode.LOITER
+    name = "LOITER"
+
+
+class Rtl(NavigatingMode):
+    """Home at RTL_ALTITUDE, or to a rally point, to circle there with RTL_RADIUS."""
+
+    number = PlaneMode.RTL
+    name = "RTL"
+    can_arm = False
+
+    def enter(self, *, force: bool) -> bool:
+        """To home, at RTL_ALTITUDE above it (below 0 at the present height), or to a rally point at its height."""
+        super().enter(force=force)
+        plane = self.plane
+        home = plane.navigation.home or (0.0, 0.0, plane.wing.ground_down)
+        height = plane.parameters["RTL_ALTITUDE"]
+        self.radius = plane.parameters["RTL_RADIUS"]
+        down = plane.wing.down if height < 0 else home[2] - height
+        self._place = best_return_place(plane, (home[0], home[1], down))
+        return True
+
+
+class TakeOff(NavigatingMode):
+    """Takes off when it is armed, climbs to TKOFF_ALT and circles TKOFF_DIST ahead."""
+
+    number = PlaneMode.TAKEOFF
+    name = "TAKEOFF"
+
+    def enter(self, *, force: bool) -> bool:
+        """Begin once more."""
+        super().enter(force=force)
+        self._place = None
+        self._climbs = False
+        return True
+
+    @property
+    def is_taking_off(self) -> bool:  # type: ignore[override]
+        """Until it is at its height."""
+        return self._climbs
+
+    def update(self, dt: float) -> None:
+        """Climb straight on, then circle."""
+        plane, wing = self.plane, self.plane.wing
+        if self._place is None:
+            self._begin()
+        assert self._place is not None
+        if self._climbs:
+            climb_out(plane)
+            self._climbs = wing.down > self._place[2] + _TAKE_OFF_DONE_M
+        else:
+            super().update(dt)
+
+    def _begin(self) -> None:
+        plane, wing = self.plane, self.plane.wing
+        home = plane.navigation.home
+        ground = wing.ground_down if home is None else home[2]
+        height, distance = plane.parameters["TKOFF_ALT"], plane.parameters["TKOFF_DIST"]
+        along = (distance * math.cos(wing.yaw), distance * math.sin(wing.yaw))
+        self._place = (wing.north + along[0], wing.east + along[1], ground - height)
+        self._climbs = wing.down > self._place[2] + _TAKE_OFF_DONE_M
+        if plane.is_landed:
+            heading = math.degrees(wing.yaw) % 360.0
+            plane.info(f"Takeoff to {height:.0f}m for {distance:.1f}m heading {heading:.1f} deg")
+        else:
+            plane.info(
+                "Climbing to TKOFF alt then loitering" if self._climbs else "Above TKOFF alt - loitering"
+            )
+
+
+class Autoland(NavigatingMode):
+    """Lands where it has taken off and in that direction; only in flight."""
+
+    number = PlaneMode.AUTOLAND
+    name = "AUTOLAND"
+    can_arm = False
+    is_landing = True
+
+    def enter(self, *, force: bool) -> bool:
+        """Needs a flight, and the direction of its take-off."""
+        plane = self.plane
+        if plane.is_landed:
+            plane.send_text(MavSeverity.WARNING, "Must already be flying!")
+            return False
+        if plane.take_off_yaw is None:
+            plane.send_text(MavSeverity.WARNING, "Takeoff initial direction not set")
+            return False
+        home = plane.navigation.home or (0.0, 0.0, plane.wing.ground_down)
+        far, height = plane.parameters["AUTOLAND_WP_DIST"], plane.parameters["AUTOLAND_WP_ALT"]
+        north, east = math.cos(plane.take_off_yaw), math.sin(plane.take_off_yaw)
+        start = (home[0] - far * north, home[1] - far * east, home[2] - height)
+        self._place, self._landing = home, Landing(plane, home, start)
+        return True
+
+    def update(self, dt: float) -> None:
+        """Approach and land."""
+        self._landing.update(dt)
+
+
+def climb_out(plane: SimulatedPlane) -> None:
+    """Full throttle straight on, and up as soon as it is fast enough."""
+    wing = plane.wing
+    plane.lift_off()
+    if wing.is_on_ground:
+        wing.bank_and_climb(plane.cruise_m_s, 0.0, wing.wing.climb_m_s)
+    else:
+        yaw = wing.yaw if plane.take_off_yaw is None else plane.take_off_yaw
+        wing.head(yaw, plane.cruise_m_s, wing.wing.climb_m_s)

@@ -1,0 +1,1 @@
+"""What is ArduRover's own: its modes, arming, failsafes, fence."""

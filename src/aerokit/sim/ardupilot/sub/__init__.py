@@ -1,0 +1,1 @@
+"""What is ArduSub's own: its modes, arming, failsafes."""

@@ -1,0 +1,216 @@
+"""`SimulatedSub`: an ArduSub 4.7 with vectored thrusters, without sockets, threads or a clock of its own."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from itertools import cycle
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from aerokit.mavlink.enums import MavCmd, MavModeFlag, MavResult, MavType, SpeedType, SubMode
+from aerokit.sim.ardupilot.level_vehicle import LevelVehicle
+from aerokit.sim.ardupilot.manual_control import SubJoystick
+from aerokit.sim.ardupilot.motors import Motors
+from aerokit.sim.ardupilot.sub.arming import SubArming
+from aerokit.sim.ardupilot.sub.failsafes import SubFailsafes
+from aerokit.sim.ardupilot.sub.modes import SUB_MODES, SubAuto, SubGuided
+from aerokit.sim.ardupilot.targets import SubTargets
+from aerokit.sim.ardupilot.telemetry_extra import DISPLAY_VALUES
+from aerokit.sim.underwater_motion import UnderwaterMotion
+
+if TYPE_CHECKING:
+    from aerokit.sim.ardupilot.mode import VehicleMode
+    from aerokit.sim.ardupilot.navigation import Ned
+    from aerokit.sim.ardupilot.parameter_tables import Kind
+    from aerokit.sim.commands import Command, CommandHandler
+    from aerokit.sim.motion import Motion, Wind
+
+__all__ = ["SimulatedSub"]
+
+_GUIDED_MODES = frozenset({"AUTO", "GUIDED", "CIRCLE", "POSHOLD"})
+_BASE = MavModeFlag.CUSTOM_MODE_ENABLED | MavModeFlag.STABILIZE_ENABLED | MavModeFlag.MANUAL_INPUT_ENABLED
+_HOLDING_THROTTLE, _PER_CLIMB = 0.45, 0.44
+_AMPERES_AT_FULL = 26.3
+_LOOK_AHEAD_M = 1.0
+_STICKS, _THROTTLE = 8, 2
+
+
+class _Motors(Motors):
+    """The thrusters that hold the depth, or follow the stick; 0.5 is no thrust at all."""
+
+    def __init__(self, sub: SimulatedSub) -> None:
+        super().__init__()
+        self._sub = sub
+
+    @property
+    def current_a(self) -> float:
+        thrust = abs(2.0 * self.throttle - 1.0) if self._follows_stick else self.throttle
+        return float(thrust**2.7) * _AMPERES_AT_FULL
+
+    @property
+    def _follows_stick(self) -> bool:
+        return self._sub.mode.has_manual_throttle
+
+    def update(self, now: float, dt: float, motion: Motion, *, landed: bool) -> None:
+        wanted = _HOLDING_THROTTLE - _PER_CLIMB * motion.velocity_down
+        if self._follows_stick:
+            wanted = (self._sub.rc[_THROTTLE] - 1000) / 1000.0
+        self.throttle = max(0.0, min(1.0, wanted)) if self.is_armed else 0.0
+
+
+class SimulatedSub(LevelVehicle):
+    """Speaks and behaves as ArduSub does where a client can see it; moves as `UnderwaterMotion` does.
+
+    Its arguments are those of `ArduPilotVehicle`; ``home`` is at the surface, so altitudes above home are negative.
+    It has 1,386 parameters. Simulated: MANUAL, STABILIZE, ACRO, ALT_HOLD and POSHOLD by the sticks, GUIDED, AUTO and
+    SURFACE; it can be armed without a position in the modes that need none. Take-off is an unknown command.
+
+    Not simulated yet: CIRCLE, SURFTRAK and MOTORDETECT (they hold still), currents. Waking up after a
+    reboot it is at the surface.
+    """
+
+    KIND: ClassVar[Kind] = "sub"
+    FIRMWARE: ClassVar[str] = "ArduSub"
+    MAV_TYPE: ClassVar[int] = MavType.SUBMARINE
+    CAPABILITIES: ClassVar[int] = 0xF9E7
+    MODES: ClassVar[tuple[Callable[[Any], VehicleMode], ...]] = SUB_MODES
+
+    motion: UnderwaterMotion
+    hull_pressure_pa: float = 101_325.0
+    """What the sensors inside measure."""
+    hull_temperature_c: float = 28.0
+
+    def make_motion(self, wind: Wind | None) -> UnderwaterMotion:
+        """SIM_BUOYANCY 1 lifts it with 0.1 m/s; wind does not reach it."""
+        return UnderwaterMotion(self.rng, buoyancy_m_s2=self.parameters["SIM_BUOYANCY"] / 10.0)
+
+    def make_motors(self) -> Motors:
+        """Thrusters."""
+        return _Motors(self)
+
+    def make_arming(self) -> SubArming:
+        """See `SubArming`."""
+        return SubArming(self)
+
+    def make_failsafes(self) -> SubFailsafes:
+        """See `SubFailsafes`."""
+        return SubFailsafes(self)
+
+    def hear_setpoints(self) -> None:
+        """See `SubTargets`."""
+        SubTargets(self, self.guided)
+
+    def make_joystick(self) -> SubJoystick:
+        """Six axes."""
+        return SubJoystick(self)
+
+    def reset_controllers(self) -> None:
+        """All sticks rest in the middle."""
+        self.display_names = cycle(DISPLAY_VALUES)
+        """Which of `DISPLAY_VALUES` is told next."""
+        for index in range(_STICKS):
+            self.rc[index] = 1500
+
+    @property
+    def first_mode(self) -> int:
+        """It has no INITIAL_MODE."""
+        return SubMode.MANUAL
+
+    @property
+    def is_landed(self) -> bool:
+        """What STANDBY in the heartbeat means here: disarmed."""
+        return not self.motors.is_armed
+
+    @is_landed.setter
+    def is_landed(self, _: bool) -> None:
+        """It never is."""
+
+    @property
+    def guided(self) -> SubGuided:
+        """GUIDED."""
+        return self.mode_of(SubGuided)
+
+    @property
+    def auto(self) -> SubAuto:
+        """AUTO."""
+        return self.mode_of(SubAuto)
+
+    @property
+    def base_mode(self) -> int:
+        """Guided in the modes that know where they are."""
+        base = int(_BASE)
+        if self.mode.name in _GUIDED_MODES:
+            base |= MavModeFlag.GUIDED_ENABLED
+        return base | MavModeFlag.SAFETY_ARMED if self.motors.is_armed else base
+
+    @property
+    def is_at_rest(self) -> bool:
+        """Whether it floats."""
+        return self.motion.is_still
+
+    @property
+    def is_at_surface(self) -> bool:
+        """Within SURFACE_DEPTH of the air."""
+        return self.motion.down <= max(0.0, -self.parameters["SURFACE_DEPTH"] / 100.0)
+
+    @property
+    def climb_speed(self) -> float:
+        """In m/s, of a full stick."""
+        return self.parameters["PILOT_SPEED_UP"] / 100.0
+
+    def refusal(self, mode: VehicleMode, reason: str) -> str:
+        """Why a mode is not entered."""
+        if reason == "requires position":
+            return f"Mode change failed: {mode.name} requires position"
+        return f"Flight mode change failed {mode.name}"
+
+    def own_commands(self) -> dict[int, CommandHandler]:
+        """LAND is the surface, LOITER_UNLIM holds the place; there is no way home by command."""
+        return {
+            MavCmd.DO_CHANGE_SPEED: self._change_speed_at_any_time,
+            MavCmd.NAV_LAND: lambda _: self.change_to(SubMode.SURFACE),
+            MavCmd.NAV_LOITER_UNLIM: lambda _: self.change_to(SubMode.POSHOLD),
+            MavCmd.CONDITION_YAW: self._turn,
+        }
+
+    def distance(self, place: Ned) -> float:
+        """Metres to a point."""
+        return math.dist(self._below(place), (self.motion.north, self.motion.east, self.motion.down))
+
+    def travel(self, place: Ned, speed: float, *, looks_ahead: bool = True) -> None:
+        """Towards a point with this speed in m/s, up and down as WPNAV_SPEED_UP and …_DN allow."""
+        motion, parameters = self.motion, self.parameters
+        north, east, down = self._below(place)
+        up, dn = parameters["WPNAV_SPEED_UP"] / 100.0, parameters["WPNAV_SPEED_DN"] / 100.0
+        ahead = math.hypot(north - motion.north, east - motion.east)
+        if looks_ahead and ahead > _LOOK_AHEAD_M:
+            motion.face(math.atan2(east - motion.east, north - motion.north))
+        slope = abs(down - motion.down)
+        slower = speed * min(1.0, ahead / max(slope, 1e-3))
+        depth = speed * min(1.0, slope / max(ahead, 1e-3))
+        motion.seek_position(
+            north, east, down, speed=max(slower, 0.05), climb=min(up, depth), descent=min(dn, depth)
+        )
+
+    def _below(self, place: Ned) -> Ned:
+        return (place[0], place[1], max(place[2], self.motion.ground_down))
+
+    def _change_speed_at_any_time(self, command: Command) -> int:
+        """Also in modes that have no use for it."""
+        if not command.param2 > 0 or command.param1 not in (SpeedType.AIRSPEED, SpeedType.GROUNDSPEED):
+            return MavResult.DENIED
+        if isinstance(self.mode, SubGuided | SubAuto):
+            self.mode.speed = command.param2
+        return MavResult.ACCEPTED
+
+    def _turn(self, command: Command) -> int:
+        angle, relative = command.param1, command.param4
+        if not 0.0 <= angle <= 360.0 or relative not in (0.0, 1.0):
+            return MavResult.FAILED
+        if self.mode is not self.guided:
+            return MavResult.ACCEPTED
+        heading = math.radians(angle)
+        if relative:
+            heading = self.motion.yaw + math.copysign(heading, command.param3 or 1.0)
+        self.guided.face(heading)
+        return MavResult.ACCEPTED
