@@ -50,7 +50,13 @@ def main() -> None:
     vehicle.wait_for_mode("GUIDED", timeout=10)
     vehicle.arm(timeout=10)
     vehicle.wait_simple_takeoff(options.altitude, epsilon=0.5, timeout=60)
-    for north, east, down in ((2, 0, 0), (0, 2, 0), (-2, -2, 0), (0, 0, 0.5)):
+    for north, east, down in (
+        (2, 0, 0),
+        (0, 2, 0),
+        (-2, -2, 0),
+        (0, 0, 0.5),
+        (0, 0, 0),
+    ):  # the last one stops it
         fly(vehicle, north, east, down, options.seconds)
         print(f"{vehicle.location.local_frame} at {vehicle.velocity} m/s")
     for heading in (90, 180):

@@ -19,6 +19,7 @@ from aerokit.mavlink.enums import (
     SubMode,
 )
 from aerokit.sim import SimulatedCopter, SimulatedPlane, SimulatedRover, SimulatedSub
+from aerokit.sim.ardupilot.copter.guided import Guided, Submode
 from aerokit.sim.ardupilot.telemetry import BUILDERS
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 
@@ -424,3 +425,71 @@ def test_a_plane_refuses_modes_for_lifting_rotors_and_returns_without_a_mission(
     assert plane.mode.number == PlaneMode.RTL
     assert client.texts[-1] == "Mission complete, changing mode to RTL"
     assert "FLY_BY_WIRE_A" in {mode.mode_name for mode in plane.available_modes()}
+
+
+# ------------------------------------------------------------------------------------------ modes
+
+
+COPTER_REFUSES = {
+    CopterMode.FLIP: ["Mode change to FLIP failed: init failed"],
+    CopterMode.AUTOTUNE: ["Mode change to AUTOTUNE failed: init failed"],
+    CopterMode.FLOWHOLD: ["Mode change to FLOWHOLD failed: init failed"],
+    CopterMode.FOLLOW: ["Set FOLL_ENABLE = 1", "Mode change to FOLLOW failed: init failed"],
+    CopterMode.SYSTEMID: ["No axis selected, SID_AXIS = 0", "Mode change to SYSTEMID failed: init failed"],
+    CopterMode.AUTO_RTL: [
+        "Unable to start landing sequence",
+        "Mode change to AUTO RTL failed: No return path or landing sequence found",
+    ],
+    CopterMode.TURTLE: ["Mode change to TURTLE failed: init failed"],
+}
+MODES = {
+    "copter": [27, 3, 1, 0, 2, 7, 5, 4, 9, 6, 11, 14, 15, 16, 17, 18, 19, 20, 21, 22, 23, 24, 25, 28],
+    "plane": [0, 1, 2, 3, 4, 5, 6, 7, 8, 10, 11, 12, 14, 15, 16, 13, 24, 26],
+}
+
+
+@pytest.mark.parametrize("kind", MODES)
+def test_its_modes_in_the_order_of_the_real_one(kind: str) -> None:
+    _, client = booted(kind)
+    client.command(MavCmd.REQUEST_MESSAGE, m.AvailableModes.ID, 0)
+    client.run(0.1)
+    assert [told.custom_mode for told in client.all(m.AvailableModes)] == MODES[kind]
+
+
+def test_a_copter_on_the_ground_goes_into_all_modes_but_those_that_lack_something() -> None:
+    _, client = booted("copter")
+    for number in range(31):
+        client.forget()
+        accepted = set_mode(client, number) == MavResult.ACCEPTED
+        client.run(0.1)
+        assert accepted == (number in MODES["copter"] and number not in COPTER_REFUSES), number
+        if number not in MODES["copter"]:
+            assert client.texts == [f"No such mode {number}"]
+        elif not accepted:
+            assert "".join(client.texts) == "".join(COPTER_REFUSES[CopterMode(number)])
+
+
+def test_a_plane_on_the_ground_refuses_what_it_lacks() -> None:
+    _, client = booted("plane")
+    refused = {PlaneMode.INITIALIZING: 16, PlaneMode.THERMAL: 24}
+    for number in (3, 4, 8, 14, *refused.values()):
+        client.forget()
+        accepted = set_mode(client, number) == MavResult.ACCEPTED
+        client.run(0.1)
+        assert accepted == (number not in refused.values())
+        assert client.texts == {
+            8: ["Started autotune", "Autotuning roll pitch yaw"],
+            16: ["Flight mode change failed"],
+            24: ["Flight mode change failed"],
+        }.get(number, [])
+
+
+def test_guided_nogps_takes_attitudes_and_no_positions() -> None:
+    vehicle, client = booted("copter")
+    assert set_mode(client, CopterMode.GUIDED_NOGPS) == MavResult.ACCEPTED
+    assert isinstance(vehicle.mode, Guided)
+    lean = m.SetAttitudeTarget(0, 1, 1, 0x07, (0.9962, 0.0872, 0.0, 0.0), 0.0, 0.0, 0.0, 0.5)
+    client.send(m.SetPositionTargetLocalNed(0, 1, 1, 1, 0xDF8, 5.0, 0, -5.0, 0, 0, 0, 0, 0, 0, 0, 0))
+    assert vehicle.mode.submode != Submode.POSITION
+    client.send(lean)
+    assert vehicle.mode.submode == Submode.ATTITUDE

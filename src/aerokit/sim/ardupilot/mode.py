@@ -22,6 +22,8 @@ class VehicleMode:
     can_arm: bool = True
     arms_with_raised_throttle: ClassVar[bool] = False
     can_change_speed: ClassVar[bool] = False
+    refused_because: ClassVar[str] = "init failed"
+    """What is said when `enter` refuses."""
     returns_on_path: ClassVar[bool] = False
     """Whether it drives back on the path that is recorded otherwise."""
     is_landing: bool = False

@@ -87,6 +87,12 @@ class ArduPilotVehicle(SimulatedAutopilot):
     GIT_HASH: ClassVar[bytes] = b"5ae20c17"
     MODES: ClassVar[tuple[Callable[[Any], VehicleMode], ...]]
     """Classes of the modes, in the order in which they are listed."""
+    ARMING: ClassVar[type[Arming]] = Arming
+    """Its arming checks."""
+    FAILSAFES: ClassVar[type[Failsafes]]
+    """What it does by itself."""
+    FENCE: ClassVar[type[Fence]] = Fence
+    """Where it may be, and what it does elsewhere."""
 
     HOME_NEEDS_ORIGIN: ClassVar[bool] = True
     """Whether home cannot be set before the estimator has an origin."""
@@ -162,10 +168,10 @@ class ArduPilotVehicle(SimulatedAutopilot):
         self.is_landed = self.motion.is_on_ground
         self.motors = self.make_motors()
         self.navigation = Navigation(self, self._frame)
-        self.arming = self.make_arming()
+        self.arming = self.ARMING(self)
         self.accessories = Accessories(self)
-        self.failsafes = self.make_failsafes()
-        self.fence = self.make_fence()
+        self.failsafes = self.FAILSAFES(self)
+        self.fence = self.FENCE(self)
         self.gimbal = Gimbal(self)
         self.camera = Camera(self)
         self.calibrations.reset()
@@ -203,18 +209,6 @@ class ArduPilotVehicle(SimulatedAutopilot):
     def make_motors(self) -> Motors:
         """What drives it."""
         return Motors()
-
-    def make_arming(self) -> Arming:
-        """Its arming checks."""
-        return Arming(self)
-
-    def make_failsafes(self) -> Failsafes:
-        """What it does by itself."""
-        raise NotImplementedError
-
-    def make_fence(self) -> Fence:
-        """Where it may be."""
-        return Fence(self)
 
     def make_commands(self) -> dict[int, CommandHandler]:
         """MAV_CMD → handler."""
@@ -369,7 +363,7 @@ class ArduPilotVehicle(SimulatedAutopilot):
         ):
             reason = "requires position"
         elif not mode.enter(force=not armed):
-            reason = "init failed"
+            reason = mode.refused_because
         if reason is not None:
             self.send_text(MavSeverity.WARNING, self.refusal(mode, reason))
             return False

@@ -1,9 +1,8 @@
 """ArduCopter's flight modes: what each needs and what it makes the vehicle do.
 
 A mode is one object per vehicle. `Mode` gives the answers of a mode that cannot do something; the simple
-modes are here, GUIDED and the ways home have files of their own. Not simulated, and refused as a firmware
-without them would: ACRO, DRIFT, SPORT, FLIP, AUTOTUNE, THROW, AVOID_ADSB, FLOWHOLD, FOLLOW, ZIGZAG, SYSTEMID,
-AUTOROTATE, TURTLE.
+modes are here; GUIDED, the ways home and the rare ones have files of their own. SPORT and AUTOROTATE are unknown, as in
+the firmware for quadrotors.
 """
 
 from __future__ import annotations

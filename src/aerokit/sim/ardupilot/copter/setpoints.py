@@ -13,6 +13,7 @@ from aerokit.mavlink.enums import AttitudeTargetTypemask as AttitudeMask
 from aerokit.mavlink.enums import MavFrame
 from aerokit.mavlink.enums import PositionTargetTypemask as Mask
 from aerokit.mavlink.messages import SetAttitudeTarget, SetPositionTargetGlobalInt, SetPositionTargetLocalNed
+from aerokit.sim.ardupilot.copter.guided import Guided
 from aerokit.sim.rotations import euler_from_quaternion
 
 if TYPE_CHECKING:
@@ -116,14 +117,15 @@ class Setpoints:
         return (forward * cos_yaw - right * sin_yaw, forward * sin_yaw + right * cos_yaw, down)
 
     def _on_attitude(self, target: SetAttitudeTarget, _: Channel) -> None:
-        if not self._is_guided:
-            return
         copter, mask = self._copter, target.type_mask
+        guided = copter.mode
+        if not isinstance(guided, Guided):
+            return
         rates_ignored = mask & _ALL_RATES
         size = math.sqrt(sum(part * part for part in target.q))
         ill = mask & AttitudeMask.THROTTLE_IGNORE or rates_ignored not in (0, _ALL_RATES)
         if ill or (not mask & AttitudeMask.ATTITUDE_IGNORE and not abs(size - 1.0) < 1e-3):
-            copter.guided.enter(force=False)
+            guided.enter(force=False)
             return
         roll = pitch = 0.0
         if not mask & AttitudeMask.ATTITUDE_IGNORE:
@@ -131,7 +133,7 @@ class Setpoints:
             copter.motion.face(yaw)
         elif not rates_ignored:
             copter.motion.turn(target.body_yaw_rate)
-        copter.guided.lean(roll, pitch, self._climb(target.thrust))
+        guided.lean(roll, pitch, self._climb(target.thrust))
 
     def _climb(self, thrust: float) -> float:
         """Thrust is a climb rate, 0.5 holds the height; the meaning by GUID_OPTIONS is not simulated."""

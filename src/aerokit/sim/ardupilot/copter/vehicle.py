@@ -13,6 +13,21 @@ from aerokit.sim.ardupilot.copter.failsafes import CopterFailsafes
 from aerokit.sim.ardupilot.copter.fence import CopterFence
 from aerokit.sim.ardupilot.copter.guided import Guided
 from aerokit.sim.ardupilot.copter.modes import AltHold, Brake, Circle, Loiter, PosHold, Stabilize
+from aerokit.sim.ardupilot.copter.other_modes import (
+    Acro,
+    AutoRtl,
+    Autotune,
+    AvoidAdsb,
+    Drift,
+    Flip,
+    FlowHold,
+    Follow,
+    GuidedNoGps,
+    SystemId,
+    Throw,
+    Turtle,
+    ZigZag,
+)
 from aerokit.sim.ardupilot.copter.returning import Land, Rtl, SmartRtl
 from aerokit.sim.ardupilot.copter.setpoints import Setpoints
 from aerokit.sim.ardupilot.copter.yaw import AutoYaw
@@ -28,9 +43,10 @@ __all__ = ["SimulatedCopter"]
 
 _LAND_DETECTOR_S = 1.0
 _BASE = MavModeFlag.STABILIZE_ENABLED | MavModeFlag.MANUAL_INPUT_ENABLED | MavModeFlag.CUSTOM_MODE_ENABLED
-_GUIDED_MODES = frozenset(
-    {"GUIDED", "LOITER", "POSHOLD", "CIRCLE", "BRAKE", "RTL", "SMARTRTL", "LAND", "AUTO"}
-)
+_GUIDED_MODES = frozenset((
+    "GUIDED", "GUIDED_NOGPS", "LOITER", "POSHOLD", "CIRCLE", "BRAKE", "RTL", "SMARTRTL", "LAND", "AUTO", "FOLLOW",
+    "AVOID_ADSB", "ZIGZAG",
+))  # fmt: skip
 
 
 class SimulatedCopter(ArduPilotVehicle):
@@ -48,20 +64,12 @@ class SimulatedCopter(ArduPilotVehicle):
     MAV_TYPE: ClassVar[int] = MavType.QUADROTOR
     CAPABILITIES: ClassVar[int] = 0xFBEF
     MODES = (
-        Auto, Stabilize, AltHold, Circle, Loiter, Guided, Land, Rtl, PosHold, Brake, SmartRtl,
+        AutoRtl, Auto, Acro, Stabilize, AltHold, Circle, Loiter, Guided, Land, Rtl, Drift, Flip, Autotune, PosHold,
+        Brake, Throw, AvoidAdsb, GuidedNoGps, SmartRtl, FlowHold, Follow, ZigZag, SystemId, Turtle,
     )  # fmt: skip
-
-    def make_arming(self) -> CopterArming:
-        """See `CopterArming`."""
-        return CopterArming(self)
-
-    def make_failsafes(self) -> CopterFailsafes:
-        """See `CopterFailsafes`."""
-        return CopterFailsafes(self)
-
-    def make_fence(self) -> CopterFence:
-        """See `CopterFence`."""
-        return CopterFence(self)
+    ARMING = CopterArming
+    FAILSAFES = CopterFailsafes
+    FENCE = CopterFence
 
     def make_commands(self) -> dict[int, CommandHandler]:
         """See `copter_commands`."""

@@ -1,7 +1,6 @@
 """ArduPlane's flight modes: what each needs and how it makes the aeroplane fly.
 
-Not simulated, and refused as a firmware without them would: TRAINING, ACRO, AUTOTUNE, AVOID_ADSB, THERMAL and the modes
-of lifting rotors.
+The modes of lifting rotors are refused, as without Q_ENABLE.
 """
 
 from __future__ import annotations

@@ -26,6 +26,14 @@ from aerokit.sim.ardupilot.plane.modes import (
     Stabilize,
     TakeOff,
 )
+from aerokit.sim.ardupilot.plane.other_modes import (
+    Acro,
+    Autotune,
+    AvoidAdsb,
+    Initialising,
+    Thermal,
+    Training,
+)
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 from aerokit.sim.fixed_wing import FixedWing
 
@@ -55,8 +63,12 @@ class SimulatedPlane(ArduPilotVehicle):
     HOME_NEEDS_ORIGIN: ClassVar[bool] = False
     CAPABILITIES: ClassVar[int] = 0xF36F
     MODES = (
-        Manual, Circle, Stabilize, FlyByWireA, FlyByWireB, Cruise, Auto, Rtl, Loiter, TakeOff, Guided, Autoland,
+        Manual, Circle, Stabilize, Training, Acro, FlyByWireA, FlyByWireB, Cruise, Autotune, Auto, Rtl, Loiter,
+        AvoidAdsb, Guided, Initialising, TakeOff, Thermal, Autoland,
     )  # fmt: skip
+    ARMING = PlaneArming
+    FAILSAFES = PlaneFailsafes
+    FENCE = PlaneFence
 
     fence: PlaneFence
     failsafes: PlaneFailsafes
@@ -80,18 +92,6 @@ class SimulatedPlane(ArduPilotVehicle):
     def make_motors(self) -> Motors:
         """One engine."""
         return _Engine()
-
-    def make_arming(self) -> PlaneArming:
-        """See `PlaneArming`."""
-        return PlaneArming(self)
-
-    def make_failsafes(self) -> PlaneFailsafes:
-        """See `PlaneFailsafes`."""
-        return PlaneFailsafes(self)
-
-    def make_fence(self) -> PlaneFence:
-        """See `PlaneFence`."""
-        return PlaneFence(self)
 
     def make_commands(self) -> dict[int, CommandHandler]:
         """See `plane_commands`."""

@@ -65,6 +65,9 @@ class SimulatedRover(LevelVehicle):
     TELLS_HOME: ClassVar[bool] = True
     CAPABILITIES: ClassVar[int] = 0xF1EF
     MODES: ClassVar[tuple[Callable[[Any], VehicleMode], ...]] = ROVER_MODES
+    ARMING = RoverArming
+    FAILSAFES = RoverFailsafes
+    FENCE = RoverFence
 
     motion: GroundMotion
 
@@ -83,18 +86,6 @@ class SimulatedRover(LevelVehicle):
     def make_motors(self) -> Motors:
         """One motor."""
         return _Motors()
-
-    def make_arming(self) -> RoverArming:
-        """See `RoverArming`."""
-        return RoverArming(self)
-
-    def make_failsafes(self) -> RoverFailsafes:
-        """See `RoverFailsafes`."""
-        return RoverFailsafes(self)
-
-    def make_fence(self) -> RoverFence:
-        """See `RoverFence`."""
-        return RoverFence(self)
 
     def reset_controllers(self) -> None:
         """The throttle stick rests in the middle, and the way back of SMART_RTL is forgotten."""

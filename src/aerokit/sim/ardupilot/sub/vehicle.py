@@ -74,6 +74,8 @@ class SimulatedSub(LevelVehicle):
     MAV_TYPE: ClassVar[int] = MavType.SUBMARINE
     CAPABILITIES: ClassVar[int] = 0xF9E7
     MODES: ClassVar[tuple[Callable[[Any], VehicleMode], ...]] = SUB_MODES
+    ARMING = SubArming
+    FAILSAFES = SubFailsafes
 
     motion: UnderwaterMotion
     hull_pressure_pa: float = 101_325.0
@@ -87,14 +89,6 @@ class SimulatedSub(LevelVehicle):
     def make_motors(self) -> Motors:
         """Thrusters."""
         return _Motors(self)
-
-    def make_arming(self) -> SubArming:
-        """See `SubArming`."""
-        return SubArming(self)
-
-    def make_failsafes(self) -> SubFailsafes:
-        """See `SubFailsafes`."""
-        return SubFailsafes(self)
 
     def hear_setpoints(self) -> None:
         """See `SubTargets`."""

@@ -1,0 +1,156 @@
+"""ArduCopter's rarer flight modes: simple stand-ins, and those that refuse as they do without what they need."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from aerokit.mavlink.enums import CopterMode, MavSeverity
+from aerokit.sim.ardupilot.copter.guided import Guided
+from aerokit.sim.ardupilot.copter.modes import AltHold, Loiter, Mode, Stabilize
+
+__all__ = [
+    "Acro",
+    "AutoRtl",
+    "Autotune",
+    "AvoidAdsb",
+    "Drift",
+    "Flip",
+    "FlowHold",
+    "Follow",
+    "GuidedNoGps",
+    "SystemId",
+    "Throw",
+    "Turtle",
+    "ZigZag",
+]
+
+
+class Acro(Stabilize):
+    """Turn rates by stick; here as STABILIZE."""
+
+    number = CopterMode.ACRO
+    name = "ACRO"
+
+
+class Drift(AltHold):
+    """Turns like an aeroplane; here as ALT_HOLD, but it needs a position."""
+
+    number = CopterMode.DRIFT
+    name = "DRIFT"
+    needs_position = True
+
+    def take_off(self, altitude_m: float, *, must_navigate: bool) -> bool:
+        """Not in this mode."""
+        return False
+
+
+class ZigZag(Loiter):
+    """Flies by stick, as LOITER, until two points are stored; here always."""
+
+    number = CopterMode.ZIGZAG
+    name = "ZIGZAG"
+
+
+class _Holding(Mode):
+    """Stays where it is."""
+
+    def update(self, dt: float) -> None:
+        """Stop."""
+        self.stay()
+
+
+class Throw(_Holding):
+    """Waits to be thrown, with motors that stand still; thrown it would hold, as it does here in the air."""
+
+    number = CopterMode.THROW
+    name = "THROW"
+
+
+class AvoidAdsb(_Holding):
+    """Holds: there is no traffic to avoid."""
+
+    number = CopterMode.AVOID_ADSB
+    name = "AVOID_ADSB"
+    can_arm = False
+
+
+class Follow(_Holding):
+    """FOLL_ENABLE lets it in; it holds, as the real one does without somebody to follow."""
+
+    number = CopterMode.FOLLOW
+    name = "FOLLOW"
+    can_arm = False
+
+    def enter(self, *, force: bool) -> bool:
+        """Not without FOLL_ENABLE."""
+        if self.copter.parameters["FOLL_ENABLE"]:
+            return True
+        self.copter.send_text(MavSeverity.WARNING, "Set FOLL_ENABLE = 1")
+        return False
+
+
+class GuidedNoGps(Guided):
+    """GUIDED for attitudes only."""
+
+    number = CopterMode.GUIDED_NOGPS
+    name = "GUIDED_NOGPS"
+    needs_position = False
+
+
+class _Refusing(Mode):
+    """What it needs is never there; says what."""
+
+    needs_position = False
+    can_arm = False
+    TEXT: ClassVar[str] = ""
+
+    def enter(self, *, force: bool) -> bool:
+        """No."""
+        if self.TEXT:
+            self.copter.send_text(MavSeverity.WARNING, self.TEXT)
+        return False
+
+
+class Flip(_Refusing):
+    """Needs a flight by stick; flips are not simulated."""
+
+    number = CopterMode.FLIP
+    name = "FLIP"
+
+
+class Autotune(_Refusing):
+    """Needs a flight in ALT_HOLD, LOITER or POSHOLD; tuning is not simulated."""
+
+    number = CopterMode.AUTOTUNE
+    name = "AUTOTUNE"
+
+
+class FlowHold(_Refusing):
+    """Needs a sensor of optical flow."""
+
+    number = CopterMode.FLOWHOLD
+    name = "FLOWHOLD"
+
+
+class SystemId(_Refusing):
+    """Needs SID_AXIS; exciting the controllers is not simulated."""
+
+    number = CopterMode.SYSTEMID
+    name = "SYSTEMID"
+    TEXT = "No axis selected, SID_AXIS = 0"
+
+
+class Turtle(_Refusing):
+    """Needs motors that turn backwards."""
+
+    number = CopterMode.TURTLE
+    name = "TURTLE"
+
+
+class AutoRtl(_Refusing):
+    """AUTO from a DO_LAND_START or DO_RETURN_PATH_START of the mission on; jumping there is not simulated."""
+
+    number = CopterMode.AUTO_RTL
+    name = "AUTO RTL"
+    TEXT = "Unable to start landing sequence"
+    refused_because = "No return path or landing sequence found"
