@@ -9,6 +9,8 @@ import time
 from dronekit import Vehicle, VehicleMode, connect, mavutil
 
 POLL_S = 0.1
+LEGS = ((2, 0, 0), (0, 2, 0), (-2, -2, 0), (0, 0, 0.5), (0, 0, 0))
+"""Metres per second north, east and down; the last one stops it."""
 ONLY_VELOCITY = 0b110111000111
 """Bits of what the vehicle is to ignore: position, acceleration, yaw and yaw rate."""
 
@@ -50,13 +52,7 @@ def main() -> None:
     vehicle.wait_for_mode("GUIDED", timeout=10)
     vehicle.arm(timeout=10)
     vehicle.wait_simple_takeoff(options.altitude, epsilon=0.5, timeout=60)
-    for north, east, down in (
-        (2, 0, 0),
-        (0, 2, 0),
-        (-2, -2, 0),
-        (0, 0, 0.5),
-        (0, 0, 0),
-    ):  # the last one stops it
+    for north, east, down in LEGS:
         fly(vehicle, north, east, down, options.seconds)
         print(f"{vehicle.location.local_frame} at {vehicle.velocity} m/s")
     for heading in (90, 180):
