@@ -45,10 +45,10 @@ def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 # ----------------------------------------------------------------------------------- command line
 
 
-@pytest.mark.parametrize("text", ["right\n", KEY.secret.hex()])
+@pytest.mark.parametrize("text", ["right\n", KEY.secret.hex(), "\ufeff" + KEY.secret.hex() + "\r\n"])
 def test_a_key_from_a_file(text: str, tmp_path: Path) -> None:
     path = tmp_path / "vehicle.key"
-    path.write_text(text)
+    path.write_text(text, encoding="utf-8")
     assert key_file(str(path)) == KEY
 
 

@@ -124,6 +124,20 @@ async def test_allow_unsigned_is_the_programs_choice() -> None:
             await vehicle.command(512, 148)
 
 
+async def test_a_mistake_in_allow_unsigned_refuses_the_frame_and_nothing_else(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    def mistaken(frame: Frame) -> bool:
+        raise ValueError(frame.system_id)
+
+    async with connected(radio_copter(signing_key=KEY), signing=Signing(KEY, allow_unsigned=mistaken)) as one:
+        connection = one.connection
+        connection.bytes_received(FrameEncoder(77, 1).encode(Heartbeat(2, 3, 0, 0, 3, 3)), None)
+        await anyio.sleep(2)
+        assert connection.is_open and (77, 1) not in connection.heard
+        assert "allow_unsigned" in caplog.text
+
+
 async def test_setup_is_refused_beforehand_and_by_the_vehicle() -> None:
     copter = radio_copter()
     async with connected(copter) as vehicle:

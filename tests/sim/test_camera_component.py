@@ -316,3 +316,12 @@ def test_it_belongs_to_one_vehicle() -> None:
     SimulatedCopter(components=[camera])
     with pytest.raises(LocalProtocolError):
         SimulatedCopter(components=[camera])
+
+
+def test_a_stream_that_is_ordered_again_comes_no_faster() -> None:
+    _, client = fitted()
+    for interval_us in (1e6, -1, 1e6, 2e6, 1e6):
+        client.ask(CAMERA, MavCmd.SET_MESSAGE_INTERVAL, m.CameraCaptureStatus.ID, interval_us)
+    client.forget()
+    client.run(10.0)
+    assert len(client.all(m.CameraCaptureStatus)) == 10

@@ -16,6 +16,7 @@ from aerokit import messages, sync
 from aerokit.errors import LinkLost
 from aerokit.sim import SimulatedCopter, SimulatorServer, simulated_link
 from aerokit.testing import Fleet, Flight, TrackPoint, run_virtual, serve_flight
+from aerokit.testing.failure import what_was_flown
 
 
 class Mistake(Exception):
@@ -154,3 +155,15 @@ def test_a_poll_ends() -> None:
 def test_ctrl_c_is_still_ctrl_c() -> None:
     with pytest.raises(KeyboardInterrupt), serve_flight():
         raise KeyboardInterrupt
+
+
+def test_a_vehicle_that_fails_while_its_story_is_told_does_not_hide_the_failure() -> None:
+    stories = []
+
+    async def fly(fleet: Fleet) -> None:
+        fleet[0].simulated.call_at(fleet[0].simulated.now, make_one)  # before the loop has a turn
+        stories.append(what_was_flown([fleet], "a test", None))
+
+    with pytest.raises(Mistake):
+        Fleet("copter").run(fly)
+    assert "fails: Mistake('in the vehicle')" in stories[0]

@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
+import anyio
 import pytest
 
 from aerokit import Position, Vehicle, connect
+from aerokit.errors import OperationRejected
+from aerokit.mavlink.enums import SubMode
 from aerokit.sim import SimulatedRover, SimulatedSub, SimulatedVehicle, simulated_link
 
 pytestmark = pytest.mark.anyio
@@ -56,3 +59,21 @@ async def test_a_submarine_at_the_surface_has_landed_at_once() -> None:
         await vehicle.set_mode("MANUAL")
         await vehicle.land(timeout=5)
         assert vehicle.mode_name == "ALT_HOLD"
+
+
+async def test_a_submarine_that_is_taken_over_in_the_deep_has_not_landed() -> None:
+    """SURFACE ends in the mode that a pilot may also choose on the way."""
+    sub = SimulatedSub(boot_time_s=1.0)
+    async with guided(sub) as vehicle, anyio.create_task_group() as tasks:
+        here = vehicle.position.value
+        await vehicle.go_to(
+            Position(here.latitude_deg, here.longitude_deg, altitude_relative_m=-20), timeout=120
+        )
+
+        async def take_over() -> None:
+            await anyio.sleep(4)
+            sub.set_mode(SubMode.ALT_HOLD)
+
+        tasks.start_soon(take_over)
+        with pytest.raises(OperationRejected, match=r"the mode changed to ALT_HOLD at -1\d\.\d m"):
+            await vehicle.land(timeout=120)

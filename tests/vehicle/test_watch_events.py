@@ -223,6 +223,20 @@ async def test_answers_to_another_program_are_not_our_round_trip() -> None:
         assert flight.vehicle.link_quality.value.round_trip_s == pytest.approx(0.3, abs=0.001)
 
 
+async def test_a_companion_computer_that_answers_first_does_not_take_the_vehicles_answer_away() -> None:
+    async with open_flight(latency_s=0.15) as flight:
+
+        def answer_first(question: m.Timesync, _: object) -> None:
+            flight.copter.send(m.Timesync(1, question.ts1), sender=(1, 191))
+
+        flight.copter.overhear(m.Timesync, answer_first)
+        with flight.vehicle.subscribe(VehicleRebooted) as reboots:
+            await anyio.sleep(6.0)
+            told_at, told_ms = flight.vehicle._watch._last_answer
+            assert now() - told_at < 3.0 and told_ms > 1000
+            assert reboots.get_nowait() is None
+
+
 async def test_the_link_goes_down(grounded: Flight) -> None:
     with grounded.vehicle.subscribe(LinkClosed, capacity=2) as events:
         grounded.wire.lose()

@@ -33,7 +33,7 @@ def key_file(path: str) -> SigningKey:
     from aerokit.mavlink.signing import SigningKey
 
     try:
-        with open(path, encoding="utf-8") as file:
+        with open(path, encoding="utf-8-sig") as file:
             return SigningKey.from_text(file.read())
     except (OSError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else "it is no text"

@@ -82,7 +82,11 @@ class SignatureGate:
         signing = self._encoder.signing
         if signing is None:
             return True
-        refusal = signing.check(frame, self._unix_time())
+        try:
+            refusal = signing.check(frame, self._unix_time())
+        except Exception:
+            logger.exception("allow_unsigned of %r raised; the frame was refused", signing)
+            return False
         if refusal is not None and refusal not in self._told:
             self._told.add(refusal)
             self._tell(frame, signing, refusal)

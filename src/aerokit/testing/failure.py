@@ -23,7 +23,7 @@ _TEXTS = 6
 def what_was_flown(flown: Iterable[Fleet | Flight | ServedFlight], test: str, directory: str | None) -> str:
     """Some lines for each vehicle; with a directory, a picture of them all is drawn there, named after the test."""
     flights = _each(flown)
-    lines = [line for flight in flights for line in _story(flight)]
+    lines = [line for flight in flights for line in _told(flight)]
     if directory is not None:
         lines.append(_picture(flights, test, Path(directory)))
     return "\n".join(lines)
@@ -34,6 +34,13 @@ def _each(flown: Iterable[Fleet | Flight | ServedFlight]) -> list[Flight | Serve
     for each in flown:
         flights += each if isinstance(each, Fleet) else [each]
     return flights
+
+
+def _told(flight: Flight | ServedFlight) -> list[str]:
+    try:
+        return _story(flight)
+    except Exception as error:  # the vehicle makes a mistake just now; the failure is to be told all the same
+        return [f"{flight.simulated!r} fails: {error!r}"]
 
 
 def _story(flight: Flight | ServedFlight) -> list[str]:

@@ -8,6 +8,7 @@ import anyio
 
 from aerokit.errors import NotSupported, OperationRejected, OperationTimeout
 from aerokit.vehicle.checks import check_range, check_seconds
+from aerokit.vehicle.modes import MODE_GRACE_S
 from aerokit.vehicle.progress import await_progress
 from aerokit.vehicle.travel import TravelActions
 from aerokit.vehicle.values import Position
@@ -20,6 +21,8 @@ __all__ = ["FlightActions"]
 
 LANDED_ON_GROUND, LANDED_IN_AIR = 1, 2
 MODE_TIMEOUT_S = 6.0
+SURFACE_M = 1.5
+"""Who is deeper below home has not surfaced, but was given another mode on the way: home is at the surface."""
 
 
 class FlightActions(TravelActions):
@@ -132,15 +135,28 @@ class FlightActions(TravelActions):
         def is_down() -> bool:
             is_disarmed = self.is_surely_disarmed and armed.updated_at > order.given_at
             is_landed = landed.latest == LANDED_ON_GROUND and landed.updated_at > order.given_at
-            is_over = self.mode_name == self.autopilot.landing_ends_in and mode.updated_at > accepted_at
-            return is_disarmed or is_landed or is_over
+            return is_disarmed or is_landed or (is_over() and not is_deep())
 
-        with self._streaming("landed_state"):
+        def is_over() -> bool:
+            return self.mode_name == self.autopilot.landing_ends_in and mode.updated_at > accepted_at
+
+        def is_deep() -> bool:
+            return self._knows_position_since(order.given_at) and self._altitude_relative() < -SURFACE_M
+
+        stays = self._stays_in(order, *order.modes)
+
+        def trouble() -> str | None:
+            if is_over() and is_deep() and self.connection.now() > accepted_at + MODE_GRACE_S:
+                return f"the mode changed to {self.mode_name} at {self._altitude_relative():.1f} m"
+            return stays()
+
+        depth = () if self.autopilot.landing_ends_in is None else ("position",)
+        with self._streaming("landed_state", *depth):
             await await_progress(
                 self,
                 what,
                 is_done=is_down,
-                trouble=self._stays_in(order, *order.modes),
+                trouble=trouble,
                 describe=lambda: f"it is at {self._altitude_relative():.1f} m",
                 timeout=timeout,
             )

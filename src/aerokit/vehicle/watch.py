@@ -202,13 +202,17 @@ class LinkWatch:
         self._connection.send(Timesync(0, self._asked[-1]), to=self._system_id)
 
     def _on_timesync(self, message: Timesync) -> None:
-        """Take the answer to our question; questions of the vehicle and answers to others are not ours."""
+        """Take the answer to our question; questions of the vehicle and answers to others are not ours.
+
+        Nor are the answers of its other components, such as a companion computer, which may be the first ones.
+        """
+        frame = message.received_frame
+        if frame is None or frame.component_id != self._component_id:
+            return
         if message.tc1 != 0 and message.ts1 in self._asked:
             self._asked.remove(message.ts1)
             self._round_trip_s = self._connection.now() - message.ts1 / 1e9
-            frame = message.received_frame
-            if frame is not None and frame.component_id == self._component_id:
-                self._on_answer(message.ts1 / 1e9, message.tc1 // 1_000_000)
+            self._on_answer(message.ts1 / 1e9, message.tc1 // 1_000_000)
 
     def _report(self) -> None:
         at, (received, lost), total = count = self._count()

@@ -47,7 +47,7 @@ class SimulatedComponent:
         self._vehicle: SimulatedVehicle | None = None
         self._commands: dict[int, CommandHandler] = {}
         self._builders: dict[int, Builder] = {}
-        self._streams: dict[tuple[Channel | None, int], float] = {}
+        self._streams: dict[tuple[Channel | None, int], _Stream] = {}
 
     # ------------------------------------------------------------------------------ what a kind says
 
@@ -143,18 +143,18 @@ class SimulatedComponent:
         if interval_s <= 0.0:
             self._streams.pop(key, None)
             return
-        is_new = self._streams.get(key) != interval_s
-        self._streams[key] = interval_s
-        if is_new:
-            self._send_stream(key, interval_s)
+        before = self._streams.get(key)
+        if before is None or before.interval_s != interval_s:
+            self._streams[key] = _Stream(interval_s)
+            self._send_stream(key, self._streams[key])
 
-    def _send_stream(self, key: tuple[Channel | None, int], interval_s: float) -> None:
-        if self._streams.get(key) != interval_s:
+    def _send_stream(self, key: tuple[Channel | None, int], stream: _Stream) -> None:
+        if self._streams.get(key) is not stream:  # another one has taken its place, perhaps just as fast
             return
         channel, message_id = key
         for message in self._builders[message_id](None):
             self.send(message, channel)
-        self.call_later(interval_s, lambda: self._send_stream(key, interval_s))
+        self.call_later(stream.interval_s, lambda: self._send_stream(key, stream))
 
     def _is_for_me(self, message: Message) -> bool:
         system, component = getattr(message, "target_system", 0), getattr(message, "target_component", 0)
@@ -211,7 +211,14 @@ class SimulatedComponent:
         message_id = int(command.param1)
         if message_id not in self._builders:
             return MavResult.DENIED
-        of_all = self._streams.get((None, message_id), 0.0)
-        interval = self._streams.get((command.channel, message_id), of_all)
+        of_all = self._streams.get((None, message_id), _Stream(0.0))
+        interval = self._streams.get((command.channel, message_id), of_all).interval_s
         self.send(MessageInterval(message_id, round(interval * 1e6) or -1), command.channel)
         return MavResult.ACCEPTED
+
+
+class _Stream:
+    """One order to send messages again and again."""
+
+    def __init__(self, interval_s: float) -> None:
+        self.interval_s = interval_s
