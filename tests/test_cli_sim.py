@@ -86,7 +86,10 @@ def test_a_fleet_stands_side_by_side() -> None:
 
 def test_what_a_kind_has_not_is_said(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["sim", "--vehicle", "px4", "--parameter", "RTL_ALT=3000"]) == 2
-    assert "the simulated px4 has no parameter 'RTL_ALT'" in capsys.readouterr().err
+    assert "the simulated vehicle has no parameter 'RTL_ALT'; similar: " in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["sim", "--vehicle", "nowhere.tlog"])
+    assert "there is no recording 'nowhere.tlog'" in capsys.readouterr().err
 
 
 def test_options_reach_the_vehicle() -> None:

@@ -91,6 +91,11 @@ def test_an_hour_costs_no_real_time() -> None:
     assert time.process_time() - spent < 1e4
 
 
+def test_a_function_is_no_coroutine() -> None:
+    with pytest.raises(TypeError, match=r"takes a coroutine, as main\(\) gives one"):
+        run_virtual(test_a_function_is_no_coroutine)  # type: ignore[arg-type]
+
+
 def test_a_deadlock_is_an_error_that_names_the_waiting_task() -> None:
     async def wait_for_nobody() -> None:
         await asyncio.Event().wait()

@@ -9,7 +9,7 @@ import anyio
 import pytest
 
 from aerokit import messages
-from aerokit.errors import CommandRejected, LocalProtocolError
+from aerokit.errors import CommandRejected, LocalProtocolError, OperationTimeout
 from aerokit.testing import Flight, open_fleet, open_flight, run_virtual, serve_flight
 
 pytestmark = pytest.mark.anyio
@@ -75,6 +75,28 @@ async def test_low_battery_and_failing_checks() -> None:
             await flight.vehicle.arm()
         await anyio.sleep(6)
         assert flight.faults.all.prearm_failures == []
+
+
+async def test_who_waits_in_vain_hears_why() -> None:
+    async with open_flight() as flight:
+        flight.faults.fail_prearm("Compass not healthy")
+        with pytest.raises(OperationTimeout, match=r"still missing:(.|\n)*PreArm: Compass not healthy"):
+            await flight.vehicle.wait_ready(timeout=40)
+
+
+async def test_a_fleet_stands_side_by_side() -> None:
+    async with open_fleet("px4", "copter", "rover", spacing_m=8) as fleet:
+        pass
+    first = fleet[0].track.home
+    for number, flight in enumerate(fleet):
+        assert first.distance_to(flight.track.home) == pytest.approx(8 * number, abs=0.1)
+        assert flight.track.home.longitude_deg >= first.longitude_deg
+
+
+async def test_an_unknown_parameter_is_said_with_its_like() -> None:
+    with pytest.raises(LocalProtocolError, match=r"no parameter 'RTL_ALT_MM'; similar: RTL_ALT\b"):
+        async with open_flight(parameters={"RTL_ALT_MM": 15}):
+            pass
 
 
 def packets_through(seed: int) -> tuple[int, int]:

@@ -51,9 +51,10 @@ def vehicle_kind(text: str) -> str:
     """A kind of simulated vehicle, or a recording of one."""
     from aerokit.sim.kinds import kind_class
 
-    if text.endswith(".tlog") and Path(text).is_file():
+    if text.endswith(".tlog"):
+        if not Path(text).is_file():
+            raise ArgumentTypeError(f"there is no recording {text!r}")
         return text
-
     try:
         kind_class(text)
     except LocalProtocolError as error:

@@ -11,7 +11,7 @@ from aerokit.cli.interrupt import on_interrupt
 from aerokit.cli.report import FlightReport
 from aerokit.cli.signing import signing_of
 from aerokit.cli.vehicles import simulated_vehicle
-from aerokit.errors import AerokitError
+from aerokit.errors import AerokitError, NotSupported
 from aerokit.vehicle.connect import connect
 
 if TYPE_CHECKING:
@@ -64,8 +64,10 @@ async def _address(options: argparse.Namespace) -> AsyncIterator[str]:
         yield options.connect
         return
     from aerokit.sim import open_simulator
+    from aerokit.sim.patience import wait_longer
 
     vehicle = simulated_vehicle(options.vehicle)
+    wait_longer([vehicle], options.speedup)
     async with open_simulator(vehicle, "tcpin:127.0.0.1:0", speedup=options.speedup) as simulator:
         address = simulator.addresses[0].replace("tcpin", "tcp")
         print(f"simulated {options.vehicle}, {options.speedup:g} times real time, on {address}", flush=True)
@@ -128,6 +130,8 @@ class _Flight:
         self._say(
             f"found {vehicle.autopilot.firmware}, system {vehicle.system_id}; waiting until it is ready"
         )
+        if vehicle.autopilot.take_off(altitude_m, 0.0, is_vtol=vehicle.is_vtol) is None:
+            raise NotSupported(f"the demonstration flies, and {vehicle.autopilot.firmware} cannot take off")
         await vehicle.wait_ready(timeout=READY_TIMEOUT_S)
         home = vehicle.home.value
         self._say(f"ready, home is {home.latitude_deg:.6f}, {home.longitude_deg:.6f}; arming")

@@ -30,10 +30,7 @@ def simulated_vehicle(
     for option in options:
         if option not in taken:
             raise LocalProtocolError(f"the simulated {name} has no {option}")
-    try:
-        return simulated(name, home=home, **options)
-    except KeyError as error:
-        raise LocalProtocolError(f"the simulated {name} has no parameter {error}") from error
+    return simulated(name, home=home, **options)
 
 
 def simulated_fleet(

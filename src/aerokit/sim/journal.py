@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -74,11 +75,13 @@ class Journal:
 
     def assert_said(self, part: str) -> None:
         """It said a text with these words in it."""
+        __tracebackhide__ = True
         said = any(part in text.text for text in self.texts)
         assert said, f"it never said {part!r}; it said:{_lines(self.texts)}"
 
     def assert_heard(self, command: int, *, times: int | None = None) -> None:
         """It heard an order of this MAV_CMD, once or more; or just so many times (0: never)."""
+        __tracebackhide__ = True
         count = len(self.commands(command))
         right = count > 0 if times is None else count == times
         wanted = "" if times is None else f", not {times} times"
@@ -89,7 +92,9 @@ class Journal:
         return [message for message in messages if isinstance(message, CommandLong | CommandInt)]
 
     def _names(self) -> list[str]:
-        return [_name(order.command) for order in self._orders()]
+        """Each once, in the order of its first time, with how often it was heard."""
+        counts = Counter(_name(order.command) for order in self._orders())
+        return [name if count == 1 else f"{name}, {count} times" for name, count in counts.items()]
 
 
 def _name(command: int) -> str:

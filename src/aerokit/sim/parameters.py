@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from difflib import get_close_matches
 
+from aerokit.errors import LocalProtocolError
 from aerokit.mavlink.enums import MavParamType
 
 __all__ = ["ParameterRow", "Parameters", "stored"]
@@ -78,6 +80,16 @@ class Parameters:
         row.value = stored(value, row.type)
         if name in self._switched.values():
             self._names = None
+
+    def change(self, values: Mapping[str, float]) -> None:
+        """Set several; LocalProtocolError for a name that is not there, with those that are like it."""
+        for name, value in values.items():
+            if name not in self:
+                similar = ", ".join(get_close_matches(name, self._rows)) or "none"
+                raise LocalProtocolError(
+                    f"the simulated vehicle has no parameter {name!r}; similar: {similar}"
+                )
+            self[name] = value
 
     def __contains__(self, name: object) -> bool:
         return name in self._rows

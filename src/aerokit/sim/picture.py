@@ -234,4 +234,4 @@ def _pillow(module: str) -> Any:
     try:
         return import_module(f"PIL.{module}")
     except ImportError:
-        raise AerokitError("a .png needs Pillow: pip install aerokit[pictures], or ask for an .svg") from None
+        raise AerokitError("a .png needs Pillow: pip install pillow, or ask for an .svg") from None

@@ -176,17 +176,20 @@ class Track(Sequence[TrackPoint]):
 
     def assert_reached_altitude(self, altitude_m: float, *, within_m: float = 1.0) -> None:
         """It was at least ``altitude_m - within_m`` metres above home once."""
+        __tracebackhide__ = True
         highest = self._highest()
         reached = highest.altitude_m >= altitude_m - within_m
         assert reached, f"it did not reach {altitude_m:g} m: the highest point was {highest}"
 
     def assert_stayed_below(self, altitude_m: float) -> None:
         """It never was more than ``altitude_m`` metres above home."""
+        __tracebackhide__ = True
         highest = self._highest()
         assert highest.altitude_m <= altitude_m, f"it rose above {altitude_m:g} m: {highest}"
 
     def assert_passed(self, place: Position, *, within_m: float = 2.0) -> None:
         """It came this near to a place; in space if the place has an ``altitude_relative_m``."""
+        __tracebackhide__ = True
         distance, point = self._nearest(place)
         assert distance <= within_m, (
             f"it did not pass within {within_m:g} m of {_text(place)}: the nearest was {distance:.1f} m, {point}"
@@ -194,6 +197,7 @@ class Track(Sequence[TrackPoint]):
 
     def assert_stayed_within(self, radius_m: float, *, of: Position | None = None) -> None:
         """It was never farther than this from home, or from a place, along the ground."""
+        __tracebackhide__ = True
         centre = self.home if of is None else of
         distance, point = self._farthest(centre)
         name = "home" if of is None else _text(of)
@@ -203,6 +207,7 @@ class Track(Sequence[TrackPoint]):
 
     def assert_stayed_inside(self, polygon: Sequence[Position]) -> None:
         """It never left a polygon of three places or more; the last is connected with the first."""
+        __tracebackhide__ = True
         assert len(polygon) >= 3, f"a polygon has three places or more, not {len(polygon)}"
         _ = self.end
         plane = _plane(self.home)
@@ -214,6 +219,7 @@ class Track(Sequence[TrackPoint]):
 
     def assert_stayed_slower_than(self, speed_m_s: float) -> None:
         """It never was faster than this over the ground."""
+        __tracebackhide__ = True
         fastest = self._fastest()
         assert fastest.speed_m_s <= speed_m_s, (
             f"it was faster than {speed_m_s:g} m/s: {fastest.speed_m_s:.1f} m/s {fastest}"
@@ -221,6 +227,7 @@ class Track(Sequence[TrackPoint]):
 
     def assert_landed_near(self, place: Position | None = None, *, within_m: float = 2.0) -> None:
         """It flew, and at the end it stands on the ground near home, or near a place."""
+        __tracebackhide__ = True
         end, target = self.end, self.home if place is None else place
         assert self.max_altitude_m > _ON_GROUND_M, f"it never took off: it ended {end}"
         assert abs(end.altitude_m) <= _ON_GROUND_M, f"it is not on the ground: it ended {end}"
@@ -232,14 +239,17 @@ class Track(Sequence[TrackPoint]):
 
     def assert_armed_at_end(self) -> None:
         """Its motors were armed at the end."""
+        __tracebackhide__ = True
         assert self.end.armed, f"it ended disarmed, {self.end}"
 
     def assert_disarmed_at_end(self) -> None:
         """Its motors were disarmed at the end."""
+        __tracebackhide__ = True
         assert not self.end.armed, f"it ended armed, {self.end}"
 
     def assert_modes(self, *names: str) -> None:
         """It went through these modes in this order; there may have been others between them."""
+        __tracebackhide__ = True
         modes = iter(self.modes)
         for name in names:
             assert name in modes, (

@@ -137,7 +137,12 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
 
 
 def run_virtual(coroutine: Coroutine[Any, Any, T]) -> T:
-    """Runs a coroutine to its end on a `VirtualClockLoop`; cancels what it left, as asyncio.run does."""
+    """Runs a coroutine to its end on a `VirtualClockLoop`; cancels what it left, as asyncio.run does.
+
+    TypeError for what is no coroutine, such as the function that makes it.
+    """
+    if not asyncio.iscoroutine(coroutine):
+        raise TypeError(f"run_virtual takes a coroutine, as main() gives one, not {coroutine!r}")
 
     async def main() -> T:
         return await coroutine

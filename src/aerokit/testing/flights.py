@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from aerokit.links import Link
     from aerokit.sim.journal import Journal
     from aerokit.sim.track import Track
+    from aerokit.sim.vehicle import SimulatedVehicle
 
 __all__ = ["Fleet", "Flight", "open_fleet", "open_flight", "repeated"]
 
@@ -81,15 +82,21 @@ class Flight:
 
 
 class Fleet(Sequence[Flight]):
-    """Simulated vehicles on one link, with system ids 1, 2, 3 …; a sequence of `Flight`. It is opened once."""
+    """Simulated vehicles on one link, with system ids 1, 2, 3 …; a sequence of `Flight`. It is opened once.
 
-    def __init__(self, *kinds: str, connect: bool = True, latency_s: float = 0.0, **options: Any) -> None:
+    They stand side by side, ``spacing_m`` metres apart, eastwards from the ``home`` of the first.
+    """
+
+    def __init__(
+        self,
+        *kinds: str,
+        connect: bool = True,
+        latency_s: float = 0.0,
+        spacing_m: float = 5.0,
+        **options: Any,
+    ) -> None:
         options.setdefault("boot_time_s", _BOOT_TIME_S)
-        first_id, seed = options.pop("system_id", 1), options.pop("seed", 0)
-        self._vehicles = [
-            simulated(kind, system_id=first_id + number, seed=seed + number, **options)
-            for number, kind in enumerate(kinds)
-        ]
+        self._vehicles = _side_by_side(kinds, spacing_m, **options)
         self._stagehand = Stagehand(self._vehicles)
         self._connect, self._latency_s = connect, latency_s
         self._server: SimulatorServer | None = None
@@ -118,7 +125,8 @@ class Fleet(Sequence[Flight]):
         return self._nearest()[0]
 
     def assert_stayed_apart(self, distance_m: float) -> None:
-        """No two of them came nearer to each other than this, in space."""
+        """No two of them came nearer to each other than this, in space; they begin 5 m apart."""
+        __tracebackhide__ = True
         nearest, time_s, names = self._nearest()
         assert nearest >= distance_m, (
             f"{names} came nearer than {distance_m:g} m: {nearest:.1f} m at {time_s:.1f} s"
@@ -211,6 +219,19 @@ class Fleet(Sequence[Flight]):
             self._server.wake()
 
 
+def _side_by_side(
+    kinds: Sequence[str], spacing_m: float, *, system_id: int = 1, seed: int = 0, **options: Any
+) -> list[SimulatedVehicle]:
+    vehicles: list[Any] = []
+    for number, kind in enumerate(kinds):
+        if vehicles:
+            frame = vehicles[0].frame
+            place = frame.to_global(0.0, number * spacing_m, 0.0)
+            options["home"] = place.latitude_e7 / 1e7, place.longitude_e7 / 1e7, frame.origin.altitude_m
+        vehicles.append(simulated(kind, system_id=system_id + number, seed=seed + number, **options))
+    return vehicles
+
+
 @asynccontextmanager
 async def open_flight(kind: str = "copter", **options: Any) -> AsyncIterator[Flight]:
     """A vehicle of a kind ("copter", "plane", "rover", "sub", "px4", "px4_plane"), connected.
@@ -225,7 +246,10 @@ async def open_flight(kind: str = "copter", **options: Any) -> AsyncIterator[Fli
 
 
 def open_fleet(*kinds: str, count: int | None = None, **options: Any) -> AbstractAsyncContextManager[Fleet]:
-    """Vehicles of these kinds, or ``count`` of one kind, on one link, as `open_flight` opens one."""
+    """Vehicles of these kinds, or ``count`` of one kind, on one link, as `open_flight` opens one.
+
+    They stand ``spacing_m`` metres apart (5), eastwards from the ``home`` of the first.
+    """
     return Fleet(*repeated(kinds, count), **options).open()
 
 

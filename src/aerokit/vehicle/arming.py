@@ -15,6 +15,8 @@ PREFLIGHT_REBOOT_SHUTDOWN = 246
 COMPONENT_ARM_DISARM = 400
 FORCE = 21196
 FORCE_REBOOT = 20190226
+SAID_AGAIN_S = 35.0
+"""ArduPilot says every 30 s why it would not arm."""
 LOOK_S = 0.1
 """So often it is looked whether a vehicle is back."""
 
@@ -26,7 +28,8 @@ class ArmingActions(ModeActions):
         """Wait until position and home are known, the estimator is healthy and the pre-arm checks pass.
 
         Raises:
-            OperationTimeout: not within ``timeout`` seconds; the text says what is still missing.
+            OperationTimeout: not within ``timeout`` seconds; the text says what is still missing, and what the vehicle
+                said of it lately.
         """
         check_seconds("timeout", timeout)
         with self._streaming("sensors", "estimator", "position"), anyio.move_on_after(timeout):
@@ -34,7 +37,8 @@ class ArmingActions(ModeActions):
                 self.connection.raise_if_ended()
                 await anyio.sleep(0.2)
             return
-        missing = "\n  - ".join(self.missing_for_flight() or ["nothing any more"])
+        said = dict.fromkeys(self._arming_texts(self.connection.now() - SAID_AGAIN_S))
+        missing = "\n  - ".join([*self.missing_for_flight(), *said] or ["nothing any more"])
         raise OperationTimeout(
             f"the vehicle was not ready within {timeout:g} s ({self.describe_link()}); still missing:\n  - {missing}"
         )

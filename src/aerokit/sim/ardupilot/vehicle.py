@@ -127,8 +127,7 @@ class ArduPilotVehicle(SimulatedAutopilot):
         self.parameters = parameters_of(self.KIND, parameter_count)
         """By name; change them as a test needs it. They survive a reboot."""
         self.parameters["MAV_SYSID"] = system_id
-        for name, value in (parameters or {}).items():
-            self.parameters[name] = value
+        self.parameters.change(parameters or {})
         super().__init__(
             system_id=system_id,
             seed=seed,

@@ -118,8 +118,7 @@ class SimulatedPx4(SimulatedAutopilot):
         self.parameters = px4_parameters(parameter_count, self.PARAMETER_TABLE)
         """By name; they survive a reboot."""
         self.parameters["MAV_SYS_ID"] = system_id
-        for name, value in (parameters or {}).items():
-            self.parameters[name] = value
+        self.parameters.change(parameters or {})
         super().__init__(
             system_id=system_id,
             seed=seed,
