@@ -65,7 +65,7 @@ async def test_px4_twenty_times_as_fast_obeys_set_points_that_come_ten_times_a_s
                     await stream.fly(VelocitySetpoint(north_m_s=1), 2.0)
                 assert px4.motion.north > 15
             else:
-                with pytest.raises(SetpointStreamStopped, match="left OFFBOARD for LOITER"):
+                with pytest.raises(SetpointStreamStopped, match="left OFFBOARD for RTL"):
                     async with stream:
                         await stream.fly(VelocitySetpoint(north_m_s=1), 2.0)
 

@@ -12,7 +12,7 @@ from aerokit.mavlink.enums import AttitudeTargetTypemask, MavFrame, MavSeverity
 from aerokit.mavlink.enums import PositionTargetTypemask as Mask
 from aerokit.mavlink.messages import SetAttitudeTarget, SetPositionTargetGlobalInt, SetPositionTargetLocalNed
 from aerokit.sim.px4.flight import velocity_towards
-from aerokit.sim.px4.modes import HOLD, OFFBOARD, POSITION, RTL
+from aerokit.sim.px4.modes import OFFBOARD, POSITION, RTL
 from aerokit.sim.rotations import euler_from_quaternion
 
 if TYPE_CHECKING:
@@ -37,7 +37,6 @@ class Offboard:
     def __init__(self, vehicle: SimulatedPx4) -> None:
         self._vehicle = vehicle
         self.updated_at = -math.inf
-        self._lost_at = -math.inf
         self._position, self._velocity, self._acceleration = _NAN3, _NAN3, _NAN3
         self._yaw = self._yaw_rate = math.nan
         self._attitude: tuple[float, float, float] | None = None
@@ -129,24 +128,17 @@ class Offboard:
         self.updated_at = self._vehicle.now
 
     def watch(self) -> None:
-        """Set-points stopped: hold for COM_FAIL_ACT_T, then the action of the version."""
-        vehicle, delay = self._vehicle, self._vehicle.parameters["COM_FAIL_ACT_T"]
+        """Without set-points it returns (1.16: waits for sticks in POSITION), at once; with new ones it goes on."""
+        vehicle = self._vehicle
         if vehicle.intended_mode != OFFBOARD or vehicle.failsafes.acts:
             return
-        if not vehicle.is_in_failsafe:
-            if not self.is_fresh:
-                self._lose(delay)
-        elif vehicle.mode == HOLD and self.is_fresh:
+        if not vehicle.is_in_failsafe and not self.is_fresh:
+            vehicle.is_in_failsafe = True
+            vehicle.send_text(MavSeverity.CRITICAL, "Failsafe activated")
+            vehicle.switch_to(POSITION if vehicle.version.startswith("1.16") else RTL)
+        elif vehicle.is_in_failsafe and self.is_fresh:
             vehicle.is_in_failsafe = False
             vehicle.switch_to(OFFBOARD)
-        elif vehicle.mode == HOLD and vehicle.now - self._lost_at >= delay:
-            vehicle.switch_to(POSITION if vehicle.version.startswith("1.16") else RTL)
-
-    def _lose(self, delay: float) -> None:
-        vehicle = self._vehicle
-        vehicle.is_in_failsafe, self._lost_at = True, vehicle.now
-        vehicle.send_text(MavSeverity.CRITICAL, f"Failsafe activated: entering Hold for {delay:.0f} seconds")
-        vehicle.switch_to(HOLD)
 
     # ---------------------------------------------------------------------------------------- flying
 
