@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from aerokit.sim.channel import Channel
     from aerokit.sim.faults import Faults
 
-__all__ = ["Command", "CommandServer", "Commanded", "Progress"]
+__all__ = ["Command", "CommandServer", "Commanded", "Progress", "whole"]
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Command:
     def place(self) -> tuple[int, int]:
         """Latitude and longitude in degrees times 1e7."""
         scale = 1e7 if self.is_long else 1
-        return (_whole(self.x * scale), _whole(self.y * scale))
+        return (whole(self.x * scale), whole(self.y * scale))
 
     @property
     def altitude_frame(self) -> int:
@@ -167,6 +167,6 @@ class CommandServer:
         self._vehicle.send(ack, command.channel)
 
 
-def _whole(value: float) -> int:
-    """NaN counts as 0, as in ArduPilot's conversion from COMMAND_LONG."""
+def whole(value: float) -> int:
+    """A parameter as a whole number. 0 for NaN, by which programs leave it open, and for what is too big."""
     return int(value) if value == value and abs(value) < 2**31 else 0

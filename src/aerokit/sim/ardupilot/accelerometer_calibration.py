@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import AccelcalVehiclePos, MavCmd, MavResult, MavSeverity
 from aerokit.mavlink.messages import CommandLong
+from aerokit.sim.commands import whole
 
 if TYPE_CHECKING:
     from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
@@ -51,7 +52,7 @@ class AccelerometerCalibration:
         """MAV_CMD_ACCELCAL_VEHICLE_POS from the client: the vehicle lies as it was asked."""
         if not self.is_waiting or command.param1 != self._asked:
             return MavResult.FAILED
-        self._asked, run, position = None, self._run, int(command.param1)
+        self._asked, run, position = None, self._run, whole(command.param1)
         self._vehicle.call_later(_SAMPLE_S, lambda: self._sampled(run, position))
         return MavResult.ACCEPTED
 

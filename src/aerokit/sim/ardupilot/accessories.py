@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import MavResult, MavSeverity
+from aerokit.sim.commands import whole
 
 if TYPE_CHECKING:
     from aerokit.sim.ardupilot.parameter_tables import Kind
@@ -52,20 +53,20 @@ class Accessories:
 
     def set_servo(self, command: Command) -> int:
         """DO_SET_SERVO, and DO_REPEAT_SERVO, of which only the first pulse is simulated."""
-        output = int(command.param1)
+        output = whole(command.param1)
         if not 1 <= output <= _SERVOS:
             return MavResult.FAILED
         if not self.is_free(output):
             self._vehicle.info(f"ServoRelayEvent: Channel {output} is already in use")
             return MavResult.FAILED
-        self.servos[output] = int(command.param2)
+        self.servos[output] = whole(command.param2)
         return MavResult.ACCEPTED
 
     def set_relay(self, command: Command) -> int:
         """DO_SET_RELAY."""
-        bit = 1 << int(command.param1)
         if not 0 <= command.param1 < self.relay_count:
             return MavResult.FAILED
+        bit = 1 << whole(command.param1)
         self.relays = self.relays | bit if command.param2 else self.relays & ~bit
         return MavResult.ACCEPTED
 
@@ -76,11 +77,11 @@ class Accessories:
 
     def switch(self, command: Command) -> int:
         """DO_AUX_FUNCTION is heard; what the function does is not simulated."""
-        function = int(command.param1)
+        function = whole(command.param1)
         if command.param2 not in _AUX_POSITIONS:
             return MavResult.DENIED
         if not 0 <= function < _FUNCTIONS or function in _NOT_THERE[self._vehicle.KIND]:
             self._vehicle.send_text(MavSeverity.INFO, f"Invalid channel option ({function})")
             return MavResult.FAILED
-        self.functions[function] = int(command.param2)
+        self.functions[function] = whole(command.param2)
         return MavResult.ACCEPTED

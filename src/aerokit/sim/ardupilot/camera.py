@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import CameraFeedbackFlags, MavCmd, MavResult, SetFocusType
+from aerokit.sim.commands import whole
 from aerokit.sim.rotations import quaternion_from_euler
 
 if TYPE_CHECKING:
@@ -123,7 +124,7 @@ class Camera:
     def _start(self, interval_s: float, count: float) -> bool:
         if count == 1.0 or (interval_s == 0.0 and count == 0.0):
             return self.take()
-        return self.take_series(interval_s, int(count) or _FOR_EVER)
+        return self.take_series(interval_s if math.isfinite(interval_s) else 0.0, whole(count) or _FOR_EVER)
 
     # ------------------------------------------------------------------------------------- commands
 
@@ -162,7 +163,7 @@ class Camera:
 
     def focus(self, command: Command) -> int:
         """MAV_CMD_SET_CAMERA_FOCUS: continuous or in percent; such a lens does not focus by itself."""
-        kind = int(command.param1)
+        kind = whole(command.param1)
         if kind in (SetFocusType.STEP, SetFocusType.METERS) or kind not in list(SetFocusType):
             return MavResult.DENIED
         if not self.is_fitted:

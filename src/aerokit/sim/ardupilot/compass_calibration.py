@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MagCalStatus, MavCmd, MavResult, MavSeverity
+from aerokit.sim.commands import whole
 
 if TYPE_CHECKING:
     from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
@@ -70,7 +71,7 @@ class CompassCalibration:
             return MavResult.FAILED
         if not 0 <= command.param1 <= 255:
             return MavResult.FAILED
-        self._mask = int(command.param1) & _ALL or _ALL
+        self._mask = whole(command.param1) & _ALL or _ALL
         self._started_at, self._saves, self._is_saved = self._vehicle.now, command.param3 != 0.0, False
         return MavResult.ACCEPTED
 
@@ -83,7 +84,7 @@ class CompassCalibration:
     def _cancel(self, command: Command) -> int:
         if not 0 <= command.param1 <= 255:
             return MavResult.FAILED
-        self._mask &= ~(int(command.param1) or _ALL)
+        self._mask &= ~(whole(command.param1) or _ALL)
         return MavResult.ACCEPTED
 
     # ------------------------------------------------------------------------------------- messages

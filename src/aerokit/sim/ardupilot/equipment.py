@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import MavCmd, MavResult, MavSeverity
 from aerokit.sim.ardupilot.accessories import Accessories
+from aerokit.sim.commands import whole
 
 if TYPE_CHECKING:
     from aerokit.sim.ardupilot.parameter_tables import Kind
@@ -114,7 +115,7 @@ class _Equipment:
 
     def reset_battery(self, command: Command) -> int:
         """The first battery's charge in percent, when the mask in param 1 has it."""
-        if int(command.param1) & 1:
+        if whole(command.param1) & 1:
             self._vehicle.battery.percent = max(0.0, min(100.0, command.param2))
         return MavResult.ACCEPTED
 

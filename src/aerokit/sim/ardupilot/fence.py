@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import FenceBreach, FenceMitigate, MavMissionType, MavResult, MavSeverity
 from aerokit.sim.ardupilot.fence_zones import Zones
+from aerokit.sim.commands import whole
 
 if TYPE_CHECKING:
     from aerokit.sim.ardupilot.mode import VehicleMode
@@ -116,7 +117,7 @@ class Fence:
 
     def command(self, command: Command) -> int:
         """MAV_CMD_DO_FENCE_ENABLE."""
-        kinds = int(command.param2) or _ALL
+        kinds = whole(command.param2) or _ALL
         if command.param1 == 1.0:
             if not self.present & kinds:
                 return MavResult.FAILED

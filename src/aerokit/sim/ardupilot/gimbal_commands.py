@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavMountMode, MavResult
+from aerokit.sim.commands import whole
 from aerokit.sim.rotations import euler_from_quaternion
 
 if TYPE_CHECKING:
@@ -43,17 +44,17 @@ class GimbalCommands:
     def _gimbal(self, device_id: float = 0) -> Gimbal | None:
         """The first one is number 1; 0 means it, too."""
         gimbal = self._vehicle.gimbal
-        return gimbal if gimbal.is_fitted and int(device_id) in (0, 1) else None
+        return gimbal if gimbal.is_fitted and whole(device_id) in (0, 1) else None
 
     def _configure_mount(self, command: Command) -> int:
         gimbal = self._gimbal()
         if gimbal is None:
             return MavResult.FAILED
-        gimbal.set_mode(int(command.param1))
+        gimbal.set_mode(whole(command.param1))
         return MavResult.ACCEPTED
 
     def _control_mount(self, command: Command) -> int:
-        gimbal, mode = self._gimbal(), int(command.z)
+        gimbal, mode = self._gimbal(), whole(command.z)
         if gimbal is None:
             return MavResult.FAILED
         if mode in _JUST_A_MODE:
@@ -62,7 +63,7 @@ class GimbalCommands:
         if mode == MavMountMode.MAVLINK_TARGETING:
             return self._point_mount(gimbal, command.param1, command.param2, command.param3)
         if mode == MavMountMode.GPS_POINT and (command.x or command.y or not command.param1):
-            place = (int(command.x), int(command.y), float(int(command.param4)))
+            place = (whole(command.x), whole(command.y), float(whole(command.param4)))
             gimbal.look_at(self._vehicle.point(*place, MavFrame.GLOBAL_RELATIVE_ALT))
             return MavResult.ACCEPTED
         return MavResult.FAILED
@@ -79,11 +80,11 @@ class GimbalCommands:
         if gimbal is None:
             return MavResult.FAILED
         angles = (0.0, command.param1, command.param2)
-        return gimbal.manage(int(command.x), angles, (0.0, command.param3, command.param4))
+        return gimbal.manage(whole(command.x), angles, (0.0, command.param3, command.param4))
 
     def _configure_manager(self, command: Command) -> int:
         gimbal = self._gimbal(command.z)
-        ids = (int(command.param1), int(command.param2))
+        ids = (whole(command.param1), whole(command.param2))
         done = gimbal is not None and gimbal.set_control(command.sender, *ids)
         return MavResult.ACCEPTED if done else MavResult.FAILED
 

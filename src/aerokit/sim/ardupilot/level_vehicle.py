@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, cast
 from aerokit.mavlink.enums import MavCmd, MavResult, SpeedType
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 from aerokit.sim.ardupilot.vehicle_commands import common_commands
+from aerokit.sim.commands import whole
 
 if TYPE_CHECKING:
     from aerokit.sim.ardupilot.mode import VehicleMode
@@ -77,7 +78,7 @@ class LevelVehicle(ArduPilotVehicle):
         if command.is_long:
             return MavResult.UNSUPPORTED
         guided = self.guided
-        if self.mode is not guided and not int(command.param2) & _CHANGE_MODE:
+        if self.mode is not guided and not whole(command.param2) & _CHANGE_MODE:
             return MavResult.DENIED
         point = self.point(*command.place(), command.z, command.altitude_frame)
         if point is None:

@@ -17,6 +17,7 @@ from aerokit.mavlink.messages import (
 )
 from aerokit.sim.ardupilot.stream_groups import KNOWN_MESSAGES, RATE_PARAMETERS, STREAM_GROUPS
 from aerokit.sim.ardupilot.telemetry_extra import DISPLAY_VALUES
+from aerokit.sim.commands import whole
 from aerokit.sim.parameter_server import UNCOUNTED
 
 if TYPE_CHECKING:
@@ -49,7 +50,7 @@ class Requests:
 
     def set_interval(self, command: Command) -> int:
         """Interval in microseconds; -1 is off, 0 the default (off, but for the heartbeat)."""
-        message_id, interval_us = int(command.param1), int(command.param2)
+        message_id, interval_us = whole(command.param1), whole(command.param2)
         if command.param3 != 0.0:
             return MavResult.DENIED
         if message_id not in self._known:
@@ -69,7 +70,7 @@ class Requests:
 
     def get_interval(self, command: Command) -> int:
         """Answers MESSAGE_INTERVAL before the acknowledgement."""
-        return self._send_interval(int(command.param1), command.channel)
+        return self._send_interval(whole(command.param1), command.channel)
 
     def _send_interval(self, message_id: int, channel: Channel) -> int:
         known = message_id in self._known
@@ -80,13 +81,13 @@ class Requests:
 
     def request_message(self, command: Command) -> int:
         """Send a message once, right after the acknowledgement."""
-        message_id = int(command.param1)
+        message_id = whole(command.param1)
         if message_id == MessageInterval.ID:
-            return self._send_interval(int(command.param2), command.channel)
+            return self._send_interval(whole(command.param2), command.channel)
         if message_id not in self._known:
             return MavResult.FAILED
         if message_id == AvailableModes.ID:
-            self._send_modes(int(command.param2), command.channel)
+            self._send_modes(whole(command.param2), command.channel)
         else:
             self.send_soon(message_id, command.channel)
         return MavResult.ACCEPTED

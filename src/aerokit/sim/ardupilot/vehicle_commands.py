@@ -11,7 +11,7 @@ from aerokit.sim.ardupilot.equipment import equipment_commands
 from aerokit.sim.ardupilot.gimbal_commands import GimbalCommands
 from aerokit.sim.ardupilot.home_and_origin import HomeAndOrigin
 from aerokit.sim.ardupilot.region_of_interest import RegionOfInterest
-from aerokit.sim.commands import Command, CommandHandler
+from aerokit.sim.commands import Command, CommandHandler, whole
 
 if TYPE_CHECKING:
     from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
@@ -65,7 +65,7 @@ class _State:
         return MavResult.ACCEPTED if done else MavResult.FAILED
 
     def set_mode(self, command: Command) -> int:
-        return self._vehicle.set_mode_from(int(command.param1), int(command.param2))
+        return self._vehicle.set_mode_from(whole(command.param1), whole(command.param2))
 
     def set_mission_current(self, command: Command) -> int:
         vehicle, resets = self._vehicle, command.param2 == 1.0
@@ -73,7 +73,7 @@ class _State:
             return MavResult.DENIED
         if resets:
             vehicle.mission.reset()
-        if not vehicle.mission.set_current(int(command.param1)):
+        if not vehicle.mission.set_current(whole(command.param1)):
             return MavResult.FAILED
         if resets:
             vehicle.mission.start_or_resume()

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import CameraCapFlags, CameraMode, CameraZoomType, MavCmd, MavResult, SetFocusType
-from aerokit.sim.commands import Progress
+from aerokit.sim.commands import Progress, whole
 from aerokit.sim.components.camera_messages import camera_settings
 
 if TYPE_CHECKING:
@@ -69,7 +70,8 @@ class _Pictures:
     def start(self, command: Command) -> int:
         """Param 1 0 or 1 is this camera; one picture with the number (param 4) of the last order is not taken again."""
         camera, captures = self._camera, self._camera.captures
-        interval, count, number = command.param2, int(command.param3), int(command.param4)
+        interval = command.param2 if math.isfinite(command.param2) else 0.0
+        count, number = whole(command.param3), whole(command.param4)
         in_wrong_mode = _has_wrong_mode(camera, CameraMode.VIDEO, _CAN_ALWAYS_CAPTURE)
         if not camera.can(CameraCapFlags.CAPTURE_IMAGE):
             return MavResult.UNSUPPORTED
@@ -140,7 +142,7 @@ class _Videos:
 
     def stream(self, command: Command, *, runs: bool) -> int:
         """Param 1 is the stream, 0 is all."""
-        camera, number = self._camera, int(command.param1)
+        camera, number = self._camera, whole(command.param1)
         there = range(1, len(camera.streams) + 1)
         if not there or number not in (0, *there):
             return MavResult.DENIED if there else MavResult.UNSUPPORTED
@@ -159,7 +161,7 @@ class _Settings:
         self._camera = camera
 
     def set_mode(self, command: Command) -> int:
-        camera, mode = self._camera, int(command.param2)
+        camera, mode = self._camera, whole(command.param2)
         if not camera.can(CameraCapFlags.HAS_MODES):
             return MavResult.UNSUPPORTED
         modes = {
@@ -183,7 +185,7 @@ class _Settings:
             CameraZoomType.STEP: camera.zoom + value * _STEP_PERCENT,
             CameraZoomType.CONTINUOUS: camera.zoom + value * 100.0,
             CameraZoomType.RANGE: value,
-        }.get(int(command.param1))  # type: ignore[call-overload]
+        }.get(whole(command.param1))  # type: ignore[call-overload]
         if zoom is None or (command.param1 == CameraZoomType.RANGE and not 0.0 <= value <= 100.0):
             return MavResult.DENIED
         camera.zoom = max(0.0, min(100.0, zoom))
@@ -191,7 +193,7 @@ class _Settings:
 
     def set_focus(self, command: Command) -> int:
         """To a percentage, or by itself: then it is in the middle."""
-        camera, kind = self._camera, int(command.param1)
+        camera, kind = self._camera, whole(command.param1)
         if not camera.can(CameraCapFlags.HAS_BASIC_FOCUS):
             return MavResult.UNSUPPORTED
         if kind == SetFocusType.RANGE and 0.0 <= command.param2 <= 100.0:

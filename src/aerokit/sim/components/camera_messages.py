@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import CameraCapFlags, VideoStreamEncoding, VideoStreamStatusFlags, VideoStreamType
+from aerokit.sim.commands import whole
 
 if TYPE_CHECKING:
     from aerokit.sim.commands import Command
@@ -46,7 +47,7 @@ def camera_settings(camera: SimulatedCamera) -> m.CameraSettings:
 
 def _number(command: Command | None) -> int:
     """Param 2; a stream of messages is of all."""
-    return 0 if command is None else int(command.param2)
+    return 0 if command is None else whole(command.param2)
 
 
 def _information(camera: SimulatedCamera) -> m.CameraInformation:
@@ -73,7 +74,7 @@ def _images(camera: SimulatedCamera, command: Command | None) -> list[m.CameraIm
     images = camera.captures.images
     if command is None:
         return images[-1:]
-    first, last = int(command.param2), int(command.param3)
+    first, last = whole(command.param2), whole(command.param3)
     if first < 0:
         return list(images)
     if last == _TO_THE_END:

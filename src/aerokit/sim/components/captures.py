@@ -121,7 +121,7 @@ class Captures:
         """Begin a video; CAMERA_CAPTURE_STATUS every so many seconds, 0 is never."""
         self._recording_since = self._camera.now
         self._camera.send(self.status())
-        if status_interval_s > 0.0:
+        if 0.0 < status_interval_s < math.inf:
             self._tell_again(self._recording_since, status_interval_s)
 
     def stop_recording(self) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from aerokit.errors import LocalProtocolError
 from aerokit.mavlink.enums import MavAutopilot, MavCmd, MavResult, MavState
 from aerokit.mavlink.messages import CommandInt, CommandLong, Heartbeat, MessageInterval, Statustext
-from aerokit.sim.commands import CommandServer
+from aerokit.sim.commands import CommandServer, whole
 from aerokit.sim.faults import Faults
 
 if TYPE_CHECKING:
@@ -196,19 +196,19 @@ class SimulatedComponent:
         return MavResult.ACCEPTED if messages else MavResult.FAILED
 
     def _request_message(self, command: Command) -> int:
-        return self.answer_with(int(command.param1), command)
+        return self.answer_with(whole(command.param1), command)
 
     def _set_interval(self, command: Command) -> int:
         """0 and -1 stop it: nothing but what `start` began has a default rate."""
-        message_id = int(command.param1)
+        message_id = whole(command.param1)
         if message_id not in self._builders:
             return MavResult.DENIED
         self._streams.pop((None, message_id), None)
-        self.stream(message_id, command.param2 / 1e6, command.channel)
+        self.stream(message_id, whole(command.param2) / 1e6, command.channel)
         return MavResult.ACCEPTED
 
     def _get_interval(self, command: Command) -> int:
-        message_id = int(command.param1)
+        message_id = whole(command.param1)
         if message_id not in self._builders:
             return MavResult.DENIED
         of_all = self._streams.get((None, message_id), _Stream(0.0))

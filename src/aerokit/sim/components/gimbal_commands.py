@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import GimbalManagerFlags as Flags
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavResult
+from aerokit.sim.commands import whole
 from aerokit.sim.components.pose import pose_of
 from aerokit.sim.local_frame import GlobalPoint
 from aerokit.sim.rotations import euler_from_quaternion
@@ -55,7 +56,7 @@ class _Orders:
         self._gimbal = gimbal
 
     def _is_mine(self, device_id: float) -> bool:
-        return int(device_id) in (0, self._gimbal.component_id)
+        return whole(device_id) in (0, self._gimbal.component_id)
 
     # ------------------------------------------------------------------------------------- commands
 
@@ -77,7 +78,7 @@ class _Orders:
         pitch, yaw, pitch_rate, yaw_rate = map(
             math.radians, (command.param1, command.param2, command.param3, command.param4)
         )
-        done = self.obey(int(command.x), (0.0, pitch, yaw), (0.0, pitch_rate, yaw_rate))
+        done = self.obey(whole(command.x), (0.0, pitch, yaw), (0.0, pitch_rate, yaw_rate))
         return MavResult.ACCEPTED if done else MavResult.DENIED
 
     def look_at(self, command: Command) -> int:

@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import MavCmd, MavModeFlag, MavResult, MavSeverity
-from aerokit.sim.commands import Command, CommandHandler, Progress
+from aerokit.sim.commands import Command, CommandHandler, Progress, whole
 from aerokit.sim.px4.message_requests import message_requests
 from aerokit.sim.px4.modes import (
     AUTO,
@@ -88,9 +88,10 @@ class _Flight:
 
     def arm_or_disarm(self, command: Command) -> int | None:
         force = command.param2 == _FORCE
-        if round(command.param1) == 1:
+        wanted = round(command.param1) if math.isfinite(command.param1) else None
+        if wanted == 1:
             done = self._px4.arming.arm()  # external commands are always checked, by force or not
-        elif round(command.param1) == 0:
+        elif wanted == 0:
             done = self._px4.arming.disarm("external command", force=force)
         else:
             self._px4.send_text(MavSeverity.CRITICAL, f"Unsupported ARM_DISARM param: {command.param1:.3f}")
@@ -100,10 +101,10 @@ class _Flight:
     def set_mode(self, command: Command) -> int:
         """Two answers: the link's own, which is always ACCEPTED, and the real one."""
         self._px4.commands.answer(command, MavResult.ACCEPTED)
-        return set_mode(self._px4, int(command.param1), (int(command.param2), int(command.param3)))
+        return set_mode(self._px4, whole(command.param1), (whole(command.param2), whole(command.param3)))
 
     def set_standard_mode(self, command: Command) -> int:
-        mode = STANDARD_MODES.get(int(command.param1))
+        mode = STANDARD_MODES.get(whole(command.param1))
         if mode is None:
             return MavResult.FAILED
         return MavResult.ACCEPTED if self._px4.change_mode(mode) else MavResult.TEMPORARILY_REJECTED
@@ -153,7 +154,7 @@ class _Flight:
 
     def reposition(self, command: Command) -> int:
         """Latitude and longitude NaN (INT32_MAX) keep the place, altitude NaN the height; altitude is AMSL."""
-        if int(command.param2) != 1:
+        if whole(command.param2) != 1:
             return MavResult.UNSUPPORTED
         result = self._change(HOLD)
         if result != MavResult.ACCEPTED:

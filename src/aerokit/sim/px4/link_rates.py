@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 import pkgutil
 from collections.abc import Collection, Sequence
 from functools import lru_cache
@@ -82,7 +83,7 @@ class LinkRates:
         rates = _table()[self._mode_of[channel]]
         if message_id not in rates:
             return MavResult.FAILED
-        wanted = round(interval_us) if interval_us == interval_us else 0
+        wanted = round(interval_us) if math.isfinite(interval_us) else 0
         wanted = _interval_us(rates[message_id]) if wanted == 0 else max(_OFF, wanted)
         self._told[channel][message_id] = wanted
         if message_id in self._built:

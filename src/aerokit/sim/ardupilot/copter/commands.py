@@ -15,7 +15,7 @@ from aerokit.mavlink.enums import (
 from aerokit.sim.ardupilot.copter.auto import Auto
 from aerokit.sim.ardupilot.copter.guided import Guided
 from aerokit.sim.ardupilot.vehicle_commands import common_commands
-from aerokit.sim.commands import Command, CommandHandler
+from aerokit.sim.commands import Command, CommandHandler, whole
 
 if TYPE_CHECKING:
     from aerokit.sim.ardupilot.copter.vehicle import SimulatedCopter
@@ -76,7 +76,7 @@ class _Flight:
         copter = self._copter
         if command.is_long:
             return MavResult.UNSUPPORTED
-        may_change_mode = int(command.param2) & _CHANGE_MODE
+        may_change_mode = whole(command.param2) & _CHANGE_MODE
         if copter.mode is not copter.guided and not may_change_mode:
             return MavResult.DENIED
         point = copter.point(*command.place(), command.z, command.altitude_frame)

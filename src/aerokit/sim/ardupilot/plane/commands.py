@@ -8,6 +8,7 @@ from aerokit.mavlink.enums import MavCmd, MavResult, PlaneMode, SpeedType
 from aerokit.sim.ardupilot.plane.guided import guided_commands
 from aerokit.sim.ardupilot.plane.modes import NavigatingMode
 from aerokit.sim.ardupilot.vehicle_commands import common_commands
+from aerokit.sim.commands import whole
 
 if TYPE_CHECKING:
     from aerokit.sim.ardupilot.plane.vehicle import SimulatedPlane
@@ -59,7 +60,7 @@ class _Flight:
         point = plane.point(*command.place(), command.z, command.altitude_frame)
         if point is None:
             return MavResult.DENIED
-        if plane.mode is not plane.guided and not int(command.param2) & _CHANGE_MODE:
+        if plane.mode is not plane.guided and not whole(command.param2) & _CHANGE_MODE:
             return MavResult.FAILED
         if not plane.set_mode(PlaneMode.GUIDED):
             return MavResult.FAILED

@@ -11,6 +11,7 @@ from aerokit.mavlink.enums import AttitudeTargetTypemask as Mask
 from aerokit.mavlink.enums import HeadingType, MavCmd, MavFrame, MavResult, MavSeverity, PlaneMode, SpeedType
 from aerokit.mavlink.enums import PositionTargetTypemask as PositionMask
 from aerokit.sim.ardupilot.plane.modes import NavigatingMode
+from aerokit.sim.commands import whole
 from aerokit.sim.rotations import euler_from_quaternion
 
 if TYPE_CHECKING:
@@ -166,7 +167,7 @@ def guided_commands(plane: SimulatedPlane) -> dict[int, CommandHandler]:
 
 def _change_speed(plane: SimulatedPlane, command: Command) -> int:
     """Params: SPEED_TYPE, of which only the airspeed is taken; m/s."""
-    if int(command.param1) != SpeedType.AIRSPEED:
+    if whole(command.param1) != SpeedType.AIRSPEED:
         return MavResult.DENIED
     if not plane.can_fly_at(command.param2):
         return MavResult.FAILED
@@ -198,7 +199,7 @@ def _change_heading(plane: SimulatedPlane, command: Command) -> int:
 
 def _change_target_altitude(plane: SimulatedPlane, command: Command) -> int:
     """Params: metres, MAV_FRAME. What it changes is the target of GUIDED."""
-    point = plane.point(0, 0, command.param1, int(command.param2))
+    point = plane.point(0, 0, command.param1, whole(command.param2))
     if point is None:
         return MavResult.DENIED
     if plane.mode is plane.guided:
