@@ -162,3 +162,11 @@ def test_an_override_does_the_same() -> None:
         client.run(0.2)
     assert rover.motion.velocity_north > 2.0
     assert client.last(m.RcChannels).chan3_raw == 1750
+
+
+@pytest.mark.parametrize("kind", ["copter", "plane", "rover", "sub"])
+def test_an_axis_beyond_its_range_ends_nothing(kind: str) -> None:
+    vehicle, client = started(kind)
+    for axis in (-32768, 32766):
+        client.send(m.ManualControl(vehicle.system_id, axis, axis, abs(axis) // 2, axis, 0))
+        assert all(0 <= pulse <= 0xFFFF for pulse in pulses(client))

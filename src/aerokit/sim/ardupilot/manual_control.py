@@ -54,7 +54,7 @@ class Joystick:
             return 0
         low, high = self.setting(f"RC{channel + 1}_MIN", 1100.0), self.setting(f"RC{channel + 1}_MAX", 1900.0)
         share = ((-value if reverse else value) - lowest) / (1000 - lowest)
-        return int(low + (high - low) * share)
+        return int(low + (high - low) * share) & 0xFFFF  # nothing checks the range of an axis
 
     def setting(self, name: str, default: float) -> float:
         """A parameter that a small table may be without."""
