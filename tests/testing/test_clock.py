@@ -4,6 +4,7 @@ import asyncio
 import socket
 import threading
 import time
+from collections.abc import Callable
 
 import anyio
 import pytest
@@ -148,3 +149,60 @@ def test_errors_and_executor_shutdown_pass_through() -> None:
 
     with pytest.raises(LookupError, match="mine"):
         run_virtual(fail())
+
+
+async def _jumps(prepare: Callable[[VirtualClockLoop], object] = lambda _: None) -> bool:
+    """Whether a jump of one second succeeds inside a callback; the clock has moved if it has, and only then."""
+    loop = asyncio.get_running_loop()
+    assert isinstance(loop, VirtualClockLoop)
+    found = loop.create_future()
+
+    def jump() -> None:
+        kept = prepare(loop)
+        before = loop.time()
+        has_jumped = loop.jump(before + 1.0)
+        assert loop.time() - before == pytest.approx(1.0 if has_jumped else 0.0)
+        del kept
+        found.set_result(has_jumped)
+
+    loop.call_soon(jump)
+    return await found
+
+
+@pytest.mark.anyio
+async def test_a_callback_may_jump_while_nothing_else_happens() -> None:
+    assert await _jumps()
+    assert await _jumps(lambda loop: loop.call_later(1.5, lambda: None))
+
+
+@pytest.mark.anyio
+@pytest.mark.parametrize("delay", [0.5, 1.0], ids=["before", "at the same instant"])
+async def test_a_timer_on_the_way_forbids_a_jump(delay: float) -> None:
+    assert not await _jumps(lambda loop: loop.call_later(delay, lambda: None))
+
+
+@pytest.mark.anyio
+async def test_a_ready_callback_forbids_a_jump() -> None:
+    assert not await _jumps(lambda loop: loop.call_soon(lambda: None))
+
+
+@pytest.mark.anyio
+async def test_a_foreign_socket_forbids_a_jump() -> None:
+    near, far = socket.socketpair()
+    loop = asyncio.get_running_loop()
+    with near, far:
+        near.setblocking(False)
+        loop.add_reader(near, lambda: None)
+        assert not await _jumps()
+        loop.remove_reader(near)
+        assert await _jumps()
+
+
+@pytest.mark.anyio
+async def test_a_working_executor_forbids_a_jump() -> None:
+    go_on = threading.Event()
+    work = asyncio.get_running_loop().run_in_executor(None, go_on.wait, 10.0)
+    assert not await _jumps()
+    go_on.set()
+    await work
+    assert await _jumps()

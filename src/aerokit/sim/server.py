@@ -24,6 +24,8 @@ __all__ = ["SimulatorServer", "open_simulator", "simulated_link"]
 _SHORTEST_WAIT_S = 0.001
 """Of the loop's time, for many vehicles or when they run faster than it: several ticks are then done in one go."""
 _MANY = 10
+_INSTANT_S = 1e-8
+"""What is due so soon on virtual time happens before anybody answers, as it does by a timer."""
 _LONGEST_LEAP_S = 0.5
 """Simulated; what the loop was late beyond that does not pass for the vehicles, unless they are to keep real time."""
 
@@ -181,19 +183,43 @@ class SimulatorServer:
     def _run_on(self, now: float) -> None:
         """The same, and on virtual time also what comes next, as long as nothing else happens in between."""
         self._step(now)
-        while not self._flush() and self._jump is not None:
-            due = min(self._dues)
-            if due == math.inf or not self._jump(self._when(due)):
-                break
-            self._step(max(self.now, due))
-        self._schedule()
+        while not self._flush():
+            if (due := self._leap()) is None:
+                self._schedule()
+                return
+            self._step(due)
+        loop = self._loop
+        if self._jump is None or loop is None or self._when(min(self._dues)) < loop.time() + _INSTANT_S:
+            self._schedule()
+        else:  # after those who hear what was sent: they may have nothing to say to it
+            loop.call_soon(self._go_on)
+
+    def _go_on(self) -> None:
+        """On virtual time, in place of a timer; one that was set meanwhile comes first."""
+        try:
+            if self._loop is None:
+                return
+            if (due := self._leap()) is None:
+                self._schedule()
+            else:
+                self._run_on(due)
+        except Exception as error:
+            self._fail(error)
+
+    def _leap(self) -> float | None:
+        """On virtual time: go to what is due next, unless something else comes before; when that is."""
+        due = min(self._dues)
+        if self._jump is None or due == math.inf or not self._jump(self._when(due)):
+            return None
+        return max(self.now, due)
 
     def _step(self, now: float) -> None:
-        for number, due in enumerate(self._dues):
+        dues = self._dues
+        for number, due in enumerate(dues):
             if due <= now:
                 vehicle = self.vehicles[number]
                 vehicle.step(now)
-                self._dues[number] = vehicle.next_due
+                dues[number] = vehicle.next_due
 
     def hear(self, data: bytes, peer: Peer, port: _Port) -> None:
         """Bytes came in on a link."""

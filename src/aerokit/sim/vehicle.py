@@ -95,7 +95,7 @@ class SimulatedVehicle:
         self._overheard: dict[int, list[Handler]] = {}
         self._timers: list[tuple[float, int, Callable[[], None]]] = []
         self._timer_count = 0
-        self._ticks_from = math.inf
+        self._ticks_from = self._next_tick = math.inf
         self._ticks_done = 0
         self._text_id = 0
         self._is_on = False
@@ -136,9 +136,11 @@ class SimulatedVehicle:
             self._skip_to(now)
             return
         while (due := self.next_due) <= now:
-            self.now = max(self.now, due)
+            if due > self.now:
+                self.now = due
             self._happen(due)
-        self.now = max(self.now, now)
+        if now > self.now:
+            self.now = now
 
     @property
     def next_due(self) -> float:
@@ -147,7 +149,7 @@ class SimulatedVehicle:
             return self.now
         if self.faults.frozen:
             return self.now + TICK_S  # nothing happens, but time is to be followed
-        due = self._ticks_from + self._ticks_done * TICK_S
+        due = self._next_tick
         if self._timers and self._timers[0][0] < due:
             due = self._timers[0][0]
         for channel in self.channels:
@@ -247,10 +249,12 @@ class SimulatedVehicle:
         if ticking == (self._ticks_from != math.inf):
             return
         self._ticks_from, self._ticks_done = (self.now, 1) if ticking else (math.inf, 0)
+        self._next_tick = self._ticks_from + self._ticks_done * TICK_S
 
     def _happen(self, due: float) -> None:
-        if self._ticks_from + self._ticks_done * TICK_S <= due:
+        if self._next_tick <= due:
             self._ticks_done += 1
+            self._next_tick = self._ticks_from + self._ticks_done * TICK_S
             self.tick(TICK_S)
         while self._timers and self._timers[0][0] <= due:
             heappop(self._timers)[2]()
@@ -269,6 +273,7 @@ class SimulatedVehicle:
         self.now = now
         self._timers = [(when + late, count, action) for when, count, action in self._timers]
         self._ticks_from += late
+        self._next_tick = self._ticks_from + self._ticks_done * TICK_S
         for channel in self.channels:
             channel.streams.postpone(late)
 

@@ -79,7 +79,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         Saves a turn of the loop to whoever would have nothing done but set a timer for ``when``.
         """
         timers, is_free = self._scheduled, not (self._ready or self._stopping or self._outside_calls)  # type: ignore[attr-defined]
-        if not is_free or self._debug or (timers and timers[0].when() <= when):  # type: ignore[attr-defined]
+        if not is_free or self._debug or (timers and timers[0].when() <= when + self._clock_resolution):  # type: ignore[attr-defined]
             return False
         if len(self._selector_map()) != self._own_sources:  # sockets are asked before every jump
             return False
