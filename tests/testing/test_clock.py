@@ -155,7 +155,7 @@ async def _jumps(prepare: Callable[[VirtualClockLoop], object] = lambda _: None)
     """Whether a jump of one second succeeds inside a callback; the clock has moved if it has, and only then."""
     loop = asyncio.get_running_loop()
     assert isinstance(loop, VirtualClockLoop)
-    found = loop.create_future()
+    found: asyncio.Future[bool] = loop.create_future()
 
     def jump() -> None:
         kept = prepare(loop)

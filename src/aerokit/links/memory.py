@@ -72,7 +72,7 @@ class MemoryLink(BaseLink):
         if self._loop is None or not self._inbox:
             return
         now = max(self._loop.time(), self._inbox[0][0])  # a timer may fire a hair early
-        due = sum(when <= now for when, _ in self._inbox)
+        due = 1 if len(self._inbox) == 1 else sum(when <= now for when, _ in self._inbox)
         for _ in range(due):
             if not self._inbox:  # closed by the receiver
                 return

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 __all__ = ["FrameEncoder"]
 
 _HEADER_V2 = Struct("<BBBBBBBHB").pack
+_BYTES = tuple(bytes((number,)) for number in range(256))
 
 
 class FrameEncoder:
@@ -65,10 +66,10 @@ class FrameEncoder:
         payload = message.encode()
         if self._version == 2:
             payload = payload.rstrip(b"\0") or payload[:1]  # the standard never cuts the first byte
-            low, high = message.ID & 0xFFFF, message.ID >> 16
-            source = self.system_id, self.component_id
+            number, source, size = message.ID, (self.system_id, self.component_id), len(payload)
             flags = 0 if signing is None else SIGNED
-            frame = _HEADER_V2(MAGIC_V2, len(payload), flags, 0, self.sequence, *source, low, high) + payload
+            head = _HEADER_V2(MAGIC_V2, size, flags, 0, self.sequence, *source, number & 0xFFFF, number >> 16)
+            frame = head + payload
         else:
             if message.ID > 255:
                 raise LocalProtocolError(f"{message.NAME} has id {message.ID}, MAVLink 1 has none above 255")
@@ -76,6 +77,6 @@ class FrameEncoder:
             source = self.system_id, self.component_id
             frame = bytes((MAGIC_V1, len(payload), self.sequence, *source, message.ID)) + payload
         self.sequence = (self.sequence + 1) & 0xFF
-        crc = x25(frame[1:] + bytes((message.CRC_EXTRA,)))
+        crc = x25(frame[1:] + _BYTES[message.CRC_EXTRA])
         frame += crc.to_bytes(2, "little")
         return frame if signing is None else frame + signing.sign(frame, now)

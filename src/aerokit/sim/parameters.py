@@ -67,8 +67,10 @@ class Parameters:
         return parameters
 
     def __getitem__(self, name: str) -> float:
-        row = self._rows[name]
-        return self.row(name).value if isinstance(row, str) else row.value
+        try:
+            return self._rows[name].value  # type: ignore[union-attr]
+        except AttributeError:  # a line of text that nobody has asked for yet
+            return self.row(name).value
 
     def get(self, name: str, default: float) -> float:
         """The value; the default when this table is without it."""

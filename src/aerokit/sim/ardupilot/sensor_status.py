@@ -14,14 +14,17 @@ if TYPE_CHECKING:
 
 __all__ = ["sensor_status"]
 
-_FENCE = Sensor.MAV_SYS_STATUS_GEOFENCE
-_PREARM = Sensor.MAV_SYS_STATUS_PREARM_CHECK
-_AHRS = Sensor.MAV_SYS_STATUS_AHRS
-_LOGGING = Sensor.MAV_SYS_STATUS_LOGGING
-_TERRAIN = Sensor.MAV_SYS_STATUS_TERRAIN
-_RATE, _ATTITUDE, _YAW = Sensor.ANGULAR_RATE_CONTROL, Sensor.ATTITUDE_STABILIZATION, Sensor.YAW_POSITION
-_HEIGHT, _PLACE = Sensor.Z_ALTITUDE_CONTROL, Sensor.XY_POSITION_CONTROL
-_BODY = (
+_FENCE = int(Sensor.MAV_SYS_STATUS_GEOFENCE)  # integers: arithmetic on flags takes ten times as long
+_PREARM = int(Sensor.MAV_SYS_STATUS_PREARM_CHECK)
+_AHRS = int(Sensor.MAV_SYS_STATUS_AHRS)
+_LOGGING = int(Sensor.MAV_SYS_STATUS_LOGGING)
+_TERRAIN = int(Sensor.MAV_SYS_STATUS_TERRAIN)
+_RATE, _ATTITUDE = int(Sensor.ANGULAR_RATE_CONTROL), int(Sensor.ATTITUDE_STABILIZATION)
+_YAW, _HEIGHT = int(Sensor.YAW_POSITION), int(Sensor.Z_ALTITUDE_CONTROL)
+_PLACE = int(Sensor.XY_POSITION_CONTROL)
+_GPS, _LASER = int(Sensor.GPS), int(Sensor.LASER_POSITION)
+_RADIO, _BATTERY, _PROPULSION = int(Sensor.RC_RECEIVER), int(Sensor.BATTERY), int(Sensor.PROPULSION)
+_BODY = int(
     Sensor.SENSOR_3D_GYRO
     | Sensor.SENSOR_3D_ACCEL
     | Sensor.SENSOR_3D_MAG
@@ -52,17 +55,19 @@ class _Suite:
 
 _SUITES: dict[Kind, _Suite] = {
     "copter": _Suite(
-        _BODY | _TERRAIN | Sensor.PROPULSION,
+        _BODY | _TERRAIN | _PROPULSION,
         _RATE | _ATTITUDE | _YAW | _HEIGHT | _PLACE,
         always=_RATE | _ATTITUDE | _YAW,
-        quietly_healthy=Sensor.PROXIMITY,
+        quietly_healthy=int(Sensor.PROXIMITY),
     ),
     "plane": _Suite(
-        _BODY | Sensor.DIFFERENTIAL_PRESSURE, _RATE | _ATTITUDE | _YAW | _HEIGHT | _PLACE, unhealthy=_TERRAIN
+        _BODY | int(Sensor.DIFFERENTIAL_PRESSURE),
+        _RATE | _ATTITUDE | _YAW | _HEIGHT | _PLACE,
+        unhealthy=_TERRAIN,
     ),
-    "rover": _Suite(_BODY, _RATE | _ATTITUDE | _YAW | _PLACE, quietly_healthy=Sensor.LASER_POSITION),
+    "rover": _Suite(_BODY, _RATE | _ATTITUDE | _YAW | _PLACE, quietly_healthy=_LASER),
     "sub": _Suite(
-        _BODY | Sensor.LASER_POSITION,
+        _BODY | _LASER,
         _RATE | _ATTITUDE | _YAW | _HEIGHT | _PLACE,
         always=_RATE | _ATTITUDE | _YAW,
     ),
@@ -105,22 +110,21 @@ _LESS_CONTROL: dict[Kind, dict[int, int]] = {
 def sensor_status(vehicle: ArduPilotVehicle) -> tuple[int, int, int]:
     """Present, enabled and healthy, as integers."""
     suite, nav = _SUITES[vehicle.KIND], vehicle.navigation
-    present = int(suite.working | suite.control | suite.unhealthy | _PREARM | _AHRS | _LOGGING)
-    enabled = int(suite.working | suite.unhealthy | _PREARM)
-    health = int(suite.working | suite.quietly_healthy | _LOGGING)
+    present = suite.working | suite.control | suite.unhealthy | _PREARM | _AHRS | _LOGGING
+    enabled = suite.working | suite.unhealthy | _PREARM
+    health = suite.working | suite.quietly_healthy | _LOGGING
     controls = suite.always | suite.control & ~_LESS_CONTROL[vehicle.KIND].get(vehicle.mode.number, 0)
     enabled, health = enabled | controls, health | controls
     if nav.is_gps_detected:
-        present, enabled = present | Sensor.GPS, enabled | Sensor.GPS
-        health |= 0 if vehicle.faults.gps_lost else Sensor.GPS
+        present, enabled = present | _GPS, enabled | _GPS
+        health |= 0 if vehicle.faults.gps_lost else _GPS
     if nav.is_healthy:
         enabled |= _AHRS
         health |= _AHRS if vehicle.timeline.estimator_leads_early or nav.has_position else 0
     if vehicle.motors.is_armed or vehicle.now - vehicle.motors.disarmed_at < _KEEPS_LOGGING_S:
         enabled |= _LOGGING
     if vehicle.rangefinder_reach_m > 0.0:
-        for_it = Sensor.LASER_POSITION
-        present, enabled, health = present | for_it, enabled | for_it, health | for_it
+        present, enabled, health = present | _LASER, enabled | _LASER, health | _LASER
     present, enabled, health = _with_fence(vehicle, present, enabled, health)
     return present, enabled, _without_failures(vehicle, health)
 
@@ -135,9 +139,9 @@ def _with_fence(vehicle: ArduPilotVehicle, present: int, enabled: int, health: i
 def _without_failures(vehicle: ArduPilotVehicle, health: int) -> int:
     health |= _PREARM if vehicle.arming.passes else 0
     if not vehicle.failsafes.hears_radio:
-        health &= ~Sensor.RC_RECEIVER
+        health &= ~_RADIO
     if vehicle.failsafes.battery_is_low:
-        health &= ~Sensor.BATTERY
+        health &= ~_BATTERY
     if vehicle.faults.motor_failed:
-        health &= ~Sensor.PROPULSION
+        health &= ~_PROPULSION
     return health

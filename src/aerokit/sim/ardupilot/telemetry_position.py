@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 __all__ = ["POSITION_BUILDERS", "global_origin", "home_position"]
 
 _NAN4 = (math.nan,) * 4
+_POS_HORIZ_ABS = int(EkfStatusFlags.POS_HORIZ_ABS)
 _POSITION_ONLY = (
     Mask.VX_IGNORE | Mask.VY_IGNORE | Mask.VZ_IGNORE | Mask.AX_IGNORE | Mask.AY_IGNORE | Mask.AZ_IGNORE
 ) | (Mask.YAW_IGNORE | Mask.YAW_RATE_IGNORE)
@@ -96,7 +97,7 @@ def _ekf_status(vehicle: ArduPilotVehicle) -> m.EkfStatusReport | None:
     flags = vehicle.navigation.flags
     if flags is None:
         return None
-    size = 0.02 if flags & EkfStatusFlags.POS_HORIZ_ABS else 0.0
+    size = 0.02 if flags & _POS_HORIZ_ABS else 0.0
     return m.EkfStatusReport(flags, size, size, size / 2, size, 0.0, 0.0)
 
 

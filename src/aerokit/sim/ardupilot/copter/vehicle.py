@@ -42,7 +42,10 @@ if TYPE_CHECKING:
 __all__ = ["SimulatedCopter"]
 
 _LAND_DETECTOR_S = 1.0
-_BASE = MavModeFlag.STABILIZE_ENABLED | MavModeFlag.MANUAL_INPUT_ENABLED | MavModeFlag.CUSTOM_MODE_ENABLED
+_BASE = int(
+    MavModeFlag.STABILIZE_ENABLED | MavModeFlag.MANUAL_INPUT_ENABLED | MavModeFlag.CUSTOM_MODE_ENABLED
+)
+_GUIDED, _ARMED = int(MavModeFlag.GUIDED_ENABLED), int(MavModeFlag.SAFETY_ARMED)
 _GUIDED_MODES = frozenset((
     "GUIDED", "GUIDED_NOGPS", "LOITER", "POSHOLD", "CIRCLE", "BRAKE", "RTL", "SMARTRTL", "LAND", "AUTO", "FOLLOW",
     "AVOID_ADSB", "ZIGZAG",
@@ -106,21 +109,22 @@ class SimulatedCopter(ArduPilotVehicle):
     @property
     def base_mode(self) -> int:
         """Guided in the modes that know where they are, in RTL when armed only."""
-        base, name = int(_BASE), self.mode.name
+        base, name = _BASE, self.mode.name
         if not self.has_left_boot:
-            return base | MavModeFlag.GUIDED_ENABLED
+            return base | _GUIDED
         if name in _GUIDED_MODES and (self.motors.is_armed or name != "RTL"):
-            base |= MavModeFlag.GUIDED_ENABLED
-        return base | MavModeFlag.SAFETY_ARMED if self.motors.is_armed else base
+            base |= _GUIDED
+        return base | _ARMED if self.motors.is_armed else base
 
     def move(self, dt: float) -> None:
         """Motion and land detector."""
         motion = self.motion
         was_on_ground = motion.is_on_ground
         motion.step(dt, powered=self.motors.is_armed and not self.faults.motor_failed)
-        if motion.is_on_ground and not was_on_ground:
+        is_on_ground = motion.is_on_ground
+        if is_on_ground and not was_on_ground:
             self.info(f"SIM Hit ground at {motion.impact_speed_m_s:f} m/s")
-        if not motion.is_on_ground or self.mode.is_taking_off:
+        if not is_on_ground or self.mode.is_taking_off:
             self._still_since = math.nan
         elif math.isnan(self._still_since):
             self._still_since = self.now
