@@ -270,6 +270,34 @@ def test_mistakes_are_explained(pytester: pytest.Pytester) -> None:
         assert text in told
 
 
+def test_a_fixture_of_ones_own_is_told_of_once(pytester: pytest.Pytester) -> None:
+    source = """
+    import pytest
+    from aerokit.testing import VIRTUAL_BACKEND, open_flight
+
+    @pytest.fixture
+    def anyio_backend():
+        return VIRTUAL_BACKEND
+
+    @pytest.fixture
+    async def ready():
+        async with open_flight() as flight:
+            await flight.vehicle.wait_ready()
+            yield flight
+
+    @pytest.fixture
+    def same(ready):
+        return ready
+
+    @pytest.mark.anyio
+    async def test_it(ready, same):
+        ready.track.assert_reached_altitude(10)
+    """
+    result = run(pytester, source)
+    result.assert_outcomes(failed=1)
+    assert result.stdout.str().count("system 1: STABILIZE, armed for 0.0 s") == 1
+
+
 def test_other_projects_are_not_disturbed(pytester: pytest.Pytester) -> None:
     source = """
     import pytest, sys

@@ -106,7 +106,7 @@ def _add_demo(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
         metavar="ADDRESS",
         help="a vehicle: udpin:0.0.0.0:14550, tcp:127.0.0.1:5760, /dev/ttyACM0,57600 …",
     )
-    _add_vehicle(demo)
+    _add_vehicle(demo, "copter, plane (ArduPilot), px4, px4_plane (copter)")
     demo.add_argument(
         "--altitude", type=number(1, 500), default=10.0, metavar="M", help="metres above home (10)"
     )
@@ -141,7 +141,8 @@ def _add_sim(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     text = "Simulate vehicles for other programs, until interrupted."
     sim = commands.add_parser("sim", help="simulate vehicles", description=text)
     sim.set_defaults(run=run)
-    _add_vehicle(sim)
+    kinds = "copter, plane, rover, sub (ArduPilot), px4, px4_plane; or a recording, flight.tlog (copter)"
+    _add_vehicle(sim, kinds)
     sim.add_argument(
         "addresses",
         nargs="*",
@@ -207,11 +208,11 @@ def _add_sim_conditions(sim: argparse.ArgumentParser) -> None:
     )
 
 
-def _add_vehicle(command: argparse.ArgumentParser) -> None:
+def _add_vehicle(command: argparse.ArgumentParser, kinds: str) -> None:
     command.add_argument(
         "--vehicle",
         type=vehicle_kind,
         default="copter",
         metavar="KIND",
-        help="simulated: copter, plane, rover, sub (ArduPilot), px4, px4_plane; or a recording, flight.tlog (copter)",
+        help=f"simulated: {kinds}",
     )

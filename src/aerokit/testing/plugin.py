@@ -41,6 +41,7 @@ __all__ = [
 
 _MARKER, _PICTURES = "simulated", "--flight-pictures"
 _OPENED = "_aerokit_opened"
+_TOLD = ("Fleet", "Flight", "ServedFlight")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -148,7 +149,7 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> Generator[None, object, o
 def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
     """Say what was flown when a test has failed."""
     report = yield
-    flown = _flown(item) if report.when == "call" and report.failed else []
+    flown = _told(item) if report.when == "call" and report.failed else []
     if flown:
         from aerokit.testing.failure import what_was_flown
 
@@ -167,6 +168,15 @@ def _flown(item: pytest.Item) -> list[Any]:
     funcargs = getattr(item, "funcargs", None) or {}
     found = [funcargs[name] for name in ("flight", "fleet", "served_flight") if name in funcargs]
     return [each for each in found if type(each).__module__.startswith("aerokit.testing.")]
+
+
+def _told(item: pytest.Item) -> list[Any]:
+    """The same, and what fixtures of the project's own have opened."""
+    values = (getattr(item, "funcargs", None) or {}).values()
+    others = [each for each in values if type(each).__module__.startswith("aerokit.testing.")]
+    return list(
+        {id(each): each for each in (*_flown(item), *others) if type(each).__name__ in _TOLD}.values()
+    )
 
 
 def _fleets(item: pytest.Item) -> list[Fleet]:
