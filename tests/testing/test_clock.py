@@ -173,6 +173,7 @@ async def _jumps(prepare: Callable[[VirtualClockLoop], object] = lambda _: None)
 async def test_a_callback_may_jump_while_nothing_else_happens() -> None:
     assert await _jumps()
     assert await _jumps(lambda loop: loop.call_later(1.5, lambda: None))
+    assert await _jumps(lambda loop: loop.call_later(0.5, lambda: None).cancel())
 
 
 @pytest.mark.anyio

@@ -26,6 +26,7 @@ _SHORTEST_WAIT_S = 0.001
 _MANY = 10
 _INSTANT_S = 1e-8
 """What is due so soon on virtual time happens before anybody answers, as it does by a timer."""
+_TURNS = 1
 _LONGEST_LEAP_S = 0.5
 """Simulated; what the loop was late beyond that does not pass for the vehicles, unless they are to keep real time."""
 
@@ -192,17 +193,20 @@ class SimulatorServer:
         if self._jump is None or loop is None or self._when(min(self._dues)) < loop.time() + _INSTANT_S:
             self._schedule()
         else:  # after those who hear what was sent: they may have nothing to say to it
-            loop.call_soon(self._go_on)
+            loop.call_soon(self._go_on, _TURNS)
 
-    def _go_on(self) -> None:
-        """On virtual time, in place of a timer; one that was set meanwhile comes first."""
+    def _go_on(self, turns: int) -> None:
+        """On virtual time, in place of a timer; who was woken by what was sent gets so many turns before."""
+        loop = self._loop
+        if loop is None:
+            return
         try:
-            if self._loop is None:
-                return
-            if (due := self._leap()) is None:
-                self._schedule()
-            else:
+            if (due := self._leap()) is not None:
                 self._run_on(due)
+            elif turns and self._timer is None:
+                loop.call_soon(self._go_on, turns - 1)
+            else:
+                self._schedule()
         except Exception as error:
             self._fail(error)
 

@@ -37,6 +37,7 @@ import asyncio
 import selectors
 import threading
 from collections.abc import Callable, Coroutine, Mapping
+from heapq import heappop
 from types import CoroutineType
 from typing import Any, TypeVar
 
@@ -78,8 +79,13 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
 
         Saves a turn of the loop to whoever would have nothing done but set a timer for ``when``.
         """
-        timers, is_free = self._scheduled, not (self._ready or self._stopping or self._outside_calls)  # type: ignore[attr-defined]
-        if not is_free or self._debug or (timers and timers[0].when() <= when + self._clock_resolution):  # type: ignore[attr-defined]
+        if self._ready or self._stopping or self._outside_calls or self._debug:  # type: ignore[attr-defined]
+            return False
+        timers: list[asyncio.TimerHandle] = self._scheduled  # type: ignore[attr-defined]
+        while timers and timers[0].cancelled():  # as the loop itself does at its next turn
+            self._timer_cancelled_count -= 1  # type: ignore[attr-defined]
+            heappop(timers)._scheduled = False  # type: ignore[attr-defined]
+        if timers and timers[0].when() <= when + self._clock_resolution:
             return False
         if len(self._selector_map()) != self._own_sources:  # sockets are asked before every jump
             return False
