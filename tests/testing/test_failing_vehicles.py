@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import signal
+import sys
+import threading
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import anyio
 import pytest
@@ -17,6 +22,8 @@ from aerokit.errors import LinkLost
 from aerokit.sim import SimulatedCopter, SimulatorServer, simulated_link
 from aerokit.testing import Fleet, Flight, TrackPoint, run_virtual, serve_flight
 from aerokit.testing.failure import what_was_flown
+from aerokit.testing.interruption import Interruption
+from aerokit.testing.served import ServedFlight
 
 
 class Mistake(Exception):
@@ -167,3 +174,41 @@ def test_a_vehicle_that_fails_while_its_story_is_told_does_not_hide_the_failure(
     with pytest.raises(Mistake):
         Fleet("copter").run(fly)
     assert "fails: Mistake('in the vehicle')" in stories[0]
+
+
+def test_an_interruption_while_a_block_is_entered_or_left_does_not_escape_it() -> None:
+    """Without care some of three hundred come out as KeyboardInterrupt, which ends the whole run of pytest."""
+    before = signal.getsignal(signal.SIGINT)
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(2e-6)
+    try:
+        for number in range(300):
+            _fail_about_now(delay_s=number % 30 * 1e-5)
+    finally:
+        sys.setswitchinterval(interval)
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def _fail_about_now(delay_s: float) -> None:
+    flight, ends = ServedFlight.__new__(ServedFlight), time.perf_counter() + delay_s
+    flight._interruption, flight._server = Interruption(), cast(Any, SimpleNamespace(failure=None))
+
+    def fail() -> None:
+        _spin(ends)
+        with contextlib.suppress(Mistake), flight._interruption.at_an_error():
+            flight._server.failure = Mistake()
+            raise flight._server.failure
+
+    thread = threading.Thread(target=fail)
+    thread.start()
+    try:
+        with contextlib.suppress(Mistake), flight.failing_at_once():
+            _spin(ends + 1e-5)
+    except KeyboardInterrupt:
+        pytest.fail("it escaped")
+    thread.join()
+
+
+def _spin(until: float) -> None:
+    while time.perf_counter() < until:
+        len("")
