@@ -419,14 +419,12 @@ class ArduPilotVehicle(SimulatedAutopilot):
 
     def build(self, message_id: int) -> Message | None:
         """What is to be streamed now."""
+        builder = BUILDERS[self.KIND].get(message_id)
+        if builder is not None:
+            return builder(self) if self.is_initialised or message_id in _BEFORE_READY else None
         if message_id == m.Timesync.ID:
             return m.Timesync(0, int(self.uptime * 1e9) + self.system_id)
-        if message_id == m.AvailableModesMonitor.ID:
-            return m.AvailableModesMonitor(0)
-        if not self.is_initialised and message_id not in _BEFORE_READY:
-            return None
-        builder = BUILDERS[self.KIND].get(message_id)
-        return None if builder is None else builder(self)
+        return m.AvailableModesMonitor(0) if message_id == m.AvailableModesMonitor.ID else None
 
     def tick(self, dt: float) -> None:
         """Mode, motors, motion, battery."""
