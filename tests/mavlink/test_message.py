@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from wire_samples import samples
 
+from aerokit.errors import LocalProtocolError
 from aerokit.mavlink import STANDARD, Field, FrameEncoder, Framer, Message, messages
 
 EVERY = [pytest.param(message_class, id=message_class.NAME) for message_class in STANDARD]
@@ -126,6 +127,17 @@ def test_repr_can_be_evaluated() -> None:
     message = messages.Statustext(6, "it's\n", 1, 2)
     assert repr(message) == 'Statustext(severity=6, text="it\'s\\n", id=1, chunk_seq=2)'
     assert eval(repr(message), vars(messages) | {"Statustext": messages.Statustext}) == message
+
+
+def test_keys_are_not_shown() -> None:
+    key = bytes(range(32))
+    message = messages.SetupSigning(1, 1, key, 5)
+    assert repr(message) == (
+        "SetupSigning(target_system=1, target_component=1, secret_key=<not shown>, initial_timestamp=5)"
+    )
+    with pytest.raises(LocalProtocolError) as raised:
+        messages.SetupSigning(1, 1, key * 2, 5).encode()
+    assert "secret_key = <not shown>" in str(raised.value)
 
 
 def test_to_dict_is_in_the_order_of_the_standard() -> None:

@@ -13,6 +13,7 @@ import pytest
 
 from aerokit import Signing, SigningKey, Vehicle, connect, events, open_connection
 from aerokit.errors import (
+    BusyError,
     CommandTimeout,
     ConnectFailed,
     LocalProtocolError,
@@ -161,6 +162,18 @@ async def test_setup_is_refused_beforehand_and_by_the_vehicle() -> None:
             await vehicle.setup_signing(Signing(KEY))
         assert vehicle.connection.signing is None
         await vehicle.arm()
+
+
+async def test_one_key_at_a_time() -> None:
+    copter = radio_copter()
+    async with connected(copter) as vehicle, anyio.create_task_group() as tasks:
+        await vehicle.wait_ready()
+        copter.faults.drop_incoming = 1
+        tasks.start_soon(vehicle.setup_signing, Signing(KEY))
+        await anyio.wait_all_tasks_blocked()
+        with pytest.raises(BusyError, match="setup_signing"):
+            await vehicle.setup_signing(Signing(WRONG))
+    assert copter.signing.key == KEY
 
 
 async def test_setup_over_a_lossy_link() -> None:

@@ -27,6 +27,8 @@ PACK_ERRORS = (struct.error, OverflowError, TypeError, ValueError, AttributeErro
 """What packing a wrong value can raise; the generated classes turn it into LocalProtocolError."""
 
 _ANY_HEADER = bytes(HEADER_LENGTH)
+_SECRETS = frozenset(("secret_key", "passkey", "password"))
+"""Fields that are shown to nobody."""
 _RANGES = {
     "int8_t": (-(1 << 7), (1 << 7) - 1),
     "uint8_t": (0, (1 << 8) - 1),
@@ -161,7 +163,7 @@ class Message:
         return all(_same(getattr(self, name), getattr(other, name)) for name in self.__match_args__)
 
     def __repr__(self) -> str:
-        fields = ", ".join(f"{name}={getattr(self, name)!r}" for name in self.__match_args__)
+        fields = ", ".join(f"{name}={_shown(name, getattr(self, name))}" for name in self.__match_args__)
         return f"{type(self).__name__}({fields})"
 
     def _encode_error(self) -> LocalProtocolError:
@@ -169,8 +171,14 @@ class Message:
             value = getattr(self, field.name, None)
             complaint = field.complaint(value)
             if complaint:
-                return LocalProtocolError(f"{self.NAME}.{field.name} = {value!r} cannot be sent: {complaint}")
+                shown = _shown(field.name, value)
+                return LocalProtocolError(f"{self.NAME}.{field.name} = {shown} cannot be sent: {complaint}")
         return LocalProtocolError(f"{self!r} cannot be sent")
+
+
+def _shown(name: str, value: object) -> str:
+    """A value as text; logs and error messages are no place for keys."""
+    return "<not shown>" if name in _SECRETS else repr(value)
 
 
 # -------------------------------------------------------------------- used by the generated classes

@@ -7,7 +7,7 @@ import logging
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import BusyError, LocalProtocolError
 from aerokit.mavlink.frame import SIGNED
 from aerokit.runtime.events import FrameRefused
 
@@ -39,6 +39,7 @@ class SignatureGate:
         self._encoder, self._unix_time, self._publish = encoder, unix_time, publish
         self._told: set[Refusal] = set()
         self._handover: _Handover | None = None
+        self._is_handing_over = False
         self.is_open = True
         """Whether everything is let in without looking at it."""
 
@@ -59,15 +60,20 @@ class SignatureGate:
         """For the time of the block, change to ``signing`` with the first frame of the component that shows it has.
 
         The event is set then. Frames are signed and checked as before until that.
+
+        BusyError while another block is open.
         """
         check_signing(signing, self._encoder.version)
+        if self._is_handing_over:
+            raise BusyError("setup_signing: another vehicle on this connection is just being given a key")
+        self._is_handing_over = True
         taken = asyncio.Event()
         self._handover = _Handover(signing, (system_id, component_id), taken)
         self._update()
         try:
             yield taken
         finally:
-            self._handover = None
+            self._handover, self._is_handing_over = None, False
             self._update()
 
     def _update(self) -> None:

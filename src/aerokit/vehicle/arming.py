@@ -117,8 +117,7 @@ class ArmingActions(ModeActions):
         reboots = self._watch.reboots
         self._link_watch.ask()  # its time before
         await self._explained_command(PREFLIGHT_REBOOT_SHUTDOWN, 1, *(0.0,) * 4, FORCE_REBOOT if force else 0)
-        self._watch.expect_reboot()
-        with anyio.move_on_after(timeout):
+        with self._watch.expecting_reboot(), anyio.move_on_after(timeout):
             await self._await_reboot(reboots)
             return
         raise OperationTimeout(f"reboot: not back within {timeout:g} s; {self.describe_link()}")

@@ -81,6 +81,7 @@ class Vehicle(FlightActions):
             NotSupported: we or the vehicle speak MAVLink 1, which has no signatures. Nothing was sent.
             OperationRejected: it is armed, or not known to be disarmed. Nothing was sent.
             OperationTimeout: it went on as before; the text has what it said.
+            BusyError: another vehicle on this connection is just being given a key. Nothing was sent.
         """
         await set_up_signing(self, signing, timeout)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import anyio
@@ -12,7 +13,7 @@ from aerokit.mavlink.messages import Attitude, GlobalPositionInt, Heartbeat, Sys
 from aerokit.runtime.events import LinkReport, VehicleBack, VehicleRebooted, VehicleSilent
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     from aerokit.mavlink.frame import Frame
     from aerokit.runtime.bus import Detach
@@ -69,9 +70,14 @@ class VehicleWatch:
         for detach in self._detach:
             detach()
 
-    def expect_reboot(self) -> None:
-        """The vehicle has accepted to reboot; it is noticed even if it had just booted before."""
+    @contextmanager
+    def expecting_reboot(self) -> Iterator[None]:
+        """The vehicle has accepted to reboot: in the block it is noticed even if it had just booted before."""
         self._expects_reboot = True
+        try:
+            yield
+        finally:
+            self._expects_reboot = False
 
     def note_answer(self, asked_at: float, milliseconds: int) -> None:
         """The vehicle's time since boot, as told in answer to a question of ours.
