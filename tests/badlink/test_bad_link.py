@@ -19,6 +19,8 @@ from aerokit.links import FaultModel
 from aerokit.protocols.transfer import PATIENCE_S
 
 SEEDS = int(os.environ.get("AEROKIT_SEEDS", "1"))
+ENOUGH = 21
+"""For a median: with fewer, luck decides."""
 LOSSES = (0.0, 0.05, 0.1, 0.2, 0.3)
 each_case = pytest.mark.parametrize("case", CASES, ids=lambda case: case.name.replace(" ", "-"))
 
@@ -49,7 +51,7 @@ def test_a_transfer_ends_with_exact_content_and_leaves_nothing(case: Case, loss:
 def test_it_takes_at_most_twice_the_ideal_at_5_and_four_times_at_20_percent(case: Case) -> None:
     for loss, most in ((0.05, 2.0), (0.2, 4.0)):
         radio = NARROW.with_loss(loss)
-        verdicts = [judge(case, TINY, radio, seed) for seed in range(max(SEEDS, 3))]
+        verdicts = [judge(case, TINY, radio, seed) for seed in range(max(SEEDS, ENOUGH))]
         assert [verdict.faults for verdict in verdicts if verdict.faults] == []
         assert statistics.median(verdict.ratio for verdict in verdicts) <= most
 

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from importlib.machinery import SourceFileLoader
 
 import pytest
+
+import aerokit.errors
 
 pytest_plugins = ["pytester"]
 
@@ -325,3 +328,8 @@ def test_importing_it_is_cheap() -> None:
     own = {name for name in done.stdout.split() if name.startswith("aerokit")}
     assert own == {"aerokit", "aerokit.lazy", "aerokit.testing", "aerokit.testing.plugin"}
     assert "asyncio" not in done.stdout.split()
+
+
+def test_aerokit_itself_is_not_rewritten() -> None:
+    """Pytest rewrites every package that has a plugin: slow, and not safe in two threads that import at once."""
+    assert isinstance(aerokit.errors.__loader__, SourceFileLoader)

@@ -33,6 +33,7 @@ __all__ = [
     "flight",
     "pytest_addoption",
     "pytest_configure",
+    "pytest_load_initial_conftests",
     "pytest_pyfunc_call",
     "pytest_runtest_call",
     "pytest_runtest_makereport",
@@ -51,6 +52,19 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         metavar="DIR",
         help="draw what was flown in each test that fails, as an .svg in this directory",
     )
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_load_initial_conftests(early_config: pytest.Config) -> None:
+    """Import aerokit as it is: pytest rewrites all modules of a package that has a plugin, in whatever thread.
+
+    That takes its time, and two threads that do it at once can stumble over each other in Python 3.10 to 3.12.
+    """
+    rewriting = getattr(early_config.pluginmanager, "rewrite_hook", None)
+    marked = getattr(rewriting, "_must_rewrite", None)  # there is no public way back
+    if rewriting is not None and isinstance(marked, set):
+        marked -= {name for name in marked if name.partition(".")[0] == "aerokit"}
+        rewriting.mark_rewrite()  # forgets what it knew of each name
 
 
 def pytest_configure(config: pytest.Config) -> None:
