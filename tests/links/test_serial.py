@@ -106,7 +106,7 @@ async def test_a_line_that_takes_nothing_costs_bounded_memory_and_never_blocks()
         assert link.dropped_writes == before + 1
         far.reads()
         await far.heard.until(lambda: len(far.heard.data) == written * 280 - 280)
-        await eventually(lambda: not link._paused)
+        await eventually(lambda: not link.unsent_bytes)
         link.write(b"again")
         await far.heard.until(lambda: far.heard.data.endswith(b"again"))
         link.close()

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from .address import ACCEPTED_FORMS, LinkAddress, parse_address
 from .create import create_link
-from .link import Link, Peer, Receiver
+from .link import DrainListener, Link, Peer, Receiver
 from .memory import MemoryLink, memory_link_pair
 from .pty import PtyLink
 from .reconnecting import Interruptible, ReconnectingLink
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ACCEPTED_FORMS",
+    "DrainListener",
     "FaultModel",
     "FaultyLink",
     "Interruptible",

@@ -10,7 +10,7 @@ from abc import abstractmethod
 
 from aerokit.errors import BusyError, ConnectionClosed, LinkError, LinkLost, LinkOpenError
 
-from .link import Link, Peer, Receiver
+from .link import DrainListener, Link, Peer, Receiver
 
 __all__ = ["BaseLink", "link_open_error"]
 
@@ -31,6 +31,7 @@ class BaseLink(Link):
         self.dropped_writes = 0
         self._state = _State.NEW
         self._receiver: Receiver | None = None  # None: no callback is made
+        self._stalled_at: float | None = None
         self._released = asyncio.Event()
         self._released.set()
 
@@ -76,6 +77,23 @@ class BaseLink(Link):
     def _deliver(self, data: bytes, peer: Peer = None) -> None:
         if self._receiver is not None:
             self._receiver.bytes_received(data, peer)
+
+    def _drop(self, writes: int) -> None:
+        self.dropped_writes += writes
+
+    def _tell_stalled(self, is_stalled: bool) -> None:
+        """Some transport of this link does not drain, or all of them do again."""
+        if is_stalled == (self._stalled_at is not None):
+            return
+        now, since = asyncio.get_running_loop().time(), self._stalled_at
+        self._stalled_at = now if is_stalled else None
+        receiver = self._receiver
+        if not isinstance(receiver, DrainListener):
+            return
+        if since is None:
+            receiver.link_stalled(self.unsent_bytes)
+        else:
+            receiver.link_drained(now - since)
 
     def _lose(self, reason: str, cause: BaseException | None = None, kind: type[LinkLost] = LinkLost) -> None:
         """The link has gone by itself: says so once and releases what is left of it."""

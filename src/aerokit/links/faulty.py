@@ -22,7 +22,8 @@ from heapq import heappop, heappush
 from aerokit.errors import BusyError, ConnectionClosed, LinkLost
 
 from .fault_model import Air, FaultModel, FaultyPath
-from .link import LINGER_S, Link, Peer, Receiver
+from .link import LINGER_S, DrainListener, Link, Peer, Receiver
+from .stalled_line import StalledLine
 
 __all__ = ["FaultyLink"]
 
@@ -59,6 +60,9 @@ class FaultyLink(Link):
         self._ears: _Ears | None = None
         self._on_the_way: _Timetable | None = None
         self._is_closed = False
+        self._line: StalledLine | None = None  # None: it has never stalled
+        self._stalled_at: float | None = None
+        self._too_late = 0
         self._drained = asyncio.Event()
         self._drained.set()
 
@@ -69,8 +73,37 @@ class FaultyLink(Link):
 
     @property
     def dropped_writes(self) -> int:  # type: ignore[override]
-        """What the wrapped link dropped, and what had no room in the queue; not what was lost on its way."""
-        return self.link.dropped_writes + self.outgoing.overflowed
+        """What the wrapped link dropped, what had no room in the queue, and what a stall kept for too long.
+
+        What was lost on its way is none.
+        """
+        return self.link.dropped_writes + self.outgoing.overflowed + self._too_late
+
+    @property
+    def unsent_bytes(self) -> int:
+        """See `Link.unsent_bytes`; what is on its way through the air has left."""
+        return self.link.unsent_bytes + (0 if self._line is None else self._line.unsent_bytes)
+
+    def discard_unsent(self) -> None:
+        """See `Link.discard_unsent`."""
+        if self._line is not None:
+            self._line.discard()
+        self.link.discard_unsent()
+
+    def stall(self, system_bytes: int = 0) -> None:
+        """From now on what is written does not leave, until :meth:`drain`: as over TCP when the network is away.
+
+        The system takes ``system_bytes`` of it, which arrive after :meth:`drain`, whenever that is; the rest waits for
+        at most a second, can be taken back by :meth:`discard_unsent`, and is dropped then. The link must be open.
+        """
+        if self._line is not None:
+            self._line.close()
+        self._line = StalledLine(system_bytes, self._carry, self._count_too_late, self._tell_stalled)
+
+    def drain(self) -> None:
+        """What was written leaves again."""
+        if self._line is not None:
+            self._line.drain()
 
     async def open(self, receiver: Receiver) -> None:
         """See `Link.open`."""
@@ -93,8 +126,16 @@ class FaultyLink(Link):
 
     def write(self, data: bytes, peer: Peer = None) -> None:
         """See `Link.write`; what is lost on its way is no dropped write."""
+        if self._on_the_way is None or self._is_closed:
+            return
+        if self._line is not None:
+            self._line.write(bytes(data), peer)
+        else:
+            self._carry(data, peer)
+
+    def _carry(self, data: bytes, peer: Peer) -> None:
         on_the_way = self._on_the_way
-        if on_the_way is None or self._is_closed:
+        if on_the_way is None:
             return
         for due, piece in self.outgoing.carry(bytes(data), on_the_way.loop.time()):
             on_the_way.put(due, lambda piece=piece: self.link.write(piece, peer))  # type: ignore[misc]
@@ -108,6 +149,8 @@ class FaultyLink(Link):
         if self._is_closed:
             return
         self._is_closed = True
+        if self._line is not None:
+            self._line.close()
         if self._ears is not None:
             self._ears.close()
         on_the_way = self._on_the_way
@@ -122,8 +165,23 @@ class FaultyLink(Link):
         await self._drained.wait()
         await self.link.wait_closed()
 
+    def _count_too_late(self, writes: int) -> None:
+        self._too_late += writes
+
+    def _tell_stalled(self, is_stalled: bool) -> None:
+        ears, now, since = self._ears, asyncio.get_running_loop().time(), self._stalled_at
+        if ears is None or is_stalled == (since is not None):
+            return
+        self._stalled_at = now if is_stalled else None
+        if since is None:
+            ears.link_stalled(self.unsent_bytes)
+        else:
+            ears.link_drained(now - since)
+
     def _lost(self) -> None:
         """What is on its way out meets nobody any more."""
+        if self._line is not None:
+            self._line.close()
         if self._on_the_way is not None:
             self._on_the_way.clear()
         self._drained.set()
@@ -153,6 +211,16 @@ class _Ears:
         self._when_lost()
         if not self._is_closed:
             self._on_the_way.put(self._on_the_way.latest_due, lambda: self._receiver.link_lost(error))
+
+    def link_stalled(self, unsent_bytes: int) -> None:
+        """See `DrainListener`."""
+        if not self._is_closed and isinstance(self._receiver, DrainListener):
+            self._receiver.link_stalled(unsent_bytes)
+
+    def link_drained(self, stalled_s: float) -> None:
+        """See `DrainListener`."""
+        if not self._is_closed and isinstance(self._receiver, DrainListener):
+            self._receiver.link_drained(stalled_s)
 
     def close(self) -> None:
         self._is_closed = True

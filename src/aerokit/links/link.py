@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Hashable
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from aerokit.errors import LinkLost
 
-__all__ = ["Link", "Peer", "Receiver"]
+__all__ = ["DrainListener", "Link", "Peer", "Receiver"]
 
 Peer = Hashable
 """Who sent the bytes, to be handed back to `Link.write`; None where there is only one. Opaque."""
@@ -28,6 +28,17 @@ class Receiver(Protocol):
         """The link has gone by itself; called at most once, and the last call there is."""
 
 
+@runtime_checkable
+class DrainListener(Receiver, Protocol):
+    """A receiver that wants to be told when a link takes bytes and does not get rid of them."""
+
+    def link_stalled(self, unsent_bytes: int) -> None:
+        """Nothing has left for a second although something waits; orders among it may arrive late, or never."""
+
+    def link_drained(self, stalled_s: float) -> None:
+        """It goes on, after so many seconds."""
+
+
 class Link(ABC):
     """Moves bytes between this program and one or several peers; knows nothing of what they mean.
 
@@ -39,7 +50,7 @@ class Link(ABC):
     """What to call it: mostly a form that `create_link` takes; a listening port 0 becomes the real one."""
 
     dropped_writes: int = 0
-    """Writes (datagrams, whole calls of `write`) that were thrown away: no room, no route, nobody there."""
+    """Writes (datagrams, whole calls of `write`) that were thrown away: no room in time, no route, nobody there."""
 
     @abstractmethod
     async def open(self, receiver: Receiver) -> None:
@@ -57,6 +68,22 @@ class Link(ABC):
         Never blocks and never raises: what cannot be sent is dropped whole and counted in `dropped_writes`;
         before `open` and after the end it does nothing.
         """
+
+    @property
+    def unsent_bytes(self) -> int:
+        """Bytes that `write` took and that have not left: an order among them may still arrive.
+
+        What waits in the link, in its transport, and, where it can be asked (Linux), in the system. 0 does not say
+        that the other side has read them.
+        """
+        return 0
+
+    def discard_unsent(self) -> None:
+        """Take back what has not left, as far as that is possible, and count it in `dropped_writes`.
+
+        What the system has of a TCP connection is beyond recall, and stays in `unsent_bytes`.
+        """
+        return
 
     def has_peer(self, peer: Peer) -> bool:
         """Whether a peer that was heard could still be written to: not a client that has gone."""

@@ -17,7 +17,7 @@ from typing import Protocol, runtime_checkable
 
 from aerokit.errors import BusyError, ConnectionClosed, LinkLost, RecordingEnded
 
-from .link import Link, Peer, Receiver
+from .link import DrainListener, Link, Peer, Receiver
 
 __all__ = ["Interruptible", "ReconnectingLink"]
 
@@ -73,6 +73,16 @@ class ReconnectingLink(Link):
     def dropped_writes(self) -> int:  # type: ignore[override]
         """What all its links dropped, and what was written while there was none."""
         return self._dropped + self._link.dropped_writes
+
+    @property
+    def unsent_bytes(self) -> int:
+        """See `Link.unsent_bytes`; nothing of a link that was lost waits any more."""
+        return self._link.unsent_bytes if self._is_up else 0
+
+    def discard_unsent(self) -> None:
+        """See `Link.discard_unsent`."""
+        if self._is_up:
+            self._link.discard_unsent()
 
     @property
     def is_away(self) -> bool:
@@ -135,6 +145,10 @@ class ReconnectingLink(Link):
             self._is_back()
         if ears is self._ears and self._receiver is not None:
             self._receiver.bytes_received(data, peer)
+
+    def _listener_of(self, ears: _Ears) -> DrainListener | None:
+        is_present = ears is self._ears and isinstance(self._receiver, DrainListener)
+        return self._receiver if is_present else None  # type: ignore[return-value]
 
     def _lost(self, ears: _Ears, error: LinkLost) -> None:
         if ears is not self._ears:
@@ -222,6 +236,14 @@ class _Ears:
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
         self._owner._heard(self, data, peer)
+
+    def link_stalled(self, unsent_bytes: int) -> None:
+        if listener := self._owner._listener_of(self):
+            listener.link_stalled(unsent_bytes)
+
+    def link_drained(self, stalled_s: float) -> None:
+        if listener := self._owner._listener_of(self):
+            listener.link_drained(stalled_s)
 
     def link_lost(self, error: LinkLost) -> None:
         self.is_lost = True

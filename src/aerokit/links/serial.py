@@ -26,6 +26,7 @@ from typing import Any
 from .address import LinkAddress
 from .base import BaseLink, link_open_error
 from .link import LINGER_S, Peer
+from .outbox import Outbox
 
 if sys.platform == "win32":
     _TermiosError = OSError
@@ -45,7 +46,7 @@ class SerialLink(BaseLink):
 
     ``baud`` is in bits per second and matters to real UARTs, not to USB ports such as /dev/ttyACM0;
     ``rtscts`` turns hardware flow control on. About two seconds' worth of bytes may wait to be sent, at least
-    4096.
+    4096; none waits here for longer than a second.
     """
 
     def __init__(self, device: str, baud: int = 57600, *, rtscts: bool = False) -> None:
@@ -55,16 +56,30 @@ class SerialLink(BaseLink):
         self._loop: asyncio.AbstractEventLoop | None = None
         self._port: Any = None
         self._transport: Any = None
-        self._paused = False
+        self._outbox: Outbox | None = None
+
+    @property
+    def unsent_bytes(self) -> int:
+        """See `Link.unsent_bytes`; with what waits in the port's driver."""
+        return 0 if self._outbox is None else self._outbox.unsent_bytes
 
     def write(self, data: bytes, peer: Peer = None) -> None:
-        """See `Link.write`; drops while more waits than the line carries in two seconds."""
-        if self._transport is None or not data:
+        """See `Link.write`; drops what is more than the line carries in two seconds, or has waited for one."""
+        if self._outbox is not None and data:
+            self._outbox.write(data)
+
+    def discard_unsent(self) -> None:
+        """See `Link.discard_unsent`; the driver's share too, which may cut a frame in two."""
+        if self._outbox is None or not self._loop or self._loop.is_closed():
             return
-        if self._paused:
-            self.dropped_writes += 1
-        else:
-            self._transport.write(data)
+        self._outbox.discard()
+        before = self._waiting_to_be_sent(self._transport)
+        self._transport.flush()
+        with contextlib.suppress(Exception):
+            self._port.reset_output_buffer()
+        taken = before - self._waiting_to_be_sent(self._transport)
+        self._outbox.taken_back(taken)
+        self.dropped_writes += taken > 0
 
     async def _connect(self) -> None:
         """Without an await in it: there is no half-way at which it could be cancelled."""
@@ -75,7 +90,14 @@ class SerialLink(BaseLink):
         self._transport = transports.SerialTransport(self._loop, _SerialProtocol(self), port)
         _replace_calls(port, self._transport, self._device_failed)
         limit = max(4096, int(self._baud / 10 * _SECONDS_HELD_BACK))
-        self._transport.set_write_buffer_limits(high=limit, low=limit // 2)
+        self._transport.set_write_buffer_limits(high=0)  # what the driver does not take waits in the outbox
+        self._outbox = Outbox(
+            self._transport.write,
+            partial(self._waiting_to_be_sent, self._transport),
+            limit=limit,
+            dropped=self._drop,
+            stalled=self._tell_stalled,
+        )
 
     def _open_port(self) -> Any:
         serial = importlib.import_module("serial")
@@ -100,8 +122,12 @@ class SerialLink(BaseLink):
 
     def _release(self) -> None:
         transport, self._transport = self._transport, None
+        outbox, self._outbox = self._outbox, None
         if transport is None or self._loop is None:
             return
+        if outbox is not None:
+            with contextlib.suppress(RuntimeError):  # the loop is closed
+                outbox.close()
         transport.pause_reading()
         if self._loop.is_running():
             until = self._loop.time() + (LINGER_S if self._is_closed else 0.0)
@@ -142,10 +168,14 @@ class _SerialProtocol(asyncio.Protocol):
         self._link._deliver(data)
 
     def pause_writing(self) -> None:
-        self._link._paused = True
+        if self._link._outbox is not None:
+            self._link._outbox.pause()
 
     def resume_writing(self) -> None:
-        self._link._paused = False
+        """On a later turn: the transport is in the middle of a write."""
+        if self._link._outbox is not None and self._link._loop is not None:
+            with contextlib.suppress(RuntimeError):  # the loop is closed
+                self._link._loop.call_soon(self._link._outbox.resume)
 
     def connection_lost(self, exc: Exception | None) -> None:  # only where the port's own calls are in use
         self._link._lose(f"the device is gone: {exc}", exc)

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import errno
 import socket
+import struct
 from abc import abstractmethod
 from typing import Any
 
@@ -14,6 +15,7 @@ import anyio
 from .address import host_and_port
 from .base import BaseLink
 from .link import LINGER_S, Peer
+from .outbox import Outbox, unsent_in_kernel
 from .sockets import Endpoint, bound_socket, resolve
 
 __all__ = ["CONNECT_TIMEOUT_S", "MAX_CLIENTS", "MAX_PENDING_BYTES", "TcpConnect", "TcpListen"]
@@ -22,7 +24,13 @@ CONNECT_TIMEOUT_S = 10.0
 """Seconds that `TcpConnect.open` waits for the other side by default."""
 
 MAX_PENDING_BYTES = 256 * 1024
-"""With more than this written and not taken by the other side, whole writes are dropped."""
+"""With more than this written and not taken by the system, whole writes are dropped; so is what waits for a second."""
+
+SEND_BUFFER = 16 * 1024
+"""So much the system may take (Linux doubles it) before the other side has acknowledged it: it is beyond recall."""
+
+NOT_SENT_LOW_WATER = 1024
+"""So much the system may take that it has never sent (TCP_NOTSENT_LOWAT, where there is one)."""
 
 MAX_CLIENTS = 64
 """Further clients of a listening link are turned away."""
@@ -35,6 +43,17 @@ class _TcpLink(BaseLink):
         super().__init__(f"{scheme}:{host_and_port(host, port)}")
         self._host, self._port = host, port
         self._streams: set[_Stream] = set()  # all that are not quite gone
+        self._stalled: set[_Stream] = set()
+
+    @property
+    def unsent_bytes(self) -> int:
+        """See `Link.unsent_bytes`; of all clients together."""
+        return sum(stream.unsent_bytes for stream in self._streams)
+
+    def discard_unsent(self) -> None:
+        """See `Link.discard_unsent`."""
+        for stream in self._streams:
+            stream.discard_unsent()
 
     @abstractmethod
     def _stream_made(self, stream: _Stream) -> None: ...
@@ -55,6 +74,11 @@ class _TcpLink(BaseLink):
         if not self._streams:
             self._released.set()
         self._stream_lost(stream, error)
+        self._stream_stalled(stream, False)
+
+    def _stream_stalled(self, stream: _Stream, is_stalled: bool) -> None:
+        (self._stalled.add if is_stalled else self._stalled.discard)(stream)
+        self._tell_stalled(bool(self._stalled))
 
     def _release(self) -> None:
         for stream in tuple(self._streams):
@@ -75,9 +99,9 @@ class TcpConnect(_TcpLink):
         return self._stream.own_address if self._stream is not None else ("", 0)
 
     def write(self, data: bytes, peer: Peer = None) -> None:
-        """See `Link.write`; drops while more than `MAX_PENDING_BYTES` wait for the other side."""
+        """See `Link.write`; drops what is more than `MAX_PENDING_BYTES`, or has waited for a second."""
         if self._stream is not None:
-            self.dropped_writes += not self._stream.write(data)
+            self._stream.write(data)
 
     async def _connect(self) -> None:
         with anyio.move_on_after(self._connect_timeout_s):
@@ -147,12 +171,12 @@ class TcpListen(_TcpLink):
         return tuple(self._clients)
 
     def write(self, data: bytes, peer: Peer = None) -> None:
-        """See `Link.write`; drops for a client that has more than `MAX_PENDING_BYTES` waiting."""
+        """See `Link.write`; drops for a client what is more than `MAX_PENDING_BYTES`, or has waited for a second."""
         if peer is None:
             for client in tuple(self._clients.values()):
-                self.dropped_writes += not client.write(data)
+                client.write(data)
         elif client_of_peer := self._clients.get(peer):
-            self.dropped_writes += not client_of_peer.write(data)
+            client_of_peer.write(data)
         else:
             self.dropped_writes += 1
 
@@ -200,12 +224,13 @@ class TcpListen(_TcpLink):
 
 
 class _Stream(asyncio.Protocol):
-    """One TCP connection: bounded in what it holds back, and in how long it lingers."""
+    """One TCP connection: bounded in what it holds back and for how long, and in how long it lingers."""
 
     def __init__(self, link: _TcpLink) -> None:
         self._link = link
         self._transport: asyncio.Transport | None = None
-        self._paused = False
+        self._outbox: Outbox | None = None
+        self._fd = -1
         self._loop = asyncio.get_running_loop()
         self._linger: asyncio.TimerHandle | None = None
         self.peer: Peer = None
@@ -215,30 +240,60 @@ class _Stream(asyncio.Protocol):
         name: Any = self._transport and self._transport.get_extra_info("sockname")
         return name[:2] if name else ("", 0)
 
-    def write(self, data: bytes) -> bool:
-        """False when it was dropped."""
-        if self._paused or self._transport is None or self._transport.is_closing():
-            return False
-        self._transport.write(data)
-        return True
+    @property
+    def unsent_bytes(self) -> int:
+        return 0 if self._outbox is None else self._outbox.unsent_bytes
+
+    def write(self, data: bytes) -> None:
+        if self._outbox is None or self._transport is None or self._transport.is_closing():
+            self._link._drop(1)
+        else:
+            self._outbox.write(data)
+
+    def discard_unsent(self) -> None:
+        if self._outbox is not None:
+            self._outbox.discard()
 
     def close(self) -> None:
-        """Sends what was written, for up to `LINGER_S`, and closes."""
-        if self._transport is None or self._transport.is_closing():
+        """Sends what was written, for up to `LINGER_S`, and closes; at once when the connection is stalled."""
+        if self._transport is None or self._outbox is None or self._transport.is_closing():
             return
         with contextlib.suppress(RuntimeError):  # the loop is closed
+            if self._outbox.is_stalled:
+                self._abort()
+                return
+            self._outbox.close()
             self._transport.close()
             if self._transport.get_write_buffer_size():
-                self._linger = self._loop.call_later(LINGER_S, self._transport.abort)
+                self._linger = self._loop.call_later(LINGER_S, self._abort)
+
+    def _abort(self) -> None:
+        """Without lingering the system forgets what it has not sent, instead of sending it when nobody waits for it."""
+        assert self._transport is not None
+        sock = self._transport.get_extra_info("socket")
+        with contextlib.suppress(OSError):
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        self._transport.abort()
 
     def connection_made(self, transport: Any) -> None:  # not every loop's is a Transport by its class
         self._transport = transport
         self.peer = transport.get_extra_info("peername") or f"client {id(self):#x}"  # it may be gone already
-        transport.set_write_buffer_limits(high=MAX_PENDING_BYTES, low=MAX_PENDING_BYTES // 2)
+        transport.set_write_buffer_limits(high=0)  # what it cannot get rid of at once waits in the outbox
         sock = transport.get_extra_info("socket")
         with contextlib.suppress(OSError):
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+            if hasattr(socket, "TCP_NOTSENT_LOWAT"):
+                sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, NOT_SENT_LOW_WATER)
+        self._fd = sock.fileno()
+        self._outbox = Outbox(
+            transport.write,
+            self._pending,
+            limit=MAX_PENDING_BYTES,
+            dropped=self._link._drop,
+            stalled=lambda is_stalled: self._link._stream_stalled(self, is_stalled),
+        )
         self._link._stream_begins(self)
 
     def data_received(self, data: bytes) -> None:
@@ -246,12 +301,23 @@ class _Stream(asyncio.Protocol):
         self._link._deliver(data, peer)
 
     def pause_writing(self) -> None:
-        self._paused = True
+        if self._outbox is not None:
+            self._outbox.pause()
 
     def resume_writing(self) -> None:
-        self._paused = False
+        if self._outbox is not None:
+            self._outbox.resume()
+
+    def _pending(self) -> int:
+        if self._transport is None or self._fd < 0:
+            return 0
+        return self._transport.get_write_buffer_size() + unsent_in_kernel(self._fd)
 
     def connection_lost(self, exc: Exception | None) -> None:
+        self._fd = -1  # another file may have the number soon
+        if self._outbox is not None:
+            self._outbox.discard()
+            self._outbox.close()
         if self._linger is not None:
             self._linger.cancel()
         self._link._stream_ends(self, exc)

@@ -21,7 +21,16 @@ from aerokit.runtime.background import Background
 from aerokit.runtime.bus import Bus, once
 from aerokit.runtime.deadlines import Deadlines
 from aerokit.runtime.endings import raisable
-from aerokit.runtime.events import Event, HeardTwice, LinkClosed, LinkInterrupted, LinkRestored, LoopBlocked
+from aerokit.runtime.events import (
+    Event,
+    HeardTwice,
+    LinkClosed,
+    LinkDrained,
+    LinkInterrupted,
+    LinkRestored,
+    LinkStalled,
+    LoopBlocked,
+)
 from aerokit.runtime.loop_watch import watch_loop
 from aerokit.runtime.recording import Recording
 from aerokit.runtime.routes import Routes
@@ -140,6 +149,22 @@ class Connection:
         frame = Frame.parse(bytes(data))
         known = self.bus.dialect.get(frame.message_id)
         self._write(frame.raw, None if known is None else self.bus.dialect.decode(frame), None)
+
+    @property
+    def unsent_bytes(self) -> int:
+        """Bytes that were sent and have not left this machine, as far as the link can tell: they may still arrive.
+
+        Above 0 for longer than a moment when a link does not drain (TCP without a network, a serial port that is held
+        up): :class:`LinkStalled`. 0 for UDP.
+        """
+        return self.link.unsent_bytes
+
+    def discard_unsent(self) -> None:
+        """Take back what was sent and has not left, as far as that is possible: an order that is not wanted any more.
+
+        All that waits goes, whoever it is for. What the system has of a TCP connection stays in :attr:`unsent_bytes`.
+        """
+        self.link.discard_unsent()
 
     @property
     def mavlink_version(self) -> int:
@@ -333,6 +358,14 @@ class Connection:
         for framer in self._framers.values():
             framer.begin_anew()
         self.bus.publish(LinkRestored(self._clock(), 0, away_s))
+
+    def link_stalled(self, unsent_bytes: int) -> None:
+        """What is written does not leave (called by the link)."""
+        self.bus.publish(LinkStalled(self._clock(), 0, unsent_bytes))
+
+    def link_drained(self, stalled_s: float) -> None:
+        """It does again (called by the link)."""
+        self.bus.publish(LinkDrained(self._clock(), 0, stalled_s))
 
     def link_lost(self, error: LinkLost) -> None:
         """The link has gone (called by the link): whatever waits ends with this error."""

@@ -19,9 +19,11 @@ __all__ = [
     "HeardTwice",
     "LandedStateChanged",
     "LinkClosed",
+    "LinkDrained",
     "LinkInterrupted",
     "LinkReport",
     "LinkRestored",
+    "LinkStalled",
     "LoopBlocked",
     "MissionCurrentChanged",
     "MissionFinished",
@@ -185,6 +187,22 @@ class LinkRestored(Event):
     """The link is there again after ``away_s`` seconds. Message rates are asked for again."""
 
     away_s: float
+
+
+class LinkStalled(Event):
+    """What was written has not left for a second; ``unsent_bytes`` wait, and an order among them may arrive late.
+
+    What has waited for a second in aerokit is dropped; what the system has taken (``connection.unsent_bytes``) is
+    beyond recall. :class:`LinkDrained` is the end of it, or the link's own end.
+    """
+
+    unsent_bytes: int
+
+
+class LinkDrained(Event):
+    """What is written leaves again, after ``stalled_s`` seconds."""
+
+    stalled_s: float
 
 
 class LinkClosed(Event):

@@ -100,6 +100,15 @@ class Connection:
         return self.aio.signing
 
     @property
+    def unsent_bytes(self) -> int:
+        """Bytes that were sent and have not left this machine; as :attr:`aerokit.Connection.unsent_bytes`."""
+        return self._loop.call(lambda: self.aio.unsent_bytes)
+
+    def discard_unsent(self) -> None:
+        """Take back what was sent and has not left; as :meth:`aerokit.Connection.discard_unsent`."""
+        self._loop.call(self.aio.discard_unsent)
+
+    @property
     def is_open(self) -> bool:
         """Whether messages can still be sent and received."""
         return self.aio.is_open

@@ -1,0 +1,396 @@
+"""What a transport does not take: bounded in bytes and seconds, told, and taken back where that is possible."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import socket
+import sys
+from collections.abc import AsyncIterator, Iterator
+
+import anyio
+import pytest
+from far_end import far_end
+from link_harness import Recorder, each_loop, eventually
+
+from aerokit import events, messages, open_connection
+from aerokit.links import FaultyLink, Link, ReconnectingLink, SerialLink, TcpConnect, memory_link_pair, outbox
+from aerokit.links.outbox import WRITE_DEADLINE_S, Outbox
+from aerokit.runtime.connection import Connection
+
+pytestmark = pytest.mark.anyio
+
+COMMAND = messages.CommandLong(1, 1, 400, 0, *(0.0,) * 7)
+on_linux = pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells what the system has not sent")
+
+
+class Line:
+    """A transport that takes ``room`` bytes and sends none of them until ``flow`` is called."""
+
+    def __init__(self, room: int, limit: int = 100) -> None:
+        self.sent: list[bytes] = []
+        self.pending, self.room, self.dropped = 0, room, 0
+        self.told: list[bool] = []
+        self.outbox = Outbox(
+            self._take, lambda: self.pending, limit=limit, dropped=self._drop, stalled=self.told.append
+        )
+
+    def _take(self, data: bytes) -> None:
+        self.sent.append(data)
+        self.pending += len(data)
+        if self.pending >= self.room:
+            self.outbox.pause()
+
+    def _drop(self, writes: int) -> None:
+        self.dropped += writes
+
+    def flow(self) -> None:
+        self.pending = 0
+        self.outbox.resume()
+
+
+async def test_what_the_transport_takes_goes_through_at_once_and_no_timer_stays() -> None:
+    line = Line(room=1000)
+    line.outbox.write(b"one")
+    line.outbox.write(b"two")
+    assert line.sent == [b"one", b"two"]
+    assert line.outbox.unsent_bytes == 6
+    line.flow()
+    await anyio.sleep(0.5)
+    assert line.outbox._timer is None
+    await anyio.sleep(100)
+    assert line.told == []
+
+
+async def test_what_is_kept_goes_out_in_order_whole_and_together() -> None:
+    line = Line(room=1)
+    for word in (b"a", b"bb", b"ccc"):
+        line.outbox.write(word)
+    assert (line.sent, line.outbox.unsent_bytes) == ([b"a"], 6)
+    line.flow()
+    assert (line.sent, line.dropped) == ([b"a", b"bbccc"], 0)
+
+
+async def test_no_more_is_kept_than_the_limit() -> None:
+    line = Line(room=1, limit=100)
+    for _ in range(1000):
+        line.outbox.write(bytes(30))
+    assert line.outbox.unsent_bytes == 30 + 90
+    assert line.dropped == 1000 - 4
+
+
+async def test_nothing_is_written_that_has_waited_for_a_second() -> None:
+    line = Line(room=1)
+    line.outbox.write(b"taken")
+    line.outbox.write(b"too late")
+    await anyio.sleep(WRITE_DEADLINE_S - 0.1)
+    line.outbox.write(b"in time")
+    await anyio.sleep(0.11)
+    line.flow()
+    assert (line.sent, line.dropped) == ([b"taken", b"in time"], 1)
+
+
+async def test_late_writes_are_given_up_without_any_other_write() -> None:
+    line = Line(room=1)
+    line.outbox.write(b"taken")
+    line.outbox.write(b"too late")
+    await anyio.sleep(2)
+    assert (line.dropped, line.outbox.unsent_bytes) == (1, 5)
+
+
+async def test_a_line_that_does_not_drain_is_told_once_and_gets_nothing_more() -> None:
+    """The system takes more for a long while: what it has is beyond recall, so it is not given any more."""
+    line = Line(room=1000)
+    for _ in range(5):
+        line.outbox.write(b"heartbeat")
+        await anyio.sleep(0.9)
+    assert line.told == [True]
+    assert len(line.sent) == 2
+    line.flow()
+    await anyio.sleep(0.3)
+    assert line.told == [True, False]
+    await anyio.sleep(0.1)
+    line.outbox.write(b"again")
+    assert line.sent[-1] == b"again"
+
+
+async def test_a_slow_line_is_no_stalled_line() -> None:
+    line = Line(room=10_000)
+    for _ in range(200):
+        line.outbox.write(bytes(10))
+        line.pending -= min(line.pending, 6)
+        await anyio.sleep(0.1)
+    assert line.told == []
+
+
+async def test_what_is_taken_back_never_leaves() -> None:
+    line = Line(room=1)
+    line.outbox.write(b"taken")
+    line.outbox.write(b"order")
+    line.outbox.discard()
+    assert (line.outbox.unsent_bytes, line.dropped) == (5, 1)
+    line.flow()
+    assert line.sent == [b"taken"]
+
+
+async def test_taking_back_is_no_progress() -> None:
+    line = Line(room=1000)
+    for _ in range(8):
+        line.outbox.write(b"x" * 10)
+        await anyio.sleep(0.2)
+        line.pending -= 5
+        line.outbox.taken_back(5)
+    assert line.told == [True]
+
+
+async def test_closed_a_stalled_one_gives_the_transport_nothing_more() -> None:
+    line = Line(room=1)
+    line.outbox.write(b"taken")
+    await anyio.sleep(1.5)
+    line.outbox.write(b"order")
+    line.outbox.close()
+    line.outbox.write(b"more")
+    assert (line.sent, line.dropped) == ([b"taken"], 2)
+
+
+async def test_closed_the_others_give_it_what_is_in_time() -> None:
+    line = Line(room=1)
+    line.outbox.write(b"taken")
+    line.outbox.write(b"in time")
+    line.outbox.close()
+    assert line.sent == [b"taken", b"in time"]
+
+
+# --------------------------------------------------------------------- a connection, on virtual time
+
+
+@pytest.fixture
+async def radio() -> FaultyLink:
+    near, far = memory_link_pair()
+    await far.open(Recorder())
+    near.far_end = far  # type: ignore[attr-defined]
+    return FaultyLink(near)
+
+
+def heard_by(radio: FaultyLink) -> Recorder:
+    recorder = radio.link.far_end._receiver  # type: ignore[attr-defined]
+    assert isinstance(recorder, Recorder)
+    return recorder
+
+
+@pytest.fixture
+async def connection(radio: FaultyLink) -> AsyncIterator[Connection]:
+    async with open_connection(radio) as connection:
+        await anyio.sleep(0.5)
+        yield connection
+
+
+async def test_a_connection_tells_that_its_link_stalls_and_that_it_drains(
+    radio: FaultyLink, connection: Connection
+) -> None:
+    told: list[events.Event] = []
+    connection.bus.attach_event(events.LinkStalled, told.append)
+    connection.bus.attach_event(events.LinkDrained, told.append)
+    radio.stall()
+    connection.send(COMMAND)
+    assert connection.unsent_bytes == radio.unsent_bytes > 0
+    await anyio.sleep(4)
+    assert [type(each) for each in told] == [events.LinkStalled]
+    radio.drain()
+    await anyio.sleep(1)
+    assert isinstance(told[-1], events.LinkDrained)
+    assert told[-1].stalled_s == pytest.approx(3, abs=0.6)
+    assert connection.unsent_bytes == 0
+
+
+async def test_an_order_in_a_stall_does_not_arrive_after_it(
+    radio: FaultyLink, connection: Connection
+) -> None:
+    before = heard_by(radio).data
+    radio.stall()
+    connection.send(COMMAND)
+    await anyio.sleep(1.5)
+    assert radio.dropped_writes >= 1
+    radio.drain()
+    await anyio.sleep(0.01)
+    assert COMMAND.encode()[:20] not in heard_by(radio).data[len(before) :]
+
+
+async def test_an_order_that_is_taken_back_does_not_arrive(radio: FaultyLink, connection: Connection) -> None:
+    before = heard_by(radio).data
+    radio.stall()
+    connection.send(COMMAND)
+    connection.discard_unsent()
+    assert connection.unsent_bytes == 0
+    radio.drain()
+    await anyio.sleep(0.1)
+    assert heard_by(radio).data == before
+
+
+async def test_what_the_system_has_taken_is_told_and_arrives_late(
+    radio: FaultyLink, connection: Connection
+) -> None:
+    before = heard_by(radio).data
+    radio.stall(system_bytes=40)
+    connection.send(COMMAND)
+    connection.discard_unsent()
+    await anyio.sleep(7)
+    assert connection.unsent_bytes >= 40
+    radio.drain()
+    await anyio.sleep(0.1)
+    assert len(heard_by(radio).data) > len(before)
+    await anyio.sleep(0.2)
+    assert connection.unsent_bytes == 0
+
+
+async def test_a_reconnecting_link_passes_all_of_it_on(radio: FaultyLink) -> None:
+    async with open_connection(ReconnectingLink(lambda: radio)) as connection:
+        told: list[events.Event] = []
+        connection.bus.attach_event(events.LinkStalled, told.append)
+        connection.bus.attach_event(events.LinkDrained, told.append)
+        radio.stall()
+        await anyio.sleep(2.9)
+        assert connection.unsent_bytes > 0
+        connection.discard_unsent()
+        assert connection.unsent_bytes == 0
+        radio.drain()
+        await anyio.sleep(0.5)
+        assert [type(each) for each in told] == [events.LinkStalled, events.LinkDrained]
+
+
+async def test_links_that_know_nothing_of_it_have_nothing_unsent() -> None:
+    near, _ = memory_link_pair()
+    assert Link.unsent_bytes.fget(near) == 0  # type: ignore[attr-defined]
+    near.discard_unsent()
+
+
+# ----------------------------------------------------------------------------- TCP and serial
+
+
+@pytest.fixture
+def deaf() -> Iterator[socket.socket]:
+    """A server whose connections have a small buffer."""
+    with socket.socket() as server:
+        server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        server.bind(("127.0.0.1", 0))
+        server.listen()
+        yield server
+
+
+class Listener(Recorder):
+    def __init__(self) -> None:
+        super().__init__()
+        self.told: list[bool] = []
+
+    def link_stalled(self, unsent_bytes: int) -> None:
+        assert unsent_bytes > 0
+        self.told.append(True)
+
+    def link_drained(self, stalled_s: float) -> None:
+        self.told.append(False)
+
+
+async def read_until(connection: socket.socket, mark: bytes) -> bytes:
+    data = b""
+    while not data.endswith(mark):
+        data += await asyncio.get_running_loop().sock_recv(connection, 65536)
+    return data
+
+
+async def fill(link: TcpConnect | SerialLink, frame: bytes) -> int:
+    """Write until something waits with us; the number of frames that were taken before."""
+    for count in range(1000):
+        link.write(frame)
+        stream = next(iter(link._streams)) if isinstance(link, TcpConnect) else link
+        if stream._outbox is not None and stream._outbox._waiting:
+            return count
+        await asyncio.sleep(0)
+    raise AssertionError("it takes whatever is written")
+
+
+@on_linux
+@each_loop
+async def test_little_of_a_tcp_connection_that_stalls_is_beyond_recall(deaf: socket.socket) -> None:
+    client = TcpConnect(*deaf.getsockname())
+    await client.open(Recorder())
+    connection, _ = deaf.accept()
+    with connection:
+        connection.setblocking(False)
+        taken = await fill(client, b"\xfd" * 280)
+        assert taken * 280 <= 64 * 1024
+        assert client.unsent_bytes > 280
+        client.write(b"an order")
+        dropped = client.dropped_writes
+        client.discard_unsent()
+        assert client.dropped_writes == dropped + 2
+        drained = asyncio.ensure_future(read_until(connection, b"after"))
+        await eventually(lambda: not client.unsent_bytes)
+        client.write(b"after")
+        data = await drained
+        assert data == b"\xfd" * (280 * taken) + b"after"
+        client.close()
+        await client.wait_closed()
+
+
+@on_linux
+@each_loop
+async def test_a_tcp_connection_that_does_not_drain_is_told_until_it_does(
+    deaf: socket.socket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(outbox, "STALLED_AFTER_S", 0.0)
+    monkeypatch.setattr(outbox, "_LOOK_EVERY_S", 0.001)
+    client, listener = TcpConnect(*deaf.getsockname()), Listener()
+    await client.open(listener)
+    connection, _ = deaf.accept()
+    with connection:
+        connection.setblocking(False)
+        await fill(client, bytes(280))
+        await eventually(lambda: listener.told[:1] == [True])
+        reading = asyncio.ensure_future(read_until(connection, b"never"))
+        await eventually(lambda: listener.told[-1:] == [False] and not client.unsent_bytes)
+        reading.cancel()
+        client.close()
+        await client.wait_closed()
+
+
+@on_linux
+@each_loop
+async def test_a_stalled_tcp_connection_that_is_closed_takes_its_bytes_with_it(
+    deaf: socket.socket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(outbox, "STALLED_AFTER_S", 0.0)
+    monkeypatch.setattr(outbox, "_LOOK_EVERY_S", 0.001)
+    client, listener = TcpConnect(*deaf.getsockname()), Listener()
+    await client.open(listener)
+    connection, _ = deaf.accept()
+    with connection:
+        await fill(client, bytes(280))
+        await eventually(lambda: listener.told[-1:] == [True])
+        client.close()
+        await client.wait_closed()
+        with pytest.raises(ConnectionResetError):
+            while connection.recv(65536):
+                pass
+
+
+@on_linux
+@pytest.mark.skipif(os.name != "posix", reason="needs pseudo-terminals")
+@each_loop
+async def test_what_waits_for_a_serial_line_can_be_taken_back() -> None:
+    with far_end() as far:
+        link = SerialLink(far.device, 57600)
+        await link.open(Recorder())
+        await fill(link, bytes(280))
+        link.write(b"an order")
+        assert link.unsent_bytes > 280
+        link.discard_unsent()
+        assert link._outbox is not None
+        assert not link._outbox._waiting
+        assert link._transport.get_write_buffer_size() == 0
+        far.reads()
+        await eventually(lambda: not link.unsent_bytes and far.heard.pieces != [])
+        link.write(b"after")
+        await far.heard.until(lambda: far.heard.data.endswith(b"after"))
+        assert b"an order" not in far.heard.data
+        link.close()
+        await link.wait_closed()
