@@ -181,7 +181,7 @@ class Outbox:
 
 
 def unsent_in_kernel(fd: int) -> int:
-    """Bytes of a socket or terminal that the system still has: not sent, or not acknowledged. 0 where it does not say."""
+    """Bytes of a socket or terminal that the system still has, unsent or not acknowledged; 0 where it does not say."""
     if sys.platform != "linux":
         return 0
     import fcntl
