@@ -235,5 +235,5 @@ def test_a_program_with_calls_that_timed_out_ends() -> None:
         )
     told = ["connected", "timeout", "timeout", "timeout", "cancelled", "left", "done"]
     assert finished.stdout.split() == told, finished.stderr
-    assert finished.stderr == ""
+    assert "an order to arm may still be carried out" in finished.stderr  # it never was answered
     assert finished.returncode == 0

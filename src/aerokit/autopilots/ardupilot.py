@@ -65,6 +65,7 @@ class ArduPilot(Autopilot):
     mission_download_window = 10
     writes_partial_missions = True
     replaced_as_they_come = frozenset((0, 2))
+    completes_at_home = True
     mission_starts_by_command = True
     sets_current_by_command = True
     takes_file_sessions = True
@@ -122,6 +123,7 @@ class ArduCopter(ArduPilot):
     condition_yaw = True
     changes_speed = True
     lands_after_return = True
+    arming_mode = "GUIDED"
     unarmable_modes = frozenset(
         (
             *(
@@ -168,6 +170,8 @@ class ArduPlane(ArduPilot):
     reposition = Reposition(relative_altitude=True, yaw=False, speed=False, armed_only=False)
     changes_speed = True
     arrival_radius_m = 90.0  # it circles at WP_LOITER_RAD, 60 m by default
+    arming_mode = "FBWA"  # the throttle is the pilot's: armed in TAKEOFF it would start
+    unarmable_modes = frozenset(("AUTOLAND", "INITIALISING", "QLAND", "QRTL", "RTL"))
 
     def _purpose_name(self, purpose: Purpose, is_vtol: bool) -> str | None:
         if self._can_hover(is_vtol) and purpose in _QUADPLANE:
@@ -210,6 +214,7 @@ class ArduRover(ArduPilot):
     reposition = Reposition(relative_altitude=True, yaw=False, speed=False, armed_only=False)
     changes_speed = True
     arrival_radius_m = 4.0
+    arming_mode = "HOLD"
     unarmable_modes = frozenset(("RTL", "SMART_RTL", "INITIALISING"))
 
     def _purpose_name(self, purpose: Purpose, is_vtol: bool) -> str | None:

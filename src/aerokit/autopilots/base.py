@@ -137,6 +137,8 @@ class Autopilot:
     """Whether MISSION_CURRENT tells the checksum of the items it holds."""
     replaced_as_they_come: frozenset[int] = frozenset((0, 1, 2))
     """MAV_MISSION_TYPEs whose old items are overwritten while new ones come; the others keep theirs until the end."""
+    completes_at_home = False
+    """Whether it calls a mission that ends with a return complete when it is back, not when the return begins."""
     mission_starts_by_command = False
     """Whether MAV_CMD_MISSION_START (300) starts the mission, also on the ground, and arms nothing."""
     sets_current_by_command = False
@@ -168,7 +170,11 @@ class Autopilot:
     landing_ends_in: ClassVar[str | None] = None
     """The mode that it goes to by itself when its mode for landing is done; None: it stays there."""
     unarmable_modes: frozenset[str] = frozenset()
-    """Modes in which the autopilot refuses to arm."""
+    """Modes in which the autopilot refuses to arm, or disarms by itself at once."""
+    judges_by_mode = False
+    """Whether SYS_STATUS tells if it could be armed in its present mode, not if it could be armed at all."""
+    arming_mode: ClassVar[str | None] = None
+    """The mode to arm in where the present one cannot be armed: one in which nothing begins to move by itself."""
 
     def __init__(self, vehicle_type: int) -> None:
         self.vehicle_type = vehicle_type
@@ -207,6 +213,10 @@ class Autopilot:
     def mode_order(self, mode: Mode) -> ModeOrder:
         """How to ask for a mode."""
         return ModeOrder((CUSTOM_MODE_ENABLED, mode.custom_mode, 0), CUSTOM_MODE_ENABLED, mode.custom_mode)
+
+    def mode_to_arm_in(self) -> Mode | None:
+        """Where to arm a vehicle that stands in a mode in which it does not arm; None: not known."""
+        return None if self.arming_mode is None else self.modes.find(self.arming_mode)
 
     def learn_mode_name(self, custom_mode: int, name: str) -> str | None:
         """The name to remember for an entry of AVAILABLE_MODES; None when it tells nothing new."""

@@ -99,6 +99,11 @@ class Px4(Autopilot):
     has_parameter_hash = True
     unknown_currents_ca = frozenset((-1, -100))  # inside PX4, −1 A is "unknown"
     reposition_purpose = "hold"
+    judges_by_mode = True
+    arming_mode = "LOITER"
+    unarmable_modes = frozenset(
+        ("LAND", "OFFBOARD", "PRECLAND", "RTL", "TERMINATION")
+    )  # OFFBOARD: without set-points
     purposes: ClassVar[Mapping[str, str]] = {
         "hold": "LOITER",
         "land": "LAND",

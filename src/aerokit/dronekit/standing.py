@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import math
 import time
 from collections import deque
 from typing import TYPE_CHECKING, Any
@@ -100,10 +101,12 @@ class Standing:
         self.is_done = False
         """Whether HEARTBEAT has told its effect: a change to it."""
         self._is_taken_over = False
+        self.told_at = -math.inf
+        """When HEARTBEAT came last."""
 
     def holds(self) -> bool:
         """Whether it may be sent again."""
-        return not self.is_done and not self._is_taken_over and self._is_newest()
+        return not self.end
 
     @property
     def end(self) -> str:
@@ -124,6 +127,7 @@ class Standing:
         def take(heartbeat: Heartbeat) -> None:
             frame = heartbeat.received_frame
             if frame is not None and frame.component_id == vehicle.component_id and is_autopilot(heartbeat):
+                self.told_at = frame.received_at
                 self._take(*_state(heartbeat))
 
         detach = vehicle.connection.bus.attach(Heartbeat, take, system_id=vehicle.system_id)
@@ -160,12 +164,10 @@ async def send_while_standing(
         CommandTimeout: there was no answer; the text says so when it was not sent again for a reason.
     """
     try:
-        await vehicle._answered(send, command, *params, component_id=0, may_repeat=standing.holds, **options)
-    except CommandTimeout as error:
+        await vehicle._answered(send, command, *params, component_id=0, standing=standing, **options)
+    except CommandTimeout:
         if standing.is_done:
             return
-        if standing.end:
-            raise CommandTimeout(f"{error}; not sent again: {standing.end}") from None
         raise
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from aerokit.errors import CommandRejected, CommandTimeout, LocalProtocolError
 from aerokit.mavlink.messages import CommandAck, CommandInt, CommandLong
@@ -14,11 +14,29 @@ if TYPE_CHECKING:
 
     from aerokit.mavlink.message import Message
 
-__all__ = ["CommandExchange", "command_int", "command_long", "command_name", "result_name"]
+__all__ = ["CommandExchange", "Standing", "command_int", "command_long", "command_name", "result_name"]
 
 ACCEPTED, IN_PROGRESS = 0, 5
 BROADCAST = 0
 FLOAT32_MAX = 3.4028234663852886e38
+LOOK_S = 0.05
+"""So often it is looked whether the vehicle has told what it does, once an order may be sent again."""
+SOONEST = 0.75
+"""After this part of ``attempt_timeout``: heartbeats come at 1 Hz, and none should be missed by a hair's breadth."""
+
+
+class Standing(Protocol):
+    """What has been heard of an order since it was sent, for whoever would send it again."""
+
+    @property
+    def end(self) -> str:
+        """Why it must not be sent again, as a clause; empty while it may."""
+        ...
+
+    @property
+    def told_at(self) -> float:
+        """When the vehicle last told what it does (HEARTBEAT), on the clock of the exchange."""
+        ...
 
 
 def command_long(
@@ -78,7 +96,13 @@ class CommandExchange(Exchange[CommandAck]):
     and is reported to ``on_progress`` (0–100, None when the vehicle does not say). An ack for another ground station
     is not ours, nor is one of another component than the target; nor are the first ``answers_before_ours``: those to
     an earlier command of the same number that was abandoned. If they do not come after all, the command is sent
-    again, and then every ack counts. It is sent again only while ``may_repeat()``, which is asked each time.
+    again, and then every ack counts.
+
+    A question (no ``standing``) is sent again every ``attempt_timeout`` seconds. An order is sent again only right
+    after the vehicle has told what it does, and only if that speaks neither of the order's effect nor of somebody
+    else's: so never into a silence.
+
+    ``is_sent``: it has been sent once, just before :meth:`start`.
 
     Raises from ``result()``:
         CommandRejected: any other result; the vehicle's reasons are added by those who see its status texts.
@@ -98,7 +122,8 @@ class CommandExchange(Exchange[CommandAck]):
         progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
         answers_before_ours: int = 0,
-        may_repeat: Callable[[], bool] | None = None,
+        standing: Standing | None = None,
+        is_sent: bool = False,
     ) -> None:
         super().__init__()
         if attempts < 1:
@@ -111,16 +136,19 @@ class CommandExchange(Exchange[CommandAck]):
         self._attempts, self._attempt_timeout = attempts, attempt_timeout
         self._progress_timeout, self._on_progress = progress_timeout, on_progress
         self._answers_before_ours = answers_before_ours
-        self._may_repeat = may_repeat
+        self._standing = standing
+        self._is_sent = is_sent
         self._sent = 0
         self._answers = 0
-        self._started = 0.0
+        self._started = self._sent_at = 0.0
         self._in_progress = False
 
     def start(self, now: float) -> None:
         """Send the command for the first time."""
         self._started = now
         self._send(now)
+        if self._is_sent:
+            self._outbox.clear()
 
     def receive(self, message: Message, now: float) -> None:
         """Take a COMMAND_ACK of the target; others are ignored."""
@@ -146,16 +174,40 @@ class CommandExchange(Exchange[CommandAck]):
         """Send again, or give up after the last attempt or when a command in progress has gone silent."""
         if self.done or self.deadline is None or now < self.deadline:
             return
-        is_last = self._in_progress or self._sent >= self._attempts
-        if is_last or (self._may_repeat is not None and not self._may_repeat()):
+        if self._in_progress:
             self._fail(CommandTimeout(self._timeout_text(now)))
-        else:
+        elif self._standing is not None:
+            self._expire_order(self._standing, now)
+        elif self._sent < self._attempts:
             self._send(now)
+        else:
+            self._fail(CommandTimeout(self._timeout_text(now)))
+
+    def _expire_order(self, standing: Standing, now: float) -> None:
+        """Send it again if it still stands, as soon as the vehicle has told so; until its time is up."""
+        until = self._started + self._attempts * self._attempt_timeout
+        if self._sent < self._attempts:
+            if standing.end:
+                self._fail(CommandTimeout(f"{self._timeout_text(now)}; not sent again: {standing.end}"))
+                return
+            if standing.told_at >= self._sent_at + SOONEST * self._attempt_timeout:
+                self._send(now)
+                return
+        if now >= until:
+            is_silent = self._sent < self._attempts
+            why = "; not sent again: the vehicle has not told since what it does" if is_silent else ""
+            self._fail(CommandTimeout(self._timeout_text(now) + why))
+        else:
+            self.deadline = min(now + LOOK_S, until)
 
     def _send(self, now: float) -> None:
         self._outbox.append(self._numbered(self._sent))
         self._sent += 1
-        self.deadline = now + self._attempt_timeout
+        self._sent_at = now
+        wait_s = self._attempt_timeout
+        if self._standing is not None:
+            wait_s *= SOONEST if self._sent < self._attempts else 1
+        self.deadline = now + wait_s
 
     def _numbered(self, confirmation: int) -> Message:
         """COMMAND_LONG counts its resends; COMMAND_INT has no field for it."""

@@ -6,6 +6,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Generic, TypeVar
 
 from aerokit.sync.cells import StateCell
+from aerokit.vehicle.progress import LONGEST_SILENCE_S
 
 if TYPE_CHECKING:
     from aerokit.missions import Fence, Mission, RallyPoints  # noqa: F401 - named in the base classes below
@@ -118,9 +119,11 @@ class MissionControl(HeldPlan["Mission"]):
         """Go on with the mission; see :meth:`aerokit.vehicle.mission.MissionControl.resume`."""
         self._loop.run(self._mission.resume, timeout=timeout)
 
-    def wait_finished(self, *, timeout: float | None = None) -> None:
+    def wait_finished(
+        self, *, timeout: float | None = None, max_silence_s: float | None = LONGEST_SILENCE_S
+    ) -> None:
         """Wait until the mission has been flown; see :meth:`aerokit.vehicle.mission.MissionControl.wait_finished`."""
-        self._loop.run(self._mission.wait_finished, timeout=timeout)
+        self._loop.run(self._mission.wait_finished, timeout=timeout, max_silence_s=max_silence_s)
 
 
 class FenceControl(HeldPlan["Fence"]):

@@ -20,6 +20,7 @@ from aerokit.sync.parameters import Parameters
 from aerokit.sync.state import VehicleState
 from aerokit.sync.subscription import Subscription
 from aerokit.vehicle.connect import connect as connect_async
+from aerokit.vehicle.progress import LONGEST_SILENCE_S
 
 if TYPE_CHECKING:
     import os
@@ -157,17 +158,23 @@ class Vehicle(VehicleState):
         """Change the flight mode and wait until HEARTBEAT tells it; see :meth:`aerokit.Vehicle.set_mode`."""
         self._loop.run(self.aio.set_mode, mode, timeout=timeout)
 
-    def arm(self, *, force: bool = False, timeout: float = 10.0) -> None:
+    def arm(self, *, mode: str | int | None = None, force: bool = False, timeout: float = 10.0) -> None:
         """Arm the motors: **propellers may start to turn**; see :meth:`aerokit.Vehicle.arm`."""
-        self._loop.run(self.aio.arm, force=force, timeout=timeout)
+        self._loop.run(self.aio.arm, mode=mode, force=force, timeout=timeout)
 
     def disarm(self, *, force: bool = False, timeout: float = 10.0) -> None:
         """Stop the motors (``force``: also in the air, **it falls**); see :meth:`aerokit.Vehicle.disarm`."""
         self._loop.run(self.aio.disarm, force=force, timeout=timeout)
 
-    def take_off(self, altitude_m: float, *, timeout: float = 60.0) -> None:
+    def take_off(
+        self,
+        altitude_m: float,
+        *,
+        timeout: float = 60.0,
+        max_silence_s: float | None = LONGEST_SILENCE_S,
+    ) -> None:
         """Take off and climb to ``altitude_m`` metres above home; see :meth:`aerokit.Vehicle.take_off`."""
-        self._loop.run(self.aio.take_off, altitude_m, timeout=timeout)
+        self._loop.run(self.aio.take_off, altitude_m, timeout=timeout, max_silence_s=max_silence_s)
 
     def go_to(
         self,
@@ -177,6 +184,7 @@ class Vehicle(VehicleState):
         heading_deg: float | None = None,
         tolerance_m: float | None = None,
         timeout: float | None = None,
+        max_silence_s: float | None = LONGEST_SILENCE_S,
     ) -> None:
         """Fly to a place and return on arrival; see :meth:`aerokit.Vehicle.go_to`."""
         self._loop.run(
@@ -186,15 +194,18 @@ class Vehicle(VehicleState):
             heading_deg=heading_deg,
             tolerance_m=tolerance_m,
             timeout=timeout,
+            max_silence_s=max_silence_s,
         )
 
-    def land(self, *, timeout: float | None = 300.0) -> None:
+    def land(self, *, timeout: float | None = 300.0, max_silence_s: float | None = LONGEST_SILENCE_S) -> None:
         """Land where the vehicle is; see :meth:`aerokit.Vehicle.land`."""
-        self._loop.run(self.aio.land, timeout=timeout)
+        self._loop.run(self.aio.land, timeout=timeout, max_silence_s=max_silence_s)
 
-    def return_to_launch(self, *, timeout: float | None = 600.0) -> None:
+    def return_to_launch(
+        self, *, timeout: float | None = 600.0, max_silence_s: float | None = LONGEST_SILENCE_S
+    ) -> None:
         """Return to the launch place; see :meth:`aerokit.Vehicle.return_to_launch`."""
-        self._loop.run(self.aio.return_to_launch, timeout=timeout)
+        self._loop.run(self.aio.return_to_launch, timeout=timeout, max_silence_s=max_silence_s)
 
     def hold(self) -> None:
         """Stop and stay; see :meth:`aerokit.Vehicle.hold`."""

@@ -2,12 +2,26 @@
 
 from __future__ import annotations
 
+import logging
+from typing import TYPE_CHECKING, Any
+
 import anyio
 
-from aerokit.errors import CommandRejected, OperationRejected, OperationTimeout
+from aerokit.errors import (
+    AerokitError,
+    CommandRejected,
+    CommandTimeout,
+    LocalProtocolError,
+    OperationRejected,
+    OperationTimeout,
+)
 from aerokit.vehicle.checks import check_seconds
-from aerokit.vehicle.modes import ModeActions
+from aerokit.vehicle.holding import HoldingActions
 from aerokit.vehicle.progress import await_progress
+
+if TYPE_CHECKING:
+    from aerokit.autopilots import Mode
+    from aerokit.vehicle.orders import Order
 
 __all__ = ["ArmingActions"]
 
@@ -19,13 +33,30 @@ SAID_AGAIN_S = 35.0
 """ArduPilot says every 30 s why it would not arm."""
 LOOK_S = 0.1
 """So often it is looked whether a vehicle is back."""
+LATE_S = 15.0
+"""For so long after an order to arm was given up the vehicle is watched, and disarmed if it arms after all."""
+ARMING_AT_END_S = 1.5
+"""How long the end of a block waits for it."""
+BOOTING = (0, 1, 2)
+"""MAV_STATE: unknown, booting, calibrating."""
+REBOOT_ANSWER_S = 3.0
+READY_IN_MODE_S = 3.0
+"""How long a vehicle that was put into another mode may take to be ready in it."""
+
+logger = logging.getLogger("aerokit")
 
 
-class ArmingActions(ModeActions):
+class ArmingActions(HoldingActions):
     """From standing there to running motors, and back."""
+
+    _late_arming: anyio.CancelScope | None = None
+    _late_arming_is_over: anyio.Event | None = None
 
     async def wait_ready(self, *, timeout: float = 90.0) -> None:
         """Wait until position and home are known, the estimator is healthy and the pre-arm checks pass.
+
+        The mode does not count: :meth:`arm` leaves one in which the vehicle does not arm. :meth:`why_not_armable`
+        names it.
 
         Raises:
             OperationTimeout: not within ``timeout`` seconds; the text says what is still missing, and what the vehicle
@@ -38,33 +69,53 @@ class ArmingActions(ModeActions):
                 await anyio.sleep(0.2)
             return
         said = dict.fromkeys(self._arming_texts(self.connection.now() - SAID_AGAIN_S))
-        missing = "\n  - ".join([*self.missing_for_flight(), *said] or ["nothing any more"])
+        still = [*self.missing_for_flight(), *said] or ["nothing any more"]
+        missing = "\n  - ".join([*still, *self._unarmable_mode()])
         raise OperationTimeout(
             f"the vehicle was not ready within {timeout:g} s ({self.describe_link()}); still missing:\n  - {missing}"
         )
 
-    async def arm(self, *, force: bool = False, timeout: float = 10.0) -> None:
+    async def arm(self, *, mode: str | int | None = None, force: bool = False, timeout: float = 10.0) -> None:
         """Arm the motors and wait until HEARTBEAT says armed: **propellers may start to turn**.
 
-        Cancelled, the vehicle may arm all the same: the order is out.
+        A vehicle that stands in a mode in which it does not arm (RTL or LAND after a flight, OFFBOARD) is put into
+        another one first. Cancelled, or without an answer, the order may still be carried out: for 15 seconds the
+        vehicle is watched, and disarmed if it arms, as long as the connection is there; a warning of logger
+        "aerokit" says what came of it.
 
         Args:
+            mode: where to arm; None: the present mode, or one that ``take_off`` begins in if it cannot be armed there.
             force: skip the vehicle's own arming checks. Dangerous.
             timeout: seconds for HEARTBEAT to say so after the command was accepted.
 
         Raises:
+            LocalProtocolError: there is no such mode, or the vehicle does not arm in it. Nothing was sent.
             CommandRejected: the vehicle refused; ``reasons`` has its pre-arm texts, failing sensors and what the
                 estimator lacks. They are asked for again where the vehicle can run its checks on request.
+            CommandTimeout: there was no answer; the text says whether the order may still arrive.
+            OperationRejected: somebody else has disarmed it, or changed its mode, meanwhile.
             OperationTimeout: it accepted and did not arm.
         """
         check_seconds("timeout", timeout)
+        wanted = self._mode_to_arm_in(mode)
+        if wanted is not None:
+            await self._ensure_mode(wanted, self._helm.order(wanted))
+            await self._settle_in_mode()
+        self._stop_watching_arming()
         started = self.connection.now()
-        try:
-            await self._commands.send_long(COMPONENT_ARM_DISARM, 1, FORCE if force else 0)
-        except CommandRejected as error:
-            reasons = await self._arming_reasons(started)
-            raise self._explained(error, started, reasons) from None
-        await self._await_armed(True, started, timeout)
+        with self._helm.aside() as order:
+            try:
+                await self._give_arm(order, True, force)
+                await self._await_armed(True, order, started, timeout)
+            except CommandRejected as error:
+                reasons = await self._arming_reasons(started)
+                raise self._explained(error, started, reasons) from None
+            except CommandTimeout as error:
+                self._watch_for_late_arming()
+                raise CommandTimeout(f"{error}; {self._may_still_arm()}") from None
+            except (anyio.get_cancelled_exc_class(), OperationTimeout):
+                self._watch_for_late_arming()
+                raise
 
     async def disarm(self, *, force: bool = False, timeout: float = 10.0) -> None:
         """Stop the motors and wait until HEARTBEAT says disarmed.
@@ -75,27 +126,116 @@ class ArmingActions(ModeActions):
 
         Raises:
             CommandRejected: the vehicle refused, usually because it flies.
+            CommandTimeout: there was no answer.
             OperationTimeout: it accepted and did not disarm.
         """
         check_seconds("timeout", timeout)
+        self._stop_watching_arming()
         started = self.connection.now()
-        try:
-            await self._commands.send_long(COMPONENT_ARM_DISARM, 0, FORCE if force else 0)
-        except CommandRejected as error:
-            await self._settle()
-            raise self._explained(error, started) from None
-        await self._await_armed(False, started, timeout)
+        with self._helm.aside() as order:
+            await self._give_arm(order, False, force)
+            await self._await_armed(False, order, started, timeout)
 
-    async def _await_armed(self, armed: bool, started: float, timeout: float) -> None:
+    async def _give_arm(self, order: Order, armed: bool, force: bool) -> None:
+        await self._give(
+            order,
+            self._commands.send_long,
+            COMPONENT_ARM_DISARM,
+            float(armed),
+            FORCE if force else 0,
+            armed=armed,
+        )
+
+    async def _await_armed(self, armed: bool, order: Order, started: float, timeout: float) -> None:
         cell = self.telemetry.armed
         await await_progress(
             self,
             "arm()" if armed else "disarm()",
             is_done=lambda: cell.latest is armed and cell.updated_at > started,
-            trouble=lambda: None,
+            trouble=lambda: order.taken_by if armed else None,
             describe=lambda: "; ".join(self.texts_since(started)) or "the vehicle said nothing about it",
             timeout=timeout,
         )
+
+    # ------------------------------------------------------------------------ where it arms
+
+    def _mode_to_arm_in(self, mode: str | int | None) -> Mode | None:
+        """The mode to change to before arming; None: the present one will do."""
+        if mode is not None:
+            wanted = self.autopilot.find_mode(mode, self.telemetry.mode_names)
+            if wanted.name in self.autopilot.unarmable_modes:
+                raise LocalProtocolError(f"mode = {mode!r} is not allowed: {self._unarmable_text(wanted)}")
+            return wanted
+        is_booting = self.telemetry.system_status.latest in BOOTING
+        if (
+            self._stream is not None
+            or is_booting
+            or not self.is_surely_disarmed
+            or not self._unarmable_mode()
+        ):
+            return None
+        return self.autopilot.mode_to_arm_in()
+
+    async def _settle_in_mode(self) -> None:
+        """PX4 tells by SYS_STATUS, some times a second, whether it could be armed in its new mode."""
+        sensors = self.telemetry.sensors
+        with self._streaming("sensors"), anyio.move_on_after(READY_IN_MODE_S):
+            since = self.connection.now()
+            await sensors.wait_until(
+                lambda each: sensors.updated_at > since and each.prearm_checks_pass is not False
+            )
+
+    # ---------------------------------------------------------------- orders that come late
+
+    def _may_still_arm(self) -> str:
+        unsent = self.connection.unsent_bytes
+        where = f"; {unsent} bytes have not left this computer yet" if unsent else ""
+        return f"the order may still be carried out{where}: if it arms within {LATE_S:g} s it is disarmed"
+
+    def _watch_for_late_arming(self) -> None:
+        """The order to arm was given up; it may have been heard, or may still arrive."""
+        self.connection.discard_unsent()
+        scope, is_over = anyio.CancelScope(), anyio.Event()
+        self._late_arming, self._late_arming_is_over = scope, is_over
+
+        async def watch() -> None:
+            with scope, anyio.move_on_after(LATE_S):
+                await self._disarm_again()
+            if self._late_arming is scope:
+                self._late_arming = None
+            is_over.set()
+
+        self._background.start(watch, "aerokit late arming")
+
+    async def _disarm_again(self) -> None:
+        armed, since = self.telemetry.armed, self.connection.now()
+        await armed.wait_until(lambda value: value and armed.updated_at > since, description="armed")
+        logger.warning("the vehicle armed although the order to arm was given up: it is disarmed again")
+        with anyio.CancelScope(shield=True):
+            try:
+                with self._helm.aside() as order:
+                    await self._give_arm(order, False, False)
+            except AerokitError as error:
+                logger.error(
+                    "the vehicle armed after the order was given up, and could not be disarmed: %s", error
+                )
+
+    def _stop_watching_arming(self) -> None:
+        if self._late_arming is not None:
+            self._late_arming.cancel()
+            self._late_arming = None
+
+    async def _finish_arming(self) -> None:
+        """At the end of everything: an order to arm that was given up is answered, or is said to be out."""
+        if self._late_arming is None or self._late_arming_is_over is None or not self.connection.is_open:
+            return
+        with anyio.CancelScope(shield=True), anyio.move_on_after(ARMING_AT_END_S):
+            await self._late_arming_is_over.wait()
+        if self._late_arming is not None:
+            logger.warning(
+                "the block of this vehicle was left while an order to arm may still be carried out: %s",
+                self.describe_link(),
+            )
 
     async def reboot(self, *, force: bool = False, timeout: float = 60.0) -> None:
         """Reboot the autopilot and wait until it is back: its time since boot has started anew.
@@ -107,6 +247,7 @@ class ArmingActions(ModeActions):
         Raises:
             OperationRejected: it is armed, or not known to be disarmed. Nothing was sent.
             CommandRejected: it refused.
+            CommandTimeout: there was no answer, and it did not reboot.
             LinkLost: the link goes down with the vehicle (USB, TCP); connect again.
             OperationTimeout: it did not come back.
         """
@@ -116,11 +257,25 @@ class ArmingActions(ModeActions):
             raise OperationRejected(f"reboot: the vehicle is {state}; nothing was sent")
         reboots = self._watch.reboots
         self._link_watch.ask()  # its time before
-        await self._explained_command(PREFLIGHT_REBOOT_SHUTDOWN, 1, *(0.0,) * 4, FORCE_REBOOT if force else 0)
-        with self._watch.expecting_reboot(), anyio.move_on_after(timeout):
-            await self._await_reboot(reboots)
-            return
+        unanswered: CommandTimeout | None = None
+        with self._watch.expecting_reboot():
+            try:
+                await self._order_reboot(force)
+            except CommandTimeout as error:
+                unanswered = error
+            with anyio.move_on_after(timeout if unanswered is None else min(timeout, LATE_S)):
+                await self._await_reboot(reboots)
+                return
+        if unanswered is not None:
+            raise CommandTimeout(f"{unanswered}; it is sent once only, and may still be carried out")
         raise OperationTimeout(f"reboot: not back within {timeout:g} s; {self.describe_link()}")
+
+    async def _order_reboot(self, force: bool) -> None:
+        """Once: a vehicle that has rebooted, and whose answer was lost, would do it again."""
+        params = (1, *(0.0,) * 4, FORCE_REBOOT if force else 0)
+        options: dict[str, Any] = {"attempts": 1, "attempt_timeout": REBOOT_ANSWER_S}
+        with self._helm.aside() as order:
+            await self._give(order, self._commands.send_long, PREFLIGHT_REBOOT_SHUTDOWN, *params, **options)
 
     async def _await_reboot(self, reboots: int) -> None:
         """Asks for its time, often at first: a fast simulation is soon older than it was before."""

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from aerokit.mavlink.messages import CommandInt, CommandLong
+    from aerokit.protocols.command import Standing
     from aerokit.runtime.connection import Connection
 
 __all__ = ["CommandSender"]
@@ -74,12 +75,14 @@ class CommandSender:
         attempt_timeout: float = 1.0,
         progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
-        may_repeat: Callable[[], bool] | None = None,
+        standing: Standing | None = None,
+        is_sent: bool = False,
     ) -> CommandAck:
         """Send a COMMAND_LONG with param1 to param7 and return its ACCEPTED ack; see :meth:`Vehicle.command`."""
         target = self._component_id if component_id is None else component_id
         message = command_long(self._system_id, target, command, params)
-        return await self._run(message, attempts, attempt_timeout, progress_timeout, on_progress, may_repeat)
+        options = (attempts, attempt_timeout, progress_timeout, on_progress, standing, is_sent)
+        return await self._run(message, *options)
 
     async def send_int(
         self,
@@ -94,12 +97,14 @@ class CommandSender:
         attempt_timeout: float = 1.0,
         progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
-        may_repeat: Callable[[], bool] | None = None,
+        standing: Standing | None = None,
     ) -> CommandAck:
         """Send a COMMAND_INT with param1 to param4, x, y, z and return its ACCEPTED ack."""
         target = self._component_id if component_id is None else component_id
         message = command_int(self._system_id, target, command, params, frame=frame, x=x, y=y, z=z)
-        return await self._run(message, attempts, attempt_timeout, progress_timeout, on_progress, may_repeat)
+        return await self._run(
+            message, attempts, attempt_timeout, progress_timeout, on_progress, standing, False
+        )
 
     def send_unconfirmed(self, command: int, *params: float) -> None:
         """Send a COMMAND_LONG once and do not wait: for ends of blocks, which must not await."""
@@ -125,7 +130,8 @@ class CommandSender:
         attempt_timeout: float,
         progress_timeout: float,
         on_progress: Callable[[int | None], None] | None,
-        may_repeat: Callable[[], bool] | None,
+        standing: Standing | None,
+        is_sent: bool,
     ) -> CommandAck:
         key = (
             message.target_component or self._component_id,
@@ -142,8 +148,9 @@ class CommandSender:
                 attempt_timeout=max(attempt_timeout, self._answers_within_s()),
                 progress_timeout=progress_timeout,
                 on_progress=on_progress,
-                answers_before_ours=self._take_answers_under_way(key),
-                may_repeat=may_repeat,
+                answers_before_ours=max(0, self._take_answers_under_way(key) - is_sent),
+                standing=standing,
+                is_sent=is_sent,
             )
             run = self._runs[key] = ExchangeRun(self._connection, exchange)
             try:

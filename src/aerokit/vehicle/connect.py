@@ -149,6 +149,7 @@ async def _attached(
         try:
             vehicle._end_stream()
             await vehicle._finish_hold()
+            await vehicle._finish_arming()
         finally:
             vehicle._close()
             connection.attached.discard(vehicle.system_id)

@@ -24,6 +24,8 @@ from aerokit.runtime.events import (
 )
 from aerokit.runtime.subscription import Overflow, Subscription
 from aerokit.vehicle.commands import CommandSender
+from aerokit.vehicle.helm import Helm
+from aerokit.vehicle.orders import MOVING_COMMANDS, QUESTIONS
 from aerokit.vehicle.rates import MessageRates, check_rate
 from aerokit.vehicle.telemetry import Telemetry
 from aerokit.vehicle.transfers import Transfers
@@ -35,6 +37,7 @@ if TYPE_CHECKING:
     from aerokit.runtime.bus import Detach, Sink
     from aerokit.runtime.connection import Connection
     from aerokit.runtime.events import Event
+    from aerokit.vehicle.orders import Order
 
 __all__ = ["VehicleCore"]
 
@@ -45,6 +48,7 @@ SETTLE_S = 0.3
 """How long after a refusal the vehicle's texts about it are waited for."""
 ACTION_HZ = 4.0
 """How fast an action wants to be told what it waits for."""
+COMPONENT_ARM_DISARM = 400
 RESULT_ACCEPTED = 0
 RESULTS_OF_REFUSAL = (1, 2, 4)
 
@@ -96,7 +100,8 @@ class VehicleCore:
             send_command=self._commands.send_long,
         )
         self._is_closed = False
-        self._detach: list[Detach] = []
+        self._helm = Helm(connection.now, self.telemetry)
+        self._detach: list[Detach] = [self._helm.close]
         self._messages: dict[type[Message], StateCell[Any]] = {}
         self._message_rates: dict[type[Message], Detach] = {}
         self._attach_telemetry()
@@ -119,7 +124,9 @@ class VehicleCore:
             command: the number, or a member of ``enums.MavCmd``.
             params: param1 to param7; missing ones are 0, NaN where the command says so.
             component_id: to another component than the autopilot; 0: to all, and the autopilot's answer counts.
-            attempts: how often it is sent at most; ``confirmation`` rises with each.
+            attempts: how often it is sent at most; ``confirmation`` rises with each. What changes something is sent
+                again only right after a HEARTBEAT that tells of no other mode, and no newer order; see
+                docs/reliability.md.
             attempt_timeout: seconds to wait for an ack after each, and at least two measured round trips.
             progress_timeout: seconds to wait after each IN_PROGRESS for the next answer; calibrations can take long.
             on_progress: called with 0–100, or None, for each IN_PROGRESS.
@@ -340,16 +347,26 @@ class VehicleCore:
         self, send: Callable[..., Awaitable[CommandAck]], command: int, *params: float, **options: Any
     ) -> CommandAck:
         """What the commands of the program itself have in common; ``send`` is one of the command sender's."""
-        self._before_command(command)
         started = self.connection.now()
         try:
-            return await send(command, *params, **options)
+            if "standing" in options or command in QUESTIONS:
+                return await send(command, *params, **options)
+            with self._own_order(command) as order:
+                armed = params[0] == 1 if command == COMPONENT_ARM_DISARM and params else None
+                with self._helm.sending(order, armed=armed) as sending:
+                    return await send(command, *params, standing=sending, **options)
         except CommandRejected as error:
             await self._settle()
             raise self._explained(error, started) from None
 
-    def _before_command(self, command: int) -> None:
-        """Any command is about to be sent by the program itself."""
+    @contextmanager
+    def _own_order(self, command: int) -> Iterator[Order]:
+        """A program that steers past the actions gives a new order, which ends theirs."""
+        if command in MOVING_COMMANDS:
+            yield self._helm.order_of_the_programs_own()
+        else:
+            with self._helm.aside() as order:
+                yield order
 
     def _close(self) -> None:
         self._is_closed = self._transfers.is_closed = True
@@ -414,6 +431,7 @@ class VehicleCore:
         self.link_quality.set(report, Source(self.system_id, self.component_id, "link"))
 
     def _on_reboot(self) -> None:
+        self._helm.note_reboot()
         self.telemetry.forget()
         for cell in self._messages.values():
             cell.forget()

@@ -8,8 +8,8 @@ import anyio
 
 from aerokit.errors import NotSupported, OperationRejected, OperationTimeout
 from aerokit.vehicle.checks import check_range, check_seconds
-from aerokit.vehicle.modes import MODE_GRACE_S
-from aerokit.vehicle.progress import await_progress
+from aerokit.vehicle.helm import MODE_GRACE_S
+from aerokit.vehicle.progress import LONGEST_SILENCE_S, Stillness, await_progress
 from aerokit.vehicle.travel import TravelActions
 from aerokit.vehicle.values import Position
 
@@ -19,7 +19,9 @@ if TYPE_CHECKING:
 
 __all__ = ["FlightActions"]
 
-LANDED_ON_GROUND, LANDED_IN_AIR = 1, 2
+LANDED_ON_GROUND, LANDED_IN_AIR, TAKING_OFF = 1, 2, 3
+RISEN_M = 0.5
+"""Who is so much higher than before has obeyed an order to take off."""
 MODE_TIMEOUT_S = 6.0
 SURFACE_M = 1.5
 """Who is deeper below home has not surfaced, but was given another mode on the way: home is at the surface."""
@@ -28,7 +30,13 @@ SURFACE_M = 1.5
 class FlightActions(TravelActions):
     """Take-off, landing, return."""
 
-    async def take_off(self, altitude_m: float, *, timeout: float = 60.0) -> None:
+    async def take_off(
+        self,
+        altitude_m: float,
+        *,
+        timeout: float = 60.0,
+        max_silence_s: float | None = LONGEST_SILENCE_S,
+    ) -> None:
         """Take off and climb to ``altitude_m`` above home; returns at that altitude.
 
         The vehicle must be armed. Where the autopilot needs its guided mode for this, it is put into it. Cancelled
@@ -37,17 +45,21 @@ class FlightActions(TravelActions):
         Args:
             altitude_m: metres above home, above 0, at most 10,000.
             timeout: seconds until it is there.
+            max_silence_s: give up when no heartbeat has come for so many seconds; None: wait on, however long.
 
         Raises:
             LocalProtocolError: the altitude is out of range. Nothing was sent.
             NotSupported: this type of vehicle cannot take off.
             OperationRejected: it is not armed or flies already, it refused, or its mode changed or it disarmed on the
                 way.
-            OperationTimeout: it did not get there in time.
+            CommandTimeout: there was no answer.
+            HeartbeatTimeout: the vehicle has been silent for ``max_silence_s`` seconds.
+            OperationTimeout: it did not get there in time, or does not move.
             ValueUnknownError: home is not known, and PX4 needs its altitude.
         """
         check_range("altitude_m", altitude_m, 0, 10_000, above=True)
         check_seconds("timeout", timeout)
+        check_seconds("max_silence_s", max_silence_s, none_is_allowed=True)
         plan = self._take_off_plan(altitude_m)
         if not self.is_armed:
             raise OperationRejected("take_off: the vehicle is not armed: arm() comes first; nothing was sent")
@@ -56,10 +68,10 @@ class FlightActions(TravelActions):
                 "take_off: the vehicle flies already: go_to() climbs too; nothing was sent"
             )
         modes = (plan.mode, plan.mode_after, self.autopilot.mode_for("take_off", is_vtol=self.is_vtol))
-        order = self._new_order(*(mode for mode in modes if mode is not None))
+        order = self._helm.order(*(mode for mode in modes if mode is not None))
         try:
-            await self._begin_take_off(plan)
-            await self._await_altitude(altitude_m, timeout, order)
+            await self._begin_take_off(plan, order)
+            await self._await_altitude(altitude_m, timeout, max_silence_s, order)
         except (anyio.get_cancelled_exc_class(), OperationTimeout):  # it may have heard the order
             self._hold_soon(order)
             raise
@@ -71,13 +83,30 @@ class FlightActions(TravelActions):
             raise NotSupported(f"take_off: {self.autopilot.firmware} cannot take off")
         return plan
 
-    async def _begin_take_off(self, plan: TakeOff) -> None:
+    async def _begin_take_off(self, plan: TakeOff, order: Order) -> None:
         if plan.mode is not None:
-            await self._ensure_mode(plan.mode)
+            await self._ensure_mode(plan.mode, order)
         if plan.command is not None:
-            await self._explained_command(plan.command, *plan.params)
+            begins_at = self._altitude_relative()
 
-    async def _await_altitude(self, altitude_m: float, timeout: float, order: Order) -> None:
+            def is_rising() -> bool:
+                climbed = self._altitude_relative() > begins_at + RISEN_M
+                return climbed or self.telemetry.landed_state.latest in (LANDED_IN_AIR, TAKING_OFF)
+
+            modes = () if plan.mode_after is None else order.modes
+            with self._streaming("position", "landed_state"):
+                await self._give(
+                    order,
+                    self._commands.send_long,
+                    plan.command,
+                    *plan.params,
+                    modes=modes,
+                    is_done=is_rising,
+                )
+
+    async def _await_altitude(
+        self, altitude_m: float, timeout: float, max_silence_s: float | None, order: Order
+    ) -> None:
         """The mode may become the take-off's own and the one after it; any other one is somebody else's doing."""
         enough_m = altitude_m - max(0.5, 0.05 * altitude_m)
         started = self.connection.now()
@@ -89,45 +118,63 @@ class FlightActions(TravelActions):
                 trouble=self._stays_in(order, *order.modes),
                 describe=lambda: f"it is at {self._altitude_relative():.1f} m",
                 timeout=timeout,
+                max_silence_s=max_silence_s,
+                stillness=Stillness(self),
             )
 
-    async def land(self, *, timeout: float | None = 300.0) -> None:
+    async def land(
+        self, *, timeout: float | None = 300.0, max_silence_s: float | None = LONGEST_SILENCE_S
+    ) -> None:
         """Land where the vehicle is; returns on the ground, where the motors may still be turning.
 
         Follow ``vehicle.armed`` for the motors. Cancelled, the vehicle goes on landing.
 
+        Args:
+            timeout: seconds until it is on the ground; None: as long as it takes.
+            max_silence_s: give up when no heartbeat has come for so many seconds; None: wait on, however long.
+
         Raises:
             NotSupported: this type of vehicle has no mode for it. Nothing was sent.
             CommandRejected: the vehicle refused the mode.
+            CommandTimeout: there was no answer.
             OperationRejected: the mode changed on the way.
+            HeartbeatTimeout: the vehicle has been silent for ``max_silence_s`` seconds.
             OperationTimeout: not on the ground in time.
         """
         check_seconds("timeout", timeout, none_is_allowed=True)
+        check_seconds("max_silence_s", max_silence_s, none_is_allowed=True)
         mode = self._mode_for("land", "land")
         if self.autopilot.landing_ends_in is None:
-            order = self._new_order(mode)
-            await self._change_mode(mode, told_since=order.given_at)
+            order = self._helm.order(mode)
+            await self._change_mode(mode, order, told_since=order.given_at)
         else:
-            order = self._new_order(mode, self.autopilot.modes.find(self.autopilot.landing_ends_in))
-            with self._changing_mode():
-                await self._request_mode(mode, MODE_TIMEOUT_S)  # it may be over before HEARTBEAT tells it
-        await self._await_ground("land", order, timeout)
+            order = self._helm.order(mode, self.autopilot.modes.find(self.autopilot.landing_ends_in))
+            with self._helm.changing_mode():
+                await self._request_mode(
+                    mode, order, MODE_TIMEOUT_S
+                )  # it may be over before HEARTBEAT tells it
+        await self._await_ground("land", order, timeout, max_silence_s)
 
-    async def return_to_launch(self, *, timeout: float | None = 600.0) -> None:
+    async def return_to_launch(
+        self, *, timeout: float | None = 600.0, max_silence_s: float | None = LONGEST_SILENCE_S
+    ) -> None:
         """Return to the launch place; returns on the ground, or above it where the vehicle does not land by itself.
 
         Raises as :meth:`land`.
         """
         check_seconds("timeout", timeout, none_is_allowed=True)
+        check_seconds("max_silence_s", max_silence_s, none_is_allowed=True)
         mode = self._mode_for("return_to_launch", "return")
-        order = self._new_order(mode)
-        await self._change_mode(mode, told_since=order.given_at)
+        order = self._helm.order(mode)
+        await self._change_mode(mode, order, told_since=order.given_at)
         if self.autopilot.lands_after_return:
-            await self._await_ground("return_to_launch", order, timeout)
+            await self._await_ground("return_to_launch", order, timeout, max_silence_s)
         else:
-            await self._await_home(order, timeout)
+            await self._await_home(order, timeout, max_silence_s)
 
-    async def _await_ground(self, what: str, order: Order, timeout: float | None) -> None:
+    async def _await_ground(
+        self, what: str, order: Order, timeout: float | None, max_silence_s: float | None
+    ) -> None:
         """Only what was told after the order counts: a state that had gone stale would end a landing in the air."""
         armed, landed, mode = self.telemetry.armed, self.telemetry.landed_state, self.telemetry.mode
         accepted_at = self.connection.now()
@@ -159,9 +206,10 @@ class FlightActions(TravelActions):
                 trouble=trouble,
                 describe=lambda: f"it is at {self._altitude_relative():.1f} m",
                 timeout=timeout,
+                max_silence_s=max_silence_s,
             )
 
-    async def _await_home(self, order: Order, timeout: float | None) -> None:
+    async def _await_home(self, order: Order, timeout: float | None, max_silence_s: float | None) -> None:
         home = self.telemetry.home.value
         place = Position(home.latitude_deg, home.longitude_deg)
         near_m = self.autopilot.arrival_radius_m
@@ -174,4 +222,5 @@ class FlightActions(TravelActions):
                 trouble=self._stays_in(order, *order.modes),
                 describe=lambda: f"it is {self.distance_to(place):.1f} m from home",
                 timeout=timeout,
+                max_silence_s=max_silence_s,
             )

@@ -222,9 +222,9 @@ class SetpointStream(Generic[SetpointT]):
         mode = self._vehicle._mode_for("a set-point stream", "setpoint")
         self._was_entered = True
         self._vehicle._stream = self
-        order = self._order = self._vehicle._new_order(mode)
+        order = self._order = self._vehicle._helm.order(mode)
         try:
-            await self._enter(mode)
+            await self._enter(mode, order)
         except OperationRejected:  # the vehicle stays with whoever steers it
             self._end()
             raise
@@ -247,27 +247,30 @@ class SetpointStream(Generic[SetpointT]):
             self._stopped = SetpointStreamStopped("the block of this set-point stream was left")
             if exc is not None:
                 self._hold()
+            elif not self._vehicle._helm.is_known:  # whoever steers by then is left alone
+                self._stop(f"the vehicle has been silent for {self._vehicle.heartbeat_age:.1f} s")
+                raise self._stopped
             elif not self._vehicle.is_surely_disarmed:
                 await self._vehicle.hold()
         elif exc is None and not self._was_told:
             raise self._stopped
 
-    async def _enter(self, mode: Mode) -> None:
+    async def _enter(self, mode: Mode, order: Order) -> None:
         """ArduPilot takes set-points once it is in GUIDED; PX4 goes to OFFBOARD once it sees set-points."""
         if self._vehicle.autopilot.setpoints.before_mode:
             self._begin()
             await self.fly(self._setpoint, ENTRY_S)
-            await self._feeding_initial(mode)
+            await self._feeding_initial(mode, order)
         else:
-            await self._vehicle._ensure_mode(mode)
+            await self._vehicle._ensure_mode(mode, order)
             self._begin()
         self._mode = mode
 
-    async def _feeding_initial(self, mode: Mode) -> None:
+    async def _feeding_initial(self, mode: Mode, order: Order) -> None:
         """Not in a task group: what is raised here reaches the user as it is."""
         self._is_entering = True
         try:
-            await self._vehicle._ensure_mode(mode)
+            await self._vehicle._ensure_mode(mode, order)
         finally:
             self._is_entering = False
             self._set_at = self._now()
@@ -316,10 +319,10 @@ class SetpointStream(Generic[SetpointT]):
     def _why_leave_alone(self) -> str | None:
         """Somebody else has taken over: a pilot, a failsafe, another program."""
         mode = self._vehicle.mode.latest
-        if self._order is not self._vehicle._order and self._mode is not None:
-            return "another order was given"
         if self._mode is not None and mode is not None and mode != self._mode:
             return f"the vehicle left {self._mode} for {mode}"
+        if self._mode is not None and self._order is not None and self._order.end:
+            return self._order.end
         if self._was_armed and self._vehicle.is_surely_disarmed:
             return "the vehicle disarmed"
         self._was_armed = self._was_armed or self._vehicle.is_armed

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import anyio
 
 from aerokit.errors import CommandRejected, CommandTimeout
 from aerokit.vehicle.core import VehicleCore
+
+if TYPE_CHECKING:
+    from aerokit.autopilots import Mode
 
 __all__ = ["VehicleHealth"]
 
@@ -24,18 +28,22 @@ class VehicleHealth(VehicleCore):
     def missing_for_flight(self) -> list[str]:
         """What is still missing before the vehicle can fly, as far as it is known already; talks to nobody."""
         telemetry = self.telemetry
-        missing = [] if not self.is_silent else [f"heartbeats (the last one {self.heartbeat_age:.1f} s ago)"]
-        missing += [
+        missing = [
             f"{cell.name} ({cell.waits_for} has not come)"
             for cell in (telemetry.sensors, telemetry.estimator, telemetry.position, telemetry.home)
             if not cell.is_known
         ]
-        missing += [
+        return [*missing, *self._out_of_date(), *self._failing()]
+
+    def _out_of_date(self) -> list[str]:
+        """What has been told, but too long ago to say anything about now."""
+        telemetry = self.telemetry
+        heartbeats = [f"heartbeats (the last one {self.heartbeat_age:.1f} s ago)"] if self.is_silent else []
+        return heartbeats + [
             f"{cell.name} (no {cell.waits_for} for {cell.age:.0f} s)"
             for cell in (telemetry.sensors, telemetry.estimator, telemetry.position)
             if FRESH_S < cell.age < math.inf
         ]
-        return missing + self._failing()
 
     async def why_not_armable(self) -> list[str]:
         """Return the reasons why arming would be refused now; an empty list means that none is known.
@@ -55,14 +63,19 @@ class VehicleHealth(VehicleCore):
             if not self._arming_texts(since) and self.autopilot.runs_prearm_checks:
                 await self._run_prearm_checks()
             await self._hear_of_health()
-        reasons = dict.fromkeys([*self._arming_texts(since), *self._unarmable_mode(), *self._failing()])
-        return tuple(reasons)
+        found = (self._arming_texts(since), self._unarmable_mode(), self._out_of_date(), self._failing())
+        return tuple(dict.fromkeys(reason for reasons in found for reason in reasons))
 
     def _unarmable_mode(self) -> list[str]:
         mode = self.telemetry.mode.latest
-        if mode is None or mode.name not in self.autopilot.unarmable_modes:
-            return []
-        return [f"{self.autopilot.firmware} does not arm in {mode.name}: set another mode first"]
+        is_unarmable = mode is not None and mode.name in self.autopilot.unarmable_modes
+        return [self._unarmable_text(mode)] if mode is not None and is_unarmable else []
+
+    def _unarmable_text(self, mode: Mode) -> str:
+        others = sorted({*self.autopilot.modes.names} - self.autopilot.unarmable_modes)
+        text = f"{self.autopilot.firmware} does not arm in {mode.name}, but in {', '.join(others)}"
+        better = self.autopilot.mode_to_arm_in()
+        return text if better is None else f"{text}; arm() goes to {better.name} first"
 
     async def _hear_of_health(self) -> None:
         """Give the vehicle a moment to tell what it has not told lately."""
@@ -84,10 +97,12 @@ class VehicleHealth(VehicleCore):
         """Failing sensors, failing pre-arm checks, missing estimates.
 
         When the vehicle says that it could be armed, a failing sensor is one it can do without (PX4: no RC receiver).
+        In a mode in which it does not arm, PX4 judges what that mode needs: that says nothing.
         """
         failing: list[str] = []
         sensors, estimator = self.telemetry.sensors.latest, self.telemetry.estimator.latest
-        if sensors is not None and sensors.prearm_checks_pass is not True:
+        says_nothing = self.autopilot.judges_by_mode and self._unarmable_mode()
+        if sensors is not None and sensors.prearm_checks_pass is not True and not says_nothing:
             failing += [f"{name} is not healthy (SYS_STATUS)" for name in sensors.failing]
             if sensors.prearm_checks_pass is False:
                 failing.append("the vehicle's pre-arm checks do not pass (SYS_STATUS)")

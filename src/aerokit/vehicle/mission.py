@@ -12,7 +12,7 @@ from aerokit.vehicle.mission_end import MissionEnd
 from aerokit.vehicle.mission_watch import MissionWatch
 from aerokit.vehicle.modes import RESULT_UNSUPPORTED
 from aerokit.vehicle.plans import HeldPlan
-from aerokit.vehicle.progress import await_progress
+from aerokit.vehicle.progress import LONGEST_SILENCE_S, await_progress
 
 if TYPE_CHECKING:
     from aerokit.missions import Mission
@@ -80,7 +80,8 @@ class MissionControl(HeldPlan["Mission"]):
         """
         self._check_item(item)
         check_seconds("timeout", timeout)
-        await self._set_current(item, timeout)
+        with self._vehicle._helm.aside() as order:
+            await self._set_current(item, timeout, order)
 
     async def start(self, item: int = 0, *, timeout: float = 10.0) -> None:
         """Fly the mission from ``item`` on, its first one by default; returns when HEARTBEAT tells the mission mode.
@@ -105,11 +106,11 @@ class MissionControl(HeldPlan["Mission"]):
             raise OperationRejected(
                 "mission.start: the vehicle is not armed: arm() comes first; nothing was sent"
             )
-        order = self._order = vehicle._new_order(mode)
+        order = self._order = vehicle._helm.order(mode)
         self._is_paused = False
         self._watch.start()
         try:
-            await self._set_current(item, timeout, goes_on=False)
+            await self._set_current(item, timeout, order, goes_on=False)
             await self._enter(mode, order, timeout)
         except (anyio.get_cancelled_exc_class(), OperationTimeout):  # it may have heard the order
             vehicle._hold_soon(order)
@@ -127,9 +128,9 @@ class MissionControl(HeldPlan["Mission"]):
                 f"mission.pause: the vehicle does not fly its mission, it is in {vehicle.mode_name};"
                 " nothing was sent"
             )
-        self._order = vehicle._new_order(mode)
+        self._order = vehicle._helm.order(mode)
         self._is_paused = True
-        await vehicle._stop_in(mode)
+        await vehicle._stop_in(mode, self._order)
 
     async def resume(self, *, timeout: float = 10.0) -> None:
         """Go on with the mission from the current item; also after a pilot or another order has interrupted it.
@@ -141,7 +142,7 @@ class MissionControl(HeldPlan["Mission"]):
         mode = vehicle._mode_for("mission.resume", "mission")
         if not vehicle.is_armed:
             raise OperationRejected("mission.resume: the vehicle is not armed; nothing was sent")
-        order = self._order = vehicle._new_order(mode)
+        order = self._order = vehicle._helm.order(mode)
         self._watch.start()
         try:
             await self._enter(mode, order, timeout)
@@ -150,18 +151,25 @@ class MissionControl(HeldPlan["Mission"]):
             raise
         self._is_paused = False
 
-    async def wait_finished(self, *, timeout: float | None = None) -> None:
+    async def wait_finished(
+        self, *, timeout: float | None = None, max_silence_s: float | None = LONGEST_SILENCE_S
+    ) -> None:
         """Wait until the mission has been flown to its end; for a mission that ends with landing, until it has landed.
 
         A :meth:`pause` from elsewhere in the program is waited through. Cancelled, the vehicle goes on.
+
+        Args:
+            timeout: seconds until it is finished; None: as long as it takes.
+            max_silence_s: give up when no heartbeat has come for so many seconds; None: wait on, however long.
 
         Raises:
             OperationRejected: it does not fly the mission any more: a pilot, a failsafe or another order has taken it
                 out of the mission's mode, or it disarmed on the way. ``reasons`` has what the vehicle said.
             OperationTimeout: not finished in time.
-            HeartbeatTimeout: the vehicle has been silent for ten seconds.
+            HeartbeatTimeout: the vehicle has been silent for ``max_silence_s`` seconds.
         """
         check_seconds("timeout", timeout, none_is_allowed=True)
+        check_seconds("max_silence_s", max_silence_s, none_is_allowed=True)
         vehicle = self._vehicle
         mode = vehicle._mode_for("mission.wait_finished", "mission")
         end = MissionEnd(vehicle, self._watch, mode, self._context.memories[0].items)
@@ -173,6 +181,7 @@ class MissionControl(HeldPlan["Mission"]):
                 trouble=lambda: end.trouble(self._order, is_paused=self._is_paused),
                 describe=end.describe,
                 timeout=timeout,
+                max_silence_s=max_silence_s,
             )
 
     # ------------------------------------------------------------------------------------ inside
@@ -195,14 +204,14 @@ class MissionControl(HeldPlan["Mission"]):
             allowed = "the mission is empty" if count == 0 else f"0 to {last}"
             raise LocalProtocolError(f"item = {item!r} is not allowed: {allowed}")
 
-    async def _set_current(self, item: int, timeout: float, *, goes_on: bool = True) -> None:
+    async def _set_current(self, item: int, timeout: float, order: Order, *, goes_on: bool = True) -> None:
         """``goes_on``: keep what it has counted of jumps. ArduPilot's item 0, home, stands for a fresh start."""
         vehicle = self._vehicle
         seq = item + self._context.offset_of(0)
         if vehicle.autopilot.sets_current_by_command:
             try:
-                await vehicle._explained_command(
-                    DO_SET_MISSION_CURRENT, 0 if item == 0 and not goes_on else seq
+                await vehicle._command_of(
+                    order, DO_SET_MISSION_CURRENT, 0 if item == 0 and not goes_on else seq
                 )
             except CommandRejected as error:
                 if error.result != RESULT_UNSUPPORTED:
@@ -232,13 +241,13 @@ class MissionControl(HeldPlan["Mission"]):
     async def _enter(self, mode: Mode, order: Order, timeout: float) -> None:
         vehicle = self._vehicle
         if not vehicle.autopilot.mission_starts_by_command:
-            await vehicle._change_mode(mode, timeout, told_since=order.given_at)
+            await vehicle._change_mode(mode, order, timeout, told_since=order.given_at)
             return
         try:
-            with vehicle._changing_mode():
-                await vehicle._explained_command(MISSION_START)
-                await vehicle._await_mode(mode, [], order.given_at, timeout, order.given_at)
+            with vehicle._helm.changing_mode():
+                await vehicle._give(order, vehicle._commands.send_long, MISSION_START, modes=(mode,))
+                await vehicle._await_mode(mode, order, [], timeout, order.given_at)
         except CommandRejected as error:
             if error.result != RESULT_UNSUPPORTED:
                 raise
-            await vehicle._change_mode(mode, timeout, told_since=order.given_at)
+            await vehicle._change_mode(mode, order, timeout, told_since=order.given_at)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from aerokit.vehicle.modes import MODE_GRACE_S
+from aerokit.vehicle.helm import MODE_GRACE_S
+from aerokit.vehicle.values import Position
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -23,22 +24,28 @@ STATE_UNKNOWN = 0
 END_GRACE_S = 2.0
 """MISSION_CURRENT comes at 1 Hz or faster, and may be lost."""
 LANDED_ON_GROUND = 1
+BACK_AT_LAST_S = 300.0
+"""A return may go to a rally point, of which nothing is known here: so long after its mission is complete it is over."""
 
 
 class MissionEnd:
     """The ends a mission can have.
 
-    The vehicle says that it is complete, or has landed and disarmed at its last item. A mission that ends with a return
-    or a landing ends on the ground: PX4 calls it complete when the return begins, which it flies in another mode.
-    Vehicles that do not tell the state have reached the last item.
+    The vehicle says that it is complete, or has landed and disarmed at its last item. A mission that ends with a
+    landing, or with a return that ends in one, ends on the ground: PX4 calls it complete when the return begins, which
+    it flies in another mode. A return that does not end in a landing ends at home. Vehicles that do not tell the state
+    have reached the last item.
     """
 
     def __init__(
         self, vehicle: Vehicle, watch: MissionWatch, mode: Mode, items: Sequence[MissionItem] | None
     ) -> None:
         self._vehicle, self._watch, self._mode = vehicle, watch, mode
-        self._order = vehicle._order
-        self._ends_by_landing = bool(items) and items is not None and items[-1].command in LANDINGS
+        self._order = vehicle._helm.newest
+        last = items[-1].command if items else None
+        self._ends_by_landing = last in LANDINGS
+        self._stays_up = last == NAV_RETURN_TO_LAUNCH and not vehicle.autopilot.lands_after_return
+        self._complete_since: float | None = None
         self._landing_modes = tuple(
             vehicle.autopilot.mode_for(purpose, is_vtol=vehicle.is_vtol) for purpose in ("return", "land")
         )
@@ -49,7 +56,8 @@ class MissionEnd:
     def is_reached(self) -> bool:
         """Whether it is over."""
         if self._watch.is_complete:
-            return not self._ends_by_landing or self._is_down
+            return not self._ends_by_landing or self._is_down or (self._stays_up and self._is_back)
+        self._complete_since = None
         if self._vehicle.is_surely_disarmed and self._is_landing:
             return True
         progress = self._watch.progress.latest
@@ -59,12 +67,12 @@ class MissionEnd:
     def trouble(self, order: Order | None, *, is_paused: bool) -> str | None:
         """Why it will not come to its end any more. ``order`` is the last one that was given for the mission."""
         vehicle, now = self._vehicle, self._vehicle.connection.now()
-        if vehicle._order not in (self._order, order):
+        if vehicle._helm.newest not in (self._order, order):
             return "another order was given"
         is_in_mode = vehicle._is_in(self._mode)
         self._was_in_mode = self._was_in_mode or is_in_mode
         if not vehicle.is_surely_disarmed and (
-            is_paused or is_in_mode or self._is_landing or now < vehicle._mode_settles_at
+            is_paused or is_in_mode or self._is_landing or now < vehicle._helm.mode_settles_at
         ):
             self._left_at = None
             return None
@@ -92,6 +100,19 @@ class MissionEnd:
         return (
             self._ends_by_landing and current is not None and current == last and mode in self._landing_modes
         )
+
+    @property
+    def _is_back(self) -> bool:
+        """At home, or wherever else it has gone to in ``BACK_AT_LAST_S`` seconds."""
+        vehicle, now = self._vehicle, self._vehicle.connection.now()
+        if vehicle.autopilot.completes_at_home:
+            return True
+        if self._complete_since is None:
+            self._complete_since = now
+        home = vehicle.telemetry.home.latest
+        place = None if home is None else Position(home.latitude_deg, home.longitude_deg)
+        is_near = place is not None and vehicle.distance_to(place) <= vehicle.autopilot.arrival_radius_m
+        return is_near or now - self._complete_since > BACK_AT_LAST_S
 
     @property
     def _is_down(self) -> bool:

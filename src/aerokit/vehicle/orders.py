@@ -1,28 +1,124 @@
-"""Who steers: one order at a time, the newest one; and a pilot before all of them."""
+"""Orders: what has been heard since one was given, and so whether it may be sent again or still be meant.
+
+docs/reliability.md has the table of all orders; nothing is sent again that is not in it.
+"""
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Collection
+
     from aerokit.autopilots import Mode
 
-__all__ = ["MOVING_COMMANDS", "Order"]
+__all__ = ["MOVING_COMMANDS", "QUESTIONS", "Order", "Sending"]
 
 MOVING_COMMANDS = frozenset((16, 17, 18, 19, 20, 21, 22, 84, 85, 176, 185, 192, 193, 252, 300, 400))
 """MAV_CMDs by which a program steers past the actions: what an action left to be done must not come after them."""
+QUESTIONS = frozenset((401, 510, 511, 512, 519, 520, 521, 522, 525, 526, 527))
+"""MAV_CMDs that ask for something and change nothing but streams: they are sent again until they are answered."""
 
 
 class Order:
-    """One order that moves the vehicle: when it was given, from which mode, and the modes it may bring about."""
+    """One order of the program, from when it is given until it is done, overruled or taken over.
 
-    __slots__ = ("given_at", "mode_before", "modes")
+    ``mode_before`` is the mode that it was given in, ``modes`` are those that it may bring about, ``expected`` others
+    that may still be told because the program had ordered them just before; until ``settles_at`` any mode may, since
+    the program had sent an order of its own making. Any other mode is a pilot's or a failsafe's doing.
+    """
 
-    def __init__(self, given_at: float, mode_before: Mode | None, modes: tuple[Mode, ...]) -> None:
+    def __init__(
+        self,
+        given_at: float,
+        *,
+        mode_before: Mode | None,
+        modes: Collection[Mode],
+        expected: Collection[Mode],
+        armed_before: bool | None,
+        is_newest: Callable[[Order], bool],
+        settles_at: float = -math.inf,
+    ) -> None:
         self.given_at = given_at
-        self.mode_before = mode_before
-        self.modes = modes
+        self.modes = tuple(modes)
+        self.taken_by = ""
+        """What somebody else has done, as a clause; empty: nothing that was told."""
+        self._allowed = {each.custom_mode for each in (mode_before, *expected) if each is not None}
+        self._own = {each.custom_mode for each in modes}
+        self._is_mode_known = mode_before is not None
+        self._was_armed = armed_before
+        self._is_newest, self._settles_at = is_newest, settles_at
 
-    def explains(self, mode: Mode | None) -> bool:
-        """Whether this mode can be the order's own doing; any other one is a pilot's or a failsafe's."""
-        return mode is None or mode == self.mode_before or mode in self.modes
+    @property
+    def end(self) -> str:
+        """Why it has nothing to say any more, as a clause; empty while it has."""
+        return self.taken_by or ("" if self._is_newest(self) else "another order was given")
+
+    def is_own(self, mode: Mode) -> bool:
+        """Whether this mode is one that the order may bring about."""
+        return mode.custom_mode in self._own
+
+    def note_mode(self, mode: Mode, at: float) -> None:
+        """The vehicle tells its mode. Once it was in one of the order's, the mode before is somebody else's, too."""
+        if self.is_own(mode):
+            self._allowed.clear()
+        elif not self._is_mode_known or at < self._settles_at:
+            self._allowed.add(mode.custom_mode)
+        elif mode.custom_mode not in self._allowed:
+            self.taken_by = self.taken_by or f"the mode changed to {mode}"
+        self._is_mode_known = True
+
+    def note_armed(self, armed: bool, at: float) -> None:
+        """The vehicle tells whether it is armed."""
+        if self._was_armed and not armed:
+            self.taken_by = self.taken_by or "the vehicle disarmed"
+        self._was_armed = armed
+
+    def note_reboot(self) -> None:
+        """The vehicle has rebooted: nothing that was ordered before is meant any more."""
+        self.taken_by = self.taken_by or "the vehicle rebooted"
+
+
+class Sending:
+    """One command of an order, from its first sending on: whether it may be sent again.
+
+    It may while what was heard since speaks neither of its effect nor of somebody else's doing. ``modes`` and
+    ``armed`` are effects that HEARTBEAT tells, if they are not there already; ``is_done`` tells any other one.
+    """
+
+    def __init__(
+        self,
+        order: Order,
+        *,
+        mode_now: Mode | None,
+        armed_now: bool | None,
+        modes: Collection[Mode] = (),
+        armed: bool | None = None,
+        is_done: Callable[[], bool] = lambda: False,
+    ) -> None:
+        self.order = order
+        self.told_at = -math.inf
+        """When HEARTBEAT came last."""
+        self.was_done = False
+        """Whether its effect has been told, whatever came after it."""
+        wanted = {each.custom_mode for each in modes}
+        is_there = mode_now is not None and mode_now.custom_mode in wanted
+        self._modes = frozenset[int]() if is_there else frozenset(wanted)
+        self._armed = None if armed is armed_now else armed
+        self._is_done = is_done
+
+    @property
+    def end(self) -> str:
+        """Why it must not be sent again, as a clause; empty while it may."""
+        self.was_done = self.was_done or self._is_done()
+        return "its effect was told" if self.was_done else self.order.end
+
+    def note_mode(self, mode: Mode, at: float) -> None:
+        """The vehicle tells its mode."""
+        self.was_done = self.was_done or mode.custom_mode in self._modes
+
+    def note_armed(self, armed: bool, at: float) -> None:
+        """The vehicle tells whether it is armed, which ends a HEARTBEAT."""
+        self.was_done = self.was_done or (self._armed is not None and armed is self._armed)
+        self.told_at = at

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import anyio
 
@@ -19,11 +19,14 @@ from aerokit.mavlink.messages import SetPositionTargetGlobalInt
 from aerokit.vehicle.arming import ArmingActions
 from aerokit.vehicle.checks import check_range, check_seconds
 from aerokit.vehicle.modes import CHANGE_MODE, DO_REPOSITION, RESULT_UNSUPPORTED
-from aerokit.vehicle.progress import await_progress
+from aerokit.vehicle.progress import LONGEST_SILENCE_S, Stillness, await_progress
 from aerokit.vehicle.values import Position
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+    from aerokit.autopilots import Mode
+    from aerokit.vehicle.orders import Order
 
 __all__ = ["TravelActions"]
 
@@ -42,8 +45,6 @@ OLD_POSITION_S = 2.0
 class TravelActions(ArmingActions):
     """Going to a place, turning, looking."""
 
-    _resend: SetPositionTargetGlobalInt | None = None
-
     async def go_to(
         self,
         target: Position,
@@ -52,11 +53,13 @@ class TravelActions(ArmingActions):
         heading_deg: float | None = None,
         tolerance_m: float | None = None,
         timeout: float | None = None,
+        max_silence_s: float | None = LONGEST_SILENCE_S,
     ) -> None:
         """Fly to a place and return on arrival.
 
         Cancelled half-way, or when it does not arrive in time or falls silent, the vehicle is told to hold where it
-        is; unless another order was given meanwhile or somebody else has changed the mode.
+        is; unless another order was given meanwhile or somebody else has changed the mode. A silent vehicle is told so
+        when it is heard again, if it still goes there then.
 
         Args:
             target: latitude and longitude, and an altitude above home or above mean sea level; without an altitude
@@ -64,7 +67,8 @@ class TravelActions(ArmingActions):
             speed_m_s: ground speed from now on, above 0; None leaves it.
             heading_deg: where to look on arrival, 0–360 clockwise from north; None leaves it to the autopilot.
             tolerance_m: how near is there, in metres; None: what suits the type of vehicle.
-            timeout: seconds; None: as long as it takes, provided that heartbeats come and the mode stays.
+            timeout: seconds; None: as long as it takes, provided that heartbeats come, the mode stays and it moves.
+            max_silence_s: give up when no heartbeat has come for so many seconds; None: wait on, however long.
 
         Sends MAV_CMD_DO_REPOSITION (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_REPOSITION), and
         SET_POSITION_TARGET_GLOBAL_INT to a vehicle that does not know it.
@@ -74,10 +78,13 @@ class TravelActions(ArmingActions):
             ValueUnknownError: position or home is not known and is needed here.
             CommandRejected: the vehicle refused (outside its fence, no position, …).
             OperationRejected: on the way the mode changed (a pilot, a failsafe) or the vehicle disarmed.
-            OperationTimeout: it did not arrive in time.
+            CommandTimeout: there was no answer.
+            HeartbeatTimeout: the vehicle has been silent for ``max_silence_s`` seconds.
+            OperationTimeout: it did not arrive in time, or does not move.
         """
         latitude, longitude, altitude, is_relative = self._global_target(target)
         _check_travel(speed_m_s, heading_deg, tolerance_m, timeout)
+        check_seconds("max_silence_s", max_silence_s, none_is_allowed=True)
         near_m = self.autopilot.arrival_radius_m if tolerance_m is None else tolerance_m
         self._check_can_turn(heading_deg)
         if not self.is_armed:
@@ -85,17 +92,18 @@ class TravelActions(ArmingActions):
         if self._stands_on_the_ground():
             raise OperationRejected("go_to: the vehicle is on the ground: take_off() first; nothing was sent")
         mode = self._mode_for("go_to", self.autopilot.reposition_purpose)
-        order = self._new_order(mode, self._mode_for("go_to", "setpoint"))
+        order = self._helm.order(mode, self._mode_for("go_to", "setpoint"))
         yaw = self._reposition_yaw(heading_deg)
         under_way = False
         try:
-            await self._send_there(latitude, longitude, altitude, is_relative, yaw, speed_m_s)
+            resend = await self._send_there(order, latitude, longitude, altitude, is_relative, yaw, speed_m_s)
             under_way = True
             if speed_m_s is not None and not self._speeds_by_reposition:
-                await self.set_speed(speed_m_s)  # ArduPilot obeys it only once it is under way
+                # ArduPilot obeys it only once it is under way
+                await self._command_of(order, DO_CHANGE_SPEED, 1, speed_m_s, -1)
             if heading_deg is not None and math.isnan(yaw):
-                await self._explained_command(CONDITION_YAW, heading_deg % 360)
-            await self._await_arrival(target, near_m, timeout, self._stays_in(order, mode))
+                await self._command_of(order, CONDITION_YAW, heading_deg % 360)
+            await self._await_arrival(target, near_m, timeout, max_silence_s, order, mode, resend)
         except (anyio.get_cancelled_exc_class(), OperationTimeout):  # it may have heard the order
             self._hold_soon(order)
             raise
@@ -106,30 +114,31 @@ class TravelActions(ArmingActions):
 
     async def _send_there(
         self,
+        order: Order,
         latitude: int,
         longitude: int,
         altitude: float,
         is_relative: bool,
         yaw: float,
         speed_m_s: float | None,
-    ) -> None:
-        started = self.connection.now()
+    ) -> SetPositionTargetGlobalInt | None:
+        """Order it; what has to be sent again for as long as it is under way, because it has no answer."""
         frame = MAV_FRAME_GLOBAL_RELATIVE_ALT_INT if is_relative else MAV_FRAME_GLOBAL_INT
         speed = speed_m_s if speed_m_s is not None and self._speeds_by_reposition else -1
         params = (speed, CHANGE_MODE, 0, yaw)
-        self._resend = None
+        place: dict[str, Any] = {"frame": frame, "x": latitude, "y": longitude, "z": altitude}
+        modes = (self._mode_for("go_to", self.autopilot.reposition_purpose),)
         try:
-            with self._changing_mode():
-                await self._commands.send_int(
-                    DO_REPOSITION, *params, frame=frame, x=latitude, y=longitude, z=altitude
-                )
+            with self._helm.changing_mode():
+                await self._give(order, self._commands.send_int, DO_REPOSITION, *params, modes=modes, **place)
         except CommandRejected as error:
             if error.result != RESULT_UNSUPPORTED:
-                await self._settle()
-                raise self._explained(error, started) from None
-            await self._ensure_mode(self._mode_for("go_to", "setpoint"))
-            self._resend = self._position_target(latitude, longitude, altitude, frame)
-            self.connection.send(self._resend)
+                raise
+            await self._ensure_mode(self._mode_for("go_to", "setpoint"), order)
+            resend = self._position_target(latitude, longitude, altitude, frame)
+            self.connection.send(resend)
+            return resend
+        return None
 
     def _position_target(
         self, latitude: int, longitude: int, altitude: float, frame: int
@@ -144,16 +153,19 @@ class TravelActions(ArmingActions):
         target: Position,
         near_m: float,
         timeout: float | None,
-        trouble: Callable[[], str | None],
+        max_silence_s: float | None,
+        order: Order,
+        mode: Mode,
+        resend: SetPositionTargetGlobalInt | None,
     ) -> None:
-        """Wait for it. The older message has no answer, so it is repeated for as long as this call lasts."""
+        """Wait for it. The older message has no answer: it is repeated while the vehicle tells that it is meant."""
         started = sent_at = self.connection.now()
-        resend = self._resend
 
         def is_there() -> bool:
             nonlocal sent_at
-            if resend is not None and self.connection.now() - sent_at >= RESEND_S:
-                sent_at = self.connection.now()
+            now = self.connection.now()
+            if resend is not None and now - sent_at >= RESEND_S and self._helm.is_known and not order.end:
+                sent_at = now
                 self.connection.send(resend)
             return self._knows_position_since(started) and self._way_left(target) <= near_m
 
@@ -162,10 +174,12 @@ class TravelActions(ArmingActions):
                 self,
                 f"go_to({target.latitude_deg:.7f}, {target.longitude_deg:.7f})",
                 is_done=is_there,
-                trouble=trouble,
+                trouble=self._stays_in(order, mode),
                 describe=lambda: f"it is {self._way_left(target):.1f} m away",
                 timeout=timeout,
+                max_silence_s=max_silence_s,
                 held_for=0.5,
+                stillness=Stillness(self),
             )
 
     async def set_speed(self, speed_m_s: float) -> None:
@@ -213,16 +227,17 @@ class TravelActions(ArmingActions):
         check_seconds("timeout", timeout)
         self._check_can_turn(heading_deg)
         mode = self._mode_for("set_heading", self.autopilot.reposition_purpose)
-        order = self._new_order(mode)
         goal = (heading_deg + (self.telemetry.heading_deg.value if relative else 0)) % 360
+        order = self._helm.order(mode)
         if self._turns_by_reposition:
             yaw = math.remainder(math.radians(goal), 2 * math.pi)
-            await self._explained_command(DO_REPOSITION, -1, CHANGE_MODE, 0, yaw, *(math.nan,) * 3)
+            params = (-1, CHANGE_MODE, 0, yaw, *(math.nan,) * 3)
+            await self._give(order, self._commands.send_long, DO_REPOSITION, *params, modes=(mode,))
         else:
-            await self._ensure_mode(mode)
+            await self._ensure_mode(mode, order)
+            # a goal, not an angle: sent again, it does not turn it further
             direction = (1 if heading_deg >= 0 else -1) if relative else 0
-            angle = abs(heading_deg) if relative else goal
-            await self._explained_command(CONDITION_YAW, angle, rate_deg_s, direction, 1 if relative else 0)
+            await self._command_of(order, CONDITION_YAW, goal, rate_deg_s, direction, 0)
         await self._await_heading(goal, tolerance_deg, timeout, self._stays_in(order, mode))
 
     async def _await_heading(
@@ -248,14 +263,9 @@ class TravelActions(ArmingActions):
         """Make nose or gimbal point at a place (MAV_CMD_DO_SET_ROI_LOCATION), until :meth:`stop_looking`."""
         latitude, longitude, altitude, is_relative = self._global_target(target)
         frame = MAV_FRAME_GLOBAL_RELATIVE_ALT_INT if is_relative else MAV_FRAME_GLOBAL_INT
-        started = self.connection.now()
-        try:
-            await self._commands.send_int(
-                DO_SET_ROI_LOCATION, frame=frame, x=latitude, y=longitude, z=altitude
-            )
-        except CommandRejected as error:
-            await self._settle()
-            raise self._explained(error, started) from None
+        place: dict[str, Any] = {"frame": frame, "x": latitude, "y": longitude, "z": altitude}
+        with self._helm.aside() as order:
+            await self._give(order, self._commands.send_int, DO_SET_ROI_LOCATION, **place)
 
     async def stop_looking(self) -> None:
         """End :meth:`look_at` (MAV_CMD_DO_SET_ROI_NONE)."""

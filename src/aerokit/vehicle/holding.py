@@ -1,0 +1,164 @@
+"""Holding: as an order, and as what is left of an order that was given up."""
+
+from __future__ import annotations
+
+import logging
+import math
+from typing import TYPE_CHECKING, Any
+
+import anyio
+
+from aerokit.errors import AerokitError
+from aerokit.vehicle.modes import CHANGE_MODE, DO_REPOSITION, DO_SET_MODE, ModeActions
+
+if TYPE_CHECKING:
+    from aerokit.autopilots import Mode
+    from aerokit.mavlink.messages import Heartbeat
+    from aerokit.runtime.connection import Connection
+    from aerokit.vehicle.guided import SetpointStream
+    from aerokit.vehicle.orders import Order
+
+__all__ = ["HoldingActions"]
+
+logger = logging.getLogger("aerokit")
+
+HOLD_AT_END_S = 1.5
+"""How long the end of a block waits for the answer to an order to hold."""
+ANSWER_S, ATTEMPTS_TO_HOLD = 0.5, 10
+"""An order to hold that was sent in passing is given again when it is not answered."""
+STOP_HERE = (DO_REPOSITION, -1, CHANGE_MODE, 0, *(math.nan,) * 4)
+"""A place that is no number means: here, with the way it takes to brake."""
+
+
+class HoldingActions(ModeActions):
+    """Stopping, and staying."""
+
+    _stream: SetpointStream[Any] | None = None
+    """The set-point stream that is open."""
+    _hold_scope: anyio.CancelScope | None = None
+    _hold_is_over: anyio.Event | None = None
+
+    def __init__(
+        self, connection: Connection, system_id: int, component_id: int, heartbeat: Heartbeat
+    ) -> None:
+        super().__init__(connection, system_id, component_id, heartbeat)
+        self._helm.on_new(self._drop_hold)
+
+    async def hold(self) -> None:
+        """Stop and stay (a fixed wing circles); returns when HEARTBEAT tells the autopilot's mode for that.
+
+        Copter BRAKE, Plane LOITER, Rover HOLD (a boat LOITER), Sub POSHOLD; PX4 LOITER where it comes to a stop.
+
+        Raises as :meth:`set_mode`; NotSupported when this vehicle has no mode for it.
+        """
+        mode = self._mode_for("hold", "hold")
+        await self._stop_in(mode, self._helm.order(mode))
+
+    async def _stop_in(self, mode: Mode, order: Order) -> None:
+        """Order it in any case; PX4 in LOITER may be on its way somewhere, where the mode alone would not stop it."""
+        if self._holds_by_reposition:
+            await self._command_of(order, *STOP_HERE)
+            await self._ensure_mode(mode, order)
+        else:
+            await self._change_mode(mode, order, told_since=order.given_at)
+
+    async def _confirm_hold(self, mode: Mode, order: Order) -> None:
+        """What :meth:`_send_hold` has sent is answered, or sent again."""
+        by_mode = DO_SET_MODE, *self.autopilot.mode_order(mode).params
+        await self._give(
+            order,
+            self._commands.send_long,
+            *(STOP_HERE if self._holds_by_reposition else by_mode),
+            modes=() if self._holds_by_reposition else (mode,),
+            attempt_timeout=ANSWER_S,
+            attempts=ATTEMPTS_TO_HOLD,
+            is_sent=True,
+        )
+
+    # -------------------------------------------------------------------- what was given up
+
+    def _hold_soon(self, order: Order) -> bool:
+        """An order was given up: tell the vehicle to hold without waiting, for the ends of blocks and cancelled calls.
+
+        One command goes out at once, if the vehicle has told lately what it does; else as soon as it tells it: what
+        a failsafe or a pilot has made of it meanwhile is left alone. A task of the vehicle's own confirms it, as
+        long as the connection is there. Nothing is sent when the order has ended, or the vehicle is known to be
+        disarmed; says whether it was, or may be.
+        """
+        mode = self.autopilot.mode_for("hold", is_vtol=self.is_vtol)
+        if mode is None or not self.connection.is_open or self.is_surely_disarmed or order.end:
+            return False
+        is_sent = self._helm.is_known
+        if is_sent:
+            self._send_hold(mode)
+            order = self._helm.order(*order.modes, mode)
+            self._helm.doubt_mode()
+        scope, is_over = anyio.CancelScope(), anyio.Event()
+        self._hold_scope, self._hold_is_over = scope, is_over
+
+        async def finish() -> None:
+            with scope:
+                await self._hold_when_known(mode, order, is_sent=is_sent)
+            if self._hold_scope is scope:
+                self._hold_scope = None
+            is_over.set()
+
+        self._background.start(finish, "aerokit hold")
+        return True
+
+    def _send_hold(self, mode: Mode) -> None:
+        if self._holds_by_reposition:
+            self._commands.send_unconfirmed(*STOP_HERE)
+        else:
+            self._commands.send_unconfirmed(DO_SET_MODE, *self.autopilot.mode_order(mode).params)
+
+    async def _hold_when_known(self, mode: Mode, order: Order, *, is_sent: bool) -> None:
+        try:
+            if is_sent:
+                await self._confirm_hold(mode, order)
+                return
+            await self._hear()
+            if not order.end and not self.is_surely_disarmed:
+                await self._stop_in(mode, self._order_to_hold(mode, order))
+        except AerokitError as error:
+            logger.warning("the vehicle was told to hold and did not confirm it: %s", error)
+
+    def _order_to_hold(self, mode: Mode, order: Order) -> Order:
+        """It is this task that gives it: it must not be dropped by it."""
+        scope, self._hold_scope = self._hold_scope, None
+        order = self._helm.order(*order.modes, mode)
+        self._hold_scope = scope
+        return order
+
+    async def _hear(self) -> None:
+        """Until the vehicle tells what it does."""
+        armed, since = self.telemetry.armed, self.connection.now()
+        await armed.wait_until(lambda _: armed.updated_at > since, description="what the vehicle does now")
+
+    def _drop_hold(self) -> None:
+        """A newer order is given: what an earlier one left to be confirmed is not confirmed any more."""
+        if self._hold_scope is not None:
+            self._hold_scope.cancel()
+            self._hold_scope = None
+
+    async def _finish_hold(self) -> None:
+        """At the end of everything: give an order to hold the time to be answered, or to be given again."""
+        if self._hold_scope is None or self._hold_is_over is None or not self.connection.is_open:
+            return
+        if self._helm.is_known:
+            with anyio.CancelScope(shield=True), anyio.move_on_after(HOLD_AT_END_S):
+                await self._hold_is_over.wait()
+        if self._hold_scope is not None:
+            logger.warning(
+                "the block of this vehicle was left before it confirmed that it holds: %s",
+                self.describe_link(),
+            )
+
+    def _end_stream(self) -> None:
+        """At the end of everything: a set-point stream that is still open ends, and the vehicle is told to hold."""
+        if self._stream is not None:
+            self._stream._stop("the block of its vehicle was left")
+
+    @property
+    def _holds_by_reposition(self) -> bool:
+        return self.autopilot.reposition is not None and self.autopilot.reposition_purpose == "hold"
