@@ -25,7 +25,7 @@ END_GRACE_S = 2.0
 """MISSION_CURRENT comes at 1 Hz or faster, and may be lost."""
 LANDED_ON_GROUND = 1
 BACK_AT_LAST_S = 300.0
-"""A return may go to a rally point, of which nothing is known here: so long after its mission is complete it is over."""
+"""A return may go to a rally point, which is not known here: so long after its mission is complete it is over."""
 
 
 class MissionEnd:
