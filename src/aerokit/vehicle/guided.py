@@ -321,7 +321,7 @@ class SetpointStream(Generic[SetpointT]):
         mode = self._vehicle.mode.latest
         if self._mode is not None and mode is not None and mode != self._mode:
             return f"the vehicle left {self._mode} for {mode}"
-        if self._mode is not None and self._order is not None and self._order.end:
+        if self._order is not None and self._order.end:
             return self._order.end
         if self._was_armed and self._vehicle.is_surely_disarmed:
             return "the vehicle disarmed"

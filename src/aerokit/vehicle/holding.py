@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import anyio
 
-from aerokit.errors import AerokitError
+from aerokit.errors import AerokitError, OperationTimeout
 from aerokit.vehicle.modes import CHANGE_MODE, DO_REPOSITION, DO_SET_MODE, ModeActions
 
 if TYPE_CHECKING:
@@ -24,6 +24,8 @@ logger = logging.getLogger("aerokit")
 
 HOLD_AT_END_S = 1.5
 """How long the end of a block waits for the answer to an order to hold."""
+ROUNDS = 3
+"""So often it is told to hold when it is heard again."""
 ANSWER_S, ATTEMPTS_TO_HOLD = 0.5, 10
 """An order to hold that was sent in passing is given again when it is not answered."""
 STOP_HERE = (DO_REPOSITION, -1, CHANGE_MODE, 0, *(math.nan,) * 4)
@@ -113,15 +115,22 @@ class HoldingActions(ModeActions):
             self._commands.send_unconfirmed(DO_SET_MODE, *self.autopilot.mode_order(mode).params)
 
     async def _hold_when_known(self, mode: Mode, order: Order, *, is_sent: bool) -> None:
-        try:
-            if is_sent:
-                await self._confirm_hold(mode, order)
+        for _ in range(ROUNDS):
+            try:
+                if is_sent:
+                    await self._confirm_hold(mode, order)
+                    return
+                await self._hear()
+                if not order.end and not self.is_surely_disarmed:
+                    order = self._order_to_hold(mode, order)
+                    await self._stop_in(mode, order)
                 return
-            await self._hear()
-            if not order.end and not self.is_surely_disarmed:
-                await self._stop_in(mode, self._order_to_hold(mode, order))
-        except AerokitError as error:
-            logger.warning("the vehicle was told to hold and did not confirm it: %s", error)
+            except OperationTimeout as error:
+                logger.warning("the vehicle was told to hold and has not confirmed it yet: %s", error)
+                is_sent = False
+            except AerokitError as error:
+                logger.warning("the vehicle was told to hold and does not: %s", error)
+                return
 
     def _order_to_hold(self, mode: Mode, order: Order) -> Order:
         """It is this task that gives it: it must not be dropped by it."""

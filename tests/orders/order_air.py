@@ -1,0 +1,138 @@
+"""The air between a program and a vehicle: what it loses, delays and cuts, and everything that crossed it."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+from dataclasses import dataclass, field
+
+from aerokit.links.link import Link, Peer, Receiver
+from aerokit.mavlink.dialect import STANDARD
+from aerokit.mavlink.framer import Framer
+from aerokit.mavlink.message import Message
+from aerokit.mavlink.messages import CommandAck, CommandInt, CommandLong, Heartbeat
+
+
+@dataclass
+class Weather:
+    """What goes wrong, in seconds since the order was given.
+
+    The first ``lost_acks`` answers to ``command`` are lost, the first ``lost_commands`` times that it is sent, too. In
+    ``outage`` (from, until) nothing crosses; what is written in ``stall`` arrives at its end, in order.
+    """
+
+    command: int = 0
+    lost_acks: int = 0
+    lost_commands: int = 0
+    outage: tuple[float, float] | None = None
+    stall: tuple[float, float] | None = None
+    latency_s: float = 0.02
+
+
+@dataclass
+class Crossing:
+    """One message that the program wrote or read, or would have; ``number`` counts both, in their order."""
+
+    number: int
+    at: float
+    message: Message
+    is_lost: bool = False
+
+
+@dataclass
+class Air(Link):
+    """The program's end of a link through :class:`Weather`, which begins at :meth:`begin`."""
+
+    link: Link
+    weather: Weather = field(default_factory=Weather)
+
+    def __post_init__(self) -> None:
+        self.address = self.link.address
+        self.sent: list[Crossing] = []
+        self.heard: list[Crossing] = []
+        self._began = float("inf")
+        self._numbers = itertools.count()
+        self._up, self._down = Framer(), Framer()
+        self._receiver: Receiver | None = None
+
+    def begin(self) -> None:
+        """The order is given now."""
+        self._began = _now()
+        self.sent.clear()
+        self.heard = [each for each in self.heard if isinstance(each.message, Heartbeat)][-1:]
+
+    @property
+    def heartbeats(self) -> list[Crossing]:
+        """What the program has heard the vehicle tell of itself."""
+        return [each for each in self.heard if isinstance(each.message, Heartbeat)]
+
+    # ------------------------------------------------------------------------------------ link
+
+    async def open(self, receiver: Receiver) -> None:
+        self._receiver = receiver
+        await self.link.open(self)
+
+    def write(self, data: bytes, peer: Peer = None) -> None:
+        for frame in self._up.receive(data, _now()):
+            message = STANDARD.decode(frame)
+            is_lost = self._is_out() or self._loses(message)
+            self.sent.append(Crossing(next(self._numbers), _now(), message, is_lost))
+            if not is_lost:
+                asyncio.get_running_loop().call_later(self._delay(), self.link.write, frame.raw)
+
+    def close(self) -> None:
+        self.link.close()
+
+    async def wait_closed(self) -> None:
+        await self.link.wait_closed()
+
+    # -------------------------------------------------------------------------------- receiver
+
+    def bytes_received(self, data: bytes, peer: Peer) -> None:
+        for frame in self._down.receive(data, _now()):
+            message = STANDARD.decode(frame)
+            is_lost = self._is_out() or self._loses(message)
+            if is_lost or self._receiver is None:
+                continue
+            asyncio.get_running_loop().call_later(self.weather.latency_s, self._arrive, frame.raw, message)
+
+    def link_lost(self, error: Exception) -> None:
+        if self._receiver is not None:
+            self._receiver.link_lost(error)  # type: ignore[arg-type]
+
+    def link_stalled(self, unsent_bytes: int) -> None:
+        """It never does."""
+
+    def link_drained(self) -> None:
+        """It always does."""
+
+    def _arrive(self, raw: bytes, message: Message) -> None:
+        self.heard.append(Crossing(next(self._numbers), _now(), message))
+        if self._receiver is not None:
+            self._receiver.bytes_received(raw, None)
+
+    def _is_out(self) -> bool:
+        since, outage = _now() - self._began, self.weather.outage
+        return outage is not None and outage[0] <= since < outage[1]
+
+    def _loses(self, message: Message) -> bool:
+        weather = self.weather
+        if _now() < self._began or getattr(message, "command", None) != weather.command:
+            return False
+        if isinstance(message, CommandAck) and weather.lost_acks:
+            weather.lost_acks -= 1
+            return True
+        if isinstance(message, (CommandLong, CommandInt)) and weather.lost_commands:
+            weather.lost_commands -= 1
+            return True
+        return False
+
+    def _delay(self) -> float:
+        since, stall = _now() - self._began, self.weather.stall
+        if stall is not None and stall[0] <= since < stall[1]:
+            return stall[1] - since + self.weather.latency_s
+        return self.weather.latency_s
+
+
+def _now() -> float:
+    return asyncio.get_running_loop().time()

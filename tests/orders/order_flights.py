@@ -1,0 +1,191 @@
+"""One flight of the order table: a vehicle in its place, an order, the weather, and somebody else who acts."""
+
+from __future__ import annotations
+
+import asyncio
+import random
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import anyio
+from order_air import Air, Weather
+from order_table import Row, upload
+
+import aerokit
+from aerokit.errors import AerokitError
+from aerokit.mavlink.enums import CopterMode
+from aerokit.mavlink.message import Message
+from aerokit.mavlink.messages import GlobalPositionInt
+from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
+from aerokit.sim.px4.modes import POSITION, RTL
+from aerokit.sim.track import true_point
+from aerokit.testing import run_virtual
+
+Simulated = SimulatedCopter | SimulatedPx4
+
+RATES: dict[type[Message], float] = {GlobalPositionInt: 4.0}
+WATCH_S, WATCH_ARMING_S = 8.0, 18.0
+"""So long after the order's end it is looked what becomes of it: an order to arm may come late."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """What happens: all times are seconds since the order was given."""
+
+    row: Row
+    autopilot: str
+    weather: Weather
+    pilot_at: float | None = None
+    """When somebody else acts: turns the mode switch; on the ground, disarms."""
+    failsafe_at: float | None = None
+    """When the vehicle returns by itself."""
+    station_failsafe: bool = False
+    """Whether it returns when it does not hear the ground station."""
+    cancel_at: float | None = None
+
+
+@dataclass
+class Flown:
+    """What came of it."""
+
+    case: Case
+    vehicle: Simulated
+    air: Air
+    given_at: float
+    ended_at: float
+    error: BaseException | None
+    told_at_end: tuple[str, bool]
+    """Mode and armed as the program knew them when the call ended."""
+    acted: list[tuple[float, str]]
+    """When somebody else acted, on the program's clock, and in which mode the vehicle was then."""
+
+    @property
+    def is_armed_at_end(self) -> bool:
+        return true_point(self.vehicle).armed
+
+
+def mode_of(vehicle: Simulated) -> str:
+    """The mode that it is truly in, as programs spell it."""
+    return true_point(vehicle).mode
+
+
+def random_case(row: Row, autopilot: str, seed: int) -> Case:
+    """Lost answers × lost copies × delays × pilot × failsafe × outage, by a seed."""
+    dice = random.Random(f"{row.name} {row.command} {autopilot} {seed}")
+    weather = Weather(
+        command=row.command,
+        lost_acks=dice.choice((0, 1, 1, 2, 9)),
+        lost_commands=dice.choice((0, 0, 1, 2)),
+        latency_s=dice.choice((0.01, 0.05, 0.2)),
+    )
+    if dice.random() < 0.35:
+        begin = round(dice.uniform(0.0, 5.0), 2)
+        weather.outage = (begin, begin + round(dice.uniform(1.0, 14.0), 2))
+    elif dice.random() < 0.15:
+        weather.stall = (0.0, round(dice.uniform(1.0, 8.0), 2))
+    happens = dice.random()
+    return Case(
+        row,
+        autopilot,
+        weather,
+        pilot_at=round(dice.uniform(0.05, 6.0), 2) if happens < 0.45 else None,
+        failsafe_at=round(dice.uniform(0.05, 6.0), 2) if 0.45 <= happens < 0.6 else None,
+        station_failsafe=dice.random() < 0.5,
+        cancel_at=round(dice.uniform(0.05, 12.0), 2) if dice.random() < 0.25 else None,
+    )
+
+
+def fly(case: Case) -> Flown:
+    """Fly it on virtual time."""
+    return run_virtual(_fly(replace(case, weather=replace(case.weather))))
+
+
+async def _go_to_place(place: str, vehicle: Simulated, program: aerokit.Vehicle) -> None:
+    await program.wait_ready()
+    if isinstance(vehicle, SimulatedCopter):
+        vehicle.rc[2] = 1000 if place in ("ground", "armed") else 1500
+        await program.set_mode("GUIDED")
+    if place != "ground":
+        await program.arm()
+    if place.startswith("air"):
+        await program.take_off(10.0)
+        await anyio.sleep(1.0)
+    if "mission" in place:
+        await upload(program)
+    if "on its mission" in place:
+        await program.mission.start()
+    if "by hand" in place:
+        take_over(vehicle)
+    await anyio.sleep(1.5)
+
+
+def take_over(vehicle: Simulated) -> None:
+    """The pilot turns the mode switch, the sticks in the middle."""
+    if isinstance(vehicle, SimulatedCopter):
+        vehicle.rc[2] = 1500
+        vehicle.set_mode(CopterMode.ALT_HOLD)
+    else:
+        vehicle.switch_to(POSITION)
+
+
+def _return(vehicle: Simulated) -> None:
+    if isinstance(vehicle, SimulatedCopter):
+        vehicle.set_mode(CopterMode.RTL)
+    else:
+        vehicle.change_mode(RTL)
+
+
+def _act(case: Case, vehicle: Simulated) -> None:
+    """Another station disarms what stands on the ground; a pilot takes what flies."""
+    if case.row.place == "ground":
+        if isinstance(vehicle, SimulatedCopter):
+            vehicle.arming.disarm()
+        else:
+            vehicle.arming.disarm("another station")
+    else:
+        take_over(vehicle)
+
+
+def _set_up(case: Case) -> Simulated:
+    if case.autopilot == "px4":
+        px4 = SimulatedPx4(boot_time_s=1.0)
+        px4.parameters["NAV_DLL_ACT"] = 2.0 * case.station_failsafe
+        return px4
+    copter = SimulatedCopter(boot_time_s=0.0)
+    copter.parameters["FS_GCS_ENABLE"] = 1.0 * case.station_failsafe
+    return copter
+
+
+async def _fly(case: Case) -> Flown:
+    vehicle, loop = _set_up(case), asyncio.get_running_loop()
+    async with simulated_link(vehicle) as link:
+        air = Air(link)
+        async with aerokit.connect(air, rates=RATES) as program:
+            await _go_to_place(case.row.place, vehicle, program)
+            air.weather = case.weather
+            air.begin()
+            given_at = loop.time()
+            acted: list[tuple[float, str]] = []
+
+            def later(at: float | None, act: Callable[[], None]) -> None:
+                def happen() -> None:
+                    act()
+                    acted.append((loop.time(), mode_of(vehicle)))
+
+                if at is not None:
+                    loop.call_later(at, happen)
+
+            later(case.pilot_at, lambda: _act(case, vehicle))
+            later(case.failsafe_at, lambda: _return(vehicle))
+            error: BaseException | None = None
+            with anyio.CancelScope(deadline=given_at + (case.cancel_at or 1e6)) as scope:
+                try:
+                    await case.row.give(program)
+                except AerokitError as caught:
+                    error = caught
+            if scope.cancelled_caught:
+                error = asyncio.CancelledError()
+            ended_at = loop.time()
+            told = (program.mode_name or "", program.is_armed)
+            await anyio.sleep(WATCH_ARMING_S if case.row.name == "arm" else WATCH_S)
+            return Flown(case, vehicle, air, given_at, ended_at, error, told, acted)

@@ -1,0 +1,194 @@
+"""What must never be: each rule of docs/reliability.md held against what crossed the air."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterator
+
+from order_air import Crossing
+from order_flights import WATCH_S, Flown, mode_of
+from order_table import ARM
+
+from aerokit.autopilots import autopilot_for, is_armed
+from aerokit.errors import OperationTimeout
+from aerokit.mavlink.message import Message
+from aerokit.mavlink.messages import (
+    CommandInt,
+    CommandLong,
+    Heartbeat,
+    SetAttitudeTarget,
+    SetMode,
+    SetPositionTargetGlobalInt,
+    SetPositionTargetLocalNed,
+)
+from aerokit.vehicle.orders import MOVING_COMMANDS, QUESTIONS
+
+KNOWN_S = 2.6
+SETPOINTS = (SetPositionTargetLocalNed, SetPositionTargetGlobalInt, SetAttitudeTarget)
+HEARD_S = 4.0
+"""So long after an outage it is known what the vehicle does, and told to hold."""
+FIRST_S = 0.01
+"""What is sent so soon after the call is the order itself."""
+
+
+def faults(flown: Flown) -> list[str]:
+    """Every rule that was broken, in words."""
+    return [
+        *_sent_again(flown),
+        *_sent_blind(flown),
+        *_taken_back(flown),
+        *_untrue(flown),
+        *_armed_late(flown),
+        *_left_flying(flown),
+        *_sent_afterwards(flown),
+        *_endless(flown),
+    ]
+
+
+def _orders(flown: Flown) -> Iterator[Crossing]:
+    for each in flown.air.sent:
+        command = getattr(each.message, "command", None)
+        is_command = isinstance(each.message, (CommandLong, CommandInt)) and command not in QUESTIONS
+        if is_command or isinstance(each.message, SetMode):
+            yield each
+
+
+def _told(flown: Flown, since: int, until: int) -> list[tuple[int, bool]]:
+    """The states that HEARTBEAT told between these two crossings."""
+    return [_state(each) for each in flown.air.heartbeats if since < each.number < until]
+
+
+def _state(heard: Crossing) -> tuple[int, bool]:
+    assert isinstance(heard.message, Heartbeat)
+    return heard.message.custom_mode, is_armed(heard.message.base_mode)
+
+
+def _key(message: Message) -> object:
+    fields = message.to_dict()
+    fields.pop("confirmation", None)
+    return message.NAME, repr(sorted(fields.items()))
+
+
+def _sent_again(flown: Flown) -> Iterator[str]:
+    """The same order again: only after a HEARTBEAT since, and all since the first sending tell the same as before."""
+    first: dict[object, int] = {}
+    last: dict[object, int] = {}
+    for each in _orders(flown):
+        key = _key(each.message)
+        if key in first:
+            before = _told(flown, -1, first[key])[-1:]
+            since = _told(flown, first[key], each.number)
+            if not _told(flown, last[key], each.number):
+                yield f"{_s(flown, each)} was sent again without a HEARTBEAT since"
+            elif any(told != before[0] for told in since):
+                yield f"{_s(flown, each)} was sent again although HEARTBEAT had told a change"
+        first.setdefault(key, each.number)
+        last[key] = each.number
+
+
+def _sent_blind(flown: Flown) -> Iterator[str]:
+    """What is left of an order is not sent into a silence."""
+    for each in _orders(flown):
+        is_late = each.at > flown.given_at + FIRST_S
+        if is_late and not any(each.at - KNOWN_S <= told.at <= each.at for told in flown.air.heartbeats):
+            yield f"{_s(flown, each)} was sent blind"
+
+
+def _taken_back(flown: Flown) -> Iterator[str]:
+    """Once somebody else's mode was told, nothing that steers is sent."""
+    taken = _taken(flown)
+    if taken is None or not flown.case.row.steers:
+        return
+    for each in flown.air.sent:
+        command = getattr(each.message, "command", None)
+        steers = command in MOVING_COMMANDS - {ARM} or isinstance(each.message, (SetMode, *SETPOINTS))
+        if steers and each.number > taken.number:
+            yield f"{_s(flown, each)} was sent after somebody else's mode: {_s(flown, taken)}"
+
+
+def _taken(flown: Flown) -> Crossing | None:
+    """The HEARTBEAT by which the program could know that somebody else steers."""
+    own = set(flown.case.row.modes[flown.case.autopilot == "px4"])
+    told = flown.air.heartbeats
+    assert isinstance(told[0].message, Heartbeat)
+    autopilot = autopilot_for(told[0].message)
+    allowed: set[str] = set()
+    for each in told:
+        assert isinstance(each.message, Heartbeat)
+        name = autopilot.mode_of(each.message).name
+        if each.at < flown.given_at:
+            allowed = {name}
+        elif name in own:
+            allowed = set()
+        elif name not in allowed:
+            return each
+    return None
+
+
+def _untrue(flown: Flown) -> Iterator[str]:
+    """What returned well was true when it returned."""
+    if flown.error is not None:
+        return
+    mode, armed = flown.told_at_end
+    row, own = flown.case.row, flown.case.row.modes[flown.case.autopilot == "px4"]
+    if row.name in ("set_mode", "hold") and mode not in own:
+        yield f"{row.name} returned in {mode}"
+    if row.name == "arm" and not armed:
+        yield "arm returned disarmed"
+    if row.name == "disarm" and armed:
+        yield "disarm returned armed"
+    if row.name.startswith("go_to") and mode not in own:
+        yield f"go_to returned in {mode}"
+
+
+def _armed_late(flown: Flown) -> Iterator[str]:
+    """An order to arm that was given up leaves nothing armed."""
+    if flown.case.row.name == "arm" and flown.error is not None and flown.is_armed_at_end:
+        yield f"arm ended with {flown.error!r} and the vehicle is armed"
+
+
+def _left_flying(flown: Flown) -> Iterator[str]:
+    """What was given up, and nobody else has taken, holds; also when it was silent then."""
+    row, given_up = flown.case.row, isinstance(flown.error, (asyncio.CancelledError, OperationTimeout))
+    outage = flown.case.weather.outage
+    is_heard = outage is None or flown.given_at + outage[1] < flown.ended_at + WATCH_S - HEARD_S
+    if (
+        row.holds
+        and given_up
+        and is_heard
+        and _taken(flown) is None
+        and not flown.acted
+        and flown.is_armed_at_end
+    ):
+        wanted = "LOITER" if flown.case.autopilot == "px4" else "BRAKE"
+        was_ordered = row.place != "armed" or flown.vehicle.altitude_m > 1.0
+        if was_ordered and mode_of(flown.vehicle) != wanted and _is_reached(flown):
+            yield f"it was given up ({flown.error!r}) and is in {mode_of(flown.vehicle)}"
+
+
+def _sent_afterwards(flown: Flown) -> Iterator[str]:
+    """A transfer or a setting that was given up sends nothing more."""
+    if flown.case.row.steers or flown.case.row.name == "arm":
+        return
+    for each in flown.air.sent:
+        is_lasting = each.message.NAME in ("PARAM_SET", "MISSION_COUNT", "MISSION_ITEM_INT", "MISSION_ITEM")
+        if each.at > flown.ended_at and (is_lasting or each in list(_orders(flown))):
+            yield f"{_s(flown, each)} was sent after the call had ended"
+
+
+def _is_reached(flown: Flown) -> bool:
+    """Whether the vehicle got anything of it."""
+    return any(not each.is_lost for each in _orders(flown))
+
+
+def _endless(flown: Flown) -> Iterator[str]:
+    if flown.ended_at - flown.given_at > 62.0:
+        yield f"it took {flown.ended_at - flown.given_at:.0f} s"
+
+
+def _s(flown: Flown, each: Crossing) -> str:
+    message = each.message.to_dict()
+    what = " ".join(
+        f"{key}={value:g}" for key, value in message.items() if isinstance(value, (int, float)) and value
+    )
+    return f"{each.at - flown.given_at:.2f} s: {each.message.NAME} {what}"

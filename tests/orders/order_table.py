@@ -1,0 +1,168 @@
+"""Every order of docs/reliability.md: how it is given, where, and what it may bring about."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from typing import Any
+
+import aerokit
+from aerokit import missions
+from aerokit.mavlink.enums import MavCmd
+
+Give = Callable[[aerokit.Vehicle], Awaitable[object]]
+
+
+@dataclass(frozen=True)
+class Row:
+    """One order. ``modes`` are those that it may bring about, on ArduCopter and on PX4.
+
+    ``steers``: it decides where the vehicle goes; given up, the vehicle is told to hold if ``holds``. ``command`` is
+    the one whose answers and copies get lost. ``place`` is where the vehicle is when it is given.
+    """
+
+    name: str
+    give: Give
+    command: int
+    place: str = "air"
+    modes: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
+    steers: bool = True
+    holds: bool = False
+    on: tuple[str, ...] = ("ardupilot", "px4")
+
+
+def north(vehicle: aerokit.Vehicle, metres: float) -> aerokit.Position:
+    return vehicle.position.value.offset(north_m=metres)
+
+
+async def _fly_setpoints(vehicle: aerokit.Vehicle) -> None:
+    async with vehicle.guided.velocity() as stream:
+        await stream.fly(aerokit.VelocitySetpoint(north_m_s=1.0), 6.0)
+
+
+async def upload(vehicle: aerokit.Vehicle) -> None:
+    here = vehicle.position.value
+    places = [here.offset(north_m=20.0 * number) for number in range(1, 4)]
+    items = [
+        missions.waypoint(each.latitude_deg, each.longitude_deg, altitude_relative_m=20) for each in places
+    ]
+    mission = missions.Mission(items)
+    await vehicle.mission.upload(mission, method="items")
+
+
+def _gimbal_up(vehicle: aerokit.Vehicle) -> Awaitable[object]:
+    return vehicle.command(MavCmd.DO_SET_SERVO, 9, 1500)
+
+
+def _set(name: tuple[str, str]) -> Give:
+    async def give(vehicle: aerokit.Vehicle) -> Any:
+        which = name[vehicle.autopilot.name == "PX4"]
+        return await vehicle.parameters.set(which, 7.0)
+
+    return give
+
+
+SET_MODE = int(MavCmd.DO_SET_MODE)
+REPOSITION = int(MavCmd.DO_REPOSITION)
+ARM = int(MavCmd.COMPONENT_ARM_DISARM)
+REBOOT = int(MavCmd.PREFLIGHT_REBOOT_SHUTDOWN)
+
+ROWS = (
+    Row(
+        "set_mode",
+        lambda v: v.set_mode("LOITER"),
+        SET_MODE,
+        modes=(("LOITER",), ("LOITER",)),
+        on=("ardupilot",),
+    ),
+    Row("set_mode", lambda v: v.set_mode("LAND"), SET_MODE, modes=(("LAND",), ("LAND",)), on=("px4",)),
+    Row("hold", lambda v: v.hold(), SET_MODE, modes=(("BRAKE",), ("LOITER",))),
+    Row("hold", lambda v: v.hold(), REPOSITION, modes=(("BRAKE",), ("LOITER",)), on=("px4",)),
+    Row("land", lambda v: v.land(), SET_MODE, modes=(("LAND",), ("LAND",))),
+    Row("return_to_launch", lambda v: v.return_to_launch(timeout=40), SET_MODE, modes=(("RTL",), ("RTL",))),
+    Row(
+        "go_to",
+        lambda v: v.go_to(north(v, 12.0), timeout=30),
+        REPOSITION,
+        modes=(("GUIDED", "BRAKE"), ("LOITER", "OFFBOARD")),
+        holds=True,
+    ),
+    Row(
+        "go_to from another mode",
+        lambda v: v.go_to(north(v, 12.0), timeout=30),
+        REPOSITION,
+        place="air, flown by hand",
+        modes=(("GUIDED", "BRAKE"), ("LOITER", "OFFBOARD")),
+        holds=True,
+    ),
+    Row(
+        "take_off",
+        lambda v: v.take_off(6.0, timeout=30),
+        int(MavCmd.NAV_TAKEOFF),
+        place="armed",
+        modes=(("GUIDED", "BRAKE"), ("TAKEOFF", "LOITER")),
+        holds=True,
+    ),
+    Row(
+        "set_heading",
+        lambda v: v.set_heading(45.0, relative=True, timeout=15),
+        int(MavCmd.CONDITION_YAW),
+        modes=(("GUIDED",), ("LOITER",)),
+        on=("ardupilot",),
+    ),
+    Row(
+        "guided.velocity",
+        _fly_setpoints,
+        SET_MODE,
+        modes=(("GUIDED", "BRAKE"), ("OFFBOARD", "LOITER")),
+        holds=True,
+    ),
+    Row(
+        "mission.start",
+        lambda v: v.mission.start(),
+        int(MavCmd.MISSION_START),
+        place="air, with a mission",
+        modes=(("AUTO", "BRAKE"), ("MISSION", "LOITER")),
+        holds=True,
+        on=("ardupilot",),
+    ),
+    Row(
+        "mission.start",
+        lambda v: v.mission.start(),
+        SET_MODE,
+        place="air, with a mission",
+        modes=(("AUTO", "BRAKE"), ("MISSION", "LOITER")),
+        holds=True,
+        on=("px4",),
+    ),
+    Row(
+        "mission.pause",
+        lambda v: v.mission.pause(),
+        SET_MODE,
+        place="air, on its mission",
+        modes=(("BRAKE",), ("LOITER",)),
+    ),
+    Row(
+        "mission.resume",
+        lambda v: v.mission.resume(),
+        SET_MODE,
+        place="air, with a mission",
+        modes=(("AUTO", "BRAKE"), ("MISSION", "LOITER")),
+        holds=True,
+    ),
+    Row(
+        "mission.set_current",
+        lambda v: v.mission.set_current(1),
+        int(MavCmd.DO_SET_MISSION_CURRENT),
+        place="air, on its mission",
+        steers=False,
+    ),
+    Row("reboot", lambda v: v.reboot(timeout=20), REBOOT, place="ground", steers=False),
+    Row("arm", lambda v: v.arm(), ARM, place="ground", steers=False),
+    Row("disarm", lambda v: v.disarm(), ARM, place="armed", steers=False),
+    Row("set_speed", lambda v: v.set_speed(2.0), int(MavCmd.DO_CHANGE_SPEED), steers=False),
+    Row("look_at", lambda v: v.look_at(north(v, 50.0)), int(MavCmd.DO_SET_ROI_LOCATION), steers=False),
+    Row("command", _gimbal_up, int(MavCmd.DO_SET_SERVO), steers=False, on=("ardupilot",)),
+    Row("parameters.set", _set(("WP_YAW_BEHAVIOR", "NAV_ACC_RAD")), 0, steers=False),
+    Row("mission.upload", upload, 0, steers=False),
+)

@@ -1,0 +1,108 @@
+"""The order table: lost answers × lost copies × delays × pilot × failsafe × outage × both autopilots, on virtual time.
+
+`nox -s orders -- SEEDS` flies many more seeds of each row than these.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+import pytest
+from order_air import Weather
+from order_flights import Case, fly, mode_of, random_case
+from order_judge import faults
+from order_table import ARM, REPOSITION, ROWS, SET_MODE, Row
+
+from aerokit.errors import CommandTimeout, OperationRejected
+
+SEEDS = int(os.environ.get("AEROKIT_ORDER_SEEDS", "3"))
+BY_NAME = {row.name: row for row in ROWS}
+BOTH = ("ardupilot", "px4")
+
+
+@pytest.mark.parametrize("seed", range(SEEDS))
+@pytest.mark.parametrize(
+    ("row", "autopilot"),
+    [pytest.param(row, each, id=f"{row.name}-{row.command}-{each}") for row in ROWS for each in row.on],
+)
+def test_no_rule_is_broken(row: Row, autopilot: str, seed: int) -> None:
+    case = random_case(row, autopilot, seed)
+    assert faults(fly(case)) == [], case
+
+
+def skip_test_each_order_stands_in_the_documentation() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "reliability.md").read_text()
+    for row in ROWS:
+        assert re.search(rf"^\| [^|]*`{re.escape(row.name.split()[0])}", text, re.MULTILINE), row.name
+
+
+# --------------------------------------------------------- the faults that were found, one by one
+
+
+@pytest.mark.parametrize("autopilot", BOTH)
+def test_a_pilot_who_took_over_during_a_lost_answer_keeps_the_vehicle(autopilot: str) -> None:
+    weather = Weather(command=REPOSITION, lost_acks=1)
+    flown = fly(Case(BY_NAME["go_to"], autopilot, weather, pilot_at=0.3))
+    assert isinstance(flown.error, OperationRejected)
+    assert len([each for each in flown.air.sent if getattr(each.message, "command", 0) == REPOSITION]) == 1
+    assert mode_of(flown.vehicle) == flown.acted[0][1]
+
+
+@pytest.mark.parametrize("name", ["land", "return_to_launch", "hold"])
+def test_a_mode_that_was_told_is_not_ordered_again(name: str) -> None:
+    """The answer is lost, HEARTBEAT tells the mode, then the pilot takes over, before the time to send again."""
+    flown = fly(Case(BY_NAME[name], "ardupilot", Weather(command=SET_MODE, lost_acks=9), pilot_at=0.4))
+    assert len([each for each in flown.air.sent if getattr(each.message, "command", 0) == SET_MODE]) == 1
+    assert mode_of(flown.vehicle) == "ALT_HOLD"
+
+
+@pytest.mark.parametrize("autopilot", BOTH)
+def test_arming_is_not_repeated_against_another_station(autopilot: str) -> None:
+    flown = fly(Case(BY_NAME["arm"], autopilot, Weather(command=ARM, lost_acks=9), pilot_at=1.3))
+    assert len([each for each in flown.air.sent if getattr(each.message, "command", 0) == ARM]) == 1
+    assert not flown.is_armed_at_end
+
+
+@pytest.mark.parametrize("until", [10.3, 11.0, 12.0, 13.0])
+@pytest.mark.parametrize("name", ["go_to", "guided.velocity"])
+def test_a_failsafe_during_an_outage_is_left_alone(name: str, until: float) -> None:
+    """FS_GCS_ENABLE returns the vehicle after five seconds; what was to be held then stays with the failsafe."""
+    weather = Weather(outage=(0.5, 0.5 + until))
+    flown = fly(Case(BY_NAME[name], "ardupilot", weather, station_failsafe=True))
+    assert flown.error is not None
+    assert mode_of(flown.vehicle) in ("RTL", "LAND")
+    assert faults(flown) == []
+
+
+@pytest.mark.parametrize("cancel_at", [2.0, 6.5, 9.0])
+def test_cancelled_in_an_outage_it_leaves_a_failsafe_alone(cancel_at: float) -> None:
+    weather = Weather(outage=(0.5, 12.0))
+    flown = fly(Case(BY_NAME["go_to"], "ardupilot", weather, station_failsafe=True, cancel_at=cancel_at))
+    assert mode_of(flown.vehicle) in ("RTL", "LAND")
+    assert faults(flown) == []
+
+
+@pytest.mark.parametrize("autopilot", BOTH)
+def test_cancelled_in_an_outage_without_a_failsafe_it_holds_when_it_is_heard_again(autopilot: str) -> None:
+    row = BY_NAME["go_to"]
+    far = Row(
+        row.name,
+        lambda v: v.go_to(v.position.value.offset(north_m=300.0)),
+        row.command,
+        modes=row.modes,
+        holds=True,
+    )
+    flown = fly(Case(far, autopilot, Weather(outage=(1.0, 6.0)), cancel_at=5.0))
+    assert mode_of(flown.vehicle) == ("LOITER" if autopilot == "px4" else "BRAKE")
+    assert faults(flown) == []
+
+
+@pytest.mark.parametrize("autopilot", BOTH)
+def test_an_order_to_arm_that_comes_late_is_taken_back(autopilot: str) -> None:
+    """A stalled line delivers it three seconds after the call has given up."""
+    flown = fly(Case(BY_NAME["arm"], autopilot, Weather(stall=(0.0, 7.0))))
+    assert isinstance(flown.error, CommandTimeout)
+    assert "may still be carried out" in str(flown.error)
+    assert not flown.is_armed_at_end
