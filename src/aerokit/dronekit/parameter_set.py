@@ -42,8 +42,8 @@ def number_of(name: str, value: object) -> int | float:
 async def set_parameter(aio: AsyncVehicle, name: str, value: float, retries: int) -> AerokitError | None:
     """Have the vehicle take a value; returns why it has not, None when it has confirmed it.
 
-    A fraction given for an integer parameter is cut off, as by ArduPilot itself. To a vehicle that answers nothing
-    PARAM_SET is sent ``retries`` + 1 times, and as many seconds are waited.
+    A fraction given for an integer parameter is cut off, as by ArduPilot itself. A vehicle that answers nothing
+    is sent PARAM_SET once, then asked what it has, for ``retries`` + 1 tries in all.
     """
     access, names = aio.parameters._access, aio.parameters._names
     patience_s = (retries + LAST_TRY) * _try_s(aio)
@@ -53,7 +53,7 @@ async def set_parameter(aio: AsyncVehicle, name: str, value: float, retries: int
             return found
         type_ = found.parameter.type
         wanted = Parameter(found.name, as_held(found.name, found.to_vehicle(value), type_), type_)
-        answers = await access.write([wanted], patience_s, most_unanswered=retries + 1)
+        answers = await access.write([wanted], patience_s)
     except LocalProtocolError as error:
         return error
     answer = answers[found.name]

@@ -34,14 +34,12 @@ also stand in a message that was under way, while PARAM_SET was lost."""
 class ParameterWrites(ParameterRequests):
     """Set some parameters; ends with what the vehicle says each of them is then.
 
-    The answer that tells value and type as asked for ends a write. One with another value may be older than the
-    write: it is set again and read back, and only what comes again is the answer. So a vehicle that rounds or clamps
-    is believed after a second answer, and nothing is sent for ever.
+    The answer that tells value and type as asked for ends a write. When none comes the vehicle is asked what it has: a
+    PARAM_SET is never sent into a silence. Only an answer with the value from ``before`` (the one known so far) has it
+    set again; any other value is the vehicle's own (it rounds or clamps) or another station's, and is the answer
+    when it comes twice. So nothing is sent for ever, and nobody's later setting is undone.
 
-    ``most_unanswered``: so many PARAM_SET are sent at most to a vehicle that answers nothing; after them it is asked
-    what it has, and an answer with another value has it set again.
-
-    ``before`` are the values known so far. ``recent`` are names that were written a moment ago: echoes of that write
+    ``recent`` are names that were written a moment ago: echoes of that write
     may still come, so that the first answer as asked is read back.
     """
 
@@ -54,7 +52,6 @@ class ParameterWrites(ParameterRequests):
         bytewise: bool,
         before: Mapping[str, float] = MappingProxyType({}),
         recent: Iterable[str] = (),
-        most_unanswered: int | None = None,
         own_system: int = 0,
         round_trip: RoundTrip | None = None,
         patience_s: float = PATIENCE_S,
@@ -74,23 +71,20 @@ class ParameterWrites(ParameterRequests):
         )
         self._before = dict(before)
         self._recent = set(recent)
-        self._most_unanswered = most_unanswered
-        self._unanswered = dict.fromkeys(self._wanted, 0)
+        self._to_set = set(self._wanted)
+        """Those that may be set with the next request."""
         self._others: dict[str, list[Parameter]] = {}
 
     def _request(self, name: str) -> list[Message]:
         wanted, others = self._wanted[name], self._others.get(name)
         read = ParamRequestRead(self.target_system, self.target_component, name, BY_NAME)
-        if others and same_value(others[-1].value, wanted.value):
+        if name not in self._to_set:
             return [read]
+        self._to_set.remove(name)
         write = set_message(
             self.target_system, self.target_component, name, wanted.value, wanted.type, self._bytewise
         )
-        if others:
-            return [write, read]
-        self._unanswered[name] += 1
-        most = self._most_unanswered
-        return [write] if most is None or self._unanswered[name] <= most else [read]
+        return [write, read] if others else [write]
 
     def _take(self, message: ParamValue, now: float) -> None:
         name = message.param_id
@@ -116,7 +110,9 @@ class ParameterWrites(ParameterRequests):
             others.clear()
         others.append(told)
         self._window.answered(name, now)
-        is_no_change = name in self._before and same_value(told.value, self._before[name])
+        is_no_change = same_value(told.value, self._before.get(name, told.value))
+        if is_no_change and not is_as_asked:
+            self._to_set.add(name)
         if len(others) >= (VERDICT_OF_NO_CHANGE if is_no_change else VERDICT):
             self._settle(name, told, now)
         else:

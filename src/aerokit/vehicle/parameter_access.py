@@ -256,8 +256,6 @@ class ParameterAccess:
         wanted: Iterable[Parameter],
         patience_s: float,
         on_progress: OnProgress | None = None,
-        *,
-        most_unanswered: int | None = None,
     ) -> dict[str, Answer]:
         """Set each of them; what the vehicle says it is then. Writes of other tasks wait until it is done."""
         wanted = tuple(wanted)
@@ -280,7 +278,6 @@ class ParameterAccess:
                 bytewise=self.store.bytewise,
                 before=before,
                 recent=recent,
-                most_unanswered=most_unanswered,
                 own_system=transfers.connection.source_system,
                 round_trip=self._answer_time if recent else transfers.round_trip,
                 patience_s=patience_s,
