@@ -20,7 +20,7 @@ from aerokit.sim import SimulatedVehicle, open_simulator, simulated_link
 from aerokit.sim.kinds import simulated
 from aerokit.sim.patience import wait_longer
 
-__all__ = ["Choice", "connected", "ready"]
+__all__ = ["Choice", "connected", "ready", "served"]
 
 SPEEDUP_BINARY = 5.0
 LATENCY_S = 0.005
@@ -62,7 +62,7 @@ class Choice:
 @asynccontextmanager
 async def connected(choice: Choice) -> AsyncIterator[Vehicle]:
     """It was switched on just now, unless it is at an address."""
-    async with _served(choice) as address, connect(address, timeout=30) as vehicle:
+    async with served(choice) as address, connect(address, timeout=30) as vehicle:
         yield vehicle
 
 
@@ -74,7 +74,7 @@ async def ready(choice: Choice) -> AsyncIterator[Vehicle]:
         yield vehicle
 
 
-def _served(choice: Choice) -> AbstractAsyncContextManager[str | Link]:
+def served(choice: Choice) -> AbstractAsyncContextManager[str | Link]:
     """The vehicle runs; gives what to connect to."""
     if choice.vehicle == "sim":
         return _simulated(choice)

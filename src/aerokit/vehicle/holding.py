@@ -129,7 +129,8 @@ class HoldingActions(ModeActions):
                 logger.warning("the vehicle was told to hold and has not confirmed it yet: %s", error)
                 is_sent = False
             except AerokitError as error:
-                logger.warning("the vehicle was told to hold and does not: %s", error)
+                if not order.end:
+                    logger.warning("the vehicle was told to hold and does not: %s", error)
                 return
 
     def _order_to_hold(self, mode: Mode, order: Order) -> Order:

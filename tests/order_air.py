@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import itertools
+from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from aerokit.links.link import Link, Peer, Receiver
@@ -50,14 +53,16 @@ class Air(Link):
         self.address = self.link.address
         self.sent: list[Crossing] = []
         self.heard: list[Crossing] = []
-        self._began = float("inf")
+        self.began_at = float("inf")
         self._numbers = itertools.count()
+        self._ups: deque[Callable[[], object]] = deque()
+        self._downs: deque[Callable[[], object]] = deque()
         self._up, self._down = Framer(), Framer()
         self._receiver: Receiver | None = None
 
     def begin(self) -> None:
         """The order is given now."""
-        self._began = _now()
+        self.began_at = _now()
         self.sent.clear()
         self.heard = [each for each in self.heard if isinstance(each.message, Heartbeat)][-1:]
 
@@ -78,7 +83,7 @@ class Air(Link):
             is_lost = self._is_out() or self._loses(message)
             self.sent.append(Crossing(next(self._numbers), _now(), message, is_lost))
             if not is_lost:
-                asyncio.get_running_loop().call_later(self._delay(), self.link.write, frame.raw)
+                self._later(self._ups, self._delay(), functools.partial(self.link.write, frame.raw))
 
     def close(self) -> None:
         self.link.close()
@@ -94,7 +99,8 @@ class Air(Link):
             is_lost = self._is_out() or self._loses(message)
             if is_lost or self._receiver is None:
                 continue
-            asyncio.get_running_loop().call_later(self.weather.latency_s, self._arrive, frame.raw, message)
+            arrive = functools.partial(self._arrive, frame.raw, message)
+            self._later(self._downs, self.weather.latency_s, arrive)
 
     def link_lost(self, error: Exception) -> None:
         if self._receiver is not None:
@@ -111,13 +117,19 @@ class Air(Link):
         if self._receiver is not None:
             self._receiver.bytes_received(raw, None)
 
+    @staticmethod
+    def _later(queue: deque[Callable[[], object]], delay_s: float, act: Callable[[], object]) -> None:
+        """In their order: the loop does not keep that of timers for the same instant."""
+        queue.append(act)
+        asyncio.get_running_loop().call_later(delay_s, lambda: queue.popleft()())
+
     def _is_out(self) -> bool:
-        since, outage = _now() - self._began, self.weather.outage
+        since, outage = _now() - self.began_at, self.weather.outage
         return outage is not None and outage[0] <= since < outage[1]
 
     def _loses(self, message: Message) -> bool:
         weather = self.weather
-        if _now() < self._began or getattr(message, "command", None) != weather.command:
+        if _now() < self.began_at or getattr(message, "command", None) != weather.command:
             return False
         if isinstance(message, CommandAck) and weather.lost_acks:
             weather.lost_acks -= 1
@@ -128,7 +140,7 @@ class Air(Link):
         return False
 
     def _delay(self) -> float:
-        since, stall = _now() - self._began, self.weather.stall
+        since, stall = _now() - self.began_at, self.weather.stall
         if stall is not None and stall[0] <= since < stall[1]:
             return stall[1] - since + self.weather.latency_s
         return self.weather.latency_s

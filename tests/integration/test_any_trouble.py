@@ -1,0 +1,160 @@
+"""What copters do on a bad day: lost answers, an outage with a failsafe, another station, a reboot in flight.
+
+The same as `tests/orders` holds simulated vehicles to, on any vehicle; see `test_any_vehicle`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import Any
+
+import anyio
+import pytest
+from any_vehicle import Choice, served
+from order_air import Air, Weather
+
+from aerokit import Vehicle, connect
+from aerokit import messages as m
+from aerokit.errors import AerokitError, HeartbeatTimeout, OperationRejected
+from aerokit.links import Link, create_link
+from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.enums import MavCmd
+from aerokit.testing import VIRTUAL_BACKEND
+
+pytestmark = pytest.mark.anyio
+
+FAR_M = 400.0
+ANOTHER_STATION = 254
+REBOOT_BY_FORCE = 20190226
+LANDED_ON_GROUND = 1
+
+
+@pytest.fixture
+def anyio_backend(choice: Choice) -> Any:
+    return VIRTUAL_BACKEND if choice.is_virtual else "asyncio"
+
+
+@pytest.fixture(autouse=True)
+def _is_a_copter(choice: Choice) -> None:
+    if choice.kind.name not in ("copter", "px4"):
+        pytest.skip("it is flown by copters of both autopilots")
+
+
+@asynccontextmanager
+async def flying(choice: Choice) -> AsyncIterator[tuple[Vehicle, Air]]:
+    """Some metres up, where it takes orders; the weather is good so far."""
+    async with served(choice) as served_at:
+        air = Air(served_at if isinstance(served_at, Link) else create_link(served_at))
+        async with connect(air, timeout=30) as vehicle:
+            await vehicle.wait_ready(timeout=choice.seconds(120))
+            name = "FS_GCS_ENABLE" if choice.kind.is_ardupilot else "NAV_DLL_ACT"
+            async with vehicle.parameters.temporarily({name: 1 if choice.kind.is_ardupilot else 2}):
+                if choice.kind.guided is not None:
+                    await vehicle.set_mode(choice.kind.guided)
+                await vehicle.arm(timeout=choice.seconds(10))
+                await vehicle.take_off(choice.kind.altitude_m, timeout=choice.seconds(120))
+                await anyio.sleep(choice.seconds(3) if choice.is_virtual else 3.0)
+                yield vehicle, air
+                if vehicle.is_armed:
+                    if vehicle.landed_state.latest != LANDED_ON_GROUND:
+                        await vehicle.return_to_launch(timeout=choice.seconds(400))
+                    await vehicle.armed.wait_until(lambda armed: not armed, timeout=choice.seconds(60))
+
+
+def far(vehicle: Vehicle) -> Any:
+    return vehicle.position.value.offset(north_m=FAR_M)
+
+
+def sent(air: Air, command: int) -> int:
+    return sum(getattr(each.message, "command", None) == command for each in air.sent)
+
+
+class AnotherStation:
+    """Sends commands on the same link, by a name of its own."""
+
+    def __init__(self, vehicle: Vehicle, air: Air) -> None:
+        self._vehicle, self._air = vehicle, air
+        self._encoder = FrameEncoder(ANOTHER_STATION, 190)
+
+    def command(self, command: int, *params: float) -> None:
+        padded = (*params, *(0.0,) * (7 - len(params)))
+        target = (self._vehicle.system_id, self._vehicle.component_id)
+        self._air.link.write(self._encoder.encode(m.CommandLong(*target, command, 0, *padded)))
+
+    def return_to_launch(self) -> None:
+        mode = self._vehicle.autopilot.mode_for("return")
+        assert mode is not None
+        self.command(MavCmd.DO_SET_MODE, *self._vehicle.autopilot.mode_order(mode).params)
+
+
+async def test_lost_answers_send_nothing_twice(choice: Choice) -> None:
+    async with flying(choice) as (vehicle, air):
+        air.weather = Weather(command=MavCmd.DO_SET_MODE, lost_acks=9)
+        air.begin()
+        await vehicle.return_to_launch(timeout=choice.seconds(400))
+        assert sent(air, MavCmd.DO_SET_MODE) == 1
+
+
+async def test_another_station_that_took_over_during_a_lost_answer_keeps_the_vehicle(choice: Choice) -> None:
+    async with flying(choice) as (vehicle, air):
+        air.weather = Weather(command=MavCmd.DO_REPOSITION, lost_acks=9)
+        air.begin()
+        async with anyio.create_task_group() as tasks:
+
+            async def take_over() -> None:
+                await anyio.sleep(0.3)
+                AnotherStation(vehicle, air).return_to_launch()
+
+            tasks.start_soon(take_over)
+            with pytest.raises(OperationRejected):
+                await vehicle.go_to(far(vehicle))
+        await anyio.sleep(5.0)
+        assert sent(air, MavCmd.DO_REPOSITION) == 1
+        assert sent(air, MavCmd.DO_SET_MODE) == 0
+        assert vehicle.mode_name == "RTL"
+
+
+async def test_a_failsafe_during_an_outage_keeps_the_vehicle(choice: Choice) -> None:
+    """Twelve seconds, with the failsafe for a lost ground station."""
+    async with flying(choice) as (vehicle, air):
+        air.begin()
+        air.weather = Weather(outage=(3.0, 15.0))
+        with pytest.raises((HeartbeatTimeout, OperationRejected)):
+            await vehicle.go_to(far(vehicle))
+        await vehicle.armed.wait_until(lambda _: vehicle.heartbeat_age < 1.0, timeout=20)
+        back_at = next(each.at for each in air.heartbeats if each.at > air.began_at + 15.0)
+        await anyio.sleep(5.0)
+        assert sent(air, MavCmd.DO_SET_MODE) == 0
+        if choice.kind.is_ardupilot:
+            assert vehicle.mode_name == "RTL"
+        else:  # it goes back to its mode when it hears us again; told that, it is told to hold
+            orders = [
+                each.at for each in air.sent if getattr(each.message, "command", 0) == MavCmd.DO_REPOSITION
+            ]
+            assert not [at for at in orders[1:] if at < back_at]
+
+
+async def test_a_reboot_in_flight_ends_what_was_ordered(choice: Choice) -> None:
+    """ArduCopter obeys, by force, and falls; PX4 denies it and flies on."""
+    async with flying(choice) as (vehicle, air):
+        station = AnotherStation(vehicle, air)
+        air.begin()
+        error: AerokitError | None = None
+        with anyio.move_on_after(30.0):
+            async with anyio.create_task_group() as tasks:
+
+                async def reboot() -> None:
+                    await anyio.sleep(2.0)
+                    station.command(MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, 1, 0, 0, 0, 0, REBOOT_BY_FORCE)
+
+                tasks.start_soon(reboot)
+                try:
+                    await vehicle.go_to(far(vehicle), timeout=25.0)
+                except AerokitError as caught:
+                    error = caught
+        assert error is not None
+        assert sent(air, MavCmd.DO_REPOSITION) <= 1 + (not choice.kind.is_ardupilot)  # PX4 holds by it
+        if choice.kind.is_ardupilot:
+            assert isinstance(error, (OperationRejected, HeartbeatTimeout))
+            assert sent(air, MavCmd.DO_SET_MODE) == 0
