@@ -1,4 +1,4 @@
-"""Sessions: tests (each Python that is there), lint, types, docs, bench and bench_…, badlinks, dronekit, clients, demo.
+"""Sessions: tests (each Python that is there), lint, types, docs, bench and bench_…, badlinks, orders, dronekit, clients, demo.
 
 `nox -l` lists them.
 """
@@ -96,6 +96,14 @@ def badlinks(session: nox.Session) -> None:
     """Judge every transfer over bad radios, 200 seeds of each, and print the table; half an hour and more."""
     session.install("-e", ".[test]")
     session.run("python", "tests/badlink/survey.py", *session.posargs, env={"PYTHONPATH": "tests"})
+
+
+@nox.session
+def orders(session: nox.Session) -> None:
+    """Fly the order table of docs/reliability.md with many seeds of each row (100): `nox -s orders -- 300`."""
+    session.install("-e", ".[test]")
+    seeds = session.posargs[0] if session.posargs else "100"
+    session.run("pytest", "-q", "tests/orders", env={"AEROKIT_ORDER_SEEDS": seeds})
 
 
 @nox.session(name="dronekit")

@@ -144,7 +144,7 @@ async def attempt(flight: Flight, action: Action, cancelled_after: float | None)
 async def after_the_dust_has_settled(flight: Flight) -> None:
     """Holds are confirmed, rates given back; then the same as at first is there."""
     flight.copter.faults.clear()
-    await anyio.sleep(9.0)
+    await anyio.sleep(18.0)  # an order to arm that was given up is watched for 15 s
     with anyio.fail_after(5.0):
         while is_asking(flight.vehicle):  # noqa: ASYNC110
             await anyio.sleep(0.05)
