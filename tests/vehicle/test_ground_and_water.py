@@ -8,8 +8,15 @@ from contextlib import asynccontextmanager
 import anyio
 import pytest
 
-from aerokit import Position, Vehicle, connect
-from aerokit.errors import OperationRejected
+from aerokit import (
+    LocalPositionSetpoint,
+    Position,
+    PositionSetpoint,
+    Vehicle,
+    VelocitySetpoint,
+    connect,
+)
+from aerokit.errors import OperationRejected, OperationTimeout, SetpointStreamStopped
 from aerokit.mavlink.enums import SubMode
 from aerokit.sim import SimulatedRover, SimulatedSub, SimulatedVehicle, simulated_link
 
@@ -77,3 +84,35 @@ async def test_a_submarine_that_is_taken_over_in_the_deep_has_not_landed() -> No
         tasks.start_soon(take_over)
         with pytest.raises(OperationRejected, match=r"the mode changed to ALT_HOLD at -1\d\.\d m"):
             await vehicle.land(timeout=120)
+
+
+@pytest.mark.parametrize("kind", ["local", "global"])
+async def test_a_submarine_gets_to_a_place_that_is_streamed(kind: str) -> None:
+    """Each of these set-points makes it begin anew: the same one is not sent ten times a second."""
+    async with guided(SimulatedSub(boot_time_s=1.0)) as vehicle:
+        here = vehicle.position.value
+        await vehicle.local_position.wait_until(lambda _: True)
+        local = LocalPositionSetpoint(8.0, 0.0, 2.0)
+        place = PositionSetpoint(
+            Position(here.latitude_deg, here.longitude_deg, altitude_relative_m=-2.0).offset(north_m=8.0)
+        )
+        if kind == "local":
+            async with vehicle.guided.local_position(local) as stream:
+                await stream.fly(local, 20.0)
+        else:
+            async with vehicle.guided.position(place) as places:
+                await places.fly(place, 20.0)
+        assert here.distance_to(vehicle.position.value) == pytest.approx(8.0, abs=1.0)
+
+
+async def test_a_vehicle_that_does_not_move_although_it_should_is_told() -> None:
+    """Its thrusters do nothing: neither an order nor a stream waits for ever."""
+    sub = SimulatedSub(boot_time_s=1.0)
+    async with guided(sub) as vehicle:
+        there = vehicle.position.value.offset(north_m=30)
+        sub.guided.update = lambda dt: None  # type: ignore[method-assign]
+        with pytest.raises(OperationTimeout, match=r"has accepted the order and not moved for 1[23] s"):
+            await vehicle.go_to(Position(there.latitude_deg, there.longitude_deg, altitude_relative_m=-1))
+        with pytest.raises(SetpointStreamStopped, match=r"not moved for 1[23] s"):
+            async with vehicle.guided.velocity() as stream:
+                await stream.fly(VelocitySetpoint(north_m_s=1.0), 30.0)

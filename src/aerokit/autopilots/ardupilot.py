@@ -234,7 +234,7 @@ class ArduSub(ArduPilot):
         "setpoint": "GUIDED",
         "mission": "AUTO",
     }
-    setpoints = SetpointRules(acceleration=False)
+    setpoints = SetpointRules(acceleration=False, place_restarts_path=True)
     landing_ends_in = "ALT_HOLD"  # at the surface
     reposition = Reposition(relative_altitude=True, yaw=False, speed=False, armed_only=False)
     condition_yaw = True

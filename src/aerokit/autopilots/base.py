@@ -47,6 +47,7 @@ class SetpointRules(Snapshot):
     ``before_mode``: the stream must run before the mode is asked for. ``minimum_hz`` is the slowest stream
     the autopilot puts up with, ``timeout_s`` how long it goes on without a new set-point by default.
     ``body_yaw_is_relative``: in MAV_FRAME_BODY_NED yaw counts from where the nose points, not from north.
+    ``place_restarts_path``: each set-point that is a place begins its path anew, from standing, also the same one.
     """
 
     local_position: bool = True
@@ -58,6 +59,7 @@ class SetpointRules(Snapshot):
     minimum_hz: float = 1.0
     timeout_s: float = 3.0
     body_yaw_is_relative: bool = False
+    place_restarts_path: bool = False
 
     @property
     def names(self) -> tuple[str, ...]:

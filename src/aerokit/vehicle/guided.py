@@ -20,6 +20,7 @@ from aerokit.errors import (
     OperationRejected,
     SetpointStreamStopped,
 )
+from aerokit.vehicle.progress import Stillness
 from aerokit.vehicle.setpoints import (
     AccelerationSetpoint,
     AttitudeSetpoint,
@@ -28,6 +29,7 @@ from aerokit.vehicle.setpoints import (
     PositionSetpoint,
     SetpointEncoder,
     VelocitySetpoint,
+    wants_motion,
 )
 
 if TYPE_CHECKING:
@@ -45,6 +47,8 @@ __all__ = ["Guided", "SetpointStream"]
 
 SetpointT = TypeVar("SetpointT")
 
+AT_FIRST, AGAIN_S = 3, 5.0
+"""A place that must not be sent without need is sent so often at once, lest one is lost, and again after so long."""
 ENTRY_S = 1.0
 """How long the initial set-point is streamed before PX4 is asked for OFFBOARD: it wants to see a stream first."""
 
@@ -151,8 +155,8 @@ class SetpointStream(Generic[SetpointT]):
 
     Entering puts the vehicle into its mode for set-points (GUIDED, OFFBOARD) with the initial set-point. Leaving, in
     any way, tells it to hold. When the stream has stopped by itself, ``set`` and leaving the block raise
-    :class:`SetpointStreamStopped`; when it stopped because the mode changed (a pilot, a failsafe), the vehicle is
-    left to whoever changed it.
+    :class:`SetpointStreamStopped`; a vehicle that should move and does not for twelve seconds stops it, too. When it
+    stopped because the mode changed (a pilot, a failsafe), the vehicle is left to whoever changed it.
     """
 
     def __init__(
@@ -181,6 +185,10 @@ class SetpointStream(Generic[SetpointT]):
         self._was_told = self._was_entered = False
         self._is_entering = False
         self._was_armed = False
+        is_place = isinstance(initial, (PositionSetpoint, LocalPositionSetpoint))
+        self._is_costly = is_place and vehicle.autopilot.setpoints.place_restarts_path
+        self._left, self._sent_at = AT_FIRST, -math.inf
+        self._stillness = Stillness(vehicle)
 
     @property
     def is_running(self) -> bool:
@@ -282,6 +290,8 @@ class SetpointStream(Generic[SetpointT]):
         """Turn it into the message to send, whole: what cannot be sent is refused here."""
         message = self._encode(setpoint)
         message.encode()
+        if setpoint != self._setpoint:
+            self._left = AT_FIRST
         self._setpoint, self._message, self._set_at = setpoint, message, self._now()
 
     def _begin(self) -> None:
@@ -297,14 +307,19 @@ class SetpointStream(Generic[SetpointT]):
         if reason := self._why_stop(self._now() - due):
             self._stop(reason)
             return
-        assert self._message is not None
         try:
-            self._vehicle.connection.send(self._message)
+            self._send()
         except Exception as error:
             self._stop(str(error))
             return
         due = max(due + self._period_s, self._now())
         self._timer = asyncio.get_running_loop().call_at(due, self._tick, due)
+
+    def _send(self) -> None:
+        assert self._message is not None
+        if not self._is_costly or self._left > 0 or self._now() - self._sent_at >= AGAIN_S:
+            self._vehicle.connection.send(self._message)
+            self._left, self._sent_at = self._left - 1, self._now()
 
     def _why_stop(self, lag: float) -> str | None:
         age = 0.0 if self._is_entering else self._now() - self._set_at
@@ -314,7 +329,10 @@ class SetpointStream(Generic[SetpointT]):
             return f"no new set-point came for {age:.1f} s (valid_for_s = {self._valid_for_s:g})"
         if self._vehicle.is_silent:
             return f"the vehicle has been silent for {self._vehicle.heartbeat_age:.1f} s"
-        return None
+        if self._mode is None or not wants_motion(self._setpoint, self._vehicle):
+            self._stillness = Stillness(self._vehicle)
+            return None
+        return self._stillness()
 
     def _why_leave_alone(self) -> str | None:
         """Somebody else has taken over: a pilot, a failsafe, another program."""

@@ -29,6 +29,7 @@ __all__ = [
     "PositionSetpoint",
     "SetpointEncoder",
     "VelocitySetpoint",
+    "wants_motion",
 ]
 
 MAV_FRAME_LOCAL_NED = 1
@@ -38,6 +39,8 @@ MAV_FRAME_BODY_NED = 8
 IGNORE_POSITION, IGNORE_VELOCITY, IGNORE_ACCELERATION = 0x007, 0x038, 0x1C0
 IGNORE_YAW, IGNORE_YAW_RATE = 0x400, 0x800
 IGNORE_BODY_RATES = 0x07
+SLOW_M_S, FAR = 0.3, 2.0
+"""Slower, and nearer than so many arrival radii, a vehicle may well stand still."""
 
 
 class VelocitySetpoint(Snapshot):
@@ -99,6 +102,26 @@ class AttitudeSetpoint(Snapshot):
     pitch_deg: float
     yaw_deg: float
     thrust: float
+
+
+def wants_motion(setpoint: object, vehicle: Vehicle) -> bool:
+    """Whether a vehicle that obeys this set-point moves now; False where that is not known."""
+    if isinstance(setpoint, VelocitySetpoint):
+        return math.hypot(setpoint.north_m_s, setpoint.east_m_s, setpoint.down_m_s) >= SLOW_M_S
+    if isinstance(setpoint, BodyVelocitySetpoint):
+        return math.hypot(setpoint.forward_m_s, setpoint.right_m_s, setpoint.down_m_s) >= SLOW_M_S
+    far_m = FAR * vehicle.autopilot.arrival_radius_m
+    if isinstance(setpoint, PositionSetpoint):
+        return far_m < vehicle.distance_to(setpoint.position) < math.inf
+    here = vehicle.local_position.latest
+    if isinstance(setpoint, LocalPositionSetpoint) and here is not None:
+        to_go = (
+            setpoint.north_m - here.north_m,
+            setpoint.east_m - here.east_m,
+            setpoint.down_m - here.down_m,
+        )
+        return math.hypot(*to_go) > far_m
+    return False
 
 
 class SetpointEncoder:

@@ -185,8 +185,10 @@ class SubGuided(_Mode):
         self._place, self._target, self._heading = position, None, None
 
     def take(self, target: Target) -> None:
-        """A position counts more than a velocity beside it."""
+        """A position counts more than a velocity beside it. Its path begins anew, from standing, as seen."""
         if target.position is not None:
+            motion = self.sub.motion
+            motion.velocity_north = motion.velocity_east = motion.velocity_down = 0.0
             self.go_to(target.position)
         else:
             self._place, self._target, self._target_at = None, target, self.sub.now
