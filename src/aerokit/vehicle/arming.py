@@ -37,8 +37,8 @@ LATE_S = 15.0
 """For so long after an order to arm was given up the vehicle is watched, and disarmed if it arms after all."""
 ARMING_AT_END_S = 1.5
 """How long the end of a block waits for it."""
-BOOTING = (0, 1, 2)
-"""MAV_STATE: unknown, booting, calibrating."""
+BOOTING = (1, 2)
+"""MAV_STATE: booting, calibrating."""
 REBOOT_ANSWER_S = 3.0
 READY_IN_MODE_S = 3.0
 """How long a vehicle that was put into another mode may take to be ready in it."""

@@ -1,0 +1,104 @@
+"""Modes in which a vehicle does not arm: left before arming, named when asked, and no reason to wait."""
+
+from __future__ import annotations
+
+import anyio
+import pytest
+from flight_harness import in_the_air, open_flight, open_px4
+
+from aerokit import connect
+from aerokit.errors import LocalProtocolError
+from aerokit.mavlink.enums import CopterMode, MavCmd, PlaneMode
+from aerokit.sim import SimulatedPlane, simulated_link
+from aerokit.sim.px4.modes import OFFBOARD
+
+pytestmark = pytest.mark.anyio
+
+ARM = MavCmd.COMPONENT_ARM_DISARM
+
+
+async def test_the_same_program_runs_twice() -> None:
+    """After the first flight a copter stands there in RTL."""
+    async with open_flight() as flight:
+        for _ in range(2):
+            await flight.vehicle.wait_ready()
+            await flight.vehicle.arm()
+            await flight.vehicle.take_off(5.0)
+            await flight.vehicle.return_to_launch()
+            await flight.vehicle.armed.wait_until(lambda armed: not armed)
+            assert flight.vehicle.mode_name == "RTL"
+
+
+async def test_a_mode_that_is_asked_for_is_set_before_arming() -> None:
+    async with open_flight() as flight:
+        await flight.vehicle.wait_ready()
+        await flight.vehicle.arm(mode="LOITER")
+        assert flight.copter.mode.number == CopterMode.LOITER
+        assert flight.vehicle.is_armed
+
+
+async def test_a_mode_in_which_it_does_not_arm_is_refused_before_anything_is_sent() -> None:
+    async with open_flight() as flight:
+        await flight.vehicle.wait_ready()
+        flight.wire.forget()
+        with pytest.raises(
+            LocalProtocolError, match=r"mode = 'LAND' .*does not arm in LAND, but in ACRO, .*GUIDED"
+        ):
+            await flight.vehicle.arm(mode="LAND")
+        with pytest.raises(LocalProtocolError, match="NOWHERE"):
+            await flight.vehicle.arm(mode="NOWHERE")
+        assert not flight.wire.commands(ARM)
+        assert not flight.wire.mode_orders()
+
+
+async def test_what_flies_is_not_put_into_another_mode() -> None:
+    async with in_the_air() as flight:
+        await flight.vehicle.set_mode("LAND")
+        flight.wire.forget()
+        await flight.vehicle.arm()
+        assert not flight.wire.mode_orders()
+        assert flight.copter.mode.number == CopterMode.LAND
+
+
+async def test_why_not_armable_names_the_mode_and_those_in_which_it_arms() -> None:
+    async with open_flight() as flight:
+        await flight.vehicle.wait_ready()
+        await flight.vehicle.set_mode("RTL")
+        (reason,) = await flight.vehicle.why_not_armable()
+        assert reason.startswith("ArduCopter does not arm in RTL, but in ACRO")
+        assert reason.endswith("arm() goes to GUIDED first")
+
+
+async def test_a_px4_that_was_left_in_offboard_is_ready_and_arms() -> None:
+    async with open_px4() as flight:
+        await flight.vehicle.wait_ready()
+        flight.px4.switch_to(OFFBOARD)
+        await flight.vehicle.mode.wait_until(lambda mode: mode.name == "OFFBOARD")
+        await anyio.sleep(1.0)
+        (reason,) = await flight.vehicle.why_not_armable()
+        assert "PX4 does not arm in OFFBOARD" in reason
+        await flight.vehicle.wait_ready(timeout=5.0)
+        await flight.vehicle.arm()
+        assert flight.vehicle.mode_name == "LOITER"
+
+
+async def test_a_plane_in_autoland_arms_in_a_mode_that_moves_nothing() -> None:
+    plane = SimulatedPlane(boot_time_s=1.0)
+    async with simulated_link(plane) as link, connect(link) as vehicle:
+        await vehicle.wait_ready()
+        plane.set_mode(PlaneMode.RTL)
+        await vehicle.mode.wait_until(lambda mode: mode.name == "RTL")
+        await vehicle.arm()
+        assert vehicle.mode_name == "FBWA"
+        assert vehicle.is_armed
+
+
+async def test_a_dead_link_is_a_reason() -> None:
+    """What rests on old values says so."""
+    async with open_flight() as flight:
+        await flight.vehicle.wait_ready()
+        flight.copter.faults.silent = True
+        await anyio.sleep(20.0)
+        reasons = await flight.vehicle.why_not_armable()
+        assert any("heartbeats (the last one 2" in each for each in reasons)
+        assert any("position (no GLOBAL_POSITION_INT" in each for each in reasons)
