@@ -10,15 +10,19 @@ from __future__ import annotations
 
 import re
 from collections.abc import Container
+from itertools import chain
 from struct import Struct
 from struct import error as StructError  # noqa: N812
 
 from aerokit.mavlink.checksum import x25
 from aerokit.mavlink.dialect import STANDARD, Dialect
 from aerokit.mavlink.frame import MAGIC_V1, MAGIC_V2, SIGNATURE_LENGTH, SIGNED, Frame
-from aerokit.mavlink.statistics import FramerStatistics, SourceStatistics
+from aerokit.mavlink.statistics import OTHERS, FramerStatistics, SourceLimit, SourceStatistics
 
-__all__ = ["Framer"]
+__all__ = ["MOST_SOURCES", "Framer"]
+
+MOST_SOURCES = 1024
+"""So many senders are counted apart by a framer that shares no `SourceLimit` with others."""
 
 # The last of version 2 is the id in its lower three bytes; the byte above them belongs to what follows.
 _HEADER_V2 = Struct("<BBBxBHI").unpack_from  # magic, length, flags, sequence, source, id
@@ -27,7 +31,8 @@ _CHECKSUM = Struct("<H").unpack_from
 _SHORTEST_V2 = 12
 _SHORTEST_V1 = 8
 _MAGICS = (MAGIC_V1, MAGIC_V2)
-_next_magic = re.compile(b"[\xfd\xfe]").search
+# What may be the beginning of a frame; of version 2 only with flags that exist, or cut off before them.
+_magics = re.compile(rb"\xfe|\xfd(?=\Z|.\Z|.[\x00\x01])", re.DOTALL).finditer
 
 # What a place in the bytes may be.
 _GOOD = 0  # a whole frame with the right checksum
@@ -40,11 +45,16 @@ _NOISE = 5
 _Found = tuple[int, int, int, int, int]
 """Begin, end, message id, sequence, source."""
 
+_Known = tuple[int, list[tuple[int, int, int]], list[int]]
+"""Of bytes that are kept: how far they were looked at, places that may yet become something (begin, what it seems, until
+which size), and places with bad checksums. So no byte is examined again and again while others come one by one."""
+_NOTHING_KNOWN: _Known = (0, [], [])
+
 
 class Framer:
     """Turns bytes of one link and one peer into frames; keeps at most two unfinished frames, about 600 bytes."""
 
-    def __init__(self, dialect: Dialect = STANDARD) -> None:
+    def __init__(self, dialect: Dialect = STANDARD, limit: SourceLimit | None = None) -> None:
         self.dialect = dialect
         """Knows the messages; ids it does not know cannot be checked and are only counted."""
         self.wanted: Container[int] | None = None
@@ -54,11 +64,18 @@ class Framer:
         recording. Their checksums cannot be checked."""
         self.statistics = FramerStatistics()
         """Counters since the beginning."""
+        self.late: list[Frame] = []
+        """Those frames of the last `receive` that newer ones of their sender have overtaken, or that came before."""
+        self.foreign: list[Frame] = []
+        """Those that come from another sender with the same ids."""
         self._rest = b""
+        self._known = _NOTHING_KNOWN
         self._unknown: list[bytes] = []
         self._rows = dialect.rows
         self._extras = dialect.extras
-        self._sources: dict[int, SourceStatistics] = {}
+        self._limit = SourceLimit(MOST_SOURCES) if limit is None else limit
+        self._limit.join(self.statistics)
+        self._sources = self.statistics.by_key
 
     def receive(self, data: bytes, now: float = 0.0) -> list[Frame]:
         """The wanted frames that are complete with ``data``, in order; ``now`` becomes their ``received_at``.
@@ -71,11 +88,15 @@ class Framer:
             data = bytes(data)
         size = len(data)
         self.statistics.bytes += size
+        if self.late or self.foreign:
+            self.late, self.foreign = [], []
+        known = _NOTHING_KNOWN
         if self._rest:
-            data, self._rest = self._rest + data, b""
+            known, data, self._rest = self._known, self._rest + data, b""
             size = len(data)
         extras, sources, wanted = self._extras, self._sources, self.wanted
         frames: list[Frame] = []
+        out_of_order: list[tuple[int, int, int]] | None = None
         begin = end = checksum = 0
         body = b""
         while begin < size:
@@ -92,9 +113,11 @@ class Framer:
                 good, body = False, b""
                 end = sequence = key = message_id = checksum = 0
             if not good:
-                found = self._examine(data, begin)[2] if data[begin] in _MAGICS else None
+                found = None
+                if data[begin] in _MAGICS and (begin or known is _NOTHING_KNOWN):
+                    found = self._examine(data, begin)[2]
                 if found is None:
-                    found = self._search(data, begin)
+                    found = self._search(data, begin, _NOTHING_KNOWN if begin else known)
                 if self._unknown:
                     frames += [Frame.parse(raw, now) for raw in self._unknown]
                     self._unknown.clear()
@@ -104,11 +127,13 @@ class Framer:
             try:
                 source = sources[key]
             except KeyError:
-                source = self._add_source(key, sequence)
+                source = self.statistics.add_source(key, sequence, self._limit.make_room(now))
             if source.expected & 0xFF == sequence:
                 source.expected += 1
             else:
-                source.out_of_order(sequence)
+                out_of_order = out_of_order or []
+                if verdict := source.out_of_order(sequence, now):
+                    out_of_order.append((len(frames), verdict, sequence << 16 | key))
             if wanted is None or message_id in wanted:
                 if good:
                     frame = Frame()
@@ -122,64 +147,79 @@ class Framer:
                     frame = Frame.parse(data[begin:end], now)
                 frames.append(frame)
             begin = end
+        if out_of_order:
+            self._sort_out(frames, out_of_order)
         return frames
 
     def begin_anew(self) -> None:
         """Forget the beginning of a frame: what comes next is another stream of bytes."""
         self._rest = b""
 
+    def retire(self) -> None:
+        """Give back the places of its senders in a `SourceLimit` that others share; it is not used any more."""
+        self._limit.leave(self.statistics)
+
     @property
     def waiting(self) -> int:
         """Bytes kept because they may become a frame, a few hundred at most."""
         return len(self._rest)
 
-    def _add_source(self, key: int, sequence: int) -> SourceStatistics:
-        source = SourceStatistics(key & 0xFF, key >> 8, sequence)
-        self._sources[key] = self.statistics.sources[key & 0xFF, key >> 8] = source
-        return source
+    def _sort_out(self, frames: list[Frame], out_of_order: list[tuple[int, int, int]]) -> None:
+        """Name those out of order among the frames that are returned; others were not wanted."""
+        for place, verdict, which in out_of_order:
+            if place < len(frames):
+                frame = frames[place]
+                if frame.sequence << 16 | frame.component_id << 8 | frame.system_id == which:
+                    (self.foreign if verdict == OTHERS else self.late).append(frame)
 
     # ------------------------------------------------------------------------------ the slow path
 
-    def _search(self, data: bytes, begin: int) -> _Found | None:
+    def _search(self, data: bytes, begin: int, known: _Known) -> _Found | None:
         """The next good frame from ``begin`` on; or None, with what may yet become one kept in ``_rest``."""
         size = len(data)
         hold = -1  # from here on the bytes are kept
         unknown = unknown_end = -1  # a whole frame of an unknown message, unless a good one is found inside
-        bad_crcs: list[int] = []
-        here = begin
-        while True:
-            magic = _next_magic(data, here)
-            here = magic.start() if magic else size
+        looked_at, before, bad_crcs = known
+        pending: list[tuple[int, int, int]] = []
+        bad_crcs = list(bad_crcs)
+        reached = size
+        news = ((place.start(), _NOISE, 0) for place in _magics(data, max(begin, looked_at)))
+        for here, verdict, end in chain(before, news, ((size, _NOISE, size),)):
             if unknown >= 0 and here >= unknown_end:
                 if unknown_end == size or data[unknown_end] in _MAGICS:
                     self._pass(begin, unknown, bad_crcs)
                     self._unknown_passed(data, unknown, unknown_end)
-                    begin = here = unknown_end
-                    hold, bad_crcs = -1, []
+                    begin = unknown_end
+                    hold, pending = -1, []
+                    bad_crcs = [place for place in bad_crcs if place >= begin]
                 unknown = -1
-                continue
             if here >= size:
                 break
-            verdict, end, found = self._examine(data, here)
-            if verdict == _GOOD:
-                self._pass(begin, here, bad_crcs)
-                return found
+            if end <= size and verdict != _UNKNOWN:
+                verdict, end, found = self._examine(data, here)
+                if verdict == _GOOD:
+                    self._pass(begin, here, bad_crcs)
+                    return found
+            if verdict == _BAD_CRC:
+                bad_crcs.append(here)
+            elif verdict != _NOISE:
+                pending.append((here, verdict, end))
             if verdict == _WAIT:
-                if unknown >= 0 and (hold < 0 or unknown < hold):
-                    hold = unknown
-                elif hold < 0:
-                    hold = here
+                hold = _earliest(hold, unknown, here)
+                reached = here + 1
                 break
             if verdict == _DOUBTFUL and hold < 0:
                 hold = here
             elif verdict == _UNKNOWN and hold < 0 and unknown < 0:
                 unknown, unknown_end = here, end
-            elif verdict == _BAD_CRC:
-                bad_crcs.append(here)
-            here += 1
         keep = size if hold < 0 else hold
         self._pass(begin, keep, bad_crcs)
         self._rest = data[keep:]
+        self._known = (
+            reached - keep,
+            [(here - keep, verdict, end - keep) for here, verdict, end in pending if here >= keep],
+            [here - keep for here in bad_crcs if here >= keep],
+        )
         return None
 
     def _unknown_passed(self, data: bytes, begin: int, end: int) -> None:
@@ -207,7 +247,7 @@ class Framer:
         if data[begin] == MAGIC_V2:
             if size - begin < _SHORTEST_V2:
                 whole = size - begin < 3 or data[begin + 2] <= SIGNED
-                return (_WAIT if whole else _NOISE), size, None
+                return (_WAIT if whole else _NOISE), begin + (3 if size - begin < 3 else _SHORTEST_V2), None
             _, length, flags, sequence, key, message_id = _HEADER_V2(data, begin)
             if flags & ~SIGNED:
                 return _NOISE, size, None
@@ -215,7 +255,7 @@ class Framer:
             end = body + length + 2 + (SIGNATURE_LENGTH if flags else 0)
         else:
             if size - begin < _SHORTEST_V1:
-                return _WAIT, size, None
+                return _WAIT, begin + _SHORTEST_V1, None
             length, sequence, key, message_id = _HEADER_V1(data, begin)
             body, flags = begin + 6, 0
             end = body + length + 2
@@ -231,3 +271,10 @@ class Framer:
         if x25(data[begin + 1 : upto] + bytes((extra,))) != _CHECKSUM(data, upto)[0]:
             return _BAD_CRC, end, None
         return _GOOD, end, (begin, end, message_id, sequence, key)
+
+
+def _earliest(hold: int, unknown: int, here: int) -> int:
+    """What is kept from, now that something likely begins here: from what began before and is not settled, if anything."""
+    if unknown >= 0 and (hold < 0 or unknown < hold):
+        return unknown
+    return here if hold < 0 else hold
