@@ -22,7 +22,8 @@ from aerokit.mavlink.messages import (
     RequestDataStream,
     Timesync,
 )
-from aerokit.runtime.connection import MOST_PEERS, Connection
+from aerokit.runtime.connection import Connection
+from aerokit.runtime.peers import MOST_PEERS
 
 pytestmark = pytest.mark.anyio
 
@@ -50,6 +51,10 @@ class PeersLink(MemoryLink):
 
     def has_peer(self, peer: Peer) -> bool:
         return peer not in self.gone
+
+    def host_of(self, peer: Peer) -> object:
+        """Peers are called "port", or "port@host"."""
+        return str(peer).partition("@")[2] or peer
 
     def frame(self, peer: Peer, source: tuple[int, int], message: Message) -> bytes:
         encoder = self._encoders.setdefault((*source, peer), FrameEncoder(*source))
@@ -134,14 +139,14 @@ async def test_only_heartbeats_make_routes(link: PeersLink, connection: Connecti
 
 
 async def test_a_vehicle_that_comes_back_from_another_port(link: PeersLink, connection: Connection) -> None:
-    link.hear("old port", (1, 1), COPTER)
+    link.hear("old@host", (1, 1), COPTER)
     async with connect(connection, rates={}) as vehicle:
         with vehicle.subscribe(events.VehicleSilent, events.VehicleBack, capacity=9) as heard:
             await anyio.sleep(5)
             link.sent.clear()
-            link.hear("new port", (1, 1), COPTER)
+            link.hear("new@host", (1, 1), COPTER)
             connection.send(command(1, 1))
-            assert link.peers_of(CommandLong) == ["new port"]
+            assert link.peers_of(CommandLong) == ["new@host"]
             assert type(await heard.get(1)) is events.VehicleSilent
             assert type(await heard.get(1)) is events.VehicleBack
         assert vehicle.heartbeat_age < 1

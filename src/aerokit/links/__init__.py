@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from .address import ACCEPTED_FORMS, LinkAddress, parse_address
 from .create import create_link
-from .link import DrainListener, Link, Peer, Receiver
+from .link import DrainListener, Link, Peer, PeerKeeper, Receiver
 from .memory import MemoryLink, memory_link_pair
 from .pty import PtyLink
 from .reconnecting import Interruptible, ReconnectingLink
@@ -33,6 +33,7 @@ __all__ = [
     "LinkAddress",
     "MemoryLink",
     "Peer",
+    "PeerKeeper",
     "PtyLink",
     "Receiver",
     "ReconnectingLink",

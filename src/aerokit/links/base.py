@@ -10,7 +10,7 @@ from abc import abstractmethod
 
 from aerokit.errors import BusyError, ConnectionClosed, LinkError, LinkLost, LinkOpenError
 
-from .link import DrainListener, Link, Peer, Receiver
+from .link import DrainListener, Link, Peer, Receiver, keeps_peers
 
 __all__ = ["BaseLink", "link_open_error"]
 
@@ -31,6 +31,7 @@ class BaseLink(Link):
         self.dropped_writes = 0
         self._state = _State.NEW
         self._receiver: Receiver | None = None  # None: no callback is made
+        self._keeps_peers = False  # whether the receiver says whom to remember
         self._stalled_at: float | None = None
         self._released = asyncio.Event()
         self._released.set()
@@ -39,6 +40,7 @@ class BaseLink(Link):
         """See `Link.open`."""
         self._check_may_open()
         self._state, self._receiver = _State.OPENING, receiver
+        self._keeps_peers = keeps_peers(receiver)
         try:
             await self._connect()
         except BaseException as error:

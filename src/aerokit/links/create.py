@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from aerokit.errors import LocalProtocolError
+
 from .address import LinkAddress, parse_address
+from .allowed import Peers
 from .link import Link
 from .pty import PtyLink
 from .replay import Replay
@@ -13,13 +16,18 @@ from .udp import UdpBroadcast, UdpConnect, UdpListen
 __all__ = ["create_link"]
 
 
-def create_link(address: str | LinkAddress, *, baud: int = 57600) -> Link:
+def create_link(address: str | LinkAddress, *, baud: int = 57600, peers: Peers | None = None) -> Link:
     """The link that a connection string describes; nothing is opened yet.
 
-    ``baud`` is for serial ports whose string does not say one. Raises LocalProtocolError for a wrong address,
-    with the reason and the accepted forms.
+    ``baud`` is for serial ports whose string does not say one. ``peers`` are the IP addresses and networks that are
+    listened to, where anybody could send or connect: udpin, udpbcast, tcpin. Raises LocalProtocolError for a wrong
+    address, with the reason and the accepted forms, and for wrong ``peers``.
     """
     where = address if isinstance(address, LinkAddress) else parse_address(address)
+    if peers is not None and where.kind not in ("udpin", "udpbcast", "tcpin"):
+        raise LocalProtocolError(
+            f"peers = … is not allowed with {where}: nobody else can send there (allowed: udpin, udpbcast, tcpin)"
+        )
     if where.kind == "serial":
         return SerialLink(where.device, where.baud or baud, rtscts=where.option("rtscts") == "1")
     if where.kind == "replay":
@@ -30,7 +38,9 @@ def create_link(address: str | LinkAddress, *, baud: int = 57600) -> Link:
         timeout = float(where.option("timeout") or CONNECT_TIMEOUT_S)
         return TcpConnect(where.host, where.port, connect_timeout_s=timeout)
     if where.kind == "tcpin":
-        return TcpListen(where.host, where.port)
+        return TcpListen(where.host, where.port, peers=peers)
     if where.kind == "udpin":
-        return UdpListen(where.host, where.port)
-    return (UdpConnect if where.kind == "udpout" else UdpBroadcast)(where.host, where.port)
+        return UdpListen(where.host, where.port, peers=peers)
+    if where.kind == "udpbcast":
+        return UdpBroadcast(where.host, where.port, peers=peers)
+    return UdpConnect(where.host, where.port)

@@ -22,7 +22,7 @@ from heapq import heappop, heappush
 from aerokit.errors import BusyError, ConnectionClosed, LinkLost
 
 from .fault_model import Air, FaultModel, FaultyPath
-from .link import LINGER_S, DrainListener, Link, Peer, Receiver
+from .link import LINGER_S, DrainListener, Link, Peer, Receiver, keeps_peers
 from .stalled_line import StalledLine
 
 __all__ = ["FaultyLink"]
@@ -140,6 +140,18 @@ class FaultyLink(Link):
         for due, piece in self.outgoing.carry(bytes(data), on_the_way.loop.time()):
             on_the_way.put(due, lambda piece=piece: self.link.write(piece, peer))  # type: ignore[misc]
 
+    def keep_peer(self, peer: Peer) -> None:
+        """See `Link.keep_peer`."""
+        self.link.keep_peer(peer)
+
+    def forget_peer(self, peer: Peer) -> None:
+        """See `Link.forget_peer`."""
+        self.link.forget_peer(peer)
+
+    def host_of(self, peer: Peer) -> object:
+        """See `Link.host_of`."""
+        return self.link.host_of(peer)
+
     def has_peer(self, peer: Peer) -> bool:
         """See `Link.has_peer`."""
         return self.link.has_peer(peer)
@@ -196,6 +208,7 @@ class _Ears:
 
     def __init__(self, path: FaultyPath, receiver: Receiver, when_lost: Callable[[], None]) -> None:
         self._path, self._receiver, self._when_lost = path, receiver, when_lost
+        self.keeps_peers = keeps_peers(receiver)
         self._on_the_way = _Timetable(asyncio.get_running_loop())
         self._is_closed = False
 

@@ -8,7 +8,7 @@ from typing import Protocol, runtime_checkable
 
 from aerokit.errors import LinkLost
 
-__all__ = ["DrainListener", "Link", "Peer", "Receiver"]
+__all__ = ["DrainListener", "Link", "Peer", "PeerKeeper", "Receiver", "keeps_peers"]
 
 Peer = Hashable
 """Who sent the bytes, to be handed back to `Link.write`; None where there is only one. Opaque."""
@@ -37,6 +37,19 @@ class DrainListener(Receiver, Protocol):
 
     def link_drained(self, stalled_s: float) -> None:
         """It goes on, after so many seconds."""
+
+
+@runtime_checkable
+class PeerKeeper(Receiver, Protocol):
+    """A receiver that says by `Link.keep_peer` whom to remember: who sends nothing but noise holds no place."""
+
+    keeps_peers: bool
+    """Whether it does: the link then writes to nobody else, and forgets nobody by itself."""
+
+
+def keeps_peers(receiver: Receiver) -> bool:
+    """Whether a receiver says whom to remember."""
+    return isinstance(receiver, PeerKeeper) and receiver.keeps_peers
 
 
 class Link(ABC):
@@ -84,6 +97,18 @@ class Link(ABC):
         What the system has of a TCP connection is beyond recall, and stays in `unsent_bytes`.
         """
         return
+
+    def keep_peer(self, peer: Peer) -> None:
+        """A peer has shown that it is one: remember it, and write to it, until `forget_peer` (see `PeerKeeper`)."""
+        return
+
+    def forget_peer(self, peer: Peer) -> None:
+        """A peer is not written to any more."""
+        return
+
+    def host_of(self, peer: Peer) -> object:
+        """What stays the same when a peer changes its port: its IP address. Of other links the peer itself."""
+        return peer
 
     def has_peer(self, peer: Peer) -> bool:
         """Whether a peer that was heard could still be written to: not a client that has gone."""

@@ -17,7 +17,7 @@ from typing import Protocol, runtime_checkable
 
 from aerokit.errors import BusyError, ConnectionClosed, LinkLost, RecordingEnded
 
-from .link import DrainListener, Link, Peer, Receiver
+from .link import DrainListener, Link, Peer, Receiver, keeps_peers
 
 __all__ = ["Interruptible", "ReconnectingLink"]
 
@@ -112,6 +112,18 @@ class ReconnectingLink(Link):
             self._link.write(data, peer)
         elif self._receiver is not None:
             self._dropped += 1
+
+    def keep_peer(self, peer: Peer) -> None:
+        """See `Link.keep_peer`."""
+        self._link.keep_peer(peer)
+
+    def forget_peer(self, peer: Peer) -> None:
+        """See `Link.forget_peer`."""
+        self._link.forget_peer(peer)
+
+    def host_of(self, peer: Peer) -> object:
+        """See `Link.host_of`."""
+        return self._link.host_of(peer)
 
     def has_peer(self, peer: Peer) -> bool:
         """See `Link.has_peer`."""
@@ -232,6 +244,7 @@ class _Ears:
 
     def __init__(self, owner: ReconnectingLink) -> None:
         self._owner = owner
+        self.keeps_peers = owner._receiver is not None and keeps_peers(owner._receiver)
         self.is_lost = False
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:

@@ -13,6 +13,7 @@ from typing import Any
 import anyio
 
 from .address import host_and_port
+from .allowed import AllowedPeers, Peers
 from .base import BaseLink
 from .link import LINGER_S, Peer
 from .outbox import Outbox, unsent_in_kernel
@@ -33,7 +34,7 @@ NOT_SENT_LOW_WATER = 1024
 """So much the system may take that it has never sent (TCP_NOTSENT_LOWAT, where there is one)."""
 
 MAX_CLIENTS = 64
-"""Further clients of a listening link are turned away."""
+"""Further clients of a listening link are turned away, or take the place of one that has said nothing yet."""
 
 
 class _TcpLink(BaseLink):
@@ -150,11 +151,14 @@ class TcpConnect(_TcpLink):
 class TcpListen(_TcpLink):
     """``tcpin:`` serves clients; each is a peer, and losing one, or all of them, does not lose the link.
 
-    Port 0 lets the system choose one; `address` and `local_address` say which once the link is open.
+    Port 0 lets the system choose one; `address` and `local_address` say which once the link is open. ``peers`` are the
+    IP addresses and networks that may connect (None: all); LocalProtocolError for what is none.
     """
 
-    def __init__(self, host: str, port: int) -> None:
+    def __init__(self, host: str, port: int, *, peers: Peers | None = None) -> None:
         super().__init__("tcpin", host, port)
+        self._allowed = AllowedPeers(peers)
+        self._kept: set[Peer] = set()
         self._socket: socket.socket | None = None  # until the server has it
         self._server: asyncio.AbstractServer | None = None
         self._local_address = ("", 0)
@@ -180,6 +184,19 @@ class TcpListen(_TcpLink):
         else:
             self.dropped_writes += 1
 
+    def keep_peer(self, peer: Peer) -> None:
+        """See `Link.keep_peer`: it is not turned away for another one."""
+        if peer in self._clients:
+            self._kept.add(peer)
+
+    def forget_peer(self, peer: Peer) -> None:
+        """See `Link.forget_peer`: it may be turned away for another one."""
+        self._kept.discard(peer)
+
+    def host_of(self, peer: Peer) -> object:
+        """See `Link.host_of`."""
+        return peer[0] if isinstance(peer, tuple) else peer
+
     def has_peer(self, peer: Peer) -> bool:
         """See `Link.has_peer`."""
         return peer in self._clients
@@ -203,14 +220,25 @@ class TcpListen(_TcpLink):
         await self._server.start_serving()
 
     def _stream_made(self, stream: _Stream) -> None:
-        if len(self._clients) < MAX_CLIENTS:
-            self._clients[stream.peer] = stream
-        else:
+        host = stream.peer[0] if isinstance(stream.peer, tuple) else ""
+        if (host and not self._allowed.allows(host)) or not self._has_room():
             stream.close()
+        else:
+            self._clients[stream.peer] = stream
+
+    def _has_room(self) -> bool:
+        if len(self._clients) < MAX_CLIENTS:
+            return True
+        silent = next((peer for peer in self._clients if peer not in self._kept), None)
+        if not self._keeps_peers or silent is None:
+            return False
+        self._clients.pop(silent).close()
+        return True
 
     def _stream_lost(self, stream: _Stream, error: Exception | None) -> None:
         if self._clients.get(stream.peer) is stream:
             del self._clients[stream.peer]
+            self._kept.discard(stream.peer)
 
     def _release(self) -> None:
         self._clients.clear()

@@ -16,6 +16,7 @@ from collections.abc import Callable
 from typing import Any
 
 from .address import host_and_port
+from .allowed import AllowedPeers, Peers
 from .base import BaseLink
 from .link import Peer
 from .sockets import Endpoint, bind_to, bound_socket, has_more, resolve
@@ -26,7 +27,13 @@ DATAGRAMS_PER_WAKE_UP = 64
 """So many are read in one go before everybody else on the loop gets a turn."""
 
 MAX_PEERS = 256
-"""So many remote peers a listening link remembers; the one not heard from for longest is forgotten first."""
+"""So many remote peers a listening link remembers; the one not heard from for longest is forgotten first.
+
+A receiver that keeps peers (`PeerKeeper`) says itself who is remembered.
+"""
+
+QUIET_AFTER_S = 3.5
+"""Who has answered a broadcast and was not heard for so long may have another port, or another address, now."""
 
 _LARGEST_DATAGRAM = 65535
 _RECEIVE_BUFFER = 1024 * 1024  # a burst of a log download while the program is busy for a moment
@@ -139,11 +146,13 @@ class _UdpLink(BaseLink):
 class UdpListen(_UdpLink):
     """``udpin:`` binds a port and talks to everybody who was heard on it; each of them is a peer.
 
-    Port 0 lets the system choose one; `address` and `local_address` say which once the link is open.
+    Port 0 lets the system choose one; `address` and `local_address` say which once the link is open. ``peers`` are the
+    IP addresses and networks that are listened to (None: all); LocalProtocolError for what is none.
     """
 
-    def __init__(self, host: str, port: int) -> None:
+    def __init__(self, host: str, port: int, *, peers: Peers | None = None) -> None:
         super().__init__("udpin", host, port)
+        self._allowed = AllowedPeers(peers)
         self._peers: dict[Peer, None] = {}  # the one heard last is at the end
         self._heard_last: Peer = None
 
@@ -162,6 +171,18 @@ class UdpListen(_UdpLink):
         else:
             self.dropped_writes += 1
 
+    def keep_peer(self, peer: Peer) -> None:
+        """See `Link.keep_peer`."""
+        self._peers[peer] = None
+
+    def forget_peer(self, peer: Peer) -> None:
+        """See `Link.forget_peer`."""
+        self._peers.pop(peer, None)
+
+    def host_of(self, peer: Peer) -> object:
+        """See `Link.host_of`."""
+        return peer[0] if isinstance(peer, tuple) else peer
+
     def has_peer(self, peer: Peer) -> bool:
         """See `Link.has_peer`."""
         return peer in self._peers
@@ -173,7 +194,11 @@ class UdpListen(_UdpLink):
 
     def _datagram_received(self, data: bytes, source: Any) -> None:
         if source != self._heard_last:
-            self._remember(source)
+            if source not in self._peers and not self._allowed.allows(source[0]):
+                return
+            self._heard_last = source
+            if not self._keeps_peers:
+                self._remember(source)
         self._deliver(data, source)
 
     def _remember(self, source: Peer) -> None:
@@ -181,7 +206,6 @@ class UdpListen(_UdpLink):
         if len(self._peers) >= MAX_PEERS:
             del self._peers[next(iter(self._peers))]
         self._peers[source] = None
-        self._heard_last = source
 
 
 class UdpConnect(_UdpLink):
@@ -210,29 +234,56 @@ class UdpConnect(_UdpLink):
 
 
 class UdpBroadcast(_UdpLink):
-    """``udpbcast:`` (IPv4) broadcasts until somebody answers, then talks to that one only."""
+    """``udpbcast:`` (IPv4) broadcasts until somebody answers, then talks to that one only.
 
-    def __init__(self, host: str, port: int) -> None:
+    When nothing has come from there for 3.5 s, it broadcasts again and hears who answers; another port of the same host
+    is heard at once. ``peers`` are the IP addresses and networks that are listened to (None: all).
+    """
+
+    def __init__(self, host: str, port: int, *, peers: Peers | None = None) -> None:
         super().__init__("udpbcast", host, port)
-        self._remote: Any = None
-        self._answered = False
+        self._allowed = AllowedPeers(peers)
+        self._everybody: Any = None
+        self._remote: Any = None  # who has answered
+        self._heard_at = 0.0
 
     def write(self, data: bytes, peer: Peer = None) -> None:
         """See `Link.write`."""
-        self._send(data, self._remote)
+        self._send(data, self._everybody if self._is_quiet() else self._remote)
+
+    def keep_peer(self, peer: Peer) -> None:
+        """See `Link.keep_peer`."""
+        self._remote, self._heard_at = peer, self._now()
+
+    def host_of(self, peer: Peer) -> object:
+        """See `Link.host_of`."""
+        return peer[0] if isinstance(peer, tuple) else peer
+
+    def _now(self) -> float:
+        return 0.0 if self._loop is None else self._loop.time()
+
+    def _is_quiet(self) -> bool:
+        return self._remote is None or self._now() - self._heard_at > QUIET_AFTER_S
 
     async def _make_socket(self) -> socket.socket:
         endpoint = (await resolve(self._host, self._port, socket.SOCK_DGRAM))[0]
-        self._remote, self._answered = endpoint.address, False
+        self._everybody, self._remote = endpoint.address, None
         sock = bind_to(Endpoint(socket.AF_INET, ("", 0)), socket.SOCK_DGRAM)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
         return sock
 
     def _datagram_received(self, data: bytes, source: Any) -> None:
-        if not self._answered:
-            self._remote, self._answered = source, True
         if source == self._remote:
-            self._deliver(data)
+            self._heard_at = self._now()
+        elif not self._may_answer(source):
+            return
+        elif not self._keeps_peers:
+            self.keep_peer(source)
+        self._deliver(data, source if self._keeps_peers else None)
+
+    def _may_answer(self, source: Any) -> bool:
+        is_its_host = self._keeps_peers and self._remote is not None and source[0] == self._remote[0]
+        return (is_its_host or self._is_quiet()) and self._allowed.allows(source[0])
 
 
 class _DatagramProtocol(asyncio.DatagramProtocol):

@@ -17,7 +17,7 @@ from struct import error as StructError  # noqa: N812
 from aerokit.mavlink.checksum import x25
 from aerokit.mavlink.dialect import STANDARD, Dialect
 from aerokit.mavlink.frame import MAGIC_V1, MAGIC_V2, SIGNATURE_LENGTH, SIGNED, Frame
-from aerokit.mavlink.statistics import OTHERS, FramerStatistics, SourceLimit, SourceStatistics
+from aerokit.mavlink.statistics import OTHERS, FramerStatistics, SourceLimit
 
 __all__ = ["MOST_SOURCES", "Framer"]
 
@@ -46,8 +46,8 @@ _Found = tuple[int, int, int, int, int]
 """Begin, end, message id, sequence, source."""
 
 _Known = tuple[int, list[tuple[int, int, int]], list[int]]
-"""Of bytes that are kept: how far they were looked at, places that may yet become something (begin, what it seems, until
-which size), and places with bad checksums. So no byte is examined again and again while others come one by one."""
+"""Of bytes that are kept: how far they were looked at, what may become something (begin, verdict, until which size),
+and places with bad checksums. So no byte is examined again and again while others come one by one."""
 _NOTHING_KNOWN: _Known = (0, [], [])
 
 
@@ -274,7 +274,7 @@ class Framer:
 
 
 def _earliest(hold: int, unknown: int, here: int) -> int:
-    """What is kept from, now that something likely begins here: from what began before and is not settled, if anything."""
+    """Where what is kept begins when something likely begins here: at what began before, if that is not settled."""
     if unknown >= 0 and (hold < 0 or unknown < hold):
         return unknown
     return here if hold < 0 else hold

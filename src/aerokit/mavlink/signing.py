@@ -23,6 +23,8 @@ EPOCH_S = 1_420_070_400
 """Time stamps begin in 2015; this is then in seconds since 1970."""
 LAST_TIMESTAMP = (1 << 48) - 1
 ONE_MINUTE = 60 * TICKS_PER_S
+MOST_STREAMS = 1024
+"""So many (system id, component id, link id) are remembered; only who has the key makes any."""
 ALWAYS_UNSIGNED = frozenset((109, 166))
 """RADIO_STATUS and RADIO: telemetry radios put them between the frames, and have no key."""
 
@@ -184,7 +186,7 @@ class Signing:
     def check(self, frame: Frame, now: float = 0.0) -> Refusal | None:
         """As :meth:`accepts`, but says why not; ``now`` is seconds since 1970, 0 when there is no clock."""
         refusal = self._check_signature(frame, now)
-        if refusal is None or self._may_be_unsigned(frame):
+        if refusal is None or self.may_be_unsigned(frame):
             return None
         self.refused[refusal] += 1
         return refusal
@@ -201,7 +203,19 @@ class Signing:
             self._hash(raw[:-_HASH_LENGTH]), raw[-_HASH_LENGTH:]
         )
 
+    def would_accept(self, frame: Frame, now: float = 0.0) -> bool:
+        """Whether a frame has a good signature and no old time stamp; nothing is counted or remembered."""
+        return self._refusal(frame, now) is None
+
     def _check_signature(self, frame: Frame, now: float) -> Refusal | None:
+        refusal = self._refusal(frame, now)
+        if refusal is None:
+            signature = frame.raw[-SIGNATURE_LENGTH:]
+            stamp = int.from_bytes(signature[1:7], "little")
+            self._remember((frame.system_id, frame.component_id, signature[0]), stamp)
+        return refusal
+
+    def _refusal(self, frame: Frame, now: float) -> Refusal | None:
         if not frame.incompat_flags & SIGNED:
             return Refusal.UNSIGNED
         if not self.has_signed(frame):
@@ -215,11 +229,17 @@ class Signing:
                 return Refusal.TOO_OLD
         elif stamp <= last:
             return Refusal.REPLAYED
-        self.streams[stream] = stamp
-        self.timestamp = max(self.timestamp, stamp)
         return None
 
-    def _may_be_unsigned(self, frame: Frame) -> bool:
+    def _remember(self, stream: tuple[int, int, int], stamp: int) -> None:
+        """Of a sender that is forgotten, time stamps are compared with ours, as of one that was never heard."""
+        if stream not in self.streams and len(self.streams) >= MOST_STREAMS:
+            del self.streams[min(self.streams, key=self.streams.__getitem__)]
+        self.streams[stream] = stamp
+        self.timestamp = max(self.timestamp, stamp)
+
+    def may_be_unsigned(self, frame: Frame) -> bool:
+        """Whether a frame without a good signature is let in."""
         if frame.message_id in ALWAYS_UNSIGNED:
             return True
         return self.allow_unsigned is not None and bool(self.allow_unsigned(frame))

@@ -13,8 +13,7 @@ from aerokit.errors import AerokitError, BusyError, ConnectionClosed, LinkLost, 
 from aerokit.links.link import Link
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
-from aerokit.mavlink.frame import Frame, is_whole_frame
-from aerokit.mavlink.framer import Framer
+from aerokit.mavlink.frame import SIGNED, Frame, is_whole_frame
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import Heartbeat
 from aerokit.runtime.background import Background
@@ -23,7 +22,6 @@ from aerokit.runtime.deadlines import Deadlines
 from aerokit.runtime.endings import raisable
 from aerokit.runtime.events import (
     Event,
-    HeardTwice,
     LinkClosed,
     LinkDrained,
     LinkInterrupted,
@@ -32,8 +30,9 @@ from aerokit.runtime.events import (
     LoopBlocked,
 )
 from aerokit.runtime.loop_watch import watch_loop
+from aerokit.runtime.peers import Peers
 from aerokit.runtime.recording import Recording
-from aerokit.runtime.routes import Routes
+from aerokit.runtime.routes import MOST_ROUTES, Routes
 from aerokit.runtime.signatures import SignatureGate, check_signing
 from aerokit.runtime.subscription import Overflow, Subscription
 
@@ -43,8 +42,9 @@ if TYPE_CHECKING:
 
     from aerokit.links.link import Peer
     from aerokit.mavlink.dialect import Dialect
+    from aerokit.mavlink.framer import Framer
     from aerokit.mavlink.signing import Signing
-    from aerokit.mavlink.statistics import FramerStatistics
+    from aerokit.mavlink.statistics import FramerStatistics, SourceStatistics
     from aerokit.runtime.bus import Detach, Sink
 
     Tap = Callable[[Frame, Peer], object]
@@ -61,13 +61,13 @@ MAV_STATE_ACTIVE = 4
 MAV_COMP_ID_MISSIONPLANNER = 190
 """The component id that ground stations take."""
 HEARTBEAT_PERIOD_S = 1.0
-MOST_PEERS = 256
 
 
 class Connection:
     """One MAVLink node (system id, component id) on one link.
 
-    Frames come in through ``bytes_received``, are checked by one framer for each remote peer, and go to ``bus``.
+    Frames come in through ``bytes_received``, are checked by one framer for each remote peer, and go to ``bus``. Who
+    may speak in whose name is said in :class:`aerokit.runtime.routes.Routes`; ``may_move`` is its own.
     ``send`` numbers a message and writes it to where its target was last heard. Everything runs on the loop's thread.
     """
 
@@ -80,6 +80,7 @@ class Connection:
         dialect: Dialect = STANDARD,
         mavlink_version: int = 2,
         signing: Signing | None = None,
+        may_move: bool = False,
     ) -> None:
         if not 1 <= source_system <= 255:
             raise LocalProtocolError(f"source_system = {source_system} is not allowed: 1 to 255")
@@ -97,6 +98,8 @@ class Connection:
         """The last HEARTBEAT of every (system id, component id) on the link."""
         self.attached: set[int] = set()
         """System ids that have a vehicle object on this connection."""
+        self.boot_clocks: dict[tuple[int, int], Callable[[float], float | None]] = {}
+        """Of some (system id, component id): its time since boot in milliseconds, by our time; None while unknown."""
         self.deadlines = Deadlines()
         """What has to happen at a time, as long as the connection is open."""
         self._clock = asyncio.get_running_loop().time
@@ -104,8 +107,10 @@ class Connection:
         self._encoder = FrameEncoder(source_system, source_component, version=mavlink_version)
         self._gate = SignatureGate(self._encoder, self.unix_time, self.bus.publish)
         self.signing = signing
-        self._framers: dict[Peer, Framer] = {}
-        self._routes = Routes(link.has_peer, self._heard_twice)
+        self._routes = Routes(link, self.bus.publish, self.attached, self.boot_clocks, may_move=may_move)
+        self._peers = Peers(link, dialect, self._routes, self._let_through)
+        self._framers = self._peers.framers
+        self.keeps_peers = True
         self._recording: Recording | None = None
         self._taps: tuple[Tap, ...] = ()
         self._enders: list[Callable[[Exception], None]] = []
@@ -276,8 +281,8 @@ class Connection:
         return self._gate.describe(self.heard.get((system_id, component_id)))
 
     def statistics(self) -> Iterator[FramerStatistics]:
-        """The counters of every peer heard so far."""
-        return (framer.statistics for framer in self._framers.values())
+        """The counters of every peer that is remembered."""
+        return (framer.statistics for framer in self._peers)
 
     def counts(self, system_id: int) -> tuple[int, int]:
         """Frames of this system that were received, and frames that its sequence numbers say were lost."""
@@ -329,20 +334,24 @@ class Connection:
         """Take bytes off the link (called by the link); never raises."""
         try:
             framer = self._framers.get(peer)
-            if framer is None:
-                framer = self._new_framer(peer)
-            frames = framer.receive(data, self._clock())
-            if not self._gate.is_open:
-                frames = self._gate.admitted(frames)
+            if framer is not None:
+                frames = framer.receive(data, self._clock())
+            else:
+                framer, frames = self._peers.receive_from_stranger(peer, data, self._clock())
             for frame in frames:
                 if self._error is not None:  # a sink has closed it
                     return
+                is_elsewhere = len(self._framers) > 1 and self._routes.is_elsewhere(frame, peer)
+                if not self._gate.is_open and not self._gate.admits(frame, may_hand_over=not is_elsewhere):
+                    continue
                 if self._recording is not None:
                     self._recording.write(frame.raw, frame.received_at)
-                if len(self._framers) > 1 and self._routes.is_of_another(frame, peer):
+                if is_elsewhere and not self._takes_place(framer, frame, peer):
+                    continue
+                if (framer.late or framer.foreign) and self._is_stale(framer, frame):
                     continue
                 if frame.message_id == Heartbeat.ID:
-                    self._note_heartbeat(frame, peer)
+                    self._note_heartbeat(framer, frame, peer)
                 self.bus.deliver(frame)
                 for tap in self._taps:
                     self._give(tap, frame, peer)
@@ -355,8 +364,7 @@ class Connection:
 
     def link_restored(self, away_s: float) -> None:
         """The link is back (called by the link)."""
-        for framer in self._framers.values():
-            framer.begin_anew()
+        self._peers.begin_anew()
         self.bus.publish(LinkRestored(self._clock(), 0, away_s))
 
     def link_stalled(self, unsent_bytes: int) -> None:
@@ -429,15 +437,8 @@ class Connection:
             self._background.start(self._watch_loop, "aerokit loop watch")
         return self.bus.attach_event(item, _only(system_id, sink) if system_id else sink)
 
-    def _new_framer(self, peer: Peer) -> Framer:
-        if len(self._framers) >= MOST_PEERS:
-            del self._framers[self._routes.least_wanted(self._framers)]
-        framer = self._framers[peer] = Framer(self.bus.dialect)
-        self._let_through(framer)
-        return framer
-
     def _let_all_through(self) -> None:
-        for framer in self._framers.values():
+        for framer in self._peers:
             self._let_through(framer)
 
     def _let_through(self, framer: Framer) -> None:
@@ -445,14 +446,31 @@ class Connection:
         framer.keep_unknown = self._recording is not None or bool(self._taps)
         framer.wanted = None if framer.keep_unknown else self.bus.wanted
 
-    def _note_heartbeat(self, frame: Frame, peer: Peer) -> None:
-        heartbeat = self.bus.dialect.decode(frame)
-        if frame.system_id != 0 and isinstance(heartbeat, Heartbeat):
-            self.heard[frame.system_id, frame.component_id] = heartbeat
-            self._routes.note(frame, peer)
+    def _takes_place(self, framer: Framer, frame: Frame, peer: Peer) -> bool:
+        is_signed = self.signing is not None and bool(frame.incompat_flags & SIGNED)  # checked by the gate
+        return self._routes.takes_place(frame, peer, _counters(framer, frame), is_signed)
 
-    def _heard_twice(self, frame: Frame) -> None:
-        self.bus.publish(HeardTwice(frame.received_at, frame.system_id, frame.component_id))
+    def _is_stale(self, framer: Framer, frame: Frame) -> bool:
+        """Whether a frame out of order is not listened to: another sender's, or a heartbeat that was overtaken."""
+        is_foreign = frame in framer.foreign
+        if not is_foreign and frame not in framer.late:
+            return False
+        counters = _counters(framer, frame)
+        if counters is not None and counters.is_double(frame.received_at):
+            self._routes.hear_double(frame)
+            if is_foreign:
+                return True
+        return frame.message_id == Heartbeat.ID and (is_foreign or self._routes.is_overtaken(frame))
+
+    def _note_heartbeat(self, framer: Framer, frame: Frame, peer: Peer) -> None:
+        heartbeat = self.bus.dialect.decode(frame)
+        if frame.system_id == 0 or not isinstance(heartbeat, Heartbeat):
+            return
+        if self._routes.note(frame, peer, _counters(framer, frame)):
+            self.heard[frame.system_id, frame.component_id] = heartbeat
+            if len(self.heard) > MOST_ROUTES:
+                for source in [source for source in self.heard if not self._routes.is_known(source)]:
+                    del self.heard[source]
 
 
 def _only(system_id: int, sink: Sink) -> Sink:
@@ -463,6 +481,10 @@ def _only(system_id: int, sink: Sink) -> Sink:
             sink(event)
 
     return filtered
+
+
+def _counters(framer: Framer, frame: Frame) -> SourceStatistics | None:
+    return framer.statistics.by_key.get(frame.component_id << 8 | frame.system_id)
 
 
 def _check_version(version: int) -> None:

@@ -29,12 +29,14 @@ __all__ = [
     "MissionFinished",
     "MissionItemReached",
     "ModeChanged",
+    "MoveRefused",
     "ParameterChanged",
     "StatusTextReceived",
     "StreamSlow",
     "StreamUnavailable",
     "VehicleBack",
     "VehicleFound",
+    "VehicleMoved",
     "VehicleRebooted",
     "VehicleSilent",
 ]
@@ -70,12 +72,31 @@ class VehicleRebooted(Event):
 
 
 class HeardTwice(Event):
-    """The same system and component id came from a second peer of the link; what it says is not listened to.
+    """The same system and component id came from a second sender; what it says is not listened to.
 
-    Two vehicles with the same ids, or two ways to the same one. Told once for each such peer.
+    Two vehicles with the same ids, or two ways to the same one, behind two peers of the link or behind one (told apart
+    by their sequence numbers). Told once for each such peer.
     """
 
     component_id: int
+
+
+class VehicleMoved(Event):
+    """A component is heard from another peer now: the addresses ``before`` and ``after``, as text."""
+
+    component_id: int
+    before: str
+    after: str
+
+
+class MoveRefused(Event):
+    """A component is silent, and ``peer`` speaks in its name without going on where it stopped; it is not listened to.
+
+    Another vehicle, or this one rebooted with another IP address: ``may_move=True`` allows it.
+    """
+
+    component_id: int
+    peer: str
 
 
 class FrameRefused(Event):

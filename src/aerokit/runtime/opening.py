@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     import os
     from collections.abc import AsyncIterator
 
+    from aerokit.links.allowed import Peers
     from aerokit.links.link import Link
     from aerokit.mavlink.dialect import Dialect
     from aerokit.mavlink.signing import Signing
@@ -38,6 +39,8 @@ async def open_connection(
     signing: Signing | None = None,
     record: str | os.PathLike[str] | None = None,
     reconnect: bool = False,
+    peers: Peers | None = None,
+    may_move: bool = False,
 ) -> AsyncIterator[Connection]:
     """Open a link and be a MAVLink node on it for the time of the ``async with`` block.
 
@@ -59,6 +62,11 @@ async def open_connection(
         reconnect: whether a link that is lost, a device unplugged for example, is opened again until it is back,
             instead of ending the connection: ``LinkInterrupted``, ``LinkRestored``. Not for the first opening, and not
             at the end of a recording.
+        peers: the IP addresses and networks that are listened to: ``"10.0.0.7"``, ``["10.0.0.0/24", "fd00::/8"]``, or
+            those of :mod:`ipaddress`. For links to which anybody can send: udpin, udpbcast, tcpin. None: all.
+        may_move: whether a vehicle that was silent may come back from another IP address without going on where it
+            stopped, by sequence numbers and time since boot: rebooted, with a new address. Else it is not listened to
+            there (``MoveRefused``), for it might be anybody.
 
     Raises:
         LocalProtocolError: an argument is wrong; nothing was opened.
@@ -67,7 +75,7 @@ async def open_connection(
     """
     if not baud > 0:
         raise LocalProtocolError(f"baud = {baud} is not allowed: above 0")
-    link = _link(address, baud, reconnect)
+    link = _link(address, baud, reconnect, peers)
     connection = Connection(
         link,
         source_system=source_system,
@@ -75,6 +83,7 @@ async def open_connection(
         dialect=dialect,
         mavlink_version=mavlink_version,
         signing=signing,
+        may_move=may_move,
     )
     try:
         if record is not None:
@@ -91,13 +100,17 @@ async def open_connection(
                 await link.wait_closed()
 
 
-def _link(address: str | Link, baud: int, reconnect: bool) -> Link:
+def _link(address: str | Link, baud: int, reconnect: bool, peers: Peers | None) -> Link:
     if isinstance(address, str):
-        make_link = partial(create_link, address, baud=baud)
+        make_link = partial(create_link, address, baud=baud, peers=peers)
         return ReconnectingLink(make_link) if reconnect else make_link()
     if reconnect:
         raise LocalProtocolError(
             "reconnect = True is not allowed with a link, which can be opened once only: pass an address,"
             " or a ReconnectingLink of aerokit.links"
+        )
+    if peers is not None:
+        raise LocalProtocolError(
+            "peers = … is not allowed with a link: pass an address, or give them to the link (UdpListen, TcpListen)"
         )
     return address

@@ -1,68 +1,243 @@
-"""``Routes``: behind which peer of a link each component is, by its heartbeats."""
+"""``Routes``: behind which peer of a link each component is, and who may take the place of whom."""
 
 from __future__ import annotations
 
+import logging
 from typing import TYPE_CHECKING
 
+from aerokit.runtime.claims import Claim, boot_time_ms
+from aerokit.runtime.events import HeardTwice, MoveRefused, VehicleMoved
+
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable
+    from collections.abc import Callable, Collection, Iterable, Mapping
 
-    from aerokit.links.link import Peer
+    from aerokit.links.link import Link, Peer
     from aerokit.mavlink.frame import Frame
+    from aerokit.mavlink.statistics import SourceStatistics
+    from aerokit.runtime.events import Event
 
-__all__ = ["Routes"]
+    Source = tuple[int, int]
+    BootClock = Callable[[float], float | None]
+
+__all__ = ["MOST_CLAIMS", "MOST_ROUTES", "MOVES_AFTER_S", "Routes"]
+
+logger = logging.getLogger("aerokit")
 
 MOVES_AFTER_S = 3.5
 """A component that was silent for so long may come from another peer: its port has changed, or the link."""
+LIVE_FOR_S = 30.0
+"""A peer is not forgotten for another one before its heartbeats have been missing for so long; a vehicle's never."""
+MOST_ROUTES = 1024
+MOST_CLAIMS = 256
+SWEEP_AFTER_S = 1.0
 EVERY_PEER: tuple[Peer, ...] = (None,)
+
+
+class _Route:
+    __slots__ = ("counters", "expected", "noted_at", "peer", "rate", "sequence")
+
+    def __init__(self, peer: Peer) -> None:
+        self.peer = peer
+        self.noted_at = 0.0
+        self.sequence = 0  # of the last heartbeat
+        self.counters: SourceStatistics | None = None  # those of the peer's framer, always up to date
+        self.expected = 0
+        self.rate = 0.0  # frames a second
 
 
 class Routes:
     """Where each (system id, component id) was last heard, and so where to send what is for it.
 
-    ``has_peer`` says whether a peer is still there; ``on_double(frame)`` is told of each peer that says what another
-    one says already, once.
+    Who is first heard under these ids, by a HEARTBEAT, keeps the place; what others say in its name is not listened to
+    (``HeardTwice``). Another peer takes the place (``VehicleMoved``)
+
+    1. at once, if it is another port of the same host, and goes on where the first one stopped: three frames whose
+       sequence numbers, and times since boot if they are known, continue its own, and nothing more of the first one;
+    2. when no heartbeat has come for 3.5 s, or a TCP client has gone, if it is of the same host (a reboot, a program
+       started again: its numbers may begin anew), or goes on as above from whatever host, or signs with our key;
+    3. then anybody, while no vehicle object stands for the system, or if the program allows it (``may_move``).
+
+    Who was refused by 2 (``MoveRefused``) is judged again when the first one has been heard again. A system with a
+    vehicle object keeps its place however long it is silent.
+
+    ``attached`` are the system ids with a vehicle object, ``boot_clocks`` say at which time since boot (milliseconds)
+    a component is at an instant of ``received_at``; ``publish`` tells events.
     """
 
-    def __init__(self, has_peer: Callable[[Peer], bool], on_double: Callable[[Frame], None]) -> None:
-        self._has_peer, self._on_double = has_peer, on_double
-        self._peers: dict[tuple[int, int], Peer] = {}
-        self._noted_at: dict[tuple[int, int], float] = {}
-        self._doubles: set[tuple[int, int, Peer]] = set()
+    def __init__(
+        self,
+        link: Link,
+        publish: Callable[[Event], object],
+        attached: Collection[int] = (),
+        boot_clocks: Mapping[Source, BootClock] | None = None,
+        *,
+        may_move: bool = False,
+    ) -> None:
+        self._link, self._publish, self._attached = link, publish, attached
+        self._boot_clocks = {} if boot_clocks is None else boot_clocks
+        self._may_move = may_move
+        self._routes: dict[Source, _Route] = {}
+        self._claims: dict[tuple[Source, Peer], Claim] = {}
+        self._swept_at = 0.0
 
-    def note(self, frame: Frame, peer: Peer) -> None:
-        """A heartbeat came from this peer."""
+    def note(self, frame: Frame, peer: Peer, counters: SourceStatistics | None) -> bool:
+        """A heartbeat came from this peer; False when there is no room to remember it."""
         source = frame.system_id, frame.component_id
-        self._peers[source], self._noted_at[source] = peer, frame.received_at
+        route = self._routes.get(source)
+        if route is None:
+            if len(self._routes) >= MOST_ROUTES and not self._sweep(frame.received_at):
+                return False
+            route = self._routes[source] = _Route(peer)
+        if counters is not None:
+            elapsed = frame.received_at - route.noted_at
+            if route.counters is counters and elapsed > 0:
+                route.rate = (counters.expected - route.expected) / elapsed
+            route.counters, route.expected = counters, counters.expected
+        route.peer, route.noted_at, route.sequence = peer, frame.received_at, frame.sequence
+        return True
+
+    def is_known(self, source: Source) -> bool:
+        """Whether a heartbeat of this component is remembered."""
+        return source in self._routes
+
+    def is_overtaken(self, frame: Frame) -> bool:
+        """Whether a heartbeat that is late by its number is older than the last one that was noted."""
+        route = self._routes.get((frame.system_id, frame.component_id))
+        if route is None or frame.received_at - route.noted_at > MOVES_AFTER_S:
+            return False
+        return 0 < (route.sequence - frame.sequence) & 0xFF < 128
 
     def peers_of(self, system_id: int, component_id: int) -> Collection[Peer]:
         """Where to send what is for this component, or for this system if the component is 0 or was never heard."""
         if system_id == 0:
             return EVERY_PEER
         try:
-            return (self._peers[system_id, component_id],)
+            return (self._routes[system_id, component_id].peer,)
         except KeyError:
-            return {peer for (system, _), peer in self._peers.items() if system == system_id} or EVERY_PEER
+            peers = {route.peer for (system, _), route in self._routes.items() if system == system_id}
+            return peers or EVERY_PEER
 
-    def is_of_another(self, frame: Frame, peer: Peer) -> bool:
-        """Whether it is heard from another peer already: two vehicles with the same ids, or two ways to one.
+    def is_elsewhere(self, frame: Frame, peer: Peer) -> bool:
+        """Whether the component of this frame is known to be behind another peer."""
+        route = self._routes.get((frame.system_id, frame.component_id))
+        return route is not None and route.peer != peer
 
-        The first one stays; another takes its place when it has gone, or been silent for ``MOVES_AFTER_S``.
+    def takes_place(
+        self, frame: Frame, peer: Peer, counters: SourceStatistics | None, is_signed: bool
+    ) -> bool:
+        """Whether a peer that :meth:`is_elsewhere` takes the place of the one that had it; see the class."""
+        source, now = (frame.system_id, frame.component_id), frame.received_at
+        route = self._routes[source]
+        is_silent = now - route.noted_at > MOVES_AFTER_S or not self._link.has_peer(route.peer)
+        is_same_host = self._link.host_of(peer) == self._link.host_of(route.peer)
+        is_free = self._may_move or is_signed or is_same_host or frame.system_id not in self._attached
+        claim = self._claim(source, peer)
+        claim.hear(frame, self._evidence(route, frame, counters))
+        if (is_silent and (is_free or claim.goes_on)) or (
+            is_same_host and claim.goes_on and claim.frames >= Claim.ENOUGH
+        ):
+            self._move(route, frame, peer)
+            return True
+        self._tell(claim, frame, peer, is_silent=is_silent, is_same_host=is_same_host)
+        return False
+
+    def hear_double(self, frame: Frame) -> None:
+        """Somebody behind the same peer speaks in this one's name."""
+        claim = self._claim((frame.system_id, frame.component_id), _SAME_PEER)
+        if not claim.is_told:
+            claim.is_told = True
+            self._publish(HeardTwice(frame.received_at, frame.system_id, frame.component_id))
+
+    def least_wanted(self, peers: Iterable[Peer], now: float) -> list[Peer]:
+        """The first behind which nobody lives (a heartbeat in the last 30 s, or a vehicle object), if there is one.
+
+        What was told of it is told anew when it comes again.
         """
-        source = frame.system_id, frame.component_id
-        first = self._peers.get(source, peer)
-        if first == peer or not self._has_peer(first):
-            return False
-        if frame.received_at - self._noted_at[source] > MOVES_AFTER_S:
-            return False
-        if (*source, peer) not in self._doubles:
-            self._doubles.add((*source, peer))
-            self._on_double(frame)
-        return True
+        live = {
+            route.peer
+            for (system_id, _), route in self._routes.items()
+            if system_id in self._attached or now - route.noted_at <= LIVE_FOR_S
+        }
+        forgotten = next((peer for peer in peers if peer not in live), None)
+        if forgotten is None:
+            return []
+        self._claims = {key: claim for key, claim in self._claims.items() if key[1] != forgotten}
+        return [forgotten]
 
-    def least_wanted(self, peers: Iterable[Peer]) -> Peer:
-        """The first that no heartbeat came from, else the first; it is told of again if it comes again."""
-        order, routes = list(peers), set(self._peers.values())
-        forgotten = next((peer for peer in order if peer not in routes), order[0])
-        self._doubles = {double for double in self._doubles if double[2] != forgotten}
-        return forgotten
+    # ------------------------------------------------------------------------------- inside
+
+    def _claim(self, source: Source, peer: Peer) -> Claim:
+        key = source, peer
+        claim = self._claims.get(key)
+        if claim is None:
+            if len(self._claims) >= MOST_CLAIMS:
+                del self._claims[next(iter(self._claims))]
+            claim = self._claims[key] = Claim()
+        return claim
+
+    def _evidence(
+        self, route: _Route, frame: Frame, counters: SourceStatistics | None
+    ) -> tuple[int, bool | None, bool | None]:
+        """How far the first one has come; whether this frame's number, and its clock, go on there (None: unknown)."""
+        follows: bool | None = None
+        silent_for = max(frame.received_at - route.noted_at, 0.0)
+        expected = 0
+        if route.counters is not None:
+            expected = route.counters.expected
+            may_be_ahead = 8 + 1.5 * route.rate * silent_for
+            if may_be_ahead < 128:
+                follows = (frame.sequence - expected) & 0xFF <= may_be_ahead
+        clock = self._boot_clocks.get((frame.system_id, frame.component_id))
+        should_be = None if clock is None else clock(frame.received_at)
+        if should_be is None:
+            return expected, follows, None if follows is None else True
+        boot_ms = boot_time_ms(frame)
+        in_time = None if boot_ms is None else abs(boot_ms - should_be) <= 1500 + 50 * silent_for
+        return expected, follows, in_time
+
+    def _move(self, route: _Route, frame: Frame, peer: Peer) -> None:
+        before, route.peer, route.noted_at = route.peer, peer, frame.received_at
+        route.counters, route.rate = None, 0.0
+        source = frame.system_id, frame.component_id
+        self._claims = {key: claim for key, claim in self._claims.items() if key[0] != source}
+        self._publish(VehicleMoved(frame.received_at, *source, _name(before), _name(peer)))
+
+    def _tell(self, claim: Claim, frame: Frame, peer: Peer, *, is_silent: bool, is_same_host: bool) -> None:
+        source = frame.system_id, frame.component_id
+        if not claim.is_told and not (is_same_host and claim.may_go_on):
+            claim.is_told = True
+            self._publish(HeardTwice(frame.received_at, *source))
+        if is_silent and not claim.may_go_on and not claim.is_refusal_told:
+            claim.is_refusal_told = True
+            logger.warning(
+                "%d/%d is silent, and %s speaks in its name without going on where it stopped: it is not listened to"
+                " (may_move=True allows it)",
+                *source,
+                _name(peer),
+            )
+            self._publish(MoveRefused(frame.received_at, *source, _name(peer)))
+
+    def _sweep(self, now: float) -> bool:
+        """Forget components that were not heard for a while, once a second at most; whether there is room then."""
+        if now - self._swept_at >= SWEEP_AFTER_S:
+            self._swept_at = now
+            self._routes = {
+                source: route
+                for source, route in self._routes.items()
+                if source[0] in self._attached or now - route.noted_at <= LIVE_FOR_S
+            }
+        return len(self._routes) < MOST_ROUTES
+
+
+class _SamePeer:
+    """Stands for somebody else behind the same peer."""
+
+
+_SAME_PEER = _SamePeer()
+
+
+def _name(peer: Peer) -> str:
+    if isinstance(peer, tuple) and len(peer) >= 2:
+        host, port = peer[:2]
+        return f"[{host}]:{port}" if ":" in str(host) else f"{host}:{port}"
+    return str(peer)

@@ -25,6 +25,11 @@ __all__ = ["SignatureGate", "check_signing"]
 logger = logging.getLogger("aerokit")
 
 
+UNSIGNED_FRAMES = 3
+UNSIGNED_S = 2.0
+"""A vehicle that has its key sends a signed heartbeat each second."""
+
+
 class SignatureGate:
     """Lets in what the encoder's ``signing`` accepts, everything while that is None.
 
@@ -49,17 +54,15 @@ class SignatureGate:
         self._encoder.signing = signing
         self._update()
 
-    def admitted(self, frames: list[Frame]) -> list[Frame]:
-        """Those of these frames that are let in."""
-        return [frame for frame in frames if self._admits(frame)]
-
     @contextmanager
     def handing_over(
         self, signing: Signing | None, system_id: int, component_id: int
     ) -> Iterator[asyncio.Event]:
-        """For the time of the block, change to ``signing`` with the first frame of the component that shows it has.
+        """For the time of the block, change to ``signing`` when frames of the component show that it has.
 
-        The event is set then. Frames are signed and checked as before until that.
+        The event is set then. Frames are signed and checked as before until that. One frame that is signed with the new
+        key, and not an old one, shows it; that there is no key any more is shown by unsigned frames, `UNSIGNED_FRAMES`
+        at least, over `UNSIGNED_S`, and no signed one in between: anybody can send a few of those.
 
         BusyError while another block is open.
         """
@@ -79,9 +82,11 @@ class SignatureGate:
     def _update(self) -> None:
         self.is_open = self._encoder.signing is None and self._handover is None
 
-    def _admits(self, frame: Frame) -> bool:
+    def admits(self, frame: Frame, *, may_hand_over: bool = True) -> bool:
+        """Whether a frame is let in; one that does not come from where its sender is says nothing about keys."""
         handover = self._handover
-        if handover is not None and handover.is_shown_by(frame):
+        is_of_handover = handover is not None and may_hand_over and handover.concerns(frame)
+        if handover is not None and is_of_handover and handover.is_shown_by(frame, self._unix_time()):
             self._handover = None
             self.use(handover.signing)
             handover.taken.set()
@@ -89,6 +94,8 @@ class SignatureGate:
         if signing is None:
             return True
         try:
+            if is_of_handover and not frame.incompat_flags & SIGNED:
+                return signing.may_be_unsigned(frame)  # neither told nor counted
             refusal = signing.check(frame, self._unix_time())
         except Exception:
             logger.exception("allow_unsigned of %r raised; the frame was refused", signing)
@@ -125,12 +132,24 @@ class _Handover:
     def __init__(self, signing: Signing | None, source: tuple[int, int], taken: asyncio.Event) -> None:
         self.signing, self.taken = signing, taken
         self._source = source
+        self._unsigned, self._unsigned_since = 0, 0.0
 
-    def is_shown_by(self, frame: Frame) -> bool:
+    def concerns(self, frame: Frame) -> bool:
+        """Whether it is a frame of this component."""
+        return (frame.system_id, frame.component_id) == self._source
+
+    def is_shown_by(self, frame: Frame, unix_time_s: float) -> bool:
         """Whether this frame shows that the component has the key; for None: that it has none."""
-        if (frame.system_id, frame.component_id) != self._source:
+        if self.signing is not None:
+            return self.signing.would_accept(frame, unix_time_s)
+        if frame.incompat_flags & SIGNED:
+            self._unsigned = 0
             return False
-        return not frame.incompat_flags if self.signing is None else self.signing.has_signed(frame)
+        self._unsigned += 1
+        if self._unsigned == 1:
+            self._unsigned_since = frame.received_at
+        long_enough = frame.received_at - self._unsigned_since >= UNSIGNED_S
+        return long_enough and self._unsigned >= UNSIGNED_FRAMES
 
 
 def check_signing(signing: Signing | None, mavlink_version: int) -> None:

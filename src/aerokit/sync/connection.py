@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
     from typing_extensions import Self
 
+    from aerokit.links.allowed import Peers
     from aerokit.links.link import Link
     from aerokit.mavlink.dialect import Dialect
     from aerokit.mavlink.message import Message
@@ -41,6 +42,8 @@ def open_connection(
     signing: Signing | None = None,
     record: str | os.PathLike[str] | None = None,
     reconnect: bool = False,
+    peers: Peers | None = None,
+    may_move: bool = False,
 ) -> Connection:
     """Open a link and be a MAVLink node on it, on a loop thread of its own, until the connection is closed.
 
@@ -59,6 +62,8 @@ def open_connection(
                 signing=signing,
                 record=record,
                 reconnect=reconnect,
+                peers=peers,
+                may_move=may_move,
             )
         )
     except BaseException:

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
     from typing_extensions import Self
 
+    from aerokit.links.allowed import Peers
     from aerokit.links.link import Link
     from aerokit.mavlink.dialect import Dialect
     from aerokit.mavlink.message import Message
@@ -60,6 +61,8 @@ def connect(
     signing: Signing | None = None,
     record: str | os.PathLike[str] | None = None,
     reconnect: bool = False,
+    peers: Peers | None = None,
+    may_move: bool = False,
 ) -> Vehicle:
     """Connect to a vehicle and return it at its first heartbeat; use it in a ``with`` block, or close it yourself.
 
@@ -82,6 +85,8 @@ def connect(
                 signing=signing,
                 record=record,
                 reconnect=reconnect,
+                peers=peers,
+                may_move=may_move,
             )
         )
     except BaseException:

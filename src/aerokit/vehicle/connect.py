@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     import os
     from collections.abc import AsyncIterator, Mapping
 
+    from aerokit.links.allowed import Peers
     from aerokit.mavlink.dialect import Dialect
     from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.message import Message
@@ -53,6 +54,8 @@ async def connect(
     signing: Signing | None = None,
     record: str | os.PathLike[str] | None = None,
     reconnect: bool = False,
+    peers: Peers | None = None,
+    may_move: bool = False,
 ) -> AsyncIterator[Vehicle]:
     """Connect to a vehicle for the time of the ``async with`` block.
 
@@ -75,6 +78,11 @@ async def connect(
         signing: signs everything we send; what is not signed with its key is refused (docs/signing.md). None: neither.
         record: a ``.tlog`` file for everything received and sent; an existing file is replaced.
         reconnect: whether a link that is lost is opened again until it is back, instead of ending the connection.
+        peers: the IP addresses and networks that are listened to: ``"10.0.0.7"``, ``["10.0.0.0/24"]``. For links to
+            which anybody can send: udpin, udpbcast, tcpin. None: all.
+        may_move: whether the vehicle, once silent, may come back from another IP address without going on where it
+            stopped, by sequence numbers and time since boot (rebooted, with a new address). Else it is not listened to
+            there (``MoveRefused``), for it might be anybody.
 
     Raises:
         LocalProtocolError: an argument is wrong. Nothing was opened.
@@ -97,6 +105,10 @@ async def connect(
             raise LocalProtocolError(
                 "reconnect = True is not allowed here: the connection is open; say it to open_connection"
             )
+        if peers is not None or may_move:
+            raise LocalProtocolError(
+                "peers and may_move are not allowed here: the connection is open; say it to open_connection"
+            )
         async with _attached(address, system_id, timeout, rates) as vehicle:
             yield vehicle
         return
@@ -111,6 +123,8 @@ async def connect(
             signing=signing,
             record=record,
             reconnect=reconnect,
+            peers=peers,
+            may_move=may_move,
         ) as connection,
         _attached(connection, system_id, timeout, rates) as vehicle,
     ):

@@ -29,6 +29,7 @@ REBOOT_SEEN_S = 0.2
 """So long, and in at least two messages, must the new time run before it is believed: one late message is no reboot."""
 LATE_MS = 2000
 """Once the vehicle has accepted to reboot: it boots for longer than this, and no message is so late."""
+CLOCK_SPAN_S = 5.0
 REPORT_PERIOD_S = 1.0
 TIMESYNC_PERIOD_S = 2.0
 QUESTIONS = 64
@@ -51,6 +52,8 @@ class VehicleWatch:
         self.is_silent = False
         self.reboots = 0
         self._times: dict[str, tuple[int, float]] = {}
+        self._first_time: tuple[int, float] | None = None
+        connection.boot_clocks[system_id, component_id] = self.boot_time_ms
         self._candidates: dict[str, tuple[int, float]] = {}
         self._expects_reboot = False
         self._last_answer = (-math.inf, 0)
@@ -67,8 +70,20 @@ class VehicleWatch:
 
     def close(self) -> None:
         """Stop watching."""
+        self._connection.boot_clocks.pop((self._system_id, self._component_id), None)
         for detach in self._detach:
             detach()
+
+    def boot_time_ms(self, now: float) -> float | None:
+        """The vehicle's time since boot at ``now``, by what its messages said last; None when they said nothing.
+
+        A simulation may be faster than time.
+        """
+        if "time_boot_ms" not in self._times or self._first_time is None:
+            return None
+        (last, at), (first, since) = self._times["time_boot_ms"], self._first_time
+        speed = (last - first) / (at - since) if at - since > CLOCK_SPAN_S else 1000.0
+        return last + speed * (now - at)
 
     @contextmanager
     def expecting_reboot(self) -> Iterator[None]:
@@ -134,6 +149,8 @@ class VehicleWatch:
             self._has_rebooted(clock, milliseconds)
         elif milliseconds + REBOOT_STEP_MS >= before:
             self._times[clock] = (milliseconds, now)
+            if self._first_time is None and clock == "time_boot_ms":
+                self._first_time = (milliseconds, now)
             if self._candidates:
                 self._candidates.pop(clock, None)
         elif self._is_confirmed(clock, milliseconds):
@@ -150,7 +167,7 @@ class VehicleWatch:
 
     def _has_rebooted(self, clock: str, milliseconds: int) -> None:
         now = self._connection.now()
-        self._times, self._candidates = {clock: (milliseconds, now)}, {}
+        self._times, self._candidates, self._first_time = {clock: (milliseconds, now)}, {}, None
         self._expects_reboot, self._last_answer = False, (now, 0)
         self.reboots += 1
         self._on_reboot()
@@ -225,7 +242,7 @@ class LinkWatch:
         then, (received_before, lost_before), total_before = self._before
         self._before = count
         seconds = max(at - then, 1e-9)
-        frames, missing = received - received_before, lost - lost_before
+        frames, missing = max(0, received - received_before), max(0, lost - lost_before)
         report = LinkReport(
             at,
             self._system_id,
