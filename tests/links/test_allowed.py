@@ -1,0 +1,261 @@
+"""``peers=``: who is listened to, where anybody could send or connect."""
+
+from __future__ import annotations
+
+import ipaddress
+import socket
+from typing import Any
+
+import pytest
+from link_harness import Recorder, each_loop, eventually
+
+import aerokit
+import aerokit.sync
+from aerokit.errors import LocalProtocolError
+from aerokit.links import (
+    FaultyLink,
+    Link,
+    ReconnectingLink,
+    TcpConnect,
+    TcpListen,
+    UdpBroadcast,
+    UdpConnect,
+    UdpListen,
+    create_link,
+    tcp,
+    udp,
+)
+from aerokit.links.allowed import AllowedPeers
+
+
+@pytest.mark.parametrize(
+    ("peers", "inside", "outside"),
+    [
+        ("10.0.0.7", ["10.0.0.7", "::ffff:10.0.0.7"], ["10.0.0.8", "::1"]),
+        ("10.0.0.0/24", ["10.0.0.1", "10.0.0.255"], ["10.0.1.1"]),
+        (["10.0.0.7", "fd00::/8"], ["10.0.0.7", "fd00::5"], ["10.0.0.6", "fe80::1%eth0"]),
+        (ipaddress.ip_address("10.0.0.7"), ["10.0.0.7"], ["10.0.0.8"]),
+        (ipaddress.ip_network("10.0.0.0/30"), ["10.0.0.3"], ["10.0.0.4"]),
+        ({ipaddress.ip_network("fe80::/64"), "127.0.0.1"}, ["fe80::1%eth0", "127.0.0.1"], ["127.0.0.2"]),
+        (None, ["1.2.3.4", "::1"], []),
+    ],
+)
+def test_addresses_and_networks(peers: Any, inside: list[str], outside: list[str]) -> None:
+    allowed = AllowedPeers(peers)
+    assert [host for host in (*inside, *outside) if allowed.allows(host)] == inside
+
+
+@pytest.mark.parametrize("peers", ["", "10.0.0", "10.0.0.1/24", "copter", [], 7, [7], b"abcd", [None], 1.5])
+def test_what_is_no_address_is_an_error(peers: Any) -> None:
+    with pytest.raises(LocalProtocolError, match="peers"):
+        AllowedPeers(peers)
+
+
+@pytest.mark.parametrize("address", ["udpin:127.0.0.1:0", "tcpin:127.0.0.1:0", "udpbcast:127.255.255.255:1"])
+def test_links_to_which_anybody_can_send_take_peers(address: str) -> None:
+    link = create_link(address, peers="10.0.0.7")
+    assert isinstance(link, (UdpListen, TcpListen, UdpBroadcast))
+    assert not link._allowed.allows("10.0.0.8")
+
+
+@pytest.mark.parametrize(
+    "address", ["udpout:127.0.0.1:1", "tcp:127.0.0.1:1", "/dev/ttyACM0", "a.tlog", "pty"]
+)
+def test_others_do_not(address: str) -> None:
+    with pytest.raises(LocalProtocolError, match=r"peers = … is not allowed with .*udpin, udpbcast, tcpin"):
+        create_link(address, peers="10.0.0.7")
+
+
+@pytest.mark.anyio
+async def test_a_link_that_is_given_has_its_own() -> None:
+    with pytest.raises(LocalProtocolError, match="give them to the link"):
+        async with aerokit.open_connection(UdpListen("127.0.0.1", 0), peers="10.0.0.7"):
+            pytest.fail("not allowed")
+    with pytest.raises(LocalProtocolError, match=r"peers: 'copter' is no IP address"):
+        async with aerokit.connect("udpin:127.0.0.1:0", peers="copter"):
+            pytest.fail("no address")
+    with pytest.raises(LocalProtocolError, match=r"peers: 'copter' is no IP address"):
+        aerokit.sync.connect("udpin:127.0.0.1:0", peers="copter")
+
+
+@pytest.mark.anyio
+async def test_an_open_connection_has_its_own() -> None:
+    async with aerokit.open_connection("udpin:127.0.0.1:0") as connection:
+        for options in ({"peers": "10.0.0.7"}, {"may_move": True}):
+            with pytest.raises(LocalProtocolError, match="say it to open_connection"):
+                async with aerokit.connect(connection, **options):  # type: ignore[arg-type]
+                    pytest.fail("not allowed")
+
+
+@each_loop
+async def test_udp_listens_to_nobody_else() -> None:
+    link, heard = UdpListen("127.0.0.1", 0, peers="127.0.0.2"), Recorder()
+    await link.open(heard)
+    with socket.socket(type=socket.SOCK_DGRAM) as stranger, socket.socket(type=socket.SOCK_DGRAM) as vehicle:
+        stranger.bind(("127.0.0.1", 0))
+        vehicle.bind(("127.0.0.2", 0))
+        for sender, data in ((stranger, b"no"), (vehicle, b"yes"), (stranger, b"no"), (vehicle, b"!")):
+            sender.sendto(data, link.local_address)
+        await heard.until_data(b"yes!")
+        assert link.peers == (vehicle.getsockname(),)
+    link.close()
+    await link.wait_closed()
+
+
+@each_loop
+async def test_tcp_lets_nobody_else_in() -> None:
+    link, heard = TcpListen("127.0.0.1", 0, peers=["10.0.0.7", "fd00::/8"]), Recorder()
+    await link.open(heard)
+    client, answered = TcpConnect(*link.local_address), Recorder()
+    await client.open(answered)
+    assert "closed the connection" in str(await answered.until_lost()) or answered.losses
+    assert link.peers == ()
+    for each in (client, link):
+        each.close()
+        await each.wait_closed()
+
+
+# ------------------------------------------------------------- a receiver that says who is a peer
+
+
+class Keeper(Recorder):
+    keeps_peers = True
+
+
+@pytest.mark.parametrize("wrap", [lambda link: link, FaultyLink, lambda link: ReconnectingLink(lambda: link)])
+@each_loop
+async def test_only_who_is_kept_is_written_to(wrap: Any) -> None:
+    inner = UdpListen("127.0.0.1", 0)
+    link: Link = wrap(inner)
+    heard = Keeper()
+    await link.open(heard)
+    with socket.socket(type=socket.SOCK_DGRAM) as one, socket.socket(type=socket.SOCK_DGRAM) as two:
+        for sender in (one, two):
+            sender.bind(("127.0.0.1", 0))
+            sender.setblocking(False)
+            sender.sendto(b"x", inner.local_address)
+        await heard.until(lambda: len(heard.pieces) == 2)
+        assert inner.peers == ()
+        link.keep_peer(one.getsockname())
+        assert link.host_of(one.getsockname()) == "127.0.0.1"
+        link.write(b"to all")
+        link.write(b"to two", two.getsockname())
+        assert link.dropped_writes == 1
+        link.forget_peer(one.getsockname())
+        link.write(b"to nobody")
+        await eventually(lambda: one.recv(100) == b"to all")
+        with pytest.raises(BlockingIOError):
+            two.recv(100)
+    link.close()
+    await link.wait_closed()
+
+
+@each_loop
+async def test_noise_pushes_no_vehicle_out_of_a_udp_port() -> None:
+    """300 one-byte datagrams from 300 ports, as the review sent them."""
+    async with aerokit.open_connection("udpin:127.0.0.1:0") as connection:
+        link = connection.link
+        assert isinstance(link, UdpListen)
+        with socket.socket(type=socket.SOCK_DGRAM) as vehicle:
+            vehicle.bind(("127.0.0.1", 0))
+            frame = aerokit.mavlink.FrameEncoder(1, 1).encode(aerokit.messages.Heartbeat(2, 3, 81, 0, 3))
+            vehicle.sendto(frame, link.local_address)
+            await eventually(lambda: (1, 1) in connection.heard)
+            for _ in range(300):
+                with socket.socket(type=socket.SOCK_DGRAM) as stranger:
+                    stranger.sendto(b"\xfd", link.local_address)
+            vehicle.sendto(frame, link.local_address)
+            await eventually(lambda: connection.counts(1)[0] == 2)
+            assert link.peers == (vehicle.getsockname(),)
+
+
+@each_loop
+async def test_who_says_nothing_makes_room_for_another_client(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tcp, "MAX_CLIENTS", 1)
+    link, heard = TcpListen("127.0.0.1", 0), Keeper()
+    await link.open(heard)
+    mute, mute_heard = TcpConnect(*link.local_address), Recorder()
+    await mute.open(mute_heard)
+    await eventually(lambda: len(link.peers) == 1)
+    vehicle, vehicle_heard = TcpConnect(*link.local_address), Recorder()
+    await vehicle.open(vehicle_heard)
+    await mute_heard.until_lost()
+    vehicle.write(b"frame")
+    await heard.until_data(b"frame")
+    link.keep_peer(link.peers[0])
+    third, third_heard = TcpConnect(*link.local_address), Recorder()
+    await third.open(third_heard)
+    await third_heard.until_lost()
+    assert vehicle_heard.losses == []
+    for each in (mute, vehicle, third, link):
+        each.close()
+        await each.wait_closed()
+
+
+# ------------------------------------------------------------------------------------ udpbcast
+
+
+@each_loop
+async def test_a_broadcast_is_repeated_and_another_port_heard_when_the_first_is_silent(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with socket.socket(type=socket.SOCK_DGRAM) as everybody, socket.socket(type=socket.SOCK_DGRAM) as first:
+        for sock in (everybody, first):
+            sock.bind(("127.0.0.1", 0))
+            sock.setblocking(False)
+        link, heard = UdpBroadcast(*everybody.getsockname()), Recorder()
+        await link.open(heard)
+        port = link.local_address[1]
+        first.sendto(b"1", ("127.0.0.1", port))
+        await heard.until_data(b"1")
+        link.write(b"to first")
+        await eventually(lambda: received(first) == b"to first")
+        with socket.socket(type=socket.SOCK_DGRAM) as again:
+            again.bind(("127.0.0.1", 0))
+            again.setblocking(False)
+            again.sendto(b"no", ("127.0.0.1", port))
+            monkeypatch.setattr(udp, "QUIET_AFTER_S", -1.0)
+            link.write(b"anybody?")
+            await eventually(lambda: received(everybody) == b"anybody?")
+            again.sendto(b"2", ("127.0.0.1", port))
+            await heard.until(lambda: heard.data.endswith(b"2"))
+            monkeypatch.setattr(udp, "QUIET_AFTER_S", 3600.0)
+            link.write(b"to again")
+            await eventually(lambda: received(again) == b"to again")
+        link.close()
+        await link.wait_closed()
+
+
+@each_loop
+async def test_a_vehicle_on_a_broadcast_link_may_change_its_port() -> None:
+    with socket.socket(type=socket.SOCK_DGRAM) as everybody:
+        everybody.bind(("127.0.0.1", 0))
+        link, heard = UdpBroadcast(*everybody.getsockname()), Keeper()
+        await link.open(heard)
+        with socket.socket(type=socket.SOCK_DGRAM) as one, socket.socket(type=socket.SOCK_DGRAM) as two:
+            for sock in (one, two):
+                sock.bind(("127.0.0.1", 0))
+                sock.setblocking(False)
+            one.sendto(b"1", ("127.0.0.1", link.local_address[1]))
+            await heard.until_data(b"1")
+            link.keep_peer(one.getsockname())
+            two.sendto(b"2", ("127.0.0.1", link.local_address[1]))
+            await heard.until_data(b"12")
+            assert heard.peers == [one.getsockname(), two.getsockname()]
+            link.keep_peer(two.getsockname())
+            link.write(b"found")
+            await eventually(lambda: received(two) == b"found")
+            assert received(one) == b""
+        link.close()
+        await link.wait_closed()
+
+
+def received(sock: socket.socket) -> bytes:
+    try:
+        return sock.recv(1000)
+    except BlockingIOError:
+        return b""
+
+
+def test_udpout_hears_one_address_and_needs_no_list() -> None:
+    assert isinstance(create_link("udpout:127.0.0.1:1"), UdpConnect)
