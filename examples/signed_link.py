@@ -1,10 +1,10 @@
-"""Give a vehicle a key for signing, over a cable, and keep the time stamp for the next program.
+"""Give a vehicle a key for signing, over a cable; the time stamp is kept in a file for the next program.
 
     python signed_link.py /dev/ttyACM0 "a long passphrase"
 
 Afterwards the vehicle takes orders only from programs that have the key:
 
-    async with aerokit.connect(address, signing=Signing(key, timestamp=kept(STAMP))) as vehicle: ...
+    async with aerokit.connect(address, signing=Signing(key, keep=STAMP)) as vehicle: ...
 """
 
 from __future__ import annotations
@@ -19,28 +19,15 @@ from aerokit import Signing, SigningKey
 STAMP = Path("signing-timestamp.txt")
 
 
-def kept(path: Path) -> int:
-    """The time stamp of the last run; the clock's counts where that is later."""
-    return int(path.read_text()) if path.exists() else 0
-
-
-def keep(path: Path, signing: Signing) -> None:
-    """For the next run."""
-    path.write_text(str(signing.timestamp))
-
-
 async def main(address: str, passphrase: str, stamp: Path = STAMP) -> None:
     """Set the key up, use it, and take it away again."""
-    signing = Signing(SigningKey.from_passphrase(passphrase), timestamp=kept(stamp))
+    signing = Signing(SigningKey.from_passphrase(passphrase), keep=stamp)
     async with aerokit.connect(address) as vehicle:
         await vehicle.wait_ready()
         await vehicle.setup_signing(signing)  # the key travels in clear, here and never again
         print("the vehicle signs with", signing.key)
-        try:
-            await vehicle.parameters.get("MAV_SYSID")  # asked for and answered with signatures
-            print(signing.frames_refused, "frames were refused")
-        finally:
-            keep(stamp, signing)
+        await vehicle.parameters.get("MAV_SYSID")  # asked for and answered with signatures
+        print(signing.frames_refused, "frames were refused")
         await vehicle.setup_signing(None)  # leave this out to keep the key on the vehicle
         print("the vehicle does not sign any more")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from aerokit.parameters.parameter import to_float32
+from aerokit.parameters.parameter import MOST_PARAMETERS, to_float32
 from aerokit.snapshot import Snapshot
 from aerokit.vehicle.parameter_names import warn_of_rename
 
@@ -75,6 +75,8 @@ class ParameterValues:
         """One has come; says whether that is news."""
         before = self._values.get(name)
         if before is not None and (before == value or (math.isnan(before) and math.isnan(value))):
+            return False
+        if before is None and len(self._values) >= MOST_PARAMETERS:
             return False
         if before is None and name != name.upper():
             self._spelled[name.upper()] = name

@@ -10,9 +10,11 @@ from collections.abc import Callable
 from enum import Enum
 from hashlib import sha256
 from hmac import compare_digest
+from os import PathLike
 
 from aerokit.errors import LocalProtocolError
 from aerokit.mavlink.frame import SIGNATURE_LENGTH, SIGNED, Frame
+from aerokit.mavlink.timestamp_file import TimestampFile
 
 __all__ = ["Refusal", "Signing", "SigningKey", "timestamp_at"]
 
@@ -118,6 +120,7 @@ class Signing:
         link_id: int = 0,
         timestamp: int = 0,
         allow_unsigned: AllowUnsigned | None = None,
+        keep: str | PathLike[str] | None = None,
     ) -> None:
         """Begin with a key.
 
@@ -130,9 +133,15 @@ class Signing:
             allow_unsigned: ``allow_unsigned(frame)`` says whether a frame is let in that carries no good signature:
                 of a camera without a key, for example. Anybody can send such a frame. None: no such frame but
                 RADIO_STATUS, which telemetry radios send.
+            keep: a file that the library keeps the time stamp in, so that nothing that was heard or sent before a
+                restart is accepted after it. One for each key, and not for two programs at once. It holds a time
+                stamp up to half a minute ahead, from which the next program goes on: so it is written twice a minute at
+                most, whole or not at all, and before the time stamps are used.
 
         Raises:
             LocalProtocolError: a number is out of range, or ``key`` is no key.
+            FileFormatError: the file of ``keep`` holds no time stamp.
+            OSError: it cannot be read or written. Later :attr:`keep_error` tells; signing goes on.
         """
         if not isinstance(key, SigningKey):
             raise LocalProtocolError(
@@ -150,6 +159,9 @@ class Signing:
         self.allow_unsigned = allow_unsigned
         self.refused: dict[Refusal, int] = dict.fromkeys(Refusal, 0)
         """How many frames were refused, for each reason."""
+        self._kept = None if keep is None else TimestampFile(keep, LAST_TIMESTAMP)
+        if self._kept is not None:
+            self.timestamp = max(self.timestamp, self._kept.timestamp)
         self._keyed = sha256(key.secret)
         self.streams: dict[tuple[int, int, int], int] = {}
         """The last time stamp of each (system id, component id, link id); all links with the key share it."""
@@ -159,7 +171,7 @@ class Signing:
         other = Signing(
             self.key, link_id=link_id, timestamp=self.timestamp, allow_unsigned=self.allow_unsigned
         )
-        other.streams = self.streams
+        other.streams, other._kept = self.streams, self._kept
         return other
 
     def timestamp_now(self, now: float = 0.0) -> int:
@@ -175,7 +187,7 @@ class Signing:
         stamp = self.timestamp_now(now)
         if stamp > LAST_TIMESTAMP:
             raise LocalProtocolError(f"the time stamps of {self.key!r} are used up: agree on another key")
-        self.timestamp = stamp + 1
+        self._advance(stamp + 1)
         place = bytes((self.link_id,)) + stamp.to_bytes(6, "little")
         return place + self._hash(frame + place)
 
@@ -190,6 +202,11 @@ class Signing:
             return None
         self.refused[refusal] += 1
         return refusal
+
+    @property
+    def keep_error(self) -> OSError | None:
+        """Why the file of ``keep`` could not be written the last time, or None; it is tried again."""
+        return None if self._kept is None else self._kept.error
 
     @property
     def frames_refused(self) -> int:
@@ -236,7 +253,13 @@ class Signing:
         if stream not in self.streams and len(self.streams) >= MOST_STREAMS:
             del self.streams[min(self.streams, key=self.streams.__getitem__)]
         self.streams[stream] = stamp
-        self.timestamp = max(self.timestamp, stamp)
+        self._advance(max(self.timestamp, stamp))
+
+    def _advance(self, timestamp: int) -> None:
+        """Kept before it is used: after a crash at any instant, the next program begins later."""
+        if self._kept is not None:
+            self._kept.reserve(timestamp, ONE_MINUTE // 2)  # a sender may be a minute behind
+        self.timestamp = timestamp
 
     def may_be_unsigned(self, frame: Frame) -> bool:
         """Whether a frame without a good signature is let in."""

@@ -11,6 +11,7 @@ from aerokit.errors import LocalProtocolError
 from aerokit.snapshot import Snapshot
 
 __all__ = [
+    "MOST_PARAMETERS",
     "NAME_LENGTH",
     "Parameter",
     "ParameterType",
@@ -19,6 +20,9 @@ __all__ = [
     "same_value",
     "to_float32",
 ]
+
+MOST_PARAMETERS = 8192
+"""Names beyond so many that come from the air are not taken for parameters; ArduPilot has 1,500, PX4 2,000."""
 
 NAME_LENGTH = 16
 """The longest name that the protocol can carry."""

@@ -11,6 +11,7 @@ from aerokit.errors import ParameterTimeout
 from aerokit.mavlink.messages import ParamError, ParamRequestList, ParamRequestRead, ParamValue
 from aerokit.parameters import Parameter, ParameterTable
 from aerokit.parameters.encoding import UNKNOWN_INDEX, parameter_of
+from aerokit.parameters.parameter import MOST_PARAMETERS
 from aerokit.parameters.px4_hash import HASH_NAME
 from aerokit.protocols.parameter_update import updated
 from aerokit.protocols.request_window import RequestWindow
@@ -142,6 +143,8 @@ class ParameterList(Transfer[ParameterTable]):
             self._quiet_at = now + self._quiet_s()
         is_new = index not in self._slots
         parameter = parameter_of(message, self._bytewise)
+        if parameter.name not in self._names and len(self._names) >= MOST_PARAMETERS:
+            return
         self._slots[index] = _Slot(parameter, message.param_count)
         self._names[parameter.name] = parameter
         if is_new:

@@ -391,6 +391,7 @@ class Connection:
         heartbeat = Heartbeat(MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID, 0, 0, MAV_STATE_ACTIVE, 3)
         while self.is_open:
             self.send(heartbeat)
+            self._gate.tell_keeping()
             if self._recording is not None:
                 self._recording.flush()
             await anyio.sleep(HEARTBEAT_PERIOD_S)

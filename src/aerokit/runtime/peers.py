@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 __all__ = ["MOST_PEERS", "MOST_SENDERS", "MOST_STRANGERS", "Peers"]
 
 MOST_PEERS = 256
+"""So many that have sent a good frame are remembered."""
 MOST_STRANGERS = 32
 """So many that have sent no good frame yet are listened to; one more pushes out the first of them, and nobody else."""
 MOST_SENDERS = 2048

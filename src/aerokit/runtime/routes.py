@@ -28,7 +28,9 @@ MOVES_AFTER_S = 3.5
 LIVE_FOR_S = 30.0
 """A peer is not forgotten for another one before its heartbeats have been missing for so long; a vehicle's never."""
 MOST_ROUTES = 1024
+"""So many components that send heartbeats are remembered; others have no route, and what is for them goes to all."""
 MOST_CLAIMS = 256
+"""So many peers that speak in the name of others are remembered; of the first, it is told again."""
 SWEEP_AFTER_S = 1.0
 EVERY_PEER: tuple[Peer, ...] = (None,)
 

@@ -45,6 +45,7 @@ class SignatureGate:
         self._told: set[Refusal] = set()
         self._handover: _Handover | None = None
         self._is_handing_over = False
+        self._keep_error: OSError | None = None
         self.is_open = True
         """Whether everything is let in without looking at it."""
 
@@ -114,6 +115,14 @@ class SignatureGate:
             signing.key,
         )
         self._publish(FrameRefused(frame.received_at, *source, refusal.value))
+
+    def tell_keeping(self) -> None:
+        """Log, once each time, that the file of ``Signing(keep=…)`` cannot be written."""
+        signing = self._encoder.signing
+        error = None if signing is None else signing.keep_error
+        if error is not None and self._keep_error is None:
+            logger.error("the time stamp of %r is not kept: %s", signing, error)
+        self._keep_error = error
 
     def describe(self, heartbeat: Heartbeat | None) -> str:
         """What keeps us and the sender of this heartbeat apart, for error texts; empty when nothing does."""

@@ -19,6 +19,9 @@ __all__ = ["Channel"]
 _DATAGRAM_SIZE = 1200
 
 
+MOST_PEERS = 256
+
+
 class Channel:
     """As on a flight controller, rates belong to the port: all who listen to it share them."""
 
@@ -45,6 +48,8 @@ class Channel:
         """What the bytes of one peer hold that the vehicle understands."""
         framer = self._framers.get(peer)
         if framer is None:
+            if len(self._framers) >= MOST_PEERS:
+                del self._framers[next(iter(self._framers))]
             framer = self._framers[peer] = Framer()
             framer.wanted = self._wanted
         frames = framer.receive(data, now)

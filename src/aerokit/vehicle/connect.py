@@ -17,6 +17,7 @@ from aerokit.runtime.diagnosis import is_autopilot, no_vehicle_reason
 from aerokit.runtime.endings import raisable
 from aerokit.runtime.events import VehicleFound
 from aerokit.runtime.opening import open_connection
+from aerokit.runtime.routes import MOST_ROUTES
 from aerokit.vehicle.rates import check_rate
 from aerokit.vehicle.vehicle import Vehicle
 
@@ -232,6 +233,8 @@ class _Search:
     def _is_alone(self, frame: Frame) -> bool:
         """A component that says it is an autopilot gives the system's first autopilot the time to be heard."""
         source = (frame.system_id, frame.component_id)
+        if source not in self._others and len(self._others) >= MOST_ROUTES:
+            return False
         self._others[source] = self._others.get(source, 0) + 1
         return self._others[source] >= HEARTBEATS_ALONE
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from aerokit.mavlink.messages import ParamValue
 from aerokit.parameters import Parameter, ParameterTable
 from aerokit.parameters.encoding import parameter_of
-from aerokit.parameters.parameter import same_value
+from aerokit.parameters.parameter import MOST_PARAMETERS, same_value
 from aerokit.parameters.px4_hash import HASH_NAME
 from aerokit.protocols.parameter_update import updated
 from aerokit.runtime.events import ParameterChanged
@@ -109,6 +109,8 @@ class ParameterStore:
             return
         told = parameter_of(message, self.bytewise)
         known, old = self._known.get(told.name), self.distrusted(told.name)
+        if known is None and len(self._known) >= MOST_PARAMETERS:
+            return
         if known is not None and old is not None and same_value(told.value, old):
             return
         after = told if known is None else updated(known, told, self.bytewise)

@@ -54,6 +54,9 @@ SAME_ALTITUDE_MM = 100
 Handler = Callable[[Any, Source], None]
 
 
+MOST_MODE_NAMES = 256
+
+
 class Telemetry:
     """All state cells of one vehicle, and what each message does to them.
 
@@ -311,7 +314,9 @@ class Telemetry:
 
     def _on_available_modes(self, message: messages.AvailableModes, source: Source) -> None:
         name = self.autopilot.learn_mode_name(message.custom_mode, message.mode_name)
-        if name is not None:
+        if name is not None and (
+            message.custom_mode in self._mode_names or len(self._mode_names) < MOST_MODE_NAMES
+        ):
             self._mode_names[message.custom_mode] = name
 
     def _on_extended_state(self, message: messages.ExtendedSysState, source: Source) -> None:

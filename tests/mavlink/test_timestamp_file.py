@@ -1,0 +1,115 @@
+"""``Signing(key, keep=path)``: a restart cannot be replayed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from aerokit.errors import FileFormatError
+from aerokit.mavlink import Frame, FrameEncoder, Framer, timestamp_file
+from aerokit.mavlink.messages import Heartbeat
+from aerokit.mavlink.signing import LAST_TIMESTAMP, ONE_MINUTE, Refusal, Signing, SigningKey
+
+KEY = SigningKey.from_passphrase("ours")
+NO_CLOCK = 0.0
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "stamp"
+
+
+def frame_of(signing: Signing, now: float = NO_CLOCK) -> Frame:
+    encoder = FrameEncoder(1, 1)
+    encoder.signing = signing
+    (frame,) = Framer().receive(encoder.encode(Heartbeat(2, 3, 0, 0, 3), now))
+    return frame
+
+
+def test_what_was_heard_before_a_restart_is_refused_after_it(path: Path) -> None:
+    vehicle = Signing(KEY, timestamp=30 * ONE_MINUTE)
+    old = frame_of(vehicle)
+    assert Signing(KEY, keep=path).accepts(old)
+    vehicle.timestamp += 2 * ONE_MINUTE
+    again = Signing(KEY, keep=path)
+    assert again.accepts(frame_of(vehicle))
+    for _ in range(2):
+        again = Signing(KEY, keep=path)
+        assert again.check(old) is Refusal.TOO_OLD
+
+
+def test_what_is_signed_after_a_restart_is_later_than_all_before(path: Path) -> None:
+    ear = Signing(KEY)
+    for _ in range(5):
+        signing = Signing(KEY, keep=path)
+        for _ in range(50):
+            assert ear.accepts(frame_of(signing))
+
+
+def test_the_file_is_ahead_of_every_frame_and_written_rarely(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writes: list[str] = []
+    write = timestamp_file.write_whole
+
+    def counting(target: Path, text: str) -> None:
+        writes.append(text)
+        write(target, text)
+
+    monkeypatch.setattr(timestamp_file, "write_whole", counting)
+    signing, now = Signing(KEY, keep=path), 1_700_000_000.0
+    for count in range(600):
+        frame = frame_of(signing, now + count / 10)
+        stamp = int.from_bytes(frame.signature[1:7], "little")
+        assert stamp < int(path.read_text())
+    assert len(writes) <= 1 + 3
+    assert int(path.read_text()) - signing.timestamp <= ONE_MINUTE // 2
+
+
+def test_other_links_with_the_key_share_the_file(path: Path) -> None:
+    other = Signing(KEY, keep=path).for_link(1)
+    frame_of(other, 1_700_000_000.0)
+    assert Signing(KEY, keep=path).timestamp > other.timestamp - 1
+
+
+@pytest.mark.parametrize("text", ["", "abc", "-5", "1.5", str(LAST_TIMESTAMP + 1), "9" * 5000, "\u0661"])
+def test_another_file_is_not_taken_for_one(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(FileFormatError, match="holds no time stamp"):
+        Signing(KEY, keep=path)
+
+
+def test_a_place_that_cannot_be_written_is_told_at_once(tmp_path: Path) -> None:
+    with pytest.raises(OSError, match="stamp"):
+        Signing(KEY, keep=tmp_path / "missing" / "stamp")
+    with pytest.raises(OSError):  # noqa: PT011
+        Signing(KEY, keep=tmp_path)
+
+
+def test_a_disk_that_is_full_later_does_not_stop_a_flight(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    signing = Signing(KEY, keep=path)
+
+    def full(target: Path, text: str) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(timestamp_file, "write_whole", full)
+        frame_of(signing, 1_700_000_000.0)
+        assert signing.keep_error is not None
+    frame_of(signing, 1_700_000_100.0)
+    assert signing.keep_error is None
+    assert Signing(KEY).keep_error is None
+
+
+def test_the_table_of_senders_is_bounded() -> None:
+    signing, now = Signing(KEY), 1_700_000_000.0
+    for link_id in range(8):
+        for system_id in range(1, 256):
+            encoder = FrameEncoder(system_id, 1)
+            encoder.signing = Signing(KEY, link_id=link_id)
+            (frame,) = Framer().receive(encoder.encode(Heartbeat(2, 3, 0, 0, 3), now))
+            assert signing.accepts(frame, now)
+    assert len(signing.streams) == 1024

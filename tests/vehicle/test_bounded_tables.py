@@ -1,0 +1,88 @@
+"""What comes from the air fills no table without end: one test for each table that has names or numbers off the link.
+
+Framers, senders, routes and peers are in ``runtime/test_nobody_elses.py`` and ``mavlink/test_hostile_bytes.py``.
+"""
+
+from __future__ import annotations
+
+import pytest
+from flight_harness import Flight, open_flight
+
+from aerokit.dronekit.parameter_values import ParameterValues
+from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.framer import Framer
+from aerokit.mavlink.message import Message
+from aerokit.mavlink.messages import AvailableModes, Heartbeat, ParamValue, Statustext
+from aerokit.parameters.parameter import MOST_PARAMETERS
+from aerokit.protocols.parameter_list import ParameterList
+from aerokit.runtime.bus import Bus
+from aerokit.sim.channel import MOST_PEERS, Channel
+from aerokit.vehicle.status_text import MOST_OPEN, StatusTextAssembler
+from aerokit.vehicle.telemetry import MOST_MODE_NAMES
+
+pytestmark = pytest.mark.anyio
+
+
+def hear(flight: Flight, encoder: FrameEncoder, message: Message) -> None:
+    flight.wire.deliver(encoder.encode(message))
+
+
+async def test_parameter_names() -> None:
+    async with open_flight() as flight:
+        encoder = FrameEncoder(1, 1)
+        for number in range(MOST_PARAMETERS + 100):
+            hear(flight, encoder, ParamValue(f"P{number}", float(number), 9, 65535, 65535))
+        assert len(flight.vehicle.parameters.table) == MOST_PARAMETERS
+        hear(flight, encoder, ParamValue("P7", 8.5, 9, 65535, 65535))
+        assert flight.vehicle.parameters.table["P7"].value == 8.5
+
+
+def test_names_of_one_list() -> None:
+    """A vehicle that gives an index another name each time."""
+    exchange = ParameterList(1, 1, bytewise=False)
+    exchange.start(0.0)
+    for number in range(MOST_PARAMETERS + 100):
+        exchange.receive(ParamValue(f"P{number}", 1.0, 9, 65535, number % 10), 0.0)
+    assert len(exchange._names) == MOST_PARAMETERS
+
+
+async def test_mode_names() -> None:
+    async with open_flight() as flight:
+        encoder = FrameEncoder(1, 1)
+        for number in range(MOST_MODE_NAMES + 50):
+            hear(flight, encoder, AvailableModes(255, number % 256, 0, 10_000 + number, 0, f"NEW {number}"))
+        assert len(flight.vehicle.telemetry.mode_names) <= MOST_MODE_NAMES
+
+
+def test_classic_parameters() -> None:
+    values = ParameterValues()
+    for number in range(MOST_PARAMETERS + 100):
+        values.take(f"p{number}", 1.0)
+    assert len(values) == MOST_PARAMETERS
+    assert values.take("p5", 2.0)
+
+
+def test_texts_under_way() -> None:
+    texts = StatusTextAssembler()
+    for number in range(1, 5000):
+        texts.receive(Statustext(6, "x" * 50, id=number, chunk_seq=0), 0.0)
+    assert len(texts._open) == MOST_OPEN
+
+
+def test_peers_of_a_simulated_vehicle() -> None:
+    channel = Channel(1, 1, (), version=2)
+    for port in range(2 * MOST_PEERS):
+        channel.frames(b"\xfd", 0.0, ("10.0.0.9", port))
+    assert len(channel._framers) == MOST_PEERS
+
+
+def test_plans_of_the_bus() -> None:
+    """One for each system and message that somebody wants, and none for others."""
+    bus = Bus()
+    bus.attach(Heartbeat, lambda _: None)
+    for system_id in range(1, 256):
+        for message in (Heartbeat(2, 3, 0, 0, 3), Statustext(6, "x")):
+            encoder = FrameEncoder(system_id, 1)
+            (frame,) = Framer().receive(encoder.encode(message))
+            bus.deliver(frame)
+    assert len(bus._plans) == 255
