@@ -26,6 +26,7 @@ from aerokit.links import (
     udp,
 )
 from aerokit.links.allowed import AllowedPeers
+from aerokit.mavlink.encoder import FrameEncoder
 
 
 @pytest.mark.parametrize(
@@ -81,9 +82,10 @@ async def test_a_link_that_is_given_has_its_own() -> None:
 @pytest.mark.anyio
 async def test_an_open_connection_has_its_own() -> None:
     async with aerokit.open_connection("udpin:127.0.0.1:0") as connection:
-        for options in ({"peers": "10.0.0.7"}, {"may_move": True}):
+        wrong: list[dict[str, Any]] = [{"peers": "10.0.0.7"}, {"may_move": True}]
+        for options in wrong:
             with pytest.raises(LocalProtocolError, match="say it to open_connection"):
-                async with aerokit.connect(connection, **options):  # type: ignore[arg-type]
+                async with aerokit.connect(connection, **options):
                     pytest.fail("not allowed")
 
 
@@ -158,7 +160,7 @@ async def test_noise_pushes_no_vehicle_out_of_a_udp_port() -> None:
         assert isinstance(link, UdpListen)
         with socket.socket(type=socket.SOCK_DGRAM) as vehicle:
             vehicle.bind(("127.0.0.1", 0))
-            frame = aerokit.mavlink.FrameEncoder(1, 1).encode(aerokit.messages.Heartbeat(2, 3, 81, 0, 3))
+            frame = FrameEncoder(1, 1).encode(aerokit.messages.Heartbeat(2, 3, 81, 0, 3))
             vehicle.sendto(frame, link.local_address)
             await eventually(lambda: (1, 1) in connection.heard)
             for _ in range(300):

@@ -9,6 +9,7 @@ import pytest
 from framer_harness import some_frames, unknown
 
 from aerokit.mavlink import Frame, FrameEncoder, Framer, framer
+from aerokit.mavlink.checksum import x25
 from aerokit.mavlink.messages import Attitude, Heartbeat
 from aerokit.mavlink.statistics import SourceLimit
 
@@ -32,7 +33,7 @@ class Work:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.places = self.checked_bytes = 0
-        examine, x25 = Framer._examine, framer.x25
+        examine = Framer._examine
 
         def counting_examine(self_: Framer, data: bytes, begin: int) -> object:
             self.places += 1
