@@ -41,7 +41,10 @@ class DrainListener(Receiver, Protocol):
 
 @runtime_checkable
 class PeerKeeper(Receiver, Protocol):
-    """A receiver that says by `Link.keep_peer` whom to remember: who sends nothing but noise holds no place."""
+    """A receiver that says by `Link.keep_peer` whom to remember: who sends nothing but noise holds no place.
+
+    A link around another one passes `Link.keep_peer`, `Link.forget_peer` and `Link.host_of` on to it.
+    """
 
     keeps_peers: bool
     """Whether it does: the link then writes to nobody else, and forgets nobody by itself."""

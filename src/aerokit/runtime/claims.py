@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from aerokit.mavlink.frame import Frame
@@ -14,31 +14,39 @@ __all__ = ["Claim", "boot_time_ms"]
 _BOOT_TIME_AT = {2: 17, 30: 9, 31: 9, 32: 9, 33: 9}
 
 
+ENOUGH = 3
+
+
 class Claim:
     """One peer's, to one (system id, component id), judged by its first frame after the last one of who had the place.
 
     While that one is silent nobody gets a second chance, so that numbers cannot be tried out.
     """
 
-    ENOUGH: ClassVar[int] = 3
-
-    __slots__ = ("_clock_is_right", "_expected", "_follows", "frames", "is_refusal_told", "is_told")
+    __slots__ = (
+        "_clock_is_right",
+        "_expected",
+        "_follows",
+        "_frames",
+        "_since",
+        "is_refusal_told",
+        "is_told",
+    )
 
     def __init__(self) -> None:
         self._expected: int | None = None
         self._follows: bool | None = None
         self._clock_is_right: bool | None = None
-        self.frames = 0
-        """So many came since the other one was heard last."""
+        self._frames, self._since = 0, 0.0  # since the other one was heard last
         self.is_told = self.is_refusal_told = False
 
     def hear(self, frame: Frame, evidence: tuple[int, bool | None, bool | None]) -> None:
         """One more frame: how far the other one has come, and whether number and clock go on there (None: unknown)."""
         expected, follows, clock_is_right = evidence
         if expected != self._expected:
-            self._expected, self.frames, self.is_refusal_told = expected, 0, False
-            self._follows, self._clock_is_right = follows, None
-        self.frames += 1
+            self._expected, self._frames, self.is_refusal_told = expected, 0, False
+            self._follows, self._clock_is_right, self._since = follows, None, frame.received_at
+        self._frames += 1
         if clock_is_right is not None and self._clock_is_right is not False:
             self._clock_is_right = clock_is_right
 
@@ -46,6 +54,10 @@ class Claim:
     def goes_on(self) -> bool:
         """Whether it goes on where the other one stopped."""
         return self._follows is not False and self._clock_is_right is True
+
+    def has_replaced(self, now: float, rate: float) -> bool:
+        """Whether it goes on, for as long as the other one, at so many frames a second, sends three frames in."""
+        return self.goes_on and self._frames >= ENOUGH and (now - self._since) * rate >= ENOUGH
 
     @property
     def may_go_on(self) -> bool:

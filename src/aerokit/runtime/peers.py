@@ -62,9 +62,11 @@ class Peers:
         return framer, frames
 
     def begin_anew(self) -> None:
-        """The link has been opened again."""
+        """The link has been opened again: another one, which knows nobody yet."""
         for framer in self:
             framer.begin_anew()
+        for peer in self.framers:
+            self._link.keep_peer(peer)
 
     def _new_stranger(self, peer: Peer) -> Framer:
         if len(self._strangers) >= MOST_STRANGERS:

@@ -54,7 +54,8 @@ class Routes:
     (``HeardTwice``). Another peer takes the place (``VehicleMoved``)
 
     1. at once, if it is another port of the same host, and goes on where the first one stopped: three frames whose
-       sequence numbers, and times since boot if they are known, continue its own, and nothing more of the first one;
+       sequence numbers, and times since boot if they are known, continue its own, and nothing more of the first one in
+       the time in which it would send three;
     2. when no heartbeat has come for 3.5 s, or a TCP client has gone, if it is of the same host (a reboot, a program
        started again: its numbers may begin anew), or goes on as above from whatever host, or signs with our key;
     3. then anybody, while no vehicle object stands for the system, or if the program allows it (``may_move``).
@@ -135,9 +136,8 @@ class Routes:
         is_free = self._may_move or is_signed or is_same_host or frame.system_id not in self._attached
         claim = self._claim(source, peer)
         claim.hear(frame, self._evidence(route, frame, counters))
-        if (is_silent and (is_free or claim.goes_on)) or (
-            is_same_host and claim.goes_on and claim.frames >= Claim.ENOUGH
-        ):
+        has_replaced = is_same_host and claim.has_replaced(now, route.rate)
+        if has_replaced or (is_silent and (is_free or claim.goes_on)):
             self._move(route, frame, peer)
             return True
         self._tell(claim, frame, peer, is_silent=is_silent, is_same_host=is_same_host)
