@@ -137,8 +137,8 @@ def _untrue(flown: Flown) -> Iterator[str]:
         yield "arm returned disarmed"
     if row.name == "disarm" and armed:
         yield "disarm returned armed"
-    if row.name.startswith("go_to") and mode not in own:
-        yield f"go_to returned in {mode}"
+    if row.name.startswith(("go_to", "take_off", "set_heading")) and mode not in own:
+        yield f"{row.name} returned in {mode}"
 
 
 def _armed_late(flown: Flown) -> Iterator[str]:

@@ -110,11 +110,16 @@ class FlightActions(TravelActions):
         """The mode may become the take-off's own and the one after it; any other one is somebody else's doing."""
         enough_m = altitude_m - max(0.5, 0.05 * altitude_m)
         started = self.connection.now()
+
+        def is_up() -> bool:
+            is_high = self._knows_position_since(started) and self._altitude_relative() >= enough_m
+            return is_high and not order.end
+
         with self._streaming("position"):
             await await_progress(
                 self,
                 f"take_off({altitude_m:g} m)",
-                is_done=lambda: self._knows_position_since(started) and self._altitude_relative() >= enough_m,
+                is_done=is_up,
                 trouble=self._stays_in(order, *order.modes),
                 describe=lambda: f"it is at {self._altitude_relative():.1f} m",
                 timeout=timeout,
@@ -214,11 +219,16 @@ class FlightActions(TravelActions):
         place = Position(home.latitude_deg, home.longitude_deg)
         near_m = self.autopilot.arrival_radius_m
         started = self.connection.now()
+
+        def is_back() -> bool:
+            is_near = self._knows_position_since(started) and self.distance_to(place) <= near_m
+            return is_near and not order.end
+
         with self._streaming("position"):
             await await_progress(
                 self,
                 "return_to_launch",
-                is_done=lambda: self._knows_position_since(started) and self.distance_to(place) <= near_m,
+                is_done=is_back,
                 trouble=self._stays_in(order, *order.modes),
                 describe=lambda: f"it is {self.distance_to(place):.1f} m from home",
                 timeout=timeout,

@@ -23,7 +23,6 @@ from aerokit.vehicle.progress import LONGEST_SILENCE_S, Stillness, await_progres
 from aerokit.vehicle.values import Position
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
 
     from aerokit.autopilots import Mode
     from aerokit.vehicle.orders import Order
@@ -167,7 +166,8 @@ class TravelActions(ArmingActions):
             if resend is not None and now - sent_at >= RESEND_S and self._helm.is_known and not order.end:
                 sent_at = now
                 self.connection.send(resend)
-            return self._knows_position_since(started) and self._way_left(target) <= near_m
+            is_near = self._knows_position_since(started) and self._way_left(target) <= near_m
+            return is_near and not order.end
 
         with self._streaming("position"):
             await await_progress(
@@ -238,10 +238,10 @@ class TravelActions(ArmingActions):
             # a goal, not an angle: sent again, it does not turn it further
             direction = (1 if heading_deg >= 0 else -1) if relative else 0
             await self._command_of(order, CONDITION_YAW, goal, rate_deg_s, direction, 0)
-        await self._await_heading(goal, tolerance_deg, timeout, self._stays_in(order, mode))
+        await self._await_heading(goal, tolerance_deg, timeout, order, mode)
 
     async def _await_heading(
-        self, goal: float, tolerance_deg: float, timeout: float, trouble: Callable[[], str | None]
+        self, goal: float, tolerance_deg: float, timeout: float, order: Order, mode: Mode
     ) -> None:
         started = self.connection.now()
         heading = self.telemetry.heading_deg
@@ -253,8 +253,8 @@ class TravelActions(ArmingActions):
             await await_progress(
                 self,
                 f"set_heading({goal:g}°)",
-                is_done=lambda: heading.updated_at >= started and off() <= tolerance_deg,
-                trouble=trouble,
+                is_done=lambda: heading.updated_at >= started and off() <= tolerance_deg and not order.end,
+                trouble=self._stays_in(order, mode),
                 describe=lambda: f"it is {off():.0f}° off",
                 timeout=timeout,
             )
