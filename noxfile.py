@@ -1,4 +1,4 @@
-"""Sessions: tests (each Python that is there), lint, types, docs, bench and bench_…, badlinks, orders, dronekit, clients, demo.
+"""Sessions: tests (each Python that is there), lint, types, docs, bench and bench_…, badlinks, orders, soak, dronekit, clients, demo.
 
 `nox -l` lists them.
 """
@@ -96,6 +96,14 @@ def badlinks(session: nox.Session) -> None:
     """Judge every transfer over bad radios, 200 seeds of each, and print the table; half an hour and more."""
     session.install("-e", ".[test]")
     session.run("python", "tests/badlink/survey.py", *session.posargs, env={"PYTHONPATH": "tests"})
+
+
+@nox.session
+def soak(session: nox.Session) -> None:
+    """Fly, lose the radio, reboot, unplug and plug in again for an hour; nothing may grow: `nox -s soak -- MINUTES`."""
+    session.install("-e", ".[test]")
+    minutes = session.posargs[0] if session.posargs else "60"
+    session.run("pytest", "-q", "-n", "0", "tests/soak", env={"AEROKIT_SOAK_MINUTES": minutes})
 
 
 @nox.session

@@ -1,0 +1,112 @@
+"""One round of a day's work: connect, fly, lose the radio, reboot, unplug, plug in again; and what is left of it."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import os
+import socket
+import threading
+from contextlib import AsyncExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+import anyio
+
+import aerokit
+from aerokit.runtime.events import LinkRestored
+from aerokit.sim import SimulatedCopter, SimulatedPx4, open_simulator
+from aerokit.sim.patience import wait_longer
+
+__all__ = ["Left", "fly_round", "left"]
+
+SPEEDUP = 20.0
+LIMIT_S = 60.0
+
+
+@dataclass(frozen=True)
+class Left:
+    """What the process holds between two rounds."""
+
+    tasks: int
+    threads: int
+    descriptors: int
+    objects: int
+    resident_kb: int
+
+
+def left() -> Left:
+    """What there is now; to be called on the loop."""
+    gc.collect()
+    pages = int(Path("/proc/self/statm").read_text().split()[1]) if Path("/proc").is_dir() else 0
+    folder = Path("/proc/self/fd")
+    descriptors = len(list(folder.iterdir())) if folder.is_dir() else 0
+    resident_kb = pages * os.sysconf("SC_PAGE_SIZE") // 1024
+    return Left(
+        len(asyncio.all_tasks()), threading.active_count(), descriptors, len(gc.get_objects()), resident_kb
+    )
+
+
+async def fly_round(number: int) -> None:
+    """By turns a copter and a PX4, over TCP, on a link that is opened again."""
+    port = _free_port()
+    with anyio.fail_after(LIMIT_S):
+        simulator = open_simulator(_vehicle(number), f"tcpin:127.0.0.1:{port}", speedup=SPEEDUP)
+        async with simulator, aerokit.connect(f"tcp:127.0.0.1:{port}") as vehicle:
+            await _fly(vehicle)
+        await _plug_in_again(number, port)
+        await _silence_and_reboot(number)
+
+
+async def _fly(vehicle: aerokit.Vehicle) -> None:
+    await vehicle.wait_ready()
+    await vehicle.arm()
+    await vehicle.take_off(4.0)
+    with vehicle.subscribe(aerokit.messages.Attitude, rate_hz=50, capacity=100) as attitudes:
+        async with vehicle.guided.velocity(rate_hz=50, max_lag_s=5.0, valid_for_s=5.0) as stream:
+            await stream.fly(aerokit.VelocitySetpoint(north_m_s=2.0), 0.3)
+        await attitudes.get(timeout=LIMIT_S)
+    with anyio.move_on_after(0.1):
+        await vehicle.go_to(vehicle.position.value.offset(north_m=50))
+    await vehicle.parameters.download()
+    await vehicle.land()
+
+
+async def _plug_in_again(number: int, port: int) -> None:
+    """The other end goes away and comes back; the same connection goes on."""
+    address, again = f"tcp:127.0.0.1:{port}", f"tcpin:127.0.0.1:{port}"
+    async with AsyncExitStack() as far, AsyncExitStack() as near:
+        await far.enter_async_context(open_simulator(_vehicle(number), again, speedup=SPEEDUP))
+        vehicle = await near.enter_async_context(aerokit.connect(address, reconnect=True))
+        restored = near.enter_context(vehicle.connection.subscribe(LinkRestored))
+        await far.aclose()
+        await far.enter_async_context(open_simulator(_vehicle(number), again, speedup=SPEEDUP))
+        await restored.get(timeout=LIMIT_S)
+        since = vehicle.connection.now()
+        await vehicle.armed.wait_until(lambda _: vehicle.armed.updated_at > since, timeout=LIMIT_S)
+
+
+async def _silence_and_reboot(number: int) -> None:
+    simulated = _vehicle(number)
+    async with open_simulator(simulated, "udpin:127.0.0.1:0", speedup=SPEEDUP) as simulator:
+        address = simulator.addresses[0].replace("udpin", "udpout")
+        async with aerokit.connect(address) as vehicle:
+            await vehicle.wait_ready()
+            simulated.faults.silent = True
+            await asyncio.sleep(0.2)
+            simulated.faults.silent = False
+            if number % 2 == 0:  # PX4 in simulation denies it
+                await vehicle.reboot()
+            await vehicle.wait_ready()
+
+
+def _vehicle(number: int) -> SimulatedCopter | SimulatedPx4:
+    vehicle = SimulatedPx4(boot_time_s=1.0) if number % 2 else SimulatedCopter(boot_time_s=0.0)
+    wait_longer([vehicle], SPEEDUP)
+    return vehicle
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
