@@ -1,4 +1,4 @@
-"""Sessions: tests (each Python that is there), lint, types, docs, bench and bench_…, badlinks, orders, soak, dronekit, clients, demo.
+"""Sessions: tests (each Python that is there), lint, types, docs, bench and bench_…, clients, demo, and the long ones.
 
 `nox -l` lists them.
 """
