@@ -27,6 +27,34 @@ def tests(session: nox.Session) -> None:
     session.run("pytest", *session.posargs)
 
 
+MEETS_OTHERS = (
+    "tests/test_sync.py", "tests/test_sync_loop.py", "tests/test_sync_parameters.py", "tests/test_beside_sniffio.py",
+    "tests/test_package.py", "tests/links", "tests/runtime/test_ends.py", "tests/runtime/test_leaks.py",
+    "tests/dronekit/test_dronekit_life.py", "tests/dronekit/test_dronekit_orders.py", "tests/vehicle/test_setpoints.py",
+    "tests/parameters", "tests/testing/test_clock.py",
+)  # fmt: skip
+"""The tests of what uses other packages: anyio and its threads, serial ports, geodesy, dialects of pymavlink."""
+
+
+@nox.session
+def lowest(session: nox.Session) -> None:
+    """Run the tests that meet other packages with the lowest versions that pyproject.toml declares."""
+    _install_lowest(session)
+    session.run("pytest", "-q", *(session.posargs or MEETS_OTHERS))
+
+
+@nox.session
+def beside_trio(session: nox.Session) -> None:
+    """Run them with trio and sniffio installed: anyio does not take asyncio for granted then."""
+    session.install("-e", ".[test,fast]", "trio", "sniffio")
+    session.run("pytest", "-q", *(session.posargs or MEETS_OTHERS))
+
+
+def _install_lowest(session: nox.Session) -> None:
+    session.install("uv>=0.5")
+    session.run("uv", "pip", "install", "-q", "--resolution", "lowest-direct", "-e", ".[test,fast]")
+
+
 @nox.session
 def lint(session: nox.Session) -> None:
     """Style, format, import direction, and generated code that is what the generator makes."""

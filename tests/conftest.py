@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import AsyncIterator
 from typing import Any
 
@@ -12,6 +13,10 @@ from recorded import headline
 
 from aerokit.testing.clock import VirtualClockLoop
 
+if (
+    signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+):  # a background job of a script: some tests interrupt themselves
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 settings.register_profile("aerokit", deadline=None, max_examples=60, derandomize=True)
 settings.load_profile("aerokit")
 

@@ -364,6 +364,15 @@ def test_ctrl_c_ends_a_connect() -> None:
     timer.join()
 
 
+@pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="needs POSIX signals")
+def test_the_tests_interrupt_themselves_also_where_ctrl_c_is_ignored() -> None:
+    test = f"{__file__}::{test_ctrl_c_ends_a_connect.__name__}"
+    code = "import signal, sys, pytest; signal.signal(signal.SIGINT, signal.SIG_IGN); sys.exit(pytest.main(sys.argv[1:]))"
+    command = [sys.executable, "-c", code, "-n", "0", "-q", "-p", "no:cacheprovider", "--timeout", "50", test]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stderr) == (0, ""), done.stdout
+
+
 def test_a_program_that_forgets_to_close_still_ends() -> None:
     code = "import sys, aerokit.sync; vehicle = aerokit.sync.connect(sys.argv[1]); print(vehicle.system_id)"
     with served_copter(system_id=7) as address:

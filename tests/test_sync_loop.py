@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import concurrent.futures
+import errno
 import os
+import subprocess
 import sys
 import threading
 import time
@@ -11,7 +14,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from aerokit.errors import ConnectionClosed
+from aerokit.errors import ConnectionClosed, LinkOpenError
 from aerokit.sync.loop_thread import LoopThread
 
 LIMIT_S = 10.0
@@ -117,3 +120,66 @@ def test_a_child_of_the_process_neither_uses_nor_waits_for_it(loop: LoopThread) 
         time.sleep(0.01)
     assert os.waitstatus_to_exitcode(ended[1]) == 2
     loop.run(nothing)
+
+
+NO_DESCRIPTORS = """
+import os
+import subprocess
+import resource
+import aerokit.sync
+from aerokit.errors import LinkOpenError
+from aerokit.sync.vehicle import connect
+
+resource.setrlimit(resource.RLIMIT_NOFILE, (40, 40))
+taken = []
+try:
+    while True:
+        taken.append(os.dup(0))
+except OSError:
+    pass
+for spare in range(4):
+    try:
+        connect("udpin:127.0.0.1:0", timeout=0.01)
+    except LinkOpenError as error:
+        print(spare, error.errno, error)
+    os.close(taken.pop())
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no limit of descriptors to set")
+def test_a_loop_that_cannot_start_is_an_error() -> None:
+    """It needs several descriptors; however many there are, connecting does not wait for what never begins."""
+    done = subprocess.run(
+        [sys.executable, "-c", NO_DESCRIPTORS], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.stdout.startswith(
+        f"0 {errno.EMFILE} the event loop's thread cannot start: Too many open files"
+    )
+    assert done.returncode in (0, 1)
+
+
+def test_a_thread_that_cannot_start_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    def start(thread: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(threading.Thread, "start", start)
+    with pytest.raises(LinkOpenError, match="the event loop's thread cannot start: can't start new thread"):
+        LoopThread()
+
+
+def test_interrupted_while_it_starts_it_ends_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    result, interruptions = concurrent.futures.Future.result, [KeyboardInterrupt()]
+
+    def interrupted_once(future: concurrent.futures.Future[object]) -> object:
+        if interruptions:
+            raise interruptions.pop()
+        return result(future)
+
+    before = threading.active_count()
+    monkeypatch.setattr(concurrent.futures.Future, "result", interrupted_once)
+    with pytest.raises(KeyboardInterrupt):
+        LoopThread()
+    threads = [each for each in threading.enumerate() if each.name == "aerokit loop"]
+    for each in threads:
+        each.join(LIMIT_S)
+    assert threading.active_count() <= before

@@ -25,6 +25,8 @@ from aerokit.testing.failure import what_was_flown
 from aerokit.testing.interruption import Interruption
 from aerokit.testing.served import ServedFlight
 
+LIMIT_S = 30.0
+
 
 class Mistake(Exception):
     pass
@@ -157,6 +159,20 @@ def test_a_poll_ends() -> None:
         flight.faults.when(lambda here: here.time_s > 2 and mistaken(here)).hang()
         while True:
             time.sleep(60)
+
+
+def test_a_poll_ends_where_ctrl_c_is_ignored() -> None:
+    """As in every background job of a script, where it must stay ignored."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with pytest.raises(Mistake), serve_flight() as flight:
+            signal.raise_signal(signal.SIGINT)
+            flight.faults.when(lambda here: here.time_s > 2 and mistaken(here)).hang()
+            time.sleep(LIMIT_S)
+            pytest.fail("it went on")
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_ctrl_c_is_still_ctrl_c() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 from typing import TYPE_CHECKING
 
@@ -37,13 +38,13 @@ class ParameterReading:
         self._vehicle, self._take_all = vehicle, take_all
         self.is_complete = False
         """Whether the whole list has come since the connection was made; it stays true when the vehicle reboots."""
-        self._ended: anyio.Event | None = None
+        self._ended: asyncio.Event | None = None
         self._has_warned = False
 
     def begin(self) -> None:
         """Begin the download, unless it is under way or done (loop thread)."""
         if self._ended is None and not self.is_complete:
-            self._ended = anyio.Event()
+            self._ended = asyncio.Event()
             self._vehicle._dk_background(self._download)
 
     def seek(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from typing import TYPE_CHECKING
 
 import anyio
@@ -74,7 +75,7 @@ class _Heard:
 
     def __init__(self, vehicle: Vehicle) -> None:
         self.something = False
-        self.is_to_be_asked = anyio.Event()
+        self.is_to_be_asked = asyncio.Event()
         bus = vehicle.connection.bus
         for message_type in STREAMED:
             vehicle._detach.append(bus.attach(message_type, self._on_message, system_id=vehicle.system_id))
@@ -83,7 +84,7 @@ class _Heard:
         self._system_id = vehicle.system_id
 
     def forget(self) -> None:
-        self.something, self.is_to_be_asked = False, anyio.Event()
+        self.something, self.is_to_be_asked = False, asyncio.Event()
 
     def _on_message(self, message: Message) -> None:
         self.something = True

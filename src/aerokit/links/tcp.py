@@ -133,7 +133,8 @@ class TcpConnect(_TcpLink):
         except BaseException:
             self._stream = None  # it was never open: not a loss
             stream.close()
-            self._stream_ends(stream, None)  # uvloop closes it without a word
+            sock.close()  # uvloop leaves that to the garbage collector
+            self._stream_ends(stream, None)  # and does not tell the protocol
             raise
 
     def _stream_made(self, stream: _Stream) -> None:

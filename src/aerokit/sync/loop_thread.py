@@ -6,6 +6,7 @@ import asyncio
 import atexit
 import concurrent.futures
 import contextlib
+import contextvars
 import functools
 import os
 import threading
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Generic, ParamSpec, TypeVar
 
 import anyio
 
-from aerokit.errors import BusyError, ConnectionClosed
+from aerokit.errors import BusyError, ConnectionClosed, LinkOpenError
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -32,17 +33,35 @@ CLOSE_S = 5.0
 
 
 class LoopThread:
-    """One asyncio loop on one thread. The thread does not keep the interpreter alive; at its exit it is closed."""
+    """One asyncio loop on one thread. The thread does not keep the interpreter alive; at its exit it is closed.
+
+    What runs there sees the context variables of the loop, not those of its caller.
+
+    Raises:
+        LinkOpenError: the system has no thread, or no file descriptors, for it.
+    """
 
     def __init__(self) -> None:
-        started: concurrent.futures.Future[tuple[_Calls, asyncio.AbstractEventLoop]]
-        started = concurrent.futures.Future()
-        self._thread = threading.Thread(target=_run, args=(started,), name="aerokit loop", daemon=True)
-        self._thread.start()
-        self._calls, self._loop = started.result()
+        self._calls = _Calls()
+        started: concurrent.futures.Future[asyncio.AbstractEventLoop] = concurrent.futures.Future()
+        # In a context of its own: sniffio keeps there which library is running, and the caller's may be another one.
+        self._thread = threading.Thread(
+            target=contextvars.Context().run,
+            args=(_run, self._calls, started),
+            name="aerokit loop",
+            daemon=True,
+        )
         self._is_closed = False
         self._process = os.getpid()
         self._lock = threading.Lock()  # nothing waits while it is held: the loop's thread takes it, too
+        try:
+            self._thread.start()
+            self._loop = started.result()
+        except (OSError, RuntimeError) as error:
+            raise _not_started(error) from error
+        except BaseException:  # Ctrl-C: nobody will close it
+            started.add_done_callback(self._calls.end_of)
+            raise
         atexit.register(self.close)
 
     def run(self, function: Callable[P, Awaitable[T]], /, *args: P.args, **kwargs: P.kwargs) -> T:
@@ -112,7 +131,7 @@ class LoopThread:
         """
         with self._lock:
             self._check()
-            self._loop.call_soon_threadsafe(functools.partial(function, *args, **kwargs))
+            self._soon(functools.partial(function, *args, **kwargs))
 
     def hold_open(self, context: AbstractAsyncContextManager[T]) -> Held[T]:
         """Enter an asynchronous context manager on the loop; it is left, in the same task, when it is closed."""
@@ -126,7 +145,7 @@ class LoopThread:
             self._is_closed = True
             if self._process == os.getpid():
                 with contextlib.suppress(RuntimeError):  # it has stopped by itself
-                    self._loop.call_soon_threadsafe(self._calls.end.set)
+                    self._soon(self._calls.end)
         atexit.unregister(self.close)
         if not self.is_current:
             self._thread.join(CLOSE_S)
@@ -151,8 +170,11 @@ class LoopThread:
         future: concurrent.futures.Future[T] = concurrent.futures.Future()
         with self._lock:
             self._check()
-            self._loop.call_soon_threadsafe(self._calls.begin, function, future)
+            self._soon(self._calls.begin, function, future)
         return future
+
+    def _soon(self, function: Callable[..., object], *args: Any) -> None:
+        self._loop.call_soon_threadsafe(function, *args, context=self._calls.context)
 
     def _check(self) -> None:
         if self._is_closed:
@@ -203,46 +225,73 @@ class _Calls:
     """What runs on the loop for other threads, until the end."""
 
     def __init__(self) -> None:
-        self.end = asyncio.Event()
-        self._tasks: dict[asyncio.Task[None], anyio.CancelScope] = {}
+        self.context = contextvars.Context()
+        self._end: asyncio.Event | None = None
+        self._tasks: dict[asyncio.Task[None], _Call[Any]] = {}
 
     def begin(self, function: Callable[[], Awaitable[T]], future: concurrent.futures.Future[T]) -> None:
         """Await it in a task; the future is told what comes of it, and cancels it."""
-        scope = anyio.CancelScope()
-        task = asyncio.get_running_loop().create_task(_live(function, future, scope))
-        self._tasks[task] = scope
+        call = _Call(function, future)
+        task = asyncio.get_running_loop().create_task(call.live())
+        self._tasks[task] = call
         task.add_done_callback(self._tasks.pop)
 
-    async def live(self) -> None:
+    def end(self) -> None:
+        """Begin the end."""
+        if self._end is not None:
+            self._end.set()
+
+    def end_of(self, started: concurrent.futures.Future[asyncio.AbstractEventLoop]) -> None:
+        """End what was just started, if it was."""
+        if started.exception() is None:
+            started.result().call_soon_threadsafe(self.end)
+
+    async def live(self, started: Callable[[asyncio.AbstractEventLoop], None]) -> None:
         """Wait for the end, and then for that of everything that was begun."""
-        await self.end.wait()
+        self.context, self._end = contextvars.copy_context(), asyncio.Event()
+        started(asyncio.get_running_loop())
+        await self._end.wait()
         while self._tasks:
-            for scope in self._tasks.values():
-                scope.cancel()
+            for call in self._tasks.values():
+                call.cancel()
             await asyncio.wait(tuple(self._tasks))
 
 
-async def _live(
-    function: Callable[[], Awaitable[T]], future: concurrent.futures.Future[T], scope: anyio.CancelScope
-) -> None:
-    loop = asyncio.get_running_loop()
+class _Call(Generic[T]):
+    """A coroutine function that is awaited on the loop, for a future on another thread."""
 
-    def cancel_with(ended: concurrent.futures.Future[T]) -> None:
-        if ended.cancelled():
-            with contextlib.suppress(RuntimeError):  # the loop is closed
-                loop.call_soon_threadsafe(scope.cancel)
+    def __init__(self, function: Callable[[], Awaitable[T]], future: concurrent.futures.Future[T]) -> None:
+        self._function, self._future = function, future
+        self._scope: anyio.CancelScope | None = None
+        self._is_cancelled = False
 
-    future.add_done_callback(cancel_with)
-    with scope:
-        try:
-            result = await function()
-        except asyncio.CancelledError:
-            future.cancel()
-            raise
-        except BaseException as error:  # sys.exit() too: it is the caller's, and not the loop's
-            _tell(future.set_exception, error)
-        else:
-            _tell(future.set_result, result)
+    def cancel(self) -> None:
+        """Cancel it; idempotent."""
+        self._is_cancelled = True
+        if self._scope is not None:
+            self._scope.cancel()
+
+    async def live(self) -> None:
+        loop, future = asyncio.get_running_loop(), self._future
+
+        def cancel_with(ended: concurrent.futures.Future[T]) -> None:
+            if ended.cancelled():
+                with contextlib.suppress(RuntimeError):  # the loop is closed
+                    loop.call_soon_threadsafe(self.cancel)
+
+        future.add_done_callback(cancel_with)
+        with anyio.CancelScope() as self._scope:  # here: outside tasks anyio does not know what is running
+            if self._is_cancelled:
+                self._scope.cancel()
+            try:
+                result = await self._function()
+            except asyncio.CancelledError:
+                future.cancel()
+                raise
+            except BaseException as error:  # sys.exit() too: it is the caller's, and not the loop's
+                _tell(future.set_exception, error)
+            else:
+                _tell(future.set_result, result)
 
 
 def _tell(setter: Callable[[T], None], value: T) -> None:
@@ -250,12 +299,18 @@ def _tell(setter: Callable[[T], None], value: T) -> None:
         setter(value)
 
 
-def _run(started: concurrent.futures.Future[tuple[_Calls, asyncio.AbstractEventLoop]]) -> None:
+def _run(calls: _Calls, started: concurrent.futures.Future[asyncio.AbstractEventLoop]) -> None:
     """What the thread does."""
+    try:
+        anyio.run(calls.live, started.set_result)
+    except BaseException as error:
+        if started.done():
+            raise
+        started.set_exception(error)
 
-    async def main() -> None:
-        calls = _Calls()
-        started.set_result((calls, asyncio.get_running_loop()))
-        await calls.live()
 
-    anyio.run(main)
+def _not_started(error: Exception) -> LinkOpenError:
+    reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
+    failed = LinkOpenError(f"the event loop's thread cannot start: {reason}")
+    failed.errno = error.errno if isinstance(error, OSError) else None
+    return failed

@@ -69,16 +69,17 @@ class Interruption:
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         if not self._is_sent:
-            self._before(number, frame)
+            if callable(self._before):  # SIG_IGN is not
+                self._before(number, frame)
         elif self._is_allowed and not self._is_told and not _is_at_the_edge(frame):
             self._is_told = True
             raise KeyboardInterrupt
 
 
 def _is_free() -> bool:
-    """Whether nobody but another of these has taken Ctrl-C."""
+    """Whether nobody but another of these has taken Ctrl-C; ignored, as by the jobs of a script, it is free."""
     handler = signal.getsignal(signal.SIGINT)
-    return handler is signal.default_int_handler or isinstance(
+    return handler in (signal.default_int_handler, signal.SIG_IGN) or isinstance(
         getattr(handler, "__self__", None), Interruption
     )
 

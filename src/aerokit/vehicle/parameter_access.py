@@ -61,8 +61,8 @@ class ParameterAccess:
     def __init__(self, transfers: Transfers, files: Files) -> None:
         self._transfers, self._files = transfers, files
         self.store = ParameterStore(transfers)
-        self._downloading = anyio.Lock()
-        self._writing = anyio.Lock()
+        self._downloading = asyncio.Lock()
+        self._writing = asyncio.Lock()
         self._has_pack: bool | None = None
         self._answers: RoundTrip | None = None
         self._attending = 0

@@ -1,0 +1,25 @@
+"""Stands in for sniffio, which trio, openai and anthropic bring: a callback outside any task is of no library."""
+
+from __future__ import annotations
+
+import asyncio
+from contextvars import ContextVar
+
+
+class AsyncLibraryNotFoundError(RuntimeError):
+    """No library is running here."""
+
+
+current_async_library_cvar: ContextVar[str | None] = ContextVar("current_async_library_cvar", default=None)
+
+
+def current_async_library() -> str:
+    told = current_async_library_cvar.get()
+    if told is not None:
+        return told
+    try:
+        if asyncio.current_task() is not None:
+            return "asyncio"
+    except RuntimeError:
+        pass
+    raise AsyncLibraryNotFoundError
