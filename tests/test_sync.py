@@ -367,7 +367,8 @@ def test_ctrl_c_ends_a_connect() -> None:
 @pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="needs POSIX signals")
 def test_the_tests_interrupt_themselves_also_where_ctrl_c_is_ignored() -> None:
     test = f"{__file__}::{test_ctrl_c_ends_a_connect.__name__}"
-    code = "import signal, sys, pytest; signal.signal(signal.SIGINT, signal.SIG_IGN); sys.exit(pytest.main(sys.argv[1:]))"
+    ignore = "import signal, sys, pytest; signal.signal(signal.SIGINT, signal.SIG_IGN)"
+    code = f"{ignore}; sys.exit(pytest.main(sys.argv[1:]))"
     command = [sys.executable, "-c", code, "-n", "0", "-q", "-p", "no:cacheprovider", "--timeout", "50", test]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert (done.returncode, done.stderr) == (0, ""), done.stdout
