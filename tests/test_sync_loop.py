@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import concurrent.futures
+import contextlib
 import errno
 import os
 import subprocess
@@ -11,6 +11,8 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from types import FrameType
+from typing import Any
 
 import pytest
 
@@ -84,10 +86,20 @@ def test_what_waits_ends_with_the_loop_and_cleans_up(loop: LoopThread) -> None:
         finally:
             ended.append(1)
 
-    future = loop._start(wait)
+    errors: list[type[BaseException]] = []
+
+    def ask() -> None:
+        try:
+            loop.run(wait)
+        except ConnectionClosed as error:
+            errors.append(type(error))
+
+    asking = threading.Thread(target=ask, daemon=True)
+    asking.start()
     assert started.wait(LIMIT_S)
     loop.close()
-    assert (ended, future.cancelled()) == ([1], True)
+    asking.join(LIMIT_S)
+    assert (ended, errors) == ([1], [ConnectionClosed])
 
 
 def test_an_exit_of_the_program_in_a_coroutine_is_the_callers(loop: LoopThread) -> None:
@@ -167,19 +179,68 @@ def test_a_thread_that_cannot_start_is_an_error(monkeypatch: pytest.MonkeyPatch)
         LoopThread()
 
 
-def test_interrupted_while_it_starts_it_ends_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    result, interruptions = concurrent.futures.Future.result, [KeyboardInterrupt()]
+def uses_of_the_loop(loops: list[LoopThread]) -> None:
+    """What a blocking program does, in short."""
+    loop = LoopThread()
+    loops.append(loop)
+    try:
+        held = loop.hold_open(contextlib.AsyncExitStack())
+        loop.run(nothing)
+        loop.call(len, "")
+        with pytest.raises(ConnectionClosed):
+            loop.run(fail)
+        held.close()
+    finally:
+        loop.close()
 
-    def interrupted_once(future: concurrent.futures.Future[object]) -> object:
-        if interruptions:
-            raise interruptions.pop()
-        return result(future)
 
-    before = threading.active_count()
-    monkeypatch.setattr(concurrent.futures.Future, "result", interrupted_once)
-    with pytest.raises(KeyboardInterrupt):
-        LoopThread()
-    threads = [each for each in threading.enumerate() if each.name == "aerokit loop"]
-    for each in threads:
-        each.join(LIMIT_S)
-    assert threading.active_count() <= before
+async def fail() -> None:
+    await asyncio.sleep(0)
+    raise ConnectionClosed("as asked for")
+
+
+Place = tuple[str, int]
+
+
+def interrupted_at(place: Place | None) -> set[Place]:
+    """Raise KeyboardInterrupt where the main thread first comes to this place; the places where it has been."""
+    seen: set[Place] = set()
+
+    def trace(frame: FrameType, event: str, argument: object) -> Any:
+        here = (frame.f_code.co_filename, frame.f_lineno)
+        if event != "line" or here in seen:
+            return trace
+        seen.add(here)
+        if here == place:
+            raise KeyboardInterrupt
+        return trace
+
+    before, loops = sys.gettrace(), list[LoopThread]()
+    sys.settrace(trace)
+    try:
+        uses_of_the_loop(loops)
+    finally:
+        sys.settrace(before)
+        for loop in loops:  # where closing was interrupted, it can be closed again
+            loop.close()
+    return seen
+
+
+def test_ctrl_c_is_never_lost_and_leaves_nothing_behind() -> None:
+    """At every line that the main thread runs, ours and those of threading; contextlib and pytest are not meant."""
+    ours = ("loop_thread.py", "reply.py", "threading.py")
+    places = sorted(place for place in interrupted_at(None) if place[0].endswith(ours))
+    assert len(places) > 80
+    lost = []
+    for place in places:
+        try:
+            interrupted_at(place)
+        except KeyboardInterrupt:
+            continue
+        except BaseException as error:
+            lost.append((place, error))
+    for thread in threading.enumerate():
+        if thread.name == "aerokit loop" and thread.ident is not None:
+            thread.join(LIMIT_S)
+            assert not thread.is_alive()
+    assert lost == []

@@ -11,6 +11,7 @@ from aerokit.dronekit.command_items import commands_of, home_command, mission_of
 from aerokit.dronekit.current_command import CurrentCommand
 from aerokit.dronekit.exceptions import APIException, TimeoutError  # noqa: A004 - DroneKit's name
 from aerokit.errors import AerokitError, OperationTimeout
+from aerokit.sync.reply import reply_of
 
 if TYPE_CHECKING:
     import concurrent.futures
@@ -235,7 +236,7 @@ class CommandSequence:
         """As DroneKit does: what is cleared or added after download() comes after it. Its end is bounded."""
         while (download := self._download) is not None and not download.done():
             try:
-                self._vehicle._handler.loop.wait_for(download)
+                self._vehicle._handler.loop.wait_for(reply_of(download))
             except AerokitError as error:
                 raise APIException(str(error)) from error
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import atexit
-import concurrent.futures
 import contextlib
 import contextvars
 import functools
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Generic, ParamSpec, TypeVar
 import anyio
 
 from aerokit.errors import BusyError, ConnectionClosed, LinkOpenError
+from aerokit.sync.reply import Reply
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -28,6 +28,7 @@ T = TypeVar("T")
 WAKE_S = 0.2
 """On Windows, Ctrl-C is noticed only between waits."""
 INTERRUPTED_CALL_ENDS_S = 2.0
+CLOSED_MEANWHILE = "the connection was closed while this call waited"
 CLOSE_S = 5.0
 """The longest that closing waits; every single step of it is bounded by itself."""
 
@@ -43,7 +44,7 @@ class LoopThread:
 
     def __init__(self) -> None:
         self._calls = _Calls()
-        started: concurrent.futures.Future[asyncio.AbstractEventLoop] = concurrent.futures.Future()
+        started: Reply[asyncio.AbstractEventLoop] = Reply()
         # In a context of its own: sniffio keeps there which library is running, and the caller's may be another one.
         self._thread = threading.Thread(
             target=contextvars.Context().run,
@@ -56,13 +57,20 @@ class LoopThread:
         self._lock = threading.Lock()  # nothing waits while it is held: the loop's thread takes it, too
         try:
             self._thread.start()
+            while not started.wait(WAKE_S):
+                pass
             self._loop = started.result()
+            atexit.register(self.close)
         except (OSError, RuntimeError) as error:
+            self._give_up(started)
+            if isinstance(
+                error.__context__, KeyboardInterrupt
+            ):  # Thread.start waits at a Condition: see Reply
+                raise error.__context__ from None
             raise _not_started(error) from error
-        except BaseException:  # Ctrl-C: nobody will close it
-            started.add_done_callback(self._calls.end_of)
+        except BaseException:
+            self._give_up(started)
             raise
-        atexit.register(self.close)
 
     def run(self, function: Callable[P, Awaitable[T]], /, *args: P.args, **kwargs: P.kwargs) -> T:
         """Await ``function(*args, **kwargs)`` on the loop and return its result or raise its exception, as it is.
@@ -91,27 +99,17 @@ class LoopThread:
         **kwargs: P.kwargs,
     ) -> T:
         """``patience_s``: how long to wait for the end of an interrupted call; None: as long as it takes."""
-        ended = threading.Event()
-
-        async def call() -> T:
-            try:
-                return await function(*args, **kwargs)
-            finally:
-                ended.set()
-
-        future = self._start(call)
+        call = _Call(functools.partial(function, *args, **kwargs))
         try:
-            self.wait_for(future)
+            self._start(call)
+            self.wait_for(call)
         except BaseException:
-            future.cancel()
-            while not ended.wait(WAKE_S if patience_s is None else patience_s):
+            self._cancel(call)
+            while call.was_started and not call.wait(WAKE_S if patience_s is None else patience_s):
                 if patience_s is not None or not self._thread.is_alive():
                     break
             raise
-        try:
-            return future.result()
-        except concurrent.futures.CancelledError:
-            raise ConnectionClosed("the connection was closed while this call waited") from None
+        return call.result()
 
     def call(self, function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:
         """Call a function that does not wait on the loop's thread; else as :meth:`run`."""
@@ -142,10 +140,10 @@ class LoopThread:
         with self._lock:
             if self._is_closed:
                 return
-            self._is_closed = True
             if self._process == os.getpid():
                 with contextlib.suppress(RuntimeError):  # it has stopped by itself
                     self._soon(self._calls.end)
+            self._is_closed = True  # afterwards: interrupted before, it can be closed again
         atexit.unregister(self.close)
         if not self.is_current:
             self._thread.join(CLOSE_S)
@@ -155,23 +153,33 @@ class LoopThread:
         """Whether the caller is on the loop's thread."""
         return threading.current_thread() is self._thread
 
-    def wait_for(self, *futures: concurrent.futures.Future[Any]) -> None:
-        """Wait until one of them is done, open to Ctrl-C on every system; ConnectionClosed when the loop ends first."""
-        while not concurrent.futures.wait(futures, WAKE_S, concurrent.futures.FIRST_COMPLETED).done:
-            if not self._thread.is_alive() and not any(future.done() for future in futures):
-                raise ConnectionClosed("the connection was closed while this call waited")
+    def wait_for(self, reply: Reply[Any]) -> None:
+        """Wait until it is done, open to Ctrl-C on every system; ConnectionClosed when the loop ends first."""
+        while not reply.wait(WAKE_S):
+            if not self._thread.is_alive() and not reply.is_done:
+                raise ConnectionClosed(CLOSED_MEANWHILE)
 
-    def _start(self, function: Callable[[], Awaitable[T]]) -> concurrent.futures.Future[T]:
+    def _start(self, call: _Call[Any]) -> None:
         if self.is_current:
             raise BusyError(
                 "a blocking call on the loop's own thread would wait for itself: predicates and callbacks run there;"
                 " call it from another thread"
             )
-        future: concurrent.futures.Future[T] = concurrent.futures.Future()
         with self._lock:
             self._check()
-            self._soon(self._calls.begin, function, future)
-        return future
+            call.was_started = True
+            self._soon(self._calls.begin, call)
+
+    def _cancel(self, call: _Call[Any]) -> None:
+        if call.was_started:
+            with contextlib.suppress(RuntimeError):  # the loop is closed
+                self._soon(call.cancel)
+
+    def _give_up(self, started: Reply[asyncio.AbstractEventLoop]) -> None:
+        """It was interrupted while it started: whenever it has, it ends."""
+        self._calls.is_over = True
+        if started.has_result:
+            started.result().call_soon_threadsafe(self._calls.end)
 
     def _soon(self, function: Callable[..., object], *args: Any) -> None:
         self._loop.call_soon_threadsafe(function, *args, context=self._calls.context)
@@ -190,35 +198,37 @@ class Held(Generic[T]):
 
     def __init__(self, loop: LoopThread, context: AbstractAsyncContextManager[T]) -> None:
         self._loop, self._context = loop, context
-        self._opened: concurrent.futures.Future[T] = concurrent.futures.Future()
+        self._opened: Reply[T] = Reply()
         self._leave = asyncio.Event()
-        self._task = loop._start(self._live)
-        self.value = self._wait_until_open()
+        self._call = _Call(self._live)
+        try:
+            loop._start(self._call)
+            loop.wait_for(self._opened)
+            if not self._opened.has_result:
+                loop.wait_for(self._call)
+                self._call.result()  # raises what entering it raised
+        except BaseException:
+            loop._cancel(self._call)
+            raise
+        self.value = self._opened.result()
         """What the context manager gave."""
 
     def close(self) -> None:
         """Leave the context manager and wait until that is done; idempotent."""
         if self._loop.is_current:
             self._leave.set()
-        elif not self._task.done():
+        elif not self._call.is_done:
             with contextlib.suppress(ConnectionClosed):
                 self._loop.call(self._leave.set)
-                concurrent.futures.wait([self._task], CLOSE_S)
+                self._call.wait(CLOSE_S)
 
     async def _live(self) -> None:
-        async with self._context as value:
-            self._opened.set_result(value)
-            await self._leave.wait()
-
-    def _wait_until_open(self) -> T:
         try:
-            self._loop.wait_for(self._opened, self._task)
-        except BaseException:
-            self._task.cancel()
-            raise
-        if not self._opened.done():
-            self._task.result()  # raises what entering it raised
-        return self._opened.result()
+            async with self._context as value:
+                self._opened.give(value)
+                await self._leave.wait()
+        finally:
+            self._opened.end()
 
 
 class _Calls:
@@ -226,44 +236,45 @@ class _Calls:
 
     def __init__(self) -> None:
         self.context = contextvars.Context()
-        self._end: asyncio.Event | None = None
+        self.is_over = False
+        """Nobody has taken the loop that was started."""
+        self._end = asyncio.Event()
         self._tasks: dict[asyncio.Task[None], _Call[Any]] = {}
 
-    def begin(self, function: Callable[[], Awaitable[T]], future: concurrent.futures.Future[T]) -> None:
-        """Await it in a task; the future is told what comes of it, and cancels it."""
-        call = _Call(function, future)
+    def begin(self, call: _Call[Any]) -> None:
+        """Await it in a task."""
         task = asyncio.get_running_loop().create_task(call.live())
         self._tasks[task] = call
-        task.add_done_callback(self._tasks.pop)
+        task.add_done_callback(self._end_of)
 
     def end(self) -> None:
         """Begin the end."""
-        if self._end is not None:
-            self._end.set()
+        self._end.set()
 
-    def end_of(self, started: concurrent.futures.Future[asyncio.AbstractEventLoop]) -> None:
-        """End what was just started, if it was."""
-        if started.exception() is None:
-            started.result().call_soon_threadsafe(self.end)
-
-    async def live(self, started: Callable[[asyncio.AbstractEventLoop], None]) -> None:
+    async def live(self, started: Reply[asyncio.AbstractEventLoop]) -> None:
         """Wait for the end, and then for that of everything that was begun."""
-        self.context, self._end = contextvars.copy_context(), asyncio.Event()
-        started(asyncio.get_running_loop())
-        await self._end.wait()
+        self.context = contextvars.copy_context()
+        started.give(asyncio.get_running_loop())
+        if not self.is_over:
+            await self._end.wait()
         while self._tasks:
             for call in self._tasks.values():
                 call.cancel()
             await asyncio.wait(tuple(self._tasks))
 
+    def _end_of(self, task: asyncio.Task[None]) -> None:
+        self._tasks.pop(task).end()  # it has ended by itself, unless it was cancelled before its first step
 
-class _Call(Generic[T]):
-    """A coroutine function that is awaited on the loop, for a future on another thread."""
 
-    def __init__(self, function: Callable[[], Awaitable[T]], future: concurrent.futures.Future[T]) -> None:
-        self._function, self._future = function, future
+class _Call(Reply[T]):
+    """A coroutine function that is awaited on the loop for another thread."""
+
+    def __init__(self, function: Callable[[], Awaitable[T]]) -> None:
+        super().__init__()
+        self._function = function
         self._scope: anyio.CancelScope | None = None
         self._is_cancelled = False
+        self.was_started = False
 
     def cancel(self) -> None:
         """Cancel it; idempotent."""
@@ -271,42 +282,33 @@ class _Call(Generic[T]):
         if self._scope is not None:
             self._scope.cancel()
 
+    def result(self) -> T:
+        """As of any reply; ConnectionClosed when it was cancelled."""
+        if self._error is None and not self.has_result:
+            raise ConnectionClosed(CLOSED_MEANWHILE)
+        return super().result()
+
     async def live(self) -> None:
-        loop, future = asyncio.get_running_loop(), self._future
-
-        def cancel_with(ended: concurrent.futures.Future[T]) -> None:
-            if ended.cancelled():
-                with contextlib.suppress(RuntimeError):  # the loop is closed
-                    loop.call_soon_threadsafe(self.cancel)
-
-        future.add_done_callback(cancel_with)
+        """Run it; never raises but when cancelled."""
         with anyio.CancelScope() as self._scope:  # here: outside tasks anyio does not know what is running
             if self._is_cancelled:
                 self._scope.cancel()
             try:
-                result = await self._function()
+                self.give(await self._function())
             except asyncio.CancelledError:
-                future.cancel()
                 raise
             except BaseException as error:  # sys.exit() too: it is the caller's, and not the loop's
-                _tell(future.set_exception, error)
-            else:
-                _tell(future.set_result, result)
+                self.fail(error)
 
 
-def _tell(setter: Callable[[T], None], value: T) -> None:
-    with contextlib.suppress(concurrent.futures.InvalidStateError):  # it was cancelled just then
-        setter(value)
-
-
-def _run(calls: _Calls, started: concurrent.futures.Future[asyncio.AbstractEventLoop]) -> None:
+def _run(calls: _Calls, started: Reply[asyncio.AbstractEventLoop]) -> None:
     """What the thread does."""
     try:
-        anyio.run(calls.live, started.set_result)
+        anyio.run(calls.live, started)
     except BaseException as error:
-        if started.done():
+        if started.is_done:
             raise
-        started.set_exception(error)
+        started.fail(error)
 
 
 def _not_started(error: Exception) -> LinkOpenError:
