@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from aerokit.mavlink.signing import Signing, SigningKey
     from aerokit.position import Position
     from aerokit.runtime.connection import Connection
+    from aerokit.runtime.link_state import LinkState
     from aerokit.runtime.opening import open_connection
     from aerokit.vehicle.connect import connect
     from aerokit.vehicle.setpoints import (
@@ -47,6 +48,7 @@ __all__ = [
     "BodyVelocitySetpoint",
     "Connection",
     "Dialect",
+    "LinkState",
     "LocalPositionSetpoint",
     "Position",
     "PositionSetpoint",
@@ -69,6 +71,7 @@ _HOMES = {
     "BodyVelocitySetpoint": "aerokit.vehicle.setpoints",
     "Connection": "aerokit.runtime.connection",
     "Dialect": "aerokit.mavlink.dialect",
+    "LinkState": "aerokit.runtime.link_state",
     "LocalPositionSetpoint": "aerokit.vehicle.setpoints",
     "Position": "aerokit.position",
     "PositionSetpoint": "aerokit.vehicle.setpoints",

@@ -387,3 +387,16 @@ class Deaf:
 
     def link_lost(self, error: LinkLost) -> None:
         """Nothing to do."""
+
+
+async def test_a_link_that_is_opened_again_is_lost_and_then_connected() -> None:
+    link = OneEnd()
+    async with open_connection(link) as connection:
+        with connection.subscribe(events.LinkStateChanged, capacity=20) as changes:
+            assert link.connection is not None
+            link.connection.link_interrupted(LinkLost("unplugged"))
+            lost = await changes.get(timeout=1)
+            assert (lost.before.name, lost.after.name) == ("CONNECTED", "LOST")
+            link.connection.link_restored(1.0)
+            back = await changes.get(timeout=1)
+            assert (back.before.name, back.after.name) == ("LOST", "CONNECTED")

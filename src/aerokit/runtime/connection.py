@@ -18,6 +18,7 @@ from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import Heartbeat
 from aerokit.runtime.background import Background
 from aerokit.runtime.bus import Bus, once
+from aerokit.runtime.cells import StateCell
 from aerokit.runtime.deadlines import Deadlines
 from aerokit.runtime.endings import raisable
 from aerokit.runtime.events import (
@@ -29,6 +30,8 @@ from aerokit.runtime.events import (
     LinkStalled,
     LoopBlocked,
 )
+from aerokit.runtime.link_state import LinkState
+from aerokit.runtime.link_watch import LinkStateWatch
 from aerokit.runtime.loop_watch import watch_loop
 from aerokit.runtime.peers import Peers
 from aerokit.runtime.recording import Recording
@@ -100,6 +103,8 @@ class Connection:
         """System ids that have a vehicle object on this connection."""
         self.boot_clocks: dict[tuple[int, int], Callable[[float], float | None]] = {}
         """Of some (system id, component id): its time since boot in milliseconds, by our time; None while unknown."""
+        self.link_state: StateCell[LinkState] = StateCell("link_state", self.now, "frame")
+        """Whether frames come at all, from whomever; ``vehicle.link_state`` is about one vehicle."""
         self.deadlines = Deadlines()
         """What has to happen at a time, as long as the connection is open."""
         self._clock = asyncio.get_running_loop().time
@@ -116,6 +121,8 @@ class Connection:
         self._enders: list[Callable[[Exception], None]] = []
         self._background = Background(self.fail)
         self._watches_loop = False
+        self._is_on_link = True
+        self._state_watch = LinkStateWatch(self.link_state, self.bus, system_id=0)
         self._error: Exception | None = None
         self.bus.attach(Heartbeat, _ignore)  # routes and diagnosis need every heartbeat
 
@@ -300,7 +307,8 @@ class Connection:
         Inside the connection's block as well: the block goes on, and whatever it asks of the connection raises.
         """
         self._end(error or ConnectionClosed("the connection was closed"))
-        self.link.close()
+        if self._is_on_link:
+            self.link.close()
         if self._recording is not None:
             self._recording.close()
             self._recording = None
@@ -360,11 +368,13 @@ class Connection:
 
     def link_interrupted(self, error: LinkLost) -> None:
         """The link has gone and is being opened again (called by the link)."""
+        self._state_watch.lost(self._clock())
         self.bus.publish(LinkInterrupted(self._clock(), 0, error))
 
     def link_restored(self, away_s: float) -> None:
         """The link is back (called by the link)."""
         self._peers.begin_anew()
+        self._state_watch.heard(self._clock())
         self.bus.publish(LinkRestored(self._clock(), 0, away_s))
 
     def link_stalled(self, unsent_bytes: int) -> None:
@@ -381,7 +391,20 @@ class Connection:
 
     # ------------------------------------------------------------------------------- inside
 
+    async def _open_link(self) -> None:
+        """Open the link; one that is open already is somebody else's, and stays as it is."""
+        try:
+            await self.link.open(self)
+        except BusyError:
+            self._is_on_link = False
+            raise
+
+    async def _wait_until_link_is_closed(self) -> None:
+        if self._is_on_link:
+            await self.link.wait_closed()
+
     def _start(self) -> None:
+        self._state_watch.heard(self._clock())
         self._background.start(self._send_heartbeats, "aerokit heartbeat")
 
     async def _watch_loop(self) -> None:
@@ -392,6 +415,7 @@ class Connection:
         while self.is_open:
             self.send(heartbeat)
             self._gate.tell_keeping()
+            self._state_watch.count(self._clock(), sum(each.frames for each in self.statistics()))
             if self._recording is not None:
                 self._recording.flush()
             await anyio.sleep(HEARTBEAT_PERIOD_S)
@@ -400,6 +424,8 @@ class Connection:
         if self._error is not None:
             return
         self._error = error
+        self._state_watch.lost(self._clock(), is_told=isinstance(error, LinkLost))
+        self.link_state.close(error)
         if isinstance(error, LinkLost):
             self.bus.publish(LinkClosed(self._clock(), 0, error))
         enders, self._enders = self._enders, []

@@ -11,6 +11,7 @@ from aerokit.snapshot import Snapshot
 
 if TYPE_CHECKING:
     from aerokit.errors import AerokitError
+    from aerokit.runtime.link_state import LinkState
 
 __all__ = [
     "ArmedChanged",
@@ -24,6 +25,7 @@ __all__ = [
     "LinkReport",
     "LinkRestored",
     "LinkStalled",
+    "LinkStateChanged",
     "LoopBlocked",
     "MissionCurrentChanged",
     "MissionFinished",
@@ -224,6 +226,13 @@ class LinkDrained(Event):
     """What is written leaves again, after ``stalled_s`` seconds."""
 
     stalled_s: float
+
+
+class LinkStateChanged(Event):
+    """The way CONNECTED → SILENT → LOST, and back: of one vehicle, or of the link as a whole (``system_id`` 0)."""
+
+    before: LinkState
+    after: LinkState
 
 
 class LinkClosed(Event):

@@ -88,7 +88,7 @@ async def open_connection(
     try:
         if record is not None:
             connection.record(record)
-        await link.open(connection)
+        await connection._open_link()
         connection._start()
         yield connection
     finally:
@@ -97,7 +97,7 @@ async def open_connection(
             await connection._background.aclose()
         finally:
             with anyio.CancelScope(shield=True), anyio.move_on_after(CLOSE_TIMEOUT_S):
-                await link.wait_closed()
+                await connection._wait_until_link_is_closed()
 
 
 def _link(address: str | Link, baud: int, reconnect: bool, peers: Peers | None) -> Link:

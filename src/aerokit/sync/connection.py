@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, TypeVar
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.runtime.connection import MAV_COMP_ID_MISSIONPLANNER
 from aerokit.runtime.opening import open_connection as open_async
+from aerokit.sync.cells import StateCell
 from aerokit.sync.loop_thread import LoopThread
 from aerokit.sync.subscription import Subscription
 
@@ -81,6 +82,8 @@ class Connection:
         self._loop, self._held = loop, held
         self.aio = connection
         """The asynchronous connection, for code that runs on the loop."""
+        self.link_state = StateCell(loop, connection.link_state)
+        """Whether frames come at all, from whomever; ``vehicle.link_state`` is about one vehicle."""
 
     def send(self, message: Message, *, to: int | None = None) -> None:
         """Number, frame and write a message; as :meth:`aerokit.Connection.send`."""

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from aerokit.autopilots import Autopilot
     from aerokit.runtime.cells import StateCell as AsyncStateCell
     from aerokit.runtime.events import LinkReport
+    from aerokit.runtime.link_state import LinkState
     from aerokit.sync.loop_thread import LoopThread
     from aerokit.vehicle.values import (
         Attitude,
@@ -232,6 +233,11 @@ class VehicleState:
         """Loss, delay and rates of the last second."""
         return self._cell(self.aio.link_quality)
 
+    @cached_property
+    def link_state(self) -> StateCell[LinkState]:
+        """CONNECTED, SILENT (no heartbeat for more than 3.5 seconds) or LOST (the link has gone)."""
+        return self._cell(self.aio.link_state)
+
     @property
     def mode_name(self) -> str:
         """Name of the flight mode, ``"unknown"`` before the first heartbeat."""
@@ -259,7 +265,7 @@ class VehicleState:
 
     @property
     def is_silent(self) -> bool:
-        """Whether no heartbeat has come for more than 3.5 seconds."""
+        """Whether no heartbeat comes: none for more than 3.5 seconds, or the link has gone."""
         return self.aio.is_silent
 
     def distance_to(self, target: Position) -> float:

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from aerokit.runtime.connection import Connection
     from aerokit.runtime.events import Event
     from aerokit.vehicle.orders import Order
+    from aerokit.runtime.link_state import LinkState
 
 __all__ = ["VehicleCore"]
 
@@ -298,8 +299,13 @@ class VehicleCore:
 
     @property
     def is_silent(self) -> bool:
-        """Whether no heartbeat has come for more than 3.5 seconds."""
+        """Whether no heartbeat comes: none for more than 3.5 seconds, or the link has gone."""
         return self._watch.is_silent
+
+    @property
+    def link_state(self) -> StateCell[LinkState]:
+        """CONNECTED, SILENT (no heartbeat for more than 3.5 seconds) or LOST (the link has gone)."""
+        return self._watch.link_state
 
     def describe_link(self) -> str:
         """One line on how well the vehicle is heard, for error texts."""
@@ -439,6 +445,7 @@ class VehicleCore:
 
     def _on_end(self, error: Exception) -> None:
         self._background.cancel()
+        self._watch.end(error)
         self.telemetry.close(error)
         self.link_quality.close(error)
         for cell in self._messages.values():

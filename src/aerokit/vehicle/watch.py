@@ -9,8 +9,12 @@ from typing import TYPE_CHECKING
 
 import anyio
 
+from aerokit.errors import LinkLost
 from aerokit.mavlink.messages import Attitude, GlobalPositionInt, Heartbeat, SystemTime, Timesync
-from aerokit.runtime.events import LinkReport, VehicleBack, VehicleRebooted, VehicleSilent
+from aerokit.runtime.cells import StateCell
+from aerokit.runtime.events import LinkInterrupted, LinkReport, VehicleBack, VehicleRebooted, VehicleSilent
+from aerokit.runtime.link_state import SILENT_AFTER_S
+from aerokit.runtime.link_watch import LinkStateWatch
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -18,11 +22,10 @@ if TYPE_CHECKING:
     from aerokit.mavlink.frame import Frame
     from aerokit.runtime.bus import Detach
     from aerokit.runtime.connection import Connection
+    from aerokit.runtime.link_state import LinkState
 
 __all__ = ["LinkWatch", "VehicleWatch"]
 
-SILENT_AFTER_S = 3.5
-"""Three missed heartbeats and a half."""
 REBOOT_STEP_MS = 3000
 """Reordered messages go back in time by less than this, a reboot by more, unless it had just booted."""
 REBOOT_SEEN_S = 0.2
@@ -49,7 +52,12 @@ class VehicleWatch:
         self._connection, self._system_id, self._component_id = connection, system_id, component_id
         self._on_reboot = on_reboot
         self.last_heartbeat_at = connection.now()
-        self.is_silent = False
+        self.link_state: StateCell[LinkState] = StateCell("link_state", connection.now, "HEARTBEAT")
+        self._state_watch = LinkStateWatch(
+            self.link_state, connection.bus, system_id=system_id, component_id=component_id
+        )
+        self._state_watch.heard(connection.now())
+        self._is_told_silent = self._has_ended = False
         self.reboots = 0
         self._times: dict[str, tuple[int, float]] = {}
         self._first_time: tuple[int, float] | None = None
@@ -67,6 +75,18 @@ class VehicleWatch:
         ):
             self._detach.append(attach_frames(message_type, take, system_id=system_id))
         self._detach.append(attach(Timesync, self._on_timesync, system_id=system_id))
+        self._detach.append(connection.bus.attach_event(LinkInterrupted, self._on_link_interrupted))
+
+    @property
+    def is_silent(self) -> bool:
+        """Whether no heartbeat comes any more: for more than 3.5 seconds, or because the link has gone."""
+        return self._is_told_silent or self._has_ended
+
+    def end(self, error: Exception) -> None:
+        """Nothing will be heard any more."""
+        self._has_ended = True
+        self._state_watch.lost(self._connection.now(), is_told=isinstance(error, LinkLost))
+        self.link_state.close(error)
 
     def close(self) -> None:
         """Stop watching."""
@@ -111,8 +131,9 @@ class VehicleWatch:
         """Publish VehicleSilent when heartbeats have stopped; called once a second."""
         now = self._connection.now()
         silent_for = now - self.last_heartbeat_at
-        if silent_for > SILENT_AFTER_S and not self.is_silent:
-            self.is_silent = True
+        self._state_watch.check(now)
+        if silent_for > SILENT_AFTER_S and not self._is_told_silent:
+            self._is_told_silent = True
             self._connection.bus.publish(VehicleSilent(now, self._system_id, silent_for))
 
     def _on_heartbeat(self, heartbeat: Heartbeat) -> None:
@@ -121,9 +142,13 @@ class VehicleWatch:
             return
         now = frame.received_at
         silent_for, self.last_heartbeat_at = now - self.last_heartbeat_at, now
-        if self.is_silent:
-            self.is_silent = False
+        self._state_watch.heard(now)
+        if self._is_told_silent:
+            self._is_told_silent = False
             self._connection.bus.publish(VehicleBack(now, self._system_id, silent_for))
+
+    def _on_link_interrupted(self, event: LinkInterrupted) -> None:
+        self._state_watch.lost(event.at)
 
     def _on_boot_time(self, frame: Frame) -> None:
         """``time_boot_ms`` is the payload's beginning."""

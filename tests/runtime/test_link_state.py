@@ -1,0 +1,89 @@
+"""CONNECTED → SILENT → LOST, of a link and of a vehicle; and a link that is in use already."""
+
+from __future__ import annotations
+
+import anyio
+import pytest
+from flight_harness import Flight
+
+from aerokit import LinkState, connect, events, open_connection
+from aerokit.errors import BusyError, ConnectionClosed, LinkLost
+from aerokit.links import memory_link_pair
+from aerokit.runtime.subscription import Subscription
+from aerokit.sim import SimulatedCopter, simulated_link
+
+pytestmark = pytest.mark.anyio
+
+CONNECTED, SILENT, LOST = LinkState.CONNECTED, LinkState.SILENT, LinkState.LOST
+
+
+def told(changes: Subscription[events.LinkStateChanged]) -> list[tuple[int, LinkState, LinkState]]:
+    found = []
+    while (change := changes.get_nowait()) is not None:
+        found.append((change.system_id, change.before, change.after))
+    return found
+
+
+async def test_the_way_from_connected_to_lost_is_a_state_and_an_event(grounded: Flight) -> None:
+    vehicle, connection = grounded.vehicle, grounded.vehicle.connection
+    with connection.subscribe(events.LinkStateChanged, capacity=20) as changes:
+        assert (vehicle.link_state.value, connection.link_state.value) == (CONNECTED, CONNECTED)
+        grounded.copter.faults.silent = True
+        await vehicle.link_state.wait_until(lambda state: state is SILENT, timeout=5)
+        assert 3.5 < vehicle.heartbeat_age < 4.7
+        await connection.link_state.wait_until(lambda state: state is SILENT, timeout=2)
+        grounded.copter.faults.silent = False
+        await vehicle.link_state.wait_until(lambda state: state is CONNECTED, timeout=2)
+        await connection.link_state.wait_until(lambda state: state is CONNECTED, timeout=2)
+        connection.link_lost(LinkLost("unplugged"))
+        one = vehicle.system_id
+        assert sorted(told(changes), key=lambda change: change[0]) == [
+            (0, CONNECTED, SILENT),
+            (0, SILENT, CONNECTED),
+            (0, CONNECTED, LOST),
+            (one, CONNECTED, SILENT),
+            (one, SILENT, CONNECTED),
+            (one, CONNECTED, LOST),
+        ]
+
+
+async def test_after_the_link_is_lost_the_vehicle_is_silent(grounded: Flight) -> None:
+    vehicle = grounded.vehicle
+    assert not vehicle.is_silent
+    vehicle.connection.link_lost(LinkLost("unplugged"))
+    assert vehicle.is_silent
+    assert (vehicle.link_state.value, vehicle.connection.link_state.value) == (LOST, LOST)
+    await anyio.sleep(10)
+    assert vehicle.heartbeat_age > 10
+    with pytest.raises(LinkLost, match="unplugged"):
+        await vehicle.link_state.wait_until(lambda state: state is CONNECTED)
+
+
+async def test_what_the_program_closes_itself_is_lost_without_an_event() -> None:
+    async with simulated_link(SimulatedCopter(boot_time_s=0)) as link, open_connection(link) as connection:
+        with connection.subscribe(events.LinkStateChanged, capacity=20) as changes:
+            async with connect(connection) as vehicle:
+                pass
+            assert (vehicle.link_state.value, connection.link_state.value) == (LOST, CONNECTED)
+            with pytest.raises(ConnectionClosed):
+                await vehicle.link_state.wait_until(lambda state: state is CONNECTED)
+        assert told(changes) == []
+
+
+async def test_nobody_there_is_silence() -> None:
+    near, _ = memory_link_pair()
+    async with open_connection(near) as connection:
+        assert connection.link_state.value is CONNECTED
+        await connection.link_state.wait_until(lambda state: state is SILENT, timeout=5)
+
+
+async def test_a_link_that_is_in_use_is_left_alone(grounded: Flight) -> None:
+    """The second one is refused; the first flies on."""
+    vehicle = grounded.vehicle
+    with pytest.raises(BusyError, match="a link is opened once"):
+        async with connect(vehicle.connection.link):
+            pytest.fail("it is in use")
+    before = vehicle.mode.updated_at
+    await anyio.sleep(3)
+    assert vehicle.mode.updated_at > before
+    await vehicle.set_mode("GUIDED")
