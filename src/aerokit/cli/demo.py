@@ -111,7 +111,7 @@ class _Flight:
             await self._come_down_after_failure()
             return FAILED
         if code is None:
-            self._say("interrupted")
+            self._say(f"interrupted, {self._vehicle.describe_now()}")
             await self._come_down()
             return INTERRUPTED
         return code
@@ -163,7 +163,7 @@ class _Flight:
         vehicle, autopilot = self._vehicle, self._vehicle.autopilot
         ours = [autopilot.mode_for(purpose) for purpose in ("take_off", "setpoint", "hold", "land")]
         if vehicle.is_armed and vehicle.mode_name not in [mode.name for mode in ours if mode is not None]:
-            self._say(f"left to whoever put it into {vehicle.mode_name}")
+            self._say(f"left to whoever put it into {vehicle.mode_name}: {vehicle.describe_now()}")
             return
         await self._come_down()
 
@@ -171,9 +171,10 @@ class _Flight:
         """Land, or switch off what stands on the ground; a second Ctrl-C leaves it to itself."""
         try:
             if await self._interruptible.run(self._end_flight) is None:
-                self._say(f"interrupted again: left in {self._vehicle.mode_name}")
+                self._say(f"interrupted again: left {self._vehicle.describe_now()}")
         except AerokitError as error:
             self._say(f"it could not be landed: {error}")
+            self._say(f"left {self._vehicle.describe_now()}")
 
     async def _end_flight(self) -> int:
         vehicle = self._vehicle

@@ -32,7 +32,7 @@ from aerokit.runtime.events import (
 )
 from aerokit.runtime.link_state import LinkState
 from aerokit.runtime.link_watch import LinkStateWatch
-from aerokit.runtime.loop_watch import watch_loop
+from aerokit.runtime.loop_watch import LoopWatch
 from aerokit.runtime.peers import Peers
 from aerokit.runtime.recording import Recording
 from aerokit.runtime.routes import MOST_ROUTES, Routes
@@ -120,7 +120,7 @@ class Connection:
         self._taps: tuple[Tap, ...] = ()
         self._enders: list[Callable[[Exception], None]] = []
         self._background = Background(self.fail)
-        self._watches_loop = False
+        self._loop_watch = LoopWatch(self._on_blocked)
         self._is_on_link = True
         self._state_watch = LinkStateWatch(self.link_state, self.bus, system_id=0)
         self._error: Exception | None = None
@@ -342,10 +342,13 @@ class Connection:
         """Take bytes off the link (called by the link); never raises."""
         try:
             framer = self._framers.get(peer)
+            now = self._clock()
+            if now > self._loop_watch.late_after:
+                now = self._loop_watch.arrival()
             if framer is not None:
-                frames = framer.receive(data, self._clock())
+                frames = framer.receive(data, now)
             else:
-                framer, frames = self._peers.receive_from_stranger(peer, data, self._clock())
+                framer, frames = self._peers.receive_from_stranger(peer, data, now)
             for frame in frames:
                 if self._error is not None:  # a sink has closed it
                     return
@@ -353,7 +356,7 @@ class Connection:
                 if not self._gate.is_open and not self._gate.admits(frame, may_hand_over=not is_elsewhere):
                     continue
                 if self._recording is not None:
-                    self._recording.write(frame.raw, frame.received_at)
+                    self._recording.write(frame.raw, self._clock())
                 if is_elsewhere and not self._takes_place(framer, frame, peer):
                     continue
                 if (framer.late or framer.foreign) and self._is_stale(framer, frame):
@@ -405,10 +408,11 @@ class Connection:
 
     def _start(self) -> None:
         self._state_watch.heard(self._clock())
+        self._loop_watch.start()
         self._background.start(self._send_heartbeats, "aerokit heartbeat")
 
-    async def _watch_loop(self) -> None:
-        await watch_loop(self)
+    def _on_blocked(self, seconds: float) -> None:
+        self.bus.publish(LoopBlocked(self._clock(), 0, seconds))
 
     async def _send_heartbeats(self) -> None:
         heartbeat = Heartbeat(MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID, 0, 0, MAV_STATE_ACTIVE, 3)
@@ -435,6 +439,7 @@ class Connection:
             except Exception:
                 logger.exception("a mistake at the end of a connection; the others are told all the same")
         self.deadlines.close()
+        self._loop_watch.close()
         self._background.cancel()
 
     def _write(self, data: bytes, message: Message | None, to: int | None) -> None:
@@ -459,9 +464,6 @@ class Connection:
     def _attach(self, item: type[Any], sink: Sink, system_id: int) -> Detach:
         if issubclass(item, Message):
             return self.bus.attach(item, sink, system_id=system_id)
-        if issubclass(LoopBlocked, item) and not self._watches_loop:
-            self._watches_loop = True  # ten wake-ups a second, only for who wants to know
-            self._background.start(self._watch_loop, "aerokit loop watch")
         return self.bus.attach_event(item, _only(system_id, sink) if system_id else sink)
 
     def _let_all_through(self) -> None:

@@ -1,27 +1,89 @@
-"""Notices when the program keeps the event loop from running."""
+"""``LoopWatch``: notices when the event loop is kept from running, and how old what is read then may be."""
 
 from __future__ import annotations
 
+import asyncio
+import math
 from typing import TYPE_CHECKING
 
-import anyio
-
-from aerokit.runtime.events import LoopBlocked
-
 if TYPE_CHECKING:
-    from aerokit.runtime.connection import Connection
+    from collections.abc import Callable
 
-__all__ = ["watch_loop"]
+__all__ = ["PERIOD_S", "LoopWatch"]
 
 PERIOD_S = 0.1
+LATE_AFTER_S = 0.1
 BLOCKED_AFTER_S = 0.25
+QUIET_TURNS = 3
+"""So many turns of the loop in which nothing was read: what had waited has been read. Loops differ in what they do
+first in a turn, timers or sockets."""
 
 
-async def watch_loop(connection: Connection) -> None:
-    """Publish LoopBlocked when a timer comes ``BLOCKED_AFTER_S`` late or more; runs until cancelled."""
-    while connection.is_open:
-        due = connection.now() + PERIOD_S
-        await anyio.sleep(PERIOD_S)
-        late = connection.now() - due
+class LoopWatch:
+    """A timer that is always under way. When it comes late, the program, or the system, kept the loop from running.
+
+    What is read afterwards may have waited since the loop last ran: nobody knows better, so that is when it came, until
+    all that had waited has been read. A pause of less than ``PERIOD_S + LATE_AFTER_S`` is not noticed; what is read is
+    called younger than it is by so much at most. ``on_blocked`` is told the length of pauses above
+    ``BLOCKED_AFTER_S``.
+    """
+
+    def __init__(self, on_blocked: Callable[[float], None]) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._on_blocked = on_blocked
+        self.late_after = math.inf
+        """What is read at a later time than this came at :meth:`arrival`, else when it was read."""
+        self._ran_at = self._due = self._loop.time()
+        self._timer: asyncio.TimerHandle | None = None
+        self._oldest: float | None = None  # while there may be something that has waited
+        self._has_read = False
+        self._quiet_turns = 0
+
+    def start(self) -> None:
+        """Watch, until :meth:`close`."""
+        self._set_timer(self._loop.time())
+
+    def close(self) -> None:
+        """Watch no more."""
+        self.late_after = math.inf
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+
+    def arrival(self) -> float:
+        """The earliest time at which what is read now may have come."""
+        self._has_read = True
+        return self._fall_behind()
+
+    def _tick(self) -> None:
+        now = self._loop.time()
+        late = now - self._due
+        if late > LATE_AFTER_S:
+            self._fall_behind()
+        self._set_timer(now)
         if late > BLOCKED_AFTER_S:
-            connection.bus.publish(LoopBlocked(connection.now(), 0, late + PERIOD_S))
+            self._on_blocked(late + PERIOD_S)
+
+    def _set_timer(self, now: float) -> None:
+        self._ran_at, self._due = now, now + PERIOD_S
+        if self._oldest is None:
+            self.late_after = self._due + LATE_AFTER_S
+        self._timer = self._loop.call_at(self._due, self._tick)
+
+    def _fall_behind(self) -> float:
+        if self._oldest is None:
+            self._oldest, self.late_after, self._quiet_turns = self._ran_at, -math.inf, 0
+            self._loop.call_soon(self._look)
+        return self._oldest
+
+    def _look(self) -> None:
+        """Once a turn, until everything that had waited has been read."""
+        self._quiet_turns = 0 if self._has_read else self._quiet_turns + 1
+        self._has_read = False
+        if self._timer is None:
+            return
+        if self._quiet_turns < QUIET_TURNS:
+            self._loop.call_soon(self._look)
+        else:
+            self._oldest = None
+            self.late_after = self._due + LATE_AFTER_S

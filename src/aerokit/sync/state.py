@@ -280,6 +280,10 @@ class VehicleState:
         """What the vehicle said (STATUSTEXT) since this time on the loop's clock, oldest first."""
         return self._loop.call(self.aio.texts_since, at)
 
+    def describe_now(self) -> str:
+        """What it does, as far as it was heard: mode, armed or not, height above home."""
+        return self.aio.describe_now()
+
     def describe_link(self) -> str:
         """One line on how well the vehicle is heard, for error texts."""
         return self._loop.call(self.aio.describe_link)

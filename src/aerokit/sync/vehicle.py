@@ -21,6 +21,7 @@ from aerokit.sync.state import VehicleState
 from aerokit.sync.subscription import Subscription
 from aerokit.vehicle.connect import connect as connect_async
 from aerokit.vehicle.progress import LONGEST_SILENCE_S
+from aerokit.vehicle.connect import tell_how_it_is_left
 
 if TYPE_CHECKING:
     import os
@@ -142,7 +143,10 @@ class Vehicle(VehicleState):
         exc: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
+        was_told = self.aio._is_told_to_hold
         self.close()
+        if exc is not None and not was_told:  # the loop's side knows of no exception
+            tell_how_it_is_left(self.aio)
 
     def __repr__(self) -> str:
         return f"<Vehicle {self.system_id}/{self.component_id} {self.autopilot.firmware}, blocking>"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING
 
@@ -31,7 +32,9 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.mavlink.signing import Signing
 
-__all__ = ["connect"]
+__all__ = ["connect", "tell_how_it_is_left"]
+
+logger = logging.getLogger("aerokit")
 
 FRESH_HEARTBEAT_S = 2.0
 """A heartbeat heard longer ago says nothing about now: the next one is waited for."""
@@ -156,19 +159,32 @@ async def _attached(
 ) -> AsyncIterator[Vehicle]:
     """Find a vehicle on an open connection and keep it for the time of the block."""
     vehicle, heartbeat = await _find_vehicle(connection, system_id, timeout)
+    is_cut_short = False
     try:
         vehicle._start(heartbeat, rates)
         connection.bus.publish(VehicleFound(connection.now(), vehicle.system_id, vehicle.component_id))
         yield vehicle
+    except BaseException:
+        is_cut_short = True
+        raise
     finally:
         try:
             vehicle._end_stream()
+            is_cut_short = is_cut_short or vehicle._is_told_to_hold
             await vehicle._finish_hold()
             await vehicle._finish_arming()
+            if is_cut_short:
+                tell_how_it_is_left(vehicle)
         finally:
             vehicle._close()
             connection.attached.discard(vehicle.system_id)
             await vehicle._background.aclose()
+
+
+def tell_how_it_is_left(vehicle: Vehicle) -> None:
+    """Log what a vehicle does that a program lets go in flight without having meant to."""
+    if not vehicle.is_surely_disarmed:
+        logger.warning("vehicle %d is let go: %s", vehicle.system_id, vehicle.describe_now())
 
 
 async def _find_vehicle(

@@ -281,12 +281,17 @@ class VehicleCore:
         return cell
 
     def _message_cell(self, message_type: type[Message]) -> StateCell[Any]:
-        cell: StateCell[Any] = StateCell(message_type.NAME, self.connection.now, message_type.NAME)
+        arrived_at = 0.0
+        cell: StateCell[Any] = StateCell(
+            message_type.NAME, self.connection.now, message_type.NAME, stamp=lambda: arrived_at
+        )
         source = Source(self.system_id, self.component_id, message_type.NAME)
 
         def take(message: Message) -> None:
+            nonlocal arrived_at
             frame = message.received_frame
             if frame is not None and self.telemetry.accepts(frame):
+                arrived_at = frame.received_at
                 cell.set(message, source)
 
         self._detach.append(self.connection.bus.attach(message_type, take, system_id=self.system_id))

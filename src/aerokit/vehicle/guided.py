@@ -327,7 +327,9 @@ class SetpointStream(Generic[SetpointT]):
             return f"the event loop was blocked for {lag:.1f} s"
         if age > self._valid_for_s:
             return f"no new set-point came for {age:.1f} s (valid_for_s = {self._valid_for_s:g})"
-        if self._vehicle.is_silent:
+        if (
+            self._vehicle.is_silent and self._vehicle.connection.is_open
+        ):  # else sending tells what has ended it
             return f"the vehicle has been silent for {self._vehicle.heartbeat_age:.1f} s"
         if self._mode is None or not wants_motion(self._setpoint, self._vehicle):
             self._stillness = Stillness(self._vehicle)

@@ -59,7 +59,7 @@ async def await_progress(
                 return
             if done_since is None and (reason := trouble()):
                 raise OperationRejected(f"{what}: {reason}", reasons=vehicle.texts_since(reasons_from))
-            if max_silence_s is not None and vehicle.heartbeat_age > max_silence_s:
+            if max_silence_s is not None and vehicle._watch.silent_for_s > max_silence_s:
                 raise HeartbeatTimeout(f"{what}: {vehicle.describe_link()}")
             if timeout is not None and now - started >= timeout:
                 raise OperationTimeout(

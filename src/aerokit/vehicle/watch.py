@@ -15,6 +15,7 @@ from aerokit.runtime.cells import StateCell
 from aerokit.runtime.events import LinkInterrupted, LinkReport, VehicleBack, VehicleRebooted, VehicleSilent
 from aerokit.runtime.link_state import SILENT_AFTER_S
 from aerokit.runtime.link_watch import LinkStateWatch
+from aerokit.runtime.loop_watch import PERIOD_S
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -51,7 +52,7 @@ class VehicleWatch:
     ) -> None:
         self._connection, self._system_id, self._component_id = connection, system_id, component_id
         self._on_reboot = on_reboot
-        self.last_heartbeat_at = connection.now()
+        self.last_heartbeat_at = self._heartbeat_read_at = connection.now()
         self.link_state: StateCell[LinkState] = StateCell("link_state", connection.now, "HEARTBEAT")
         self._state_watch = LinkStateWatch(
             self.link_state, connection.bus, system_id=system_id, component_id=component_id
@@ -81,6 +82,15 @@ class VehicleWatch:
     def is_silent(self) -> bool:
         """Whether no heartbeat comes any more: for more than 3.5 seconds, or because the link has gone."""
         return self._is_told_silent or self._has_ended
+
+    @property
+    def silent_for_s(self) -> float:
+        """Seconds in which no heartbeat was read.
+
+        It may be older than that (:attr:`last_heartbeat_at`) when the loop was kept from reading: a pause of ours does
+        not make the vehicle silent.
+        """
+        return self._connection.now() - self._heartbeat_read_at
 
     def end(self, error: Exception) -> None:
         """Nothing will be heard any more."""
@@ -130,7 +140,7 @@ class VehicleWatch:
     def check(self) -> None:
         """Publish VehicleSilent when heartbeats have stopped; called once a second."""
         now = self._connection.now()
-        silent_for = now - self.last_heartbeat_at
+        silent_for = self.silent_for_s
         self._state_watch.check(now)
         if silent_for > SILENT_AFTER_S and not self._is_told_silent:
             self._is_told_silent = True
@@ -140,8 +150,9 @@ class VehicleWatch:
         frame = heartbeat.received_frame
         if frame is None or frame.component_id != self._component_id:
             return
-        now = frame.received_at
-        silent_for, self.last_heartbeat_at = now - self.last_heartbeat_at, now
+        now = self._connection.now()
+        silent_for, self._heartbeat_read_at = self.silent_for_s, now
+        self.last_heartbeat_at = frame.received_at
         self._state_watch.heard(now)
         if self._is_told_silent:
             self._is_told_silent = False
@@ -167,9 +178,9 @@ class VehicleWatch:
             self._note_time(frame, "TIMESYNC", message.tc1 // 1_000_000)
 
     def _note_time(self, frame: Frame, clock: str, milliseconds: int) -> None:
-        now = frame.received_at
+        now = self._connection.now()
         before, then = self._times.get(clock, (milliseconds, now))
-        late = 1000 * (now - then) - (milliseconds - before)
+        late = 1000 * (frame.received_at - then) - (milliseconds - before)  # at least: it may have come later
         if self._expects_reboot and late > LATE_MS:
             self._has_rebooted(clock, milliseconds)
         elif milliseconds + REBOOT_STEP_MS >= before:
@@ -259,7 +270,9 @@ class LinkWatch:
             return
         if message.tc1 != 0 and message.ts1 in self._asked:
             self._asked.remove(message.ts1)
-            self._round_trip_s = self._connection.now() - message.ts1 / 1e9
+            now = self._connection.now()
+            if now - frame.received_at < PERIOD_S:  # else it had waited for us
+                self._round_trip_s = now - message.ts1 / 1e9
             self._on_answer(message.ts1 / 1e9, message.tc1 // 1_000_000)
 
     def _report(self) -> None:

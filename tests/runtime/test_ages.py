@@ -1,0 +1,153 @@
+"""Ages after a pause of ours: what is read then may have come long before, and is not called younger."""
+
+from __future__ import annotations
+
+import socket
+
+import anyio
+import anyio.lowlevel
+import pytest
+from flight_harness import Flight, block_loop
+
+from aerokit import LinkState, open_connection
+from aerokit import messages as m
+from aerokit.errors import LinkLost, StaleValueError
+from aerokit.links import Peer
+from aerokit.links.base import BaseLink
+from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.runtime.connection import Connection
+from aerokit.runtime.events import VehicleRebooted, VehicleSilent
+from aerokit.runtime.loop_watch import QUIET_TURNS
+
+pytestmark = pytest.mark.anyio
+
+
+class Wire(BaseLink):
+    """A link that is nothing but its receiver."""
+
+    def __init__(self) -> None:
+        super().__init__("wire")
+        self._encoder = FrameEncoder(1, 1)
+
+    async def _connect(self) -> None: ...
+
+    def _release(self) -> None: ...
+
+    def write(self, data: bytes, peer: Peer = None) -> None: ...
+
+    def hear(self, number: int = 0) -> None:
+        self._deliver(self._encoder.encode(m.Attitude(number, 0, 0, 0, 0, 0, 0)))
+
+
+async def ages_of(connection: Connection, wire: Wire, hear: int = 1) -> list[float]:
+    ages: list[float] = []
+
+    def take(attitude: m.Attitude) -> None:
+        assert attitude.received_frame is not None
+        ages.append(connection.now() - attitude.received_frame.received_at)
+
+    (detach,) = connection.attach([m.Attitude], take)
+    for _ in range(hear):
+        wire.hear()
+        await anyio.lowlevel.checkpoint()  # as a socket that is read in bursts, one in each turn
+    detach()
+    return ages
+
+
+async def test_what_is_read_after_a_pause_is_as_old_as_the_pause() -> None:
+    wire = Wire()
+    async with open_connection(wire) as connection:
+        await anyio.sleep(5.03)
+        assert await ages_of(connection, wire) == [0.0]
+        block_loop(3.7)
+        assert await ages_of(connection, wire, hear=50) == pytest.approx([3.73] * 50, abs=0.11)
+
+
+async def test_as_old_until_all_that_waited_has_been_read() -> None:
+    """The timer that notices the pause may come before the sockets have been read."""
+    wire = Wire()
+    async with open_connection(wire) as connection:
+        await anyio.sleep(1)
+        block_loop(3.7)
+        await anyio.lowlevel.checkpoint()
+        assert all(age > 3.5 for age in await ages_of(connection, wire, hear=50))
+        for _ in range(QUIET_TURNS + 2):
+            await anyio.lowlevel.checkpoint()
+        assert await ages_of(connection, wire) == [0.0]
+        await anyio.sleep(1)
+        assert await ages_of(connection, wire) == [0.0]
+
+
+@pytest.mark.parametrize("scheme", ["udpin", "tcpin"])
+async def test_as_old_however_long_reading_takes(scheme: str) -> None:
+    """On virtual time; the sockets are real, and hold more than is read in one turn."""
+    encoder, ages = FrameEncoder(1, 1), list[float]()
+    kind = socket.SOCK_DGRAM if scheme == "udpin" else socket.SOCK_STREAM
+    async with open_connection(f"{scheme}:127.0.0.1:0") as connection:
+        host, port = connection.link.address.removeprefix(f"{scheme}:").split(":")
+
+        def take(attitude: m.Attitude) -> None:
+            assert attitude.received_frame is not None
+            ages.append(connection.now() - attitude.received_frame.received_at)
+
+        connection.attach([m.Attitude], take)
+        with socket.socket(socket.AF_INET, kind) as sender:
+            sender.connect((host, int(port)))
+            await anyio.sleep(1)
+            for number in range(300):
+                sender.send(encoder.encode(m.Attitude(number, 0, 0, 0, 0, 0, 0)))
+            block_loop(3.7)
+            while len(ages) < 300:
+                await anyio.lowlevel.checkpoint()
+    assert min(ages) > 3.6
+
+
+async def test_a_short_pause_is_the_error_of_all_ages() -> None:
+    wire = Wire()
+    async with open_connection(wire) as connection:
+        await anyio.sleep(1)
+        block_loop(0.15)
+        (age,) = await ages_of(connection, wire)
+        assert age <= 0.3
+
+
+async def test_a_value_from_before_the_pause_is_not_fresh(grounded: Flight) -> None:
+    vehicle = grounded.vehicle
+    cell = vehicle.message(m.Attitude)
+    await anyio.sleep(1)
+    assert vehicle.attitude.fresh(within=0.5)
+    block_loop(3.7)
+    await anyio.lowlevel.checkpoint()
+    await anyio.lowlevel.checkpoint()
+    for each in (vehicle.attitude, cell):
+        with pytest.raises(StaleValueError):
+            each.fresh(within=0.5)
+    assert vehicle.heartbeat_age > 3.5
+    await anyio.sleep(1.2)
+    assert vehicle.attitude.fresh(within=0.5)
+    assert cell.fresh(within=0.5)
+    assert vehicle.heartbeat_age < 1.2
+
+
+async def test_a_pause_is_neither_silence_nor_a_reboot_nor_a_long_way(grounded: Flight) -> None:
+    vehicle = grounded.vehicle
+    await anyio.sleep(3)
+    round_trip = vehicle.link_quality.value.round_trip_s
+    assert round_trip is not None
+    assert round_trip < 0.1
+    with vehicle.subscribe(VehicleSilent, VehicleRebooted, capacity=5) as events:
+        vehicle._link_watch.ask()
+        block_loop(10)
+        await anyio.sleep(0.3)
+        assert vehicle._link_watch.round_trip_s == pytest.approx(round_trip, abs=0.05)
+        assert vehicle.link_state.value is LinkState.CONNECTED
+        await anyio.sleep(5)
+        assert events.get_nowait() is None
+
+
+async def test_nothing_is_watched_after_the_end() -> None:
+    wire = Wire()
+    async with open_connection(wire) as connection:
+        connection.link_lost(LinkLost("unplugged"))
+        block_loop(5)
+        await anyio.sleep(1)
