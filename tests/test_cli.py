@@ -164,6 +164,7 @@ def test_ctrl_c_in_the_air_lands_the_vehicle(tmp_path: Path) -> None:
     with served([copter]) as address, in_the_air(address, tmp_path) as process:
         process.send_signal(signal.SIGINT)
         told = read_rest(process)
+        assert "interrupted, in GUIDED, still armed, " in told or "interrupted, holding in BRAKE, still armed" in told
         assert "landing here" in told
         assert "disarmed" in told
         assert process.returncode == 130
@@ -176,7 +177,7 @@ def test_a_second_ctrl_c_leaves_it_landing(tmp_path: Path) -> None:
         process.send_signal(signal.SIGINT)
         read_until(process, "mode LAND")
         process.send_signal(signal.SIGINT)
-        assert "interrupted again: left in LAND" in read_rest(process)
+        assert "interrupted again: left in LAND, still armed, " in read_rest(process)
         assert process.returncode == 130
 
 

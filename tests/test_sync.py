@@ -430,3 +430,13 @@ def test_two_vehicles_on_one_connection_share_its_thread() -> None:
 def test_the_asynchronous_vehicle_is_in_reach(vehicle: aerokit.sync.Vehicle) -> None:
     assert isinstance(vehicle.aio, aerokit.Vehicle)
     assert inspect.isasyncgenfunction(inspect.unwrap(open_connection))
+
+
+def test_an_exception_in_flight_says_what_the_vehicle_does(caplog: pytest.LogCaptureFixture) -> None:
+    with served_copter() as address, pytest.raises(KeyboardInterrupt):
+        with aerokit.sync.connect(address) as vehicle:
+            vehicle.wait_ready()
+            vehicle.arm()
+            vehicle.take_off(5)
+            raise KeyboardInterrupt
+    assert "vehicle 1 is let go: in GUIDED, still armed, " in caplog.text
