@@ -164,7 +164,10 @@ def test_ctrl_c_in_the_air_lands_the_vehicle(tmp_path: Path) -> None:
     with served([copter]) as address, in_the_air(address, tmp_path) as process:
         process.send_signal(signal.SIGINT)
         told = read_rest(process)
-        assert "interrupted, in GUIDED, still armed, " in told or "interrupted, holding in BRAKE, still armed" in told
+        assert (
+            "interrupted, in GUIDED, still armed, " in told
+            or "interrupted, holding in BRAKE, still armed" in told
+        )
         assert "landing here" in told
         assert "disarmed" in told
         assert process.returncode == 130

@@ -433,10 +433,13 @@ def test_the_asynchronous_vehicle_is_in_reach(vehicle: aerokit.sync.Vehicle) -> 
 
 
 def test_an_exception_in_flight_says_what_the_vehicle_does(caplog: pytest.LogCaptureFixture) -> None:
-    with served_copter() as address, pytest.raises(KeyboardInterrupt):
-        with aerokit.sync.connect(address) as vehicle:
-            vehicle.wait_ready()
-            vehicle.arm()
-            vehicle.take_off(5)
-            raise KeyboardInterrupt
+    with (
+        served_copter() as address,
+        pytest.raises(KeyboardInterrupt),
+        aerokit.sync.connect(address) as vehicle,
+    ):
+        vehicle.wait_ready()
+        vehicle.arm()
+        vehicle.take_off(5)
+        raise KeyboardInterrupt
     assert "vehicle 1 is let go: in GUIDED, still armed, " in caplog.text

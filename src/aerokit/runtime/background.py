@@ -32,16 +32,12 @@ class Background:
     def __len__(self) -> int:
         return len(self._tasks)
 
-    def start(
-        self, function: Callable[[], Awaitable[None]], name: str | None = None
-    ) -> asyncio.Task[None] | None:
-        """Run it in a task of its own, which may be cancelled; nothing happens after :meth:`cancel`."""
-        if self._is_over:
-            return None
-        task = asyncio.get_running_loop().create_task(self._guarded(function), name=name)
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
-        return task
+    def start(self, function: Callable[[], Awaitable[None]], name: str | None = None) -> None:
+        """Run it in a task of its own; nothing happens after :meth:`cancel`."""
+        if not self._is_over:
+            task = asyncio.get_running_loop().create_task(self._guarded(function), name=name)
+            self._tasks.add(task)
+            task.add_done_callback(self._tasks.discard)
 
     def cancel(self) -> None:
         """Have all of them end, and start no more. Never blocks; idempotent."""

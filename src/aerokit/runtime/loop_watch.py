@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 __all__ = ["PERIOD_S", "LoopWatch"]
 
 PERIOD_S = 0.1
+"""How often it is looked."""
 LATE_AFTER_S = 0.1
 BLOCKED_AFTER_S = 0.25
 QUIET_TURNS = 3

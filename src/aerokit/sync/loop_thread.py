@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Generic, ParamSpec, TypeVar
 import anyio
 
 from aerokit.errors import BusyError, ConnectionClosed, LinkOpenError
+from aerokit.runtime.cancellation import Cancellation
 from aerokit.sync.reply import Reply
 
 if TYPE_CHECKING:
@@ -272,15 +273,12 @@ class _Call(Reply[T]):
     def __init__(self, function: Callable[[], Awaitable[T]]) -> None:
         super().__init__()
         self._function = function
-        self._scope: anyio.CancelScope | None = None
-        self._is_cancelled = False
+        self._cancellation = Cancellation()
         self.was_started = False
 
     def cancel(self) -> None:
-        """Cancel it; idempotent."""
-        self._is_cancelled = True
-        if self._scope is not None:
-            self._scope.cancel()
+        """Cancel it (loop thread); idempotent."""
+        self._cancellation.cancel()
 
     def result(self) -> T:
         """As of any reply; ConnectionClosed when it was cancelled."""
@@ -290,9 +288,7 @@ class _Call(Reply[T]):
 
     async def live(self) -> None:
         """Run it; never raises but when cancelled."""
-        with anyio.CancelScope() as self._scope:  # here: outside tasks anyio does not know what is running
-            if self._is_cancelled:
-                self._scope.cancel()
+        with self._cancellation:
             try:
                 self.give(await self._function())
             except asyncio.CancelledError:

@@ -20,8 +20,8 @@ from aerokit.sync.parameters import Parameters
 from aerokit.sync.state import VehicleState
 from aerokit.sync.subscription import Subscription
 from aerokit.vehicle.connect import connect as connect_async
-from aerokit.vehicle.progress import LONGEST_SILENCE_S
 from aerokit.vehicle.connect import tell_how_it_is_left
+from aerokit.vehicle.progress import LONGEST_SILENCE_S
 
 if TYPE_CHECKING:
     import os

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,7 @@ from aerokit.errors import (
     OperationRejected,
     OperationTimeout,
 )
+from aerokit.runtime.cancellation import Cancellation
 from aerokit.vehicle.checks import check_seconds
 from aerokit.vehicle.holding import HoldingActions
 from aerokit.vehicle.progress import await_progress
@@ -49,8 +51,8 @@ logger = logging.getLogger("aerokit")
 class ArmingActions(HoldingActions):
     """From standing there to running motors, and back."""
 
-    _late_arming: anyio.CancelScope | None = None
-    _late_arming_is_over: anyio.Event | None = None
+    _late_arming: Cancellation | None = None
+    _late_arming_is_over: asyncio.Event | None = None
 
     async def wait_ready(self, *, timeout: float = 90.0) -> None:
         """Wait until position and home are known, the estimator is healthy and the pre-arm checks pass.
@@ -195,7 +197,7 @@ class ArmingActions(HoldingActions):
     def _watch_for_late_arming(self) -> None:
         """The order to arm was given up; it may have been heard, or may still arrive."""
         self.connection.discard_unsent()
-        scope, is_over = anyio.CancelScope(), anyio.Event()
+        scope, is_over = Cancellation(), asyncio.Event()
         self._late_arming, self._late_arming_is_over = scope, is_over
 
         async def watch() -> None:

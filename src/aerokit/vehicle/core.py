@@ -37,8 +37,8 @@ if TYPE_CHECKING:
     from aerokit.runtime.bus import Detach, Sink
     from aerokit.runtime.connection import Connection
     from aerokit.runtime.events import Event
-    from aerokit.vehicle.orders import Order
     from aerokit.runtime.link_state import LinkState
+    from aerokit.vehicle.orders import Order
 
 __all__ = ["VehicleCore"]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import math
 from typing import TYPE_CHECKING, Any
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import anyio
 
 from aerokit.errors import AerokitError, OperationTimeout
+from aerokit.runtime.cancellation import Cancellation
 from aerokit.vehicle.modes import CHANGE_MODE, DO_REPOSITION, DO_SET_MODE, ModeActions
 
 if TYPE_CHECKING:
@@ -37,8 +39,8 @@ class HoldingActions(ModeActions):
 
     _stream: SetpointStream[Any] | None = None
     """The set-point stream that is open."""
-    _hold_scope: anyio.CancelScope | None = None
-    _hold_is_over: anyio.Event | None = None
+    _hold_scope: Cancellation | None = None
+    _hold_is_over: asyncio.Event | None = None
 
     def __init__(
         self, connection: Connection, system_id: int, component_id: int, heartbeat: Heartbeat
@@ -95,7 +97,7 @@ class HoldingActions(ModeActions):
             self._send_hold(mode)
             order = self._helm.order(*order.modes, mode)
             self._helm.doubt_mode()
-        scope, is_over = anyio.CancelScope(), anyio.Event()
+        scope, is_over = Cancellation(), asyncio.Event()
         self._hold_scope, self._hold_is_over = scope, is_over
 
         async def finish() -> None:
@@ -150,6 +152,11 @@ class HoldingActions(ModeActions):
         if self._hold_scope is not None:
             self._hold_scope.cancel()
             self._hold_scope = None
+
+    @property
+    def _is_told_to_hold(self) -> bool:
+        """Whether a flight was given up and the hold that was ordered is not confirmed yet."""
+        return self._hold_scope is not None
 
     async def _finish_hold(self) -> None:
         """At the end of everything: give an order to hold the time to be answered, or to be given again."""

@@ -200,7 +200,7 @@ class VehicleState(VehicleHealth):
         return "unknown" if mode is None else mode.name
 
     def describe_now(self) -> str:
-        """What it does, as far as it was heard: ``holding in BRAKE, still armed, 9.8 m above home, heard 0.3 s ago``."""
+        """What it does, as far as it was heard: ``holding in BRAKE, still armed, 9 m above home, heard 0.3 s ago``."""
         hold, mode = self.autopilot.mode_for("hold", is_vtol=self.is_vtol), self.telemetry.mode.latest
         armed = "still armed" if self.is_armed else "disarmed" if self.is_surely_disarmed else "perhaps armed"
         position = self.telemetry.position.latest
