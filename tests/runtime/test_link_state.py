@@ -49,7 +49,6 @@ async def test_the_way_from_connected_to_lost_is_a_state_and_an_event(grounded: 
 
 async def test_after_the_link_is_lost_the_vehicle_is_silent(grounded: Flight) -> None:
     vehicle = grounded.vehicle
-    assert not vehicle.is_silent
     vehicle.connection.link_lost(LinkLost("unplugged"))
     assert vehicle.is_silent
     assert (vehicle.link_state.value, vehicle.connection.link_state.value) == (LOST, LOST)
