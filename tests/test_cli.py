@@ -78,6 +78,11 @@ def read_rest(process: subprocess.Popen[str]) -> str:
         ["sim", "--home", "47.4,8.5,nan"],
         ["sim", "--parameter", "MNT1_TYPE"],
         ["sim", "--parameter", "MNT1_TYPE=servo"],
+        ["sim", "--parameter", "RTL_ALT=nan"],
+        ["sim", "--parameter", "RTL_ALT=-inf"],
+        ["sim", "--parameter", "RTL_ALT=1e39"],
+        ["params", "set", "udpin:127.0.0.1:1", "RTL_ALT=nan"],
+        ["params", "set", "udpin:127.0.0.1:1", "RTL_ALT"],
     ],
     ids=" ".join,
 )

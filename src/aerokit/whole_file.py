@@ -1,11 +1,16 @@
-"""``write_whole``: a text file that appears whole or not at all."""
+"""``write_whole``: a text file that appears whole or not at all; ``read_bounded``: one that is not too long."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
 
-__all__ = ["write_whole"]
+from aerokit.errors import FileFormatError
+
+__all__ = ["LARGEST_FILE", "read_bounded", "too_large", "write_whole"]
+
+LARGEST_FILE = 16 << 20
+"""Bytes of the largest file of parameters, metadata, plans or definitions that is read; real ones have 5 MB at most."""
 
 
 def write_whole(path: str | os.PathLike[str], text: str) -> None:
@@ -20,3 +25,17 @@ def write_whole(path: str | os.PathLike[str], text: str) -> None:
         part.replace(target)
     finally:
         part.unlink(missing_ok=True)
+
+
+def read_bounded(path: str | os.PathLike[str]) -> bytes:
+    """All bytes of a file; FileFormatError beyond :data:`LARGEST_FILE`, OSError when it cannot be read."""
+    with open(path, "rb") as file:
+        data = file.read(LARGEST_FILE + 1)
+    if len(data) > LARGEST_FILE:
+        raise too_large(os.fspath(path))
+    return data
+
+
+def too_large(name: str) -> FileFormatError:
+    """The complaint about a file beyond :data:`LARGEST_FILE`."""
+    return FileFormatError(f"{name} has more than {LARGEST_FILE >> 20} MB: that is no such file")

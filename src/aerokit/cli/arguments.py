@@ -11,7 +11,8 @@ from aerokit import geo
 from aerokit.cli.places import place_of
 from aerokit.errors import AerokitError, LocalProtocolError
 from aerokit.links import parse_address
-from aerokit.parameters import check_name
+from aerokit.parameters import ParameterType, check_name, checked_value
+from aerokit.parameters.number_text import parse_number
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 __all__ = [
     "address",
     "address_or_form",
+    "assignment",
     "count",
     "directory",
     "home",
@@ -107,13 +109,26 @@ def number(low: float, high: float) -> Callable[[str], float]:
     return parse
 
 
-def parameter(text: str) -> tuple[str, float]:
-    """``NAME=VALUE``."""
-    name, _, value = text.partition("=")
+def assignment(text: str) -> tuple[str, int | float]:
+    """``NAME=VALUE``, a parameter and what it may be set to; whole numbers also as 0x1F."""
+    name, mark, value = text.partition("=")
     try:
-        return check_name(name.upper()), float(value)
+        number = parse_number(value)
     except ValueError:
-        raise ArgumentTypeError(f"{text!r} is not NAME=VALUE, a parameter and a number") from None
+        mark = ""
+    if not mark:
+        raise ArgumentTypeError(f"{text!r} is not NAME=VALUE with a finite number")
+    try:
+        checked_value(check_name(name), number, ParameterType.REAL32)
+    except LocalProtocolError as error:
+        raise ArgumentTypeError(str(error)) from None
+    return name, number
+
+
+def parameter(text: str) -> tuple[str, float]:
+    """The same of a simulated vehicle, whose names are in capitals."""
+    name, number = assignment(text)
+    return name.upper(), float(number)
 
 
 def system_id(text: str) -> int:

@@ -6,7 +6,7 @@ import argparse
 import fnmatch
 from typing import TYPE_CHECKING
 
-from aerokit.cli.arguments import writable_file
+from aerokit.cli.arguments import assignment, writable_file
 from aerokit.cli.progress import progress_bar
 from aerokit.cli.vehicle_command import add_action, connected
 
@@ -50,19 +50,6 @@ def _add_writing(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -
     set_.add_argument("values", nargs="+", type=assignment, metavar="NAME=VALUE")
     load = add_action(actions, "load", _load, "Set all parameters of a file that differ on the vehicle.")
     load.add_argument("file")
-
-
-def assignment(text: str) -> tuple[str, float]:
-    """``NAME=VALUE``."""
-    name, _, value = text.partition("=")
-    try:
-        return name, int(value, 0)
-    except ValueError:
-        pass
-    try:
-        return name, float(value)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not NAME=VALUE with a number") from None
 
 
 # ---------------------------------------------------------------------------------------- actions

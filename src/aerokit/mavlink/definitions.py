@@ -7,14 +7,23 @@ for CRC_EXTRA, https://mavlink.io/en/guide/serialization.html.
 from __future__ import annotations
 
 import keyword
+import os
 import re
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from xml.etree import ElementTree
+from typing import TYPE_CHECKING
+from xml.etree.ElementTree import ParseError
+
+from defusedxml import ElementTree as DefusedXml
 
 from aerokit.errors import LocalProtocolError
 from aerokit.mavlink.checksum import x25
+from aerokit.whole_file import read_bounded
+
+if TYPE_CHECKING:
+    from xml.etree.ElementTree import Element
 
 __all__ = [
     "DialectDefinition",
@@ -42,15 +51,17 @@ SIZES = {
 }
 """Bytes on the wire of each type the standard knows."""
 
+_LOWEST, _HIGHEST = -(1 << 63), (1 << 64) - 1
+
 # Names that a message class needs for itself; a private dialect's field of that name gets a trailing underscore.
 _RESERVED = frozenset(
     (
         *("ID", "NAME", "CRC_EXTRA", "FIELDS", "LENGTH", "BASE_LENGTH", "received_frame"),
-        *("decode", "decode_body", "encode", "to_dict", "self", "cls"),
+        *("decode", "decode_body", "encode", "to_dict", "self", "cls", "tuple"),
     )
 )
 _IDENTIFIER = re.compile(r"[A-Za-z][A-Za-z0-9_]*\Z")
-_FIELD_TYPE = re.compile(r"(\w+?)(?:_mavlink_version)?(?:\[(\d+)\])?\Z")
+_FIELD_TYPE = re.compile(r"(\w+?)(?:_mavlink_version)?(?:\[([0-9]{1,3})\])?\Z")
 
 
 @dataclass(frozen=True)
@@ -167,14 +178,15 @@ class DialectDefinition:
 
 def cap_words(name: str) -> str:
     """``GLOBAL_POSITION_INT`` → ``GlobalPositionInt``."""
-    return "".join(part.capitalize() for part in name.split("_"))
+    words = "".join(part.capitalize() for part in name.split("_"))
+    return words + "_" if keyword.iskeyword(words) else words  # None, True, False
 
 
 def read_dialect(path: Path, search: Sequence[Path] = ()) -> list[DialectDefinition]:
     """Read a file and everything it includes, the included first.
 
     Includes are looked for beside the file, then in the folders of ``search``.
-    Raises LocalProtocolError when a file is missing or is no MAVLink XML.
+    Raises LocalProtocolError when a file is missing, has more than 16 MB or is no MAVLink XML.
     """
     found: dict[str, DialectDefinition] = {}
     pending: set[str] = set()
@@ -195,7 +207,7 @@ def read_dialect(path: Path, search: Sequence[Path] = ()) -> list[DialectDefinit
 def read_xml(path: Path) -> DialectDefinition:
     """Read one file, without what it includes; LocalProtocolError when it is no MAVLink XML."""
     try:
-        root = ElementTree.parse(path).getroot()
+        root = DefusedXml.fromstring(read_bounded(path), forbid_dtd=True)
         return DialectDefinition(
             name=path.stem,
             messages=tuple(_message(node, path.stem) for node in root.findall("messages/message")),
@@ -204,7 +216,9 @@ def read_xml(path: Path) -> DialectDefinition:
         )
     except FileNotFoundError:
         raise LocalProtocolError(f"no dialect file {path}") from None
-    except (ElementTree.ParseError, KeyError, ValueError) as error:
+    except LocalProtocolError:
+        raise
+    except (ParseError, LookupError, ValueError) as error:
         raise LocalProtocolError(f"{path} is not a MAVLink dialect: {error!r}") from error
 
 
@@ -229,13 +243,13 @@ def merged_enums(dialects: Iterable[DialectDefinition]) -> list[EnumDefinition]:
 def _find_include(include: str, file: Path, search: Sequence[Path]) -> Path:
     folders = [file.parent, *search]
     for folder in folders:
-        if (folder / include).is_file():
+        if os.path.isfile(folder / include):  # whatever the name is: Path.is_file raises for a long one
             return folder / include
     looked = ", ".join(str(folder) for folder in folders)
     raise LocalProtocolError(f"{file.name} includes {include}, which is in none of: {looked}")
 
 
-def _message(node: ElementTree.Element, origin: str) -> MessageDefinition:
+def _message(node: Element, origin: str) -> MessageDefinition:
     fields: list[FieldDefinition] = []
     extension = False
     for child in node:
@@ -253,14 +267,18 @@ def _message(node: ElementTree.Element, origin: str) -> MessageDefinition:
     )
     if not 0 <= message.id < 1 << 24:
         raise ValueError(f"{message.name}: message id {message.id} is not in 0..16777215")
+    names = Counter(each.attribute for each in fields)
+    twice = [name for name, count in names.items() if count > 1]
+    if twice:
+        raise ValueError(f"{message.name}: the field {twice[0]} is defined twice")
     if message.length > 255:
         raise ValueError(f"{message.name}: a payload of {message.length} bytes, at most 255 fit in a frame")
     return message
 
 
-def _field(node: ElementTree.Element, extension: bool) -> FieldDefinition:
+def _field(node: Element, extension: bool) -> FieldDefinition:
     found = _FIELD_TYPE.match(node.attrib["type"])
-    if found is None or found[1] not in SIZES:
+    if found is None or found[1] not in SIZES or found[2] == "0":
         raise ValueError(f"unknown field type {node.attrib['type']!r}")
     return FieldDefinition(
         name=_identifier(node.attrib["name"]),
@@ -271,11 +289,11 @@ def _field(node: ElementTree.Element, extension: bool) -> FieldDefinition:
         invalid=node.get("invalid", ""),
         description=_text(node),
         extension=extension,
-        default=3 if node.attrib["type"].endswith("_mavlink_version") else None,
+        default=3 if node.attrib["type"] == "uint8_t_mavlink_version" else None,
     )
 
 
-def _enum(node: ElementTree.Element, origin: str) -> EnumDefinition:
+def _enum(node: Element, origin: str) -> EnumDefinition:
     entries: list[EntryDefinition] = []
     highest = 0
     for child in node.findall("entry"):
@@ -300,7 +318,7 @@ def _enum(node: ElementTree.Element, origin: str) -> EnumDefinition:
     )
 
 
-def _param(node: ElementTree.Element) -> tuple[int, str, str, str]:
+def _param(node: Element) -> tuple[int, str, str, str]:
     return int(node.attrib["index"]), node.get("label", ""), node.get("units", ""), _text(node)
 
 
@@ -309,8 +327,16 @@ def _integer(text: str) -> int:
     for operator in ("<<", "**"):
         if operator in text:
             left, right = (int(part.strip(), 0) for part in text.split(operator))
-            return left << right if operator == "<<" else int(left**right)
-    return int(text.strip(), 0)
+            if not (0 <= left <= _HIGHEST and 0 <= right <= 64):
+                raise ValueError(f"{text!r} is no value of an enum")
+            return _in_range(left << right if operator == "<<" else int(left**right))
+    return _in_range(int(text.strip(), 0))
+
+
+def _in_range(value: int) -> int:
+    if not _LOWEST <= value <= _HIGHEST:
+        raise ValueError(f"the value of an enum is beyond 64 bits: {value:#x}")
+    return value
 
 
 def _identifier(name: str) -> str:
@@ -319,11 +345,11 @@ def _identifier(name: str) -> str:
     return name
 
 
-def _text(node: ElementTree.Element | None) -> str:
+def _text(node: Element | None) -> str:
     return "" if node is None else " ".join("".join(node.itertext()).split())
 
 
-def _remarks(node: ElementTree.Element) -> tuple[str, ...]:
+def _remarks(node: Element) -> tuple[str, ...]:
     remarks: list[str] = []
     for child in node:
         if child.tag in ("deprecated", "superseded"):
@@ -340,6 +366,8 @@ def _remarks(node: ElementTree.Element) -> tuple[str, ...]:
 
 
 def _common_prefix(enum: str, names: list[str]) -> str:
+    if not names:
+        return ""
     own = enum + "_"
     if sum(name.startswith(own) for name in names) * 2 > len(names):
         return own

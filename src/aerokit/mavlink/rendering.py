@@ -6,6 +6,7 @@ kinds of classes are the same.
 
 from __future__ import annotations
 
+import json
 import textwrap
 from collections.abc import Iterable
 
@@ -147,7 +148,7 @@ def _docstring(paragraphs: Iterable[str], indent: str) -> list[str]:
 
 
 def _quoted(text: str) -> str:
-    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    return json.dumps(text, ensure_ascii=False)  # the same rules, control characters included
 
 
 def _tuple(name: str, items: list[str]) -> list[str]:

@@ -86,17 +86,15 @@ def _dialect(name: str, definitions: Iterable[MessageDefinition], enums: Iterabl
                 f" {definition.name} in {definition.origin}"
             )
     classes = [_standard_class(definition) or compile_message(definition) for definition in by_id.values()]
-    enum_types = {
-        enum.name: make_enum(
-            f"{__name__}.{name}",
-            enum.class_name,
-            enum.bitmask,
-            enum.description,
-            [(member, entry.value) for member, entry in enum.members()],
-        )
-        for enum in enums
-    }
-    return Dialect(name, classes, enum_types)
+    return Dialect(name, classes, {enum.name: _enum_type(name, enum) for enum in enums})
+
+
+def _enum_type(dialect: str, enum: EnumDefinition) -> type[Any]:
+    members = [(member, entry.value) for member, entry in enum.members()]
+    try:
+        return make_enum(f"{__name__}.{dialect}", enum.class_name, enum.bitmask, enum.description, members)
+    except (TypeError, ValueError) as error:  # two of a name, names that Python keeps for itself
+        raise LocalProtocolError(f"enum {enum.name} of {enum.origin or dialect}: {error}") from error
 
 
 def _standard_class(definition: MessageDefinition) -> type[Message] | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 from aerokit.errors import FileFormatError
@@ -41,7 +42,8 @@ class JsonValue:
 
     def error(self, expected: str) -> FileFormatError:
         """The complaint that this value is not what was expected."""
-        found = json.dumps(self.value)
+        # Piece by piece, so that a large value is not written out to be cut off.
+        found = "".join(islice(json.JSONEncoder().iterencode(self.value), 41))
         found = found if len(found) <= 40 else f"{found[:37]}..."
         return FileFormatError(f"{self.name}: {self.path or 'the document'} = {found}: expected {expected}")
 

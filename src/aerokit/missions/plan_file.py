@@ -76,6 +76,20 @@ def format_plan(plan: Plan) -> str:
     Raises :class:`LocalProtocolError` for what such a file cannot keep: rally points and a return point of the fence
     with altitudes other than above home, numbers that are infinite.
     """
+    try:
+        return json.dumps(_document(plan), indent=4, allow_nan=False) + "\n"
+    except RecursionError:
+        raise LocalProtocolError(
+            "the plan was read from a file that is nested too deep to be written"
+        ) from None
+    except LocalProtocolError:
+        raise
+    except ValueError as error:
+        raise LocalProtocolError("a number of the plan is not finite: a .plan file cannot keep it") from error
+
+
+def _document(plan: Plan) -> dict[str, Any]:
+    document: dict[str, Any]
     if plan.source:
         document, old = json.loads(plan.source), parse_plan(plan.source)
     else:
@@ -89,10 +103,7 @@ def format_plan(plan: Plan) -> str:
     if old is None or plan.rally != old.rally:
         points = [_rally_point(item, index) for index, item in enumerate(plan.rally)]
         document.setdefault("rallyPoints", {}).update({"points": points, "version": 2})
-    try:
-        return json.dumps(document, indent=4, allow_nan=False) + "\n"
-    except ValueError as error:
-        raise LocalProtocolError("a number of the plan is not finite: a .plan file cannot keep it") from error
+    return document
 
 
 # ------------------------------------------------------------------------------------------- reading

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Mapping
-from pathlib import Path
 from typing import Literal
 
 from aerokit.errors import FileFormatError, LocalProtocolError
@@ -18,7 +17,7 @@ from aerokit.parameters.differences import ParameterValues, plain_values
 from aerokit.parameters.number_text import number_text, parse_number
 from aerokit.parameters.parameter import Parameter, ParameterType, check_name, checked_value
 from aerokit.parameters.table import ParameterTable
-from aerokit.whole_file import write_whole
+from aerokit.whole_file import read_bounded, write_whole
 
 __all__ = [
     "FileFormat",
@@ -79,11 +78,11 @@ def read_parameter_file(path: str | os.PathLike[str], *, component_id: int | Non
     """Read a file of any of the three formats; which one is seen from its first parameter.
 
     Of a QGroundControl file with several components ``component_id`` chooses one; the autopilot's (1) otherwise. Raises
-    :class:`FileFormatError` naming the line for a damaged one, a name twice, NaN, a name over 16 characters;
-    OSError when the file cannot be read.
+    :class:`FileFormatError` naming the line for a damaged one, a name twice, NaN, a name over 16 characters, and for
+    more than 16 MB; OSError when the file cannot be read.
     """
     try:
-        text = Path(path).read_bytes().decode("utf-8-sig")
+        text = read_bounded(path).decode("utf-8-sig")
     except UnicodeDecodeError:
         raise FileFormatError(f"{os.fspath(path)} is no parameter file: it is no text (UTF-8)") from None
     return parse_parameter_file(text, os.fspath(path), component_id=component_id)

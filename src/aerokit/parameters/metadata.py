@@ -17,15 +17,16 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterable, Iterator, Mapping
-from pathlib import Path
 from types import MappingProxyType
 
 from aerokit.errors import FileFormatError, LocalProtocolError
 from aerokit.snapshot import Snapshot
+from aerokit.whole_file import LARGEST_FILE, read_bounded, too_large
 
 __all__ = ["Metadata", "ParameterMetadata", "load_metadata", "parse_metadata"]
 
 _XZ = b"\xfd7zXZ\x00"
+_MOST_MEMORY = 128 << 20  # xz -9 takes 65 MB
 _NOTHING: Mapping[float, str] = MappingProxyType({})
 _NO_BITS: Mapping[int, str] = MappingProxyType({})
 
@@ -58,7 +59,7 @@ class ParameterMetadata(Snapshot):
         """A value in words: its name, the names of its bits, or the number with its unit."""
         if value in self.values:
             return self.values[value]
-        if self.bitmask and value == int(value) and value >= 0:
+        if self.bitmask and 0 <= value < math.inf and value == int(value):
             bits = [bit for bit in range(64) if int(value) >> bit & 1]
             return ", ".join(self.bitmask.get(bit, f"bit {bit}") for bit in bits) or "none"
         return f"{value:g} {self.unit}".rstrip()
@@ -121,10 +122,11 @@ class Metadata(Mapping[str, ParameterMetadata]):
 def load_metadata(path: str | os.PathLike[str]) -> Metadata:
     """Read a file of either autopilot, XML or JSON, compressed (``.xz``) or not; see above for where they are.
 
-    Raises :class:`FileFormatError` when it is none of these, OSError when it cannot be read. Of a parameter that stands
-    in the file several times, for frame types that do not exist together, the first counts.
+    Raises :class:`FileFormatError` when it is none of these or has more than 16 MB (unpacked, too),
+    OSError when it cannot be read. Of a parameter that stands in the file several times, for frame types that do not
+    exist together, the first counts.
     """
-    return parse_metadata(Path(path).read_bytes(), os.fspath(path))
+    return parse_metadata(read_bounded(path), os.fspath(path))
 
 
 def parse_metadata(data: bytes, source: str = "metadata") -> Metadata:
@@ -132,8 +134,10 @@ def parse_metadata(data: bytes, source: str = "metadata") -> Metadata:
     from aerokit.parameters import metadata_formats
 
     try:
-        found = metadata_formats.parse(_unpacked(data))
-    except (ValueError, SyntaxError, TypeError, AttributeError, LookupError) as error:
+        found = metadata_formats.parse(_unpacked(data, source))
+    except FileFormatError:
+        raise
+    except (ValueError, SyntaxError, TypeError, AttributeError, LookupError, RecursionError) as error:
         raise FileFormatError(
             f"{source} is no apm.pdef.xml, apm.pdef.json, parameters.xml or parameters.json: {error}"
         ) from None
@@ -142,12 +146,19 @@ def parse_metadata(data: bytes, source: str = "metadata") -> Metadata:
     return Metadata(found)
 
 
-def _unpacked(data: bytes) -> bytes:
+def _unpacked(data: bytes, source: str) -> bytes:
+    """Never more than LARGEST_FILE, whatever a small file claims to hold."""
     if not data.startswith(_XZ):
         return data
     import lzma  # some builds of Python are without it
 
+    unpacker = lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=_MOST_MEMORY)
     try:
-        return lzma.decompress(data)
+        unpacked = unpacker.decompress(data, LARGEST_FILE + 1)
     except lzma.LZMAError as error:
         raise ValueError(error) from None
+    if len(unpacked) > LARGEST_FILE:
+        raise too_large(source)
+    if not unpacker.eof:
+        raise ValueError("it is cut off")
+    return unpacked

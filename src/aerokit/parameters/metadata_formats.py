@@ -7,26 +7,35 @@ generators write "0 10" and "-1,1" by hand; a file of another kind raises ValueE
 from __future__ import annotations
 
 import json
+import reprlib
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any
-from xml.etree import ElementTree
+from typing import TYPE_CHECKING, Any
+
+from defusedxml import ElementTree as DefusedXml
 
 from aerokit.parameters.metadata import ParameterMetadata
 from aerokit.parameters.number_text import parse_number
 
+if TYPE_CHECKING:
+    from xml.etree.ElementTree import Element
+
 __all__ = ["parse"]
+
+_BITS = range(64)
 
 
 def parse(data: bytes) -> list[ParameterMetadata]:
     """What the file says of each parameter, in its order."""
     if data.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<"):
-        root = ElementTree.fromstring(data)
+        root = DefusedXml.fromstring(data, forbid_dtd=True)
         if root.tag == "paramfile":
             return list(_ardupilot_xml(root))
         if root.tag == "parameters":
             return list(_px4_xml(root))
         raise ValueError(f"its outermost element is <{root.tag}>")
     content = json.loads(data.decode("utf-8-sig"))
+    if not isinstance(content, dict):
+        raise ValueError("its outermost value is no object")
     if isinstance(content.get("parameters"), list):
         return [_px4_entry(entry) for entry in content["parameters"]]
     return list(_ardupilot_json(content))
@@ -35,7 +44,7 @@ def parse(data: bytes) -> list[ParameterMetadata]:
 # ------------------------------------------------------------------------------------- ArduPilot
 
 
-def _ardupilot_xml(root: ElementTree.Element) -> Iterator[ParameterMetadata]:
+def _ardupilot_xml(root: Element) -> Iterator[ParameterMetadata]:
     for group in root.iter("parameters"):
         for param in group.iter("param"):
             fields = {field.get("name", ""): field.text or "" for field in param.iter("field")}
@@ -66,9 +75,9 @@ def _ardupilot_json(content: Mapping[str, Any]) -> Iterator[ParameterMetadata]:
             limits = fields.get("Range", {})
             yield ParameterMetadata(
                 name,
-                short_description=fields["DisplayName"],
-                description=fields.get("Description", ""),
-                unit=fields.get("Units", ""),
+                short_description=_text(fields["DisplayName"]),
+                description=_text(fields.get("Description", "")),
+                unit=_text(fields.get("Units", "")),
                 minimum=_number(limits.get("low")),
                 maximum=_number(limits.get("high")),
                 increment=_number(fields.get("Increment")),
@@ -76,7 +85,7 @@ def _ardupilot_json(content: Mapping[str, Any]) -> Iterator[ParameterMetadata]:
                 bitmask=_bits(fields.get("Bitmask", {}).items()),
                 reboot_required=_is_true(fields.get("RebootRequired")),
                 group=group,
-                category=fields.get("User", ""),
+                category=_text(fields.get("User", "")),
                 read_only=_is_true(fields.get("ReadOnly")),
                 volatile=_is_true(fields.get("Volatile")),
             )
@@ -90,10 +99,9 @@ def _range(text: str) -> tuple[float | None, float | None]:
 # ------------------------------------------------------------------------------------------- PX4
 
 
-def _px4_xml(root: ElementTree.Element) -> Iterator[ParameterMetadata]:
+def _px4_xml(root: Element) -> Iterator[ParameterMetadata]:
     for group in root.iter("group"):
         for param in group.iter("parameter"):
-            places = _number(param.findtext("decimal"))
             is_boolean = _is_true(param.get("boolean"))
             values = _named((each.get("code"), each.text) for each in param.iter("value"))
             yield ParameterMetadata(
@@ -108,7 +116,7 @@ def _px4_xml(root: ElementTree.Element) -> Iterator[ParameterMetadata]:
                 values=values or ({0: "Disabled", 1: "Enabled"} if is_boolean else values),
                 bitmask=_bits((each.get("index"), each.text) for each in param.iter("bit")),
                 reboot_required=_is_true(param.findtext("reboot_required")),
-                decimal_places=None if places is None else int(places),
+                decimal_places=_whole(param.findtext("decimal")),
                 group=group.get("name", ""),
                 category=param.get("category", "Standard"),
                 volatile=_is_true(param.get("volatile")),
@@ -117,10 +125,10 @@ def _px4_xml(root: ElementTree.Element) -> Iterator[ParameterMetadata]:
 
 def _px4_entry(entry: Mapping[str, Any]) -> ParameterMetadata:
     return ParameterMetadata(
-        entry["name"],
-        short_description=entry.get("shortDesc", ""),
-        description=entry.get("longDesc", "").strip(),
-        unit=entry.get("units", ""),
+        _text(entry["name"]),
+        short_description=_text(entry.get("shortDesc", "")),
+        description=_text(entry.get("longDesc", "")).strip(),
+        unit=_text(entry.get("units", "")),
         minimum=_number(entry.get("min")),
         maximum=_number(entry.get("max")),
         increment=_number(entry.get("increment")),
@@ -128,9 +136,9 @@ def _px4_entry(entry: Mapping[str, Any]) -> ParameterMetadata:
         values=_named((each["value"], each["description"]) for each in entry.get("values", ())),
         bitmask=_bits((each["index"], each["description"]) for each in entry.get("bitmask", ())),
         reboot_required=bool(entry.get("rebootRequired", False)),
-        decimal_places=entry.get("decimalPlaces"),
-        group=entry.get("group", ""),
-        category=entry.get("category", ""),
+        decimal_places=_whole(entry.get("decimalPlaces")),
+        group=_text(entry.get("group", "")),
+        category=_text(entry.get("category", "")),
         volatile=bool(entry.get("volatile", False)),
     )
 
@@ -138,8 +146,19 @@ def _px4_entry(entry: Mapping[str, Any]) -> ParameterMetadata:
 # --------------------------------------------------------------------------------------- pieces
 
 
+def _text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise ValueError(f"{reprlib.repr(value)} is no text")
+    return value
+
+
+def _whole(value: Any) -> int | None:
+    number = _number(value)
+    return int(number) if number is not None and number == int(number) else None
+
+
 def _number(value: Any) -> int | float | None:
-    if value is None:
+    if not isinstance(value, (int, float, str)):
         return None
     try:
         return parse_number(str(value).strip())
@@ -153,7 +172,7 @@ def _named(pairs: Iterable[tuple[Any, Any]]) -> Mapping[float, str]:
 
 
 def _bits(pairs: Iterable[tuple[Any, Any]]) -> Mapping[int, str]:
-    return {int(bit): text for bit, text in _named(pairs).items()}
+    return {int(bit): text for bit, text in _named(pairs).items() if bit in _BITS}
 
 
 def _is_true(text: str | None) -> bool:

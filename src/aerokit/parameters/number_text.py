@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import math
 import re
 
 from aerokit.parameters.parameter import to_float32
 
 __all__ = ["number_text", "parse_number"]
 
-_INTEGER = re.compile(r"[+-]?[0-9]+")
-_HEXADECIMAL = re.compile(r"0[xX][0-9a-fA-F]+")
+_INTEGER = re.compile(r"[+-]?[0-9]{1,999}")
+_HEXADECIMAL = re.compile(r"0[xX][0-9a-fA-F]{1,999}")
 _DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 
@@ -35,4 +36,7 @@ def parse_number(text: str) -> int | float:
         return int(text, 16)
     if not _DECIMAL.fullmatch(text):
         raise ValueError(text)
-    return float(text)
+    number = float(text)
+    if math.isinf(number):  # 1e999
+        raise ValueError(text)
+    return number

@@ -9,6 +9,7 @@ from typing import SupportsFloat, SupportsIndex
 
 from aerokit.errors import LocalProtocolError
 from aerokit.snapshot import Snapshot
+from aerokit.wording import shown
 
 __all__ = [
     "MOST_PARAMETERS",
@@ -104,13 +105,13 @@ def check_name(name: str) -> str:
     Raises :class:`LocalProtocolError` unless it is 1 to 16 printable ASCII characters without spaces.
     """
     if not isinstance(name, str):
-        raise LocalProtocolError(f"parameter name = {name!r} is no text")
+        raise LocalProtocolError(f"parameter name = {shown(name)} is no text")
     if not 0 < len(name) <= NAME_LENGTH:
         raise LocalProtocolError(
-            f"parameter name = {name!r} has {len(name)} characters, 1 to {NAME_LENGTH} are possible"
+            f"parameter name = {shown(name)} has {len(name)} characters, 1 to {NAME_LENGTH} are possible"
         )
     if not all("!" <= character <= "~" for character in name):
-        raise LocalProtocolError(f"parameter name = {name!r}: ASCII without spaces is possible only")
+        raise LocalProtocolError(f"parameter name = {shown(name)}: ASCII without spaces is possible only")
     return name
 
 
@@ -122,12 +123,14 @@ def checked_value(name: str, value: float, type: ParameterType) -> int | float: 
     """
     number = _number(name, value)
     if isinstance(number, float) and not math.isfinite(number):
-        raise LocalProtocolError(f"{name} = {value!r}: a finite number is allowed only")
+        raise LocalProtocolError(f"{name} = {shown(value)}: a finite number is allowed only")
     if type.is_integer and number != int(number):
-        raise LocalProtocolError(f"{name} = {value!r}: whole numbers are allowed only (it is an {type.name})")
+        raise LocalProtocolError(
+            f"{name} = {shown(value)}: whole numbers are allowed only (it is an {type.name})"
+        )
     if not type.low <= number <= type.high:
         raise LocalProtocolError(
-            f"{name} = {value!r} must be in {type.low}..{type.high} (it is an {type.name})"
+            f"{name} = {shown(value)} must be in {type.low}..{type.high} (it is an {type.name})"
         )
     if type.is_integer:
         return int(number)
@@ -142,7 +145,7 @@ def _number(name: str, value: object) -> int | float:
         return value.__index__()
     if isinstance(value, SupportsFloat):
         return float(value)
-    raise LocalProtocolError(f"{name} = {value!r} is no number")
+    raise LocalProtocolError(f"{name} = {shown(value)} is no number")
 
 
 def to_float32(value: float) -> float:

@@ -1,0 +1,29 @@
+"""Words for errors: values as text whatever they are, and names that were perhaps meant."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+__all__ = ["did_you_mean", "shown"]
+
+_LONGEST = 100
+
+
+def shown(value: object) -> str:
+    """``repr`` of a value; cut short when it is long, its type when it has none (an int of 5000 digits has not)."""
+    try:
+        text = repr(value)
+    except Exception:  # whatever a stranger's class does
+        text = f"<{type(value).__name__}>"
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
+
+
+def did_you_mean(name: object, known: Iterable[str]) -> str:
+    """``" (did you mean 'GUIDED'?)"``, in whatever case the name is written; nothing when no known name is like it."""
+    if not isinstance(name, str) or len(name) > _LONGEST:
+        return ""
+    import difflib  # only now: it is needed for such texts alone
+
+    by_capitals = {each.upper(): each for each in known}
+    close = difflib.get_close_matches(name.upper(), by_capitals, n=1)
+    return f" (did you mean {by_capitals[close[0]]!r}?)" if close else ""

@@ -1,0 +1,220 @@
+"""Files from outside that mean no good: our documented errors, bounded memory and time."""
+
+from __future__ import annotations
+
+import json
+import lzma
+import sys
+import tracemalloc
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from aerokit.errors import FileFormatError, LocalProtocolError
+from aerokit.mavlink import Dialect
+from aerokit.missions import Plan, read_plan_file
+from aerokit.missions.plan_file import format_plan, parse_plan
+from aerokit.parameters import load_metadata, parse_metadata, parse_parameter_file, read_parameter_file
+from aerokit.whole_file import LARGEST_FILE
+
+MEGABYTE = 1 << 20
+BOMB = """<?xml version="1.0"?>
+<!DOCTYPE paramfile [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;&a;&a;">]>
+<paramfile><parameters name="&b;"/></paramfile>
+"""
+
+
+def px4(**changes: Any) -> bytes:
+    entry = {"name": "MPC_XY_VEL_MAX", "shortDesc": "Fast", "min": 0, **changes}
+    return json.dumps({"parameters": [entry]}).encode()
+
+
+# ----------------------------------------------------------------------------------------- metadata
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"[" * 100_000,
+        b'{"parameters": ' + b"[" * 100_000,
+        b"[1, 2]",
+        px4(name=["A"]),
+        px4(name=None),
+        px4(shortDesc=3),
+        px4(values=3),
+        px4(bitmask=[3]),
+        b'{"GROUP": {"A": {"DisplayName": ["list"]}}}',
+        b'{"GROUP": {"A": 3}}',
+        BOMB.encode(),
+        b"\xfd7zXZ\x00",
+        lzma.compress(px4())[:-5],
+    ],
+    ids=lambda data: repr(data[:30]),
+)
+def test_metadata_that_is_wrong(data: bytes) -> None:
+    with pytest.raises(FileFormatError, match=r"^metadata "):
+        parse_metadata(data)
+
+
+@pytest.mark.parametrize("number", ["inf", "1e999", "nan", "9" * 5000, "0x" + "f" * 5000, 1e400, -1, 1.5, 64])
+def test_a_bit_that_is_none_is_left_out(number: object) -> None:
+    bitmask = [{"index": number, "description": "No bit"}, {"index": 3, "description": "A bit"}]
+    assert parse_metadata(px4(bitmask=bitmask))["MPC_XY_VEL_MAX"].bitmask == {3: "A bit"}
+
+
+@pytest.mark.parametrize("places", ["inf", 1e400, 1.5, "many", [1]])
+def test_decimal_places_that_are_none_are_left_out(places: object) -> None:
+    assert parse_metadata(px4(decimalPlaces=places))["MPC_XY_VEL_MAX"].decimal_places is None
+
+
+@pytest.mark.parametrize("value", [float("inf"), float("nan"), -float("inf"), 1e300])
+def test_any_value_is_described(value: float) -> None:
+    known = parse_metadata(px4(bitmask=[{"index": 1, "description": "A bit"}]))["MPC_XY_VEL_MAX"]
+    assert isinstance(known.describe(value), str)
+
+
+def test_a_small_file_that_unpacks_to_a_large_one() -> None:
+    packer = lzma.LZMACompressor(preset=0)
+    zeros = bytes(MEGABYTE)
+    bomb = b"".join((*(packer.compress(zeros) for _ in range(100)), packer.flush()))
+    del zeros
+    tracemalloc.start()
+    try:
+        with pytest.raises(FileFormatError, match=r"^metadata has more than 16 MB"):
+            parse_metadata(bomb)
+        assert tracemalloc.get_traced_memory()[1] < 3 * LARGEST_FILE
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("read", [load_metadata, read_parameter_file, read_plan_file, Dialect.from_xml])
+def test_a_file_that_is_too_large(read: Callable[[Path], object], tmp_path: Path) -> None:
+    path = tmp_path / "large"
+    with path.open("wb") as file:
+        file.truncate(LARGEST_FILE + 1)
+    with pytest.raises(FileFormatError, match=r"large has more than 16 MB"):
+        read(path)
+
+
+# ------------------------------------------------------------------------------- parameters, plans
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "1e999", "9" * 5000, "0x" + "f" * 5000, "1e39"])
+def test_a_value_that_no_vehicle_can_hold(value: str) -> None:
+    with pytest.raises(FileFormatError, match=r"line 2"):
+        parse_parameter_file(f"RTL_ALT,1500\nRTL_SPEED,{value}\n")
+
+
+def nested_plan(depth: int) -> str:
+    unknown = "[" * depth + "]" * depth
+    return json.dumps({"fileType": "Plan", "version": 1, "rallyPoints": {"points": [], "version": 2}})[
+        :-1
+    ] + (f', "groundStation": {unknown}}}')
+
+
+def test_a_plan_that_is_nested_deep() -> None:
+    with pytest.raises(FileFormatError):
+        parse_plan(nested_plan(100_000))
+
+
+def test_a_value_in_the_wrong_place_that_is_nested_deep_or_large() -> None:
+    deep = "[" * 300 + "]" * 300
+    with pytest.raises(FileFormatError, match=r"fileType = \[{37}\.\.\.: expected"):
+        parse_plan(f'{{"fileType": {deep}}}')
+
+
+def deepest_plan() -> Plan:
+    for depth in range(
+        2_000 if sys.version_info < (3, 12) else 100_000, 0, -1 if sys.version_info < (3, 12) else -100
+    ):
+        try:
+            return parse_plan(nested_plan(depth))
+        except FileFormatError:
+            continue
+    raise AssertionError("no plan can be read")
+
+
+def test_a_plan_that_is_nested_too_deep_to_be_written_again() -> None:
+    with pytest.raises(LocalProtocolError):
+        format_plan(deepest_plan())
+
+
+# ----------------------------------------------------------------------------------------- dialects
+
+
+def dialect(body: str) -> str:
+    return f'<?xml version="1.0"?><mavlink>{body}</mavlink>'
+
+
+def message(body: str, name: str = "WINCH", attributes: str = "") -> str:
+    return dialect(f'<messages><message id="52000" name="{name}" {attributes}>{body}</message></messages>')
+
+
+def entries(*values: str, name: str = "E") -> str:
+    rows = "".join(f'<entry name="{name}_{i}" value="{value}"/>' for i, value in enumerate(values))
+    return dialect(f'<enums><enum name="{name}">{rows}</enum></enums>')
+
+
+FIELD = '<field type="uint8_t" name="a">Text</field>'
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        (message(FIELD + FIELD), "WINCH: the field a is defined twice"),
+        (message('<field type="int8_t" name="from"/><field type="int8_t" name="from_"/>'), "defined twice"),
+        (message('<field type="uint8_t[0]" name="a"/>'), "unknown field type"),
+        (message(f'<field type="uint8_t[{"9" * 5000}]" name="a"/>'), "unknown field type"),
+        (message('<field type="uint8_t[999]" name="a"/>'), "at most 255 fit"),
+        (message(FIELD, name="A&#10;B"), "is not a name"),
+        (entries("1&lt;&lt;99999999999"), "is no value of an enum"),
+        (entries("9**99999999999"), "is no value of an enum"),
+        (entries("2**-1"), "is no value of an enum"),
+        (entries("0x1" + "0" * 20), "beyond 64 bits"),
+        (entries("9" * 5000), "is not a MAVLink dialect"),
+        (dialect('<enums><enum name="E"><entry name="E_A"/><entry name="E_A"/></enum></enums>'), "enum E of"),
+        (dialect('<enums><enum name="E"><entry name="E__X_"/></enum></enums>'), "enum E of"),
+        (dialect(f"<include>{'a' * 5000}</include>"), "which is in none of"),
+        (dialect("<include/>"), "which is in none of"),
+        ('<?xml version="1.0" encoding="nonsense"?><mavlink/>', "is not a MAVLink dialect"),
+        (BOMB, "is not a MAVLink dialect"),
+        ("", "is not a MAVLink dialect"),
+    ],
+    ids=lambda text: text[-60:],
+)
+def test_a_dialect_that_is_wrong(text: str, complaint: str, tmp_path: Path) -> None:
+    path = tmp_path / "private.xml"
+    path.write_text(text)
+    with pytest.raises(LocalProtocolError, match=complaint):
+        Dialect.from_xml(path)
+
+
+@pytest.mark.parametrize("name", ["NONE", "TRUE", "FALSE", "STRUCT", "MESSAGE", "FRAME"])
+@pytest.mark.parametrize("field", ["tuple", "bytes", "values", "body", "frame", "None", "struct"])
+def test_names_that_python_has_use_for(name: str, field: str, tmp_path: Path) -> None:
+    path = tmp_path / "private.xml"
+    path.write_text(
+        message(f'<field type="uint8_t" name="{field}"/><field type="int16_t[5]" name="b"/>', name=name)
+    )
+    (winch,) = Dialect.from_xml(path)
+    attribute = winch.FIELDS[0].name
+    made = winch(**{attribute: 3, "b": (1, 2, 3, 4, 5)})
+    assert name == made.NAME
+    assert winch.decode(made.encode()) == made
+
+
+def test_control_characters_in_attributes_stay_texts(tmp_path: Path) -> None:
+    path = tmp_path / "private.xml"
+    path.write_text(
+        message('<field type="uint8_t" name="a" units="m&#10;s&quot;\\" invalid="&#13;&#9;">T</field>')
+    )
+    (winch,) = Dialect.from_xml(path)
+    assert (winch.FIELDS[0].units, winch.FIELDS[0].invalid) == ('m\ns"\\', "\r\t")
+
+
+def test_an_enum_without_entries(tmp_path: Path) -> None:
+    path = tmp_path / "private.xml"
+    path.write_text(dialect('<enums><enum name="EMPTY"/></enums>'))
+    assert len(Dialect.from_xml(path).enum("EMPTY")) == 0
