@@ -170,7 +170,7 @@ def test_entries_that_do_not_come_are_named() -> None:
     while not exchange.done:
         assert exchange.deadline is not None
         exchange.expire(exchange.deadline)
-    with pytest.raises(FileTimeout, match="entries of 1, 3, 4") as raised:
+    with pytest.raises(FileTimeout, match="entries of 1, 3–4") as raised:
         exchange.result()
     assert raised.value.missing == ((1, 1), (3, 1), (4, 1))
     assert isinstance(exchange.take_outbox()[-1], LogRequestEnd)

@@ -29,7 +29,7 @@ PACK_ERRORS = (struct.error, OverflowError, TypeError, ValueError, AttributeErro
 _ANY_HEADER = bytes(HEADER_LENGTH)
 _SECRETS = frozenset(("secret_key", "passkey", "password"))
 """Fields that are shown to nobody."""
-_RANGES = {
+INTEGER_RANGES = {
     "int8_t": (-(1 << 7), (1 << 7) - 1),
     "uint8_t": (0, (1 << 8) - 1),
     "int16_t": (-(1 << 15), (1 << 15) - 1),
@@ -39,6 +39,7 @@ _RANGES = {
     "int64_t": (-(1 << 63), (1 << 63) - 1),
     "uint64_t": (0, (1 << 64) - 1),
 }
+"""Lowest and highest number of each integer type."""
 
 
 class Field:
@@ -217,8 +218,8 @@ def _same(one: Any, other: Any) -> bool:
 
 
 def _number_complaint(value: Any, kind: str) -> str | None:
-    if kind in _RANGES:
-        low, high = _RANGES[kind]
+    if kind in INTEGER_RANGES:
+        low, high = INTEGER_RANGES[kind]
         try:
             struct.pack("<q" if low < 0 else "<Q", value)
         except (struct.error, OverflowError, TypeError):

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from aerokit.errors import FileTimeout
 from aerokit.mavlink.messages import LogEntry, LogRequestEnd, LogRequestList
 from aerokit.protocols.message_stream import MessageStream
-from aerokit.protocols.transfer import PATIENCE_S, OnProgress, Transfer
+from aerokit.protocols.transfer import PATIENCE_S, OnProgress, Transfer, ranges
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
@@ -79,7 +79,7 @@ class LogList(Transfer[tuple[LogEntry, ...]]):
         if not self._missing:
             self._finish(tuple(self._entries[number] for number in sorted(self._entries)))
             self._outbox.append(LogRequestEnd(self.target_system, self.target_component))
-        elif message.id > max(self._missing):
+        elif message.id > next(reversed(self._missing)):  # the last one: they are in order
             self._ask_for_missing(now)
         self._set_deadline()
 
@@ -120,6 +120,7 @@ class LogList(Transfer[tuple[LogEntry, ...]]):
     def _timed_out(self) -> FileTimeout:
         if self._missing is None:
             return FileTimeout("list of logs: the vehicle does not answer", missing=((self._start, 0),))
-        ids = ", ".join(map(str, self._missing))
         missing = tuple((number, 1) for number in self._missing)
-        return FileTimeout(f"list of logs: the entries of {ids} are missing", missing=missing)
+        return FileTimeout(
+            f"list of logs: the entries of {ranges(self._missing)} are missing", missing=missing
+        )

@@ -89,7 +89,7 @@ class LogDownload(Transfer[int]):
         """Take a block."""
         if self.done or not isinstance(message, LogData):
             return
-        if message.id != self._id or not self._is_from_target(message):
+        if message.id != self._id or not self._is_from_target(message) or not self._is_asked_for(message.ofs):
             return
         end = message.ofs + message.count
         if message.count < LOG_BLOCK and end < self._size:
@@ -118,6 +118,10 @@ class LogDownload(Transfer[int]):
             self._is_streaming = False
             self._stream.fails += 1
         self._go_on(now)
+
+    def _is_asked_for(self, offset: int) -> bool:
+        """Whether a block of ours can be there. What lies far behind all others would make millions of gaps."""
+        return offset < self._size and offset - self._into.tail < LONGEST_RANGE * LOG_BLOCK
 
     def _take_block(self, message: LogData, now: float) -> None:
         offset, into = message.ofs, self._into

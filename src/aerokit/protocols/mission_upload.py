@@ -21,8 +21,8 @@ from aerokit.protocols.missions import (
     FORGOTTEN_S,
     MissionExchange,
     opaque_id_of,
-    ranges,
 )
+from aerokit.protocols.transfer import ranges
 from aerokit.snapshot import Snapshot
 
 if TYPE_CHECKING:

@@ -6,7 +6,6 @@ among them here.
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from typing import TYPE_CHECKING, TypeVar
 
 from aerokit.errors import MissionRejected, MissionTimeout
@@ -25,7 +24,6 @@ __all__ = [
     "MissionClear",
     "MissionExchange",
     "opaque_id_of",
-    "ranges",
 ]
 
 ResultT = TypeVar("ResultT")
@@ -185,14 +183,3 @@ class MissionClear(MissionExchange[None]):
             f"{self.kind}: no answer to MISSION_CLEAR_ALL, sent {self._attempt} times"
             f" in {now - self._started_at:.1f} s; whether it was cleared is not known"
         )
-
-
-def ranges(seqs: Collection[int]) -> str:
-    """Numbers as text: ``"0–3, 7"``."""
-    parts: list[tuple[int, int]] = []
-    for seq in sorted(seqs):
-        if parts and seq == parts[-1][1] + 1:
-            parts[-1] = (parts[-1][0], seq)
-        else:
-            parts.append((seq, seq))
-    return ", ".join(str(a) if a == b else f"{a}–{b}" for a, b in parts)

@@ -15,7 +15,7 @@ from aerokit.parameters.parameter import MOST_PARAMETERS
 from aerokit.parameters.px4_hash import HASH_NAME
 from aerokit.protocols.parameter_update import updated
 from aerokit.protocols.request_window import RequestWindow
-from aerokit.protocols.transfer import PATIENCE_S, OnProgress, Transfer
+from aerokit.protocols.transfer import PATIENCE_S, OnProgress, Transfer, ranges
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
@@ -283,17 +283,5 @@ class ParameterList(Transfer[ParameterTable]):
         missing = self._missing()
         return (
             f"{len(missing)} of {self._count} parameters did not come: nothing new for {self._patience_s:g} s,"
-            f" missing {_ranges(missing)}"
+            f" missing {ranges(missing)}"
         )
-
-
-def _ranges(numbers: tuple[int, ...]) -> str:
-    """``3, 7–12 and 40 more``."""
-    ranges: list[list[int]] = []
-    for number in numbers:
-        if ranges and number == ranges[-1][1] + 1:
-            ranges[-1][1] = number
-        else:
-            ranges.append([number, number])
-    texts = [f"{low}" if low == high else f"{low}–{high}" for low, high in ranges]
-    return ", ".join(texts[:10]) + (f" and {len(texts) - 10} more ranges" if len(texts) > 10 else "")

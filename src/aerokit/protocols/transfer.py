@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, TypeVar
 
 from aerokit.errors import LocalProtocolError
@@ -13,7 +13,7 @@ from aerokit.snapshot import Snapshot
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
 
-__all__ = ["PATIENCE_S", "OnProgress", "Progress", "Transfer"]
+__all__ = ["PATIENCE_S", "OnProgress", "Progress", "Transfer", "ranges"]
 
 ResultT = TypeVar("ResultT")
 
@@ -39,6 +39,22 @@ class Progress(Snapshot):
     def rate(self) -> float:
         """Parameters, items or bytes per second since the start; 0 before any time has passed."""
         return self.done / self.elapsed_s if self.elapsed_s > 0 else 0.0
+
+
+_MOST_RANGES = 10
+
+
+def ranges(numbers: Iterable[int]) -> str:
+    """Numbers as text: ``3, 7–12``; of many ranges the first ten, and how many more there are."""
+    found: list[tuple[int, int]] = []
+    for number in sorted(numbers):
+        if found and number == found[-1][1] + 1:
+            found[-1] = (found[-1][0], number)
+        else:
+            found.append((number, number))
+    text = ", ".join(str(low) if low == high else f"{low}–{high}" for low, high in found[:_MOST_RANGES])
+    more = len(found) - _MOST_RANGES
+    return f"{text} and {more} more ranges" if more > 0 else text
 
 
 OnProgress = Callable[[Progress], None]

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Container, Hashable
 from typing import TYPE_CHECKING
 
+from aerokit.errors import LocalProtocolError
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.framer import Framer
+from aerokit.sim.fitting import fitted
 from aerokit.sim.streams import Streams
 
 if TYPE_CHECKING:
@@ -64,7 +66,12 @@ class Channel:
         if encoder is None:
             encoder = self._encoders[sender] = FrameEncoder(*sender, version=self.version)
             encoder.signing = self.signing
-        return encoder.encode(message)
+        try:
+            return encoder.encode(message)
+        except (
+            LocalProtocolError
+        ):  # NaN of a parameter, a place beyond the world: whatever made it, vehicles go on
+            return encoder.encode(fitted(message))
 
     def write(self, data: bytes) -> None:
         """Put a frame, or other bytes that belong together, into the outbox."""

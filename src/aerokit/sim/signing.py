@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.messages import SetupSigning
-from aerokit.mavlink.signing import Signing, SigningKey
+from aerokit.mavlink.signing import LAST_TIMESTAMP, Signing, SigningKey
 
 if TYPE_CHECKING:
     from aerokit.sim.autopilot import SimulatedAutopilot
@@ -49,10 +49,10 @@ class VehicleSigning:
         if self.key is None or channel.version == 1 or not self.is_for(link_id):
             channel.sign_with(None)
             return
-        signing = Signing(
+        signing = _Signing(
             self.key,
             link_id=link_id,
-            timestamp=self.timestamp + self.AHEAD,
+            timestamp=(self.timestamp + self.AHEAD) & LAST_TIMESTAMP,
             allow_unsigned=self.unsigned_on(link_id),
         )
         signing.streams = self._streams
@@ -81,6 +81,15 @@ class VehicleSigning:
         if not self.may_change():
             return
         self.key = SigningKey(message.secret_key) if any(message.secret_key) else None
-        self.timestamp = message.initial_timestamp
+        self.timestamp = message.initial_timestamp & LAST_TIMESTAMP  # all that a frame has room for
         self.load()
         self.changed()
+
+
+class _Signing(Signing):
+    """As firmwares count: behind the last time stamp of 48 bits comes the first."""
+
+    def sign(self, frame: bytes, now: float = 0.0) -> bytes:
+        if self.timestamp > LAST_TIMESTAMP:
+            self.timestamp = 0
+        return super().sign(frame, now)

@@ -1,0 +1,128 @@
+"""Targets of files from outside: plans, parameter files and packs, metadata, dialects."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from target import Target
+
+from aerokit.errors import FileFormatError, LocalProtocolError, RemoteProtocolError
+from aerokit.mavlink import Dialect
+from aerokit.missions import Mission
+from aerokit.missions.pack import unpack_items
+from aerokit.missions.plan_file import format_plan, parse_plan
+from aerokit.missions.waypoint_file import format_waypoints, parse_waypoints
+from aerokit.parameters import (
+    pack_parameters,
+    parse_metadata,
+    parse_parameter_file,
+    unpack_parameters,
+)
+from aerokit.parameters.files import parameter_file_text
+from aerokit.parameters.pack import unpack_upload
+
+__all__ = ["FILE_TARGETS"]
+
+
+def fuzz_plan(data: bytes) -> None:
+    """What is read is written, and read again as the same; with other items, too."""
+    try:
+        plan = parse_plan(data.decode(errors="surrogateescape"))
+    except FileFormatError:
+        return
+    for each in (plan, plan.replace(mission=Mission(), source=plan.source), plan.replace(source="")):
+        try:
+            text = format_plan(each)
+        except LocalProtocolError:
+            continue
+        assert parse_plan(text) == each
+
+
+def fuzz_waypoints(data: bytes) -> None:
+    """What is read is written, and read again as the same."""
+    try:
+        mission = parse_waypoints(data.decode(errors="surrogateescape"))
+        text = format_waypoints(mission)
+    except LocalProtocolError:
+        return
+    again = parse_waypoints(text)
+    assert len(again.items) == len(mission.items)
+
+
+def fuzz_parameter_file(data: bytes) -> None:
+    """What is read is written in each format, and read again as the same numbers."""
+    try:
+        file = parse_parameter_file(data.decode(errors="surrogateescape"))
+    except FileFormatError:
+        return
+    for form in ("missionplanner", "mavproxy", "qgroundcontrol"):
+        try:
+            text = parameter_file_text(file, form)  # type: ignore[arg-type]  # mypy has no literal of a loop
+        except LocalProtocolError:
+            continue
+        again = parse_parameter_file(text)
+        assert again.keys() == file.keys()
+        assert all(math.isclose(again[name], file[name], rel_tol=1e-6, abs_tol=1e-37) for name in file)
+
+
+def fuzz_parameter_pack(data: bytes) -> None:
+    """Each reader of packed files: a table, or our error."""
+    readers: Iterable[Callable[[bytes], object]] = (unpack_upload, unpack_items)
+    for read in readers:
+        _may_refuse(read, data)
+    try:
+        table = unpack_parameters(data)
+    except RemoteProtocolError:
+        return
+    try:
+        packed = pack_parameters(table.values())
+    except LocalProtocolError:  # NaN
+        return
+    assert unpack_upload(packed).keys() == table.keys()
+
+
+def _may_refuse(read: Callable[[bytes], object], data: bytes) -> None:
+    try:
+        read(data)
+    except RemoteProtocolError:
+        return
+
+
+def fuzz_metadata(data: bytes) -> None:
+    """What is said of each parameter can be used with any number."""
+    try:
+        metadata = parse_metadata(data)
+    except FileFormatError:
+        return
+    for name, known in metadata.items():
+        for value in (0, 5, -1.5, math.inf, math.nan, 1e300, *known.values):
+            assert isinstance(known.describe(value), str)
+            known.complaint(value)
+        assert name == known.name
+
+
+def fuzz_dialect(data: bytes) -> None:
+    """A dialect whose messages can be made, sent and read, or our error."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "fuzzed.xml"
+        path.write_bytes(data)
+        try:
+            dialect = Dialect.from_xml(path)
+        except LocalProtocolError:
+            return
+    for message_class in dialect:
+        message = message_class.decode(bytes(3))
+        assert message_class.decode(message.encode()) == message
+
+
+FILE_TARGETS = (
+    Target("plan", fuzz_plan, 16384),
+    Target("waypoints", fuzz_waypoints, 4096),
+    Target("parameter_file", fuzz_parameter_file, 4096),
+    Target("parameter_pack", fuzz_parameter_pack, 2048),
+    Target("metadata", fuzz_metadata, 8192),
+    Target("dialect", fuzz_dialect, 4096),
+)

@@ -1,0 +1,22 @@
+"""What a fuzz target is: one function that takes bytes, and what it may raise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+__all__ = ["FuzzOne", "Target"]
+
+FuzzOne = Callable[[bytes], None]
+
+
+@dataclass(frozen=True)
+class Target:
+    """``fuzz_one`` raises AssertionError, or what it tests does, when something is wrong; ``longest`` bytes go in."""
+
+    name: str
+    fuzz_one: FuzzOne
+    longest: int = 1024
+
+    def __call__(self, data: bytes) -> None:
+        self.fuzz_one(data[: self.longest])

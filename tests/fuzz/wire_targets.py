@@ -1,0 +1,116 @@
+"""Targets of the wire: framer, decoder, signing, recordings, addresses."""
+
+from __future__ import annotations
+
+import io
+
+from target import Target
+
+from aerokit.errors import LocalProtocolError
+from aerokit.links import parse_address
+from aerokit.links.create import create_link
+from aerokit.mavlink import STANDARD, Framer
+from aerokit.mavlink.checksum import x25
+from aerokit.mavlink.frame import MAGIC_V1, MAGIC_V2
+from aerokit.mavlink.message import Message
+from aerokit.mavlink.signing import Signing, SigningKey
+from aerokit.mavlink.tlog import read_tlog
+from aerokit.sim import RecordedVehicle
+
+__all__ = ["WIRE_TARGETS"]
+
+_KEY = SigningKey(bytes(range(32)))
+_IDS = sorted(STANDARD.rows)
+
+
+def fuzz_framer(data: bytes) -> None:
+    """Any bytes, in one piece and in two: the same frames, nothing raised, nothing lost count of.
+
+    Of unknown messages nobody can check the checksum: what is taken for one depends on what is there of it.
+    """
+    whole, parts, all_of_it = Framer(), Framer(), Framer()
+    all_of_it.keep_unknown = True
+    all_of_it.receive(data, 1.0)
+    cut = data[0] % len(data) if data else 0
+    at_once = [frame.raw for frame in whole.receive(data, 1.0)]
+    in_two = [frame.raw for piece in (data[:cut], data[cut:]) for frame in parts.receive(piece, 1.0)]
+    assert at_once == in_two
+    assert whole.statistics.bytes == len(data)
+    assert whole.waiting <= 280
+
+
+def decode(message: Message) -> None:
+    """What is done with every message: shown, compared, and sent again by some."""
+    assert message == message
+    assert repr(message)
+    assert len(message.to_dict()) == len(message.FIELDS)
+    try:
+        again = type(message).decode(message.encode())
+    except LocalProtocolError:  # what was no UTF-8 takes more room than it had
+        assert any("\ufffd" in str(value) for value in message.to_dict().values())
+        return
+    assert again == message
+
+
+def fuzz_decoder(data: bytes) -> None:
+    """Any payload of any message."""
+    message_id = _IDS[int.from_bytes(data[:2], "little") % len(_IDS)]
+    decode(STANDARD[message_id].decode(data[2:257]))
+
+
+def fuzz_signing(data: bytes) -> None:
+    """Frames with any signature: refused, whatever they are; those that we sign are let in, once."""
+    ours, theirs = Signing(_KEY, link_id=1), Signing(_KEY, link_id=2)
+    for frame in Framer().receive(data, 1.0):
+        assert not theirs.accepts(frame) or frame.message_id == 109
+        raw = frame.raw
+        if raw[0] == MAGIC_V1 or raw[2]:
+            continue
+        body = raw[1:2] + b"\x01" + raw[3:-2]
+        signed = _checked(body)
+        (good,) = Framer().receive(signed + ours.sign(signed), 1.0)
+        assert theirs.accepts(good)
+        assert not theirs.accepts(good) or good.message_id == 109
+
+
+def _checked(body: bytes) -> bytes:
+    message_id = int.from_bytes(body[6:9], "little")
+    return bytes((MAGIC_V2,)) + body + x25(body + STANDARD.extras[message_id]).to_bytes(2, "little")
+
+
+def fuzz_tlog(data: bytes) -> None:
+    """Any file: records with whole frames in them, or nothing."""
+    for time, raw in read_tlog(io.BytesIO(data)):
+        assert 0 <= time < 1 << 33
+        assert len(raw) <= 280
+
+
+def fuzz_recording(data: bytes) -> None:
+    """Any recording as a vehicle: it plays, or says that there is none."""
+    try:
+        vehicle = RecordedVehicle(io.BytesIO(data))
+    except LocalProtocolError:
+        return
+    for second in range(20):
+        vehicle.step(float(second))
+    assert Framer().receive(vehicle.take_outbox(), 0.0) is not None
+
+
+def fuzz_address(data: bytes) -> None:
+    """Any text: an address that says the same when it is written again, or our error."""
+    try:
+        address = parse_address(data.decode(errors="surrogateescape"))
+    except LocalProtocolError:
+        return
+    assert parse_address(str(address)) == address
+    create_link(str(address))
+
+
+WIRE_TARGETS = (
+    Target("framer", fuzz_framer, 2048),
+    Target("decoder", fuzz_decoder, 257),
+    Target("signing", fuzz_signing, 1024),
+    Target("tlog", fuzz_tlog, 4096),
+    Target("recording", fuzz_recording, 4096),
+    Target("address", fuzz_address, 200),
+)
