@@ -10,8 +10,8 @@ import pytest
 SOURCE = Path(__file__).parent.parent / "src" / "aerokit"
 
 FLOORS = [
-    {"errors", "lazy", "snapshot", "wording"},
-    {"geo", "whole_file"},
+    {"errors", "lazy", "async_block", "snapshot", "wording"},
+    {"arguments", "geo", "whole_file"},
     {"position"},
     {"mavlink"},
     {"parameters", "missions", "links", "autopilots"},

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-__all__ = ["did_you_mean", "shown"]
+__all__ = ["did_you_mean", "one", "shown"]
 
 _LONGEST = 100
 
@@ -16,6 +16,11 @@ def shown(value: object) -> str:
     except Exception:  # whatever a stranger's class does
         text = f"<{type(value).__name__}>"
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
+
+
+def one(kind: str) -> str:
+    """``a Position``, ``an AttitudeSetpoint``."""
+    return f"{'an' if kind[:1] in 'AEIO' else 'a'} {kind}"
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:

@@ -25,7 +25,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="Fuzz aerokit.")
     parser.add_argument("targets", nargs="*", metavar="TARGET", help="all of them by default")
     parser.add_argument("--runs", type=int, default=RUNS, help=f"inputs for each target ({RUNS})")
-    parser.add_argument("--grow", type=Path, metavar="DIR", help="keep inputs that reach new code there, by target")
+    parser.add_argument(
+        "--grow", type=Path, metavar="DIR", help="keep inputs that reach new code there, by target"
+    )
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--one", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
@@ -40,7 +42,16 @@ def main() -> int:
 
 def succeeds(name: str, options: argparse.Namespace) -> bool:
     print(f"{name} …", flush=True)
-    command = [sys.executable, __file__, "--one", "--runs", str(options.runs), "--seed", str(options.seed), name]
+    command = [
+        sys.executable,
+        __file__,
+        "--one",
+        "--runs",
+        str(options.runs),
+        "--seed",
+        str(options.seed),
+        name,
+    ]
     if options.grow is not None:
         command += ["--grow", str(options.grow)]
     done = subprocess.run(command, capture_output=True, text=True)

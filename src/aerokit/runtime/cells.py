@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import AsyncIterator, Callable
 from typing import Generic, Protocol, TypeVar
 
+from aerokit.arguments import checked
 from aerokit.errors import OperationTimeout, StaleValueError, ValueUnknownError
 from aerokit.runtime.endings import raisable
 from aerokit.snapshot import Snapshot
@@ -134,6 +135,7 @@ class StateCell(Generic[T]):
         self._catch_up()
         return self._source
 
+    @checked
     def fresh(self, within: float) -> T:
         """The latest value if it is at most ``within`` seconds old.
 
@@ -150,6 +152,7 @@ class StateCell(Generic[T]):
 
     # ------------------------------------------------------------------------------ waiting
 
+    @checked
     async def wait_until(
         self,
         predicate: Callable[[T], object],
@@ -182,6 +185,7 @@ class StateCell(Generic[T]):
         """Like :meth:`changes`, but each value that comes counts, also when it equals the one before."""
         return Changes(self, every_arrival=True)
 
+    @checked
     def observe(
         self, callback: Callable[[T | None, T], None], *, every_arrival: bool = False
     ) -> Callable[[], None]:

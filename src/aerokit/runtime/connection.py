@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import anyio
 
+from aerokit.arguments import checked
 from aerokit.errors import AerokitError, BusyError, ConnectionClosed, LinkLost, LocalProtocolError
 from aerokit.links.link import Link
 from aerokit.mavlink.dialect import STANDARD
@@ -128,6 +129,7 @@ class Connection:
 
     # ------------------------------------------------------------------------------- sending
 
+    @checked
     def send(self, message: Message, *, to: int | None = None) -> None:
         """Number, frame and write a message; never blocks.
 
@@ -143,6 +145,7 @@ class Connection:
         now = 0.0 if self._encoder.signing is None else self.unix_time()
         self._write(self._encoder.encode(message, now), message, to)
 
+    @checked
     def write_raw(self, data: bytes) -> None:
         """Write one whole frame of somebody else as it is, for programs that forward; never blocks.
 
@@ -205,6 +208,7 @@ class Connection:
     def signing(self, signing: Signing | None) -> None:
         self._gate.use(signing)
 
+    @checked
     def subscribe(
         self,
         *types: type[ItemT],

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from contextlib import asynccontextmanager
 from functools import partial
 from typing import TYPE_CHECKING
 
 import anyio
 
+from aerokit.arguments import checked
+from aerokit.async_block import async_block
 from aerokit.errors import LocalProtocolError
 from aerokit.links import ReconnectingLink, create_link
 from aerokit.mavlink.dialect import STANDARD
@@ -27,7 +28,8 @@ __all__ = ["open_connection"]
 CLOSE_TIMEOUT_S = 2.0
 
 
-@asynccontextmanager
+@checked
+@async_block
 async def open_connection(
     address: str | Link,
     *,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Generic, Literal, TypeVar
 
 import anyio
 
+from aerokit.arguments import checked
 from aerokit.errors import BusyError, LocalProtocolError, OperationTimeout, SubscriptionOverflow
 from aerokit.runtime.endings import raisable
 
@@ -84,6 +85,7 @@ class Subscription(Generic[ItemT]):
             await self._wait()
         return self._queue.popleft()
 
+    @checked
     async def get(self, timeout: float | None = None) -> ItemT:
         """Return the next item.
 

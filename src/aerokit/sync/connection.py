@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, TypeVar
 
+from aerokit.arguments import checked
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.runtime.connection import MAV_COMP_ID_MISSIONPLANNER
 from aerokit.runtime.opening import open_connection as open_async
@@ -32,6 +33,7 @@ __all__ = ["Connection", "open_connection"]
 ItemT = TypeVar("ItemT", bound="Message | Event")
 
 
+@checked
 def open_connection(
     address: str | Link,
     *,

@@ -6,6 +6,7 @@ import contextlib
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, TypeVar
 
+from aerokit.arguments import checked
 from aerokit.errors import ConnectionClosed
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.runtime.connection import MAV_COMP_ID_MISSIONPLANNER
@@ -48,6 +49,7 @@ ItemT = TypeVar("ItemT", bound="Message | Event")
 MessageT = TypeVar("MessageT", bound="Message")
 
 
+@checked
 def connect(
     address: str | Link | Connection,
     *,

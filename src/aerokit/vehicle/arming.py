@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import anyio
 
+from aerokit.arguments import checks_arguments
 from aerokit.errors import (
     AerokitError,
     CommandRejected,
@@ -48,6 +49,7 @@ READY_IN_MODE_S = 3.0
 logger = logging.getLogger("aerokit")
 
 
+@checks_arguments
 class ArmingActions(HoldingActions):
     """From standing there to running motors, and back."""
 

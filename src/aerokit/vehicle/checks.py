@@ -3,8 +3,15 @@
 from __future__ import annotations
 
 from aerokit.errors import LocalProtocolError
+from aerokit.wording import one, shown
 
-__all__ = ["check_range", "check_seconds"]
+__all__ = ["check_kind", "check_range", "check_seconds"]
+
+
+def check_kind(name: str, value: object, kind: type) -> None:
+    """Raise LocalProtocolError unless ``value`` is of that class: where type hints say "of the same kind" only."""
+    if not isinstance(value, kind):
+        raise LocalProtocolError(f"{name} = {shown(value)} is not allowed: {one(kind.__name__)}")
 
 
 def check_range(name: str, value: float, lowest: float, highest: float, *, above: bool = False) -> None:
@@ -15,7 +22,7 @@ def check_range(name: str, value: float, lowest: float, highest: float, *, above
         is_allowed = False
     if not is_allowed:
         begin = f"above {lowest:g}" if above else f"{lowest:g}"
-        raise LocalProtocolError(f"{name} = {value!r} is not allowed: {begin} to {highest:g}")
+        raise LocalProtocolError(f"{name} = {shown(value)} is not allowed: {begin} to {highest:g}")
 
 
 def check_seconds(name: str, value: float | None, *, none_is_allowed: bool = False) -> None:
@@ -24,4 +31,4 @@ def check_seconds(name: str, value: float | None, *, none_is_allowed: bool = Fal
         return
     if not isinstance(value, (int, float)) or not value > 0:
         allowed = "above 0, or None" if none_is_allowed else "above 0"
-        raise LocalProtocolError(f"{name} = {value!r} is not allowed: seconds {allowed}")
+        raise LocalProtocolError(f"{name} = {shown(value)} is not allowed: seconds {allowed}")

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 
 import anyio
 
+from aerokit.arguments import checked
+from aerokit.async_block import async_block
 from aerokit.errors import BusyError, ConnectFailed, LocalProtocolError
 from aerokit.links.link import Link
 from aerokit.mavlink.dialect import STANDARD
@@ -43,7 +45,8 @@ HEARTBEATS_ALONE = 3
 """So many heartbeats of another component and none of component 1 make it the vehicle's autopilot."""
 
 
-@asynccontextmanager
+@checked
+@async_block
 async def connect(
     address: str | Link | Connection,
     *,

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import anyio
 
+from aerokit.arguments import checks_arguments
 from aerokit.autopilots import autopilot_for
 from aerokit.autopilots.streams import subscription_rate_hz
 from aerokit.errors import CommandRejected, ConnectionClosed
@@ -54,6 +55,7 @@ RESULT_ACCEPTED = 0
 RESULTS_OF_REFUSAL = (1, 2, 4)
 
 
+@checks_arguments
 class VehicleCore:
     """One remote system: system id, autopilot component, and what was heard of it."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from aerokit.arguments import checks_arguments
 from aerokit.vehicle.plans import HeldPlan
 
 if TYPE_CHECKING:
@@ -14,6 +15,7 @@ __all__ = ["FenceControl"]
 DO_FENCE_ENABLE = 207
 
 
+@checks_arguments
 class FenceControl(HeldPlan["Fence"]):
     """``await vehicle.fence.upload(Fence(polygons=[...]))``: where the vehicle may and may not be.
 

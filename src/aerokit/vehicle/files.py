@@ -6,6 +6,7 @@ import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from aerokit.arguments import checks_arguments
 from aerokit.errors import FileError, LocalProtocolError, RemoteProtocolError, VerificationFailed
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
 from aerokit.protocols.ftp import DATA_SIZE, path_bytes
@@ -41,6 +42,7 @@ class FileEntry(Snapshot):
     is_directory: bool
 
 
+@checks_arguments
 class Files:
     """Reads, writes and lists files on the vehicle. Operations follow each other in the order of their calls.
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import anyio
 
+from aerokit.arguments import checks_arguments
 from aerokit.errors import NotSupported, OperationRejected, OperationTimeout
 from aerokit.vehicle.checks import check_range, check_seconds
 from aerokit.vehicle.helm import MODE_GRACE_S
@@ -27,6 +28,7 @@ SURFACE_M = 1.5
 """Who is deeper below home has not surfaced, but was given another mode on the way: home is at the surface."""
 
 
+@checks_arguments
 class FlightActions(TravelActions):
     """Take-off, landing, return."""
 

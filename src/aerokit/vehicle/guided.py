@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 
 import anyio
 
+from aerokit.arguments import checks_arguments
 from aerokit.errors import (
     BusyError,
     LocalProtocolError,
@@ -20,6 +21,7 @@ from aerokit.errors import (
     OperationRejected,
     SetpointStreamStopped,
 )
+from aerokit.vehicle.checks import check_kind
 from aerokit.vehicle.progress import Stillness
 from aerokit.vehicle.setpoints import (
     AccelerationSetpoint,
@@ -53,6 +55,7 @@ ENTRY_S = 1.0
 """How long the initial set-point is streamed before PX4 is asked for OFFBOARD: it wants to see a stream first."""
 
 
+@checks_arguments
 class Guided:
     """Opens set-point streams: ``async with vehicle.guided.velocity() as stream: stream.set(...)``.
 
@@ -150,6 +153,7 @@ class Guided:
         return SetpointStream(self._vehicle, encode, initial, *limits)
 
 
+@checks_arguments
 class SetpointStream(Generic[SetpointT]):
     """Sends the latest set-point at a rate for as long as the ``async with`` block feeds it.
 
@@ -202,6 +206,7 @@ class SetpointStream(Generic[SetpointT]):
             LocalProtocolError: a value is out of range; the one before stays in force until it is too old.
             SetpointStreamStopped: the stream has ended by itself, or the block was left.
         """
+        check_kind("setpoint", setpoint, type(self._setpoint))
         self._raise_if_stopped()
         if self._timer is None:
             raise SetpointStreamStopped(
@@ -215,6 +220,7 @@ class SetpointStream(Generic[SetpointT]):
         Raises:
             SetpointStreamStopped: the stream ended meanwhile.
         """
+        check_kind("setpoint", setpoint, type(self._setpoint))
         until = self._now() + duration_s
         while (left := until - self._now()) > 0:
             self.set(setpoint)

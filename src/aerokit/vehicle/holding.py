@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import anyio
 
+from aerokit.arguments import checks_arguments
 from aerokit.errors import AerokitError, OperationTimeout
 from aerokit.runtime.cancellation import Cancellation
 from aerokit.vehicle.modes import CHANGE_MODE, DO_REPOSITION, DO_SET_MODE, ModeActions
@@ -34,6 +35,7 @@ STOP_HERE = (DO_REPOSITION, -1, CHANGE_MODE, 0, *(math.nan,) * 4)
 """A place that is no number means: here, with the way it takes to brake."""
 
 
+@checks_arguments
 class HoldingActions(ModeActions):
     """Stopping, and staying."""
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 import anyio
 
+from aerokit.arguments import checks_arguments
 from aerokit.errors import AerokitError, FileError, FileTimeout, LocalProtocolError, OperationTimeout
 from aerokit.mavlink.enums import MavFtpErr
 from aerokit.mavlink.messages import LogErase
@@ -50,6 +51,7 @@ class LogEntry(Snapshot):
     time_utc: datetime | None
 
 
+@checks_arguments
 class Logs:
     """Lists, downloads and erases flight logs. Operations follow each other in the order of their calls.
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import anyio
 
+from aerokit.arguments import checks_arguments
 from aerokit.errors import CommandRejected, LocalProtocolError, OperationRejected, OperationTimeout
 from aerokit.vehicle.checks import check_seconds
 from aerokit.vehicle.mission_end import MissionEnd
@@ -28,6 +29,7 @@ MODE_TIMEOUT_S = 6.0
 LAST_ITEM = 0xFFFF - 1
 
 
+@checks_arguments
 class MissionControl(HeldPlan["Mission"]):
     """``await vehicle.mission.upload(mission)``, ``start()``, ``wait_finished()``.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
+from aerokit.arguments import checks_arguments
 from aerokit.errors import CommandRejected, CommandTimeout, NotSupported, OperationRejected
 from aerokit.vehicle.checks import check_seconds
 from aerokit.vehicle.helm import MODE_GRACE_S
@@ -28,6 +29,7 @@ FRESH_MODE_S = 2.5
 """An older mode is no reason to leave an order out."""
 
 
+@checks_arguments
 class ModeActions(VehicleState):
     """Changing the flight mode."""
 

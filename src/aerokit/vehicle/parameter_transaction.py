@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import anyio
 
+from aerokit.arguments import checks_arguments
 from aerokit.errors import AerokitError, LocalProtocolError, RollbackFailed, VerificationFailed
 from aerokit.parameters import Parameter
 from aerokit.parameters.parameter import same_value
@@ -149,6 +150,7 @@ class Temporarily(_Block):
         await self._put_back(exc)
 
 
+@checks_arguments
 class Transaction(_Block):
     """Several writes, all or none.
 

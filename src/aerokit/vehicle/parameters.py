@@ -9,6 +9,7 @@ import os
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
+from aerokit.arguments import checks_arguments
 from aerokit.errors import NotSupported, ParameterRejected, ParameterTimeout
 from aerokit.parameters import Parameter, ParameterTable
 from aerokit.protocols.transfer import PATIENCE_S
@@ -32,6 +33,7 @@ ParameterSource = ParameterTable | Mapping[str, float] | str | os.PathLike[str]
 """A table, a plain dict of values, or a parameter file."""
 
 
+@checks_arguments
 class Parameters:
     """The parameters of one autopilot. Coroutines talk to it; ``table`` is what is known, and never does.
 
@@ -249,6 +251,7 @@ class Parameters:
         from aerokit.parameters import diff
 
         values = _values_of(parameters)
+        check_values(values)
         table = await self.download(patience_s=patience_s, timeout=timeout, on_progress=on_progress)
         translated = self._names.translated(values, table)
         return diff(table, translated, names=translated)

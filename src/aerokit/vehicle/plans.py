@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Generic, Literal, Protocol, TypeVar
 
 import anyio
 
+from aerokit.arguments import checks_arguments
 from aerokit.errors import LocalProtocolError
 from aerokit.mavlink.messages import MissionCurrent
-from aerokit.vehicle.checks import check_seconds
+from aerokit.vehicle.checks import check_kind, check_seconds
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Sequence
@@ -34,6 +35,7 @@ IDS_AT = (6, 10, 14)
 """Where in its payload ``mission_id``, ``fence_id`` and ``rally_points_id`` are: the dialect does not have them yet."""
 
 
+@checks_arguments
 class HeldPlan(Generic[PlanT]):
     """A mission, a fence or rally points that a vehicle holds.
 
@@ -133,8 +135,7 @@ class HeldPlan(Generic[PlanT]):
 
     def _checked(self, plan: PlanT) -> PlanT:
         plan_type = self._plan_type()
-        if not isinstance(plan, plan_type):
-            raise LocalProtocolError(f"plan = {plan!r} is not allowed: a {plan_type.__name__}")
+        check_kind("plan", plan, plan_type)
         plan.check(home_is_item_0=bool(self._context.offset_of(plan_type.MISSION_TYPE)))
         return plan
 

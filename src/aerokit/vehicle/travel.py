@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import anyio
 
 from aerokit import geo
+from aerokit.arguments import checks_arguments
 from aerokit.errors import (
     CommandRejected,
     LocalProtocolError,
@@ -41,6 +42,7 @@ RESEND_S = 1.0
 OLD_POSITION_S = 2.0
 
 
+@checks_arguments
 class TravelActions(ArmingActions):
     """Going to a place, turning, looking."""
 

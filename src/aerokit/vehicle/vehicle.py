@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import anyio
 
+from aerokit.arguments import checks_arguments
 from aerokit.errors import CommandRejected, CommandTimeout
 from aerokit.vehicle.fence import FenceControl
 from aerokit.vehicle.files import Files
@@ -34,6 +35,7 @@ ASK_AGAIN_S = 3.0
 EAGER_REQUESTS, EAGER_S = 4, 0.3
 
 
+@checks_arguments
 class Vehicle(FlightActions):
     """One vehicle. Coroutines talk to it, properties never do; everything has a deadline and can be cancelled.
 

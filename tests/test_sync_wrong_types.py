@@ -1,0 +1,70 @@
+"""The same in the blocking twin: arguments of wrong types end in our error, and nothing is sent."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+from served_copter import served
+from wrong_types import Misuse, misuses, misuses_of, refusal_of
+
+import aerokit.sync
+from aerokit.mavlink import messages as m
+from aerokit.sim import SimulatedCopter
+from aerokit.sim.journal import Journal
+
+OWNERS: dict[str, Callable[[aerokit.sync.Vehicle], Any]] = {
+    "vehicle": lambda vehicle: vehicle,
+    "guided": lambda vehicle: vehicle.guided,
+    "stream": lambda vehicle: vehicle.guided.velocity(),
+    "parameters": lambda vehicle: vehicle.parameters,
+    "mission": lambda vehicle: vehicle.mission,
+    "fence": lambda vehicle: vehicle.fence,
+    "rally": lambda vehicle: vehicle.rally,
+    "files": lambda vehicle: vehicle.files,
+    "logs": lambda vehicle: vehicle.logs,
+    "cell": lambda vehicle: vehicle.position,
+    "subscription": lambda vehicle: vehicle.subscribe(m.Heartbeat),
+    "connection": lambda vehicle: vehicle.connection,
+}
+LEFT_OUT = {"subscription": frozenset({"close"}), "connection": frozenset({"counts"})}
+ASKED_BY_ITSELF = (m.Heartbeat, m.CommandLong, m.Timesync)
+"""What a vehicle object sends on its own: it asks for the version and for rates."""
+
+
+@pytest.fixture(scope="module")
+def flight() -> Iterator[tuple[aerokit.sync.Vehicle, Journal]]:
+    copter = SimulatedCopter(boot_time_s=0.0)
+    with served([copter]) as address, aerokit.sync.connect(address, rates={}) as vehicle:
+        copter.journal = journal = Journal()
+        yield vehicle, journal
+
+
+def misuse_it(misuse: Misuse) -> BaseException | None:
+    try:
+        made = misuse.call()
+        if hasattr(made, "__enter__"):
+            with made:
+                pass
+    except Exception as error:
+        return error
+    return None
+
+
+@pytest.mark.parametrize("owner", OWNERS)
+def test_nothing_is_done(owner: str, flight: tuple[aerokit.sync.Vehicle, Journal]) -> None:
+    vehicle, journal = flight
+    left_out = LEFT_OUT.get(owner, frozenset())
+    wrong = [
+        refusal_of(each, misuse_it(each)) for each in misuses(OWNERS[owner](vehicle), leave_out=left_out)
+    ]
+    assert not (found := list(filter(None, wrong))), "\n".join(found)
+    kinds = {type(heard.message) for heard in journal.messages}
+    assert kinds <= set(ASKED_BY_ITSELF)
+
+
+@pytest.mark.parametrize("function", [aerokit.sync.connect, aerokit.sync.open_connection])
+def test_nothing_is_opened(function: Callable[..., Any]) -> None:
+    wrong = [refusal_of(each, misuse_it(each)) for each in misuses_of(function, function.__name__)]
+    assert not (found := list(filter(None, wrong))), "\n".join(found)

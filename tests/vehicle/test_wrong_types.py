@@ -1,0 +1,113 @@
+"""Arguments of wrong types: our error with the argument's name, and not a byte goes out; for every public method."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from typing import Any
+
+import anyio
+import pytest
+from flight_harness import Flight, in_the_air
+from wrong_types import Misuse, misuses, misuses_of, refusal_of
+
+import aerokit
+from aerokit.errors import LocalProtocolError
+from aerokit.mavlink import messages as m
+
+pytestmark = pytest.mark.anyio
+
+OWNERS: dict[str, Callable[[aerokit.Vehicle], Any]] = {
+    "vehicle": lambda vehicle: vehicle,
+    "guided": lambda vehicle: vehicle.guided,
+    "stream": lambda vehicle: vehicle.guided.velocity(),
+    "parameters": lambda vehicle: vehicle.parameters,
+    "mission": lambda vehicle: vehicle.mission,
+    "fence": lambda vehicle: vehicle.fence,
+    "rally": lambda vehicle: vehicle.rally,
+    "files": lambda vehicle: vehicle.files,
+    "logs": lambda vehicle: vehicle.logs,
+    "cell": lambda vehicle: vehicle.position,
+    "subscription": lambda vehicle: vehicle.subscribe(m.Heartbeat),
+    "connection": lambda vehicle: vehicle.connection,
+}
+USED_BY_THE_LIBRARY = {
+    "cell": frozenset({"set", "forget", "close"}),
+    "subscription": frozenset({"close"}),
+    "connection": frozenset(
+        {
+            "attach",
+            "bytes_received",
+            "check_types",
+            "close",
+            "counts",
+            "describe_signatures",
+            "fail",
+            "link_interrupted",
+        }
+        | {"link_lost", "link_restored", "on_end", "record", "tap"}
+    ),
+}
+
+
+async def misuse_it(misuse: Misuse) -> BaseException | None:
+    """What it raises; it is given no time to do anything."""
+    error: BaseException | None = None
+    with anyio.move_on_after(1.0):
+        try:
+            made = misuse.call()
+            if inspect.isawaitable(made):
+                await made
+            elif hasattr(made, "__aenter__"):
+                async with made:
+                    pass
+            elif hasattr(made, "__enter__"):
+                with made:
+                    pass
+        except Exception as raised:
+            error = raised
+    return error
+
+
+@asynccontextmanager
+async def quiet_flight() -> AsyncIterator[Flight]:
+    async with in_the_air() as flight:
+        await flight.vehicle.wait_ready()
+        flight.wire.forget()
+        yield flight
+
+
+@pytest.mark.parametrize("owner", OWNERS)
+async def test_nothing_is_done(owner: str) -> None:
+    async with quiet_flight() as flight:
+        mode = flight.copter.mode.number
+        wrong = []
+        for misuse in misuses(
+            OWNERS[owner](flight.vehicle), leave_out=USED_BY_THE_LIBRARY.get(owner, frozenset())
+        ):
+            error = await misuse_it(misuse)
+            wrong.append(refusal_of(misuse, error))
+        assert not (found := list(filter(None, wrong))), "\n".join(found)
+        heard = [message for _, message in flight.wire.sent if not isinstance(message, m.Heartbeat)]
+        assert heard == []
+        assert flight.copter.mode.number == mode
+        assert flight.copter.is_armed
+
+
+@pytest.mark.parametrize("function", [aerokit.connect, aerokit.open_connection])
+async def test_nothing_is_opened(function: Callable[..., Any]) -> None:
+    wrong = [
+        refusal_of(misuse, await misuse_it(misuse)) for misuse in misuses_of(function, function.__name__)
+    ]
+    assert not (found := list(filter(None, wrong))), "\n".join(found)
+
+
+@pytest.mark.parametrize("values", [{"RTL_ALT": "b"}, {1: 2.0}, {"RTL_ALT": None}, {"RTL_ALT": (1,)}])
+async def test_values_of_parameters(values: Any) -> None:
+    async with quiet_flight() as flight:
+        parameters = flight.vehicle.parameters
+        for call in (parameters.upload, parameters.diff, parameters.set_many):
+            with pytest.raises(LocalProtocolError):
+                await call(values)
+        assert [message for _, message in flight.wire.sent if not isinstance(message, m.Heartbeat)] == []

@@ -1,0 +1,161 @@
+"""Every public method of an object, and for each of its parameters values of wrong types, from the type hints.
+
+A type hint that is not listed here is an error, so that what is added to the library later is covered.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterator
+from decimal import Decimal
+from typing import Any, NamedTuple
+
+from aerokit import Position, messages
+from aerokit.errors import LocalProtocolError
+from aerokit.missions import Mission
+from aerokit.vehicle.setpoints import (
+    AttitudeSetpoint,
+    LocalPositionSetpoint,
+    PositionSetpoint,
+    VelocitySetpoint,
+)
+
+__all__ = ["Misuse", "misuses", "misuses_of", "refusal_of"]
+
+
+class _Anything:
+    """Of no type that anybody knows."""
+
+    def __repr__(self) -> str:
+        raise RuntimeError("not even that")
+
+
+PLACE = Position(47.0, 8.0)
+NOTHING: tuple[object, ...] = (None,)
+STRANGE: tuple[object, ...] = (_Anything(), [PLACE], (47.0, 8.0), {"a": "b"}, 1j, type)
+TEXT: tuple[object, ...] = ("ten",)
+NUMBER: tuple[object, ...] = (12,)
+WRONG: dict[str, tuple[object, ...]] = {
+    "float": (*NOTHING, *STRANGE, *TEXT, Decimal(1), "1.0", b"1"),
+    "float | None": (*STRANGE, *TEXT, Decimal(1), "1.0"),
+    "int": (*NOTHING, *STRANGE, *TEXT, 1.5, "1"),
+    "int | None": (*STRANGE, *TEXT, 1.5, "1"),
+    "bool": (*NOTHING, *STRANGE, "no", 2),
+    "str": (*NOTHING, *STRANGE, *NUMBER, b"text"),
+    "bytes": (*NOTHING, *STRANGE, *TEXT, *NUMBER),
+    "str | int": (*NOTHING, *STRANGE, 1.5, b"GUIDED"),
+    "str | os.PathLike[str]": (*NOTHING, *STRANGE, *NUMBER),
+    "str | os.PathLike[str] | None": (*STRANGE, *NUMBER),
+    "Position": (*NOTHING, *STRANGE, *TEXT, *NUMBER, [47.0, 8.0]),
+    "Message": (*NOTHING, *STRANGE, *TEXT, *NUMBER, messages.Heartbeat),
+    "type[Message]": (*NOTHING, *STRANGE, *TEXT, *NUMBER, messages.Heartbeat(0, 0, 0, 0, 0), int),
+    "Mapping[str, float]": (*NOTHING, *STRANGE, *TEXT, *NUMBER, {1: 1.0}, {"A": "1"}, {"A": None}, ["A"]),
+    "Mapping[type[Message], float] | None": (
+        *STRANGE,
+        *TEXT,
+        *NUMBER,
+        {"HEARTBEAT": 1.0},
+        {messages.Heartbeat: "1"},
+    ),
+    "Callable[[int | None], None] | None": (*TEXT, *NUMBER, [print]),
+    "OnProgress | None": (*TEXT, *NUMBER, [print]),
+    "Callable[[T], object]": (*NOTHING, *TEXT, *NUMBER, [print]),
+    "Callable[[T | None, T], None]": (*NOTHING, *TEXT, *NUMBER, [print]),
+    "Signing | None": (*STRANGE, *TEXT, *NUMBER, bytes(32)),
+    "Dialect": (*NOTHING, *STRANGE, *TEXT, *NUMBER),
+    "LogEntry | int": (*NOTHING, *STRANGE, *TEXT, 1.5),
+    "ParameterSource": (*NOTHING, _Anything(), [PLACE], (47.0, 8.0), 1j, *NUMBER),
+    "PlanT": (*NOTHING, *STRANGE, *TEXT, *NUMBER, PLACE),
+    "SetpointT": (*NOTHING, *STRANGE, *TEXT, *NUMBER, PLACE),
+    "str | Link": (*NOTHING, *STRANGE, *NUMBER, b"udpin:0.0.0.0:14550"),
+    "str | Link | Connection": (*NOTHING, *STRANGE, *NUMBER, b"udpin:0.0.0.0:14550"),
+}
+"""Type hint → values that it does not allow."""
+WRONG["type[ItemT]"] = WRONG["type[MessageT]"] = WRONG["type[Message]"]
+for _setpoint in ("Velocity", "BodyVelocity", "Acceleration", "LocalPosition", "Position", "Attitude"):
+    WRONG[f"{_setpoint}Setpoint"] = (*NOTHING, *STRANGE, *TEXT, *NUMBER, PLACE)
+WRONG["CacheChoice"] = (*NOTHING, *STRANGE, *NUMBER)
+for _literal in ("DownloadMethod", "UploadMethod", "PlanMethod", "LogMethod", "Overflow"):
+    WRONG[_literal] = (*STRANGE, *NUMBER, "quick")
+
+RIGHT: dict[str, object] = {
+    "float": 1.0,
+    "int": 1,
+    "bool": False,
+    "str": "A",
+    "bytes": b"",
+    "str | int": "GUIDED",
+    "str | os.PathLike[str]": "/nowhere/at/all",
+    "str | Link": "udpin:127.0.0.1:0",
+    "str | Link | Connection": "udpin:127.0.0.1:0",
+    "Position": PLACE,
+    "Message": messages.Heartbeat(6, 8, 0, 0, 4),
+    "type[Message]": messages.Heartbeat,
+    "type[MessageT]": messages.Heartbeat,
+    "Mapping[str, float]": {"A": 1.0},
+    "ParameterSource": {"A": 1.0},
+    "Callable[[T], object]": bool,
+    "Callable[[T | None, T], None]": print,
+    "LogEntry | int": 1,
+    "Signing | None": None,
+    "PlanT": Mission(),
+    "SetpointT": VelocitySetpoint(),
+    "PositionSetpoint": PositionSetpoint(PLACE),
+    "LocalPositionSetpoint": LocalPositionSetpoint(0, 0, -5),
+    "AttitudeSetpoint": AttitudeSetpoint(0, 0, 0, thrust=0.5),
+}
+"""Type hint → a value for a parameter that must be given while another one is wrong."""
+
+
+class Misuse(NamedTuple):
+    """A method, one of its parameters, and the call with a wrong value there."""
+
+    method: str
+    parameter: str
+    value: object
+    call: Callable[[], Any]
+
+    def __repr__(self) -> str:
+        return f"{self.method}({self.parameter}=<{type(self.value).__name__}>)"
+
+
+def misuses(owner: object, *, leave_out: frozenset[str] = frozenset()) -> Iterator[Misuse]:
+    """Each public method of an object with each parameter wrong in each way."""
+    for name, _ in inspect.getmembers(type(owner), inspect.isfunction):
+        if not name.startswith("_") and name not in leave_out:
+            yield from misuses_of(getattr(owner, name), f"{type(owner).__name__}.{name}")
+
+
+def misuses_of(function: Callable[..., Any], name: str) -> Iterator[Misuse]:
+    """One function with each parameter wrong in each way."""
+    parameters = inspect.signature(function).parameters
+    needed = [
+        each
+        for each in parameters.values()
+        if each.default is each.empty and each.kind is not each.VAR_POSITIONAL
+    ]
+    for parameter in parameters.values():
+        others = [each for each in needed if each is not parameter]
+        for value in WRONG[str(parameter.annotation)]:
+            args, kwargs = _arguments(parameter, value, others)
+            yield Misuse(
+                name, parameter.name, value, lambda args=args, kwargs=kwargs: function(*args, **kwargs)
+            )  # type: ignore[misc]
+
+
+def _arguments(
+    wrong: inspect.Parameter, value: object, others: list[inspect.Parameter]
+) -> tuple[list[object], dict[str, object]]:
+    """By name; only what has no name goes by its place, and what stands before it as well."""
+    if wrong.kind is wrong.VAR_POSITIONAL:
+        first = [RIGHT[str(each.annotation)] for each in others if each.kind is each.POSITIONAL_OR_KEYWORD]
+        rest = {each.name: RIGHT[str(each.annotation)] for each in others if each.kind is each.KEYWORD_ONLY}
+        return [*first, value], rest
+    return [], {wrong.name: value} | {each.name: RIGHT[str(each.annotation)] for each in others}
+
+
+def refusal_of(misuse: Misuse, error: BaseException | None) -> str | None:
+    """What is wrong with how it was refused; None when nothing is."""
+    if not isinstance(error, LocalProtocolError):
+        return f"{misuse!r}: {error!r}"
+    return None if misuse.parameter in str(error) else f"{misuse!r} is not named: {error}"
