@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 from aerokit.errors import LocalProtocolError
 from aerokit.snapshot import Snapshot
+from aerokit.wording import did_you_mean, shown
 
 __all__ = ["CUSTOM_MODE_ENABLED", "Mode", "ModeTable", "base_mode_name", "is_armed"]
 
@@ -97,12 +98,9 @@ class ModeTable:
         return int(number)
 
     def _unknown(self, name: str, extra: Mapping[int, str]) -> str:
-        import difflib  # only now: it is needed for this text alone
-
         known = [*self.names, *(extra[n] for n in sorted(extra) if n not in self._names)]
-        close = difflib.get_close_matches(name.upper(), known, n=1)
-        hint = f" (did you mean {close[0]!r}?)" if close else ""
-        return f"mode = {name!r} is not known{hint}; this vehicle's modes are " + ", ".join(known)
+        hint = did_you_mean(name, known)
+        return f"mode = {shown(name)} is not known{hint}; this vehicle's modes are " + ", ".join(known)
 
 
 def is_armed(base_mode: int) -> bool:

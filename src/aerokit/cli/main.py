@@ -25,6 +25,7 @@ from aerokit.cli.files import add_files
 from aerokit.cli.logs import add_logs
 from aerokit.cli.mission import add_mission
 from aerokit.cli.params import add_params
+from aerokit.cli.parser import Parser
 from aerokit.cli.places import EACH_ITS_OWN
 from aerokit.cli.signing import ENVIRONMENT, add_signing_key
 from aerokit.cli.vehicles import HOME
@@ -73,7 +74,7 @@ def _failed(text: str, code: int) -> int:
 def _parser() -> argparse.ArgumentParser:
     from aerokit import __version__
 
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="aerokit",
         description="Control drones over MAVLink.",
         epilog="Exit codes: 0 done, 1 failed, 2 wrong arguments, 130 interrupted.",

@@ -10,6 +10,7 @@ from urllib.parse import quote, unquote
 
 from aerokit.errors import LocalProtocolError
 from aerokit.snapshot import Snapshot
+from aerokit.wording import did_you_mean
 
 __all__ = ["ACCEPTED_FORMS", "LinkAddress", "LinkKind", "host_and_port", "parse_address"]
 
@@ -240,7 +241,8 @@ class _Parser:
             key = key.strip().lower()
             if key not in _OPTIONS.get(kind, ()):
                 known = ", ".join(_OPTIONS.get(kind, ())) or "none"
-                self.fail(f"{key!r} is not an option of {kind} links (they have: {known})")
+                meant = did_you_mean(key, _OPTIONS.get(kind, ()))
+                self.fail(f"{key!r} is not an option of {kind} links (they have: {known}){meant}")
             found[key] = self.option_value(key, value.strip().lower())
         return {
             key: value
@@ -272,7 +274,7 @@ class _Parser:
         known = (
             "pymavlink has it, aerokit does not" if scheme in _NOT_HERE else "there is no such kind of link"
         )
-        self.fail(f"{scheme}: {known}")
+        self.fail(f"{scheme}: {known}{did_you_mean(scheme, _SCHEMES)}")
 
     def fail(self, reason: str) -> NoReturn:
         raise LocalProtocolError(

@@ -6,6 +6,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from aerokit.errors import LocalProtocolError
+from aerokit.wording import did_you_mean, shown
 
 if TYPE_CHECKING:
     from aerokit.sim.vehicle import SimulatedVehicle
@@ -31,7 +32,9 @@ def kind_names() -> tuple[str, ...]:
 def kind_class(name: str) -> type[SimulatedVehicle]:
     """The class of a kind; LocalProtocolError lists the kinds when there is none of that name."""
     if name not in _KINDS:
-        raise LocalProtocolError(f"vehicle = {name!r} is not one of: {', '.join(_KINDS)}")
+        raise LocalProtocolError(
+            f"vehicle = {shown(name)} is not one of: {', '.join(_KINDS)}{did_you_mean(name, _KINDS)}"
+        )
     module, class_name = _KINDS[name]
     found: type[SimulatedVehicle] = getattr(import_module(module), class_name)
     return found

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from aerokit.errors import ParameterRejected, ParameterTimeout
 from aerokit.parameters import Parameter, check_name
 from aerokit.snapshot import Snapshot
+from aerokit.wording import did_you_mean
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -118,7 +119,14 @@ class ParameterNames:
             rename = find_rename(name)
             if isinstance(answer, Parameter) and rename is not None:
                 return Found(name, answer, other in answers, Renamed(name, other, rename))
-        return own or ParameterRejected(f"the vehicle has no parameter {name}", name=name)
+        return self._with_hint(own or ParameterRejected(f"the vehicle has no parameter {name}", name=name))
+
+    def _with_hint(self, answer: NotFound) -> NotFound:
+        """The same, and what was perhaps meant, by the names that are known."""
+        hint = did_you_mean(answer.name, self._access.store.table) if isinstance(answer, ParameterRejected) else ""
+        if not hint or not isinstance(answer, ParameterRejected):
+            return answer
+        return ParameterRejected(f"{answer}{hint}", name=answer.name, code=answer.code)
 
 
 def warn_of_rename(renamed: Renamed) -> None:

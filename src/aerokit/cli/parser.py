@@ -1,0 +1,37 @@
+"""``Parser``: argparse's, and what was perhaps meant when a command or an option is not known."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from aerokit.wording import did_you_mean
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+__all__ = ["Parser"]
+
+_CHOICE = re.compile(r"invalid choice: '(.*)' \(choose from (.*)\)")
+
+
+class Parser(argparse.ArgumentParser):
+    """Its subparsers are of this class, too, and each complains of its own arguments."""
+
+    def parse_known_args(  # type: ignore[override]  # typeshed has overloads for other namespaces
+        self, args: Sequence[str] | None = None, namespace: Any = None
+    ) -> tuple[Any, list[str]]:
+        """Refuse unknown options here, where the known ones are known."""
+        namespace, unknown = super().parse_known_args(args, namespace)
+        options = [each for each in unknown if each.startswith("-")]
+        if options:
+            meant = did_you_mean(options[0].partition("=")[0], self._option_string_actions)
+            self.error(f"unrecognized arguments: {' '.join(unknown)}{meant}")
+        return namespace, unknown
+
+    def error(self, message: str) -> NoReturn:
+        """Exit code 2."""
+        if found := _CHOICE.search(message):
+            message += did_you_mean(found[1], re.findall(r"[\w.-]+", found[2]))
+        super().error(message)
