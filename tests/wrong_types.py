@@ -43,6 +43,7 @@ WRONG: dict[str, tuple[object, ...]] = {
     "bool": (*NOTHING, *STRANGE, "no", 2),
     "str": (*NOTHING, *STRANGE, *NUMBER, b"text"),
     "bytes": (*NOTHING, *STRANGE, *TEXT, *NUMBER),
+    "str | int | None": (*STRANGE, 1.5, b"GUIDED"),
     "str | int": (*NOTHING, *STRANGE, 1.5, b"GUIDED"),
     "str | os.PathLike[str]": (*NOTHING, *STRANGE, *NUMBER),
     "str | os.PathLike[str] | None": (*STRANGE, *NUMBER),

@@ -561,3 +561,12 @@ async def test_look_at_refused(flying: Flight) -> None:
     flying.copter.faults.refuse(MavCmd.DO_SET_ROI_LOCATION, MavResult.DENIED, "No mount")
     with pytest.raises(CommandRejected, match="No mount"):
         await flying.vehicle.look_at(north_of_home(flying, 50.0))
+
+
+async def test_a_take_off_that_is_refused_in_the_air_says_so(flying: Flight) -> None:
+    """The vehicle says nothing but FAILED; the landed state had not been heard when the order was given."""
+    flying.vehicle.telemetry.landed_state.forget()
+    with pytest.raises(
+        CommandRejected, match=r"in the air.*, 10\.\d m above home: it takes off from the ground only"
+    ):
+        await flying.vehicle.take_off(20)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import anyio
 
 from aerokit.arguments import checks_arguments
-from aerokit.errors import NotSupported, OperationRejected, OperationTimeout
+from aerokit.errors import CommandRejected, NotSupported, OperationRejected, OperationTimeout
 from aerokit.vehicle.checks import check_range, check_seconds
 from aerokit.vehicle.helm import MODE_GRACE_S
 from aerokit.vehicle.progress import LONGEST_SILENCE_S, Stillness, await_progress
@@ -21,6 +22,10 @@ if TYPE_CHECKING:
 __all__ = ["FlightActions"]
 
 LANDED_ON_GROUND, LANDED_IN_AIR, TAKING_OFF = 1, 2, 3
+IN_THE_AIR: dict[int | None, str] = {LANDED_IN_AIR: "in the air", TAKING_OFF: "taking off", 4: "landing"}
+"""MAV_LANDED_STATE."""
+FLYING_M = 2.0
+"""So far above home, who says nothing of it is taken to fly."""
 RISEN_M = 0.5
 """Who is so much higher than before has obeyed an order to take off."""
 MODE_TIMEOUT_S = 6.0
@@ -77,6 +82,19 @@ class FlightActions(TravelActions):
         except (anyio.get_cancelled_exc_class(), OperationTimeout):  # it may have heard the order
             self._hold_soon(order)
             raise
+        except CommandRejected as error:
+            raise self._with_state(error) from error
+
+    def _with_state(self, error: CommandRejected) -> CommandRejected:
+        """What the vehicle leaves unsaid when it is asked to take off in the air."""
+        state, altitude = IN_THE_AIR.get(self.telemetry.landed_state.latest), self._altitude_relative()
+        if state is None and not altitude > FLYING_M:
+            return error
+        height = f", {altitude:.1f} m above home" if altitude > -math.inf else ""
+        why = f"it is {state or 'in the air, it seems'}{height}: it takes off from the ground only; go_to() climbs, too"
+        explained = CommandRejected(f"{error}", command=error.command, result=error.result, reasons=(why,))
+        explained.reasons = (*error.reasons, why)
+        return explained
 
     def _take_off_plan(self, altitude_m: float) -> TakeOff:
         home = self._home_altitude() if self.autopilot.take_off_needs_home() else None

@@ -123,7 +123,11 @@ class ParameterNames:
 
     def _with_hint(self, answer: NotFound) -> NotFound:
         """The same, and what was perhaps meant, by the names that are known."""
-        hint = did_you_mean(answer.name, self._access.store.table) if isinstance(answer, ParameterRejected) else ""
+        hint = (
+            did_you_mean(answer.name, self._access.store.table)
+            if isinstance(answer, ParameterRejected)
+            else ""
+        )
         if not hint or not isinstance(answer, ParameterRejected):
             return answer
         return ParameterRejected(f"{answer}{hint}", name=answer.name, code=answer.code)
