@@ -29,6 +29,7 @@ def main() -> int:
         "--grow", type=Path, metavar="DIR", help="keep inputs that reach new code there, by target"
     )
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--plain", action="store_true", help="without atheris")
     parser.add_argument("--one", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.one:
@@ -52,6 +53,7 @@ def succeeds(name: str, options: argparse.Namespace) -> bool:
         str(options.seed),
         name,
     ]
+    command += ["--plain"] if options.plain else []
     if options.grow is not None:
         command += ["--grow", str(options.grow)]
     done = subprocess.run(command, capture_output=True, text=True)
@@ -62,7 +64,7 @@ def succeeds(name: str, options: argparse.Namespace) -> bool:
 
 def fuzz(name: str, options: argparse.Namespace) -> int:
     FAILURES.mkdir(exist_ok=True)
-    if importlib.util.find_spec("atheris") is not None:
+    if importlib.util.find_spec("atheris") is not None and not options.plain:
         fuzz_with_atheris(name, options)  # does not return
     from targets import TARGETS
 

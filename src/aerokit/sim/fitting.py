@@ -29,8 +29,13 @@ def fitted(message: MessageT) -> MessageT:
 
 
 def _fitting(field: Field, value: Any) -> Any:
-    if isinstance(value, str):
-        return value.encode(errors="replace")[: field.array_length or 1].decode(errors="ignore")
+    if field.type == "char":
+        is_text = isinstance(value, str)
+        return (
+            value.encode(errors="replace")[: field.array_length or 1].decode(errors="ignore")
+            if is_text
+            else value
+        )
     fit = _fit_of(field.type)
     return tuple(map(fit, value)) if isinstance(value, tuple) else fit(value)
 

@@ -1,0 +1,59 @@
+"""Each fuzz target on its corpus, and on a bounded number of inputs made of it; ``nox -s fuzz`` goes further."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+from targets import TARGETS
+
+HERE = Path(__file__).parent
+CORPUS = HERE / "corpus"
+KNOWN = {name: [path.read_bytes() for path in sorted((CORPUS / name).iterdir())] for name in TARGETS}
+EXAMPLES = 40
+
+edits = st.tuples(st.floats(0, 1), st.integers(0, 4), st.binary(max_size=4))
+"""Where, how many bytes are cut out there, and what is put in."""
+
+
+def edited(data: bytes, changes: list[tuple[float, int, bytes]]) -> bytes:
+    for place, cut, put in changes:
+        at = int(place * len(data))
+        data = data[:at] + put + data[at + cut :]
+    return data
+
+
+@pytest.mark.parametrize(
+    "path", sorted(CORPUS.glob("*/*")), ids=lambda path: f"{path.parent.name}/{path.name}"
+)
+def test_known_inputs(path: Path) -> None:
+    TARGETS[path.parent.name](path.read_bytes())
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_other_inputs(name: str) -> None:
+    inputs = st.builds(edited, st.sampled_from(KNOWN[name]), st.lists(edits, max_size=6)) | st.binary(
+        max_size=300
+    )
+
+    @settings(max_examples=EXAMPLES, phases=[Phase.generate], suppress_health_check=list(HealthCheck))
+    @given(inputs)
+    def fuzz(data: bytes) -> None:
+        TARGETS[name](data)
+
+    fuzz()
+
+
+def test_each_folder_of_the_corpus_is_of_a_target() -> None:
+    assert {path.name for path in CORPUS.iterdir()} == set(TARGETS)
+
+
+def test_the_command_line_finds_what_is_wrong(tmp_path: Path) -> None:
+    command = [sys.executable, str(HERE / "run.py"), "--plain", "--runs", "20", "address", "waypoints"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.endswith("all passed\n")
