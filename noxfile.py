@@ -120,6 +120,17 @@ def bench_scale(session: nox.Session) -> None:
 
 
 @nox.session
+def fuzz(session: nox.Session) -> None:
+    """Fuzz what takes bytes from outside, a quarter of an hour; `-- --runs 100000 address plan` for some of it, longer.
+
+    With atheris, which follows what code an input reaches, where it installs.
+    """
+    session.install("-e", ".[test]")
+    session.run("python", "-m", "pip", "install", "-q", "atheris", success_codes=[0, 1])
+    session.run("python", "tests/fuzz/fuzz.py", *session.posargs)
+
+
+@nox.session
 def badlinks(session: nox.Session) -> None:
     """Judge every transfer over bad radios, 200 seeds of each, and print the table; half an hour and more."""
     session.install("-e", ".[test]")

@@ -217,4 +217,4 @@ def test_control_characters_in_attributes_stay_texts(tmp_path: Path) -> None:
 def test_an_enum_without_entries(tmp_path: Path) -> None:
     path = tmp_path / "private.xml"
     path.write_text(dialect('<enums><enum name="EMPTY"/></enums>'))
-    assert len(Dialect.from_xml(path).enum("EMPTY")) == 0
+    assert Dialect.from_xml(path).enum("EMPTY").__members__ == {}

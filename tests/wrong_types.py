@@ -8,6 +8,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterator
 from decimal import Decimal
+from functools import partial
 from typing import Any, NamedTuple
 
 from aerokit import Position, messages
@@ -139,9 +140,7 @@ def misuses_of(function: Callable[..., Any], name: str) -> Iterator[Misuse]:
         others = [each for each in needed if each is not parameter]
         for value in WRONG[str(parameter.annotation)]:
             args, kwargs = _arguments(parameter, value, others)
-            yield Misuse(
-                name, parameter.name, value, lambda args=args, kwargs=kwargs: function(*args, **kwargs)
-            )  # type: ignore[misc]
+            yield Misuse(name, parameter.name, value, partial(function, *args, **kwargs))
 
 
 def _arguments(

@@ -48,14 +48,15 @@ class _Talk:
 
     def __init__(self, exchange: Exchange[Any], script: Script) -> None:
         self.exchange, self.script = exchange, script
-        self.now, self.last = 100.0, None
+        self.now = 100.0
+        self.last: Message | None = None
         exchange.start(self.now)
         self._take()
 
     def _take(self) -> None:
         for message in self.exchange.take_outbox():
             message.encode()
-            self.last: Message | None = message
+            self.last = message
 
     def run(self) -> None:
         for _ in range(MOST_ANSWERS):

@@ -60,7 +60,7 @@ def fuzz_parameter_file(data: bytes) -> None:
         return
     for form in ("missionplanner", "mavproxy", "qgroundcontrol"):
         try:
-            text = parameter_file_text(file, form)  # type: ignore[arg-type]  # mypy has no literal of a loop
+            text = parameter_file_text(file, form)
         except LocalProtocolError:
             continue
         again = parse_parameter_file(text)

@@ -15,6 +15,7 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.checksum import x25
 from aerokit.mavlink.enums import MavCmd
 from aerokit.mavlink.frame import MAGIC_V2
+from aerokit.sim.parameters import Parameters
 from aerokit.sim.vehicle import SimulatedVehicle
 
 __all__ = ["Script", "play"]
@@ -109,6 +110,9 @@ class _Player:
     def say(self, message: Message) -> None:
         self._send(message.ID, message.encode())
 
+    def _say_with(self, message_class: Callable[..., Message], *fields: float) -> None:
+        self.say(message_class(*fields))
+
     def _send(self, message_id: int, payload: bytes) -> None:
         self.sequence += 1
         self.hear(framed(message_id, payload, self.sequence))
@@ -130,7 +134,8 @@ class _Player:
     def _command_int(self) -> None:
         command = COMMANDS[int.from_bytes(self.script.take(2), "little") % len(COMMANDS)]
         numbers = [self.script.number() for _ in range(4)]
-        self.say(m.CommandInt(*self._target(), self.script.byte(), command, 0, 0, *numbers, *self._place()))
+        head = (*self._target(), self.script.byte(), command, 0, 0)
+        self._say_with(m.CommandInt, *head, *numbers, *self._place())
 
     def _place(self) -> tuple[int, int, float]:
         x, y = (self.script.whole(-(1 << 31), (1 << 31) - 1) for _ in range(2))
@@ -172,7 +177,7 @@ class _Player:
         if not names:
             return
         name = names[number % len(names)]
-        kind = parameters.type(name) if hasattr(parameters, "type") else 9
+        kind = parameters.type(name) if isinstance(parameters, Parameters) else 9
         value = self.script.number()
         if kind == 6 and not hasattr(self.vehicle, "guided") and math.isfinite(value):  # PX4: the bits of it
             (value,) = _F32.unpack(struct.pack("<i", max(-(1 << 31), min((1 << 31) - 1, int(value)))))
@@ -184,24 +189,14 @@ class _Player:
     def _plan(self) -> None:
         """A whole upload of some items, and perhaps a start."""
         kind, count = self.script.byte() % 3, self.script.byte() % 6
-        self.say(m.MissionCount(self.vehicle.system_id, 1, count, kind))
+        target = (self.vehicle.system_id, 1)
+        self.say(m.MissionCount(*target, count, kind))
         for seq in range(count):
             command = self._plan_command(kind)
             frame = self.script.byte() % 22
             numbers = [self.script.number() for _ in range(4)]
-            item = m.MissionItemInt(
-                self.vehicle.system_id,
-                1,
-                seq,
-                frame,
-                command,
-                0,
-                self.script.byte() & 1,
-                *numbers,
-                *self._place(),
-                kind,
-            )
-            self.say(item)
+            head = (*target, seq, frame, command, 0, self.script.byte() & 1)
+            self._say_with(m.MissionItemInt, *head, *numbers, *self._place(), kind)
             self.wait(0.05)
 
     def _plan_command(self, kind: int) -> int:

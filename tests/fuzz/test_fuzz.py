@@ -40,7 +40,7 @@ def test_other_inputs(name: str) -> None:
         max_size=300
     )
 
-    @settings(max_examples=EXAMPLES, phases=[Phase.generate], suppress_health_check=list(HealthCheck))
+    @settings(max_examples=EXAMPLES, phases=[Phase.generate], suppress_health_check=[HealthCheck.too_slow])
     @given(inputs)
     def fuzz(data: bytes) -> None:
         TARGETS[name](data)
@@ -53,7 +53,7 @@ def test_each_folder_of_the_corpus_is_of_a_target() -> None:
 
 
 def test_the_command_line_finds_what_is_wrong(tmp_path: Path) -> None:
-    command = [sys.executable, str(HERE / "run.py"), "--plain", "--runs", "20", "address", "waypoints"]
+    command = [sys.executable, str(HERE / "fuzz.py"), "--plain", "--runs", "20", "address", "waypoints"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.endswith("all passed\n")

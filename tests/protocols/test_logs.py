@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import tracemalloc
 from dataclasses import dataclass
 from heapq import heappop, heappush
 from typing import Any
@@ -261,3 +262,33 @@ def test_an_end_that_was_sent_is_not_sent_again() -> None:
     exchange = LogEnd(1, 1, is_sent=True)
     exchange.start(0.0)
     assert exchange.take_outbox() == []
+
+
+def test_a_block_far_behind_all_others_is_not_believed() -> None:
+    """It would make 47 million gaps, 3 GB."""
+    content = bytearray()
+    exchange = LogDownload(1, 1, 1, 0xFFFF_FFFF, Reassembly(content.extend, block_size=LOG_BLOCK))
+    exchange.start(0.0)
+    last = 0xFFFF_FFFF // LOG_BLOCK * LOG_BLOCK
+    tracemalloc.start()
+    try:
+        for offset in (last, last - LOG_BLOCK, 0):
+            exchange.receive(LogData(1, offset, LOG_BLOCK, bytes(LOG_BLOCK)), 0.1)
+        assert tracemalloc.get_traced_memory()[1] < 1_000_000
+    finally:
+        tracemalloc.stop()
+    assert len(content) == LOG_BLOCK
+
+
+def test_many_entries_that_do_not_come_are_named_shortly() -> None:
+    exchange = make_list(patience_s=1.0)
+    exchange.start(0.0)
+    for number in range(2, 60_000, 1000):
+        exchange.receive(LogEntry(number, 65_535, 65_535, 0, 7), 0.1)
+    while not exchange.done:
+        assert exchange.deadline is not None
+        exchange.expire(exchange.deadline)
+    with pytest.raises(FileTimeout) as raised:
+        exchange.result()
+    assert len(str(raised.value)) < 300
+    assert len(raised.value.missing) == 65_535 - 60

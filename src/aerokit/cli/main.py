@@ -74,7 +74,7 @@ def _failed(text: str, code: int) -> int:
 def _parser() -> argparse.ArgumentParser:
     from aerokit import __version__
 
-    parser = Parser(
+    parser: argparse.ArgumentParser = Parser(
         prog="aerokit",
         description="Control drones over MAVLink.",
         epilog="Exit codes: 0 done, 1 failed, 2 wrong arguments, 130 interrupted.",

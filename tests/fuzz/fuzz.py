@@ -1,4 +1,4 @@
-"""Fuzzing from the command line: ``python tests/fuzz/run.py [--runs N] [TARGET …]``; see ``nox -s fuzz``.
+"""Fuzzing from the command line: ``python tests/fuzz/fuzz.py [--runs N] [TARGET …]``; see ``nox -s fuzz``.
 
 With atheris, which follows what code an input reaches, where it is installed; else with random bytes and changed
 pieces of the corpus. Each target runs in a process of its own, as an input that fails ends it. Such an input is left in
@@ -8,11 +8,13 @@ pieces of the corpus. Each target runs in a process of its own, as an input that
 from __future__ import annotations
 
 import argparse
+import importlib
 import importlib.util
 import random
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE), str(HERE.parent)]
@@ -80,7 +82,7 @@ def fuzz(name: str, options: argparse.Namespace) -> int:
 
 
 def fuzz_with_atheris(name: str, options: argparse.Namespace) -> None:
-    import atheris
+    atheris: Any = importlib.import_module("atheris")
 
     with atheris.instrument_imports(include=["aerokit"]):
         from targets import TARGETS
