@@ -38,6 +38,7 @@ _SIMPLE: dict[str, Rule] = {
     "None": (lambda value: value is None, "None"),
     "Callable": (callable, "a function"),
     "OnProgress": (callable, "a function"),
+    "Peers": (lambda _: True, "addresses and networks"),  # links know better, and say so
     "PathLike": (lambda value: isinstance(value, os.PathLike), "a path"),
 }
 

@@ -49,11 +49,11 @@ async def misuse_it(misuse: Misuse) -> BaseException | None:
     with anyio.move_on_after(1.0):
         try:
             made = misuse.call()
-            if inspect.isawaitable(made):
-                await made
-            elif hasattr(made, "__aenter__"):
+            if hasattr(made, "__aenter__"):
                 async with made:
                     pass
+            elif inspect.isawaitable(made):
+                await made
             elif hasattr(made, "__enter__"):
                 with made:
                     pass

@@ -6,12 +6,21 @@ import ipaddress
 from collections.abc import Iterable
 
 from aerokit.errors import LocalProtocolError
+from aerokit.wording import shown
 
 __all__ = ["AllowedPeers", "Network", "Peers"]
 
 Network = ipaddress.IPv4Network | ipaddress.IPv6Network
 Peers = str | ipaddress.IPv4Address | ipaddress.IPv6Address | Network | Iterable[object]
 """What ``peers`` may be: an IP address or network ("10.0.0.7", "10.0.0.0/24", those of `ipaddress`), or several."""
+
+_KINDS = (
+    str,
+    ipaddress.IPv4Address,
+    ipaddress.IPv6Address,
+    ipaddress.IPv4Network,
+    ipaddress.IPv6Network,
+)
 
 
 class AllowedPeers:
@@ -43,13 +52,12 @@ def _several(peers: Peers) -> Iterable[object]:
 
 
 def _network(item: object) -> Network:
-    if isinstance(item, (int, bytes)):  # ipaddress would take them
-        raise LocalProtocolError(
-            f"peers: {item!r} is no IP address or network, such as '10.0.0.7' or '10.0.0.0/24'"
-        )
-    try:
-        return ipaddress.ip_network(item)  # type: ignore[arg-type]
-    except ValueError as error:
-        raise LocalProtocolError(
-            f"peers: {item!r} is no IP address or network, such as '10.0.0.7' or '10.0.0.0/24' ({error})"
-        ) from None
+    error: object = "of another type"
+    if isinstance(item, _KINDS):
+        try:
+            return ipaddress.ip_network(item)
+        except ValueError as refused:
+            error = refused
+    raise LocalProtocolError(
+        f"peers: {shown(item)} is no IP address or network, such as '10.0.0.7' or '10.0.0.0/24' ({error})"
+    )
