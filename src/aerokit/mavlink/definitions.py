@@ -14,9 +14,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
-from xml.etree.ElementTree import ParseError
-
-from defusedxml import ElementTree as DefusedXml
 
 from aerokit.errors import LocalProtocolError
 from aerokit.mavlink.checksum import x25
@@ -206,6 +203,12 @@ def read_dialect(path: Path, search: Sequence[Path] = ()) -> list[DialectDefinit
 
 def read_xml(path: Path) -> DialectDefinition:
     """Read one file, without what it includes; LocalProtocolError when it is no MAVLink XML."""
+    from xml.etree.ElementTree import (
+        ParseError,  # not for those who have definitions of pymavlink's classes only
+    )
+
+    from defusedxml import ElementTree as DefusedXml
+
     try:
         root = DefusedXml.fromstring(read_bounded(path), forbid_dtd=True)
         return DialectDefinition(
