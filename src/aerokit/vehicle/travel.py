@@ -24,7 +24,6 @@ from aerokit.vehicle.progress import LONGEST_SILENCE_S, Stillness, await_progres
 from aerokit.vehicle.values import Position
 
 if TYPE_CHECKING:
-
     from aerokit.autopilots import Mode
     from aerokit.vehicle.orders import Order
 
