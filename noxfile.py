@@ -29,7 +29,7 @@ def tests(session: nox.Session) -> None:
 
 MEETS_OTHERS = (
     "tests/test_sync.py", "tests/test_sync_loop.py", "tests/test_sync_parameters.py", "tests/test_beside_sniffio.py",
-    "tests/test_package.py", "tests/links", "tests/runtime/test_ends.py", "tests/runtime/test_leaks.py",
+    "tests/test_package.py", "tests/links/test_serial.py", "tests/runtime/test_ends.py", "tests/runtime/test_leaks.py",
     "tests/dronekit/test_dronekit_life.py", "tests/dronekit/test_dronekit_orders.py", "tests/vehicle/test_guided.py",
     "tests/parameters", "tests/testing/test_clock.py",
 )  # fmt: skip

@@ -154,7 +154,8 @@ class Helm:
             expected=before.modes if is_unsettled and before is not None else (),
             armed_before=self._telemetry.armed.latest,
             is_newest=is_newest,
-            settles_at=self._any_mode_until,
+            settles_at=self.mode_settles_at,
+            any_until=self._any_mode_until,
         )
 
     def _on_mode(self, _: Mode | None, mode: Mode) -> None:

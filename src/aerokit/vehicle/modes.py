@@ -80,11 +80,11 @@ class ModeActions(VehicleState):
             try:
                 await send(command, *params, standing=sending, **options)
             except CommandRejected as error:
-                if not sending.end or not sending.was_done:
+                if not sending.has_worked:
                     await self._settle()
                     raise self._explained(error, started) from None
             except CommandTimeout as error:
-                if not sending.end or not sending.was_done:
+                if not sending.has_worked:
                     raise self._unanswered(error, order) from None
 
     def _raise_if_over(self, order: Order) -> None:

@@ -25,8 +25,9 @@ class Order:
     """One order of the program, from when it is given until it is done, overruled or taken over.
 
     ``mode_before`` is the mode that it was given in, ``modes`` are those that it may bring about, ``expected`` others
-    that may still be told because the program had ordered them just before; until ``settles_at`` any mode may, since
-    the program had sent an order of its own making. Any other mode is a pilot's or a failsafe's doing.
+    that may still be told because the program had ordered them just before, and until ``settles_at`` in any order; until
+    ``any_until`` every mode may, since the program had sent an order of its own making. Any other mode is a pilot's or
+    a failsafe's doing.
     """
 
     def __init__(
@@ -39,6 +40,7 @@ class Order:
         armed_before: bool | None,
         is_newest: Callable[[Order], bool],
         settles_at: float = -math.inf,
+        any_until: float = -math.inf,
     ) -> None:
         self.given_at = given_at
         self.modes = tuple(modes)
@@ -48,7 +50,8 @@ class Order:
         self._own = {each.custom_mode for each in modes}
         self._is_mode_known = mode_before is not None
         self._was_armed = armed_before
-        self._is_newest, self._settles_at = is_newest, settles_at
+        self._is_newest = is_newest
+        self._settles_at, self._any_until = settles_at, any_until
 
     @property
     def end(self) -> str:
@@ -62,8 +65,9 @@ class Order:
     def note_mode(self, mode: Mode, at: float) -> None:
         """The vehicle tells its mode. Once it was in one of the order's, the mode before is somebody else's, too."""
         if self.is_own(mode):
-            self._allowed.clear()
-        elif not self._is_mode_known or at < self._settles_at:
+            if at >= self._settles_at:
+                self._allowed.clear()
+        elif not self._is_mode_known or at < self._any_until:
             self._allowed.add(mode.custom_mode)
         elif mode.custom_mode not in self._allowed:
             self.taken_by = self.taken_by or f"the mode changed to {mode}"
@@ -100,8 +104,7 @@ class Sending:
         self.order = order
         self.told_at = -math.inf
         """When HEARTBEAT came last."""
-        self.was_done = False
-        """Whether its effect has been told, whatever came after it."""
+        self._was_told = False
         wanted = {each.custom_mode for each in modes}
         is_there = mode_now is not None and mode_now.custom_mode in wanted
         self._modes = frozenset[int]() if is_there else frozenset(wanted)
@@ -109,16 +112,21 @@ class Sending:
         self._is_done = is_done
 
     @property
+    def has_worked(self) -> bool:
+        """Whether its effect has been told, whatever came after it."""
+        self._was_told = self._was_told or self._is_done()
+        return self._was_told
+
+    @property
     def end(self) -> str:
         """Why it must not be sent again, as a clause; empty while it may."""
-        self.was_done = self.was_done or self._is_done()
-        return "its effect was told" if self.was_done else self.order.end
+        return "its effect was told" if self.has_worked else self.order.end
 
     def note_mode(self, mode: Mode, at: float) -> None:
         """The vehicle tells its mode."""
-        self.was_done = self.was_done or mode.custom_mode in self._modes
+        self._was_told = self._was_told or mode.custom_mode in self._modes
 
     def note_armed(self, armed: bool, at: float) -> None:
         """The vehicle tells whether it is armed, which ends a HEARTBEAT."""
-        self.was_done = self.was_done or (self._armed is not None and armed is self._armed)
+        self._was_told = self._was_told or (self._armed is not None and armed is self._armed)
         self.told_at = at
