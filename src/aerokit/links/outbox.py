@@ -79,13 +79,12 @@ class Outbox:
         self._is_full = True
 
     def resume(self) -> None:
-        """The transport takes some again."""
+        """The transport takes some again: something has left it, whatever waits here."""
         self._is_full = False
         if self._is_closed:
             return
-        if self._is_stalled:
-            self._stop_looking()
-            self._look()
+        self._moved_at = self._loop.time()
+        self._set_stalled(False)
         self._flush()
 
     def discard(self) -> None:
