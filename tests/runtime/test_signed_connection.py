@@ -27,6 +27,7 @@ from aerokit.mavlink.messages import Attitude, Heartbeat, RadioStatus, SetupSign
 from aerokit.mavlink.signing import Refusal
 from aerokit.runtime.connection import Connection
 from aerokit.sim import SimulatedCopter, SimulatedPx4, SimulatedVehicle, simulated_link
+from aerokit.sim.channel import Channel
 from aerokit.vehicle.connect import connect as connect_vehicle
 
 pytestmark = pytest.mark.anyio
@@ -97,6 +98,51 @@ async def test_a_vehicle_with_a_key_does_not_hear_who_has_none() -> None:
             await vehicle.command(512, 148)
         vehicle.connection.signing = Signing(KEY)
         await vehicle.command(512, 148)
+
+
+class Zeros(SigningKey):
+    """What PX4 signs with that has no key; SigningKey refuses it."""
+
+    def __init__(self) -> None:
+        self._secret = bytes(32)
+
+
+async def test_signed_with_zeros_means_that_it_has_no_key() -> None:
+    px4 = SimulatedPx4()
+    async with connected(px4) as vehicle:
+        px4.channels[0].sign_with(lenient(Zeros()))
+        await anyio.sleep(2)
+        heartbeat = vehicle.connection.heard[1, 1].received_frame
+        assert heartbeat is not None
+        assert lenient(Zeros()).has_signed(heartbeat)
+        px4.faults.ignore(512)
+        with pytest.raises(CommandTimeout) as failure:
+            await vehicle.command(512, 148)
+        assert "signed" not in str(failure.value)
+
+
+async def test_a_key_is_taken_away_from_who_signs_with_zeros_then(monkeypatch: pytest.MonkeyPatch) -> None:
+    px4 = SimulatedPx4(signing_key=KEY)
+    start = px4.signing.start
+
+    def with_zeros(channel: Channel) -> None:
+        start(channel)
+        if px4.signing.key is None:
+            channel.sign_with(lenient(Zeros()))
+
+    monkeypatch.setattr(px4.signing, "start", with_zeros)
+    async with connected(px4, signing=Signing(KEY)) as vehicle:
+        await vehicle.wait_ready()
+        await vehicle.setup_signing(None)
+        assert [px4.signing.key, vehicle.connection.signing] == [None, None]
+
+
+async def test_px4_takes_keys_by_usb_only_and_the_error_says_so() -> None:
+    px4 = SimulatedPx4()
+    px4.signing.may_change = lambda: False  # type: ignore[method-assign]
+    async with connected(px4) as vehicle:
+        with pytest.raises(OperationTimeout, match="PX4 takes a key on its USB port only"):
+            await vehicle.setup_signing(Signing(KEY))
 
 
 @pytest.mark.parametrize(("vehicle_key", "why"), [(None, "is not signed"), (WRONG, "another key")])

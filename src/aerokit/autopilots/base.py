@@ -113,6 +113,8 @@ class Autopilot:
     """None: DO_REPOSITION is not known to work."""
     home_is_item_0 = False
     """Whether a mission's item 0 is home."""
+    keys_are_taken = ""
+    """Where SETUP_SIGNING is obeyed, in words, if that is not everywhere."""
     runs_prearm_checks = False
     """Whether MAV_CMD_RUN_PREARM_CHECKS (401) repeats the failing checks as status texts."""
     condition_yaw = False

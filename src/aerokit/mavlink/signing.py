@@ -16,7 +16,7 @@ from aerokit.errors import LocalProtocolError
 from aerokit.mavlink.frame import SIGNATURE_LENGTH, SIGNED, Frame
 from aerokit.mavlink.timestamp_file import TimestampFile
 
-__all__ = ["Refusal", "Signing", "SigningKey", "timestamp_at"]
+__all__ = ["Refusal", "Signing", "SigningKey", "is_signed_with_a_key", "timestamp_at"]
 
 KEY_LENGTH = 32
 TICKS_PER_S = 100_000
@@ -31,6 +31,7 @@ ALWAYS_UNSIGNED = frozenset((109, 166))
 """RADIO_STATUS and RADIO: telemetry radios put them between the frames, and have no key."""
 
 _HASH_LENGTH = 6
+_NO_KEY = bytes(KEY_LENGTH)
 
 AllowUnsigned = Callable[[Frame], bool]
 
@@ -38,6 +39,14 @@ AllowUnsigned = Callable[[Frame], bool]
 def timestamp_at(unix_time_s: float) -> int:
     """The time stamp of an instant, given in seconds since 1970; 0 for everything before 2015."""
     return max(0, int((unix_time_s - EPOCH_S) * TICKS_PER_S))
+
+
+def is_signed_with_a_key(frame: Frame) -> bool:
+    """Whether a frame has a signature that says anything: PX4 without a key signs with one of zeros, as anybody can."""
+    raw = frame.raw
+    return bool(frame.incompat_flags & SIGNED) and (
+        sha256(_NO_KEY + raw[:-_HASH_LENGTH]).digest()[:_HASH_LENGTH] != raw[-_HASH_LENGTH:]
+    )
 
 
 class SigningKey:

@@ -39,6 +39,8 @@ async def set_up_signing(vehicle: Vehicle, signing: Signing | None, timeout: flo
         if taken.is_set():
             return
     texts = "; ".join(vehicle.texts_since(started)) or "it said nothing about it"
+    if vehicle.autopilot.keys_are_taken:
+        texts += f"; {vehicle.autopilot.keys_are_taken}"
     wanted = "without a signature" if signing is None else f"signed with {signing.key!r}"
     raise OperationTimeout(
         f"setup_signing: no frame {wanted} came within {timeout:g} s; {texts}; {vehicle.describe_link()}"
