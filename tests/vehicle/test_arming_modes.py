@@ -7,7 +7,7 @@ import pytest
 from flight_harness import in_the_air, open_flight, open_px4
 
 from aerokit import connect
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import LinkLost, LocalProtocolError, OperationTimeout
 from aerokit.mavlink.enums import CopterMode, MavCmd, PlaneMode
 from aerokit.sim import SimulatedPlane, simulated_link
 from aerokit.sim.px4.modes import OFFBOARD
@@ -102,3 +102,22 @@ async def test_a_dead_link_is_a_reason() -> None:
         reasons = await flight.vehicle.why_not_armable()
         assert any("heartbeats (the last one 2" in each for each in reasons)
         assert any("position (no GLOBAL_POSITION_INT" in each for each in reasons)
+
+
+async def test_while_the_link_is_lost_nothing_is_ready() -> None:
+    """At once, with values that are still young; and only a heartbeat of after it brings it back."""
+    async with open_flight() as flight:
+        vehicle, connection = flight.vehicle, flight.vehicle.connection
+        await vehicle.wait_ready()
+        flight.copter.faults.silent = True
+        connection.link_interrupted(LinkLost("unplugged"))
+        await anyio.sleep(0.5)
+        with pytest.raises(OperationTimeout, match=r"heartbeats \(the last one .* s ago, the link is lost\)"):
+            await vehicle.wait_ready(timeout=2.0)
+        assert any("the link is lost" in each for each in await vehicle.why_not_armable())
+        connection.link_restored(3.0)
+        with pytest.raises(OperationTimeout, match="the link is lost"):
+            await vehicle.wait_ready(timeout=0.2)
+        flight.copter.faults.silent = False
+        await vehicle.wait_ready(timeout=5.0)
+        assert await vehicle.why_not_armable() == []

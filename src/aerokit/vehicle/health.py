@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import anyio
 
 from aerokit.errors import CommandRejected, CommandTimeout
+from aerokit.runtime.link_state import LinkState
 from aerokit.vehicle.core import VehicleCore
 
 if TYPE_CHECKING:
@@ -38,7 +39,9 @@ class VehicleHealth(VehicleCore):
     def _out_of_date(self) -> list[str]:
         """What has been told, but too long ago to say anything about now."""
         telemetry = self.telemetry
-        heartbeats = [f"heartbeats (the last one {self.heartbeat_age:.1f} s ago)"] if self.is_silent else []
+        is_lost = self.link_state.latest is LinkState.LOST
+        why = f"the last one {self.heartbeat_age:.1f} s ago{', the link is lost' if is_lost else ''}"
+        heartbeats = [f"heartbeats ({why})"] if is_lost or self.is_silent else []
         return heartbeats + [
             f"{cell.name} (no {cell.waits_for} for {cell.age:.0f} s)"
             for cell in (telemetry.sensors, telemetry.estimator, telemetry.position)
