@@ -141,6 +141,80 @@ async def test_a_log_that_is_not_there(bench: Bench) -> None:
         await bench.logs.read(larger)
 
 
+MORE = 30_001
+
+
+@pytest.mark.parametrize("clock_s", [-100, 0, 100])
+@pytest.mark.parametrize(
+    ("kind", "method"),
+    [("ardupilot", "auto"), ("ardupilot", "log"), ("ardupilot", "ftp"), ("px4", "auto"), ("px4", "log")],
+)
+async def test_a_log_that_is_still_written_comes_as_far_as_it_goes(
+    kind: str, method: Any, clock_s: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """ArduPilot tells its clock's time while it writes, and the file's afterwards, which may be earlier."""
+    async with open_bench(kind) as bench:
+        entry = (await bench.logs.list())[-1]
+        assert entry.time_utc is not None
+        time_utc, server = int(entry.time_utc.timestamp()) + clock_s, bench.server
+        server.write_on(MORE, time_utc)
+        for tenths in range(1, 6):  # in the midst of it
+            bench.simulated.call_later(tenths / 10, lambda: server.write_on(100, time_utc))
+        with caplog.at_level("INFO", "aerokit"):
+            content = await bench.logs.read(entry, method=method)
+            assert len(content) >= entry.size + MORE
+            await bench.logs.download(entry, tmp_path / "flight.bin", method=method)
+        assert bench.content(-1).startswith(content)
+        assert bench.content(-1).startswith((tmp_path / "flight.bin").read_bytes())
+        said = [each.getMessage() for each in caplog.records]
+        assert f"log {entry.id} is, or was, still being written: {entry.size} bytes when it" in said[0]
+        assert f"{len(content)} when they were asked for" in said[0]
+        await bench.all_quiet()
+
+
+async def test_a_log_that_does_not_grow_is_read_without_a_word(
+    ardupilot: Bench, caplog: pytest.LogCaptureFixture
+) -> None:
+    entry = (await ardupilot.logs.list())[-1]
+    with caplog.at_level("INFO", "aerokit"):
+        await ardupilot.logs.read(entry, method="log")
+        await ardupilot.logs.read(entry, method="ftp")
+    assert not [each for each in caplog.records if "being written" in each.getMessage()]
+
+
+async def test_a_log_of_another_time_is_another_log(bench: Bench) -> None:
+    entry = (await bench.logs.list())[-1]
+    assert entry.time_utc is not None
+    bench.server.write_on(MORE, int(entry.time_utc.timestamp()) - 100_000)
+    with pytest.raises(FileError, match="list them again"):
+        await bench.logs.read(entry, method="log")
+
+
+async def test_an_interrupted_download_of_a_log_that_grows_is_whole_in_the_end(
+    ardupilot: Bench, tmp_path: Path
+) -> None:
+    """Its CRC is that of more than came: it begins anew."""
+    entry, to = (await ardupilot.logs.list())[-1], tmp_path / "flight.bin"
+
+    def stop(progress: Progress) -> None:
+        if progress.done > 20_000:
+            scope.cancel()
+
+    with anyio.CancelScope() as scope:
+        await ardupilot.logs.download(entry, to, method="ftp", on_progress=stop)
+    assert names_in(tmp_path) == ["flight.bin.part"]
+    assert entry.time_utc is not None
+    time_utc = int(entry.time_utc.timestamp())
+    more = [lambda: ardupilot.server.write_on(1000, time_utc)] * 3
+    for number, write in enumerate(more):
+        ardupilot.simulated.call_later(0.1 * number, write)
+    await ardupilot.logs.download(entry, to, method="ftp")
+    content = to.read_bytes()
+    assert len(content) > entry.size
+    assert ardupilot.content(-1).startswith(content)
+    assert names_in(tmp_path) == ["flight.bin"]
+
+
 async def test_arguments_that_cannot_be(bench: Bench) -> None:
     bench.wire.forget()
     logs: Any = bench.logs

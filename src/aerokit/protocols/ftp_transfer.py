@@ -226,6 +226,8 @@ class FtpDownload(FtpExchange[int]):
         return self._size is not None and offset >= self._size
 
     def _add(self, offset: int, data: bytes, now: float) -> None:
+        if self._size is not None:
+            data = data[: self._size - offset]  # the file may have grown
         try:
             is_new = self._into.add(offset, data)
         except Exception as error:  # the disk is full: nothing that comes from now on can be kept

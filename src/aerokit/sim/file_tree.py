@@ -157,6 +157,10 @@ class FileTree:
         folder[name] = _File(content, size)
         return self
 
+    def append(self, path: str, data: bytes) -> None:
+        """Let a file grow; who has it open reads on."""
+        self._file(path).content.extend(data)
+
     def get(self, path: str) -> bytes:
         """The whole content of a file; FileFault when there is none."""
         return bytes(self._file(path).content)

@@ -37,10 +37,21 @@ class SimulatedLog:
     size: int
     time_utc: int = 1_790_000_000
     """Seconds since 1970."""
+    seed: int | None = None
+    """What the noise follows from instead."""
 
     def make(self) -> bytes:
-        """All of its content."""
-        return random.Random(self.size * 31 + self.time_utc).randbytes(self.size)
+        """All of its content; of a longer one with the same seed it is the beginning."""
+        words = -(-self.size // 4)
+        return random.Random(self._noise).randbytes(4 * words)[: self.size]
+
+    def grown(self, count: int, time_utc: int) -> SimulatedLog:
+        """The same log when ``count`` bytes more have been written."""
+        return SimulatedLog(self.size + count, time_utc, self._noise)
+
+    @property
+    def _noise(self) -> int:
+        return self.size * 31 + self.time_utc if self.seed is None else self.seed
 
 
 class LogServer:
@@ -58,11 +69,12 @@ class LogServer:
         *,
         rate_hz: float,
         erase_files: Callable[[], None] = lambda: None,
+        append_to_file: Callable[[int, bytes], None] = lambda number, data: None,
     ) -> None:
         self.logs = list(logs)
         self.rate_hz = rate_hz
         self._vehicle = vehicle
-        self._erase_files = erase_files
+        self._erase_files, self._append_to_file = erase_files, append_to_file
         self._outgoing: deque[Callable[[], Message]] = deque()
         self._channel: Channel | None = None
         self._transfer = 0
@@ -103,9 +115,15 @@ class LogServer:
 
     def content(self, number: int) -> bytes:
         """All of the log at this place of the list."""
-        if self._content[0] != number:
+        if (self._content[0], len(self._content[1])) != (number, self.logs[number].size):
             self._content = (number, self.logs[number].make())
         return self._content[1]
+
+    def write_on(self, count: int, time_utc: int) -> None:
+        """The newest log has been written on: it has ``count`` bytes more, and this time."""
+        before = self.logs[-1]
+        self.logs[-1] = before.grown(count, time_utc)
+        self._append_to_file(len(self.logs) - 1, self.logs[-1].make()[before.size :])
 
     def blocks(self, number: int, log_id: int, offset: int, count: int) -> list[Callable[[], Message]]:
         """What sends ``count`` bytes from ``offset`` on, block by block; an empty block where there are none."""
@@ -144,8 +162,11 @@ class ArduPilotLogServer(LogServer):
         is_armed: Callable[[], bool],
         rate_hz: float = 4000.0,
         erase_files: Callable[[], None] = lambda: None,
+        append_to_file: Callable[[int, bytes], None] = lambda number, data: None,
     ) -> None:
-        super().__init__(vehicle, logs, rate_hz=rate_hz, erase_files=erase_files)
+        super().__init__(
+            vehicle, logs, rate_hz=rate_hz, erase_files=erase_files, append_to_file=append_to_file
+        )
         self._is_armed = is_armed
         self._has_warned = False
 
@@ -204,8 +225,11 @@ class Px4LogServer(LogServer):
         *,
         rate_hz: float = 4000.0,
         erase_files: Callable[[], None] = lambda: None,
+        append_to_file: Callable[[int, bytes], None] = lambda number, data: None,
     ) -> None:
-        super().__init__(vehicle, logs, rate_hz=rate_hz, erase_files=erase_files)
+        super().__init__(
+            vehicle, logs, rate_hz=rate_hz, erase_files=erase_files, append_to_file=append_to_file
+        )
         self._was_listed = False
 
     def _on_list(self, request: LogRequestList, channel: Channel) -> None:

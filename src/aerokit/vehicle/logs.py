@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from contextlib import asynccontextmanager, suppress
-from datetime import datetime, timezone
+from datetime import datetime, timedelta, timezone
 from typing import TYPE_CHECKING, Literal
 
 import anyio
@@ -16,7 +17,7 @@ from aerokit.mavlink.messages import LogErase
 from aerokit.protocols.log_list import LogList
 from aerokit.protocols.logs import LOG_BLOCK, LogDownload, LogEnd
 from aerokit.protocols.reassembly import Reassembly
-from aerokit.protocols.transfer import PATIENCE_S, OnProgress
+from aerokit.protocols.transfer import PATIENCE_S, OnProgress, Progress
 from aerokit.snapshot import Snapshot
 from aerokit.vehicle.checks import check_seconds
 from aerokit.vehicle.log_paths import listed_logs, log_path
@@ -38,6 +39,10 @@ SILENT_REQUESTS = 4
 LARGEST_ID = 0xFFFF
 ERASE_PERIOD_S = 1.0
 ERASE_PATIENCE_S = 60.0
+CLOCKS_APART = timedelta(days=1)
+"""The time of a log that is being written is the vehicle's clock, afterwards it is that of the file."""
+
+logger = logging.getLogger("aerokit")
 
 
 class LogEntry(Snapshot):
@@ -58,7 +63,9 @@ class Logs:
     Every method takes ``patience_s``, the seconds to go on while nothing comes, and ``timeout``, those for all of it
     (None: no limit). Every method may be cancelled at any moment; the vehicle is told to stop sending.
 
-    ArduPilot answers to the LOG_* messages only while it is disarmed; by MAVFTP its logs can be read in flight, too.
+    ArduPilot answers to the LOG_* messages only while it is disarmed, and ends the log that it is writing when one is
+    read by them; by MAVFTP its logs can be read in flight, too. Of a log that is being written comes what it has when
+    it is asked for; if that is more than its entry says, logger "aerokit" tells so (INFO).
     """
 
     def __init__(self, transfers: Transfers, files: Files) -> None:
@@ -90,7 +97,8 @@ class Logs:
     ) -> None:
         """Copy a log to the disk of this computer. It gets its name when it is complete.
 
-        Until then it is ``<to>.part`` by MAVFTP, ``<to>.log<id>-<time>.part`` by the LOG_* messages.
+        Of one that is being written, that is as far as it goes when it is asked for. Until then it is ``<to>.part`` by
+        MAVFTP, ``<to>.log<id>-<time>.part`` by the LOG_* messages.
 
         Args:
             log: an entry of :meth:`list`, or its id.
@@ -111,18 +119,21 @@ class Logs:
         """
         _check(log, method)
         path, entry = await self._find(log, method, patience_s, timeout)
+        growth = _Growth(entry if isinstance(log, int) else log, on_progress)
         if path is not None:
             await self._files.download(
-                path, to, resume=resume, patience_s=patience_s, timeout=timeout, on_progress=on_progress
+                path, to, resume=resume, patience_s=patience_s, timeout=timeout, on_progress=growth
             )
+            growth.tell()
             return
         part = PartFile(to, _mark(entry))
         is_known = entry.time_utc is not None  # without a time, another flight's log may have the same mark
         start = part.size if resume and is_known and part.size <= entry.size else 0
         with part.writing(start) as disk:
             into = Reassembly(disk.write, block_size=LOG_BLOCK, start=start)
-            await self._fetch(entry, into, patience_s, timeout, on_progress)
+            await self._fetch(entry, into, patience_s, timeout, growth)
         part.finish()
+        growth.tell()
 
     async def read(
         self,
@@ -136,14 +147,16 @@ class Logs:
         """Return the content of a log; see :meth:`download`."""
         _check(log, method)
         path, entry = await self._find(log, method, patience_s, timeout)
+        growth = _Growth(entry if isinstance(log, int) else log, on_progress)
         if path is not None:
-            return await self._files.read(
-                path, patience_s=patience_s, timeout=timeout, on_progress=on_progress
-            )
-        content = bytearray()
-        into = Reassembly(content.extend, block_size=LOG_BLOCK)
-        await self._fetch(entry, into, patience_s, timeout, on_progress)
-        return bytes(content)
+            content = await self._files.read(path, patience_s=patience_s, timeout=timeout, on_progress=growth)
+        else:
+            blocks = bytearray()
+            into = Reassembly(blocks.extend, block_size=LOG_BLOCK)
+            await self._fetch(entry, into, patience_s, timeout, growth)
+            content = bytes(blocks)
+        growth.tell()
+        return content
 
     async def erase(self, *, patience_s: float = ERASE_PATIENCE_S, timeout: float | None = None) -> None:
         """Erase all logs, and wait until they are gone; that can take minutes on some boards.
@@ -265,7 +278,7 @@ class Logs:
         into: Reassembly,
         patience_s: float,
         timeout: float | None,
-        on_progress: OnProgress | None,
+        on_progress: OnProgress,
     ) -> None:
         exchange = LogDownload(
             self._transfers.system_id,
@@ -342,11 +355,36 @@ def _make_entry(log_id: int, size: int, time_utc: int) -> LogEntry:
     return LogEntry(log_id, size, datetime.fromtimestamp(time_utc, tz=timezone.utc) if time_utc else None)
 
 
+class _Growth:
+    """Passes progress on, and tells in the log when there is more of a log than its entry says."""
+
+    def __init__(self, entry: LogEntry, on_progress: OnProgress | None) -> None:
+        self._entry, self._on_progress = entry, on_progress
+        self._size = entry.size
+
+    def __call__(self, progress: Progress) -> None:
+        self._size = progress.total or self._size
+        if self._on_progress is not None:
+            self._on_progress(progress)
+
+    def tell(self) -> None:
+        if self._size > self._entry.size:
+            logger.info(
+                "log %d is, or was, still being written: %d bytes when it was listed, %d when they were asked for,"
+                " which were read",
+                self._entry.id,
+                self._entry.size,
+                self._size,
+            )
+
+
 def _is_other(before: LogEntry, now: LogEntry) -> bool:
-    """Logs grow while they are written, and are written later; they do not shrink."""
+    """Logs grow while they are written; they do not shrink, and do not become much older."""
     if now.size < before.size:
         return True
-    return before.time_utc is not None and (now.time_utc is None or now.time_utc < before.time_utc)
+    if before.time_utc is None:
+        return False
+    return now.time_utc is None or now.time_utc < before.time_utc - CLOCKS_APART
 
 
 def _no_such_log(log_id: int, text: str) -> FileError:

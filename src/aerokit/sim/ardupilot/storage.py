@@ -59,7 +59,11 @@ class Storage:
         )
         self.ftp = ArduPilotFtp(vehicle, self.files, send_banner=banner)
         self.logs = ArduPilotLogServer(
-            vehicle, logs, is_armed=lambda: vehicle.is_armed, erase_files=self._erase_logs
+            vehicle,
+            logs,
+            is_armed=lambda: vehicle.is_armed,
+            erase_files=self._erase_logs,
+            append_to_file=lambda number, data: self.files.append(_log_path(number), data),
         )
         if link_bytes_per_s is not None:
             self.parameters.list_rate_hz = _PARAMETERS_SHARE * link_bytes_per_s / _PARAM_VALUE_FRAME
@@ -74,8 +78,8 @@ class Storage:
         self.logs.restart()
 
     def _put_logs(self, logs: Sequence[SimulatedLog]) -> None:
-        for number, log in enumerate(logs, start=1):
-            self.files.put(f"{LOG_FOLDER}/{number:08}.BIN", log.make, size=log.size)
+        for number, log in enumerate(logs):
+            self.files.put(_log_path(number), log.make, size=log.size)
         self.files.put(f"{LOG_FOLDER}/LASTLOG.TXT", f"{len(logs)}\r\n".encode())
 
     def _erase_logs(self) -> None:
@@ -87,3 +91,7 @@ class Storage:
         parameters = self._vehicle.parameters
         if name not in self._vehicle.faults.read_only_parameters:
             parameters[name] = rounded(self.parameters.clamped(name, value), parameters.type(name))
+
+
+def _log_path(number: int) -> str:
+    return f"{LOG_FOLDER}/{number + 1:08}.BIN"

@@ -46,7 +46,12 @@ class Storage:
         errors = not px4.version.startswith("1.16")
         self.parameters = Px4ParameterServer(px4, px4.parameters, errors=errors)
         self.ftp = Px4Ftp(px4, self.files)
-        self.logs = Px4LogServer(px4, logs, erase_files=self._erase_logs)
+        self.logs = Px4LogServer(
+            px4,
+            logs,
+            erase_files=self._erase_logs,
+            append_to_file=lambda number, data: self.files.append(_log_path(number), data),
+        )
         if link_bytes_per_s is not None:
             self.parameters.list_rate_hz = _SHARE * link_bytes_per_s / _PARAM_VALUE_FRAME
             self.ftp.burst_interval_s = _FTP_FRAME / (_SHARE * link_bytes_per_s)
@@ -61,8 +66,7 @@ class Storage:
 
     def _put_logs(self, logs: Sequence[SimulatedLog]) -> None:
         for number, log in enumerate(logs):
-            path = f"{LOG_FOLDER}/2026-11-21/{10 + number:02}_00_00.ulg"
-            self.files.put(path, log.make, size=log.size)
+            self.files.put(_log_path(number), log.make, size=log.size)
         if not logs:
             self.files.put(f"{LOG_FOLDER}/.keep", b"").remove_file(f"{LOG_FOLDER}/.keep")
 
@@ -76,3 +80,7 @@ class Storage:
         """One parameter of an uploaded file."""
         if name not in self._px4.faults.read_only_parameters:
             self._px4.parameters[name] = self.parameters.clamped(name, value)
+
+
+def _log_path(number: int) -> str:
+    return f"{LOG_FOLDER}/2026-11-21/{10 + number:02}_00_00.ulg"
