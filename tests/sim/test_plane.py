@@ -102,6 +102,26 @@ async def test_autoland_is_for_the_air() -> None:
             await vehicle.set_mode("AUTOLAND")
 
 
+async def test_after_an_autoland_it_arms_and_disarms_by_itself() -> None:
+    """As the real one: the landing is still complete. `arm` leaves the mode first."""
+    plane = SimulatedPlane(boot_time_s=1.0)
+    async with flown(plane) as vehicle:
+        await take_off(vehicle)
+        await vehicle.set_mode("AUTOLAND")
+        await vehicle.armed.wait_until(lambda armed: not armed, timeout=300)
+        await asyncio.sleep(5.0)
+        with vehicle.subscribe(StatusTextReceived, capacity=20) as texts:
+            ack = await vehicle.command(MavCmd.COMPONENT_ARM_DISARM, 1)
+            assert ack.result == MavResult.ACCEPTED
+            await asyncio.sleep(2.0)
+            said = [each.text for each in iter(texts.get_nowait, None)]
+        assert said == ["Throttle armed", "Throttle disarmed", "Auto disarmed"]
+        assert (plane.is_armed, vehicle.mode_name) == (False, "AUTOLAND")
+        await vehicle.arm()
+        await asyncio.sleep(5.0)
+        assert (plane.is_armed, vehicle.mode_name) == (True, "FBWA")
+
+
 async def test_circles_in_the_wind() -> None:
     plane = SimulatedPlane(boot_time_s=1.0, wind=Wind(4.0, -3.0))
     async with flown(plane) as vehicle:

@@ -26,7 +26,7 @@ class Landing:
         self._start = start
         wing = plane.wing
         self._from: Ned = (wing.north, wing.east, wing.down)
-        self._flares = False
+        self._flares = self._is_told = False
         self._stopped_at = math.nan
 
     def update(self, dt: float) -> None:
@@ -94,5 +94,11 @@ class Landing:
         if plane.is_armed and delay > 0 and plane.now - self._stopped_at >= delay:
             plane.arming.disarm()
             plane.info("Auto disarmed")
-            aside = math.hypot(self.point[0] - plane.wing.north, self.point[1] - plane.wing.east)
-            plane.info(f"Distance from LAND point={aside:.2f}m")
+            self._tell_distance()
+
+    def _tell_distance(self) -> None:
+        """Once."""
+        if not self._is_told:
+            wing, self._is_told = self._plane.wing, True
+            aside = math.hypot(self.point[0] - wing.north, self.point[1] - wing.east)
+            self._plane.info(f"Distance from LAND point={aside:.2f}m")

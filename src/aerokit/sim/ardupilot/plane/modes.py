@@ -289,16 +289,17 @@ class TakeOff(NavigatingMode):
 
 
 class Autoland(NavigatingMode):
-    """Lands where it has taken off and in that direction; only in flight."""
+    """Lands where it has taken off and in that direction; only in flight. Armed after that, it disarms at once."""
 
     number = PlaneMode.AUTOLAND
     name = "AUTOLAND"
-    can_arm = False
     is_landing = True
 
     def enter(self, *, force: bool) -> bool:
         """Needs a flight, and the direction of its take-off."""
         plane = self.plane
+        if plane.mode is self and plane.is_landed:  # armed again where it has landed
+            return True
         if plane.is_landed:
             plane.send_text(MavSeverity.WARNING, "Must already be flying!")
             return False
