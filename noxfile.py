@@ -146,6 +146,13 @@ def soak(session: nox.Session) -> None:
 
 
 @nox.session
+def mutants(session: nox.Session) -> None:
+    """Change one thing at a time and see whether a test notices: `nox -s mutants -- [PATH …] [--sample N] [--seed S]`."""
+    session.install("-e", ".[test]", "coverage>=7.6", "cosmic-ray>=8.3")
+    session.run("nice", "python", "tests/mutants/run.py", *session.posargs, external=True)
+
+
+@nox.session
 def orders(session: nox.Session) -> None:
     """Fly the order table of docs/reliability.md with many seeds of each row (100): `nox -s orders -- 300`."""
     session.install("-e", ".[test]")

@@ -209,6 +209,14 @@ def test_a_likely_false_beginning_is_waited_for_but_nothing_behind_it_is_lost() 
     assert framer.statistics.bad_bytes == len(claim)
 
 
+def test_flags_that_do_not_exist_end_the_waiting_as_soon_as_they_come() -> None:
+    framer = Framer()
+    framer.receive(b"\xfd\x09")
+    assert framer.waiting == 2
+    framer.receive(b"\x02")
+    assert (framer.waiting, framer.statistics.bad_bytes) == (0, 3)
+
+
 def test_text_before_the_first_frame() -> None:
     text = b"\n\nInit ArduCopter V4.7.0-dev (21910f24)\n\nFree RAM: 524288\nBooting 0/0\n"
     framer = Framer()
@@ -265,6 +273,24 @@ def test_a_good_frame_inside_a_seeming_unknown_one_is_found() -> None:
     framer = Framer()
     assert raws(framer.receive(bytes(seeming) + raw)) == [raw, raw]
     assert framer.statistics.unknown_ids == 0
+
+
+def test_a_seeming_unknown_frame_inside_one_that_is_not_whole_yet_is_none() -> None:
+    inner, outer = unknown(20, 1_000_001), bytearray(unknown(200, 1_000_002))
+    outer[40 : 40 + len(inner)] = inner
+    framer = Framer()
+    feed(framer, cut(bytes(outer), [100]))
+    assert framer.statistics.unknown_messages == {1_000_002: 1}
+
+
+def test_a_wrong_checksum_behind_an_unknown_frame_is_counted_once_however_it_is_cut() -> None:
+    claim = b"\xfd\xff\x00\x00\x00\x01\x01\x1e\x00\x00"  # longer than an ATTITUDE can be
+    damaged = frame_of(ATTITUDE)[:-1] + b"\x00"
+    stream = (claim + unknown() + damaged).ljust(300, b"\0")
+    for places in ([], [120], range(len(stream))):
+        framer = Framer()
+        assert feed(framer, cut(stream, places)) == []
+        assert (framer.statistics.bad_crcs, framer.statistics.unknown_ids) == (2, 1)
 
 
 def test_unknown_frames_of_a_known_sender_are_not_lost_ones() -> None:

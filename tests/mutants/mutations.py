@@ -118,8 +118,8 @@ def _statements(source: str) -> dict[int, tuple[int, ...]]:
 
 def difference(before: str, after: str) -> tuple[str, str]:
     """What stood there and what stands there now, in one line each."""
-    changes = [line for line in difflib.ndiff(before.splitlines(), after.splitlines()) if line[0] in "-+"]
-    old, new = (" ".join(line[2:].strip() for line in changes if line[0] == sign) for sign in "-+")
+    changes = list(difflib.unified_diff(before.splitlines(), after.splitlines(), n=0))[3:]
+    old, new = (" ".join(line[1:].strip() for line in changes if line[0] == sign) for sign in "-+")
     return old, new
 
 

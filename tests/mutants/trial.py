@@ -64,7 +64,7 @@ class Trials:
         with tempfile.TemporaryFile("w+") as output:
             child = os.fork()
             if child == 0:
-                self._child(tests, int(20 + 3 * expected_s), output.fileno())
+                self._child(tests, int(10 + 3 * expected_s), output.fileno())
             status = _wait(child, 120 + 10 * expected_s)
             output.seek(0)
             said = output.read()
