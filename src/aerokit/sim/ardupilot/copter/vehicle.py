@@ -124,7 +124,7 @@ class SimulatedCopter(ArduPilotVehicle):
         is_on_ground = motion.is_on_ground
         if is_on_ground and not was_on_ground:
             self.info(f"SIM Hit ground at {motion.impact_speed_m_s:f} m/s")
-        if not is_on_ground or self.mode.is_taking_off:
+        if not is_on_ground or (self.motors.is_armed and self.mode.is_taking_off):
             self._still_since = math.nan
         elif math.isnan(self._still_since):
             self._still_since = self.now

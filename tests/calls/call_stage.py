@@ -1,0 +1,192 @@
+"""A simulated vehicle with files, logs and a mission, a program's vehicle object on it, and the places to call from."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import anyio
+from flight_harness import Wire
+
+import aerokit
+from aerokit import Position, messages
+from aerokit.mavlink.enums import MavCmd
+from aerokit.missions import Fence, FenceCircle, Mission, RallyPoints, rally_point, waypoint
+from aerokit.sim import SimulatedCopter, SimulatedLog, SimulatedPx4, simulated_link
+
+__all__ = ["AUTOPILOTS", "Place", "Stage", "airborne", "anywhere", "armed", "grounded", "on_mission", "open_stage"]
+
+AUTOPILOTS = ("ardupilot", "px4")
+LOGS = [SimulatedLog(20_000, 1_790_000_000), SimulatedLog(4_000, 1_790_000_500)]
+DATA = bytes(range(256)) * 20
+
+
+@dataclass
+class Stage:
+    """Where a call is made."""
+
+    simulated: SimulatedCopter | SimulatedPx4
+    vehicle: aerokit.Vehicle
+    wire: Wire
+    folder: Path
+    """For files of this computer."""
+    counter: int = field(default=0)
+
+    @property
+    def is_px4(self) -> bool:
+        return isinstance(self.simulated, SimulatedPx4)
+
+    @property
+    def parameter(self) -> str:
+        """One that changes nothing in flight."""
+        return "NAV_ACC_RAD" if self.is_px4 else "WP_YAW_BEHAVIOR"
+
+    def other_value(self) -> float:
+        """Another one than it has."""
+        self.counter += 1
+        return float(self.counter % 2 + 1)
+
+    # ------------------------------------------------------------------------------- places
+
+    @property
+    def home(self) -> Position:
+        home = self.vehicle.home.value
+        return Position(home.latitude_deg, home.longitude_deg)
+
+    def target(self) -> Position:
+        """Some way to go, never far from home."""
+        here = self.vehicle.position.value.replace(altitude_amsl_m=None)
+        is_far = self.vehicle.distance_to(self.home) > 60
+        return self.home.replace(altitude_relative_m=here.altitude_relative_m) if is_far else here.offset(north_m=25)
+
+    def mission(self) -> Mission:
+        """Places to the north; another one each time."""
+        self.counter += 1
+        places = [self.home.offset(north_m=100.0 * n, east_m=self.counter % 7) for n in range(1, 6)]
+        return Mission(
+            [waypoint(each.latitude_deg, each.longitude_deg, altitude_relative_m=20) for each in places]
+        )
+
+    def fence(self) -> Fence:
+        self.counter += 1
+        return Fence(circles=[FenceCircle(self.home, 5000 + self.counter % 7)])
+
+    def rally(self) -> RallyPoints:
+        self.counter += 1
+        place = self.home.offset(east_m=20.0 + self.counter % 7)
+        return RallyPoints([rally_point(place.latitude_deg, place.longitude_deg, altitude_relative_m=30)])
+
+    # --------------------------------------------------------------------------------- files
+
+    @property
+    def root(self) -> str:
+        return "/fs/microsd" if self.is_px4 else "/APM"
+
+    @property
+    def file(self) -> str:
+        """A file on the vehicle."""
+        return f"{self.root}/there.bin"
+
+    def new_name(self) -> str:
+        """A path on the vehicle that was not used before."""
+        self.counter += 1
+        return f"{self.root}/new{self.counter}"
+
+    def put(self, path: str, data: bytes = DATA) -> str:
+        """Have a file on the vehicle."""
+        file = self.simulated.ftp.files.open(path, writing=True, create=True)
+        file.write(0, data)
+        file.close()
+        return path
+
+    def put_logs(self) -> None:
+        """Have logs on the vehicle that were erased."""
+        self.simulated.storage.logs.logs[:] = LOGS
+
+    def local(self, name: str = "here.bin") -> Path:
+        """A file on this computer that is not there yet."""
+        self.counter += 1
+        return self.folder / f"{self.counter}-{name}"
+
+    def local_file(self) -> Path:
+        """One that is there."""
+        path = self.folder / "given.bin"
+        path.write_bytes(DATA)
+        return path
+
+    # -------------------------------------------------------------------------------- answers
+
+    async def answers(self) -> None:
+        """The vehicle object works, and the vehicle does what it says."""
+        await self.vehicle.command(MavCmd.REQUEST_MESSAGE, messages.AutopilotVersion.ID)
+
+
+Place = Callable[[Stage], Awaitable[None]]
+
+
+async def anywhere(stage: Stage) -> None:
+    """As it is."""
+    stage.simulated.battery.percent = 100.0
+
+
+async def grounded(stage: Stage) -> None:
+    """Disarmed on the ground, ready, in a mode in which it arms."""
+    vehicle = stage.vehicle
+    await anywhere(stage)
+    if vehicle.is_armed:
+        with anyio.fail_after(60):
+            await vehicle.disarm(force=True)
+            while not stage.simulated.motion.is_on_ground:
+                await anyio.sleep(0.1)
+    await vehicle.set_mode("LOITER" if stage.is_px4 else "GUIDED")
+    await vehicle.wait_ready()
+
+
+async def armed(stage: Stage) -> None:
+    """Armed on the ground, a moment ago: both autopilots disarm by themselves who does not take off."""
+    await grounded(stage)
+    await stage.vehicle.arm()
+
+
+async def airborne(stage: Stage) -> None:
+    """Hovering."""
+    vehicle = stage.vehicle
+    await anywhere(stage)
+    if not (vehicle.is_armed and _altitude(stage) > 3.0):
+        await armed(stage)
+        await vehicle.take_off(6.0)
+    elif vehicle.mode_name not in ("GUIDED", "LOITER"):
+        await vehicle.set_mode("LOITER" if stage.is_px4 else "GUIDED")
+
+
+async def on_mission(stage: Stage) -> None:
+    """Flying a long mission."""
+    await airborne(stage)
+    if stage.vehicle.mission.count.latest != 5:
+        await stage.vehicle.mission.upload(stage.mission())
+    if stage.vehicle.distance_to(stage.home) > 60:
+        await stage.vehicle.go_to(stage.home.replace(altitude_relative_m=6.0))
+    await stage.vehicle.mission.start()
+
+
+def _altitude(stage: Stage) -> float:
+    return stage.vehicle.position.value.altitude_relative_m or 0.0
+
+
+@asynccontextmanager
+async def open_stage(autopilot: str, folder: Path) -> AsyncIterator[Stage]:
+    """Ready on the ground."""
+    simulated: SimulatedCopter | SimulatedPx4
+    if autopilot == "px4":
+        simulated = SimulatedPx4(boot_time_s=0.0, logs=LOGS)
+    else:
+        simulated = SimulatedCopter(boot_time_s=0.0, logs=LOGS)
+    async with simulated_link(simulated) as link:
+        wire = Wire(link)
+        async with aerokit.connect(wire) as vehicle:
+            await vehicle.wait_ready()
+            stage = Stage(simulated, vehicle, wire, folder)
+            stage.put(stage.file)
+            yield stage

@@ -1,0 +1,267 @@
+"""How each public coroutine is called, and where: one row for each name of `public_surface.awaited`."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from typing import Any
+
+import anyio
+from call_stage import DATA, Place, Stage, airborne, anywhere, armed, grounded, on_mission
+
+import aerokit
+from aerokit import (
+    AccelerationSetpoint,
+    AttitudeSetpoint,
+    BodyVelocitySetpoint,
+    LocalPositionSetpoint,
+    PositionSetpoint,
+    Signing,
+    SigningKey,
+    VelocitySetpoint,
+    messages,
+)
+from aerokit.mavlink.enums import MavCmd
+from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
+
+__all__ = ["CALLS", "Call"]
+
+COPTER, PX4 = ("ardupilot",), ("px4",)
+BOTH = COPTER + PX4
+KEY = SigningKey.from_passphrase("calls")
+
+
+def _nothing(_: Stage) -> None:
+    pass
+
+
+@dataclass(frozen=True)
+class Call:
+    """One call that ends well. ``before`` and ``after`` are for the simulated vehicle itself, around each call."""
+
+    do: Callable[[Stage], Awaitable[object]]
+    place: Place = anywhere
+    on: tuple[str, ...] = BOTH
+    before: Callable[[Stage], object] = _nothing
+    after: Callable[[Stage], object] = _nothing
+
+
+def _simulated(stage: Stage) -> SimulatedCopter | SimulatedPx4:
+    return SimulatedPx4(boot_time_s=0.0) if stage.is_px4 else SimulatedCopter(boot_time_s=0.0)
+
+
+async def _connect(stage: Stage) -> None:
+    async with simulated_link(_simulated(stage)) as link, aerokit.connect(link) as vehicle:
+        await vehicle.wait_ready()
+
+
+async def _open_connection(stage: Stage) -> None:
+    async with simulated_link(_simulated(stage)) as link, aerokit.open_connection(link):
+        await anyio.sleep(1.5)
+
+
+async def _not_ready(stage: Stage) -> None:
+    await stage.vehicle.sensors.wait_until(lambda each: each.prearm_checks_pass is False, timeout=5)
+    stage.simulated.faults.prearm_failures.clear()
+    await stage.vehicle.wait_ready()
+
+
+async def _subscribe(stage: Stage) -> None:
+    with stage.vehicle.subscribe(messages.Attitude, rate_hz=20, capacity=4) as attitudes:
+        async for _ in attitudes:
+            break
+        await attitudes.__anext__()
+
+
+async def _subscribe_to_connection(stage: Stage) -> None:
+    with stage.vehicle.connection.subscribe(messages.Heartbeat) as heartbeats:
+        await heartbeats.__anext__()
+
+
+async def _get(stage: Stage) -> None:
+    with stage.vehicle.subscribe(messages.Attitude) as attitudes:
+        await attitudes.get(timeout=5)
+
+
+async def _changes(stage: Stage) -> None:
+    async for _ in stage.vehicle.position.changes():
+        if stage.vehicle.position.age == 0:
+            break
+
+
+async def _updates(stage: Stage) -> None:
+    updates = stage.vehicle.mode.updates()
+    for _ in range(2):
+        await updates.__anext__()
+
+
+def _stream(kind: str, setpoint: Callable[[Stage], Any]) -> Call:
+    async def do(stage: Stage) -> None:
+        async with getattr(stage.vehicle.guided, kind)(setpoint(stage)) as stream:
+            await stream.fly(setpoint(stage), 0.7)
+
+    return Call(do, airborne)
+
+
+async def _fly(stage: Stage) -> None:
+    async with stage.vehicle.guided.velocity() as stream:
+        await stream.fly(VelocitySetpoint(north_m_s=1.0), 1.0)
+
+
+async def _temporarily(stage: Stage) -> None:
+    async with stage.vehicle.parameters.temporarily({stage.parameter: stage.other_value()}):
+        await anyio.sleep(0.5)
+
+
+async def _transaction(stage: Stage) -> None:
+    async with stage.vehicle.parameters.transaction() as transaction:
+        await transaction.set(stage.parameter, stage.other_value())
+        await anyio.sleep(0.5)
+
+
+async def _transaction_of_many(stage: Stage) -> None:
+    async with stage.vehicle.parameters.transaction() as transaction:
+        await transaction.set_many({stage.parameter: stage.other_value()})
+
+
+async def _mission_again(stage: Stage) -> None:
+    await stage.vehicle.mission.pause()
+    await stage.vehicle.mission.resume()
+
+
+async def _fly_mission(stage: Stage) -> None:
+    """One place, which is near."""
+    vehicle = stage.vehicle
+    await vehicle.mission.upload(aerokit_mission(stage))
+    await vehicle.mission.start()
+    await vehicle.mission.wait_finished(timeout=60)
+
+
+def aerokit_mission(stage: Stage) -> Any:
+    """Of one place that is near."""
+    place = stage.vehicle.position.value.offset(north_m=6)
+    from aerokit.missions import Mission, waypoint
+
+    return Mission([waypoint(place.latitude_deg, place.longitude_deg, altitude_relative_m=6)])
+
+
+async def _twice(stage: Stage, name: str) -> None:
+    """Something, and then nothing."""
+    held = getattr(stage.vehicle, name)
+    await held.upload(getattr(stage, name)())
+    await held.clear()
+
+
+def _no_key(stage: Stage) -> None:
+    """The key that it may have taken is gone."""
+    stage.simulated.signing.key = None
+    stage.simulated.signing.load()
+    stage.vehicle.connection.signing = None
+
+
+async def _sign(stage: Stage) -> None:
+    await stage.vehicle.setup_signing(Signing(KEY))
+
+
+def _fail_checks(stage: Stage) -> None:
+    stage.simulated.faults.prearm_failures.append("Compass not healthy")
+
+
+def _pass_checks(stage: Stage) -> None:
+    stage.simulated.faults.prearm_failures.clear()
+
+
+CALLS: dict[str, Call] = {
+    "connect": Call(_connect),
+    "open_connection": Call(_open_connection),
+    # ------------------------------------------------------------------------------------ Vehicle
+    "Vehicle.wait_ready": Call(_not_ready, grounded, before=_fail_checks, after=_pass_checks),
+    "Vehicle.why_not_armable": Call(lambda s: s.vehicle.why_not_armable(), grounded),
+    "Vehicle.set_mode": Call(lambda s: s.vehicle.set_mode("LAND"), airborne),
+    "Vehicle.hold": Call(lambda s: s.vehicle.hold(), airborne),
+    "Vehicle.arm": Call(lambda s: s.vehicle.arm(), grounded),
+    "Vehicle.disarm": Call(lambda s: s.vehicle.disarm(), armed),
+    "Vehicle.take_off": Call(lambda s: s.vehicle.take_off(5.0), armed),
+    "Vehicle.go_to": Call(lambda s: s.vehicle.go_to(s.target(), speed_m_s=4, heading_deg=90), airborne),
+    "Vehicle.land": Call(lambda s: s.vehicle.land(), airborne),
+    "Vehicle.return_to_launch": Call(lambda s: s.vehicle.return_to_launch(), airborne),
+    "Vehicle.set_speed": Call(lambda s: s.vehicle.set_speed(3.0), on_mission),
+    "Vehicle.set_heading": Call(lambda s: s.vehicle.set_heading(60, relative=True), airborne),
+    "Vehicle.look_at": Call(lambda s: s.vehicle.look_at(s.home.replace(altitude_relative_m=0.0)), airborne),
+    "Vehicle.stop_looking": Call(lambda s: s.vehicle.stop_looking(), airborne),
+    "Vehicle.reboot": Call(lambda s: s.vehicle.reboot(), grounded),
+    "Vehicle.setup_signing": Call(_sign, grounded, after=_no_key),
+    "Vehicle.command": Call(lambda s: s.vehicle.command(MavCmd.REQUEST_MESSAGE, messages.AutopilotVersion.ID)),
+    "Vehicle.command_int": Call(
+        lambda s: s.vehicle.command_int(MavCmd.REQUEST_MESSAGE, messages.AutopilotVersion.ID, frame=0)
+    ),
+    "Vehicle.subscribe": Call(_subscribe),
+    # ------------------------------------------------------------------------------------- Guided
+    "Guided.velocity": _stream("velocity", lambda _: VelocitySetpoint(north_m_s=1.0)),
+    "Guided.body_velocity": _stream("body_velocity", lambda _: BodyVelocitySetpoint(forward_m_s=1.0)),
+    "Guided.acceleration": _stream("acceleration", lambda _: AccelerationSetpoint(north_m_s2=0.2)),
+    "Guided.local_position": _stream("local_position", lambda _: LocalPositionSetpoint(3, 3, -6)),
+    "Guided.position": _stream("position", lambda s: PositionSetpoint(s.target())),
+    "Guided.attitude": _stream("attitude", lambda _: AttitudeSetpoint(0, 2, 0, thrust=0.5)),
+    "SetpointStream.fly": Call(_fly, airborne),
+    # --------------------------------------------------------------------------------- Parameters
+    "Parameters.download": Call(lambda s: s.vehicle.parameters.download(refresh=True)),
+    "Parameters.diff": Call(lambda s: s.vehicle.parameters.diff({s.parameter: 1.0})),
+    "Parameters.changed_from_default": Call(lambda s: s.vehicle.parameters.changed_from_default(), on=COPTER),
+    "Parameters.get": Call(lambda s: s.vehicle.parameters.get(s.parameter)),
+    "Parameters.read": Call(lambda s: s.vehicle.parameters.read(s.parameter)),
+    "Parameters.set": Call(lambda s: s.vehicle.parameters.set(s.parameter, s.other_value())),
+    "Parameters.set_many": Call(lambda s: s.vehicle.parameters.set_many({s.parameter: s.other_value()})),
+    "Parameters.upload": Call(lambda s: s.vehicle.parameters.upload({s.parameter: s.other_value()})),
+    "Parameters.temporarily": Call(_temporarily),
+    "Parameters.transaction": Call(_transaction),
+    "Transaction.set": Call(_transaction),
+    "Transaction.set_many": Call(_transaction_of_many),
+    # ----------------------------------------------------------------------------------- missions
+    "MissionControl.upload": Call(lambda s: s.vehicle.mission.upload(s.mission()), grounded),
+    "MissionControl.download": Call(lambda s: s.vehicle.mission.download()),
+    "MissionControl.clear": Call(lambda s: _twice(s, "mission"), grounded),
+    "MissionControl.set_current": Call(lambda s: s.vehicle.mission.set_current(2), on_mission),
+    "MissionControl.start": Call(lambda s: s.vehicle.mission.start(1), on_mission),
+    "MissionControl.pause": Call(lambda s: s.vehicle.mission.pause(), on_mission),
+    "MissionControl.resume": Call(_mission_again, on_mission),
+    "MissionControl.wait_finished": Call(_fly_mission, airborne),
+    "FenceControl.upload": Call(lambda s: s.vehicle.fence.upload(s.fence()), grounded),
+    "FenceControl.download": Call(lambda s: s.vehicle.fence.download(), grounded),
+    "FenceControl.clear": Call(lambda s: _twice(s, "fence"), grounded),
+    "FenceControl.enable": Call(lambda s: s.vehicle.fence.enable(False), grounded, on=COPTER),
+    "RallyControl.upload": Call(lambda s: s.vehicle.rally.upload(s.rally()), grounded),
+    "RallyControl.download": Call(lambda s: s.vehicle.rally.download(), grounded),
+    "RallyControl.clear": Call(lambda s: _twice(s, "rally"), grounded),
+    # ------------------------------------------------------------------------------ files and logs
+    "Files.is_supported": Call(lambda s: s.vehicle.files.is_supported()),
+    "Files.read": Call(lambda s: s.vehicle.files.read(s.file)),
+    "Files.download": Call(lambda s: s.vehicle.files.download(s.file, s.local())),
+    "Files.list": Call(lambda s: s.vehicle.files.list(s.root)),
+    "Files.crc32": Call(lambda s: s.vehicle.files.crc32(s.file)),
+    "Files.write": Call(lambda s: s.vehicle.files.write(s.new_name(), DATA)),
+    "Files.upload": Call(lambda s: s.vehicle.files.upload(s.local_file(), s.new_name())),
+    "Files.truncate": Call(lambda s: s.vehicle.files.truncate(s.put(s.new_name()), 10), on=PX4),
+    "Files.remove": Call(lambda s: s.vehicle.files.remove(s.put(s.new_name()))),
+    "Files.make_directory": Call(lambda s: s.vehicle.files.make_directory(s.new_name())),
+    "Files.remove_directory": Call(lambda s: _directory_and_back(s)),
+    "Files.rename": Call(lambda s: s.vehicle.files.rename(s.put(s.new_name()), s.new_name())),
+    "Logs.list": Call(lambda s: s.vehicle.logs.list(), grounded),
+    "Logs.read": Call(lambda s: s.vehicle.logs.read(1, method="log"), grounded),
+    "Logs.download": Call(lambda s: s.vehicle.logs.download(1, s.local()), grounded),
+    "Logs.erase": Call(lambda s: s.vehicle.logs.erase(), grounded, after=Stage.put_logs),
+    # ---------------------------------------------------------------------------- cells and streams
+    "StateCell.wait_until": Call(
+        lambda s: s.vehicle.position.wait_until(lambda _: s.vehicle.position.age == 0, held_for=1.0, timeout=9)
+    ),
+    "StateCell.changes": Call(_changes),
+    "StateCell.updates": Call(_updates),
+    "Subscription.get": Call(_get),
+    "Connection.subscribe": Call(_subscribe_to_connection),
+}
+
+
+async def _directory_and_back(stage: Stage) -> None:
+    path = stage.new_name()
+    await stage.vehicle.files.make_directory(path)
+    await stage.vehicle.files.remove_directory(path)

@@ -1,0 +1,103 @@
+"""What a program may call, read from the library itself, so that what is added later is found."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterator
+from types import FunctionType
+from typing import Any, NamedTuple
+
+import aerokit
+from aerokit.runtime.cells import Changes, StateCell
+from aerokit.runtime.connection import Connection
+from aerokit.runtime.subscription import Subscription
+from aerokit.vehicle.fence import FenceControl
+from aerokit.vehicle.files import Files
+from aerokit.vehicle.guided import Guided, SetpointStream
+from aerokit.vehicle.logs import Logs
+from aerokit.vehicle.mission import MissionControl
+from aerokit.vehicle.parameter_transaction import Temporarily, Transaction
+from aerokit.vehicle.parameters import Parameters
+from aerokit.vehicle.rally import RallyControl
+
+__all__ = ["CLASSES", "FUNCTIONS", "Member", "awaited", "members", "own_classes_in"]
+
+CLASSES: tuple[type, ...] = (
+    aerokit.Vehicle,
+    Guided,
+    SetpointStream,
+    Parameters,
+    Temporarily,
+    Transaction,
+    MissionControl,
+    FenceControl,
+    RallyControl,
+    Files,
+    Logs,
+    StateCell,
+    Changes,
+    Subscription,
+    Connection,
+)
+"""The objects that a program gets; a test finds those that are missing here."""
+FUNCTIONS: tuple[Callable[..., Any], ...] = (aerokit.connect, aerokit.open_connection)
+
+ENTERED = ("__aenter__", "__anext__")
+"""Who has one of these awaits something without being a coroutine."""
+
+
+class Member(NamedTuple):
+    """One public function of a class, or of the package."""
+
+    owner: type | None
+    name: str
+    function: Callable[..., Any]
+
+    @property
+    def qualified(self) -> str:
+        """As programs know it: of the class that they have, not of that which defines it."""
+        return self.name if self.owner is None else f"{self.owner.__name__}.{self.name}"
+
+    @property
+    def docstring(self) -> str:
+        return inspect.getdoc(self.function) or ""
+
+    @property
+    def is_awaited(self) -> bool:
+        """A coroutine function, or an asynchronous context manager or iterator, or what gives one."""
+        plain = inspect.unwrap(self.function)
+        if inspect.iscoroutinefunction(plain) or inspect.isasyncgenfunction(plain):
+            return True
+        given = str(inspect.signature(plain).return_annotation).partition("[")[0]
+        return any(each.__name__ == given and _is_entered(each) for each in CLASSES)
+
+
+def _is_entered(cls: type) -> bool:
+    return any(hasattr(cls, name) for name in ENTERED)
+
+
+def members() -> Iterator[Member]:
+    """Every public function, properties left out: those never wait."""
+    for function in FUNCTIONS:
+        yield Member(None, function.__name__, function)
+    for cls in CLASSES:
+        for name in dir(cls):
+            found = inspect.getattr_static(cls, name)
+            found = found.__func__ if isinstance(found, (classmethod, staticmethod)) else found
+            if not name.startswith("_") and isinstance(found, FunctionType):
+                yield Member(cls, name, found)
+
+
+def awaited() -> dict[str, Member]:
+    """What a program awaits, enters or iterates, by its qualified name."""
+    return {each.qualified: each for each in members() if each.is_awaited}
+
+
+def own_classes_in(vehicle: aerokit.Vehicle) -> Iterator[type]:
+    """The classes of the public attributes of a vehicle that have something to await."""
+    for name in dir(vehicle):
+        if not name.startswith("_"):
+            cls = type(getattr(vehicle, name))
+            coroutines = [each for each in vars(cls).values() if inspect.iscoroutinefunction(each)]
+            if cls.__module__.startswith("aerokit") and coroutines:
+                yield cls

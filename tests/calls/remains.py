@@ -1,0 +1,98 @@
+"""What a call could leave behind: tasks, timers, sinks, waiters, locks, rates, open files."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
+
+import anyio
+from call_stage import Stage
+
+__all__ = ["SETTLED_S", "look", "what_is_left"]
+
+SETTLED_S = 20.0
+"""An order to arm that was given up is watched for 15 s, and answered then."""
+LOOK_S = 0.25
+
+
+def look(stage: Stage) -> Counter[str]:
+    """What is there now, by name."""
+    return Counter(_all(stage))
+
+
+async def what_is_left(stage: Stage, before: Counter[str]) -> Counter[str]:
+    """What is more than before, and stays; waits until nothing is, or the dust has settled."""
+    waited = 0.0
+    while (left := look(stage) - before) and waited < SETTLED_S:
+        await anyio.sleep(LOOK_S)
+        waited += LOOK_S
+    return left
+
+
+def _all(stage: Stage) -> Iterator[str]:
+    vehicle: Any = stage.vehicle
+    connection = vehicle.connection
+    yield from _tasks()
+    yield from _timers()
+    yield from (f"sink of message {key}" for key, sinks in connection.bus._sinks.items() for _ in sinks)
+    yield from (f"sink of {key.__name__}" for key, sinks in connection.bus._event_sinks.items() for _ in sinks)
+    yield from (f"wanted message {key}" for key, count in connection.bus.wanted.items() for _ in range(count))
+    yield from _times("end of the connection", connection._enders)
+    yield from _times("deadline", connection.deadlines._due)
+    for cell in (*vehicle.telemetry.cells.values(), vehicle.link_quality):
+        yield from _times(f"waiter on {cell.name}", cell._sinks)
+    for stream in vehicle._rates._streams.values():
+        yield from _times(f"wish for {stream.message_type.NAME}", stream.wishes)
+    yield from _times("answer under way", [key for key in vehicle._commands._under_way if _is_awaited(vehicle, key)])
+    yield from _times("command that waits", vehicle._commands._runs)
+    yield from _times("order", vehicle._helm._orders[1:])
+    yield from _times("sending", vehicle._helm._sendings)
+    yield from _times("held parameter", vehicle.parameters._holds._blocks)
+    closing = vehicle.files._channel._closing.values()
+    yield from _times("file that is being closed", [each for each in closing if not each.ended.is_set()])
+    yield from _times("open session", range(stage.simulated.ftp.open_sessions))
+    yield from _times("log on its way", range(stage.simulated.storage.logs.is_busy))
+    yield from _times("set-point stream", range(vehicle._stream is not None))
+    yield from (f"lock {name}" for name, lock in _locks("vehicle", vehicle, set()) if lock.locked())
+
+
+def _is_awaited(vehicle: Any, key: tuple[int, int]) -> bool:
+    return key[0] == vehicle.component_id and vehicle._commands.awaits_answer(key[1])
+
+
+def _times(name: str, items: Iterable[object]) -> Iterator[str]:
+    return (name for _ in items)
+
+
+def _tasks() -> Iterator[str]:
+    current = asyncio.current_task()
+    for task in asyncio.all_tasks():
+        if task is not current:
+            is_named = not task.get_name().startswith("Task-")
+            yield f"task {task.get_name() if is_named else getattr(task.get_coro(), '__qualname__', '')}"
+
+
+def _timers() -> Iterator[str]:
+    """Those of sleeping tasks and of the simulator come and go; the tasks are counted."""
+    loop: Any = asyncio.get_running_loop()
+    for timer in loop._scheduled:
+        module = getattr(timer._callback, "__module__", "")
+        if not timer.cancelled() and module.startswith(("aerokit.vehicle", "aerokit.runtime")):
+            yield f"timer {timer._callback.__qualname__}"
+
+
+def _locks(name: str, item: Any, seen: set[int]) -> Iterator[tuple[str, asyncio.Lock]]:
+    """Every lock that a vehicle holds, wherever."""
+    if id(item) in seen:
+        return
+    seen.add(id(item))
+    if isinstance(item, asyncio.Lock):
+        yield name, item
+    elif isinstance(item, Mapping) and len(item) < 100:
+        for key, value in item.items():
+            yield from _locks(f"{name}[{key}]", value, seen)
+    elif type(item).__module__.startswith(("aerokit.vehicle", "aerokit.runtime")):
+        for key, value in getattr(item, "__dict__", {}).items():
+            yield from _locks(f"{name}.{key}", value, seen)

@@ -1,0 +1,111 @@
+"""Every public coroutine, cancelled at every await: it ends at once, and nothing is left of it.
+
+Here a few of the awaits of each; `nox -s cancel` does all of them.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import anyio
+import pytest
+from call_stage import AUTOPILOTS, Stage, open_stage
+from call_table import CALLS
+from public_surface import CLASSES, awaited, own_classes_in
+from remains import look, what_is_left
+from suspensions import Cancelled, Point, cancel_at, points_of
+
+from aerokit.testing import run_virtual
+
+POINTS = int(os.environ.get("AEROKIT_CANCEL_POINTS", "4"))
+"""At so many awaits of each call; 0: at all."""
+ENDS_S = 2.0
+
+
+def test_each_public_coroutine_is_in_the_table() -> None:
+    assert [name for name in awaited() if name not in CALLS] == []
+    assert [name for name in CALLS if name not in awaited()] == []
+
+
+def test_each_part_of_a_vehicle_is_looked_at(tmp_path: Path) -> None:
+    async def look_for_them() -> None:
+        async with open_stage("ardupilot", tmp_path) as stage:
+            assert [each for each in own_classes_in(stage.vehicle) if each not in CLASSES] == []
+
+    run_virtual(look_for_them())
+
+
+def groups() -> Iterator[tuple[str, list[str]]]:
+    """One flight serves all calls of one class."""
+    for owner in dict.fromkeys(name.rpartition(".")[0] for name in CALLS):
+        yield owner or "functions", [name for name in CALLS if name.rpartition(".")[0] == owner]
+
+
+@pytest.mark.parametrize("autopilot", AUTOPILOTS)
+@pytest.mark.parametrize("names", [pytest.param(names, id=owner) for owner, names in groups()])
+def test_cancelled_at_any_await(names: list[str], autopilot: str, tmp_path: Path) -> None:
+    async def all_of_them() -> list[str]:
+        async with open_stage(autopilot, tmp_path) as stage:
+            return [fault for name in names async for fault in faults_of(stage, name, autopilot)]
+
+    faults = run_virtual(all_of_them())
+    assert not faults, "\n".join(faults)
+
+
+async def faults_of(stage: Stage, name: str, autopilot: str):  # type: ignore[no-untyped-def]
+    if autopilot not in CALLS[name].on:
+        return
+    rehearsed = await run(stage, name, None)
+    if rehearsed.error is not None or rehearsed.counted is None:
+        yield f"{name} does not work: {rehearsed.error!r}"
+        return
+    await what_is_left(stage, look(stage))
+    await anyio.sleep(2.0)
+    for point in points_of(rehearsed.counted.waits, POINTS or None):
+        fault = await fault_at(stage, name, point)
+        if fault:
+            yield f"{name} at {point} of {rehearsed.counted.count}: {fault}"
+
+
+async def run(stage: Stage, name: str, point: Point | None) -> Cancelled:
+    """From its place, and with everything back in order behind it."""
+    call = CALLS[name]
+    await call.place(stage)
+    call.before(stage)
+    outcome = await cancel_at(call.do(stage), point)
+    call.after(stage)
+    return outcome
+
+
+async def fault_at(stage: Stage, name: str, point: Point) -> str:
+    call = CALLS[name]
+    await call.place(stage)
+    before = look(stage)
+    call.before(stage)
+    outcome = await cancel_at(call.do(stage), point)
+    call.after(stage)
+    if fault := fault_of(outcome, point):
+        return fault
+    left = await what_is_left(stage, before)
+    if left:
+        return f"left are {dict(left)}"
+    try:
+        with anyio.fail_after(10):
+            await stage.answers()
+    except Exception as error:
+        return f"then it does not work any more: {error!r}"
+    return ""
+
+
+def fault_of(outcome: Cancelled, point: Point) -> str:
+    if outcome.at is None:
+        return "" if outcome.error is None else f"ended with {outcome.error!r}"
+    if outcome.ended_at - outcome.at > ENDS_S:
+        return f"ended {outcome.ended_at - outcome.at:.1f} s after it was cancelled"
+    if point.how == "scope":  # a shielded end that comes at once is not cancelled any more
+        return "" if outcome.error is None else f"ended with {outcome.error!r}"
+    ended = isinstance(outcome.error, asyncio.CancelledError)
+    return "" if ended else f"swallowed the cancellation: {outcome.error!r}"
