@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
@@ -12,11 +13,22 @@ from flight_harness import Wire
 
 import aerokit
 from aerokit import Position, messages
+from aerokit.errors import AerokitError
 from aerokit.mavlink.enums import MavCmd
 from aerokit.missions import Fence, FenceCircle, Mission, RallyPoints, rally_point, waypoint
 from aerokit.sim import SimulatedCopter, SimulatedLog, SimulatedPx4, simulated_link
 
-__all__ = ["AUTOPILOTS", "Place", "Stage", "airborne", "anywhere", "armed", "grounded", "on_mission", "open_stage"]
+__all__ = [
+    "AUTOPILOTS",
+    "Place",
+    "Stage",
+    "airborne",
+    "anywhere",
+    "armed",
+    "grounded",
+    "on_mission",
+    "open_stage",
+]
 
 AUTOPILOTS = ("ardupilot", "px4")
 LOGS = [SimulatedLog(20_000, 1_790_000_000), SimulatedLog(4_000, 1_790_000_500)]
@@ -59,7 +71,11 @@ class Stage:
         """Some way to go, never far from home."""
         here = self.vehicle.position.value.replace(altitude_amsl_m=None)
         is_far = self.vehicle.distance_to(self.home) > 60
-        return self.home.replace(altitude_relative_m=here.altitude_relative_m) if is_far else here.offset(north_m=25)
+        return (
+            self.home.replace(altitude_relative_m=here.altitude_relative_m)
+            if is_far
+            else here.offset(north_m=25)
+        )
 
     def mission(self) -> Mission:
         """Places to the north; another one each time."""
@@ -140,8 +156,13 @@ async def grounded(stage: Stage) -> None:
             await vehicle.disarm(force=True)
             while not stage.simulated.motion.is_on_ground:
                 await anyio.sleep(0.1)
-    await vehicle.set_mode("LOITER" if stage.is_px4 else "GUIDED")
+            await vehicle.landed_state.wait_until(lambda state: state == 1)
+    with contextlib.suppress(
+        AerokitError
+    ):  # an order to reboot that was given up may be carried out just now
+        await vehicle.set_mode("LOITER" if stage.is_px4 else "GUIDED")
     await vehicle.wait_ready()
+    await vehicle.set_mode("LOITER" if stage.is_px4 else "GUIDED")
 
 
 async def armed(stage: Stage) -> None:

@@ -191,7 +191,9 @@ CALLS: dict[str, Call] = {
     "Vehicle.stop_looking": Call(lambda s: s.vehicle.stop_looking(), airborne),
     "Vehicle.reboot": Call(lambda s: s.vehicle.reboot(), grounded),
     "Vehicle.setup_signing": Call(_sign, grounded, after=_no_key),
-    "Vehicle.command": Call(lambda s: s.vehicle.command(MavCmd.REQUEST_MESSAGE, messages.AutopilotVersion.ID)),
+    "Vehicle.command": Call(
+        lambda s: s.vehicle.command(MavCmd.REQUEST_MESSAGE, messages.AutopilotVersion.ID)
+    ),
     "Vehicle.command_int": Call(
         lambda s: s.vehicle.command_int(MavCmd.REQUEST_MESSAGE, messages.AutopilotVersion.ID, frame=0)
     ),
@@ -252,7 +254,9 @@ CALLS: dict[str, Call] = {
     "Logs.erase": Call(lambda s: s.vehicle.logs.erase(), grounded, after=Stage.put_logs),
     # ---------------------------------------------------------------------------- cells and streams
     "StateCell.wait_until": Call(
-        lambda s: s.vehicle.position.wait_until(lambda _: s.vehicle.position.age == 0, held_for=1.0, timeout=9)
+        lambda s: s.vehicle.position.wait_until(
+            lambda _: s.vehicle.position.age == 0, held_for=1.0, timeout=9
+        )
     ),
     "StateCell.changes": Call(_changes),
     "StateCell.updates": Call(_updates),

@@ -36,16 +36,23 @@ def _all(stage: Stage) -> Iterator[str]:
     connection = vehicle.connection
     yield from _tasks()
     yield from _timers()
-    yield from (f"sink of message {key}" for key, sinks in connection.bus._sinks.items() for _ in sinks)
-    yield from (f"sink of {key.__name__}" for key, sinks in connection.bus._event_sinks.items() for _ in sinks)
-    yield from (f"wanted message {key}" for key, count in connection.bus.wanted.items() for _ in range(count))
+    counters = [
+        stream.on_message for stream in vehicle._rates._streams.values()
+    ]  # they stay, one for each stream
+    for key, sinks in connection.bus._sinks.items():
+        yield from _times(f"sink of message {key}", [sink for _, sink in sinks if sink not in counters])
+    yield from (
+        f"sink of {key.__name__}" for key, sinks in connection.bus._event_sinks.items() for _ in sinks
+    )
     yield from _times("end of the connection", connection._enders)
     yield from _times("deadline", connection.deadlines._due)
     for cell in (*vehicle.telemetry.cells.values(), vehicle.link_quality):
         yield from _times(f"waiter on {cell.name}", cell._sinks)
     for stream in vehicle._rates._streams.values():
         yield from _times(f"wish for {stream.message_type.NAME}", stream.wishes)
-    yield from _times("answer under way", [key for key in vehicle._commands._under_way if _is_awaited(vehicle, key)])
+    yield from _times(
+        "answer under way", [key for key in vehicle._commands._under_way if _is_awaited(vehicle, key)]
+    )
     yield from _times("command that waits", vehicle._commands._runs)
     yield from _times("order", vehicle._helm._orders[1:])
     yield from _times("sending", vehicle._helm._sendings)

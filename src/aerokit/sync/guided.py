@@ -137,7 +137,7 @@ class SetpointStream(Generic[SetpointT]):
         self._loop.run(self._stream.fly, setpoint, duration_s)
 
     def __enter__(self) -> Self:
-        self._loop.run(self._stream.__aenter__)
+        self._loop.enter(self._stream)
         return self
 
     def __exit__(

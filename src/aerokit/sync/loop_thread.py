@@ -9,6 +9,7 @@ import contextvars
 import functools
 import os
 import threading
+from contextlib import AbstractAsyncContextManager, AbstractContextManager
 from typing import TYPE_CHECKING, Any, Generic, ParamSpec, TypeVar
 
 import anyio
@@ -19,7 +20,6 @@ from aerokit.sync.reply import Reply
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
-    from contextlib import AbstractAsyncContextManager
 
 __all__ = ["Held", "LoopThread"]
 
@@ -119,6 +119,30 @@ class LoopThread:
             return function(*args, **kwargs)
 
         return self.run(call)
+
+    def enter(self, context: AbstractAsyncContextManager[T]) -> T:
+        """Enter a context manager for a ``with`` block of the program, which leaves it by :meth:`run_to_its_end`.
+
+        Ctrl-C that comes when it is entered already, and before the block has begun, leaves it again.
+        """
+        is_entered = False
+
+        async def enter() -> T:
+            nonlocal is_entered
+            value = await context.__aenter__()
+            is_entered = True
+            return value
+
+        try:
+            return self.run_to_its_end(enter)
+        except BaseException as error:
+            if is_entered:
+                self.run_to_its_end(context.__aexit__, type(error), error, error.__traceback__)
+            raise
+
+    def enter_at_once(self, context: AbstractContextManager[T]) -> T:
+        """As :meth:`enter`, for one that does not wait."""
+        return self.enter(_Awaited(context))
 
     def call_soon(self, function: Callable[P, object], /, *args: P.args, **kwargs: P.kwargs) -> None:
         """Have a function that does not wait called on the loop, after those asked for before; from any thread.
@@ -230,6 +254,19 @@ class Held(Generic[T]):
                 await self._leave.wait()
         finally:
             self._opened.end()
+
+
+class _Awaited(AbstractAsyncContextManager[T]):
+    """A context manager that does not wait."""
+
+    def __init__(self, context: AbstractContextManager[T]) -> None:
+        self._context = context
+
+    async def __aenter__(self) -> T:
+        return self._context.__enter__()
+
+    async def __aexit__(self, *exc: Any) -> bool | None:
+        return self._context.__exit__(*exc)
 
 
 class _Calls:

@@ -161,7 +161,7 @@ class Temporarily:
         self._loop, self._block = loop, block
 
     def __enter__(self) -> dict[str, ParameterWrite]:
-        return self._loop.run_to_its_end(self._block.__aenter__)
+        return self._loop.enter(self._block)
 
     def __exit__(
         self,
@@ -197,7 +197,7 @@ class Transaction:
         return self._loop.run(self._block.set_many, values)
 
     def __enter__(self) -> Self:
-        self._loop.run_to_its_end(self._block.__aenter__)
+        self._loop.enter(self._block)
         return self
 
     def __exit__(

@@ -55,7 +55,7 @@ class Subscription(Generic[ItemT]):
         self._loop.call(self._subscription.close, error)
 
     def __enter__(self) -> Self:
-        self._loop.call(self._subscription.__enter__)
+        self._loop.enter_at_once(self._subscription)
         return self
 
     def __exit__(

@@ -340,7 +340,7 @@ class Vehicle(VehicleState):
     def rate(self, message_type: type[Message], rate_hz: float) -> Iterator[None]:
         """Have the vehicle send ``message_type`` at ``rate_hz`` or faster for the time of the ``with`` block."""
         rate = self.aio.rate(message_type, rate_hz)
-        self._loop.call(rate.__enter__)
+        self._loop.enter_at_once(rate)
         try:
             yield
         finally:

@@ -1,0 +1,90 @@
+"""Every call of the blocking twin, interrupted by Ctrl-C at its first await, at a later one and at its end: its task has
+ended when KeyboardInterrupt leaves it, and nothing is left of it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, cast
+
+import pytest
+from blocking_calls import blocking_calls, blocking_names
+from call_stage import LOGS, Stage
+from call_table import CALLS, Call
+from interrupter import AT_ITS_END, Interrupter
+from remains import look
+from served_copter import served
+
+import aerokit.sync
+from aerokit import messages
+from aerokit.errors import AerokitError
+from aerokit.sim import SimulatedCopter
+
+LATER = 4
+"""Interrupted a second time at this await, if it comes there, and a third time when it has ended."""
+PATIENCE_S = 5.0
+"""For what is left to go: an order to arm is watched, and answered."""
+
+
+@dataclass
+class BlockingStage(Stage):
+    """With the twin's vehicle."""
+
+    address: str = ""
+
+
+@pytest.fixture(scope="module")
+def stages(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[BlockingStage, Stage]]:
+    """For the twin's calls, and for what is done on its loop."""
+    copter, folder = SimulatedCopter(boot_time_s=0.0, logs=LOGS), tmp_path_factory.mktemp("calls")
+    with served([copter], "tcpin:127.0.0.1:0", "tcpin:127.0.0.1:0") as address:
+        with aerokit.sync.connect(address) as vehicle:
+            vehicle.wait_ready()
+            blocking = BlockingStage(copter, cast(Any, vehicle), cast(Any, None), folder, address=address)
+            blocking.put(blocking.file)
+            vehicle.message(messages.ScaledPressure)  # for as long as the vehicle lives
+            yield blocking, Stage(copter, vehicle.aio, cast(Any, None), folder)
+
+
+def test_each_call_of_the_twin_is_in_the_table() -> None:
+    calls = blocking_calls()
+    assert [name for name in blocking_names() if name not in calls] == []
+    assert [name for name in calls if name not in set(blocking_names())] == []
+
+
+@pytest.mark.parametrize("name", blocking_calls())
+def test_interrupted(name: str, stages: tuple[BlockingStage, Stage], monkeypatch: pytest.MonkeyPatch) -> None:
+    blocking, stage = stages
+    call = CALLS.get(name, Call(blocking_calls()[name]))
+    if "ardupilot" not in call.on:
+        pytest.skip("the copter does not know it")
+    loop, do = cast(Any, blocking.vehicle)._loop, blocking_calls()[name]
+    interrupter = Interrupter(monkeypatch)
+
+    def attempt() -> None:
+        with contextlib.suppress(AerokitError):
+            do(blocking)
+
+    threads = threading.active_count()
+    for at in (1, LATER, AT_ITS_END):
+        loop.run(call.place, stage)
+        before = loop.call(look, stage)
+        call.before(stage)
+        was_interrupted = interrupter.interrupted(attempt, at)
+        assert was_interrupted or at != AT_ITS_END
+        call.after(stage)
+        assert (_left(loop, stage, before), at) == (Counter(), at)
+        loop.run(stage.answers)
+    assert threading.active_count() == threads
+
+
+def _left(loop: Any, stage: Stage, before: Counter[str]) -> Counter[str]:
+    patience = time.monotonic() + PATIENCE_S
+    while (left := loop.call(look, stage) - before) and time.monotonic() < patience:
+        time.sleep(0.01)
+    return Counter(left)
