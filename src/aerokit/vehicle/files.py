@@ -55,7 +55,8 @@ class Files:
         LocalProtocolError: a path is empty, has a NUL, is not encodable, or is longer than 238 bytes. Nothing was sent.
         FileError: the vehicle refused; ``code`` and ``errno`` say why.
         FileTimeout: it did not end; ``missing`` has the ranges that did not arrive.
-        RemoteProtocolError: the vehicle's answers make no sense, or its file became shorter while it was read.
+
+    :meth:`is_supported` raises none of them.
     """
 
     def __init__(self, transfers: Transfers) -> None:
@@ -77,7 +78,11 @@ class Files:
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> bytes:
-        """Return the content of a file."""
+        """Return the content of a file.
+
+        Raises:
+            RemoteProtocolError: the vehicle's answers make no sense, or its file became shorter while it was read.
+        """
         content = bytearray()
         await self._fetch(
             path, Reassembly(content.extend, block_size=DATA_SIZE), patience_s, timeout, on_progress
@@ -101,6 +106,7 @@ class Files:
         all of it is fetched again. Files whose names begin with ``@`` are always fetched as a whole.
 
         Raises:
+            RemoteProtocolError: as for :meth:`read`.
             OSError: the file cannot be written here.
         """
         path_bytes(path)
@@ -118,7 +124,11 @@ class Files:
     async def list(
         self, path: str, *, patience_s: float = PATIENCE_S, timeout: float | None = None
     ) -> tuple[FileEntry, ...]:
-        """Return what is in a directory, without ``.`` and ``..``, in the vehicle's order."""
+        """Return what is in a directory, without ``.`` and ``..``, in the vehicle's order.
+
+        Raises:
+            RemoteProtocolError: the vehicle's list does not end.
+        """
         path_bytes(path)
         entries: dict[str, FileEntry] = {}
         offset = fruitless = 0
@@ -139,6 +149,9 @@ class Files:
         """Return the CRC-32 that the vehicle computes of a file: polynomial 0x04C11DB7, nothing inverted.
 
         That is ``zlib.crc32(data, 0xFFFFFFFF) ^ 0xFFFFFFFF``.
+
+        Raises:
+            RemoteProtocolError: its answer is no CRC-32.
         """
         reply = await self._request(MavFtpOpcode.CALCFILECRC, path, patience_s, timeout)
         return _crc32_in(path, reply)
@@ -162,6 +175,7 @@ class Files:
 
         Raises:
             VerificationFailed: all was acknowledged, and yet something else is in the file.
+            RemoteProtocolError: the CRC-32 that it tells is none.
         """
         path_bytes(path)
         data = bytes(data)
@@ -193,6 +207,7 @@ class Files:
         """Copy a file of this computer to ``path`` on the vehicle, as :meth:`write` does.
 
         Raises:
+            VerificationFailed, RemoteProtocolError: as for :meth:`write`.
             OSError: the file cannot be read here. Nothing was sent.
         """
         await self.write(

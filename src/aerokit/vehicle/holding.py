@@ -55,7 +55,11 @@ class HoldingActions(ModeActions):
 
         Copter BRAKE, Plane LOITER, Rover HOLD (a boat LOITER), Sub POSHOLD; PX4 LOITER where it comes to a stop.
 
-        Raises as :meth:`set_mode`; NotSupported when this vehicle has no mode for it.
+        Raises:
+            NotSupported: this vehicle has no mode for it. Nothing was sent.
+            CommandRejected: the vehicle refused; ``reasons`` has what it said meanwhile.
+            OperationRejected: a pilot or a failsafe has chosen another mode meanwhile.
+            OperationTimeout: it accepted and stayed in another mode, or did not answer.
         """
         mode = self._mode_for("hold", "hold")
         await self._stop_in(mode, self._helm.order(mode))

@@ -144,7 +144,13 @@ class Logs:
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> bytes:
-        """Return the content of a log; see :meth:`download`."""
+        """Return the content of a log; arguments as for :meth:`download`.
+
+        Raises:
+            LocalProtocolError: an argument that cannot be right. Nothing was sent.
+            FileError: there is no such log, or it cannot be reached by MAVFTP when that was asked for.
+            FileTimeout: it did not arrive; ``missing`` has the ranges.
+        """
         _check(log, method)
         path, entry = await self._find(log, method, patience_s, timeout)
         growth = _Growth(entry if isinstance(log, int) else log, on_progress)

@@ -100,9 +100,15 @@ class HeldPlan(Generic[PlanT]):
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> PlanT:
-        """Read what the vehicle holds; arguments and errors as for :meth:`upload`.
+        """Read what the vehicle holds; arguments as for :meth:`upload`.
 
-        Raises MissionTimeout when items are missing in the end, RemoteProtocolError when they make no sense together.
+        Raises:
+            LocalProtocolError: an argument that cannot be right; nothing was sent.
+            MissionRejected: the vehicle refused.
+            MissionTimeout: items are missing in the end; ``missing`` has them.
+            RemoteProtocolError: what it sent makes no sense.
+            NotSupported, FileError, FileTimeout: as for :meth:`upload`, with ``"ftp"``.
+            OperationTimeout: not done within ``timeout``.
         """
 
         async def work(transfer: PlanTransfer[PlanT]) -> PlanT:
@@ -113,9 +119,14 @@ class HeldPlan(Generic[PlanT]):
         return await self._transfer(work, method, patience_s, timeout, on_progress)
 
     async def clear(self, *, patience_s: float = 10.0, timeout: float | None = None) -> None:
-        """Have the vehicle forget it, and see that it has; errors as for :meth:`upload`.
+        """Have the vehicle forget it, and see that it has. ArduPilot refuses to forget a mission that it is flying.
 
-        ArduPilot refuses to forget a mission that it is flying.
+        Raises:
+            LocalProtocolError: an argument that cannot be right; nothing was sent.
+            MissionRejected: the vehicle refused.
+            MissionTimeout: it fell silent.
+            VerificationFailed: it confirmed, and still holds items.
+            OperationTimeout: not done within ``timeout``.
         """
 
         async def work(transfer: PlanTransfer[PlanT]) -> None:

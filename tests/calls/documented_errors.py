@@ -1,0 +1,53 @@
+"""Which errors the docstrings of the public functions promise: their ``Raises:``, and what their prose says of them."""
+
+from __future__ import annotations
+
+import inspect
+import re
+
+from public_surface import CLASSES, Member, members
+
+from aerokit import errors
+
+__all__ = ["documented"]
+
+NAMES = {*errors.__all__, "OSError"}
+AS_OTHERS = re.compile(r"(?:[Rr]aises as|else as|[Ee]rrors as for|errors are those of|is as for|see) :meth:`([\w.]+)`")
+FOR_ALL = re.compile(r"(Every method raises:|All methods take|NotSupported is\s+raised for).*", re.DOTALL)
+"""What the docstring of a class says of all its methods."""
+
+
+def documented() -> set[tuple[str, str]]:
+    """(call, error) for everything that is promised."""
+    known = {each.qualified: each for each in members()}
+    pairs = {(name, error) for name, each in known.items() for error in _of(each, known, set())}
+    return pairs | {(each.__name__, error) for each in CLASSES for error in _of_class(each)}
+
+
+def _of(member: Member, known: dict[str, Member], seen: set[str]) -> set[str]:
+    """Those named in the docstring, those of the functions it refers to, and those of all methods of its class."""
+    seen.add(member.qualified)
+    found = _named_in(member.docstring)
+    if member.owner is not None and member.is_awaited:
+        takes = inspect.signature(member.function).parameters
+        if "timeout" in takes or "initial" in takes:
+            found |= _of_all_methods(member.owner)
+    for name in AS_OTHERS.findall(member.docstring):
+        other = known.get(name) or known[f"{member.qualified.partition('.')[0]}.{name}"]
+        if other.qualified not in seen:
+            found |= _of(other, known, seen)
+    return found
+
+
+def _of_all_methods(cls: type) -> set[str]:
+    said = FOR_ALL.search(inspect.getdoc(cls) or "")
+    return _named_in(said[0]) if said else set()
+
+
+def _of_class(cls: type) -> set[str]:
+    """What its docstring says of the object itself, of entering and leaving it."""
+    return _named_in(FOR_ALL.sub("", inspect.getdoc(cls) or ""))
+
+
+def _named_in(text: str) -> set[str]:
+    return NAMES & set(re.findall(r"\w+", text))

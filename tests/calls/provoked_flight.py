@@ -1,0 +1,332 @@
+"""Provocations of what actions, set-points, cells and connections promise to raise."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import Callable
+from typing import Any
+
+import anyio
+from call_stage import Stage, airborne, armed, grounded, on_mission
+from call_table import KEY
+from provoked import Do, Provocation, falls_silent, ignored, later, lost, pilot, refused
+
+import aerokit
+from aerokit import Position, PositionSetpoint, Signing, VelocitySetpoint, errors, messages
+from aerokit.mavlink.enums import MavCmd
+from aerokit.sim import SimulatedCopter, simulated_link
+from aerokit.vehicle.setpoints import AttitudeSetpoint, LocalPositionSetpoint
+
+__all__ = ["FLIGHT"]
+
+P, Cmd = Provocation, MavCmd
+Table = dict[tuple[str, str], Provocation]
+
+
+def _method(name: str, *args: Any, **options: Any) -> Do:
+    return lambda stage: getattr(stage.vehicle, name)(*args, **options)
+
+
+def _now(function: Callable[[Stage], object]) -> Do:
+    """What does not wait."""
+
+    async def do(stage: Stage) -> object:
+        return function(stage)
+
+    return do
+
+
+def _go(stage: Stage, **options: Any) -> Any:
+    return stage.vehicle.go_to(stage.target(), **options)
+
+
+def _does_not_move(stage: Stage) -> None:
+    stage.simulated.faults.motor_failed = True
+
+
+def _no_modes(stage: Stage) -> None:
+    """A kind of vehicle that has no such modes."""
+    autopilot: Any = stage.vehicle.autopilot
+    autopilot.mode_for = lambda purpose, **_: None
+    autopilot.take_off = lambda *_, **__: None
+
+
+def _obeys_nothing(stage: Stage) -> None:
+    from aerokit.autopilots.base import Autopilot
+
+    autopilot: Any = stage.vehicle.autopilot
+    autopilot.setpoints = Autopilot.setpoints
+
+
+def _old(stage: Stage) -> None:
+    """MAVLink 1 on our side."""
+    connection: Any = stage.vehicle.connection
+    connection._encoder.version = 1
+
+
+def _forget(name: str) -> Callable[[Stage], None]:
+    return lambda stage: getattr(stage.vehicle.telemetry, name).forget()
+
+
+def _actions() -> Table:
+    reboot, arm, mode = Cmd.PREFLIGHT_REBOOT_SHUTDOWN, Cmd.COMPONENT_ARM_DISARM, Cmd.DO_SET_MODE
+    command = _method("command", Cmd.DO_SET_HOME, 1)
+    command_int = _method("command_int", Cmd.DO_SET_HOME, 1, frame=0)
+    rows: Table = {
+        ("Vehicle.command", "LocalProtocolError"): P(_method("command", -1)),
+        ("Vehicle.command", "CommandRejected"): P(command, before=refused(Cmd.DO_SET_HOME)),
+        ("Vehicle.command", "CommandTimeout"): P(command, before=ignored(Cmd.DO_SET_HOME)),
+        ("Vehicle.command_int", "LocalProtocolError"): P(_method("command_int", 1, frame=999)),
+        ("Vehicle.command_int", "CommandRejected"): P(command_int, before=refused(Cmd.DO_SET_HOME)),
+        ("Vehicle.command_int", "CommandTimeout"): P(command_int, before=ignored(Cmd.DO_SET_HOME)),
+        ("Vehicle.arm", "LocalProtocolError"): P(_method("arm", mode="NONE")),
+        ("Vehicle.arm", "CommandRejected"): P(_method("arm"), grounded, refused(arm)),
+        ("Vehicle.arm", "CommandTimeout"): P(_method("arm"), grounded, ignored(arm)),
+        ("Vehicle.arm", "OperationRejected"): later(_method("arm"), pilot, 0.1, grounded, before=ignored(arm)),
+        ("Vehicle.arm", "OperationTimeout"): P(_method("arm", timeout=1.5), grounded, _accept_only(arm)),
+        ("Vehicle.disarm", "CommandRejected"): P(_method("disarm"), airborne),
+        ("Vehicle.disarm", "CommandTimeout"): P(_method("disarm"), armed, ignored(arm)),
+        ("Vehicle.disarm", "OperationTimeout"): P(_method("disarm", timeout=1.5), armed, _accept_only(arm)),
+        ("Vehicle.reboot", "OperationRejected"): P(_method("reboot"), armed),
+        ("Vehicle.reboot", "CommandRejected"): P(_method("reboot"), grounded, refused(reboot)),
+        ("Vehicle.reboot", "CommandTimeout"): P(_method("reboot"), grounded, ignored(reboot)),
+        ("Vehicle.reboot", "OperationTimeout"): P(_method("reboot", timeout=2), grounded, _accept_only(reboot)),
+        ("Vehicle.reboot", "LinkLost"): later(_method("reboot"), lost, 0.05, grounded, alone=True),
+        ("Vehicle.wait_ready", "OperationTimeout"): P(_method("wait_ready", timeout=1), before=_forget("home")),
+        ("Vehicle.set_speed", "LocalProtocolError"): P(_method("set_speed", -1)),
+        ("Vehicle.set_speed", "CommandRejected"): P(_method("set_speed", 3), airborne, refused(Cmd.DO_CHANGE_SPEED)),
+        ("Vehicle.send", "LocalProtocolError"): P(_now(lambda s: s.vehicle.send(messages.Ping(0, 0, 999, 0)))),
+        ("Vehicle.send", "ConnectionClosed"): _ended(lambda s: s.vehicle.send(messages.Ping(0, 0, 0, 0))),
+        ("Vehicle.send", "LinkLost"): _ended(lambda s: s.vehicle.send(messages.Ping(0, 0, 0, 0)), lost),
+        ("Vehicle.subscribe", "LocalProtocolError"): P(_now(lambda s: s.vehicle.subscribe())),
+        ("Vehicle.message", "LocalProtocolError"): P(
+            _now(lambda s: s.vehicle.message(messages.Attitude, rate_hz=5000))
+        ),
+        ("Vehicle.setup_signing", "NotSupported"): P(_sign, grounded, _old, alone=True),
+        ("Vehicle.setup_signing", "OperationRejected"): P(_sign, armed),
+        ("Vehicle.setup_signing", "OperationTimeout"): P(_sign, grounded, falls_silent),
+        ("Vehicle.setup_signing", "BusyError"): P(_sign_twice, grounded, falls_silent),
+        ("Vehicle.set_mode", "LocalProtocolError"): P(_method("set_mode", "NONE")),
+        ("Vehicle.set_heading", "LocalProtocolError"): P(_method("set_heading", 999), airborne),
+        ("Vehicle.go_to", "LocalProtocolError"): P(_method("go_to", Position(0, 0, altitude_relative_m=9e9)), airborne),
+        ("Vehicle.go_to", "ValueUnknownError"): P(_method("go_to", Position(0, 0)), airborne, _forget("position")),
+        ("Vehicle.take_off", "LocalProtocolError"): P(_method("take_off", -1)),
+        ("Vehicle.take_off", "NotSupported"): P(_method("take_off", 5), armed, _no_modes, alone=True),
+        ("Vehicle.take_off", "OperationRejected"): P(_method("take_off", 5), grounded),
+        ("Vehicle.take_off", "CommandTimeout"): P(_method("take_off", 5), armed, ignored(Cmd.NAV_TAKEOFF)),
+        ("Vehicle.take_off", "HeartbeatTimeout"): later(_method("take_off", 50), falls_silent, 1.0, armed),
+        ("Vehicle.take_off", "OperationTimeout"): P(_method("take_off", 50, timeout=2), armed),
+        ("Vehicle.take_off", "ValueUnknownError"): P(_method("take_off", 5), armed, _forget("home"), on="px4"),
+    }
+    for name, do, repeated in (
+        ("Vehicle.set_mode", _method("set_mode", "LOITER"), mode),
+        ("Vehicle.hold", _method("hold"), mode),
+        ("Vehicle.go_to", _go, Cmd.DO_REPOSITION),
+        ("Vehicle.set_heading", _method("set_heading", 90, relative=True), Cmd.CONDITION_YAW),
+        ("Vehicle.land", _method("land"), mode),
+        ("Vehicle.return_to_launch", _method("return_to_launch"), mode),
+    ):
+        rows[name, "CommandRejected"] = P(do, airborne, refused(repeated))
+        rows[name, "OperationRejected"] = later(do, pilot, 0.3, before=ignored(repeated))
+        rows[name, "OperationTimeout"] = P(do, airborne, ignored(repeated))
+        rows[name, "CommandTimeout"] = P(do, airborne, ignored(repeated))
+        rows[name, "NotSupported"] = P(do, airborne, _no_modes, alone=True)
+    rows["Vehicle.set_heading", "OperationTimeout"] = P(_method("set_heading", 90, relative=True, timeout=0.2), airborne)
+    for name, options in (("land", {}), ("return_to_launch", {})):
+        rows[f"Vehicle.{name}", "HeartbeatTimeout"] = later(_method(name, **options), falls_silent)
+        rows[f"Vehicle.{name}", "OperationTimeout"] = P(_method(name, timeout=1), airborne)
+    rows["Vehicle.go_to", "HeartbeatTimeout"] = later(_go, falls_silent)
+    rows["Vehicle.go_to", "OperationTimeout"] = P(lambda s: _go(s, timeout=1), airborne)
+    return rows
+
+
+def _accept_only(command: int) -> Callable[[Stage], object]:
+    """The answer is ACCEPTED, and nothing is done."""
+
+    def forge(stage: Stage) -> None:
+        from aerokit.sim.commands import CommandServer
+
+        servers: Any = [each for each in vars(stage.simulated).values() if isinstance(each, CommandServer)]
+        for server in servers:
+            server._handlers[command] = lambda *_: 0
+
+    return forge
+
+
+def _sign(stage: Stage) -> Any:
+    return stage.vehicle.setup_signing(Signing(KEY), timeout=1)
+
+
+async def _sign_twice(stage: Stage) -> None:
+    first = asyncio.ensure_future(_sign(stage))
+    try:
+        await asyncio.sleep(0)
+        await _sign(stage)
+    finally:
+        first.cancel()
+
+
+def _ended(function: Callable[[Stage], object], how: Callable[[Stage], None] | None = None) -> Provocation:
+    """After the end of the connection."""
+    end = how or (lambda stage: stage.vehicle.connection.close())
+    return P(_now(function), before=end, alone=True)
+
+
+# ------------------------------------------------------------------------------ set-points, cells
+
+
+async def _stop(stage: Stage, feed: Callable[[Any], Any]) -> None:
+    """A stream that has stopped by itself."""
+    async with stage.vehicle.guided.velocity(valid_for_s=0.3) as stream:
+        await anyio.sleep(1)
+        await feed(stream)
+
+
+async def _set_too_much(stage: Stage) -> None:
+    async with stage.vehicle.guided.velocity() as stream:
+        stream.set(VelocitySetpoint(north_m_s=math.nan))
+
+
+async def _set_after_the_end(stream: Any) -> None:
+    stream.set(VelocitySetpoint())
+
+
+async def _nothing(stream: Any) -> None:
+    pass
+
+
+async def _read(stage: Stage, *, entered: bool = True, **options: Any) -> None:
+    subscription = stage.vehicle.subscribe(messages.Ping)
+    if not entered:
+        await subscription.get(timeout=1)
+    with subscription:
+        if not entered:
+            subscription.close()
+        await subscription.get(**options)
+
+
+async def _read_closed(stage: Stage) -> None:
+    with stage.vehicle.subscribe(messages.Ping) as subscription:
+        pass
+    await subscription.get()
+
+
+def _parts() -> Table:
+    guided = {
+        "velocity": (),
+        "body_velocity": (),
+        "acceleration": (),
+        "attitude": (AttitudeSetpoint(0, 0, 0, thrust=0.5),),
+        "local_position": (LocalPositionSetpoint(0, 0, -5),),
+        "position": (PositionSetpoint(Position(47, 8, altitude_relative_m=5)),),
+    }
+    rows: Table = {
+        (f"Guided.{name}", "NotSupported"): P(
+            _now(lambda s, name=name, args=args: getattr(s.vehicle.guided, name)(*args)),  # type: ignore[misc]
+            before=_obeys_nothing,
+            alone=True,
+        )
+        for name, args in guided.items()
+    }
+    stopped = "SetpointStreamStopped"
+    return rows | {
+        ("SetpointStream", stopped): P(lambda s: _stop(s, _nothing), airborne),
+        ("SetpointStream.set", stopped): P(lambda s: _stop(s, _set_after_the_end), airborne),
+        ("SetpointStream.set", "LocalProtocolError"): P(_set_too_much, airborne),
+        ("SetpointStream.fly", stopped): later(
+            lambda s: _fly(s), pilot, 1.0
+        ),
+        ("StateCell.fresh", "StaleValueError"): P(_now(lambda s: s.vehicle.version.fresh(0.0)), grounded),
+        ("StateCell.fresh", "ValueUnknownError"): P(_now(lambda s: s.vehicle.rc.fresh(1)), before=_forget("rc")),
+        ("StateCell.wait_until", "OperationTimeout"): P(
+            lambda s: s.vehicle.mode.wait_until(lambda _: False, timeout=1)
+        ),
+        ("Subscription.get", "OperationTimeout"): P(lambda s: _read(s, timeout=1)),
+        ("Subscription.get", "LocalProtocolError"): P(_read_closed),
+        ("Subscription.get", "ConnectionClosed"): later(
+            _read, lambda s: s.vehicle.connection.close(), 0.1, alone=True
+        ),
+        ("Subscription.get", "LinkLost"): later(_read, lost, 0.1, alone=True),
+    }
+
+
+async def _fly(stage: Stage) -> None:
+    async with stage.vehicle.guided.velocity() as stream:
+        await stream.fly(VelocitySetpoint(north_m_s=1), 5)
+
+
+# ------------------------------------------------------------------------------------ connections
+
+
+async def _connect(stage: Stage, link: Any = None, **options: Any) -> None:
+    async with simulated_link(SimulatedCopter(boot_time_s=0.0)) as other:
+        async with aerokit.connect(other if link is None else link, **options):
+            pass
+
+
+async def _connect_and(stage: Stage, end: Callable[[Any], object]) -> None:
+    """The connection ends while it is waited for the vehicle."""
+    async with simulated_link(SimulatedCopter(boot_time_s=0.0)) as link:
+        async with aerokit.open_connection(link) as connection:
+            asyncio.get_running_loop().call_later(0.5, end, connection)
+            async with aerokit.connect(connection, system_id=77):
+                pass
+
+
+async def _open(stage: Stage, link: Any, **options: Any) -> None:
+    async with aerokit.open_connection(link, **options):
+        pass
+
+
+async def _record_twice(stage: Stage) -> None:
+    stage.vehicle.connection.record(stage.local())
+    stage.vehicle.connection.record(stage.local())
+
+
+async def _used(stage: Stage, *, now: bool) -> None:
+    async with simulated_link(SimulatedCopter(boot_time_s=0.0)) as link:
+        async with aerokit.open_connection(link):
+            if now:
+                await _open(stage, link)
+        await _open(stage, link)
+
+
+def _connections() -> Table:
+    nowhere = "/nowhere/at/all.tlog"
+    ping = messages.Ping(0, 0, 0, 0)
+    rows: Table = {
+        ("connect", "LocalProtocolError"): P(lambda s: _connect(s, "udp:nowhere:port")),
+        ("connect", "BusyError"): P(lambda s: _connect(s, s.vehicle.connection)),
+        ("connect", "LinkOpenError"): P(lambda s: _connect(s, record=nowhere)),
+        ("connect", "LinkLost"): P(
+            lambda s: _connect_and(s, lambda each: each.link_lost(errors.LinkLost("unplugged")))
+        ),
+        ("connect", "ConnectionClosed"): P(lambda s: _connect_and(s, lambda each: each.close())),
+        ("connect", "ConnectFailed"): P(lambda s: _connect(s, system_id=77, timeout=3)),
+        ("open_connection", "LocalProtocolError"): P(lambda s: _open(s, "nonsense:")),
+        ("open_connection", "LinkOpenError"): P(lambda s: _open(s, "tcp:127.0.0.1:9")),
+        ("open_connection", "BusyError"): P(lambda s: _used(s, now=True)),
+        ("open_connection", "ConnectionClosed"): P(lambda s: _used(s, now=False)),
+        ("Connection.check_types", "LocalProtocolError"): P(_now(lambda s: s.vehicle.connection.check_types(()))),
+        ("Connection.subscribe", "LocalProtocolError"): P(_now(lambda s: s.vehicle.connection.subscribe())),
+        ("Connection.record", "LinkOpenError"): P(_now(lambda s: s.vehicle.connection.record(nowhere))),
+        ("Connection.record", "BusyError"): P(_record_twice, alone=True),
+        ("Connection.send", "LocalProtocolError"): P(
+            _now(lambda s: s.vehicle.connection.send(messages.Ping(0, 0, 999, 0)))
+        ),
+        ("Connection.write_raw", "LocalProtocolError"): P(_now(lambda s: s.vehicle.connection.write_raw(b"no"))),
+    }
+    frame = bytes.fromhex("fe0900ff00000000000006080003030000")
+    for name, function in {
+        "raise_if_ended": lambda s: s.vehicle.connection.raise_if_ended(),
+        "send": lambda s: s.vehicle.connection.send(ping),
+        "write_raw": lambda s: s.vehicle.connection.write_raw(frame),
+        "record": lambda s: s.vehicle.connection.record(s.local()),
+    }.items():
+        rows[f"Connection.{name}", "ConnectionClosed"] = _ended(function)
+        rows[f"Connection.{name}", "LinkLost"] = _ended(function, lost)
+    return rows
+
+
+FLIGHT: Table = {**_actions(), **_parts(), **_connections()}

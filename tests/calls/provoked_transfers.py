@@ -1,0 +1,1 @@
+TRANSFERS: dict = {}

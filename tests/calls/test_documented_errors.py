@@ -1,0 +1,92 @@
+"""Every error that a docstring promises is provoked; the list of them is made from the docstrings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import AsyncExitStack
+from pathlib import Path
+
+import anyio
+import pytest
+from call_stage import Stage, grounded, open_stage
+from documented_errors import NAMES, documented
+from provoked import Provocation
+from provoked_flight import FLIGHT
+from provoked_transfers import TRANSFERS
+
+from aerokit import errors
+from aerokit.sim.faults import Faults
+from aerokit.testing import run_virtual
+
+PROVOCATIONS = FLIGHT | TRANSFERS
+PROMISED = documented()
+LONGEST_S = 200.0
+
+
+def test_each_documented_error_is_provoked() -> None:
+    assert sorted(PROMISED - PROVOCATIONS.keys()) == []
+
+
+def groups() -> Iterator[tuple[str, list[tuple[str, str]]]]:
+    """One vehicle serves all calls of one class, but for those after which it is of no use."""
+    for owner in sorted({name.partition(".")[0] for name, _ in PROMISED & PROVOCATIONS.keys()}):
+        yield owner, sorted(each for each in PROMISED & PROVOCATIONS.keys() if each[0].partition(".")[0] == owner)
+
+
+@pytest.mark.parametrize("pairs", [pytest.param(pairs, id=owner) for owner, pairs in groups()])
+def test_it_is_raised(pairs: list[tuple[str, str]], tmp_path: Path) -> None:
+    faults = run_virtual(faults_of(pairs, tmp_path))
+    assert not faults, "\n".join(faults)
+
+
+async def faults_of(pairs: list[tuple[str, str]], folder: Path) -> list[str]:
+    """What is wrong with these; those of one autopilot share a flight."""
+    found = []
+    for on in ("ardupilot", "px4"):
+        together = [each for each in pairs if PROVOCATIONS[each].on == on and not PROVOCATIONS[each].alone]
+        alone = [[each] for each in pairs if PROVOCATIONS[each].on == on and PROVOCATIONS[each].alone]
+        for group in filter(None, [together, *alone]):
+            async with AsyncExitStack() as stack:
+                stage = await stack.enter_async_context(open_stage(on, folder))
+                for pair in group:
+                    found += [f"{pair}: {each}" for each in await fault_of(stage, *pair)]
+    return found
+
+
+async def fault_of(stage: Stage, name: str, error: str) -> list[str]:
+    row: Provocation = PROVOCATIONS[name, error]
+    handlers = dict(stage.simulated.handlers)
+    try:
+        await row.place(stage)
+        row.before(stage)
+        with anyio.fail_after(LONGEST_S):
+            await row.do(stage)
+    except Exception as raised:
+        return [] if is_it(raised, name, error) else [f"raised {type(raised).__name__}: {raised}"]
+    finally:
+        if not row.alone:
+            stage.simulated.faults = Faults()
+            stage.simulated.handlers.update(handlers)
+            with anyio.CancelScope(shield=True):
+                await settle(stage)
+    return ["raised nothing"]
+
+
+async def settle(stage: Stage) -> None:
+    """The vehicle is heard again, what was left to be confirmed is, and it stands."""
+    await anyio.sleep(4.0)
+    await stage.vehicle.home.wait_until(lambda _: True, timeout=30)
+    stage.vehicle._stop_watching_arming()
+
+
+def is_it(raised: Exception, name: str, error: str) -> bool:
+    """This error, or a special case of it that is not promised by itself."""
+    known = {cls.__name__ for cls in type(raised).__mro__} & NAMES
+    return error in known and not any(
+        (name, each) in PROMISED and each != error and issubclass(getattr(errors, each, OSError), _class(error))
+        for each in known
+    )
+
+
+def _class(error: str) -> type:
+    return getattr(errors, error, OSError)
