@@ -160,6 +160,13 @@ def orders(session: nox.Session) -> None:
     session.run("pytest", "-q", "tests/orders", env={"AEROKIT_ORDER_SEEDS": seeds})
 
 
+@nox.session
+def cancel(session: nox.Session) -> None:
+    """Cancel every public coroutine at every await, not only at a few; a minute."""
+    session.install("-e", ".[test]")
+    session.run("pytest", "-q", "tests/calls/test_cancellation.py", env={"AEROKIT_CANCEL_POINTS": "0"})
+
+
 @nox.session(name="dronekit")
 def dronekit_itself(session: nox.Session) -> None:
     """Have DroneKit 2.9.2 itself play the scenarios of its behaviour that the tests hold aerokit.dronekit to."""

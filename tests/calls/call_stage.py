@@ -154,7 +154,7 @@ async def grounded(stage: Stage) -> None:
     if vehicle.is_armed:
         with anyio.fail_after(60):
             await vehicle.disarm(force=True)
-            while not stage.simulated.motion.is_on_ground:
+            while not stage.simulated.motion.is_on_ground:  # noqa: ASYNC110
                 await anyio.sleep(0.1)
             await vehicle.landed_state.wait_until(lambda state: state == 1)
     with contextlib.suppress(

@@ -12,7 +12,9 @@ from aerokit import errors
 __all__ = ["documented"]
 
 NAMES = {*errors.__all__, "OSError"}
-AS_OTHERS = re.compile(r"(?:[Rr]aises as|else as|[Ee]rrors as for|errors are those of|is as for|see) :meth:`([\w.]+)`")
+AS_OTHERS = re.compile(
+    r"(?:[Rr]aises as|else as|[Ee]rrors as for|errors are those of|is as for|see) :meth:`([\w.]+)`"
+)
 FOR_ALL = re.compile(r"(Every method raises:|All methods take|NotSupported is\s+raised for).*", re.DOTALL)
 """What the docstring of a class says of all its methods."""
 
@@ -28,7 +30,7 @@ def _of(member: Member, known: dict[str, Member], seen: set[str]) -> set[str]:
     """Those named in the docstring, those of the functions it refers to, and those of all methods of its class."""
     seen.add(member.qualified)
     found = _named_in(member.docstring)
-    if member.owner is not None and member.is_awaited:
+    if member.owner is not None and member.is_awaited and len(seen) == 1:
         takes = inspect.signature(member.function).parameters
         if "timeout" in takes or "initial" in takes:
             found |= _of_all_methods(member.owner)

@@ -10,10 +10,25 @@ from typing import Any
 from call_stage import Place, Stage, airborne, anywhere
 
 from aerokit import messages as m
-from aerokit.mavlink.enums import MavFtpOpcode, MavResult
+from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode, MavResult
 from aerokit.protocols.ftp_message import FtpMessage
 
-__all__ = ["Do", "Provocation", "falls_silent", "garbage", "ignored", "later", "lost", "pilot", "refused"]
+__all__ = [
+    "FORGETTING",
+    "NONSENSE",
+    "REFUSING",
+    "Do",
+    "Provocation",
+    "Table",
+    "accepted",
+    "falls_silent",
+    "ignored",
+    "later",
+    "lost",
+    "no_modes",
+    "pilot",
+    "refused",
+]
 
 Do = Callable[[Stage], Awaitable[object]]
 Trouble = Callable[[Stage], object]
@@ -21,13 +36,17 @@ Trouble = Callable[[Stage], object]
 
 @dataclass(frozen=True)
 class Provocation:
-    """``before`` is done once the vehicle is in its place. ``alone``: nothing can be done with the vehicle afterwards."""
+    """``before`` is done once the vehicle is in its place. ``alone``: the vehicle is of no use afterwards."""
 
     do: Do
     place: Place = anywhere
     before: Trouble = lambda stage: None
     on: str = "ardupilot"
     alone: bool = False
+
+
+Table = dict[tuple[str, str], Provocation]
+"""(call, error) → how it is provoked."""
 
 
 def refused(command: int, result: int = MavResult.FAILED) -> Trouble:
@@ -56,7 +75,9 @@ def pilot(stage: Stage) -> None:
     assert stage.simulated.set_mode(2)  # type: ignore[union-attr]
 
 
-def later(do: Do, trouble: Trouble, after_s: float = 1.0, place: Place = airborne, **options: Any) -> Provocation:
+def later(
+    do: Do, trouble: Trouble, after_s: float = 1.0, place: Place = airborne, **options: Any
+) -> Provocation:
     """The trouble comes while the call is under way."""
 
     async def disturbed(stage: Stage) -> object:
@@ -66,27 +87,57 @@ def later(do: Do, trouble: Trouble, after_s: float = 1.0, place: Place = airborn
     return Provocation(disturbed, place, **options)
 
 
-def garbage(stage: Stage) -> None:
-    """A file server that gives much less than it promised, no CRC-32, and lists without an end."""
+def no_modes(stage: Stage) -> None:
+    """A kind of vehicle that has no modes for anything."""
+    autopilot: Any = stage.vehicle.autopilot
+    autopilot.mode_for = lambda purpose, **_: None
+    autopilot.take_off = lambda *_, **__: None
 
-    def handle(message: m.FileTransferProtocol, channel: Any) -> None:
-        request = FtpMessage.decode(message.payload)
-        data = {
-            MavFtpOpcode.OPENFILERO: (10_000).to_bytes(4, "little"),
-            MavFtpOpcode.CALCFILECRC: b"\1",
-            MavFtpOpcode.LISTDIRECTORY: b"Fsame\t1\0",
-            MavFtpOpcode.BURSTREADFILE: bytes(300),
-            MavFtpOpcode.READFILE: bytes(300),
-        }.get(MavFtpOpcode(request.opcode), b"")
-        reply = FtpMessage(
-            (request.sequence + 1) % 65536,
-            MavFtpOpcode.ACK,
-            session=request.session,
-            size=len(data[:239]),
-            request_opcode=request.opcode,
-            offset=request.offset,
-            data=data[:239],
-        )
-        stage.simulated.send(m.FileTransferProtocol(0, 255, 190, reply.encode()), channel)
 
-    stage.simulated.handlers[m.FileTransferProtocol.ID] = handle
+def accepted(command: int) -> Trouble:
+    """The vehicle answers ACCEPTED, and does nothing."""
+    return refused(command, MavResult.ACCEPTED)
+
+
+def file_server(answers: dict[int, bytes | int]) -> Trouble:
+    """A file server that answers all requests with an ACK, with these data; a number is the code of a NAK."""
+
+    def trouble(stage: Stage) -> None:
+        def handle(message: m.FileTransferProtocol, channel: Any) -> None:
+            request = FtpMessage.decode(message.payload)
+            data = answers.get(request.opcode, answers.get(-1, b""))
+            stage.simulated.send(m.FileTransferProtocol(0, 255, 190, _reply(request, data).encode()), channel)
+
+        stage.simulated.handlers[m.FileTransferProtocol.ID] = handle
+
+    return trouble
+
+
+def _reply(request: FtpMessage, data: bytes | int) -> FtpMessage:
+    payload = bytes([data]) if isinstance(data, int) else data
+    return FtpMessage(
+        (request.sequence + 1) % 65536,
+        MavFtpOpcode.NAK if isinstance(data, int) else MavFtpOpcode.ACK,
+        session=request.session,
+        size=len(payload),
+        request_opcode=request.opcode,
+        offset=request.offset,
+        data=payload,
+    )
+
+
+Op = MavFtpOpcode
+REFUSING = file_server({-1: int(MavFtpErr.FILENOTFOUND)})
+"""It has no file at all."""
+NONSENSE = file_server(
+    {
+        Op.OPENFILERO: (10_000).to_bytes(4, "little"),
+        Op.READFILE: int(MavFtpErr.EOF),
+        Op.BURSTREADFILE: int(MavFtpErr.EOF),
+        Op.CALCFILECRC: b"\1",
+        Op.LISTDIRECTORY: b"Fsame\t1\0",
+    }
+)
+"""Files end before they are whole, a CRC-32 has one byte, a list does not end."""
+FORGETTING = file_server({Op.CALCFILECRC: bytes(4)})
+"""It says that it has written all, and something else is there."""

@@ -8,9 +8,21 @@ from collections.abc import Callable
 from typing import Any
 
 import anyio
-from call_stage import Stage, airborne, armed, grounded, on_mission
+from call_stage import Stage, airborne, armed, grounded
 from call_table import KEY
-from provoked import Do, Provocation, falls_silent, ignored, later, lost, pilot, refused
+from provoked import (
+    Do,
+    Provocation,
+    Table,
+    accepted,
+    falls_silent,
+    ignored,
+    later,
+    lost,
+    no_modes,
+    pilot,
+    refused,
+)
 
 import aerokit
 from aerokit import Position, PositionSetpoint, Signing, VelocitySetpoint, errors, messages
@@ -21,7 +33,6 @@ from aerokit.vehicle.setpoints import AttitudeSetpoint, LocalPositionSetpoint
 __all__ = ["FLIGHT"]
 
 P, Cmd = Provocation, MavCmd
-Table = dict[tuple[str, str], Provocation]
 
 
 def _method(name: str, *args: Any, **options: Any) -> Do:
@@ -43,13 +54,6 @@ def _go(stage: Stage, **options: Any) -> Any:
 
 def _does_not_move(stage: Stage) -> None:
     stage.simulated.faults.motor_failed = True
-
-
-def _no_modes(stage: Stage) -> None:
-    """A kind of vehicle that has no such modes."""
-    autopilot: Any = stage.vehicle.autopilot
-    autopilot.mode_for = lambda purpose, **_: None
-    autopilot.take_off = lambda *_, **__: None
 
 
 def _obeys_nothing(stage: Stage) -> None:
@@ -83,20 +87,28 @@ def _actions() -> Table:
         ("Vehicle.arm", "LocalProtocolError"): P(_method("arm", mode="NONE")),
         ("Vehicle.arm", "CommandRejected"): P(_method("arm"), grounded, refused(arm)),
         ("Vehicle.arm", "CommandTimeout"): P(_method("arm"), grounded, ignored(arm)),
-        ("Vehicle.arm", "OperationRejected"): later(_method("arm"), pilot, 0.1, grounded, before=ignored(arm)),
-        ("Vehicle.arm", "OperationTimeout"): P(_method("arm", timeout=1.5), grounded, _accept_only(arm)),
+        ("Vehicle.arm", "OperationRejected"): later(
+            _method("arm"), pilot, 0.1, grounded, before=ignored(arm)
+        ),
+        ("Vehicle.arm", "OperationTimeout"): P(_method("arm", timeout=1.5), grounded, accepted(arm)),
         ("Vehicle.disarm", "CommandRejected"): P(_method("disarm"), airborne),
         ("Vehicle.disarm", "CommandTimeout"): P(_method("disarm"), armed, ignored(arm)),
-        ("Vehicle.disarm", "OperationTimeout"): P(_method("disarm", timeout=1.5), armed, _accept_only(arm)),
+        ("Vehicle.disarm", "OperationTimeout"): P(_method("disarm", timeout=1.5), armed, accepted(arm)),
         ("Vehicle.reboot", "OperationRejected"): P(_method("reboot"), armed),
         ("Vehicle.reboot", "CommandRejected"): P(_method("reboot"), grounded, refused(reboot)),
         ("Vehicle.reboot", "CommandTimeout"): P(_method("reboot"), grounded, ignored(reboot)),
-        ("Vehicle.reboot", "OperationTimeout"): P(_method("reboot", timeout=2), grounded, _accept_only(reboot)),
+        ("Vehicle.reboot", "OperationTimeout"): P(_method("reboot", timeout=2), grounded, accepted(reboot)),
         ("Vehicle.reboot", "LinkLost"): later(_method("reboot"), lost, 0.05, grounded, alone=True),
-        ("Vehicle.wait_ready", "OperationTimeout"): P(_method("wait_ready", timeout=1), before=_forget("home")),
+        ("Vehicle.wait_ready", "OperationTimeout"): P(
+            _method("wait_ready", timeout=1), before=_forget("home")
+        ),
         ("Vehicle.set_speed", "LocalProtocolError"): P(_method("set_speed", -1)),
-        ("Vehicle.set_speed", "CommandRejected"): P(_method("set_speed", 3), airborne, refused(Cmd.DO_CHANGE_SPEED)),
-        ("Vehicle.send", "LocalProtocolError"): P(_now(lambda s: s.vehicle.send(messages.Ping(0, 0, 999, 0)))),
+        ("Vehicle.set_speed", "CommandRejected"): P(
+            _method("set_speed", 3), airborne, refused(Cmd.DO_CHANGE_SPEED)
+        ),
+        ("Vehicle.send", "LocalProtocolError"): P(
+            _now(lambda s: s.vehicle.send(messages.Ping(0, 0, 999, 0)))
+        ),
         ("Vehicle.send", "ConnectionClosed"): _ended(lambda s: s.vehicle.send(messages.Ping(0, 0, 0, 0))),
         ("Vehicle.send", "LinkLost"): _ended(lambda s: s.vehicle.send(messages.Ping(0, 0, 0, 0)), lost),
         ("Vehicle.subscribe", "LocalProtocolError"): P(_now(lambda s: s.vehicle.subscribe())),
@@ -109,15 +121,21 @@ def _actions() -> Table:
         ("Vehicle.setup_signing", "BusyError"): P(_sign_twice, grounded, falls_silent),
         ("Vehicle.set_mode", "LocalProtocolError"): P(_method("set_mode", "NONE")),
         ("Vehicle.set_heading", "LocalProtocolError"): P(_method("set_heading", 999), airborne),
-        ("Vehicle.go_to", "LocalProtocolError"): P(_method("go_to", Position(0, 0, altitude_relative_m=9e9)), airborne),
-        ("Vehicle.go_to", "ValueUnknownError"): P(_method("go_to", Position(0, 0)), airborne, _forget("position")),
+        ("Vehicle.go_to", "LocalProtocolError"): P(
+            _method("go_to", Position(0, 0, altitude_relative_m=9e9)), airborne
+        ),
+        ("Vehicle.go_to", "ValueUnknownError"): P(
+            _method("go_to", Position(0, 0)), airborne, _forget("position")
+        ),
         ("Vehicle.take_off", "LocalProtocolError"): P(_method("take_off", -1)),
-        ("Vehicle.take_off", "NotSupported"): P(_method("take_off", 5), armed, _no_modes, alone=True),
+        ("Vehicle.take_off", "NotSupported"): P(_method("take_off", 5), armed, no_modes, alone=True),
         ("Vehicle.take_off", "OperationRejected"): P(_method("take_off", 5), grounded),
         ("Vehicle.take_off", "CommandTimeout"): P(_method("take_off", 5), armed, ignored(Cmd.NAV_TAKEOFF)),
         ("Vehicle.take_off", "HeartbeatTimeout"): later(_method("take_off", 50), falls_silent, 1.0, armed),
         ("Vehicle.take_off", "OperationTimeout"): P(_method("take_off", 50, timeout=2), armed),
-        ("Vehicle.take_off", "ValueUnknownError"): P(_method("take_off", 5), armed, _forget("home"), on="px4"),
+        ("Vehicle.take_off", "ValueUnknownError"): P(
+            _method("take_off", 5), armed, _forget("home"), on="px4"
+        ),
     }
     for name, do, repeated in (
         ("Vehicle.set_mode", _method("set_mode", "LOITER"), mode),
@@ -130,28 +148,20 @@ def _actions() -> Table:
         rows[name, "CommandRejected"] = P(do, airborne, refused(repeated))
         rows[name, "OperationRejected"] = later(do, pilot, 0.3, before=ignored(repeated))
         rows[name, "OperationTimeout"] = P(do, airborne, ignored(repeated))
-        rows[name, "CommandTimeout"] = P(do, airborne, ignored(repeated))
-        rows[name, "NotSupported"] = P(do, airborne, _no_modes, alone=True)
-    rows["Vehicle.set_heading", "OperationTimeout"] = P(_method("set_heading", 90, relative=True, timeout=0.2), airborne)
+    for name, do in (("land", _method("land")), ("return_to_launch", _method("return_to_launch"))):
+        rows[f"Vehicle.{name}", "CommandTimeout"] = P(do, airborne, ignored(mode))
+        rows[f"Vehicle.{name}", "NotSupported"] = P(do, airborne, no_modes, alone=True)
+    rows["Vehicle.hold", "NotSupported"] = P(_method("hold"), airborne, no_modes, alone=True)
+    rows["Vehicle.go_to", "CommandTimeout"] = P(_go, airborne, ignored(Cmd.DO_REPOSITION))
+    rows["Vehicle.set_heading", "OperationTimeout"] = P(
+        _method("set_heading", 90, relative=True, timeout=0.2), airborne
+    )
     for name, options in (("land", {}), ("return_to_launch", {})):
         rows[f"Vehicle.{name}", "HeartbeatTimeout"] = later(_method(name, **options), falls_silent)
         rows[f"Vehicle.{name}", "OperationTimeout"] = P(_method(name, timeout=1), airborne)
     rows["Vehicle.go_to", "HeartbeatTimeout"] = later(_go, falls_silent)
     rows["Vehicle.go_to", "OperationTimeout"] = P(lambda s: _go(s, timeout=1), airborne)
     return rows
-
-
-def _accept_only(command: int) -> Callable[[Stage], object]:
-    """The answer is ACCEPTED, and nothing is done."""
-
-    def forge(stage: Stage) -> None:
-        from aerokit.sim.commands import CommandServer
-
-        servers: Any = [each for each in vars(stage.simulated).values() if isinstance(each, CommandServer)]
-        for server in servers:
-            server._handlers[command] = lambda *_: 0
-
-    return forge
 
 
 def _sign(stage: Stage) -> Any:
@@ -234,11 +244,11 @@ def _parts() -> Table:
         ("SetpointStream", stopped): P(lambda s: _stop(s, _nothing), airborne),
         ("SetpointStream.set", stopped): P(lambda s: _stop(s, _set_after_the_end), airborne),
         ("SetpointStream.set", "LocalProtocolError"): P(_set_too_much, airborne),
-        ("SetpointStream.fly", stopped): later(
-            lambda s: _fly(s), pilot, 1.0
-        ),
+        ("SetpointStream.fly", stopped): later(lambda s: _fly(s), pilot, 1.0),
         ("StateCell.fresh", "StaleValueError"): P(_now(lambda s: s.vehicle.version.fresh(0.0)), grounded),
-        ("StateCell.fresh", "ValueUnknownError"): P(_now(lambda s: s.vehicle.rc.fresh(1)), before=_forget("rc")),
+        ("StateCell.fresh", "ValueUnknownError"): P(
+            _now(lambda s: s.vehicle.home.fresh(1)), before=_forget("home")
+        ),
         ("StateCell.wait_until", "OperationTimeout"): P(
             lambda s: s.vehicle.mode.wait_until(lambda _: False, timeout=1)
         ),
@@ -261,17 +271,20 @@ async def _fly(stage: Stage) -> None:
 
 async def _connect(stage: Stage, link: Any = None, **options: Any) -> None:
     async with simulated_link(SimulatedCopter(boot_time_s=0.0)) as other:
-        async with aerokit.connect(other if link is None else link, **options):
+        given = other if link is None else link
+        async with aerokit.connect(given, **options):
             pass
 
 
 async def _connect_and(stage: Stage, end: Callable[[Any], object]) -> None:
     """The connection ends while it is waited for the vehicle."""
-    async with simulated_link(SimulatedCopter(boot_time_s=0.0)) as link:
-        async with aerokit.open_connection(link) as connection:
-            asyncio.get_running_loop().call_later(0.5, end, connection)
-            async with aerokit.connect(connection, system_id=77):
-                pass
+    async with (
+        simulated_link(SimulatedCopter(boot_time_s=0.0)) as link,
+        aerokit.open_connection(link) as connection,
+    ):
+        asyncio.get_running_loop().call_later(0.5, end, connection)
+        async with aerokit.connect(connection, system_id=77):
+            pass
 
 
 async def _open(stage: Stage, link: Any, **options: Any) -> None:
@@ -308,14 +321,18 @@ def _connections() -> Table:
         ("open_connection", "LinkOpenError"): P(lambda s: _open(s, "tcp:127.0.0.1:9")),
         ("open_connection", "BusyError"): P(lambda s: _used(s, now=True)),
         ("open_connection", "ConnectionClosed"): P(lambda s: _used(s, now=False)),
-        ("Connection.check_types", "LocalProtocolError"): P(_now(lambda s: s.vehicle.connection.check_types(()))),
+        ("Connection.check_types", "LocalProtocolError"): P(
+            _now(lambda s: s.vehicle.connection.check_types(()))
+        ),
         ("Connection.subscribe", "LocalProtocolError"): P(_now(lambda s: s.vehicle.connection.subscribe())),
         ("Connection.record", "LinkOpenError"): P(_now(lambda s: s.vehicle.connection.record(nowhere))),
         ("Connection.record", "BusyError"): P(_record_twice, alone=True),
         ("Connection.send", "LocalProtocolError"): P(
             _now(lambda s: s.vehicle.connection.send(messages.Ping(0, 0, 999, 0)))
         ),
-        ("Connection.write_raw", "LocalProtocolError"): P(_now(lambda s: s.vehicle.connection.write_raw(b"no"))),
+        ("Connection.write_raw", "LocalProtocolError"): P(
+            _now(lambda s: s.vehicle.connection.write_raw(b"no"))
+        ),
     }
     frame = bytes.fromhex("fe0900ff00000000000006080003030000")
     for name, function in {

@@ -13,6 +13,7 @@ __all__ = ["Cancelled", "Counted", "Point", "cancel_at", "points_of"]
 
 IN_THE_MIDDLE_S = 0.02
 """Waits that are longer are cut off in their middle, too: what comes from the vehicle meanwhile wakes nobody."""
+LONGEST_S = 900.0
 Cancel = Callable[[], object]
 
 
@@ -120,7 +121,8 @@ async def cancel_at(work: Awaitable[object], point: Point | None) -> Cancelled:
 
     counted = outcome.counted = Counted(work, suspended)
     task = loop.create_task(run(), name="the call")
-    await asyncio.wait([task])
+    _, endless = await asyncio.wait([task], timeout=LONGEST_S)
+    assert not endless, f"it does not end within {LONGEST_S:g} s: {point}"
     outcome.ended_at = loop.time()
     if not task.cancelled():
         outcome.error = task.exception()

@@ -20,7 +20,7 @@ from suspensions import Cancelled, Point, cancel_at, points_of
 
 from aerokit.testing import run_virtual
 
-POINTS = int(os.environ.get("AEROKIT_CANCEL_POINTS", "4"))
+POINTS = int(os.environ.get("AEROKIT_CANCEL_POINTS", "5"))
 """At so many awaits of each call; 0: at all."""
 ENDS_S = 2.0
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import anyio
 import pytest
-from call_stage import Stage, grounded, open_stage
+from call_stage import Stage, open_stage
 from documented_errors import NAMES, documented
 from provoked import Provocation
 from provoked_flight import FLIGHT
@@ -30,7 +30,10 @@ def test_each_documented_error_is_provoked() -> None:
 def groups() -> Iterator[tuple[str, list[tuple[str, str]]]]:
     """One vehicle serves all calls of one class, but for those after which it is of no use."""
     for owner in sorted({name.partition(".")[0] for name, _ in PROMISED & PROVOCATIONS.keys()}):
-        yield owner, sorted(each for each in PROMISED & PROVOCATIONS.keys() if each[0].partition(".")[0] == owner)
+        yield (
+            owner,
+            sorted(each for each in PROMISED & PROVOCATIONS.keys() if each[0].partition(".")[0] == owner),
+        )
 
 
 @pytest.mark.parametrize("pairs", [pytest.param(pairs, id=owner) for owner, pairs in groups()])
@@ -83,7 +86,9 @@ def is_it(raised: Exception, name: str, error: str) -> bool:
     """This error, or a special case of it that is not promised by itself."""
     known = {cls.__name__ for cls in type(raised).__mro__} & NAMES
     return error in known and not any(
-        (name, each) in PROMISED and each != error and issubclass(getattr(errors, each, OSError), _class(error))
+        (name, each) in PROMISED
+        and each != error
+        and issubclass(getattr(errors, each, OSError), _class(error))
         for each in known
     )
 

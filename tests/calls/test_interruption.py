@@ -1,5 +1,6 @@
-"""Every call of the blocking twin, interrupted by Ctrl-C at its first await, at a later one and at its end: its task has
-ended when KeyboardInterrupt leaves it, and nothing is left of it.
+"""Every call of the blocking twin, interrupted by Ctrl-C at its first await, at a later one and at its end.
+
+Its task has ended when KeyboardInterrupt leaves it, and nothing is left of it.
 """
 
 from __future__ import annotations
@@ -42,13 +43,15 @@ class BlockingStage(Stage):
 def stages(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[BlockingStage, Stage]]:
     """For the twin's calls, and for what is done on its loop."""
     copter, folder = SimulatedCopter(boot_time_s=0.0, logs=LOGS), tmp_path_factory.mktemp("calls")
-    with served([copter], "tcpin:127.0.0.1:0", "tcpin:127.0.0.1:0") as address:
-        with aerokit.sync.connect(address) as vehicle:
-            vehicle.wait_ready()
-            blocking = BlockingStage(copter, cast(Any, vehicle), cast(Any, None), folder, address=address)
-            blocking.put(blocking.file)
-            vehicle.message(messages.ScaledPressure)  # for as long as the vehicle lives
-            yield blocking, Stage(copter, vehicle.aio, cast(Any, None), folder)
+    with (
+        served([copter], "tcpin:127.0.0.1:0", "tcpin:127.0.0.1:0") as address,
+        aerokit.sync.connect(address) as vehicle,
+    ):
+        vehicle.wait_ready()
+        blocking = BlockingStage(copter, cast(Any, vehicle), cast(Any, None), folder, address=address)
+        blocking.put(blocking.file)
+        vehicle.message(messages.ScaledPressure)  # for as long as the vehicle lives
+        yield blocking, Stage(copter, vehicle.aio, cast(Any, None), folder)
 
 
 def test_each_call_of_the_twin_is_in_the_table() -> None:

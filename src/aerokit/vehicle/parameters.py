@@ -115,7 +115,7 @@ class Parameters:
 
         Raises:
             ParameterTimeout: the list did not come whole; ``missing`` has the indices. What did come is in ``table``.
-            FileError, FileTimeout, NotSupported: with ``method="ftp"`` only.
+            FileError, FileTimeout, RemoteProtocolError: with ``method="ftp"`` only.
         """
         with self._transfers.limit(timeout):
             return await self._access.download(
