@@ -156,8 +156,8 @@ def _actions() -> Table:
     rows["Vehicle.set_heading", "OperationTimeout"] = P(
         _method("set_heading", 90, relative=True, timeout=0.2), airborne
     )
-    for name, options in (("land", {}), ("return_to_launch", {})):
-        rows[f"Vehicle.{name}", "HeartbeatTimeout"] = later(_method(name, **options), falls_silent)
+    for name in ("land", "return_to_launch"):
+        rows[f"Vehicle.{name}", "HeartbeatTimeout"] = later(_method(name), falls_silent)
         rows[f"Vehicle.{name}", "OperationTimeout"] = P(_method(name, timeout=1), airborne)
     rows["Vehicle.go_to", "HeartbeatTimeout"] = later(_go, falls_silent)
     rows["Vehicle.go_to", "OperationTimeout"] = P(lambda s: _go(s, timeout=1), airborne)

@@ -134,7 +134,7 @@ def _parameters() -> Table:
         ("download", (), None, None),
     ):
         options = {"refresh": True} if name == "download" else {}
-        do: Callable[..., Do] = lambda *given, name=name, **more: _of("parameters", name, *given, **more)  # type: ignore[misc]  # noqa: E731
+        do: Callable[..., Do] = lambda *given, name=name, **more: _of("parameters", name, *given, **more)  # noqa: E731
         key = f"Parameters.{name}"
         rows[key, "OperationTimeout"] = P(do(*args, **HURRY, **options), before=_unknown_and_silent)
         if wrong is not None:

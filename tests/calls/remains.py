@@ -66,7 +66,7 @@ def _all(stage: Stage) -> Iterator[str]:
 
 
 def _is_awaited(vehicle: Any, key: tuple[int, int]) -> bool:
-    return key[0] == vehicle.component_id and vehicle._commands.awaits_answer(key[1])
+    return bool(key[0] == vehicle.component_id and vehicle._commands.awaits_answer(key[1]))
 
 
 def _times(name: str, items: Iterable[object]) -> Iterator[str]:

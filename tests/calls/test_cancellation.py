@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import os
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
 import anyio
@@ -20,7 +20,7 @@ from suspensions import Cancelled, Point, cancel_at, points_of
 
 from aerokit.testing import run_virtual
 
-POINTS = int(os.environ.get("AEROKIT_CANCEL_POINTS", "5"))
+POINTS = int(os.environ.get("AEROKIT_CANCEL_POINTS", "4"))
 """At so many awaits of each call; 0: at all."""
 ENDS_S = 2.0
 
@@ -55,7 +55,7 @@ def test_cancelled_at_any_await(names: list[str], autopilot: str, tmp_path: Path
     assert not faults, "\n".join(faults)
 
 
-async def faults_of(stage: Stage, name: str, autopilot: str):  # type: ignore[no-untyped-def]
+async def faults_of(stage: Stage, name: str, autopilot: str) -> AsyncIterator[str]:
     if autopilot not in CALLS[name].on:
         return
     rehearsed = await run(stage, name, None)

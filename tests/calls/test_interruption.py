@@ -63,7 +63,7 @@ def test_each_call_of_the_twin_is_in_the_table() -> None:
 @pytest.mark.parametrize("name", blocking_calls())
 def test_interrupted(name: str, stages: tuple[BlockingStage, Stage], monkeypatch: pytest.MonkeyPatch) -> None:
     blocking, stage = stages
-    call = CALLS.get(name, Call(blocking_calls()[name]))
+    call = CALLS.get(name, Call(cast(Any, blocking_calls()[name])))
     if "ardupilot" not in call.on:
         pytest.skip("the copter does not know it")
     loop, do = cast(Any, blocking.vehicle)._loop, blocking_calls()[name]
