@@ -68,6 +68,18 @@ def test_take_off_takes_as_long_as_the_real_one() -> None:
     assert copter.altitude_m == pytest.approx(10.0, abs=0.05)
 
 
+def test_disarmed_while_it_takes_off_it_falls_and_has_landed() -> None:
+    copter, client = ready_copter()
+    set_mode(client, CopterMode.GUIDED)
+    client.command(MavCmd.COMPONENT_ARM_DISARM, 1)
+    client.command(MavCmd.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 10.0)
+    client.run_until(lambda: copter.altitude_m > 3.0)
+    client.command(MavCmd.COMPONENT_ARM_DISARM, 0, 21196)
+    client.run(4.0)
+    assert copter.motion.is_on_ground
+    assert copter.is_landed
+
+
 def test_landed_state_goes_through_take_off_to_in_air() -> None:
     copter, client = ready_copter()
     client.command(MavCmd.SET_MESSAGE_INTERVAL, m.ExtendedSysState.ID, 100_000)
