@@ -84,9 +84,10 @@ async def _get(stage: Stage) -> None:
 
 
 async def _changes(stage: Stage) -> None:
-    async for _ in stage.vehicle.position.changes():
-        if stage.vehicle.position.age == 0:
-            break
+    changes = stage.vehicle.mode.changes()
+    await changes.__anext__()
+    with anyio.move_on_after(1.0):  # the next one does not come
+        await changes.__anext__()
 
 
 async def _updates(stage: Stage) -> None:
