@@ -28,7 +28,7 @@ from aerokit.sim import SimulatedCopter
 
 LATER = 4
 """Interrupted a second time at this await, if it comes there, and a third time when it has ended."""
-PATIENCE_S = 5.0
+PATIENCE_S = 40.0
 """For what is left to go: an order to arm is watched, and answered."""
 
 
