@@ -110,6 +110,7 @@ def connect(
         vehicle: Vehicle | VehicleT = Vehicle(handler) if vehicle_class is None else vehicle_class(handler)
         if status_printer is not None:
             _print_texts(handler, status_printer)
+            handler.listener_thread.keep(vehicle, has_listeners=True)
         if _initialize:
             vehicle.initialize(rate=rate, heartbeat_timeout=heartbeat_timeout)
         if wait_ready:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit.dronekit.exceptions import APIException
 from aerokit.dronekit.pymavlink_messages import message_of
+from aerokit.dronekit.weakly import weakly
 from aerokit.errors import LocalProtocolError
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.runtime.diagnosis import is_autopilot
@@ -91,9 +92,9 @@ class Inbox(Mapping[str, Any]):
         if is_first:
             loop, tap = self._connection.loop, self._connection._tap
             if loop.is_current:
-                tap(self._take)
+                tap(weakly(self._take))
             else:
-                loop.call(tap, self._take)  # which waits: what comes after the first question is kept
+                loop.call(tap, weakly(self._take))  # which waits: what comes after the first question is kept
 
     def _waits(self) -> bool:
         is_young = self._started is not None and time.monotonic() < self._started + FIRST_S

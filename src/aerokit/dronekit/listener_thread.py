@@ -33,6 +33,7 @@ class ListenerThread:
         self._lock = threading.Lock()
         self._is_stopped = False
         self._dropped = 0
+        self._kept: dict[int, object] = {}
 
     def post(self, function: Callable[..., object], *args: Any) -> None:
         """Have ``function(*args)`` called; from any thread, never blocks. Nothing happens once it is stopped."""
@@ -76,6 +77,13 @@ class ListenerThread:
             if time.monotonic() > end:
                 break
 
+    def keep(self, owner: object, *, has_listeners: bool) -> None:
+        """Keep an object for as long as it has listeners: a program may have nothing else of it any more."""
+        if has_listeners and not self._is_stopped:
+            self._kept[id(owner)] = owner
+        else:
+            self._kept.pop(id(owner), None)
+
     @property
     def is_stopped(self) -> bool:
         """Whether nothing is called any more."""
@@ -95,6 +103,7 @@ class ListenerThread:
         """Call nothing more. Idempotent; never blocks."""
         with self._lock:
             self._is_stopped = True
+        self._kept.clear()
         self._calls.put((_nothing, ()))
 
     def join(self) -> None:
@@ -122,6 +131,7 @@ class ListenerThread:
                 function(*args)
             except BaseException:  # sys.exit() in a callback would end the callbacks, and nothing else
                 logger.exception("Exception in a callback")
+            del function, args  # they would be kept until the next call
 
 
 class _Thread(threading.Thread):

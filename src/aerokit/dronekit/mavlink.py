@@ -5,10 +5,12 @@ from __future__ import annotations
 import asyncio
 import atexit
 import contextlib
+import functools
 import logging
 import queue
 import threading
 import time
+import weakref
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
@@ -17,6 +19,7 @@ from aerokit.dronekit.exceptions import APIException
 from aerokit.dronekit.listener_thread import ListenerThread
 from aerokit.dronekit.orders import Orders
 from aerokit.dronekit.standing import Given
+from aerokit.dronekit.weakly import weakly
 from aerokit.errors import AerokitError, ConnectionClosed, LinkOpenError, LocalProtocolError
 from aerokit.links.address import ACCEPTED_FORMS
 from aerokit.links.reconnecting import ReconnectingLink
@@ -33,7 +36,7 @@ if TYPE_CHECKING:
 
 __all__ = ["MAVConnection", "MAVWriter", "mavudpin_multi"]
 
-logger = logging.getLogger("dronekit.mavlink")
+logger, of_vehicles = logging.getLogger("dronekit.mavlink"), logging.getLogger("dronekit")
 
 FunctionT = TypeVar("FunctionT", bound=Callable[..., object])
 
@@ -86,10 +89,14 @@ class MAVConnection:
         """Functions that are called about 20 times a second; see :meth:`forward_loop`."""
         self.message_listeners: list[Callable[[MAVConnection, Any], object]] = []
         """Functions that get every message; see :meth:`forward_message`."""
-        atexit.register(self.close)
+        self._at_exit = weakly(self.close)
+        atexit.register(self._at_exit)
+        self.loop.when_dropped(
+            functools.partial(_let_go, ip, self._at_exit, self.listener_thread, self._at_close)
+        )
         made = _made.get()
         if made is not None:
-            made.append(self)
+            made.add(self)
 
     # ------------------------------------------------------------------------------- sending
 
@@ -184,7 +191,7 @@ class MAVConnection:
             if self._is_closed.is_set():
                 return
             self._is_closed.set()
-        atexit.unregister(self.close)
+        atexit.unregister(self._at_exit)
         try:
             self.orders.wait(ORDERS_END_S)
         finally:
@@ -271,13 +278,27 @@ class MAVConnection:
                 self.connection.mavlink_version = version
 
 
-_made: ContextVar[list[MAVConnection] | None] = ContextVar("connections_made", default=None)
+def _let_go(
+    address: str,
+    at_exit: Callable[[], None],
+    listener_thread: ListenerThread,
+    at_close: list[Callable[[], object]],
+) -> None:
+    """On the loop, which ends then: nobody can reach the connection any more, or has anything called by it."""
+    of_vehicles.warning("the vehicle at %s is closed: the program has dropped it without close()", address)
+    atexit.unregister(at_exit)
+    listener_thread.stop()
+    for function in at_close:
+        function()
+
+
+_made: ContextVar[weakref.WeakSet[MAVConnection] | None] = ContextVar("connections_made", default=None)
 
 
 @contextlib.contextmanager
-def connections_made() -> Iterator[list[MAVConnection]]:
-    """Collect the connections that this thread makes in the block."""
-    connections: list[MAVConnection] = []
+def connections_made() -> Iterator[weakref.WeakSet[MAVConnection]]:
+    """Collect the connections that this thread makes in the block, without keeping those that are dropped."""
+    connections: weakref.WeakSet[MAVConnection] = weakref.WeakSet()
     token = _made.set(connections)
     try:
         yield connections

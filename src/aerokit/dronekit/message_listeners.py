@@ -51,6 +51,7 @@ class MessageListeners:
             if listener in present:
                 return
             self._listeners[name] = (*present, listener)
+            self._stay()
         self._attach_now()
 
     def remove(self, name: str, listener: MessageListener) -> None:
@@ -61,6 +62,7 @@ class MessageListeners:
                 self._listeners[name] = left
                 return
             was_there = self._listeners.pop(name, None) is not None
+            self._stay()
         if was_there:
             self._attach_now()
 
@@ -79,6 +81,9 @@ class MessageListeners:
         """The vehicle was found: hear what comes from now on (loop thread)."""
         self._is_started = True
         self._attach()
+
+    def _stay(self) -> None:
+        self._handler.listener_thread.keep(self, has_listeners=bool(self._listeners))
 
     def _attach_now(self) -> None:
         """Wait for it, so that whatever comes once a listener was added is heard."""

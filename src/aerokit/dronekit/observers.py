@@ -50,6 +50,7 @@ class HasObservers:
             if observer in present:
                 return
             self._attribute_listeners[attr_name] = (*present, observer)
+            self._dk_stay()
         self._dk_review()
 
     def remove_attribute_listener(self, attr_name: str, observer: AttributeListener) -> None:
@@ -69,6 +70,7 @@ class HasObservers:
                 self._attribute_listeners[attr_name] = left
             else:
                 del self._attribute_listeners[attr_name]
+                self._dk_stay()
         self._dk_review()
 
     def on_attribute(self, name: str | list[str] | tuple[str, ...]) -> Callable[[ListenerT], ListenerT]:
@@ -122,6 +124,11 @@ class HasObservers:
             return True
         self._attribute_cache[attr_name] = value
         return False
+
+    def _dk_stay(self) -> None:
+        """With listeners it stays, even when the program has dropped it."""
+        if self._dk_listener_thread is not None:
+            self._dk_listener_thread.keep(self, has_listeners=bool(self._attribute_listeners))
 
     def _dk_review(self) -> None:
         """Who listens to what has changed."""

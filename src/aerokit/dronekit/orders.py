@@ -118,7 +118,8 @@ class Orders:
             await work()
         except Exception as error:
             if not isinstance(error, ConnectionClosed):
-                logger.warning("%s: %s%s", kind, error, self._state_at(error))
+                text = str(error)  # who keeps log records keeps no frames, and so no vehicle
+                logger.warning("%s: %s%s", kind, text, self._state_at(error))
             future.set_exception(error)
         else:
             future.set_result(None)

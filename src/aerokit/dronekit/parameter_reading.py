@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import anyio
 
+from aerokit.dronekit.weakly import weakly
 from aerokit.errors import AerokitError, ConnectionClosed, ParameterRejected
 from aerokit.parameters import Parameter
 
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from aerokit.dronekit.vehicle import Vehicle
     from aerokit.parameters import ParameterTable
     from aerokit.vehicle.parameter_access import DownloadMethod
+    from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
 __all__ = ["ParameterReading"]
 
@@ -45,7 +47,9 @@ class ParameterReading:
         """Begin the download, unless it is under way or done (loop thread)."""
         if self._ended is None and not self.is_complete:
             self._ended = asyncio.Event()
-            self._vehicle._dk_background(self._download)
+            aio, take = self._vehicle._dk_vehicle, weakly(self._take)
+            fail, end = weakly(self._warn), weakly(self._end)
+            self._vehicle._dk_background(lambda: _download(aio, take, fail, end))
 
     def seek(self) -> None:
         """As :meth:`begin`, from any thread; silent when the connection is closed."""
@@ -76,28 +80,15 @@ class ParameterReading:
             if self._ended is not None:
                 await self._ended.wait()
 
-    async def _download(self) -> None:
-        try:
-            parameters = self._vehicle._dk_vehicle.parameters
-            self._take_all(await parameters.download(method=await self._method()))
-            self.is_complete = True
-            self._vehicle._dk_tell("parameters", self._vehicle.parameters)
-        except ConnectionClosed:
-            return
-        except AerokitError as error:
-            self._warn(error)
-            await anyio.sleep(AGAIN_S)
-        finally:
-            ended, self._ended = self._ended, None
-            if ended is not None:
-                ended.set()
+    def _take(self, table: ParameterTable) -> None:
+        self._take_all(table)
+        self.is_complete = True
+        self._vehicle._dk_tell("parameters", self._vehicle.parameters)
 
-    async def _method(self) -> DownloadMethod:
-        """A vehicle that does not say what it can is not waited for long."""
-        version = self._vehicle._dk_vehicle.telemetry.version
-        with anyio.move_on_after(VERSION_S):
-            await version.wait_until(lambda _: True)
-        return "auto" if version.is_known else "list"
+    def _end(self) -> None:
+        ended, self._ended = self._ended, None
+        if ended is not None:
+            ended.set()
 
     def _warn(self, error: AerokitError) -> None:
         if not self._has_warned:
@@ -120,3 +111,29 @@ class ParameterReading:
         return any(isinstance(each, Parameter) for each in answers) or all(
             isinstance(each, ParameterRejected) and each.code is not None for each in answers
         )
+
+
+async def _download(
+    vehicle: AsyncVehicle,
+    take: Callable[[ParameterTable], None],
+    fail: Callable[[AerokitError], None],
+    end: Callable[[], None],
+) -> None:
+    """Nobody's but the loop's: it does not keep the vehicle of a program that has dropped it."""
+    try:
+        take(await vehicle.parameters.download(method=await _method(vehicle)))
+    except ConnectionClosed:
+        return
+    except AerokitError as error:
+        fail(error)
+        await anyio.sleep(AGAIN_S)
+    finally:
+        end()
+
+
+async def _method(vehicle: AsyncVehicle) -> DownloadMethod:
+    """A vehicle that does not say what it can is not waited for long."""
+    version = vehicle.telemetry.version
+    with anyio.move_on_after(VERSION_S):
+        await version.wait_until(lambda _: True)
+    return "auto" if version.is_known else "list"

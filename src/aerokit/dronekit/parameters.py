@@ -12,6 +12,7 @@ from aerokit.dronekit.observers import AttributeListener, HasObservers
 from aerokit.dronekit.parameter_reading import ParameterReading
 from aerokit.dronekit.parameter_set import number_of, set_parameter
 from aerokit.dronekit.parameter_values import ParameterValues
+from aerokit.dronekit.weakly import weakly
 from aerokit.errors import LocalProtocolError, ParameterTimeout
 from aerokit.mavlink.messages import ParamValue
 from aerokit.parameters import check_name
@@ -232,7 +233,7 @@ class Parameters(MutableMapping[str, float], HasObservers):
 
     def _start(self) -> None:
         aio = self._vehicle._dk_vehicle
-        aio._detach.append(aio.connection.bus.attach_event(ParameterChanged, self._on_changed))
+        aio._detach.append(aio.connection.bus.attach_event(ParameterChanged, weakly(self._on_changed)))
         self._reading.begin()
 
     def _on_value(self, message: ParamValue) -> None:

@@ -55,7 +55,16 @@ class Stream:
     ``names`` are those that the handlers tell of; until each has been told once, they run in any case.
     """
 
-    __slots__ = ("_component_id", "_decode", "_handlers", "_key", "_names", "_store", "is_heard")
+    __slots__ = (
+        "__weakref__",
+        "_component_id",
+        "_decode",
+        "_handlers",
+        "_key",
+        "_names",
+        "_store",
+        "is_heard",
+    )
 
     def __init__(self, owner: object, attribute: Latest[Any], names: tuple[str, ...]) -> None:
         self._store, self._key = owner.__dict__, attribute.key

@@ -51,7 +51,7 @@ def run_script(path: str | os.PathLike[str], arguments: Sequence[str] = ()) -> N
         try:
             _run_file(os.fspath(path), arguments)
         finally:
-            for connection in connections:
+            for connection in tuple(connections):
                 connection.close()
 
 

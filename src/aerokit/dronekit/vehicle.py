@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import weakref
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +27,7 @@ from aerokit.dronekit.privates import VehiclePrivates
 from aerokit.dronekit.readiness import Readiness
 from aerokit.dronekit.shadowable import Shadowable
 from aerokit.dronekit.streams import request_streams
+from aerokit.dronekit.weakly import weakly
 from aerokit.errors import AerokitError, ConnectFailed, LocalProtocolError, OperationTimeout
 from aerokit.mavlink.messages import CommandLong
 from aerokit.runtime.background import Background
@@ -42,6 +44,7 @@ if TYPE_CHECKING:
     from aerokit.dronekit.master import Master
     from aerokit.dronekit.mavlink import MAVConnection
     from aerokit.mavlink.message import Message
+    from aerokit.runtime.connection import Connection
     from aerokit.vehicle.values import StatusText
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
@@ -185,7 +188,7 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, Readiness, VehiclePriv
             timeout = self._dk_heartbeat_limit or CONNECT_S
             loop = self._handler.loop
             try:
-                held = loop.hold_open(self._dk_found(timeout, rate))
+                held = loop.hold_open(_found(self._handler.connection, timeout, weakly(self._dk_begin), rate))
                 self._dk_sync = sync.Vehicle(loop, held, owns_loop=False)
                 self._dk_wait_until_booted(timeout)
                 if rate is not None:
@@ -295,31 +298,25 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, Readiness, VehiclePriv
 
     # ------------------------------------------------------------------------------- inside
 
-    @asynccontextmanager
-    async def _dk_found(self, timeout: float, rate: float | None) -> AsyncIterator[AsyncVehicle]:
-        connection = self._handler.connection
-        async with connect_async(connection, timeout=timeout, rates={}) as aio:
-            self._dk_tasks = Background(connection.fail)
-            try:
-                self._dk_begin(aio, rate)
-                yield aio
-            finally:
-                await self._dk_tasks.aclose()
-
-    def _dk_begin(self, aio: AsyncVehicle, rate: float | None) -> None:
-        """On the loop, in the turn in which the vehicle was found."""
-        self._dk_aio = aio
+    def _dk_begin(self, aio: AsyncVehicle, tasks: Background, rate: float | None) -> None:
+        """On the loop, in the turn in which the vehicle was found; the loop gets weak references only."""
+        self._dk_aio, self._dk_tasks = aio, tasks
         self._handler.target_system = aio.system_id
         self._handler.master.vehicle = self
         self._handler.orders.describe = self._dk_describe
         for message_type, stream in self._dk_streams.items():
             stream.begin(aio.component_id)
-            detach = aio.connection.bus.attach_frames(message_type, stream.take, system_id=aio.system_id)
+            detach = aio.connection.bus.attach_frames(
+                message_type, weakly(stream.take), system_id=aio.system_id
+            )
             aio._detach.append(detach)
         for message_type, handler, only_autopilot in self._dk_message_handlers:
-            take = _only_of(aio.component_id, handler) if only_autopilot else handler
+            take = weakly(handler)
+            take = _only_of(aio.component_id, take) if only_autopilot else take
             aio._detach.append(aio.connection.bus.attach(message_type, take, system_id=aio.system_id))
-        aio._detach.append(aio.telemetry.status_text.observe(self._dk_on_status_text, every_arrival=True))
+        aio._detach.append(
+            aio.telemetry.status_text.observe(weakly(self._dk_on_status_text), every_arrival=True)
+        )
         first = aio.connection.heard.get((aio.system_id, aio.component_id))
         if first is not None:
             self._handler.follow_version(first)
@@ -327,8 +324,9 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, Readiness, VehiclePriv
         self._message_listeners.start()
         if rate is not None:
             self._dk_background(lambda: request_streams(aio, rate))
-        self._dk_background(lambda: self._dk_request_capabilities(aio))
-        self._dk_background(lambda: watch_link(self, aio))
+        self._dk_background(lambda: _request_capabilities(aio))
+        itself = weakref.ref(self)
+        self._dk_background(lambda: watch_link(itself, aio))
         for starter in self._dk_starters:
             starter()
 
@@ -347,14 +345,6 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, Readiness, VehiclePriv
         if self._autopilot_logger.isEnabledFor(level):
             self._handler.listener_thread.post(self._autopilot_logger.log, level, "%s", text.text.strip())
 
-    async def _dk_request_capabilities(self, aio: AsyncVehicle) -> None:
-        """As old firmware wants to be asked, with each heartbeat until there is an answer."""
-        for _ in range(5):
-            if aio.telemetry.version.is_known:
-                return
-            aio.send(CommandLong(aio.system_id, 0, REQUEST_AUTOPILOT_CAPABILITIES, 0, 1, *(0.0,) * 6))
-            await anyio.sleep(1.0)
-
     def _dk_describe(self) -> str:
         return f"the vehicle is {'armed' if self._armed else 'disarmed'}, in {self._flightmode}"
 
@@ -365,6 +355,29 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, Readiness, VehiclePriv
             raise APIException(
                 f"Timeout in initializing connection. The vehicle is still in mode {self._flightmode}"
             ) from None
+
+
+@asynccontextmanager
+async def _found(
+    connection: Connection, timeout: float, begin: Callable[..., None], rate: float | None
+) -> AsyncIterator[AsyncVehicle]:
+    """Held open by the loop: nothing of the classic vehicle is in here."""
+    async with connect_async(connection, timeout=timeout, rates={}) as aio:
+        tasks = Background(connection.fail)
+        try:
+            begin(aio, tasks, rate)
+            yield aio
+        finally:
+            await tasks.aclose()
+
+
+async def _request_capabilities(aio: AsyncVehicle) -> None:
+    """As old firmware wants to be asked, with each heartbeat until there is an answer."""
+    for _ in range(5):
+        if aio.telemetry.version.is_known:
+            return
+        aio.send(CommandLong(aio.system_id, 0, REQUEST_AUTOPILOT_CAPABILITIES, 0, 1, *(0.0,) * 6))
+        await anyio.sleep(1.0)
 
 
 def _only_of(component_id: int, handler: Callable[[Any], None]) -> Callable[[Any], None]:

@@ -9,6 +9,7 @@ import contextvars
 import functools
 import os
 import threading
+import weakref
 from contextlib import AbstractAsyncContextManager, AbstractContextManager
 from typing import TYPE_CHECKING, Any, Generic, ParamSpec, TypeVar
 
@@ -37,6 +38,8 @@ CLOSE_S = 5.0
 class LoopThread:
     """One asyncio loop on one thread. The thread does not keep the interpreter alive; at its exit it is closed.
 
+    Neither the loop nor its thread refer to this object: who can reach it can use the loop, see :meth:`when_dropped`.
+
     What runs there sees the context variables of the loop, not those of its caller.
 
     Raises:
@@ -54,14 +57,14 @@ class LoopThread:
             daemon=True,
         )
         self._is_closed = False
-        self._process = os.getpid()
+        self._if_dropped: weakref.finalize[Any, Any] | None = None
         self._lock = threading.Lock()  # nothing waits while it is held: the loop's thread takes it, too
         try:
             self._thread.start()
             while not started.wait(WAKE_S):
                 pass
             self._loop = started.result()
-            atexit.register(self.close)
+            atexit.register(self._calls.finish, self._thread)
         except (OSError, RuntimeError) as error:
             self._give_up(started)
             if isinstance(
@@ -165,13 +168,22 @@ class LoopThread:
         with self._lock:
             if self._is_closed:
                 return
-            if self._process == os.getpid():
-                with contextlib.suppress(RuntimeError):  # it has stopped by itself
-                    self._soon(self._calls.end)
+            self._calls.end_soon()
             self._is_closed = True  # afterwards: interrupted before, it can be closed again
-        atexit.unregister(self.close)
+        if self._if_dropped is not None:
+            self._if_dropped.detach()
+        atexit.unregister(self._calls.finish)
         if not self.is_current:
             self._thread.join(CLOSE_S)
+
+    def when_dropped(self, function: Callable[[], object]) -> None:
+        """Have the loop end when nobody can reach this object any more, after calling a function there.
+
+        The function must not refer to this object, directly or through others. Not called once this was closed, nor
+        at the interpreter's exit.
+        """
+        self._if_dropped = weakref.finalize(self, self._calls.end_soon, function)
+        self._if_dropped.atexit = False
 
     @property
     def is_current(self) -> bool:
@@ -212,7 +224,7 @@ class LoopThread:
     def _check(self) -> None:
         if self._is_closed:
             raise ConnectionClosed("the connection was closed")
-        if self._process != os.getpid():
+        if not self._calls.is_of_this_process:
             raise ConnectionClosed(
                 "the connection belongs to the process that opened it, and not to its children"
             )
@@ -222,38 +234,47 @@ class Held(Generic[T]):
     """An asynchronous context manager that is open on a :class:`LoopThread`, in a task of its own."""
 
     def __init__(self, loop: LoopThread, context: AbstractAsyncContextManager[T]) -> None:
-        self._loop, self._context = loop, context
-        self._opened: Reply[T] = Reply()
-        self._leave = asyncio.Event()
-        self._call = _Call(self._live)
+        self._loop, self._block = loop, _Block(context)
+        self._call = _Call(self._block.live)
+        opened = self._block.opened
         try:
             loop._start(self._call)
-            loop.wait_for(self._opened)
-            if not self._opened.has_result:
+            loop.wait_for(opened)
+            if not opened.has_result:
                 loop.wait_for(self._call)
                 self._call.result()  # raises what entering it raised
         except BaseException:
             loop._cancel(self._call)
             raise
-        self.value = self._opened.result()
+        self.value = opened.result()
         """What the context manager gave."""
 
     def close(self) -> None:
         """Leave the context manager and wait until that is done; idempotent."""
         if self._loop.is_current:
-            self._leave.set()
+            self._block.leave.set()
         elif not self._call.is_done:
             with contextlib.suppress(ConnectionClosed):
-                self._loop.call(self._leave.set)
+                self._loop.call(self._block.leave.set)
                 self._call.wait(CLOSE_S)
 
-    async def _live(self) -> None:
+
+class _Block(Generic[T]):
+    """What the loop has of a :class:`Held`."""
+
+    def __init__(self, context: AbstractAsyncContextManager[T]) -> None:
+        self._context = context
+        self.opened: Reply[T] = Reply()
+        self.leave = asyncio.Event()
+
+    async def live(self) -> None:
+        """Enter the context manager, and leave it when that is asked for."""
         try:
             async with self._context as value:
-                self._opened.give(value)
-                await self._leave.wait()
+                self.opened.give(value)
+                await self.leave.wait()
         finally:
-            self._opened.end()
+            self.opened.end()
 
 
 class _Awaited(AbstractAsyncContextManager[T]):
@@ -278,6 +299,13 @@ class _Calls:
         """Nobody has taken the loop that was started."""
         self._end = asyncio.Event()
         self._tasks: dict[asyncio.Task[None], _Call[Any]] = {}
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._process = os.getpid()
+
+    @property
+    def is_of_this_process(self) -> bool:
+        """Whether the loop's thread lives in this process, and not in the one it was forked from."""
+        return self._process == os.getpid()
 
     def begin(self, call: _Call[Any]) -> None:
         """Await it in a task."""
@@ -289,16 +317,35 @@ class _Calls:
         """Begin the end."""
         self._end.set()
 
+    def end_soon(self, function: Callable[[], object] | None = None) -> None:
+        """Begin the end, after calling a function on the loop; from any thread, never blocks, idempotent."""
+        if self._loop is not None and self.is_of_this_process:
+            with contextlib.suppress(RuntimeError):  # it has stopped by itself
+                self._loop.call_soon_threadsafe(self._end_after, function, context=self.context)
+
+    def finish(self, thread: threading.Thread) -> None:
+        """Begin the end and wait for that of the thread, at the interpreter's exit."""
+        self.end_soon()
+        thread.join(CLOSE_S)
+
     async def live(self, started: Reply[asyncio.AbstractEventLoop]) -> None:
         """Wait for the end, and then for that of everything that was begun."""
         self.context = contextvars.copy_context()
-        started.give(asyncio.get_running_loop())
+        self._loop = asyncio.get_running_loop()
+        started.give(self._loop)
         if not self.is_over:
             await self._end.wait()
         while self._tasks:
             for call in self._tasks.values():
                 call.cancel()
             await asyncio.wait(tuple(self._tasks))
+
+    def _end_after(self, function: Callable[[], object] | None) -> None:
+        try:
+            if function is not None:
+                function()
+        finally:
+            self.end()
 
     def _end_of(self, task: asyncio.Task[None]) -> None:
         self._tasks.pop(task).end()  # it has ended by itself, unless it was cancelled before its first step
@@ -342,6 +389,8 @@ def _run(calls: _Calls, started: Reply[asyncio.AbstractEventLoop]) -> None:
         if started.is_done:
             raise
         started.fail(error)
+    finally:
+        atexit.unregister(calls.finish)
 
 
 def _not_started(error: Exception) -> LinkOpenError:

@@ -1,0 +1,336 @@
+"""A classic vehicle that the program has dropped without ``close()``: it ends, unless it has listeners or orders."""
+
+from __future__ import annotations
+
+import gc
+import logging
+import os
+import subprocess
+import sys
+import threading
+import time
+import weakref
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import anyio
+import pytest
+from served_copter import served_copter
+
+import aerokit.dronekit as dronekit
+from aerokit.dronekit import mavlink, parameter_reading
+from aerokit.links import tcp
+
+LIMIT_S = 20.0
+SOURCES = Path(__file__).parent.parent.parent / "src"
+CLOSED = "the program has dropped it without close()"
+
+
+@pytest.fixture(scope="module")
+def address() -> Iterator[str]:
+    with served_copter() as each:
+        yield each
+
+
+@pytest.fixture(autouse=True)
+def nothing_else_is_open() -> Iterator[None]:
+    """What a test leaves open, above all when it fails, is closed here."""
+    with mavlink.connections_made() as connections:
+        yield
+        for each in tuple(connections):
+            each.close()
+
+
+def own_threads() -> list[str]:
+    return [each.name for each in threading.enumerate() if each.name.startswith(("aerokit", "dronekit"))]
+
+
+def eventually(is_true: Callable[[], object]) -> None:
+    deadline = time.monotonic() + LIMIT_S
+    while not is_true():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def is_gone(vehicle: weakref.ref[Any]) -> bool:
+    """At this moment the loop may be in one of its methods."""
+    gc.collect()
+    return vehicle() is None
+
+
+class Listening(dronekit.Vehicle):
+    """Listens to itself, as subclasses of the classic Vehicle do."""
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.add_message_listener("ATTITUDE", self.on_attitude)
+
+    def on_attitude(self, _vehicle: object, _name: str, _message: object) -> None: ...
+
+
+def test_a_dropped_vehicle_leaves_its_place_to_the_next(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(tcp, "MAX_CLIENTS", 1)
+    with served_copter() as address:
+        vehicle = dronekit.connect(address, wait_ready=["attitude"])
+        dropped = weakref.ref(vehicle)
+        del vehicle
+        eventually(lambda: is_gone(dropped))
+        eventually(lambda: not own_threads())
+    with (
+        served_copter(address.replace("tcp:", "tcpin:")),
+        dronekit.connect(address, wait_ready=["attitude"]) as vehicle,
+    ):
+        assert vehicle.attitude.pitch is not None
+    told = [
+        (each.name, each.levelname, each.getMessage()) for each in caplog.records if CLOSED in each.message
+    ]
+    assert told == [("dronekit", "WARNING", f"the vehicle at {address} is closed: {CLOSED}")]
+
+
+USES: dict[str, Callable[[dronekit.Vehicle], object]] = {
+    "everything": lambda vehicle: vehicle.wait_ready(True, timeout=LIMIT_S),
+    "aio and sync": lambda vehicle: (vehicle.aio.mode.value, vehicle.sync.mode.value),
+    "inbox": lambda vehicle: vehicle._master.recv_match(type="HEARTBEAT", blocking=True, timeout=LIMIT_S),
+    "mission": lambda vehicle: (vehicle.commands.download(), vehicle.commands.wait_ready()),
+    "orders": lambda vehicle: (setattr(vehicle, "mode", "ALT_HOLD"), vehicle.wait_for_mode("STABILIZE")),
+    "refused": lambda vehicle: vehicle.simple_takeoff(10),
+}
+
+
+@pytest.mark.parametrize("use", USES.values(), ids=USES)
+def test_what_it_was_used_for_does_not_keep_it(
+    address: str, use: Callable[[dronekit.Vehicle], object]
+) -> None:
+    vehicle = dronekit.connect(address)
+    dropped = weakref.ref(vehicle)
+    use(vehicle)
+    del vehicle
+    eventually(lambda: is_gone(dropped))
+    eventually(lambda: not own_threads())
+
+
+def test_a_download_of_parameters_does_not_keep_it(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parameter_reading, "_method", lambda _: anyio.sleep_forever())
+    vehicle = dronekit.connect(address)
+    dropped = weakref.ref(vehicle)
+    del vehicle
+    eventually(lambda: is_gone(dropped))
+    eventually(lambda: not own_threads())
+
+
+OWNERS: dict[str, Callable[[dronekit.Vehicle], Any]] = {
+    "vehicle": lambda vehicle: vehicle,
+    "location": lambda vehicle: vehicle.location,
+}
+
+
+@pytest.mark.parametrize("owner", OWNERS.values(), ids=OWNERS)
+def test_an_attribute_listener_keeps_it_until_it_is_removed(
+    address: str, owner: Callable[[dronekit.Vehicle], Any]
+) -> None:
+    told, is_to_go = threading.Event(), threading.Event()
+
+    def listener(self: Any, name: str, value: object) -> None:
+        told.set()
+        if is_to_go.is_set():
+            self.remove_attribute_listener("*", listener)
+
+    vehicle = dronekit.connect(address)
+    dropped = weakref.ref(vehicle)
+    owner(vehicle).add_attribute_listener("*", listener)
+    del vehicle
+    for _ in range(3):
+        assert not is_gone(dropped)
+        told.clear()
+        assert told.wait(LIMIT_S)
+    is_to_go.set()
+    eventually(lambda: is_gone(dropped))
+    eventually(lambda: not own_threads())
+
+
+@pytest.mark.parametrize("name", ["*", "ATTITUDE"])
+def test_a_message_listener_keeps_it_until_it_is_removed(address: str, name: str) -> None:
+    told, is_to_go = threading.Event(), threading.Event()
+
+    def listener(self: dronekit.Vehicle, _: str, message: object) -> None:
+        told.set()
+        if is_to_go.is_set():
+            self.remove_message_listener(name, listener)
+
+    vehicle = dronekit.connect(address)
+    dropped = weakref.ref(vehicle)
+    vehicle.add_message_listener(name, listener)
+    del vehicle
+    for _ in range(3):
+        assert not is_gone(dropped)
+        told.clear()
+        assert told.wait(LIMIT_S)
+    is_to_go.set()
+    eventually(lambda: is_gone(dropped))
+    eventually(lambda: not own_threads())
+
+
+def test_a_listener_to_a_parameter_keeps_it(address: str) -> None:
+    told = threading.Event()
+    vehicle = dronekit.connect(address, wait_ready=["parameters"])
+    vehicle.parameters.add_attribute_listener("RTL_ALT", lambda *_: told.set())
+    dropped = weakref.ref(vehicle)
+    del vehicle
+    assert not is_gone(dropped)
+    with dronekit.connect(address) as other:
+        other.parameters["RTL_ALT"] = 1234 if other.parameters["RTL_ALT"] != 1234 else 1235
+        assert told.wait(LIMIT_S)
+
+
+@pytest.mark.parametrize(
+    "options", [{"vehicle_class": Listening}, {"status_printer": lambda _: None}], ids=["subclass", "printer"]
+)
+def test_callbacks_given_when_connecting_keep_it(address: str, options: dict[str, Any]) -> None:
+    dropped = weakref.ref(dronekit.connect(address, **options))
+    assert not is_gone(dropped)
+    vehicle = dropped()
+    assert vehicle is not None
+    vehicle.close()
+    del vehicle
+    eventually(lambda: is_gone(dropped))
+
+
+def test_listeners_of_the_connection_keep_it(address: str) -> None:
+    told = threading.Event()
+    dronekit.connect(address)._handler.forward_message(lambda _, message: told.set())
+    for _ in range(3):
+        gc.collect()
+        told.clear()
+        assert told.wait(LIMIT_S)
+
+
+PARTS: dict[str, Callable[[dronekit.Vehicle], Any]] = {
+    "parameters": lambda vehicle: vehicle.parameters,
+    "location": lambda vehicle: vehicle.location,
+    "commands": lambda vehicle: vehicle.commands,
+    "channels": lambda vehicle: vehicle.channels,
+    "gimbal": lambda vehicle: vehicle.gimbal,
+    "factory": lambda vehicle: vehicle.message_factory,
+    "handler": lambda vehicle: vehicle._handler,
+    "sync": lambda vehicle: vehicle.sync,
+    "cell": lambda vehicle: vehicle.sync.position,
+}
+
+
+@pytest.mark.parametrize("part", PARTS.values(), ids=PARTS)
+def test_a_part_of_it_keeps_the_connection(address: str, part: Callable[[dronekit.Vehicle], Any]) -> None:
+    kept = part(dronekit.connect(address))
+    gc.collect()
+    assert own_threads() == ["aerokit loop"]
+    del kept
+    eventually(lambda: (gc.collect(), not own_threads())[1])
+
+
+def test_an_order_under_way_keeps_it_and_is_carried_out(address: str) -> None:
+    may_end, has_ended = threading.Event(), threading.Event()
+
+    async def order() -> None:
+        await anyio.to_thread.run_sync(may_end.wait, LIMIT_S)
+        has_ended.set()
+
+    vehicle = dronekit.connect(address)
+    dropped = weakref.ref(vehicle)
+    vehicle._dk_order("test", order)
+    del vehicle
+    for _ in range(3):
+        assert not is_gone(dropped)
+        assert own_threads() == ["aerokit loop"]
+    may_end.set()
+    eventually(lambda: is_gone(dropped))
+    eventually(lambda: not own_threads())
+    assert has_ended.is_set()
+
+
+def test_a_call_that_waits_keeps_it(address: str) -> None:
+    may_end, ended = threading.Event(), list[str]()
+
+    def wait(vehicle: dronekit.Vehicle) -> None:
+        vehicle.wait_for(may_end.is_set, timeout=LIMIT_S)
+        ended.append("well")
+
+    vehicle = dronekit.connect(address)
+    dropped = weakref.ref(vehicle)
+    waiting = threading.Thread(target=wait, args=(vehicle,))
+    waiting.start()
+    del vehicle
+    assert not is_gone(dropped)
+    may_end.set()
+    waiting.join(LIMIT_S)
+    assert ended == ["well"]
+    eventually(lambda: is_gone(dropped))
+    eventually(lambda: not own_threads())
+
+
+def test_a_connection_that_is_dropped_while_connections_are_collected(address: str) -> None:
+    with mavlink.connections_made() as made:
+        connection = mavlink.MAVConnection(address)
+        assert list(made) == [connection]
+        del connection
+        eventually(lambda: (gc.collect(), not own_threads())[1])
+        assert not made
+
+
+def test_what_is_called_when_it_is_closed_is_called_when_it_is_dropped(address: str) -> None:
+    closed = list[str]()
+    dronekit.connect(address)._handler.on_close(lambda: closed.append("well"))
+    eventually(lambda: (gc.collect(), closed)[1])
+    eventually(lambda: not own_threads())
+
+
+def test_closing_is_not_dropping(address: str, caplog: pytest.LogCaptureFixture) -> None:
+    with dronekit.connect(address) as vehicle:
+        dropped = weakref.ref(vehicle)
+    del vehicle
+    eventually(lambda: is_gone(dropped))
+    assert CLOSED not in caplog.text
+
+
+@pytest.mark.parametrize("collects", ["", "gc.collect()"])
+def test_a_program_may_end_with_a_vehicle_that_it_has_dropped(collects: str) -> None:
+    with served_copter() as address:
+        program = f"""
+import gc
+from aerokit.dronekit import connect
+connect({address!r}, wait_ready=['attitude'])
+{collects}
+"""
+        result = subprocess.run(
+            [sys.executable, "-W", "error", "-c", program],
+            env={**os.environ, "PYTHONPATH": str(SOURCES)},
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+    assert (result.returncode, result.stdout) == (0, "")
+    assert not [line for line in result.stderr.splitlines() if CLOSED not in line]
+
+
+def test_who_logs_slowly_does_not_hold_the_collector_up(address: str) -> None:
+    is_held, may_go_on = threading.Event(), threading.Event()
+
+    class Slow(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            if CLOSED in record.getMessage():
+                is_held.set()
+                may_go_on.wait(LIMIT_S)
+
+    handler = Slow()
+    logging.getLogger("dronekit").addHandler(handler)
+    try:
+        dropped = weakref.ref(dronekit.connect(address))
+        eventually(lambda: is_gone(dropped))  # on this thread: it does not wait for the handler
+        assert is_held.wait(LIMIT_S)
+        assert own_threads()
+    finally:
+        may_go_on.set()
+        logging.getLogger("dronekit").removeHandler(handler)
+    eventually(lambda: not own_threads())
