@@ -8,6 +8,7 @@ from aerokit.arguments import checked
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.runtime.connection import MAV_COMP_ID_MISSIONPLANNER
 from aerokit.runtime.opening import open_connection as open_async
+from aerokit.sync.blocking_block import BlockingBlock
 from aerokit.sync.cells import StateCell
 from aerokit.sync.loop_thread import LoopThread
 from aerokit.sync.subscription import Subscription
@@ -75,8 +76,10 @@ def open_connection(
     return Connection(loop, held.value, held)
 
 
-class Connection:
+class Connection(BlockingBlock):
     """One MAVLink node on one link; as :class:`aerokit.Connection`. A context manager."""
+
+    _opened_by = "open_connection"
 
     def __init__(
         self, loop: LoopThread, connection: AsyncConnection, held: Held[AsyncConnection] | None = None

@@ -10,6 +10,7 @@ from aerokit.arguments import checked
 from aerokit.errors import ConnectionClosed
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.runtime.connection import MAV_COMP_ID_MISSIONPLANNER
+from aerokit.sync.blocking_block import BlockingBlock
 from aerokit.sync.cells import StateCell
 from aerokit.sync.connection import Connection
 from aerokit.sync.files import Files
@@ -99,11 +100,13 @@ def connect(
     return Vehicle(loop, held, owns_loop=not isinstance(address, Connection))
 
 
-class Vehicle(VehicleState):
+class Vehicle(VehicleState, BlockingBlock):
     """One vehicle, blocking; the methods, arguments and errors of :class:`aerokit.Vehicle`. A context manager.
 
     Made by :func:`aerokit.sync.connect`. Methods block, properties never do. Any thread may use it.
     """
+
+    _opened_by = "connect"
 
     def __init__(self, loop: LoopThread, held: Held[AsyncVehicle], *, owns_loop: bool) -> None:
         super().__init__(loop, held.value)

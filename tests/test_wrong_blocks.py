@@ -1,0 +1,69 @@
+"""``await``, ``with``, ``async with`` where another one of them belongs: the error says which; nothing stays open."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+import pytest
+from served_copter import served_copter
+
+import aerokit
+import aerokit.sync
+
+ASYNCHRONOUS = {"connect": aerokit.connect, "open_connection": aerokit.open_connection}
+BLOCKING = {"connect": aerokit.sync.connect, "open_connection": aerokit.sync.open_connection}
+
+
+def threads() -> list[str]:
+    return [each.name for each in threading.enumerate() if each.name.startswith("aerokit")]
+
+
+@pytest.mark.anyio
+@pytest.mark.parametrize("name", ASYNCHRONOUS)
+async def test_the_asynchronous_one_is_not_awaited(name: str) -> None:
+    opened: Any = ASYNCHRONOUS[name]("udpin:127.0.0.1:0")
+    with pytest.raises(TypeError) as caught:
+        await opened
+    assert str(caught.value) == (
+        f"{name}(…) is not for `await`: write `async with {name}(…) as …:` in an async function, or take aerokit.sync"
+        " for a program without async"
+    )
+
+
+@pytest.mark.parametrize("name", ASYNCHRONOUS)
+def test_the_asynchronous_one_is_not_for_with(name: str) -> None:
+    opened: Any = ASYNCHRONOUS[name]("udpin:127.0.0.1:0")
+    with pytest.raises(TypeError) as caught, opened:
+        pass
+    assert str(caught.value) == (
+        f"{name}(…) is not for `with`: write `async with {name}(…) as …:` in an async function, or take aerokit.sync"
+        " for a program without async"
+    )
+
+
+def misuse(word: str, opened: Any) -> Any:
+    """A coroutine that does so."""
+
+    async def wait() -> None:
+        await opened
+
+    async def enter() -> None:
+        async with opened:
+            pass
+
+    return wait() if word == "await" else enter()
+
+
+@pytest.mark.parametrize("word", ["await", "async with"])
+@pytest.mark.parametrize("name", BLOCKING)
+def test_the_blocking_one_is_for_with(name: str, word: str) -> None:
+    with served_copter() as address:
+        coroutine = misuse(word, BLOCKING[name](address))
+        with pytest.raises(TypeError) as caught:
+            coroutine.send(None)
+    assert str(caught.value) == (
+        f"aerokit.sync.{name}(…) blocks, and is not for `{word}`: write `with aerokit.sync.{name}(…) as …:`, or"
+        f" `async with aerokit.{name}(…) as …:` in an async function; what was opened is closed again"
+    )
+    assert not threads()
