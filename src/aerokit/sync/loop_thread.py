@@ -66,14 +66,14 @@ class LoopThread:
             self._loop = started.result()
             atexit.register(self._calls.finish, self._thread)
         except (OSError, RuntimeError) as error:
-            self._give_up(started)
+            self._give_up()
             if isinstance(
                 error.__context__, KeyboardInterrupt
             ):  # Thread.start waits at a Condition: see Reply
                 raise error.__context__ from None
             raise _not_started(error) from error
         except BaseException:
-            self._give_up(started)
+            self._give_up()
             raise
 
     def run(self, function: Callable[P, Awaitable[T]], /, *args: P.args, **kwargs: P.kwargs) -> T:
@@ -212,11 +212,10 @@ class LoopThread:
             with contextlib.suppress(RuntimeError):  # the loop is closed
                 self._soon(call.cancel)
 
-    def _give_up(self, started: Reply[asyncio.AbstractEventLoop]) -> None:
+    def _give_up(self) -> None:
         """It was interrupted while it started: whenever it has, it ends."""
         self._calls.is_over = True
-        if started.has_result:
-            started.result().call_soon_threadsafe(self._calls.end)
+        self._calls.end_soon()
 
     def _soon(self, function: Callable[..., object], *args: Any) -> None:
         self._loop.call_soon_threadsafe(function, *args, context=self._calls.context)
