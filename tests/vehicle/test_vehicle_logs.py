@@ -167,8 +167,8 @@ async def test_a_log_that_is_still_written_comes_as_far_as_it_goes(
         assert bench.content(-1).startswith(content)
         assert bench.content(-1).startswith((tmp_path / "flight.bin").read_bytes())
         said = [each.getMessage() for each in caplog.records]
-        assert f"log {entry.id} is, or was, still being written: {entry.size} bytes when it" in said[0]
-        assert f"{len(content)} when they were asked for" in said[0]
+        assert f"log {entry.id} was still being written when it was listed with {entry.size} byt" in said[0]
+        assert f"it had {len(content)} when it was asked for" in said[0]
         await bench.all_quiet()
 
 

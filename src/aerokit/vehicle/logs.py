@@ -376,8 +376,8 @@ class _Growth:
     def tell(self) -> None:
         if self._size > self._entry.size:
             logger.info(
-                "log %d is, or was, still being written: %d bytes when it was listed, %d when they were asked for,"
-                " which were read",
+                "log %d was still being written when it was listed with %d bytes: it had %d when it was asked for, and"
+                " they were read",
                 self._entry.id,
                 self._entry.size,
                 self._size,
