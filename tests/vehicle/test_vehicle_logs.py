@@ -182,6 +182,19 @@ async def test_a_log_that_does_not_grow_is_read_without_a_word(
     assert not [each for each in caplog.records if "being written" in each.getMessage()]
 
 
+async def test_in_flight_mavftp_reads_a_log_that_has_ended_since(ardupilot: Bench) -> None:
+    """Reading one by LOG_* ends the log that is written, and arming begins another one."""
+    older, entry = await ardupilot.logs.list()
+    ardupilot.server.write_on(MORE, 1_789_996_000)
+    content = ardupilot.content(-1)
+    ardupilot.simulated.storage.files.put("/APM/LOGS/00000003.BIN", b"the next one")
+    await ardupilot.vehicle.wait_ready()
+    await ardupilot.vehicle.arm()
+    assert await ardupilot.logs.read(entry) == content
+    with pytest.raises(FileTimeout, match="does not answer"):
+        await ardupilot.logs.read(older.replace(size=older.size - 1), patience_s=2.0)
+
+
 async def test_a_log_of_another_time_is_another_log(bench: Bench) -> None:
     entry = (await bench.logs.list())[-1]
     assert entry.time_utc is not None

@@ -27,13 +27,18 @@ class ListedLog(NamedTuple):
 
 
 async def log_path(
-    files: Files, directories: tuple[str, ...], log: LogEntry, patience_s: float
+    files: Files,
+    directories: tuple[str, ...],
+    log: LogEntry,
+    patience_s: float,
+    *,
+    has_grown: bool = False,
 ) -> str | None:
     """The path of a log for MAVFTP; None when it is not certain.
 
     ArduPilot's log 1 is the oldest of its ``00000001.BIN``, and the others follow in the order of their numbers. PX4
     writes its list to a file when it is asked for it, in the order of the ids, with the paths. In both cases the size
-    must be that of the entry, or larger for a log that still grows.
+    must be that of the entry, or larger for a log that still grows, or (``has_grown``) may have been growing.
     """
     for directory in directories:
         try:
@@ -44,7 +49,7 @@ async def log_path(
             int(match[1]): entry for entry in entries if (match := ARDUPILOT_NAME.fullmatch(entry.name))
         }
         if numbered:
-            return _numbered_path(directory, numbered, log)
+            return _numbered_path(directory, numbered, log, has_grown)
         if any(entry.is_directory for entry in entries):
             logs = await _list_in(files, directory, patience_s)
             is_there = log.id < len(logs) and logs[log.id].size == log.size
@@ -82,11 +87,13 @@ async def _list_in(files: Files, directory: str, patience_s: float) -> tuple[Lis
     return tuple(logs) if len(logs) == len(matches) else ()
 
 
-def _numbered_path(directory: str, entries: dict[int, FileEntry], log: LogEntry) -> str | None:
+def _numbered_path(
+    directory: str, entries: dict[int, FileEntry], log: LogEntry, has_grown: bool
+) -> str | None:
     number = min(entries) + log.id - 1
     entry = entries.get(number)
     if entry is None or entry.size is None:
         return None
-    is_newest = number == max(entries)
-    is_it = entry.size == log.size or (is_newest and entry.size > log.size)
+    may_be_larger = has_grown or number == max(entries)
+    is_it = entry.size == log.size or (may_be_larger and entry.size > log.size)
     return f"{directory}/{entry.name}" if is_it else None

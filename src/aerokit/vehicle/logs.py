@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 from contextlib import asynccontextmanager, suppress
 from datetime import datetime, timedelta, timezone
 from typing import TYPE_CHECKING, Literal
@@ -17,9 +16,10 @@ from aerokit.mavlink.messages import LogErase
 from aerokit.protocols.log_list import LogList
 from aerokit.protocols.logs import LOG_BLOCK, LogDownload, LogEnd
 from aerokit.protocols.reassembly import Reassembly
-from aerokit.protocols.transfer import PATIENCE_S, OnProgress, Progress
+from aerokit.protocols.transfer import PATIENCE_S, OnProgress
 from aerokit.snapshot import Snapshot
 from aerokit.vehicle.checks import check_seconds
+from aerokit.vehicle.log_growth import GrowthWatch
 from aerokit.vehicle.log_paths import listed_logs, log_path
 from aerokit.vehicle.part_file import PartFile
 
@@ -41,8 +41,6 @@ ERASE_PERIOD_S = 1.0
 ERASE_PATIENCE_S = 60.0
 CLOCKS_APART = timedelta(days=1)
 """The time of a log that is being written is the vehicle's clock, afterwards it is that of the file."""
-
-logger = logging.getLogger("aerokit")
 
 
 class LogEntry(Snapshot):
@@ -72,6 +70,8 @@ class Logs:
         self._transfers, self._files = transfers, files
         self._lock = asyncio.Lock()
         self._ending: asyncio.Event | None = None
+        self._newest: LogEntry | None = None
+        """In the last list: it may have been growing then."""
 
     async def list(
         self, *, patience_s: float = PATIENCE_S, timeout: float | None = None
@@ -82,7 +82,9 @@ class Logs:
             FileTimeout: not all entries came; the text names the missing ones.
         """
         async with self._operation("list of logs", timeout, patience_s):
-            return await self._entries(patience_s)
+            entries = await self._entries(patience_s)
+        self._newest = entries[-1] if entries else None
+        return entries
 
     async def download(
         self,
@@ -119,7 +121,7 @@ class Logs:
         """
         _check(log, method)
         path, entry = await self._find(log, method, patience_s, timeout)
-        growth = _Growth(entry if isinstance(log, int) else log, on_progress)
+        growth = GrowthWatch(entry if isinstance(log, int) else log, on_progress)
         if path is not None:
             await self._files.download(
                 path, to, resume=resume, patience_s=patience_s, timeout=timeout, on_progress=growth
@@ -153,7 +155,7 @@ class Logs:
         """
         _check(log, method)
         path, entry = await self._find(log, method, patience_s, timeout)
-        growth = _Growth(entry if isinstance(log, int) else log, on_progress)
+        growth = GrowthWatch(entry if isinstance(log, int) else log, on_progress)
         if path is not None:
             content = await self._files.read(path, patience_s=patience_s, timeout=timeout, on_progress=growth)
         else:
@@ -219,7 +221,7 @@ class Logs:
         directories = self._transfers.autopilot.log_directories
         if not directories or not await self._files.is_supported():
             return None
-        return await log_path(self._files, directories, entry, patience_s)
+        return await log_path(self._files, directories, entry, patience_s, has_grown=entry == self._newest)
 
     async def _entry(
         self, log: LogEntry | int, patience_s: float, timeout: float | None, *, may_be_silent: bool
@@ -359,29 +361,6 @@ def _check(log: LogEntry | int, method: str) -> None:
 
 def _make_entry(log_id: int, size: int, time_utc: int) -> LogEntry:
     return LogEntry(log_id, size, datetime.fromtimestamp(time_utc, tz=timezone.utc) if time_utc else None)
-
-
-class _Growth:
-    """Passes progress on, and tells in the log when there is more of a log than its entry says."""
-
-    def __init__(self, entry: LogEntry, on_progress: OnProgress | None) -> None:
-        self._entry, self._on_progress = entry, on_progress
-        self._size = entry.size
-
-    def __call__(self, progress: Progress) -> None:
-        self._size = progress.total or self._size
-        if self._on_progress is not None:
-            self._on_progress(progress)
-
-    def tell(self) -> None:
-        if self._size > self._entry.size:
-            logger.info(
-                "log %d was still being written when it was listed with %d bytes: it had %d when it was asked for, and"
-                " they were read",
-                self._entry.id,
-                self._entry.size,
-                self._size,
-            )
 
 
 def _is_other(before: LogEntry, now: LogEntry) -> bool:
