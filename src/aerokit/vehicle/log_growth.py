@@ -22,6 +22,7 @@ class GrowthWatch:
         self._size = entry.size
 
     def __call__(self, progress: Progress) -> None:
+        """As an OnProgress."""
         self._size = progress.total or self._size
         if self._on_progress is not None:
             self._on_progress(progress)
