@@ -11,7 +11,7 @@ from flight_harness import Px4Flight, now, open_px4
 
 from aerokit import Position, geo
 from aerokit import messages as m
-from aerokit.errors import CommandRejected, OperationRejected
+from aerokit.errors import CommandRejected, OperationRejected, OperationTimeout
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.sim.px4.modes import POSITION
 
@@ -48,6 +48,19 @@ async def test_take_off_gives_the_altitude_above_the_sea_and_ends_in_loiter() ->
         assert not flight.wire.commands(MavCmd.DO_SET_MODE)
         assert flight.vehicle.position.value.altitude_relative_m == pytest.approx(12.0, abs=0.7)
         await flight.vehicle.mode.wait_until(lambda mode: mode.name == "LOITER", timeout=10.0)
+
+
+async def test_take_off_is_not_sent_again_once_its_mode_was_told() -> None:
+    """It starts in LOITER, where it also ends, and stands for a second while the motors spin up."""
+    async with open_px4() as flight:
+        await flight.vehicle.wait_ready()
+        await flight.vehicle.set_mode("LOITER")
+        await flight.vehicle.arm()
+        flight.px4.faults.motor_failed = True  # it does not rise
+        flight.px4.faults.lose_ack(MavCmd.NAV_TAKEOFF, times=9)
+        with pytest.raises(OperationTimeout):
+            await flight.vehicle.take_off(10.0, timeout=8.0)
+        assert len(flight.wire.commands(MavCmd.NAV_TAKEOFF)) == 1
 
 
 async def test_take_off_refused_says_why() -> None:

@@ -105,9 +105,7 @@ class Sending:
         self.told_at = -math.inf
         """When HEARTBEAT came last."""
         self._was_told = False
-        wanted = {each.custom_mode for each in modes}
-        is_there = mode_now is not None and mode_now.custom_mode in wanted
-        self._modes = frozenset[int]() if is_there else frozenset(wanted)
+        self._modes = {each.custom_mode for each in modes} - {mode_now and mode_now.custom_mode}
         self._armed = None if armed is armed_now else armed
         self._is_done = is_done
 
