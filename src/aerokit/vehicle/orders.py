@@ -105,7 +105,8 @@ class Sending:
         self.told_at = -math.inf
         """When HEARTBEAT came last."""
         self._was_told = False
-        self._modes = {each.custom_mode for each in modes} - {mode_now and mode_now.custom_mode}
+        is_there = None if mode_now is None else mode_now.custom_mode
+        self._modes = {each.custom_mode for each in modes} - {is_there}
         self._armed = None if armed is armed_now else armed
         self._is_done = is_done
 
