@@ -1,4 +1,4 @@
-"""Which tests run which lines: each test file is run once under coverage, and again only when it or the sources change."""
+"""Which tests run which lines: each test file runs once under coverage, again only when it or the sources change."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Does a test notice when one thing in the sources is changed? `nox -s mutants -- [PATH …] [--sample N] [--seed S]`.
 
-A sample of all single changes (`mutations.py`) is drawn; for each the tests that run the changed lines (`reach.py`) are run
-on a copy of the sources, the nearest and quickest first, until one fails. What no test notices is printed, unless
+A sample of all single changes (`mutations.py`) is drawn; for each the tests that run the changed lines (`reach.py`) are
+run on a copy of the sources, the nearest and quickest first, until one fails. What no test notices is printed, unless
 `equivalent.json` says why it changes nothing.
 """
 
@@ -46,7 +46,9 @@ def main() -> int:
                 verdict = "explained"
             counts[verdict] += 1
             took = time.monotonic() - begin
-            _say(f"{number:4} {verdict:9} {took:4.0f} s {len(tests):4} tests  {mutation.path}:{mutation.lines[0]}  {by}")
+            _say(
+                f"{number:4} {verdict:9} {took:4.0f} s {len(tests):4} tests  {mutation.path}:{mutation.lines[0]}  {by}"
+            )
             if verdict != NOTICED or options.verbose:
                 _say(f"       - {old}\n       + {new}")
     judged = sum(counts.values()) - counts["explained"]
@@ -69,7 +71,9 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("paths", nargs="*", default=PACKAGES, help="files or folders in src/aerokit")
     parser.add_argument("--sample", type=int, default=200, help="so many changes, drawn by chance (200)")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--seconds", type=float, default=60, help="processor time of the tests of a change (60)")
+    parser.add_argument(
+        "--seconds", type=float, default=60, help="processor time of the tests of a change (60)"
+    )
     parser.add_argument("--tests", nargs="*", default=TESTS, help="test files or folders in tests/")
     parser.add_argument("--only", nargs="*", type=int, help="of the sample, those with these numbers")
     parser.add_argument("--verbose", action="store_true", help="show the changes that were noticed, too")
@@ -89,9 +93,7 @@ def _test_files(name: str) -> list[Path]:
     return sorted(path.rglob("test_*.py")) if path.is_dir() else [path]
 
 
-def _sample(
-    sources: Iterator[Path], size: int, chance: random.Random
-) -> Iterator[tuple[Mutation, str, str]]:
+def _sample(sources: Iterator[Path], size: int, chance: random.Random) -> Iterator[tuple[Mutation, str, str]]:
     texts = {str(path.relative_to(SOURCE)): path.read_text() for path in sources}
     everything = [mutation for path, text in texts.items() for mutation in mutations_of(path, text)]
     chance.shuffle(everything)
@@ -104,7 +106,7 @@ def _sample(
 
 
 def _tests_of(mutation: Mutation, reach: Reach, seconds: float) -> list[str]:
-    """The tests that run the line: those named after its file first, then the quickest, as many as there is time for."""
+    """The tests that run the line, as many as there is time for: those named after its file, then the quickest."""
     words = (Path(mutation.path).stem, *Path(mutation.path).stem.split("_"))
     chosen, left = [], seconds
 

@@ -20,7 +20,14 @@ import pytest
 from reach import PYTEST, ROOT, SOURCE
 
 NOTICED, TOO_LONG, SURVIVED = "noticed", "too long", "SURVIVED"
-PRELOADED = ("anyio._backends._asyncio", "hypothesis", "fastcrc", "pymavlink.mavutil", "geographiclib.geodesic", "serial")
+PRELOADED = (
+    "anyio._backends._asyncio",
+    "hypothesis",
+    "fastcrc",
+    "pymavlink.mavutil",
+    "geographiclib.geodesic",
+    "serial",
+)
 
 PRELOADED_IS_FINE = ("-W", "ignore::pytest.PytestAssertRewriteWarning")
 
@@ -32,8 +39,8 @@ class Trials:
         self._copy = folder / "aerokit"
 
     def __enter__(self) -> Trials:
-        shutil.copytree(SOURCE, self._copy, ignore=shutil.ignore_patterns("__pycache__"))
-        compileall.compile_dir(self._copy, quiet=2)
+        shutil.copytree(SOURCE, self._copy)
+        compileall.compile_dir(self._copy, quiet=2)  # what was not imported yet
         for name in PRELOADED:
             importlib.import_module(name)
         return self
@@ -73,7 +80,11 @@ class Trials:
         code = os.WEXITSTATUS(status)
         if code == pytest.ExitCode.OK:
             return SURVIVED, ""
-        if code not in (pytest.ExitCode.TESTS_FAILED, pytest.ExitCode.INTERRUPTED, pytest.ExitCode.USAGE_ERROR):
+        if code not in (
+            pytest.ExitCode.TESTS_FAILED,
+            pytest.ExitCode.INTERRUPTED,
+            pytest.ExitCode.USAGE_ERROR,
+        ):
             raise RuntimeError(f"pytest did not run {tests[0]}: {said[-2000:]}")
         return NOTICED, _first_failure(said)
 

@@ -1,4 +1,4 @@
-"""Orders: sent again only right after the vehicle has told what it does; and the limits of commands, to the last one."""
+"""Orders: sent again only right after the vehicle has told what it does; the limits of commands to the last one."""
 
 from __future__ import annotations
 

@@ -25,9 +25,7 @@ def upload(count: int = 4, **options: Any) -> MissionUpload:
 
 def told(exchange: MissionUpload) -> list[int | str]:
     """What it sent since: items by their numbers, other messages by their names."""
-    return [
-        each.seq if isinstance(each, m.MissionItemInt) else each.NAME for each in exchange.take_outbox()
-    ]
+    return [each.seq if isinstance(each, m.MissionItemInt) else each.NAME for each in exchange.take_outbox()]
 
 
 def ask(exchange: MissionUpload, seq: int, now: float) -> list[int | str]:

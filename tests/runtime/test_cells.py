@@ -250,6 +250,50 @@ async def test_observers_see_every_change_with_what_was_before() -> None:
     assert seen == [(None, 1), (1, 2)]
 
 
+async def test_what_an_observer_raises_is_logged_and_the_others_are_told(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    cell, seen = make_cell(), list[int]()
+    cell.observe(lambda _, value: 1 // 0)
+    cell.observe(lambda _, value: seen.append(value))
+    cell.set(1, HEARTBEAT)
+    assert seen == [1]
+    assert "an observer of altitude raised" in caplog.text
+    assert "ZeroDivisionError" in caplog.text
+
+
+class LazyFeed:
+    """Works values out when somebody looks, and counts how often it was told of watchers."""
+
+    pending: object = None
+
+    def __init__(self) -> None:
+        self.told: list[bool] = []
+        self.cell = make_cell()
+        self.cell._feed_from(self)
+
+    def catch_up(self) -> None:
+        value, self.pending = self.pending, None
+        self.cell.set(value, HEARTBEAT)  # type: ignore[arg-type]
+
+    def watchers_changed(self) -> None:
+        self.told.append(self.cell._is_watched)
+
+
+async def test_what_works_out_values_is_told_who_watches_and_asked_by_who_looks() -> None:
+    feed = LazyFeed()
+    stop = feed.cell.observe(lambda _, __: None)
+    stop()
+    assert feed.told == [True, False]
+    feed.pending = 5
+    assert feed.cell.value == 5
+    feed.pending = 6
+    feed.cell.changes()
+    assert feed.pending is None
+    feed.cell.changes()
+    assert feed.told == [True, False, True]
+
+
 async def test_repr_is_readable() -> None:
     cell = make_cell()
     assert repr(cell) == "<StateCell altitude is not known yet, no HEARTBEAT has been received>"

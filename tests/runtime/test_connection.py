@@ -13,8 +13,16 @@ import anyio.lowlevel
 import pytest
 
 from aerokit import Vehicle, VelocitySetpoint, connect, open_connection
-from aerokit.errors import BusyError, ConnectFailed, ConnectionClosed, LinkLost, LinkOpenError
+from aerokit.errors import (
+    BusyError,
+    ConnectFailed,
+    ConnectionClosed,
+    LinkLost,
+    LinkOpenError,
+    LocalProtocolError,
+)
 from aerokit.links import MemoryLink, Peer, memory_link_pair
+from aerokit.mavlink import STANDARD, Dialect
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.messages import Attitude, CommandLong, Heartbeat
@@ -65,6 +73,27 @@ async def test_our_heartbeat_goes_out_at_1_hz_from_the_start() -> None:
         gaps = [later - earlier for earlier, later in zip(ear.times, ear.times[1:], strict=False)]
         assert gaps == pytest.approx([1.0] * 5)
         assert ear.times[0] < 0.1
+
+
+async def test_our_heartbeat_is_that_of_a_ground_station() -> None:
+    async with far_end() as (near, _, ear), open_connection(near):
+        await anyio.sleep(0.5)
+        (frame,) = Framer().receive(ear.data)
+        assert (frame.version, frame.system_id, frame.component_id) == (2, 255, 190)
+        assert STANDARD.decode(frame) == Heartbeat(6, 8, 0, 0, 4, 3)
+
+
+async def test_what_the_dialect_does_not_know_cannot_be_subscribed_to() -> None:
+    few = Dialect("heartbeats", [Heartbeat])
+    async with far_end() as (near, _, _), open_connection(near, dialect=few) as connection:
+        connection.check_types((Heartbeat, LinkClosed))
+        for types, text in (
+            ((Attitude,), "ATTITUDE is not in this connection's dialect"),
+            ((str,), "neither a message class nor an event class"),
+            ((), "at least one"),
+        ):
+            with pytest.raises(LocalProtocolError, match=text):
+                connection.check_types(types)
 
 
 async def test_a_message_out_of_range_is_not_sent() -> None:

@@ -249,6 +249,14 @@ async def test_the_clock_must_go_on_where_there_is_one(link: KeptPeers) -> None:
         assert is_armed(vehicle)
 
 
+async def test_the_numbers_must_go_on_where_they_are_known(link: KeptPeers) -> None:
+    async with flown(link) as (vehicle, copter):
+        impostor = Copter(link, copter.encoder.sequence + 100 & 0xFF)
+        await anyio.sleep(4)
+        await impostor.live("14550@mobile", 4, DISARMED)
+        assert is_armed(vehicle)
+
+
 async def test_another_port_of_the_same_host_is_taken_at_once_if_it_goes_on(link: KeptPeers) -> None:
     async with flown(link) as (vehicle, copter):
         heard, begun = told(vehicle.connection), vehicle.connection.now()

@@ -1,0 +1,292 @@
+"""Who steers: every rule by which an order, or one sending of it, ends; without a vehicle, a loop or a clock."""
+
+from __future__ import annotations
+
+import math
+from contextlib import ExitStack
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from aerokit.autopilots import Mode
+from aerokit.errors import CommandRejected, CommandTimeout
+from aerokit.runtime.cells import Source, StateCell
+from aerokit.vehicle.helm import KNOWN_S, MODE_GRACE_S, Helm
+from aerokit.vehicle.orders import MOVING_COMMANDS, QUESTIONS, Order, Sending
+from aerokit.vehicle.telemetry import Telemetry
+
+HEARTBEAT = Source(1, 1, "HEARTBEAT")
+GUIDED, LOITER, RTL, BRAKE = (
+    Mode(name, number) for number, name in ((4, "GUIDED"), (5, "LOITER"), (6, "RTL"), (17, "BRAKE"))
+)
+
+
+class Stage:
+    """A helm, and heartbeats at the test's word."""
+
+    def __init__(self, mode: Mode | None = LOITER, armed: bool | None = True) -> None:
+        self.now, self.open = 0.0, ExitStack()
+        self.mode = StateCell[Mode]("mode", lambda: self.now, "HEARTBEAT")
+        self.armed = StateCell[bool]("armed", lambda: self.now, "HEARTBEAT")
+        self.helm = Helm(
+            lambda: self.now, cast("Telemetry", SimpleNamespace(mode=self.mode, armed=self.armed))
+        )
+        if mode is not None and armed is not None:
+            self.tell(mode, armed)
+
+    def tell(self, mode: Mode, armed: bool = True, *, after: float = 1.0) -> None:
+        self.now += after
+        self.mode.set(mode, HEARTBEAT)
+        self.armed.set(armed, HEARTBEAT)
+
+
+# -------------------------------------------------------------------------------- the newest
+
+
+def test_a_newer_order_ends_the_one_before_and_is_announced_first() -> None:
+    stage, ends = Stage(), list[str]()
+    first = stage.helm.order(GUIDED)
+    stage.helm.on_new(lambda: ends.append(first.end))
+    second = stage.helm.order(RTL)
+    assert ends == [""]  # called before
+    assert first.end == "another order was given"
+    assert (first.taken_by, second.end) == ("", "")
+    assert stage.helm.newest is second
+
+
+def test_what_does_not_steer_ends_with_the_order_that_steers_and_ends_none() -> None:
+    stage = Stage()
+    steering = stage.helm.order(GUIDED)
+    with stage.helm.aside() as aside:
+        assert (steering.end, aside.end) == ("", "")
+        assert aside.modes == steering.modes
+        stage.helm.order(RTL)
+        assert aside.end == "another order was given"
+
+
+def test_what_does_not_steer_hears_nothing_after_its_block() -> None:
+    stage = Stage()
+    with stage.helm.aside() as aside:
+        assert aside.modes == ()
+        stage.tell(LOITER)
+    stage.tell(RTL)
+    assert aside.end == ""
+    with pytest.raises(KeyError), stage.helm.aside() as aside:
+        raise KeyError
+    stage.tell(BRAKE)
+    assert aside.end == ""
+
+
+def test_a_closed_helm_hears_nothing() -> None:
+    stage = Stage()
+    order = stage.helm.order(GUIDED)
+    stage.helm.close()
+    stage.tell(RTL, armed=False)
+    assert order.end == ""
+
+
+# ------------------------------------------------------------------------------ somebody else
+
+
+@pytest.mark.parametrize("told", [[LOITER], [GUIDED], [LOITER, LOITER, GUIDED, GUIDED]])
+def test_the_mode_before_and_the_orders_own_are_nobody_elses(told: list[Mode]) -> None:
+    stage = Stage()
+    order = stage.helm.order(GUIDED)
+    for mode in told:
+        stage.tell(mode)
+    assert order.end == ""
+
+
+@pytest.mark.parametrize("told", [[RTL], [GUIDED, LOITER], [GUIDED, RTL, GUIDED], [LOITER, RTL, LOITER]])
+def test_another_mode_ends_it_for_good(told: list[Mode]) -> None:
+    """The mode before, too, once the vehicle was in the one that was ordered."""
+    stage = Stage()
+    order = stage.helm.order(GUIDED)
+    for mode in told:
+        stage.tell(mode)
+    assert (
+        order.end
+        == order.taken_by
+        == f"the mode changed to {next(m for m in told[1:] or told if m != GUIDED)}"
+    )
+
+
+def test_the_first_who_took_it_is_named() -> None:
+    stage = Stage()
+    order = stage.helm.order(GUIDED)
+    stage.tell(RTL)
+    stage.tell(BRAKE, armed=False)
+    stage.helm.note_reboot()
+    assert order.end == "the mode changed to RTL"
+
+
+def test_disarming_and_rebooting_end_it() -> None:
+    stage = Stage()
+    order = stage.helm.order(GUIDED)
+    stage.tell(LOITER, armed=False)
+    assert order.end == "the vehicle disarmed"
+    order = stage.helm.order(GUIDED)
+    stage.tell(LOITER, armed=False)
+    assert order.end == ""  # it was so before
+    stage.helm.note_reboot()
+    assert order.end == "the vehicle rebooted"
+
+
+def test_disarming_counts_from_when_it_was_armed() -> None:
+    stage = Stage(armed=False)
+    order = stage.helm.order(GUIDED)
+    stage.tell(LOITER, armed=True)
+    assert order.end == ""
+    stage.tell(LOITER, armed=False)
+    assert order.end == "the vehicle disarmed"
+
+
+def test_a_mode_that_was_not_known_before_is_the_one_before() -> None:
+    stage = Stage(mode=None)
+    order = stage.helm.order(GUIDED)
+    stage.tell(RTL)
+    assert order.end == ""
+    stage.tell(BRAKE)
+    assert order.end == "the mode changed to BRAKE"
+
+
+# --------------------------------------------------------------------------------- doubts
+
+
+def test_the_mode_of_the_order_before_may_still_come_while_that_is_under_way() -> None:
+    stage = Stage()
+    stage.helm.order(GUIDED)
+    stage.tell(GUIDED)
+    order = stage.helm.order(BRAKE)
+    stage.tell(GUIDED)
+    assert order.end == ""
+    stage.tell(BRAKE)
+    stage.tell(GUIDED)
+    assert order.end == "the mode changed to GUIDED"
+
+
+@pytest.mark.parametrize(("in_doubt", "end"), [(True, ""), (False, "the mode changed to GUIDED")])
+def test_a_mode_that_was_ordered_and_not_told_may_come_while_it_is_in_doubt(in_doubt: bool, end: str) -> None:
+    stage = Stage()
+    stage.helm.order(GUIDED)
+    stage.helm.mode_is_in_doubt = in_doubt
+    order = stage.helm.order(BRAKE)
+    stage.tell(GUIDED)
+    assert order.end == end
+
+
+@pytest.mark.parametrize(
+    ("after_s", "end"), [(MODE_GRACE_S - 0.1, ""), (MODE_GRACE_S, "the mode changed to GUIDED")]
+)
+def test_a_mode_that_was_given_up_may_come_for_three_seconds(after_s: float, end: str) -> None:
+    stage = Stage()
+    stage.helm.order(GUIDED)
+    stage.helm.doubt_mode()
+    stage.helm.mode_is_in_doubt = False
+    stage.now += after_s
+    order = stage.helm.order(BRAKE)
+    stage.tell(GUIDED)
+    assert order.end == end
+
+
+@pytest.mark.parametrize(("after_s", "end"), [(2.9, ""), (3.0, "the mode changed to RTL")])
+def test_after_an_order_of_the_programs_own_any_mode_may_come_for_three_seconds(
+    after_s: float, end: str
+) -> None:
+    stage = Stage()
+    own = stage.helm.order_of_the_programs_own()
+    order = stage.helm.order(GUIDED)
+    assert own.end == "another order was given"
+    stage.tell(RTL, after=after_s)
+    assert order.end == end
+
+
+def test_a_mode_is_in_doubt_until_the_answer_is_known() -> None:
+    helm = Stage().helm
+    with helm.changing_mode():
+        assert helm.mode_is_in_doubt
+    assert not helm.mode_is_in_doubt
+    with pytest.raises(CommandRejected), helm.changing_mode():
+        raise CommandRejected("no", command=176, result=4)
+    assert not helm.mode_is_in_doubt
+    assert helm.mode_settles_at == -math.inf
+    with pytest.raises(CommandTimeout), helm.changing_mode():
+        raise CommandTimeout("no answer")
+    assert helm.mode_is_in_doubt
+    assert helm.mode_settles_at == 1.0 + MODE_GRACE_S
+
+
+def test_what_it_does_is_known_for_two_and_a_half_seconds() -> None:
+    stage = Stage()
+    stage.now += KNOWN_S
+    assert stage.helm.is_known
+    stage.now += 0.1
+    assert not stage.helm.is_known
+    assert not Stage(mode=None).helm.is_known
+
+
+# --------------------------------------------------------------------------------- sendings
+
+
+def sending(stage: Stage, **options: Any) -> Sending:
+    order = stage.helm.order(GUIDED)
+    return stage.open.enter_context(stage.helm.sending(order, **options))
+
+
+def test_a_sending_ends_when_its_mode_is_told_whatever_comes_then() -> None:
+    stage = Stage()
+    each = sending(stage, modes=(GUIDED,))
+    stage.tell(LOITER)
+    assert (each.end, each.was_done) == ("", False)
+    stage.tell(GUIDED)
+    assert (each.end, each.was_done) == ("its effect was told", True)
+    stage.tell(RTL)
+    assert each.end == "its effect was told"
+
+
+def test_a_sending_ends_when_it_is_armed_as_ordered() -> None:
+    for armed in (True, False):
+        stage = Stage(armed=not armed)
+        each = sending(stage, armed=armed)
+        stage.tell(LOITER, armed=not armed)
+        assert each.end == ""
+        stage.tell(LOITER, armed=armed)
+        assert each.was_done
+
+
+def test_what_is_so_already_tells_nothing_of_an_effect() -> None:
+    stage = Stage(GUIDED)
+    each = sending(stage, modes=(GUIDED, LOITER), armed=True)
+    stage.tell(GUIDED)
+    stage.tell(LOITER)
+    assert not each.was_done
+
+
+def test_a_sending_ends_with_its_order_and_by_its_own_sign() -> None:
+    stage, done = Stage(), list[int]()
+    each = sending(stage, is_done=lambda: bool(done))
+    stage.tell(RTL)
+    assert each.end == "the mode changed to RTL"
+    done.append(1)
+    assert each.end == "its effect was told"
+    done.clear()
+    assert each.end == "its effect was told"
+
+
+def test_a_sending_knows_when_the_vehicle_told_last_until_its_block_ends() -> None:
+    stage = Stage()
+    with stage.helm.sending(stage.helm.order(GUIDED)) as each:
+        assert each.told_at == -math.inf
+        stage.tell(LOITER)
+        assert each.told_at == 2.0
+    stage.tell(LOITER)
+    assert each.told_at == 2.0
+
+
+def test_orders_know_what_moves_and_what_only_asks() -> None:
+    assert {22, 21, 20, 176, 192, 300, 400} <= MOVING_COMMANDS
+    assert not MOVING_COMMANDS & QUESTIONS
+    assert {511, 512, 520} <= QUESTIONS
+    order = Order(0.0, mode_before=None, modes=[], expected=[], armed_before=None, is_newest=lambda _: True)
+    assert order.end == ""
