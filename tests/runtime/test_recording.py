@@ -57,6 +57,16 @@ async def test_both_directions_are_recorded_and_pymavlink_reads_every_frame(tmp_
     assert ours[1] - theirs[1] < 60  # AVAILABLE_MODES and CURRENT_MODE are unknown to its dialect
 
 
+async def test_a_recording_that_begins_later_has_frames_that_nobody_wants(tmp_path: Path) -> None:
+    near, _ = memory_link_pair()
+    async with open_connection(near) as connection:
+        encoder = FrameEncoder(1, 1)
+        connection.bytes_received(encoder.encode(ATTITUDE), None)
+        connection.record(tmp_path / "late.tlog")
+        connection.bytes_received(encoder.encode(ATTITUDE), None)
+    assert senders(tmp_path / "late.tlog")[1] == 1
+
+
 async def test_frames_nobody_wants_are_recorded_too(tmp_path: Path) -> None:
     path = tmp_path / "all.tlog"
     async with (

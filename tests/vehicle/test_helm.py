@@ -11,6 +11,7 @@ import pytest
 
 from aerokit.autopilots import Mode
 from aerokit.errors import CommandRejected, CommandTimeout
+from aerokit.mavlink.enums import MavCmd
 from aerokit.runtime.cells import Source, StateCell
 from aerokit.vehicle.helm import KNOWN_S, MODE_GRACE_S, Helm
 from aerokit.vehicle.orders import MOVING_COMMANDS, QUESTIONS, Order, Sending
@@ -285,8 +286,19 @@ def test_a_sending_knows_when_the_vehicle_told_last_until_its_block_ends() -> No
 
 
 def test_orders_know_what_moves_and_what_only_asks() -> None:
-    assert {22, 21, 20, 176, 192, 300, 400} <= MOVING_COMMANDS
-    assert not MOVING_COMMANDS & QUESTIONS
-    assert {511, 512, 520} <= QUESTIONS
-    order = Order(0.0, mode_before=None, modes=[], expected=[], armed_before=None, is_newest=lambda _: True)
+    assert {MavCmd(each).name for each in MOVING_COMMANDS} == {
+        *("NAV_WAYPOINT", "NAV_LOITER_UNLIM", "NAV_LOITER_TURNS", "NAV_LOITER_TIME", "NAV_RETURN_TO_LAUNCH"),
+        *("NAV_LAND", "NAV_TAKEOFF", "NAV_VTOL_TAKEOFF", "NAV_VTOL_LAND", "DO_SET_MODE", "DO_REPOSITION"),
+        *("DO_FLIGHTTERMINATION", "DO_PAUSE_CONTINUE", "OVERRIDE_GOTO", "MISSION_START"),
+        "COMPONENT_ARM_DISARM",
+    }
+    for each in QUESTIONS - {MavCmd.SET_MESSAGE_INTERVAL, MavCmd.RUN_PREARM_CHECKS}:
+        assert MavCmd(each).name.startswith(("REQUEST_", "GET_")), "what changes something is no question"
+    assert len(QUESTIONS) == 11
+
+
+def test_an_order_of_nothing_in_no_mode_stands() -> None:
+    order = Order(
+        0.0, mode_before=None, modes=[], expected=[], armed_before=None, is_newest=lambda _: True
+    )
     assert order.end == ""

@@ -1,0 +1,313 @@
+"""Reboots, silence, loss, round trips, standing still: the rules by themselves, on a clock of the test's own."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from aerokit import Position
+from aerokit.mavlink import STANDARD, Frame, FrameEncoder, Framer, Message
+from aerokit.mavlink.messages import Attitude, Heartbeat, SystemTime, Timesync
+from aerokit.runtime.cells import Source, StateCell
+from aerokit.runtime.connection import Connection
+from aerokit.runtime.events import LinkReport, VehicleBack, VehicleRebooted, VehicleSilent
+from aerokit.vehicle.core import VehicleCore
+from aerokit.vehicle.progress import Stillness
+from aerokit.vehicle.watch import LinkWatch, VehicleWatch
+
+HEARTBEAT = Heartbeat(2, 3, 81, 0, 3)
+
+
+class Bus:
+    """Gives frames and messages to who is attached, as the real one does."""
+
+    def __init__(self) -> None:
+        self.sinks: dict[type[Any], list[Callable[[Any], object]]] = {}
+        self.takers: dict[type[Any], list[Callable[[Any], object]]] = {}
+        self.published: list[Any] = []
+
+    def attach(self, kind: type[Any], sink: Callable[[Any], object], **_: object) -> Callable[[], None]:
+        self.sinks.setdefault(kind, []).append(sink)
+        return lambda: self.sinks[kind].remove(sink)
+
+    attach_event = attach
+
+    def attach_frames(
+        self, kind: type[Any], taker: Callable[[Any], object], **_: object
+    ) -> Callable[[], None]:
+        self.takers.setdefault(kind, []).append(taker)
+        return lambda: self.takers[kind].remove(taker)
+
+    def publish(self, event: Any) -> None:
+        self.published.append(event)
+
+
+class Stage:
+    """A connection that is none, and what a vehicle says on it."""
+
+    def __init__(self) -> None:
+        self.at, self.counted, self.bytes = 0.0, (0, 0), 0
+        self.bus, self.boot_clocks, self.sent = Bus(), dict[tuple[int, int], Any](), list[Message]()
+        self.connection = cast(
+            "Connection",
+            SimpleNamespace(
+                bus=self.bus,
+                boot_clocks=self.boot_clocks,
+                now=lambda: self.at,
+                counts=lambda _: self.counted,
+                statistics=lambda: [SimpleNamespace(bytes=self.bytes)],
+                send=lambda message, to: self.sent.append(message),
+            ),
+        )
+        self.encoder = FrameEncoder(1, 1)
+
+    def hear(self, message: Message, *, component_id: int = 1) -> None:
+        encoder = self.encoder if component_id == 1 else FrameEncoder(1, component_id)
+        (frame,) = Framer().receive(encoder.encode(message), self.at)
+        for take in self.bus.takers.get(type(message), ()):
+            take(frame)
+        for sink in self.bus.sinks.get(type(message), ()):
+            sink(self._decoded(frame))
+
+    @staticmethod
+    def _decoded(frame: Frame) -> Message:
+        return STANDARD.decode(frame)
+
+    def told(self) -> Counter[type[Any]]:
+        return Counter(map(type, self.bus.published))
+
+
+def attitude(boot_ms: int) -> Attitude:
+    return Attitude(boot_ms, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+# ----------------------------------------------------------------------------------- reboots
+
+
+class Watched(Stage):
+    def __init__(self) -> None:
+        super().__init__()
+        self.reboots_told = 0
+        self.watch = VehicleWatch(self.connection, 1, 1, self._count)
+
+    def _count(self) -> None:
+        self.reboots_told += 1
+
+    def clock(self, boot_ms: int, *, after: float = 0.1) -> int:
+        self.at += after
+        self.hear(attitude(boot_ms))
+        return self.watch.reboots
+
+
+def test_an_earlier_time_that_runs_is_a_reboot() -> None:
+    stage = Watched()
+    stage.clock(100_000)
+    assert stage.clock(50) == 0
+    assert stage.clock(150) == 0
+    assert stage.clock(250, after=0.11) == 1
+    assert stage.clock(350) == 1
+    assert (stage.reboots_told, stage.told()[VehicleRebooted]) == (1, 1)
+
+
+def test_a_time_that_is_earlier_by_three_seconds_is_a_late_message() -> None:
+    stage = Watched()
+    stage.clock(100_000)
+    for boot_ms in (97_000, 97_100, 97_200, 97_400):
+        assert stage.clock(boot_ms) == 0
+
+
+def test_late_messages_of_different_times_are_no_reboot() -> None:
+    stage = Watched()
+    for seconds in range(100, 130):
+        stage.clock(seconds * 1000, after=1.0)
+        if seconds % 10 == 0:
+            assert stage.clock(seconds * 1000 - 8000, after=0.0) == 0
+
+
+def test_an_earlier_time_that_stands_still_is_no_reboot() -> None:
+    stage = Watched()
+    stage.clock(100_000)
+    for _ in range(20):
+        assert stage.clock(5000) == 0
+
+
+def test_other_components_tell_nothing_of_the_autopilot() -> None:
+    stage = Watched()
+    stage.clock(100_000)
+    for count in range(10):
+        stage.at += 0.1
+        stage.hear(attitude(100 * count + 1), component_id=154)
+        stage.hear(SystemTime(0, 100 * count + 1), component_id=154)
+        stage.hear(Timesync((100 * count + 1) * 1_000_000, 5), component_id=154)
+    assert stage.watch.reboots == 0
+
+
+def test_the_boot_clock_goes_on_between_messages() -> None:
+    stage = Watched()
+    clock = stage.boot_clocks[1, 1]
+    assert clock(0.0) is None
+    stage.hear(SystemTime(1_700_000_000_000_000, 5000))
+    assert clock(1.5) == 6500.0
+    stage.clock(65_000, after=6.0)  # ten times as fast
+    assert clock(7.0) == 75_000.0
+    stage.watch.close()
+    assert stage.boot_clocks == {}
+
+
+def test_a_reboot_that_was_ordered_is_seen_at_once() -> None:
+    stage = Watched()
+    stage.clock(3000)
+    with stage.watch.expecting_reboot():
+        assert stage.clock(5010, after=4.0) == 0  # two seconds late may be the radio's doing
+        assert stage.clock(7000, after=4.0) == 1
+        assert stage.clock(7100, after=9.0) == 1  # it was that one
+    assert stage.clock(7200, after=10.0) == 1
+
+
+def test_an_answer_with_an_earlier_time_is_a_reboot_unless_it_was_asked_before() -> None:
+    stage = Watched()
+    stage.at = 10.0
+    stage.watch.note_answer(9.9, 5000)
+    stage.at = 11.0
+    stage.watch.note_answer(10.0, 4000)  # asked when the other one had not come yet
+    assert stage.watch.reboots == 0
+    stage.watch.note_answer(10.5, 5000)
+    assert stage.watch.reboots == 0
+    stage.at = 12.0
+    stage.watch.note_answer(11.5, 4999)
+    assert stage.watch.reboots == 1
+
+
+# ----------------------------------------------------------------------------------- silence
+
+
+def test_silence_is_told_once_after_three_and_a_half_seconds_and_its_end() -> None:
+    stage = Watched()
+    for at, silent in ((3.5, False), (3.6, True), (9.0, True)):
+        stage.at = at
+        stage.watch.check()
+        assert stage.watch.is_silent is silent
+    stage.hear(HEARTBEAT, component_id=154)
+    assert stage.watch.is_silent
+    stage.hear(HEARTBEAT)
+    assert not stage.watch.is_silent
+    assert (stage.told()[VehicleSilent], stage.told()[VehicleBack]) == (1, 1)
+    (back,) = [each for each in stage.bus.published if isinstance(each, VehicleBack)]
+    assert back.silent_for_s == 9.0
+
+
+# ---------------------------------------------------------------------------------- the link
+
+
+class Measured(Stage):
+    def __init__(self) -> None:
+        super().__init__()
+        self.reports, self.answers = list[LinkReport](), list[tuple[float, int]]()
+        self.watch = LinkWatch(
+            self.connection, 1, 1, self.reports.append, lambda *each: self.answers.append(each)
+        )
+
+    def ask(self) -> Timesync:
+        self.watch.ask()
+        question = self.sent[-1]
+        assert isinstance(question, Timesync)
+        return question
+
+    def report(self, counted: tuple[int, int], total: int) -> LinkReport:
+        self.at, self.counted, self.bytes = self.at + 1.0, counted, total
+        self.watch._report()
+        return self.reports[-1]
+
+
+def test_a_round_trip_is_that_of_the_first_answer_to_our_question() -> None:
+    stage = Measured()
+    stage.at = 5.0
+    question = stage.ask()
+    assert (question.tc1, question.ts1) == (0, 5_000_000_000)
+    answer = Timesync(77_000_000, question.ts1)
+    stage.at = 5.1
+    stage.hear(answer, component_id=154)
+    stage.hear(Timesync(0, question.ts1))
+    stage.hear(Timesync(77_000_000, 12345))
+    assert stage.watch.round_trip_s is None
+    stage.hear(answer)
+    stage.at = 5.9
+    stage.hear(answer)  # a second copy of it
+    assert stage.watch.round_trip_s == pytest.approx(0.1)
+    assert stage.answers == [(5.0, 77)]
+
+
+def test_loss_and_rates_of_a_second() -> None:
+    stage = Measured()
+    report = stage.report((75, 25), 4000)
+    assert (report.loss_percent, report.frames_per_s, report.bytes_per_s) == (25.0, 75.0, 4000.0)
+    report = stage.report((75, 25), 4000)
+    assert (report.loss_percent, report.frames_per_s, report.bytes_per_s) == (None, 0.0, 0.0)
+    report = stage.report((10, 20), 4000)  # a peer that was forgotten takes its counters along
+    assert (report.loss_percent, report.frames_per_s) == (None, 0.0)
+    report = stage.report((5, 30), 4000)
+    assert (report.loss_percent, report.frames_per_s) == (100.0, 0.0)
+
+
+# ------------------------------------------------------------------------------- standing still
+
+
+class Standing:
+    def __init__(self) -> None:
+        self.at = 0.0
+        self.cell = StateCell[Position]("position", lambda: self.at, "GLOBAL_POSITION_INT")
+        vehicle = SimpleNamespace(
+            connection=SimpleNamespace(now=lambda: self.at), telemetry=SimpleNamespace(position=self.cell)
+        )
+        self.stillness = Stillness(cast("VehicleCore", vehicle))
+
+    def tell(self, place: Position | None, at: float) -> str | None:
+        self.at = at
+        if place is not None:
+            self.cell.set(place, Source(1, 1, "GLOBAL_POSITION_INT"))
+        return self.stillness()
+
+
+HERE = Position(47.0, 8.0)
+
+
+@pytest.mark.parametrize("altitudes", [{}, {"altitude_relative_m": 5.0}, {"altitude_amsl_m": 5.0}])
+def test_who_stands_for_twelve_seconds_does_not_move(altitudes: dict[str, float]) -> None:
+    standing, here = Standing(), Position(47.0, 8.0, **altitudes)
+    for at in range(12):
+        assert standing.tell(here, float(at)) is None
+    assert standing.tell(here, 12.0) == "it has accepted the order and not moved for 12 s"
+
+
+@pytest.mark.parametrize(
+    ("further", "moves"),
+    [
+        (HERE.offset(north_m=0.29), False),
+        (HERE.offset(north_m=0.31), True),
+        (Position(47.0, 8.0, altitude_relative_m=5.31), True),
+        (Position(47.0, 8.0, altitude_relative_m=4.69), True),
+        (Position(47.0, 8.0, altitude_relative_m=5.29), False),
+    ],
+)
+def test_who_moves_by_a_foot_moves(further: Position, moves: bool) -> None:
+    standing = Standing()
+    here = HERE if further.altitude_relative_m is None else HERE.replace(altitude_relative_m=5.0)
+    for at in range(12):
+        standing.tell(here, float(at))
+    assert (standing.tell(further, 12.0) is None) is moves
+    assert (standing.tell(further, 23.0) is None) is moves
+
+
+def test_without_a_position_of_the_last_two_seconds_nothing_is_known() -> None:
+    standing = Standing()
+    assert standing.tell(None, 0.0) is None
+    assert standing.tell(HERE, 1.0) is None
+    assert standing.tell(None, 3.1) is None
+    for at in range(4, 16):
+        assert standing.tell(HERE, float(at)) is None
+    assert standing.tell(None, 17.0) is not None
+    assert standing.tell(None, 17.1) is None
