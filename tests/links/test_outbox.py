@@ -114,6 +114,17 @@ async def test_a_line_that_does_not_drain_is_told_once_and_gets_nothing_more() -
     assert line.sent[-1] == b"again"
 
 
+async def test_what_came_during_a_stall_goes_out_when_the_line_moves_again() -> None:
+    line = Line(room=1000)
+    line.outbox.write(b"taken")
+    await anyio.sleep(1.4)
+    line.outbox.write(b"in time")
+    assert (line.told, line.sent) == ([True], [b"taken"])
+    line.pending = 0  # it was never full: nobody says resume
+    await anyio.sleep(0.3)
+    assert (line.told, line.sent) == ([True, False], [b"taken", b"in time"])
+
+
 async def test_a_slow_line_is_no_stalled_line() -> None:
     line = Line(room=10_000)
     for _ in range(200):

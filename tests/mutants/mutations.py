@@ -83,6 +83,8 @@ class Mutation:
     occurrence: int
     lines: tuple[int, ...]
     """Of the statement: the tests that run one of them run the change."""
+    at_import: bool
+    """Whether it is run once only, by whoever imports the file first: then any test may depend on it."""
 
     def apply(self, source: str) -> str | None:
         """The changed source; ``None`` where only an annotation changes, which nobody runs."""
@@ -98,7 +100,7 @@ def mutations_of(path: str, source: str) -> list[Mutation]:
         for name, operator in OPERATORS.items():
             for (line, _), _ in operator().mutation_positions(node):
                 if not _is_marker(node):
-                    found.append(Mutation(path, name, counts[name], statements.get(line, (line,))))
+                    found.append(Mutation(path, name, counts[name], *statements.get(line, ((line,), True))))
                 counts[name] += 1
     return found
 
@@ -108,16 +110,20 @@ def _is_marker(node: Any) -> bool:
     return node.type == "operator" and node.value == "*" and node.parent.type not in ("term", "arith_expr")
 
 
-def _statements(source: str) -> dict[int, tuple[int, ...]]:
-    """The lines of the innermost statement on each line, of a compound one its head."""
-    found: dict[int, tuple[int, ...]] = {}
-    for node in ast.walk(ast.parse(source)):  # from the outside in
-        if isinstance(node, ast.stmt):
-            body = getattr(node, "body", None)
-            end = max(body[0].lineno - 1, node.lineno) if body else node.end_lineno or node.lineno
-            found |= dict.fromkeys(range(node.lineno, end + 1), tuple(range(node.lineno, end + 1)))
-        elif isinstance(node, ast.excepthandler):
-            found[node.lineno] = (node.lineno,)
+def _statements(source: str) -> dict[int, tuple[tuple[int, ...], bool]]:
+    """The lines of the innermost statement on each line, of a compound one its head; whether it runs at import."""
+    found: dict[int, tuple[tuple[int, ...], bool]] = {}
+
+    def visit(node: ast.AST, at_import: bool) -> None:
+        for child in ast.iter_child_nodes(node):
+            if isinstance(child, (ast.stmt, ast.excepthandler)):
+                body = getattr(child, "body", None)
+                end = max(body[0].lineno - 1, child.lineno) if body else child.end_lineno or child.lineno
+                lines = range(child.lineno, end + 1)
+                found.update(dict.fromkeys(lines, (tuple(lines), at_import)))
+            visit(child, at_import and not isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef)))
+
+    visit(ast.parse(source), True)
     return found
 
 

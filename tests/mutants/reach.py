@@ -23,15 +23,14 @@ AT_IMPORT = ""
 
 @dataclass
 class Reach:
-    """What the measured tests run; lines that run at import count for every test that runs a line of that file."""
+    """What the measured tests run, and how long they take."""
 
     seconds: dict[str, float] = field(default_factory=dict)
     by_line: dict[tuple[str, int], set[str]] = field(default_factory=dict)
     by_file: dict[str, set[str]] = field(default_factory=dict)
 
     def tests_of(self, path: str, lines: Iterable[int]) -> set[str]:
-        tests = set().union(*(self.by_line.get((path, line), set()) for line in lines))
-        return self.by_file.get(path, set(self.seconds)) if AT_IMPORT in tests else tests
+        return set().union(*(self.by_line.get((path, line), set()) for line in lines)) - {AT_IMPORT}
 
     def add(self, seconds: dict[str, float], lines: dict[str, dict[str, list[int]]]) -> None:
         self.seconds.update(seconds)

@@ -108,12 +108,14 @@ def _sample(sources: Iterator[Path], size: int, chance: random.Random) -> Iterat
 def _tests_of(mutation: Mutation, reach: Reach, seconds: float) -> list[str]:
     """The tests that run the line, as many as there is time for: those named after its file, then the quickest."""
     words = (Path(mutation.path).stem, *Path(mutation.path).stem.split("_"))
+    near = reach.by_file.get(mutation.path, set())
     chosen, left = [], seconds
 
-    def distance(test: str) -> tuple[int, float]:
-        return -sum(word in test for word in words), reach.seconds[test]
+    def distance(test: str) -> tuple[int, bool, float]:
+        return -sum(word in test for word in words), test not in near, reach.seconds[test]
 
-    for test in sorted(reach.tests_of(mutation.path, mutation.lines), key=distance):
+    tests = set(reach.seconds) if mutation.at_import else reach.tests_of(mutation.path, mutation.lines)
+    for test in sorted(tests, key=distance):
         left -= reach.seconds[test]
         if left < 0:
             break

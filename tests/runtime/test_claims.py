@@ -95,7 +95,12 @@ def test_where_numbers_say_nothing_the_clock_counts_alone() -> None:
     """After 8 s at 10 Hz the counter may have come round."""
     assert not Stage().claims(9.1, 0)  # and there is no clock
     clocks = {(1, 1): lambda at: 1000 * at}
-    for boot_ms, takes in ((9000 + 1900, True), (9000 + 1901, False), (9000 - 1900, True), (9000 - 1901, False)):
+    for boot_ms, takes in (
+        (9000 + 1900, True),
+        (9000 + 1901, False),
+        (9000 - 1900, True),
+        (9000 - 1901, False),
+    ):
         assert Stage(boot_clocks=clocks).claims(9.0, -100, message=attitude(boot_ms)) is takes
 
 
@@ -149,7 +154,9 @@ def test_a_double_behind_the_same_peer_is_told_once() -> None:
     ("behind", "after_s", "is_overtaken"),
     [(0, 0.1, False), (1, 0.1, True), (127, 0.1, True), (128, 0.1, False), (-1, 0.1, False), (1, 3.6, False)],
 )
-def test_a_heartbeat_is_overtaken_by_up_to_127_frames(behind: int, after_s: float, is_overtaken: bool) -> None:
+def test_a_heartbeat_is_overtaken_by_up_to_127_frames(
+    behind: int, after_s: float, is_overtaken: bool
+) -> None:
     stage = Stage()
     frame, _ = Sender(1, stage.next_number - 1 - behind).say(1.0 + after_s)
     assert stage.routes.is_overtaken(frame) is is_overtaken

@@ -298,7 +298,5 @@ def test_orders_know_what_moves_and_what_only_asks() -> None:
 
 
 def test_an_order_of_nothing_in_no_mode_stands() -> None:
-    order = Order(
-        0.0, mode_before=None, modes=[], expected=[], armed_before=None, is_newest=lambda _: True
-    )
+    order = Order(0.0, mode_before=None, modes=[], expected=[], armed_before=None, is_newest=lambda _: True)
     assert order.end == ""

@@ -11,10 +11,20 @@ import anyio
 import pytest
 from flight_harness import Flight, in_the_air, now, open_flight, open_px4
 
+from aerokit import connect
 from aerokit import messages as m
-from aerokit.errors import CommandTimeout, HeartbeatTimeout
-from aerokit.mavlink.enums import MavCmd
+from aerokit.errors import (
+    CommandRejected,
+    CommandTimeout,
+    HeartbeatTimeout,
+    NotSupported,
+    OperationRejected,
+    OperationTimeout,
+    SetpointStreamStopped,
+)
+from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.runtime.events import VehicleSilent
+from aerokit.sim import SimulatedCopter, SimulatedRover, simulated_link
 from aerokit.sim.px4.modes import OFFBOARD
 from aerokit.vehicle.commands import UNDER_WAY_S, CommandSender
 from aerokit.vehicle.progress import await_progress
@@ -184,6 +194,73 @@ async def test_each_answer_is_the_end_of_one(grounded: Flight, sender: CommandSe
     grounded.copter.faults.clear()
     await sender.send_long(BANNER, attempts=2)  # the first answer may be to one of those
     assert not sender.awaits_answer(BANNER)
+
+
+async def test_an_answer_is_to_the_oldest_of_those_under_way(grounded: Flight, sender: CommandSender) -> None:
+    grounded.copter.faults.ignore(BANNER, times=1)
+    sender.send_unconfirmed(BANNER)
+    await anyio.sleep(1.5)
+    sender.send_unconfirmed(BANNER)
+    await anyio.sleep(1.0)
+    assert sender.awaits_answer(BANNER)
+
+
+# ---------------------------------------------------------------------------------- go_to
+
+
+async def test_a_go_to_whose_heading_is_refused_on_the_way_holds(flying: Flight) -> None:
+    flying.copter.faults.refuse(MavCmd.CONDITION_YAW, MavResult.FAILED)
+    with pytest.raises(CommandRejected, match="CONDITION_YAW"):
+        await flying.vehicle.go_to(flying.vehicle.position.value.offset(north_m=100), heading_deg=90.0)
+    await anyio.sleep(2.0)
+    assert flying.wire.mode_orders() == [17]
+
+
+async def test_the_older_message_is_sent_once_a_second() -> None:
+    copter = SimulatedCopter(boot_time_s=0.0, unsupported_commands=[MavCmd.DO_REPOSITION])
+    async with in_the_air(copter=copter) as flight:
+        await flight.vehicle.go_to(flight.vehicle.position.value.offset(north_m=40))
+        times = flight.wire.times(m.SetPositionTargetGlobalInt)
+    gaps = [later - earlier for earlier, later in itertools.pairwise(times)]
+    assert len(gaps) > 3
+    assert all(1.0 <= gap < 1.3 for gap in gaps)
+
+
+async def test_on_the_ground_it_goes_nowhere(grounded: Flight) -> None:
+    await grounded.vehicle.set_mode("GUIDED")
+    await grounded.vehicle.arm()
+    assert grounded.vehicle.landed_state.value == 1
+    with pytest.raises(OperationRejected, match=r"on the ground: take_off\(\) first; nothing was sent"):
+        await grounded.vehicle.go_to(grounded.vehicle.position.value.offset(north_m=10))
+    assert not grounded.wire.commands(MavCmd.DO_REPOSITION)
+
+
+# ------------------------------------------------------------------------------- refusals
+
+
+async def test_a_rover_does_not_take_off() -> None:
+    async with simulated_link(SimulatedRover(boot_time_s=1.0)) as link, connect(link) as vehicle:
+        with pytest.raises(NotSupported, match="take_off: Rover cannot take off"):
+            await vehicle.take_off(5.0)
+
+
+async def test_a_reboot_says_why_it_is_none(flying: Flight) -> None:
+    with pytest.raises(OperationRejected, match="reboot: the vehicle is armed; nothing was sent"):
+        await flying.vehicle.reboot()
+
+
+async def test_being_armed_is_waited_for_ten_seconds(grounded: Flight) -> None:
+    grounded.copter.faults.refuse(MavCmd.COMPONENT_ARM_DISARM, MavResult.ACCEPTED)
+    with pytest.raises(OperationTimeout, match=r"^arm\(\): not done within 10 s"):
+        await grounded.vehicle.arm()
+
+
+async def test_px4_is_told_to_hold_when_no_set_point_comes_after_entering() -> None:
+    async with open_px4() as flight:
+        await flight.take_off()
+        with pytest.raises(SetpointStreamStopped, match="no new set-point came for"):
+            async with flight.vehicle.guided.velocity(valid_for_s=1.0):
+                await anyio.sleep(5.0)
 
 
 # ---------------------------------------------------------------------- left in a silence

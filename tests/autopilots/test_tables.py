@@ -1,0 +1,223 @@
+"""Double entry: what is told of each autopilot is told here a second time, so that no slip of a digit goes unseen."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from aerokit.autopilots import Autopilot, ModeTable, Reposition, SetpointRules, ardupilot_modes, autopilot_for
+from aerokit.autopilots.health import ESTIMATES, SENSORS, names_of
+from aerokit.autopilots.px4 import MODES, px4_custom_mode
+from aerokit.autopilots.streams import ARDUPILOT_GROUPS, DEFAULT_RATES_HZ, subscription_rate_hz
+from aerokit.autopilots.version import version_text
+from aerokit.mavlink import enums, messages
+from aerokit.mavlink.messages import Heartbeat
+
+# ------------------------------------------------------------------------------------- modes
+
+SPELT_OTHERWISE = {
+    "FLY_BY_WIRE_A": "FBWA",
+    "FLY_BY_WIRE_B": "FBWB",
+    "LOITER_ALT_QLAND": "LOITERALTQLAND",
+    "INITIALIZING": "INITIALISING",
+    "MOTORDETECT": "MOTOR_DETECT",
+    "SERVO_TEST": "SERVOTEST",
+}
+NOT_OF_THE_STANDARD = {
+    ("CopterMode", 8): "POSITION",
+    ("CopterMode", 10): "OF_LOITER",
+    ("CopterMode", 29): "RATE_ACRO",
+    ("RoverMode", 2): "LEARNING",
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "table"),
+    [
+        ("CopterMode", ardupilot_modes.COPTER),
+        ("PlaneMode", ardupilot_modes.PLANE),
+        ("RoverMode", ardupilot_modes.ROVER),
+        ("SubMode", ardupilot_modes.SUB),
+        ("TrackerMode", ardupilot_modes.TRACKER),
+    ],
+)
+def test_modes_of_ardupilot_are_those_of_the_standard(name: str, table: ModeTable) -> None:
+    theirs = {each.value: SPELT_OTHERWISE.get(each.name, each.name) for each in getattr(enums, name)} | {
+        number: text for (kind, number), text in NOT_OF_THE_STANDARD.items() if kind == name
+    }
+    assert dict(table.numbers) == theirs
+
+
+def test_modes_of_px4() -> None:
+    main = "MANUAL ALTCTL POSCTL AUTO ACRO OFFBOARD STABILIZED RATTITUDE SIMPLE TERMINATION ALTITUDE_CRUISE"
+    auto = "READY TAKEOFF LOITER MISSION RTL LAND RTGS FOLLOWME PRECLAND VTOL_TAKEOFF"
+    expected = {px4_custom_mode(number): name for number, name in enumerate(main.split(), 1)}
+    del expected[px4_custom_mode(4)]
+    expected |= {4 << 16 | number << 24: name for number, name in enumerate(auto.split(), 1)}
+    expected |= {4 << 16 | 10 + number << 24: f"EXTERNAL{number}" for number in range(1, 9)}
+    expected |= {3 << 16 | 1 << 24: "ORBIT", 3 << 16 | 2 << 24: "POSITION_SLOW"}
+    assert dict(MODES.numbers) == expected
+    px4 = of(12, 2)
+    for sub, is_external in ((10, False), (11, True), (18, True), (19, False)):
+        mode = px4.mode(px4_custom_mode(4, sub), 1, {px4_custom_mode(4, sub): "Mine"})
+        assert (mode.name == "Mine") is (is_external or sub == 19)  # 19 has no name of its own
+        assert px4.learn_mode_name(px4_custom_mode(4, sub), "Mine") == (None if sub == 10 else "Mine")
+
+
+# -------------------------------------------------------------------------------------- bits
+
+
+def test_bits_have_their_names() -> None:
+    assert list(SENSORS) == [1 << bit for bit in range(31)]
+    assert list(ESTIMATES) == [1 << bit for bit in range(10)]
+    assert names_of(0x8000_0000 | 4 | 0x0200_0000, SENSORS) == ("compass", "battery")
+
+
+@pytest.mark.parametrize(
+    ("kind", "suffix"),
+    [
+        (0, "-dev"),
+        (63, "-dev"),
+        (64, "-alpha"),
+        (127, "-alpha"),
+        (128, "-beta"),
+        (191, "-beta"),
+        (192, "-rc"),
+        (254, "-rc"),
+        (255, ""),
+    ],
+)
+def test_kinds_of_versions_begin_at_their_numbers(kind: int, suffix: str) -> None:
+    assert version_text(0x0102_0300 | kind) == (f"1.2.3{suffix}", (1, 2, 3))
+
+
+# ------------------------------------------------------------------------------------ streams
+
+
+def test_default_rates() -> None:
+    by_rate: dict[float, set[str]] = {}
+    for name, hz in DEFAULT_RATES_HZ.items():
+        by_rate.setdefault(hz, set()).add(name)
+    assert by_rate == {
+        10.0: {"Attitude", "GlobalPositionInt", "LocalPositionNed"},
+        5.0: {"VfrHud", "ExtendedSysState", "DistanceSensor"},
+        2.0: {"SysStatus", "GpsRawInt", "EkfStatusReport", "EstimatorStatus", "RcChannels", "ServoOutputRaw"},
+        1.0: {"BatteryStatus", "MissionCurrent", "SystemTime", "Vibration", "Wind", "WindCov", "CurrentMode"},
+    }
+    rates = [subscription_rate_hz(name) for name in ("Attitude", "RawImu", "Odometry", "StatusText")]
+    assert rates == [10.0, 4.0, 4.0, None]
+
+
+def test_every_stream_group_has_its_number() -> None:
+    first_of = {
+        1: messages.RawImu,
+        2: messages.SysStatus,
+        3: messages.ServoOutputRaw,
+        4: messages.RcChannelsScaled,
+        6: messages.LocalPositionNed,
+        10: messages.EscTelemetry1To4,
+        11: messages.VfrHud,
+        12: messages.Vibration,
+    }
+    assert {ARDUPILOT_GROUPS[message.ID]: message for message in first_of.values()} == first_of
+    assert set(ARDUPILOT_GROUPS.values()) == set(first_of)
+
+
+# ------------------------------------------------------------------------------------- habits
+
+
+def of(autopilot: int, vehicle_type: int) -> Autopilot:
+    return autopilot_for(Heartbeat(vehicle_type, autopilot, 0, 0, 3))
+
+
+UNKNOWN: dict[str, Any] = {
+    **dict.fromkeys(("changes_speed", "completes_at_home", "condition_yaw", "has_parameter_hash"), False),
+    **dict.fromkeys(("has_upper_case_parameters", "home_is_item_0", "judges_by_mode"), False),
+    **dict.fromkeys(("lands_after_return", "logs_by_messages", "mission_starts_by_command"), False),
+    **dict.fromkeys(("repeats_item_reached", "runs_prearm_checks", "sends_mission_requests_float"), False),
+    **dict.fromkeys(("sets_current_by_command", "silent_without_logs", "stays_on_the_ground"), False),
+    **dict.fromkeys(("takes_file_sessions", "tells_mission_checksum", "writes_partial_missions"), False),
+    "arrival_radius_m": 2.0,
+    "first_log_id": 0,
+    "parameter_interval_s": None,
+    "reposition": None,
+    "mission_download_window": 1,
+    "mission_upload_window": 1,
+    "replaced_as_they_come": {0, 1, 2},
+    "unknown_currents_ca": {-1},
+    "landing_ends_in": None,
+    "reposition_purpose": "setpoint",
+    "setpoints": SetpointRules(False, False, False, False, False, False, 1.0, 3.0, False, False),
+}
+ARDUPILOT = UNKNOWN | {
+    **dict.fromkeys(("completes_at_home", "has_upper_case_parameters", "home_is_item_0"), True),
+    **dict.fromkeys(("logs_by_messages", "mission_starts_by_command", "runs_prearm_checks"), True),
+    **dict.fromkeys(("sends_mission_requests_float", "sets_current_by_command"), True),
+    **dict.fromkeys(("takes_file_sessions", "writes_partial_missions"), True),
+    "first_log_id": 1,
+    "mission_download_window": 10,
+    "mission_upload_window": 6,
+    "parameter_interval_s": 0.02,
+    "replaced_as_they_come": {0, 2},
+}
+STEERED = ARDUPILOT | {
+    "changes_speed": True,
+    "reposition": Reposition(relative_altitude=True, yaw=False, speed=False, armed_only=False),
+}
+COPTER = STEERED | {
+    "condition_yaw": True,
+    "lands_after_return": True,
+    "setpoints": SetpointRules(True, True, True, True, True, False, 1.0, 3.0, True, False),
+}
+PLANE = STEERED | {
+    "arrival_radius_m": 90.0,
+    "setpoints": SetpointRules(False, False, False, False, True, False, 1.0, 3.0, False, False),
+}
+ROVER = STEERED | {
+    "arrival_radius_m": 4.0,
+    "stays_on_the_ground": True,
+    "setpoints": SetpointRules(True, True, True, False, True, False, 1.0, 3.0, True, False),
+}
+SUB = STEERED | {
+    "condition_yaw": True,
+    "landing_ends_in": "ALT_HOLD",
+    "setpoints": SetpointRules(True, True, True, False, True, False, 1.0, 3.0, False, True),
+}
+PX4 = UNKNOWN | {
+    **dict.fromkeys(("changes_speed", "has_parameter_hash", "judges_by_mode", "lands_after_return"), True),
+    **dict.fromkeys(("repeats_item_reached", "silent_without_logs", "tells_mission_checksum"), True),
+    "mission_upload_window": 6,
+    "replaced_as_they_come": set(),
+    "unknown_currents_ca": {-1, -100},
+    "reposition": Reposition(relative_altitude=False, yaw=True, speed=True, armed_only=True),
+    "reposition_purpose": "hold",
+    "setpoints": SetpointRules(True, True, True, True, True, True, 2.0, 0.5, False, False),
+}
+PX4_DOWN = PX4 | {"lands_after_return": False}
+
+
+@pytest.mark.parametrize(
+    ("autopilot", "vehicle_type", "firmware", "habits"),
+    [
+        (0, 2, "unknown", UNKNOWN),
+        (3, 200, "ArduPilot", ARDUPILOT),
+        *((3, kind, "ArduCopter", COPTER) for kind in (2, 3, 4, 13, 14, 15, 29, 35)),
+        *((3, kind, "ArduPlane", PLANE) for kind in (1, 19, 20, 21, 22, 23, 24, 25)),
+        *((3, kind, "Rover", ROVER) for kind in (10, 11)),
+        (3, 12, "ArduSub", SUB),
+        (3, 7, "Blimp", ARDUPILOT),
+        (3, 5, "AntennaTracker", ARDUPILOT),
+        (3, 18, "ArduPilot", ARDUPILOT),
+        (3, 26, "ArduPilot", ARDUPILOT),
+        (12, 2, "PX4", PX4),
+        (12, 22, "PX4", PX4),
+        (12, 1, "PX4", PX4_DOWN | {"arrival_radius_m": 120.0}),
+        *((12, kind, "PX4", PX4_DOWN | {"stays_on_the_ground": True}) for kind in (10, 11)),
+        (12, 12, "PX4", PX4_DOWN),
+    ],
+)
+def test_habits(autopilot: int, vehicle_type: int, firmware: str, habits: dict[str, Any]) -> None:
+    each = of(autopilot, vehicle_type)
+    assert each.firmware == firmware
+    assert {name: getattr(each, name) for name in habits} == habits
