@@ -149,7 +149,7 @@ def soak(session: nox.Session) -> None:
 def mutants(session: nox.Session) -> None:
     """Change one thing at a time: does a test notice? `nox -s mutants -- [PATH …] [--sample N] [--seed S]`; an hour."""
     session.install("-e", ".[test]", "coverage>=7.6", "cosmic-ray>=8.3")
-    session.run("nice", "python", "tests/mutants/run.py", *session.posargs, external=True)
+    session.run("nice", "python", "tests/mutants/mutate.py", *session.posargs, external=True)
 
 
 @nox.session

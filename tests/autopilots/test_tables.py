@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import pytest
@@ -12,6 +13,7 @@ from aerokit.autopilots.px4 import MODES, px4_custom_mode
 from aerokit.autopilots.streams import ARDUPILOT_GROUPS, DEFAULT_RATES_HZ, subscription_rate_hz
 from aerokit.autopilots.version import version_text
 from aerokit.mavlink import enums, messages
+from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import Heartbeat
 
 # ------------------------------------------------------------------------------------- modes
@@ -92,6 +94,51 @@ def test_kinds_of_versions_begin_at_their_numbers(kind: int, suffix: str) -> Non
     assert version_text(0x0102_0300 | kind) == (f"1.2.3{suffix}", (1, 2, 3))
 
 
+@pytest.mark.parametrize(
+    ("autopilot", "needed"),
+    [
+        (12, {1: "attitude", 2: "horizontal velocity", 4: "vertical velocity", 32: "absolute altitude"}),
+        (3, {1: "attitude", 32: "absolute altitude"}),
+        (0, {1: "attitude", 32: "absolute altitude"}),
+    ],
+)
+def test_each_estimate_that_is_needed_is_named_when_it_lacks(autopilot: int, needed: dict[int, str]) -> None:
+    for bit in (1, 2, 4, 8, 32, 64, 128, 256):
+        missing = of(autopilot, 2).missing_estimates(0x3FF & ~bit)
+        assert missing == ((needed[bit],) if bit in needed else ())
+
+
+def test_the_summary_of_the_checks_is_its_own_bit_alone() -> None:
+    for autopilot in (3, 12):
+        each = of(autopilot, 2)
+        assert each.failing_sensors(0x7FFF_FFFF, 0x7FFF_FFFF, 0x7FFF_FFFF & ~(1 << 28 | 1)) == ("gyroscope",)
+        assert each.prearm_checks_pass(0x7FFF_FFFF, 0x7FFF_FFFF, 0x7FFF_FFFF & ~(1 << 28)) is False
+        assert each.prearm_checks_pass(1 << 28, 1 << 28, 1 << 28) is True
+
+
+# ---------------------------------------------------------------------------------- take-off
+
+
+def test_take_off_asks_for_an_altitude_and_nothing_else() -> None:
+    for vehicle_type in (2, 20):
+        plan = of(3, vehicle_type).take_off(7.0, None)
+        assert plan is not None
+        assert plan.params == (0, 0, 0, 0, 0, 0, 7.0)
+    plan = of(12, 2).take_off(7.0, 500.0)
+    assert plan is not None
+    assert [param for param in plan.params if not math.isnan(param)] == [0, 0, 507.0]
+    assert [place for place, param in enumerate(plan.params) if math.isnan(param)] == [0, 3, 4, 5]
+
+
+@pytest.mark.parametrize(
+    ("autopilot", "vehicle_type", "name"),
+    [(3, 2, "GUIDED"), (3, 1, "FBWA"), (3, 10, "HOLD"), (12, 2, "LOITER"), (3, 12, None), (0, 2, None)],
+)
+def test_where_it_is_armed(autopilot: int, vehicle_type: int, name: str | None) -> None:
+    mode = of(autopilot, vehicle_type).mode_to_arm_in()
+    assert (None if mode is None else mode.name) == name
+
+
 # ------------------------------------------------------------------------------------ streams
 
 
@@ -110,7 +157,7 @@ def test_default_rates() -> None:
 
 
 def test_every_stream_group_has_its_number() -> None:
-    first_of = {
+    first_of: dict[int, type[Message]] = {
         1: messages.RawImu,
         2: messages.SysStatus,
         3: messages.ServoOutputRaw,

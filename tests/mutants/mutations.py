@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-import parso
 from cosmic_ray.ast import ast_nodes, get_ast
 from cosmic_ray.mutating import mutate_code
 from cosmic_ray.operators import boolean_replacer as booleans
@@ -39,7 +38,7 @@ class RemoveStatement(Operator):  # type: ignore[misc]
             yield node.start_pos, node.children[0].end_pos
 
     def mutate(self, node: Any, index: int) -> Any:
-        return parso.parse(f"{node.get_first_leaf().prefix}pass\n")
+        return get_ast(f"{node.get_first_leaf().prefix}pass\n")
 
     @classmethod
     def examples(cls) -> tuple[Example, ...]:

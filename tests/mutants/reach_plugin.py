@@ -46,4 +46,5 @@ def pytest_sessionfinish() -> None:
         for line, contexts in data.contexts_by_lineno(path).items():
             for context in set(contexts) - failed:
                 lines.setdefault(context, {}).setdefault(name, []).append(line)
-    RESULT.write_text(json.dumps({"seconds": seconds, "lines": lines}))
+    passed = {test: took for test, took in seconds.items() if test not in failed}
+    RESULT.write_text(json.dumps({"seconds": passed, "lines": lines}))

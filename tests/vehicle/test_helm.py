@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -203,27 +203,31 @@ def test_after_an_order_of_the_programs_own_any_mode_may_come_for_three_seconds(
     assert order.end == end
 
 
-def test_a_mode_is_in_doubt_until_the_answer_is_known() -> None:
-    helm = Stage().helm
-    with helm.changing_mode():
-        assert helm.mode_is_in_doubt
-    assert not helm.mode_is_in_doubt
-    with pytest.raises(CommandRejected), helm.changing_mode():
-        raise CommandRejected("no", command=176, result=4)
-    assert not helm.mode_is_in_doubt
-    assert helm.mode_settles_at == -math.inf
-    with pytest.raises(CommandTimeout), helm.changing_mode():
-        raise CommandTimeout("no answer")
-    assert helm.mode_is_in_doubt
-    assert helm.mode_settles_at == 1.0 + MODE_GRACE_S
+@pytest.mark.parametrize(
+    ("error", "in_doubt", "settles_at"),
+    [
+        (None, False, -math.inf),
+        (CommandRejected("no", command=176, result=4), False, -math.inf),
+        (CommandTimeout("no answer"), True, 1.0 + MODE_GRACE_S),
+    ],
+)
+def test_a_mode_is_in_doubt_until_the_answer_is_known(
+    error: Exception | None, in_doubt: bool, settles_at: float
+) -> None:
+    helm, seen = Stage().helm, list[bool]()
+    with nullcontext() if error is None else pytest.raises(type(error)), helm.changing_mode():
+        seen.append(helm.mode_is_in_doubt)
+        if error is not None:
+            raise error
+    assert [*seen, helm.mode_is_in_doubt] == [True, in_doubt]
+    assert helm.mode_settles_at == settles_at
 
 
 def test_what_it_does_is_known_for_two_and_a_half_seconds() -> None:
     stage = Stage()
-    stage.now += KNOWN_S
-    assert stage.helm.is_known
-    stage.now += 0.1
-    assert not stage.helm.is_known
+    for later, known in ((KNOWN_S, True), (0.1, False)):
+        stage.now += later
+        assert stage.helm.is_known is known
     assert not Stage(mode=None).helm.is_known
 
 

@@ -306,6 +306,23 @@ async def test_in_a_silence_nothing_is_sent_until_the_vehicle_is_heard() -> None
         assert flight.wire.mode_orders() == [17]
 
 
+async def test_who_took_it_in_a_silence_keeps_it() -> None:
+    async with in_the_air() as flight:
+        with anyio.CancelScope() as scope:
+            async with anyio.create_task_group() as tasks:
+                tasks.start_soon(flight.vehicle.go_to, flight.vehicle.position.value.offset(north_m=500))
+                await anyio.sleep(2.0)
+                flight.copter.faults.silent = True
+                await anyio.sleep(5.0)
+                scope.cancel()
+        flight.wire.forget()
+        flight.pilot_takes_over()
+        flight.copter.faults.silent = False
+        await anyio.sleep(4.0)
+        assert not flight.wire.mode_orders()
+        assert flight.vehicle.mode_name == "LOITER"
+
+
 async def test_an_order_to_arm_without_an_answer_is_told_at_the_end(caplog: pytest.LogCaptureFixture) -> None:
     async with open_flight() as flight:
         await flight.vehicle.wait_ready()

@@ -191,10 +191,9 @@ def test_silence_is_told_once_after_three_and_a_half_seconds_and_its_end() -> No
         stage.at = at
         stage.watch.check()
         assert stage.watch.is_silent is silent
-    stage.hear(HEARTBEAT, component_id=154)
-    assert stage.watch.is_silent
-    stage.hear(HEARTBEAT)
-    assert not stage.watch.is_silent
+    for component_id, silent in ((154, True), (1, False)):
+        stage.hear(HEARTBEAT, component_id=component_id)
+        assert stage.watch.is_silent is silent
     assert (stage.told()[VehicleSilent], stage.told()[VehicleBack]) == (1, 1)
     (back,) = [each for each in stage.bus.published if isinstance(each, VehicleBack)]
     assert back.silent_for_s == 9.0
