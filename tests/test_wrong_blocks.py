@@ -11,8 +11,11 @@ from served_copter import served_copter
 import aerokit
 import aerokit.sync
 
-ASYNCHRONOUS = {"connect": aerokit.connect, "open_connection": aerokit.open_connection}
-BLOCKING = {"connect": aerokit.sync.connect, "open_connection": aerokit.sync.open_connection}
+ASYNCHRONOUS: dict[str, Any] = {"connect": aerokit.connect, "open_connection": aerokit.open_connection}
+BLOCKING: dict[str, Any] = {
+    "connect": aerokit.sync.connect,
+    "open_connection": aerokit.sync.open_connection,
+}
 
 
 def threads() -> list[str]:

@@ -90,12 +90,22 @@ def test_a_dropped_vehicle_leaves_its_place_to_the_next(
     assert told == [("dronekit", "WARNING", f"the vehicle at {address} is closed: {CLOSED}")]
 
 
+def _download(vehicle: dronekit.Vehicle) -> None:
+    vehicle.commands.download()
+    vehicle.commands.wait_ready()
+
+
+def _order(vehicle: dronekit.Vehicle) -> None:
+    vehicle.mode = "ALT_HOLD"
+    vehicle.wait_for_mode("STABILIZE")
+
+
 USES: dict[str, Callable[[dronekit.Vehicle], object]] = {
     "everything": lambda vehicle: vehicle.wait_ready(True, timeout=LIMIT_S),
     "aio and sync": lambda vehicle: (vehicle.aio.mode.value, vehicle.sync.mode.value),
     "inbox": lambda vehicle: vehicle._master.recv_match(type="HEARTBEAT", blocking=True, timeout=LIMIT_S),
-    "mission": lambda vehicle: (vehicle.commands.download(), vehicle.commands.wait_ready()),
-    "orders": lambda vehicle: (setattr(vehicle, "mode", "ALT_HOLD"), vehicle.wait_for_mode("STABILIZE")),
+    "mission": _download,
+    "orders": _order,
     "refused": lambda vehicle: vehicle.simple_takeoff(10),
 }
 

@@ -243,9 +243,9 @@ def test_a_sending_ends_when_its_mode_is_told_whatever_comes_then() -> None:
     stage = Stage()
     each = sending(stage, modes=(GUIDED,))
     stage.tell(LOITER)
-    assert (each.end, each.was_done) == ("", False)
+    assert (each.end, each.has_worked) == ("", False)
     stage.tell(GUIDED)
-    assert (each.end, each.was_done) == ("its effect was told", True)
+    assert (each.end, each.has_worked) == ("its effect was told", True)
     stage.tell(RTL)
     assert each.end == "its effect was told"
 
@@ -257,15 +257,16 @@ def test_a_sending_ends_when_it_is_armed_as_ordered() -> None:
         stage.tell(LOITER, armed=not armed)
         assert each.end == ""
         stage.tell(LOITER, armed=armed)
-        assert each.was_done
+        assert each.has_worked
 
 
 def test_what_is_so_already_tells_nothing_of_an_effect() -> None:
     stage = Stage(GUIDED)
     each = sending(stage, modes=(GUIDED, LOITER), armed=True)
     stage.tell(GUIDED)
+    assert not each.has_worked
     stage.tell(LOITER)
-    assert not each.was_done
+    assert each.has_worked
 
 
 def test_a_sending_ends_with_its_order_and_by_its_own_sign() -> None:

@@ -25,9 +25,9 @@ class Order:
     """One order of the program, from when it is given until it is done, overruled or taken over.
 
     ``mode_before`` is the mode that it was given in, ``modes`` are those that it may bring about, ``expected`` others
-    that may still be told because the program had ordered them just before, and until ``settles_at`` in any order; until
-    ``any_until`` every mode may, since the program had sent an order of its own making. Any other mode is a pilot's or
-    a failsafe's doing.
+    that may still be told because the program had ordered them just before, and until ``settles_at`` in any order;
+    until ``any_until`` every mode may, since the program had sent an order of its own making. Any other mode is a
+    pilot's or a failsafe's doing.
     """
 
     def __init__(
