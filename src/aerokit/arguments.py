@@ -57,18 +57,18 @@ def checked(function: FunctionT) -> FunctionT:
     if inspect.iscoroutinefunction(function):
 
         @wraps(function)
-        async def checking(*args: Any, **kwargs: Any) -> Any:
+        async def awaiting(*args: Any, **kwargs: Any) -> Any:
             rules.check(args, kwargs)
             return await function(*args, **kwargs)
 
-    else:
+        return awaiting  # type: ignore[return-value]  # of the same signature
 
-        @wraps(function)
-        def checking(*args: Any, **kwargs: Any) -> Any:
-            rules.check(args, kwargs)
-            return function(*args, **kwargs)
+    @wraps(function)
+    def calling(*args: Any, **kwargs: Any) -> Any:
+        rules.check(args, kwargs)
+        return function(*args, **kwargs)
 
-    return checking  # type: ignore[return-value]  # of the same signature
+    return calling  # type: ignore[return-value]  # the same
 
 
 class _Rules:

@@ -32,7 +32,7 @@ def main() -> int:
     mutants = list(_sample(_sources(options.paths), options.sample, random.Random(options.seed)))
     reach = measure(path for name in options.tests for path in _test_files(name))
     explained = {(e["path"], e["old"], e["new"]) for e in json.loads(EQUIVALENT.read_text())}
-    counts = dict.fromkeys((NOTICED, TOO_LONG, SURVIVED, "explained"), 0)
+    counts: dict[str, int] = dict.fromkeys((NOTICED, TOO_LONG, SURVIVED, "explained"), 0)
     with tempfile.TemporaryDirectory() as folder, Trials(Path(folder)) as trials:
         _check_unchanged(trials, reach)
         for number, (mutation, source, changed) in enumerate(mutants, 1):

@@ -82,7 +82,7 @@ def test_it_is_not_sent_again_when_it_stands_no_more_whatever_was_told() -> None
 
 
 def test_into_a_silence_it_is_sent_once_and_ends_in_its_time() -> None:
-    machine, looked = order(Told(), attempts=3), 0
+    machine, looked, now = order(Told(), attempts=3), 0, 0.0
     while not machine.done:
         assert machine.deadline is not None
         assert machine.deadline <= 3.0

@@ -113,11 +113,9 @@ def assignment(text: str) -> tuple[str, int | float]:
     """``NAME=VALUE``, a parameter and what it may be set to; whole numbers also as 0x1F."""
     name, mark, value = text.partition("=")
     try:
-        number = parse_number(value)
+        number = parse_number(value if mark else "")
     except ValueError:
-        mark = ""
-    if not mark:
-        raise ArgumentTypeError(f"{text!r} is not NAME=VALUE with a finite number")
+        raise ArgumentTypeError(f"{text!r} is not NAME=VALUE with a finite number") from None
     try:
         checked_value(check_name(name), number, ParameterType.REAL32)
     except LocalProtocolError as error:

@@ -74,11 +74,7 @@ def _failed(text: str, code: int) -> int:
 def _parser() -> argparse.ArgumentParser:
     from aerokit import __version__
 
-    parser: argparse.ArgumentParser = Parser(
-        prog="aerokit",
-        description="Control drones over MAVLink.",
-        epilog="Exit codes: 0 done, 1 failed, 2 wrong arguments, 130 interrupted.",
-    )
+    parser = _plain_parser()
     parser.add_argument("--version", action="version", version=f"aerokit {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND", title="commands")
     _add_demo(commands)
@@ -87,6 +83,14 @@ def _parser() -> argparse.ArgumentParser:
         add(commands)
     commands.add_parser(RUN, help="run a DroneKit program unchanged", add_help=False)
     return parser
+
+
+def _plain_parser() -> argparse.ArgumentParser:
+    return Parser(
+        prog="aerokit",
+        description="Control drones over MAVLink.",
+        epilog="Exit codes: 0 done, 1 failed, 2 wrong arguments, 130 interrupted.",
+    )
 
 
 def _add_demo(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

@@ -74,11 +74,13 @@ class HoldingActions(ModeActions):
 
     async def _confirm_hold(self, mode: Mode, order: Order) -> None:
         """What :meth:`_send_hold` has sent is answered, or sent again."""
-        by_mode = DO_SET_MODE, *self.autopilot.mode_order(mode).params
+        by_mode = (DO_SET_MODE, *self.autopilot.mode_order(mode).params)
+        command, *params = STOP_HERE if self._holds_by_reposition else by_mode
         await self._give(
             order,
             self._commands.send_long,
-            *(STOP_HERE if self._holds_by_reposition else by_mode),
+            int(command),
+            *params,
             modes=() if self._holds_by_reposition else (mode,),
             attempt_timeout=ANSWER_S,
             attempts=ATTEMPTS_TO_HOLD,
