@@ -7,7 +7,15 @@ from typing import Any
 
 import pytest
 
-from aerokit.autopilots import Autopilot, ModeTable, Reposition, SetpointRules, ardupilot_modes, autopilot_for
+from aerokit.autopilots import (
+    Autopilot,
+    Mode,
+    ModeTable,
+    Reposition,
+    SetpointRules,
+    ardupilot_modes,
+    autopilot_for,
+)
 from aerokit.autopilots.health import ESTIMATES, SENSORS, names_of
 from aerokit.autopilots.px4 import MODES, px4_custom_mode
 from aerokit.autopilots.streams import ARDUPILOT_GROUPS, DEFAULT_RATES_HZ, subscription_rate_hz
@@ -65,6 +73,13 @@ def test_modes_of_px4() -> None:
         mode = px4.mode(px4_custom_mode(4, sub), 1, {px4_custom_mode(4, sub): "Mine"})
         assert (mode.name == "Mine") is (is_external or sub == 19)  # 19 has no name of its own
         assert px4.learn_mode_name(px4_custom_mode(4, sub), "Mine") == (None if sub == 10 else "Mine")
+
+
+def test_a_mode_is_its_name_and_its_number() -> None:
+    assert Mode("AUTO", 3) == Mode("AUTO", 3, 209)
+    assert Mode("AUTO", 3) != Mode("AUTO", 10)
+    assert Mode("AUTO", 3) != Mode("MISSION", 3)
+    assert Mode("AUTO", 3) != "AUTO"
 
 
 # -------------------------------------------------------------------------------------- bits

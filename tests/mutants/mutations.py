@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import difflib
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,7 +32,7 @@ SWAPS = {
 class RemoveStatement(Operator):  # type: ignore[misc]
     """A call, a change of an object, a raise, a return or a continue that is gone: resends, checks, tables."""
 
-    def mutation_positions(self, node: Any) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:
+    def mutation_positions(self, node: Any) -> Any:
         if node.type == "simple_stmt" and _does_something(node.children[0]):
             yield node.start_pos, node.children[0].end_pos
 
@@ -41,7 +40,7 @@ class RemoveStatement(Operator):  # type: ignore[misc]
         return get_ast(f"{node.get_first_leaf().prefix}pass\n")
 
     @classmethod
-    def examples(cls) -> tuple[Example, ...]:
+    def examples(cls) -> Any:
         return (Example("send(order)\n", "pass\n"),)
 
 
@@ -97,7 +96,8 @@ def mutations_of(path: str, source: str) -> list[Mutation]:
     statements = _statements(source)
     for node in ast_nodes(get_ast(source)):
         for name, operator in OPERATORS.items():
-            for (line, _), _ in operator().mutation_positions(node):
+            positions: Any = operator().mutation_positions(node)
+            for (line, _), _ in positions:
                 if not _is_marker(node):
                     found.append(Mutation(path, name, counts[name], *statements.get(line, ((line,), True))))
                 counts[name] += 1
