@@ -245,13 +245,13 @@ def row_39_wait_ready(stage: Stage) -> Any:
     )
 
 
-@scenario("TimeoutError: wait_ready experienced a timeout after 0.4 seconds. attitude,gps_0", is_slow=True)
+@scenario("TimeoutError: wait_ready experienced a timeout after 2 seconds. attitude,gps_0", is_slow=True)
 def wait_ready_names_of_true(stage: Stage) -> Any:
     missing: set[str] = set()
     stage.vehicle.wait_ready("parameters", "armed", "mode")
     text = caught(
         lambda: stage.vehicle.wait_ready(
-            True, timeout=0.4, still_waiting_callback=missing.update, still_waiting_interval=0.1
+            True, timeout=2, still_waiting_callback=missing.update, still_waiting_interval=0.1
         )
     )
     return f"{text} {','.join(sorted(missing))}"

@@ -17,7 +17,7 @@ from order_table import ARM, REPOSITION, ROWS, SET_MODE, Row
 
 from aerokit.errors import CommandTimeout, OperationRejected
 
-SEEDS = int(os.environ.get("AEROKIT_ORDER_SEEDS", "3"))
+SEEDS = int(os.environ.get("AEROKIT_ORDER_SEEDS", "2"))
 BY_NAME = {row.name: row for row in ROWS}
 BOTH = ("ardupilot", "px4")
 
