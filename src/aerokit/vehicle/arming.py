@@ -19,6 +19,7 @@ from aerokit.errors import (
 )
 from aerokit.runtime.cancellation import Cancellation
 from aerokit.vehicle.checks import check_seconds
+from aerokit.vehicle.core import COMPONENT_ARM_DISARM
 from aerokit.vehicle.holding import HoldingActions
 from aerokit.vehicle.progress import await_progress
 
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
 __all__ = ["ArmingActions"]
 
 PREFLIGHT_REBOOT_SHUTDOWN = 246
-COMPONENT_ARM_DISARM = 400
 FORCE = 21196
 FORCE_REBOOT = 20190226
 SAID_AGAIN_S = 35.0

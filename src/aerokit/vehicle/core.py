@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from aerokit.runtime.link_state import LinkState
     from aerokit.vehicle.orders import Order
 
-__all__ = ["VehicleCore"]
+__all__ = ["COMPONENT_ARM_DISARM", "VehicleCore"]
 
 ItemT = TypeVar("ItemT", bound="Message | Event")
 MessageT = TypeVar("MessageT", bound=Message)

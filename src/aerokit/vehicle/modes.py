@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from aerokit.arguments import checks_arguments
 from aerokit.errors import CommandRejected, CommandTimeout, NotSupported, OperationRejected
 from aerokit.vehicle.checks import check_seconds
-from aerokit.vehicle.helm import MODE_GRACE_S
+from aerokit.vehicle.helm import KNOWN_S, MODE_GRACE_S
 from aerokit.vehicle.progress import await_progress
 from aerokit.vehicle.state import VehicleState
 
@@ -25,8 +25,6 @@ DO_SET_MODE = 176
 DO_REPOSITION = 192
 CHANGE_MODE = 1
 RESULT_UNSUPPORTED = 3
-FRESH_MODE_S = 2.5
-"""An older mode is no reason to leave an order out."""
 
 
 @checks_arguments
@@ -156,8 +154,8 @@ class ModeActions(VehicleState):
         return latest is not None and latest.custom_mode == mode.custom_mode
 
     async def _ensure_mode(self, mode: Mode, order: Order) -> None:
-        """Change the mode, unless it was told lately that the vehicle is in it."""
-        is_told = self._is_in(mode) and self.telemetry.mode.age <= FRESH_MODE_S
+        """Change the mode, unless it was told lately that the vehicle is in it: an older mode is no reason."""
+        is_told = self._is_in(mode) and self.telemetry.mode.age <= KNOWN_S
         if self._helm.mode_is_in_doubt or not is_told:
             await self._change_mode(mode, order)
 

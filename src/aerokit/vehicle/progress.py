@@ -13,12 +13,12 @@ if TYPE_CHECKING:
     from aerokit.position import Position
     from aerokit.vehicle.core import VehicleCore
 
-__all__ = ["LONGEST_SILENCE_S", "Stillness", "await_progress"]
+__all__ = ["LONGEST_SILENCE_S", "OLD_POSITION_S", "Stillness", "await_progress"]
 
 TICK_S = 0.25
 """Silence brings no message, so it is looked for this often."""
 LONGEST_SILENCE_S = 10.0
-FRESH_S = 2.0
+OLD_POSITION_S = 2.0
 STILL_S, MOVED_M = 12.0, 0.3
 
 
@@ -93,7 +93,7 @@ class Stillness:
         """How long it has not moved, in words; None: it moves, or that is not known."""
         now, cell = self._vehicle.connection.now(), self._vehicle.telemetry.position
         here = cell.latest
-        if here is None or cell.age > FRESH_S:
+        if here is None or cell.age > OLD_POSITION_S:
             self._from = None
         elif self._from is None or _metres(here, self._from) > MOVED_M:
             self._from, self._since = here, now

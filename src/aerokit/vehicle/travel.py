@@ -20,7 +20,7 @@ from aerokit.mavlink.messages import SetPositionTargetGlobalInt
 from aerokit.vehicle.arming import ArmingActions
 from aerokit.vehicle.checks import check_range, check_seconds
 from aerokit.vehicle.modes import CHANGE_MODE, DO_REPOSITION, RESULT_UNSUPPORTED
-from aerokit.vehicle.progress import LONGEST_SILENCE_S, Stillness, await_progress
+from aerokit.vehicle.progress import LONGEST_SILENCE_S, OLD_POSITION_S, Stillness, await_progress
 from aerokit.vehicle.values import Position
 
 if TYPE_CHECKING:
@@ -38,7 +38,6 @@ MAV_FRAME_GLOBAL_RELATIVE_ALT_INT = 6
 POSITION_ONLY = 0x0DF8
 LANDED_ON_GROUND = 1
 RESEND_S = 1.0
-OLD_POSITION_S = 2.0
 
 
 @checks_arguments
