@@ -36,7 +36,8 @@ class Case:
     autopilot: str
     weather: Weather
     pilot_at: float | None = None
-    """When somebody else acts: turns the mode switch; on the ground, disarms."""
+    """When somebody else acts: turns the mode switch; on the ground, disarms, unless ``by_switch``."""
+    by_switch: bool = False
     failsafe_at: float | None = None
     """When the vehicle returns by itself."""
     station_failsafe: bool = False
@@ -92,6 +93,7 @@ def random_case(row: Row, autopilot: str, seed: int) -> Case:
         failsafe_at=round(dice.uniform(0.05, 6.0), 2) if 0.45 <= happens < 0.6 else None,
         station_failsafe=dice.random() < 0.5,
         cancel_at=round(dice.uniform(0.05, 12.0), 2) if dice.random() < 0.25 else None,
+        by_switch=dice.random() < 0.5,
     )
 
 
@@ -123,6 +125,12 @@ def take_over(vehicle: Simulated) -> None:
     """The pilot turns the mode switch, the sticks in the middle."""
     if isinstance(vehicle, SimulatedCopter):
         vehicle.rc[2] = 1500
+    turn_switch(vehicle)
+
+
+def turn_switch(vehicle: Simulated) -> None:
+    """To a mode that is flown by hand."""
+    if isinstance(vehicle, SimulatedCopter):
         vehicle.set_mode(CopterMode.ALT_HOLD)
     else:
         vehicle.switch_to(POSITION)
@@ -136,9 +144,11 @@ def _return(vehicle: Simulated) -> None:
 
 
 def _act(case: Case, vehicle: Simulated) -> None:
-    """Another station disarms what stands on the ground; a pilot takes what flies."""
+    """Another station disarms what stands on the ground, or changes its mode; a pilot takes what flies."""
     if case.row.place == "ground":
-        if isinstance(vehicle, SimulatedCopter):
+        if case.by_switch:
+            turn_switch(vehicle)
+        elif isinstance(vehicle, SimulatedCopter):
             vehicle.arming.disarm()
         else:
             vehicle.arming.disarm("another station")
@@ -150,9 +160,11 @@ def _set_up(case: Case) -> Simulated:
     if case.autopilot == "px4":
         px4 = SimulatedPx4(boot_time_s=1.0)
         px4.parameters["NAV_DLL_ACT"] = 2.0 * case.station_failsafe
+        px4.parameters["COM_DISARM_PRFLT"] = 0.0  # what stays armed is seen
         return px4
     copter = SimulatedCopter(boot_time_s=0.0)
     copter.parameters["FS_GCS_ENABLE"] = 1.0 * case.station_failsafe
+    copter.parameters["DISARM_DELAY"] = 0.0
     return copter
 
 

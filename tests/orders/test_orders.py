@@ -106,3 +106,11 @@ def test_an_order_to_arm_that_comes_late_is_taken_back(autopilot: str) -> None:
     assert isinstance(flown.error, CommandTimeout)
     assert "may still be carried out" in str(flown.error)
     assert not flown.is_armed_at_end
+
+
+def test_an_order_to_arm_that_comes_late_is_taken_back_from_somebody_else_too() -> None:
+    """HEARTBEAT comes through and tells another mode while the order waits on its way."""
+    weather = Weather(stall=(0.0, 5.0))
+    flown = fly(Case(BY_NAME["arm"], "ardupilot", weather, pilot_at=0.5, by_switch=True))
+    assert isinstance(flown.error, OperationRejected)
+    assert not flown.is_armed_at_end

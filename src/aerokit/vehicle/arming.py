@@ -83,9 +83,9 @@ class ArmingActions(HoldingActions):
         """Arm the motors and wait until HEARTBEAT says armed: **propellers may start to turn**.
 
         A vehicle that stands in a mode in which it does not arm (RTL or LAND after a flight, OFFBOARD) is put into
-        another one first. Cancelled, or without an answer, the order may still be carried out: for 15 seconds the
-        vehicle is watched, and disarmed if it arms, as long as the connection is there; a warning of logger
-        "aerokit" says what came of it.
+        another one first. Cancelled, or ended by any error but a refusal, the order may still be carried out: for 15
+        seconds the vehicle is watched, and disarmed if it arms, as long as the connection is there; a warning of
+        logger "aerokit" says what came of it. Who arms it meanwhile by another way is not told apart.
 
         Args:
             mode: where to arm; None: the present mode, or one that ``take_off`` begins in if it cannot be armed there.
@@ -117,7 +117,7 @@ class ArmingActions(HoldingActions):
             except CommandTimeout as error:
                 self._watch_for_late_arming()
                 raise CommandTimeout(f"{error}; {self._may_still_arm()}") from None
-            except (anyio.get_cancelled_exc_class(), OperationTimeout):
+            except (anyio.get_cancelled_exc_class(), AerokitError):
                 self._watch_for_late_arming()
                 raise
 
@@ -213,7 +213,11 @@ class ArmingActions(HoldingActions):
 
     async def _disarm_again(self) -> None:
         armed, since = self.telemetry.armed, self.connection.now()
-        await armed.wait_until(lambda value: value and armed.updated_at > since, description="armed")
+        try:
+            await armed.wait_until(lambda value: value and armed.updated_at > since, description="armed")
+        except AerokitError as error:
+            logger.warning("the link ended while an order to arm may still be carried out: %s", error)
+            return
         logger.warning("the vehicle armed although the order to arm was given up: it is disarmed again")
         with anyio.CancelScope(shield=True):
             try:
