@@ -142,7 +142,9 @@ def soak(session: nox.Session) -> None:
     """Fly, lose the radio, reboot, unplug and plug in again for an hour; nothing may grow: `nox -s soak -- MINUTES`."""
     session.install("-e", ".[test]")
     minutes = session.posargs[0] if session.posargs else "60"
-    session.run("pytest", "-q", "-n", "0", "tests/soak", env={"AEROKIT_SOAK_MINUTES": minutes})
+    # pytest would keep what is logged, which grows
+    options = ("-q", "-n", "0", "-p", "no:logging")
+    session.run("pytest", *options, "tests/soak", env={"AEROKIT_SOAK_MINUTES": minutes})
 
 
 @nox.session
