@@ -91,6 +91,12 @@ def _actions() -> Table:
             _method("arm"), pilot, 0.1, grounded, before=ignored(arm)
         ),
         ("Vehicle.arm", "OperationTimeout"): P(_method("arm", timeout=1.5), grounded, accepted(arm)),
+        ("Vehicle.arm", "HeartbeatTimeout"): later(
+            _method("arm", timeout=30), falls_silent, 1.0, grounded, before=accepted(arm)
+        ),
+        ("Vehicle.disarm", "HeartbeatTimeout"): later(
+            _method("disarm", timeout=30), falls_silent, 1.0, armed, before=accepted(arm)
+        ),
         ("Vehicle.disarm", "CommandRejected"): P(_method("disarm"), airborne),
         ("Vehicle.disarm", "CommandTimeout"): P(_method("disarm"), armed, ignored(arm)),
         ("Vehicle.disarm", "OperationTimeout"): P(_method("disarm", timeout=1.5), armed, accepted(arm)),
@@ -121,6 +127,9 @@ def _actions() -> Table:
         ("Vehicle.setup_signing", "BusyError"): P(_sign_twice, grounded, falls_silent),
         ("Vehicle.set_mode", "LocalProtocolError"): P(_method("set_mode", "NONE")),
         ("Vehicle.set_heading", "LocalProtocolError"): P(_method("set_heading", 999), airborne),
+        ("Vehicle.set_heading", "HeartbeatTimeout"): later(
+            _method("set_heading", 179, relative=True, rate_deg_s=1), falls_silent, 3.0
+        ),
         ("Vehicle.go_to", "LocalProtocolError"): P(
             _method("go_to", Position(0, 0, altitude_relative_m=9e9)), airborne
         ),

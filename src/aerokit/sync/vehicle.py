@@ -172,13 +172,26 @@ class Vehicle(VehicleState, BlockingBlock):
         """Change the flight mode and wait until HEARTBEAT tells it; see :meth:`aerokit.Vehicle.set_mode`."""
         self._loop.run(self.aio.set_mode, mode, timeout=timeout)
 
-    def arm(self, *, mode: str | int | None = None, force: bool = False, timeout: float = 10.0) -> None:
+    def arm(
+        self,
+        *,
+        mode: str | int | None = None,
+        force: bool = False,
+        timeout: float = 10.0,
+        max_silence_s: float | None = LONGEST_SILENCE_S,
+    ) -> None:
         """Arm the motors: **propellers may start to turn**; see :meth:`aerokit.Vehicle.arm`."""
-        self._loop.run(self.aio.arm, mode=mode, force=force, timeout=timeout)
+        self._loop.run(self.aio.arm, mode=mode, force=force, timeout=timeout, max_silence_s=max_silence_s)
 
-    def disarm(self, *, force: bool = False, timeout: float = 10.0) -> None:
+    def disarm(
+        self,
+        *,
+        force: bool = False,
+        timeout: float = 10.0,
+        max_silence_s: float | None = LONGEST_SILENCE_S,
+    ) -> None:
         """Stop the motors (``force``: also in the air, **it falls**); see :meth:`aerokit.Vehicle.disarm`."""
-        self._loop.run(self.aio.disarm, force=force, timeout=timeout)
+        self._loop.run(self.aio.disarm, force=force, timeout=timeout, max_silence_s=max_silence_s)
 
     def take_off(
         self,
@@ -237,6 +250,7 @@ class Vehicle(VehicleState, BlockingBlock):
         rate_deg_s: float = 0.0,
         tolerance_deg: float = 5.0,
         timeout: float = 60.0,
+        max_silence_s: float | None = LONGEST_SILENCE_S,
     ) -> None:
         """Turn on the spot and return when the nose points there; see :meth:`aerokit.Vehicle.set_heading`."""
         self._loop.run(
@@ -246,6 +260,7 @@ class Vehicle(VehicleState, BlockingBlock):
             rate_deg_s=rate_deg_s,
             tolerance_deg=tolerance_deg,
             timeout=timeout,
+            max_silence_s=max_silence_s,
         )
 
     def look_at(self, target: Position) -> None:

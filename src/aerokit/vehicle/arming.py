@@ -21,7 +21,7 @@ from aerokit.runtime.cancellation import Cancellation
 from aerokit.vehicle.checks import check_seconds
 from aerokit.vehicle.core import COMPONENT_ARM_DISARM
 from aerokit.vehicle.holding import HoldingActions
-from aerokit.vehicle.progress import await_progress
+from aerokit.vehicle.progress import LONGEST_SILENCE_S, await_progress
 
 if TYPE_CHECKING:
     from aerokit.autopilots import Mode
@@ -79,7 +79,14 @@ class ArmingActions(HoldingActions):
             f"the vehicle was not ready within {timeout:g} s ({self.describe_link()}); still missing:\n  - {missing}"
         )
 
-    async def arm(self, *, mode: str | int | None = None, force: bool = False, timeout: float = 10.0) -> None:
+    async def arm(
+        self,
+        *,
+        mode: str | int | None = None,
+        force: bool = False,
+        timeout: float = 10.0,
+        max_silence_s: float | None = LONGEST_SILENCE_S,
+    ) -> None:
         """Arm the motors and wait until HEARTBEAT says armed: **propellers may start to turn**.
 
         A vehicle that stands in a mode in which it does not arm (RTL or LAND after a flight, OFFBOARD) is put into
@@ -91,6 +98,7 @@ class ArmingActions(HoldingActions):
             mode: where to arm; None: the present mode, or one that ``take_off`` begins in if it cannot be armed there.
             force: skip the vehicle's own arming checks. Dangerous.
             timeout: seconds for HEARTBEAT to say so after the command was accepted.
+            max_silence_s: give up when no heartbeat has come for so many seconds; None: wait on until ``timeout``.
 
         Raises:
             LocalProtocolError: there is no such mode, or the vehicle does not arm in it. Nothing was sent.
@@ -98,9 +106,11 @@ class ArmingActions(HoldingActions):
                 estimator lacks. They are asked for again where the vehicle can run its checks on request.
             CommandTimeout: there was no answer; the text says whether the order may still arrive.
             OperationRejected: somebody else has disarmed it, or changed its mode, meanwhile.
+            HeartbeatTimeout: the vehicle has been silent for ``max_silence_s`` seconds.
             OperationTimeout: it accepted and did not arm.
         """
         check_seconds("timeout", timeout)
+        check_seconds("max_silence_s", max_silence_s, none_is_allowed=True)
         wanted = self._mode_to_arm_in(mode)
         if wanted is not None:
             await self._ensure_mode(wanted, self._helm.order(wanted))
@@ -110,7 +120,7 @@ class ArmingActions(HoldingActions):
         with self._helm.aside() as order:
             try:
                 await self._give_arm(order, True, force)
-                await self._await_armed(True, order, started, timeout)
+                await self._await_armed(True, order, started, timeout, max_silence_s)
             except CommandRejected as error:
                 reasons = await self._arming_reasons(started)
                 raise self._explained(error, started, reasons) from None
@@ -121,24 +131,33 @@ class ArmingActions(HoldingActions):
                 self._watch_for_late_arming()
                 raise
 
-    async def disarm(self, *, force: bool = False, timeout: float = 10.0) -> None:
+    async def disarm(
+        self,
+        *,
+        force: bool = False,
+        timeout: float = 10.0,
+        max_silence_s: float | None = LONGEST_SILENCE_S,
+    ) -> None:
         """Stop the motors and wait until HEARTBEAT says disarmed.
 
         Args:
             force: also in the air: **the vehicle falls**.
             timeout: seconds for HEARTBEAT to say so after the command was accepted.
+            max_silence_s: give up when no heartbeat has come for so many seconds; None: wait on until ``timeout``.
 
         Raises:
             CommandRejected: the vehicle refused, usually because it flies.
             CommandTimeout: there was no answer.
+            HeartbeatTimeout: the vehicle has been silent for ``max_silence_s`` seconds.
             OperationTimeout: it accepted and did not disarm.
         """
         check_seconds("timeout", timeout)
+        check_seconds("max_silence_s", max_silence_s, none_is_allowed=True)
         self._stop_watching_arming()
         started = self.connection.now()
         with self._helm.aside() as order:
             await self._give_arm(order, False, force)
-            await self._await_armed(False, order, started, timeout)
+            await self._await_armed(False, order, started, timeout, max_silence_s)
 
     async def _give_arm(self, order: Order, armed: bool, force: bool) -> None:
         await self._give(
@@ -150,7 +169,9 @@ class ArmingActions(HoldingActions):
             armed=armed,
         )
 
-    async def _await_armed(self, armed: bool, order: Order, started: float, timeout: float) -> None:
+    async def _await_armed(
+        self, armed: bool, order: Order, started: float, timeout: float, max_silence_s: float | None
+    ) -> None:
         cell = self.telemetry.armed
         await await_progress(
             self,
@@ -159,6 +180,7 @@ class ArmingActions(HoldingActions):
             trouble=lambda: order.taken_by if armed else None,
             describe=lambda: "; ".join(self.texts_since(started)) or "the vehicle said nothing about it",
             timeout=timeout,
+            max_silence_s=max_silence_s,
         )
 
     # ------------------------------------------------------------------------ where it arms

@@ -202,6 +202,7 @@ class TravelActions(ArmingActions):
         rate_deg_s: float = 0.0,
         tolerance_deg: float = 5.0,
         timeout: float = 60.0,
+        max_silence_s: float | None = LONGEST_SILENCE_S,
     ) -> None:
         """Turn on the spot and return when the nose points there.
 
@@ -214,17 +215,20 @@ class TravelActions(ArmingActions):
             rate_deg_s: how fast, degrees per second; 0 leaves it to the autopilot. PX4 does not look at it.
             tolerance_deg: how near is there.
             timeout: seconds until it is there.
+            max_silence_s: give up when no heartbeat has come for so many seconds; None: wait on, however long.
 
         Raises:
             LocalProtocolError: out of range. Nothing was sent.
             CommandRejected: the vehicle refused.
             OperationRejected: the mode changed or it disarmed on the way.
+            HeartbeatTimeout: the vehicle has been silent for ``max_silence_s`` seconds.
             OperationTimeout: it did not get there in time.
         """
         check_range("heading_deg", heading_deg, -360, 360)
         check_range("rate_deg_s", rate_deg_s, 0, 360)
         check_range("tolerance_deg", tolerance_deg, 0, 180, above=True)
         check_seconds("timeout", timeout)
+        check_seconds("max_silence_s", max_silence_s, none_is_allowed=True)
         self._check_can_turn(heading_deg)
         mode = self._mode_for("set_heading", self.autopilot.reposition_purpose)
         goal = (heading_deg + (self.telemetry.heading_deg.value if relative else 0)) % 360
@@ -238,10 +242,16 @@ class TravelActions(ArmingActions):
             # a goal, not an angle: sent again, it does not turn it further
             direction = (1 if heading_deg >= 0 else -1) if relative else 0
             await self._command_of(order, CONDITION_YAW, goal, rate_deg_s, direction, 0)
-        await self._await_heading(goal, tolerance_deg, timeout, order, mode)
+        await self._await_heading(goal, tolerance_deg, timeout, max_silence_s, order, mode)
 
     async def _await_heading(
-        self, goal: float, tolerance_deg: float, timeout: float, order: Order, mode: Mode
+        self,
+        goal: float,
+        tolerance_deg: float,
+        timeout: float,
+        max_silence_s: float | None,
+        order: Order,
+        mode: Mode,
     ) -> None:
         started = self.connection.now()
         heading = self.telemetry.heading_deg
@@ -257,6 +267,7 @@ class TravelActions(ArmingActions):
                 trouble=self._stays_in(order, mode),
                 describe=lambda: f"it is {off():.0f}° off",
                 timeout=timeout,
+                max_silence_s=max_silence_s,
             )
 
     async def look_at(self, target: Position) -> None:
