@@ -190,18 +190,33 @@ def test_a_second_ctrl_c_leaves_it_landing(tmp_path: Path) -> None:
 
 
 @posix_only
-def test_a_pilot_who_takes_over_keeps_the_vehicle(tmp_path: Path) -> None:
+@pytest.mark.parametrize("mode", ["LOITER", "BRAKE"])
+def test_a_pilot_who_takes_over_keeps_the_vehicle(mode: str, tmp_path: Path) -> None:
     with (
         served([SimulatedCopter(boot_time_s=0.0)], "tcpin:127.0.0.1:0") as address,
         in_the_air(address, tmp_path) as process,
         aerokit.sync.connect(address, source_system=254) as pilot,
     ):
-        pilot.set_mode("LOITER")
+        pilot.set_mode(mode)
         told = read_rest(process)
-        assert "the mode changed to LOITER" in told
-        assert "left to whoever put it into LOITER" in told
+        assert f"the mode changed to {mode}" in told
+        assert f"left to whoever put it into {mode}" in told
         assert process.returncode == 1
         assert pilot.is_armed
+
+
+def test_demo_leaves_a_vehicle_that_flies_already_alone(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    with served_copter() as address, aerokit.sync.connect(address) as pilot:
+        pilot.wait_ready()
+        pilot.arm()
+        pilot.take_off(5)
+        pilot.set_mode("BRAKE")  # in which it could not be armed
+        record = str(tmp_path / "flight.tlog")
+        assert main(["demo", "--connect", address, "--record", record]) == 1
+        assert "it is left to whoever armed it (holding in BRAKE, still armed, " in capsys.readouterr().out
+        assert (pilot.mode_name, pilot.is_armed) == ("BRAKE", True)
 
 
 @posix_only

@@ -11,7 +11,7 @@ from aerokit.cli.interrupt import on_interrupt
 from aerokit.cli.report import FlightReport
 from aerokit.cli.signing import signing_of
 from aerokit.cli.vehicles import simulated_vehicle
-from aerokit.errors import AerokitError, NotSupported
+from aerokit.errors import AerokitError, NotSupported, OperationRejected
 from aerokit.vehicle.connect import connect
 
 if TYPE_CHECKING:
@@ -101,6 +101,7 @@ class _Flight:
 
     def __init__(self, vehicle: Vehicle, report: FlightReport, interruptible: _Interruptible) -> None:
         self._vehicle, self._say, self._interruptible = vehicle, report.say, interruptible
+        self._is_ours = False  # armed by us; what somebody else flies is not ours to land
 
     async def fly(self, altitude_m: float, side_m: float) -> int:
         """Fly it, come down whatever happens, and return the exit code."""
@@ -108,11 +109,13 @@ class _Flight:
             code = await self._interruptible.run(lambda: self._fly_square(altitude_m, side_m))
         except AerokitError as error:
             self._say(f"failed: {error}")
-            await self._come_down_after_failure()
+            if self._is_ours:
+                await self._come_down_after_failure(error)
             return FAILED
         if code is None:
             self._say(f"interrupted, {self._vehicle.describe_now()}")
-            await self._come_down()
+            if self._is_ours:
+                await self._come_down()
             return INTERRUPTED
         return code
 
@@ -135,18 +138,14 @@ class _Flight:
         await vehicle.wait_ready(timeout=READY_TIMEOUT_S)
         home = vehicle.home.value
         self._say(f"ready, home is {home.latitude_deg:.6f}, {home.longitude_deg:.6f}; arming")
-        await self._leave_unarmable_mode()
+        if not vehicle.is_surely_disarmed:
+            now = vehicle.describe_now()
+            raise OperationRejected(f"it is left to whoever armed it ({now}); nothing was sent")
+        self._is_ours = True
         await vehicle.arm()
         self._say(f"armed; taking off to {altitude_m:g} m")
         await vehicle.take_off(altitude_m)
         self._say("at altitude; flying the square")
-
-    async def _leave_unarmable_mode(self) -> None:
-        """ArduPilot refuses to arm in LAND, where the flight before has left it."""
-        vehicle = self._vehicle
-        mode = vehicle.autopilot.mode_for("take_off")
-        if mode is not None and vehicle.mode_name in vehicle.autopilot.unarmable_modes:
-            await vehicle.set_mode(mode.name)
 
     async def _land(self) -> int:
         self._say("landing")
@@ -158,10 +157,16 @@ class _Flight:
 
     # ---------------------------------------------------------------------- when it went wrong
 
-    async def _come_down_after_failure(self) -> None:
-        """Whoever changed the mode, a pilot or a failsafe, keeps the vehicle."""
+    async def _come_down_after_failure(self, error: AerokitError) -> None:
+        """Whoever changed the mode, a pilot or a failsafe, keeps the vehicle.
+
+        Holding and landing are our own after an answer that did not come; not when an order ended because of the mode.
+        """
         vehicle, autopilot = self._vehicle, self._vehicle.autopilot
-        ours = [autopilot.mode_for(purpose) for purpose in ("take_off", "setpoint", "hold", "land")]
+        purposes = ["take_off", "setpoint"]
+        if type(error) is not OperationRejected:
+            purposes += ["hold", "land"]
+        ours = [autopilot.mode_for(purpose) for purpose in purposes]
         if vehicle.is_armed and vehicle.mode_name not in [mode.name for mode in ours if mode is not None]:
             self._say(f"left to whoever put it into {vehicle.mode_name}: {vehicle.describe_now()}")
             return
