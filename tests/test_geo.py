@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -47,9 +49,11 @@ def test_across_the_date_line() -> None:
         (90.1, 0, "latitude_deg = 90.1"),
         (0, -181, "longitude_deg = -181"),
         (float("nan"), 0, "latitude_deg = nan"),
+        ("47", 8, "latitude_deg = '47' is not allowed"),
+        (47, None, "longitude_deg = None is not allowed"),
     ],
 )
-def test_what_is_no_place_is_refused_by_name(latitude: float, longitude: float, text: str) -> None:
+def test_what_is_no_place_is_refused_by_name(latitude: Any, longitude: Any, text: str) -> None:
     with pytest.raises(LocalProtocolError, match=text):
         geo.check_place(latitude, longitude)
 

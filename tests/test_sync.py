@@ -229,6 +229,8 @@ def test_cells_read_without_the_loop(vehicle: aerokit.sync.Vehicle) -> None:
     vehicle.close()
     assert cell.latest == cell.value
     assert 0 <= cell.age < 60
+    with pytest.raises(TypeError, match="neither true nor false"):
+        bool(cell)
     with pytest.raises(errors.ConnectionClosed):
         cell.wait_until(lambda _: False)
 

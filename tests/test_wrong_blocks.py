@@ -19,7 +19,10 @@ BLOCKING: dict[str, Any] = {
 
 
 def threads() -> list[str]:
-    return [each.name for each in threading.enumerate() if each.name.startswith("aerokit")]
+    """Those that run: another test's that Ctrl-C had kept from starting are in ``threading``'s list for ever."""
+    return [
+        each.name for each in threading.enumerate() if each.name.startswith("aerokit") and each.is_alive()
+    ]
 
 
 @pytest.mark.anyio
@@ -43,6 +46,17 @@ def test_the_asynchronous_one_is_not_for_with(name: str) -> None:
         f"{name}(…) is not for `with`: write `async with {name}(…) as …:` in an async function, or take aerokit.sync"
         " for a program without async"
     )
+
+
+@pytest.mark.parametrize("name", ASYNCHRONOUS)
+def test_the_asynchronous_one_is_not_used_before_it_is_entered(name: str) -> None:
+    opened: Any = ASYNCHRONOUS[name]("udpin:127.0.0.1:0")
+    with pytest.raises(AttributeError) as caught:
+        opened.wait_ready()
+    assert str(caught.value) == (
+        f"{name}(…) has no 'wait_ready': it is not open yet; write `async with {name}(…) as …:`"
+    )
+    assert not hasattr(opened, "__len__")
 
 
 def misuse(word: str, opened: Any) -> Any:

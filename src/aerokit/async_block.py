@@ -50,6 +50,13 @@ class _Block(AbstractAsyncContextManager[T]):
     def __exit__(self, *_: object) -> None:
         """Never: it cannot be entered so. Python looks for it first."""
 
+    def __getattr__(self, name: str) -> None:
+        raise AttributeError(
+            f"{self._name}(…) has no {name!r}: it is not open yet; write `async with {self._name}(…) as …:`",
+            name=name,
+            obj=self,
+        )
+
     def _misused(self, word: str) -> TypeError:
         return TypeError(
             f"{self._name}(…) is not for `{word}`: write `async with {self._name}(…) as …:` in an async function,"

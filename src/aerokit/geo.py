@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from numbers import Real
 from typing import TYPE_CHECKING
 
 from aerokit.errors import LocalProtocolError
@@ -48,7 +49,7 @@ def north_east_m(
 def check_place(latitude_deg: float, longitude_deg: float) -> None:
     """Raise :class:`LocalProtocolError`, which names the field, unless this is a place on earth."""
     for name, value, limit in (("latitude_deg", latitude_deg, 90), ("longitude_deg", longitude_deg, 180)):
-        if not -limit <= value <= limit:
+        if not isinstance(value, (float, int, Real)) or not -limit <= value <= limit:
             raise LocalProtocolError(f"{name} = {value!r} is not allowed: -{limit} to {limit} degrees")
 
 

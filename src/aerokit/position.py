@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from numbers import Real
 from typing import TYPE_CHECKING
 
 from aerokit import geo
+from aerokit.arguments import checks_arguments
 from aerokit.errors import LocalProtocolError
 from aerokit.snapshot import Snapshot
 
@@ -15,6 +17,7 @@ if TYPE_CHECKING:
 __all__ = ["Position"]
 
 
+@checks_arguments
 class Position(Snapshot):
     """A place: degrees (WGS 84) and metres; ``Position(47.3977, 8.5456, altitude_relative_m=30)``.
 
@@ -45,7 +48,9 @@ class Position(Snapshot):
         geo.check_place(self.latitude_deg, self.longitude_deg)
         for name in ("altitude_amsl_m", "altitude_relative_m"):
             altitude = getattr(self, name)
-            if altitude is not None and not math.isfinite(altitude):
+            if altitude is not None and not (
+                isinstance(altitude, (float, int, Real)) and math.isfinite(altitude)
+            ):
                 raise LocalProtocolError(f"{name} = {altitude!r} is not a finite number")
 
 

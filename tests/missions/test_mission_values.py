@@ -171,6 +171,10 @@ def test_fence_items_and_back() -> None:
         (lambda: FenceCircle(SQUARE[0], 0), "radius_m = 0 is not allowed"),
         (lambda: FenceCircle(SQUARE[0], math.nan), "radius_m = nan"),
         (
+            lambda: FenceCircle(SQUARE[0], "5"),  # type: ignore[arg-type]
+            "radius_m = '5' is not allowed",
+        ),
+        (
             lambda: FenceCircle((1, 2), 3),  # type: ignore[arg-type]
             r"center = \(1, 2\)",
         ),

@@ -6,6 +6,7 @@ import asyncio
 import gc
 import math
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 
@@ -30,6 +31,13 @@ async def test_unknown_value_names_what_it_waits_for() -> None:
     with pytest.raises(ValueUnknownError, match="altitude is not known yet: no HEARTBEAT has been received"):
         _ = cell.value
     assert (cell.latest, cell.source, cell.is_known, cell.age) == (None, None, False, math.inf)
+
+
+async def test_a_cell_is_no_condition() -> None:
+    armed: Any = make_cell("armed")
+    with pytest.raises(TypeError) as caught:
+        bool(armed)
+    assert str(caught.value) == "a StateCell is neither true nor false: write .value or .latest behind armed"
 
 
 async def test_value_age_and_source() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -31,11 +32,18 @@ def test_a_position_as_users_write_it() -> None:
             {"latitude_deg": 0.0, "longitude_deg": 0.0, "altitude_relative_m": math.inf},
             "altitude_relative_m = inf",
         ),
+        ({"latitude_deg": 0.0, "longitude_deg": 0.0, "altitude_amsl_m": "30"}, "altitude_amsl_m = '30'"),
     ],
 )
-def test_nonsense_is_refused_by_name(fields: dict[str, float], text: str) -> None:
+def test_nonsense_is_refused_by_name(fields: dict[str, Any], text: str) -> None:
     with pytest.raises(LocalProtocolError, match=text):
         Position(**fields)
+
+
+def test_an_offset_of_a_wrong_type_is_refused_by_name() -> None:
+    north: Any = "30"
+    with pytest.raises(LocalProtocolError, match="north_m = '30' is not allowed: a number"):
+        Position(47.3977, 8.5456).offset(north_m=north)
 
 
 def test_offsets_keep_and_raise_the_altitude() -> None:

@@ -6,6 +6,7 @@ https://mavlink.io/en/services/mission.html#mission-types
 from __future__ import annotations
 
 from collections.abc import Sequence
+from numbers import Real
 from typing import TYPE_CHECKING, ClassVar
 
 from aerokit.errors import LocalProtocolError, RemoteProtocolError
@@ -54,7 +55,7 @@ class FenceCircle(Snapshot):
     def _check(self) -> None:
         if not isinstance(self.center, Position):
             raise LocalProtocolError(f"center = {self.center!r} is no Position")
-        if not 0 < self.radius_m < 3e7:
+        if not isinstance(self.radius_m, (float, int, Real)) or not 0 < self.radius_m < 3e7:
             raise LocalProtocolError(
                 f"radius_m = {self.radius_m!r} is not allowed: above 0 m, and on this planet"
             )

@@ -7,7 +7,7 @@ import logging
 import math
 from collections import deque
 from collections.abc import AsyncIterator, Callable
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, NoReturn, Protocol, TypeVar
 
 from aerokit.arguments import checked
 from aerokit.errors import OperationTimeout, StaleValueError, ValueUnknownError
@@ -273,6 +273,10 @@ class StateCell(Generic[T]):
 
     def __repr__(self) -> str:
         return f"<StateCell {self._describe()}>"
+
+    def __bool__(self) -> NoReturn:
+        """``if vehicle.armed:`` would be true for ever."""
+        raise TypeError(f"a StateCell is neither true nor false: write .value or .latest behind {self.name}")
 
 
 class Changes(AsyncIterator[T]):

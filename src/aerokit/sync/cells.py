@@ -102,6 +102,9 @@ class StateCell(Generic[T]):
     def __repr__(self) -> str:
         return repr(self.aio)
 
+    def __bool__(self) -> bool:
+        return bool(self.aio)  # raises
+
 
 class Changes(Generic[T]):
     """An endless iterator over a cell; the latest value wins. Raises the error that the connection ended with."""
