@@ -7,7 +7,7 @@ import pytest
 from flight_harness import in_the_air, open_flight, open_px4
 
 from aerokit import connect
-from aerokit.errors import LinkLost, LocalProtocolError, OperationTimeout
+from aerokit.errors import LinkLost, LocalProtocolError, OperationRejected, OperationTimeout
 from aerokit.mavlink.enums import CopterMode, MavCmd, PlaneMode
 from aerokit.sim import SimulatedPlane, simulated_link
 from aerokit.sim.px4.modes import OFFBOARD
@@ -56,6 +56,10 @@ async def test_what_flies_is_not_put_into_another_mode() -> None:
         await flight.vehicle.set_mode("LAND")
         flight.wire.forget()
         await flight.vehicle.arm()
+        with pytest.raises(
+            OperationRejected, match="arm: the vehicle is armed already, in LAND; nothing was sent"
+        ):
+            await flight.vehicle.arm(mode="GUIDED")
         assert not flight.wire.mode_orders()
         assert flight.copter.mode.number == CopterMode.LAND
 

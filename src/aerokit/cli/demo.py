@@ -163,10 +163,9 @@ class _Flight:
         Holding and landing are our own after an answer that did not come; not when an order ended because of the mode.
         """
         vehicle, autopilot = self._vehicle, self._vehicle.autopilot
-        purposes = ["take_off", "setpoint"]
+        ours = [autopilot.mode_for("take_off"), autopilot.mode_for("setpoint")]
         if type(error) is not OperationRejected:
-            purposes += ["hold", "land"]
-        ours = [autopilot.mode_for(purpose) for purpose in purposes]
+            ours += [autopilot.mode_for("hold"), autopilot.mode_for("land")]
         if vehicle.is_armed and vehicle.mode_name not in [mode.name for mode in ours if mode is not None]:
             self._say(f"left to whoever put it into {vehicle.mode_name}: {vehicle.describe_now()}")
             return

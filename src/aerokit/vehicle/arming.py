@@ -105,7 +105,8 @@ class ArmingActions(HoldingActions):
             CommandRejected: the vehicle refused; ``reasons`` has its pre-arm texts, failing sensors and what the
                 estimator lacks. They are asked for again where the vehicle can run its checks on request.
             CommandTimeout: there was no answer; the text says whether the order may still arrive.
-            OperationRejected: somebody else has disarmed it, or changed its mode, meanwhile.
+            OperationRejected: it is armed already, in another mode than ``mode``, and nothing was sent; or somebody
+                else has disarmed it, or changed its mode, meanwhile.
             HeartbeatTimeout: the vehicle has been silent for ``max_silence_s`` seconds.
             OperationTimeout: it accepted and did not arm.
         """
@@ -191,6 +192,10 @@ class ArmingActions(HoldingActions):
             wanted = self.autopilot.find_mode(mode, self.telemetry.mode_names)
             if wanted.name in self.autopilot.unarmable_modes:
                 raise LocalProtocolError(f"mode = {mode!r} is not allowed: {self._unarmable_text(wanted)}")
+            if self.is_armed and wanted != self.telemetry.mode.latest:
+                raise OperationRejected(
+                    f"arm: the vehicle is armed already, in {self.mode_name}; nothing was sent"
+                )
             return wanted
         is_booting = self.telemetry.system_status.latest in BOOTING
         if (
