@@ -125,3 +125,16 @@ async def test_while_the_link_is_lost_nothing_is_ready() -> None:
         flight.copter.faults.silent = False
         await vehicle.wait_ready(timeout=5.0)
         assert await vehicle.why_not_armable() == []
+
+
+async def test_arming_what_is_armed_already_and_giving_up_does_not_disarm_it() -> None:
+    """On the ground, armed by its pilot; the program asks again and is cancelled at once."""
+    async with open_flight() as flight:
+        await flight.vehicle.wait_ready()
+        await flight.vehicle.arm()
+        flight.wire.forget()
+        with anyio.move_on_after(0.001):
+            await flight.vehicle.arm()
+        await anyio.sleep(5.0)
+        assert [each.param1 for each in flight.wire.commands(ARM)] == [1.0]
+        assert flight.vehicle.is_armed

@@ -117,7 +117,7 @@ class ArmingActions(HoldingActions):
             await self._ensure_mode(wanted, self._helm.order(wanted))
             await self._settle_in_mode()
         self._stop_watching_arming()
-        started = self.connection.now()
+        started, was_armed = self.connection.now(), self.is_armed
         with self._helm.aside() as order:
             try:
                 await self._give_arm(order, True, force)
@@ -126,10 +126,10 @@ class ArmingActions(HoldingActions):
                 reasons = await self._arming_reasons(started)
                 raise self._explained(error, started, reasons) from None
             except CommandTimeout as error:
-                self._watch_for_late_arming()
+                self._watch_for_late_arming(was_armed)
                 raise CommandTimeout(f"{error}; {self._may_still_arm()}") from None
             except (anyio.get_cancelled_exc_class(), AerokitError):
-                self._watch_for_late_arming()
+                self._watch_for_late_arming(was_armed)
                 raise
 
     async def disarm(
@@ -223,7 +223,7 @@ class ArmingActions(HoldingActions):
         where = f"; {unsent} bytes have not left this computer yet" if unsent else ""
         return f"the order may still be carried out{where}: if it arms within {LATE_S:g} s it is disarmed"
 
-    def _watch_for_late_arming(self) -> None:
+    def _watch_for_late_arming(self, was_armed: bool) -> None:
         """The order to arm was given up; it may have been heard, or may still arrive."""
         self.connection.discard_unsent()
         scope, is_over = Cancellation(), asyncio.Event()
@@ -231,16 +231,19 @@ class ArmingActions(HoldingActions):
 
         async def watch() -> None:
             with scope, anyio.move_on_after(LATE_S):
-                await self._disarm_again()
+                await self._disarm_again(was_armed)
             if self._late_arming is scope:
                 self._late_arming = None
             is_over.set()
 
         self._background.start(watch, "aerokit late arming")
 
-    async def _disarm_again(self) -> None:
+    async def _disarm_again(self, was_armed: bool) -> None:
+        """What was armed before the order is left alone, until it has been heard disarmed."""
         armed, since = self.telemetry.armed, self.connection.now()
         try:
+            if was_armed:
+                await armed.wait_until(lambda value: not value, description="disarmed")
             await armed.wait_until(lambda value: value and armed.updated_at > since, description="armed")
         except AerokitError as error:
             logger.warning("the link ended while an order to arm may still be carried out: %s", error)
