@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from aerokit.errors import CommandTimeout, ConnectionClosed
 from aerokit.mavlink.messages import CommandAck
-from aerokit.protocols.command import CommandExchange, command_int, command_long
+from aerokit.protocols.command import CommandExchange, command_int, command_long, command_name
 from aerokit.runtime.driver import ExchangeRun
 
 if TYPE_CHECKING:
@@ -35,7 +35,8 @@ class CommandSender:
     """The command protocol with one vehicle (https://mavlink.io/en/services/command.html).
 
     COMMAND_ACK carries no request id, so two equal commands to one component follow each other; different
-    commands never wait for each other. What a cancelled or unconfirmed command left under way is not taken for the
+    commands never wait for each other. An order that a newer one has ended makes way at once, and one that ended while
+    it waited is not sent. What a cancelled or unconfirmed command left under way is not taken for the
     answer to the next one.
     """
 
@@ -52,6 +53,8 @@ class CommandSender:
         self._describe, self._round_trip_s = describe, round_trip_s
         self._locks: defaultdict[_Key, asyncio.Lock] = defaultdict(asyncio.Lock)
         self._runs: dict[_Key, ExchangeRun[CommandAck]] = {}
+        self._standings: dict[_Key, Standing | None] = {}
+        """Of those that run."""
         self._under_way: dict[_Key, list[float]] = {}
         self._is_closed = False
         self._detach = (
@@ -137,9 +140,12 @@ class CommandSender:
             message.target_component or self._component_id,
             message.command,
         )  # to all: the autopilot answers
+        self._make_way(key)
         async with self._locks[key]:
             if self._is_closed:
                 raise ConnectionClosed("the block of this vehicle was left; nothing was sent")
+            if standing is not None and standing.end and not is_sent:  # while it waited
+                raise CommandTimeout(f"{command_name(message.command)} was not sent: {standing.end}")
             exchange = CommandExchange(
                 message,
                 own_system=self._connection.source_system,
@@ -153,13 +159,21 @@ class CommandSender:
                 is_sent=is_sent,
             )
             run = self._runs[key] = ExchangeRun(self._connection, exchange)
+            self._standings[key] = standing
             try:
                 return await run.result()
             except CommandTimeout as error:
                 raise CommandTimeout(f"{error}; {self._describe()}") from None
             finally:
-                del self._runs[key]
+                del self._runs[key], self._standings[key]
                 self._expect_answers(key, exchange.answers_to_come)
+
+    def _make_way(self, key: _Key) -> None:
+        """An order that has ended keeps no newer one waiting for its answer."""
+        standing = self._standings.get(key)
+        if standing is not None and standing.end:
+            text = f"no COMMAND_ACK for {command_name(key[1])} yet; not sent again: {standing.end}"
+            self._runs[key].abort(CommandTimeout(text))
 
     def _answers_within_s(self) -> float:
         """A stalled link that comes back has a round trip of all the time it was away: that is no reason to wait."""

@@ -109,6 +109,8 @@ class Helm:
             armed=armed,
             is_done=is_done,
         )
+        for each in self._sendings:
+            each.note_newer(armed)
         self._sendings.append(sending)
         try:
             yield sending

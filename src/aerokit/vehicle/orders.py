@@ -108,6 +108,7 @@ class Sending:
         is_there = None if mode_now is None else mode_now.custom_mode
         self._modes = {each.custom_mode for each in modes} - {is_there}
         self._armed = None if armed is armed_now else armed
+        self._arms, self._is_overruled = armed, False
         self._is_done = is_done
 
     @property
@@ -119,7 +120,14 @@ class Sending:
     @property
     def end(self) -> str:
         """Why it must not be sent again, as a clause; empty while it may."""
-        return "its effect was told" if self.has_worked else self.order.end
+        if self.has_worked:
+            return "its effect was told"
+        return self.order.end or ("another order was given" if self._is_overruled else "")
+
+    def note_newer(self, armed: bool | None) -> None:
+        """Another command is given: one to disarm ends one to arm, and the other way round."""
+        if armed is not None and self._arms is not None and armed is not self._arms:
+            self._is_overruled = True
 
     def note_mode(self, mode: Mode, at: float) -> None:
         """The vehicle tells its mode."""

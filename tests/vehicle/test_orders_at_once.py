@@ -1,0 +1,125 @@
+"""Two orders at once, where the second needs the command that the first waits for: the newest is the one that holds."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Awaitable
+from contextlib import asynccontextmanager, suppress
+
+import anyio
+import pytest
+from order_air import Air, Weather
+
+import aerokit
+from aerokit.errors import AerokitError
+from aerokit.mavlink.enums import CopterMode, MavCmd
+from aerokit.mavlink.messages import CommandInt, CommandLong, GlobalPositionInt
+from aerokit.sim import SimulatedCopter, simulated_link
+from aerokit.sim.track import true_point
+
+pytestmark = pytest.mark.anyio
+
+Stage = tuple[SimulatedCopter, aerokit.Vehicle, Air]
+
+
+@asynccontextmanager
+async def _copter(*, flies: bool) -> AsyncIterator[Stage]:
+    copter = SimulatedCopter(boot_time_s=0.0)
+    async with simulated_link(copter) as link:
+        air = Air(link)
+        async with aerokit.connect(air, rates={GlobalPositionInt: 4.0}) as vehicle:
+            await vehicle.wait_ready()
+            await vehicle.set_mode("GUIDED")
+            if flies:
+                await vehicle.arm()
+                await vehicle.take_off(10.0)
+            await anyio.sleep(1.3)
+            yield copter, vehicle, air
+
+
+async def _ended(order: Awaitable[object]) -> None:
+    with suppress(AerokitError):
+        await order
+
+
+def _begin(air: Air, weather: Weather) -> None:
+    air.weather = weather
+    air.begin()
+
+
+def _commands(air: Air, command: int) -> list[tuple[float, float]]:
+    """When it was sent since the beginning, and with which param1 (176: param2)."""
+    return [
+        (
+            each.at - air.began_at,
+            each.message.param2 if command == MavCmd.DO_SET_MODE else each.message.param1,
+        )
+        for each in air.sent
+        if isinstance(each.message, (CommandLong, CommandInt)) and each.message.command == command
+    ]
+
+
+async def test_an_order_that_was_overruled_while_it_waited_is_never_sent() -> None:
+    async with _copter(flies=True) as (copter, vehicle, air):
+        there = vehicle.position.value.offset(north_m=8)
+        _begin(air, Weather(command=MavCmd.DO_SET_MODE, lost_acks=9, lost_commands=9))
+        async with anyio.create_task_group() as tasks:
+            for order in (vehicle.set_mode("LOITER"), vehicle.land()):
+                tasks.start_soon(_ended, order)
+            await anyio.sleep(0.1)
+            await vehicle.go_to(there, timeout=30)
+        assert true_point(copter).mode == "GUIDED"
+        assert CopterMode.LAND not in [mode for at, mode in _commands(air, MavCmd.DO_SET_MODE) if at >= 0.1]
+
+
+async def test_an_order_waits_for_none_that_it_has_overruled() -> None:
+    async with _copter(flies=True) as (_, vehicle, air):
+        _begin(air, Weather(command=MavCmd.DO_SET_MODE, lost_acks=1, lost_commands=1))
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(_ended, vehicle.set_mode("LOITER"))
+            await anyio.sleep(0.1)
+            await vehicle.hold()
+        assert [(round(at, 2), mode) for at, mode in _commands(air, MavCmd.DO_SET_MODE)] == [
+            (0.0, CopterMode.LOITER),
+            (0.1, CopterMode.BRAKE),
+        ]
+
+
+async def test_a_pilot_keeps_what_he_took_while_the_order_waited() -> None:
+    """Both commands are the program's own, so that the second waits for the answer to the first."""
+    async with _copter(flies=True) as (copter, vehicle, air):
+        _begin(air, Weather(command=MavCmd.DO_CHANGE_SPEED, lost_acks=9))
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(_ended, vehicle.command(MavCmd.DO_CHANGE_SPEED, 1, 3, -1, attempt_timeout=3))
+            await anyio.sleep(0.1)
+            tasks.start_soon(_ended, vehicle.set_speed(7))
+            copter.rc[2] = 1500
+            copter.set_mode(CopterMode.ALT_HOLD)
+        assert len(_commands(air, MavCmd.DO_CHANGE_SPEED)) == 1
+
+
+async def test_disarm_does_not_wait_for_arm_and_ends_it() -> None:
+    async with _copter(flies=False) as (copter, vehicle, air):
+        _begin(air, Weather(command=MavCmd.COMPONENT_ARM_DISARM, lost_acks=9, lost_commands=1))
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(_ended, vehicle.arm())
+            await anyio.sleep(0.1)
+            tasks.start_soon(_ended, vehicle.disarm())
+        sent = _commands(air, MavCmd.COMPONENT_ARM_DISARM)
+        assert [(round(at, 2), arms) for at, arms in sent[:2]] == [(0.0, 1.0), (0.1, 0.0)]
+        assert [arms for _, arms in sent[2:]].count(1.0) == 0
+        assert not true_point(copter).armed
+
+
+async def test_a_command_to_disarm_ends_arm_as_well_and_arm_ends_it() -> None:
+    async with _copter(flies=False) as (copter, vehicle, air):
+        _begin(air, Weather(command=MavCmd.COMPONENT_ARM_DISARM, lost_acks=9, lost_commands=2))
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(_ended, vehicle.arm())
+            await asyncio.sleep(0.1)
+            tasks.start_soon(_ended, vehicle.command(MavCmd.COMPONENT_ARM_DISARM, 0))
+            await asyncio.sleep(0.1)
+            await vehicle.arm()
+        sent = _commands(air, MavCmd.COMPONENT_ARM_DISARM)
+        assert [arms for _, arms in sent] == [1.0, 0.0, 1.0]
+        assert true_point(copter).armed
