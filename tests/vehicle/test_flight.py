@@ -18,6 +18,7 @@ from aerokit.errors import (
     OperationTimeout,
 )
 from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult
+from aerokit.runtime.cells import Source
 from aerokit.sim import SimulatedCopter
 from aerokit.vehicle.setpoints import VelocitySetpoint
 
@@ -134,6 +135,31 @@ async def test_take_off_refused_says_why(grounded: Flight) -> None:
     assert caught.value.result == MavResult.FAILED
     assert "Takeoff: not today" in caught.value.reasons
     assert "Takeoff: not today" in str(caught.value)
+
+
+async def test_a_state_of_the_last_flight_is_no_effect_of_a_take_off(grounded: Flight) -> None:
+    """TAKING_OFF was the last that it told before nobody asked for it any more."""
+    await grounded.vehicle.wait_ready()
+    await grounded.vehicle.set_mode("GUIDED")
+    await grounded.vehicle.arm()
+    grounded.vehicle.telemetry.landed_state.set(3, Source(1, 1, "EXTENDED_SYS_STATE"))
+    grounded.copter.faults.refuse(MavCmd.NAV_TAKEOFF, MavResult.FAILED, "No")
+    with pytest.raises(CommandRejected, match="MAV_CMD_NAV_TAKEOFF was refused"):
+        await grounded.vehicle.take_off(10.0)
+
+
+async def test_a_flight_of_long_ago_does_not_forbid_a_take_off(grounded: Flight) -> None:
+    """Its landing was not heard, and nothing of its state since."""
+    vehicle = grounded.vehicle
+    await vehicle.wait_ready()
+    await vehicle.set_mode("GUIDED")
+    await vehicle.arm()
+    vehicle.telemetry.landed_state.set(2, Source(1, 1, "EXTENDED_SYS_STATE"))
+    grounded.copter.faults.silent = True
+    await anyio.sleep(4.0)
+    grounded.copter.faults.silent = False
+    assert vehicle.telemetry.landed_state.latest == 2
+    await vehicle.take_off(8.0)
 
 
 async def test_take_off_cancelled_half_way_holds(grounded: Flight) -> None:

@@ -507,3 +507,20 @@ async def test_px4_cancelled_while_entering() -> None:
             flight.wire.forget()
             await anyio.sleep(3.0)
             assert not flight.wire.setpoints()
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.3, 0.6, 0.9])
+async def test_no_setpoint_is_sent_to_a_vehicle_that_is_silent_for_three_and_a_half_seconds(
+    phase: float,
+) -> None:
+    """Whenever the second begins in which silence is looked for."""
+    async with in_the_air() as flight:
+        await anyio.sleep(phase)
+        with pytest.raises(SetpointStreamStopped, match="silent"):
+            async with flight.vehicle.guided.velocity() as stream:
+                await stream.fly(NORTH, 2.0)
+                flight.copter.faults.silent = True
+                silent_since = now() - flight.vehicle.heartbeat_age
+                await stream.fly(NORTH, 8.0)
+        assert max(at for at, _ in flight.wire.setpoints()) - silent_since <= 3.5
+        assert flight.vehicle.is_silent

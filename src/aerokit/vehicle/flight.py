@@ -11,11 +11,13 @@ from aerokit.arguments import checks_arguments
 from aerokit.errors import CommandRejected, NotSupported, OperationRejected, OperationTimeout
 from aerokit.vehicle.checks import check_range, check_seconds
 from aerokit.vehicle.helm import MODE_GRACE_S
-from aerokit.vehicle.progress import LONGEST_SILENCE_S, Stillness, await_progress
+from aerokit.vehicle.progress import LONGEST_SILENCE_S, OLD_POSITION_S, Stillness, await_progress
 from aerokit.vehicle.travel import TravelActions
 from aerokit.vehicle.values import Position
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from aerokit.autopilots import TakeOff
     from aerokit.vehicle.orders import Order
 
@@ -70,7 +72,8 @@ class FlightActions(TravelActions):
         plan = self._take_off_plan(altitude_m)
         if not self.is_armed:
             raise OperationRejected("take_off: the vehicle is not armed: arm() comes first; nothing was sent")
-        if self.telemetry.landed_state.latest == LANDED_IN_AIR:
+        landed = self.telemetry.landed_state
+        if landed.latest == LANDED_IN_AIR and landed.age <= OLD_POSITION_S:
             raise OperationRejected(
                 "take_off: the vehicle flies already: go_to() climbs too; nothing was sent"
             )
@@ -107,12 +110,7 @@ class FlightActions(TravelActions):
         if plan.mode is not None:
             await self._ensure_mode(plan.mode, order)
         if plan.command is not None:
-            begins_at = self._altitude_relative()
-
-            def is_rising() -> bool:
-                climbed = self._altitude_relative() > begins_at + RISEN_M
-                return climbed or self.telemetry.landed_state.latest in (LANDED_IN_AIR, TAKING_OFF)
-
+            is_rising = self._rises_from_here()
             modes = () if plan.mode_after is None else order.modes
             with self._streaming("position", "landed_state"):
                 await self._give(
@@ -123,6 +121,18 @@ class FlightActions(TravelActions):
                     modes=modes,
                     is_done=is_rising,
                 )
+
+    def _rises_from_here(self) -> Callable[[], bool]:
+        """Whether it rises, by what it tells from now on: what it told before may be of its last flight."""
+        here, landed = self.telemetry.position.latest, self.telemetry.landed_state
+        begins_at = math.nan if here is None else self._altitude_relative()
+        state_before = landed.latest
+
+        def is_rising() -> bool:
+            is_told = landed.latest != state_before and landed.latest in (LANDED_IN_AIR, TAKING_OFF)
+            return is_told or self._altitude_relative() > begins_at + RISEN_M
+
+        return is_rising
 
     async def _await_altitude(
         self, altitude_m: float, timeout: float, max_silence_s: float | None, order: Order

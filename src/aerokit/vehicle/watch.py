@@ -81,7 +81,7 @@ class VehicleWatch:
     @property
     def is_silent(self) -> bool:
         """Whether no heartbeat comes any more: for more than 3.5 seconds, or because the link has gone."""
-        return self._is_told_silent or self._has_ended
+        return self._is_told_silent or self._has_ended or self.silent_for_s > SILENT_AFTER_S
 
     @property
     def silent_for_s(self) -> float:
