@@ -21,6 +21,7 @@ from aerokit.errors import (
     SetpointStreamStopped,
 )
 from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult
+from aerokit.sim.px4.modes import POSITION
 from aerokit.vehicle.guided import SetpointStream
 from aerokit.vehicle.setpoints import (
     AccelerationSetpoint,
@@ -507,6 +508,20 @@ async def test_px4_cancelled_while_entering() -> None:
             flight.wire.forget()
             await anyio.sleep(3.0)
             assert not flight.wire.setpoints()
+
+
+async def test_px4_of_a_pilot_is_left_to_him_when_the_entry_is_cancelled_before_offboard_was_asked_for() -> (
+    None
+):
+    async with open_px4() as flight:
+        await flight.take_off()
+        flight.px4.switch_to(POSITION)
+        await anyio.sleep(2.0)
+        with anyio.move_on_after(0.5):
+            async with flight.vehicle.guided.velocity(NORTH):
+                raise AssertionError("entered")
+        await anyio.sleep(5.0)
+        assert flight.vehicle.mode_name == "POSCTL"
 
 
 @pytest.mark.parametrize("phase", [0.0, 0.3, 0.6, 0.9])

@@ -187,7 +187,7 @@ class SetpointStream(Generic[SetpointT]):
         self._timer: asyncio.TimerHandle | None = None
         self._stopped: SetpointStreamStopped | None = None
         self._was_told = self._was_entered = False
-        self._is_entering = False
+        self._is_entering = self._steers = False
         self._was_armed = False
         is_place = isinstance(initial, (PositionSetpoint, LocalPositionSetpoint))
         self._is_costly = is_place and vehicle.autopilot.setpoints.place_restarts_path
@@ -236,6 +236,7 @@ class SetpointStream(Generic[SetpointT]):
         mode = self._vehicle._mode_for("a set-point stream", "setpoint")
         self._was_entered = True
         self._vehicle._stream = self
+        self._steers = self._vehicle._helm.steers or self._vehicle._is_in(mode)
         order = self._order = self._vehicle._helm.order(mode)
         try:
             await self._enter(mode, order)
@@ -244,7 +245,7 @@ class SetpointStream(Generic[SetpointT]):
             raise
         except BaseException:
             self._end()
-            self._vehicle._hold_soon(order)
+            self._hold()
             raise
         return self
 
@@ -274,8 +275,10 @@ class SetpointStream(Generic[SetpointT]):
         if self._vehicle.autopilot.setpoints.before_mode:
             self._begin()
             await self.fly(self._setpoint, ENTRY_S)
+            self._steers = True
             await self._feeding_initial(mode, order)
         else:
+            self._steers = True
             await self._vehicle._ensure_mode(mode, order)
             self._begin()
         self._mode = mode
@@ -364,7 +367,8 @@ class SetpointStream(Generic[SetpointT]):
         )
 
     def _hold(self) -> bool:
-        return self._order is not None and self._vehicle._hold_soon(self._order)
+        """Before the mode is asked for, a pilot flies on as he did, and what the program has ordered before is held."""
+        return self._order is not None and self._steers and self._vehicle._hold_soon(self._order)
 
     def _end(self) -> None:
         self._cancel_timer()

@@ -117,6 +117,12 @@ class Helm:
         finally:
             self._sendings.remove(sending)
 
+    @property
+    def steers(self) -> bool:
+        """Whether the vehicle is in a mode of the newest order, and nobody has taken it from that."""
+        order, mode = self.newest, self._telemetry.mode.latest
+        return order is not None and mode is not None and order.is_own(mode) and not order.taken_by
+
     # --------------------------------------------------------------------------------- doubts
 
     @property
