@@ -170,6 +170,7 @@ def test_a_newer_order_overrules_those_of_its_subject() -> None:
         (m.SetMode(1, 1, LOITER), {"mode", "motion"}),
         (m.CommandLong(1, 0, SET_MODE, 0, 1, 5, 0, 0, 0, 0, 0), {"mode", "motion"}),
         (m.CommandLong(1, 0, 21, 0, 0, 0, 0, 0, 0, 0, 0), {"mode", "motion"}),
+        *((m.CommandLong(1, 0, each, 0, 0, 0, 0, 0, 0, 0, 0), {"motion"}) for each in (17, 18, 19, 193)),
         (m.CommandLong(1, 0, ARM, 0, 0, 0, 0, 0, 0, 0, 0), {"arm"}),
         (m.CommandLong(1, 0, 178, 0, 0, 5, 0, 0, 0, 0, 0), set()),
         (m.SetPositionTargetLocalNed(0, 1, 0, 8, 0x0DC7, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0), {"motion"}),

@@ -12,8 +12,14 @@ from order_air import Air, Weather
 
 import aerokit
 from aerokit.errors import AerokitError
-from aerokit.mavlink.enums import CopterMode, MavCmd
-from aerokit.mavlink.messages import CommandInt, CommandLong, GlobalPositionInt
+from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult
+from aerokit.mavlink.messages import (
+    CommandInt,
+    CommandLong,
+    GlobalPositionInt,
+    SetMode,
+    SetPositionTargetGlobalInt,
+)
 from aerokit.sim import SimulatedCopter, simulated_link
 from aerokit.sim.track import true_point
 
@@ -123,3 +129,28 @@ async def test_a_command_to_disarm_ends_arm_as_well_and_arm_ends_it() -> None:
         sent = _commands(air, MavCmd.COMPONENT_ARM_DISARM)
         assert [arms for _, arms in sent] == [1.0, 0.0, 1.0]
         assert true_point(copter).armed
+
+
+@pytest.mark.parametrize("legacy", [MavCmd.DO_SET_MODE, MavCmd.DO_REPOSITION])
+async def test_what_old_firmware_wants_instead_is_not_sent_for_an_order_that_ended_meanwhile(
+    legacy: MavCmd,
+) -> None:
+    """It would be sent 0.3 s after the refusal, whose reasons are waited for."""
+    async with _copter(flies=True) as (copter, vehicle, air):
+        copter.faults.refuse(legacy, MavResult.UNSUPPORTED)
+        there = vehicle.position.value.offset(north_m=8)
+        _begin(air, Weather())
+        async with anyio.create_task_group() as tasks:
+            order = vehicle.set_mode("LAND") if legacy == MavCmd.DO_SET_MODE else vehicle.go_to(there)
+            tasks.start_soon(_ended, order)
+            await anyio.sleep(0.1)
+            await vehicle.set_heading(90.0)
+        await anyio.sleep(2.0)
+        old = [
+            each
+            for each in air.sent
+            if isinstance(each.message, SetPositionTargetGlobalInt)
+            or (isinstance(each.message, SetMode) and each.message.custom_mode == CopterMode.LAND)
+        ]
+        assert not old
+        assert true_point(copter).mode == "GUIDED"

@@ -27,7 +27,7 @@ OWN_MODES_S = 10.0
 """A mode that the program ordered so long ago may be told only now: that is nobody who takes over."""
 CHANGES_BY_COMMAND: dict[int, tuple[str, ...]] = {
     **dict.fromkeys((20, 21, 84, 85, 185, 252, 300), ("mode", "motion")),
-    **dict.fromkeys((16, 22, 34, 192), ("motion",)),
+    **dict.fromkeys((16, 17, 18, 19, 22, 34, 192, 193), ("motion",)),
     176: ("mode", "motion"),
     400: ("arm",),
 }

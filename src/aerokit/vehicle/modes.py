@@ -125,6 +125,7 @@ class ModeActions(VehicleState):
         except CommandRejected as error:
             if error.result != RESULT_UNSUPPORTED:
                 raise
+            self._raise_if_over(order)
             self.connection.send(self.autopilot.mode_order(wanted).legacy(self.system_id))
 
     async def _await_mode(

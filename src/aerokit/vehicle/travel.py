@@ -134,6 +134,7 @@ class TravelActions(ArmingActions):
             if error.result != RESULT_UNSUPPORTED:
                 raise
             await self._ensure_mode(self._mode_for("go_to", "setpoint"), order)
+            self._raise_if_over(order)
             resend = self._position_target(latitude, longitude, altitude, frame)
             self.connection.send(resend)
             return resend
