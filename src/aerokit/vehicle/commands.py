@@ -141,10 +141,11 @@ class CommandSender:
             message.command,
         )  # to all: the autopilot answers
         self._make_way(key)
+        end = "" if standing is None else standing.end
         async with self._locks[key]:
             if self._is_closed:
                 raise ConnectionClosed("the block of this vehicle was left; nothing was sent")
-            if standing is not None and standing.end and not is_sent:  # while it waited
+            if standing is not None and standing.end != end and not is_sent:  # while it waited
                 raise CommandTimeout(f"{command_name(message.command)} was not sent: {standing.end}")
             exchange = CommandExchange(
                 message,
