@@ -11,7 +11,7 @@ import anyio
 import pytest
 from flight_harness import Flight, Px4Flight, block_loop, in_the_air, now, open_flight, open_px4, speed_of
 
-from aerokit import Position
+from aerokit import Position, missions
 from aerokit import messages as m
 from aerokit.errors import (
     CommandRejected,
@@ -539,3 +539,24 @@ async def test_no_setpoint_is_sent_to_a_vehicle_that_is_silent_for_three_and_a_h
                 await stream.fly(NORTH, 8.0)
         assert max(at for at, _ in flight.wire.setpoints()) - silent_since <= 3.5
         assert flight.vehicle.is_silent
+
+
+async def test_px4_of_a_pilot_is_left_to_him_when_a_mission_is_cancelled_before_its_mode_was_asked_for() -> (
+    None
+):
+    async with open_px4() as flight:
+        await flight.take_off()
+        here = flight.vehicle.position.value
+        place = missions.waypoint(here.latitude_deg, here.longitude_deg, altitude_relative_m=20)
+        await flight.vehicle.mission.upload(missions.Mission([place, place]))
+        flight.px4.switch_to(POSITION)
+        await anyio.sleep(2.0)
+        flight.px4.faults.silent = True
+        with anyio.move_on_after(0.5) as scope:
+            try:
+                await flight.vehicle.mission.start(1)
+            finally:
+                flight.px4.faults.silent = False
+        assert scope.cancelled_caught
+        await anyio.sleep(5.0)
+        assert flight.vehicle.mode_name == "POSCTL"

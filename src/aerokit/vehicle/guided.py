@@ -187,7 +187,7 @@ class SetpointStream(Generic[SetpointT]):
         self._timer: asyncio.TimerHandle | None = None
         self._stopped: SetpointStreamStopped | None = None
         self._was_told = self._was_entered = False
-        self._is_entering = self._steers = False
+        self._is_entering = False
         self._was_armed = False
         is_place = isinstance(initial, (PositionSetpoint, LocalPositionSetpoint))
         self._is_costly = is_place and vehicle.autopilot.setpoints.place_restarts_path
@@ -236,8 +236,8 @@ class SetpointStream(Generic[SetpointT]):
         mode = self._vehicle._mode_for("a set-point stream", "setpoint")
         self._was_entered = True
         self._vehicle._stream = self
-        self._steers = self._vehicle._helm.steers or self._vehicle._is_in(mode)
         order = self._order = self._vehicle._helm.order(mode)
+        order.is_given = order.is_given or self._vehicle._is_in(mode)
         try:
             await self._enter(mode, order)
         except OperationRejected:  # the vehicle stays with whoever steers it
@@ -275,10 +275,8 @@ class SetpointStream(Generic[SetpointT]):
         if self._vehicle.autopilot.setpoints.before_mode:
             self._begin()
             await self.fly(self._setpoint, ENTRY_S)
-            self._steers = True
             await self._feeding_initial(mode, order)
         else:
-            self._steers = True
             await self._vehicle._ensure_mode(mode, order)
             self._begin()
         self._mode = mode
@@ -367,8 +365,7 @@ class SetpointStream(Generic[SetpointT]):
         )
 
     def _hold(self) -> bool:
-        """Before the mode is asked for, a pilot flies on as he did, and what the program has ordered before is held."""
-        return self._order is not None and self._steers and self._vehicle._hold_soon(self._order)
+        return self._order is not None and self._vehicle._hold_soon(self._order)
 
     def _end(self) -> None:
         self._cancel_timer()

@@ -60,6 +60,7 @@ class Helm:
         for each in self._on_new:
             each()
         order = self._new(modes, lambda order: order is self.newest)
+        order.is_given = self._steers()
         self.newest = order
         self._orders = [order]
         return order
@@ -117,12 +118,6 @@ class Helm:
         finally:
             self._sendings.remove(sending)
 
-    @property
-    def steers(self) -> bool:
-        """Whether the vehicle is in a mode of the newest order, and nobody has taken it from that."""
-        order, mode = self.newest, self._telemetry.mode.latest
-        return order is not None and mode is not None and order.is_own(mode) and not order.taken_by
-
     # --------------------------------------------------------------------------------- doubts
 
     @property
@@ -165,6 +160,11 @@ class Helm:
             settles_at=self.mode_settles_at,
             any_until=self._any_mode_until,
         )
+
+    def _steers(self) -> bool:
+        """Whether the vehicle is in a mode of the newest order, and nobody has taken it from that."""
+        order, mode = self.newest, self._telemetry.mode.latest
+        return order is not None and mode is not None and order.is_own(mode) and not order.taken_by
 
     def _on_mode(self, _: Mode | None, mode: Mode) -> None:
         for each in self._followers():

@@ -94,9 +94,11 @@ class HoldingActions(ModeActions):
 
         One command goes out at once, if the vehicle has told lately what it does; else as soon as it tells it: what
         a failsafe or a pilot has made of it meanwhile is left alone. A task of the vehicle's own confirms it, as
-        long as the connection is there. Nothing is sent when the order has ended, or the vehicle is known to be
-        disarmed; says whether it was, or may be.
+        long as the connection is there. Nothing is sent when the order has ended, when nothing was given of it yet to
+        a vehicle that somebody else flies, or the vehicle is known to be disarmed; says whether it was, or may be.
         """
+        if not order.is_given:
+            return False
         mode = self.autopilot.mode_for("hold", is_vtol=self.is_vtol)
         if mode is None or not self.connection.is_open or self.is_surely_disarmed or order.end:
             return False

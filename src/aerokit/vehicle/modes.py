@@ -9,6 +9,7 @@ from aerokit.arguments import checks_arguments
 from aerokit.errors import CommandRejected, CommandTimeout, NotSupported, OperationRejected
 from aerokit.vehicle.checks import check_seconds
 from aerokit.vehicle.helm import KNOWN_S, MODE_GRACE_S
+from aerokit.vehicle.orders import MOVING_COMMANDS
 from aerokit.vehicle.progress import await_progress
 from aerokit.vehicle.state import VehicleState
 
@@ -73,6 +74,7 @@ class ModeActions(VehicleState):
             CommandTimeout: there was no answer; the text says so when it was not sent again for a reason.
         """
         self._raise_if_over(order)
+        order.is_given = order.is_given or command in MOVING_COMMANDS
         started = self.connection.now()
         with self._helm.sending(order, modes=modes, armed=armed, is_done=is_done) as sending:
             try:

@@ -46,6 +46,8 @@ class Order:
         self.modes = tuple(modes)
         self.taken_by = ""
         """What somebody else has done, as a clause; empty: nothing that was told."""
+        self.is_given = False
+        """Whether the vehicle may move by it, or moves by what the program had ordered before: given up, it is held."""
         self._allowed = {each.custom_mode for each in (mode_before, *expected) if each is not None}
         self._own = {each.custom_mode for each in modes}
         self._is_mode_known = mode_before is not None
