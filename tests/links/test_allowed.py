@@ -252,6 +252,26 @@ async def test_a_vehicle_on_a_broadcast_link_may_change_its_port() -> None:
         await link.wait_closed()
 
 
+@each_loop
+async def test_what_is_for_a_vehicle_that_is_silent_is_not_broadcast(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Others of the same system id would obey."""
+    with socket.socket(type=socket.SOCK_DGRAM) as everybody, socket.socket(type=socket.SOCK_DGRAM) as one:
+        for sock in (everybody, one):
+            sock.bind(("127.0.0.1", 0))
+            sock.setblocking(False)
+        link = UdpBroadcast(*everybody.getsockname())
+        await link.open(Keeper())
+        link.keep_peer(one.getsockname())
+        monkeypatch.setattr(udp, "QUIET_AFTER_S", -1.0)
+        link.write(b"an order", one.getsockname())
+        link.write(b"heartbeat")
+        await eventually(lambda: received(one) == b"an order")
+        await eventually(lambda: received(everybody) == b"heartbeat")
+        assert received(everybody) == b""
+        link.close()
+        await link.wait_closed()
+
+
 def received(sock: socket.socket) -> bytes:
     try:
         return sock.recv(1000)
