@@ -237,7 +237,8 @@ class UdpBroadcast(_UdpLink):
     """``udpbcast:`` (IPv4) broadcasts until somebody answers, then talks to that one only.
 
     When nothing has come from there for 3.5 s, it broadcasts again and hears who answers; another port of the same host
-    is heard at once. What is for one peer is sent to that one, and never to everybody. ``peers`` are the IP addresses and networks that are listened to (None: all).
+    is heard at once. What is for one peer is sent to that one, and never to everybody. ``peers`` are the IP addresses
+    and networks that are listened to (None: all).
     """
 
     def __init__(self, host: str, port: int, *, peers: Peers | None = None) -> None:
