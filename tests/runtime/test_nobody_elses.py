@@ -434,3 +434,24 @@ async def test_a_link_that_is_opened_again_is_told_who_its_peers_are(link: KeptP
         link.kept.clear()
         vehicle.connection.link_restored(1.0)
         assert link.kept == ["14550@copter"]
+
+
+async def test_what_is_for_all_components_goes_to_no_other_vehicle_of_the_same_system_id(
+    link: KeptPeers,
+) -> None:
+    """Its autopilot is not listened to, its camera has ids that nobody else has; both would obey what is for all."""
+    camera = Heartbeat(30, 8, 0, 0, 4)
+    async with flown(link) as (vehicle, copter):
+        other = Copter(link, first=99, booted_at=-9000.0)
+        others_camera = FrameEncoder(1, 100)
+        for _ in range(3):
+            copter.say("14550@copter", ARMED)
+            other.say("14550@other", DISARMED)
+            vehicle.connection.bytes_received(others_camera.encode(camera), "14550@other")
+            await anyio.sleep(1.0)
+        link.sent.clear()
+        vehicle.send(command(1, 0))
+        assert link.peers_of(CommandLong) == ["14550@copter"]
+        link.sent.clear()
+        vehicle.send(command(1, 100))
+        assert link.peers_of(CommandLong) == ["14550@other"]

@@ -32,6 +32,7 @@ MOST_ROUTES = 1024
 MOST_CLAIMS = 256
 """So many peers that speak in the name of others are remembered; of the first, it is told again."""
 SWEEP_AFTER_S = 1.0
+MAV_COMP_ID_AUTOPILOT1 = 1
 EVERY_PEER: tuple[Peer, ...] = (None,)
 
 
@@ -111,13 +112,18 @@ class Routes:
         return 0 < (route.sequence - frame.sequence) & 0xFF < 128
 
     def peers_of(self, system_id: int, component_id: int) -> Collection[Peer]:
-        """Where to send what is for this component, or for this system if the component is 0 or was never heard."""
+        """Where to send what is for this component, or for this system if the component is 0 or was never heard.
+
+        Who speaks in another one's name is not part of the system: it would obey what is for all components.
+        """
         if system_id == 0:
             return EVERY_PEER
         try:
             return (self._routes[system_id, component_id].peer,)
         except KeyError:
             peers = {route.peer for (system, _), route in self._routes.items() if system == system_id}
+            if len(peers) > 1:
+                peers -= self._doubles_of(system_id)
             return peers or EVERY_PEER
 
     def is_elsewhere(self, frame: Frame, peer: Peer) -> bool:
@@ -167,6 +173,13 @@ class Routes:
         return [forgotten]
 
     # ------------------------------------------------------------------------------- inside
+
+    def _doubles_of(self, system_id: int) -> set[Peer]:
+        """Peers that speak in the name of this system's autopilot, and are not believed."""
+        autopilot = system_id, MAV_COMP_ID_AUTOPILOT1
+        return {
+            peer for (source, peer), claim in self._claims.items() if source == autopilot and claim.is_told
+        }
 
     def _claim(self, source: Source, peer: Peer) -> Claim:
         key = source, peer
