@@ -154,3 +154,16 @@ async def test_what_old_firmware_wants_instead_is_not_sent_for_an_order_that_end
         ]
         assert not old
         assert true_point(copter).mode == "GUIDED"
+
+
+async def test_a_command_that_the_program_sends_by_itself_ends_the_action_before_it() -> None:
+    async with _copter(flies=True) as (copter, vehicle, air):
+        there = vehicle.position.value.offset(north_m=100)
+        _begin(air, Weather(command=MavCmd.DO_REPOSITION, lost_acks=9))
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(_ended, vehicle.go_to(there, timeout=8))
+            await anyio.sleep(0.3)
+            vehicle.send(CommandLong(1, 1, MavCmd.DO_PAUSE_CONTINUE, 0, *(0.0,) * 7))
+        await anyio.sleep(2.0)
+        assert len(_commands(air, MavCmd.DO_REPOSITION)) == 1
+        assert _commands(air, MavCmd.DO_SET_MODE) == []

@@ -12,7 +12,7 @@ from aerokit.autopilots import autopilot_for
 from aerokit.autopilots.streams import subscription_rate_hz
 from aerokit.errors import CommandRejected, ConnectionClosed
 from aerokit.mavlink.message import Message
-from aerokit.mavlink.messages import CommandAck, Heartbeat
+from aerokit.mavlink.messages import CommandAck, CommandInt, CommandLong, Heartbeat, SetMode
 from aerokit.runtime.background import Background
 from aerokit.runtime.cells import Source, StateCell
 from aerokit.runtime.events import (
@@ -189,6 +189,8 @@ class VehicleCore:
     def send(self, message: Message) -> None:
         """Send one message as it is, once; never blocks. Its ``target_system`` is yours to set.
 
+        A command that steers (as by :meth:`command`) and SET_MODE are newer orders: those of the actions end.
+
         Raises:
             LocalProtocolError: a field is out of range; nothing was sent.
             ConnectionClosed, LinkLost: the connection has ended, or the block of this vehicle was left.
@@ -196,6 +198,9 @@ class VehicleCore:
         if self._is_closed:
             raise ConnectionClosed("the block of this vehicle was left; nothing was sent")
         self.connection.send(message)
+        is_command = isinstance(message, (CommandInt, CommandLong)) and message.command in MOVING_COMMANDS
+        if is_command or isinstance(message, SetMode):
+            self._helm.order_of_the_programs_own()
 
     # ----------------------------------------------------------------------- subscriptions
 
