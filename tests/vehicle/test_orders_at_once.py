@@ -157,7 +157,7 @@ async def test_what_old_firmware_wants_instead_is_not_sent_for_an_order_that_end
 
 
 async def test_a_command_that_the_program_sends_by_itself_ends_the_action_before_it() -> None:
-    async with _copter(flies=True) as (copter, vehicle, air):
+    async with _copter(flies=True) as (_, vehicle, air):
         there = vehicle.position.value.offset(north_m=100)
         _begin(air, Weather(command=MavCmd.DO_REPOSITION, lost_acks=9))
         async with anyio.create_task_group() as tasks:
