@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 from order_air import Crossing
 from order_flights import WATCH_S, Flown, mode_of
-from order_table import ARM, REPOSITION
+from order_table import ARM, REPOSITION, SET_MODE
 
 from aerokit.autopilots import autopilot_for, is_armed
 from aerokit.errors import OperationTimeout
@@ -28,6 +28,7 @@ SETPOINTS = (SetPositionTargetLocalNed, SetPositionTargetGlobalInt, SetAttitudeT
 HEARD_S = 4.0
 """So long after an outage it is known what the vehicle does, and told to hold."""
 PX4_LOITER = 4 << 16 | 3 << 24
+COPTER_AUTO, COPTER_GUIDED, COPTER_BRAKE = 3, 4, 17
 FIRST_S = 0.01
 """What is sent so soon after the call is the order itself."""
 
@@ -81,19 +82,22 @@ def _sent_again(flown: Flown) -> Iterator[str]:
             since = _told(flown, first[key], each.number)
             if not _told(flown, last[key], each.number):
                 yield f"{_s(flown, each)} was sent again without a HEARTBEAT since"
-            elif any(told != before[0] and not _is_stop_in_hold(each.message, told) for told in since):
+            elif any(told != before[0] and not _may_be_told(flown, each.message, told) for told in since):
                 yield f"{_s(flown, each)} was sent again although HEARTBEAT had told a change"
         first.setdefault(key, each.number)
         last[key] = each.number
 
 
-def _is_stop_in_hold(message: Message, told: tuple[int, bool]) -> bool:
-    """PX4 told to stop by DO_REPOSITION: its mode for holding may be that of the flight that was given up.
-
-    So the mode is not the effect, and as long as nobody else's is told it is told again to stop.
+def _may_be_told(flown: Flown, message: Message, told: tuple[int, bool]) -> bool:
+    """What was given up may come into force late: it is held again then. PX4 told to stop by DO_REPOSITION may be in
+    its mode for holding all the time: that is not the effect.
     """
-    is_stop = isinstance(message, CommandLong) and message.command == REPOSITION
-    return is_stop and told == (PX4_LOITER, True)
+    if not isinstance(message, CommandLong):
+        return False
+    if message.command == REPOSITION:
+        return told == (PX4_LOITER, True)
+    is_hold = message.command == SET_MODE and message.param2 == COPTER_BRAKE
+    return is_hold and flown.case.row.holds and told in {(COPTER_GUIDED, True), (COPTER_AUTO, True)}
 
 
 def _sent_blind(flown: Flown) -> Iterator[str]:

@@ -114,3 +114,11 @@ def test_an_order_to_arm_that_comes_late_is_taken_back_from_somebody_else_too() 
     flown = fly(Case(BY_NAME["arm"], "ardupilot", weather, pilot_at=0.5, by_switch=True))
     assert isinstance(flown.error, OperationRejected)
     assert not flown.is_armed_at_end
+
+
+def test_a_pilot_who_goes_back_to_the_mode_from_before_keeps_the_vehicle() -> None:
+    """Flown by hand, sent somewhere, given up and told to stop, which was told: then by hand again."""
+    weather = Weather(command=REPOSITION, lost_acks=9, lost_commands=1, latency_s=0.2)
+    flown = fly(Case(BY_NAME["go_to from another mode"], "px4", weather, pilot_at=1.51, cancel_at=0.98))
+    assert faults(flown) == []
+    assert mode_of(flown.vehicle) == "POSCTL"

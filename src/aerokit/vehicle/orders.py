@@ -48,7 +48,9 @@ class Order:
         """What somebody else has done, as a clause; empty: nothing that was told."""
         self.is_given = False
         """Whether the vehicle may move by it, or moves by what the program had ordered before: given up, it is held."""
-        self._allowed = {each.custom_mode for each in (mode_before, *expected) if each is not None}
+        late = {each.custom_mode for each in expected}
+        self._before = set() if mode_before is None else {mode_before.custom_mode} - late
+        self._allowed = self._before | late
         self._own = {each.custom_mode for each in modes}
         self._is_mode_known = mode_before is not None
         self._was_armed = armed_before
@@ -67,8 +69,7 @@ class Order:
     def note_mode(self, mode: Mode, at: float) -> None:
         """The vehicle tells its mode. Once it was in one of the order's, the mode before is somebody else's, too."""
         if self.is_own(mode):
-            if at >= self._settles_at:
-                self._allowed.clear()
+            self._allowed -= self._allowed if at >= self._settles_at else self._before
         elif not self._is_mode_known or at < self._any_until:
             self._allowed.add(mode.custom_mode)
         elif mode.custom_mode not in self._allowed:
