@@ -55,7 +55,8 @@ async def _stream(vehicle: aerokit.Vehicle) -> None:
         await stream.fly(aerokit.VelocitySetpoint(north_m_s=1.0), 3.0)
 
 
-GUIDED, HOLD = ("mode", 4, 0), ({("mode", 17, 0)}, {"stop", ("mode", 4, 3)})
+GUIDED = ("mode", 4, 0)
+HOLD: tuple[set[Hashable], set[Hashable]] = ({("mode", 17, 0)}, {"stop", ("mode", 4, 3)})
 CHOICES = (
     Choice("hold", lambda v: v.hold(), HOLD),
     Choice("land", lambda v: v.land(), ({("mode", 9, 0)}, {("mode", 4, 6)})),

@@ -531,6 +531,7 @@ async def test_no_setpoint_is_sent_to_a_vehicle_that_is_silent_for_three_and_a_h
     """Whenever the second begins in which silence is looked for."""
     async with in_the_air() as flight:
         await anyio.sleep(phase)
+        silent_since = math.inf
         with pytest.raises(SetpointStreamStopped, match="silent"):
             async with flight.vehicle.guided.velocity() as stream:
                 await stream.fly(NORTH, 2.0)
