@@ -242,6 +242,9 @@ def _flown() -> Table:
         ("MissionControl.set_current", "CommandRejected"): P(
             _of(mission, "set_current", 2), on_mission, refused(current)
         ),
+        ("MissionControl.set_current", "OperationRejected"): P(
+            later(_of(mission, "set_current", 2), pilot, 0.3).do, on_mission, ignored(current)
+        ),
         ("MissionControl.set_current", "OperationTimeout"): P(
             _of(mission, "set_current", 2), on_mission, ignored(current)
         ),

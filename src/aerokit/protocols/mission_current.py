@@ -11,9 +11,11 @@ from aerokit.protocols.transfer import Transfer
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
+    from aerokit.protocols.command import Standing
 
 __all__ = ["MissionSetCurrent"]
 
+LOOK_S = 0.1
 TOLD_EVERY_S = 1.0
 """MISSION_CURRENT is streamed at 1 Hz, and sent when it changes."""
 
@@ -22,17 +24,27 @@ class MissionSetCurrent(Transfer[None]):
     """There is no acknowledgement: PX4 sends MISSION_CURRENT when the item has changed, else at its next turn.
 
     ``told`` is the item that the vehicle told last: from the item wanted to the one after it, it flies on by itself.
+    With a ``standing``, it is sent again only after a HEARTBEAT that came since, and while that is not against it.
     """
 
     expects = (MissionCurrent,)
 
     def __init__(
-        self, target_system: int, target_component: int, seq: int, told: int | None = None, **options: Any
+        self,
+        target_system: int,
+        target_component: int,
+        seq: int,
+        told: int | None = None,
+        *,
+        standing: Standing | None = None,
+        **options: Any,
     ) -> None:
         super().__init__(target_system, target_component, **options)
         self._seq = seq
         self._told = told
+        self._standing = standing
         self._attempts = 0
+        self._sent_at = 0.0
 
     def start(self, now: float) -> None:
         """Send it."""
@@ -49,16 +61,20 @@ class MissionSetCurrent(Transfer[None]):
 
     def expire(self, now: float) -> None:
         """Send it again, or give up."""
-        if self._is_out_of_patience(now):
+        end = "" if self._standing is None else self._standing.end
+        if end or self._is_out_of_patience(now):
             told = "nothing" if self._told is None else f"item {self._told}"
             self._fail(
                 OperationTimeout(
                     f"MISSION_SET_CURRENT {self._seq} was not confirmed in {now - self._started_at:.1f} s"
                     f" ({self._attempts} attempts); MISSION_CURRENT told {told} (numbers on the wire)"
+                    + (f"; not sent again: {end}" if end else "")
                 )
             )
-            return
-        self._send(now)
+        elif self._standing is not None and self._standing.told_at < self._sent_at:
+            self.deadline = now + LOOK_S
+        else:
+            self._send(now)
 
     def _has_passed(self, seq: int) -> bool:
         """Whether it has gone to our item and run through it: not what flying on from where it was comes to."""
@@ -67,6 +83,7 @@ class MissionSetCurrent(Transfer[None]):
 
     def _send(self, now: float) -> None:
         self._attempts += 1
+        self._sent_at = now
         self._outbox.append(SetCurrentMessage(self.target_system, self.target_component, self._seq))
         left = self._started_at + self._patience_s - now
         self.deadline = now + min(max(self.round_trip.timeout_s(), TOLD_EVERY_S), max(left, 0.01))

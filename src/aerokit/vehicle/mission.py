@@ -18,7 +18,7 @@ from aerokit.vehicle.progress import LONGEST_SILENCE_S, await_progress
 if TYPE_CHECKING:
     from aerokit.missions import Mission
     from aerokit.runtime.cells import StateCell
-    from aerokit.vehicle.orders import Order
+    from aerokit.vehicle.orders import Order, Sending
     from aerokit.vehicle.plans import PlanContext
     from aerokit.vehicle.values import MissionProgress, Mode
 
@@ -78,6 +78,7 @@ class MissionControl(HeldPlan["Mission"]):
         Raises:
             LocalProtocolError: there is no such item. Nothing was sent.
             CommandRejected: the vehicle refused.
+            OperationRejected: somebody else steers, or a newer order was given, before it was confirmed.
             OperationTimeout: MISSION_CURRENT did not confirm it.
         """
         self._check_item(item)
@@ -220,17 +221,32 @@ class MissionControl(HeldPlan["Mission"]):
                     raise
             else:
                 return
-        await self._set_current_by_message(seq, timeout)
+        with vehicle._helm.sending(order) as sending:
+            try:
+                await self._set_current_by_message(seq, timeout, sending)
+            except OperationTimeout as error:
+                if order.end:
+                    raise OperationRejected(str(error), reasons=vehicle.texts_since(order.given_at)) from None
+                raise
 
-    async def _set_current_by_message(self, seq: int, timeout: float) -> None:
+    async def _set_current_by_message(
+        self, seq: int, timeout: float, standing: Sending | None = None
+    ) -> None:
         from aerokit.protocols.mission_current import MissionSetCurrent
 
         transfers = self._context.transfers
         target = (transfers.system_id, transfers.component_id)
         async with self._context.lock:  # PX4 does not hear it during a transfer
+            if standing is not None:
+                self._vehicle._raise_if_over(standing.order)
             await transfers.run(
                 MissionSetCurrent(
-                    *target, seq, self._told_seq, round_trip=transfers.round_trip, patience_s=timeout
+                    *target,
+                    seq,
+                    self._told_seq,
+                    standing=standing,
+                    round_trip=transfers.round_trip,
+                    patience_s=timeout,
                 )
             )
 

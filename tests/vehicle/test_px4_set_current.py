@@ -1,0 +1,58 @@
+"""PX4 knows MISSION_SET_CURRENT alone, which has no answer: the rules of all orders hold for it, too."""
+
+from __future__ import annotations
+
+import anyio
+import pytest
+from flight_harness import Px4Flight, open_px4
+
+from aerokit import messages as m
+from aerokit import missions
+from aerokit.errors import OperationRejected, OperationTimeout
+from aerokit.mavlink.enums import MavCmd
+from aerokit.protocols.mission_current import MissionSetCurrent
+from aerokit.sim.px4.modes import POSITION
+
+pytestmark = pytest.mark.anyio
+
+
+async def _start_mission(flight: Px4Flight) -> None:
+    await flight.take_off()
+    here = flight.vehicle.position.value
+    places = [here.offset(north_m=50.0 * number) for number in (1, 2, 3)]
+    items = [
+        missions.waypoint(each.latitude_deg, each.longitude_deg, altitude_relative_m=10) for each in places
+    ]
+    await flight.vehicle.mission.upload(missions.Mission(items))
+    await flight.vehicle.mission.start()
+    await anyio.sleep(1.5)
+    flight.wire.forget()
+
+
+@pytest.mark.parametrize("who", ["a pilot", "the program"])
+async def test_it_is_not_sent_again_against_who_steers_now(who: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    async with open_px4() as flight:
+        await _start_mission(flight)
+        monkeypatch.setattr(MissionSetCurrent, "receive", lambda *_: None)  # it is never confirmed
+        async with anyio.create_task_group() as tasks:
+
+            async def interfere() -> None:
+                await anyio.sleep(0.3)
+                if who == "a pilot":
+                    flight.px4.switch_to(POSITION)
+                else:
+                    await flight.vehicle.command(MavCmd.NAV_RETURN_TO_LAUNCH)
+
+            tasks.start_soon(interfere)
+            with pytest.raises(OperationRejected, match=r"not sent again: (the mode|another order)"):
+                await flight.vehicle.mission.set_current(2)
+        assert len(flight.wire.all(m.MissionSetCurrent)) == 1
+
+
+async def test_it_is_not_sent_again_into_a_silence() -> None:
+    async with open_px4() as flight:
+        await _start_mission(flight)
+        flight.px4.faults.silent = True
+        with pytest.raises(OperationTimeout, match="1 attempts"):
+            await flight.vehicle.mission.set_current(2)
+        assert len(flight.wire.all(m.MissionSetCurrent)) == 1
