@@ -67,6 +67,16 @@ def test_what_was_told_is_not_ordered_again_against_the_pilot(
     assert (vehicle.armed, vehicle.mode.name) == (False, "LOITER")
 
 
+def test_arming_without_an_answer_says_that_it_may_still_be_carried_out(
+    copter: FlightController, vehicle: dronekit.Vehicle, caplog: pytest.LogCaptureFixture
+) -> None:
+    lose_answers(copter, ARM, does=False)
+    vehicle.armed = True
+    vehicle._handler.orders.wait(LIMIT_S)
+    (record,) = caplog.records
+    assert record.message.endswith("; it may still be carried out, and nobody watches for that")
+
+
 def test_a_pilot_who_takes_over_before_the_order_has_come_keeps_the_vehicle(
     copter: FlightController, vehicle: dronekit.Vehicle, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -6,6 +6,10 @@ import anyio
 import pytest
 from flight_harness import in_the_air, open_flight
 
+import aerokit
+from aerokit.errors import AerokitError, ConnectionClosed, OperationRejected
+from aerokit.sim import SimulatedCopter, simulated_link
+
 pytestmark = pytest.mark.anyio
 
 
@@ -35,3 +39,26 @@ async def test_nothing_is_said_on_the_ground_or_when_it_was_meant(caplog: pytest
     async with in_the_air():
         pass
     assert "let go" not in caplog.text
+
+
+async def test_the_block_is_left_while_another_task_flies(caplog: pytest.LogCaptureFixture) -> None:
+    """Nobody waits for the flight any more: the vehicle is told to hold before the connection ends."""
+    ended: list[Exception] = []
+    copter = SimulatedCopter(boot_time_s=0.0)
+    async with simulated_link(copter) as link, anyio.create_task_group() as tasks:
+        async with aerokit.connect(link) as vehicle:
+            await vehicle.wait_ready()
+            await vehicle.arm()
+            await vehicle.take_off(10.0)
+
+            async def go() -> None:
+                try:
+                    await vehicle.go_to(vehicle.position.value.offset(north_m=300))
+                except AerokitError as error:
+                    ended.append(error)
+
+            tasks.start_soon(go)
+            await anyio.sleep(3.0)
+        assert copter.mode.name == "BRAKE"
+    assert isinstance(ended[0], (ConnectionClosed, OperationRejected))
+    assert "vehicle 1 is let go: holding in BRAKE" in caplog.text

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from aerokit.autopilots.px4 import Px4
 from aerokit.dronekit.exceptions import APIException
 from aerokit.dronekit.standing import send_while_standing
-from aerokit.errors import CommandRejected, LocalProtocolError
+from aerokit.errors import CommandRejected, LocalProtocolError, OperationTimeout
 from aerokit.mavlink.messages import SetPositionTargetGlobalInt
 
 if TYPE_CHECKING:
@@ -28,14 +28,18 @@ ARMED_IS_TOLD_S = 10.0
 
 async def change_armed(vehicle: AsyncVehicle, standing: Standing, value: bool) -> None:
     """Arm or disarm, and wait until HEARTBEAT says so."""
-    with standing.watching(vehicle):
-        send = vehicle._commands.send_long
-        await send_while_standing(vehicle, standing, send, COMPONENT_ARM_DISARM, float(value))
-        await vehicle.telemetry.armed.wait_until(
-            lambda armed: armed is value or standing.is_done,
-            timeout=ARMED_IS_TOLD_S,
-            description="armed" if value else "disarmed",
-        )
+    try:
+        with standing.watching(vehicle):
+            send = vehicle._commands.send_long
+            await send_while_standing(vehicle, standing, send, COMPONENT_ARM_DISARM, float(value))
+            await vehicle.telemetry.armed.wait_until(
+                lambda armed: armed is value or standing.is_done,
+                timeout=ARMED_IS_TOLD_S,
+                description="armed" if value else "disarmed",
+            )
+    except OperationTimeout as error:
+        error.args = (f"{error}; it may still be carried out, and nobody watches for that",)
+        raise
 
 
 async def take_off(vehicle: AsyncVehicle, standing: Standing, command: int, *params: float) -> None:

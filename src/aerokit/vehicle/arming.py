@@ -13,6 +13,7 @@ from aerokit.errors import (
     AerokitError,
     CommandRejected,
     CommandTimeout,
+    HeartbeatTimeout,
     LocalProtocolError,
     OperationRejected,
     OperationTimeout,
@@ -114,8 +115,7 @@ class ArmingActions(HoldingActions):
         check_seconds("max_silence_s", max_silence_s, none_is_allowed=True)
         wanted = self._mode_to_arm_in(mode)
         if wanted is not None:
-            await self._ensure_mode(wanted, self._helm.order(wanted))
-            await self._settle_in_mode()
+            await self._go_to_arming_mode(wanted)
         self._stop_watching_arming()
         started, was_armed = self.connection.now(), self.is_armed
         with self._helm.aside() as order:
@@ -207,6 +207,17 @@ class ArmingActions(HoldingActions):
             return None
         return self.autopilot.mode_to_arm_in()
 
+    async def _go_to_arming_mode(self, wanted: Mode) -> None:
+        """Afterwards the order to arm is not meant any more, or not yet, if anything has come between."""
+        order, count = self._helm.order(wanted), self._helm.arming_orders
+        await self._ensure_mode(wanted, order)
+        await self._settle_in_mode()
+        self._raise_if_over(order)
+        if self._helm.arming_orders != count:
+            raise OperationRejected("arm(): another order to arm or disarm was given; it was not told to arm")
+        if not self._helm.is_known:
+            raise HeartbeatTimeout(f"arm(): {self.describe_link()}; it was not told to arm")
+
     async def _settle_in_mode(self) -> None:
         """PX4 tells by SYS_STATUS, some times a second, whether it could be armed in its new mode."""
         sensors = self.telemetry.sensors
@@ -226,19 +237,20 @@ class ArmingActions(HoldingActions):
     def _watch_for_late_arming(self, was_armed: bool) -> None:
         """The order to arm was given up; it may have been heard, or may still arrive."""
         self.connection.discard_unsent()
+        count = self._helm.arming_orders
         scope, is_over = Cancellation(), asyncio.Event()
         self._late_arming, self._late_arming_is_over = scope, is_over
 
         async def watch() -> None:
             with scope, anyio.move_on_after(LATE_S):
-                await self._disarm_again(was_armed)
+                await self._disarm_again(was_armed, count)
             if self._late_arming is scope:
                 self._late_arming = None
             is_over.set()
 
         self._background.start(watch, "aerokit late arming")
 
-    async def _disarm_again(self, was_armed: bool) -> None:
+    async def _disarm_again(self, was_armed: bool, count: int) -> None:
         """What was armed before the order is left alone, until it has been heard disarmed."""
         armed, since = self.telemetry.armed, self.connection.now()
         try:
@@ -247,6 +259,8 @@ class ArmingActions(HoldingActions):
             await armed.wait_until(lambda value: value and armed.updated_at > since, description="armed")
         except AerokitError as error:
             logger.warning("the link ended while an order to arm may still be carried out: %s", error)
+            return
+        if self._helm.arming_orders != count:  # the program has ordered it by a command of its own
             return
         logger.warning("the vehicle armed although the order to arm was given up: it is disarmed again")
         with anyio.CancelScope(shield=True):

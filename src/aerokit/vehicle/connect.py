@@ -172,7 +172,7 @@ async def _attached(
         raise
     finally:
         try:
-            vehicle._end_stream()
+            vehicle._end_flights()
             is_cut_short = is_cut_short or vehicle._is_told_to_hold
             await vehicle._finish_hold()
             await vehicle._finish_arming()

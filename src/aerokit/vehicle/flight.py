@@ -81,7 +81,8 @@ class FlightActions(TravelActions):
         order = self._helm.order(*(mode for mode in modes if mode is not None))
         try:
             await self._begin_take_off(plan, order)
-            await self._await_altitude(altitude_m, timeout, max_silence_s, order)
+            with self._flying(order):
+                await self._await_altitude(altitude_m, timeout, max_silence_s, order)
         except (anyio.get_cancelled_exc_class(), OperationTimeout):  # it may have heard the order
             self._hold_soon(order)
             raise

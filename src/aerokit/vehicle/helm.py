@@ -35,6 +35,8 @@ class Helm:
         self._now, self._telemetry = now, telemetry
         self.newest: Order | None = None
         """The last order that steers."""
+        self.arming_orders = 0
+        """How many orders to arm or disarm were sent."""
         self.mode_is_in_doubt = False
         """An order that changes the mode is out and its end is not known: the mode told may be about to change."""
         self.mode_settles_at = -math.inf
@@ -110,6 +112,7 @@ class Helm:
             armed=armed,
             is_done=is_done,
         )
+        self.arming_orders += armed is not None
         for each in self._sendings:
             each.note_newer(armed)
         self._sendings.append(sending)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import anyio
@@ -15,6 +16,8 @@ from aerokit.runtime.cancellation import Cancellation
 from aerokit.vehicle.modes import CHANGE_MODE, DO_REPOSITION, DO_SET_MODE, ModeActions
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from aerokit.autopilots import Mode
     from aerokit.mavlink.messages import Heartbeat
     from aerokit.runtime.connection import Connection
@@ -41,6 +44,8 @@ class HoldingActions(ModeActions):
 
     _stream: SetpointStream[Any] | None = None
     """The set-point stream that is open."""
+    _flight: Order | None = None
+    """The order to go somewhere that a call waits for."""
     _hold_scope: Cancellation | None = None
     _hold_is_over: asyncio.Event | None = None
 
@@ -181,10 +186,22 @@ class HoldingActions(ModeActions):
                 self.describe_link(),
             )
 
-    def _end_stream(self) -> None:
-        """At the end of everything: a set-point stream that is still open ends, and the vehicle is told to hold."""
+    @contextmanager
+    def _flying(self, order: Order) -> Iterator[None]:
+        """For as long as a call waits for this order, the end of the vehicle's block means hold."""
+        self._flight = order
+        try:
+            yield
+        finally:
+            if self._flight is order:
+                self._flight = None
+
+    def _end_flights(self) -> None:
+        """At the end of everything: what other tasks still have under way ends, and the vehicle is told to hold."""
         if self._stream is not None:
             self._stream._stop("the block of its vehicle was left")
+        if self._flight is not None:
+            self._hold_soon(self._flight)
 
     @property
     def _holds_by_reposition(self) -> bool:

@@ -102,7 +102,8 @@ class TravelActions(ArmingActions):
                 await self._command_of(order, DO_CHANGE_SPEED, 1, speed_m_s, -1)
             if heading_deg is not None and math.isnan(yaw):
                 await self._command_of(order, CONDITION_YAW, heading_deg % 360)
-            await self._await_arrival(target, near_m, timeout, max_silence_s, order, mode, resend)
+            with self._flying(order):
+                await self._await_arrival(target, near_m, timeout, max_silence_s, order, mode, resend)
         except (anyio.get_cancelled_exc_class(), OperationTimeout):  # it may have heard the order
             self._hold_soon(order)
             raise

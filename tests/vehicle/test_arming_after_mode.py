@@ -1,0 +1,78 @@
+"""arm() that has to change the mode first, or was given up: what the program orders between its steps."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
+
+import anyio
+import pytest
+from flight_harness import Px4Flight, open_px4
+
+from aerokit.errors import CommandTimeout, HeartbeatTimeout, OperationRejected
+from aerokit.mavlink.enums import MavCmd
+from aerokit.mavlink.messages import CommandLong
+from aerokit.sim.px4.modes import RTL
+from aerokit.sim.track import true_point
+
+pytestmark = pytest.mark.anyio
+
+
+@asynccontextmanager
+async def _in_rtl() -> AsyncIterator[Px4Flight]:
+    async with open_px4() as flight:
+        await flight.vehicle.wait_ready()
+        flight.px4.switch_to(RTL)
+        await anyio.sleep(2.0)
+        flight.wire.forget()
+        yield flight
+
+
+def _told_to_arm(flight: Px4Flight) -> bool:
+    sent = flight.wire.commands(MavCmd.COMPONENT_ARM_DISARM)
+    return any(isinstance(each, CommandLong) and each.param1 == 1 for each in sent)
+
+
+async def test_disarm_while_the_mode_changes_ends_arm() -> None:
+    async with _in_rtl() as flight:
+        ended: list[BaseException] = []
+
+        async def arm() -> None:
+            try:
+                await flight.vehicle.arm()
+            except OperationRejected as error:
+                ended.append(error)
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(arm)
+            await anyio.sleep(0.02)
+            await flight.vehicle.disarm()
+        assert "another order to arm or disarm was given" in str(ended[0])
+        assert not _told_to_arm(flight)
+        assert not true_point(flight.px4).armed
+
+
+async def test_a_vehicle_that_falls_silent_in_its_new_mode_is_not_told_to_arm() -> None:
+    async with _in_rtl() as flight:
+
+        def cut(_: object, mode: object) -> None:
+            flight.px4.faults.silent = True
+
+        end = flight.vehicle.mode.observe(cut)
+        with pytest.raises(HeartbeatTimeout, match="it was not told to arm"):
+            await flight.vehicle.arm()
+        end()
+        assert not _told_to_arm(flight)
+
+
+async def test_who_is_armed_by_a_command_after_arm_was_given_up_stays_armed() -> None:
+    async with open_px4() as flight:
+        await flight.vehicle.wait_ready()
+        flight.px4.faults.ignore(MavCmd.COMPONENT_ARM_DISARM)
+        with pytest.raises(CommandTimeout):
+            await flight.vehicle.arm()
+        flight.px4.faults.commands.clear()
+        with suppress(CommandTimeout):  # its answer is taken for one to the orders before
+            await flight.vehicle.command(MavCmd.COMPONENT_ARM_DISARM, 1)
+        await anyio.sleep(5.0)
+        assert true_point(flight.px4).armed
