@@ -241,8 +241,25 @@ async def test_bytes_may_come_before_it_is_open_and_it_may_be_lost_then() -> Non
         "back after 0.2 s",
         "hello",
     ]
+    assert len(device.tried_at) == 3  # by one opener, who was at it when the second was lost
     link.close()
     await link.wait_closed()
+
+
+async def test_closed_by_who_is_told_that_it_is_away_it_stays_closed() -> None:
+    class Leaving(Told):
+        def link_interrupted(self, error: LinkLost) -> None:
+            super().link_interrupted(error)
+            link.close()
+
+    device, heard = Device(), Leaving()
+    link = ReconnectingLink(device.plug)
+    await link.open(heard)
+    device.unplug(gone=False)
+    await link.wait_closed()
+    await anyio.sleep(60)
+    assert len(device.tried_at) == 1
+    assert heard.told == ["away: device: unplugged"]
 
 
 async def test_the_lost_one_is_gone_before_another_is_opened() -> None:
