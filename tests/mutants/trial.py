@@ -29,6 +29,10 @@ PRELOADED = (
     "serial",
 )
 
+NOTICED_BY = (pytest.ExitCode.TESTS_FAILED, pytest.ExitCode.INTERRUPTED, pytest.ExitCode.USAGE_ERROR)
+LEFT_OPEN = "PytestUnraisableExceptionWarning"
+"""Of a file, say, that nobody closed: pytest fails at its very end, with no exit code for it."""
+
 PRELOADED_IS_FINE = ("-W", "ignore::pytest.PytestAssertRewriteWarning")
 
 
@@ -80,11 +84,7 @@ class Trials:
         code = os.WEXITSTATUS(status)
         if code == pytest.ExitCode.OK:
             return SURVIVED, ""
-        if code not in (
-            pytest.ExitCode.TESTS_FAILED,
-            pytest.ExitCode.INTERRUPTED,
-            pytest.ExitCode.USAGE_ERROR,
-        ):
+        if code not in NOTICED_BY and LEFT_OPEN not in said:
             raise RuntimeError(f"pytest did not run {tests[0]}: {said[-2000:]}")
         return NOTICED, _first_failure(said)
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from aerokit.errors import FileError, FileTimeout
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
 from aerokit.protocols.ftp import DATA_SIZE, FtpSessionLost
-from aerokit.protocols.ftp_transfer import FtpDownload, FtpUpload, is_virtual
+from aerokit.protocols.ftp_transfer import MOST_GAPS, MOST_REPEATED, FtpDownload, FtpUpload, is_virtual
 from aerokit.protocols.reassembly import Reassembly
 from aerokit.protocols.round_trip import RoundTrip
 from aerokit.protocols.transfer import Progress
@@ -145,6 +145,91 @@ def test_blocks_of_another_burst_are_not_taken() -> None:
     exchange.receive(as_message(reply_to(burst, b"x" * 239, offset=0, ahead=5)), 0.1)
     assert not download.content
     assert download.into.tail == 0
+
+
+def bursts_in(download: Download) -> list[int]:
+    """The offsets of the bursts that it asked for since."""
+    requests = requests_in(download.exchange.take_outbox())
+    return [each.offset for each in requests if each.opcode == Op.BURSTREADFILE]
+
+
+def test_after_the_last_block_of_a_burst_the_next_one_is_asked_for_at_once() -> None:
+    download = Download(10_000)
+    download.exchange.start(0.0)
+    (burst,) = requests_in(download.exchange.take_outbox())
+    download.exchange.receive(as_message(reply_to(burst, content(239), offset=0)), 0.1)
+    assert bursts_in(download) == []
+    last = reply_to(burst, content(239), offset=239, ahead=2).replace(burst_complete=True)
+    download.exchange.receive(as_message(last), 0.11)
+    assert bursts_in(download) == [478]
+
+
+@pytest.mark.parametrize(("missing", "asked"), [(MOST_GAPS - 1, 1), (MOST_GAPS, 0)])
+def test_with_too_many_gaps_the_burst_does_not_go_on(missing: int, asked: int) -> None:
+    download = Download(10_000_000)
+    download.exchange.start(0.0)
+    (burst,) = requests_in(download.exchange.take_outbox())
+    last = reply_to(burst, content(239), offset=239 * missing, ahead=missing + 1)
+    download.exchange.receive(as_message(last.replace(burst_complete=True)), 0.1)
+    assert len(bursts_in(download)) == asked
+
+
+def test_a_burst_in_vain_is_asked_for_again_twice_before_it_is_waited_longer() -> None:
+    download = Download(1000)
+    exchange = download.exchange
+    round_trip = exchange.round_trip
+    exchange.start(0.0)
+    waits, now = list[float](), 0.0
+    for _ in range(4):
+        assert bursts_in(download) == [0]
+        assert exchange.deadline is not None
+        waits.append(exchange.deadline - now)
+        now = exchange.deadline
+        exchange.expire(now)
+    assert waits == pytest.approx([round_trip.timeout_s(attempt) for attempt in (1, 2, 3, 4)])
+    assert waits[1] == pytest.approx(waits[0])
+    assert waits[2] > 1.4 * waits[1]
+
+
+def test_the_first_block_of_the_first_burst_measures_the_round_trip_and_no_other_does() -> None:
+    for ahead, measured in ((1, 0.3), (2, None)):
+        into = Reassembly(bytearray().extend, block_size=DATA_SIZE)
+        exchange = FtpDownload(make_client(), "/a", into, session=1, size=5000)
+        exchange.start(0.0)
+        (burst,) = requests_in(exchange.take_outbox())
+        block = reply_to(burst, content(239), offset=239 * (ahead - 1), ahead=ahead)
+        exchange.receive(as_message(block), 0.3)
+        assert exchange.round_trip.smoothed_s == measured
+
+
+def test_a_file_that_has_grown_is_read_as_far_as_it_was_there() -> None:
+    download = Download(300)
+    download.exchange.start(0.0)
+    (burst,) = requests_in(download.exchange.take_outbox())
+    for number in (0, 1):
+        block = reply_to(burst, content(600)[239 * number :][:239], offset=239 * number, ahead=number + 1)
+        download.exchange.receive(as_message(block), 0.1)
+    assert download.exchange.result() == 300
+    assert download.content == content(600)[:300]
+
+
+def test_a_server_that_sends_empty_blocks_does_not_keep_it_waiting() -> None:
+    """Three such bursts are taken for life; then only what is new is."""
+    download = Download(1000, patience_s=2.0)
+    exchange = download.exchange
+    exchange.start(0.0)
+    now = heard_at = 0.0
+    answered = 0
+    while not exchange.done:
+        for request in requests_in(exchange.take_outbox()):
+            heard_at, answered = now, answered + 1
+            exchange.receive(as_message(reply_to(request, b"", offset=0)), now)
+        assert exchange.deadline is not None
+        now = exchange.deadline
+        exchange.expire(now)
+        if answered == MOST_REPEATED:
+            believed_until = heard_at + 2.0
+    assert now == pytest.approx(believed_until)
 
 
 def test_it_gives_up_and_says_what_is_missing() -> None:

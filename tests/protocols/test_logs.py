@@ -17,7 +17,7 @@ from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import LogData, LogEntry, LogRequestData, LogRequestEnd, LogRequestList
 from aerokit.protocols.exchange import Exchange
 from aerokit.protocols.log_list import LogList
-from aerokit.protocols.logs import LOG_BLOCK, LogDownload, LogEnd
+from aerokit.protocols.logs import LOG_BLOCK, SPACING_S, LogDownload, LogEnd
 from aerokit.protocols.reassembly import Reassembly
 from aerokit.protocols.round_trip import RoundTrip
 
@@ -218,6 +218,7 @@ def test_it_gives_up_and_tells_the_vehicle() -> None:
     exchange.start(0.0)
     exchange.receive(LogData(1, 0, 90, bytes(90)), 0.1)
     exchange.receive(LogData(1, 180, 90, bytes(90)), 0.1)
+    exchange.receive(LogData(1, 450, 90, bytes(90)), 0.1)
     exchange.receive(LogData(2, 270, 90, bytes(90)), 0.1)  # of another log
     messages = exchange.take_outbox()
     while not exchange.done:
@@ -226,9 +227,20 @@ def test_it_gives_up_and_tells_the_vehicle() -> None:
         messages += exchange.take_outbox()
     with pytest.raises(FileTimeout, match="log 1: nothing has come for 2 s") as raised:
         exchange.result()
-    assert raised.value.missing == ((90, 90), (270, 730))
+    assert raised.value.missing == ((90, 90), (270, 180), (540, 460))
     assert isinstance(messages[-1], LogRequestEnd)
     assert len(messages) < 40
+
+
+def test_what_is_missing_of_a_range_is_asked_for_two_at_once_and_then_apart() -> None:
+    exchange, _ = make_download(5 * LOG_BLOCK)
+    exchange.start(0.0)
+    exchange.take_outbox()
+    for offset in (0, 4 * LOG_BLOCK):
+        exchange.receive(LogData(1, offset, LOG_BLOCK, bytes(LOG_BLOCK)), 0.1)
+    asked = [each.ofs for each in exchange.take_outbox() if isinstance(each, LogRequestData)]
+    assert asked == [LOG_BLOCK, 2 * LOG_BLOCK]
+    assert exchange.deadline == pytest.approx(0.1 + SPACING_S)
 
 
 def test_a_log_that_ends_before_its_end() -> None:
@@ -236,6 +248,8 @@ def test_a_log_that_ends_before_its_end() -> None:
     exchange, _ = make_download(1000)
     exchange.start(0.0)
     for _ in range(3):
+        (request,) = exchange.take_outbox()  # at once: it may read its log the next time
+        assert isinstance(request, LogRequestData)
         exchange.receive(LogData(1, 450, 50, bytes(90)), 0.1)
     with pytest.raises(RemoteProtocolError, match="ends after 500 bytes"):
         exchange.result()

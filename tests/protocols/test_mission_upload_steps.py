@@ -44,6 +44,17 @@ def rejected(exchange: MissionUpload) -> MissionRejected:
     return caught.value
 
 
+def test_an_item_measures_the_round_trip_when_it_was_sent_once() -> None:
+    exchange = upload(round_trip=RoundTrip())
+    told(exchange)
+    assert ask(exchange, 0, 1.0) == [0]
+    assert ask(exchange, 1, 1.3) == [1]
+    assert exchange.round_trip.smoothed_s == pytest.approx(0.3)
+    assert ask(exchange, 1, 3.0) == [1]  # lost on the way: which of the two is answered nobody knows
+    assert ask(exchange, 2, 3.1) == [2]
+    assert exchange.round_trip.smoothed_s == pytest.approx(0.3)
+
+
 # -------------------------------------------------------------------------------- an ERROR
 
 
@@ -57,6 +68,7 @@ def test_an_error_is_believed_when_it_comes_again_after_a_round_trip() -> None:
     assert not exchange.done
     assert acknowledge(exchange, Result.ERROR, 1.25) == []
     assert (rejected(exchange).result, rejected(exchange).item) == (Result.ERROR, 1)
+    assert str(rejected(exchange)).startswith("mission: the vehicle refused item 1: ")
 
 
 def test_an_error_that_a_request_follows_was_none() -> None:
@@ -101,6 +113,7 @@ def test_a_part_that_is_refused_at_once_is_refused() -> None:
     assert told(exchange) == ["MISSION_WRITE_PARTIAL_LIST"]
     acknowledge(exchange, Result.ERROR, 0.1)
     assert rejected(exchange).result == Result.ERROR
+    assert str(rejected(exchange)).startswith("mission: the vehicle refused: ")
     assert not exchange.was_begun
 
 

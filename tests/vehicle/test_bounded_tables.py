@@ -12,9 +12,10 @@ from aerokit.dronekit.parameter_values import ParameterValues
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.message import Message
-from aerokit.mavlink.messages import AvailableModes, Heartbeat, ParamValue, Statustext
+from aerokit.mavlink.messages import AvailableModes, Heartbeat, ParamRequestRead, ParamValue, Statustext
 from aerokit.parameters.parameter import MOST_PARAMETERS
 from aerokit.protocols.parameter_list import ParameterList
+from aerokit.protocols.round_trip import RoundTrip
 from aerokit.runtime.bus import Bus
 from aerokit.sim.channel import MOST_PEERS, Channel
 from aerokit.vehicle.status_text import MOST_OPEN, StatusTextAssembler
@@ -44,6 +45,17 @@ def test_names_of_one_list() -> None:
     for number in range(MOST_PARAMETERS + 100):
         exchange.receive(ParamValue(f"P{number}", 1.0, 9, 65535, number % 10), 0.0)
     assert len(exchange._names) == MOST_PARAMETERS
+
+
+def test_a_parameter_there_is_no_room_for_is_not_asked_for_again_and_again() -> None:
+    exchange, count = ParameterList(1, 1, bytewise=False, round_trip=RoundTrip(0.1)), MOST_PARAMETERS + 1
+    exchange.start(0.0)
+    for number in range(count):
+        exchange.receive(ParamValue(f"P{number}", 1.0, 9, count, number), 0.0)
+    for _ in range(3):
+        exchange.receive(ParamValue(f"P{count - 1}", 1.0, 9, count, count - 1), 0.1)
+    asked = [each for each in exchange.take_outbox() if isinstance(each, ParamRequestRead)]
+    assert [each.param_index for each in asked] == [count - 1]
 
 
 async def test_mode_names() -> None:

@@ -1,0 +1,59 @@
+"""Which requests are under way, and when they are sent again: windows of names and indices, and of blocks."""
+
+from __future__ import annotations
+
+import pytest
+
+from aerokit.protocols.block_requests import BlockRequests
+from aerokit.protocols.request_window import FEW, LONGEST_S, RequestWindow
+from aerokit.protocols.round_trip import RoundTrip
+
+
+def window_of(count: int, round_trip: RoundTrip) -> RequestWindow[int]:
+    """So many requests, all sent at 0."""
+    window: RequestWindow[int] = RequestWindow(round_trip)
+    for key in range(count):
+        window.ask(key)
+    assert window.take_due(0.0) == list(range(count))
+    return window
+
+
+def test_what_was_answered_is_neither_under_way_nor_sent_again() -> None:
+    window = window_of(2, RoundTrip(0.2))
+    window.answered(0, 0.2)
+    assert (len(window), 0 in window, 1 in window) == (1, False, True)
+    assert window.take_due(10.0) == [1]
+
+
+def test_nothing_is_waited_for_longer_than_two_seconds() -> None:
+    round_trip = RoundTrip(3.0)
+    assert round_trip.timeout_s() > LONGEST_S
+    assert window_of(FEW + 1, round_trip).deadline == 2.0
+
+
+def test_after_a_silence_it_is_waited_longer() -> None:
+    round_trip = RoundTrip(0.2)
+    timeout_s = round_trip.timeout_s()
+    window = window_of(FEW + 3, round_trip)
+    silent = window.take_due(timeout_s)  # nothing has come at all
+    assert len(silent) == FEW + 3
+    assert window.deadline == pytest.approx(timeout_s + round_trip.timeout_s(3))
+
+
+def test_blocks_that_are_held_back_for_a_moment_are_not_waited_for_once_they_are_sent() -> None:
+    round_trip = RoundTrip(0.1)
+    requests = BlockRequests(round_trip, at_once=1, spacing_s=0.005)
+    for offset in (0, 239, 478):
+        requests.ask(offset)
+    assert requests.take_due(0.0) == [0, 239]
+    assert requests.deadline == 0.005
+    assert requests.take_due(0.005) == [478]
+    assert requests.deadline == pytest.approx(round_trip.timeout_s())
+
+
+def test_a_request_that_is_alone_is_not_held_back() -> None:
+    requests = BlockRequests(RoundTrip(0.1), at_once=1, spacing_s=0.005)
+    for offset in (0, 239):
+        requests.ask(offset)
+        assert requests.take_due(0.001) == [offset]
+        requests.answered(offset, 0.001)
