@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import importlib
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from aerokit.errors import LocalProtocolError
 from aerokit.mavlink import enums, generator, messages
 
 PACKAGES = {"messages": messages, "enums": enums}
@@ -30,6 +32,18 @@ def test_other_xml_has_another_fingerprint(tmp_path: Path) -> None:
     (tmp_path / "minimal.xml").write_text(text, encoding="utf-8")
     assert generator.fingerprint(tmp_path) != generator.fingerprint()
     assert set(generator.differences(tmp_path)) >= {"messages/__init__.py", "messages/minimal.py"}
+
+
+def test_one_name_for_two_messages_is_refused(tmp_path: Path) -> None:
+    """A module would have one of them, whichever comes last."""
+    for stem in ("minimal", "standard", "common", "development", *generator.MODULES["ardupilotmega"]):
+        (tmp_path / f"{stem}.xml").write_bytes((generator.xml_folder() / f"{stem}.xml").read_bytes())
+    path = tmp_path / "development.xml"
+    text, count = re.subn('(<message id="[0-9]+" name=")[A-Z_]+"', r'\1AHRS"', path.read_text(), count=1)
+    assert count == 1
+    path.write_text(text)
+    with pytest.raises(LocalProtocolError, match="two definitions would both be called Ahrs"):
+        generator.generate(tmp_path)
 
 
 @pytest.mark.parametrize("other", [False, True])

@@ -233,6 +233,16 @@ def test_when_the_first_is_over_the_other_is_listened_to() -> None:
     assert not ear.is_double
 
 
+def test_when_the_first_comes_back_it_is_believed_with_its_third_frame() -> None:
+    ear, ours, theirs = Ear(), Sender(10), Sender(150)
+    ear.hear(*ours.frames(60))
+    for _, frame in interleaved(ours, theirs, 2, 5):
+        ear.hear(frame)
+    ear.now += 2.0
+    assert ear.hear(*theirs.frames(10)) == [""] * 10
+    assert ear.hear(*ours.frames(5)) == ["late", "late", "", "", ""]
+
+
 Disorder = Callable[[random.Random, list[bytes]], list[bytes]]
 
 
