@@ -27,6 +27,7 @@ from aerokit.links import (
 )
 from aerokit.links.allowed import AllowedPeers
 from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.runtime.link_state import SILENT_AFTER_S
 
 
 @pytest.mark.parametrize(
@@ -226,6 +227,10 @@ async def test_a_broadcast_is_repeated_and_another_port_heard_when_the_first_is_
             await eventually(lambda: received(again) == b"to again")
         link.close()
         await link.wait_closed()
+
+
+def test_who_was_silent_for_as_long_as_a_vehicle_may_be_is_asked_for_by_broadcast() -> None:
+    assert udp.QUIET_AFTER_S == SILENT_AFTER_S
 
 
 @each_loop

@@ -46,6 +46,19 @@ async def test_the_other_end_is_lost_after_it_has_heard_everything() -> None:
 
 
 @each_loop
+async def test_an_end_that_was_never_opened_takes_nobody_with_it() -> None:
+    near, far = memory_link_pair()
+    right = Recorder()
+    await far.open(right)
+    near.close()
+    await near.wait_closed()
+    for _ in range(5):
+        await asyncio.sleep(0)
+    assert right.losses == []
+    far.close()
+
+
+@each_loop
 async def test_nothing_arrives_after_close() -> None:
     near, far = memory_link_pair()
     left, right = Recorder(), Recorder()

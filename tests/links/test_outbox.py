@@ -90,6 +90,17 @@ async def test_nothing_is_written_that_has_waited_for_a_second() -> None:
     assert (line.sent, line.dropped) == ([b"taken", b"in time"], 1)
 
 
+async def test_a_second_is_too_long_to_the_last_tick_of_the_clock() -> None:
+    line = Line(room=1)
+    line.outbox.write(b"taken")
+    line.outbox.write(b"too late")
+    until = asyncio.get_running_loop().time() + WRITE_DEADLINE_S
+    await anyio.sleep(WRITE_DEADLINE_S)
+    assert asyncio.get_running_loop().time() == until
+    line.flow()
+    assert (line.sent, line.dropped) == ([b"taken"], 1)
+
+
 async def test_late_writes_are_given_up_without_any_other_write() -> None:
     line = Line(room=1)
     line.outbox.write(b"taken")

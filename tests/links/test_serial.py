@@ -188,6 +188,7 @@ async def test_a_port_is_not_shared_and_a_link_is_opened_once() -> None:
 @each_loop
 async def test_a_missing_device_is_an_error_that_lists_the_ports() -> None:
     link = SerialLink("/dev/ttyNoSuchPort", 57600)
+    assert link.unsent_bytes == 0
     with pytest.raises(
         LinkOpenError, match=r"cannot open serial:///dev/ttyNoSuchPort:57600: .*serial port"
     ) as caught:
