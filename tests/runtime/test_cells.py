@@ -124,6 +124,22 @@ async def test_timeout_says_what_was_seen() -> None:
     )
 
 
+async def test_timeout_names_a_value_again_that_has_come_back() -> None:
+    cell = make_cell("mode")
+    for at, value in enumerate((3, 4, 4, 3)):
+        later(at / 4, cell.set, value, HEARTBEAT)
+    with pytest.raises(OperationTimeout, match="4 values seen, last 3, 4, 3$"):
+        await cell.wait_until(lambda value: value == 99, timeout=2)
+
+
+async def test_timeout_tells_one_value_once() -> None:
+    cell = make_cell("mode")
+    cell.set(3, HEARTBEAT)
+    with pytest.raises(OperationTimeout) as caught:
+        await cell.wait_until(lambda value: value == 99, timeout=2)
+    assert str(caught.value) == "mode: not reached within 2 s; mode is 3, 2.0 s old"
+
+
 async def test_timeout_of_an_unknown_value_says_so() -> None:
     with pytest.raises(OperationTimeout, match="not known yet, no HEARTBEAT has been received"):
         await make_cell().wait_until(lambda _: True, timeout=1)
