@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
 import anyio
 import pytest
+from flight_harness import Wire
 
 from aerokit import (
     LocalPositionSetpoint,
@@ -18,6 +20,7 @@ from aerokit import (
 )
 from aerokit.errors import OperationRejected, OperationTimeout, SetpointStreamStopped
 from aerokit.mavlink.enums import SubMode
+from aerokit.mavlink.messages import SetPositionTargetLocalNed
 from aerokit.sim import SimulatedRover, SimulatedSub, SimulatedVehicle, simulated_link
 
 pytestmark = pytest.mark.anyio
@@ -103,6 +106,22 @@ async def test_a_submarine_gets_to_a_place_that_is_streamed(kind: str) -> None:
             async with vehicle.guided.position(place) as places:
                 await places.fly(place, 20.0)
         assert here.distance_to(vehicle.position.value) == pytest.approx(8.0, abs=1.0)
+
+
+async def test_a_submarine_is_told_the_same_place_three_times_and_then_every_five_seconds() -> None:
+    async with simulated_link(SimulatedSub(boot_time_s=1.0)) as link:
+        wire = Wire(link)
+        async with connect(wire) as vehicle:
+            await vehicle.wait_ready()
+            await vehicle.set_mode("GUIDED")
+            await vehicle.arm()
+            await vehicle.local_position.wait_until(lambda _: True)
+            local = LocalPositionSetpoint(30.0, 0.0, 2.0)
+            async with vehicle.guided.local_position(local) as stream:
+                await stream.fly(local, 12.0)
+    times = wire.times(SetPositionTargetLocalNed)
+    gaps = [later - earlier for earlier, later in itertools.pairwise(times)]
+    assert gaps == pytest.approx([0.1, 0.1, 5.0, 5.0], abs=0.11)
 
 
 async def test_a_vehicle_that_does_not_move_although_it_should_is_told() -> None:

@@ -1,0 +1,66 @@
+"""An order to hold that is left of a flight that was given up: at once, and until it is obeyed."""
+
+from __future__ import annotations
+
+import anyio
+import pytest
+from flight_harness import Flight, in_the_air, now, open_px4
+
+from aerokit import messages as m
+from aerokit.mavlink.enums import CopterMode, MavCmd
+
+pytestmark = pytest.mark.anyio
+
+BRAKE = CopterMode.BRAKE
+
+
+async def give_up(flight: Flight) -> None:
+    """A long way, cancelled after two seconds."""
+    with anyio.move_on_after(2.0) as scope:
+        await flight.vehicle.go_to(flight.vehicle.position.value.offset(north_m=500))
+    assert scope.cancelled_caught
+
+
+async def test_it_goes_out_in_the_same_instant() -> None:
+    async with in_the_air() as flight:
+        await give_up(flight)
+        assert flight.wire.sent[-1][0] == now()
+        assert flight.wire.mode_orders() == [BRAKE]
+
+
+async def test_px4_too_is_told_in_the_same_instant() -> None:
+    async with open_px4() as flight:
+        await flight.take_off()
+        with anyio.move_on_after(2.0):
+            await flight.vehicle.go_to(flight.vehicle.position.value.offset(north_m=500))
+        assert len(flight.wire.commands(MavCmd.DO_REPOSITION)) == 2
+        last_at, last = flight.wire.sent[-1]
+        assert isinstance(last, m.CommandLong)
+        assert (last_at, last.command) == (now(), MavCmd.DO_REPOSITION)
+
+
+@pytest.mark.parametrize("silent_s", [3.0, 60.0])
+async def test_lost_in_a_silence_it_is_given_again_however_long_that_was(silent_s: float) -> None:
+    async with in_the_air() as flight:
+        await give_up(flight)
+        flight.copter.faults.silent = True
+        await anyio.sleep(silent_s)
+        assert flight.wire.mode_orders() == [BRAKE]
+        flight.copter.faults.silent = False
+        await anyio.sleep(4.0)
+        assert flight.wire.mode_orders() == [BRAKE, BRAKE]
+        assert flight.vehicle.mode_name == "BRAKE"
+
+
+async def test_to_a_vehicle_that_does_not_obey_it_is_told_in_three_rounds(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    async with in_the_air() as flight:
+        flight.copter.faults.ignore(MavCmd.DO_SET_MODE)
+        await give_up(flight)
+        await anyio.sleep(60.0)
+        told = [each for each in caplog.messages if "has not confirmed it yet" in each]
+        assert len(told) == 3
+        flight.wire.forget()
+        await anyio.sleep(60.0)
+        assert not flight.wire.mode_orders()
