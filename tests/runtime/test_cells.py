@@ -128,7 +128,7 @@ async def test_timeout_names_a_value_again_that_has_come_back() -> None:
     cell = make_cell("mode")
     for at, value in enumerate((3, 4, 4, 3)):
         later(at / 4, cell.set, value, HEARTBEAT)
-    with pytest.raises(OperationTimeout, match="4 values seen, last 3, 4, 3$"):
+    with pytest.raises(OperationTimeout, match=r"4 values seen, last 3, 4, 3$"):
         await cell.wait_until(lambda value: value == 99, timeout=2)
 
 

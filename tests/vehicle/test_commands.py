@@ -257,6 +257,21 @@ async def test_reboot_waits_until_it_is_back_and_forgets_what_was(grounded: Flig
     assert vehicle.attitude.fresh(within=0.5)
 
 
+async def test_the_time_of_a_vehicle_that_reboots_is_asked_for_as_soon_as_it_has_answered(
+    grounded: Flight,
+) -> None:
+    answered_at: list[float] = []
+    (detach,) = grounded.vehicle.connection.attach(
+        [m.CommandAck], lambda ack: answered_at.append(now()) if ack.command == REBOOT else None
+    )
+    await grounded.vehicle.reboot()
+    detach()
+    sent = [each for each in grounded.wire.sent if isinstance(each[1], (m.CommandLong, m.Timesync))]
+    ordered = next(i for i, (_, each) in enumerate(sent) if getattr(each, "command", 0) == REBOOT)
+    assert isinstance(sent[ordered + 1][1], m.Timesync)
+    assert [sent[ordered + 1][0]] == answered_at
+
+
 async def test_reboot_is_noticed_without_any_stream() -> None:
     async with open_flight(rates={}) as flight:
         await anyio.sleep(3.5)

@@ -8,7 +8,7 @@ from typing import Any
 
 import anyio
 import pytest
-from flight_harness import Flight, Px4Flight, open_flight, open_px4
+from flight_harness import Flight, Px4Flight, now, open_flight, open_px4
 from plan_flights import changed, long_mission, near_home, sent_for_plans
 
 from aerokit import messages as m
@@ -250,6 +250,16 @@ async def test_nonsense_is_not_sent(plan: Any, options: dict[str, Any], text: st
         with pytest.raises(LocalProtocolError, match=text):
             await flight.vehicle.mission.upload(plan, **options)
         assert sent_for_plans(flight.wire) == []
+
+
+async def test_nonsense_is_refused_before_it_waits_for_its_turn() -> None:
+    async with open_flight(latency_s=0.2) as flight, anyio.create_task_group() as tasks:
+        tasks.start_soon(flight.vehicle.mission.upload, long_mission(40))
+        await anyio.sleep(1.0)
+        begin = now()
+        with pytest.raises(LocalProtocolError, match="patience_s = -1 is not allowed"):
+            await flight.vehicle.mission.upload(long_mission(2), patience_s=-1)
+        assert now() == begin
 
 
 # --------------------------------------------------------------------------- one at a time, given up

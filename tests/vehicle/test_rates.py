@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
+from contextlib import AsyncExitStack
+
 import anyio
 import pytest
 from flight_harness import Flight, open_flight, open_px4
@@ -146,6 +149,20 @@ async def test_a_sensor_that_is_not_there_is_not_asked_for_all_the_time() -> Non
         assert 2 <= len(asked(flight, m.DistanceSensor)) <= 7
 
 
+async def test_who_has_answered_is_asked_again_as_soon_as_ever() -> None:
+    """Each question in vain doubles the pause, until one is answered."""
+    async with open_flight(rates={}) as flight, AsyncExitStack() as wishes:
+        await anyio.sleep(3.0)
+        for times, hz in ((3, 20.0), (1, 50.0)):
+            flight.wire.forget()
+            flight.copter.faults.ignore(SET_INTERVAL, times=times)
+            wishes.enter_context(flight.vehicle.rate(m.RawImu, hz))
+            await anyio.sleep(40.0)
+            at = [when for when, each in flight.wire.sent if isinstance(each, m.CommandLong)]
+            gaps = [later - earlier for earlier, later in itertools.pairwise(at)]
+            assert gaps == pytest.approx([3.0, 5.0, 9.0][:times], abs=1.01)
+
+
 # ------------------------------------------------------------------------------------- events
 
 
@@ -157,6 +174,18 @@ async def test_a_stream_that_comes_too_slowly_is_an_event(grounded: Flight) -> N
         assert event.achieved_hz < 5.0
         await anyio.sleep(20.0)
         assert events.get_nowait() is None  # told once, not every second
+
+
+@pytest.mark.parametrize(("interval_s", "is_slow"), [(0.54, False), (0.7, True)])
+async def test_half_the_rate_but_one_message_in_five_seconds_is_not_slow_yet(
+    interval_s: float, is_slow: bool
+) -> None:
+    async with open_flight(rates={m.RawImu: 4.0}) as flight:
+        with flight.vehicle.subscribe(StreamSlow, capacity=20) as events:
+            await anyio.sleep(3.0)
+            flight.copter.channels[0].streams.set_interval(m.RawImu.ID, interval_s, flight.copter.now)
+            await anyio.sleep(20.0)
+            assert (events.get_nowait() is not None) is is_slow
 
 
 async def test_a_wanted_stream_that_does_not_come_at_all_is_an_event() -> None:

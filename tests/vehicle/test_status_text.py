@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import anyio
 import pytest
+from flight_harness import now, open_flight
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aerokit.mavlink import STANDARD, Frame
+from aerokit.mavlink import STANDARD, Frame, FrameEncoder
 from aerokit.mavlink.messages import Statustext
 from aerokit.vehicle.status_text import MOST_OPEN, StatusTextAssembler
 from aerokit.vehicle.values import StatusText
@@ -90,6 +92,17 @@ def test_a_missing_end_is_told_after_two_seconds() -> None:
     assert texts.expire(1.9) == []
     assert texts.expire(2.1) == [StatusText(4, LONG[:50].rstrip() + "…", 2.1)]
     assert texts.expire(9) == []
+
+
+@pytest.mark.anyio
+async def test_a_vehicle_that_says_nothing_more_is_not_waited_for() -> None:
+    async with open_flight() as flight:
+        await flight.vehicle.wait_ready()
+        begin = now()
+        flight.wire.deliver(FrameEncoder(1, 1).encode(Statustext(4, LONG[:50], 77, 0)))
+        await anyio.sleep(4.0)
+        (text,) = flight.vehicle.texts_since(begin)
+        assert text.startswith(LONG[:50])
 
 
 def test_a_new_text_with_the_same_id_cuts_the_old_one_off() -> None:

@@ -77,7 +77,10 @@ def test_a_quarter_turn_to_the_right() -> None:
     assert Attitude(0, 0, 90).quaternion == pytest.approx((half, 0, 0, half))
 
 
-@pytest.mark.parametrize(("fix_type", "has_fix"), [(0, False), (2, False), (3, True), (6, True), (99, False)])
+@pytest.mark.parametrize(
+    ("fix_type", "has_fix"),
+    [(0, False), (2, False), (3, True), (6, True), (8, True), (9, False), (99, False)],
+)
 def test_fix(fix_type: int, has_fix: bool) -> None:
     assert GpsReceiver(0, fix_type).has_3d_fix is has_fix
 
