@@ -340,3 +340,14 @@ async def test_the_end_of_a_block_says_nothing_of_arming_that_was_answered(
         await flight.vehicle.arm()
         await flight.vehicle.disarm()
     assert "order to arm" not in caplog.text
+
+
+@pytest.mark.parametrize(("order", "longest_s"), [("land", 300.0), ("return_to_launch", 600.0)])
+async def test_a_vehicle_that_stays_up_is_waited_for_five_or_ten_minutes(
+    flying: Flight, order: str, longest_s: float
+) -> None:
+    flying.copter.motion.step = lambda dt, powered=True: None  # type: ignore[method-assign]
+    begin = now()
+    with pytest.raises(OperationTimeout, match=f"{order}: not done within {longest_s:g} s; it is at 10.0 m"):
+        await getattr(flying.vehicle, order)()
+    assert longest_s <= now() - begin < longest_s + 3.0

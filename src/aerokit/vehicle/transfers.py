@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import anyio
 
@@ -88,17 +88,6 @@ class Transfers:
             raise
         except TimeoutError:
             raise OperationTimeout(f"not done within {timeout:g} s; {self._describe()}") from None
-
-    def in_background(self, exchange: Exchange[Any], name: str) -> None:
-        """Run an exchange that ends something, with nobody waiting; its failure is nobody's."""
-
-        async def end() -> None:
-            try:
-                await run_exchange(self.connection, self.system_id, exchange)
-            except Exception:
-                return  # the vehicle ends it by itself after its own time-out
-
-        self.background.start(end, f"aerokit {name}")
 
     def command_in_background(self, command: int, *params: float) -> None:
         """Send a command that makes things better, with nobody waiting; its failure is nobody's."""
