@@ -161,6 +161,12 @@ async def test_why_not_armable_works_when_the_vehicle_cannot_run_its_checks(grou
     ]
 
 
+async def test_why_not_armable_asks_a_vehicle_that_does_not_answer_twice(grounded: Flight) -> None:
+    grounded.copter.faults.ignore(MavCmd.RUN_PREARM_CHECKS)
+    assert await grounded.vehicle.why_not_armable() == []
+    assert len(grounded.wire.commands(MavCmd.RUN_PREARM_CHECKS)) == 2
+
+
 async def test_why_not_armable_works_without_default_streams() -> None:
     copter = SimulatedCopter(boot_time_s=0.0)
     copter.faults.refuse(MavCmd.RUN_PREARM_CHECKS, MavResult.UNSUPPORTED)

@@ -40,13 +40,14 @@ def params_of(command: m.CommandLong | m.CommandInt) -> list[float]:
     return [value for name in names if (value := getattr(command, name, None)) is not None]
 
 
-async def test_px4_turns_where_it_is_and_keeps_its_speed() -> None:
+@pytest.mark.parametrize(("heading_deg", "yaw"), [(90.0, math.pi / 2), (270.0, -math.pi / 2)])
+async def test_px4_turns_where_it_is_and_keeps_its_speed(heading_deg: float, yaw: float) -> None:
     async with open_px4() as flight:
         await flight.take_off()
-        await flight.vehicle.set_heading(90.0)
+        await flight.vehicle.set_heading(heading_deg)
         (command,) = flight.wire.commands(MavCmd.DO_REPOSITION)
         params = params_of(command)
-        assert params[:4] == pytest.approx([-1.0, 1.0, 0.0, math.pi / 2])
+        assert params[:4] == pytest.approx([-1.0, 1.0, 0.0, yaw])
         assert all(math.isnan(each) for each in params[4:])
 
 

@@ -14,6 +14,7 @@ from aerokit.errors import (
     OperationRejected,
     OperationTimeout,
 )
+from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult
 from aerokit.sim import SimulatedCopter
 
@@ -156,3 +157,19 @@ async def test_px4_heartbeats_lag_behind() -> None:
         for mode in ("POSCTL", "ALTCTL", "LOITER"):
             await flight.vehicle.set_mode(mode)
             assert flight.vehicle.mode_name == mode
+
+
+@pytest.mark.parametrize("result", [MavResult.TEMPORARILY_REJECTED, MavResult.DENIED, MavResult.FAILED])
+async def test_every_refusal_after_an_acceptance_takes_it_back(grounded: Flight, result: MavResult) -> None:
+    """As of a PX4, which answers twice."""
+    grounded.copter.set_mode_from = lambda *_: MavResult.ACCEPTED  # type: ignore[method-assign]
+    async with anyio.create_task_group() as tasks:
+
+        async def answer_again() -> None:
+            await anyio.sleep(1.0)
+            again = m.CommandAck(MavCmd.DO_SET_MODE, result, target_system=255, target_component=190)
+            grounded.wire.deliver(FrameEncoder(1, 1).encode(again))
+
+        tasks.start_soon(answer_again)
+        with pytest.raises(OperationRejected, match="the vehicle took its acceptance back"):
+            await grounded.vehicle.set_mode("GUIDED")

@@ -181,6 +181,9 @@ def test_an_answer_with_an_earlier_time_is_a_reboot_unless_it_was_asked_before()
     stage.at = 12.0
     stage.watch.note_answer(11.5, 4999)
     assert stage.watch.reboots == 1
+    stage.at = 13.0
+    stage.watch.note_answer(12.5, 0)  # of its first millisecond: the same reboot
+    assert stage.watch.reboots == 1
 
 
 # ----------------------------------------------------------------------------------- silence
