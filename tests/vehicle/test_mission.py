@@ -262,3 +262,13 @@ async def test_a_mission_that_is_flown_is_not_cleared_but_replaced() -> None:
         assert flight.wire.all(m.MissionCount)  # ArduPilot cannot empty it for a file
         assert flight.vehicle.mission.count.value == 4
         assert flight.vehicle.mode_name == "AUTO"
+
+
+async def test_while_nobody_knows_how_many_items_there_are_every_number_of_one_is_allowed() -> None:
+    async with open_flight(rates={}) as flight:
+        mission = flight.vehicle.mission
+        assert not mission.count.is_known
+        with pytest.raises(LocalProtocolError, match="item = 65535 is not allowed: 0 to 65534"):
+            await mission.set_current(65535)
+        with pytest.raises(CommandRejected):
+            await mission.set_current(65534)
