@@ -278,6 +278,8 @@ async def test_old_firmware_has_no_group_for_some_messages() -> None:
         ):
             event = await events.get(timeout=5.0)
             assert event.message == "ATTITUDE_QUATERNION"
+            await anyio.sleep(120.0)
+            assert events.get_nowait() is None
 
 
 # ------------------------------------------------------------------------------------------ PX4

@@ -1,0 +1,56 @@
+"""An order to arm that was given up: what is watched afterwards, and what is left alone."""
+
+from __future__ import annotations
+
+import anyio
+import pytest
+from flight_harness import Flight
+
+from aerokit.errors import CommandTimeout
+from aerokit.mavlink.enums import MavCmd
+
+pytestmark = pytest.mark.anyio
+
+ARM = MavCmd.COMPONENT_ARM_DISARM
+
+
+def ordered(flight: Flight) -> list[float]:
+    """1 for each order to arm that was sent, 0 for each to disarm."""
+    return [each.param1 for each in flight.wire.commands(ARM)]
+
+
+async def test_who_arms_after_it_was_given_up_is_disarmed(grounded: Flight) -> None:
+    await grounded.vehicle.set_mode("GUIDED")
+    with anyio.move_on_after(0.0):
+        await grounded.vehicle.arm()
+    await anyio.sleep(5.0)
+    assert ordered(grounded) == [1, 0]
+    assert not grounded.copter.is_armed
+
+
+async def test_only_what_is_told_after_it_was_given_up_counts(grounded: Flight) -> None:
+    await grounded.vehicle.set_mode("GUIDED")
+    grounded.copter.faults.lose_ack(ARM)
+    with anyio.CancelScope() as scope:
+        detach = grounded.vehicle.armed.observe(lambda _, armed: scope.cancel())
+        await grounded.vehicle.arm()
+    assert scope.cancelled_caught
+    detach()
+    assert grounded.vehicle.is_armed
+    grounded.copter.arming.disarm()  # somebody else, before another heartbeat
+    await anyio.sleep(5.0)
+    assert ordered(grounded) == [1]
+
+
+@pytest.mark.parametrize("ends", ["cancelled", "unanswered"])
+async def test_who_was_armed_before_is_left_alone(flying: Flight, ends: str) -> None:
+    """It flies: that it is armed is nothing that this order has done."""
+    if ends == "cancelled":
+        with anyio.move_on_after(0.0):
+            await flying.vehicle.arm()
+    else:
+        flying.copter.faults.ignore(ARM)
+        with pytest.raises(CommandTimeout):
+            await flying.vehicle.arm()
+    await anyio.sleep(20.0)
+    assert ordered(flying).count(0) == 0
