@@ -31,8 +31,9 @@ async def test_who_arms_after_it_was_given_up_is_disarmed(grounded: Flight) -> N
 async def test_only_what_is_told_after_it_was_given_up_counts(grounded: Flight) -> None:
     await grounded.vehicle.set_mode("GUIDED")
     grounded.copter.faults.lose_ack(ARM)
-    with anyio.CancelScope() as scope:
-        detach = grounded.vehicle.armed.observe(lambda _, armed: scope.cancel())
+    scope = anyio.CancelScope()
+    detach = grounded.vehicle.armed.observe(lambda _, armed: scope.cancel())
+    with scope:
         await grounded.vehicle.arm()
     assert scope.cancelled_caught
     detach()
