@@ -25,6 +25,15 @@ def test_what_was_answered_is_neither_under_way_nor_sent_again() -> None:
     assert window.take_due(10.0) == [1]
 
 
+def test_what_is_not_wanted_any_longer_is_neither_under_way_nor_sent_again() -> None:
+    window = window_of(2, RoundTrip(0.2))
+    window.ask(2)
+    for key in (0, 2):
+        window.forget(key)
+    assert (len(window), 0 in window, 2 in window) == (1, False, False)
+    assert window.take_due(10.0) == [1]
+
+
 def test_nothing_is_waited_for_longer_than_two_seconds() -> None:
     round_trip = RoundTrip(3.0)
     assert round_trip.timeout_s() > LONGEST_S
@@ -43,6 +52,7 @@ def test_after_a_silence_it_is_waited_longer() -> None:
 def test_blocks_that_are_held_back_for_a_moment_are_not_waited_for_once_they_are_sent() -> None:
     round_trip = RoundTrip(0.1)
     requests = BlockRequests(round_trip, at_once=1, spacing_s=0.005)
+    assert requests.deadline is None
     for offset in (0, 239, 478):
         requests.ask(offset)
     assert requests.take_due(0.0) == [0, 239]
