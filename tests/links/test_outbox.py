@@ -16,6 +16,7 @@ from link_harness import Recorder, each_loop, eventually
 from aerokit import events, messages, open_connection
 from aerokit.links import FaultyLink, Link, ReconnectingLink, SerialLink, TcpConnect, memory_link_pair, outbox
 from aerokit.links.outbox import WRITE_DEADLINE_S, Outbox
+from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.runtime.connection import Connection
 
 pytestmark = pytest.mark.anyio
@@ -263,6 +264,18 @@ async def test_what_the_system_has_taken_is_told_and_arrives_late(
     assert len(heard_by(radio).data) > len(before)
     await anyio.sleep(0.2)
     assert connection.unsent_bytes == 0
+
+
+async def test_what_the_system_has_room_for_is_beyond_recall_to_the_byte(
+    radio: FaultyLink, connection: Connection
+) -> None:
+    size = len(FrameEncoder(255, 190).encode(COMMAND))
+    radio.stall(system_bytes=size)
+    for _ in range(2):
+        connection.send(COMMAND)
+    assert connection.unsent_bytes == 2 * size
+    connection.discard_unsent()
+    assert connection.unsent_bytes == size
 
 
 async def test_a_reconnecting_link_passes_all_of_it_on(radio: FaultyLink) -> None:

@@ -15,7 +15,7 @@ from aerokit.mavlink.enums import MavMissionResult as Result
 from aerokit.missions import MissionItem
 from aerokit.missions.wire import to_wire_float
 from aerokit.protocols.mission_current import MissionSetCurrent
-from aerokit.protocols.mission_download import MissionDownload
+from aerokit.protocols.mission_download import MAX_RESTARTS, MissionDownload
 from aerokit.protocols.missions import MissionClear
 from aerokit.protocols.round_trip import RoundTrip
 
@@ -35,6 +35,20 @@ def test_over_a_good_link_nothing_is_asked_twice(model: type[Store], window: int
     assert sum(isinstance(message, m.MissionRequestInt) for message in result.sent) == len(HELD)
     assert result.seconds <= (2 + len(HELD) / window) * 0.1 + 0.01
     assert isinstance(result.sent[-1], m.MissionAck)
+
+
+def test_a_vehicle_that_gives_up_is_asked_anew_eight_times() -> None:
+    exchange, now = download(round_trip=RoundTrip(0.1)), 0.0
+    exchange.start(now)
+    lists = 0
+    while not exchange.done:
+        lists += sum(isinstance(each, m.MissionRequestList) for each in exchange.take_outbox())
+        now += 1.0
+        exchange.receive(m.MissionCount(*GCS, 3), now)
+        exchange.receive(m.MissionAck(*GCS, Result.ERROR), now)
+    assert lists == 1 + MAX_RESTARTS == 9
+    with pytest.raises(MissionRejected):
+        exchange.result()
 
 
 @settings(max_examples=60, deadline=None)

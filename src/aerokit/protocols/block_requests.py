@@ -171,11 +171,6 @@ class BlockRequests:
             due.append(offset)
         return due
 
-    def attempts(self, offset: int) -> int:
-        """How often it was sent."""
-        block = self._blocks.get(offset)
-        return 0 if block is None else block.attempts
-
     def _due_at(self, block: _Block) -> float:
         return max(block.sent_at, self._busy_at) + self._round_trip.timeout_s(max(1, self._silent - STEADY))
 
