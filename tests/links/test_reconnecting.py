@@ -185,6 +185,7 @@ async def test_what_the_links_dropped_is_counted_together() -> None:
         link.write(b"too much")
         device.unplug(gone=False)
         link.write(b"into the void")
+        assert link.unsent_bytes == 0
         await anyio.sleep(5)
     assert link.dropped_writes == 4
     link.close()

@@ -240,3 +240,20 @@ def test_pyserial_is_imported_only_when_a_port_is_opened() -> None:
     program = "import aerokit.links, sys; sys.exit('serial' in sys.modules)"
     path = os.pathsep.join(entry for entry in sys.path if entry)
     subprocess.run([sys.executable, "-c", program], check=True, env={**os.environ, "PYTHONPATH": path})
+
+
+@each_loop
+@pytest.mark.parametrize("taken", [0, 1])
+async def test_a_byte_that_is_taken_out_of_a_serial_driver_is_a_write_less(
+    monkeypatch: pytest.MonkeyPatch, taken: int
+) -> None:
+    with far_end() as far:
+        link = SerialLink(far.device, 57600)
+        await link.open(Recorder())
+        waiting = iter((taken, 0))
+        monkeypatch.setattr(link, "_waiting_to_be_sent", lambda transport: next(waiting))
+        link.discard_unsent()
+        assert link.dropped_writes == taken
+        monkeypatch.undo()
+        link.close()
+        await link.wait_closed()

@@ -135,6 +135,17 @@ async def test_a_reset_is_a_lost_link_with_its_reason() -> None:
 
 
 @each_loop
+async def test_an_error_that_has_no_number_tells_its_text() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        client, answered = TcpConnect(*server.getsockname()), Recorder()
+        await client.open(answered)
+        for stream in tuple(client._streams):
+            stream.connection_lost(ConnectionError("an odd end"))
+        assert "an odd end" in str(await answered.until_lost())
+        await client.wait_closed()
+
+
+@each_loop
 async def test_a_peer_that_does_not_read_costs_bounded_memory_and_time(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from aerokit.errors import LocalProtocolError
-from aerokit.mavlink import FrameEncoder, Framer, Message, enums, messages
+from aerokit.mavlink import Frame, FrameEncoder, Framer, Message, enums, messages
 from aerokit.mavlink.checksum import x25, x25_in_python
 
 
@@ -179,3 +179,11 @@ def test_checksums_without_the_library_are_the_same() -> None:
         data = bytes((number * 37 + size) & 0xFF for number in range(size))
         assert slow(data) == x25(data)
     assert slow(b"123456789") == 0x6F91  # the check value of CRC-16/MCRF4XX
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_a_frame_that_is_taken_apart_has_its_checksum(version: int) -> None:
+    raw = FrameEncoder(1, 1, version=version).encode(attitude())
+    frame = Frame.parse(raw)
+    assert frame.checksum == int.from_bytes(raw[-2:], "little")
+    assert frame.raw == raw

@@ -162,6 +162,14 @@ def test_overtaken_frames_are_late_and_no_others() -> None:
     assert not ear.is_double
 
 
+def test_what_was_late_is_told_once() -> None:
+    ear, frames = Ear(), Sender(0).frames(9)
+    ear.hear(*frames[:3], frames[4], frames[3])
+    assert len(ear.framer.late) == 1
+    ear.hear(frames[5])
+    assert ear.framer.late == []
+
+
 def test_overtaken_frames_of_one_datagram_are_told_too() -> None:
     ear, frames = Ear(), Sender(250).frames(20)
     assert ear.hear(b"".join((*frames[:3], frames[5], frames[3], frames[4], frames[6]))) == [

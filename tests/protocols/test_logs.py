@@ -158,8 +158,9 @@ def test_one_entry_only() -> None:
 def test_a_list_that_does_not_come() -> None:
     exchange = make_list(patience_s=3.0)
     assert run(exchange, LogVehicle([b"a"]), loss=1.0) < 20
-    with pytest.raises(FileTimeout, match="does not answer"):
+    with pytest.raises(FileTimeout, match="does not answer") as raised:
         exchange.result()
+    assert raised.value.missing == ((1, 0),)  # from there to an end that nobody knows
     exchange = make_list(most_unanswered=4)
     assert run(exchange, LogVehicle([b"a"]), loss=1.0) == 5
 

@@ -90,6 +90,15 @@ def test_an_error_after_everything_was_sent_is_an_end_that_is_not_sure() -> None
     assert exchange.result() == UploadEnd(False, 0, 1)
 
 
+def test_an_end_that_is_not_sure_names_an_item_as_the_program_counts() -> None:
+    exchange = upload(3, offset=1)
+    for seq in (0, 1, 2):
+        ask(exchange, seq, 1.0 + seq / 10)
+    for now in (1.4, 1.5):
+        acknowledge(exchange, Result.ERROR, now)
+    assert exchange.result() == UploadEnd(False, 0, 1)
+
+
 def test_a_busy_vehicle_is_asked_every_second_and_given_up_after_nine() -> None:
     exchange = upload()
     told(exchange)

@@ -67,3 +67,17 @@ def test_a_request_that_is_alone_is_not_held_back() -> None:
         requests.ask(offset)
         assert requests.take_due(0.001) == [offset]
         requests.answered(offset, 0.001)
+
+
+def test_blocks_in_vain_are_asked_for_as_often_five_times_and_then_more_rarely() -> None:
+    round_trip = RoundTrip(0.1)
+    requests = BlockRequests(round_trip)
+    requests.ask(0)
+    now, waits = 0.0, list[float]()
+    for _ in range(8):
+        assert requests.take_due(now) == [0]
+        assert requests.deadline is not None
+        waits.append(requests.deadline - now)
+        now = requests.deadline
+    assert waits == pytest.approx([round_trip.timeout_s(attempt) for attempt in (1, 1, 1, 1, 1, 2, 3, 4)])
+    assert waits[6] > 1.4 * waits[5]

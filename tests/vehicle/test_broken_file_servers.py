@@ -124,3 +124,16 @@ async def test_a_file_that_is_not_there_after_writing_is_told(grounded: Flight) 
     serve(grounded, forgetful)
     with pytest.raises(FileError, match="no such file"):
         await grounded.vehicle.files.write("/a", b"data")
+
+
+@pytest.mark.parametrize("code", [MavFtpErr.FAIL, MavFtpErr.UNKNOWNCOMMAND])
+async def test_a_server_without_checksums_is_believed(grounded: Flight, code: MavFtpErr) -> None:
+    asked: list[int] = []
+
+    def answer(request: FtpMessage) -> Iterator[FtpMessage]:
+        asked.append(request.opcode)
+        yield nak(request, code) if request.opcode == MavFtpOpcode.CALCFILECRC else ack(request)
+
+    serve(grounded, answer)
+    await grounded.vehicle.files.write("/APM/a.txt", b"written")
+    assert MavFtpOpcode.CALCFILECRC in asked

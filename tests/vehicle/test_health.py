@@ -7,7 +7,9 @@ import pytest
 from flight_harness import Flight, now, open_flight, open_px4
 
 from aerokit.errors import CommandRejected, CommandTimeout, OperationTimeout
+from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavCmd, MavResult
+from aerokit.mavlink.messages import Statustext
 from aerokit.sim import SimulatedCopter, SimulatedPx4
 
 pytestmark = pytest.mark.anyio
@@ -165,6 +167,17 @@ async def test_why_not_armable_asks_a_vehicle_that_does_not_answer_twice(grounde
     grounded.copter.faults.ignore(MavCmd.RUN_PREARM_CHECKS)
     assert await grounded.vehicle.why_not_armable() == []
     assert len(grounded.wire.commands(MavCmd.RUN_PREARM_CHECKS)) == 2
+
+
+async def test_why_not_armable_gives_the_vehicle_a_second_for_its_texts(grounded: Flight) -> None:
+    async with anyio.create_task_group() as tasks:
+
+        async def say_it_late() -> None:
+            await anyio.sleep(0.9)
+            grounded.wire.deliver(FrameEncoder(1, 1).encode(Statustext(2, "PreArm: Gyros inconsistent")))
+
+        tasks.start_soon(say_it_late)
+        assert await grounded.vehicle.why_not_armable() == ["PreArm: Gyros inconsistent"]
 
 
 async def test_why_not_armable_works_without_default_streams() -> None:

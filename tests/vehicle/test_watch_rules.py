@@ -9,7 +9,7 @@ from typing import Any, cast
 
 import pytest
 
-from aerokit import Position
+from aerokit import Position, Vehicle
 from aerokit.mavlink import STANDARD, Frame, FrameEncoder, Framer, Message
 from aerokit.mavlink.messages import Attitude, Heartbeat, SystemTime, Timesync
 from aerokit.runtime.cells import Source, StateCell
@@ -17,6 +17,7 @@ from aerokit.runtime.connection import Connection
 from aerokit.runtime.events import LinkReport, VehicleBack, VehicleRebooted, VehicleSilent
 from aerokit.vehicle.core import VehicleCore
 from aerokit.vehicle.progress import Stillness
+from aerokit.vehicle.setpoints import SLOW_M_S, BodyVelocitySetpoint, VelocitySetpoint, wants_motion
 from aerokit.vehicle.watch import LinkWatch, VehicleWatch
 
 HEARTBEAT = Heartbeat(2, 3, 81, 0, 3)
@@ -314,3 +315,10 @@ def test_without_a_position_of_the_last_two_seconds_nothing_is_known() -> None:
         assert standing.tell(HERE, float(at)) is None
     assert standing.tell(None, 17.0) is not None
     assert standing.tell(None, 17.1) is None
+
+
+@pytest.mark.parametrize(("speed_m_s", "wanted"), [(SLOW_M_S, True), (0.99 * SLOW_M_S, False)])
+def test_who_is_told_to_move_at_0_3_m_s_should_move(speed_m_s: float, wanted: bool) -> None:
+    nobody = cast("Vehicle", None)  # a velocity alone says it
+    assert wants_motion(VelocitySetpoint(east_m_s=speed_m_s), nobody) is wanted
+    assert wants_motion(BodyVelocitySetpoint(right_m_s=speed_m_s), nobody) is wanted

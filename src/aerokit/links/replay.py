@@ -78,9 +78,7 @@ class Replay(BaseLink):
             self.frames += 1
             self._deliver(self._next[1])
             self._advance()
-        if self._receiver is None:
-            return
-        if self._next is None:
+        if self._next is None:  # nothing is lost that the receiver has closed
             self._lose(f"end of recording after {self.frames} frames", kind=RecordingEnded)
         else:
             self._wake_up = self._loop.call_at(max(now, self._due), self._play)
