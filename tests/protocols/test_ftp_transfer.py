@@ -218,7 +218,7 @@ def test_a_server_that_sends_empty_blocks_does_not_keep_it_waiting() -> None:
     download = Download(1000, patience_s=2.0)
     exchange = download.exchange
     exchange.start(0.0)
-    now = heard_at = 0.0
+    now = heard_at = believed_until = 0.0
     answered = 0
     while not exchange.done:
         for request in requests_in(exchange.take_outbox()):
