@@ -26,7 +26,7 @@ from table import Row, row
 
 import aerokit
 from aerokit import messages
-from aerokit.autopilots.streams import DEFAULT_RATES_HZ
+from aerokit.vehicle.state.states import DEFAULT_RATES_HZ
 from aerokit.links import memory_link_pair
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavCmd

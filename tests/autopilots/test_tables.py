@@ -18,7 +18,7 @@ from aerokit.autopilots import (
 )
 from aerokit.autopilots.health import ESTIMATES, SENSORS, names_of
 from aerokit.autopilots.px4 import MODES, px4_custom_mode
-from aerokit.autopilots.streams import ARDUPILOT_GROUPS, DEFAULT_RATES_HZ, subscription_rate_hz
+from aerokit.autopilots.streams import ARDUPILOT_GROUPS
 from aerokit.autopilots.version import version_text
 from aerokit.mavlink import enums, messages
 from aerokit.mavlink.message import Message
@@ -155,20 +155,6 @@ def test_where_it_is_armed(autopilot: int, vehicle_type: int, name: str | None) 
 
 
 # ------------------------------------------------------------------------------------ streams
-
-
-def test_default_rates() -> None:
-    by_rate: dict[float, set[str]] = {}
-    for name, hz in DEFAULT_RATES_HZ.items():
-        by_rate.setdefault(hz, set()).add(name)
-    assert by_rate == {
-        10.0: {"Attitude", "GlobalPositionInt", "LocalPositionNed"},
-        5.0: {"VfrHud", "ExtendedSysState", "DistanceSensor"},
-        2.0: {"SysStatus", "GpsRawInt", "EkfStatusReport", "EstimatorStatus", "RcChannels", "ServoOutputRaw"},
-        1.0: {"BatteryStatus", "MissionCurrent", "SystemTime", "Vibration", "Wind", "WindCov", "CurrentMode"},
-    }
-    rates = [subscription_rate_hz(name) for name in ("Attitude", "RawImu", "Odometry", "StatusText")]
-    assert rates == [10.0, 4.0, 4.0, None]
 
 
 def test_every_stream_group_has_its_number() -> None:

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aerokit.errors import LocalProtocolError
-from aerokit.vehicle.values import Attitude, GpsReceiver, Home, Position, SensorHealth, Velocity
+from aerokit.vehicle.state.values import Attitude, GpsReceiver, Home, Position, SensorHealth, Velocity
 
 angles = st.floats(-179, 179)
 

@@ -74,8 +74,6 @@ class ArduPilot(Autopilot):
     log_directories = ("/APM/LOGS", "/logs")
     first_log_id = 1
     logs_by_messages = True
-    estimator_message = "EKF_STATUS_REPORT"
-    wind_message = "WIND"
     stream_groups = ARDUPILOT_GROUPS
     never_sent = frozenset(("ESTIMATOR_STATUS", "WIND_COV", "ALTITUDE", "CURRENT_MODE")) - {
         "ATTITUDE_QUATERNION"  # on request

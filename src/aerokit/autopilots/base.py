@@ -165,8 +165,6 @@ class Autopilot:
     """Whether LOG_REQUEST_LIST is not answered when there are no logs."""
     unknown_currents_ca: frozenset[int] = frozenset((-1,))
     """What a battery's current in 0.01 A says when it is not known; the standard says −1."""
-    estimator_message = "ESTIMATOR_STATUS"
-    wind_message = "WIND_COV"
     stream_groups: ClassVar[Mapping[int, int]] = {}
     """Message id → MAV_DATA_STREAM, for firmware that knows no MAV_CMD_SET_MESSAGE_INTERVAL."""
     stays_on_the_ground = False
@@ -258,7 +256,7 @@ class Autopilot:
     def missing_estimates(self, flags: int) -> tuple[str, ...]:
         """What the estimator lacks for arming in a mode that needs a position; empty when it is good enough.
 
-        ``flags`` are those of the message named in ``estimator_message``.
+        ``flags`` are those of EKF_STATUS_REPORT or ESTIMATOR_STATUS.
         """
         return self._missing_estimates(flags, required=0x01 | 0x20, horizontal=0x10)
 

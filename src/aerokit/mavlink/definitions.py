@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 
 from aerokit.errors import LocalProtocolError
 from aerokit.mavlink.checksum import x25
+from aerokit.mavlink.message import SIZES
 from aerokit.whole_file import read_bounded
 
 if TYPE_CHECKING:
@@ -32,21 +33,6 @@ __all__ = [
     "read_dialect",
     "read_xml",
 ]
-
-SIZES = {
-    "char": 1,
-    "int8_t": 1,
-    "uint8_t": 1,
-    "int16_t": 2,
-    "uint16_t": 2,
-    "int32_t": 4,
-    "uint32_t": 4,
-    "int64_t": 8,
-    "uint64_t": 8,
-    "float": 4,
-    "double": 8,
-}
-"""Bytes on the wire of each type the standard knows."""
 
 _LOWEST, _HIGHEST = -(1 << 63), (1 << 64) - 1
 

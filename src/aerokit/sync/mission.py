@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.plans import HeldPlan as AsyncHeldPlan
     from aerokit.vehicle.plans import PlanMethod
     from aerokit.vehicle.rally import RallyControl as AsyncRallyControl
-    from aerokit.vehicle.values import MissionProgress
+    from aerokit.vehicle.state.values import MissionProgress
 
 __all__ = ["FenceControl", "HeldPlan", "MissionControl", "RallyControl"]
 

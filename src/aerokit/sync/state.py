@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from aerokit.runtime.events import LinkReport
     from aerokit.runtime.link_state import LinkState
     from aerokit.sync.loop_thread import LoopThread
-    from aerokit.vehicle.values import (
+    from aerokit.vehicle.state.values import (
         Attitude,
         AutopilotVersion,
         Battery,
@@ -42,7 +42,7 @@ T = TypeVar("T")
 
 
 class VehicleState:
-    """The state of a vehicle, one cell for each thing; as :class:`aerokit.vehicle.state.VehicleState`."""
+    """The state of a vehicle, one cell for each thing; as those of :class:`aerokit.Vehicle`."""
 
     def __init__(self, loop: LoopThread, vehicle: AsyncVehicle) -> None:
         self._loop = loop

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from aerokit.runtime.events import Event
     from aerokit.runtime.subscription import Overflow
     from aerokit.sync.loop_thread import Held
-    from aerokit.vehicle.values import Position
+    from aerokit.vehicle.state.values import Position
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
 __all__ = ["Vehicle", "connect"]

@@ -9,7 +9,6 @@ import anyio
 
 from aerokit.arguments import checks_arguments
 from aerokit.autopilots import autopilot_for
-from aerokit.autopilots.streams import subscription_rate_hz
 from aerokit.errors import CommandRejected, ConnectionClosed
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import CommandAck, CommandInt, CommandLong, Heartbeat, SetMode
@@ -27,8 +26,9 @@ from aerokit.runtime.subscription import Overflow, Subscription
 from aerokit.vehicle.commands import CommandSender
 from aerokit.vehicle.helm import Helm
 from aerokit.vehicle.orders import MOVING_COMMANDS, QUESTIONS
-from aerokit.vehicle.rates import MessageRates, check_rate
-from aerokit.vehicle.telemetry import Telemetry
+from aerokit.vehicle.rates import MessageRates, check_rate, subscription_rate_hz
+from aerokit.vehicle.state.states import States
+from aerokit.vehicle.state.telemetry import Telemetry
 from aerokit.vehicle.transfers import Transfers
 from aerokit.vehicle.watch import LinkWatch, VehicleWatch
 
@@ -56,7 +56,7 @@ RESULTS_OF_REFUSAL = (1, 2, 4)
 
 
 @checks_arguments
-class VehicleCore:
+class VehicleCore(States):
     """One remote system: system id, autopilot component, and what was heard of it."""
 
     def __init__(
@@ -108,6 +108,9 @@ class VehicleCore:
         self._messages: dict[type[Message], StateCell[Any]] = {}
         self._message_rates: dict[type[Message], Detach] = {}
         self._attach_telemetry()
+
+    def _cell_of(self, name: str) -> StateCell[Any]:
+        return self.telemetry.cells[name]
 
     # ---------------------------------------------------------------------------- commands
 
@@ -232,7 +235,7 @@ class VehicleCore:
             detach = self.connection.attach(types, sink, system_id=self.system_id)
             detach.append(self.connection.on_end(subscription.close))
             for each in messages:
-                hz = subscription_rate_hz(each.__name__) if rate_hz is None else rate_hz
+                hz = subscription_rate_hz(each) if rate_hz is None else rate_hz
                 if hz is not None:
                     detach.append(self._rates.want(each, hz))
             return detach
@@ -279,7 +282,7 @@ class VehicleCore:
         if cell is None:
             self.connection.check_types((message_type,))
             cell = self._messages[message_type] = self._message_cell(message_type)
-            rate_hz = subscription_rate_hz(message_type.__name__) if rate_hz is None else rate_hz
+            rate_hz = subscription_rate_hz(message_type) if rate_hz is None else rate_hz
         if rate_hz is not None:
             release = self._message_rates.pop(message_type, None)
             self._message_rates[message_type] = self._rates.want(message_type, rate_hz)

@@ -13,7 +13,6 @@ from aerokit.vehicle.checks import check_range, check_seconds
 from aerokit.vehicle.helm import MODE_GRACE_S
 from aerokit.vehicle.progress import LONGEST_SILENCE_S, OLD_POSITION_S, Stillness, await_progress
 from aerokit.vehicle.travel import TravelActions
-from aerokit.vehicle.values import Position
 
 if TYPE_CHECKING:
     from collections.abc import Callable

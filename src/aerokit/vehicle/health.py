@@ -122,3 +122,25 @@ class VehicleHealth(VehicleCore):
     def is_surely_disarmed(self) -> bool:
         """Whether the last heartbeat says disarmed; False while it is not known."""
         return self.telemetry.armed.latest is False
+
+    @property
+    def mode_name(self) -> str:
+        """Name of the flight mode, ``"unknown"`` before the first heartbeat."""
+        mode = self.telemetry.mode.latest
+        return "unknown" if mode is None else mode.name
+
+    def describe_now(self) -> str:
+        """What it does, as far as it was heard: ``holding in BRAKE, still armed, 9 m above home, heard 0.3 s ago``."""
+        hold, mode = self.autopilot.mode_for("hold", is_vtol=self.is_vtol), self.telemetry.mode.latest
+        armed = "still armed" if self.is_armed else "disarmed" if self.is_surely_disarmed else "perhaps armed"
+        position = self.telemetry.position.latest
+        height = None if position is None else position.altitude_relative_m
+        return (
+            f"{'holding in' if mode is not None and mode == hold else 'in'} {self.mode_name}, {armed},"
+            f" {'' if height is None else f'{height:.1f} m above home, '}heard {self.heartbeat_age:.1f} s ago"
+        )
+
+    @property
+    def is_vtol(self) -> bool:
+        """Whether it can hover and cruise on wings: EXTENDED_SYS_STATE tells a VTOL state."""
+        return bool(self.telemetry.vtol_state.latest)

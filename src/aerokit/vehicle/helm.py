@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator
 
     from aerokit.autopilots import Mode
-    from aerokit.vehicle.telemetry import Telemetry
+    from aerokit.vehicle.state.telemetry import Telemetry
 
 __all__ = ["KNOWN_S", "MODE_GRACE_S", "Helm"]
 

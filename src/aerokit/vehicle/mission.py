@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from aerokit.runtime.cells import StateCell
     from aerokit.vehicle.orders import Order, Sending
     from aerokit.vehicle.plans import PlanContext
-    from aerokit.vehicle.values import MissionProgress, Mode
+    from aerokit.vehicle.state.values import MissionProgress, Mode
 
 __all__ = ["MissionControl"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from aerokit.vehicle.helm import MODE_GRACE_S
-from aerokit.vehicle.values import Position
+from aerokit.vehicle.state.values import Position
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from aerokit.missions.item import MissionItem
     from aerokit.vehicle.mission_watch import MissionWatch
     from aerokit.vehicle.orders import Order
-    from aerokit.vehicle.values import Mode
+    from aerokit.vehicle.state.values import Mode
     from aerokit.vehicle.vehicle import Vehicle
 
 __all__ = ["MissionEnd"]

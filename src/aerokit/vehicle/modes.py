@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 from aerokit.arguments import checks_arguments
 from aerokit.errors import CommandRejected, CommandTimeout, NotSupported, OperationRejected
 from aerokit.vehicle.checks import check_seconds
+from aerokit.vehicle.health import VehicleHealth
 from aerokit.vehicle.helm import KNOWN_S, MODE_GRACE_S
 from aerokit.vehicle.orders import MOVING_COMMANDS
 from aerokit.vehicle.progress import await_progress
-from aerokit.vehicle.state import VehicleState
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -29,7 +29,7 @@ RESULT_UNSUPPORTED = 3
 
 
 @checks_arguments
-class ModeActions(VehicleState):
+class ModeActions(VehicleHealth):
     """Changing the flight mode."""
 
     async def set_mode(self, mode: str | int, *, timeout: float = 6.0) -> None:

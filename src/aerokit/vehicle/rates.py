@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING
 
 import anyio
 
+from aerokit.autopilots.streams import STREAMED
 from aerokit.errors import CommandRejected, CommandTimeout, LocalProtocolError
 from aerokit.mavlink.messages import RequestDataStream
 from aerokit.protocols.command import result_name
 from aerokit.runtime.events import StreamSlow, StreamUnavailable
+from aerokit.vehicle.state.states import DEFAULT_RATES_HZ
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -34,6 +36,14 @@ ASK_AGAIN_S = 5.0
 """A stream that does not come at all is asked for again this often, rising to the longest."""
 ASK_AGAIN_LONGEST_S = 60.0
 AUTOPILOT_DEFAULT = 0.0
+SUBSCRIPTION_HZ = 4.0
+"""How fast a streamed message without a default rate is asked for by a subscription that names no rate."""
+
+
+def subscription_rate_hz(message_type: type[Message]) -> float | None:
+    """The rate that a subscription asks for when it names none; None: the message is sent when there is need for it."""
+    name = message_type.__name__
+    return DEFAULT_RATES_HZ.get(name, SUBSCRIPTION_HZ if name in STREAMED else None)
 
 
 def check_rate(message_type: type[Message], hz: float) -> None:

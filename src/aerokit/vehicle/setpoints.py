@@ -15,7 +15,7 @@ from aerokit.mavlink.messages import (
     SetPositionTargetLocalNed,
 )
 from aerokit.snapshot import Snapshot
-from aerokit.vehicle.values import Attitude, Position
+from aerokit.vehicle.state.values import Attitude, Position
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message

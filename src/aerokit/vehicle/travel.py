@@ -21,7 +21,7 @@ from aerokit.vehicle.arming import ArmingActions
 from aerokit.vehicle.checks import check_range, check_seconds
 from aerokit.vehicle.modes import CHANGE_MODE, DO_REPOSITION, RESULT_UNSUPPORTED
 from aerokit.vehicle.progress import LONGEST_SILENCE_S, OLD_POSITION_S, Stillness, await_progress
-from aerokit.vehicle.values import Position
+from aerokit.vehicle.state.values import Position
 
 if TYPE_CHECKING:
     from aerokit.autopilots import Mode

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     import threading
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Sequence
 
     from aerokit.mavlink.frame import Frame
     from aerokit.runtime.cells import StateCell
 
-__all__ = ["STREAMED", "StreamedMessage"]
+__all__ = ["StreamedMessage"]
 
 LOOK_S = 5.0
 """So often, in seconds, they are worked out although nobody looks: a value that a later message does not have any more
@@ -20,37 +20,11 @@ LOOK_S = 5.0
 
 _HEADER_LENGTH = 9
 
-STREAMED: Mapping[str, tuple[str, ...]] = {
-    "SysStatus": ("sensors", "batteries"),
-    "SystemTime": ("system_time",),
-    "GpsRawInt": ("gps",),
-    "Gps2Raw": ("gps",),
-    "Attitude": ("attitude",),
-    "AttitudeQuaternion": ("attitude",),
-    "LocalPositionNed": ("local_position", "velocity"),
-    "GlobalPositionInt": ("heading_deg", "position", "velocity"),
-    "RcChannels": ("rc_channels",),
-    "ServoOutputRaw": ("servo_outputs",),
-    "MissionCurrent": ("mission_current",),
-    "VfrHud": ("ground_speed_m_s", "climb_m_s", "throttle_percent", "air_speed_m_s", "heading_deg"),
-    "DistanceSensor": ("range_finders",),
-    "Rangefinder": ("range_finders",),
-    "BatteryStatus": ("batteries",),
-    "Wind": ("wind",),
-    "WindCov": ("wind",),
-    "EkfStatusReport": ("estimator",),
-    "EstimatorStatus": ("estimator",),
-    "Vibration": ("vibration",),
-}
-"""Name of the message class → names of the cells it may change."""
-
-NUMBER_AT: Mapping[str, int] = {"ServoOutputRaw": 20, "DistanceSensor": 11, "BatteryStatus": 32}
-"""Name of the message class → where in the payload the byte is that says which one of several it speaks of."""
-
 
 class StreamedMessage:
     """One kind of message of one vehicle's autopilot. It keeps the latest frame, and works it out when it is looked at.
 
+    ``number_at``: where in the payload the byte is that says which one of several it speaks of; each of them is kept.
     While one of ``cells`` is watched, each frame is worked out (``apply(frame)``) as it comes. Frames come on the
     loop's thread; any thread may look. ``lock`` keeps the threads apart.
     """
@@ -68,14 +42,13 @@ class StreamedMessage:
 
     def __init__(
         self,
-        class_name: str,
         component_id: int,
         cells: Sequence[StateCell[object]],
+        number_at: int | None,
         apply: Callable[[Frame], None],
         lock: threading.RLock,
     ) -> None:
         self._component_id, self._cells, self._apply, self._lock = component_id, cells, apply, lock
-        number_at = NUMBER_AT.get(class_name)
         self._number_at = None if number_at is None else number_at + _HEADER_LENGTH
         self._look_at = -math.inf
         self._is_watched = False

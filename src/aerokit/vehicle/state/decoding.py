@@ -4,22 +4,34 @@ from __future__ import annotations
 
 import math
 from operator import attrgetter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from aerokit import geo
-from aerokit.mavlink.enums import GpsFixType, MavBatteryChargeState, MissionState
-from aerokit.vehicle.values import (
+from aerokit.autopilots import is_armed
+from aerokit.mavlink.enums import (
+    GpsFixType,
+    MavBatteryChargeState,
+    MavLandedState,
+    MavProtocolCapability,
+    MavState,
+    MavVtolState,
+    MissionState,
+)
+from aerokit.vehicle.state.values import (
     Attitude,
+    AutopilotVersion,
     Battery,
     EstimatorHealth,
     GpsReceiver,
     Home,
     LocalPosition,
     MissionProgress,
+    Mode,
     Position,
     RangeFinder,
     RcChannels,
     SensorHealth,
+    ServoOutputs,
     SystemTime,
     Velocity,
     Vibration,
@@ -27,6 +39,8 @@ from aerokit.vehicle.values import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
     from aerokit.autopilots import Autopilot
     from aerokit.mavlink import messages
 
@@ -43,11 +57,79 @@ FULL_CELL = 0xFFFE
 """The most a cell can say; a pack of more than 65.5 V fills several "cells" with it."""
 EARLIEST_UNIX_S = 1_000_000_000
 INVALID_QUALITY = 1
+OUTPUTS_PER_PORT = 16
+SAME_ALTITUDE_MM = 100
+
+
+class Context:
+    """What a decoder may know beside the message; ``before`` is the latest value of the state that it decodes."""
+
+    __slots__ = ("autopilot", "base_mode", "before", "home_is_known", "mode_names")
+
+    def __init__(
+        self, autopilot: Autopilot, mode_names: Mapping[int, str], home_is_known: Callable[[], bool]
+    ) -> None:
+        self.autopilot, self.mode_names, self.home_is_known = autopilot, mode_names, home_is_known
+        self.base_mode = 0
+        self.before: Any = None
 
 
 def member(enum: type[int], value: int) -> int:
     """The enum's member, or the number itself when the enum does not know it."""
     return enum._value2member_map_.get(value, value)  # type: ignore[attr-defined,no-any-return]
+
+
+# ----------------------------------------------------------------------------------- mode and state
+
+
+def mode(message: messages.Heartbeat, context: Context) -> Mode:
+    """The flight mode."""
+    return context.autopilot.mode_of(message, context.mode_names)
+
+
+def current_mode(message: messages.CurrentMode, context: Context) -> Mode | None:
+    """The same sooner; it lacks what HEARTBEAT says beside the number."""
+    if not message.custom_mode or context.before is None:
+        return None
+    return context.autopilot.mode(message.custom_mode, context.base_mode, context.mode_names)
+
+
+def armed(message: messages.Heartbeat) -> bool:
+    """Whether the motors are armed."""
+    return is_armed(message.base_mode)
+
+
+def system_status(message: messages.Heartbeat) -> int:
+    """MAV_STATE."""
+    return member(MavState, message.system_status)
+
+
+def vtol_state(message: messages.ExtendedSysState) -> int:
+    """MAV_VTOL_STATE."""
+    return member(MavVtolState, message.vtol_state)
+
+
+def landed_state(message: messages.ExtendedSysState) -> int | None:
+    """MAV_LANDED_STATE."""
+    if message.landed_state == MavLandedState.UNDEFINED:
+        return None
+    return member(MavLandedState, message.landed_state)
+
+
+def landed_state_of_heartbeat(message: messages.Heartbeat, context: Context) -> int | None:
+    """What some autopilots' HEARTBEAT says of it."""
+    told = context.autopilot.landed_state_of(message)
+    return None if told is None else MavLandedState(told)
+
+
+def version(message: messages.AutopilotVersion, context: Context) -> AutopilotVersion:
+    """Firmware and hardware."""
+    return context.autopilot.version_of(message)
+
+
+def capabilities(message: messages.AutopilotVersion) -> int:
+    """MAV_PROTOCOL_CAPABILITY."""
+    return MavProtocolCapability(message.capabilities)
 
 
 # --------------------------------------------------------------------------- where and how it moves
@@ -65,17 +147,22 @@ def place(latitude: int, longitude: int) -> tuple[float, float] | None:
     return latitude / 1e7, longitude / 1e7
 
 
-def position(message: messages.GlobalPositionInt, *, relative_is_known: bool) -> Position | None:
-    """The position, None before the first fix."""
+def position(message: messages.GlobalPositionInt, context: Context) -> Position | None:
+    """The position, None before the first fix.
+
+    Until home is set, ``relative_alt`` is no more than the altitude above the sea once again.
+    """
     where = place(message.lat, message.lon)
     if where is None:
         return None
-    relative = message.relative_alt / 1e3 if relative_is_known else None
-    return Position(*where, message.alt / 1e3, relative)
+    is_known = context.home_is_known() or abs(message.relative_alt - message.alt) > SAME_ALTITUDE_MM
+    return Position(*where, message.alt / 1e3, message.relative_alt / 1e3 if is_known else None)
 
 
-def global_velocity(message: messages.GlobalPositionInt) -> Velocity:
-    """Velocity over ground."""
+def global_velocity(message: messages.GlobalPositionInt) -> Velocity | None:
+    """Velocity over ground, None before the first fix."""
+    if place(message.lat, message.lon) is None:
+        return None
     return Velocity(message.vx / 100, message.vy / 100, message.vz / 100)
 
 
@@ -87,6 +174,36 @@ def heading_deg(message: messages.GlobalPositionInt) -> float | None:
 def local_position(message: messages.LocalPositionNed) -> LocalPosition:
     """Position and velocity in the local frame."""
     return LocalPosition(message.x, message.y, message.z, message.vx, message.vy, message.vz)
+
+
+def local_velocity(message: messages.LocalPositionNed) -> Velocity:
+    """The velocity alone."""
+    return Velocity(message.vx, message.vy, message.vz)
+
+
+def heading_of_hud(message: messages.VfrHud) -> float:
+    """The same in whole degrees."""
+    return float(message.heading % 360)
+
+
+def ground_speed_m_s(message: messages.VfrHud) -> float:
+    """Ground speed."""
+    return message.groundspeed
+
+
+def air_speed_m_s(message: messages.VfrHud) -> float | None:
+    """Air speed; PX4 without a sensor says NaN."""
+    return finite(message.airspeed)
+
+
+def climb_m_s(message: messages.VfrHud) -> float:
+    """Climb rate."""
+    return message.climb
+
+
+def throttle_percent(message: messages.VfrHud) -> float:
+    """Throttle."""
+    return float(message.throttle)
 
 
 def attitude(message: messages.Attitude) -> Attitude:
@@ -139,11 +256,11 @@ def wind_of_covariance(message: messages.WindCov) -> Wind | None:
     return Wind(math.hypot(message.wind_x, message.wind_y), geo.wrap_360(comes_from), finite(message.wind_z))
 
 
-def distance_sensor(message: messages.DistanceSensor) -> RangeFinder:
-    """One of several distance sensors."""
+def distance_sensors(message: messages.DistanceSensor, context: Context) -> tuple[RangeFinder, ...]:
+    """Those known before, with this one in its place."""
     quality = message.signal_quality
     is_valid = quality != INVALID_QUALITY
-    return RangeFinder(
+    sensor = RangeFinder(
         message.id,
         message.current_distance / 100 if is_valid else None,
         message.orientation,
@@ -151,18 +268,28 @@ def distance_sensor(message: messages.DistanceSensor) -> RangeFinder:
         message.max_distance / 100,
         quality if quality > INVALID_QUALITY else None,
     )
+    return _with(context.before, sensor, _id_of)
 
 
-def range_finder(message: messages.Rangefinder) -> RangeFinder:
+def range_finder(message: messages.Rangefinder, context: Context) -> tuple[RangeFinder, ...]:
     """ArduPilot's older message about the one that looks down."""
-    return RangeFinder(0, finite(message.distance), LOOKING_DOWN)
+    return _with(context.before, RangeFinder(0, finite(message.distance), LOOKING_DOWN), _id_of)
 
 
 # ------------------------------------------------------------------------------- what it runs on
 
 
-def gps_receiver(message: messages.GpsRawInt | messages.Gps2Raw, index: int) -> GpsReceiver:
-    """One receiver."""
+def first_gps(message: messages.GpsRawInt, context: Context) -> tuple[GpsReceiver, ...]:
+    """The receivers known before, with the first in its place."""
+    return _with(context.before, _gps_receiver(message, 0), _index_of)
+
+
+def second_gps(message: messages.Gps2Raw, context: Context) -> tuple[GpsReceiver, ...]:
+    """The receivers known before, with the second in its place."""
+    return _with(context.before, _gps_receiver(message, 1), _index_of)
+
+
+def _gps_receiver(message: messages.GpsRawInt | messages.Gps2Raw, index: int) -> GpsReceiver:
     where = place(message.lat, message.lon) if message.fix_type >= GpsFixType.TYPE_2D_FIX else None
     latitude, longitude = where or (None, None)
     return GpsReceiver(
@@ -183,15 +310,15 @@ def gps_receiver(message: messages.GpsRawInt | messages.Gps2Raw, index: int) -> 
     )
 
 
-def battery(message: messages.BatteryStatus, autopilot: Autopilot) -> Battery:
-    """One battery; cells 11 to 14 are 0 where there are none."""
+def batteries(message: messages.BatteryStatus, context: Context) -> tuple[Battery, ...]:
+    """Those known before, with this one in its place; cells 11 to 14 are 0 where there are none."""
     cells = [mv for mv in message.voltages if mv != U16]
     cells += [mv for mv in message.voltages_ext if mv not in (0, U16)]
     is_pack = len(cells) == 1 or FULL_CELL in cells
-    return Battery(
+    battery = Battery(
         message.id,
         sum(cells) / 1e3 if cells else None,
-        current(message.current_battery, autopilot),
+        current(message.current_battery, context.autopilot),
         unless(message.battery_remaining, -1),
         () if is_pack else tuple(mv / 1e3 for mv in cells),
         scaled(message.temperature, I16, 100),
@@ -200,15 +327,17 @@ def battery(message: messages.BatteryStatus, autopilot: Autopilot) -> Battery:
         unless(message.time_remaining, 0),
         member(MavBatteryChargeState, message.charge_state),
     )
+    return _with(context.before, battery, _id_of)
 
 
-def main_battery(message: messages.SysStatus, autopilot: Autopilot) -> Battery | None:
+def main_battery(message: messages.SysStatus, context: Context) -> tuple[Battery, ...] | None:
     """The little that SYS_STATUS says of the first battery; None when that is nothing."""
     voltage = None if message.voltage_battery in (0, U16) else message.voltage_battery / 1e3
     remaining = unless(message.battery_remaining, -1)
     if voltage is None and remaining is None:
         return None
-    return Battery(0, voltage, current(message.current_battery, autopilot), remaining)
+    battery = Battery(0, voltage, current(message.current_battery, context.autopilot), remaining)
+    return _with(context.before, battery, _id_of)
 
 
 def current(centiampere: int, autopilot: Autopilot) -> float | None:
@@ -223,12 +352,14 @@ def rc_channels(message: messages.RcChannels) -> RcChannels:
     return RcChannels(tuple([None if us == U16 else us for us in channels]), unless(message.rssi, U8))
 
 
-def servo_outputs(message: messages.ServoOutputRaw) -> tuple[int, ...]:
-    """Sixteen outputs, or eight in MAVLink 1."""
+def servo_outputs(message: messages.ServoOutputRaw, context: Context) -> ServoOutputs:
+    """Those known before, with the sixteen of this port in their place, or eight in MAVLink 1."""
     frame = message.received_frame
-    count = 8 if frame is not None and frame.version == 1 else 16
-    outputs: tuple[int, ...] = _SERVOS(message)[:count]
-    return outputs
+    outputs: tuple[int, ...] = _SERVOS(message)[: 8 if frame is not None and frame.version == 1 else 16]
+    before: tuple[int, ...] = () if context.before is None else context.before.outputs_us
+    begin = message.port * OUTPUTS_PER_PORT
+    head = (*before[:begin], *(0,) * (begin - len(before)))
+    return ServoOutputs((*head, *outputs, *before[begin + len(outputs) :]))
 
 
 def vibration(message: messages.Vibration) -> Vibration:
@@ -246,7 +377,7 @@ def system_time(message: messages.SystemTime) -> SystemTime:
 # ---------------------------------------------------------------------------------- how it fares
 
 
-def sensor_health(message: messages.SysStatus, autopilot: Autopilot) -> SensorHealth:
+def sensor_health(message: messages.SysStatus, context: Context) -> SensorHealth:
     """What works and what does not, in the autopilot's reading of the bits."""
     bits = (
         message.onboard_control_sensors_present,
@@ -254,16 +385,19 @@ def sensor_health(message: messages.SysStatus, autopilot: Autopilot) -> SensorHe
         message.onboard_control_sensors_health,
     )
     return SensorHealth(
-        *bits, autopilot.failing_sensors(*bits), autopilot.prearm_checks_pass(*bits), message.load / 10
+        *bits,
+        context.autopilot.failing_sensors(*bits),
+        context.autopilot.prearm_checks_pass(*bits),
+        message.load / 10,
     )
 
 
-def ekf_health(message: messages.EkfStatusReport, autopilot: Autopilot) -> EstimatorHealth:
+def ekf_health(message: messages.EkfStatusReport, context: Context) -> EstimatorHealth:
     """ArduPilot's estimator."""
     return EstimatorHealth(
         message.NAME,
         message.flags,
-        autopilot.missing_estimates(message.flags),
+        context.autopilot.missing_estimates(message.flags),
         finite(message.velocity_variance),
         finite(message.pos_horiz_variance),
         finite(message.pos_vert_variance),
@@ -273,12 +407,12 @@ def ekf_health(message: messages.EkfStatusReport, autopilot: Autopilot) -> Estim
     )
 
 
-def estimator_health(message: messages.EstimatorStatus, autopilot: Autopilot) -> EstimatorHealth:
+def estimator_health(message: messages.EstimatorStatus, context: Context) -> EstimatorHealth:
     """PX4's estimator."""
     return EstimatorHealth(
         message.NAME,
         message.flags,
-        autopilot.missing_estimates(message.flags),
+        context.autopilot.missing_estimates(message.flags),
         finite(message.vel_ratio),
         finite(message.pos_horiz_ratio),
         finite(message.pos_vert_ratio),
@@ -296,6 +430,28 @@ def mission_progress(message: messages.MissionCurrent) -> MissionProgress:
     if message.total == U16:
         return MissionProgress(None, None, state)
     return MissionProgress(unless(message.seq, U16), unless(message.total, 0), state)
+
+
+def mission_reached(message: messages.MissionItemReached) -> int:
+    """The number of the item."""
+    return message.seq
+
+
+# ----------------------------------------------------------------------------------- several of a kind
+
+
+def _with(items: tuple[Any, ...] | None, item: Any, key: Callable[[Any], int]) -> tuple[Any, ...]:
+    """The items in the order of their numbers, with this one in the place of the former of its number."""
+    number = key(item)
+    return tuple(sorted((item, *(each for each in items or () if key(each) != number)), key=key))
+
+
+def _id_of(item: Battery | RangeFinder) -> int:
+    return item.id
+
+
+def _index_of(receiver: GpsReceiver) -> int:
+    return receiver.index
 
 
 # --------------------------------------------------------------------------------------- numbers
