@@ -23,7 +23,7 @@ from aerokit.dronekit.weakly import weakly
 from aerokit.errors import AerokitError, ConnectionClosed, LinkOpenError, LocalProtocolError
 from aerokit.links.address import ACCEPTED_FORMS
 from aerokit.links.reconnecting import ReconnectingLink
-from aerokit.sync.connection import open_connection
+from aerokit.sync.twins import open_connection
 
 if TYPE_CHECKING:
     from aerokit.dronekit.master import Master
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.runtime.bus import Detach
     from aerokit.runtime.connection import Connection
-    from aerokit.sync.connection import Connection as SyncConnection
+    from aerokit.sync.twins import Connection as SyncConnection
 
 __all__ = ["MAVConnection", "MAVWriter", "mavudpin_multi"]
 

@@ -35,6 +35,7 @@ from aerokit.vehicle.watch import LinkWatch, VehicleWatch
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterator
 
+    from aerokit.autopilots import Autopilot
     from aerokit.runtime.bus import Detach, Sink
     from aerokit.runtime.connection import Connection
     from aerokit.runtime.events import Event
@@ -62,15 +63,15 @@ class VehicleCore(States):
     def __init__(
         self, connection: Connection, system_id: int, component_id: int, heartbeat: Heartbeat
     ) -> None:
-        self.connection = connection
+        self.connection: Connection = connection
         """The connection it is reached by."""
-        self.system_id = system_id
+        self.system_id: int = system_id
         """MAVLink system id, 1–255."""
-        self.component_id = component_id
+        self.component_id: int = component_id
         """Component id of its autopilot, usually 1."""
-        self.vehicle_type = heartbeat.type
+        self.vehicle_type: int = heartbeat.type
         """MAV_TYPE of the first heartbeat (https://mavlink.io/en/messages/minimal.html#MAV_TYPE)."""
-        self.autopilot = autopilot_for(heartbeat)
+        self.autopilot: Autopilot = autopilot_for(heartbeat)
         """What differs between ArduPilot, PX4 and others."""
         self.telemetry = Telemetry(
             connection.now, system_id=system_id, component_id=component_id, autopilot=self.autopilot

@@ -12,6 +12,7 @@ from aerokit.errors import CommandRejected, NotSupported, OperationRejected, Ope
 from aerokit.vehicle.checks import check_range, check_seconds
 from aerokit.vehicle.helm import MODE_GRACE_S
 from aerokit.vehicle.progress import LONGEST_SILENCE_S, OLD_POSITION_S, Stillness, await_progress
+from aerokit.vehicle.state.values import Position
 from aerokit.vehicle.travel import TravelActions
 
 if TYPE_CHECKING:
