@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 from aerokit import Position, messages
 from aerokit.errors import LocalProtocolError
-from aerokit.missions import Mission
+from aerokit.missions import Fence, Mission, RallyPoints
 from aerokit.vehicle.setpoints import (
     AttitudeSetpoint,
     LocalPositionSetpoint,
@@ -68,7 +68,9 @@ WRONG: dict[str, tuple[object, ...]] = {
     "Dialect": (*NOTHING, *STRANGE, *TEXT, *NUMBER),
     "LogEntry | int": (*NOTHING, *STRANGE, *TEXT, 1.5),
     "ParameterSource": (*NOTHING, _Anything(), [PLACE], (47.0, 8.0), 1j, *NUMBER),
-    "PlanT": (*NOTHING, *STRANGE, *TEXT, *NUMBER, PLACE),
+    **dict.fromkeys(
+        ("PlanT", "Mission", "Fence", "RallyPoints"), (*NOTHING, *STRANGE, *TEXT, *NUMBER, PLACE)
+    ),
     "SetpointT": (*NOTHING, *STRANGE, *TEXT, *NUMBER, PLACE),
     "str | Link": (*NOTHING, *STRANGE, *NUMBER, b"udpin:0.0.0.0:14550"),
     "str | Link | Connection": (*NOTHING, *STRANGE, *NUMBER, b"udpin:0.0.0.0:14550"),
@@ -101,6 +103,7 @@ RIGHT: dict[str, object] = {
     "Callable[[T | None, T], None]": print,
     "LogEntry | int": 1,
     "Signing | None": None,
+    **{kind.__name__: kind() for kind in (Mission, Fence, RallyPoints)},
     "PlanT": Mission(),
     "SetpointT": VelocitySetpoint(),
     "PositionSetpoint": PositionSetpoint(PLACE),

@@ -96,6 +96,7 @@ TWINS = (
         direct=_names("distance_to describe_now"),
     ),
 )
+"""The classes that programs without ``async`` use, each below those that it gives."""
 FUNCTIONS = ("aerokit.runtime.opening.open_connection", "aerokit.vehicle.connect.connect")
 """Blocks that are opened by a function."""
 
