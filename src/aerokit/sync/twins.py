@@ -1708,6 +1708,8 @@ class Vehicle(VehicleTwin):
     def send(self, message: Message) -> None:
         """Send one message as it is, once; never blocks. Its ``target_system`` is yours to set.
 
+        A command that steers (as by :meth:`command`) and SET_MODE are newer orders: those of the actions end.
+
         Raises:
             LocalProtocolError: a field is out of range; nothing was sent.
             ConnectionClosed, LinkLost: the connection has ended, or the block of this vehicle was left.
@@ -1885,7 +1887,8 @@ class Vehicle(VehicleTwin):
             CommandRejected: the vehicle refused; ``reasons`` has its pre-arm texts, failing sensors and what the
                 estimator lacks. They are asked for again where the vehicle can run its checks on request.
             CommandTimeout: there was no answer; the text says whether the order may still arrive.
-            OperationRejected: somebody else has disarmed it, or changed its mode, meanwhile.
+            OperationRejected: it is armed already, in another mode than ``mode``, and nothing was sent; or somebody
+                else has disarmed it, or changed its mode, meanwhile.
             HeartbeatTimeout: the vehicle has been silent for ``max_silence_s`` seconds.
             OperationTimeout: it accepted and did not arm.
         """
