@@ -27,14 +27,14 @@ from aerokit.runtime.opening import open_connection
 from aerokit.runtime.subscription import Subscription
 from aerokit.sim import SimulatedCopter
 from aerokit.sync.generator import FILE, generate
-from aerokit.vehicle.fence import FenceControl
-from aerokit.vehicle.files import Files
-from aerokit.vehicle.guided import Guided, SetpointStream
-from aerokit.vehicle.logs import Logs
-from aerokit.vehicle.mission import MissionControl
-from aerokit.vehicle.parameters import Parameters, Transaction
-from aerokit.vehicle.rally import RallyControl
-from aerokit.vehicle.setpoints import VelocitySetpoint
+from aerokit.vehicle.files.files import Files
+from aerokit.vehicle.files.logs import Logs
+from aerokit.vehicle.orders.guided import Guided, SetpointStream
+from aerokit.vehicle.orders.setpoints import VelocitySetpoint
+from aerokit.vehicle.parameters.parameters import Parameters, Transaction
+from aerokit.vehicle.plans.fence import FenceControl
+from aerokit.vehicle.plans.mission import MissionControl
+from aerokit.vehicle.plans.rally import RallyControl
 from aerokit.vehicle.state.told import Told
 
 LOOP_THREAD = "aerokit loop"

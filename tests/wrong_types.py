@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from aerokit import Position, messages
 from aerokit.errors import LocalProtocolError
 from aerokit.missions import Fence, Mission, RallyPoints
-from aerokit.vehicle.setpoints import (
+from aerokit.vehicle.orders.setpoints import (
     AttitudeSetpoint,
     LocalPositionSetpoint,
     PositionSetpoint,

@@ -19,7 +19,7 @@ from aerokit.dronekit import parameters as parameters_module
 from aerokit.errors import ParameterTimeout
 from aerokit.parameters.renames import ParameterRenamedWarning
 from aerokit.sim import SimulatedCopter, SimulatedPx4, open_simulator
-from aerokit.vehicle.parameters import Parameters as AsyncParameters
+from aerokit.vehicle.parameters.parameters import Parameters as AsyncParameters
 
 LIMIT_S = 10.0
 INT8, INT16 = 2, 4

@@ -20,7 +20,7 @@ from aerokit.errors import (
 from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult
 from aerokit.runtime.cells import Source
 from aerokit.sim import SimulatedCopter
-from aerokit.vehicle.setpoints import VelocitySetpoint
+from aerokit.vehicle.orders.setpoints import VelocitySetpoint
 
 pytestmark = pytest.mark.anyio
 

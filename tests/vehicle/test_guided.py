@@ -22,8 +22,8 @@ from aerokit.errors import (
 )
 from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult
 from aerokit.sim.px4.modes import POSITION
-from aerokit.vehicle.guided import SetpointStream
-from aerokit.vehicle.setpoints import (
+from aerokit.vehicle.orders.guided import SetpointStream
+from aerokit.vehicle.orders.setpoints import (
     AccelerationSetpoint,
     AttitudeSetpoint,
     BodyVelocitySetpoint,

@@ -19,7 +19,7 @@ from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult
 from aerokit.runtime.events import ModeChanged
 from aerokit.sim import SimulatedCopter
 from aerokit.testing.clock import run_virtual
-from aerokit.vehicle.setpoints import BodyVelocitySetpoint, VelocitySetpoint
+from aerokit.vehicle.orders.setpoints import BodyVelocitySetpoint, VelocitySetpoint
 
 Action = Callable[[Flight], Awaitable[object]]
 

@@ -28,8 +28,8 @@ from aerokit.parameters import ParameterRenamedWarning, ParameterType
 from aerokit.protocols.transfer import Progress
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.vehicle.connect import connect
-from aerokit.vehicle.files import Files
-from aerokit.vehicle.parameters import Parameters
+from aerokit.vehicle.files.files import Files
+from aerokit.vehicle.parameters.parameters import Parameters
 
 pytestmark = pytest.mark.anyio
 

@@ -9,10 +9,10 @@ import pytest
 import aerokit
 import aerokit.sync
 from aerokit.mavlink import messages
-from aerokit.vehicle.rates import subscription_rate_hz
 from aerokit.vehicle.state.states import DEFAULT_RATES_HZ, STATES
 from aerokit.vehicle.state.table import documentation, rendered
 from aerokit.vehicle.state.told import By, Told
+from aerokit.vehicle.talk.rates import subscription_rate_hz
 
 
 def test_default_rates() -> None:

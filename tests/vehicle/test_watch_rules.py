@@ -16,9 +16,9 @@ from aerokit.runtime.cells import Source, StateCell
 from aerokit.runtime.connection import Connection
 from aerokit.runtime.events import LinkReport, VehicleBack, VehicleRebooted, VehicleSilent
 from aerokit.vehicle.core import VehicleCore
-from aerokit.vehicle.progress import Stillness
-from aerokit.vehicle.setpoints import SLOW_M_S, BodyVelocitySetpoint, VelocitySetpoint, wants_motion
-from aerokit.vehicle.watch import LinkWatch, VehicleWatch
+from aerokit.vehicle.orders.progress import Stillness
+from aerokit.vehicle.orders.setpoints import SLOW_M_S, BodyVelocitySetpoint, VelocitySetpoint, wants_motion
+from aerokit.vehicle.talk.watch import LinkWatch, VehicleWatch
 
 HEARTBEAT = Heartbeat(2, 3, 81, 0, 3)
 

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, SupportsFloat, SupportsIndex
 
 from aerokit.errors import AerokitError, LocalProtocolError, ParameterRejected
 from aerokit.parameters import Parameter, checked_value
-from aerokit.vehicle.parameter_names import Found
-from aerokit.vehicle.parameter_results import outcome_of
+from aerokit.vehicle.parameters.names import Found
+from aerokit.vehicle.parameters.results import outcome_of
 
 if TYPE_CHECKING:
     from aerokit.parameters import ParameterType

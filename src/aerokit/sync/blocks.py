@@ -18,8 +18,12 @@ if TYPE_CHECKING:
 
     from typing_extensions import Self
 
+    from aerokit.runtime.cells import Changes, StateCell  # noqa: F401 - named in the base classes below
     from aerokit.runtime.connection import Connection
-    from aerokit.vehicle.parameter_results import ParameterWrite
+    from aerokit.runtime.subscription import Subscription  # noqa: F401
+    from aerokit.vehicle.orders.guided import SetpointStream  # noqa: F401
+    from aerokit.vehicle.parameters.results import ParameterWrite
+    from aerokit.vehicle.parameters.transaction import Temporarily, Transaction  # noqa: F401
     from aerokit.vehicle.vehicle import Vehicle
 
 __all__ = [

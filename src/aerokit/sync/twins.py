@@ -29,9 +29,13 @@ from aerokit.sync.blocks import (
     opened,
 )
 from aerokit.vehicle.connect import connect as connect_async
-from aerokit.vehicle.logs import ERASE_PATIENCE_S
-from aerokit.vehicle.progress import LONGEST_SILENCE_S
-from aerokit.vehicle.setpoints import AccelerationSetpoint, BodyVelocitySetpoint, VelocitySetpoint
+from aerokit.vehicle.files.logs import ERASE_PATIENCE_S
+from aerokit.vehicle.orders.progress import LONGEST_SILENCE_S
+from aerokit.vehicle.orders.setpoints import (
+    AccelerationSetpoint,
+    BodyVelocitySetpoint,
+    VelocitySetpoint,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -51,17 +55,24 @@ if TYPE_CHECKING:
     from aerokit.runtime.events import Event, LinkReport
     from aerokit.runtime.link_state import LinkState
     from aerokit.runtime.subscription import Overflow
-    from aerokit.vehicle.fence import FenceControl as AsyncFenceControl
-    from aerokit.vehicle.files import FileEntry, Files as AsyncFiles
-    from aerokit.vehicle.guided import Guided as AsyncGuided
-    from aerokit.vehicle.logs import LogEntry, LogMethod, Logs as AsyncLogs
-    from aerokit.vehicle.mission import MissionControl as AsyncMissionControl
-    from aerokit.vehicle.parameter_access import CacheChoice, DownloadMethod, UploadMethod
-    from aerokit.vehicle.parameter_results import ParameterWrite
-    from aerokit.vehicle.parameters import ParameterSource, Parameters as AsyncParameters
-    from aerokit.vehicle.plans import PlanMethod
-    from aerokit.vehicle.rally import RallyControl as AsyncRallyControl
-    from aerokit.vehicle.setpoints import AttitudeSetpoint, LocalPositionSetpoint, PositionSetpoint
+    from aerokit.vehicle.files.files import FileEntry, Files as AsyncFiles
+    from aerokit.vehicle.files.logs import LogEntry, LogMethod, Logs as AsyncLogs
+    from aerokit.vehicle.orders.guided import Guided as AsyncGuided
+    from aerokit.vehicle.orders.setpoints import (
+        AttitudeSetpoint,
+        LocalPositionSetpoint,
+        PositionSetpoint,
+    )
+    from aerokit.vehicle.parameters.access import CacheChoice, DownloadMethod, UploadMethod
+    from aerokit.vehicle.parameters.parameters import (
+        ParameterSource,
+        Parameters as AsyncParameters,
+    )
+    from aerokit.vehicle.parameters.results import ParameterWrite
+    from aerokit.vehicle.plans.fence import FenceControl as AsyncFenceControl
+    from aerokit.vehicle.plans.held import PlanMethod
+    from aerokit.vehicle.plans.mission import MissionControl as AsyncMissionControl
+    from aerokit.vehicle.plans.rally import RallyControl as AsyncRallyControl
     from aerokit.vehicle.state.values import (
         Attitude,
         AutopilotVersion,

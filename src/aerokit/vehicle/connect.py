@@ -21,7 +21,7 @@ from aerokit.runtime.endings import raisable
 from aerokit.runtime.events import VehicleFound
 from aerokit.runtime.opening import open_connection
 from aerokit.runtime.routes import MOST_ROUTES
-from aerokit.vehicle.rates import check_rate
+from aerokit.vehicle.talk.rates import check_rate
 from aerokit.vehicle.vehicle import Vehicle
 
 if TYPE_CHECKING:

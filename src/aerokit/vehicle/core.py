@@ -23,14 +23,14 @@ from aerokit.runtime.events import (
     StatusTextReceived,
 )
 from aerokit.runtime.subscription import Overflow, Subscription
-from aerokit.vehicle.commands import CommandSender
-from aerokit.vehicle.helm import Helm
-from aerokit.vehicle.orders import MOVING_COMMANDS, QUESTIONS
-from aerokit.vehicle.rates import MessageRates, check_rate, subscription_rate_hz
+from aerokit.vehicle.orders.helm import Helm
+from aerokit.vehicle.orders.order import MOVING_COMMANDS, QUESTIONS
 from aerokit.vehicle.state.states import States
 from aerokit.vehicle.state.telemetry import Telemetry
-from aerokit.vehicle.transfers import Transfers
-from aerokit.vehicle.watch import LinkWatch, VehicleWatch
+from aerokit.vehicle.talk.commands import CommandSender
+from aerokit.vehicle.talk.rates import MessageRates, check_rate, subscription_rate_hz
+from aerokit.vehicle.talk.transfers import Transfers
+from aerokit.vehicle.talk.watch import LinkWatch, VehicleWatch
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterator
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from aerokit.runtime.connection import Connection
     from aerokit.runtime.events import Event
     from aerokit.runtime.link_state import LinkState
-    from aerokit.vehicle.orders import Order
+    from aerokit.vehicle.orders.order import Order
 
 __all__ = ["COMPONENT_ARM_DISARM", "VehicleCore"]
 

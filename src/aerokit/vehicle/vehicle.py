@@ -8,16 +8,16 @@ import anyio
 
 from aerokit.arguments import checks_arguments
 from aerokit.errors import CommandRejected, CommandTimeout
-from aerokit.vehicle.fence import FenceControl
-from aerokit.vehicle.files import Files
-from aerokit.vehicle.flight import FlightActions
-from aerokit.vehicle.guided import Guided
-from aerokit.vehicle.logs import Logs
-from aerokit.vehicle.mission import MissionControl
-from aerokit.vehicle.parameters import Parameters
-from aerokit.vehicle.plans import PlanContext
-from aerokit.vehicle.rally import RallyControl
-from aerokit.vehicle.signing import set_up_signing
+from aerokit.vehicle.files.files import Files
+from aerokit.vehicle.files.logs import Logs
+from aerokit.vehicle.orders.flight import FlightActions
+from aerokit.vehicle.orders.guided import Guided
+from aerokit.vehicle.parameters.parameters import Parameters
+from aerokit.vehicle.plans.fence import FenceControl
+from aerokit.vehicle.plans.held import PlanContext
+from aerokit.vehicle.plans.mission import MissionControl
+from aerokit.vehicle.plans.rally import RallyControl
+from aerokit.vehicle.talk.signing import set_up_signing
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

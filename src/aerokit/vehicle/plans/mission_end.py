@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from aerokit.vehicle.helm import MODE_GRACE_S
+from aerokit.vehicle.orders.helm import MODE_GRACE_S
 from aerokit.vehicle.state.values import Position
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from aerokit.missions.item import MissionItem
-    from aerokit.vehicle.mission_watch import MissionWatch
-    from aerokit.vehicle.orders import Order
+    from aerokit.vehicle.orders.order import Order
+    from aerokit.vehicle.plans.mission_watch import MissionWatch
     from aerokit.vehicle.state.values import Mode
     from aerokit.vehicle.vehicle import Vehicle
 

@@ -17,7 +17,7 @@ from aerokit.missions.compare import changed_items, item_differences
 from aerokit.missions.storage import Storage
 from aerokit.missions.wire import shift_jumps, with_home
 from aerokit.protocols.mission_checksum import mission_checksum
-from aerokit.vehicle.plan_channel import PlanChannel
+from aerokit.vehicle.plans.channel import PlanChannel
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from aerokit.missions.item import MissionItem
     from aerokit.protocols.transfer import OnProgress
-    from aerokit.vehicle.plans import PlanContext
+    from aerokit.vehicle.plans.held import PlanContext
 
 __all__ = ["Plan", "PlanTransfer"]
 

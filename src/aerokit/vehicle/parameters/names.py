@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from aerokit.parameters import ParameterTable
     from aerokit.parameters.renames import Renamed
     from aerokit.protocols.parameter_requests import Answer
-    from aerokit.vehicle.parameter_access import ParameterAccess
+    from aerokit.vehicle.parameters.access import ParameterAccess
 
 __all__ = ["Found", "NotFound", "ParameterNames", "warn_of_rename"]
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from aerokit.missions.item import MissionItem
     from aerokit.position import Position
     from aerokit.protocols.transfer import OnProgress
-    from aerokit.vehicle.plan_transfer import Plan, PlanTransfer
+    from aerokit.vehicle.plans.transfer import Plan, PlanTransfer
     from aerokit.vehicle.vehicle import Vehicle
 
 __all__ = ["HeldPlan", "PlanContext", "PlanFiles", "PlanMemory", "PlanMethod"]
@@ -158,7 +158,7 @@ class HeldPlan(Generic[PlanT]):
         timeout: float | None,
         on_progress: OnProgress | None,
     ) -> ResultT:
-        from aerokit.vehicle.plan_transfer import PlanTransfer
+        from aerokit.vehicle.plans.transfer import PlanTransfer
 
         if method not in METHODS:
             raise LocalProtocolError(f"method = {method!r} is not allowed: {', '.join(METHODS)}")

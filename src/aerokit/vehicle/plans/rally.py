@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from aerokit.vehicle.plans import HeldPlan
+from aerokit.vehicle.plans.held import HeldPlan
 
 if TYPE_CHECKING:
     from aerokit.missions import RallyPoints

@@ -17,15 +17,15 @@ from aerokit.errors import (
     OperationTimeout,
 )
 from aerokit.mavlink.messages import SetPositionTargetGlobalInt
-from aerokit.vehicle.arming import ArmingActions
 from aerokit.vehicle.checks import check_range, check_seconds
-from aerokit.vehicle.modes import CHANGE_MODE, DO_REPOSITION, RESULT_UNSUPPORTED
-from aerokit.vehicle.progress import LONGEST_SILENCE_S, OLD_POSITION_S, Stillness, await_progress
+from aerokit.vehicle.orders.arming import ArmingActions
+from aerokit.vehicle.orders.modes import CHANGE_MODE, DO_REPOSITION, RESULT_UNSUPPORTED
+from aerokit.vehicle.orders.progress import LONGEST_SILENCE_S, OLD_POSITION_S, Stillness, await_progress
 from aerokit.vehicle.state.values import Position
 
 if TYPE_CHECKING:
     from aerokit.autopilots import Mode
-    from aerokit.vehicle.orders import Order
+    from aerokit.vehicle.orders.order import Order
 
 __all__ = ["TravelActions"]
 

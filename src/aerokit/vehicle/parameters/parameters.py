@@ -13,19 +13,19 @@ from aerokit.arguments import checks_arguments
 from aerokit.errors import NotSupported, ParameterRejected, ParameterTimeout
 from aerokit.parameters import Parameter, ParameterTable
 from aerokit.protocols.transfer import PATIENCE_S
-from aerokit.vehicle.parameter_access import CacheChoice, DownloadMethod, ParameterAccess, UploadMethod
-from aerokit.vehicle.parameter_names import Found, ParameterNames
-from aerokit.vehicle.parameter_results import Outcome, ParameterWrite
-from aerokit.vehicle.parameter_transaction import Holds, Temporarily, Transaction
-from aerokit.vehicle.parameter_writing import ParameterWriting, check_values
+from aerokit.vehicle.parameters.access import CacheChoice, DownloadMethod, ParameterAccess, UploadMethod
+from aerokit.vehicle.parameters.names import Found, ParameterNames
+from aerokit.vehicle.parameters.results import Outcome, ParameterWrite
+from aerokit.vehicle.parameters.transaction import Holds, Temporarily, Transaction
+from aerokit.vehicle.parameters.writing import ParameterWriting, check_values
 
 if TYPE_CHECKING:
     from aerokit.parameters import Metadata, ParameterDifference
     from aerokit.protocols.parameter_requests import Answer
     from aerokit.protocols.transfer import OnProgress
     from aerokit.runtime.bus import Detach
-    from aerokit.vehicle.files import Files
-    from aerokit.vehicle.transfers import Transfers
+    from aerokit.vehicle.files.files import Files
+    from aerokit.vehicle.talk.transfers import Transfers
 
 __all__ = ["Outcome", "ParameterWrite", "Parameters", "Transaction"]
 

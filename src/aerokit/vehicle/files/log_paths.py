@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, NamedTuple
 from aerokit.errors import FileError
 
 if TYPE_CHECKING:
-    from aerokit.vehicle.files import FileEntry, Files
-    from aerokit.vehicle.logs import LogEntry
+    from aerokit.vehicle.files.files import FileEntry, Files
+    from aerokit.vehicle.files.logs import LogEntry
 
 __all__ = ["ListedLog", "listed_logs", "log_path"]
 

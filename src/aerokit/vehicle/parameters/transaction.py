@@ -12,7 +12,7 @@ from aerokit.errors import AerokitError, LocalProtocolError, RollbackFailed, Ver
 from aerokit.parameters import Parameter
 from aerokit.parameters.parameter import same_value
 from aerokit.runtime.background import to_its_end
-from aerokit.vehicle.parameter_names import Found
+from aerokit.vehicle.parameters.names import Found
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
     from aerokit.parameters import ParameterDifference
-    from aerokit.vehicle.parameter_access import ParameterAccess
-    from aerokit.vehicle.parameter_results import ParameterWrite
-    from aerokit.vehicle.parameter_writing import ParameterWriting
+    from aerokit.vehicle.parameters.access import ParameterAccess
+    from aerokit.vehicle.parameters.results import ParameterWrite
+    from aerokit.vehicle.parameters.writing import ParameterWriting
 
 __all__ = ["Holds", "Temporarily", "Transaction"]
 

@@ -9,13 +9,13 @@ from aerokit.errors import AerokitError, LocalProtocolError, ParameterRejected
 from aerokit.parameters import Parameter, ParameterType, check_name, checked_value
 from aerokit.parameters.parameter import same_value
 from aerokit.snapshot import Snapshot
-from aerokit.vehicle.parameter_names import Found, ParameterNames
-from aerokit.vehicle.parameter_results import ParameterWrite, failed, outcome_of
+from aerokit.vehicle.parameters.names import Found, ParameterNames
+from aerokit.vehicle.parameters.results import ParameterWrite, failed, outcome_of
 
 if TYPE_CHECKING:
     from aerokit.protocols.parameter_requests import Answer
     from aerokit.protocols.transfer import OnProgress
-    from aerokit.vehicle.parameter_access import ParameterAccess, UploadMethod
+    from aerokit.vehicle.parameters.access import ParameterAccess, UploadMethod
 
 __all__ = ["ParameterWriting", "check_values"]
 

@@ -9,17 +9,17 @@ import anyio
 from aerokit.arguments import checks_arguments
 from aerokit.errors import CommandRejected, LocalProtocolError, OperationRejected, OperationTimeout
 from aerokit.vehicle.checks import check_seconds
-from aerokit.vehicle.mission_end import MissionEnd
-from aerokit.vehicle.mission_watch import MissionWatch
-from aerokit.vehicle.modes import RESULT_UNSUPPORTED
-from aerokit.vehicle.plans import HeldPlan
-from aerokit.vehicle.progress import LONGEST_SILENCE_S, await_progress
+from aerokit.vehicle.orders.modes import RESULT_UNSUPPORTED
+from aerokit.vehicle.orders.progress import LONGEST_SILENCE_S, await_progress
+from aerokit.vehicle.plans.held import HeldPlan
+from aerokit.vehicle.plans.mission_end import MissionEnd
+from aerokit.vehicle.plans.mission_watch import MissionWatch
 
 if TYPE_CHECKING:
     from aerokit.missions import Mission
     from aerokit.runtime.cells import StateCell
-    from aerokit.vehicle.orders import Order, Sending
-    from aerokit.vehicle.plans import PlanContext
+    from aerokit.vehicle.orders.order import Order, Sending
+    from aerokit.vehicle.plans.held import PlanContext
     from aerokit.vehicle.state.values import MissionProgress, Mode
 
 __all__ = ["MissionControl"]

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from aerokit.errors import CommandRejected
-from aerokit.vehicle.orders import Order, Sending
+from aerokit.vehicle.orders.order import Order, Sending
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator

@@ -14,15 +14,15 @@ from aerokit.protocols.ftp_transfer import FtpDownload, FtpUpload, is_virtual
 from aerokit.protocols.reassembly import Reassembly
 from aerokit.protocols.transfer import PATIENCE_S, OnProgress
 from aerokit.snapshot import Snapshot
-from aerokit.vehicle.file_channel import FileChannel
-from aerokit.vehicle.part_file import PartFile
+from aerokit.vehicle.files.channel import FileChannel
+from aerokit.vehicle.files.part_file import PartFile
 
 if TYPE_CHECKING:
     import os
 
     from aerokit.protocols.ftp import FtpMessage
-    from aerokit.vehicle.file_channel import OpenFile
-    from aerokit.vehicle.transfers import Transfers
+    from aerokit.vehicle.files.channel import OpenFile
+    from aerokit.vehicle.talk.transfers import Transfers
 
 __all__ = ["FileEntry", "Files"]
 

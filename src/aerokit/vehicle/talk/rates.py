@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.runtime.bus import Detach
     from aerokit.runtime.connection import Connection
-    from aerokit.vehicle.commands import CommandSender
+    from aerokit.vehicle.talk.commands import CommandSender
 
 __all__ = ["MessageRates"]
 

@@ -14,7 +14,7 @@ from aerokit.runtime.events import ParameterChanged
 
 if TYPE_CHECKING:
     from aerokit.runtime.bus import Detach
-    from aerokit.vehicle.transfers import Transfers
+    from aerokit.vehicle.talk.transfers import Transfers
 
 __all__ = ["ParameterStore"]
 

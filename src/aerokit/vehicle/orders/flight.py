@@ -10,16 +10,16 @@ import anyio
 from aerokit.arguments import checks_arguments
 from aerokit.errors import CommandRejected, NotSupported, OperationRejected, OperationTimeout
 from aerokit.vehicle.checks import check_range, check_seconds
-from aerokit.vehicle.helm import MODE_GRACE_S
-from aerokit.vehicle.progress import LONGEST_SILENCE_S, OLD_POSITION_S, Stillness, await_progress
+from aerokit.vehicle.orders.helm import MODE_GRACE_S
+from aerokit.vehicle.orders.progress import LONGEST_SILENCE_S, OLD_POSITION_S, Stillness, await_progress
+from aerokit.vehicle.orders.travel import TravelActions
 from aerokit.vehicle.state.values import Position
-from aerokit.vehicle.travel import TravelActions
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from aerokit.autopilots import TakeOff
-    from aerokit.vehicle.orders import Order
+    from aerokit.vehicle.orders.order import Order
 
 __all__ = ["FlightActions"]
 

@@ -13,7 +13,7 @@ import anyio
 from aerokit.arguments import checks_arguments
 from aerokit.errors import AerokitError, OperationTimeout
 from aerokit.runtime.cancellation import Cancellation
-from aerokit.vehicle.modes import CHANGE_MODE, DO_REPOSITION, DO_SET_MODE, ModeActions
+from aerokit.vehicle.orders.modes import CHANGE_MODE, DO_REPOSITION, DO_SET_MODE, ModeActions
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from aerokit.autopilots import Mode
     from aerokit.mavlink.messages import Heartbeat
     from aerokit.runtime.connection import Connection
-    from aerokit.vehicle.guided import SetpointStream
-    from aerokit.vehicle.orders import Order
+    from aerokit.vehicle.orders.guided import SetpointStream
+    from aerokit.vehicle.orders.order import Order
 
 __all__ = ["HoldingActions"]
 

@@ -8,17 +8,17 @@ from typing import TYPE_CHECKING, Any
 from aerokit.arguments import checks_arguments
 from aerokit.errors import CommandRejected, CommandTimeout, NotSupported, OperationRejected
 from aerokit.vehicle.checks import check_seconds
-from aerokit.vehicle.health import VehicleHealth
-from aerokit.vehicle.helm import KNOWN_S, MODE_GRACE_S
-from aerokit.vehicle.orders import MOVING_COMMANDS
-from aerokit.vehicle.progress import await_progress
+from aerokit.vehicle.orders.health import VehicleHealth
+from aerokit.vehicle.orders.helm import KNOWN_S, MODE_GRACE_S
+from aerokit.vehicle.orders.order import MOVING_COMMANDS
+from aerokit.vehicle.orders.progress import await_progress
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
     from aerokit.autopilots import Mode, Purpose
     from aerokit.mavlink.messages import CommandAck
-    from aerokit.vehicle.orders import Order
+    from aerokit.vehicle.orders.order import Order
 
 __all__ = ["CHANGE_MODE", "DO_REPOSITION", "RESULT_UNSUPPORTED", "ModeActions"]
 

@@ -22,8 +22,8 @@ from aerokit.errors import (
     SetpointStreamStopped,
 )
 from aerokit.vehicle.checks import check_kind
-from aerokit.vehicle.progress import Stillness
-from aerokit.vehicle.setpoints import (
+from aerokit.vehicle.orders.progress import Stillness
+from aerokit.vehicle.orders.setpoints import (
     AccelerationSetpoint,
     AttitudeSetpoint,
     BodyVelocitySetpoint,
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
     from aerokit.autopilots import Mode
     from aerokit.mavlink.message import Message
-    from aerokit.vehicle.orders import Order
+    from aerokit.vehicle.orders.order import Order
     from aerokit.vehicle.vehicle import Vehicle
 
 __all__ = ["Guided", "SetpointStream"]

@@ -19,16 +19,16 @@ from aerokit.protocols.reassembly import Reassembly
 from aerokit.protocols.transfer import PATIENCE_S, OnProgress
 from aerokit.snapshot import Snapshot
 from aerokit.vehicle.checks import check_seconds
-from aerokit.vehicle.log_growth import GrowthWatch
-from aerokit.vehicle.log_paths import listed_logs, log_path
-from aerokit.vehicle.part_file import PartFile
+from aerokit.vehicle.files.log_growth import GrowthWatch
+from aerokit.vehicle.files.log_paths import listed_logs, log_path
+from aerokit.vehicle.files.part_file import PartFile
 
 if TYPE_CHECKING:
     import os
     from collections.abc import AsyncIterator, Callable
 
-    from aerokit.vehicle.files import Files
-    from aerokit.vehicle.transfers import Transfers
+    from aerokit.vehicle.files.files import Files
+    from aerokit.vehicle.talk.transfers import Transfers
 
 __all__ = ["LogEntry", "LogMethod", "Logs"]
 

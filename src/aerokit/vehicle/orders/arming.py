@@ -21,12 +21,12 @@ from aerokit.errors import (
 from aerokit.runtime.cancellation import Cancellation
 from aerokit.vehicle.checks import check_seconds
 from aerokit.vehicle.core import COMPONENT_ARM_DISARM
-from aerokit.vehicle.holding import HoldingActions
-from aerokit.vehicle.progress import LONGEST_SILENCE_S, await_progress
+from aerokit.vehicle.orders.holding import HoldingActions
+from aerokit.vehicle.orders.progress import LONGEST_SILENCE_S, await_progress
 
 if TYPE_CHECKING:
     from aerokit.autopilots import Mode
-    from aerokit.vehicle.orders import Order
+    from aerokit.vehicle.orders.order import Order
 
 __all__ = ["ArmingActions"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from aerokit.arguments import checks_arguments
-from aerokit.vehicle.plans import HeldPlan
+from aerokit.vehicle.plans.held import HeldPlan
 
 if TYPE_CHECKING:
     from aerokit.missions import Fence

@@ -21,16 +21,16 @@ from aerokit.parameters import Parameter, ParameterTable
 from aerokit.parameters.parameter import same_value
 from aerokit.parameters.px4_hash import HASH_NAME
 from aerokit.protocols.round_trip import RoundTrip
-from aerokit.vehicle.parameter_store import ParameterStore
+from aerokit.vehicle.parameters.store import ParameterStore
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     from aerokit.protocols.parameter_requests import Answer
     from aerokit.protocols.transfer import OnProgress
-    from aerokit.vehicle.files import Files
-    from aerokit.vehicle.parameter_cache import ParameterCache
-    from aerokit.vehicle.transfers import Transfers
+    from aerokit.vehicle.files.files import Files
+    from aerokit.vehicle.parameters.cache import ParameterCache
+    from aerokit.vehicle.talk.transfers import Transfers
 
 __all__ = ["CacheChoice", "DownloadMethod", "ParameterAccess", "UploadMethod"]
 
@@ -104,7 +104,7 @@ class ParameterAccess:
                 return self.store.table
             keeper = None
             if cache is not False and self._transfers.autopilot.has_parameter_hash:
-                from aerokit.vehicle.parameter_cache import ParameterCache
+                from aerokit.vehicle.parameters.cache import ParameterCache
 
                 keeper = _Keeper(self, ParameterCache(None if cache is True else cache), patience_s)
                 if await keeper.begin(refresh):
@@ -372,7 +372,7 @@ class _Keeper:
             self._cache.save(await self._key(), self._hash, self._access.store.table)
 
     async def _key(self) -> str:
-        from aerokit.vehicle.parameter_cache import vehicle_key
+        from aerokit.vehicle.parameters.cache import vehicle_key
 
         transfers = self._access._transfers
         await transfers.capabilities()
