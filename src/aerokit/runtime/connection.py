@@ -21,6 +21,7 @@ from aerokit.runtime.background import Background
 from aerokit.runtime.bus import Bus, once
 from aerokit.runtime.cells import StateCell
 from aerokit.runtime.deadlines import Deadlines
+from aerokit.runtime.diagnosis import is_autopilot
 from aerokit.runtime.endings import raisable
 from aerokit.runtime.events import (
     Event,
@@ -30,6 +31,7 @@ from aerokit.runtime.events import (
     LinkRestored,
     LinkStalled,
     LoopBlocked,
+    VehicleFound,
 )
 from aerokit.runtime.link_state import LinkState
 from aerokit.runtime.link_watch import LinkStateWatch
@@ -500,7 +502,11 @@ class Connection:
         if frame.system_id == 0 or not isinstance(heartbeat, Heartbeat):
             return
         if self._routes.note(frame, peer, _counters(framer, frame)):
-            self.heard[frame.system_id, frame.component_id] = heartbeat
+            source = frame.system_id, frame.component_id
+            is_new = source not in self.heard
+            self.heard[source] = heartbeat
+            if is_new and is_autopilot(heartbeat):
+                self.bus.publish(VehicleFound(self._clock(), *source))
             if len(self.heard) > MOST_ROUTES:
                 for source in [source for source in self.heard if not self._routes.is_known(source)]:
                     del self.heard[source]

@@ -18,7 +18,6 @@ from aerokit.mavlink.messages import Heartbeat
 from aerokit.runtime.connection import MAV_COMP_ID_MISSIONPLANNER, Connection
 from aerokit.runtime.diagnosis import is_autopilot, no_vehicle_reason
 from aerokit.runtime.endings import raisable
-from aerokit.runtime.events import VehicleFound
 from aerokit.runtime.opening import open_connection
 from aerokit.runtime.routes import MOST_ROUTES
 from aerokit.vehicle.talk.rates import check_rate
@@ -165,7 +164,6 @@ async def _attached(
     is_cut_short = False
     try:
         vehicle._start(heartbeat, rates)
-        connection.bus.publish(VehicleFound(connection.now(), vehicle.system_id, vehicle.component_id))
         yield vehicle
     except BaseException:
         is_cut_short = True
