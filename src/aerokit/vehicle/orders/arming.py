@@ -20,8 +20,8 @@ from aerokit.errors import (
 )
 from aerokit.runtime.cancellation import Cancellation
 from aerokit.vehicle.checks import check_seconds
-from aerokit.vehicle.core import COMPONENT_ARM_DISARM
-from aerokit.vehicle.orders.holding import HoldingActions
+from aerokit.vehicle.orders.late_arming import LATE_S, give_arm
+from aerokit.vehicle.orders.part import Part
 from aerokit.vehicle.orders.progress import LONGEST_SILENCE_S, await_progress
 
 if TYPE_CHECKING:
@@ -31,16 +31,11 @@ if TYPE_CHECKING:
 __all__ = ["ArmingActions"]
 
 PREFLIGHT_REBOOT_SHUTDOWN = 246
-FORCE = 21196
 FORCE_REBOOT = 20190226
 SAID_AGAIN_S = 35.0
 """ArduPilot says every 30 s why it would not arm."""
 LOOK_S = 0.1
 """So often it is looked whether a vehicle is back."""
-LATE_S = 15.0
-"""For so long after an order to arm was given up the vehicle is watched, and disarmed if it arms after all."""
-ARMING_AT_END_S = 1.5
-"""How long the end of a block waits for it."""
 BOOTING = (1, 2)
 """MAV_STATE: booting, calibrating."""
 REBOOT_ANSWER_S = 3.0
@@ -51,11 +46,21 @@ logger = logging.getLogger("aerokit")
 
 
 @checks_arguments
-class ArmingActions(HoldingActions):
+class ArmingActions(Part):
     """From standing there to running motors, and back."""
 
-    _late_arming: Cancellation | None = None
-    _late_arming_is_over: asyncio.Event | None = None
+    def missing_for_flight(self) -> list[str]:
+        """What is still missing before the vehicle can fly, as far as it is known already; talks to nobody."""
+        return self._health.missing_for_flight()
+
+    async def why_not_armable(self) -> list[str]:
+        """Return the reasons why arming would be refused now; an empty list means that none is known.
+
+        Asks the vehicle to run its checks (MAV_CMD_RUN_PREARM_CHECKS) where it can do so on request and listens to
+        what it says; reads SYS_STATUS and the estimator's flags (ArduPilot EKF_STATUS_REPORT, PX4 ESTIMATOR_STATUS).
+        Takes about a second. The vehicle is not armed by it.
+        """
+        return await self._health.why_not_armable()
 
     async def wait_ready(self, *, timeout: float = 90.0) -> None:
         """Wait until position and home are known, the estimator is healthy and the pre-arm checks pass.
@@ -68,16 +73,16 @@ class ArmingActions(HoldingActions):
                 said of it lately.
         """
         check_seconds("timeout", timeout)
-        with self._streaming("sensors", "estimator", "position"), anyio.move_on_after(timeout):
-            while self.missing_for_flight():
+        with self._talk.streaming("sensors", "estimator", "position"), anyio.move_on_after(timeout):
+            while self._health.missing_for_flight():
                 self.connection.raise_if_ended()
                 await anyio.sleep(0.2)
             return
-        said = dict.fromkeys(self._arming_texts(self.connection.now() - SAID_AGAIN_S))
-        still = [*self.missing_for_flight(), *said] or ["nothing any more"]
-        missing = "\n  - ".join([*still, *self._unarmable_mode()])
+        said = dict.fromkeys(self._health.arming_texts(self.connection.now() - SAID_AGAIN_S))
+        still = [*self._health.missing_for_flight(), *said] or ["nothing any more"]
+        missing = "\n  - ".join([*still, *self._health.unarmable_mode()])
         raise OperationTimeout(
-            f"the vehicle was not ready within {timeout:g} s ({self.describe_link()}); still missing:\n  - {missing}"
+            f"the vehicle was not ready within {timeout:g} s ({self._talk.describe_link()}); still missing:\n  - {missing}"
         )
 
     async def arm(
@@ -116,20 +121,20 @@ class ArmingActions(HoldingActions):
         wanted = self._mode_to_arm_in(mode)
         if wanted is not None:
             await self._go_to_arming_mode(wanted)
-        self._stop_watching_arming()
-        started, was_armed = self.connection.now(), self.is_armed
+        self._late_arming.stop()
+        started, was_armed = self.connection.now(), self.telemetry.is_armed
         with self._helm.aside() as order:
             try:
-                await self._give_arm(order, True, force)
+                await give_arm(self._talk, self._orders, order, True, force=force)
                 await self._await_armed(True, order, started, timeout, max_silence_s)
             except CommandRejected as error:
-                reasons = await self._arming_reasons(started)
-                raise self._explained(error, started, reasons) from None
+                reasons = await self._health.arming_reasons(started)
+                raise self._talk.explained(error, started, reasons) from None
             except CommandTimeout as error:
-                self._watch_for_late_arming(was_armed)
-                raise CommandTimeout(f"{error}; {self._may_still_arm()}") from None
+                self._late_arming.watch(was_armed)
+                raise CommandTimeout(f"{error}; {self._late_arming.text()}") from None
             except (anyio.get_cancelled_exc_class(), AerokitError):
-                self._watch_for_late_arming(was_armed)
+                self._late_arming.watch(was_armed)
                 raise
 
     async def disarm(
@@ -154,32 +159,22 @@ class ArmingActions(HoldingActions):
         """
         check_seconds("timeout", timeout)
         check_seconds("max_silence_s", max_silence_s, none_is_allowed=True)
-        self._stop_watching_arming()
+        self._late_arming.stop()
         started = self.connection.now()
         with self._helm.aside() as order:
-            await self._give_arm(order, False, force)
+            await give_arm(self._talk, self._orders, order, False, force=force)
             await self._await_armed(False, order, started, timeout, max_silence_s)
-
-    async def _give_arm(self, order: Order, armed: bool, force: bool) -> None:
-        await self._give(
-            order,
-            self._commands.send_long,
-            COMPONENT_ARM_DISARM,
-            float(armed),
-            FORCE if force else 0,
-            armed=armed,
-        )
 
     async def _await_armed(
         self, armed: bool, order: Order, started: float, timeout: float, max_silence_s: float | None
     ) -> None:
         cell = self.telemetry.armed
         await await_progress(
-            self,
+            self._talk,
             "arm()" if armed else "disarm()",
             is_done=lambda: cell.latest is armed and cell.updated_at > started,
             trouble=lambda: order.taken_by if armed else None,
-            describe=lambda: "; ".join(self.texts_since(started)) or "the vehicle said nothing about it",
+            describe=lambda: "; ".join(self._talk.texts_since(started)) or "the vehicle said nothing about it",
             timeout=timeout,
             max_silence_s=max_silence_s,
         )
@@ -191,18 +186,18 @@ class ArmingActions(HoldingActions):
         if mode is not None:
             wanted = self.autopilot.find_mode(mode, self.telemetry.mode_names)
             if wanted.name in self.autopilot.unarmable_modes:
-                raise LocalProtocolError(f"mode = {mode!r} is not allowed: {self._unarmable_text(wanted)}")
-            if self.is_armed and wanted != self.telemetry.mode.latest:
+                raise LocalProtocolError(f"mode = {mode!r} is not allowed: {self._health.unarmable_text(wanted)}")
+            if self.telemetry.is_armed and wanted != self.telemetry.mode.latest:
                 raise OperationRejected(
-                    f"arm: the vehicle is armed already, in {self.mode_name}; nothing was sent"
+                    f"arm: the vehicle is armed already, in {self.telemetry.mode_name}; nothing was sent"
                 )
             return wanted
         is_booting = self.telemetry.system_status.latest in BOOTING
         if (
-            self._stream is not None
+            self._holding.stream is not None
             or is_booting
-            or not self.is_surely_disarmed
-            or not self._unarmable_mode()
+            or not self.telemetry.is_surely_disarmed
+            or not self._health.unarmable_mode()
         ):
             return None
         return self.autopilot.mode_to_arm_in()
@@ -210,84 +205,24 @@ class ArmingActions(HoldingActions):
     async def _go_to_arming_mode(self, wanted: Mode) -> None:
         """Afterwards the order to arm is not meant any more, or not yet, if anything has come between."""
         order, count = self._helm.order(wanted), self._helm.arming_orders
-        await self._ensure_mode(wanted, order)
+        await self._orders.ensure_mode(wanted, order)
         await self._settle_in_mode()
-        self._raise_if_over(order)
+        self._orders.raise_if_over(order)
         if self._helm.arming_orders != count:
             raise OperationRejected("arm(): another order to arm or disarm was given; it was not told to arm")
         if not self._helm.is_known:
-            raise HeartbeatTimeout(f"arm(): {self.describe_link()}; it was not told to arm")
+            raise HeartbeatTimeout(f"arm(): {self._talk.describe_link()}; it was not told to arm")
 
     async def _settle_in_mode(self) -> None:
         """PX4 tells by SYS_STATUS, some times a second, whether it could be armed in its new mode."""
         sensors = self.telemetry.sensors
-        with self._streaming("sensors"), anyio.move_on_after(READY_IN_MODE_S):
+        with self._talk.streaming("sensors"), anyio.move_on_after(READY_IN_MODE_S):
             since = self.connection.now()
             await sensors.wait_until(
                 lambda each: sensors.updated_at > since and each.prearm_checks_pass is not False
             )
 
-    # ---------------------------------------------------------------- orders that come late
-
-    def _may_still_arm(self) -> str:
-        unsent = self.connection.unsent_bytes
-        where = f"; {unsent} bytes have not left this computer yet" if unsent else ""
-        return f"the order may still be carried out{where}: if it arms within {LATE_S:g} s it is disarmed"
-
-    def _watch_for_late_arming(self, was_armed: bool) -> None:
-        """The order to arm was given up; it may have been heard, or may still arrive."""
-        self.connection.discard_unsent()
-        count = self._helm.arming_orders
-        scope, is_over = Cancellation(), asyncio.Event()
-        self._late_arming, self._late_arming_is_over = scope, is_over
-
-        async def watch() -> None:
-            with scope, anyio.move_on_after(LATE_S):
-                await self._disarm_again(was_armed, count)
-            if self._late_arming is scope:
-                self._late_arming = None
-            is_over.set()
-
-        self._background.start(watch, "aerokit late arming")
-
-    async def _disarm_again(self, was_armed: bool, count: int) -> None:
-        """What was armed before the order is left alone, until it has been heard disarmed."""
-        armed, since = self.telemetry.armed, self.connection.now()
-        try:
-            if was_armed:
-                await armed.wait_until(lambda value: not value, description="disarmed")
-            await armed.wait_until(lambda value: value and armed.updated_at > since, description="armed")
-        except AerokitError as error:
-            logger.warning("the link ended while an order to arm may still be carried out: %s", error)
-            return
-        if self._helm.arming_orders != count:  # the program has ordered it by a command of its own
-            return
-        logger.warning("the vehicle armed although the order to arm was given up: it is disarmed again")
-        with anyio.CancelScope(shield=True):
-            try:
-                with self._helm.aside() as order:
-                    await self._give_arm(order, False, False)
-            except AerokitError as error:
-                logger.error(
-                    "the vehicle armed after the order was given up, and could not be disarmed: %s", error
-                )
-
-    def _stop_watching_arming(self) -> None:
-        if self._late_arming is not None:
-            self._late_arming.cancel()
-            self._late_arming = None
-
-    async def _finish_arming(self) -> None:
-        """At the end of everything: an order to arm that was given up is answered, or is said to be out."""
-        if self._late_arming is None or self._late_arming_is_over is None or not self.connection.is_open:
-            return
-        with anyio.CancelScope(shield=True), anyio.move_on_after(ARMING_AT_END_S):
-            await self._late_arming_is_over.wait()
-        if self._late_arming is not None:
-            logger.warning(
-                "the block of this vehicle was left while an order to arm may still be carried out: %s",
-                self.describe_link(),
-            )
+    # ------------------------------------------------------------------------------ rebooting
 
     async def reboot(self, *, force: bool = False, timeout: float = 60.0) -> None:
         """Reboot the autopilot and wait until it is back: its time since boot has started anew.
@@ -304,13 +239,13 @@ class ArmingActions(HoldingActions):
             OperationTimeout: it did not come back.
         """
         check_seconds("timeout", timeout)
-        if not force and not self.is_surely_disarmed:
-            state = "armed" if self.is_armed else "not known to be disarmed"
+        if not force and not self.telemetry.is_surely_disarmed:
+            state = "armed" if self.telemetry.is_armed else "not known to be disarmed"
             raise OperationRejected(f"reboot: the vehicle is {state}; nothing was sent")
-        reboots = self._watch.reboots
-        self._link_watch.ask()  # its time before
+        reboots = self._talk.watch.reboots
+        self._talk.link_watch.ask()  # its time before
         unanswered: CommandTimeout | None = None
-        with self._watch.expecting_reboot():
+        with self._talk.watch.expecting_reboot():
             try:
                 await self._order_reboot(force)
             except CommandTimeout as error:
@@ -320,22 +255,22 @@ class ArmingActions(HoldingActions):
                 return
         if unanswered is not None:
             raise CommandTimeout(f"{unanswered}; it is sent once only, and may still be carried out")
-        raise OperationTimeout(f"reboot: not back within {timeout:g} s; {self.describe_link()}")
+        raise OperationTimeout(f"reboot: not back within {timeout:g} s; {self._talk.describe_link()}")
 
     async def _order_reboot(self, force: bool) -> None:
         """Once: a vehicle that has rebooted, and whose answer was lost, would do it again."""
         params = (1, *(0.0,) * 4, FORCE_REBOOT if force else 0)
         options: dict[str, Any] = {"attempts": 1, "attempt_timeout": REBOOT_ANSWER_S}
         with self._helm.aside() as order:
-            await self._give(order, self._commands.send_long, PREFLIGHT_REBOOT_SHUTDOWN, *params, **options)
+            await self._orders.give(order, self._talk.commands.send_long, PREFLIGHT_REBOOT_SHUTDOWN, *params, **options)
 
     async def _await_reboot(self, reboots: int) -> None:
         """Asks for its time, often at first: a fast simulation is soon older than it was before."""
         accepted_at = ask_at = self.connection.now()
-        while self._watch.reboots == reboots:
+        while self._talk.watch.reboots == reboots:
             self.connection.raise_if_ended()
             now = self.connection.now()
             if now >= ask_at:
-                self._link_watch.ask()
+                self._talk.link_watch.ask()
                 ask_at = now + LOOK_S + (now - accepted_at) / 10
             await anyio.sleep(LOOK_S)

@@ -11,8 +11,8 @@ from aerokit.arguments import checks_arguments
 from aerokit.errors import CommandRejected, NotSupported, OperationRejected, OperationTimeout
 from aerokit.vehicle.checks import check_range, check_seconds
 from aerokit.vehicle.orders.helm import MODE_GRACE_S
+from aerokit.vehicle.orders.part import Part
 from aerokit.vehicle.orders.progress import LONGEST_SILENCE_S, OLD_POSITION_S, Stillness, await_progress
-from aerokit.vehicle.orders.travel import TravelActions
 from aerokit.vehicle.state.values import Position
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ SURFACE_M = 1.5
 
 
 @checks_arguments
-class FlightActions(TravelActions):
+class FlightActions(Part):
     """Take-off, landing, return."""
 
     async def take_off(
@@ -70,28 +70,28 @@ class FlightActions(TravelActions):
         check_seconds("timeout", timeout)
         check_seconds("max_silence_s", max_silence_s, none_is_allowed=True)
         plan = self._take_off_plan(altitude_m)
-        if not self.is_armed:
+        if not self.telemetry.is_armed:
             raise OperationRejected("take_off: the vehicle is not armed: arm() comes first; nothing was sent")
         landed = self.telemetry.landed_state
         if landed.latest == LANDED_IN_AIR and landed.age <= OLD_POSITION_S:
             raise OperationRejected(
                 "take_off: the vehicle flies already: go_to() climbs too; nothing was sent"
             )
-        modes = (plan.mode, plan.mode_after, self.autopilot.mode_for("take_off", is_vtol=self.is_vtol))
+        modes = (plan.mode, plan.mode_after, self.autopilot.mode_for("take_off", is_vtol=self.telemetry.is_vtol))
         order = self._helm.order(*(mode for mode in modes if mode is not None))
         try:
             await self._begin_take_off(plan, order)
-            with self._flying(order):
+            with self._holding.flying(order):
                 await self._await_altitude(altitude_m, timeout, max_silence_s, order)
         except (anyio.get_cancelled_exc_class(), OperationTimeout):  # it may have heard the order
-            self._hold_soon(order)
+            self._holding.hold_soon(order)
             raise
         except CommandRejected as error:
             raise self._with_state(error) from error
 
     def _with_state(self, error: CommandRejected) -> CommandRejected:
         """What the vehicle leaves unsaid when it is asked to take off in the air."""
-        state, altitude = IN_THE_AIR.get(self.telemetry.landed_state.latest), self._altitude_relative()
+        state, altitude = IN_THE_AIR.get(self.telemetry.landed_state.latest), self._where.altitude_relative()
         if state is None and not altitude > FLYING_M:
             return error
         height = f", {altitude:.1f} m above home" if altitude > -math.inf else ""
@@ -101,22 +101,22 @@ class FlightActions(TravelActions):
         return explained
 
     def _take_off_plan(self, altitude_m: float) -> TakeOff:
-        home = self._home_altitude() if self.autopilot.take_off_needs_home() else None
-        plan = self.autopilot.take_off(altitude_m, home, is_vtol=self.is_vtol)
+        home = self._where.home_altitude() if self.autopilot.take_off_needs_home() else None
+        plan = self.autopilot.take_off(altitude_m, home, is_vtol=self.telemetry.is_vtol)
         if plan is None:
             raise NotSupported(f"take_off: {self.autopilot.firmware} cannot take off")
         return plan
 
     async def _begin_take_off(self, plan: TakeOff, order: Order) -> None:
         if plan.mode is not None:
-            await self._ensure_mode(plan.mode, order)
+            await self._orders.ensure_mode(plan.mode, order)
         if plan.command is not None:
             is_rising = self._rises_from_here()
             modes = () if plan.mode_after is None else order.modes
-            with self._streaming("position", "landed_state"):
-                await self._give(
+            with self._talk.streaming("position", "landed_state"):
+                await self._orders.give(
                     order,
-                    self._commands.send_long,
+                    self._talk.commands.send_long,
                     plan.command,
                     *plan.params,
                     modes=modes,
@@ -126,12 +126,12 @@ class FlightActions(TravelActions):
     def _rises_from_here(self) -> Callable[[], bool]:
         """Whether it rises, by what it tells from now on: what it told before may be of its last flight."""
         here, landed = self.telemetry.position.latest, self.telemetry.landed_state
-        begins_at = math.nan if here is None else self._altitude_relative()
+        begins_at = math.nan if here is None else self._where.altitude_relative()
         state_before = landed.latest
 
         def is_rising() -> bool:
             is_told = landed.latest != state_before and landed.latest in (LANDED_IN_AIR, TAKING_OFF)
-            return is_told or self._altitude_relative() > begins_at + RISEN_M
+            return is_told or self._where.altitude_relative() > begins_at + RISEN_M
 
         return is_rising
 
@@ -143,19 +143,19 @@ class FlightActions(TravelActions):
         started = self.connection.now()
 
         def is_up() -> bool:
-            is_high = self._knows_position_since(started) and self._altitude_relative() >= enough_m
+            is_high = self._where.is_known_since(started) and self._where.altitude_relative() >= enough_m
             return is_high and not order.end
 
-        with self._streaming("position"):
+        with self._talk.streaming("position"):
             await await_progress(
-                self,
+                self._talk,
                 f"take_off({altitude_m:g} m)",
                 is_done=is_up,
-                trouble=self._stays_in(order, *order.modes),
-                describe=lambda: f"it is at {self._altitude_relative():.1f} m",
+                trouble=self._orders.stays_in(order, *order.modes),
+                describe=lambda: f"it is at {self._where.altitude_relative():.1f} m",
                 timeout=timeout,
                 max_silence_s=max_silence_s,
-                stillness=Stillness(self),
+                stillness=Stillness(self._talk),
             )
 
     async def land(
@@ -179,14 +179,14 @@ class FlightActions(TravelActions):
         """
         check_seconds("timeout", timeout, none_is_allowed=True)
         check_seconds("max_silence_s", max_silence_s, none_is_allowed=True)
-        mode = self._mode_for("land", "land")
+        mode = self._orders.mode_for("land", "land")
         if self.autopilot.landing_ends_in is None:
             order = self._helm.order(mode)
-            await self._change_mode(mode, order, told_since=order.given_at)
+            await self._orders.change_mode(mode, order, told_since=order.given_at)
         else:
             order = self._helm.order(mode, self.autopilot.modes.find(self.autopilot.landing_ends_in))
             with self._helm.changing_mode():
-                await self._request_mode(
+                await self._orders.request_mode(
                     mode, order, MODE_TIMEOUT_S
                 )  # it may be over before HEARTBEAT tells it
         await self._await_ground("land", order, timeout, max_silence_s)
@@ -200,9 +200,9 @@ class FlightActions(TravelActions):
         """
         check_seconds("timeout", timeout, none_is_allowed=True)
         check_seconds("max_silence_s", max_silence_s, none_is_allowed=True)
-        mode = self._mode_for("return_to_launch", "return")
+        mode = self._orders.mode_for("return_to_launch", "return")
         order = self._helm.order(mode)
-        await self._change_mode(mode, order, told_since=order.given_at)
+        await self._orders.change_mode(mode, order, told_since=order.given_at)
         if self.autopilot.lands_after_return:
             await self._await_ground("return_to_launch", order, timeout, max_silence_s)
         else:
@@ -216,31 +216,31 @@ class FlightActions(TravelActions):
         accepted_at = self.connection.now()
 
         def is_down() -> bool:
-            is_disarmed = self.is_surely_disarmed and armed.updated_at > order.given_at
+            is_disarmed = self.telemetry.is_surely_disarmed and armed.updated_at > order.given_at
             is_landed = landed.latest == LANDED_ON_GROUND and landed.updated_at > order.given_at
             return is_disarmed or is_landed or (is_over() and not is_deep())
 
         def is_over() -> bool:
-            return self.mode_name == self.autopilot.landing_ends_in and mode.updated_at > accepted_at
+            return self.telemetry.mode_name == self.autopilot.landing_ends_in and mode.updated_at > accepted_at
 
         def is_deep() -> bool:
-            return self._knows_position_since(order.given_at) and self._altitude_relative() < -SURFACE_M
+            return self._where.is_known_since(order.given_at) and self._where.altitude_relative() < -SURFACE_M
 
-        stays = self._stays_in(order, *order.modes)
+        stays = self._orders.stays_in(order, *order.modes)
 
         def trouble() -> str | None:
             if is_over() and is_deep() and self.connection.now() > accepted_at + MODE_GRACE_S:
-                return f"the mode changed to {self.mode_name} at {self._altitude_relative():.1f} m"
+                return f"the mode changed to {self.telemetry.mode_name} at {self._where.altitude_relative():.1f} m"
             return stays()
 
         depth = () if self.autopilot.landing_ends_in is None else ("position",)
-        with self._streaming("landed_state", *depth):
+        with self._talk.streaming("landed_state", *depth):
             await await_progress(
-                self,
+                self._talk,
                 what,
                 is_done=is_down,
                 trouble=trouble,
-                describe=lambda: f"it is at {self._altitude_relative():.1f} m",
+                describe=lambda: f"it is at {self._where.altitude_relative():.1f} m",
                 timeout=timeout,
                 max_silence_s=max_silence_s,
             )
@@ -252,16 +252,16 @@ class FlightActions(TravelActions):
         started = self.connection.now()
 
         def is_back() -> bool:
-            is_near = self._knows_position_since(started) and self.distance_to(place) <= near_m
+            is_near = self._where.is_known_since(started) and self._where.distance_to(place) <= near_m
             return is_near and not order.end
 
-        with self._streaming("position"):
+        with self._talk.streaming("position"):
             await await_progress(
-                self,
+                self._talk,
                 "return_to_launch",
                 is_done=is_back,
-                trouble=self._stays_in(order, *order.modes),
-                describe=lambda: f"it is {self.distance_to(place):.1f} m from home",
+                trouble=self._orders.stays_in(order, *order.modes),
+                describe=lambda: f"it is {self._where.distance_to(place):.1f} m from home",
                 timeout=timeout,
                 max_silence_s=max_silence_s,
             )

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from aerokit.autopilots import Mode
     from aerokit.mavlink.message import Message
     from aerokit.vehicle.orders.order import Order
-    from aerokit.vehicle.vehicle import Vehicle
+    from aerokit.vehicle.orders.bridge import Bridge
 
 __all__ = ["Guided", "SetpointStream"]
 
@@ -65,9 +65,9 @@ class Guided:
     times as fast, and does not wait longer for it, wants ten times as many set-points.
     """
 
-    def __init__(self, vehicle: Vehicle) -> None:
-        self._vehicle = vehicle
-        self._encode = SetpointEncoder(vehicle)
+    def __init__(self, bridge: Bridge) -> None:
+        self._bridge = bridge
+        self._encode = SetpointEncoder(bridge)
 
     def velocity(
         self,
@@ -144,13 +144,13 @@ class Guided:
     def _stream(
         self, kind: str, encode: Callable[[SetpointT], Message], initial: SetpointT, *limits: float
     ) -> SetpointStream[SetpointT]:
-        autopilot = self._vehicle.autopilot
+        autopilot = self._bridge.talk.autopilot
         if kind not in autopilot.setpoints.names:
             obeyed = ", ".join(autopilot.setpoints.names) or "none"
             raise NotSupported(
                 f"{autopilot.firmware} does not obey {kind} set-points; those it obeys: {obeyed}"
             )
-        return SetpointStream(self._vehicle, encode, initial, *limits)
+        return SetpointStream(self._bridge, encode, initial, *limits)
 
 
 @checks_arguments
@@ -165,7 +165,7 @@ class SetpointStream(Generic[SetpointT]):
 
     def __init__(
         self,
-        vehicle: Vehicle,
+        bridge: Bridge,
         encode: Callable[[SetpointT], Message],
         initial: SetpointT,
         rate_hz: float,
@@ -177,7 +177,8 @@ class SetpointStream(Generic[SetpointT]):
         for name, value in (("valid_for_s", valid_for_s), ("max_lag_s", max_lag_s)):
             if not 0 < value <= 60:
                 raise LocalProtocolError(f"{name} = {value!r} is not allowed: above 0, at most 60")
-        self._vehicle, self._encode = vehicle, encode
+        self._bridge, self._talk, self._holding = bridge, bridge.talk, bridge.holding
+        self._encode = encode
         self._period_s, self._valid_for_s, self._max_lag_s = 1 / rate_hz, valid_for_s, max_lag_s
         self._setpoint = initial
         self._message: Message | None = None
@@ -190,9 +191,9 @@ class SetpointStream(Generic[SetpointT]):
         self._is_entering = False
         self._was_armed = False
         is_place = isinstance(initial, (PositionSetpoint, LocalPositionSetpoint))
-        self._is_costly = is_place and vehicle.autopilot.setpoints.place_restarts_path
+        self._is_costly = is_place and bridge.talk.autopilot.setpoints.place_restarts_path
         self._left, self._sent_at = AT_FIRST, -math.inf
-        self._stillness = Stillness(vehicle)
+        self._stillness = Stillness(bridge.talk)
 
     @property
     def is_running(self) -> bool:
@@ -231,13 +232,13 @@ class SetpointStream(Generic[SetpointT]):
         if self._was_entered:
             raise SetpointStreamStopped("a set-point stream is entered once: open another one")
         self._take(self._setpoint)  # refuse nonsense before anything is sent
-        if self._vehicle._stream is not None:
+        if self._holding.stream is not None:
             raise BusyError("another set-point stream is open: leave it first; nothing was sent")
-        mode = self._vehicle._mode_for("a set-point stream", "setpoint")
+        mode = self._bridge.orders.mode_for("a set-point stream", "setpoint")
         self._was_entered = True
-        self._vehicle._stream = self
-        order = self._order = self._vehicle._helm.order(mode)
-        order.is_given = order.is_given or self._vehicle._is_in(mode)
+        self._holding.stream = self
+        order = self._order = self._bridge.helm.order(mode)
+        order.is_given = order.is_given or self._talk.telemetry.is_in(mode)
         try:
             await self._enter(mode, order)
         except OperationRejected:  # the vehicle stays with whoever steers it
@@ -256,28 +257,28 @@ class SetpointStream(Generic[SetpointT]):
         traceback: TracebackType | None,
     ) -> None:
         if self._stopped is None and (reason := self._why_leave_alone()):
-            self._stop(reason, hold=False)
+            self.stop(reason, hold=False)
         if self._stopped is None:
             self._end()
             self._stopped = SetpointStreamStopped("the block of this set-point stream was left")
             if exc is not None:
                 self._hold()
-            elif not self._vehicle._helm.is_known:  # whoever steers by then is left alone
-                self._stop(f"the vehicle has been silent for {self._vehicle.heartbeat_age:.1f} s")
+            elif not self._bridge.helm.is_known:  # whoever steers by then is left alone
+                self.stop(f"the vehicle has been silent for {self._talk.heartbeat_age:.1f} s")
                 raise self._stopped
-            elif not self._vehicle.is_surely_disarmed:
-                await self._vehicle.hold()
+            elif not self._talk.telemetry.is_surely_disarmed:
+                await self._holding.hold()
         elif exc is None and not self._was_told:
             raise self._stopped
 
     async def _enter(self, mode: Mode, order: Order) -> None:
         """ArduPilot takes set-points once it is in GUIDED; PX4 goes to OFFBOARD once it sees set-points."""
-        if self._vehicle.autopilot.setpoints.before_mode:
+        if self._talk.autopilot.setpoints.before_mode:
             self._begin()
             await self.fly(self._setpoint, ENTRY_S)
             await self._feeding_initial(mode, order)
         else:
-            await self._vehicle._ensure_mode(mode, order)
+            await self._bridge.orders.ensure_mode(mode, order)
             self._begin()
         self._mode = mode
 
@@ -285,7 +286,7 @@ class SetpointStream(Generic[SetpointT]):
         """Not in a task group: what is raised here reaches the user as it is."""
         self._is_entering = True
         try:
-            await self._vehicle._ensure_mode(mode, order)
+            await self._bridge.orders.ensure_mode(mode, order)
         finally:
             self._is_entering = False
             self._set_at = self._now()
@@ -309,15 +310,15 @@ class SetpointStream(Generic[SetpointT]):
         """Send once more, unless something says that nobody steers any more."""
         self._timer = None
         if reason := self._why_leave_alone():
-            self._stop(reason, hold=False)
+            self.stop(reason, hold=False)
             return
         if reason := self._why_stop(self._now() - due):
-            self._stop(reason)
+            self.stop(reason)
             return
         try:
             self._send()
         except Exception as error:
-            self._stop(str(error))
+            self.stop(str(error))
             return
         due = max(due + self._period_s, self._now())
         self._timer = asyncio.get_running_loop().call_at(due, self._tick, due)
@@ -325,7 +326,7 @@ class SetpointStream(Generic[SetpointT]):
     def _send(self) -> None:
         assert self._message is not None
         if not self._is_costly or self._left > 0 or self._now() - self._sent_at >= AGAIN_S:
-            self._vehicle.connection.send(self._message)
+            self._talk.connection.send(self._message)
             self._left, self._sent_at = self._left - 1, self._now()
 
     def _why_stop(self, lag: float) -> str | None:
@@ -335,27 +336,27 @@ class SetpointStream(Generic[SetpointT]):
         if age > self._valid_for_s:
             return f"no new set-point came for {age:.1f} s (valid_for_s = {self._valid_for_s:g})"
         if (
-            self._vehicle.is_silent and self._vehicle.connection.is_open
+            self._talk.watch.is_silent and self._talk.connection.is_open
         ):  # else sending tells what has ended it
-            return f"the vehicle has been silent for {self._vehicle.heartbeat_age:.1f} s"
-        if self._mode is None or not wants_motion(self._setpoint, self._vehicle):
-            self._stillness = Stillness(self._vehicle)
+            return f"the vehicle has been silent for {self._talk.heartbeat_age:.1f} s"
+        if self._mode is None or not wants_motion(self._setpoint, self._bridge):
+            self._stillness = Stillness(self._talk)
             return None
         return self._stillness()
 
     def _why_leave_alone(self) -> str | None:
         """Somebody else has taken over: a pilot, a failsafe, another program."""
-        mode = self._vehicle.mode.latest
+        mode = self._talk.telemetry.mode.latest
         if self._mode is not None and mode is not None and mode != self._mode:
             return f"the vehicle left {self._mode} for {mode}"
         if self._order is not None and self._order.end:
             return self._order.end
-        if self._was_armed and self._vehicle.is_surely_disarmed:
+        if self._was_armed and self._talk.telemetry.is_surely_disarmed:
             return "the vehicle disarmed"
-        self._was_armed = self._was_armed or self._vehicle.is_armed
+        self._was_armed = self._was_armed or self._talk.telemetry.is_armed
         return None
 
-    def _stop(self, reason: str, *, hold: bool = True) -> None:
+    def stop(self, reason: str, *, hold: bool = True) -> None:
         """End it by itself. The vehicle is told to hold, unless somebody else steers it by now."""
         self._end()
         is_told = hold and self._hold()
@@ -365,12 +366,12 @@ class SetpointStream(Generic[SetpointT]):
         )
 
     def _hold(self) -> bool:
-        return self._order is not None and self._vehicle._hold_soon(self._order)
+        return self._order is not None and self._holding.hold_soon(self._order)
 
     def _end(self) -> None:
         self._cancel_timer()
-        if self._vehicle._stream is self:
-            self._vehicle._stream = None
+        if self._holding.stream is self:
+            self._holding.stream = None
 
     def _cancel_timer(self) -> None:
         if self._timer is not None:
@@ -383,4 +384,4 @@ class SetpointStream(Generic[SetpointT]):
             raise self._stopped
 
     def _now(self) -> float:
-        return self._vehicle.connection.now()
+        return self._talk.connection.now()

@@ -1,4 +1,4 @@
-"""Holding: as an order, and as what is left of an order that was given up."""
+"""`Holding`: what is left of an order that was given up: the vehicle is told to hold, as far as it may be."""
 
 from __future__ import annotations
 
@@ -6,25 +6,24 @@ import asyncio
 import logging
 import math
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Protocol
 
 import anyio
 
-from aerokit.arguments import checks_arguments
 from aerokit.errors import AerokitError, OperationTimeout
 from aerokit.runtime.cancellation import Cancellation
-from aerokit.vehicle.orders.modes import CHANGE_MODE, DO_REPOSITION, DO_SET_MODE, ModeActions
+from aerokit.vehicle.orders.orders import CHANGE_MODE, DO_REPOSITION, DO_SET_MODE
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from aerokit.autopilots import Mode
-    from aerokit.mavlink.messages import Heartbeat
-    from aerokit.runtime.connection import Connection
-    from aerokit.vehicle.orders.guided import SetpointStream
+    from aerokit.vehicle.orders.helm import Helm
     from aerokit.vehicle.orders.order import Order
+    from aerokit.vehicle.orders.orders import Orders
+    from aerokit.vehicle.talk.talk import Talk
 
-__all__ = ["HoldingActions"]
+__all__ = ["Holding"]
 
 logger = logging.getLogger("aerokit")
 
@@ -38,52 +37,47 @@ STOP_HERE = (DO_REPOSITION, -1, CHANGE_MODE, 0, *(math.nan,) * 4)
 """A place that is no number means: here, with the way it takes to brake."""
 
 
-@checks_arguments
-class HoldingActions(ModeActions):
-    """Stopping, and staying."""
+class OpenStream(Protocol):
+    """A set-point stream, as far as it has to be ended here."""
 
-    _stream: SetpointStream[Any] | None = None
-    """The set-point stream that is open."""
-    _flight: Order | None = None
-    """The order to go somewhere that a call waits for."""
-    _hold_scope: Cancellation | None = None
-    _hold_is_over: asyncio.Event | None = None
+    def stop(self, reason: str) -> None:
+        """End it, and have the vehicle told to hold."""
 
-    def __init__(
-        self, connection: Connection, system_id: int, component_id: int, heartbeat: Heartbeat
-    ) -> None:
-        super().__init__(connection, system_id, component_id, heartbeat)
-        self._helm.on_new(self._drop_hold)
+
+class Holding:
+    """Stops the vehicle: as an order, and when one was given up.
+
+    ``stream`` is the set-point stream that is open.
+    """
+
+    def __init__(self, talk: Talk, helm: Helm, orders: Orders) -> None:
+        self._talk, self._helm, self._orders = talk, helm, orders
+        self.stream: OpenStream | None = None
+        self._flight: Order | None = None
+        self._scope: Cancellation | None = None
+        self._is_over: asyncio.Event | None = None
+        helm.on_new(self.drop)
 
     async def hold(self) -> None:
-        """Stop and stay (a fixed wing circles); returns when HEARTBEAT tells the autopilot's mode for that.
+        """Order it, as :meth:`aerokit.Vehicle.hold` says."""
+        mode = self._orders.mode_for("hold", "hold")
+        await self.stop_in(mode, self._helm.order(mode))
 
-        Copter BRAKE, Plane LOITER, Rover HOLD (a boat LOITER), Sub POSHOLD; PX4 LOITER where it comes to a stop.
-
-        Raises:
-            NotSupported: this vehicle has no mode for it. Nothing was sent.
-            CommandRejected: the vehicle refused; ``reasons`` has what it said meanwhile.
-            OperationRejected: a pilot or a failsafe has chosen another mode meanwhile.
-            OperationTimeout: it accepted and stayed in another mode, or did not answer.
-        """
-        mode = self._mode_for("hold", "hold")
-        await self._stop_in(mode, self._helm.order(mode))
-
-    async def _stop_in(self, mode: Mode, order: Order) -> None:
+    async def stop_in(self, mode: Mode, order: Order) -> None:
         """Order it in any case; PX4 in LOITER may be on its way somewhere, where the mode alone would not stop it."""
         if self._holds_by_reposition:
-            await self._command_of(order, *STOP_HERE)
-            await self._ensure_mode(mode, order)
+            await self._orders.command_of(order, *STOP_HERE)
+            await self._orders.ensure_mode(mode, order)
         else:
-            await self._change_mode(mode, order, told_since=order.given_at)
+            await self._orders.change_mode(mode, order, told_since=order.given_at)
 
     async def _confirm_hold(self, mode: Mode, order: Order) -> None:
         """What :meth:`_send_hold` has sent is answered, or sent again."""
-        by_mode = (DO_SET_MODE, *self.autopilot.mode_order(mode).params)
+        by_mode = (DO_SET_MODE, *self._talk.autopilot.mode_order(mode).params)
         command, *params = STOP_HERE if self._holds_by_reposition else by_mode
-        await self._give(
+        await self._orders.give(
             order,
-            self._commands.send_long,
+            self._talk.commands.send_long,
             int(command),
             *params,
             modes=() if self._holds_by_reposition else (mode,),
@@ -94,7 +88,7 @@ class HoldingActions(ModeActions):
 
     # -------------------------------------------------------------------- what was given up
 
-    def _hold_soon(self, order: Order) -> bool:
+    def hold_soon(self, order: Order) -> bool:
         """An order was given up: tell the vehicle to hold without waiting, for the ends of blocks and cancelled calls.
 
         One command goes out at once, if the vehicle has told lately what it does; else as soon as it tells it: what
@@ -104,8 +98,8 @@ class HoldingActions(ModeActions):
         """
         if not order.is_given:
             return False
-        mode = self.autopilot.mode_for("hold", is_vtol=self.is_vtol)
-        if mode is None or not self.connection.is_open or self.is_surely_disarmed or order.end:
+        mode = self._talk.autopilot.mode_for("hold", is_vtol=self._talk.telemetry.is_vtol)
+        if mode is None or not self._talk.connection.is_open or self._talk.telemetry.is_surely_disarmed or order.end:
             return False
         is_sent = self._helm.is_known
         if is_sent:
@@ -113,23 +107,23 @@ class HoldingActions(ModeActions):
             order = self._helm.order(*order.modes, mode)
             self._helm.doubt_mode()
         scope, is_over = Cancellation(), asyncio.Event()
-        self._hold_scope, self._hold_is_over = scope, is_over
+        self._scope, self._is_over = scope, is_over
 
         async def finish() -> None:
             with scope:
                 await self._hold_when_known(mode, order, is_sent=is_sent)
-            if self._hold_scope is scope:
-                self._hold_scope = None
+            if self._scope is scope:
+                self._scope = None
             is_over.set()
 
-        self._background.start(finish, "aerokit hold")
+        self._talk.background.start(finish, "aerokit hold")
         return True
 
     def _send_hold(self, mode: Mode) -> None:
         if self._holds_by_reposition:
-            self._commands.send_unconfirmed(*STOP_HERE)
+            self._talk.commands.send_unconfirmed(*STOP_HERE)
         else:
-            self._commands.send_unconfirmed(DO_SET_MODE, *self.autopilot.mode_order(mode).params)
+            self._talk.commands.send_unconfirmed(DO_SET_MODE, *self._talk.autopilot.mode_order(mode).params)
 
     async def _hold_when_known(self, mode: Mode, order: Order, *, is_sent: bool) -> None:
         for _ in range(ROUNDS):
@@ -138,9 +132,9 @@ class HoldingActions(ModeActions):
                     await self._confirm_hold(mode, order)
                     return
                 await self._hear()
-                if not order.end and not self.is_surely_disarmed:
+                if not order.end and not self._talk.telemetry.is_surely_disarmed:
                     order = self._order_to_hold(mode, order)
-                    await self._stop_in(mode, order)
+                    await self.stop_in(mode, order)
                 return
             except OperationTimeout as error:
                 logger.warning("the vehicle was told to hold and has not confirmed it yet: %s", error)
@@ -152,42 +146,42 @@ class HoldingActions(ModeActions):
 
     def _order_to_hold(self, mode: Mode, order: Order) -> Order:
         """It is this task that gives it: it must not be dropped by it."""
-        scope, self._hold_scope = self._hold_scope, None
+        scope, self._scope = self._scope, None
         order = self._helm.order(*order.modes, mode)
-        self._hold_scope = scope
+        self._scope = scope
         return order
 
     async def _hear(self) -> None:
         """Until the vehicle tells what it does."""
-        armed, since = self.telemetry.armed, self.connection.now()
+        armed, since = self._talk.telemetry.armed, self._talk.connection.now()
         await armed.wait_until(lambda _: armed.updated_at > since, description="what the vehicle does now")
 
-    def _drop_hold(self) -> None:
+    def drop(self) -> None:
         """A newer order is given: what an earlier one left to be confirmed is not confirmed any more."""
-        if self._hold_scope is not None:
-            self._hold_scope.cancel()
-            self._hold_scope = None
+        if self._scope is not None:
+            self._scope.cancel()
+            self._scope = None
 
     @property
-    def _is_told_to_hold(self) -> bool:
+    def is_told_to_hold(self) -> bool:
         """Whether a flight was given up and the hold that was ordered is not confirmed yet."""
-        return self._hold_scope is not None
+        return self._scope is not None
 
-    async def _finish_hold(self) -> None:
+    async def finish(self) -> None:
         """At the end of everything: give an order to hold the time to be answered, or to be given again."""
-        if self._hold_scope is None or self._hold_is_over is None or not self.connection.is_open:
+        if self._scope is None or self._is_over is None or not self._talk.connection.is_open:
             return
         if self._helm.is_known:
             with anyio.CancelScope(shield=True), anyio.move_on_after(HOLD_AT_END_S):
-                await self._hold_is_over.wait()
-        if self._hold_scope is not None:
+                await self._is_over.wait()
+        if self._scope is not None:
             logger.warning(
                 "the block of this vehicle was left before it confirmed that it holds: %s",
-                self.describe_link(),
+                self._talk.describe_link(),
             )
 
     @contextmanager
-    def _flying(self, order: Order) -> Iterator[None]:
+    def flying(self, order: Order) -> Iterator[None]:
         """For as long as a call waits for this order, the end of the vehicle's block means hold."""
         self._flight = order
         try:
@@ -196,13 +190,13 @@ class HoldingActions(ModeActions):
             if self._flight is order:
                 self._flight = None
 
-    def _end_flights(self) -> None:
+    def end_flights(self) -> None:
         """At the end of everything: what other tasks still have under way ends, and the vehicle is told to hold."""
-        if self._stream is not None:
-            self._stream._stop("the block of its vehicle was left")
+        if self.stream is not None:
+            self.stream.stop("the block of its vehicle was left")
         if self._flight is not None:
-            self._hold_soon(self._flight)
+            self.hold_soon(self._flight)
 
     @property
     def _holds_by_reposition(self) -> bool:
-        return self.autopilot.reposition is not None and self.autopilot.reposition_purpose == "hold"
+        return self._talk.autopilot.reposition is not None and self._talk.autopilot.reposition_purpose == "hold"

@@ -13,8 +13,9 @@ if TYPE_CHECKING:
 
     from aerokit.autopilots import Mode
 
-__all__ = ["MOVING_COMMANDS", "QUESTIONS", "Order", "Sending"]
+__all__ = ["COMPONENT_ARM_DISARM", "MOVING_COMMANDS", "QUESTIONS", "Order", "Sending"]
 
+COMPONENT_ARM_DISARM = 400
 MOVING_COMMANDS = frozenset((16, 17, 18, 19, 20, 21, 22, 84, 85, 176, 185, 192, 193, 252, 300, 400))
 """MAV_CMDs by which a program steers past the actions: what an action left to be done must not come after them."""
 QUESTIONS = frozenset((401, 510, 511, 512, 519, 520, 521, 522, 525, 527, 528))

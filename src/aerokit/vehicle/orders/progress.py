@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from aerokit.position import Position
-    from aerokit.vehicle.core import VehicleCore
+    from aerokit.vehicle.talk.talk import Talk
 
 __all__ = ["LONGEST_SILENCE_S", "OLD_POSITION_S", "Stillness", "await_progress"]
 
@@ -23,7 +23,7 @@ STILL_S, MOVED_M = 12.0, 0.3
 
 
 async def await_progress(
-    vehicle: VehicleCore,
+    talk: Talk,
     what: str,
     *,
     is_done: Callable[[], bool],
@@ -44,29 +44,29 @@ async def await_progress(
         ConnectionClosed, LinkLost: the connection ended.
     """
     changed, loop = asyncio.Event(), asyncio.get_running_loop()
-    started = vehicle.connection.now()
+    started = talk.connection.now()
     reasons_from = started
-    cells = (vehicle.telemetry.mode, vehicle.telemetry.armed, vehicle.telemetry.position)
-    ends = [cell.observe(lambda *_: changed.set()) for cell in (*cells, vehicle.telemetry.landed_state)]
-    ends.append(vehicle.connection.on_end(lambda _: changed.set()))
+    cells = (talk.telemetry.mode, talk.telemetry.armed, talk.telemetry.position)
+    ends = [cell.observe(lambda *_: changed.set()) for cell in (*cells, talk.telemetry.landed_state)]
+    ends.append(talk.connection.on_end(lambda _: changed.set()))
     done_since: float | None = None
     try:
         while True:
-            now = vehicle.connection.now()
-            vehicle.connection.raise_if_ended()
+            now = talk.connection.now()
+            talk.connection.raise_if_ended()
             done_since = (now if done_since is None else done_since) if is_done() else None
             if done_since is not None and now - done_since >= held_for:
                 return
             if done_since is None and (reason := trouble()):
-                raise OperationRejected(f"{what}: {reason}", reasons=vehicle.texts_since(reasons_from))
-            if max_silence_s is not None and vehicle._watch.silent_for_s > max_silence_s:
-                raise HeartbeatTimeout(f"{what}: {vehicle.describe_link()}")
+                raise OperationRejected(f"{what}: {reason}", reasons=talk.texts_since(reasons_from))
+            if max_silence_s is not None and talk.watch.silent_for_s > max_silence_s:
+                raise HeartbeatTimeout(f"{what}: {talk.describe_link()}")
             if timeout is not None and now - started >= timeout:
                 raise OperationTimeout(
-                    f"{what}: not done within {timeout:g} s; {describe()}; {vehicle.describe_link()}"
+                    f"{what}: not done within {timeout:g} s; {describe()}; {talk.describe_link()}"
                 )
             if stillness is not None and (still := stillness()):
-                raise OperationTimeout(f"{what}: {still}; {describe()}; {vehicle.describe_link()}")
+                raise OperationTimeout(f"{what}: {still}; {describe()}; {talk.describe_link()}")
             changed.clear()
             tick = loop.call_later(TICK_S, changed.set)  # no cancel scope: on Python 3.10 one that runs out
             try:  # swallows a cancellation that comes at the same turn of the loop
@@ -84,14 +84,14 @@ class Stillness:
     Nothing is said while its position is not heard, nor before ``STILL_S`` seconds: it turns first, or spools up.
     """
 
-    def __init__(self, vehicle: VehicleCore) -> None:
-        self._vehicle = vehicle
+    def __init__(self, talk: Talk) -> None:
+        self._talk = talk
         self._from: Position | None = None
         self._since = 0.0
 
     def __call__(self) -> str | None:
         """How long it has not moved, in words; None: it moves, or that is not known."""
-        now, cell = self._vehicle.connection.now(), self._vehicle.telemetry.position
+        now, cell = self._talk.connection.now(), self._talk.telemetry.position
         here = cell.latest
         if here is None or cell.age > OLD_POSITION_S:
             self._from = None

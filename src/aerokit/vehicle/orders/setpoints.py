@@ -19,7 +19,7 @@ from aerokit.vehicle.state.values import Attitude, Position
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
-    from aerokit.vehicle.vehicle import Vehicle
+    from aerokit.vehicle.orders.bridge import Bridge
 
 __all__ = [
     "AccelerationSetpoint",
@@ -104,16 +104,16 @@ class AttitudeSetpoint(Snapshot):
     thrust: float
 
 
-def wants_motion(setpoint: object, vehicle: Vehicle) -> bool:
+def wants_motion(setpoint: object, bridge: Bridge) -> bool:
     """Whether a vehicle that obeys this set-point moves now; False where that is not known."""
     if isinstance(setpoint, VelocitySetpoint):
         return math.hypot(setpoint.north_m_s, setpoint.east_m_s, setpoint.down_m_s) >= SLOW_M_S
     if isinstance(setpoint, BodyVelocitySetpoint):
         return math.hypot(setpoint.forward_m_s, setpoint.right_m_s, setpoint.down_m_s) >= SLOW_M_S
-    far_m = FAR * vehicle.autopilot.arrival_radius_m
+    far_m = FAR * bridge.talk.autopilot.arrival_radius_m
     if isinstance(setpoint, PositionSetpoint):
-        return far_m < vehicle.distance_to(setpoint.position) < math.inf
-    here = vehicle.local_position.latest
+        return far_m < bridge.where.distance_to(setpoint.position) < math.inf
+    here = bridge.talk.telemetry.local_position.latest
     if isinstance(setpoint, LocalPositionSetpoint) and here is not None:
         to_go = (
             setpoint.north_m - here.north_m,
@@ -127,8 +127,8 @@ def wants_motion(setpoint: object, vehicle: Vehicle) -> bool:
 class SetpointEncoder:
     """Turns set-points into messages for one vehicle; raises LocalProtocolError for what is no set-point."""
 
-    def __init__(self, vehicle: Vehicle) -> None:
-        self._vehicle = vehicle
+    def __init__(self, bridge: Bridge) -> None:
+        self._talk, self._where = bridge.talk, bridge.where
 
     def velocity(self, s: VelocitySetpoint) -> Message:
         """SET_POSITION_TARGET_LOCAL_NED with a velocity in MAV_FRAME_LOCAL_NED."""
@@ -142,9 +142,9 @@ class SetpointEncoder:
         ArduPilot adds each yaw to the one it commanded before, and correcting that by telemetry swings to and fro.
         """
         vector = (s.forward_m_s, s.right_m_s, s.down_m_s)
-        if s.yaw_deg is None or not self._vehicle.autopilot.setpoints.body_yaw_is_relative:
+        if s.yaw_deg is None or not self._talk.autopilot.setpoints.body_yaw_is_relative:
             return self._local(MAV_FRAME_BODY_NED, IGNORE_VELOCITY, vector, s.yaw_deg, s.yaw_rate_deg_s)
-        heading = math.radians(self._vehicle.heading_deg.value)
+        heading = math.radians(self._talk.telemetry.heading_deg.value)
         north = s.forward_m_s * math.cos(heading) - s.right_m_s * math.sin(heading)
         east = s.forward_m_s * math.sin(heading) + s.right_m_s * math.cos(heading)
         vector = (north, east, s.down_m_s)
@@ -176,8 +176,8 @@ class SetpointEncoder:
         vectors = [vector if group == each else none for each in _GROUPS]
         return SetPositionTargetLocalNed(
             self._time_ms(),
-            self._vehicle.system_id,
-            self._vehicle.component_id,
+            self._talk.system_id,
+            self._talk.component_id,
             frame,
             (everything & ~group) | mask,
             *vectors[0],
@@ -190,11 +190,11 @@ class SetpointEncoder:
     def position(self, s: PositionSetpoint) -> Message:
         """SET_POSITION_TARGET_GLOBAL_INT with a place, above home or above the sea."""
         mask, yaw, yaw_rate = _yaw(s.yaw_deg, s.yaw_rate_deg_s)
-        latitude, longitude, altitude, is_relative = self._vehicle._global_target(s.position)
+        latitude, longitude, altitude, is_relative = self._where.global_target(s.position)
         return SetPositionTargetGlobalInt(
             self._time_ms(),
-            self._vehicle.system_id,
-            self._vehicle.component_id,
+            self._talk.system_id,
+            self._talk.component_id,
             MAV_FRAME_GLOBAL_RELATIVE_ALT_INT if is_relative else MAV_FRAME_GLOBAL_INT,
             IGNORE_VELOCITY | IGNORE_ACCELERATION | mask,
             latitude,
@@ -213,8 +213,8 @@ class SetpointEncoder:
             raise LocalProtocolError(f"thrust = {s.thrust} is not allowed: 0 to 1")
         return SetAttitudeTarget(
             self._time_ms(),
-            self._vehicle.system_id,
-            self._vehicle.component_id,
+            self._talk.system_id,
+            self._talk.component_id,
             IGNORE_BODY_RATES,
             Attitude(s.roll_deg, s.pitch_deg, s.yaw_deg).quaternion,
             0.0,
@@ -224,7 +224,7 @@ class SetpointEncoder:
         )
 
     def _time_ms(self) -> int:
-        return int(self._vehicle.connection.now() * 1000) & 0xFFFFFFFF
+        return int(self._talk.connection.now() * 1000) & 0xFFFFFFFF
 
 
 _GROUPS = (IGNORE_POSITION, IGNORE_VELOCITY, IGNORE_ACCELERATION)

@@ -18,8 +18,8 @@ from aerokit.errors import (
 )
 from aerokit.mavlink.messages import SetPositionTargetGlobalInt
 from aerokit.vehicle.checks import check_range, check_seconds
-from aerokit.vehicle.orders.arming import ArmingActions
-from aerokit.vehicle.orders.modes import CHANGE_MODE, DO_REPOSITION, RESULT_UNSUPPORTED
+from aerokit.vehicle.orders.orders import CHANGE_MODE, DO_REPOSITION, RESULT_UNSUPPORTED
+from aerokit.vehicle.orders.part import Part
 from aerokit.vehicle.orders.progress import LONGEST_SILENCE_S, OLD_POSITION_S, Stillness, await_progress
 from aerokit.vehicle.state.values import Position
 
@@ -36,12 +36,11 @@ DO_SET_ROI_NONE = 197
 MAV_FRAME_GLOBAL_INT = 5
 MAV_FRAME_GLOBAL_RELATIVE_ALT_INT = 6
 POSITION_ONLY = 0x0DF8
-LANDED_ON_GROUND = 1
 RESEND_S = 1.0
 
 
 @checks_arguments
-class TravelActions(ArmingActions):
+class TravelActions(Part):
     """Going to a place, turning, looking."""
 
     async def go_to(
@@ -81,17 +80,17 @@ class TravelActions(ArmingActions):
             HeartbeatTimeout: the vehicle has been silent for ``max_silence_s`` seconds.
             OperationTimeout: it did not arrive in time, or does not move.
         """
-        latitude, longitude, altitude, is_relative = self._global_target(target)
+        latitude, longitude, altitude, is_relative = self._where.global_target(target)
         _check_travel(speed_m_s, heading_deg, tolerance_m, timeout)
         check_seconds("max_silence_s", max_silence_s, none_is_allowed=True)
         near_m = self.autopilot.arrival_radius_m if tolerance_m is None else tolerance_m
         self._check_can_turn(heading_deg)
-        if not self.is_armed:
+        if not self.telemetry.is_armed:
             raise OperationRejected("go_to: the vehicle is not armed; nothing was sent")
-        if self._stands_on_the_ground():
+        if self._where.stands_on_the_ground():
             raise OperationRejected("go_to: the vehicle is on the ground: take_off() first; nothing was sent")
-        mode = self._mode_for("go_to", self.autopilot.reposition_purpose)
-        order = self._helm.order(mode, self._mode_for("go_to", "setpoint"))
+        mode = self._orders.mode_for("go_to", self.autopilot.reposition_purpose)
+        order = self._helm.order(mode, self._orders.mode_for("go_to", "setpoint"))
         yaw = self._reposition_yaw(heading_deg)
         under_way = False
         try:
@@ -99,17 +98,17 @@ class TravelActions(ArmingActions):
             under_way = True
             if speed_m_s is not None and not self._speeds_by_reposition:
                 # ArduPilot obeys it only once it is under way
-                await self._command_of(order, DO_CHANGE_SPEED, 1, speed_m_s, -1)
+                await self._orders.command_of(order, DO_CHANGE_SPEED, 1, speed_m_s, -1)
             if heading_deg is not None and math.isnan(yaw):
-                await self._command_of(order, CONDITION_YAW, heading_deg % 360)
-            with self._flying(order):
+                await self._orders.command_of(order, CONDITION_YAW, heading_deg % 360)
+            with self._holding.flying(order):
                 await self._await_arrival(target, near_m, timeout, max_silence_s, order, mode, resend)
         except (anyio.get_cancelled_exc_class(), OperationTimeout):  # it may have heard the order
-            self._hold_soon(order)
+            self._holding.hold_soon(order)
             raise
         except CommandRejected:
             if under_way:
-                self._hold_soon(order)
+                self._holding.hold_soon(order)
             raise
 
     async def _send_there(
@@ -127,15 +126,15 @@ class TravelActions(ArmingActions):
         speed = speed_m_s if speed_m_s is not None and self._speeds_by_reposition else -1
         params = (speed, CHANGE_MODE, 0, yaw)
         place: dict[str, Any] = {"frame": frame, "x": latitude, "y": longitude, "z": altitude}
-        modes = (self._mode_for("go_to", self.autopilot.reposition_purpose),)
+        modes = (self._orders.mode_for("go_to", self.autopilot.reposition_purpose),)
         try:
             with self._helm.changing_mode():
-                await self._give(order, self._commands.send_int, DO_REPOSITION, *params, modes=modes, **place)
+                await self._orders.give(order, self._talk.commands.send_int, DO_REPOSITION, *params, modes=modes, **place)
         except CommandRejected as error:
             if error.result != RESULT_UNSUPPORTED:
                 raise
-            await self._ensure_mode(self._mode_for("go_to", "setpoint"), order)
-            self._raise_if_over(order)
+            await self._orders.ensure_mode(self._orders.mode_for("go_to", "setpoint"), order)
+            self._orders.raise_if_over(order)
             resend = self._position_target(latitude, longitude, altitude, frame)
             self.connection.send(resend)
             return resend
@@ -168,20 +167,20 @@ class TravelActions(ArmingActions):
             if resend is not None and now - sent_at >= RESEND_S and self._helm.is_known and not order.end:
                 sent_at = now
                 self.connection.send(resend)
-            is_near = self._knows_position_since(started) and self._way_left(target) <= near_m
+            is_near = self._where.is_known_since(started) and self._where.way_left(target) <= near_m
             return is_near and not order.end
 
-        with self._streaming("position"):
+        with self._talk.streaming("position"):
             await await_progress(
-                self,
+                self._talk,
                 f"go_to({target.latitude_deg:.7f}, {target.longitude_deg:.7f})",
                 is_done=is_there,
-                trouble=self._stays_in(order, mode),
-                describe=lambda: f"it is {self._way_left(target):.1f} m away",
+                trouble=self._orders.stays_in(order, mode),
+                describe=lambda: f"it is {self._where.way_left(target):.1f} m away",
                 timeout=timeout,
                 max_silence_s=max_silence_s,
                 held_for=0.5,
-                stillness=Stillness(self),
+                stillness=Stillness(self._talk),
             )
 
     async def set_speed(self, speed_m_s: float) -> None:
@@ -194,7 +193,7 @@ class TravelActions(ArmingActions):
             CommandRejected: the vehicle refused.
         """
         check_range("speed_m_s", speed_m_s, 0, 1000, above=True)
-        await self._explained_command(DO_CHANGE_SPEED, 1, speed_m_s, -1)
+        await self._orders.command_aside(DO_CHANGE_SPEED, 1, speed_m_s, -1)
 
     async def set_heading(
         self,
@@ -232,18 +231,18 @@ class TravelActions(ArmingActions):
         check_seconds("timeout", timeout)
         check_seconds("max_silence_s", max_silence_s, none_is_allowed=True)
         self._check_can_turn(heading_deg)
-        mode = self._mode_for("set_heading", self.autopilot.reposition_purpose)
+        mode = self._orders.mode_for("set_heading", self.autopilot.reposition_purpose)
         goal = (heading_deg + (self.telemetry.heading_deg.value if relative else 0)) % 360
         order = self._helm.order(mode)
         if self._turns_by_reposition:
             yaw = math.remainder(math.radians(goal), 2 * math.pi)
             params = (-1, CHANGE_MODE, 0, yaw, *(math.nan,) * 3)
-            await self._give(order, self._commands.send_long, DO_REPOSITION, *params, modes=(mode,))
+            await self._orders.give(order, self._talk.commands.send_long, DO_REPOSITION, *params, modes=(mode,))
         else:
-            await self._ensure_mode(mode, order)
+            await self._orders.ensure_mode(mode, order)
             # a goal, not an angle: sent again, it does not turn it further
             direction = (1 if heading_deg >= 0 else -1) if relative else 0
-            await self._command_of(order, CONDITION_YAW, goal, rate_deg_s, direction, 0)
+            await self._orders.command_of(order, CONDITION_YAW, goal, rate_deg_s, direction, 0)
         await self._await_heading(goal, tolerance_deg, timeout, max_silence_s, order, mode)
 
     async def _await_heading(
@@ -261,12 +260,12 @@ class TravelActions(ArmingActions):
         def off() -> float:
             return abs(math.remainder(heading.value - goal, 360)) if heading.is_known else math.inf
 
-        with self._streaming("heading_deg"):
+        with self._talk.streaming("heading_deg"):
             await await_progress(
-                self,
+                self._talk,
                 f"set_heading({goal:g}°)",
                 is_done=lambda: heading.updated_at >= started and off() <= tolerance_deg and not order.end,
-                trouble=self._stays_in(order, mode),
+                trouble=self._orders.stays_in(order, mode),
                 describe=lambda: f"it is {off():.0f}° off",
                 timeout=timeout,
                 max_silence_s=max_silence_s,
@@ -274,84 +273,26 @@ class TravelActions(ArmingActions):
 
     async def look_at(self, target: Position) -> None:
         """Make nose or gimbal point at a place (MAV_CMD_DO_SET_ROI_LOCATION), until :meth:`stop_looking`."""
-        latitude, longitude, altitude, is_relative = self._global_target(target)
+        latitude, longitude, altitude, is_relative = self._where.global_target(target)
         frame = MAV_FRAME_GLOBAL_RELATIVE_ALT_INT if is_relative else MAV_FRAME_GLOBAL_INT
         place: dict[str, Any] = {"frame": frame, "x": latitude, "y": longitude, "z": altitude}
         with self._helm.aside() as order:
-            await self._give(order, self._commands.send_int, DO_SET_ROI_LOCATION, **place)
+            await self._orders.give(order, self._talk.commands.send_int, DO_SET_ROI_LOCATION, **place)
 
     async def stop_looking(self) -> None:
         """End :meth:`look_at` (MAV_CMD_DO_SET_ROI_NONE)."""
-        await self._explained_command(DO_SET_ROI_NONE)
+        await self._orders.command_aside(DO_SET_ROI_NONE)
 
     def distance_to(self, target: Position) -> float:
         """Metres from where the vehicle is to ``target``; in three dimensions when ``target`` has an altitude.
 
         Infinite while the position is unknown.
         """
-        here = self.telemetry.position.latest
-        if here is None:
-            return math.inf
-        along = geo.distance_m(
-            here.latitude_deg, here.longitude_deg, target.latitude_deg, target.longitude_deg
-        )
-        return math.hypot(along, self._altitude_difference(here, target))
-
-    def _way_left(self, target: Position) -> float:
-        """Along the ground for a vehicle that stays on it; the altitude it tells may count from anywhere."""
-        if self.autopilot.stays_on_the_ground:
-            return self.distance_to(Position(target.latitude_deg, target.longitude_deg))
-        return self.distance_to(target)
-
-    @staticmethod
-    def _altitude_difference(here: Position, target: Position) -> float:
-        for mine, its in (
-            (here.altitude_relative_m, target.altitude_relative_m),
-            (here.altitude_amsl_m, target.altitude_amsl_m),
-        ):
-            if mine is not None and its is not None:
-                return mine - its
-        return 0.0
-
-    def _knows_position_since(self, started: float) -> bool:
-        """Whether a position has come since then and is not old: nobody arrives by an old one."""
-        position = self.telemetry.position
-        return position.updated_at >= started and position.age <= OLD_POSITION_S
-
-    def _altitude_relative(self) -> float:
-        here = self.telemetry.position.latest
-        altitude = None if here is None else here.altitude_relative_m
-        return -math.inf if altitude is None else altitude
-
-    def _home_altitude(self) -> float:
-        return self.telemetry.home.value.altitude_amsl_m
-
-    def _global_target(self, target: Position) -> tuple[int, int, float, bool]:
-        """Latitude and longitude in 1e-7 degrees, altitude in metres, and whether it is above home.
-
-        PX4 reads altitudes above mean sea level only, so home must be known there for one above home.
-        """
-        relative, amsl = target.altitude_relative_m, target.altitude_amsl_m
-        if relative is None and amsl is None:
-            relative = self.telemetry.position.fresh(OLD_POSITION_S).altitude_relative_m
-        is_relative = relative is not None
-        altitude = relative if relative is not None else amsl
-        if altitude is None:
-            raise LocalProtocolError("the target has no altitude, and the vehicle's own is not known")
-        check_range("altitude", altitude, -12_000, 100_000)
-        if is_relative and not self._takes_relative_altitude:
-            altitude, is_relative = altitude + self._home_altitude(), False
-        return round(target.latitude_deg * 1e7), round(target.longitude_deg * 1e7), altitude, is_relative
+        return self._where.distance_to(target)
 
     def _check_can_turn(self, heading_deg: float | None) -> None:
         if heading_deg is not None and not self._turns_by_reposition and not self.autopilot.condition_yaw:
             raise NotSupported(f"{self.autopilot.firmware} cannot be told where to look; nothing was sent")
-
-    def _stands_on_the_ground(self) -> bool:
-        """Whether it was told just now that a vehicle which flies is on the ground."""
-        landed = self.telemetry.landed_state
-        flies = self.autopilot.mode_for("take_off", is_vtol=self.is_vtol) is not None
-        return flies and landed.latest == LANDED_ON_GROUND and landed.age <= OLD_POSITION_S
 
     @property
     def _speeds_by_reposition(self) -> bool:
@@ -360,10 +301,6 @@ class TravelActions(ArmingActions):
     @property
     def _turns_by_reposition(self) -> bool:
         return self.autopilot.reposition is not None and self.autopilot.reposition.yaw
-
-    @property
-    def _takes_relative_altitude(self) -> bool:
-        return self.autopilot.reposition is None or self.autopilot.reposition.relative_altitude
 
     def _reposition_yaw(self, heading_deg: float | None) -> float:
         if heading_deg is None or not self._turns_by_reposition:

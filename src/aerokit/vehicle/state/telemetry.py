@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from aerokit.mavlink import messages
     from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.message import Message
-    from aerokit.vehicle.state.values import StatusText
+    from aerokit.vehicle.state.values import Mode, StatusText
 
 __all__ = ["Telemetry"]
 
@@ -129,6 +129,32 @@ class Telemetry(States):
     def required_messages(self, name: str) -> tuple[type[Message], ...]:
         """The messages to ask for when a program wants the cell of this name."""
         return tuple(STATES[name].asked_of(self.autopilot))
+
+    @property
+    def is_armed(self) -> bool:
+        """Whether the last heartbeat says armed; False before the first, and after a reboot until the next one."""
+        return self.armed.latest is True
+
+    @property
+    def is_surely_disarmed(self) -> bool:
+        """Whether the last heartbeat says disarmed; False while it is not known."""
+        return self.armed.latest is False
+
+    @property
+    def is_vtol(self) -> bool:
+        """Whether it can hover and cruise on wings: EXTENDED_SYS_STATE tells a VTOL state."""
+        return bool(self.vtol_state.latest)
+
+    @property
+    def mode_name(self) -> str:
+        """Name of the flight mode, ``"unknown"`` before the first heartbeat."""
+        mode = self.mode.latest
+        return "unknown" if mode is None else mode.name
+
+    def is_in(self, mode: Mode) -> bool:
+        """Whether the last heartbeat told this mode."""
+        latest = self.mode.latest
+        return latest is not None and latest.custom_mode == mode.custom_mode
 
     def texts_since(self, at: float) -> tuple[StatusText, ...]:
         """What the vehicle said since then (64 texts at most), oldest first."""
