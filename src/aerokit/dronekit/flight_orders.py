@@ -30,7 +30,7 @@ async def change_armed(vehicle: AsyncVehicle, standing: Standing, value: bool) -
     """Arm or disarm, and wait until HEARTBEAT says so."""
     try:
         with standing.watching(vehicle):
-            send = vehicle._commands.send_long
+            send = vehicle._talk.commands.send_long
             await send_while_standing(vehicle, standing, send, COMPONENT_ARM_DISARM, float(value))
             await vehicle.telemetry.armed.wait_until(
                 lambda armed: armed is value or standing.is_done,
@@ -45,7 +45,7 @@ async def change_armed(vehicle: AsyncVehicle, standing: Standing, value: bool) -
 async def take_off(vehicle: AsyncVehicle, standing: Standing, command: int, *params: float) -> None:
     """Send the command to take off."""
     with standing.watching(vehicle):
-        await send_while_standing(vehicle, standing, vehicle._commands.send_long, command, *params)
+        await send_while_standing(vehicle, standing, vehicle._talk.commands.send_long, command, *params)
 
 
 async def go_to(
@@ -61,7 +61,7 @@ async def go_to(
             await send_while_standing(
                 vehicle,
                 standing,
-                vehicle._commands.send_int,
+                vehicle._talk.commands.send_int,
                 DO_REPOSITION,
                 *(-1, CHANGE_MODE if is_px4 else 0, 0, math.nan),
                 frame=GLOBAL_INT if is_px4 else GLOBAL_RELATIVE_ALT_INT,

@@ -107,7 +107,7 @@ async def _change_mode(vehicle: Vehicle, order: Order, standing: Standing) -> No
     """PX4 acks twice: the first ack is always ACCEPTED, the second one may take it back."""
     base_mode, custom_mode = order[0], told_as(vehicle, order)
     started = vehicle.connection.now()
-    with vehicle._refusals_of(DO_SET_MODE) as refusals:
+    with vehicle._talk.refusals_of(DO_SET_MODE) as refusals:
         await _request(vehicle, order, standing)
         with anyio.move_on_after(MODE_IS_TOLD_S):
             while not (standing.is_done or _is_in(vehicle, custom_mode)):
@@ -122,7 +122,7 @@ async def _change_mode(vehicle: Vehicle, order: Order, standing: Standing) -> No
 
 async def _request(vehicle: Vehicle, order: Order, standing: Standing) -> None:
     try:
-        await send_while_standing(vehicle, standing, vehicle._commands.send_long, DO_SET_MODE, *order)
+        await send_while_standing(vehicle, standing, vehicle._talk.commands.send_long, DO_SET_MODE, *order)
     except CommandRejected as error:
         if error.result != RESULT_UNSUPPORTED:
             raise

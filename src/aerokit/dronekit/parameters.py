@@ -233,7 +233,7 @@ class Parameters(MutableMapping[str, float], HasObservers):
 
     def _start(self) -> None:
         aio = self._vehicle._dk_vehicle
-        aio._detach.append(aio.connection.bus.attach_event(ParameterChanged, weakly(self._on_changed)))
+        aio._talk.detach.append(aio.connection.bus.attach_event(ParameterChanged, weakly(self._on_changed)))
         self._reading.begin()
 
     def _on_value(self, message: ParamValue) -> None:

@@ -67,7 +67,7 @@ async def _request_missing(vehicle: Vehicle, rate: float) -> None:
     for name in NEEDED:
         if not vehicle.telemetry.cells[name].is_known:
             for message_type in vehicle.telemetry.required_messages(name):
-                vehicle._rates.want(message_type, rate, is_optional=True)
+                vehicle._talk.rates.want(message_type, rate, is_optional=True)
 
 
 class _Heard:
@@ -78,9 +78,11 @@ class _Heard:
         self.is_to_be_asked = asyncio.Event()
         bus = vehicle.connection.bus
         for message_type in STREAMED:
-            vehicle._detach.append(bus.attach(message_type, self._on_message, system_id=vehicle.system_id))
+            vehicle._talk.detach.append(
+                bus.attach(message_type, self._on_message, system_id=vehicle.system_id)
+            )
         for event_type in (LinkRestored, VehicleBack, VehicleRebooted):
-            vehicle._detach.append(bus.attach_event(event_type, self._on_event))
+            vehicle._talk.detach.append(bus.attach_event(event_type, self._on_event))
         self._system_id = vehicle.system_id
 
     def forget(self) -> None:

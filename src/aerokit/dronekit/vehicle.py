@@ -309,12 +309,12 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, Readiness, VehiclePriv
             detach = aio.connection.bus.attach_frames(
                 message_type, weakly(stream.take), system_id=aio.system_id
             )
-            aio._detach.append(detach)
+            aio._talk.detach.append(detach)
         for message_type, handler, only_autopilot in self._dk_message_handlers:
             take = weakly(handler)
             take = _only_of(aio.component_id, take) if only_autopilot else take
-            aio._detach.append(aio.connection.bus.attach(message_type, take, system_id=aio.system_id))
-        aio._detach.append(
+            aio._talk.detach.append(aio.connection.bus.attach(message_type, take, system_id=aio.system_id))
+        aio._talk.detach.append(
             aio.telemetry.status_text.observe(weakly(self._dk_on_status_text), every_arrival=True)
         )
         first = aio.connection.heard.get((aio.system_id, aio.component_id))

@@ -224,7 +224,7 @@ class VehicleTwin(TwinOf["Vehicle"], BlockingBlock):
         exc: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        was_told = self.aio._is_told_to_hold
+        was_told = self.aio.is_told_to_hold
         self.close()
         if exc is not None and not was_told:  # the loop's side knows of no exception
             tell_how_it_is_left(self.aio)

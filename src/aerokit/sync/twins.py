@@ -371,6 +371,10 @@ class SetpointStream(StreamTwin[SetpointT]):
         """
         self._loop.run(self.aio.fly, setpoint, duration_s)
 
+    def stop(self, reason: str, *, hold: bool=True) -> None:
+        """End it by itself. The vehicle is told to hold, unless somebody else steers it by now."""
+        self._loop.call(self.aio.stop, reason, hold=hold)
+
 
 class Guided(TwinOf["AsyncGuided"]):
     """Opens set-point streams: ``async with vehicle.guided.velocity() as stream: stream.set(...)``.
@@ -1769,6 +1773,26 @@ class Vehicle(VehicleTwin):
         return StateCell(self._loop, self._loop.call(self.aio.message, message_type, rate_hz=rate_hz))
 
     @property
+    def mode_name(self) -> str:
+        """Name of the flight mode, ``"unknown"`` before the first heartbeat."""
+        return self.aio.mode_name
+
+    @property
+    def is_armed(self) -> bool:
+        """Whether the last heartbeat says armed; False before the first, and after a reboot until the next one."""
+        return self.aio.is_armed
+
+    @property
+    def is_surely_disarmed(self) -> bool:
+        """Whether the last heartbeat says disarmed; False while it is not known."""
+        return self.aio.is_surely_disarmed
+
+    @property
+    def is_vtol(self) -> bool:
+        """Whether it can hover and cruise on wings: EXTENDED_SYS_STATE tells a VTOL state."""
+        return self.aio.is_vtol
+
+    @property
     def heartbeat_age(self) -> float:
         """Seconds since the last heartbeat of the autopilot."""
         return self.aio.heartbeat_age
@@ -1787,46 +1811,13 @@ class Vehicle(VehicleTwin):
         """One line on how well the vehicle is heard, for error texts."""
         return self._loop.call(self.aio.describe_link)
 
-    def texts_since(self, at: float) -> tuple[str, ...]:
-        """What the vehicle said (STATUSTEXT) since this time on the loop's clock, oldest first."""
-        return self._loop.call(self.aio.texts_since, at)
-
-    def missing_for_flight(self) -> list[str]:
-        """What is still missing before the vehicle can fly, as far as it is known already; talks to nobody."""
-        return self._loop.call(self.aio.missing_for_flight)
-
-    def why_not_armable(self) -> list[str]:
-        """Return the reasons why arming would be refused now; an empty list means that none is known.
-
-        Asks the vehicle to run its checks (MAV_CMD_RUN_PREARM_CHECKS) where it can do so on request and listens to
-        what it says; reads SYS_STATUS and the estimator's flags (ArduPilot EKF_STATUS_REPORT, PX4 ESTIMATOR_STATUS).
-        Takes about a second. The vehicle is not armed by it.
-        """
-        return self._loop.run(self.aio.why_not_armable)
-
-    @property
-    def is_armed(self) -> bool:
-        """Whether the last heartbeat says armed; False before the first, and after a reboot until the next one."""
-        return self.aio.is_armed
-
-    @property
-    def is_surely_disarmed(self) -> bool:
-        """Whether the last heartbeat says disarmed; False while it is not known."""
-        return self.aio.is_surely_disarmed
-
-    @property
-    def mode_name(self) -> str:
-        """Name of the flight mode, ``"unknown"`` before the first heartbeat."""
-        return self.aio.mode_name
-
     def describe_now(self) -> str:
         """What it does, as far as it was heard: ``holding in BRAKE, still armed, 9 m above home, heard 0.3 s ago``."""
         return self.aio.describe_now()
 
-    @property
-    def is_vtol(self) -> bool:
-        """Whether it can hover and cruise on wings: EXTENDED_SYS_STATE tells a VTOL state."""
-        return self.aio.is_vtol
+    def texts_since(self, at: float) -> tuple[str, ...]:
+        """What the vehicle said (STATUSTEXT) since this time on the loop's clock, oldest first."""
+        return self._loop.call(self.aio.texts_since, at)
 
     def set_mode(self, mode: str | int, *, timeout: float=6.0) -> None:
         """Change the flight mode and wait until HEARTBEAT tells it.
@@ -1859,6 +1850,24 @@ class Vehicle(VehicleTwin):
             OperationTimeout: it accepted and stayed in another mode, or did not answer.
         """
         self._loop.run(self.aio.hold)
+
+    @property
+    def is_told_to_hold(self) -> bool:
+        """Whether a flight was given up, and the order to hold that followed is not confirmed yet."""
+        return self.aio.is_told_to_hold
+
+    def missing_for_flight(self) -> list[str]:
+        """What is still missing before the vehicle can fly, as far as it is known already; talks to nobody."""
+        return self._loop.call(self.aio.missing_for_flight)
+
+    def why_not_armable(self) -> list[str]:
+        """Return the reasons why arming would be refused now; an empty list means that none is known.
+
+        Asks the vehicle to run its checks (MAV_CMD_RUN_PREARM_CHECKS) where it can do so on request and listens to
+        what it says; reads SYS_STATUS and the estimator's flags (ArduPilot EKF_STATUS_REPORT, PX4 ESTIMATOR_STATUS).
+        Takes about a second. The vehicle is not armed by it.
+        """
+        return self._loop.run(self.aio.why_not_armable)
 
     def wait_ready(self, *, timeout: float=90.0) -> None:
         """Wait until position and home are known, the estimator is healthy and the pre-arm checks pass.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import logging
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +17,6 @@ from aerokit.errors import (
     OperationRejected,
     OperationTimeout,
 )
-from aerokit.runtime.cancellation import Cancellation
 from aerokit.vehicle.checks import check_seconds
 from aerokit.vehicle.orders.late_arming import LATE_S, give_arm
 from aerokit.vehicle.orders.part import Part
@@ -82,7 +80,8 @@ class ArmingActions(Part):
         still = [*self._health.missing_for_flight(), *said] or ["nothing any more"]
         missing = "\n  - ".join([*still, *self._health.unarmable_mode()])
         raise OperationTimeout(
-            f"the vehicle was not ready within {timeout:g} s ({self._talk.describe_link()}); still missing:\n  - {missing}"
+            f"the vehicle was not ready within {timeout:g} s ({self._talk.describe_link()}); still missing:\n"
+            f"  - {missing}"
         )
 
     async def arm(
@@ -174,7 +173,9 @@ class ArmingActions(Part):
             "arm()" if armed else "disarm()",
             is_done=lambda: cell.latest is armed and cell.updated_at > started,
             trouble=lambda: order.taken_by if armed else None,
-            describe=lambda: "; ".join(self._talk.texts_since(started)) or "the vehicle said nothing about it",
+            describe=lambda: (
+                "; ".join(self._talk.texts_since(started)) or "the vehicle said nothing about it"
+            ),
             timeout=timeout,
             max_silence_s=max_silence_s,
         )
@@ -186,7 +187,9 @@ class ArmingActions(Part):
         if mode is not None:
             wanted = self.autopilot.find_mode(mode, self.telemetry.mode_names)
             if wanted.name in self.autopilot.unarmable_modes:
-                raise LocalProtocolError(f"mode = {mode!r} is not allowed: {self._health.unarmable_text(wanted)}")
+                raise LocalProtocolError(
+                    f"mode = {mode!r} is not allowed: {self._health.unarmable_text(wanted)}"
+                )
             if self.telemetry.is_armed and wanted != self.telemetry.mode.latest:
                 raise OperationRejected(
                     f"arm: the vehicle is armed already, in {self.telemetry.mode_name}; nothing was sent"
@@ -262,7 +265,9 @@ class ArmingActions(Part):
         params = (1, *(0.0,) * 4, FORCE_REBOOT if force else 0)
         options: dict[str, Any] = {"attempts": 1, "attempt_timeout": REBOOT_ANSWER_S}
         with self._helm.aside() as order:
-            await self._orders.give(order, self._talk.commands.send_long, PREFLIGHT_REBOOT_SHUTDOWN, *params, **options)
+            await self._orders.give(
+                order, self._talk.commands.send_long, PREFLIGHT_REBOOT_SHUTDOWN, *params, **options
+            )
 
     async def _await_reboot(self, reboots: int) -> None:
         """Asks for its time, often at first: a fast simulation is soon older than it was before."""

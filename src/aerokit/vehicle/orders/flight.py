@@ -77,7 +77,11 @@ class FlightActions(Part):
             raise OperationRejected(
                 "take_off: the vehicle flies already: go_to() climbs too; nothing was sent"
             )
-        modes = (plan.mode, plan.mode_after, self.autopilot.mode_for("take_off", is_vtol=self.telemetry.is_vtol))
+        modes = (
+            plan.mode,
+            plan.mode_after,
+            self.autopilot.mode_for("take_off", is_vtol=self.telemetry.is_vtol),
+        )
         order = self._helm.order(*(mode for mode in modes if mode is not None))
         try:
             await self._begin_take_off(plan, order)
@@ -221,7 +225,9 @@ class FlightActions(Part):
             return is_disarmed or is_landed or (is_over() and not is_deep())
 
         def is_over() -> bool:
-            return self.telemetry.mode_name == self.autopilot.landing_ends_in and mode.updated_at > accepted_at
+            return (
+                self.telemetry.mode_name == self.autopilot.landing_ends_in and mode.updated_at > accepted_at
+            )
 
         def is_deep() -> bool:
             return self._where.is_known_since(order.given_at) and self._where.altitude_relative() < -SURFACE_M

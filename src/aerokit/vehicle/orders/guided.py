@@ -42,8 +42,8 @@ if TYPE_CHECKING:
 
     from aerokit.autopilots import Mode
     from aerokit.mavlink.message import Message
-    from aerokit.vehicle.orders.order import Order
     from aerokit.vehicle.orders.bridge import Bridge
+    from aerokit.vehicle.orders.order import Order
 
 __all__ = ["Guided", "SetpointStream"]
 

@@ -95,7 +95,9 @@ class Health:
 
     def arming_texts(self, since: float) -> list[str]:
         """What it has said about arming since then."""
-        return [text for text in self._talk.texts_since(since) if self._autopilot.arming_reason(text) is not None]
+        return [
+            text for text in self._talk.texts_since(since) if self._autopilot.arming_reason(text) is not None
+        ]
 
     def _failing(self) -> list[str]:
         """Failing sensors, failing pre-arm checks, missing estimates.

@@ -99,7 +99,12 @@ class Holding:
         if not order.is_given:
             return False
         mode = self._talk.autopilot.mode_for("hold", is_vtol=self._talk.telemetry.is_vtol)
-        if mode is None or not self._talk.connection.is_open or self._talk.telemetry.is_surely_disarmed or order.end:
+        if (
+            mode is None
+            or not self._talk.connection.is_open
+            or self._talk.telemetry.is_surely_disarmed
+            or order.end
+        ):
             return False
         is_sent = self._helm.is_known
         if is_sent:
@@ -199,4 +204,6 @@ class Holding:
 
     @property
     def _holds_by_reposition(self) -> bool:
-        return self._talk.autopilot.reposition is not None and self._talk.autopilot.reposition_purpose == "hold"
+        return (
+            self._talk.autopilot.reposition is not None and self._talk.autopilot.reposition_purpose == "hold"
+        )

@@ -46,3 +46,8 @@ class ModeActions(Part):
             OperationTimeout: it accepted and stayed in another mode, or did not answer.
         """
         await self._holding.hold()
+
+    @property
+    def is_told_to_hold(self) -> bool:
+        """Whether a flight was given up, and the order to hold that followed is not confirmed yet."""
+        return self._holding.is_told_to_hold

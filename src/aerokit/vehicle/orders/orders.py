@@ -92,6 +92,7 @@ class Orders:
             self._helm.mode_settles_at = -math.inf
 
     async def request_mode(self, wanted: Mode, order: Order, timeout: float) -> None:
+        """Order a mode, and do not wait for HEARTBEAT to tell it."""
         params = self._talk.autopilot.mode_order(wanted).params
         try:
             await self.give(
@@ -124,7 +125,9 @@ class Orders:
         await await_progress(
             self._talk,
             f"set_mode({wanted.name})",
-            is_done=lambda: self._talk.telemetry.is_in(wanted) and self._talk.telemetry.mode.updated_at > told_since,
+            is_done=lambda: (
+                self._talk.telemetry.is_in(wanted) and self._talk.telemetry.mode.updated_at > told_since
+            ),
             trouble=trouble,
             describe=lambda: f"the vehicle is in {self._talk.telemetry.mode_name}",
             timeout=max(0.1, timeout),
@@ -137,6 +140,7 @@ class Orders:
             await self.change_mode(mode, order)
 
     def mode_for(self, action: str, purpose: Purpose) -> Mode:
+        """The autopilot's mode for this; NotSupported, which names the action, where it has none."""
         mode = self._talk.autopilot.mode_for(purpose, is_vtol=self._talk.telemetry.is_vtol)
         if mode is None:
             raise NotSupported(f"{action}: {self._talk.autopilot.firmware} has no mode for it")

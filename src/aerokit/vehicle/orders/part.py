@@ -20,7 +20,7 @@ class Part(States):
     """A part of :class:`aerokit.Vehicle`: some of its actions. Parts know the bridge, and not each other."""
 
     def __init__(self, bridge: Bridge) -> None:
-        talk = bridge.talk
+        self._bridge, talk = bridge, bridge.talk
         self.connection: Connection = talk.connection
         """The connection it is reached by."""
         self.system_id: int = talk.system_id

@@ -7,11 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import anyio
 
-from aerokit import geo
 from aerokit.arguments import checks_arguments
 from aerokit.errors import (
     CommandRejected,
-    LocalProtocolError,
     NotSupported,
     OperationRejected,
     OperationTimeout,
@@ -20,7 +18,7 @@ from aerokit.mavlink.messages import SetPositionTargetGlobalInt
 from aerokit.vehicle.checks import check_range, check_seconds
 from aerokit.vehicle.orders.orders import CHANGE_MODE, DO_REPOSITION, RESULT_UNSUPPORTED
 from aerokit.vehicle.orders.part import Part
-from aerokit.vehicle.orders.progress import LONGEST_SILENCE_S, OLD_POSITION_S, Stillness, await_progress
+from aerokit.vehicle.orders.progress import LONGEST_SILENCE_S, Stillness, await_progress
 from aerokit.vehicle.state.values import Position
 
 if TYPE_CHECKING:
@@ -129,7 +127,9 @@ class TravelActions(Part):
         modes = (self._orders.mode_for("go_to", self.autopilot.reposition_purpose),)
         try:
             with self._helm.changing_mode():
-                await self._orders.give(order, self._talk.commands.send_int, DO_REPOSITION, *params, modes=modes, **place)
+                await self._orders.give(
+                    order, self._talk.commands.send_int, DO_REPOSITION, *params, modes=modes, **place
+                )
         except CommandRejected as error:
             if error.result != RESULT_UNSUPPORTED:
                 raise
@@ -237,7 +237,9 @@ class TravelActions(Part):
         if self._turns_by_reposition:
             yaw = math.remainder(math.radians(goal), 2 * math.pi)
             params = (-1, CHANGE_MODE, 0, yaw, *(math.nan,) * 3)
-            await self._orders.give(order, self._talk.commands.send_long, DO_REPOSITION, *params, modes=(mode,))
+            await self._orders.give(
+                order, self._talk.commands.send_long, DO_REPOSITION, *params, modes=(mode,)
+            )
         else:
             await self._orders.ensure_mode(mode, order)
             # a goal, not an angle: sent again, it does not turn it further

@@ -23,9 +23,8 @@ if TYPE_CHECKING:
     from aerokit.parameters import Metadata, ParameterDifference
     from aerokit.protocols.parameter_requests import Answer
     from aerokit.protocols.transfer import OnProgress
-    from aerokit.runtime.bus import Detach
     from aerokit.vehicle.files.files import Files
-    from aerokit.vehicle.talk.transfers import Transfers
+    from aerokit.vehicle.talk.talk import Talk
 
 __all__ = ["Outcome", "ParameterWrite", "Parameters", "Transaction"]
 
@@ -48,9 +47,11 @@ class Parameters:
     then OperationTimeout). Each can be cancelled at any moment.
     """
 
-    def __init__(self, transfers: Transfers, files: Files) -> None:
-        self._transfers = transfers
+    def __init__(self, talk: Talk, files: Files) -> None:
+        self._transfers = transfers = talk.transfers
         self._access = ParameterAccess(transfers, files)
+        talk.detach.append(self._access.store.attach())
+        talk.on_reboot.append(self._access.forget)
         self._names = ParameterNames(self._access)
         self._metadata: Metadata | None = None
         self._writing = ParameterWriting(self._access, self._names, self._note_of)
@@ -274,13 +275,6 @@ class Parameters:
         return table.changed_from_default()
 
     # ------------------------------------------------------------------------------- inside
-
-    def _attach(self) -> Detach:
-        return self._access.store.attach()
-
-    def _forget(self) -> None:
-        """The vehicle has rebooted."""
-        self._access.forget()
 
     def _with_documented_defaults(self, table: ParameterTable) -> ParameterTable:
         defaults = {name: each.default for name, each in (self._metadata or {}).items() if name in table}

@@ -165,7 +165,7 @@ class PlanChannel:
             return await self._context.transfers.run(exchange)
         except MissionRejected as error:
             await anyio.sleep(SETTLE_S)
-            texts = self._context.vehicle.texts_since(started)
+            texts = self._context.talk.texts_since(started)
             message = f"{error}{self._what_is_left(exchange)}"
             raise MissionRejected(message, result=error.result, item=error.item, reasons=texts) from None
         except MissionTimeout as error:

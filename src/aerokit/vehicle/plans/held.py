@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from aerokit.missions.item import MissionItem
     from aerokit.position import Position
     from aerokit.protocols.transfer import OnProgress
+    from aerokit.vehicle.orders.bridge import Bridge
     from aerokit.vehicle.plans.transfer import Plan, PlanTransfer
-    from aerokit.vehicle.vehicle import Vehicle
 
 __all__ = ["HeldPlan", "PlanContext", "PlanFiles", "PlanMemory", "PlanMethod"]
 
@@ -205,22 +205,22 @@ class PlanMemory:
 class PlanContext:
     """One lock, since autopilots have one state for the transfers of all three; what MISSION_CURRENT calls them."""
 
-    def __init__(self, vehicle: Vehicle, files: PlanFiles | None) -> None:
-        self.vehicle, self.files = vehicle, files
-        self.transfers = vehicle._transfers
-        self.autopilot = vehicle.autopilot
+    def __init__(self, bridge: Bridge, files: PlanFiles | None) -> None:
+        self.bridge, self.talk, self.files = bridge, bridge.talk, files
+        self.transfers = bridge.talk.transfers
+        self.autopilot = bridge.talk.autopilot
         self.lock = asyncio.Lock()
         self.memories = (PlanMemory(), PlanMemory(), PlanMemory())
         """By MAV_MISSION_TYPE."""
         self._current: Frame | None = None
-        bus = vehicle.connection.bus
-        vehicle._detach.append(
-            bus.attach_frames(MissionCurrent, self._note_current, system_id=vehicle.system_id)
+        talk = bridge.talk
+        talk.detach.append(
+            talk.connection.bus.attach_frames(MissionCurrent, self._note_current, system_id=talk.system_id)
         )
 
     def now(self) -> float:
         """Seconds on the loop's clock."""
-        return self.vehicle.connection.now()
+        return self.talk.connection.now()
 
     def offset_of(self, mission_type: int) -> int:
         """How much higher the vehicle counts items than the program does: home may be its item 0."""
@@ -229,14 +229,18 @@ class PlanContext:
     @property
     def home(self) -> Position | None:
         """Where the vehicle says that its home is."""
-        home = self.vehicle.telemetry.home.latest
+        home = self.talk.telemetry.home.latest
         return None if home is None else home.position.replace(altitude_amsl_m=home.altitude_amsl_m)
 
     @property
     def is_flown(self) -> bool:
         """Whether the vehicle is flying its mission."""
-        mode = self.autopilot.mode_for("mission", is_vtol=self.vehicle.is_vtol)
-        return mode is not None and self.vehicle._is_in(mode) and not self.vehicle.is_surely_disarmed
+        mode = self.autopilot.mode_for("mission", is_vtol=self.talk.telemetry.is_vtol)
+        return (
+            mode is not None
+            and self.talk.telemetry.is_in(mode)
+            and not self.talk.telemetry.is_surely_disarmed
+        )
 
     def id_of(self, mission_type: int, since: float) -> int:
         """What a MISSION_CURRENT that came lately, and after ``since``, calls the plan; 0 where it does not."""
@@ -254,7 +258,7 @@ class PlanContext:
             if self.id_of(mission_type, now) == opaque_id:
                 told.set()
 
-        detach = self.vehicle.connection.bus.attach(MissionCurrent, look, system_id=self.vehicle.system_id)
+        detach = self.talk.connection.bus.attach(MissionCurrent, look, system_id=self.talk.system_id)
         try:
             with anyio.move_on_after(FRESH_IDS_S):
                 await told.wait()
@@ -263,5 +267,5 @@ class PlanContext:
         return told.is_set()
 
     def _note_current(self, frame: Frame) -> None:
-        if self.vehicle.telemetry.accepts(frame):
+        if self.talk.telemetry.accepts(frame):
             self._current = frame

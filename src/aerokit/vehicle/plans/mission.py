@@ -9,7 +9,7 @@ import anyio
 from aerokit.arguments import checks_arguments
 from aerokit.errors import CommandRejected, LocalProtocolError, OperationRejected, OperationTimeout
 from aerokit.vehicle.checks import check_seconds
-from aerokit.vehicle.orders.modes import RESULT_UNSUPPORTED
+from aerokit.vehicle.orders.orders import RESULT_UNSUPPORTED
 from aerokit.vehicle.orders.progress import LONGEST_SILENCE_S, await_progress
 from aerokit.vehicle.plans.held import HeldPlan
 from aerokit.vehicle.plans.mission_end import MissionEnd
@@ -39,8 +39,9 @@ class MissionControl(HeldPlan["Mission"]):
 
     def __init__(self, context: PlanContext) -> None:
         super().__init__(context)
-        self._vehicle = context.vehicle
-        self._watch = MissionWatch(context.vehicle)
+        self._bridge, self._talk = context.bridge, context.talk
+        self._watch = MissionWatch(context.talk)
+        context.talk.on_reboot.append(self._watch.forget)
         self._order: Order | None = None
         """The last one given here."""
         self._is_paused = False
@@ -83,7 +84,7 @@ class MissionControl(HeldPlan["Mission"]):
         """
         self._check_item(item)
         check_seconds("timeout", timeout)
-        with self._vehicle._helm.aside() as order:
+        with self._bridge.helm.aside() as order:
             await self._set_current(item, timeout, order)
 
     async def start(self, item: int = 0, *, timeout: float = 10.0) -> None:
@@ -103,20 +104,20 @@ class MissionControl(HeldPlan["Mission"]):
         """
         self._check_item(item)
         check_seconds("timeout", timeout)
-        vehicle = self._vehicle
-        mode = vehicle._mode_for("mission.start", "mission")
-        if not vehicle.is_armed:
+        bridge, talk = self._bridge, self._talk
+        mode = bridge.orders.mode_for("mission.start", "mission")
+        if not talk.telemetry.is_armed:
             raise OperationRejected(
                 "mission.start: the vehicle is not armed: arm() comes first; nothing was sent"
             )
-        order = self._order = vehicle._helm.order(mode)
+        order = self._order = bridge.helm.order(mode)
         self._is_paused = False
         self._watch.start()
         try:
             await self._set_current(item, timeout, order, goes_on=False)
             await self._enter(mode, order, timeout)
         except (anyio.get_cancelled_exc_class(), OperationTimeout):  # it may have heard the order
-            vehicle._hold_soon(order)
+            bridge.holding.hold_soon(order)
             raise
 
     async def pause(self) -> None:
@@ -124,16 +125,16 @@ class MissionControl(HeldPlan["Mission"]):
 
         Raises OperationRejected when it does not fly its mission, else as :meth:`Vehicle.hold`.
         """
-        vehicle = self._vehicle
-        mode = vehicle._mode_for("mission.pause", "hold")
+        bridge, talk = self._bridge, self._talk
+        mode = bridge.orders.mode_for("mission.pause", "hold")
         if not self._context.is_flown:
             raise OperationRejected(
-                f"mission.pause: the vehicle does not fly its mission, it is in {vehicle.mode_name};"
+                f"mission.pause: the vehicle does not fly its mission, it is in {talk.telemetry.mode_name};"
                 " nothing was sent"
             )
-        self._order = vehicle._helm.order(mode)
+        self._order = bridge.helm.order(mode)
         self._is_paused = True
-        await vehicle._stop_in(mode, self._order)
+        await bridge.holding.stop_in(mode, self._order)
 
     async def resume(self, *, timeout: float = 10.0) -> None:
         """Go on with the mission from the current item; also after a pilot or another order has interrupted it.
@@ -141,16 +142,16 @@ class MissionControl(HeldPlan["Mission"]):
         ArduPilot begins anew if its parameter MIS_RESTART is 1. Raises as :meth:`start`.
         """
         check_seconds("timeout", timeout)
-        vehicle = self._vehicle
-        mode = vehicle._mode_for("mission.resume", "mission")
-        if not vehicle.is_armed:
+        bridge, talk = self._bridge, self._talk
+        mode = bridge.orders.mode_for("mission.resume", "mission")
+        if not talk.telemetry.is_armed:
             raise OperationRejected("mission.resume: the vehicle is not armed; nothing was sent")
-        order = self._order = vehicle._helm.order(mode)
+        order = self._order = bridge.helm.order(mode)
         self._watch.start()
         try:
             await self._enter(mode, order, timeout)
         except (anyio.get_cancelled_exc_class(), OperationTimeout):
-            vehicle._hold_soon(order)
+            bridge.holding.hold_soon(order)
             raise
         self._is_paused = False
 
@@ -173,12 +174,12 @@ class MissionControl(HeldPlan["Mission"]):
         """
         check_seconds("timeout", timeout, none_is_allowed=True)
         check_seconds("max_silence_s", max_silence_s, none_is_allowed=True)
-        vehicle = self._vehicle
-        mode = vehicle._mode_for("mission.wait_finished", "mission")
-        end = MissionEnd(vehicle, self._watch, mode, self._context.memories[0].items)
-        with vehicle._streaming("mission_current", "landed_state"):
+        bridge, talk = self._bridge, self._talk
+        mode = bridge.orders.mode_for("mission.wait_finished", "mission")
+        end = MissionEnd(bridge, self._watch, mode, self._context.memories[0].items)
+        with talk.streaming("mission_current", "landed_state"):
             await await_progress(
-                vehicle,
+                talk,
                 "mission.wait_finished",
                 is_done=end.is_reached,
                 trouble=lambda: end.trouble(self._order, is_paused=self._is_paused),
@@ -194,9 +195,6 @@ class MissionControl(HeldPlan["Mission"]):
 
         return Mission
 
-    def _forget(self) -> None:
-        self._watch.forget()
-
     def _counted(self, count: int) -> None:
         self._watch.counted(count)
 
@@ -209,11 +207,11 @@ class MissionControl(HeldPlan["Mission"]):
 
     async def _set_current(self, item: int, timeout: float, order: Order, *, goes_on: bool = True) -> None:
         """``goes_on``: keep what it has counted of jumps. ArduPilot's item 0, home, stands for a fresh start."""
-        vehicle = self._vehicle
+        bridge, talk = self._bridge, self._talk
         seq = item + self._context.offset_of(0)
-        if vehicle.autopilot.sets_current_by_command:
+        if talk.autopilot.sets_current_by_command:
             try:
-                await vehicle._command_of(
+                await bridge.orders.command_of(
                     order, DO_SET_MISSION_CURRENT, 0 if item == 0 and not goes_on else seq
                 )
             except CommandRejected as error:
@@ -253,19 +251,19 @@ class MissionControl(HeldPlan["Mission"]):
     @property
     def _told_seq(self) -> int | None:
         """The item in the last MISSION_CURRENT, as counted on the wire."""
-        progress = self._vehicle.telemetry.mission_current.latest
+        progress = self._talk.telemetry.mission_current.latest
         return None if progress is None else progress.current
 
     async def _enter(self, mode: Mode, order: Order, timeout: float) -> None:
-        vehicle = self._vehicle
-        if not vehicle.autopilot.mission_starts_by_command:
-            await vehicle._change_mode(mode, order, timeout, told_since=order.given_at)
+        bridge, talk = self._bridge, self._talk
+        if not talk.autopilot.mission_starts_by_command:
+            await bridge.orders.change_mode(mode, order, timeout, told_since=order.given_at)
             return
         try:
-            with vehicle._helm.changing_mode():
-                await vehicle._give(order, vehicle._commands.send_long, MISSION_START, modes=(mode,))
-                await vehicle._await_mode(mode, order, [], timeout, order.given_at)
+            with bridge.helm.changing_mode():
+                await bridge.orders.give(order, talk.commands.send_long, MISSION_START, modes=(mode,))
+                await bridge.orders.await_mode(mode, order, [], timeout, order.given_at)
         except CommandRejected as error:
             if error.result != RESULT_UNSUPPORTED:
                 raise
-            await vehicle._change_mode(mode, order, timeout, told_since=order.given_at)
+            await bridge.orders.change_mode(mode, order, timeout, told_since=order.given_at)

@@ -11,10 +11,10 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from aerokit.missions.item import MissionItem
+    from aerokit.vehicle.orders.bridge import Bridge
     from aerokit.vehicle.orders.order import Order
     from aerokit.vehicle.plans.mission_watch import MissionWatch
     from aerokit.vehicle.state.values import Mode
-    from aerokit.vehicle.vehicle import Vehicle
 
 __all__ = ["MissionEnd"]
 
@@ -38,18 +38,20 @@ class MissionEnd:
     """
 
     def __init__(
-        self, vehicle: Vehicle, watch: MissionWatch, mode: Mode, items: Sequence[MissionItem] | None
+        self, bridge: Bridge, watch: MissionWatch, mode: Mode, items: Sequence[MissionItem] | None
     ) -> None:
-        self._vehicle, self._watch, self._mode = vehicle, watch, mode
-        self._order = vehicle._helm.newest
+        talk = bridge.talk
+        self._bridge, self._talk = bridge, talk
+        self._watch, self._mode = watch, mode
+        self._order = bridge.helm.newest
         last = items[-1].command if items else None
         self._ends_by_landing = last in LANDINGS
-        self._stays_up = last == NAV_RETURN_TO_LAUNCH and not vehicle.autopilot.lands_after_return
+        self._stays_up = last == NAV_RETURN_TO_LAUNCH and not talk.autopilot.lands_after_return
         self._complete_since: float | None = None
         self._landing_modes = tuple(
-            vehicle.autopilot.mode_for(purpose, is_vtol=vehicle.is_vtol) for purpose in ("return", "land")
+            talk.autopilot.mode_for(purpose, is_vtol=talk.telemetry.is_vtol) for purpose in ("return", "land")
         )
-        self._grace_until = vehicle.connection.now() + MODE_GRACE_S
+        self._grace_until = talk.connection.now() + MODE_GRACE_S
         self._was_in_mode = False
         self._left_at: float | None = None
 
@@ -58,7 +60,7 @@ class MissionEnd:
         if self._watch.is_complete:
             return not self._ends_by_landing or self._is_down or (self._stays_up and self._is_back)
         self._complete_since = None
-        if self._vehicle.is_surely_disarmed and self._is_landing:
+        if self._talk.telemetry.is_surely_disarmed and self._is_landing:
             return True
         progress = self._watch.progress.latest
         tells_state = progress is not None and progress.state != STATE_UNKNOWN
@@ -66,13 +68,13 @@ class MissionEnd:
 
     def trouble(self, order: Order | None, *, is_paused: bool) -> str | None:
         """Why it will not come to its end any more. ``order`` is the last one that was given for the mission."""
-        vehicle, now = self._vehicle, self._vehicle.connection.now()
-        if vehicle._helm.newest not in (self._order, order):
+        talk, now = self._talk, self._talk.connection.now()
+        if self._bridge.helm.newest not in (self._order, order):
             return "another order was given"
-        is_in_mode = vehicle._is_in(self._mode)
+        is_in_mode = talk.telemetry.is_in(self._mode)
         self._was_in_mode = self._was_in_mode or is_in_mode
-        if not vehicle.is_surely_disarmed and (
-            is_paused or is_in_mode or self._is_landing or now < vehicle._helm.mode_settles_at
+        if not talk.telemetry.is_surely_disarmed and (
+            is_paused or is_in_mode or self._is_landing or now < self._bridge.helm.mode_settles_at
         ):
             self._left_at = None
             return None
@@ -80,11 +82,11 @@ class MissionEnd:
             self._left_at = now
         if now - self._left_at < END_GRACE_S or now < self._grace_until:
             return None
-        if vehicle.is_surely_disarmed:
+        if talk.telemetry.is_surely_disarmed:
             return f"the vehicle is not armed, {self.describe()}"
         if self._was_in_mode:
-            return f"the mode changed to {vehicle.mode_name}, {self.describe()}"
-        return f"the vehicle does not fly its mission, it is in {vehicle.mode_name}"
+            return f"the mode changed to {talk.telemetry.mode_name}, {self.describe()}"
+        return f"the vehicle does not fly its mission, it is in {talk.telemetry.mode_name}"
 
     def describe(self) -> str:
         """How far it is."""
@@ -95,7 +97,7 @@ class MissionEnd:
     @property
     def _is_landing(self) -> bool:
         """Whether it has left the mission's mode for that of its last item."""
-        mode = self._vehicle.telemetry.mode.latest
+        mode = self._talk.telemetry.mode.latest
         current, last = self._watch.current.latest, self._watch.last
         return (
             self._ends_by_landing and current is not None and current == last and mode in self._landing_modes
@@ -104,17 +106,19 @@ class MissionEnd:
     @property
     def _is_back(self) -> bool:
         """At home, or wherever else it has gone to in ``BACK_AT_LAST_S`` seconds."""
-        vehicle, now = self._vehicle, self._vehicle.connection.now()
-        if vehicle.autopilot.completes_at_home:
+        talk, now = self._talk, self._talk.connection.now()
+        if talk.autopilot.completes_at_home:
             return True
         if self._complete_since is None:
             self._complete_since = now
-        home = vehicle.telemetry.home.latest
+        home = talk.telemetry.home.latest
         place = None if home is None else Position(home.latitude_deg, home.longitude_deg)
-        is_near = place is not None and vehicle.distance_to(place) <= vehicle.autopilot.arrival_radius_m
+        is_near = (
+            place is not None and self._bridge.where.distance_to(place) <= talk.autopilot.arrival_radius_m
+        )
         return is_near or now - self._complete_since > BACK_AT_LAST_S
 
     @property
     def _is_down(self) -> bool:
-        landed = self._vehicle.telemetry.landed_state.latest
-        return self._vehicle.is_surely_disarmed or landed == LANDED_ON_GROUND
+        landed = self._talk.telemetry.landed_state.latest
+        return self._talk.telemetry.is_surely_disarmed or landed == LANDED_ON_GROUND

@@ -11,7 +11,7 @@ from aerokit.runtime.events import MissionCurrentChanged, MissionFinished, Missi
 from aerokit.vehicle.state.values import MissionProgress
 
 if TYPE_CHECKING:
-    from aerokit.vehicle.vehicle import Vehicle
+    from aerokit.vehicle.talk.talk import Talk
 
 __all__ = ["MissionWatch"]
 
@@ -33,11 +33,11 @@ class MissionWatch:
     reached ten times over.
     """
 
-    def __init__(self, vehicle: Vehicle) -> None:
-        self._vehicle = vehicle
-        self._offset = int(vehicle.autopilot.home_is_item_0)
-        self._repeats = vehicle.autopilot.repeats_item_reached
-        now = vehicle.connection.now
+    def __init__(self, talk: Talk) -> None:
+        self._talk = talk
+        self._offset = int(talk.autopilot.home_is_item_0)
+        self._repeats = talk.autopilot.repeats_item_reached
+        now = talk.connection.now
         self.current: StateCell[int | None] = StateCell("mission.current", now, "MISSION_CURRENT")
         self.count: StateCell[int] = StateCell("mission.count", now, "MISSION_CURRENT with a number of items")
         self.progress: StateCell[MissionProgress] = StateCell("mission.progress", now, "MISSION_CURRENT")
@@ -49,12 +49,12 @@ class MissionWatch:
         self._may_repeat = False
         self._was_active = False
         self._stale_until = -math.inf
-        telemetry = vehicle.telemetry
-        vehicle._detach += [
+        telemetry = talk.telemetry
+        talk.detach += [
             telemetry.mission_current.observe(self._on_current, every_arrival=True),
             telemetry.mission_reached.observe(self._on_reached, every_arrival=True),
             telemetry.armed.observe(self._on_armed),
-            vehicle.connection.on_end(self.close),
+            talk.connection.on_end(self.close),
             lambda: self.close(ConnectionClosed("the block of this vehicle was left")),
         ]
 
@@ -67,7 +67,7 @@ class MissionWatch:
     @property
     def is_at_last(self) -> bool:
         """Whether it goes for the last item, or did so a moment ago."""
-        return self._vehicle.connection.now() - self._at_last_at <= LAST_S
+        return self._talk.connection.now() - self._at_last_at <= LAST_S
 
     def counted(self, count: int) -> None:
         """A transfer has told how many items there are."""
@@ -76,7 +76,7 @@ class MissionWatch:
     def start(self) -> None:
         """The mission is flown from now on; what is told of the one before does not count."""
         self.is_complete = self._was_active = False
-        self._stale_until = self._vehicle.connection.now() + STALE_S
+        self._stale_until = self._talk.connection.now() + STALE_S
 
     def forget(self) -> None:
         """The vehicle has rebooted."""
@@ -104,24 +104,24 @@ class MissionWatch:
         )
         self.current.set(current, self._source("MISSION_CURRENT"))
         if current is not None and current == self.last:
-            self._at_last_at = self._vehicle.connection.now()
+            self._at_last_at = self._talk.connection.now()
         if current != before:
             self._note_return(before, current)
-            self._vehicle._publish(MissionCurrentChanged, before, current)
+            self._talk.publish(MissionCurrentChanged, before, current)
         self._on_state(told.state)
 
     def _note_return(self, before: int | None, current: int | None) -> None:
         """Going for an item again that was reached before; PX4 may tell that it is reached before it is the current."""
         if current is not None and current == self.reached:
-            is_long_ago = self._vehicle.connection.now() - self._reached_at > AGAIN_S
+            is_long_ago = self._talk.connection.now() - self._reached_at > AGAIN_S
             self._may_repeat = self._may_repeat or is_long_ago or (before is not None and before > current)
 
     def _on_state(self, state: int) -> None:
         if state != STATE_COMPLETE:
             self._stale_until = -math.inf
-            if state == STATE_ACTIVE and self._is_in_mission_mode and self._vehicle.is_armed:
+            if state == STATE_ACTIVE and self._is_in_mission_mode and self._talk.telemetry.is_armed:
                 self._was_active, self.is_complete = True, False
-        elif self._vehicle.connection.now() >= self._stale_until:
+        elif self._talk.connection.now() >= self._stale_until:
             self._complete()
 
     def _on_armed(self, _: bool | None, is_armed: bool) -> None:
@@ -130,14 +130,14 @@ class MissionWatch:
 
     def _on_reached(self, _: int | None, seq: int) -> None:
         """ArduPilot tells item 0, home, when it has come to a guided target."""
-        item, now = seq - self._offset, self._vehicle.connection.now()
+        item, now = seq - self._offset, self._talk.connection.now()
         is_again = item == self.reached and (
             not self._may_repeat if self._repeats else now - self._reached_at < TWICE_S
         )
         if item < 0 or is_again:
             return
         self.reached, self._reached_at, self._may_repeat = item, now, False
-        self._vehicle._publish(MissionItemReached, item)
+        self._talk.publish(MissionItemReached, item)
 
     # ------------------------------------------------------------------------------------ inside
 
@@ -145,15 +145,15 @@ class MissionWatch:
         self.is_complete = True
         if self._was_active:
             self._was_active = False
-            self._vehicle._publish(MissionFinished)
+            self._talk.publish(MissionFinished)
 
     @property
     def _is_in_mission_mode(self) -> bool:
-        mode = self._vehicle.autopilot.mode_for("mission", is_vtol=self._vehicle.is_vtol)
-        return mode is not None and self._vehicle._is_in(mode)
+        mode = self._talk.autopilot.mode_for("mission", is_vtol=self._talk.telemetry.is_vtol)
+        return mode is not None and self._talk.telemetry.is_in(mode)
 
     def _set_count(self, count: int, message: str) -> None:
         self.count.set(count, self._source(message))
 
     def _source(self, message: str) -> Source:
-        return Source(self._vehicle.system_id, self._vehicle.component_id, message)
+        return Source(self._talk.system_id, self._talk.component_id, message)
