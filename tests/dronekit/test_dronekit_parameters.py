@@ -363,7 +363,7 @@ def test_parameters_that_appear_later(vehicle: dronekit.Vehicle, fc: FlightContr
 def test_what_is_known_outlives_reboot_and_connection(
     vehicle: dronekit.Vehicle, fc: FlightController
 ) -> None:
-    vehicle._handler.loop.call(vehicle.aio._on_reboot)
+    vehicle._handler.loop.call(vehicle.aio._talk._note_reboot)
     parameters = vehicle.parameters
     assert parameters["FOO"] == 1.0
     assert parameters.set("FOO", 2)

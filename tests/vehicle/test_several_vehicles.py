@@ -299,7 +299,7 @@ async def test_telemetry_of_another_component_or_system_is_not_the_vehicles() ->
             assert vehicle.mode_name == "GUIDED"
             assert not vehicle.is_armed
             assert "Crash!" not in vehicle.texts_since(0.0)
-            assert vehicle._watch.reboots == 0
+            assert vehicle._talk.watch.reboots == 0
 
 
 async def test_an_ack_of_another_system_is_not_taken() -> None:

@@ -15,9 +15,9 @@ from aerokit.mavlink.messages import Attitude, Heartbeat, SystemTime, Timesync
 from aerokit.runtime.cells import Source, StateCell
 from aerokit.runtime.connection import Connection
 from aerokit.runtime.events import LinkReport, VehicleBack, VehicleRebooted, VehicleSilent
-from aerokit.vehicle.core import VehicleCore
 from aerokit.vehicle.orders.progress import Stillness
 from aerokit.vehicle.orders.setpoints import SLOW_M_S, BodyVelocitySetpoint, VelocitySetpoint, wants_motion
+from aerokit.vehicle.talk.talk import Talk
 from aerokit.vehicle.talk.watch import LinkWatch, VehicleWatch
 
 HEARTBEAT = Heartbeat(2, 3, 81, 0, 3)
@@ -264,10 +264,10 @@ class Standing:
     def __init__(self) -> None:
         self.at = 0.0
         self.cell = StateCell[Position]("position", lambda: self.at, "GLOBAL_POSITION_INT")
-        vehicle = SimpleNamespace(
+        talk = SimpleNamespace(
             connection=SimpleNamespace(now=lambda: self.at), telemetry=SimpleNamespace(position=self.cell)
         )
-        self.stillness = Stillness(cast("VehicleCore", vehicle))
+        self.stillness = Stillness(cast("Talk", talk))
 
     def tell(self, place: Position | None, at: float) -> str | None:
         self.at = at

@@ -1195,6 +1195,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         Raises:
             LocalProtocolError: there is no such item. Nothing was sent.
             CommandRejected: the vehicle refused.
+            OperationRejected: somebody else steers, or a newer order was given, before it was confirmed.
             OperationTimeout: MISSION_CURRENT did not confirm it.
         """
         self._loop.run(self.aio.set_current, item, timeout=timeout)

@@ -219,12 +219,12 @@ class MissionControl(HeldPlan["Mission"]):
                     raise
             else:
                 return
-        with vehicle._helm.sending(order) as sending:
+        with bridge.helm.sending(order) as sending:
             try:
                 await self._set_current_by_message(seq, timeout, sending)
             except OperationTimeout as error:
                 if order.end:
-                    raise OperationRejected(str(error), reasons=vehicle.texts_since(order.given_at)) from None
+                    raise OperationRejected(str(error), reasons=talk.texts_since(order.given_at)) from None
                 raise
 
     async def _set_current_by_message(
@@ -236,7 +236,7 @@ class MissionControl(HeldPlan["Mission"]):
         target = (transfers.system_id, transfers.component_id)
         async with self._context.lock:  # PX4 does not hear it during a transfer
             if standing is not None:
-                self._vehicle._raise_if_over(standing.order)
+                self._bridge.orders.raise_if_over(standing.order)
             await transfers.run(
                 MissionSetCurrent(
                     *target,
