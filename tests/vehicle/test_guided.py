@@ -435,7 +435,7 @@ async def test_kinds_that_the_autopilot_ignores_are_not_offered() -> None:
     from aerokit.autopilots import ArduPlane
 
     async with open_flight() as flight:
-        flight.vehicle.autopilot = ArduPlane(1)
+        flight.vehicle._talk.autopilot = ArduPlane(1)
         with pytest.raises(NotSupported, match=r"velocity.*attitude"):
             async with flight.vehicle.guided.velocity():
                 raise AssertionError("entered")

@@ -13,7 +13,7 @@ from aerokit.dronekit.pymavlink_messages import message_of
 from aerokit.dronekit.weakly import weakly
 from aerokit.errors import LocalProtocolError
 from aerokit.mavlink.dialect import STANDARD
-from aerokit.runtime.diagnosis import is_autopilot
+from aerokit.runtime.components import is_autopilot
 
 if TYPE_CHECKING:
     from aerokit.dronekit.mavlink import MAVConnection

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit.dronekit.pymavlink_messages import message_of
 from aerokit.errors import AerokitError
-from aerokit.runtime.diagnosis import is_autopilot
+from aerokit.runtime.components import is_autopilot
 
 if TYPE_CHECKING:
     from aerokit.dronekit.mavlink import MAVConnection

@@ -31,7 +31,7 @@ from aerokit.dronekit.weakly import weakly
 from aerokit.errors import AerokitError, ConnectFailed, LocalProtocolError, OperationTimeout
 from aerokit.mavlink.messages import CommandLong
 from aerokit.runtime.background import Background
-from aerokit.runtime.diagnosis import is_autopilot
+from aerokit.runtime.components import is_autopilot
 from aerokit.vehicle.connect import connect as connect_async
 
 if TYPE_CHECKING:

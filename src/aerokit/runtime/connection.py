@@ -20,8 +20,8 @@ from aerokit.mavlink.messages import Heartbeat
 from aerokit.runtime.background import Background
 from aerokit.runtime.bus import Bus, once
 from aerokit.runtime.cells import StateCell
+from aerokit.runtime.components import MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS, is_autopilot
 from aerokit.runtime.deadlines import Deadlines
-from aerokit.runtime.diagnosis import is_autopilot
 from aerokit.runtime.endings import raisable
 from aerokit.runtime.events import (
     Event,
@@ -61,8 +61,6 @@ logger = logging.getLogger("aerokit")
 
 ItemT = TypeVar("ItemT", bound="Message | Event")
 
-MAV_TYPE_GCS = 6
-MAV_AUTOPILOT_INVALID = 8
 MAV_STATE_ACTIVE = 4
 MAV_COMP_ID_MISSIONPLANNER = 190
 """The component id that ground stations take."""

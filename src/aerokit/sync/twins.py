@@ -56,7 +56,8 @@ if TYPE_CHECKING:
     from aerokit.runtime.link_state import LinkState
     from aerokit.runtime.subscription import Overflow
     from aerokit.vehicle.files.files import FileEntry, Files as AsyncFiles
-    from aerokit.vehicle.files.logs import LogEntry, LogMethod, Logs as AsyncLogs
+    from aerokit.vehicle.files.log_entry import LogEntry
+    from aerokit.vehicle.files.logs import LogMethod, Logs as AsyncLogs
     from aerokit.vehicle.orders.guided import Guided as AsyncGuided
     from aerokit.vehicle.orders.setpoints import (
         AttitudeSetpoint,

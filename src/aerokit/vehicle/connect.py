@@ -15,8 +15,9 @@ from aerokit.errors import BusyError, ConnectFailed, LocalProtocolError
 from aerokit.links.link import Link
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.messages import Heartbeat
+from aerokit.runtime.components import is_autopilot
 from aerokit.runtime.connection import MAV_COMP_ID_MISSIONPLANNER, Connection
-from aerokit.runtime.diagnosis import is_autopilot, no_vehicle_reason
+from aerokit.runtime.diagnosis import no_vehicle_reason
 from aerokit.runtime.endings import raisable
 from aerokit.runtime.opening import open_connection
 from aerokit.runtime.routes import MOST_ROUTES

@@ -14,8 +14,8 @@ from aerokit.vehicle.orders.modes import ModeActions
 from aerokit.vehicle.orders.talking import TalkActions
 from aerokit.vehicle.orders.travel import TravelActions
 from aerokit.vehicle.parameters.parameters import Parameters
+from aerokit.vehicle.plans.context import PlanContext
 from aerokit.vehicle.plans.fence import FenceControl
-from aerokit.vehicle.plans.held import PlanContext
 from aerokit.vehicle.plans.mission import MissionControl
 from aerokit.vehicle.plans.rally import RallyControl
 from aerokit.vehicle.talk.signing import set_up_signing

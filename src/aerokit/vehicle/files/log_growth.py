@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from aerokit.protocols.transfer import OnProgress, Progress
-    from aerokit.vehicle.files.logs import LogEntry
+    from aerokit.vehicle.files.log_entry import LogEntry
 
 __all__ = ["GrowthWatch"]
 

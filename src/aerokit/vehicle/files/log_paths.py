@@ -9,7 +9,7 @@ from aerokit.errors import FileError
 
 if TYPE_CHECKING:
     from aerokit.vehicle.files.files import FileEntry, Files
-    from aerokit.vehicle.files.logs import LogEntry
+    from aerokit.vehicle.files.log_entry import LogEntry
 
 __all__ = ["ListedLog", "listed_logs", "log_path"]
 

@@ -17,8 +17,8 @@ from aerokit.protocols.log_list import LogList
 from aerokit.protocols.logs import LOG_BLOCK, LogDownload, LogEnd
 from aerokit.protocols.reassembly import Reassembly
 from aerokit.protocols.transfer import PATIENCE_S, OnProgress
-from aerokit.snapshot import Snapshot
 from aerokit.vehicle.checks import check_seconds
+from aerokit.vehicle.files.log_entry import LogEntry
 from aerokit.vehicle.files.log_growth import GrowthWatch
 from aerokit.vehicle.files.log_paths import listed_logs, log_path
 from aerokit.vehicle.files.part_file import PartFile
@@ -41,17 +41,6 @@ ERASE_PERIOD_S = 1.0
 ERASE_PATIENCE_S = 60.0
 CLOCKS_APART = timedelta(days=1)
 """The time of a log that is being written is the vehicle's clock, afterwards it is that of the file."""
-
-
-class LogEntry(Snapshot):
-    """One flight log: its id for :meth:`Logs.download`, its size in bytes, and when it was last written.
-
-    The time is None when the vehicle did not know it; the size of a log that is being written is that of the moment.
-    """
-
-    id: int
-    size: int
-    time_utc: datetime | None
 
 
 @checks_arguments

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from aerokit.missions.item import MissionItem
     from aerokit.protocols.missions import MissionExchange
     from aerokit.protocols.transfer import OnProgress
-    from aerokit.vehicle.plans.held import PlanContext
+    from aerokit.vehicle.plans.context import PlanContext
 
 __all__ = ["PlanChannel"]
 

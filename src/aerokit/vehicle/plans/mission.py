@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from aerokit.missions import Mission
     from aerokit.runtime.cells import StateCell
     from aerokit.vehicle.orders.order import Order, Sending
-    from aerokit.vehicle.plans.held import PlanContext
+    from aerokit.vehicle.plans.context import PlanContext
     from aerokit.vehicle.state.values import MissionProgress, Mode
 
 __all__ = ["MissionControl"]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from aerokit.autopilots import Autopilot, autopilot_for
 from aerokit.mavlink.message import offset_of
 from aerokit.runtime.cells import Source, StateCell
-from aerokit.runtime.diagnosis import is_autopilot
+from aerokit.runtime.components import is_autopilot
 from aerokit.vehicle.state.decoding import Context
 from aerokit.vehicle.state.states import DEFAULT_RATES_HZ, LAZY, SOURCES, STATES, States
 from aerokit.vehicle.state.status_text import StatusTextAssembler
