@@ -20,7 +20,7 @@ from aerokit.errors import (
 from aerokit.vehicle.checks import check_seconds
 from aerokit.vehicle.orders.late_arming import LATE_S, give_arm
 from aerokit.vehicle.orders.part import Part
-from aerokit.vehicle.orders.progress import LONGEST_SILENCE_S, await_progress
+from aerokit.vehicle.orders.progress import LONGEST_SILENCE_S, Arrivals, await_progress
 
 if TYPE_CHECKING:
     from aerokit.autopilots import Mode
@@ -71,10 +71,16 @@ class ArmingActions(Part):
                 said of it lately.
         """
         check_seconds("timeout", timeout)
-        with self._talk.streaming("sensors", "estimator", "position"), anyio.move_on_after(timeout):
+        told = self.telemetry
+        cells = (told.sensors, told.estimator, told.position, told.home, told.armed)
+        with (
+            self._talk.streaming("sensors", "estimator", "position"),
+            Arrivals(self._talk, *cells, every_arrival=True) as news,
+            anyio.move_on_after(timeout),
+        ):
             while self._health.missing_for_flight():
                 self.connection.raise_if_ended()
-                await anyio.sleep(0.2)
+                await news.next(timeout)
             return
         said = dict.fromkeys(self._health.arming_texts(self.connection.now() - SAID_AGAIN_S))
         still = [*self._health.missing_for_flight(), *said] or ["nothing any more"]

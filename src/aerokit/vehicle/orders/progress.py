@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from aerokit.errors import HeartbeatTimeout, OperationRejected, OperationTimeout
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from typing_extensions import Self
+
     from aerokit.position import Position
+    from aerokit.runtime.cells import StateCell
     from aerokit.vehicle.talk.talk import Talk
 
-__all__ = ["LONGEST_SILENCE_S", "OLD_POSITION_S", "Stillness", "await_progress"]
+__all__ = ["LONGEST_SILENCE_S", "OLD_POSITION_S", "Arrivals", "Stillness", "await_progress"]
 
 TICK_S = 0.25
 """Silence brings no message, so it is looked for this often."""
@@ -43,14 +46,11 @@ async def await_progress(
             tells how far it came.
         ConnectionClosed, LinkLost: the connection ended.
     """
-    changed, loop = asyncio.Event(), asyncio.get_running_loop()
-    started = talk.connection.now()
-    reasons_from = started
-    cells = (talk.telemetry.mode, talk.telemetry.armed, talk.telemetry.position)
-    ends = [cell.observe(lambda *_: changed.set()) for cell in (*cells, talk.telemetry.landed_state)]
-    ends.append(talk.connection.on_end(lambda _: changed.set()))
+    started = reasons_from = talk.connection.now()
+    telemetry = talk.telemetry
+    cells = (telemetry.mode, telemetry.armed, telemetry.position, telemetry.landed_state)
     done_since: float | None = None
-    try:
+    with Arrivals(talk, *cells) as news:
         while True:
             now = talk.connection.now()
             talk.connection.raise_if_ended()
@@ -67,15 +67,38 @@ async def await_progress(
                 )
             if stillness is not None and (still := stillness()):
                 raise OperationTimeout(f"{what}: {still}; {describe()}; {talk.describe_link()}")
-            changed.clear()
-            tick = loop.call_later(TICK_S, changed.set)  # no cancel scope: on Python 3.10 one that runs out
-            try:  # swallows a cancellation that comes at the same turn of the loop
-                await changed.wait()
-            finally:
-                tick.cancel()
-    finally:
-        for end in ends:
+            await news.next(TICK_S)
+
+
+class Arrivals:
+    """In its block: what is heard in any of these cells, and the end of the connection."""
+
+    def __init__(self, talk: Talk, *cells: StateCell[Any], every_arrival: bool = False) -> None:
+        self._talk, self._cells, self._every_arrival = talk, cells, every_arrival
+        self._news = asyncio.Event()
+        self._ends: list[Callable[[], None]] = []
+
+    def __enter__(self) -> Self:
+        hear = self._news.set
+        self._ends = [
+            cell.observe(lambda *_: hear(), every_arrival=self._every_arrival) for cell in self._cells
+        ]
+        self._ends.append(self._talk.connection.on_end(lambda _: hear()))
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for end in self._ends:
             end()
+
+    async def next(self, at_most_s: float) -> None:
+        """Wait for news, or for so many seconds: silence brings none."""
+        self._news.clear()
+        # no cancel scope: on Python 3.10 one that runs out swallows a cancellation of the same turn of the loop
+        tick = asyncio.get_running_loop().call_later(at_most_s, self._news.set)
+        try:
+            await self._news.wait()
+        finally:
+            tick.cancel()
 
 
 class Stillness:
