@@ -9,7 +9,7 @@ from typing import Any, cast
 
 import pytest
 
-from aerokit import Position, Vehicle
+from aerokit import Position
 from aerokit.mavlink import STANDARD, Frame, FrameEncoder, Framer, Message
 from aerokit.mavlink.messages import Attitude, Heartbeat, SystemTime, Timesync
 from aerokit.runtime.cells import Source, StateCell
@@ -319,6 +319,6 @@ def test_without_a_position_of_the_last_two_seconds_nothing_is_known() -> None:
 
 @pytest.mark.parametrize(("speed_m_s", "wanted"), [(SLOW_M_S, True), (0.99 * SLOW_M_S, False)])
 def test_who_is_told_to_move_at_0_3_m_s_should_move(speed_m_s: float, wanted: bool) -> None:
-    nobody = cast("Vehicle", None)  # a velocity alone says it
+    nobody = cast("Bridge", None)  # a velocity alone says it
     assert wants_motion(VelocitySetpoint(east_m_s=speed_m_s), nobody) is wanted
     assert wants_motion(BodyVelocitySetpoint(right_m_s=speed_m_s), nobody) is wanted
