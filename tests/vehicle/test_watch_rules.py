@@ -15,6 +15,7 @@ from aerokit.mavlink.messages import Attitude, Heartbeat, SystemTime, Timesync
 from aerokit.runtime.cells import Source, StateCell
 from aerokit.runtime.connection import Connection
 from aerokit.runtime.events import LinkReport, VehicleBack, VehicleRebooted, VehicleSilent
+from aerokit.vehicle.orders.bridge import Bridge
 from aerokit.vehicle.orders.progress import Stillness
 from aerokit.vehicle.orders.setpoints import SLOW_M_S, BodyVelocitySetpoint, VelocitySetpoint, wants_motion
 from aerokit.vehicle.talk.talk import Talk
