@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from aerokit.dronekit.mavlink import MAVConnection
     from aerokit.mavlink.message import Message
     from aerokit.runtime.connection import Connection
-    from aerokit.vehicle.state.values import StatusText
+    from aerokit.vehicle.state.condition import StatusText
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
 __all__ = ["Vehicle"]

@@ -42,6 +42,8 @@ if TYPE_CHECKING:
     from contextlib import AbstractContextManager
     import os
     from aerokit.autopilots import Autopilot
+    from aerokit.autopilots.modes import Mode
+    from aerokit.autopilots.version import AutopilotVersion
     from aerokit.links.allowed import Peers
     from aerokit.links.link import Link
     from aerokit.mavlink.dialect import Dialect
@@ -50,6 +52,7 @@ if TYPE_CHECKING:
     from aerokit.mavlink.signing import Signing
     from aerokit.missions import Fence, Mission, RallyPoints
     from aerokit.parameters import Metadata, Parameter, ParameterDifference, ParameterTable
+    from aerokit.position import Position
     from aerokit.protocols.transfer import OnProgress
     from aerokit.runtime.cells import Source
     from aerokit.runtime.events import Event, LinkReport
@@ -74,27 +77,22 @@ if TYPE_CHECKING:
     from aerokit.vehicle.plans.held import PlanMethod
     from aerokit.vehicle.plans.mission import MissionControl as AsyncMissionControl
     from aerokit.vehicle.plans.rally import RallyControl as AsyncRallyControl
-    from aerokit.vehicle.state.values import (
-        Attitude,
-        AutopilotVersion,
-        Battery,
+    from aerokit.vehicle.state.condition import (
         EstimatorHealth,
-        GpsReceiver,
-        Home,
-        LocalPosition,
         MissionProgress,
-        Mode,
-        Position,
-        RangeFinder,
-        RcChannels,
         SensorHealth,
-        ServoOutputs,
         StatusText,
         SystemTime,
-        Velocity,
-        Vibration,
-        Wind,
     )
+    from aerokit.vehicle.state.equipment import (
+        Battery,
+        GpsReceiver,
+        RangeFinder,
+        RcChannels,
+        ServoOutputs,
+        Vibration,
+    )
+    from aerokit.vehicle.state.movement import Attitude, Home, LocalPosition, Velocity, Wind
 
 __all__ = [
     "Changes",

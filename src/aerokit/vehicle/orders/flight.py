@@ -9,11 +9,11 @@ import anyio
 
 from aerokit.arguments import checks_arguments
 from aerokit.errors import CommandRejected, NotSupported, OperationRejected, OperationTimeout
+from aerokit.position import Position
 from aerokit.vehicle.checks import check_range, check_seconds
 from aerokit.vehicle.orders.helm import MODE_GRACE_S
 from aerokit.vehicle.orders.part import Part
 from aerokit.vehicle.orders.progress import LONGEST_SILENCE_S, OLD_POSITION_S, Stillness, await_progress
-from aerokit.vehicle.state.values import Position
 
 if TYPE_CHECKING:
     from collections.abc import Callable

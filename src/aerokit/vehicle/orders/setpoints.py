@@ -14,8 +14,9 @@ from aerokit.mavlink.messages import (
     SetPositionTargetGlobalInt,
     SetPositionTargetLocalNed,
 )
+from aerokit.position import Position
 from aerokit.snapshot import Snapshot
-from aerokit.vehicle.state.values import Attitude, Position
+from aerokit.vehicle.state.movement import Attitude
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message

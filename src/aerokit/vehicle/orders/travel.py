@@ -15,11 +15,11 @@ from aerokit.errors import (
     OperationTimeout,
 )
 from aerokit.mavlink.messages import SetPositionTargetGlobalInt
+from aerokit.position import Position
 from aerokit.vehicle.checks import check_range, check_seconds
 from aerokit.vehicle.orders.orders import CHANGE_MODE, DO_REPOSITION, RESULT_UNSUPPORTED
 from aerokit.vehicle.orders.part import Part
 from aerokit.vehicle.orders.progress import LONGEST_SILENCE_S, Stillness, await_progress
-from aerokit.vehicle.state.values import Position
 
 if TYPE_CHECKING:
     from aerokit.autopilots import Mode

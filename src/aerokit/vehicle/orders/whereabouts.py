@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 from aerokit import geo
 from aerokit.errors import LocalProtocolError
+from aerokit.position import Position
 from aerokit.vehicle.checks import check_range
 from aerokit.vehicle.orders.progress import OLD_POSITION_S
-from aerokit.vehicle.state.values import Position
 
 if TYPE_CHECKING:
     from aerokit.vehicle.talk.talk import Talk

@@ -16,11 +16,12 @@ from aerokit.vehicle.plans.mission_end import MissionEnd
 from aerokit.vehicle.plans.mission_watch import MissionWatch
 
 if TYPE_CHECKING:
+    from aerokit.autopilots.modes import Mode
     from aerokit.missions import Mission
     from aerokit.runtime.cells import StateCell
     from aerokit.vehicle.orders.order import Order, Sending
     from aerokit.vehicle.plans.context import PlanContext
-    from aerokit.vehicle.state.values import MissionProgress, Mode
+    from aerokit.vehicle.state.condition import MissionProgress
 
 __all__ = ["MissionControl"]
 

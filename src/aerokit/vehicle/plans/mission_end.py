@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from aerokit.position import Position
 from aerokit.vehicle.orders.helm import MODE_GRACE_S
-from aerokit.vehicle.state.values import Position
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from aerokit.autopilots.modes import Mode
     from aerokit.missions.item import MissionItem
     from aerokit.vehicle.orders.bridge import Bridge
     from aerokit.vehicle.orders.order import Order
     from aerokit.vehicle.plans.mission_watch import MissionWatch
-    from aerokit.vehicle.state.values import Mode
 
 __all__ = ["MissionEnd"]
 

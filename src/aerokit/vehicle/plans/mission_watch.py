@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from aerokit.errors import ConnectionClosed
 from aerokit.runtime.cells import Source, StateCell
 from aerokit.runtime.events import MissionCurrentChanged, MissionFinished, MissionItemReached
-from aerokit.vehicle.state.values import MissionProgress
+from aerokit.vehicle.state.condition import MissionProgress
 
 if TYPE_CHECKING:
     from aerokit.vehicle.talk.talk import Talk

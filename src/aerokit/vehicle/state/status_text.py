@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from typing import TYPE_CHECKING
 
-from aerokit.vehicle.state.values import StatusText
+from aerokit.vehicle.state.condition import StatusText
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -20,7 +20,7 @@ HEAD = """# What a vehicle tells
 
 Each is a cell of the vehicle: `vehicle.position.value`, `.latest`, `.age`, `.source`, `.fresh(within=1)`,
 `await vehicle.position.wait_until(…)`, `async for … in vehicle.position.changes()`. Values are in SI units and
-degrees; their classes are in [values.py](../src/aerokit/vehicle/state/values.py). The messages are named with the best
+degrees; their classes are in [vehicle/state](../src/aerokit/vehicle/state). The messages are named with the best
 source first, and with the rate at which the vehicle is asked for them unless `connect(rates=…)` says otherwise.
 
 | State | Type | What it is | Messages |

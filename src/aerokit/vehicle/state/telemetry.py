@@ -10,7 +10,7 @@ from aerokit.autopilots import Autopilot, autopilot_for
 from aerokit.mavlink.message import offset_of
 from aerokit.runtime.cells import Source, StateCell
 from aerokit.runtime.components import is_autopilot
-from aerokit.vehicle.state.decoding import Context
+from aerokit.vehicle.state.reading import Context
 from aerokit.vehicle.state.states import DEFAULT_RATES_HZ, LAZY, SOURCES, STATES, States
 from aerokit.vehicle.state.status_text import StatusTextAssembler
 from aerokit.vehicle.state.streamed import StreamedMessage
@@ -19,10 +19,11 @@ from aerokit.vehicle.state.told import MESSAGE_IDS, By, message_type
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from aerokit.autopilots.modes import Mode
     from aerokit.mavlink import messages
     from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.message import Message
-    from aerokit.vehicle.state.values import Mode, StatusText
+    from aerokit.vehicle.state.condition import StatusText
 
 __all__ = ["Telemetry"]
 

@@ -33,7 +33,7 @@ class By(Generic[T]):
     Args:
         message: name of its class; a name, so that not all messages are imported.
         decode: gives the value, or None when the message does not know it; None: the telemetry itself does it.
-        knowing: ``decode`` is given what else is known (``decoding.Context``), too.
+        knowing: ``decode`` is given what else is known (``reading.Context``), too.
         hz: the rate that it is asked for when a program asks for nothing special.
         second_best: it counts only while no better message has told the state lately.
         instead: some autopilots send this one instead of the first.
