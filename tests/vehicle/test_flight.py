@@ -583,6 +583,16 @@ async def test_look_at_and_stop_looking(flying: Flight) -> None:
     assert len(flying.wire.commands(MavCmd.DO_SET_ROI_NONE)) == 1
 
 
+async def test_home_is_set_where_it_is_and_somewhere_else(flying: Flight) -> None:
+    await flying.vehicle.go_to(north_of_home(flying, 30.0))
+    before = flying.vehicle.home.value
+    await flying.vehicle.set_home()
+    assert before.position.distance_to(flying.vehicle.home.value.position) == pytest.approx(30.0, abs=3.0)
+    place = Position(before.latitude_deg, before.longitude_deg, altitude_amsl_m=before.altitude_amsl_m)
+    await flying.vehicle.set_home(place)
+    assert flying.vehicle.home.value.position.distance_to(place) < 0.1
+
+
 async def test_look_at_refused(flying: Flight) -> None:
     flying.copter.faults.refuse(MavCmd.DO_SET_ROI_LOCATION, MavResult.DENIED, "No mount")
     with pytest.raises(CommandRejected, match="No mount"):

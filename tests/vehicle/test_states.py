@@ -9,8 +9,11 @@ import pytest
 import aerokit
 import aerokit.sync
 from aerokit.mavlink import messages
+from aerokit.mavlink.enums import MavPowerStatus
+from aerokit.vehicle.state.equipment import Power
 from aerokit.vehicle.state.states import DEFAULT_RATES_HZ, STATES
 from aerokit.vehicle.state.table import documentation, rendered
+from aerokit.vehicle.state.telemetry import Telemetry
 from aerokit.vehicle.state.told import By, Told
 from aerokit.vehicle.talk.rates import subscription_rate_hz
 
@@ -23,10 +26,20 @@ def test_default_rates() -> None:
         10.0: {"Attitude", "GlobalPositionInt", "LocalPositionNed"},
         5.0: {"VfrHud", "ExtendedSysState", "DistanceSensor"},
         2.0: {"SysStatus", "GpsRawInt", "EkfStatusReport", "EstimatorStatus", "RcChannels", "ServoOutputRaw"},
-        1.0: {"BatteryStatus", "MissionCurrent", "SystemTime", "Vibration", "Wind", "WindCov", "CurrentMode"},
+        1.0: {
+            *("BatteryStatus", "MissionCurrent", "SystemTime", "Vibration", "Wind", "WindCov", "CurrentMode"),
+            "PowerStatus",
+        },
     }
     kinds = (messages.Attitude, messages.RawImu, messages.Odometry, messages.Statustext)
     assert [subscription_rate_hz(kind) for kind in kinds] == [10.0, 4.0, 4.0, None]
+
+
+def test_power() -> None:
+    telemetry = Telemetry(lambda: 0.0)
+    assert telemetry.power.waits_for == "POWER_STATUS"
+    telemetry.receive(messages.PowerStatus(5012, 0, MavPowerStatus.BRICK_VALID))
+    assert telemetry.power.value == Power(5.012, None, MavPowerStatus.BRICK_VALID)
 
 
 def test_a_declaration_that_cannot_be_right_is_an_error_at_once() -> None:

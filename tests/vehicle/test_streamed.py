@@ -37,6 +37,7 @@ ANYTHING: dict[str, Message] = {
     "BatteryStatus": messages.BatteryStatus(0, 1, 1, 2500, (12000, *[65535] * 9), 100, 10, 10, 90),
     "Wind": messages.Wind(10.0, 3.0, 0.0),
     "WindCov": messages.WindCov(0, 1.0, 2.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+    "PowerStatus": messages.PowerStatus(5012, 0, 1),
     "EkfStatusReport": messages.EkfStatusReport(831, 0.1, 0.1, 0.1, 0.1, 0.1),
     "EstimatorStatus": messages.EstimatorStatus(0, 831, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 1.0, 1.0),
     "Vibration": messages.Vibration(0, 1.0, 1.0, 1.0, 0, 0, 0),

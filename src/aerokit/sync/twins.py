@@ -87,6 +87,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.state.equipment import (
         Battery,
         GpsReceiver,
+        Power,
         RangeFinder,
         RcChannels,
         ServoOutputs,
@@ -1541,6 +1542,11 @@ class Vehicle(VehicleTwin):
         return StateCell(self._loop, self.aio.batteries)
 
     @cached_property
+    def power(self) -> StateCell[Power]:
+        """Supply of the board and of its servos in volts (POWER_STATUS)."""
+        return StateCell(self._loop, self.aio.power)
+
+    @cached_property
     def sensors(self) -> StateCell[SensorHealth]:
         """Health of the sensors and the pre-arm checks (SYS_STATUS)."""
         return StateCell(self._loop, self.aio.sensors)
@@ -2057,6 +2063,23 @@ class Vehicle(VehicleTwin):
     def stop_looking(self) -> None:
         """End :meth:`look_at` (MAV_CMD_DO_SET_ROI_NONE)."""
         self._loop.run(self.aio.stop_looking)
+
+    def set_home(self, place: Position | None=None, *, timeout: float=5.0) -> None:
+        """Have the vehicle return to another place, or to where it is now, and wait until HOME_POSITION tells it.
+
+        Args:
+            place: latitude, longitude and an altitude above mean sea level; None: where it is now.
+            timeout: seconds until HOME_POSITION tells it.
+
+        Sends MAV_CMD_DO_SET_HOME (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_HOME).
+
+        Raises:
+            LocalProtocolError: the place has no altitude above mean sea level. Nothing was sent.
+            CommandRejected: the vehicle refused: it knows no position, or the place is none.
+            CommandTimeout: there was no answer.
+            OperationTimeout: it accepted, and HOME_POSITION did not tell it.
+        """
+        self._loop.run(self.aio.set_home, place, timeout=timeout)
 
     def distance_to(self, target: Position) -> float:
         """Metres from where the vehicle is to ``target``; in three dimensions when ``target`` has an altitude.

@@ -10,6 +10,7 @@ import anyio
 from aerokit.arguments import checks_arguments
 from aerokit.errors import (
     CommandRejected,
+    LocalProtocolError,
     NotSupported,
     OperationRejected,
     OperationTimeout,
@@ -29,8 +30,11 @@ __all__ = ["TravelActions"]
 
 CONDITION_YAW = 115
 DO_CHANGE_SPEED = 178
+DO_SET_HOME = 179
 DO_SET_ROI_LOCATION = 195
 DO_SET_ROI_NONE = 197
+REQUEST_MESSAGE, HOME_POSITION = 512, 242
+MAV_FRAME_GLOBAL = 0
 MAV_FRAME_GLOBAL_INT = 5
 MAV_FRAME_GLOBAL_RELATIVE_ALT_INT = 6
 POSITION_ONLY = 0x0DF8
@@ -284,6 +288,37 @@ class TravelActions(Part):
     async def stop_looking(self) -> None:
         """End :meth:`look_at` (MAV_CMD_DO_SET_ROI_NONE)."""
         await self._orders.command_aside(DO_SET_ROI_NONE)
+
+    async def set_home(self, place: Position | None = None, *, timeout: float = 5.0) -> None:
+        """Have the vehicle return to another place, or to where it is now, and wait until HOME_POSITION tells it.
+
+        Args:
+            place: latitude, longitude and an altitude above mean sea level; None: where it is now.
+            timeout: seconds until HOME_POSITION tells it.
+
+        Sends MAV_CMD_DO_SET_HOME (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_HOME).
+
+        Raises:
+            LocalProtocolError: the place has no altitude above mean sea level. Nothing was sent.
+            CommandRejected: the vehicle refused: it knows no position, or the place is none.
+            CommandTimeout: there was no answer.
+            OperationTimeout: it accepted, and HOME_POSITION did not tell it.
+        """
+        check_seconds("timeout", timeout)
+        if place is not None and place.altitude_amsl_m is None:
+            raise LocalProtocolError("place has no altitude_amsl_m: home needs one above mean sea level")
+        home = self.telemetry.home
+        with self._helm.aside() as order:
+            if place is None:
+                await self._orders.give(order, self._talk.commands.send_long, DO_SET_HOME, 1)
+            else:
+                latitude, longitude, altitude, _ = self._where.global_target(place)
+                where: dict[str, Any] = {"frame": MAV_FRAME_GLOBAL, "x": latitude, "y": longitude}
+                send = self._talk.commands.send_int
+                await self._orders.give(order, send, DO_SET_HOME, 0, z=altitude, **where)
+        asked_at = self.connection.now()
+        await self._talk.commands.send_long(REQUEST_MESSAGE, HOME_POSITION)
+        await home.wait_until(lambda _: home.updated_at >= asked_at, timeout=timeout, description="set_home")
 
     def distance_to(self, target: Position) -> float:
         """Metres from where the vehicle is to ``target``; in three dimensions when ``target`` has an altitude.

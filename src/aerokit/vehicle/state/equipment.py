@@ -5,7 +5,7 @@ from __future__ import annotations
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
-from aerokit.mavlink.enums import GpsFixType, MavBatteryChargeState
+from aerokit.mavlink.enums import GpsFixType, MavBatteryChargeState, MavPowerStatus
 from aerokit.snapshot import Snapshot
 from aerokit.vehicle.state.movement import place
 from aerokit.vehicle.state.reading import I16, U8, U16, Context, finite, member, scaled, unless
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Battery",
     "GpsReceiver",
+    "Power",
     "RangeFinder",
     "RcChannels",
     "ServoOutputs",
@@ -28,6 +29,7 @@ __all__ = [
     "distance_sensors",
     "first_gps",
     "main_battery",
+    "power",
     "range_finder",
     "rc_channels",
     "second_gps",
@@ -104,6 +106,14 @@ class Battery(Snapshot):
     consumed_wh: float | None = None
     time_remaining_s: int | None = None
     charge_state: int = 0
+
+
+class Power(Snapshot):
+    """The supply of the board and of its servos in volts, and MAV_POWER_STATUS bits; None: not measured."""
+
+    board_v: float | None
+    servos_v: float | None
+    flags: int
 
 
 class RcChannels(Snapshot):
@@ -212,6 +222,13 @@ def main_battery(message: messages.SysStatus, context: Context) -> tuple[Battery
 def current(centiampere: int, autopilot: Autopilot) -> float | None:
     """Amperes, None for what this autopilot sends when it does not know."""
     return None if centiampere in autopilot.unknown_currents_ca else centiampere / 100
+
+
+def power(message: messages.PowerStatus) -> Power:
+    """Supply voltages; 0 stands for none."""
+    return Power(
+        scaled(message.Vcc, 0, 1000), scaled(message.Vservo, 0, 1000), member(MavPowerStatus, message.flags)
+    )
 
 
 def rc_channels(message: messages.RcChannels) -> RcChannels:

@@ -23,6 +23,7 @@ from aerokit.vehicle.state.condition import (
 from aerokit.vehicle.state.equipment import (
     Battery,
     GpsReceiver,
+    Power,
     RangeFinder,
     RcChannels,
     ServoOutputs,
@@ -122,6 +123,9 @@ class States:
         waits_for="BATTERY_STATUS or SYS_STATUS",
     )
     """Every battery (BATTERY_STATUS, else SYS_STATUS)."""
+
+    power: Told[Power] = Told(By("PowerStatus", equipment.power, hz=1.0))
+    """Supply of the board and of its servos in volts (POWER_STATUS)."""
 
     sensors: Told[SensorHealth] = Told(By("SysStatus", condition.sensor_health, knowing=True, hz=2.0))
     """Health of the sensors and the pre-arm checks (SYS_STATUS)."""
