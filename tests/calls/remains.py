@@ -61,7 +61,7 @@ def _all(stage: Stage) -> Iterator[str]:
     yield from _times("file that is being closed", [each for each in closing if not each.ended.is_set()])
     yield from _times("open session", range(stage.simulated.ftp.open_sessions))
     yield from _times("log on its way", range(stage.simulated.storage.logs.is_busy))
-    yield from _times("set-point stream", range(vehicle._holding.stream is not None))
+    yield from _times("set-point stream", range(vehicle._holding.end_stream is not None))
     yield from (f"lock {name}" for name, lock in _locks("vehicle", vehicle, set()) if lock.locked())
 
 

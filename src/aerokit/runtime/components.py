@@ -10,7 +10,9 @@ if TYPE_CHECKING:
 __all__ = ["MAV_AUTOPILOT_INVALID", "MAV_TYPE_GCS", "is_autopilot"]
 
 MAV_TYPE_GCS = 6
+"""A ground station."""
 MAV_AUTOPILOT_INVALID = 8
+"""No flight controller."""
 NO_AUTOPILOTS = frozenset((MAV_TYPE_GCS, 18, 26, 27, *range(30, 35), *range(36, 43), 44, 48))
 """Types of other components: onboard controller, gimbal, ADS-B, camera, servo, battery, … (MAV_TYPE)."""
 

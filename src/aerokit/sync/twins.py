@@ -371,10 +371,6 @@ class SetpointStream(StreamTwin[SetpointT]):
         """
         self._loop.run(self.aio.fly, setpoint, duration_s)
 
-    def stop(self, reason: str, *, hold: bool=True) -> None:
-        """End it by itself. The vehicle is told to hold, unless somebody else steers it by now."""
-        self._loop.call(self.aio.stop, reason, hold=hold)
-
 
 class Guided(TwinOf["AsyncGuided"]):
     """Opens set-point streams: ``async with vehicle.guided.velocity() as stream: stream.set(...)``.

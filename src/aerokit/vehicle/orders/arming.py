@@ -203,7 +203,7 @@ class ArmingActions(Part):
             return wanted
         is_booting = self.telemetry.system_status.latest in BOOTING
         if (
-            self._holding.stream is not None
+            self._holding.end_stream is not None
             or is_booting
             or not self.telemetry.is_surely_disarmed
             or not self._health.unarmable_mode()

@@ -232,11 +232,11 @@ class SetpointStream(Generic[SetpointT]):
         if self._was_entered:
             raise SetpointStreamStopped("a set-point stream is entered once: open another one")
         self._take(self._setpoint)  # refuse nonsense before anything is sent
-        if self._holding.stream is not None:
+        if self._holding.end_stream is not None:
             raise BusyError("another set-point stream is open: leave it first; nothing was sent")
         mode = self._bridge.orders.mode_for("a set-point stream", "setpoint")
         self._was_entered = True
-        self._holding.stream = self
+        self._holding.end_stream = self._stop
         order = self._order = self._bridge.helm.order(mode)
         order.is_given = order.is_given or self._talk.telemetry.is_in(mode)
         try:
@@ -257,14 +257,14 @@ class SetpointStream(Generic[SetpointT]):
         traceback: TracebackType | None,
     ) -> None:
         if self._stopped is None and (reason := self._why_leave_alone()):
-            self.stop(reason, hold=False)
+            self._stop(reason, hold=False)
         if self._stopped is None:
             self._end()
             self._stopped = SetpointStreamStopped("the block of this set-point stream was left")
             if exc is not None:
                 self._hold()
             elif not self._bridge.helm.is_known:  # whoever steers by then is left alone
-                self.stop(f"the vehicle has been silent for {self._talk.heartbeat_age:.1f} s")
+                self._stop(f"the vehicle has been silent for {self._talk.heartbeat_age:.1f} s")
                 raise self._stopped
             elif not self._talk.telemetry.is_surely_disarmed:
                 await self._holding.hold()
@@ -310,15 +310,15 @@ class SetpointStream(Generic[SetpointT]):
         """Send once more, unless something says that nobody steers any more."""
         self._timer = None
         if reason := self._why_leave_alone():
-            self.stop(reason, hold=False)
+            self._stop(reason, hold=False)
             return
         if reason := self._why_stop(self._now() - due):
-            self.stop(reason)
+            self._stop(reason)
             return
         try:
             self._send()
         except Exception as error:
-            self.stop(str(error))
+            self._stop(str(error))
             return
         due = max(due + self._period_s, self._now())
         self._timer = asyncio.get_running_loop().call_at(due, self._tick, due)
@@ -356,7 +356,7 @@ class SetpointStream(Generic[SetpointT]):
         self._was_armed = self._was_armed or self._talk.telemetry.is_armed
         return None
 
-    def stop(self, reason: str, *, hold: bool = True) -> None:
+    def _stop(self, reason: str, *, hold: bool = True) -> None:
         """End it by itself. The vehicle is told to hold, unless somebody else steers it by now."""
         self._end()
         is_told = hold and self._hold()
@@ -370,8 +370,8 @@ class SetpointStream(Generic[SetpointT]):
 
     def _end(self) -> None:
         self._cancel_timer()
-        if self._holding.stream is self:
-            self._holding.stream = None
+        if self._holding.end_stream == self._stop:
+            self._holding.end_stream = None
 
     def _cancel_timer(self) -> None:
         if self._timer is not None:

@@ -6,7 +6,7 @@ import asyncio
 import logging
 import math
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import anyio
 
@@ -15,7 +15,7 @@ from aerokit.runtime.cancellation import Cancellation
 from aerokit.vehicle.orders.orders import CHANGE_MODE, DO_REPOSITION, DO_SET_MODE
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from aerokit.autopilots import Mode
     from aerokit.vehicle.orders.helm import Helm
@@ -37,22 +37,15 @@ STOP_HERE = (DO_REPOSITION, -1, CHANGE_MODE, 0, *(math.nan,) * 4)
 """A place that is no number means: here, with the way it takes to brake."""
 
 
-class OpenStream(Protocol):
-    """A set-point stream, as far as it has to be ended here."""
-
-    def stop(self, reason: str) -> None:
-        """End it, and have the vehicle told to hold."""
-
-
 class Holding:
     """Stops the vehicle: as an order, and when one was given up.
 
-    ``stream`` is the set-point stream that is open.
+    ``end_stream`` ends the set-point stream that is open, for a reason.
     """
 
     def __init__(self, talk: Talk, helm: Helm, orders: Orders) -> None:
         self._talk, self._helm, self._orders = talk, helm, orders
-        self.stream: OpenStream | None = None
+        self.end_stream: Callable[[str], None] | None = None
         self._flight: Order | None = None
         self._scope: Cancellation | None = None
         self._is_over: asyncio.Event | None = None
@@ -197,8 +190,8 @@ class Holding:
 
     def end_flights(self) -> None:
         """At the end of everything: what other tasks still have under way ends, and the vehicle is told to hold."""
-        if self.stream is not None:
-            self.stream.stop("the block of its vehicle was left")
+        if self.end_stream is not None:
+            self.end_stream("the block of its vehicle was left")
         if self._flight is not None:
             self.hold_soon(self._flight)
 
