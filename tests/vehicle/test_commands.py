@@ -266,8 +266,9 @@ async def test_the_time_of_a_vehicle_that_reboots_is_asked_for_as_soon_as_it_has
     )
     await grounded.vehicle.reboot()
     detach()
-    (ordered_at,) = (at for at, each in grounded.wire.sent if getattr(each, "command", 0) == REBOOT)
-    asked_at = [at for at in grounded.wire.times(m.Timesync) if at > ordered_at]
+    sent = grounded.wire.sent
+    ordered = next(i for i, (_, each) in enumerate(sent) if getattr(each, "command", 0) == REBOOT)
+    asked_at = [at for at, each in sent[ordered:] if isinstance(each, m.Timesync)]
     assert asked_at[:1] == answered_at
 
 
