@@ -137,15 +137,21 @@ class EnumDefinition:
     description: str = ""
     origin: str = ""
     remarks: tuple[str, ...] = ()
+    own_prefix: str = ""  # see `prefix`; empty: worked out from the entries
 
     @property
     def class_name(self) -> str:
         """The name of its class: ``MAV_CMD`` is ``MavCmd``."""
         return cap_words(self.name)
 
+    @property
+    def prefix(self) -> str:
+        """What is taken off the names of the entries: what they begin with."""
+        return self.own_prefix or _common_prefix(self.name, [entry.name for entry in self.entries])
+
     def members(self) -> list[tuple[str, EntryDefinition]]:
-        """The entries with their Python names: what all of them begin with is taken off."""
-        prefix = _common_prefix(self.name, [entry.name for entry in self.entries])
+        """The entries with their Python names."""
+        prefix = self.prefix
         return [(_member_name(self.name, prefix, entry.name), entry) for entry in self.entries]
 
 
