@@ -1,8 +1,8 @@
 """`Dialect`: which message an id stands for.
 
-`STANDARD` knows all generated messages: MAVLink's own minimal, standard, common and development, and ardupilotmega (with
-what it includes). Others are read at run time from an XML file or a pymavlink dialect module; their messages which are the
-standard's are the same classes, so that ``isinstance(message, messages.Heartbeat)`` goes on working.
+`STANDARD` knows all generated messages: MAVLink's own minimal, standard, common and development, and ardupilotmega
+(with what it includes). Others are read at run time from an XML file or a pymavlink dialect module; their messages
+which are the standard's are the same classes, so that ``isinstance(message, messages.Heartbeat)`` goes on working.
 """
 
 from __future__ import annotations
