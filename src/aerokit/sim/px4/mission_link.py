@@ -10,7 +10,6 @@ from aerokit.mavlink.enums import MavMissionResult, MavSeverity
 from aerokit.missions.wire import to_wire
 from aerokit.sim.missions import AnyItem, AnyRequest, item_from, item_message_float
 from aerokit.sim.px4.mission_items import checksum, given_back, stored
-from aerokit.sim.px4.mission_messages import AckWithId, CountWithId
 from aerokit.sim.vehicle import sender_of
 
 if TYPE_CHECKING:
@@ -62,11 +61,11 @@ class MissionLink:
         self._px4.send_text(MavSeverity.CRITICAL, text)
 
     def _acknowledge(self, to: tuple[int, int], result: int, opaque_id: int = 0) -> None:
-        self._px4.send(AckWithId(to, result, self._type, opaque_id), self._channel)
+        self._px4.send(m.MissionAck(*to, result, self._type, opaque_id), self._channel)
 
     def _send_count(self) -> None:
         self._sent_at = self._px4.now
-        count = CountWithId(self._partner, self._count, self._type, self._server.id(self._type))
+        count = m.MissionCount(*self._partner, self._count, self._type, self._server.id(self._type))
         self._px4.send(count, self._channel)
 
     def _ask(self) -> None:

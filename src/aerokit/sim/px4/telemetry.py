@@ -18,7 +18,6 @@ from aerokit.mavlink.enums import (
     MavState,
 )
 from aerokit.sim.missions import INVALID_INDEX
-from aerokit.sim.px4.mission_messages import CurrentWithIds
 from aerokit.sim.px4.modes import (
     ACRO,
     ALTITUDE,
@@ -46,7 +45,6 @@ from aerokit.sim.px4.modes import (
 )
 from aerokit.sim.px4.telemetry_identity import IDENTITY_BUILDERS
 from aerokit.sim.px4.telemetry_sensors import SENSOR_BUILDERS
-from aerokit.sim.px4.wire_messages import CurrentEventSequence
 from aerokit.sim.rotations import quaternion_from_euler
 
 if TYPE_CHECKING:
@@ -291,7 +289,7 @@ def _mission_current(px4: SimulatedPx4) -> m.MissionCurrent:
     mission, store = px4.mission, px4.missions
     ids = (store.id(0), store.id(1), store.id(2))
     total = mission.count or INVALID_INDEX
-    return CurrentWithIds(mission.current, total, mission.state, mission.mode, ids)
+    return m.MissionCurrent(mission.current, total, mission.state, mission.mode, *ids)
 
 
 def _vibration(px4: SimulatedPx4) -> m.Vibration:
@@ -348,7 +346,7 @@ BUILDERS: dict[int, Callable[[SimulatedPx4], Message | None]] = {
     m.SystemTime.ID: _system_time,
     m.CurrentMode.ID: _current_mode,
     m.Ping.ID: _ping,
-    CurrentEventSequence.ID: lambda px4: px4.events.current(),
+    m.CurrentEventSequence.ID: lambda px4: px4.events.current(),
     **SENSOR_BUILDERS,
     **IDENTITY_BUILDERS,
 }

@@ -23,8 +23,6 @@ __all__ = ["PlanContext", "PlanFiles", "PlanMemory"]
 
 FRESH_IDS_S = 2.5
 """MISSION_CURRENT comes at 1 Hz."""
-IDS_AT = (6, 10, 14)
-"""Where in its payload ``mission_id``, ``fence_id`` and ``rally_points_id`` are: the dialect does not have them yet."""
 
 
 class PlanFiles(Protocol):
@@ -103,8 +101,8 @@ class PlanContext:
         frame = self._current
         if frame is None or frame.received_at <= since or self.now() - frame.received_at > FRESH_IDS_S:
             return 0
-        at = IDS_AT[mission_type]
-        return int.from_bytes(frame.payload[at : at + 4], "little")
+        current = MissionCurrent.decode_body(frame.body)
+        return (current.mission_id, current.fence_id, current.rally_points_id)[mission_type]
 
     async def is_called(self, mission_type: int, opaque_id: int) -> bool:
         """Whether MISSION_CURRENT, waited for, calls the plan so."""
