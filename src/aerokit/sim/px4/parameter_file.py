@@ -6,8 +6,8 @@ import struct
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from aerokit.protocols.ftp_message import DATA_SIZE
 from aerokit.sim.file_tree import EINVAL, FileFault, OpenFile
-from aerokit.sim.ftp import DATA_SIZE
 from aerokit.sim.parameter_pack_file import FORMATS, HEADER, MAGIC, ParameterPackMount
 
 if TYPE_CHECKING:
