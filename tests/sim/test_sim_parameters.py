@@ -25,7 +25,8 @@ from aerokit.sim import SimulatedCopter, SimulatedPx4
 from aerokit.sim.ardupilot.parameter_server import rounded
 from aerokit.sim.ardupilot.parameter_tables import KINDS, parameters_of
 from aerokit.sim.file_tree import FileFault
-from aerokit.sim.parameter_pack_file import packed_parameters
+from aerokit.sim.parameter_pack_file import ParameterPackMount
+from aerokit.sim.parameters import Parameters
 from aerokit.sim.px4.parameter_server import parameter_hash
 from aerokit.sim.px4.parameters import px4_parameters
 
@@ -185,13 +186,22 @@ def test_faults_clamp_protect_and_mute() -> None:
 def test_the_pack_is_what_the_firmware_packs(block: int) -> None:
     parameters = parameters_of("copter")
     rows = [parameters.row(name) for name in parameters.names]
-    for whole in (False, True):
-        packed = packed_parameters(rows, len(rows), block, with_defaults=True, whole_defaults=whole)
-        assert list(unpack_parameters(packed)) == [row.name for row in rows]
-    table = unpack_parameters(packed)
-    assert list(table) == [row.name for row in rows]
-    for row in rows:
-        assert (table[row.name].value, table[row.name].default) == (row.value, row.default)
+    for fixed in (None, block):
+        table = unpack_parameters(served(parameters, "param.pck?withdefaults=1", block, fixed))
+        assert list(table) == [row.name for row in rows]
+        for row in rows:
+            assert (table[row.name].value, table[row.name].default) == (row.value, row.default)
+
+
+def served(
+    parameters: Parameters, path: str = "param.pck", block: int = 239, fixed: int | None = None
+) -> bytes:
+    """What a vehicle gives to who reads in such blocks."""
+    file = ParameterPackMount(parameters, lambda *_: None, block=fixed).open(path, writing=False)
+    content = b""
+    while piece := file.read(len(content), block):
+        content += piece
+    return content
 
 
 def test_a_pack_is_read_by_parts_and_in_one_block_size() -> None:
@@ -212,9 +222,8 @@ def test_a_pack_is_read_by_parts_and_in_one_block_size() -> None:
 def test_an_uploaded_pack_takes_effect_at_its_end() -> None:
     copter, client = a_copter(parameter_count=100)
     ftp = FtpClient(client)
-    some = [copter.parameters.row(name) for name in copter.parameters.names]
-    assert some
-    table = unpack_parameters(packed_parameters(some, len(some), 239))
+    table = unpack_parameters(served(copter.parameters))
+    assert table
     content = pack_parameters(table)
     for name in ("RTL_ALT", "WPNAV_SPEED", "DISARM_DELAY"):
         copter.parameters[name] = 1
@@ -332,8 +341,7 @@ def test_px4_has_the_file_when_it_is_new_enough() -> None:
 def test_px4_takes_a_pack_in_order_only() -> None:
     px4, client = a_px4(parameter_count=100, parameter_file=True)
     ftp = FtpClient(client)
-    rows = [px4.parameters.row(name) for name in px4.parameters.names]
-    content = pack_parameters(unpack_parameters(packed_parameters(rows, len(rows), 239)))
+    content = pack_parameters(unpack_parameters(served(px4.parameters)))
     first, second = content[:239], content[239:478]
     names = px4.parameters.names
     for name in names:
