@@ -12,6 +12,7 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavResult, MavState
 from aerokit.missions import MissionItem
 from aerokit.sim import SimulatedPx4
+from aerokit.sim.px4.telemetry import BUILDERS
 
 NAN = math.nan
 ARM = MavCmd.COMPONENT_ARM_DISARM
@@ -297,10 +298,19 @@ def test_events_are_counted_from_just_before_the_overflow() -> None:
     assert (event.sequence, event.id, event.arguments[0]) == (65526, 26266355, 4)
 
 
+def test_all_that_it_can_tell_can_be_sent() -> None:
+    px4, _ = ready()
+    built = [message for message in map(px4.build, BUILDERS) if message is not None]
+    assert len(built) > 60
+    assert all(len(message.encode()) == message.LENGTH for message in built)
+
+
 def test_messages_that_pymavlink_has_not_are_read_by_their_names() -> None:
     px4, client = ready()
     client.command(MavCmd.REQUEST_MESSAGE, m.ComponentMetadata.ID)
     assert client.last(m.ComponentMetadata).uri == "mftp://etc/extras/component_general.json.xz"
+    client.command(MavCmd.REQUEST_MESSAGE, m.ComponentInformation.ID)
+    assert client.last(m.ComponentInformation).peripherals_metadata_uri == ""
     client.command(MavCmd.REQUEST_PROTOCOL_VERSION)
     assert client.last(m.ProtocolVersion).max_version == 203
     assert px4.build(m.TimeEstimateToTarget.ID) == m.TimeEstimateToTarget(-1, -1, -1, -1, -1)

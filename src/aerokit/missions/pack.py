@@ -44,12 +44,12 @@ class PlanHeader(NamedTuple):
     mission_type: int
     options: int
     first: int
-    count: int
+    items: int
 
     @property
     def length(self) -> int:
         """Bytes of the whole file."""
-        return HEADER.size + self.count * _ITEM_LENGTH
+        return HEADER.size + self.items * _ITEM_LENGTH
 
 
 def pack_items(
@@ -107,7 +107,7 @@ def unpack_items(data: bytes, mission_type: int | None = None) -> tuple[MissionI
         )
     if len(data) != header.length:
         raise RemoteProtocolError(
-            f"a packed plan of {header.count} items has {header.length} bytes, this has {len(data)}"
+            f"a packed plan of {header.items} items has {header.length} bytes, this has {len(data)}"
         )
     starts = range(HEADER.size, header.length, _ITEM_LENGTH)
     return tuple(from_wire(MissionItemInt.decode(data[at : at + _ITEM_LENGTH])) for at in starts)

@@ -63,7 +63,7 @@ class PackHeader(NamedTuple):
     """The first six bytes; ``total`` is the number of the vehicle's parameters, in an upload the length in bytes."""
 
     magic: int
-    count: int
+    parameters: int
     total: int
 
 

@@ -61,7 +61,7 @@ logger = logging.getLogger("aerokit")
 
 ItemT = TypeVar("ItemT", bound="Message | Event")
 
-MAV_STATE_ACTIVE = 4
+MAV_STATE_ACTIVE = 4  # no enums here: they would take two milliseconds of every connect
 MAV_COMP_ID_MISSIONPLANNER = 190
 """The component id that ground stations take."""
 HEARTBEAT_PERIOD_S = 1.0

@@ -79,7 +79,7 @@ class _Writer(OpenFile):
         if offset == 0:
             with suppress(RemoteProtocolError):
                 header = read_header(data)
-                if header.count < INVALID_INDEX:
+                if header.items < INVALID_INDEX:
                     content.extend(bytes(max(0, header.length - len(content))))
         content.extend(bytes(max(0, offset + len(data) - len(content))))
         content[offset : offset + len(data)] = data
@@ -87,7 +87,7 @@ class _Writer(OpenFile):
     def close(self) -> None:
         self.is_closed = True
         try:
-            header = read_header(self._content)
+            header = read_header(bytes(self._content))
             items = unpack_items(bytes(self._content[: header.length]))
         except (RemoteProtocolError, LocalProtocolError):
             raise FileFault(EINVAL) from None

@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import MavParamError, MavParamType
 from aerokit.mavlink.messages import ParamValue
-from aerokit.sim.parameter_server import UNCOUNTED, ParameterServer
+from aerokit.parameters.encoding import UNKNOWN_INDEX
+from aerokit.parameters.px4_hash import HASH_NAME
+from aerokit.sim.parameter_server import ParameterServer
 from aerokit.sim.vehicle import sender_of
 
 if TYPE_CHECKING:
@@ -17,11 +19,9 @@ if TYPE_CHECKING:
     from aerokit.sim.parameters import Parameters
     from aerokit.sim.vehicle import SimulatedVehicle
 
-__all__ = ["HASH_NAME", "Px4ParameterServer", "parameter_hash"]
+__all__ = ["Px4ParameterServer", "parameter_hash"]
 
-HASH_NAME = "_HASH_CHECK"
 _SECOND_ECHO_S = 0.02
-_TYPE_UNSUPPORTED, _TYPE_MISMATCH = 6, 7
 _GARBAGE = 24400
 """What was seen in the field of a PARAM_ERROR that is not used."""
 
@@ -61,7 +61,7 @@ class Px4ParameterServer(ParameterServer):
 
     def _send_hash(self, channel: Channel) -> None:
         bits, count = parameter_hash(self._parameters).to_bytes(4, "little"), len(self._parameters)
-        message = _BytewiseParamValue(HASH_NAME, bits, MavParamType.UINT32, count, UNCOUNTED)
+        message = _BytewiseParamValue(HASH_NAME, bits, MavParamType.UINT32, count, UNKNOWN_INDEX)
         self._vehicle.send(message, channel)
 
     def _on_read(self, request: ParamRequestRead, channel: Channel) -> None:
@@ -102,8 +102,8 @@ class Px4ParameterServer(ParameterServer):
         if name not in self._parameters:
             return MavParamError.DOES_NOT_EXIST
         if type_ not in (MavParamType.INT32, MavParamType.REAL32):
-            return _TYPE_UNSUPPORTED
-        return None if type_ == self._parameters.type(name) else _TYPE_MISMATCH
+            return MavParamError.TYPE_UNSUPPORTED
+        return None if type_ == self._parameters.type(name) else MavParamError.TYPE_MISMATCH
 
     def _refuse(self, to: tuple[int, int], name: str, index: int, code: int, channel: Channel) -> None:
         if self.errors:

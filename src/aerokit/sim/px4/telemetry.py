@@ -16,6 +16,7 @@ from aerokit.mavlink.enums import (
     MavLandedState,
     MavModeFlag,
     MavState,
+    MavSysStatusSensor,
 )
 from aerokit.sim.missions import INVALID_INDEX
 from aerokit.sim.px4.modes import (
@@ -55,7 +56,8 @@ __all__ = ["BUILDERS", "available_modes", "global_origin"]
 
 _PRESENT, _ENABLED = 0x0300402F, 0x0301402F
 _HEALTHY, _BOOTING = 0x1320C83F, 0x0320883F
-_GPS_BIT, _RC_BIT, _PREARM_BIT = 0x20, 0x10000, 0x10000000
+_GPS_BIT, _RC_BIT = int(MavSysStatusSensor.GPS), int(MavSysStatusSensor.RC_RECEIVER)
+_PREARM_BIT = int(MavSysStatusSensor.MAV_SYS_STATUS_PREARM_CHECK)
 _STANDARD = {mode: number for number, mode in STANDARD_MODES.items()}
 """Mode → MAV_STANDARD_MODE."""
 _LISTED = (

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavAutopilot
+from aerokit.mavlink.enums import MavAutopilot, MavOdidUaType, MavType, StorageStatus
 from aerokit.sim.px4.modes import custom_mode
 
 if TYPE_CHECKING:
@@ -19,7 +19,6 @@ __all__ = ["IDENTITY_BUILDERS"]
 _LIBRARY_HASH = b"\xa4C\x87s\xec\x08o="
 _METADATA_URI, _METADATA_CRC = "mftp://etc/extras/component_general.json.xz", 2472443404
 _CAPACITY_MIB, _USED_MIB = 258_019.6, 192_146.9
-_STATUS_READY = 2
 _REMOTE_ID_EPOCH = 1_546_300_800
 """2019-01-01, from which OPEN_DRONE_ID counts seconds."""
 _ANYONE = bytes(20)
@@ -39,7 +38,7 @@ def _protocol_version(_: SimulatedPx4) -> m.ProtocolVersion:
 def _storage_information(px4: SimulatedPx4) -> m.StorageInformation:
     free = _CAPACITY_MIB - _USED_MIB
     return m.StorageInformation(
-        px4.time_boot_ms, 1, 1, _STATUS_READY, _CAPACITY_MIB, _USED_MIB, free, 0.0, 0.0
+        px4.time_boot_ms, 1, 1, StorageStatus.READY, _CAPACITY_MIB, _USED_MIB, free, 0.0, 0.0
     )
 
 
@@ -54,7 +53,7 @@ def _component_metadata(px4: SimulatedPx4) -> m.ComponentMetadata:
 
 
 def _component_information(px4: SimulatedPx4) -> m.ComponentInformation:
-    return m.ComponentInformation(px4.time_boot_ms, _METADATA_CRC, 0, _METADATA_URI, "")
+    return m.ComponentInformation(px4.time_boot_ms, _METADATA_CRC, _METADATA_URI, 0, "")
 
 
 def _mag_cal_report(_: SimulatedPx4) -> m.MagCalReport:
@@ -99,7 +98,8 @@ def _high_latency(px4: SimulatedPx4) -> m.HighLatency2:
 
 
 def _basic_id(px4: SimulatedPx4) -> m.OpenDroneIdBasicId:
-    kind = 1 if px4.VEHICLE_TYPE == 1 else 2
+    is_plane = px4.VEHICLE_TYPE == MavType.FIXED_WING
+    kind = MavOdidUaType.AEROPLANE if is_plane else MavOdidUaType.HELICOPTER_OR_MULTIROTOR
     return m.OpenDroneIdBasicId(0, 0, _ANYONE, 1, kind, b"1006554d49534954414\0")
 
 

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import MavLandedState
 from aerokit.sim.motion import GRAVITY_M_S2
 from aerokit.sim.px4.modes import ORBIT
 from aerokit.sim.rotations import quaternion_from_euler
@@ -25,7 +26,6 @@ _COVARIANCE = tuple([math.nan] * 21)
 _UNUSED_CHANNEL = 65535
 _OUTPUTS = 16
 _DISARMED_US = 900
-_LANDED, _IN_AIR = 1, 2
 _CLIMB_M_S, _DESCENT_M_S = 3.0, 0.7
 
 
@@ -141,7 +141,7 @@ def _state_for_gimbal(px4: SimulatedPx4) -> m.AutopilotStateForGimbalDevice:
     o = px4.motion
     q = quaternion_from_euler(o.roll, o.pitch, o.yaw)
     velocity = (o.velocity_north, o.velocity_east, o.velocity_down)
-    landed = _LANDED if px4.is_landed else _IN_AIR
+    landed = MavLandedState.ON_GROUND if px4.is_landed else MavLandedState.IN_AIR
     return m.AutopilotStateForGimbalDevice(
         0,
         0,
