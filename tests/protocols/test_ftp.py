@@ -56,7 +56,7 @@ def test_what_is_encoded_is_decoded(
     sequence: int, opcode: int, session: int, asked: int, complete: bool, offset: int, data: bytes
 ) -> None:
     message = FtpMessage(sequence, opcode, session, len(data), asked, complete, offset, data)
-    theirs = FTP_OP(sequence, session, opcode, len(data), asked, complete, offset, data).pack()
+    theirs = FTP_OP(sequence, session, opcode, len(data), asked, complete, offset, bytearray(data)).pack()
     assert message.encode() == bytes(theirs).ljust(251, b"\0")
     assert FtpMessage.decode(message.encode()) == message
     assert FtpMessage.decode(message.encode(), cut=False).data == data.ljust(239, b"\0")

@@ -68,11 +68,12 @@ class PackHeader(NamedTuple):
 
 
 class PackEntry(NamedTuple):
-    """One parameter as the file has it: ``values`` are the value and, where it is there, the default."""
+    """One parameter as the file has it; ``default`` is None where it is not there."""
 
     name: bytes
     type: ParameterType
-    values: tuple[int | float, ...]
+    value: int | float
+    default: int | float | None
     end: int
 
 
@@ -173,8 +174,9 @@ def read_entry(data: bytes, position: int, last: bytes) -> PackEntry | None:
     end = start + format_.size * (2 if flags else 1)
     if end > len(data):
         return None
-    values = tuple(format_.unpack_from(data, at)[0] for at in range(start, end, format_.size))
-    return PackEntry(last[:common] + data[position + 2 : start], kind, values, end)
+    value = format_.unpack_from(data, start)[0]
+    default = format_.unpack_from(data, start + format_.size)[0] if flags else None
+    return PackEntry(last[:common] + data[position + 2 : start], kind, value, default, end)
 
 
 def _parameters(data: bytes, with_defaults: bool, index: int) -> Iterator[Parameter]:
@@ -183,8 +185,8 @@ def _parameters(data: bytes, with_defaults: bool, index: int) -> Iterator[Parame
         entry = read_entry(data, position, last)
         if entry is None:
             _damaged(position, "ends within an entry")
-        default = entry.values[-1] if with_defaults else entry.values[1] if len(entry.values) > 1 else None
-        yield Parameter(_text(entry.name, position), entry.values[0], entry.type, default, index)
+        default = entry.value if entry.default is None and with_defaults else entry.default
+        yield Parameter(_text(entry.name, position), entry.value, entry.type, default, index)
         position, last, index = entry.end, entry.name, index + 1
 
 

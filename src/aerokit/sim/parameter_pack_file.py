@@ -129,11 +129,11 @@ class _Writer(OpenFile):
         position, last = HEADER.size, b""
         for _ in range(count):
             entry = read_entry(content, position, last) if position < len(content) else None
-            if entry is None or len(entry.values) > 1:
+            if entry is None or entry.default is not None:
                 raise FileFault(EINVAL)
             name = entry.name.decode("ascii", "replace")
             if name in self._parameters:
-                self._apply(name, entry.values[0])
+                self._apply(name, entry.value)
             position, last = entry.end, entry.name
 
 

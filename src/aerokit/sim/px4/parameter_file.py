@@ -88,10 +88,10 @@ class _Writer(OpenFile):
             self._spoil()
         if entry is None:
             return False
-        if len(entry.values) > 1:
+        if entry.default is not None:
             self._spoil()
         name = entry.name.decode("ascii", "replace")
         if name in self._parameters:
-            self._apply(name, entry.values[0])
+            self._apply(name, entry.value)
         self._pending, self._last, self._count = pending[entry.end :], entry.name, self._count + 1
         return True
