@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import math
 import struct
+import zlib
 from contextlib import suppress
 
 import pytest
@@ -14,20 +15,15 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavParamError, MavParamType
 from aerokit.mavlink.message import Message
 from aerokit.parameters import (
-    Parameter,
-    ParameterTable,
-    ParameterType,
     pack_parameters,
     unpack_parameters,
 )
-from aerokit.parameters.px4_hash import px4_hash
 from aerokit.sim import SimulatedCopter, SimulatedPx4
 from aerokit.sim.ardupilot.parameter_server import rounded
 from aerokit.sim.ardupilot.parameter_tables import KINDS, parameters_of
 from aerokit.sim.file_tree import FileFault
 from aerokit.sim.parameter_pack_file import ParameterPackMount
 from aerokit.sim.parameters import Parameters
-from aerokit.sim.px4.parameter_server import parameter_hash
 from aerokit.sim.px4.parameters import px4_parameters
 
 REAL, INT8, INT16, INT32 = MavParamType.REAL32, MavParamType.INT8, MavParamType.INT16, MavParamType.INT32
@@ -248,31 +244,36 @@ def test_no_uploaded_bytes_break_the_vehicle(noise: bytes, count: int) -> None:
 # ------------------------------------------------------------------------------------------ PX4
 
 
-def test_px4s_hash_is_that_of_the_library() -> None:
-    parameters = px4_parameters()
-    rows = [parameters.row(name) for name in parameters.names]
-    volatile = {row.name for row in rows if row.is_volatile}
-    assert "CAL_ACC0_XOFF" in volatile
-    table = ParameterTable(
-        Parameter(row.name, int(row.value) if row.type == INT32 else row.value, ParameterType(row.type))
-        for row in rows
-    )
-    assert parameter_hash(parameters) == px4_hash(table, volatile)
-    parameters["CAL_ACC0_XOFF"] = 1.0
-    assert parameter_hash(parameters) == px4_hash(table, volatile)
-    parameters["MPC_XY_CRUISE"] = 6.0
-    assert parameter_hash(parameters) != px4_hash(table, volatile)
+def test_px4s_hash_is_of_all_but_the_volatile_ones() -> None:
+    px4, client = a_px4()
+    rows = [px4.parameters.row(name) for name in px4.parameters.names]
+    crc = 0xFFFFFFFF
+    for row in rows:
+        if not row.is_volatile:
+            value = struct.pack("<i", int(row.value)) if row.type == INT32 else struct.pack("<f", row.value)
+            crc = zlib.crc32(row.name.encode() + value, crc)
+    assert px4.parameters.row("CAL_ACC0_XOFF").is_volatile
+
+    def told_hash() -> int:
+        (answer,) = told(client, m.ParamRequestRead(1, 1, "_HASH_CHECK", -1))
+        return bits_of(answer)
+
+    assert told_hash() == crc ^ 0xFFFFFFFF
+    px4.parameters["CAL_ACC0_XOFF"] = 1.0
+    assert told_hash() == crc ^ 0xFFFFFFFF
+    px4.parameters["MPC_XY_CRUISE"] = 6.0
+    assert told_hash() != crc ^ 0xFFFFFFFF
 
 
 def test_px4_sends_its_hash_first_and_a_second_request_begins_without() -> None:
-    px4, client = a_px4()
+    _, client = a_px4()
     client.send(m.ParamRequestList(1, 1))
     client.run(0.2)
     client.send(m.ParamRequestList(1, 1))
     client.run(1.5)
     values = client.all(m.ParamValue)
     assert [v.param_id for v in values].count("_HASH_CHECK") == 1
-    assert (bits_of(values[0]), values[0].param_index) == (parameter_hash(px4.parameters), 0xFFFF)
+    assert (values[0].param_id, values[0].param_index) == ("_HASH_CHECK", 0xFFFF)
     assert [v.param_index for v in values[-910:]] == list(range(910))
     assert told(client, m.ParamRequestList(0, 0), 1.0) == []
 

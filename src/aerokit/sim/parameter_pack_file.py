@@ -10,12 +10,11 @@ from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from aerokit.errors import LocalProtocolError, RemoteProtocolError
-from aerokit.parameters import Parameter, ParameterType
 from aerokit.parameters.pack import HEADER, MAGIC, pack_served, read_entry, read_header
 from aerokit.sim.file_tree import EINVAL, ENOENT, FileFault, Mount, OpenFile
 
 if TYPE_CHECKING:
-    from aerokit.sim.parameters import ParameterRow, Parameters
+    from aerokit.sim.parameters import Parameters
 
 __all__ = ["ParameterPackMount"]
 
@@ -76,7 +75,7 @@ class _Reader(OpenFile):
     def _packed(self) -> bytes:
         try:
             return pack_served(
-                map(_parameter, map(self._parameters.row, self._parameters.names)),
+                (self._parameters.row(name).as_parameter() for name in self._parameters.names),
                 start=self._start,
                 count=self._count,
                 with_defaults=bool(self._with_defaults),
@@ -135,12 +134,6 @@ class _Writer(OpenFile):
             if name in self._parameters:
                 self._apply(name, entry.value)
             position, last = entry.end, entry.name
-
-
-def _parameter(row: ParameterRow) -> Parameter:
-    type_ = ParameterType(row.type)
-    value, default = (int(x) if type_.is_integer else x for x in (row.value, row.default))
-    return Parameter(row.name, value, type_, default)
 
 
 def _query(path: str) -> dict[str, int]:
