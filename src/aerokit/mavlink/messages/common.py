@@ -21142,9 +21142,9 @@ _S300 = Struct('<HHH8s8s')
 
 
 class ProtocolVersion(Message):
-    """PROTOCOL_VERSION (300): Which versions of MAVLink a node speaks; sent on request, as MAVLink 2.
+    """PROTOCOL_VERSION (300): Which versions of MAVLink a node speaks; sent on request.
 
-    Deprecated since 2025-11, replaced by Nothing.
+    Deprecated since 2025-11. Nothing takes its place.
 
     https://mavlink.io/en/messages/common.html#PROTOCOL_VERSION
     """
