@@ -4,8 +4,8 @@
     python -m aerokit.sync.generator --check    # compare: 0 the same, 1 different
 
 Two rules make a member: a coroutine runs on the loop, and anything else is called there. What is returned and has a
-twin is wrapped in it; what only reads is read where the program is. `TWINS` has the classes. Arguments, defaults and
-docstrings are those of the originals; names in annotations are imported from where the original has them.
+twin is wrapped in it; what only reads is read where the program is. `originals.py` has the classes. Arguments,
+defaults and docstrings are those of the originals; names in annotations are imported from where the original has them.
 """
 
 from __future__ import annotations
@@ -13,90 +13,23 @@ from __future__ import annotations
 import argparse
 import ast
 import builtins
-import copy
 import importlib
 import inspect
 import sys
-from dataclasses import dataclass, field, replace
-from functools import cache
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, ForwardRef, get_args, get_origin
+from typing import TYPE_CHECKING
+
+from aerokit.sync.originals import TWINS, Member, Twin, decorators_of, function_node, imports_of, members_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Sequence
 
-__all__ = ["TWINS", "Twin", "generate"]
+__all__ = ["FILE", "generate"]
 
 FILE = Path(__file__).with_name("twins.py")
+"""What is written."""
 WIDTH = 100
-
-
-@dataclass(frozen=True)
-class Twin:
-    """One class to be made: ``base`` is what is written by hand for it, in ``blocks.py``.
-
-    ``only``: these members alone; ``without``: all but these. ``direct``: methods that only read, and are called on
-    the thread of the program; ``called``: properties that are read on the loop.
-    """
-
-    path: str
-    base: str = "TwinOf"
-    only: frozenset[str] = frozenset()
-    without: frozenset[str] = frozenset()
-    direct: frozenset[str] = frozenset()
-    called: frozenset[str] = frozenset()
-    parameter: str = ""
-
-    @property
-    def name(self) -> str:
-        """Of the class; both have the same."""
-        return self.path.rpartition(".")[2]
-
-    @property
-    def module(self) -> str:
-        """Where the original is."""
-        return self.path.rpartition(".")[0]
-
-
-def _names(text: str) -> frozenset[str]:
-    return frozenset(text.split())
-
-
-TWINS = (
-    Twin(
-        "aerokit.runtime.cells.StateCell",
-        "CellTwin",
-        without=_names("observe set forget close"),
-        direct=_names("fresh"),
-        parameter="T",
-    ),
-    Twin("aerokit.runtime.cells.Changes", "ChangesTwin", parameter="T"),
-    Twin("aerokit.runtime.subscription.Subscription", "SubscriptionTwin", parameter="ItemT"),
-    Twin(
-        "aerokit.runtime.connection.Connection",
-        "ConnectionTwin",
-        only=_names("send subscribe link_state signing unsent_bytes discard_unsent is_open now counts"),
-        direct=_names("now"),
-        called=_names("unsent_bytes"),
-    ),
-    Twin("aerokit.vehicle.orders.guided.SetpointStream", "StreamTwin", parameter="SetpointT"),
-    Twin("aerokit.vehicle.orders.guided.Guided"),
-    Twin("aerokit.vehicle.files.files.Files"),
-    Twin("aerokit.vehicle.files.logs.Logs"),
-    Twin("aerokit.vehicle.parameters.transaction.Temporarily", "TemporarilyTwin"),
-    Twin("aerokit.vehicle.parameters.transaction.Transaction", "TransactionTwin"),
-    Twin("aerokit.vehicle.parameters.parameters.Parameters", direct=_names("load_metadata")),
-    Twin("aerokit.vehicle.plans.mission.MissionControl"),
-    Twin("aerokit.vehicle.plans.fence.FenceControl"),
-    Twin("aerokit.vehicle.plans.rally.RallyControl"),
-    Twin(
-        "aerokit.vehicle.vehicle.Vehicle",
-        "VehicleTwin",
-        without=_names("telemetry"),
-        direct=_names("distance_to describe_now"),
-    ),
-)
-"""The classes that programs without ``async`` use, each below those that it gives."""
 FUNCTIONS = ("aerokit.runtime.opening.open_connection", "aerokit.vehicle.connect.connect")
 """Blocks that are opened by a function."""
 
@@ -114,145 +47,6 @@ from functools import cached_property
 from typing import TYPE_CHECKING, TypeVar
 
 '''
-
-
-# --------------------------------------------------------------------------------------- reading
-
-
-@cache
-def _tree(module: str) -> ast.Module:
-    return ast.parse(Path(inspect.getfile(importlib.import_module(module))).read_text(encoding="utf-8"))
-
-
-@cache
-def _imports(module: str) -> dict[str, tuple[str, str]]:
-    """Name in this module → where it is imported from, and by which name."""
-    found: dict[str, tuple[str, str]] = {}
-    for node in ast.walk(_tree(module)):
-        if isinstance(node, ast.ImportFrom) and node.module:
-            found |= {each.asname or each.name: (node.module, each.name) for each in node.names}
-        elif isinstance(node, ast.Import):
-            found |= {each.asname or each.name: (each.name, "") for each in node.names}
-    return found
-
-
-def _class_node(cls: type) -> ast.ClassDef:
-    return next(
-        node
-        for node in _tree(cls.__module__).body
-        if isinstance(node, ast.ClassDef) and node.name == cls.__name__
-    )
-
-
-def _function_node(module: str, name: str) -> ast.AsyncFunctionDef:
-    return next(
-        node for node in _tree(module).body if isinstance(node, ast.AsyncFunctionDef) and node.name == name
-    )
-
-
-# --------------------------------------------------------------------------------------- members
-
-
-@dataclass
-class Member:
-    """One member of a twin, and the modules that its annotations are to be understood in."""
-
-    name: str
-    module: tuple[str, ...]
-    node: ast.FunctionDef | ast.AsyncFunctionDef | None
-    returns: ast.expr | None
-    text: str | None
-    is_cell: bool = False
-    """A declared state."""
-
-
-def _members(twin: Twin) -> list[Member]:
-    """Those of the class and of what it inherits, each once, in the order of the oldest definition."""
-    cls = getattr(importlib.import_module(twin.module), twin.name)
-    found: dict[str, Member] = {}
-    filled = _filled(cls)
-    for each in reversed(cls.__mro__):
-        if each.__module__.startswith("aerokit."):
-            found |= {member.name: filled(member) for member in _own(each)}
-    wanted = twin.only or frozenset(found)
-    return [each for name, each in found.items() if name in wanted and name not in twin.without]
-
-
-def _filled(cls: type) -> Callable[[Member], Member]:
-    """Puts what a class gives its generic base into the place of the base's type variable."""
-    given: dict[str, str] = {}
-    for base in getattr(cls, "__orig_bases__", ()):
-        names = [each.__name__ for each in getattr(get_origin(base), "__parameters__", ())]
-        values = [each.__forward_arg__ for each in get_args(base) if isinstance(each, ForwardRef)]
-        given |= dict(zip(names, values))  # noqa: B905 - none of them where it is no forward reference
-
-    class Fill(ast.NodeTransformer):
-        def visit_Name(self, node: ast.Name) -> ast.Name:
-            return ast.Name(given.get(node.id, node.id))
-
-    def fill(member: Member) -> Member:
-        if not given or member.node is None:
-            return member
-        node = Fill().visit(copy.deepcopy(member.node))
-        return replace(member, node=node, returns=node.returns, module=(*member.module, cls.__module__))
-
-    return fill
-
-
-def _own(cls: type) -> Iterator[Member]:
-    body = _class_node(cls).body
-    for index, node in enumerate(body):
-        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
-            if node.name == "__init__" and isinstance(node, ast.FunctionDef):
-                yield from _attributes(node, (cls.__module__,))
-            elif not node.name.startswith("_") and not _is_setter(node):
-                yield Member(node.name, (cls.__module__,), node, node.returns, ast.get_docstring(node))
-        elif isinstance(node, ast.AnnAssign) and _is_told(node.annotation):
-            assert isinstance(node.target, ast.Name)
-            assert isinstance(node.annotation, ast.Subscript)
-            kind = ast.Subscript(ast.Name("StateCell"), node.annotation.slice)
-            yield Member(
-                node.target.id, (cls.__module__,), None, kind, _text_below(body, index), is_cell=True
-            )
-
-
-def _attributes(init: ast.FunctionDef, module: tuple[str, ...]) -> Iterator[Member]:
-    """Public attributes, with their documentation below them; the type is annotated, or the class that is called."""
-    for index, node in enumerate(init.body):
-        target: ast.expr | None = node.target if isinstance(node, ast.AnnAssign) else None
-        if isinstance(node, ast.Assign) and len(node.targets) == 1:
-            target = node.targets[0]
-        if not isinstance(target, ast.Attribute) or target.attr.startswith("_"):
-            continue
-        kind: ast.expr | None = None
-        if isinstance(node, ast.AnnAssign):
-            kind = node.annotation
-        elif isinstance(node, ast.Assign) and isinstance(node.value, ast.Call):
-            kind = node.value.func
-        yield Member(target.attr, module, None, kind, _text_below(init.body, index))
-
-
-def _text_below(body: Sequence[ast.stmt], index: int) -> str | None:
-    below = body[index + 1] if index + 1 < len(body) else None
-    if isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant):
-        return inspect.cleandoc(str(below.value.value))
-    return None
-
-
-def _is_told(annotation: ast.expr) -> bool:
-    return (
-        isinstance(annotation, ast.Subscript)
-        and isinstance(annotation.value, ast.Name)
-        and annotation.value.id == "Told"
-    )
-
-
-def _decorators(node: ast.FunctionDef | ast.AsyncFunctionDef) -> set[str]:
-    return {ast.unparse(each) for each in node.decorator_list}
-
-
-def _is_setter(node: ast.FunctionDef | ast.AsyncFunctionDef) -> bool:
-    return any(each.endswith(".setter") for each in _decorators(node))
 
 
 # --------------------------------------------------------------------------------------- writing
@@ -280,7 +74,7 @@ class Page:
     def _need_name(self, name: str, modules: tuple[str, ...], at_run_time: bool) -> None:
         if name in self._twins or name in TYPE_VARIABLES or hasattr(builtins, name):
             return
-        where = next((found[name] for found in map(_imports, modules) if name in found), (modules[0], name))
+        where = next((found[name] for found in map(imports_of, modules) if name in found), (modules[0], name))
         (self.at_run_time if at_run_time else self.for_types).add(where)
 
     def returned(self, expression: str, returns: ast.expr | None) -> str:
@@ -292,14 +86,14 @@ class Page:
         """The lines of one member."""
         self.need(member.returns, member.module)
         node, name = member.node, member.name
-        if node is None or "property" in _decorators(node):
+        if node is None or "property" in decorators_of(node):
             return self._value(twin, member)
         for argument in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs, node.args.vararg):
             self.need(argument.annotation if argument else None, member.module)
         for default in (*node.args.defaults, *node.args.kw_defaults):
             self.need(default, member.module, at_run_time=True)
         arguments = _forwarded(node)
-        if "contextmanager" in _decorators(node):
+        if "contextmanager" in decorators_of(node):
             self.for_types.add(("contextlib", "AbstractContextManager"))
             inner = node.returns.slice if isinstance(node.returns, ast.Subscript) else ast.Constant(None)
             kind = ast.Subscript(ast.Name("AbstractContextManager"), inner)
@@ -427,13 +221,13 @@ def _class(page: Page, twin: Twin) -> str:
     if base == "TwinOf":
         base += f'["Async{twin.name}"]'
     text = _docstring(inspect.getdoc(original), "    ")
-    members = "\n".join(page.member(twin, each) for each in _members(twin))
+    members = "\n".join(page.member(twin, each) for each in members_of(twin))
     return f"class {twin.name}({base}):\n{text}\n{members}"
 
 
 def _opener(page: Page, path: str) -> str:
     module, _, name = path.rpartition(".")
-    node = _function_node(module, name)
+    node = function_node(module, name)
     for argument in (*node.args.args, *node.args.kwonlyargs):
         page.need(argument.annotation, (module,))
     for default in (*node.args.defaults, *node.args.kw_defaults):
