@@ -51,7 +51,7 @@ def test_planes_take_off_in_their_own_mode_unless_they_hover() -> None:
     plan = plane.take_off(50, None)
     assert plan is not None
     assert plan.mode is not None
-    assert (plan.mode.name, plan.command, plan.sets_altitude) == ("TAKEOFF", None, False)
+    assert (plan.mode.name, plan.command) == ("TAKEOFF", None)
     hovering = plane.take_off(50, None, is_vtol=True)
     assert hovering == autopilot(3, 20).take_off(50, None)
     assert hovering is not None

@@ -59,7 +59,6 @@ class ArduPilot(Autopilot):
     home_is_item_0 = True
     runs_prearm_checks = True
     parameter_interval_s = 0.02
-    sends_mission_requests_float = True
     mission_storage = "ardupilot"
     mission_upload_window = 6
     mission_download_window = 10
@@ -117,9 +116,8 @@ class ArduCopter(ArduPilot):
         "mission": "AUTO",
     }
     setpoints = SetpointRules(body_yaw_is_relative=True)
-    reposition = Reposition(relative_altitude=True, yaw=False, speed=False, armed_only=False)
+    reposition = Reposition(relative_altitude=True, yaw=False, speed=False)
     condition_yaw = True
-    changes_speed = True
     lands_after_return = True
     arming_mode = "GUIDED"
     unarmable_modes = frozenset(
@@ -165,8 +163,7 @@ class ArduPlane(ArduPilot):
         "mission": "AUTO",
     }
     setpoints = SetpointRules(local_position=False, global_position=False, velocity=False, acceleration=False)
-    reposition = Reposition(relative_altitude=True, yaw=False, speed=False, armed_only=False)
-    changes_speed = True
+    reposition = Reposition(relative_altitude=True, yaw=False, speed=False)
     arrival_radius_m = 90.0  # it circles at WP_LOITER_RAD, 60 m by default
     arming_mode = "FBWA"  # the throttle is the pilot's: armed in TAKEOFF it would start
     unarmable_modes = frozenset(("AUTOLAND", "INITIALISING", "QLAND", "QRTL", "RTL"))
@@ -183,7 +180,7 @@ class ArduPlane(ArduPilot):
         if self._can_hover(is_vtol):
             params = (0, 0, 0, 0, 0, 0, altitude_relative_m)
             return TakeOff(self.modes.find("GUIDED"), NAV_TAKEOFF, params, None)
-        return TakeOff(self.modes.find("TAKEOFF"), None, (), None, sets_altitude=False)
+        return TakeOff(self.modes.find("TAKEOFF"), None, (), None)
 
     def landed_state_of(self, heartbeat: Heartbeat) -> int | None:
         """STANDBY is said on the ground only, ACTIVE while flying."""
@@ -209,8 +206,7 @@ class ArduRover(ArduPilot):
         "mission": "AUTO",
     }
     setpoints = SetpointRules(acceleration=False, body_yaw_is_relative=True)
-    reposition = Reposition(relative_altitude=True, yaw=False, speed=False, armed_only=False)
-    changes_speed = True
+    reposition = Reposition(relative_altitude=True, yaw=False, speed=False)
     arrival_radius_m = 4.0
     arming_mode = "HOLD"
     unarmable_modes = frozenset(("RTL", "SMART_RTL", "INITIALISING"))
@@ -234,9 +230,8 @@ class ArduSub(ArduPilot):
     }
     setpoints = SetpointRules(acceleration=False, place_restarts_path=True)
     landing_ends_in = "ALT_HOLD"  # at the surface
-    reposition = Reposition(relative_altitude=True, yaw=False, speed=False, armed_only=False)
+    reposition = Reposition(relative_altitude=True, yaw=False, speed=False)
     condition_yaw = True
-    changes_speed = True
 
 
 class Blimp(ArduPilot):

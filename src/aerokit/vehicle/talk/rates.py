@@ -117,11 +117,6 @@ class MessageRates:
         self._legacy = False
         self._times_forgotten = 0
 
-    @property
-    def uses_data_streams(self) -> bool:
-        """Whether the vehicle turned out not to know MAV_CMD_SET_MESSAGE_INTERVAL."""
-        return self._legacy
-
     def want(self, message_type: type[Message], hz: float, *, is_optional: bool = False) -> Detach:
         """Ask for ``message_type`` at ``hz`` (above 0, at most 1000) or faster until the returned function is called.
 
