@@ -10,6 +10,7 @@ from aerokit.autopilots import autopilot_for
 from aerokit.mavlink import FrameEncoder, Framer, Message, messages
 from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.message import offset_of
+from aerokit.runtime.bus import Bus
 from aerokit.vehicle.state.states import LAZY, SOURCES
 from aerokit.vehicle.state.streamed import LOOK_S
 from aerokit.vehicle.state.telemetry import Telemetry
@@ -183,3 +184,15 @@ def test_other_threads_look_while_frames_come(telemetry: Telemetry) -> None:
     for thread in threads:
         thread.join()
     assert wrong == []
+
+
+def test_what_somebody_else_has_had_decoded_is_not_decoded_again(telemetry: Telemetry) -> None:
+    bus, seen = Bus(), list[Message]()
+    stream = telemetry.streams[MESSAGE_IDS["Attitude"]]
+    bus.attach_lazily(messages.Attitude, stream.take)
+    bus.attach(messages.Attitude, seen.append)
+    for at in (100.0, 100.5):
+        bus.deliver(frame_of(ANYTHING["Attitude"], at))
+    (pending,) = stream.pending.values()
+    assert pending[1] is seen[1]
+    assert telemetry.attitude.value.yaw_deg == pytest.approx(17.19, abs=0.01)

@@ -232,10 +232,10 @@ class Telemetry(States):
         source, kind = self._source(class_name), message_type(class_name)
         decode = kind.decode_body
 
-        def apply(frame: Frame) -> None:
+        def apply(frame: Frame, message: Message | None) -> None:
             before, self._arrived_at = self._arrived_at, frame.received_at
             try:
-                handler(decode(frame.body, frame), source)
+                handler(decode(frame.body, frame) if message is None else message, source)
             finally:
                 self._arrived_at = before
 

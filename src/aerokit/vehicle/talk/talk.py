@@ -207,7 +207,7 @@ class Talk:
             if message_type is None:
                 continue
             if message_id in streams:
-                detach = bus.attach_frames(message_type, streams[message_id].take, system_id=self.system_id)
+                detach = bus.attach_lazily(message_type, streams[message_id].take, system_id=self.system_id)
             else:
                 detach = bus.attach(message_type, handler, system_id=self.system_id)
             self.detach.append(detach)
