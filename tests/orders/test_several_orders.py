@@ -21,6 +21,7 @@ from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import CommandInt, CommandLong, SetPositionTargetLocalNed
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.testing import run_virtual
+from aerokit.vehicle.orders.helm import MODE_GRACE_S
 
 SEEDS = int(os.environ.get("AEROKIT_ORDER_SEEDS", "2"))
 COMMANDS = (176, 192, 400, 20)
@@ -161,6 +162,9 @@ def _judge(sent: Crossing, given: list[Given], told: Crossing | None, is_px4: bo
     allowed = HOLD[is_px4].union(*(each.choice.sends[is_px4] for each in at_once))
     assert kind in allowed, f"an order that was overruled: {about}"
     is_against_the_pilot = told is not None and newest.at < told.at and sent.number > told.number
+    own = [each.at for each in given if each.choice.name == "command"]
+    if told is not None and own and told.at - own[-1] < MODE_GRACE_S:
+        return  # any mode is taken for its effect: docs/reliability.md says so
     assert kind == "set-point" or not is_against_the_pilot, f"after the pilot was told: {about}"
 
 
