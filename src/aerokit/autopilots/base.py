@@ -106,6 +106,8 @@ class Autopilot:
     firmware = "unknown"
     """The firmware for this vehicle type, ``"ArduCopter"``."""
     modes = ModeTable({})
+    modes_are_numbered = True
+    """Whether users know a mode by its plain number, too."""
     purposes: ClassVar[Mapping[str, str]] = {}
     """Purpose → name of the mode that serves it."""
     setpoints = SetpointRules(*[False] * 5)

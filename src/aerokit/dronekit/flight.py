@@ -20,7 +20,7 @@ from aerokit.dronekit.flight_orders import (
     set_home,
     take_off,
 )
-from aerokit.dronekit.modes import Order, change_mode, mode_name, mode_order, told_as
+from aerokit.dronekit.modes import change_mode, mode_named
 from aerokit.dronekit.values import LocationGlobal, LocationGlobalRelative, VehicleMode
 from aerokit.errors import CommandRejected, OperationTimeout
 from aerokit.mavlink.messages import HomePosition
@@ -78,11 +78,11 @@ class FlightMethods(VehicleAttributes):
     def mode(self, value: VehicleMode | str | int) -> None:
         self._dk_set_mode(value)
 
-    def _dk_set_mode(self, value: VehicleMode | str | int) -> tuple[Order, concurrent.futures.Future[None]]:
+    def _dk_set_mode(self, value: VehicleMode | str | int) -> tuple[str, concurrent.futures.Future[None]]:
         aio = self._dk_check_link()
-        order = mode_order(aio, value.name if isinstance(value, VehicleMode) else value)
-        standing = self._handler.given.order("mode", "motion", mode=told_as(aio, order))
-        return order, self._dk_order("mode", change_mode, aio, order, standing)
+        wanted = mode_named(aio, value.name if isinstance(value, VehicleMode) else value)
+        standing = self._handler.given.order("mode", "motion", mode=wanted.custom_mode)
+        return wanted.name, self._dk_order("mode", change_mode, aio, wanted, standing)
 
     def wait_for_mode(self, mode: VehicleMode | str | int, timeout: float | None = None) -> None:
         """Set the mode and wait until the vehicle is in it.
@@ -91,9 +91,7 @@ class FlightMethods(VehicleAttributes):
             TimeoutError: it is not within ``timeout`` seconds, or, sooner, the vehicle has refused it.
             KeyError: this vehicle has no such mode.
         """
-        wanted, done = self._dk_set_mode(mode)
-        aio = self._dk_check_link()
-        name = mode_name(aio, wanted[0], told_as(aio, wanted))
+        name, done = self._dk_set_mode(mode)
         self._dk_wait_for_order(done, lambda: self._flightmode == name, timeout, "failed to set flight mode")
 
     # -------------------------------------------------------------------------------- arming

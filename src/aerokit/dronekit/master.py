@@ -14,7 +14,6 @@ from aerokit.runtime.diagnosis import is_autopilot
 
 if TYPE_CHECKING:
     from aerokit.dronekit.mavlink import MAVConnection
-    from aerokit.dronekit.vehicle import Vehicle
     from aerokit.mavlink.messages import Heartbeat
 
 __all__ = ["Master", "MessageFactory"]
@@ -34,8 +33,6 @@ class Master:
 
     def __init__(self, connection: MAVConnection) -> None:
         self._connection = connection
-        self.vehicle: Vehicle | None = None
-        """The vehicle of this connection, once there is one."""
         ours = connection.connection
         self.mav = MessageFactory(self._send, ours.source_system, ours.source_component)
         """Makes and sends messages."""
@@ -97,8 +94,9 @@ class Master:
         """
         heartbeat = self._heard()[1]
         is_px4 = heartbeat is not None and heartbeat.autopilot == PX4
-        if self.vehicle is not None and (isinstance(mode, str) or not is_px4):
-            self.vehicle.mode = mode
+        vehicle = self._connection.vehicle
+        if vehicle is not None and (isinstance(mode, str) or not is_px4):
+            vehicle.mode = mode
             return
         order = (self.mode_mapping() or {})[mode] if isinstance(mode, str) else mode
         if is_px4 and not isinstance(mode, str):

@@ -27,6 +27,7 @@ from aerokit.sync.connection import open_connection
 
 if TYPE_CHECKING:
     from aerokit.dronekit.master import Master
+    from aerokit.dronekit.vehicle import Vehicle
     from aerokit.links.link import Peer
     from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.message import Message
@@ -85,6 +86,8 @@ class MAVConnection:
         """Whether the vehicle has said that it understands MAVLink 2, whichever version it speaks so far."""
         self._at_close: list[Callable[[], object]] = []
         self._master: Master | None = None
+        self.vehicle: Vehicle | None = None
+        """The vehicle of this connection, once there is one."""
         self.loop_listeners: list[Callable[[MAVConnection], object]] = []
         """Functions that are called about 20 times a second; see :meth:`forward_loop`."""
         self.message_listeners: list[Callable[[MAVConnection, Any], object]] = []

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from aerokit.dronekit.message_listeners import MessageListener, MessageListeners
-from aerokit.dronekit.pymavlink_messages import sendable
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -69,5 +68,7 @@ class MessageMethods:
             LocalProtocolError: a ValueError; a field is wrong. Nothing was sent.
             APIException: the link is down.
         """
+        from aerokit.dronekit.sendable_messages import sendable
+
         self._dk_check_link()
         self._handler.send(sendable(message, self._dk_target_system), to=self._dk_target_system)

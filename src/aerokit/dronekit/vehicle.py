@@ -6,13 +6,13 @@ import logging
 import threading
 import weakref
 from contextlib import asynccontextmanager
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import anyio
 
-from aerokit import sync
 from aerokit.dronekit.channels import Channels
-from aerokit.dronekit.commands import CommandSequence, WaypointLoader
+from aerokit.dronekit.current_command import CurrentCommand
 from aerokit.dronekit.exceptions import APIException, TimeoutError  # noqa: A004 - DroneKit's name
 from aerokit.dronekit.flight import FlightMethods
 from aerokit.dronekit.gimbal import Gimbal
@@ -41,10 +41,13 @@ if TYPE_CHECKING:
 
     from typing_extensions import Self
 
+    from aerokit import sync
+    from aerokit.dronekit.commands import CommandSequence, WaypointLoader
     from aerokit.dronekit.master import Master
     from aerokit.dronekit.mavlink import MAVConnection
     from aerokit.mavlink.message import Message
     from aerokit.runtime.connection import Connection
+    from aerokit.sync.loop_thread import Held
     from aerokit.vehicle.values import StatusText
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
@@ -76,6 +79,7 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, Readiness, VehiclePriv
         self._logger = logging.getLogger("dronekit")
         self._autopilot_logger = logging.getLogger("autopilot")
         self._dk_aio: AsyncVehicle | None = None
+        self._dk_held: Held[AsyncVehicle] | None = None
         self._dk_sync: sync.Vehicle | None = None
         self._dk_heartbeat_limit: float = 0.0
         self._dk_message_handlers: list[tuple[type[Message], Callable[[Any], None], bool]] = []
@@ -89,7 +93,8 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, Readiness, VehiclePriv
         self._channels = Channels(self, 8)
         self._gimbal = Gimbal(self)
         self._parameters = Parameters(self)
-        self._commands = CommandSequence(self)
+        self._dk_current_command = CurrentCommand(self)
+        self._dk_mark_ready("commands")
 
     # --------------------------------------------------------------------------------- parts
 
@@ -118,6 +123,14 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, Readiness, VehiclePriv
         """The autopilot's parameters, as a mapping of names to values."""
         return self._parameters
 
+    @cached_property
+    def _commands(self) -> CommandSequence:
+        from aerokit.dronekit.commands import (
+            CommandSequence,  # with pymavlink: programs without missions do without
+        )
+
+        return self.__dict__.setdefault("_commands", CommandSequence(self))
+
     @property
     def commands(self) -> CommandSequence:
         """The mission: download, change, upload."""
@@ -129,6 +142,8 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, Readiness, VehiclePriv
 
     @property
     def _wploader(self) -> WaypointLoader:
+        from aerokit.dronekit.commands import WaypointLoader
+
         return WaypointLoader(self._commands)
 
     def flush(self) -> None:
@@ -156,8 +171,12 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, Readiness, VehiclePriv
         Raises:
             APIException: the vehicle is not connected.
         """
-        if self._dk_sync is None:
+        if self._dk_held is None:
             raise APIException("the vehicle is not connected yet: call initialize()")
+        if self._dk_sync is None:
+            from aerokit.sync import Vehicle  # for programs that use it
+
+            self._dk_sync = Vehicle(self._handler.loop, self._dk_held, owns_loop=False)
         return self._dk_sync
 
     def run(self, function: Callable[..., Awaitable[Any]], /, *args: Any, **kwargs: Any) -> Any:
@@ -186,10 +205,9 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, Readiness, VehiclePriv
                 return
             self._dk_heartbeat_limit = max(heartbeat_timeout or 0.0, 0.0)
             timeout = self._dk_heartbeat_limit or CONNECT_S
-            loop = self._handler.loop
             try:
-                held = loop.hold_open(_found(self._handler.connection, timeout, weakly(self._dk_begin), rate))
-                self._dk_sync = sync.Vehicle(loop, held, owns_loop=False)
+                found = _found(self._handler.connection, timeout, weakly(self._dk_begin), rate)
+                self._dk_held = self._handler.loop.hold_open(found)
                 self._dk_wait_until_booted(timeout)
                 if rate is not None:
                     Readiness.wait_ready(self, *FIRST_VALUES, timeout=FIRST_VALUES_S, raise_exception=False)
@@ -302,7 +320,7 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, Readiness, VehiclePriv
         """On the loop, in the turn in which the vehicle was found; the loop gets weak references only."""
         self._dk_aio, self._dk_tasks = aio, tasks
         self._handler.target_system = aio.system_id
-        self._handler.master.vehicle = self
+        self._handler.vehicle = self
         self._handler.orders.describe = self._dk_describe
         for message_type, stream in self._dk_streams.items():
             stream.begin(aio.component_id)
