@@ -271,7 +271,19 @@ def test_names_of_listeners_are_upper_cased_and_may_be_a_list(
     assert seen == ["FOO", "BAR"]
     parameters.notify_attribute_listeners("foo", 17.0)
     parameters.notify_attribute_listeners("foo", 17.0)
-    assert seen == ["FOO", "BAR", "FOO"]
+    assert seen == ["FOO", "BAR", "FOO", "FOO"]
+    parameters.notify_attribute_listeners("foo", 18.0, cache=True)
+    parameters.notify_attribute_listeners("foo", 18.0, True)
+    assert seen == ["FOO", "BAR", *["FOO"] * 3]
+
+
+def test_the_decorators_argument_is_called_as_with_dronekit(
+    vehicle: dronekit.Vehicle, fc: FlightController
+) -> None:
+    seen: list[str] = []
+    vehicle.parameters.on_attribute(attr_name="foo")(lambda _, name, value: seen.append(name))
+    told(vehicle, fc, "FOO", 2.0)
+    assert seen == ["FOO"]
 
 
 def test_without_listeners_nothing_is_queued(fc: FlightController) -> None:

@@ -63,6 +63,14 @@ class Inbox(Mapping[str, Any]):
             if (names is None or message.get_type() in names) and condition(message):
                 return message
 
+    def age_s(self, name: str) -> float:
+        """Seconds since a message of this type came, or since the first question."""
+        self._start()
+        frame = self._latest.get(_id_of(name))
+        if frame is None:
+            return time.monotonic() - (self._started or 0.0)
+        return self._connection.connection.now() - frame.received_at
+
     def __getitem__(self, name: str) -> Any:
         self._start()
         message_id = _id_of(name)

@@ -199,6 +199,30 @@ class Master:
         """The next HEARTBEAT; None when there is none in ``timeout`` seconds."""
         return self.recv_match(type="HEARTBEAT", blocking=blocking, timeout=timeout)
 
+    def field(self, type: str, field: str, default: Any = None) -> Any:  # noqa: A002 - pymavlink's word
+        """A field of the last message of a type; ``default`` when there is none."""
+        return getattr(self.messages.get(type), field, default)
+
+    def time_since(self, mtype: str) -> float:
+        """Seconds since the last message of a type, or, while there is none, since messages were first asked for."""
+        return self.messages.age_s(mtype)
+
+    def param(self, name: str, default: float | None = None) -> float | None:
+        """A parameter as far as it is known; ``default`` while it is not."""
+        vehicle = self._connection.vehicle
+        return default if vehicle is None else vehicle.parameters.get(name, False, default=default)
+
+    def location(self, relative_alt: bool = False) -> Any:
+        """``lat``, ``lon`` (degrees), ``alt`` (metres) and ``heading`` (degrees), of messages that come from now on.
+
+        Waits for a GPS fix in three dimensions. The altitude is above home (``relative_alt``) or the sea.
+        """
+        gps = self.recv_match(condition="GPS_RAW_INT.fix_type>=3", type="GPS_RAW_INT", blocking=True)
+        hud = self.recv_match(type="VFR_HUD", blocking=True)
+        position = self.recv_match(type="GLOBAL_POSITION_INT", blocking=True)
+        alt = position.relative_alt * 1e-3 if relative_alt else hud.alt
+        return mavutil.location(gps.lat * 1e-7, gps.lon * 1e-7, alt, hud.heading)
+
     @staticmethod
     def probably_vehicle_heartbeat(msg: Any) -> bool:
         """Whether a HEARTBEAT is an autopilot's: not a gimbal's, a camera's or a ground station's."""

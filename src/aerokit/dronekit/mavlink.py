@@ -21,9 +21,10 @@ from aerokit.dronekit.orders import Orders
 from aerokit.dronekit.standing import Given
 from aerokit.dronekit.weakly import weakly
 from aerokit.errors import AerokitError, ConnectionClosed, LinkOpenError, LocalProtocolError
-from aerokit.links.address import ACCEPTED_FORMS
+from aerokit.links.address import ACCEPTED_FORMS, parse_address
 from aerokit.links.reconnecting import ReconnectingLink
-from aerokit.sync.connection import open_connection
+from aerokit.runtime.opening import open_connection
+from aerokit.sync.loop_thread import LoopThread
 
 if TYPE_CHECKING:
     from aerokit.dronekit.master import Master
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.runtime.bus import Detach
     from aerokit.runtime.connection import Connection
-    from aerokit.sync.connection import Connection as SyncConnection
+    from aerokit.sync.loop_thread import Held
 
 __all__ = ["MAVConnection", "MAVWriter", "mavudpin_multi"]
 
@@ -72,9 +73,11 @@ class MAVConnection:
         """System id of the vehicle, 0 before it was heard."""
         self.listener_thread = ListenerThread()
         """Where the callbacks of the program run."""
-        self._sync = _open(ip, baud, source_system, source_component)
-        self.loop = self._sync._loop
+        self.loop = LoopThread()
         """The event loop's thread."""
+        self._held = _open(self.loop, ip, baud, source_system, source_component)
+        self.connection = self._held.value
+        """The asynchronous connection, for code that runs on its loop."""
         self.orders = Orders(self.loop)
         """What was ordered without waiting."""
         self.given = Given()
@@ -102,11 +105,6 @@ class MAVConnection:
             made.add(self)
 
     # ------------------------------------------------------------------------------- sending
-
-    @property
-    def connection(self) -> Connection:
-        """The asynchronous connection, for code that runs on its loop."""
-        return self._sync.aio
 
     def send(self, message: Message, *, to: int | None = None) -> None:
         """Send a message, in the order of the calls; from any thread, never blocks.
@@ -199,7 +197,10 @@ class MAVConnection:
             self.orders.wait(ORDERS_END_S)
         finally:
             self.listener_thread.stop()
-            self._sync.close()
+            try:
+                self._held.close()
+            finally:
+                self.loop.close()
             self.listener_thread.join()
             for function in self._at_close:
                 function()
@@ -223,11 +224,23 @@ class MAVConnection:
 
     @property
     def _accept_input(self) -> bool:
-        return self._alive
+        return self._alive and "bytes_received" not in vars(self.connection)
+
+    @_accept_input.setter
+    def _accept_input(self, value: bool) -> None:
+        """False: as if nothing came, which is how programs try what they do then. What comes meanwhile is lost."""
+        if value:
+            vars(self.connection).pop("bytes_received", None)
+        else:
+            vars(self.connection)["bytes_received"] = lambda data, peer: None
 
     @property
     def _death_error(self) -> Exception | None:
-        return self.connection._error
+        try:
+            self.connection.raise_if_ended()
+        except AerokitError as error:
+            return error
+        return None
 
     @property
     def out_queue(self) -> queue.Queue[bytes]:
@@ -309,20 +322,42 @@ def connections_made() -> Iterator[weakref.WeakSet[MAVConnection]]:
         _made.reset(token)
 
 
-def _open(ip: str, baud: int, source_system: int, source_component: int) -> SyncConnection:
+def _open(
+    loop: LoopThread, ip: str, baud: int, source_system: int, source_component: int
+) -> Held[Connection]:
     """Open it; what refuses at first may be a simulator that the program has just started."""
+    try:
+        _check_address(ip)
+        for attempt in range(ATTEMPTS):
+            try:
+                return loop.hold_open(
+                    open_connection(
+                        ip,
+                        baud=baud,
+                        source_system=source_system,
+                        source_component=source_component,
+                        reconnect=True,
+                    )
+                )
+            except LinkOpenError as error:
+                if attempt == ATTEMPTS - 1 or not isinstance(error.__cause__, ConnectionRefusedError):
+                    _raise_classic(error)
+                time.sleep(BETWEEN_ATTEMPTS_S)
+        raise AssertionError
+    except BaseException:
+        loop.close()
+        raise
+
+
+def _check_address(ip: object) -> None:
     if not isinstance(ip, str):
         raise LocalProtocolError(f"ip = {ip!r} is no connection string; accepted are\n{ACCEPTED_FORMS}")
-    for attempt in range(ATTEMPTS):
-        try:
-            return open_connection(
-                ip, baud=baud, source_system=source_system, source_component=source_component, reconnect=True
-            )
-        except LinkOpenError as error:
-            if attempt == ATTEMPTS - 1 or not isinstance(error.__cause__, ConnectionRefusedError):
-                _raise_classic(error)
-            time.sleep(BETWEEN_ATTEMPTS_S)
-    raise AssertionError
+    try:
+        parse_address(ip)
+    except LocalProtocolError as error:
+        from aerokit.dronekit.address_error import AddressError
+
+        raise AddressError(str(error)) from None
 
 
 def _raise_classic(error: LinkOpenError) -> NoReturn:

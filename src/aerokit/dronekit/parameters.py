@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import ItemsView, Iterator, KeysView, MutableMapping, ValuesView
+from collections.abc import Callable, ItemsView, Iterator, KeysView, MutableMapping, ValuesView
 from typing import TYPE_CHECKING, Any
 
 import anyio
 
 from aerokit.dronekit.exceptions import APIException, TimeoutError  # noqa: A004 - DroneKit's name
-from aerokit.dronekit.observers import AttributeListener, HasObservers
+from aerokit.dronekit.observers import AttributeListener, HasObservers, ListenerT
 from aerokit.dronekit.parameter_reading import ParameterReading
 from aerokit.dronekit.parameter_set import number_of, set_parameter
 from aerokit.dronekit.parameter_values import ParameterValues
@@ -194,9 +194,15 @@ class Parameters(MutableMapping[str, float], HasObservers):
         """
         super().remove_attribute_listener(attr_name.upper(), observer)
 
-    def notify_attribute_listeners(self, attr_name: str, value: Any, cache: bool = True) -> None:
-        """Tell the listeners of a parameter a value, unless it is the one told before, whatever ``cache`` says."""
-        super().notify_attribute_listeners(attr_name.upper(), value, cache=True)
+    def notify_attribute_listeners(self, attr_name: str, value: Any, cache: bool = False) -> None:
+        """Tell the listeners of a parameter a value; with ``cache`` only when it is not the one told before."""
+        super().notify_attribute_listeners(attr_name.upper(), value, cache)
+
+    def on_attribute(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self, attr_name: str | list[str] | tuple[str, ...]
+    ) -> Callable[[ListenerT], ListenerT]:
+        """Decorate a listener with the name, or the list of names, of parameters. It cannot be removed by name then."""
+        return super().on_attribute(attr_name)
 
     # ------------------------------------------------------------------------------- inside
 

@@ -212,9 +212,9 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, Readiness, VehiclePriv
                 if rate is not None:
                     Readiness.wait_ready(self, *FIRST_VALUES, timeout=FIRST_VALUES_S, raise_exception=False)
             except ConnectFailed as error:
-                raise APIException(f"Timeout in initializing connection. {error}") from error
+                raise APIException(f"Timeout in initializing connection. {error}") from None
             except AerokitError as error:
-                raise APIException(str(error)) from error
+                raise APIException(str(error)) from None
 
     def close(self) -> None:
         """End it: what was ordered a moment before gets the time to be answered, then link and threads end.
