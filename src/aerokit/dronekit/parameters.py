@@ -37,7 +37,7 @@ class Parameters(MutableMapping[str, float], HasObservers):
     Reading a value that has not come yet asks the vehicle for that one, so it seldom waits for the whole list;
     iterating does, :func:`len` tells how many have come. A value that is known is read without waiting.
 
-    Names from before ArduPilot 4.7 and since are taken by both, and values converted, with a warning.
+    Names from before and after ArduPilot renamed a parameter are taken by both, and values converted, with a warning.
 
     Listeners get ``(parameters, name, value)``, when a value has changed or has come for the first time.
     """
@@ -56,7 +56,7 @@ class Parameters(MutableMapping[str, float], HasObservers):
     def __getitem__(self, name: str) -> float:
         value = self.get(name)
         if value is None:
-            raise KeyError(name.upper() if isinstance(name, str) else name)
+            raise KeyError(_described(name.upper()) if isinstance(name, str) else name)
         return value
 
     def get(  # type: ignore[override]
@@ -284,6 +284,13 @@ def _upper(name: str) -> str:
     if not isinstance(name, str):
         raise LocalProtocolError(f"parameter name = {name!r} is no text")
     return name.upper()
+
+
+def _described(name: str) -> str:
+    from aerokit.parameters.renames import replacement_of
+
+    replaced = replacement_of(name)
+    return f"{name}: replaced by {replaced}" if replaced else name
 
 
 def _is_possible(name: str) -> bool:
