@@ -91,6 +91,7 @@ class Px4(Autopilot):
     keys_are_taken = "PX4 takes a key on its USB port only, and before 1.17 nowhere"
     modes = MODES
     modes_are_numbered = False
+    roi_altitude_is_amsl = True
     setpoints = SetpointRules(before_mode=True, minimum_hz=2.0, timeout_s=0.5)
     reposition = Reposition(relative_altitude=False, yaw=True, speed=True, armed_only=True)
     log_suffix = ".ulg"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from typing import TYPE_CHECKING, Any
 
-from aerokit.autopilots.px4 import Px4
 from aerokit.dronekit.modes import mode_name
 from aerokit.dronekit.observers import HasObservers
 from aerokit.dronekit.reception import Latest, Stream
@@ -174,7 +173,7 @@ class VehicleAttributes(HasObservers):
         """
         if self._flightmode in NO_MODE or self._dk_heartbeat is None:
             return False
-        if isinstance(getattr(self._dk_aio, "autopilot", None), Px4):
+        if self._dk_aio is not None and self._dk_aio.autopilot.judges_by_mode:
             status = self._dk_sys_status
             return status is not None and bool(status.onboard_control_sensors_health & PREARM_CHECK)
         gps = self._dk_gps

@@ -8,7 +8,6 @@ import math
 import time
 from typing import TYPE_CHECKING, Any
 
-from aerokit.autopilots.px4 import Px4
 from aerokit.dronekit.attributes import VehicleAttributes
 from aerokit.dronekit.exceptions import APIException, TimeoutError  # noqa: A004 - DroneKit's name
 from aerokit.dronekit.flight_orders import (
@@ -28,6 +27,7 @@ from aerokit.mavlink.messages import HomePosition
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
+    from aerokit.autopilots import Mode, Purpose
     from aerokit.dronekit.mavlink import MAVConnection
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
@@ -37,8 +37,6 @@ NAV_TAKEOFF, DO_CHANGE_SPEED = 22, 178
 AIRSPEED, GROUNDSPEED = 0, 1
 REQUEST_MESSAGE = 512
 HOME_TIMEOUT_S = 10.0
-PX4_TAKEOFF, PX4_LOITER = 4 << 16 | 2 << 24, 4 << 16 | 3 << 24
-PX4_FLIES_TO_PLACES_IN = ("LOITER", "TAKEOFF")
 POLL_S = 0.1
 
 
@@ -171,12 +169,15 @@ class FlightMethods(VehicleAttributes):
         if not math.isfinite(altitude):
             raise ValueError("Altitude was NaN or Infinity. Please provide a real number")
         aio = self._dk_check_link()
-        if isinstance(aio.autopilot, Px4):  # it counts from the sea
+        if aio.autopilot.repositions_amsl:  # as it does take-offs
             home = self._dk_known_home().alt
-            plan = aio.autopilot.take_off(altitude, home, is_vtol=aio.is_vtol)
-            if plan is None or plan.command is None:
+            plan, mode = (
+                aio.autopilot.take_off(altitude, home, is_vtol=aio.is_vtol),
+                aio.autopilot.mode_for("take_off"),
+            )
+            if plan is None or plan.command is None or mode is None:
                 raise APIException("this vehicle cannot take off by a command")
-            standing = self._handler.given.order("motion", mode=PX4_TAKEOFF)
+            standing = self._handler.given.order("motion", mode=mode.custom_mode)
             return self._dk_order("takeoff", take_off, aio, standing, plan.command, *plan.params)
         standing = self._handler.given.order("motion")
         return self._dk_order("takeoff", take_off, aio, standing, NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude)
@@ -215,13 +216,13 @@ class FlightMethods(VehicleAttributes):
             ValueError: it is no such location, or one of its numbers is missing or wrong. Nothing was sent.
         """
         aio = self._dk_check_link()
-        is_px4 = isinstance(aio.autopilot, Px4)
-        place = self._dk_place(location, is_relative=not is_px4)
+        flies_in = _flies_to_places_in(aio)
+        place = self._dk_place(location, is_relative=not flies_in)
         for name, speed in (("airspeed", airspeed), ("groundspeed", groundspeed)):
             check_speed(name, speed)
-        standing = self._handler.given.order("motion", mode=PX4_LOITER if is_px4 else None)
-        if is_px4 and self._flightmode not in PX4_FLIES_TO_PLACES_IN:
-            self._dk_order("goto", refuse, f"not in {self._flightmode}: set the mode LOITER first")
+        standing = self._handler.given.order("motion", mode=flies_in[0].custom_mode if flies_in else None)
+        if flies_in and self._flightmode not in map(str, flies_in):
+            self._dk_order("goto", refuse, f"not in {self._flightmode}: set the mode {flies_in[0]} first")
         else:
             self._dk_order("goto", go_to, aio, standing, *place)
         if airspeed is not None:
@@ -406,3 +407,14 @@ class FlightMethods(VehicleAttributes):
                 self._dk_pause(min(POLL_S, max(deadline - time.monotonic(), 0.0)))
             else:
                 concurrent.futures.wait([order], min(POLL_S, max(deadline - time.monotonic(), 0.0)))
+
+
+def _flies_to_places_in(aio: AsyncVehicle) -> tuple[Mode, ...]:
+    """Where the order to fly to a place changes the mode itself: those in which the program meant it to; the first is
+    the one that the order brings about. Empty where the mode stays what it is, and the vehicle refuses in a wrong one.
+    """
+    if not aio.autopilot.repositions_amsl:
+        return ()
+    purposes: tuple[Purpose, ...] = (aio.autopilot.reposition_purpose, "take_off")
+    modes = map(aio.autopilot.mode_for, purposes)
+    return tuple(mode for mode in modes if mode is not None)

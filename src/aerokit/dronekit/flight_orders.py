@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from aerokit.autopilots.px4 import Px4
 from aerokit.dronekit.exceptions import APIException
 from aerokit.dronekit.standing import send_while_standing
 from aerokit.errors import CommandRejected, LocalProtocolError, OperationTimeout
@@ -53,9 +52,9 @@ async def go_to(
 ) -> None:
     """DO_REPOSITION, which is answered; and the message for a vehicle that does not know it.
 
-    The altitude is above home, with PX4 above the sea.
+    The altitude is above home, or above the sea where the autopilot repositions so (PX4).
     """
-    is_px4 = isinstance(vehicle.autopilot, Px4)
+    is_amsl = vehicle.autopilot.repositions_amsl
     try:
         with standing.watching(vehicle):
             await send_while_standing(
@@ -63,16 +62,14 @@ async def go_to(
                 standing,
                 vehicle._commands.send_int,
                 DO_REPOSITION,
-                *(-1, CHANGE_MODE if is_px4 else 0, 0, math.nan),
-                frame=GLOBAL_INT if is_px4 else GLOBAL_RELATIVE_ALT_INT,
+                *(-1, CHANGE_MODE if is_amsl else 0, 0, math.nan),
+                frame=GLOBAL_INT if is_amsl else GLOBAL_RELATIVE_ALT_INT,
                 x=latitude,
                 y=longitude,
                 z=altitude,
             )
     except CommandRejected as error:
-        if is_px4:
-            raise
-        if error.result != RESULT_UNSUPPORTED:
+        if is_amsl or error.result != RESULT_UNSUPPORTED:
             raise
         target = (vehicle.system_id, 0, GLOBAL_RELATIVE_ALT_INT, POSITION_ONLY)
         vehicle.send(SetPositionTargetGlobalInt(0, *target, latitude, longitude, altitude, *(0.0,) * 8))

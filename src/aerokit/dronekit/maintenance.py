@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from aerokit.autopilots.ardupilot import ArduPilot
 from aerokit.dronekit.exceptions import APIException
 from aerokit.errors import LocalProtocolError
 from aerokit.mavlink.messages import PlayTune
@@ -48,7 +47,7 @@ class Maintenance:
 
     def send_calibrate_magnetometer(self) -> None:
         """Calibrate the compasses: turn the vehicle about all axes until it says that it is done."""
-        if isinstance(self._dk_check_link().autopilot, ArduPilot):
+        if self._dk_check_link().autopilot.calibrates_compasses_by_command:
             self._dk_calibrate(DO_START_MAG_CAL, 0, 1, 1)  # all compasses; retry; save by itself
         else:
             self._dk_calibrate(PREFLIGHT_CALIBRATION, 0, 1)

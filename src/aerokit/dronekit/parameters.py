@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, ItemsView, Iterator, KeysView, MutableMapping, ValuesView
+from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
 import anyio
@@ -237,9 +238,9 @@ class Parameters(MutableMapping[str, float], HasObservers):
             self.wait_ready()
         return self._values.copy()
 
-    def _start(self) -> None:
-        aio = self._vehicle._dk_vehicle
-        aio._detach.append(aio.connection.bus.attach_event(ParameterChanged, weakly(self._on_changed)))
+    def _start(self, ends: ExitStack) -> None:
+        bus = self._vehicle._dk_vehicle.connection.bus
+        ends.callback(bus.attach_event(ParameterChanged, weakly(self._on_changed)))
         self._reading.begin()
 
     def _on_value(self, message: ParamValue) -> None:

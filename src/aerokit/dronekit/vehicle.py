@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import weakref
-from contextlib import asynccontextmanager
+from contextlib import ExitStack, asynccontextmanager
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -83,7 +83,7 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, Readiness, VehiclePriv
         self._dk_sync: sync.Vehicle | None = None
         self._dk_heartbeat_limit: float = 0.0
         self._dk_message_handlers: list[tuple[type[Message], Callable[[Any], None], bool]] = []
-        self._dk_starters: list[Callable[[], None]] = []
+        self._dk_starters: list[Callable[[ExitStack], None]] = []
         self._dk_initializing = threading.Lock()
         self._dk_tasks: Background | None = None
         self._message_listeners = MessageListeners(self, handler)
@@ -265,7 +265,7 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, Readiness, VehiclePriv
     def _dk_on_any_component(self, message_type: type[Message], handler: Callable[[Any], None]) -> None:
         self._dk_message_handlers.append((message_type, handler, False))
 
-    def _dk_at_start(self, function: Callable[[], None]) -> None:
+    def _dk_at_start(self, function: Callable[[ExitStack], None]) -> None:
         self._dk_starters.append(function)
 
     def _dk_background(self, function: Callable[[], Awaitable[None]]) -> None:
@@ -316,7 +316,7 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, Readiness, VehiclePriv
 
     # ------------------------------------------------------------------------------- inside
 
-    def _dk_begin(self, aio: AsyncVehicle, tasks: Background, rate: float | None) -> None:
+    def _dk_begin(self, aio: AsyncVehicle, tasks: Background, ends: ExitStack, rate: float | None) -> None:
         """On the loop, in the turn in which the vehicle was found; the loop gets weak references only."""
         self._dk_aio, self._dk_tasks = aio, tasks
         self._handler.target_system = aio.system_id
@@ -327,14 +327,12 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, Readiness, VehiclePriv
             detach = aio.connection.bus.attach_frames(
                 message_type, weakly(stream.take), system_id=aio.system_id
             )
-            aio._detach.append(detach)
+            ends.callback(detach)
         for message_type, handler, only_autopilot in self._dk_message_handlers:
             take = weakly(handler)
             take = _only_of(aio.component_id, take) if only_autopilot else take
-            aio._detach.append(aio.connection.bus.attach(message_type, take, system_id=aio.system_id))
-        aio._detach.append(
-            aio.telemetry.status_text.observe(weakly(self._dk_on_status_text), every_arrival=True)
-        )
+            ends.callback(aio.connection.bus.attach(message_type, take, system_id=aio.system_id))
+        ends.callback(aio.telemetry.status_text.observe(weakly(self._dk_on_status_text), every_arrival=True))
         first = aio.connection.heard.get((aio.system_id, aio.component_id))
         if first is not None:
             self._handler.follow_version(first)
@@ -346,7 +344,7 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, Readiness, VehiclePriv
         itself = weakref.ref(self)
         self._dk_background(lambda: watch_link(itself, aio))
         for starter in self._dk_starters:
-            starter()
+            starter(ends)
 
     def _dk_on_heartbeat(self, message: Any) -> None:
         if not is_autopilot(message):  # a ground station or a companion that took the autopilot's ids
@@ -383,8 +381,9 @@ async def _found(
     async with connect_async(connection, timeout=timeout, rates={}) as aio:
         tasks = Background(connection.fail)
         try:
-            begin(aio, tasks, rate)
-            yield aio
+            with ExitStack() as ends:
+                begin(aio, tasks, ends, rate)
+                yield aio
         finally:
             await tasks.aclose()
 
