@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 from aerokit.dronekit.exceptions import APIException
-from aerokit.dronekit.standing import send_while_standing
+from aerokit.dronekit.standing import until_answered
 from aerokit.errors import CommandRejected, LocalProtocolError, OperationTimeout
 from aerokit.mavlink.messages import SetPositionTargetGlobalInt
 
@@ -29,8 +29,8 @@ async def change_armed(vehicle: AsyncVehicle, standing: Standing, value: bool) -
     """Arm or disarm, and wait until HEARTBEAT says so."""
     try:
         with standing.watching(vehicle):
-            send = vehicle._commands.send_long
-            await send_while_standing(vehicle, standing, send, COMPONENT_ARM_DISARM, float(value))
+            sending = vehicle.command(COMPONENT_ARM_DISARM, float(value), component_id=0, standing=standing)
+            await until_answered(sending, standing)
             await vehicle.telemetry.armed.wait_until(
                 lambda armed: armed is value or standing.is_done,
                 timeout=ARMED_IS_TOLD_S,
@@ -44,7 +44,7 @@ async def change_armed(vehicle: AsyncVehicle, standing: Standing, value: bool) -
 async def take_off(vehicle: AsyncVehicle, standing: Standing, command: int, *params: float) -> None:
     """Send the command to take off."""
     with standing.watching(vehicle):
-        await send_while_standing(vehicle, standing, vehicle._commands.send_long, command, *params)
+        await until_answered(vehicle.command(command, *params, component_id=0, standing=standing), standing)
 
 
 async def go_to(
@@ -57,17 +57,17 @@ async def go_to(
     is_amsl = vehicle.autopilot.repositions_amsl
     try:
         with standing.watching(vehicle):
-            await send_while_standing(
-                vehicle,
-                standing,
-                vehicle._commands.send_int,
+            sending = vehicle.command_int(
                 DO_REPOSITION,
                 *(-1, CHANGE_MODE if is_amsl else 0, 0, math.nan),
                 frame=GLOBAL_INT if is_amsl else GLOBAL_RELATIVE_ALT_INT,
                 x=latitude,
                 y=longitude,
                 z=altitude,
+                component_id=0,
+                standing=standing,
             )
+            await until_answered(sending, standing)
     except CommandRejected as error:
         if is_amsl or error.result != RESULT_UNSUPPORTED:
             raise

@@ -355,7 +355,7 @@ def _check_address(ip: object) -> None:
     try:
         parse_address(ip)
     except LocalProtocolError as error:
-        from aerokit.dronekit.address_error import AddressError
+        from aerokit.links.address_error import AddressError
 
         raise AddressError(str(error)) from None
 

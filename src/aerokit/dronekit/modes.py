@@ -8,7 +8,7 @@ import anyio
 
 from aerokit.autopilots import autopilot_for
 from aerokit.autopilots.modes import CUSTOM_MODE_ENABLED, Mode
-from aerokit.dronekit.standing import send_while_standing
+from aerokit.dronekit.standing import until_answered
 from aerokit.errors import CommandRejected, LocalProtocolError, OperationTimeout
 from aerokit.mavlink.messages import Heartbeat
 from aerokit.protocols.command import result_name
@@ -102,7 +102,9 @@ async def _request(vehicle: Vehicle, wanted: Mode, standing: Standing) -> None:
     order = vehicle.autopilot.mode_order(wanted)
     params = (_flags(vehicle, wanted), *order.params[1:])
     try:
-        await send_while_standing(vehicle, standing, vehicle._commands.send_long, DO_SET_MODE, *params)
+        await until_answered(
+            vehicle.command(DO_SET_MODE, *params, component_id=0, standing=standing), standing
+        )
     except CommandRejected as error:
         if error.result != RESULT_UNSUPPORTED:
             raise

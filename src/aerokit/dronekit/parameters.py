@@ -47,6 +47,8 @@ class Parameters(MutableMapping[str, float], HasObservers):
         HasObservers.__init__(self, vehicle._dk_listener_thread)
         self._vehicle = vehicle
         self._values = ParameterValues()
+        self._count = 0
+        """How many there are by the last message."""
         self._reading = ParameterReading(vehicle, self._take_all)
         vehicle._dk_on(ParamValue, self._on_value)
         vehicle._dk_at_start(self._start)
@@ -222,10 +224,7 @@ class Parameters(MutableMapping[str, float], HasObservers):
     @property
     def _is_settled(self) -> bool:
         """Whether the vehicle has nothing but what is known: the whole list has come, and is as long as it says."""
-        if not self._reading.is_complete:
-            return False
-        count = self._vehicle._dk_vehicle.parameters._access.store.count
-        return count is None or count <= len(self._values)
+        return self._reading.is_complete and self._count <= len(self._values)
 
     async def _wait_for(self, name: str) -> None:
         with anyio.move_on_after(READY_S) as waiting:
@@ -245,7 +244,8 @@ class Parameters(MutableMapping[str, float], HasObservers):
 
     def _on_value(self, message: ParamValue) -> None:
         """The table underneath has taken it already: there, integers are what they are."""
-        told = self._vehicle._dk_vehicle.parameters._access.store.get(message.param_id)
+        self._count = message.param_count
+        told = self._vehicle._dk_vehicle.parameters.known(message.param_id)
         if told is not None:
             self._take(told.name, float(told.value))
 

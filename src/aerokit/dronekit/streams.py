@@ -70,8 +70,9 @@ def _request(vehicle: Vehicle, rate: float) -> None:
 async def _request_missing(vehicle: Vehicle, rate: float) -> None:
     await anyio.sleep(COMES_WITHIN_S)
     missing = [name for name in NEEDED if not vehicle.telemetry.cells[name].is_known]
+    required = vehicle.telemetry.required_messages
     with ExitStack() as rates:
-        for message_type in {each for name in missing for each in vehicle.telemetry.required_messages(name)}:
+        for message_type in dict.fromkeys(each for name in missing for each in required(name)):
             rates.enter_context(vehicle.rate(message_type, rate))
         await anyio.sleep_forever()
 

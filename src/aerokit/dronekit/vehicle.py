@@ -129,7 +129,8 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, Readiness, VehiclePriv
             CommandSequence,  # with pymavlink: programs without missions do without
         )
 
-        return self.__dict__.setdefault("_commands", CommandSequence(self))
+        made: CommandSequence = self.__dict__.setdefault("_commands", CommandSequence(self))
+        return made
 
     @property
     def commands(self) -> CommandSequence:

@@ -71,6 +71,10 @@ class Parameters:
             on_progress=on_progress,
         )
 
+    def known(self, name: str) -> Parameter | None:
+        """What was told last of one parameter; see :meth:`aerokit.vehicle.parameters.Parameters.known`."""
+        return self._parameters.known(name)
+
     def get(self, name: str, *, patience_s: float = PATIENCE_S, timeout: float | None = None) -> int | float:
         """Ask the vehicle for one value; see :meth:`aerokit.vehicle.parameters.Parameters.get`."""
         return self._loop.run(self._parameters.get, name, patience_s=patience_s, timeout=timeout)

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.mavlink.messages import CommandAck
     from aerokit.mavlink.signing import Signing
+    from aerokit.protocols.command import Standing
     from aerokit.runtime.events import Event
     from aerokit.runtime.subscription import Overflow
     from aerokit.sync.loop_thread import Held
@@ -290,6 +291,7 @@ class Vehicle(VehicleState, BlockingBlock):
         attempt_timeout: float = 1.0,
         progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
+        standing: Standing | None = None,
     ) -> CommandAck:
         """Send any MAV_CMD as COMMAND_LONG and return its ACCEPTED ack; see :meth:`aerokit.Vehicle.command`."""
         return self._loop.run(
@@ -301,6 +303,7 @@ class Vehicle(VehicleState, BlockingBlock):
             attempt_timeout=attempt_timeout,
             progress_timeout=progress_timeout,
             on_progress=on_progress,
+            standing=standing,
         )
 
     def command_int(
@@ -316,6 +319,7 @@ class Vehicle(VehicleState, BlockingBlock):
         attempt_timeout: float = 1.0,
         progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
+        standing: Standing | None = None,
     ) -> CommandAck:
         """Send any MAV_CMD as COMMAND_INT; see :meth:`aerokit.Vehicle.command_int`."""
         return self._loop.run(
@@ -331,6 +335,7 @@ class Vehicle(VehicleState, BlockingBlock):
             attempt_timeout=attempt_timeout,
             progress_timeout=progress_timeout,
             on_progress=on_progress,
+            standing=standing,
         )
 
     def send(self, message: Message) -> None:

@@ -35,6 +35,7 @@ from aerokit.vehicle.watch import LinkWatch, VehicleWatch
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterator
 
+    from aerokit.protocols.command import Standing
     from aerokit.runtime.bus import Detach, Sink
     from aerokit.runtime.connection import Connection
     from aerokit.runtime.events import Event
@@ -120,6 +121,7 @@ class VehicleCore:
         attempt_timeout: float = 1.0,
         progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
+        standing: Standing | None = None,
     ) -> CommandAck:
         """Send any MAV_CMD as COMMAND_LONG and return its ACCEPTED ack.
 
@@ -133,6 +135,8 @@ class VehicleCore:
             attempt_timeout: seconds to wait for an ack after each, and at least two measured round trips.
             progress_timeout: seconds to wait after each IN_PROGRESS for the next answer; calibrations can take long.
             on_progress: called with 0–100, or None, for each IN_PROGRESS.
+            standing: says whether it may be sent again, instead of these rules: for programs that keep orders of their
+                own. The order is no newer one then.
 
         See https://mavlink.io/en/services/command.html.
 
@@ -150,6 +154,7 @@ class VehicleCore:
             attempt_timeout=attempt_timeout,
             progress_timeout=progress_timeout,
             on_progress=on_progress,
+            standing=standing,
         )
 
     async def command_int(
@@ -165,6 +170,7 @@ class VehicleCore:
         attempt_timeout: float = 1.0,
         progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
+        standing: Standing | None = None,
     ) -> CommandAck:
         """Send any MAV_CMD as COMMAND_INT: param1 to param4, ``x``, ``y``, ``z`` in ``frame`` (MAV_FRAME).
 
@@ -184,6 +190,7 @@ class VehicleCore:
             attempt_timeout=attempt_timeout,
             progress_timeout=progress_timeout,
             on_progress=on_progress,
+            standing=standing,
         )
 
     def send(self, message: Message) -> None:
@@ -362,13 +369,18 @@ class VehicleCore:
         ]
 
     async def _answered(
-        self, send: Callable[..., Awaitable[CommandAck]], command: int, *params: float, **options: Any
+        self,
+        send: Callable[..., Awaitable[CommandAck]],
+        command: int,
+        *params: float,
+        standing: Standing | None,
+        **options: Any,
     ) -> CommandAck:
         """What the commands of the program itself have in common; ``send`` is one of the command sender's."""
         started = self.connection.now()
         try:
-            if "standing" in options or command in QUESTIONS:
-                return await send(command, *params, **options)
+            if standing is not None or command in QUESTIONS:
+                return await send(command, *params, standing=standing, **options)
             with self._own_order(command) as order:
                 armed = params[0] == 1 if command == COMPONENT_ARM_DISARM and params else None
                 with self._helm.sending(order, armed=armed) as sending:

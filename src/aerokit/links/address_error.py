@@ -1,4 +1,4 @@
-"""A connection string that is none: an error by itself, because pyserial is imported for it."""
+"""``AddressError``: a connection string that is none, for programs that expect pyserial's error. Imports pyserial."""
 
 from __future__ import annotations
 
@@ -10,4 +10,4 @@ __all__ = ["AddressError"]
 
 
 class AddressError(SerialException, LocalProtocolError):  # type: ignore[misc]  # pyserial has no types
-    """It names no link. DroneKit takes what it does not know for a serial port: an OSError; and it is a ValueError."""
+    """It names no link. pymavlink takes it for a serial port, so it is an OSError; and it is a ValueError."""
