@@ -25,10 +25,9 @@ from aerokit.errors import CommandRejected, OperationTimeout
 from aerokit.mavlink.messages import HomePosition
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
+    from collections.abc import Callable
 
     from aerokit.autopilots import Mode, Purpose
-    from aerokit.dronekit.mavlink import MAVConnection
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
 __all__ = ["FlightMethods"]
@@ -46,16 +45,6 @@ class FlightMethods(VehicleAttributes):
     """
 
     _dk_arming: tuple[bool, concurrent.futures.Future[None]] | None = None
-
-    if TYPE_CHECKING:
-        _handler: MAVConnection
-
-        def _dk_check_link(self) -> AsyncVehicle: ...
-        def _dk_run(self, function: Callable[..., Awaitable[Any]], *args: Any, **kwargs: Any) -> Any: ...
-        def _dk_order(
-            self, kind: str, function: Callable[..., Awaitable[object]], *args: Any, **kwargs: Any
-        ) -> concurrent.futures.Future[None]: ...
-        def _dk_pause(self, seconds: float) -> None: ...
 
     # --------------------------------------------------------------------------------- modes
 

@@ -23,6 +23,7 @@ from aerokit.dronekit.weakly import weakly
 from aerokit.errors import AerokitError, ConnectionClosed, LinkOpenError, LocalProtocolError
 from aerokit.links.address import ACCEPTED_FORMS, parse_address
 from aerokit.links.reconnecting import ReconnectingLink
+from aerokit.runtime.diagnosis import is_autopilot
 from aerokit.runtime.opening import open_connection
 from aerokit.sync.loop_thread import LoopThread
 
@@ -150,7 +151,7 @@ class MAVConnection:
         """
         self.message_listeners.append(fn)
         if len(self.message_listeners) == 1:
-            self.loop.call_soon(self._tap, self._forward)
+            self.loop.call_soon(self.tap, self._forward)
         return fn
 
     def forward_loop(self, fn: FunctionT) -> FunctionT:
@@ -163,8 +164,8 @@ class MAVConnection:
     def pipe(self, target: MAVConnection) -> MAVConnection:
         """Pass everything on that comes here to ``target``, and the other way round; returns ``target``."""
         target.target_system = self.target_system
-        self.loop.call_soon(self._tap, lambda frame, peer: target._pass_on(frame))
-        target.loop.call_soon(target._tap, lambda frame, peer: self._pass_on(frame))
+        self.loop.call_soon(self.tap, lambda frame, peer: target._pass_on(frame))
+        target.loop.call_soon(target.tap, lambda frame, peer: self._pass_on(frame))
         return target
 
     # ---------------------------------------------------------------------------- life cycle
@@ -249,7 +250,8 @@ class MAVConnection:
 
     # ------------------------------------------------------------------------------- inside
 
-    def _tap(self, sink: Callable[[Frame, Peer], None]) -> None:
+    def tap(self, sink: Callable[[Frame, Peer], None]) -> None:
+        """Have a function called with every frame that comes, until the connection is closed (loop thread)."""
         self._detach.append(self.connection.tap(sink))
 
     def _forward(self, frame: Frame, peer: Peer) -> None:
@@ -284,6 +286,13 @@ class MAVConnection:
     def _write_raw(self, frame: Frame) -> None:
         with contextlib.suppress(AerokitError):
             self.connection.write_raw(frame.raw)
+
+    def is_of_another_vehicle(self, system_id: int) -> bool:
+        """Whether this system has an autopilot of its own and is not the connected vehicle."""
+        heard = self.connection.heard
+        return system_id != self.target_system and any(
+            source[0] == system_id and is_autopilot(heartbeat) for source, heartbeat in heard.items()
+        )
 
     def follow_version(self, heartbeat: Message) -> None:
         """Speak the version of MAVLink that the vehicle speaks: old firmware knows no other one (loop thread)."""

@@ -9,7 +9,6 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from aerokit.errors import AerokitError
-from aerokit.runtime.diagnosis import is_autopilot
 
 if TYPE_CHECKING:
     from aerokit.dronekit.mavlink import MAVConnection
@@ -123,12 +122,8 @@ class MessageListeners:
             self._take_frame(message.received_frame, None)
 
     def _take_frame(self, frame: Frame, peer: Peer) -> None:
-        if frame.system_id == self._handler.target_system or not self._is_of_another_vehicle(frame.system_id):
+        if not self._handler.is_of_another_vehicle(frame.system_id):
             self._handler.listener_thread.offer(self._deliver, frame)
-
-    def _is_of_another_vehicle(self, system_id: int) -> bool:
-        heard = self._handler.connection.heard
-        return any(source[0] == system_id and is_autopilot(heartbeat) for source, heartbeat in heard.items())
 
     def _deliver(self, frame: Frame) -> None:
         message = self._message_of(frame)

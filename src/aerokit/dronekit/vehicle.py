@@ -28,14 +28,13 @@ from aerokit.dronekit.readiness import Readiness
 from aerokit.dronekit.shadowable import Shadowable
 from aerokit.dronekit.streams import request_streams
 from aerokit.dronekit.weakly import weakly
-from aerokit.errors import AerokitError, ConnectFailed, LocalProtocolError, OperationTimeout
+from aerokit.errors import AerokitError, ConnectFailed
 from aerokit.mavlink.messages import CommandLong
 from aerokit.runtime.background import Background
 from aerokit.runtime.diagnosis import is_autopilot
 from aerokit.vehicle.connect import connect as connect_async
 
 if TYPE_CHECKING:
-    import concurrent.futures
     from collections.abc import AsyncIterator, Awaitable, Callable
     from types import TracebackType
 
@@ -45,7 +44,6 @@ if TYPE_CHECKING:
     from aerokit.dronekit.commands import CommandSequence, WaypointLoader
     from aerokit.dronekit.master import Master
     from aerokit.dronekit.mavlink import MAVConnection
-    from aerokit.mavlink.message import Message
     from aerokit.runtime.connection import Connection
     from aerokit.sync.loop_thread import Held
     from aerokit.vehicle.values import StatusText
@@ -74,18 +72,10 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, Readiness, VehiclePriv
     """
 
     def __init__(self, handler: MAVConnection) -> None:
-        super().__init__(handler.listener_thread)
-        self._handler = handler
-        self._logger = logging.getLogger("dronekit")
-        self._autopilot_logger = logging.getLogger("autopilot")
-        self._dk_aio: AsyncVehicle | None = None
+        super().__init__(handler)
         self._dk_held: Held[AsyncVehicle] | None = None
         self._dk_sync: sync.Vehicle | None = None
-        self._dk_heartbeat_limit: float = 0.0
-        self._dk_message_handlers: list[tuple[type[Message], Callable[[Any], None], bool]] = []
-        self._dk_starters: list[Callable[[ExitStack], None]] = []
         self._dk_initializing = threading.Lock()
-        self._dk_tasks: Background | None = None
         self._message_listeners = MessageListeners(self, handler)
         self._dk_make_streams()
         self._location = Locations(self)
@@ -242,78 +232,6 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, Readiness, VehiclePriv
 
     def _is_mode_available(self, mode_code: int, base_mode: int = 0) -> bool:
         return not mode_name(self._dk_vehicle, base_mode or 1, mode_code).endswith(f" {mode_code}")
-
-    @property
-    def _dk_target_system(self) -> int:
-        return self._handler.target_system
-
-    # -------------------------------------------------------------------- for the other parts
-    # `_dk_`: names that no subclass in the classic style takes for its own things.
-
-    @property
-    def _dk_vehicle(self) -> AsyncVehicle:
-        if self._dk_aio is None:
-            raise APIException("the vehicle is not connected yet: call initialize()")
-        return self._dk_aio
-
-    def _dk_on(self, message_type: type[Message], handler: Callable[[Any], None]) -> None:
-        stream = self._dk_streams.get(message_type)
-        if stream is None:
-            self._dk_message_handlers.append((message_type, handler, True))
-        else:
-            stream.add(handler)
-
-    def _dk_on_any_component(self, message_type: type[Message], handler: Callable[[Any], None]) -> None:
-        self._dk_message_handlers.append((message_type, handler, False))
-
-    def _dk_at_start(self, function: Callable[[ExitStack], None]) -> None:
-        self._dk_starters.append(function)
-
-    def _dk_background(self, function: Callable[[], Awaitable[None]]) -> None:
-        if self._dk_tasks is not None:
-            self._dk_tasks.start(function, f"dronekit {getattr(function, '__name__', 'task')}")
-
-    def _dk_check_link(self) -> AsyncVehicle:
-        """The asynchronous vehicle, if it can be talked to."""
-        aio = self._dk_vehicle
-        if self._handler.is_closed:
-            raise APIException("the vehicle was closed")
-        try:
-            aio.connection.raise_if_ended()
-        except AerokitError as error:
-            raise APIException(str(error)) from error
-        age = aio.heartbeat_age
-        if self._dk_heartbeat_limit and age > self._dk_heartbeat_limit:
-            raise APIException(f"no heartbeat of the vehicle for {age:.0f} s")
-        return aio
-
-    def _dk_run(self, function: Callable[..., Awaitable[Any]], *args: Any, **kwargs: Any) -> Any:
-        self._dk_check_link()
-        try:
-            return self._handler.loop.run(function, *args, **kwargs)
-        except LocalProtocolError:
-            raise
-        except OperationTimeout as error:
-            raise TimeoutError(str(error)) from error
-        except AerokitError as error:
-            raise APIException(str(error)) from error
-
-    def _dk_order(
-        self, kind: str, function: Callable[..., Awaitable[object]], *args: Any, **kwargs: Any
-    ) -> concurrent.futures.Future[None]:
-        self._dk_check_link()
-        try:
-            return self._handler.orders.give(kind, function, *args, **kwargs)
-        except AerokitError as error:
-            raise APIException(str(error)) from error
-
-    def _dk_send(self, message: Message) -> None:
-        self._dk_check_link()
-        self._handler.send(message)
-
-    def _dk_pause(self, seconds: float) -> None:
-        """Sleep, unless the vehicle is closed meanwhile."""
-        self._handler.wait_closed(seconds)
 
     # ------------------------------------------------------------------------------- inside
 
