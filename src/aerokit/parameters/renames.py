@@ -231,7 +231,7 @@ def _by_name() -> Mapping[str, tuple[Rename, ...]]:
             if old not in row.names:  # its new name is the old one of a later renaming, in the same unit
                 row = row.replace(older=(*row.older, old))
             rows.update(dict.fromkeys(row.names, row))
-    found = {name: (row,) for name, row in rows.items()}
+    found: dict[str, tuple[Rename, ...]] = {name: (row,) for name, row in rows.items()}
     for since, vehicles, divisor, pairs in ONE_WAY:
         for old, new in _pairs(pairs):
             row = Rename(old, new, divisor, vehicles=vehicles, since=since)
