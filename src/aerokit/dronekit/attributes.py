@@ -221,7 +221,7 @@ class VehicleAttributes(VehicleCore):
             message.base_mode,
         ):
             assert self._dk_aio is not None
-            self._flightmode = mode_name(self._dk_aio, message.base_mode, message.custom_mode)
+            self._flightmode = mode_name(self._dk_aio, message.custom_mode)
         self._dk_tell("armed", self._armed, cache=True)
         self._dk_tell("mode", VehicleMode(self._flightmode), cache=True)
         self._dk_tell("system_status", self.system_status, cache=True)

@@ -10,7 +10,7 @@ from aerokit.autopilots import autopilot_for
 from aerokit.autopilots.modes import CUSTOM_MODE_ENABLED, Mode
 from aerokit.dronekit.standing import until_answered
 from aerokit.errors import CommandRejected, LocalProtocolError, OperationTimeout
-from aerokit.mavlink.messages import Heartbeat
+from aerokit.mavlink.messages import Heartbeat, SetMode
 from aerokit.protocols.command import result_name
 
 if TYPE_CHECKING:
@@ -29,10 +29,9 @@ LOOK_S = 0.05
 ATTEMPTS, ASK_AGAIN_S = 4, 0.5
 
 
-def mode_name(vehicle: Vehicle, base_mode: int, custom_mode: int) -> str:
+def mode_name(vehicle: Vehicle, custom_mode: int) -> str:
     """The name of a mode in HEARTBEAT: pymavlink's and the autopilot's are the same."""
-    known = vehicle.telemetry.mode_names
-    return _as_known(vehicle).mode(custom_mode, base_mode | CUSTOM_MODE_ENABLED, known).name
+    return _as_known(vehicle).mode(custom_mode, CUSTOM_MODE_ENABLED, vehicle.telemetry.mode_names).name
 
 
 def mode_named(vehicle: Vehicle, mode: str | int) -> Mode:
@@ -43,14 +42,21 @@ def mode_named(vehicle: Vehicle, mode: str | int) -> Mode:
     """
     autopilot = _as_known(vehicle)
     if isinstance(mode, int) and autopilot.modes_are_numbered:
-        return Mode(mode_name(vehicle, 0, mode), mode)
+        return Mode(mode_name(vehicle, mode), mode)
     try:
         found = autopilot.find_mode(mode, vehicle.telemetry.mode_names)
     except (LocalProtocolError, AttributeError, TypeError) as error:  # the first lists the modes there are
         raise KeyError(mode) from (error if isinstance(error, LocalProtocolError) else None)
     if not isinstance(mode, str) or not (mode.isupper() or mode == found.name):
         raise KeyError(mode)
-    return found
+    return found if autopilot.modes_are_numbered else found.replace(base_mode=_px4_flags(found.name))
+
+
+def _px4_flags(name: str) -> int:
+    """MAV_MODE_FLAG as pymavlink sends them; PX4 looks at the one for custom modes only."""
+    from pymavlink.mavutil import px4_map
+
+    return int(px4_map.get(name, (CUSTOM_MODE_ENABLED,))[0])
 
 
 def _as_known(vehicle: Vehicle) -> Autopilot:
@@ -100,7 +106,7 @@ async def _change_mode(vehicle: Vehicle, wanted: Mode, standing: Standing) -> No
 
 async def _request(vehicle: Vehicle, wanted: Mode, standing: Standing) -> None:
     order = vehicle.autopilot.mode_order(wanted)
-    params = (_flags(vehicle, wanted), *order.params[1:])
+    params = (wanted.base_mode, *order.params[1:])
     try:
         await until_answered(
             vehicle.command(DO_SET_MODE, *params, component_id=0, standing=standing), standing
@@ -108,16 +114,7 @@ async def _request(vehicle: Vehicle, wanted: Mode, standing: Standing) -> None:
     except CommandRejected as error:
         if error.result != RESULT_UNSUPPORTED:
             raise
-        vehicle.send(order.legacy(vehicle.system_id))
-
-
-def _flags(vehicle: Vehicle, wanted: Mode) -> int:
-    """MAV_MODE_FLAG as pymavlink sends them; vehicles look at the one for custom modes only."""
-    if vehicle.autopilot.modes_are_numbered:
-        return CUSTOM_MODE_ENABLED
-    from pymavlink.mavutil import px4_map
-
-    return int(px4_map.get(wanted.name, (CUSTOM_MODE_ENABLED,))[0])
+        vehicle.send(SetMode(vehicle.system_id, wanted.base_mode, wanted.custom_mode))
 
 
 def _is_in(vehicle: Vehicle, wanted: Mode) -> bool:

@@ -231,7 +231,7 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, Readiness, VehiclePriv
         return self._handler.master
 
     def _is_mode_available(self, mode_code: int, base_mode: int = 0) -> bool:
-        return not mode_name(self._dk_vehicle, base_mode or 1, mode_code).endswith(f" {mode_code}")
+        return not mode_name(self._dk_vehicle, mode_code).endswith(f" {mode_code}")
 
     # ------------------------------------------------------------------------------- inside
 
