@@ -14,6 +14,7 @@ from aerokit.dronekit.flight_orders import (
     change_armed,
     check_speed,
     checked_place,
+    flies_to_places_in,
     go_to,
     refuse,
     set_home,
@@ -27,8 +28,6 @@ from aerokit.mavlink.messages import HomePosition
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from aerokit.autopilots import Mode, Purpose
-    from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
 __all__ = ["FlightMethods"]
 
@@ -205,7 +204,7 @@ class FlightMethods(VehicleAttributes):
             ValueError: it is no such location, or one of its numbers is missing or wrong. Nothing was sent.
         """
         aio = self._dk_check_link()
-        flies_in = _flies_to_places_in(aio)
+        flies_in = flies_to_places_in(aio)
         place = self._dk_place(location, is_relative=not flies_in)
         for name, speed in (("airspeed", airspeed), ("groundspeed", groundspeed)):
             check_speed(name, speed)
@@ -396,14 +395,3 @@ class FlightMethods(VehicleAttributes):
                 self._dk_pause(min(POLL_S, max(deadline - time.monotonic(), 0.0)))
             else:
                 concurrent.futures.wait([order], min(POLL_S, max(deadline - time.monotonic(), 0.0)))
-
-
-def _flies_to_places_in(aio: AsyncVehicle) -> tuple[Mode, ...]:
-    """Where the order to fly to a place changes the mode itself: those in which the program meant it to; the first is
-    the one that the order brings about. Empty where the mode stays what it is, and the vehicle refuses in a wrong one.
-    """
-    if not aio.autopilot.repositions_amsl:
-        return ()
-    purposes: tuple[Purpose, ...] = (aio.autopilot.reposition_purpose, "take_off")
-    modes = map(aio.autopilot.mode_for, purposes)
-    return tuple(mode for mode in modes if mode is not None)

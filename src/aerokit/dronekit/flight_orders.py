@@ -11,11 +11,21 @@ from aerokit.errors import CommandRejected, LocalProtocolError, OperationTimeout
 from aerokit.mavlink.messages import SetPositionTargetGlobalInt
 
 if TYPE_CHECKING:
+    from aerokit.autopilots import Mode, Purpose
     from aerokit.dronekit.standing import Standing
     from aerokit.dronekit.values import LocationGlobal, LocationGlobalRelative
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
-__all__ = ["change_armed", "check_speed", "checked_place", "go_to", "refuse", "set_home", "take_off"]
+__all__ = [
+    "change_armed",
+    "check_speed",
+    "checked_place",
+    "flies_to_places_in",
+    "go_to",
+    "refuse",
+    "set_home",
+    "take_off",
+]
 
 COMPONENT_ARM_DISARM, DO_SET_HOME, DO_REPOSITION = 400, 179, 192
 GLOBAL, GLOBAL_INT, GLOBAL_RELATIVE_ALT_INT = 0, 5, 6
@@ -73,6 +83,17 @@ async def go_to(
             raise
         target = (vehicle.system_id, 0, GLOBAL_RELATIVE_ALT_INT, POSITION_ONLY)
         vehicle.send(SetPositionTargetGlobalInt(0, *target, latitude, longitude, altitude, *(0.0,) * 8))
+
+
+def flies_to_places_in(aio: AsyncVehicle) -> tuple[Mode, ...]:
+    """Where the order to fly to a place changes the mode itself: those in which the program meant it to; the first is
+    the one that the order brings about. Empty where the mode stays what it is, and the vehicle refuses in a wrong one.
+    """
+    if not aio.autopilot.repositions_amsl:
+        return ()
+    purposes: tuple[Purpose, ...] = (aio.autopilot.reposition_purpose, "take_off")
+    modes = map(aio.autopilot.mode_for, purposes)
+    return tuple(mode for mode in modes if mode is not None)
 
 
 async def set_home(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: float) -> None:

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from aerokit.dronekit.exceptions import APIException
 from aerokit.dronekit.listener_thread import ListenerThread
+from aerokit.dronekit.mav_writer import MAVWriter
 from aerokit.dronekit.orders import Orders
 from aerokit.dronekit.standing import Given
 from aerokit.dronekit.weakly import weakly
@@ -384,22 +385,3 @@ def _raise_classic(error: LinkOpenError) -> NoReturn:
 def mavudpin_multi(device: str, baud: int | None = None, **_: Any) -> MAVConnection:
     """Listen for UDP and answer everybody heard: any connection that listens does."""
     return MAVConnection(f"udpin:{device}")
-
-
-class MAVWriter:
-    """A file-like object whose ``write`` puts bytes into a queue, as programs that build their own MAVLink use it."""
-
-    def __init__(self, queue: queue.Queue[bytes]) -> None:
-        self.queue = queue
-
-    def write(self, pkt: bytes) -> None:
-        """Put them there."""
-        self.queue.put(pkt)
-
-    def read(self) -> NoReturn:
-        """Nothing can be read.
-
-        Raises:
-            RuntimeError: always.
-        """
-        raise RuntimeError("a MAVWriter is for writing")
