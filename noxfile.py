@@ -63,6 +63,7 @@ def lint(session: nox.Session) -> None:
     session.run("ruff", "format", "--check", ".")
     session.run("pytest", "-q", "tests/test_layers.py")
     session.run("python", "-m", "aerokit.mavlink.generator", "--check")
+    session.run("python", "-m", "aerokit.sync.generator", "--check")
 
 
 @nox.session

@@ -26,7 +26,6 @@ from table import Row, row
 
 import aerokit
 from aerokit import messages
-from aerokit.autopilots.streams import DEFAULT_RATES_HZ
 from aerokit.links import memory_link_pair
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavCmd
@@ -34,6 +33,7 @@ from aerokit.mavlink.message import Message
 from aerokit.missions import Mission, land, take_off, waypoint
 from aerokit.sim import SimulatedCopter, SimulatedPx4, SimulatedVehicle, SimulatorServer, simulated_link
 from aerokit.testing import run_virtual
+from aerokit.vehicle.state.states import DEFAULT_RATES_HZ
 
 NAMES = ("copter_hundred", "px4_hundred", "copter_flight", "px4_flight")
 RATES: Mapping[type[Message], float] = {getattr(messages, name): 4.0 for name in DEFAULT_RATES_HZ}

@@ -22,6 +22,19 @@ FLOORS = [
     {"dronekit"},
     {"testing", "cli"},
 ]
+ROOMS = {
+    "vehicle": [
+        {"checks"},
+        {"state"},
+        {"talk"},
+        {"orders"},
+        {"files"},
+        {"parameters", "plans"},
+        {"vehicle"},
+        {"connect"},
+    ],
+}
+"""The rooms of packages that have some, from below; a file beside them is a room of its own."""
 ALLOWED_BESIDE = {("sim", "autopilots"), ("sim", "links")}
 REEXPORTED = {"messages": "mavlink", "enums": "mavlink", "events": "runtime", "__version__": "errors"}
 SANS_IO = ("mavlink", "parameters", "missions", "protocols", "autopilots")
@@ -84,3 +97,20 @@ def test_only_the_right_floors_touch_the_world(path: Path) -> None:
         assert not tops & SOCKETS
     imported = {name.split(".")[1] for name in imports_of(path) if name.startswith("aerokit.")}
     assert own == "testing" or "testing" not in imported
+
+
+VEHICLE_FILES = [path for path in FILES if package_of(path) == "vehicle"]
+
+
+@pytest.mark.parametrize("path", VEHICLE_FILES, ids=lambda path: str(path.relative_to(SOURCE)))
+def test_a_room_imports_only_from_rooms_below(path: Path) -> None:
+    rooms = ROOMS["vehicle"]
+    own = path.relative_to(SOURCE).with_suffix("").parts[1]
+
+    def height(room: str) -> int:
+        return next(i for i, floor in enumerate(rooms) if room in floor)
+
+    for name in imports_of(path):
+        parts = name.split(".")
+        if parts[:2] == ["aerokit", "vehicle"] and len(parts) > 2 and parts[2] != own:
+            assert height(parts[2]) < height(own), f"vehicle/{own} may not import {name}"

@@ -140,7 +140,7 @@ import subprocess
 import resource
 import aerokit.sync
 from aerokit.errors import LinkOpenError
-from aerokit.sync.vehicle import connect
+from aerokit.sync.twins import connect
 
 resource.setrlimit(resource.RLIMIT_NOFILE, (40, 40))
 taken = []

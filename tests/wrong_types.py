@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 
 from aerokit import Position, messages
 from aerokit.errors import LocalProtocolError
-from aerokit.missions import Mission
-from aerokit.vehicle.setpoints import (
+from aerokit.missions import Fence, Mission, RallyPoints
+from aerokit.vehicle.orders.setpoints import (
     AttitudeSetpoint,
     LocalPositionSetpoint,
     PositionSetpoint,
@@ -49,6 +49,7 @@ WRONG: dict[str, tuple[object, ...]] = {
     "str | os.PathLike[str]": (*NOTHING, *STRANGE, *NUMBER),
     "str | os.PathLike[str] | None": (*STRANGE, *NUMBER),
     "Position": (*NOTHING, *STRANGE, *TEXT, *NUMBER, [47.0, 8.0]),
+    "Position | None": (*STRANGE, *TEXT, *NUMBER, [47.0, 8.0]),
     "Message": (*NOTHING, *STRANGE, *TEXT, *NUMBER, messages.Heartbeat),
     "type[Message]": (*NOTHING, *STRANGE, *TEXT, *NUMBER, messages.Heartbeat(0, 0, 0, 0, 0), int),
     "Mapping[str, float]": (*NOTHING, *STRANGE, *TEXT, *NUMBER, {1: 1.0}, {"A": "1"}, {"A": None}, ["A"]),
@@ -69,7 +70,9 @@ WRONG: dict[str, tuple[object, ...]] = {
     "Dialect": (*NOTHING, *STRANGE, *TEXT, *NUMBER),
     "LogEntry | int": (*NOTHING, *STRANGE, *TEXT, 1.5),
     "ParameterSource": (*NOTHING, _Anything(), [PLACE], (47.0, 8.0), 1j, *NUMBER),
-    "PlanT": (*NOTHING, *STRANGE, *TEXT, *NUMBER, PLACE),
+    **dict.fromkeys(
+        ("PlanT", "Mission", "Fence", "RallyPoints"), (*NOTHING, *STRANGE, *TEXT, *NUMBER, PLACE)
+    ),
     "SetpointT": (*NOTHING, *STRANGE, *TEXT, *NUMBER, PLACE),
     "str | Link": (*NOTHING, *STRANGE, *NUMBER, b"udpin:0.0.0.0:14550"),
     "str | Link | Connection": (*NOTHING, *STRANGE, *NUMBER, b"udpin:0.0.0.0:14550"),
@@ -93,6 +96,7 @@ RIGHT: dict[str, object] = {
     "str | Link": "udpin:127.0.0.1:0",
     "str | Link | Connection": "udpin:127.0.0.1:0",
     "Position": PLACE,
+    "Position | None": PLACE,
     "Message": messages.Heartbeat(6, 8, 0, 0, 4),
     "type[Message]": messages.Heartbeat,
     "type[MessageT]": messages.Heartbeat,
@@ -102,6 +106,7 @@ RIGHT: dict[str, object] = {
     "Callable[[T | None, T], None]": print,
     "LogEntry | int": 1,
     "Signing | None": None,
+    **{kind.__name__: kind() for kind in (Mission, Fence, RallyPoints)},
     "PlanT": Mission(),
     "SetpointT": VelocitySetpoint(),
     "PositionSetpoint": PositionSetpoint(PLACE),

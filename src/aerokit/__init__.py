@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from aerokit.runtime.link_state import LinkState
     from aerokit.runtime.opening import open_connection
     from aerokit.vehicle.connect import connect
-    from aerokit.vehicle.setpoints import (
+    from aerokit.vehicle.orders.setpoints import (
         AccelerationSetpoint,
         AttitudeSetpoint,
         BodyVelocitySetpoint,
@@ -66,19 +66,19 @@ __all__ = [
 
 # Imported when first asked for: whoever wants `aerokit.messages` does not pay for asyncio.
 _HOMES = {
-    "AccelerationSetpoint": "aerokit.vehicle.setpoints",
-    "AttitudeSetpoint": "aerokit.vehicle.setpoints",
-    "BodyVelocitySetpoint": "aerokit.vehicle.setpoints",
+    "AccelerationSetpoint": "aerokit.vehicle.orders.setpoints",
+    "AttitudeSetpoint": "aerokit.vehicle.orders.setpoints",
+    "BodyVelocitySetpoint": "aerokit.vehicle.orders.setpoints",
     "Connection": "aerokit.runtime.connection",
     "Dialect": "aerokit.mavlink.dialect",
     "LinkState": "aerokit.runtime.link_state",
-    "LocalPositionSetpoint": "aerokit.vehicle.setpoints",
+    "LocalPositionSetpoint": "aerokit.vehicle.orders.setpoints",
     "Position": "aerokit.position",
-    "PositionSetpoint": "aerokit.vehicle.setpoints",
+    "PositionSetpoint": "aerokit.vehicle.orders.setpoints",
     "Signing": "aerokit.mavlink.signing",
     "SigningKey": "aerokit.mavlink.signing",
     "Vehicle": "aerokit.vehicle.vehicle",
-    "VelocitySetpoint": "aerokit.vehicle.setpoints",
+    "VelocitySetpoint": "aerokit.vehicle.orders.setpoints",
     "connect": "aerokit.vehicle.connect",
     "enums": "aerokit.mavlink.enums",
     "errors": "aerokit.errors",

@@ -28,11 +28,13 @@ class _SnapshotType(type):
     def __new__(mcs, name: str, bases: tuple[type, ...], namespace: dict[str, Any]) -> _SnapshotType:
         annotations: dict[str, str] = namespace.get("__annotations__", {})
         own = tuple(field for field, kind in annotations.items() if not kind.startswith("ClassVar"))
-        defaults = {field: namespace.pop(field) for field in own if field in namespace}
+        defaults = {field: value for base in bases for field, value in getattr(base, "_defaults", {}).items()}
+        defaults.update({field: namespace.pop(field) for field in own if field in namespace})
         fields = (*(field for base in bases for field in getattr(base, "__match_args__", ())), *own)
         cls = super().__new__(mcs, name, bases, {**namespace, "__slots__": own, "__match_args__": fields})
         if own:
             _write_init(cls, fields, defaults)
+        type.__setattr__(cls, "_defaults", defaults)
         type.__setattr__(cls, "_values", attrgetter(*(fields or ("__class__",))))
         return cls
 
@@ -55,7 +57,7 @@ class Snapshot(metaclass=_SnapshotType):
     """Base of the values that programs read: immutable, comparable, printable.
 
     A subclass may have a method ``_check(self)``, which raises when the fields make no sense together. The fields of
-    a base class come first, and must have no defaults.
+    a base class come first, with their defaults.
     """
 
     __match_args__: ClassVar[tuple[str, ...]]

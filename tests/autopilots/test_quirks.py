@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from aerokit.autopilots import DEFAULT_RATES_HZ, Autopilot, autopilot_for
+from aerokit.autopilots import Autopilot, autopilot_for
 from aerokit.autopilots.health import PREARM_CHECK
 from aerokit.autopilots.streams import ARDUPILOT_GROUPS
 from aerokit.errors import LocalProtocolError
@@ -51,7 +51,7 @@ def test_planes_take_off_in_their_own_mode_unless_they_hover() -> None:
     plan = plane.take_off(50, None)
     assert plan is not None
     assert plan.mode is not None
-    assert (plan.mode.name, plan.command, plan.sets_altitude) == ("TAKEOFF", None, False)
+    assert (plan.mode.name, plan.command) == ("TAKEOFF", None)
     hovering = plane.take_off(50, None, is_vtol=True)
     assert hovering == autopilot(3, 20).take_off(50, None)
     assert hovering is not None
@@ -203,11 +203,7 @@ def test_stream_groups_of_ardupilot() -> None:
     assert px4.stream_groups == {}
 
 
-def test_default_rates_are_for_messages_that_exist() -> None:
-    for name, hz in DEFAULT_RATES_HZ.items():
-        message = getattr(messages, name)
-        assert message.ID in messages.INDEX
-        assert 0 < hz <= 10
+def test_each_autopilot_sends_its_own_message_of_the_estimator() -> None:
     assert px4.sends(messages.EstimatorStatus)
     assert not px4.sends(messages.EkfStatusReport)
     assert not copter.sends(messages.EstimatorStatus)

@@ -18,7 +18,7 @@ from aerokit.autopilots import (
 )
 from aerokit.autopilots.health import ESTIMATES, SENSORS, names_of
 from aerokit.autopilots.px4 import MODES, px4_custom_mode
-from aerokit.autopilots.streams import ARDUPILOT_GROUPS, DEFAULT_RATES_HZ, subscription_rate_hz
+from aerokit.autopilots.streams import ARDUPILOT_GROUPS
 from aerokit.autopilots.version import version_text
 from aerokit.mavlink import enums, messages
 from aerokit.mavlink.message import Message
@@ -157,20 +157,6 @@ def test_where_it_is_armed(autopilot: int, vehicle_type: int, name: str | None) 
 # ------------------------------------------------------------------------------------ streams
 
 
-def test_default_rates() -> None:
-    by_rate: dict[float, set[str]] = {}
-    for name, hz in DEFAULT_RATES_HZ.items():
-        by_rate.setdefault(hz, set()).add(name)
-    assert by_rate == {
-        10.0: {"Attitude", "GlobalPositionInt", "LocalPositionNed"},
-        5.0: {"VfrHud", "ExtendedSysState", "DistanceSensor"},
-        2.0: {"SysStatus", "GpsRawInt", "EkfStatusReport", "EstimatorStatus", "RcChannels", "ServoOutputRaw"},
-        1.0: {"BatteryStatus", "MissionCurrent", "SystemTime", "Vibration", "Wind", "WindCov", "CurrentMode"},
-    }
-    rates = [subscription_rate_hz(name) for name in ("Attitude", "RawImu", "Odometry", "StatusText")]
-    assert rates == [10.0, 4.0, 4.0, None]
-
-
 def test_every_stream_group_has_its_number() -> None:
     first_of: dict[int, type[Message]] = {
         1: messages.RawImu,
@@ -194,10 +180,10 @@ def of(autopilot: int, vehicle_type: int) -> Autopilot:
 
 
 UNKNOWN: dict[str, Any] = {
-    **dict.fromkeys(("changes_speed", "completes_at_home", "condition_yaw", "has_parameter_hash"), False),
+    **dict.fromkeys(("completes_at_home", "condition_yaw", "has_parameter_hash"), False),
     **dict.fromkeys(("has_upper_case_parameters", "home_is_item_0", "judges_by_mode"), False),
     **dict.fromkeys(("lands_after_return", "logs_by_messages", "mission_starts_by_command"), False),
-    **dict.fromkeys(("repeats_item_reached", "runs_prearm_checks", "sends_mission_requests_float"), False),
+    **dict.fromkeys(("repeats_item_reached", "runs_prearm_checks"), False),
     **dict.fromkeys(("sets_current_by_command", "silent_without_logs", "stays_on_the_ground"), False),
     **dict.fromkeys(("takes_file_sessions", "tells_mission_checksum", "writes_partial_missions"), False),
     "arrival_radius_m": 2.0,
@@ -210,12 +196,12 @@ UNKNOWN: dict[str, Any] = {
     "unknown_currents_ca": {-1},
     "landing_ends_in": None,
     "reposition_purpose": "setpoint",
-    "setpoints": SetpointRules(False, False, False, False, False, False, 1.0, 3.0, False, False),
+    "setpoints": SetpointRules(False, False, False, False, False, False, False, False),
 }
 ARDUPILOT = UNKNOWN | {
     **dict.fromkeys(("completes_at_home", "has_upper_case_parameters", "home_is_item_0"), True),
     **dict.fromkeys(("logs_by_messages", "mission_starts_by_command", "runs_prearm_checks"), True),
-    **dict.fromkeys(("sends_mission_requests_float", "sets_current_by_command"), True),
+    **dict.fromkeys(("sets_current_by_command",), True),
     **dict.fromkeys(("takes_file_sessions", "writes_partial_missions"), True),
     "first_log_id": 1,
     "mission_download_window": 10,
@@ -224,37 +210,36 @@ ARDUPILOT = UNKNOWN | {
     "replaced_as_they_come": {0, 2},
 }
 STEERED = ARDUPILOT | {
-    "changes_speed": True,
-    "reposition": Reposition(relative_altitude=True, yaw=False, speed=False, armed_only=False),
+    "reposition": Reposition(relative_altitude=True, yaw=False, speed=False),
 }
 COPTER = STEERED | {
     "condition_yaw": True,
     "lands_after_return": True,
-    "setpoints": SetpointRules(True, True, True, True, True, False, 1.0, 3.0, True, False),
+    "setpoints": SetpointRules(True, True, True, True, True, False, True, False),
 }
 PLANE = STEERED | {
     "arrival_radius_m": 90.0,
-    "setpoints": SetpointRules(False, False, False, False, True, False, 1.0, 3.0, False, False),
+    "setpoints": SetpointRules(False, False, False, False, True, False, False, False),
 }
 ROVER = STEERED | {
     "arrival_radius_m": 4.0,
     "stays_on_the_ground": True,
-    "setpoints": SetpointRules(True, True, True, False, True, False, 1.0, 3.0, True, False),
+    "setpoints": SetpointRules(True, True, True, False, True, False, True, False),
 }
 SUB = STEERED | {
     "condition_yaw": True,
     "landing_ends_in": "ALT_HOLD",
-    "setpoints": SetpointRules(True, True, True, False, True, False, 1.0, 3.0, False, True),
+    "setpoints": SetpointRules(True, True, True, False, True, False, False, True),
 }
 PX4 = UNKNOWN | {
-    **dict.fromkeys(("changes_speed", "has_parameter_hash", "judges_by_mode", "lands_after_return"), True),
+    **dict.fromkeys(("has_parameter_hash", "judges_by_mode", "lands_after_return"), True),
     **dict.fromkeys(("repeats_item_reached", "silent_without_logs", "tells_mission_checksum"), True),
     "mission_upload_window": 6,
     "replaced_as_they_come": set(),
     "unknown_currents_ca": {-1, -100},
-    "reposition": Reposition(relative_altitude=False, yaw=True, speed=True, armed_only=True),
+    "reposition": Reposition(relative_altitude=False, yaw=True, speed=True),
     "reposition_purpose": "hold",
-    "setpoints": SetpointRules(True, True, True, True, True, True, 2.0, 0.5, False, False),
+    "setpoints": SetpointRules(True, True, True, True, True, True, False, False),
 }
 PX4_DOWN = PX4 | {"lands_after_return": False}
 

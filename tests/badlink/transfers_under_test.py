@@ -19,7 +19,7 @@ from aerokit.position import Position
 from aerokit.sim import SimulatedCopter
 from aerokit.sim.logs import SimulatedLog
 from aerokit.sim.parameters import stored
-from aerokit.vehicle.logs import LogMethod
+from aerokit.vehicle.files.logs import LogMethod
 
 REAL32 = 9
 NO_ANSWER = ("no answer to", "was not answered", "did not say how many")

@@ -21,26 +21,26 @@ from aerokit import (
     VelocitySetpoint,
     messages,
 )
-from aerokit.sync import cells, connection, files, guided, logs, mission, parameters, subscription, vehicle
+from aerokit.sync import twins
 
 __all__ = ["blocking_calls", "blocking_names"]
 
 Do = Callable[[Any], object]
 
 CLASSES: tuple[type, ...] = (
-    vehicle.Vehicle,
-    guided.Guided,
-    guided.SetpointStream,
-    parameters.Parameters,
-    parameters.Transaction,
-    mission.MissionControl,
-    mission.FenceControl,
-    mission.RallyControl,
-    files.Files,
-    logs.Logs,
-    cells.StateCell,
-    subscription.Subscription,
-    connection.Connection,
+    twins.Vehicle,
+    twins.Guided,
+    twins.SetpointStream,
+    twins.Parameters,
+    twins.Transaction,
+    twins.MissionControl,
+    twins.FenceControl,
+    twins.RallyControl,
+    twins.Files,
+    twins.Logs,
+    twins.StateCell,
+    twins.Subscription,
+    twins.Connection,
 )
 CLOSING = frozenset({"Vehicle.close", "Connection.close"})
 """At the end of every test."""
@@ -54,7 +54,7 @@ def blocking_names() -> Iterator[str]:
             function = inspect.getattr_static(cls, name)
             if not name.startswith("_") and isinstance(function, FunctionType):
                 code = inspect.unwrap(function).__code__
-                if {"_loop", "_stream"} & set(code.co_names) and f"{cls.__name__}.{name}" not in CLOSING:
+                if {"_loop", "_block"} & set(code.co_names) and f"{cls.__name__}.{name}" not in CLOSING:
                     yield f"{cls.__name__}.{name}"
 
 

@@ -188,6 +188,7 @@ CALLS: dict[str, Call] = {
     "Vehicle.return_to_launch": Call(lambda s: s.vehicle.return_to_launch(), airborne),
     "Vehicle.set_speed": Call(lambda s: s.vehicle.set_speed(3.0), on_mission),
     "Vehicle.set_heading": Call(lambda s: s.vehicle.set_heading(60, relative=True), airborne),
+    "Vehicle.set_home": Call(lambda s: s.vehicle.set_home(), airborne),
     "Vehicle.look_at": Call(lambda s: s.vehicle.look_at(s.home.replace(altitude_relative_m=0.0)), airborne),
     "Vehicle.stop_looking": Call(lambda s: s.vehicle.stop_looking(), airborne),
     "Vehicle.reboot": Call(lambda s: s.vehicle.reboot(), grounded),

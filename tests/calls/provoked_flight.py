@@ -28,7 +28,7 @@ import aerokit
 from aerokit import Position, PositionSetpoint, Signing, VelocitySetpoint, errors, messages
 from aerokit.mavlink.enums import MavCmd
 from aerokit.sim import SimulatedCopter, simulated_link
-from aerokit.vehicle.setpoints import AttitudeSetpoint, LocalPositionSetpoint
+from aerokit.vehicle.orders.setpoints import AttitudeSetpoint, LocalPositionSetpoint
 
 __all__ = ["FLIGHT"]
 
@@ -127,6 +127,13 @@ def _actions() -> Table:
         ("Vehicle.setup_signing", "BusyError"): P(_sign_twice, grounded, falls_silent),
         ("Vehicle.set_mode", "LocalProtocolError"): P(_method("set_mode", "NONE")),
         ("Vehicle.set_heading", "LocalProtocolError"): P(_method("set_heading", 999), airborne),
+        ("Vehicle.set_home", "LocalProtocolError"): P(_method("set_home", Position(1, 1))),
+        ("Vehicle.set_home", "CommandRejected"): P(_method("set_home"), before=refused(Cmd.DO_SET_HOME)),
+        ("Vehicle.set_home", "CommandTimeout"): P(_method("set_home"), before=ignored(Cmd.DO_SET_HOME)),
+        ("Vehicle.set_home", "OperationTimeout"): P(
+            _method("set_home", timeout=1),
+            before=lambda s: [accepted(each)(s) for each in (Cmd.DO_SET_HOME, Cmd.REQUEST_MESSAGE)],
+        ),
         ("Vehicle.set_heading", "HeartbeatTimeout"): later(
             _method("set_heading", 179, relative=True, rate_deg_s=1), falls_silent, 3.0
         ),
@@ -202,6 +209,11 @@ async def _stop(stage: Stage, feed: Callable[[Any], Any]) -> None:
         await feed(stream)
 
 
+async def _old_value(stage: Stage) -> object:
+    await anyio.sleep(1.0)
+    return stage.vehicle.version.fresh(0.5)
+
+
 async def _set_too_much(stage: Stage) -> None:
     async with stage.vehicle.guided.velocity() as stream:
         stream.set(VelocitySetpoint(north_m_s=math.nan))
@@ -254,7 +266,7 @@ def _parts() -> Table:
         ("SetpointStream.set", stopped): P(lambda s: _stop(s, _set_after_the_end), airborne),
         ("SetpointStream.set", "LocalProtocolError"): P(_set_too_much, airborne),
         ("SetpointStream.fly", stopped): later(lambda s: _fly(s), pilot, 1.0),
-        ("StateCell.fresh", "StaleValueError"): P(_now(lambda s: s.vehicle.version.fresh(0.0)), grounded),
+        ("StateCell.fresh", "StaleValueError"): P(_old_value, grounded),
         ("StateCell.fresh", "ValueUnknownError"): P(
             _now(lambda s: s.vehicle.home.fresh(1)), before=_forget("home")
         ),

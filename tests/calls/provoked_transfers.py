@@ -147,7 +147,7 @@ def _parameters() -> Table:
 
 
 def _unknown_and_silent(stage: Stage) -> None:
-    stage.vehicle.parameters._forget()
+    stage.vehicle.parameters._access.forget()
     falls_silent(stage)
 
 

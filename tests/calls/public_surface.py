@@ -11,14 +11,14 @@ import aerokit
 from aerokit.runtime.cells import Changes, StateCell
 from aerokit.runtime.connection import Connection
 from aerokit.runtime.subscription import Subscription
-from aerokit.vehicle.fence import FenceControl
-from aerokit.vehicle.files import Files
-from aerokit.vehicle.guided import Guided, SetpointStream
-from aerokit.vehicle.logs import Logs
-from aerokit.vehicle.mission import MissionControl
-from aerokit.vehicle.parameter_transaction import Temporarily, Transaction
-from aerokit.vehicle.parameters import Parameters
-from aerokit.vehicle.rally import RallyControl
+from aerokit.vehicle.files.files import Files
+from aerokit.vehicle.files.logs import Logs
+from aerokit.vehicle.orders.guided import Guided, SetpointStream
+from aerokit.vehicle.parameters.parameters import Parameters
+from aerokit.vehicle.parameters.transaction import Temporarily, Transaction
+from aerokit.vehicle.plans.fence import FenceControl
+from aerokit.vehicle.plans.mission import MissionControl
+from aerokit.vehicle.plans.rally import RallyControl
 
 __all__ = ["CLASSES", "FUNCTIONS", "Member", "awaited", "members", "own_classes_in"]
 

@@ -37,7 +37,7 @@ def _all(stage: Stage) -> Iterator[str]:
     yield from _tasks()
     yield from _timers()
     counters = [
-        stream.on_message for stream in vehicle._rates._streams.values()
+        stream.on_message for stream in vehicle._talk.rates._streams.values()
     ]  # they stay, one for each stream
     for key, sinks in connection.bus._sinks.items():
         yield from _times(f"sink of message {key}", [sink for _, sink in sinks if sink not in counters])
@@ -48,12 +48,12 @@ def _all(stage: Stage) -> Iterator[str]:
     yield from _times("deadline", connection.deadlines._due)
     for cell in (*vehicle.telemetry.cells.values(), vehicle.link_quality):
         yield from _times(f"waiter on {cell.name}", cell._sinks)
-    for stream in vehicle._rates._streams.values():
+    for stream in vehicle._talk.rates._streams.values():
         yield from _times(f"wish for {stream.message_type.NAME}", stream.wishes)
     yield from _times(
-        "answer under way", [key for key in vehicle._commands._under_way if _is_awaited(vehicle, key)]
+        "answer under way", [key for key in vehicle._talk.commands._under_way if _is_awaited(vehicle, key)]
     )
-    yield from _times("command that waits", vehicle._commands._runs)
+    yield from _times("command that waits", vehicle._talk.commands._runs)
     yield from _times("order", vehicle._helm._orders[1:])
     yield from _times("sending", vehicle._helm._sendings)
     yield from _times("held parameter", vehicle.parameters._holds._blocks)
@@ -61,12 +61,12 @@ def _all(stage: Stage) -> Iterator[str]:
     yield from _times("file that is being closed", [each for each in closing if not each.ended.is_set()])
     yield from _times("open session", range(stage.simulated.ftp.open_sessions))
     yield from _times("log on its way", range(stage.simulated.storage.logs.is_busy))
-    yield from _times("set-point stream", range(vehicle._stream is not None))
+    yield from _times("set-point stream", range(vehicle._holding.end_stream is not None))
     yield from (f"lock {name}" for name, lock in _locks("vehicle", vehicle, set()) if lock.locked())
 
 
 def _is_awaited(vehicle: Any, key: tuple[int, int]) -> bool:
-    return bool(key[0] == vehicle.component_id and vehicle._commands.awaits_answer(key[1]))
+    return bool(key[0] == vehicle.component_id and vehicle._talk.commands.awaits_answer(key[1]))
 
 
 def _times(name: str, items: Iterable[object]) -> Iterator[str]:

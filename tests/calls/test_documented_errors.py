@@ -79,7 +79,7 @@ async def settle(stage: Stage) -> None:
     """The vehicle is heard again, what was left to be confirmed is, and it stands."""
     await anyio.sleep(4.0)
     await stage.vehicle.home.wait_until(lambda _: True, timeout=30)
-    stage.vehicle._stop_watching_arming()
+    stage.vehicle._late_arming.stop()
 
 
 def is_it(raised: Exception, name: str, error: str) -> bool:

@@ -37,7 +37,7 @@ vehicle = connect({fc.address!r}, wait_ready=['mode'])
 vehicle.mode = VehicleMode('GUIDED')
 vehicle.armed = True
 vehicle.close()
-print([each for each in ('pymavlink', 'aerokit.sync.vehicle', 'argparse') if each in sys.modules])
+print([each for each in ('pymavlink', 'aerokit.sync.twins', 'argparse') if each in sys.modules])
 """
     ran = subprocess.run(
         [sys.executable, "-c", program],

@@ -19,7 +19,7 @@ from aerokit.dronekit import parameters as parameters_module
 from aerokit.errors import ParameterTimeout
 from aerokit.parameters.renames import ParameterRenamedWarning
 from aerokit.sim import SimulatedCopter, SimulatedPx4, open_simulator
-from aerokit.vehicle.parameters import Parameters as AsyncParameters
+from aerokit.vehicle.parameters.parameters import Parameters as AsyncParameters
 
 LIMIT_S = 10.0
 INT8, INT16 = 2, 4
@@ -392,7 +392,7 @@ def test_parameters_that_appear_later(vehicle: dronekit.Vehicle, fc: FlightContr
 def test_what_is_known_outlives_reboot_and_connection(
     vehicle: dronekit.Vehicle, fc: FlightController
 ) -> None:
-    vehicle._handler.loop.call(vehicle.aio._on_reboot)
+    vehicle._handler.loop.call(vehicle.aio._talk._note_reboot)
     parameters = vehicle.parameters
     assert parameters["FOO"] == 1.0
     assert parameters.set("FOO", 2)

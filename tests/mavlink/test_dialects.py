@@ -309,14 +309,31 @@ def test_extended_by(tmp_path: Path) -> None:
     assert both.by_name("WINCH_REPORT") is private[60_001]
     assert both.by_name("HEARTBEAT") is messages.Heartbeat
     assert both.enum("WINCH_STATE") is private.enum("WINCH_STATE")
-    assert both.enum("MAV_CMD") is enums.MavCmd
+    assert both.enum("MAV_RESULT") is enums.MavResult
     (frame,) = Framer(both).receive(FrameEncoder(1, 1).encode(winch(private)))
     assert both.decode(frame) == winch(private)
     assert sorted(cls.ID for cls in both) == sorted([*STANDARD.rows, 60_001])
 
 
-def test_extended_by_takes_the_longer_enum(private: Dialect) -> None:
-    assert STANDARD.extended_by(private).enum("MAV_CMD").NAV_TAKEOFF == 22
+def test_extended_by_has_the_entries_of_both_enums(private: Dialect) -> None:
+    both = STANDARD.extended_by(private)
+    commands = both.enum("MAV_CMD")
+    assert (commands.WINCH_DROP, commands.NAV_TAKEOFF) == (60_000, 22)
+    assert commands.DO_SET_RESUME_REPEAT_DIST == 215, "ArduPilot's, which the private dialect has not"
+    assert commands is both.enum("MAV_CMD")
+    assert both.enum("MAV_RESULT") is enums.MavResult, "nothing was added"
+    assert both.enum("WINCH_FLAGS") is private.enum("WINCH_FLAGS")
+
+
+@pytest.mark.parametrize("name", ["ardupilotmega", "development"])
+def test_pymavlinks_dialects_with_fewer_extension_fields_are_the_standards_classes(name: str) -> None:
+    """Pymavlink's MISSION_ACK ends before ``opaque_id``; a program that loads its dialect sees one class."""
+    module, dialect = loaded(name)
+    assert "opaque_id" not in module.mavlink_map[messages.MissionAck.ID].fieldnames
+    assert dialect[messages.MissionAck.ID] is messages.MissionAck
+    both = STANDARD.extended_by(dialect)
+    (frame,) = Framer(both).receive(FrameEncoder(1, 1).encode(messages.MissionAck(255, 190, 0, 0, 77)))
+    assert both.decode(frame) == messages.MissionAck(255, 190, 0, opaque_id=77)
 
 
 def test_a_clash_is_told(tmp_path: Path) -> None:
@@ -332,7 +349,7 @@ def test_a_clash_is_told(tmp_path: Path) -> None:
 
 def test_the_standard() -> None:
     assert STANDARD.name == "standard"
-    assert len(STANDARD) == len(list(STANDARD)) == 308
+    assert len(STANDARD) == len(list(STANDARD)) == 340
     assert [cls.ID for cls in STANDARD] == sorted(STANDARD.rows)
     assert STANDARD.get(33) is messages.GlobalPositionInt
     assert STANDARD.get(16_000_000) is None

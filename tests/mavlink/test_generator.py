@@ -6,12 +6,15 @@ import importlib
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from aerokit.errors import LocalProtocolError
 from aerokit.mavlink import enums, generator, messages
+from aerokit.mavlink.definitions import DialectDefinition, merged_enums, read_xml
+from aerokit.mavlink.union import read_additions, with_added_enums, with_added_messages
 
 PACKAGES = {"messages": messages, "enums": enums}
 
@@ -76,3 +79,26 @@ def test_importing_the_wire_imports_no_message() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == []
+
+
+def test_the_additions_say_nothing_that_pymavlink_says() -> None:
+    """So that what it has learnt since is taken out of them."""
+    if generator.fingerprint() != generator.generated_fingerprint():
+        pytest.skip("the installed pymavlink carries other XML than the additions were made for")
+    folder = generator.xml_folder()
+    dialects = [read_xml(folder / f"{stem}.xml") for stems in generator.MODULES.values() for stem in stems]
+    theirs, their_enums = [m for dialect in dialects for m in dialect.messages], merged_enums(dialects)
+    known = {(m.id, f.name): (f.units, f.enum, f.invalid) for m in theirs for f in m.fields}
+    for dialect in read_additions():
+        for message in dialect.messages:
+            alone = DialectDefinition(dialect.name, messages=(message,))
+            assert with_added_messages(theirs, [alone]) != theirs, message.name
+            for f in message.fields:
+                assert known.get((message.id, f.name)) != (f.units, f.enum, f.invalid), (
+                    f"{message.name}.{f.name}"
+                )
+        for enum in dialect.enums:
+            for entry in enum.entries:
+                one = DialectDefinition(dialect.name, enums=(replace(enum, entries=(entry,)),))
+                union = {e.name: e.entries for e in with_added_enums(their_enums, [one])}
+                assert union != {e.name: e.entries for e in their_enums}, entry.name

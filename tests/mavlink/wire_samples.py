@@ -10,10 +10,13 @@ from functools import cache
 from importlib import import_module
 from typing import Any
 
+from added_peer import added_module
+
 from aerokit.mavlink import STANDARD, Field, Message
 
 __all__ = [
     "PEERS",
+    "added_peer",
     "dialect_module",
     "for_peer",
     "peer_class",
@@ -25,7 +28,7 @@ __all__ = [
 ]
 
 PEERS = ("ardupilotmega", "development")
-"""Pymavlink's dialects which together know every message of `STANDARD`."""
+"""Pymavlink's dialects which together know every message of `STANDARD` but those of our additions."""
 
 _BITS = {"int8_t": 7, "uint8_t": 8, "int16_t": 15, "uint16_t": 16, "int32_t": 31, "uint32_t": 32} | {
     "int64_t": 63,
@@ -96,11 +99,25 @@ def dialect_module(name: str, version: int) -> Any:
 
 def peer_class(message_class: type[Message], version: int) -> tuple[Any, Any]:
     """Pymavlink's (module, class) for one of our classes; MAVLink 1 has none above 255."""
-    for name in PEERS:
-        module = dialect_module(name, version)
+    modules = [dialect_module(name, version) for name in PEERS]
+    if any((message_class.ID, field.name) not in _known() for field in message_class.FIELDS):
+        modules = [added_peer(version)]
+    for module in modules:
         if message_class.ID in module.mavlink_map:
             return module, module.mavlink_map[message_class.ID]
     raise LookupError(f"no dialect of pymavlink knows {message_class.NAME} in version {version}")
+
+
+def added_peer(version: int = 2) -> Any:
+    """Pymavlink's module, made in the tests, for the messages that it lacks or knows fewer fields of."""
+    return added_module(version, _known())
+
+
+@cache
+def _known() -> frozenset[tuple[int, str]]:
+    """Message id and name of every field in pymavlink's own modules."""
+    classes = [cls for name in PEERS for cls in dialect_module(name, 2).mavlink_map.values()]
+    return frozenset((cls.id, field) for cls in classes for field in cls.fieldnames)
 
 
 def peer_message(message: Message, version: int) -> tuple[Any, Any]:

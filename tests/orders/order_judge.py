@@ -21,7 +21,7 @@ from aerokit.mavlink.messages import (
     SetPositionTargetGlobalInt,
     SetPositionTargetLocalNed,
 )
-from aerokit.vehicle.orders import MOVING_COMMANDS, QUESTIONS
+from aerokit.vehicle.orders.order import MOVING_COMMANDS, QUESTIONS
 
 KNOWN_S = 2.6
 SETPOINTS = (SetPositionTargetLocalNed, SetPositionTargetGlobalInt, SetAttitudeTarget)

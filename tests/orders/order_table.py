@@ -161,6 +161,7 @@ ROWS = (
     Row("arm", lambda v: v.arm(), ARM, place="ground", steers=False),
     Row("disarm", lambda v: v.disarm(), ARM, place="armed", steers=False),
     Row("set_speed", lambda v: v.set_speed(2.0), int(MavCmd.DO_CHANGE_SPEED), steers=False),
+    Row("set_home", lambda v: v.set_home(), int(MavCmd.DO_SET_HOME), steers=False),
     Row("look_at", lambda v: v.look_at(north(v, 50.0)), int(MavCmd.DO_SET_ROI_LOCATION), steers=False),
     Row("command", _gimbal_up, int(MavCmd.DO_SET_SERVO), steers=False, on=("ardupilot",)),
     Row("parameters.set", _set(("WP_YAW_BEHAVIOR", "NAV_ACC_RAD")), 0, steers=False),

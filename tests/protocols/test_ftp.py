@@ -8,6 +8,7 @@ import pytest
 from ftp_server import as_message, make_client, reply_to, requests_in
 from hypothesis import given
 from hypothesis import strategies as st
+from pymavlink.mavftp import FTP_OP
 
 from aerokit.errors import FileError, FileTimeout, LocalProtocolError
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
@@ -55,8 +56,10 @@ def test_what_is_encoded_is_decoded(
     sequence: int, opcode: int, session: int, asked: int, complete: bool, offset: int, data: bytes
 ) -> None:
     message = FtpMessage(sequence, opcode, session, len(data), asked, complete, offset, data)
-    assert len(message.encode()) == 251
+    theirs = FTP_OP(sequence, session, opcode, len(data), asked, complete, offset, bytearray(data)).pack()
+    assert message.encode() == bytes(theirs).ljust(251, b"\0")
     assert FtpMessage.decode(message.encode()) == message
+    assert FtpMessage.decode(message.encode(), cut=False).data == data.ljust(239, b"\0")
 
 
 @given(st.binary(max_size=300))

@@ -136,10 +136,10 @@ async def test_a_pause_is_neither_silence_nor_a_reboot_nor_a_long_way(grounded: 
     assert round_trip is not None
     assert round_trip < 0.1
     with vehicle.subscribe(VehicleSilent, VehicleRebooted, capacity=5) as events:
-        vehicle._link_watch.ask()
+        vehicle._talk.link_watch.ask()
         block_loop(10)
         await anyio.sleep(0.3)
-        assert vehicle._link_watch.round_trip_s == pytest.approx(round_trip, abs=0.05)
+        assert vehicle._talk.link_watch.round_trip_s == pytest.approx(round_trip, abs=0.05)
         assert vehicle.link_state.value is LinkState.CONNECTED
         await anyio.sleep(5)
         assert events.get_nowait() is None

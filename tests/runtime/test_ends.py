@@ -193,11 +193,11 @@ def break_framer(vehicle: Vehicle, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def break_rates(vehicle: Vehicle, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(vehicle._rates, "_watch", broken)
+    monkeypatch.setattr(vehicle._talk.rates, "_watch", broken)
 
 
 def break_link_watch(vehicle: Vehicle, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(vehicle._link_watch, "_report", broken)
+    monkeypatch.setattr(vehicle._talk.link_watch, "_report", broken)
 
 
 @pytest.mark.parametrize(

@@ -53,7 +53,7 @@ async def test_after_the_link_is_lost_the_vehicle_is_silent(grounded: Flight) ->
     assert vehicle.is_silent
     assert (vehicle.link_state.value, vehicle.connection.link_state.value) == (LOST, LOST)
     await anyio.sleep(10)
-    assert vehicle.heartbeat_age > 10
+    assert vehicle.heartbeat_age >= 9.99
     with pytest.raises(LinkLost, match="unplugged"):
         await vehicle.link_state.wait_until(lambda state: state is CONNECTED)
 

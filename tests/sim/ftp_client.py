@@ -32,7 +32,7 @@ class FtpClient:
         self.sequence = (self.sequence + 1) & 0xFFFF if sequence is None else sequence
         size = len(data) if size is None else size
         packet = FtpPacket(
-            self.sequence, session, opcode, size, offset=offset, data=data, client=self.client.target
+            self.sequence, opcode, session, size, offset=offset, data=data, client=self.client.target
         )
         self.client.send(packet.message())
 

@@ -467,10 +467,11 @@ def test_any_command_is_answered(command: int, numbers: tuple[float, ...], flyin
 @settings(max_examples=15)
 @given(mask=st.integers(0, 0xFFF), frame=st.integers(0, 21), numbers=st.tuples(*(st.floats(width=32),) * 11))
 def test_any_setpoint_is_survived(mask: int, frame: int, numbers: tuple[float, ...]) -> None:
+    rates_and_thrust = numbers[4], numbers[5], numbers[6], numbers[7]
     px4, client = flying_px4(3.0)
     for _ in range(8):
         client.send(m.SetPositionTargetLocalNed(0, 1, 1, frame, mask, *numbers))
-        client.send(m.SetAttitudeTarget(0, 1, 1, mask & 0xFF, numbers[:4], *numbers[4:8]))
+        client.send(m.SetAttitudeTarget(0, 1, 1, mask & 0xFF, numbers[:4], *rates_and_thrust))
         client.send(m.SetPositionTargetGlobalInt(0, 1, 1, frame, mask, 473_000_000, 85_000_000, *numbers[2:]))
         client.run(0.25)
         set_mode(client, 6)

@@ -12,7 +12,7 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavResult, MavState
 from aerokit.missions import MissionItem
 from aerokit.sim import SimulatedPx4
-from aerokit.sim.px4.wire_messages import CurrentEventSequence, Event, LinkNodeStatus
+from aerokit.sim.px4.telemetry import BUILDERS
 
 NAN = math.nan
 ARM = MavCmd.COMPONENT_ARM_DISARM
@@ -291,17 +291,29 @@ def test_the_modes_are_listed_with_places_for_modes_of_others() -> None:
 
 def test_events_are_counted_from_just_before_the_overflow() -> None:
     px4, client = ready()
-    before = px4.build(CurrentEventSequence.ID)
-    assert before is not None
-    assert before.encode() == (65525).to_bytes(2, "little") + b"\0"
+    assert px4.build(m.CurrentEventSequence.ID) == m.CurrentEventSequence(65525, 0)
     client.command(ARM, 1)
-    now = px4.build(CurrentEventSequence.ID)
-    assert now is not None
-    assert now.encode() == (65526).to_bytes(2, "little") + b"\0"
-    assert len(Event.of(1, 2, 3, 0, 0, 4, b"").encode()) == Event.LENGTH
-    status = px4.build(LinkNodeStatus.ID)
-    assert status is not None
-    assert len(status.encode()) == LinkNodeStatus.LENGTH
+    assert px4.build(m.CurrentEventSequence.ID) == m.CurrentEventSequence(65526, 0)
+    event = client.last(m.Event)
+    assert (event.sequence, event.id, event.arguments[0]) == (65526, 26266355, 4)
+
+
+def test_all_that_it_can_tell_can_be_sent() -> None:
+    px4, _ = ready()
+    built = [message for message in map(px4.build, BUILDERS) if message is not None]
+    assert len(built) > 40
+    assert all(len(message.encode()) == message.LENGTH for message in built)
+
+
+def test_messages_that_pymavlink_has_not_are_read_by_their_names() -> None:
+    px4, client = ready()
+    client.command(MavCmd.REQUEST_MESSAGE, m.ComponentMetadata.ID)
+    assert client.last(m.ComponentMetadata).uri == "mftp://etc/extras/component_general.json.xz"
+    client.command(MavCmd.REQUEST_MESSAGE, m.ComponentInformation.ID)
+    assert client.last(m.ComponentInformation).peripherals_metadata_uri == ""
+    client.command(MavCmd.REQUEST_PROTOCOL_VERSION)
+    assert client.last(m.ProtocolVersion).max_version == 203
+    assert px4.build(m.TimeEstimateToTarget.ID) == m.TimeEstimateToTarget(-1, -1, -1, -1, -1)
 
 
 # ------------------------------------------------------------------------- set-points, fence, rally

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import math
 import struct
+import zlib
 from contextlib import suppress
 
 import pytest
@@ -14,19 +15,15 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavParamError, MavParamType
 from aerokit.mavlink.message import Message
 from aerokit.parameters import (
-    Parameter,
-    ParameterTable,
-    ParameterType,
     pack_parameters,
     unpack_parameters,
 )
-from aerokit.parameters.px4_hash import px4_hash
 from aerokit.sim import SimulatedCopter, SimulatedPx4
 from aerokit.sim.ardupilot.parameter_server import rounded
 from aerokit.sim.ardupilot.parameter_tables import KINDS, parameters_of
 from aerokit.sim.file_tree import FileFault
-from aerokit.sim.parameter_pack_file import packed_parameters
-from aerokit.sim.px4.parameter_server import parameter_hash
+from aerokit.sim.parameter_pack_file import ParameterPackMount
+from aerokit.sim.parameters import Parameters
 from aerokit.sim.px4.parameters import px4_parameters
 
 REAL, INT8, INT16, INT32 = MavParamType.REAL32, MavParamType.INT8, MavParamType.INT16, MavParamType.INT32
@@ -185,13 +182,22 @@ def test_faults_clamp_protect_and_mute() -> None:
 def test_the_pack_is_what_the_firmware_packs(block: int) -> None:
     parameters = parameters_of("copter")
     rows = [parameters.row(name) for name in parameters.names]
-    for whole in (False, True):
-        packed = packed_parameters(rows, len(rows), block, with_defaults=True, whole_defaults=whole)
-        assert list(unpack_parameters(packed)) == [row.name for row in rows]
-    table = unpack_parameters(packed)
-    assert list(table) == [row.name for row in rows]
-    for row in rows:
-        assert (table[row.name].value, table[row.name].default) == (row.value, row.default)
+    for fixed in (None, block):
+        table = unpack_parameters(served(parameters, "param.pck?withdefaults=1", block, fixed))
+        assert list(table) == [row.name for row in rows]
+        for row in rows:
+            assert (table[row.name].value, table[row.name].default) == (row.value, row.default)
+
+
+def served(
+    parameters: Parameters, path: str = "param.pck", block: int = 239, fixed: int | None = None
+) -> bytes:
+    """What a vehicle gives to who reads in such blocks."""
+    file = ParameterPackMount(parameters, lambda *_: None, block=fixed).open(path, writing=False)
+    content = b""
+    while piece := file.read(len(content), block):
+        content += piece
+    return content
 
 
 def test_a_pack_is_read_by_parts_and_in_one_block_size() -> None:
@@ -212,9 +218,8 @@ def test_a_pack_is_read_by_parts_and_in_one_block_size() -> None:
 def test_an_uploaded_pack_takes_effect_at_its_end() -> None:
     copter, client = a_copter(parameter_count=100)
     ftp = FtpClient(client)
-    some = [copter.parameters.row(name) for name in copter.parameters.names]
-    assert some
-    table = unpack_parameters(packed_parameters(some, len(some), 239))
+    table = unpack_parameters(served(copter.parameters))
+    assert table
     content = pack_parameters(table)
     for name in ("RTL_ALT", "WPNAV_SPEED", "DISARM_DELAY"):
         copter.parameters[name] = 1
@@ -239,31 +244,36 @@ def test_no_uploaded_bytes_break_the_vehicle(noise: bytes, count: int) -> None:
 # ------------------------------------------------------------------------------------------ PX4
 
 
-def test_px4s_hash_is_that_of_the_library() -> None:
-    parameters = px4_parameters()
-    rows = [parameters.row(name) for name in parameters.names]
-    volatile = {row.name for row in rows if row.is_volatile}
-    assert "CAL_ACC0_XOFF" in volatile
-    table = ParameterTable(
-        Parameter(row.name, int(row.value) if row.type == INT32 else row.value, ParameterType(row.type))
-        for row in rows
-    )
-    assert parameter_hash(parameters) == px4_hash(table, volatile)
-    parameters["CAL_ACC0_XOFF"] = 1.0
-    assert parameter_hash(parameters) == px4_hash(table, volatile)
-    parameters["MPC_XY_CRUISE"] = 6.0
-    assert parameter_hash(parameters) != px4_hash(table, volatile)
+def test_px4s_hash_is_of_all_but_the_volatile_ones() -> None:
+    px4, client = a_px4()
+    rows = [px4.parameters.row(name) for name in px4.parameters.names]
+    crc = 0xFFFFFFFF
+    for row in rows:
+        if not row.is_volatile:
+            value = struct.pack("<i", int(row.value)) if row.type == INT32 else struct.pack("<f", row.value)
+            crc = zlib.crc32(row.name.encode() + value, crc)
+    assert px4.parameters.row("CAL_ACC0_XOFF").is_volatile
+
+    def told_hash() -> int:
+        (answer,) = told(client, m.ParamRequestRead(1, 1, "_HASH_CHECK", -1))
+        return bits_of(answer)
+
+    assert told_hash() == crc ^ 0xFFFFFFFF
+    px4.parameters["CAL_ACC0_XOFF"] = 1.0
+    assert told_hash() == crc ^ 0xFFFFFFFF
+    px4.parameters["MPC_XY_CRUISE"] = 6.0
+    assert told_hash() != crc ^ 0xFFFFFFFF
 
 
 def test_px4_sends_its_hash_first_and_a_second_request_begins_without() -> None:
-    px4, client = a_px4()
+    _, client = a_px4()
     client.send(m.ParamRequestList(1, 1))
     client.run(0.2)
     client.send(m.ParamRequestList(1, 1))
     client.run(1.5)
     values = client.all(m.ParamValue)
     assert [v.param_id for v in values].count("_HASH_CHECK") == 1
-    assert (bits_of(values[0]), values[0].param_index) == (parameter_hash(px4.parameters), 0xFFFF)
+    assert (values[0].param_id, values[0].param_index) == ("_HASH_CHECK", 0xFFFF)
     assert [v.param_index for v in values[-910:]] == list(range(910))
     assert told(client, m.ParamRequestList(0, 0), 1.0) == []
 
@@ -332,8 +342,7 @@ def test_px4_has_the_file_when_it_is_new_enough() -> None:
 def test_px4_takes_a_pack_in_order_only() -> None:
     px4, client = a_px4(parameter_count=100, parameter_file=True)
     ftp = FtpClient(client)
-    rows = [px4.parameters.row(name) for name in px4.parameters.names]
-    content = pack_parameters(unpack_parameters(packed_parameters(rows, len(rows), 239)))
+    content = pack_parameters(unpack_parameters(served(px4.parameters)))
     first, second = content[:239], content[239:478]
     names = px4.parameters.names
     for name in names:

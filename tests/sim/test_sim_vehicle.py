@@ -252,9 +252,10 @@ def test_any_command_is_answered_once(command: int, numbers: tuple[float, ...], 
     numbers=st.tuples(*(FLOATS,) * 11),
 )
 def test_any_setpoint_is_survived(mask: int, frame: int, numbers: tuple[float, ...]) -> None:
+    rates_and_thrust = numbers[4], numbers[5], numbers[6], numbers[7]
     copter, client = flying_copter()
     client.send(m.SetPositionTargetLocalNed(0, 1, 1, frame, mask, *numbers))
-    client.send(m.SetAttitudeTarget(0, 1, 1, mask & 0xFF, numbers[:4], *numbers[4:8]))
+    client.send(m.SetAttitudeTarget(0, 1, 1, mask & 0xFF, numbers[:4], *rates_and_thrust))
     client.send(m.SetPositionTargetGlobalInt(0, 1, 1, frame, mask, 473_000_000, 85_000_000, *numbers[2:]))
     client.send(m.RequestDataStream(1, 1, MavDataStream.ALL, 4, 1))
     client.run(2.0)

@@ -18,8 +18,8 @@ from aerokit.protocols.parameter_list import ParameterList
 from aerokit.protocols.round_trip import RoundTrip
 from aerokit.runtime.bus import Bus
 from aerokit.sim.channel import MOST_PEERS, Channel
-from aerokit.vehicle.status_text import MOST_OPEN, StatusTextAssembler
-from aerokit.vehicle.telemetry import MOST_MODE_NAMES
+from aerokit.vehicle.state.status_text import MOST_OPEN, StatusTextAssembler
+from aerokit.vehicle.state.telemetry import MOST_MODE_NAMES
 
 pytestmark = pytest.mark.anyio
 

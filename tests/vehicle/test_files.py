@@ -30,7 +30,7 @@ from aerokit.protocols.ftp import FtpMessage
 from aerokit.protocols.transfer import Progress
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.testing import run_virtual
-from aerokit.vehicle.files import FileEntry
+from aerokit.vehicle.files.files import FileEntry
 
 pytestmark = pytest.mark.anyio
 

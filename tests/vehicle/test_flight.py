@@ -20,7 +20,7 @@ from aerokit.errors import (
 from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult
 from aerokit.runtime.cells import Source
 from aerokit.sim import SimulatedCopter
-from aerokit.vehicle.setpoints import VelocitySetpoint
+from aerokit.vehicle.orders.setpoints import VelocitySetpoint
 
 pytestmark = pytest.mark.anyio
 
@@ -581,6 +581,16 @@ async def test_look_at_and_stop_looking(flying: Flight) -> None:
     assert (command.frame, command.x) == (6, round(latitude * 1e7))
     await flying.vehicle.stop_looking()
     assert len(flying.wire.commands(MavCmd.DO_SET_ROI_NONE)) == 1
+
+
+async def test_home_is_set_where_it_is_and_somewhere_else(flying: Flight) -> None:
+    await flying.vehicle.go_to(north_of_home(flying, 30.0))
+    before = flying.vehicle.home.value
+    await flying.vehicle.set_home()
+    assert before.position.distance_to(flying.vehicle.home.value.position) == pytest.approx(30.0, abs=3.0)
+    place = Position(before.latitude_deg, before.longitude_deg, altitude_amsl_m=before.altitude_amsl_m)
+    await flying.vehicle.set_home(place)
+    assert flying.vehicle.home.value.position.distance_to(place) < 0.1
 
 
 async def test_look_at_refused(flying: Flight) -> None:

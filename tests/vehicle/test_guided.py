@@ -22,8 +22,8 @@ from aerokit.errors import (
 )
 from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult
 from aerokit.sim.px4.modes import POSITION
-from aerokit.vehicle.guided import SetpointStream
-from aerokit.vehicle.setpoints import (
+from aerokit.vehicle.orders.guided import SetpointStream
+from aerokit.vehicle.orders.setpoints import (
     AccelerationSetpoint,
     AttitudeSetpoint,
     BodyVelocitySetpoint,
@@ -435,7 +435,7 @@ async def test_kinds_that_the_autopilot_ignores_are_not_offered() -> None:
     from aerokit.autopilots import ArduPlane
 
     async with open_flight() as flight:
-        flight.vehicle.autopilot = ArduPlane(1)
+        flight.vehicle._talk.autopilot = ArduPlane(1)
         with pytest.raises(NotSupported, match=r"velocity.*attitude"):
             async with flight.vehicle.guided.velocity():
                 raise AssertionError("entered")

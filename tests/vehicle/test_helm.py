@@ -13,9 +13,9 @@ from aerokit.autopilots import Mode
 from aerokit.errors import CommandRejected, CommandTimeout
 from aerokit.mavlink.enums import MavCmd
 from aerokit.runtime.cells import Source, StateCell
-from aerokit.vehicle.helm import KNOWN_S, MODE_GRACE_S, Helm
-from aerokit.vehicle.orders import MOVING_COMMANDS, QUESTIONS, Order, Sending
-from aerokit.vehicle.telemetry import Telemetry
+from aerokit.vehicle.orders.helm import KNOWN_S, MODE_GRACE_S, Helm
+from aerokit.vehicle.orders.order import MOVING_COMMANDS, QUESTIONS, Order, Sending
+from aerokit.vehicle.state.telemetry import Telemetry
 
 HEARTBEAT = Source(1, 1, "HEARTBEAT")
 GUIDED, LOITER, RTL, BRAKE = (

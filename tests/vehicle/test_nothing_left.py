@@ -19,7 +19,7 @@ from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult
 from aerokit.runtime.events import ModeChanged
 from aerokit.sim import SimulatedCopter
 from aerokit.testing.clock import run_virtual
-from aerokit.vehicle.setpoints import BodyVelocitySetpoint, VelocitySetpoint
+from aerokit.vehicle.orders.setpoints import BodyVelocitySetpoint, VelocitySetpoint
 
 Action = Callable[[Flight], Awaitable[object]]
 
@@ -152,7 +152,7 @@ async def after_the_dust_has_settled(flight: Flight) -> None:
 
 def is_asking(vehicle: Vehicle) -> bool:
     """Whether a command waits for its answer; now and then the vehicle object asks for a stream again."""
-    return any(lock.locked() for lock in vehicle._commands._locks.values())
+    return any(lock.locked() for lock in vehicle._talk.commands._locks.values())
 
 
 def tasks() -> int:
@@ -242,4 +242,4 @@ async def test_a_thousand_calls_leave_as_little_as_one() -> None:
             waiting_on_cells(flight.vehicle),
             attached_sinks(flight.vehicle.connection),
         )
-        assert not flight.vehicle._commands._under_way
+        assert not flight.vehicle._talk.commands._under_way

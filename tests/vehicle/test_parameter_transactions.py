@@ -17,7 +17,7 @@ from aerokit.errors import (
     VerificationFailed,
 )
 from aerokit.sim import SimulatedCopter, SimulatedPx4
-from aerokit.vehicle.parameters import Parameters
+from aerokit.vehicle.parameters.parameters import Parameters
 
 pytestmark = pytest.mark.anyio
 

@@ -28,8 +28,8 @@ from aerokit.parameters import ParameterRenamedWarning, ParameterType
 from aerokit.protocols.transfer import Progress
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.vehicle.connect import connect
-from aerokit.vehicle.files import Files
-from aerokit.vehicle.parameters import Parameters
+from aerokit.vehicle.files.files import Files
+from aerokit.vehicle.parameters.parameters import Parameters
 
 pytestmark = pytest.mark.anyio
 
@@ -131,7 +131,7 @@ async def test_a_vehicle_without_the_file_is_asked_for_it_once_until_it_reboots(
         assert asked
         await parameters.download(refresh=True)
         assert len(flight.wire.all(messages.FileTransferProtocol)) == asked
-        parameters._forget()
+        parameters._access.forget()
         await parameters.download()
         assert len(flight.wire.all(messages.FileTransferProtocol)) > asked
         with pytest.raises(FileError):
@@ -593,12 +593,12 @@ async def test_a_change_makes_the_cache_worthless(tmp_path: Path) -> None:
     async with open_px4(simulated) as flight:
         await flight.vehicle.parameters.download(cache=tmp_path)
         simulated.parameters["COM_RC_IN_MODE"] = 4
-        flight.vehicle.parameters._forget()
+        flight.vehicle.parameters._access.forget()
         flight.wire.forget()
         table = await flight.vehicle.parameters.download(cache=tmp_path)
         assert table["COM_RC_IN_MODE"].value == 4
         assert len(flight.wire.all(messages.ParamRequestList)) == 1
-        flight.vehicle.parameters._forget()
+        flight.vehicle.parameters._access.forget()
         flight.wire.forget()
         await flight.vehicle.parameters.download(cache=tmp_path)
         assert hash_requests(flight) == ["_HASH_CHECK"]

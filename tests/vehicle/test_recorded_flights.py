@@ -16,8 +16,8 @@ from pymavlink.dialects.v20 import ardupilotmega
 from recorded import recording
 
 from aerokit.mavlink import STANDARD, Framer, read_tlog
-from aerokit.vehicle.telemetry import Telemetry
-from aerokit.vehicle.values import Position
+from aerokit.position import Position
+from aerokit.vehicle.state.telemetry import Telemetry
 
 SYSTEM_IDS = {"ardupilot-copter": 1, "ardupilot-plane": 2, "ardupilot-rover": 3, "px4-quad": 1}
 

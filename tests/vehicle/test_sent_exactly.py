@@ -26,9 +26,9 @@ from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.runtime.events import VehicleSilent
 from aerokit.sim import SimulatedCopter, SimulatedRover, simulated_link
 from aerokit.sim.px4.modes import OFFBOARD
-from aerokit.vehicle.commands import UNDER_WAY_S, CommandSender
-from aerokit.vehicle.progress import await_progress
-from aerokit.vehicle.setpoints import AttitudeSetpoint, LocalPositionSetpoint, PositionSetpoint
+from aerokit.vehicle.orders.progress import await_progress
+from aerokit.vehicle.orders.setpoints import AttitudeSetpoint, LocalPositionSetpoint, PositionSetpoint
+from aerokit.vehicle.talk.commands import UNDER_WAY_S, CommandSender
 
 pytestmark = pytest.mark.anyio
 
@@ -118,7 +118,7 @@ async def test_a_set_point_is_valid_from_when_the_mode_is_told() -> None:
 async def test_what_is_done_already_is_not_waited_for(grounded: Flight) -> None:
     started = now()
     await await_progress(
-        grounded.vehicle,
+        grounded.vehicle._talk,
         "nothing",
         is_done=lambda: True,
         trouble=lambda: None,
@@ -135,7 +135,7 @@ async def test_silence_is_longer_than_what_is_put_up_with(grounded: Flight) -> N
     started = now()
     with pytest.raises(HeartbeatTimeout):
         await await_progress(
-            grounded.vehicle,
+            grounded.vehicle._talk,
             "nothing",
             is_done=lambda: False,
             trouble=lambda: None,

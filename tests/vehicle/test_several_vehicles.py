@@ -15,7 +15,7 @@ from aerokit import messages as m
 from aerokit.errors import BusyError, CommandTimeout
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import CopterMode, MavAutopilot, MavCmd, MavResult, MavState, MavType
-from aerokit.runtime.events import ArmedChanged, ModeChanged, StatusTextReceived, VehicleSilent
+from aerokit.runtime.events import ArmedChanged, ModeChanged, StatusTextReceived, VehicleFound, VehicleSilent
 from aerokit.runtime.opening import open_connection
 from aerokit.sim import ExtraComponent, SimulatedCopter, SimulatedPx4, simulated_link
 
@@ -299,7 +299,7 @@ async def test_telemetry_of_another_component_or_system_is_not_the_vehicles() ->
             assert vehicle.mode_name == "GUIDED"
             assert not vehicle.is_armed
             assert "Crash!" not in vehicle.texts_since(0.0)
-            assert vehicle._watch.reboots == 0
+            assert vehicle._talk.watch.reboots == 0
 
 
 async def test_an_ack_of_another_system_is_not_taken() -> None:
@@ -318,3 +318,14 @@ async def test_an_ack_of_another_system_is_not_taken() -> None:
                 tasks.start_soon(answer)
                 with pytest.raises(CommandTimeout):
                     await vehicle.command(MavCmd.DO_SEND_BANNER, attempts=2)
+
+
+async def test_each_autopilot_is_told_of_once_whether_it_is_connected_to_or_not() -> None:
+    first, second = SimulatedCopter(boot_time_s=0.0), SimulatedPx4(system_id=2, boot_time_s=0.0)
+    async with simulated_link([first, second]) as link, open_connection(link) as connection:
+        with connection.subscribe(VehicleFound, capacity=10) as found:
+            async with aerokit.connect(connection, system_id=1):
+                await anyio.sleep(5.0)
+            told = [await found.get(timeout=1.0), await found.get(timeout=1.0)]
+            assert [(each.system_id, each.component_id) for each in told] == [(1, 1), (2, 1)]
+            assert found.get_nowait() is None

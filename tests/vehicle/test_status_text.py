@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from aerokit.mavlink import STANDARD, Frame, FrameEncoder
 from aerokit.mavlink.messages import Statustext
-from aerokit.vehicle.status_text import MOST_OPEN, StatusTextAssembler
-from aerokit.vehicle.values import StatusText
+from aerokit.vehicle.state.condition import StatusText
+from aerokit.vehicle.state.status_text import MOST_OPEN, StatusTextAssembler
 
 LONG = (
     "A text much longer than the fifty characters which fit into one STATUSTEXT message, and then some more."

@@ -9,9 +9,12 @@ import pytest
 from aerokit.autopilots import autopilot_for
 from aerokit.mavlink import FrameEncoder, Framer, Message, messages
 from aerokit.mavlink.frame import Frame
-from aerokit.vehicle.feeds import MESSAGE_IDS, message_type
-from aerokit.vehicle.streamed import LOOK_S, NUMBER_AT, STREAMED
-from aerokit.vehicle.telemetry import Telemetry
+from aerokit.mavlink.message import offset_of
+from aerokit.runtime.bus import Bus
+from aerokit.vehicle.state.states import LAZY, SOURCES
+from aerokit.vehicle.state.streamed import LOOK_S
+from aerokit.vehicle.state.telemetry import Telemetry
+from aerokit.vehicle.state.told import MESSAGE_IDS, message_type
 
 HEARTBEAT = messages.Heartbeat(2, 3, 81, 4, 3)
 CHANNELS: dict[str, int] = {f"chan{number}_raw": 1500 for number in range(1, 19)}
@@ -35,6 +38,7 @@ ANYTHING: dict[str, Message] = {
     "BatteryStatus": messages.BatteryStatus(0, 1, 1, 2500, (12000, *[65535] * 9), 100, 10, 10, 90),
     "Wind": messages.Wind(10.0, 3.0, 0.0),
     "WindCov": messages.WindCov(0, 1.0, 2.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+    "PowerStatus": messages.PowerStatus(5012, 0, 1),
     "EkfStatusReport": messages.EkfStatusReport(831, 0.1, 0.1, 0.1, 0.1, 0.1),
     "EstimatorStatus": messages.EstimatorStatus(0, 831, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 1.0, 1.0),
     "Vibration": messages.Vibration(0, 1.0, 1.0, 1.0, 0, 0, 0),
@@ -66,20 +70,21 @@ def take(telemetry: Telemetry, message: Message, at: float, component_id: int = 
     telemetry.streams[message.ID].take(frame_of(message, at, component_id))
 
 
-@pytest.mark.parametrize("name", STREAMED)
+@pytest.mark.parametrize("name", LAZY)
 def test_the_table_names_every_cell_that_a_message_changes(telemetry: Telemetry, name: str) -> None:
     telemetry.receive(ANYTHING[name])
     changed = {cell.name for cell in telemetry.cells.values() if cell.is_known}
-    assert changed == set(STREAMED[name])
+    assert changed == {told.name for told, _ in SOURCES[name]}
 
 
-@pytest.mark.parametrize("name", NUMBER_AT)
-def test_which_one_of_several_is_read_where_it_is(name: str) -> None:
-    field = "port" if name == "ServoOutputRaw" else "id"
+@pytest.mark.parametrize(
+    ("name", "field"), [("ServoOutputRaw", "port"), ("DistanceSensor", "id"), ("BatteryStatus", "id")]
+)
+def test_which_one_of_several_is_read_where_it_is(name: str, field: str) -> None:
     message = ANYTHING[name]
     fields = {each.name: getattr(message, each.name) for each in message.FIELDS}
     body = frame_of(message_type(name)(**{**fields, field: 201})).body
-    assert body[9 + NUMBER_AT[name]] == 201
+    assert body[9 + offset_of(message_type(name), field)] == 201
 
 
 def test_what_nobody_looks_at_waits(telemetry: Telemetry, clock: Clock) -> None:
@@ -179,3 +184,15 @@ def test_other_threads_look_while_frames_come(telemetry: Telemetry) -> None:
     for thread in threads:
         thread.join()
     assert wrong == []
+
+
+def test_what_somebody_else_has_had_decoded_is_not_decoded_again(telemetry: Telemetry) -> None:
+    bus, seen = Bus(), list[Message]()
+    stream = telemetry.streams[MESSAGE_IDS["Attitude"]]
+    bus.attach_lazily(messages.Attitude, stream.take)
+    bus.attach(messages.Attitude, seen.append)
+    for at in (100.0, 100.5):
+        bus.deliver(frame_of(ANYTHING["Attitude"], at))
+    (pending,) = stream.pending.values()
+    assert pending[1] is seen[1]
+    assert telemetry.attitude.value.yaw_deg == pytest.approx(17.19, abs=0.01)

@@ -11,8 +11,9 @@ from aerokit.autopilots import autopilot_for
 from aerokit.errors import ConnectionClosed, ValueUnknownError
 from aerokit.mavlink import Frame, FrameEncoder, Framer, messages
 from aerokit.mavlink.message import Message
-from aerokit.vehicle.telemetry import Telemetry
-from aerokit.vehicle.values import Position, Velocity
+from aerokit.position import Position
+from aerokit.vehicle.state.movement import Velocity
+from aerokit.vehicle.state.telemetry import Telemetry
 
 NAN = math.nan
 U16 = 0xFFFF

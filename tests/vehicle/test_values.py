@@ -10,7 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aerokit.errors import LocalProtocolError
-from aerokit.vehicle.values import Attitude, GpsReceiver, Home, Position, SensorHealth, Velocity
+from aerokit.position import Position
+from aerokit.vehicle.state.condition import SensorHealth
+from aerokit.vehicle.state.equipment import GpsReceiver
+from aerokit.vehicle.state.movement import Attitude, Home, Velocity
 
 angles = st.floats(-179, 179)
 

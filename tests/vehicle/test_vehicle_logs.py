@@ -20,9 +20,9 @@ from aerokit.links import FaultModel, FaultyLink
 from aerokit.protocols.transfer import Progress
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.testing import run_virtual
-from aerokit.vehicle.files import FileEntry
-from aerokit.vehicle.log_paths import log_path
-from aerokit.vehicle.logs import LogEntry
+from aerokit.vehicle.files.files import FileEntry
+from aerokit.vehicle.files.log_paths import log_path
+from aerokit.vehicle.files.logs import LogEntry
 
 pytestmark = pytest.mark.anyio
 

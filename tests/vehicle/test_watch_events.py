@@ -232,7 +232,7 @@ async def test_a_companion_computer_that_answers_first_does_not_take_the_vehicle
         flight.copter.overhear(m.Timesync, answer_first)
         with flight.vehicle.subscribe(VehicleRebooted) as reboots:
             await anyio.sleep(6.0)
-            told_at, told_ms = flight.vehicle._watch._last_answer
+            told_at, told_ms = flight.vehicle._talk.watch._last_answer
             assert now() - told_at < 3.0
             assert told_ms > 1000
             assert reboots.get_nowait() is None

@@ -9,16 +9,17 @@ from typing import Any, cast
 
 import pytest
 
-from aerokit import Position, Vehicle
+from aerokit import Position
 from aerokit.mavlink import STANDARD, Frame, FrameEncoder, Framer, Message
 from aerokit.mavlink.messages import Attitude, Heartbeat, SystemTime, Timesync
 from aerokit.runtime.cells import Source, StateCell
 from aerokit.runtime.connection import Connection
 from aerokit.runtime.events import LinkReport, VehicleBack, VehicleRebooted, VehicleSilent
-from aerokit.vehicle.core import VehicleCore
-from aerokit.vehicle.progress import Stillness
-from aerokit.vehicle.setpoints import SLOW_M_S, BodyVelocitySetpoint, VelocitySetpoint, wants_motion
-from aerokit.vehicle.watch import LinkWatch, VehicleWatch
+from aerokit.vehicle.orders.bridge import Bridge
+from aerokit.vehicle.orders.progress import Stillness
+from aerokit.vehicle.orders.setpoints import SLOW_M_S, BodyVelocitySetpoint, VelocitySetpoint, wants_motion
+from aerokit.vehicle.talk.talk import Talk
+from aerokit.vehicle.talk.watch import LinkWatch, VehicleWatch
 
 HEARTBEAT = Heartbeat(2, 3, 81, 0, 3)
 
@@ -264,10 +265,10 @@ class Standing:
     def __init__(self) -> None:
         self.at = 0.0
         self.cell = StateCell[Position]("position", lambda: self.at, "GLOBAL_POSITION_INT")
-        vehicle = SimpleNamespace(
+        talk = SimpleNamespace(
             connection=SimpleNamespace(now=lambda: self.at), telemetry=SimpleNamespace(position=self.cell)
         )
-        self.stillness = Stillness(cast("VehicleCore", vehicle))
+        self.stillness = Stillness(cast("Talk", talk))
 
     def tell(self, place: Position | None, at: float) -> str | None:
         self.at = at
@@ -319,6 +320,6 @@ def test_without_a_position_of_the_last_two_seconds_nothing_is_known() -> None:
 
 @pytest.mark.parametrize(("speed_m_s", "wanted"), [(SLOW_M_S, True), (0.99 * SLOW_M_S, False)])
 def test_who_is_told_to_move_at_0_3_m_s_should_move(speed_m_s: float, wanted: bool) -> None:
-    nobody = cast("Vehicle", None)  # a velocity alone says it
+    nobody = cast("Bridge", None)  # a velocity alone says it
     assert wants_motion(VelocitySetpoint(east_m_s=speed_m_s), nobody) is wanted
     assert wants_motion(BodyVelocitySetpoint(right_m_s=speed_m_s), nobody) is wanted

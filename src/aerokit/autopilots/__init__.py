@@ -21,14 +21,12 @@ from aerokit.autopilots.ardupilot import (
 from aerokit.autopilots.base import Autopilot, ModeOrder, Purpose, Reposition, SetpointRules, TakeOff
 from aerokit.autopilots.modes import Mode, ModeTable, is_armed
 from aerokit.autopilots.px4 import Px4, px4_custom_mode
-from aerokit.autopilots.streams import DEFAULT_RATES_HZ
 from aerokit.autopilots.version import AutopilotVersion
 
 if TYPE_CHECKING:
     from aerokit.mavlink.messages import Heartbeat
 
 __all__ = [
-    "DEFAULT_RATES_HZ",
     "AntennaTracker",
     "ArduCopter",
     "ArduPilot",

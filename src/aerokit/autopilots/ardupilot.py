@@ -60,7 +60,6 @@ class ArduPilot(Autopilot):
     runs_prearm_checks = True
     calibrates_compasses_by_command = True
     parameter_interval_s = 0.02
-    sends_mission_requests_float = True
     mission_storage = "ardupilot"
     mission_upload_window = 6
     mission_download_window = 10
@@ -75,8 +74,6 @@ class ArduPilot(Autopilot):
     log_directories = ("/APM/LOGS", "/logs")
     first_log_id = 1
     logs_by_messages = True
-    estimator_message = "EKF_STATUS_REPORT"
-    wind_message = "WIND"
     stream_groups = ARDUPILOT_GROUPS
     never_sent = frozenset(("ESTIMATOR_STATUS", "WIND_COV", "ALTITUDE", "CURRENT_MODE")) - {
         "ATTITUDE_QUATERNION"  # on request
@@ -120,9 +117,8 @@ class ArduCopter(ArduPilot):
         "mission": "AUTO",
     }
     setpoints = SetpointRules(body_yaw_is_relative=True)
-    reposition = Reposition(relative_altitude=True, yaw=False, speed=False, armed_only=False)
+    reposition = Reposition(relative_altitude=True, yaw=False, speed=False)
     condition_yaw = True
-    changes_speed = True
     lands_after_return = True
     arming_mode = "GUIDED"
     unarmable_modes = frozenset(
@@ -168,8 +164,7 @@ class ArduPlane(ArduPilot):
         "mission": "AUTO",
     }
     setpoints = SetpointRules(local_position=False, global_position=False, velocity=False, acceleration=False)
-    reposition = Reposition(relative_altitude=True, yaw=False, speed=False, armed_only=False)
-    changes_speed = True
+    reposition = Reposition(relative_altitude=True, yaw=False, speed=False)
     arrival_radius_m = 90.0  # it circles at WP_LOITER_RAD, 60 m by default
     arming_mode = "FBWA"  # the throttle is the pilot's: armed in TAKEOFF it would start
     unarmable_modes = frozenset(("AUTOLAND", "INITIALISING", "QLAND", "QRTL", "RTL"))
@@ -186,7 +181,7 @@ class ArduPlane(ArduPilot):
         if self._can_hover(is_vtol):
             params = (0, 0, 0, 0, 0, 0, altitude_relative_m)
             return TakeOff(self.modes.find("GUIDED"), NAV_TAKEOFF, params, None)
-        return TakeOff(self.modes.find("TAKEOFF"), None, (), None, sets_altitude=False)
+        return TakeOff(self.modes.find("TAKEOFF"), None, (), None)
 
     def landed_state_of(self, heartbeat: Heartbeat) -> int | None:
         """STANDBY is said on the ground only, ACTIVE while flying."""
@@ -212,8 +207,7 @@ class ArduRover(ArduPilot):
         "mission": "AUTO",
     }
     setpoints = SetpointRules(acceleration=False, body_yaw_is_relative=True)
-    reposition = Reposition(relative_altitude=True, yaw=False, speed=False, armed_only=False)
-    changes_speed = True
+    reposition = Reposition(relative_altitude=True, yaw=False, speed=False)
     arrival_radius_m = 4.0
     arming_mode = "HOLD"
     unarmable_modes = frozenset(("RTL", "SMART_RTL", "INITIALISING"))
@@ -237,9 +231,8 @@ class ArduSub(ArduPilot):
     }
     setpoints = SetpointRules(acceleration=False, place_restarts_path=True)
     landing_ends_in = "ALT_HOLD"  # at the surface
-    reposition = Reposition(relative_altitude=True, yaw=False, speed=False, armed_only=False)
+    reposition = Reposition(relative_altitude=True, yaw=False, speed=False)
     condition_yaw = True
-    changes_speed = True
 
 
 class Blimp(ArduPilot):

@@ -30,22 +30,19 @@ class TakeOff(Snapshot):
     """How this vehicle takes off.
 
     Go to ``mode`` (None: stay), arm, then send the command ``command`` (None: arming in ``mode`` is all) with
-    ``params``. ``mode_after`` is where it ends up by itself, None when it stays. ``sets_altitude`` is False
-    when the vehicle climbs to an altitude of its own (a parameter) whatever is asked for.
+    ``params``. ``mode_after`` is where it ends up by itself, None when it stays.
     """
 
     mode: Mode | None
     command: int | None
     params: tuple[float, ...]
     mode_after: Mode | None
-    sets_altitude: bool = True
 
 
 class SetpointRules(Snapshot):
     """Which guided set-points are obeyed, and what the autopilot expects of the stream.
 
-    ``before_mode``: the stream must run before the mode is asked for. ``minimum_hz`` is the slowest stream
-    the autopilot puts up with, ``timeout_s`` how long it goes on without a new set-point by default.
+    ``before_mode``: the stream must run before the mode is asked for.
     ``body_yaw_is_relative``: in MAV_FRAME_BODY_NED yaw counts from where the nose points, not from north.
     ``place_restarts_path``: each set-point that is a place begins its path anew, from standing, also the same one.
     """
@@ -56,8 +53,6 @@ class SetpointRules(Snapshot):
     acceleration: bool = True
     attitude: bool = True
     before_mode: bool = False
-    minimum_hz: float = 1.0
-    timeout_s: float = 3.0
     body_yaw_is_relative: bool = False
     place_restarts_path: bool = False
 
@@ -72,14 +67,12 @@ class Reposition(Snapshot):
     """How MAV_CMD_DO_REPOSITION (192) is understood here.
 
     ``relative_altitude``: frames relative to home are obeyed; else the altitude must be AMSL. ``yaw``: param4
-    turns the vehicle, in radians. ``speed``: param1 sets the ground speed. ``armed_only``: it is ignored
-    while disarmed.
+    turns the vehicle, in radians. ``speed``: param1 sets the ground speed.
     """
 
     relative_altitude: bool
     yaw: bool
     speed: bool
-    armed_only: bool
 
 
 class ModeOrder(Snapshot):
@@ -125,16 +118,12 @@ class Autopilot:
     """Whether MAV_CMD_DO_SET_ROI_LOCATION (195) takes every altitude for one above the sea, whatever the frame says."""
     condition_yaw = False
     """Whether MAV_CMD_CONDITION_YAW (115) turns the vehicle in its mode for set-points."""
-    changes_speed = False
-    """Whether MAV_CMD_DO_CHANGE_SPEED (178) is obeyed outside missions."""
     reposition_purpose: Purpose = "setpoint"
     """Which mode DO_REPOSITION puts the vehicle into."""
     lands_after_return = False
     """Whether the mode for returning ends on the ground."""
     arrival_radius_m = 2.0
     """How near it comes to a place that it was sent to, or circles it, by default."""
-    sends_mission_requests_float = False
-    """Whether it asks for mission items by MISSION_REQUEST instead of MISSION_REQUEST_INT."""
     mission_storage = "any"
     """What it keeps of a mission item: a value of :class:`aerokit.missions.Storage`."""
     mission_upload_window = 1
@@ -171,8 +160,6 @@ class Autopilot:
     """Whether LOG_REQUEST_LIST is not answered when there are no logs."""
     unknown_currents_ca: frozenset[int] = frozenset((-1,))
     """What a battery's current in 0.01 A says when it is not known; the standard says −1."""
-    estimator_message = "ESTIMATOR_STATUS"
-    wind_message = "WIND_COV"
     stream_groups: ClassVar[Mapping[int, int]] = {}
     """Message id → MAV_DATA_STREAM, for firmware that knows no MAV_CMD_SET_MESSAGE_INTERVAL."""
     stays_on_the_ground = False
@@ -269,7 +256,7 @@ class Autopilot:
     def missing_estimates(self, flags: int) -> tuple[str, ...]:
         """What the estimator lacks for arming in a mode that needs a position; empty when it is good enough.
 
-        ``flags`` are those of the message named in ``estimator_message``.
+        ``flags`` are those of EKF_STATUS_REPORT or ESTIMATOR_STATUS.
         """
         return self._missing_estimates(flags, required=0x01 | 0x20, horizontal=0x10)
 

@@ -92,12 +92,11 @@ class Px4(Autopilot):
     modes = MODES
     modes_are_numbered = False
     roi_altitude_is_amsl = True
-    setpoints = SetpointRules(before_mode=True, minimum_hz=2.0, timeout_s=0.5)
-    reposition = Reposition(relative_altitude=False, yaw=True, speed=True, armed_only=True)
+    setpoints = SetpointRules(before_mode=True)
+    reposition = Reposition(relative_altitude=False, yaw=True, speed=True)
     log_suffix = ".ulg"
     log_directories = ("/fs/microsd/log", "/log")
     silent_without_logs = True
-    changes_speed = True
     _bytewise_by_default = True
     has_parameter_hash = True
     unknown_currents_ca = frozenset((-1, -100))  # inside PX4, −1 A is "unknown"

@@ -15,7 +15,7 @@ from aerokit.errors import LocalProtocolError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from aerokit.vehicle.logs import LogEntry
+    from aerokit.vehicle.files.logs import LogEntry
 
 __all__ = ["add_logs"]
 

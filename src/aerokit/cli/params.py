@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from aerokit.parameters import Parameter, ParameterTable
-    from aerokit.vehicle.parameters import ParameterWrite
+    from aerokit.vehicle.parameters.parameters import ParameterWrite
     from aerokit.vehicle.vehicle import Vehicle
 
 __all__ = ["add_params"]

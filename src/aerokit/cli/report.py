@@ -17,7 +17,7 @@ from aerokit.errors import AerokitError
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from aerokit.vehicle.values import Position
+    from aerokit.position import Position
     from aerokit.vehicle.vehicle import Vehicle
 
 __all__ = ["FlightReport"]

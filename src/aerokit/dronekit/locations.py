@@ -9,7 +9,7 @@ from aerokit.dronekit.observers import HasObservers
 from aerokit.dronekit.privates import LocationPrivates
 from aerokit.dronekit.values import LocationGlobal, LocationGlobalRelative, LocationLocal
 from aerokit.mavlink.messages import GlobalPositionInt, LocalPositionNed
-from aerokit.vehicle.decoding import place
+from aerokit.vehicle.state.movement import place
 
 if TYPE_CHECKING:
     from aerokit.dronekit.vehicle import Vehicle

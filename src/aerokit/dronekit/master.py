@@ -10,7 +10,7 @@ from pymavlink import mavutil
 from aerokit.dronekit.inbox import Inbox
 from aerokit.dronekit.message_factory import MessageFactory
 from aerokit.dronekit.pymavlink_messages import message_of, sendable
-from aerokit.runtime.diagnosis import is_autopilot
+from aerokit.runtime.components import is_autopilot
 
 if TYPE_CHECKING:
     from aerokit.dronekit.mavlink import MAVConnection

@@ -24,7 +24,7 @@ from aerokit.dronekit.weakly import weakly
 from aerokit.errors import AerokitError, ConnectionClosed, LinkOpenError, LocalProtocolError
 from aerokit.links.address import ACCEPTED_FORMS, parse_address
 from aerokit.links.reconnecting import ReconnectingLink
-from aerokit.runtime.diagnosis import is_autopilot
+from aerokit.runtime.components import is_autopilot
 from aerokit.runtime.opening import open_connection
 from aerokit.sync.loop_thread import LoopThread
 

@@ -93,7 +93,7 @@ async def change_mode(vehicle: Vehicle, wanted: Mode, standing: Standing) -> Non
 async def _change_mode(vehicle: Vehicle, wanted: Mode, standing: Standing) -> None:
     """PX4 acks twice: the first ack is always ACCEPTED, the second one may take it back."""
     started = vehicle.connection.now()
-    with vehicle._refusals_of(DO_SET_MODE) as refusals:
+    with vehicle._talk.refusals_of(DO_SET_MODE) as refusals:
         await _request(vehicle, wanted, standing)
         with anyio.move_on_after(MODE_IS_TOLD_S):
             while not (standing.is_done or _is_in(vehicle, wanted)):

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from aerokit.dronekit.vehicle import Vehicle
     from aerokit.parameters import ParameterTable
-    from aerokit.vehicle.parameter_access import DownloadMethod
+    from aerokit.vehicle.parameters.access import DownloadMethod
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
 __all__ = ["ParameterReading"]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from aerokit.parameters.parameter import MOST_PARAMETERS, to_float32
 from aerokit.snapshot import Snapshot
-from aerokit.vehicle.parameter_names import warn_of_rename
+from aerokit.vehicle.parameters.names import warn_of_rename
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

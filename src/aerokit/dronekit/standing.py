@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit.errors import CommandTimeout
 from aerokit.mavlink.messages import Heartbeat
-from aerokit.runtime.diagnosis import is_autopilot
+from aerokit.runtime.components import is_autopilot
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterator

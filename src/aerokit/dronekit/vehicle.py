@@ -31,7 +31,7 @@ from aerokit.dronekit.weakly import weakly
 from aerokit.errors import AerokitError, ConnectFailed
 from aerokit.mavlink.messages import CommandLong
 from aerokit.runtime.background import Background
-from aerokit.runtime.diagnosis import is_autopilot
+from aerokit.runtime.components import is_autopilot
 from aerokit.vehicle.connect import connect as connect_async
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from aerokit.dronekit.mavlink import MAVConnection
     from aerokit.runtime.connection import Connection
     from aerokit.sync.loop_thread import Held
-    from aerokit.vehicle.values import StatusText
+    from aerokit.vehicle.state.condition import StatusText
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
 __all__ = ["Vehicle"]

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 
 from aerokit.errors import LocalProtocolError
 from aerokit.mavlink.checksum import x25
+from aerokit.mavlink.message import SIZES
 from aerokit.whole_file import read_bounded
 
 if TYPE_CHECKING:
@@ -32,21 +33,6 @@ __all__ = [
     "read_dialect",
     "read_xml",
 ]
-
-SIZES = {
-    "char": 1,
-    "int8_t": 1,
-    "uint8_t": 1,
-    "int16_t": 2,
-    "uint16_t": 2,
-    "int32_t": 4,
-    "uint32_t": 4,
-    "int64_t": 8,
-    "uint64_t": 8,
-    "float": 4,
-    "double": 8,
-}
-"""Bytes on the wire of each type the standard knows."""
 
 _LOWEST, _HIGHEST = -(1 << 63), (1 << 64) - 1
 
@@ -151,15 +137,21 @@ class EnumDefinition:
     description: str = ""
     origin: str = ""
     remarks: tuple[str, ...] = ()
+    own_prefix: str = ""  # see `prefix`; empty: worked out from the entries
 
     @property
     def class_name(self) -> str:
         """The name of its class: ``MAV_CMD`` is ``MavCmd``."""
         return cap_words(self.name)
 
+    @property
+    def prefix(self) -> str:
+        """What is taken off the names of the entries: what they begin with."""
+        return self.own_prefix or _common_prefix(self.name, [entry.name for entry in self.entries])
+
     def members(self) -> list[tuple[str, EntryDefinition]]:
-        """The entries with their Python names: what all of them begin with is taken off."""
-        prefix = _common_prefix(self.name, [entry.name for entry in self.entries])
+        """The entries with their Python names."""
+        prefix = self.prefix
         return [(_member_name(self.name, prefix, entry.name), entry) for entry in self.entries]
 
 

@@ -1,18 +1,20 @@
 """`Dialect`: which message an id stands for.
 
-`STANDARD` knows all generated messages: minimal, standard, common, ardupilotmega (with what it includes) and
-development. Others are read at run time from an XML file or a pymavlink dialect module; their messages which are the
-standard's are the same classes, so that ``isinstance(message, messages.Heartbeat)`` goes on working.
+`STANDARD` knows all generated messages: MAVLink's own minimal, standard, common and development, and ardupilotmega
+(with what it includes). Others are read at run time from an XML file or a pymavlink dialect module; their messages
+which are the standard's are the same classes, so that ``isinstance(message, messages.Heartbeat)`` goes on working.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from enum import IntFlag
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from aerokit.errors import LocalProtocolError
 from aerokit.mavlink import enums, messages
+from aerokit.mavlink.enumeration import make_enum
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -155,18 +157,24 @@ class _Extended(Dialect):
         return first[message_id] if message_id in first else second[message_id]
 
     def enum(self, name: str) -> type[Any]:
-        # A private dialect may add entries to an enum of the standard: then its own is the longer one.
         found: list[type[Any]] = []
         for part in self._parts:
             try:
                 found.append(part.enum(name))
             except LocalProtocolError:
                 continue
-        return max(found, key=_size) if found else super().enum(name)
+        if len(found) < 2 or found[1].__members__.keys() <= found[0].__members__.keys():
+            return found[0] if found else super().enum(name)
+        if name not in self._enums:
+            self._enums[name] = _united(*found)
+        return self._enums[name]
 
 
-def _size(enum: Any) -> int:
-    return len(enum)
+def _united(first: type[Any], second: type[Any]) -> type[Any]:
+    """An enum with the entries of both: private dialects add to enums of the standard, which has more than theirs."""
+    members = {**second.__members__, **first.__members__}
+    bitmask = issubclass(first, IntFlag)
+    return make_enum(first.__module__, first.__name__, bitmask, first.__doc__ or "", members.items())
 
 
 def _cap_words(name: str) -> str:

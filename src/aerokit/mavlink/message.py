@@ -21,7 +21,7 @@ else:  # importing typing_extensions would cost more than everything else here
         return lambda cls: cls
 
 
-__all__ = ["Field", "Message"]
+__all__ = ["Field", "Message", "offset_of"]
 
 PACK_ERRORS = (struct.error, OverflowError, TypeError, ValueError, AttributeError)
 """What packing a wrong value can raise; the generated classes turn it into LocalProtocolError."""
@@ -29,6 +29,20 @@ PACK_ERRORS = (struct.error, OverflowError, TypeError, ValueError, AttributeErro
 _ANY_HEADER = bytes(HEADER_LENGTH)
 _SECRETS = frozenset(("secret_key", "passkey", "password"))
 """Fields that are shown to nobody."""
+SIZES = {
+    "char": 1,
+    "int8_t": 1,
+    "uint8_t": 1,
+    "int16_t": 2,
+    "uint16_t": 2,
+    "int32_t": 4,
+    "uint32_t": 4,
+    "int64_t": 8,
+    "uint64_t": 8,
+    "float": 4,
+    "double": 8,
+}
+"""Bytes on the wire of each type the standard knows."""
 INTEGER_RANGES = {
     "int8_t": (-(1 << 7), (1 << 7) - 1),
     "uint8_t": (0, (1 << 8) - 1),
@@ -104,6 +118,21 @@ class _Fields:
         fields = tuple(Field(*row) for row in owner._FIELDS)
         setattr(owner, "FIELDS", fields)  # noqa: B010 - a plain assignment looks wrong to the type checker
         return fields
+
+
+def offset_of(message_type: type[Message], field: str) -> int:
+    """Where in the payload this field begins: large types first, extensions behind them in their order.
+
+    https://mavlink.io/en/guide/serialization.html#field_reordering
+    """
+    fields = [each for each in message_type.FIELDS if not each.extension]
+    fields.sort(key=lambda each: -SIZES[each.type])
+    offset = 0
+    for each in (*fields, *(each for each in message_type.FIELDS if each.extension)):
+        if each.name == field:
+            return offset
+        offset += SIZES[each.type] * (each.array_length or 1)
+    raise LocalProtocolError(f"{message_type.NAME} has no field {field!r}")
 
 
 @dataclass_transform(frozen_default=True)

@@ -98,13 +98,14 @@ def _enum_type(dialect: str, enum: EnumDefinition) -> type[Any]:
 
 
 def _standard_class(definition: MessageDefinition) -> type[Message] | None:
-    """The committed class, when it says the same about the bytes."""
-    row = (definition.crc_extra, definition.base_length, definition.length)
-    if STANDARD.rows.get(definition.id) != row:
+    """The committed class, when it says the same about the bytes, or knows more extension fields behind them."""
+    row = STANDARD.rows.get(definition.id)
+    if row is None or row[:2] != (definition.crc_extra, definition.base_length):
         return None
     standard = STANDARD[definition.id]
-    same_fields = standard.__match_args__ == tuple(f.attribute for f in definition.fields)
-    return standard if definition.name == standard.NAME and same_fields else None
+    fields = [(f.attribute, f.type, f.array_length) for f in definition.fields]
+    known = [(f.name, f.type, f.array_length) for f in standard.FIELDS[: len(fields)]]
+    return standard if definition.name == standard.NAME and known == fields else None
 
 
 # -------------------------------------------------------------------------------- pymavlink modules

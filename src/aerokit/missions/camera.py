@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from aerokit.mavlink.enums import MavCmd
+from aerokit.mavlink.enums import MavCmd, MavMountMode
 from aerokit.missions.places import action, in_range, place, whole
 
 if TYPE_CHECKING:
@@ -26,8 +26,6 @@ __all__ = [
     "take_photos",
     "trigger_camera",
 ]
-
-_TARGETING_BY_ANGLES = 2.0  # MAV_MOUNT_MODE_MAVLINK_TARGETING
 
 
 def set_camera_trigger_distance(distance_m: float, *, trigger_now: bool = False) -> MissionItem:
@@ -130,5 +128,5 @@ def point_gimbal(*, pitch_deg: float = 0.0, roll_deg: float = 0.0, yaw_deg: floa
     return action(
         MavCmd.DO_MOUNT_CONTROL,
         *(in_range(name, value, -180, 180) for name, value in angles),
-        z=_TARGETING_BY_ANGLES,
+        z=float(MavMountMode.MAVLINK_TARGETING),
     )

@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 from aerokit.errors import LocalProtocolError
+from aerokit.mavlink.enums import MavFrame
 from aerokit.missions.commands import DEFAULT_XY, canonical_frame, command_name, xy_scale
 from aerokit.position import Position
 from aerokit.snapshot import Snapshot
@@ -60,8 +61,8 @@ class MissionItem(Snapshot):
             return Position(
                 self.x / 1e7,
                 self.y / 1e7,
-                altitude_amsl_m=altitude if frame == 0 else None,
-                altitude_relative_m=altitude if frame == 3 else None,
+                altitude_amsl_m=altitude if frame == MavFrame.GLOBAL else None,
+                altitude_relative_m=altitude if frame == MavFrame.GLOBAL_RELATIVE_ALT else None,
             )
         except LocalProtocolError:
             return None

@@ -7,7 +7,7 @@ endian), then 38 bytes for each item: a MISSION_ITEM_INT as on the wire, untrimm
 from __future__ import annotations
 
 import struct
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from aerokit.errors import LocalProtocolError, RemoteProtocolError
 from aerokit.mavlink.messages import MissionItemInt
@@ -19,7 +19,16 @@ if TYPE_CHECKING:
 
     from aerokit.missions.item import MissionItem
 
-__all__ = ["HEADER", "MAGIC", "NO_CLEAR", "PACKED_NAMES", "pack_items", "unpack_items"]
+__all__ = [
+    "HEADER",
+    "MAGIC",
+    "NO_CLEAR",
+    "PACKED_NAMES",
+    "PlanHeader",
+    "pack_items",
+    "read_header",
+    "unpack_items",
+]
 
 MAGIC = 0x763D
 HEADER = struct.Struct("<5H")
@@ -27,6 +36,20 @@ NO_CLEAR = 1  # in options: the items that are there stay, those that come repla
 PACKED_NAMES = {0: "@MISSION/mission.dat", 1: "@MISSION/fence.dat", 2: "@MISSION/rally.dat"}
 
 _ITEM_LENGTH = MissionItemInt.LENGTH
+
+
+class PlanHeader(NamedTuple):
+    """What a packed plan says of itself."""
+
+    mission_type: int
+    options: int
+    first: int
+    items: int
+
+    @property
+    def length(self) -> int:
+        """Bytes of the whole file."""
+        return HEADER.size + self.items * _ITEM_LENGTH
 
 
 def pack_items(
@@ -60,24 +83,31 @@ def pack_items(
     )
 
 
+def read_header(data: bytes) -> PlanHeader:
+    """The first ten bytes; :class:`RemoteProtocolError` when they are not those of a packed plan."""
+    if len(data) < HEADER.size:
+        raise RemoteProtocolError(
+            f"a packed plan begins with {HEADER.size} bytes of header, these are {len(data)}"
+        )
+    magic, *numbers = HEADER.unpack_from(data)
+    if magic != MAGIC:
+        raise RemoteProtocolError(f"a packed plan begins with 0x{MAGIC:04X}, this with 0x{magic:04X}")
+    return PlanHeader(*numbers)
+
+
 def unpack_items(data: bytes, mission_type: int | None = None) -> tuple[MissionItem, ...]:
     """The items of a file, counted as the vehicle counts them.
 
     Raises :class:`RemoteProtocolError` when it is none, is cut off, or is about another ``mission_type``.
     """
-    if len(data) < HEADER.size:
+    header = read_header(data)
+    if mission_type is not None and header.mission_type != mission_type:
         raise RemoteProtocolError(
-            f"a packed plan begins with {HEADER.size} bytes of header, these are {len(data)}"
+            f"a packed plan of MAV_MISSION_TYPE {mission_type} was expected, this is of {header.mission_type}"
         )
-    magic, kind, _options, _first, count = HEADER.unpack_from(data)
-    if magic != MAGIC:
-        raise RemoteProtocolError(f"a packed plan begins with 0x{MAGIC:04X}, this with 0x{magic:04X}")
-    if mission_type is not None and kind != mission_type:
+    if len(data) != header.length:
         raise RemoteProtocolError(
-            f"a packed plan of MAV_MISSION_TYPE {mission_type} was expected, this is of {kind}"
+            f"a packed plan of {header.items} items has {header.length} bytes, this has {len(data)}"
         )
-    length = HEADER.size + count * _ITEM_LENGTH
-    if len(data) != length:
-        raise RemoteProtocolError(f"a packed plan of {count} items has {length} bytes, this has {len(data)}")
-    starts = range(HEADER.size, length, _ITEM_LENGTH)
+    starts = range(HEADER.size, header.length, _ITEM_LENGTH)
     return tuple(from_wire(MissionItemInt.decode(data[at : at + _ITEM_LENGTH])) for at in starts)

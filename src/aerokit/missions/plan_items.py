@@ -32,7 +32,11 @@ _FRAME_OF_MODE = {
     3: MavFrame.GLOBAL,
     4: MavFrame.GLOBAL_TERRAIN_ALT,
 }
-_MODE_OF_FRAME: dict[int, int] = {0: 2, 3: 1, 10: 4}
+_MODE_OF_FRAME: dict[int, int] = {
+    MavFrame.GLOBAL: 2,
+    MavFrame.GLOBAL_RELATIVE_ALT: 1,
+    MavFrame.GLOBAL_TERRAIN_ALT: 4,
+}
 
 
 def read_entries(entries: Sequence[JsonValue]) -> list[tuple[MissionItem, ...]]:

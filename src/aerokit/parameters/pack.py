@@ -11,18 +11,24 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from struct import Struct
+from typing import NamedTuple, NoReturn
 
 from aerokit.errors import LocalProtocolError, RemoteProtocolError
 from aerokit.parameters.parameter import NAME_LENGTH, Parameter, ParameterType, check_name, checked_value
 from aerokit.parameters.table import ParameterTable
 
 __all__ = [
+    "HEADER",
+    "MAGIC",
     "PACK_PATH",
     "PACK_PATH_WITH_DEFAULTS",
+    "PackEntry",
+    "PackHeader",
     "pack_parameters",
     "pack_served",
+    "read_entry",
+    "read_header",
     "unpack_parameters",
-    "unpack_upload",
 ]
 
 PACK_PATH = "@PARAM/param.pck"
@@ -30,9 +36,9 @@ PACK_PATH = "@PARAM/param.pck"
 PACK_PATH_WITH_DEFAULTS = "@PARAM/param.pck?withdefaults=1"
 """The same for reading, with the defaults of those parameters that have been changed."""
 
-_MAGIC, _MAGIC_WITH_DEFAULTS = 0x671B, 0x671C
+MAGIC, _MAGIC_WITH_DEFAULTS = 0x671B, 0x671C
+HEADER = Struct("<HHH")
 _HAS_DEFAULT = 0x10
-_HEADER = Struct("<HHH")
 _LONGEST = 0xFFFF
 
 # The file has codes of its own, those of ArduPilot's variables, not of MAV_PARAM_TYPE.
@@ -53,6 +59,24 @@ _CODE_OF = {
 }
 
 
+class PackHeader(NamedTuple):
+    """The first six bytes; ``total`` is the number of the vehicle's parameters, in an upload the length in bytes."""
+
+    magic: int
+    parameters: int
+    total: int
+
+
+class PackEntry(NamedTuple):
+    """One parameter as the file has it; ``default`` is None where it is not there."""
+
+    name: bytes
+    type: ParameterType
+    value: int | float
+    default: int | float | None
+    end: int
+
+
 def unpack_parameters(data: bytes, *, start: int = 0) -> ParameterTable:
     """The table in a downloaded file; ``start`` is the index of its first parameter, as asked for in its path.
 
@@ -60,23 +84,10 @@ def unpack_parameters(data: bytes, *, start: int = 0) -> ParameterTable:
     :class:`RemoteProtocolError` when the file is damaged, or has another number of parameters than its header says
     (ArduPilot does that once when its list has just changed: download it again).
     """
-    magic, count, total = _header(data)
-    if magic not in (_MAGIC, _MAGIC_WITH_DEFAULTS) or count > total:
+    magic, count, total = read_header(data)
+    if magic not in (MAGIC, _MAGIC_WITH_DEFAULTS) or count > total:
         raise RemoteProtocolError(f"this is no param.pck: its header is {magic:#06x}, {count} of {total}")
-    found = list(_entries(data, magic == _MAGIC_WITH_DEFAULTS, start))
-    return ParameterTable(_checked(found, count))
-
-
-def unpack_upload(data: bytes) -> ParameterTable:
-    """The parameters of a file made for upload, as a vehicle reads it; RemoteProtocolError when it would not."""
-    magic, count, length = _header(data)
-    if magic != _MAGIC or length != len(data):
-        raise RemoteProtocolError(
-            f"no upload: header {magic:#06x}, {length} bytes announced, {len(data)} here"
-        )
-    found = [p.replace(index=None) for p in _entries(data, False, 0)]
-    if any(p.default is not None for p in found):
-        raise RemoteProtocolError("an upload has no defaults")
+    found = list(_parameters(data, magic == _MAGIC_WITH_DEFAULTS, start))
     return ParameterTable(_checked(found, count))
 
 
@@ -91,15 +102,15 @@ def pack_parameters(parameters: Mapping[str, Parameter] | Iterable[Parameter]) -
     body = bytearray()
     last = b""
     for parameter in rows:
-        name, entry = _entry(parameter, last, False)
-        body += entry
+        name, code = check_name(parameter.name).encode("ascii"), _code_of(parameter)
+        body += _entry(name, last, code, checked_value(parameter.name, parameter.value, _CODES[code][0]))
         last = name
-    length = _HEADER.size + len(body)
+    length = HEADER.size + len(body)
     if length > _LONGEST:
         raise LocalProtocolError(
             f"{len(rows)} parameters make {length} bytes, at most {_LONGEST} are possible"
         )
-    return _HEADER.pack(_MAGIC, len(rows), length) + bytes(body)
+    return HEADER.pack(MAGIC, len(rows), length) + bytes(body)
 
 
 def pack_served(
@@ -109,23 +120,28 @@ def pack_served(
     count: int = 0,
     with_defaults: bool = False,
     block_size: int = 239,
+    whole_defaults: bool = True,
 ) -> bytes:
-    """The file that a vehicle with these parameters serves when it is read in blocks of that size.
+    """The file that a vehicle with these parameters serves when it is read in blocks of that size; nothing is checked.
 
-    ``count`` 0 means all from ``start``. LocalProtocolError when ``start`` is beyond the list.
+    ``count`` 0 means all from ``start``. A value and its default lie in one block (PX4), or, without
+    ``whole_defaults``, the default alone (ArduPilot). LocalProtocolError when ``start`` is beyond the list.
     """
     rows = list(_rows(parameters))
     if not 0 <= start < len(rows):
         raise LocalProtocolError(f"start = {start!r} must be in 0..{len(rows) - 1}")
     chosen = rows[start : start + count if count else None]
-    file = bytearray(_HEADER.pack(_MAGIC_WITH_DEFAULTS if with_defaults else _MAGIC, len(chosen), len(rows)))
+    file = bytearray(HEADER.pack(_MAGIC_WITH_DEFAULTS if with_defaults else MAGIC, len(chosen), len(rows)))
     last = b""
     for parameter in chosen:
-        shows_default = with_defaults and bool(parameter.is_changed)
-        name, entry = _entry(parameter, last, shows_default)
-        data_size = _CODES[_CODE_OF[parameter.type]][1].size * (1 + shows_default)
+        values = [parameter.value]
+        if with_defaults and parameter.is_changed and parameter.default is not None:
+            values.append(parameter.default)
+        name, code = parameter.name.encode(), _code_of(parameter)
+        entry = _entry(name, last, code, *values)
+        kept = _CODES[code][1].size * (len(values) if whole_defaults else 1)
         beyond = (len(file) + len(entry)) % block_size
-        file += bytes(data_size - beyond if 0 < beyond < data_size else 0) + entry
+        file += bytes(kept - beyond if 0 < beyond < kept else 0) + entry
         last = name
     return bytes(file)
 
@@ -133,46 +149,52 @@ def pack_served(
 # --------------------------------------------------------------------------------------- reading
 
 
-def _header(data: bytes) -> tuple[int, int, int]:
-    if len(data) < _HEADER.size:
-        raise RemoteProtocolError(f"param.pck has {len(data)} bytes, its header alone has {_HEADER.size}")
-    return _HEADER.unpack_from(data)
+def read_header(data: bytes) -> PackHeader:
+    """The header of any file; RemoteProtocolError when it is shorter than that."""
+    if len(data) < HEADER.size:
+        raise RemoteProtocolError(f"param.pck has {len(data)} bytes, its header alone has {HEADER.size}")
+    return PackHeader(*HEADER.unpack_from(data))
 
 
-def _entries(data: bytes, with_defaults: bool, index: int) -> Iterator[Parameter]:
-    position, last = _HEADER.size, b""
-    try:
-        while True:
-            while data[position] == 0:  # padding; no entry begins with a zero
-                position += 1
-            parameter, last, position = _read_entry(data, position, last, with_defaults, index)
-            yield parameter
-            index += 1
-    except IndexError:
-        return
+def read_entry(data: bytes, position: int, last: bytes) -> PackEntry | None:
+    """The entry at a position, behind the padding; ``last`` is the name before. None when the data end within it.
 
-
-def _read_entry(
-    data: bytes, position: int, last: bytes, with_defaults: bool, index: int
-) -> tuple[Parameter, bytes, int]:
+    RemoteProtocolError when there is none: a type or flags that do not exist, a name that is too long.
+    """
     code, flags = data[position] & 0x0F, data[position] & 0xF0
-    lengths = data[position + 1 : position + 2] or _damaged(position, "ends within an entry")
-    common, own = lengths[0] & 0x0F, (lengths[0] >> 4) + 1
     if code not in _CODES or flags & ~_HAS_DEFAULT:
         _damaged(position, f"type {code}, flags {flags >> 4}")
+    if position + 1 == len(data):
+        return None
+    common, own = data[position + 1] & 0x0F, (data[position + 1] >> 4) + 1
     if common > len(last) or common + own > NAME_LENGTH:
         _damaged(position, f"a name of {common} + {own} characters after {last!r}")
     kind, format_ = _CODES[code]
     start = position + 2 + own
     end = start + format_.size * (2 if flags else 1)
     if end > len(data):
-        _damaged(position, "ends within an entry")
-    name = last[:common] + data[position + 2 : start]
+        return None
     value = format_.unpack_from(data, start)[0]
-    default = (
-        format_.unpack_from(data, start + format_.size)[0] if flags else value if with_defaults else None
-    )
-    return Parameter(_text(name, position), value, kind, default, index), name, end
+    default = format_.unpack_from(data, start + format_.size)[0] if flags else None
+    return PackEntry(last[:common] + data[position + 2 : start], kind, value, default, end)
+
+
+def _parameters(data: bytes, with_defaults: bool, index: int) -> Iterator[Parameter]:
+    position, last = HEADER.size, b""
+    while (position := _behind_padding(data, position)) < len(data):
+        entry = read_entry(data, position, last)
+        if entry is None:
+            _damaged(position, "ends within an entry")
+        default = entry.value if entry.default is None and with_defaults else entry.default
+        yield Parameter(_text(entry.name, position), entry.value, entry.type, default, index)
+        position, last, index = entry.end, entry.name, index + 1
+
+
+def _behind_padding(data: bytes, position: int) -> int:
+    """No entry begins with a zero."""
+    while position < len(data) and data[position] == 0:
+        position += 1
+    return position
 
 
 def _text(name: bytes, position: int) -> str:
@@ -181,7 +203,7 @@ def _text(name: bytes, position: int) -> str:
     return name.decode("ascii")
 
 
-def _damaged(position: int, what: str) -> bytes:
+def _damaged(position: int, what: str) -> NoReturn:
     raise RemoteProtocolError(f"param.pck is damaged at byte {position}: {what}")
 
 
@@ -200,20 +222,18 @@ def _rows(parameters: Mapping[str, Parameter] | Iterable[Parameter]) -> Iterator
     return iter(parameters.values() if isinstance(parameters, Mapping) else parameters)
 
 
-def _entry(parameter: Parameter, last: bytes, with_default: bool) -> tuple[bytes, bytes]:
-    name = check_name(parameter.name).encode("ascii")
+def _code_of(parameter: Parameter) -> int:
     if parameter.type not in _CODE_OF:
         raise LocalProtocolError(
             f"{parameter.name} is an {parameter.type.name}, which param.pck cannot carry"
         )
-    code = _CODE_OF[parameter.type]
-    kind, format_ = _CODES[code]
-    data = format_.pack(checked_value(parameter.name, parameter.value, kind))
-    if with_default and parameter.default is not None:
-        data += format_.pack(checked_value(parameter.name, parameter.default, kind))
-    common = _common_length(name, last)
-    first = bytes((code | (_HAS_DEFAULT if with_default else 0), common | (len(name) - common - 1) << 4))
-    return name, first + name[common:] + data
+    return _CODE_OF[parameter.type]
+
+
+def _entry(name: bytes, last: bytes, code: int, *values: float) -> bytes:
+    common, pack = _common_length(name, last), _CODES[code][1].pack
+    first = (code | (_HAS_DEFAULT if len(values) > 1 else 0), common | (len(name) - common - 1) << 4)
+    return bytes(first) + name[common:] + b"".join(map(pack, values))
 
 
 def _common_length(name: bytes, last: bytes) -> int:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 __all__ = ["CommandExchange", "Standing", "command_int", "command_long", "command_name", "result_name"]
 
-ACCEPTED, IN_PROGRESS = 0, 5
+ACCEPTED, IN_PROGRESS = 0, 5  # of MAV_RESULT, which every import would have to make
 BROADCAST = 0
 FLOAT32_MAX = 3.4028234663852886e38
 LOOK_S = 0.05

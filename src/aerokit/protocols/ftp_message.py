@@ -6,10 +6,14 @@ See https://mavlink.io/en/services/ftp.html.
 from __future__ import annotations
 
 import struct
+from typing import TYPE_CHECKING
 
 from aerokit.errors import FileError, LocalProtocolError
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
 from aerokit.snapshot import Snapshot
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 __all__ = [
     "DATA_SIZE",
@@ -103,11 +107,11 @@ class FtpMessage(Snapshot):
     data: bytes = b""
 
     @classmethod
-    def decode(cls, payload: bytes) -> FtpMessage:
-        """Read a payload; ``data`` is cut to ``size``. Never raises for bytes off the air."""
+    def decode(cls, payload: bytes, *, cut: bool = True) -> Self:
+        """Read a payload; ``data`` is cut to ``size``, or all 239 bytes. Never raises for bytes off the air."""
         payload = payload.ljust(PAYLOAD_SIZE, b"\0")
         sequence, session, opcode, size, request_opcode, burst_complete, offset = HEADER.unpack_from(payload)
-        data = payload[HEADER.size : HEADER.size + size]
+        data = payload[HEADER.size : HEADER.size + size if cut else PAYLOAD_SIZE]
         return cls(sequence, opcode, session, size, request_opcode, burst_complete != 0, offset, data)
 
     def encode(self) -> bytes:

@@ -21,7 +21,6 @@ from aerokit.protocols.missions import (
     BUSY_S,
     FORGOTTEN_S,
     MissionExchange,
-    opaque_id_of,
 )
 from aerokit.protocols.transfer import ranges
 from aerokit.snapshot import Snapshot
@@ -118,7 +117,7 @@ class MissionDownload(MissionExchange[Downloaded]):
     # --------------------------------------------------------------------------------- answers
 
     def _take_count(self, message: MissionCount, now: float) -> None:
-        opaque_id = opaque_id_of(message)
+        opaque_id = message.opaque_id
         if self._count is None:
             if self._attempt == 1 and not self._restarts and self._window > 1:  # PX4 repeats it by itself
                 self.round_trip.measured(now - self._list_at)

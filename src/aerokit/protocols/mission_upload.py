@@ -20,7 +20,6 @@ from aerokit.protocols.missions import (
     BUSY_S,
     FORGOTTEN_S,
     MissionExchange,
-    opaque_id_of,
 )
 from aerokit.protocols.transfer import ranges
 from aerokit.snapshot import Snapshot
@@ -193,7 +192,7 @@ class MissionUpload(MissionExchange[UploadEnd]):
         result = ack.type
         if result == MavMissionResult.ACCEPTED:
             if self._is_asked and self._sent == self._end:
-                self._end_well(not self._tail_was_repeated, opaque_id_of(ack), now)
+                self._end_well(not self._tail_was_repeated, ack.opaque_id, now)
         elif result == MavMissionResult.INVALID_SEQUENCE:
             if self._is_asked:
                 self._send_window(now, ahead=1)

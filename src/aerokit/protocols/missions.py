@@ -23,7 +23,6 @@ __all__ = [
     "FORGOTTEN_S",
     "MissionClear",
     "MissionExchange",
-    "opaque_id_of",
 ]
 
 ResultT = TypeVar("ResultT")
@@ -58,19 +57,6 @@ RESULTS = {
         )
     },
 }
-
-
-def opaque_id_of(message: Message) -> int:
-    """The ``opaque_id`` of a MISSION_COUNT or MISSION_ACK, 0 when there is none: an extension not yet in the dialect.
-
-    PX4 sends it: a checksum of what is stored. See https://mavlink.io/en/messages/common.html#MISSION_COUNT.
-    """
-    return _number_at(message, 5 if message.NAME == "MISSION_COUNT" else 4)
-
-
-def _number_at(message: Message, offset: int) -> int:
-    frame = message.received_frame
-    return 0 if frame is None else int.from_bytes(frame.payload[offset : offset + 4], "little")
 
 
 class MissionExchange(Transfer[ResultT]):

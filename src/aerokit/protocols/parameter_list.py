@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from aerokit.errors import ParameterTimeout
+from aerokit.mavlink.enums import MavParamError
 from aerokit.mavlink.messages import ParamError, ParamRequestList, ParamRequestRead, ParamValue
 from aerokit.parameters import Parameter, ParameterTable
 from aerokit.parameters.encoding import UNKNOWN_INDEX, parameter_of
@@ -36,7 +37,6 @@ SHORTEST_START_S = 0.3
 ROUNDS = 3
 """How often indices are asked for again that have shifted since."""
 REFUSALS = 2
-DOES_NOT_EXIST = 1
 
 
 class _Slot:
@@ -164,7 +164,7 @@ class ParameterList(Transfer[ParameterTable]):
     def _take_refusal(self, message: ParamError) -> None:
         """An index that the vehicle has no more: the list has become shorter. Only the index counts, see PX4."""
         index = message.param_index
-        if message.error != DOES_NOT_EXIST or index not in self._window or index in self._slots:
+        if message.error != MavParamError.DOES_NOT_EXIST or index not in self._window or index in self._slots:
             return
         self._refusals[index] = self._refusals.get(index, 0) + 1
         if self._refusals[index] >= REFUSALS and self._count is not None:

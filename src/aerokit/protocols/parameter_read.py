@@ -11,6 +11,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from aerokit.errors import ParameterRejected
+from aerokit.mavlink.enums import MavParamError
 from aerokit.mavlink.messages import ParamRequestRead
 from aerokit.parameters.encoding import parameter_of
 from aerokit.parameters.parameter import same_value
@@ -26,7 +27,6 @@ __all__ = ["ParameterReads"]
 
 READS_AT_ONCE = 20
 BY_NAME = -1
-DOES_NOT_EXIST = 1
 PROBE, PROBE_INDEX = "", 0
 """The request for a parameter that every vehicle has."""
 DOUBT = 1e-4
@@ -125,7 +125,7 @@ class ParameterReads(ParameterRequests):
         """PX4 says that there is no such parameter also when it has no room to send it: once more, then."""
         name = message.param_id
         is_first = name in self._names and name in self._window and name not in self._refused
-        if is_first and message.error == DOES_NOT_EXIST:
+        if is_first and message.error == MavParamError.DOES_NOT_EXIST:
             self._refused.add(name)
             self._window.answered(name, now)
             self._window.ask(name)

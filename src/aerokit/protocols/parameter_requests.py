@@ -75,7 +75,6 @@ class ParameterRequests(Transfer[dict[str, Answer]]):
         )
         self._answers: dict[str, Answer] = {}
         self._sent_at: dict[str, float] = {}
-        self._early: dict[str, int] = {}
 
     def start(self, now: float) -> None:
         """Ask for the first of them."""

@@ -26,8 +26,9 @@ Sink = Callable[[Any], None]
 
 EventT = TypeVar("EventT", bound=Event)
 
-_Entry = tuple[bool, Sink]
-"""Whether it takes frames, and who takes it."""
+_Entry = tuple[int, Callable[..., None]]
+"""What it takes (`MESSAGE`, `FRAME`, `BOTH`), and who takes it."""
+MESSAGE, FRAME, BOTH = range(3)
 _Plan = tuple[bool, tuple[_Entry, ...]]
 """Whether anyone takes the message, and all who take it or its frame."""
 EVERY_SYSTEM = 0
@@ -48,13 +49,23 @@ class Bus:
 
     def attach(self, message_type: type[Message], sink: Sink, *, system_id: int = EVERY_SYSTEM) -> Detach:
         """Have every ``message_type`` of ``system_id`` (0: of every system) delivered to ``sink``."""
-        return self._attach((system_id, message_type.ID), (False, sink))
+        return self._attach((system_id, message_type.ID), (MESSAGE, sink))
 
     def attach_frames(
         self, message_type: type[Message], sink: Sink, *, system_id: int = EVERY_SYSTEM
     ) -> Detach:
         """As :meth:`attach`, for who may never need what is in the message: ``sink`` gets the frame, not decoded."""
-        return self._attach((system_id, message_type.ID), (True, sink))
+        return self._attach((system_id, message_type.ID), (FRAME, sink))
+
+    def attach_lazily(
+        self,
+        message_type: type[Message],
+        sink: Callable[[Frame, Message | None], None],
+        *,
+        system_id: int = EVERY_SYSTEM,
+    ) -> Detach:
+        """As :meth:`attach_frames`; ``sink`` gets the message, too, if somebody else has had it decoded anyway."""
+        return self._attach((system_id, message_type.ID), (BOTH, sink))
 
     def attach_event(self, event_type: type[EventT], sink: Callable[[EventT], None]) -> Detach:
         """Have every event of this class and of its subclasses delivered to ``sink``."""
@@ -68,9 +79,14 @@ class Bus:
         except KeyError:
             is_read, entries = self._plan(frame)
         message = self.dialect.decode(frame) if is_read else None
-        for takes_frame, sink in entries:
+        for kind, sink in entries:
             try:
-                sink(frame if takes_frame else message)
+                if kind == MESSAGE:
+                    sink(message)
+                elif kind == FRAME:
+                    sink(frame)
+                else:
+                    sink(frame, message)
             except Exception:
                 _report(sink)
 
@@ -96,7 +112,7 @@ class Bus:
         sinks += self._sinks.get((EVERY_SYSTEM, message_id), ())
         if not sinks or self.dialect.get(message_id) is None:
             return False, ()
-        plan = any(not takes_frame for takes_frame, _ in sinks), sinks
+        plan = any(kind == MESSAGE for kind, _ in sinks), sinks
         self._plans[system_id << 24 | message_id] = plan
         return plan
 
@@ -134,5 +150,5 @@ def once(action: Callable[[], None]) -> Detach:
     return detach
 
 
-def _report(sink: Sink) -> None:
+def _report(sink: Callable[..., None]) -> None:
     logger.exception("a subscriber (%r) raised; the message was delivered to the others", sink)

@@ -79,10 +79,11 @@ class StateCell(Generic[T]):
         *,
         stamp: Callable[[], float] | None = None,
     ) -> None:
-        self.name = name
+        self.name: str = name
+        """What it is the value of."""
         self._clock = clock
         self._stamp = clock if stamp is None else stamp  # the time that a value set now came at
-        self.waits_for = waits_for
+        self.waits_for: str = waits_for
         """The messages that the value comes from."""
         self._known = False
         self._latest: T | None = None

@@ -20,6 +20,7 @@ from aerokit.mavlink.messages import Heartbeat
 from aerokit.runtime.background import Background
 from aerokit.runtime.bus import Bus, once
 from aerokit.runtime.cells import StateCell
+from aerokit.runtime.components import MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS, is_autopilot
 from aerokit.runtime.deadlines import Deadlines
 from aerokit.runtime.endings import raisable
 from aerokit.runtime.events import (
@@ -30,6 +31,7 @@ from aerokit.runtime.events import (
     LinkRestored,
     LinkStalled,
     LoopBlocked,
+    VehicleFound,
 )
 from aerokit.runtime.link_state import LinkState
 from aerokit.runtime.link_watch import LinkStateWatch
@@ -59,9 +61,7 @@ logger = logging.getLogger("aerokit")
 
 ItemT = TypeVar("ItemT", bound="Message | Event")
 
-MAV_TYPE_GCS = 6
-MAV_AUTOPILOT_INVALID = 8
-MAV_STATE_ACTIVE = 4
+MAV_STATE_ACTIVE = 4  # no enums here: they would take two milliseconds of every connect
 MAV_COMP_ID_MISSIONPLANNER = 190
 """The component id that ground stations take."""
 HEARTBEAT_PERIOD_S = 1.0
@@ -500,7 +500,11 @@ class Connection:
         if frame.system_id == 0 or not isinstance(heartbeat, Heartbeat):
             return
         if self._routes.note(frame, peer, _counters(framer, frame)):
-            self.heard[frame.system_id, frame.component_id] = heartbeat
+            source = frame.system_id, frame.component_id
+            is_new = source not in self.heard
+            self.heard[source] = heartbeat
+            if is_new and is_autopilot(heartbeat):
+                self.bus.publish(VehicleFound(self._clock(), *source))
             if len(self.heard) > MOST_ROUTES:
                 for source in [source for source in self.heard if not self._routes.is_known(source)]:
                     del self.heard[source]

@@ -4,28 +4,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from aerokit.runtime.components import MAV_TYPE_GCS, is_autopilot
+
 if TYPE_CHECKING:
-    from aerokit.mavlink.messages import Heartbeat
     from aerokit.runtime.connection import Connection
 
-__all__ = ["is_autopilot", "no_vehicle_reason"]
-
-MAV_TYPE_GCS = 6
-MAV_AUTOPILOT_INVALID = 8
-NO_AUTOPILOTS = frozenset((MAV_TYPE_GCS, 18, 26, 27, *range(30, 35), *range(36, 43), 44, 48))
-"""Types of other components: onboard controller, gimbal, ADS-B, camera, servo, battery, … (MAV_TYPE)."""
+__all__ = ["no_vehicle_reason"]
 
 NOISE_BYTES = 500
 """In so many bytes of noise there is about a tenth of a place that looks like a damaged frame."""
 SOME = 5
-
-
-def is_autopilot(heartbeat: Heartbeat) -> bool:
-    """Whether it comes from an autopilot: not from a ground station, a gimbal, a camera or an ADS-B receiver.
-
-    Some of those call their autopilot GENERIC instead of INVALID, so their type counts too.
-    """
-    return heartbeat.autopilot != MAV_AUTOPILOT_INVALID and heartbeat.type not in NO_AUTOPILOTS
 
 
 def no_vehicle_reason(connection: Connection, wanted_system: int | None) -> str:

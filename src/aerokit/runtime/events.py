@@ -52,7 +52,7 @@ class Event(Snapshot):
 
 
 class VehicleFound(Event):
-    """The first heartbeat of an autopilot with this system id was heard."""
+    """The first heartbeat of this autopilot was heard on the connection, whether a vehicle is connected to or not."""
 
     component_id: int
 

@@ -49,7 +49,7 @@ class Subscription(Generic[ItemT]):
             raise LocalProtocolError(
                 f"overflow = {overflow!r} is not allowed: 'drop_oldest', 'drop_newest' or 'error'"
             )
-        self.missed = 0
+        self.missed: int = 0
         """How many items were dropped because the reader was slow."""
         self._attach = attach
         self._detach: list[Detach] = []

@@ -5,13 +5,12 @@ https://mavlink.io/en/services/ftp.html
 
 from __future__ import annotations
 
-import struct
 import zlib
-from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
 from aerokit.mavlink.messages import FileTransferProtocol
+from aerokit.protocols.ftp_message import FtpMessage
 from aerokit.sim.file_tree import EEXIST, ENOENT
 from aerokit.sim.vehicle import sender_of
 
@@ -20,58 +19,43 @@ if TYPE_CHECKING:
     from aerokit.sim.file_tree import FileTree
     from aerokit.sim.vehicle import SimulatedVehicle
 
-__all__ = ["DATA_SIZE", "FtpPacket", "FtpServer", "crc32", "path_in", "read_crc32"]
-
-DATA_SIZE = 239
-"""Bytes of data in one message at most."""
-
-_HEADER = struct.Struct("<HBBBBBxI")
+__all__ = ["FtpPacket", "FtpServer", "crc32", "path_in", "read_crc32"]
 
 
-@dataclass(frozen=True)
-class FtpPacket:
-    """The payload of a FILE_TRANSFER_PROTOCOL, and whom it is from or for."""
+class FtpPacket(FtpMessage):
+    """What is in a FILE_TRANSFER_PROTOCOL, and whom it is from or for. A request's ``data`` are all 239 bytes."""
 
-    sequence: int
-    session: int
-    opcode: int
-    size: int = 0
-    request_opcode: int = 0
-    burst_complete: int = 0
-    offset: int = 0
-    data: bytes = b""
-    """Of a request all 239 bytes, of an answer those that count."""
     client: tuple[int, int] = (0, 0)
     """System and component id."""
 
     @classmethod
     def parse(cls, message: FileTransferProtocol) -> FtpPacket:
         """Read what came in; any payload is some packet."""
-        payload = message.payload.ljust(_HEADER.size + DATA_SIZE, b"\0")
-        sequence, session, opcode, size, request_opcode, complete, offset = _HEADER.unpack_from(payload)
-        data, client = payload[_HEADER.size :], sender_of(message)
-        return cls(sequence, session, opcode, size, request_opcode, complete, offset, data, client)
+        return cls.decode(message.payload, cut=False).replace(client=sender_of(message))
 
     def message(self) -> FileTransferProtocol:
         """The message that carries it."""
-        numbers = (self.sequence & 0xFFFF, self.session, self.opcode, self.size, self.request_opcode)
-        header = _HEADER.pack(*numbers, self.burst_complete, self.offset & 0xFFFFFFFF)
-        return FileTransferProtocol(
-            0, *self.client, (header + self.data).ljust(_HEADER.size + DATA_SIZE, b"\0")
-        )
+        return FileTransferProtocol(0, *self.client, self.encode())
 
     def acknowledge(self, data: bytes = b"", *, offset: int = 0, session: int | None = None) -> FtpPacket:
         """The answer to this request that says yes."""
         session = self.session if session is None else session
         sequence, opcode = self.sequence + 1 & 0xFFFF, MavFtpOpcode.ACK
         return FtpPacket(
-            sequence, session, opcode, len(data), self.opcode, 0, offset, data, client=self.client
+            sequence,
+            opcode,
+            session,
+            len(data),
+            self.opcode,
+            offset=offset & 0xFFFFFFFF,
+            data=data,
+            client=self.client,
         )
 
     def refuse(self, code: int, errno: int | None = None) -> FtpPacket:
         """The answer to this request that says no."""
         data = bytes([code]) if errno is None else bytes([code, errno])
-        return replace(self.acknowledge(data), opcode=MavFtpOpcode.NAK)
+        return self.acknowledge(data).replace(opcode=MavFtpOpcode.NAK)
 
     def refuse_errno(self, errno: int) -> FtpPacket:
         """The same for what the file system says: two numbers have error codes of their own."""

@@ -1,21 +1,22 @@
 """``@MISSION/mission.dat``, ``fence.dat`` and ``rally.dat``: missions as files, applied when they were written.
 
-The layout is that of ArduPilot's libraries/AP_Filesystem/README.md: ten bytes, then MISSION_ITEM_INTs.
+The layout is in `missions.pack`.
 """
 
 from __future__ import annotations
 
-import struct
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import LocalProtocolError, RemoteProtocolError
 from aerokit.mavlink.enums import MavMissionResult, MavMissionType
 from aerokit.mavlink.messages import MissionItemInt
+from aerokit.missions import MissionItem
+from aerokit.missions.pack import NO_CLEAR, pack_items, read_header, unpack_items
 from aerokit.sim.file_tree import EINVAL, ENFILE, ENOENT, FileFault, Mount, OpenFile
-from aerokit.sim.missions import item_from
+from aerokit.sim.missions import INVALID_INDEX
 
 if TYPE_CHECKING:
-    from aerokit.missions import MissionItem
     from aerokit.sim.missions import MissionStore
 
 __all__ = ["MissionMount"]
@@ -25,9 +26,8 @@ _FILES = {
     "fence.dat": MavMissionType.FENCE,
     "rally.dat": MavMissionType.RALLY,
 }
-_MAGIC = 0x763D
-_HEADER = struct.Struct("<HHHHH")
-_NO_CLEAR = 1
+_EMPTY = MissionItem(0, 0, autocontinue=False)
+"""What is where nothing was written."""
 _PLACEHOLDER_SIZE = 1 << 20
 
 
@@ -76,44 +76,31 @@ class _Writer(OpenFile):
 
     def write(self, offset: int, data: bytes) -> None:
         content = self._content
-        if offset == 0 and len(data) >= _HEADER.size:
-            count = _HEADER.unpack_from(data)[4]
-            whole = _HEADER.size + count * MissionItemInt.LENGTH
-            if count < 0xFFFF:
-                content.extend(bytes(max(0, whole - len(content))))
+        if offset == 0:
+            with suppress(RemoteProtocolError):
+                header = read_header(data)
+                if header.items < INVALID_INDEX:
+                    content.extend(bytes(max(0, header.length - len(content))))
         content.extend(bytes(max(0, offset + len(data) - len(content))))
         content[offset : offset + len(data)] = data
 
     def close(self) -> None:
         self.is_closed = True
-        content, step = bytes(self._content), MissionItemInt.LENGTH
-        if len(content) < _HEADER.size:
+        try:
+            header = read_header(bytes(self._content))
+            items = unpack_items(bytes(self._content[: header.length]))
+        except (RemoteProtocolError, LocalProtocolError):
+            raise FileFault(EINVAL) from None
+        if len(self._content) >= header.length + MissionItemInt.LENGTH or _EMPTY in items:
             raise FileFault(EINVAL)
-        magic, _, options, start, count = _HEADER.unpack_from(content)
-        pieces = [content[at : at + step] for at in range(_HEADER.size, len(content) - step + 1, step)]
-        if magic != _MAGIC or count != len(pieces) or not all(any(piece) for piece in pieces):
-            raise FileFault(EINVAL)
-        items = _unpacked(pieces)
-        clear = not options & _NO_CLEAR
-        if self._store.replace(self._type, items, start=start, clear=clear) != MavMissionResult.ACCEPTED:
+        clear = not header.options & NO_CLEAR
+        result = self._store.replace(self._type, items, start=header.first, clear=clear)
+        if result != MavMissionResult.ACCEPTED:
             raise FileFault(EINVAL)
 
 
 def _packed(items: list[MissionItem], type_: int) -> bytes:
-    content = bytearray(_HEADER.pack(_MAGIC, type_, 0, 0, len(items)))
-    for seq, item in enumerate(items):
-        params = (item.param1, item.param2, item.param3, item.param4)
-        place = (int(item.x), int(item.y), item.z)
-        head = (0, 0, seq, item.frame, item.command, 0, int(item.autocontinue))
-        content.extend(MissionItemInt(*head, *params, *place, type_).encode())
-    return bytes(content)
-
-
-def _unpacked(pieces: list[bytes]) -> list[MissionItem]:
-    try:
-        return [item_from(MissionItemInt.decode(piece)) for piece in pieces]
-    except LocalProtocolError:  # no value of ours, such as one of a command 0
-        raise FileFault(EINVAL) from None
+    return pack_items([item.replace(x=int(item.x), y=int(item.y)) for item in items], type_)
 
 
 def _type_of(path: str) -> int:

@@ -1,27 +1,24 @@
 """``@PARAM/param.pck``: all parameters as one file that is packed when it is read and applied when it was written.
 
-The layout is that of ArduPilot's libraries/AP_Filesystem/README.md.
+The layout is in `parameters.pack`.
 """
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
-from aerokit.mavlink.enums import MavParamType
+from aerokit.errors import LocalProtocolError, RemoteProtocolError
+from aerokit.parameters.pack import HEADER, MAGIC, pack_served, read_entry, read_header
 from aerokit.sim.file_tree import EINVAL, ENOENT, FileFault, Mount, OpenFile
 
 if TYPE_CHECKING:
-    from aerokit.sim.parameters import ParameterRow, Parameters
+    from aerokit.sim.parameters import Parameters
 
-__all__ = ["FORMATS", "HEADER", "MAGIC", "ParameterPackMount", "packed_parameters"]
+__all__ = ["ParameterPackMount"]
 
 _NAME = "param.pck"
-MAGIC, _MAGIC_WITH_DEFAULTS = 0x671B, 0x671C
-HEADER = struct.Struct("<HHH")
-_TYPES = {MavParamType.INT8: 1, MavParamType.INT16: 2, MavParamType.INT32: 3, MavParamType.REAL32: 4}
-FORMATS = {1: "<b", 2: "<h", 3: "<i", 4: "<f"}
 _GUESSED_ROW_SIZE = 12
 
 
@@ -72,19 +69,21 @@ class _Reader(OpenFile):
     def content(self) -> bytes:
         """The whole file, as it is at the first look."""
         if self._content is None:
-            parameters = self._parameters
-            if len(parameters) <= self._start:
-                raise FileFault(EINVAL)
-            end = self._start + self._count if self._count else None
-            rows = [parameters.row(name) for name in parameters.names[self._start : end]]
-            self._content = packed_parameters(
-                rows,
-                len(parameters),
-                self._block,
+            self._content = self._packed()
+        return self._content
+
+    def _packed(self) -> bytes:
+        try:
+            return pack_served(
+                (self._parameters.row(name).as_parameter() for name in self._parameters.names),
+                start=self._start,
+                count=self._count,
                 with_defaults=bool(self._with_defaults),
+                block_size=self._block,
                 whole_defaults=self._whole_defaults,
             )
-        return self._content
+        except LocalProtocolError:
+            raise FileFault(EINVAL) from None
 
     def read(self, offset: int, size: int) -> bytes:
         if size == 0:
@@ -108,81 +107,33 @@ class _Writer(OpenFile):
 
     def write(self, offset: int, data: bytes) -> None:
         content = self._content
-        if offset == 0 and len(data) >= HEADER.size:
-            magic, _, total = HEADER.unpack_from(data)
-            if magic == MAGIC:
-                content.extend(bytes(max(0, total - len(content))))
+        if offset == 0:
+            with suppress(RemoteProtocolError):
+                magic, _, length = read_header(data)
+                content.extend(bytes(max(0, length - len(content)) if magic == MAGIC else 0))
         content.extend(bytes(max(0, offset + len(data) - len(content))))
         content[offset : offset + len(data)] = data
 
     def close(self) -> None:
         content = bytes(self._content)
-        if len(content) < HEADER.size:
-            raise FileFault(EINVAL)
-        magic, count, total = HEADER.unpack_from(content)
-        if magic != MAGIC or total != len(content):
-            raise FileFault(EINVAL)
         try:
+            magic, count, length = read_header(content)
+            if magic != MAGIC or length != len(content):
+                raise FileFault(EINVAL)
             self._read_rows(content, count)
-        except (struct.error, IndexError, UnicodeDecodeError):
+        except RemoteProtocolError:
             raise FileFault(EINVAL) from None
 
     def _read_rows(self, content: bytes, count: int) -> None:
         position, last = HEADER.size, b""
         for _ in range(count):
-            kind, flags = content[position] & 0xF, content[position] >> 4
-            common, length = content[position + 1] & 0xF, (content[position + 1] >> 4) + 1
-            if flags or common + length > 16:
+            entry = read_entry(content, position, last) if position < len(content) else None
+            if entry is None or entry.default is not None:
                 raise FileFault(EINVAL)
-            last = last[:common] + content[position + 2 : position + 2 + length]
-            position += 2 + length
-            format_ = FORMATS.get(kind, "<f")
-            (value,) = struct.unpack_from(format_, content, position)
-            position += struct.calcsize(format_)
-            name = last.decode()
-            if kind in FORMATS and name in self._parameters:
-                self._apply(name, value)
-
-
-def packed_parameters(
-    rows: list[ParameterRow],
-    total: int,
-    block: int,
-    *,
-    with_defaults: bool = False,
-    whole_defaults: bool = False,
-) -> bytes:
-    """The file: zeros are put in front of a parameter whose value would lie across two blocks of ``block`` bytes.
-
-    With ``whole_defaults`` value and default together do not (PX4); else a default alone is looked at.
-    """
-    content = bytearray(HEADER.pack(_MAGIC_WITH_DEFAULTS if with_defaults else MAGIC, len(rows), total))
-    last = b""
-    for row in rows:
-        packed, width, has_default = _packed_row(row, last, with_defaults=with_defaults)
-        kept = 2 * width if has_default and whole_defaults else width
-        over = (len(content) + len(packed)) % block
-        if kept > 1 and 0 < over < kept:
-            content.extend(bytes(kept - over))
-        content.extend(packed)
-        last = row.name.encode()
-    return bytes(content)
-
-
-def _packed_row(row: ParameterRow, last: bytes, *, with_defaults: bool) -> tuple[bytes, int, bool]:
-    """The bytes, how many of them the value has, and whether a default follows it."""
-    name, kind = row.name.encode(), _TYPES[MavParamType(row.type)]
-    common = 0
-    while common < len(name) - 1 and name[common : common + 1] == last[common : common + 1]:
-        common += 1
-    differs = with_defaults and row.default != row.value
-    head = bytes([kind | differs << 4, common | (len(name) - common - 1) << 4]) + name[common:]
-    value = _value(row.value, kind)
-    return head + value + (_value(row.default, kind) if differs else b""), len(value), differs
-
-
-def _value(value: float, kind: int) -> bytes:
-    return struct.pack(FORMATS[kind], value if kind == _TYPES[MavParamType.REAL32] else int(value))
+            name = entry.name.decode("ascii", "replace")
+            if name in self._parameters:
+                self._apply(name, entry.value)
+            position, last = entry.end, entry.name
 
 
 def _query(path: str) -> dict[str, int]:

@@ -14,10 +14,7 @@ if TYPE_CHECKING:
     from aerokit.sim.parameters import Parameters
     from aerokit.sim.vehicle import SimulatedVehicle
 
-__all__ = ["UNCOUNTED", "ParameterServer"]
-
-UNCOUNTED = 0xFFFF
-"""param_index of a PARAM_VALUE that is not one of a list."""
+__all__ = ["ParameterServer"]
 
 
 class ParameterServer:

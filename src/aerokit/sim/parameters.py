@@ -10,6 +10,7 @@ from difflib import get_close_matches
 
 from aerokit.errors import LocalProtocolError
 from aerokit.mavlink.enums import MavParamType
+from aerokit.parameters import Parameter, ParameterType
 
 __all__ = ["ParameterRow", "Parameters", "stored"]
 
@@ -38,6 +39,12 @@ class ParameterRow:
     """Left out of PX4's hash: the vehicle changes it by itself."""
     switch: str | None = None
     """ArduPilot lists and counts it only while this parameter is not 0; it is there by name at any time."""
+
+    def as_parameter(self, index: int | None = None) -> Parameter:
+        """The same as clients have it: whole numbers are integers."""
+        type_ = ParameterType(self.type)
+        value, default = (int(x) if type_.is_integer else x for x in (self.value, self.default))
+        return Parameter(self.name, value, type_, default, index)
 
 
 class Parameters:

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavParamError
+from aerokit.parameters.encoding import UNKNOWN_INDEX
+from aerokit.parameters.px4_hash import HASH_NAME
 from aerokit.sim.vehicle import sender_of
 
 if TYPE_CHECKING:
@@ -14,9 +16,7 @@ if TYPE_CHECKING:
 
 __all__ = ["RecordedParameters"]
 
-_UNCOUNTED = 0xFFFF
 _LIST_INTERVAL_S, _BURST = 0.005, 5
-_HASH = "_HASH_CHECK"
 
 
 class RecordedParameters:
@@ -26,20 +26,22 @@ class RecordedParameters:
         self._vehicle = vehicle
         self._written: dict[str, float] = {}
         values = [value for _, value in vehicle.recording.parameters]
-        counted = {value.param_id: value.param_index for value in values if value.param_index != _UNCOUNTED}
+        counted = {
+            value.param_id: value.param_index for value in values if value.param_index != UNKNOWN_INDEX
+        }
         uncounted = [value.param_id for value in values if value.param_id not in counted]
         is_whole = bool(counted) and len(counted) == max(value.param_count for value in values)
         self.names = sorted(counted, key=lambda name: (counted[name], name))
         """In the order of the list."""
-        self.names += [name for name in dict.fromkeys(uncounted) if name != _HASH]
-        self._hash = is_whole and _HASH in uncounted
+        self.names += [name for name in dict.fromkeys(uncounted) if name != HASH_NAME]
+        self._hash = is_whole and HASH_NAME in uncounted
         """The hash is of all parameters: it says nothing when some were not recorded."""
         vehicle.on(m.ParamRequestList, self._on_list)
         vehicle.on(m.ParamRequestRead, self._on_read)
         vehicle.on(m.ParamSet, self._on_set)
 
     def _known(self, name: str) -> bool:
-        return name in self.names or (name == _HASH and self._hash)
+        return name in self.names or (name == HASH_NAME and self._hash)
 
     def value_message(self, name: str, index: int | None = None) -> m.ParamValue:
         """PARAM_VALUE as it was last told, or will be told first, or was written since."""
@@ -49,12 +51,12 @@ class RecordedParameters:
                 told = value
         assert told is not None
         if index is None:
-            index = _UNCOUNTED if name == _HASH else self.names.index(name)
+            index = UNKNOWN_INDEX if name == HASH_NAME else self.names.index(name)
         written = self._written.get(name, told.param_value)
         return m.ParamValue(name, written, told.param_type, len(self.names), index)
 
     def _on_list(self, request: m.ParamRequestList, channel: Channel) -> None:
-        messages = [self.value_message(_HASH)] if self._hash else []
+        messages = [self.value_message(HASH_NAME)] if self._hash else []
         latest = self._latest()
         count = len(self.names)
         for index, name in enumerate(self.names):

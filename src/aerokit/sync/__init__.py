@@ -27,11 +27,16 @@ from typing import TYPE_CHECKING
 from aerokit.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from aerokit.sync.cells import StateCell
-    from aerokit.sync.connection import Connection, open_connection
-    from aerokit.sync.guided import Guided, SetpointStream
-    from aerokit.sync.subscription import Subscription
-    from aerokit.sync.vehicle import Vehicle, connect
+    from aerokit.sync.twins import (
+        Connection,
+        Guided,
+        SetpointStream,
+        StateCell,
+        Subscription,
+        Vehicle,
+        connect,
+        open_connection,
+    )
 
 __all__ = [
     "Connection",
@@ -44,15 +49,4 @@ __all__ = [
     "open_connection",
 ]
 
-_HOMES = {
-    "Connection": "aerokit.sync.connection",
-    "Guided": "aerokit.sync.guided",
-    "SetpointStream": "aerokit.sync.guided",
-    "StateCell": "aerokit.sync.cells",
-    "Subscription": "aerokit.sync.subscription",
-    "Vehicle": "aerokit.sync.vehicle",
-    "connect": "aerokit.sync.vehicle",
-    "open_connection": "aerokit.sync.connection",
-}
-
-__getattr__, __dir__ = lazy_names(__name__, _HOMES, __all__)
+__getattr__, __dir__ = lazy_names(__name__, dict.fromkeys(__all__, "aerokit.sync.twins"), __all__)

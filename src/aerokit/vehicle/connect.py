@@ -15,13 +15,15 @@ from aerokit.errors import BusyError, ConnectFailed, LocalProtocolError
 from aerokit.links.link import Link
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.messages import Heartbeat
+from aerokit.runtime.components import is_autopilot
 from aerokit.runtime.connection import MAV_COMP_ID_MISSIONPLANNER, Connection
-from aerokit.runtime.diagnosis import is_autopilot, no_vehicle_reason
+from aerokit.runtime.diagnosis import no_vehicle_reason
 from aerokit.runtime.endings import raisable
-from aerokit.runtime.events import VehicleFound
 from aerokit.runtime.opening import open_connection
 from aerokit.runtime.routes import MOST_ROUTES
-from aerokit.vehicle.rates import check_rate
+from aerokit.vehicle.orders.bridge import Bridge
+from aerokit.vehicle.talk.rates import check_rate
+from aerokit.vehicle.talk.talk import Talk
 from aerokit.vehicle.vehicle import Vehicle
 
 if TYPE_CHECKING:
@@ -161,27 +163,23 @@ async def _attached(
     rates: Mapping[type[Message], float] | None,
 ) -> AsyncIterator[Vehicle]:
     """Find a vehicle on an open connection and keep it for the time of the block."""
-    vehicle, heartbeat = await _find_vehicle(connection, system_id, timeout)
+    bridge, vehicle, heartbeat = await _find_vehicle(connection, system_id, timeout)
     is_cut_short = False
     try:
-        vehicle._start(heartbeat, rates)
-        connection.bus.publish(VehicleFound(connection.now(), vehicle.system_id, vehicle.component_id))
+        bridge.talk.start(heartbeat, rates)
         yield vehicle
     except BaseException:
         is_cut_short = True
         raise
     finally:
         try:
-            vehicle._end_flights()
-            is_cut_short = is_cut_short or vehicle._is_told_to_hold
-            await vehicle._finish_hold()
-            await vehicle._finish_arming()
-            if is_cut_short:
+            is_given_up = await bridge.finish()
+            if is_cut_short or is_given_up:
                 tell_how_it_is_left(vehicle)
         finally:
-            vehicle._close()
+            bridge.talk.close()
             connection.attached.discard(vehicle.system_id)
-            await vehicle._background.aclose()
+            await bridge.talk.background.aclose()
 
 
 def tell_how_it_is_left(vehicle: Vehicle) -> None:
@@ -190,9 +188,7 @@ def tell_how_it_is_left(vehicle: Vehicle) -> None:
         logger.warning("vehicle %d is let go: %s", vehicle.system_id, vehicle.describe_now())
 
 
-async def _find_vehicle(
-    connection: Connection, system_id: int | None, timeout: float
-) -> tuple[Vehicle, Heartbeat]:
+async def _find_vehicle(connection: Connection, system_id: int | None, timeout: float) -> _Found:
     """The vehicle of the first heartbeat that will do, listening from the instant it came."""
     connection.raise_if_ended()
     search = _Search(connection, system_id)
@@ -217,6 +213,9 @@ async def _find_vehicle(
     )
 
 
+_Found = tuple[Bridge, Vehicle, Heartbeat]
+
+
 class _Search:
     """Makes the vehicle as soon as it is heard, inside the delivery of its heartbeat: what follows is not missed.
 
@@ -225,8 +224,7 @@ class _Search:
 
     def __init__(self, connection: Connection, system_id: int | None) -> None:
         self._connection, self._system_id = connection, system_id
-        self._vehicle: Vehicle | None = None
-        self._heartbeat: Heartbeat | None = None
+        self._found: _Found | None = None
         self._error: Exception | None = None
         self._ended = asyncio.Event()
         self._others: dict[tuple[int, int], int] = {}
@@ -242,8 +240,8 @@ class _Search:
         try:
             if frame.system_id in self._connection.attached:
                 raise BusyError(f"system {frame.system_id} has a vehicle object on this connection already")
-            self._vehicle = Vehicle(self._connection, frame.system_id, frame.component_id, heartbeat)
-            self._heartbeat = heartbeat
+            bridge = Bridge(Talk(self._connection, frame.system_id, frame.component_id, heartbeat))
+            self._found = (bridge, Vehicle(bridge), heartbeat)
             self._connection.attached.add(frame.system_id)
         except Exception as error:
             self._error = error
@@ -263,21 +261,22 @@ class _Search:
             self._error = raisable(error)
             self._ended.set()
 
-    async def result(self) -> tuple[Vehicle, Heartbeat]:
+    async def result(self) -> _Found:
         """The vehicle, now its finder's to close, and its first heartbeat."""
         await self._ended.wait()
-        if self._vehicle is None or self._heartbeat is None:
+        if self._found is None:
             assert self._error is not None
             raise self._error
-        vehicle, self._vehicle = self._vehicle, None
-        return vehicle, self._heartbeat
+        found, self._found = self._found, None
+        return found
 
     def forget(self) -> None:
         """Close the vehicle if nobody took it: the wait was cancelled just then."""
         self._ended.set()
-        if self._vehicle is not None:
-            self._vehicle._close()
-            self._connection.attached.discard(self._vehicle.system_id)
+        if self._found is not None:
+            talk = self._found[0].talk
+            talk.close()
+            self._connection.attached.discard(talk.system_id)
 
     def _is_wanted(self, frame: Frame, heartbeat: Heartbeat) -> bool:
         return frame.system_id != 0 and self._system_id in (None, frame.system_id) and is_autopilot(heartbeat)

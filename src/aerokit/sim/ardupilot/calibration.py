@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavCmd, MavResult, MavSeverity
+from aerokit.mavlink.enums import MavCmd, MavResult, MavSeverity, PreflightCalibrationAccelerometer
 from aerokit.sim.ardupilot.accelerometer_calibration import AccelerometerCalibration
 from aerokit.sim.ardupilot.compass_calibration import CompassCalibration
 from aerokit.sim.commands import Progress
@@ -22,7 +22,7 @@ __all__ = ["CALIBRATION_BUILDERS", "Calibrations"]
 _GYROS_S, _TRIM_S, _ACCELEROMETERS_S = 0.5, 1.0, 1.0
 _ACCELEROMETERS_AGAIN_S = 5.0
 _FORCED = 76
-_ACCELEROMETERS, _TRIM, _ACCELEROMETERS_SIMPLE = 1, 2, 4
+_Accelerometers = PreflightCalibrationAccelerometer
 
 
 class Calibrations:
@@ -67,15 +67,15 @@ class Calibrations:
 
     def _calibrate_accelerometers(self, command: Command) -> int | Progress:
         vehicle = self._vehicle
-        if command.x == _ACCELEROMETERS:
+        if command.x == _Accelerometers.FULL:
             vehicle.info("Initialising ArduPilot")
             return Progress((), _GYROS_S, finish=self.accelerometers.start)
-        if command.x == _TRIM:
+        if command.x == _Accelerometers.TRIM:
             vehicle.info("Initialising ArduPilot")
             return Progress(
                 (), _TRIM_S, finish=lambda: vehicle.info("Trim OK: roll=0.00 pitch=0.00 yaw=0.00")
             )
-        if command.x == _ACCELEROMETERS_SIMPLE:
+        if command.x == _Accelerometers.SIMPLE:
             if vehicle.now - self._accelerometers_at < _ACCELEROMETERS_AGAIN_S:
                 return MavResult.TEMPORARILY_REJECTED
             self._accelerometers_at = vehicle.now

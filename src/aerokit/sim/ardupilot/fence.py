@@ -6,7 +6,14 @@ import math
 from typing import TYPE_CHECKING, ClassVar
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import FenceBreach, FenceMitigate, MavMissionType, MavResult, MavSeverity
+from aerokit.mavlink.enums import (
+    FenceBreach,
+    FenceMitigate,
+    FenceType,
+    MavMissionType,
+    MavResult,
+    MavSeverity,
+)
 from aerokit.sim.ardupilot.fence_zones import Zones
 from aerokit.sim.commands import whole
 
@@ -18,7 +25,8 @@ if TYPE_CHECKING:
 
 __all__ = ["CIRCLE", "MAX_ALT", "MIN_ALT", "POLYGON", "REPORT_ONLY", "Fence", "fence_status"]
 
-MAX_ALT, CIRCLE, POLYGON, MIN_ALT = 1, 2, 4, 8
+MAX_ALT, CIRCLE = int(FenceType.ALT_MAX), int(FenceType.CIRCLE)
+POLYGON, MIN_ALT = int(FenceType.POLYGON), int(FenceType.ALT_MIN)
 """Bits of FENCE_TYPE."""
 
 _NAMES = {MAX_ALT: "Max Alt", CIRCLE: "Circle", POLYGON: "Polygon", MIN_ALT: "Min Alt"}

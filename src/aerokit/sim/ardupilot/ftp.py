@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode, MavSeverity
+from aerokit.protocols.ftp_message import DATA_SIZE
 from aerokit.sim.file_tree import EISDIR, ENOENT, FileFault
-from aerokit.sim.ftp import DATA_SIZE, FtpPacket, FtpServer, path_in, read_crc32
+from aerokit.sim.ftp import FtpPacket, FtpServer, path_in, read_crc32
 
 if TYPE_CHECKING:
     from aerokit.sim.channel import Channel
@@ -63,7 +63,7 @@ class ArduPilotFtp(FtpServer):
         self._writing = False
         self._session = _NO_SESSION
         self._used_at = float("-inf")
-        self._reply = FtpPacket(0, _NO_SESSION, 0)
+        self._reply = FtpPacket(0, Op.NONE, _NO_SESSION)
         self._banner_wanted = False
 
     @property
@@ -213,16 +213,16 @@ class ArduPilotFtp(FtpServer):
         sequence = request.sequence + 1 + number & 0xFFFF
         if refusal is not None:
             last = self._reply if number else refusal
-            end = replace(refusal, sequence=sequence, offset=last.offset, burst_complete=last.burst_complete)
+            end = refusal.replace(sequence=sequence, offset=last.offset, burst_complete=last.burst_complete)
             self._send(end, channel)
             self._work()
             return
         is_last = number == _BURST_BLOCKS - 1
-        complete = int(len(data) < step or is_last)
+        complete = len(data) < step or is_last
         block = request.acknowledge(data, offset=offset)
-        self._send(replace(block, sequence=sequence, burst_complete=complete), channel)
+        self._send(block.replace(sequence=sequence, burst_complete=complete), channel)
         after = offset + len(data) if len(data) < step else offset
-        self._reply = replace(self._reply, sequence=sequence + 1 & 0xFFFF, offset=after)
+        self._reply = self._reply.replace(sequence=sequence + 1 & 0xFFFF, offset=after)
         if is_last:
             self._vehicle.call_later(self.burst_interval_s, self._work)
         else:
@@ -233,11 +233,11 @@ class ArduPilotFtp(FtpServer):
 
     def _list(self, request: FtpPacket) -> FtpPacket:
         if not _is_path(request):
-            return replace(request.refuse(MavFtpErr.INVALIDDATASIZE), offset=request.offset)
+            return request.refuse(MavFtpErr.INVALIDDATASIZE).replace(offset=request.offset)
         try:
             entries = self._entries(path_in(request.data))
         except FileFault as fault:
-            return replace(request.refuse_errno(fault.errno), offset=request.offset)
+            return request.refuse_errno(fault.errno).replace(offset=request.offset)
         listing = b""
         for name, size in entries[request.offset :]:
             text = f"D{name}" if size is None else f"F{name}\t{size}"
@@ -245,7 +245,7 @@ class ArduPilotFtp(FtpServer):
                 break
             listing += text.encode() + b"\0\0"
         if not listing:
-            return replace(request.refuse(MavFtpErr.EOF), offset=request.offset)
+            return request.refuse(MavFtpErr.EOF).replace(offset=request.offset)
         return request.acknowledge(listing, offset=request.offset)
 
     def _entries(self, path: str) -> list[Entry]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, cast
 
-from aerokit.mavlink.enums import MavCmd, MavResult, SpeedType
+from aerokit.mavlink.enums import MavCmd, MavDoRepositionFlags, MavResult, SpeedType
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 from aerokit.sim.ardupilot.vehicle_commands import common_commands
 from aerokit.sim.commands import whole
@@ -15,7 +15,6 @@ if TYPE_CHECKING:
 
 __all__ = ["LevelVehicle"]
 
-_CHANGE_MODE = 1
 _STICK_MIDDLE = 1500
 
 
@@ -78,7 +77,7 @@ class LevelVehicle(ArduPilotVehicle):
         if command.is_long:
             return MavResult.UNSUPPORTED
         guided = self.guided
-        if self.mode is not guided and not whole(command.param2) & _CHANGE_MODE:
+        if self.mode is not guided and not whole(command.param2) & MavDoRepositionFlags.CHANGE_MODE:
             return MavResult.DENIED
         point = self.point(*command.place(), command.z, command.altitude_frame)
         if point is None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, ClassVar
 
-from aerokit.mavlink.enums import MavCmd, MavMissionResult
+from aerokit.mavlink.enums import MavCmd, MavFrame, MavMissionResult
 from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.mission_items import altitude_frame, is_place, stored
 from aerokit.sim.missions import float32
@@ -207,7 +207,7 @@ def _kept_rally_point(item: MissionItem) -> MissionItem | int:
     if not _LOWEST_RALLY_M <= item.z <= _HIGHEST_RALLY_M:
         return MavMissionResult.INVALID_PARAM7
     frame = altitude_frame(item.frame)
-    if frame is None or item.frame == 2:
+    if frame is None or item.frame == MavFrame.MISSION:
         return MavMissionResult.UNSUPPORTED_FRAME
     place, height = (int(item.x), int(item.y)), float32(int(item.z))
     return MissionItem(item.command, frame, 0.0, 0.0, 0.0, 0.0, *place, height, autocontinue=False)

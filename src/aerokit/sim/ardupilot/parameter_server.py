@@ -9,7 +9,8 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import MavParamError, MavParamType, MavSeverity
-from aerokit.sim.parameter_server import UNCOUNTED, ParameterServer
+from aerokit.parameters.encoding import UNKNOWN_INDEX
+from aerokit.sim.parameter_server import ParameterServer
 from aerokit.sim.vehicle import sender_of
 
 if TYPE_CHECKING:
@@ -88,13 +89,13 @@ class ArduPilotParameterServer(ParameterServer):
         elif name in faults.read_only_parameters:
             self._vehicle.send_text(MavSeverity.WARNING, f"Param write denied ({name})")
             self._refuse(request, MavParamError.PERMISSION_DENIED, channel)
-            self.send(name, UNCOUNTED, channel)
+            self.send(name, UNKNOWN_INDEX, channel)
         else:
             value = self.clamped(name, request.param_value)
             self._parameters[name] = rounded(value, self._parameters.type(name))
             if self.errors:
-                self.send(name, UNCOUNTED, channel)
-            self._vehicle.call_later(0.0, lambda: self.send(name, UNCOUNTED, None))
+                self.send(name, UNKNOWN_INDEX, channel)
+            self._vehicle.call_later(0.0, lambda: self.send(name, UNKNOWN_INDEX, None))
 
     def _refuse(self, request: ParamSet, code: int, channel: Channel) -> None:
         if self.errors:

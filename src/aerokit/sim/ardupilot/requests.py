@@ -15,10 +15,10 @@ from aerokit.mavlink.messages import (
     RequestDataStream,
     TerrainRequest,
 )
+from aerokit.parameters.encoding import UNKNOWN_INDEX
 from aerokit.sim.ardupilot.stream_groups import KNOWN_MESSAGES, RATE_PARAMETERS, STREAM_GROUPS
 from aerokit.sim.ardupilot.telemetry_extra import DISPLAY_VALUES
 from aerokit.sim.commands import whole
-from aerokit.sim.parameter_server import UNCOUNTED
 
 if TYPE_CHECKING:
     from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
@@ -150,7 +150,7 @@ class Requests:
             self._saved[name] = (self._saved.get(name, (parameters[name], rate))[0], rate)
         parameters[name] = rate
         if vehicle.KIND == "plane":
-            vehicle.storage.parameters.send(name, UNCOUNTED, None)
+            vehicle.storage.parameters.send(name, UNKNOWN_INDEX, None)
 
     def _stream_group(self, stream: int, rate: float, channel: Channel, first: float) -> None:
         interval = max(1.0 / rate, _SHORTEST_S) if rate > 0 else 0.0

@@ -10,7 +10,7 @@ import re
 import struct
 from typing import TYPE_CHECKING
 
-from aerokit.sim.px4.wire_messages import CurrentEventSequence, Event
+from aerokit.mavlink.messages import CurrentEventSequence, Event
 
 if TYPE_CHECKING:
     from aerokit.sim.px4.vehicle import SimulatedPx4
@@ -40,7 +40,7 @@ class Events:
 
     def current(self) -> CurrentEventSequence:
         """CURRENT_EVENT_SEQUENCE."""
-        return CurrentEventSequence.of((self._next - 1) & 0xFFFF, 0)
+        return CurrentEventSequence((self._next - 1) & 0xFFFF, 0)
 
     def tell(self, text: str) -> None:
         """Send the event of a status text, if it has one."""
@@ -48,7 +48,7 @@ class Events:
         if known is None:
             return
         (number, arguments), px4 = known, self._px4
-        px4.send(Event.of(number, px4.time_boot_ms, self._next, 0, 0, _INFO_LEVELS, arguments))
+        px4.send(Event(0, 0, number, px4.time_boot_ms, self._next, _INFO_LEVELS, arguments))
         self._next = (self._next + 1) & 0xFFFF
 
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
+from aerokit.protocols.ftp_message import DATA_SIZE
 from aerokit.sim.file_tree import EEXIST, FileFault
-from aerokit.sim.ftp import DATA_SIZE, FtpPacket, FtpServer, path_in, read_crc32
+from aerokit.sim.ftp import FtpPacket, FtpServer, path_in, read_crc32
 
 if TYPE_CHECKING:
     from aerokit.sim.channel import Channel
@@ -96,7 +97,7 @@ class Px4Ftp(FtpServer):
         if answer.opcode == Op.NAK:
             if port.errno == EEXIST:
                 answer = request.refuse(MavFtpErr.FILEEXISTS)
-            answer = replace(answer, offset=request.offset)
+            answer = answer.replace(offset=request.offset)
         self._reply(port, answer)
 
     def _reply(self, port: _Port, answer: FtpPacket) -> None:
@@ -180,7 +181,7 @@ class Px4Ftp(FtpServer):
         if request.session != 0 or port.file is None:
             return request.refuse(MavFtpErr.INVALIDSESSION)
         is_running = port.burst is not None
-        port.burst, port.burst_sent = replace(request, sequence=request.sequence + 1 & 0xFFFF), 0
+        port.burst, port.burst_sent = request.replace(sequence=request.sequence + 1 & 0xFFFF), 0
         if not is_running:
             self._vehicle.call_later(self.burst_interval_s, lambda: self._send_blocks(port))
         return None
@@ -195,23 +196,21 @@ class Px4Ftp(FtpServer):
         self._vehicle.call_later(self.burst_interval_s, lambda: self._send_blocks(port))
 
     def _send_block(self, port: _Port, file: OpenFile, burst: FtpPacket, *, may_end: bool) -> None:
-        answer = replace(burst.acknowledge(offset=burst.offset, session=0), sequence=burst.sequence)
-        refusal = replace(
-            burst.refuse(MavFtpErr.EOF), sequence=burst.sequence, offset=burst.offset, session=0
-        )
+        answer = burst.acknowledge(offset=burst.offset, session=0).replace(sequence=burst.sequence)
+        refusal = burst.refuse(MavFtpErr.EOF).replace(sequence=burst.sequence, offset=burst.offset, session=0)
         try:
             data = b"" if burst.offset >= port.size else file.read(burst.offset, DATA_SIZE)
         except FileFault as fault:
             data, port.errno = b"", fault.errno
-            refusal = replace(refusal, data=bytes([MavFtpErr.FAILERRNO, port.errno]), size=2)
+            refusal = refusal.replace(data=bytes([MavFtpErr.FAILERRNO, port.errno]), size=2)
         if not data:
             port.burst = None
             self._reply(port, refusal)
             return
         port.burst_sent += len(data)
         complete = may_end and port.burst_sent > _BURST_BYTES
-        self._reply(port, replace(answer, data=data, size=len(data), burst_complete=int(complete)))
-        following = replace(burst, sequence=burst.sequence + 1 & 0xFFFF, offset=burst.offset + len(data))
+        self._reply(port, answer.replace(data=data, size=len(data), burst_complete=complete))
+        following = burst.replace(sequence=burst.sequence + 1 & 0xFFFF, offset=burst.offset + len(data))
         port.burst = None if complete else following
 
     # ------------------------------------------------------------------------------------ whole files

@@ -30,8 +30,7 @@ _FAST_IN_SIMULATION = (
     m.ServoOutputRaw.ID,
 )
 _MORE_IN_SIMULATION_HZ = {m.RcChannels.ID: 20.0, m.OpticalFlowRad.ID: 10.0, m.Statustext.ID: 20.0}
-_EVENT_SEQUENCE_ID = 411
-_ALWAYS_HZ = {m.Heartbeat.ID: 1.0, m.MissionCurrent.ID: 1.0, _EVENT_SEQUENCE_ID: 0.3}
+_ALWAYS_HZ = {m.Heartbeat.ID: 1.0, m.MissionCurrent.ID: 1.0, m.CurrentEventSequence.ID: 0.3}
 """On every link, and not to be changed."""
 
 _OFF, _WHEN_IT_CHANGES = -1, 0

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.sim.px4.telemetry import available_modes
-from aerokit.sim.px4.wire_messages import CurrentEventSequence, ProtocolVersion
 
 if TYPE_CHECKING:
     from aerokit.sim.commands import Command, CommandHandler
@@ -15,7 +14,7 @@ if TYPE_CHECKING:
 
 __all__ = ["message_requests"]
 
-_NOT_ON_REQUEST = frozenset({m.MissionCurrent.ID, CurrentEventSequence.ID})
+_NOT_ON_REQUEST = frozenset({m.MissionCurrent.ID, m.CurrentEventSequence.ID})
 _NOTHING_BUT_AN_ANSWER = frozenset({m.Heartbeat.ID})
 
 
@@ -34,7 +33,7 @@ def message_requests(px4: SimulatedPx4) -> dict[int, CommandHandler]:
 
 _ELDER = {
     MavCmd.REQUEST_AUTOPILOT_CAPABILITIES: m.AutopilotVersion.ID,
-    MavCmd.REQUEST_PROTOCOL_VERSION: ProtocolVersion.ID,
+    MavCmd.REQUEST_PROTOCOL_VERSION: m.ProtocolVersion.ID,
     MavCmd.REQUEST_STORAGE_INFORMATION: m.StorageInformation.ID,
     MavCmd.REQUEST_FLIGHT_INFORMATION: m.FlightInformation.ID,
     MavCmd.GET_HOME_POSITION: m.HomePosition.ID,

@@ -6,11 +6,10 @@ from enum import Enum
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavMissionResult, MavSeverity
+from aerokit.mavlink.enums import MavFrame, MavMissionResult, MavSeverity
 from aerokit.missions.wire import to_wire
 from aerokit.sim.missions import AnyItem, AnyRequest, item_from, item_message_float
 from aerokit.sim.px4.mission_items import checksum, given_back, stored
-from aerokit.sim.px4.mission_messages import AckWithId, CountWithId
 from aerokit.sim.vehicle import sender_of
 
 if TYPE_CHECKING:
@@ -62,11 +61,11 @@ class MissionLink:
         self._px4.send_text(MavSeverity.CRITICAL, text)
 
     def _acknowledge(self, to: tuple[int, int], result: int, opaque_id: int = 0) -> None:
-        self._px4.send(AckWithId(to, result, self._type, opaque_id), self._channel)
+        self._px4.send(m.MissionAck(*to, result, self._type, opaque_id), self._channel)
 
     def _send_count(self) -> None:
         self._sent_at = self._px4.now
-        count = CountWithId(self._partner, self._count, self._type, self._server.id(self._type))
+        count = m.MissionCount(*self._partner, self._count, self._type, self._server.id(self._type))
         self._px4.send(count, self._channel)
 
     def _ask(self) -> None:
@@ -97,7 +96,7 @@ class MissionLink:
                 current=bool(current),
             )
         else:
-            scale = 1e-7 if item.frame != 2 else 1.0
+            scale = 1e-7 if item.frame != MavFrame.MISSION else 1.0
             place = (item.x * scale, item.y * scale)
             message = item_message_float(given, place, seq, self._partner, self._type, current)
         self._px4.send(message, self._channel)
@@ -262,7 +261,9 @@ class MissionLink:
     def _take(self, message: AnyItem, *, is_int: bool) -> None:
         item = item_from(message)
         place = item if is_int else item.replace(x=float(item.x), y=float(item.y))
-        whole = item if is_int or item.frame == 2 else item.replace(x=_e7(item.x), y=_e7(item.y))
+        whole = (
+            item if is_int or item.frame == MavFrame.MISSION else item.replace(x=_e7(item.x), y=_e7(item.y))
+        )
         kept = stored(whole, self._type, is_int=is_int)
         if isinstance(kept, int):
             if kept != _R.ERROR:

@@ -63,14 +63,13 @@ _NO_FIGURE_EIGHT = "Figure 8 command only available for fixed wing and vtol vehi
 _GRIPS_FOR_S = 1.3
 _LOG_STOPS_AFTER_S = 2.0
 _UNKNOWN_PROGRESS = 255
-_CANCELLED = 6
 
 
 def other_commands(px4: SimulatedPx4) -> dict[int, CommandHandler]:
     """MAV_CMD → handler."""
     handlers: dict[int, CommandHandler] = dict.fromkeys(_ACCEPTED, lambda _: MavResult.ACCEPTED)
     handlers |= dict.fromkeys(_SILENT, lambda _: None)
-    handlers[_C.DO_LAND_START] = lambda _: _CANCELLED
+    handlers[_C.DO_LAND_START] = lambda _: MavResult.CANCELLED
     handlers[_C.DO_FIGURE_EIGHT] = lambda _: px4.send_text(MavSeverity.CRITICAL, _NO_FIGURE_EIGHT)
     handlers[_C.CONTROL_HIGH_LATENCY] = _with_text(px4)
     handlers[_C.EXTERNAL_WIND_ESTIMATE] = lambda command: _answer_twice(px4, command)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
+from aerokit.errors import RemoteProtocolError
+from aerokit.parameters.pack import HEADER, MAGIC, read_entry, read_header
+from aerokit.protocols.ftp_message import DATA_SIZE
 from aerokit.sim.file_tree import EINVAL, FileFault, OpenFile
-from aerokit.sim.ftp import DATA_SIZE
-from aerokit.sim.parameter_pack_file import FORMATS, HEADER, MAGIC, ParameterPackMount
+from aerokit.sim.parameter_pack_file import ParameterPackMount
 
 if TYPE_CHECKING:
     from aerokit.sim.parameters import Parameters
@@ -63,7 +64,7 @@ class _Writer(OpenFile):
         if self._is_spoilt or self._pending or self._header != (self._count, self._written):
             raise FileFault(EINVAL)
 
-    def _spoil(self) -> None:
+    def _spoil(self) -> NoReturn:
         self._is_spoilt = True
         raise FileFault(EINVAL)
 
@@ -72,7 +73,7 @@ class _Writer(OpenFile):
         if self._header is None:
             if len(self._pending) < HEADER.size:
                 return
-            magic, count, size = HEADER.unpack_from(self._pending)
+            magic, count, size = read_header(self._pending)
             if magic != MAGIC or size < HEADER.size:
                 self._spoil()
             self._header, self._pending = (count, size), self._pending[HEADER.size :]
@@ -81,18 +82,16 @@ class _Writer(OpenFile):
 
     def _take_one(self) -> bool:
         pending = self._pending = self._pending.lstrip(b"\0")
-        if len(pending) < 2:
-            return False
-        kind, common, length = pending[0], pending[1] & 0xF, (pending[1] >> 4) + 1
-        if kind not in FORMATS or common + length > 16 or common > len(self._last):
+        try:
+            entry = read_entry(pending, 0, self._last) if pending else None
+        except RemoteProtocolError:
             self._spoil()
-        end = 2 + length + struct.calcsize(FORMATS[kind])
-        if len(pending) < end:
+        if entry is None:
             return False
-        self._last = self._last[:common] + pending[2 : 2 + length]
-        (value,) = struct.unpack_from(FORMATS[kind], pending, 2 + length)
-        name = self._last.decode("ascii", "replace")
+        if entry.default is not None:
+            self._spoil()
+        name = entry.name.decode("ascii", "replace")
         if name in self._parameters:
-            self._apply(name, value)
-        self._pending, self._count = pending[end:], self._count + 1
+            self._apply(name, entry.value)
+        self._pending, self._last, self._count = pending[entry.end :], entry.name, self._count + 1
         return True

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import struct
-import zlib
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import MavParamError, MavParamType
 from aerokit.mavlink.messages import ParamValue
-from aerokit.sim.parameter_server import UNCOUNTED, ParameterServer
+from aerokit.parameters import Parameter, ParameterTable, ParameterType
+from aerokit.parameters.encoding import value_message, value_of
+from aerokit.parameters.px4_hash import HASH_NAME, px4_hash
+from aerokit.sim.parameter_server import ParameterServer
 from aerokit.sim.vehicle import sender_of
 
 if TYPE_CHECKING:
@@ -17,11 +18,9 @@ if TYPE_CHECKING:
     from aerokit.sim.parameters import Parameters
     from aerokit.sim.vehicle import SimulatedVehicle
 
-__all__ = ["HASH_NAME", "Px4ParameterServer", "parameter_hash"]
+__all__ = ["Px4ParameterServer"]
 
-HASH_NAME = "_HASH_CHECK"
 _SECOND_ECHO_S = 0.02
-_TYPE_UNSUPPORTED, _TYPE_MISMATCH = 6, 7
 _GARBAGE = 24400
 """What was seen in the field of a PARAM_ERROR that is not used."""
 
@@ -49,8 +48,8 @@ class Px4ParameterServer(ParameterServer):
 
     def value_message(self, name: str, index: int) -> ParamValue:
         """The PARAM_VALUE of a parameter: the four bytes of its value, whatever they would be as a float."""
-        parameters, type_ = self._parameters, self._parameters.type(name)
-        return _BytewiseParamValue(name, _bits(parameters[name], type_), type_, len(parameters), index)
+        parameter = self._parameters.row(name).as_parameter(index)
+        return value_message(parameter, len(self._parameters), bytewise=True)
 
     def _on_list(self, request: ParamRequestList, channel: Channel) -> None:
         if request.target_system == 0:
@@ -60,9 +59,11 @@ class Px4ParameterServer(ParameterServer):
         self.start_list(channel)
 
     def _send_hash(self, channel: Channel) -> None:
-        bits, count = parameter_hash(self._parameters).to_bytes(4, "little"), len(self._parameters)
-        message = _BytewiseParamValue(HASH_NAME, bits, MavParamType.UINT32, count, UNCOUNTED)
-        self._vehicle.send(message, channel)
+        rows = [self._parameters.row(name) for name in self._parameters.names]
+        volatile = {row.name for row in rows if row.is_volatile}
+        number = px4_hash(ParameterTable(row.as_parameter() for row in rows), volatile)
+        parameter = Parameter(HASH_NAME, number, ParameterType.UINT32)
+        self._vehicle.send(value_message(parameter, len(rows), bytewise=True), channel)
 
     def _on_read(self, request: ParamRequestRead, channel: Channel) -> None:
         names, index, sender = self._parameters.names, request.param_index, sender_of(request)
@@ -86,9 +87,7 @@ class Px4ParameterServer(ParameterServer):
         if code is not None:
             self._refuse(sender_of(request), name, _GARBAGE, code, channel)
             return
-        frame = request.received_frame
-        bits = struct.pack("<f", request.param_value) if frame is None else frame.payload[:4].ljust(4, b"\0")
-        (value,) = struct.unpack("<i" if request.param_type == MavParamType.INT32 else "<f", bits)
+        value = value_of(request, bytewise=True)
         before = parameters[name]
         if name not in self._vehicle.faults.read_only_parameters:
             parameters[name] = self.clamped(name, value)
@@ -102,35 +101,9 @@ class Px4ParameterServer(ParameterServer):
         if name not in self._parameters:
             return MavParamError.DOES_NOT_EXIST
         if type_ not in (MavParamType.INT32, MavParamType.REAL32):
-            return _TYPE_UNSUPPORTED
-        return None if type_ == self._parameters.type(name) else _TYPE_MISMATCH
+            return MavParamError.TYPE_UNSUPPORTED
+        return None if type_ == self._parameters.type(name) else MavParamError.TYPE_MISMATCH
 
     def _refuse(self, to: tuple[int, int], name: str, index: int, code: int, channel: Channel) -> None:
         if self.errors:
             self.send_error(to, name, index, code, channel)
-
-
-class _BytewiseParamValue(ParamValue):
-    """A float on its way through Python loses a bit of a signalling NaN; these four bytes lose none."""
-
-    def __init__(self, name: str, bits: bytes, type_: int, count: int, index: int) -> None:
-        super().__init__(name, struct.unpack("<f", bits)[0], type_, count, index)
-        object.__setattr__(self, "_bits", bits)
-
-    def encode(self) -> bytes:
-        bits: bytes = object.__getattribute__(self, "_bits")
-        return bits + super().encode()[len(bits) :]
-
-
-def parameter_hash(parameters: Parameters) -> int:
-    """The _HASH_CHECK: over names and values in order, volatile ones left out."""
-    crc = 0xFFFFFFFF
-    for name in parameters.names:
-        row = parameters.row(name)
-        if not row.is_volatile:
-            crc = zlib.crc32(_bits(row.value, row.type), zlib.crc32(name.encode(), crc))
-    return crc ^ 0xFFFFFFFF
-
-
-def _bits(value: float, type_: int) -> bytes:
-    return struct.pack("<i", int(value)) if type_ == MavParamType.INT32 else struct.pack("<f", value)

@@ -16,9 +16,9 @@ from aerokit.mavlink.enums import (
     MavLandedState,
     MavModeFlag,
     MavState,
+    MavSysStatusSensor,
 )
 from aerokit.sim.missions import INVALID_INDEX
-from aerokit.sim.px4.mission_messages import CurrentWithIds
 from aerokit.sim.px4.modes import (
     ACRO,
     ALTITUDE,
@@ -46,7 +46,6 @@ from aerokit.sim.px4.modes import (
 )
 from aerokit.sim.px4.telemetry_identity import IDENTITY_BUILDERS
 from aerokit.sim.px4.telemetry_sensors import SENSOR_BUILDERS
-from aerokit.sim.px4.wire_messages import CurrentEventSequence
 from aerokit.sim.rotations import quaternion_from_euler
 
 if TYPE_CHECKING:
@@ -57,7 +56,8 @@ __all__ = ["BUILDERS", "available_modes", "global_origin"]
 
 _PRESENT, _ENABLED = 0x0300402F, 0x0301402F
 _HEALTHY, _BOOTING = 0x1320C83F, 0x0320883F
-_GPS_BIT, _RC_BIT, _PREARM_BIT = 0x20, 0x10000, 0x10000000
+_GPS_BIT, _RC_BIT = int(MavSysStatusSensor.GPS), int(MavSysStatusSensor.RC_RECEIVER)
+_PREARM_BIT = int(MavSysStatusSensor.MAV_SYS_STATUS_PREARM_CHECK)
 _STANDARD = {mode: number for number, mode in STANDARD_MODES.items()}
 """Mode → MAV_STANDARD_MODE."""
 _LISTED = (
@@ -291,7 +291,7 @@ def _mission_current(px4: SimulatedPx4) -> m.MissionCurrent:
     mission, store = px4.mission, px4.missions
     ids = (store.id(0), store.id(1), store.id(2))
     total = mission.count or INVALID_INDEX
-    return CurrentWithIds(mission.current, total, mission.state, mission.mode, ids)
+    return m.MissionCurrent(mission.current, total, mission.state, mission.mode, *ids)
 
 
 def _vibration(px4: SimulatedPx4) -> m.Vibration:
@@ -348,7 +348,7 @@ BUILDERS: dict[int, Callable[[SimulatedPx4], Message | None]] = {
     m.SystemTime.ID: _system_time,
     m.CurrentMode.ID: _current_mode,
     m.Ping.ID: _ping,
-    CurrentEventSequence.ID: lambda px4: px4.events.current(),
+    m.CurrentEventSequence.ID: lambda px4: px4.events.current(),
     **SENSOR_BUILDERS,
     **IDENTITY_BUILDERS,
 }

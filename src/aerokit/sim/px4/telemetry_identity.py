@@ -7,9 +7,8 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavAutopilot
+from aerokit.mavlink.enums import MavAutopilot, MavOdidUaType, MavType, StorageStatus
 from aerokit.sim.px4.modes import custom_mode
-from aerokit.sim.px4.wire_messages import ComponentInformation, ComponentMetadata, ProtocolVersion
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
@@ -18,9 +17,8 @@ if TYPE_CHECKING:
 __all__ = ["IDENTITY_BUILDERS"]
 
 _LIBRARY_HASH = b"\xa4C\x87s\xec\x08o="
-_METADATA_URI, _METADATA_CRC = b"mftp://etc/extras/component_general.json.xz", 2472443404
+_METADATA_URI, _METADATA_CRC = "mftp://etc/extras/component_general.json.xz", 2472443404
 _CAPACITY_MIB, _USED_MIB = 258_019.6, 192_146.9
-_STATUS_READY = 2
 _REMOTE_ID_EPOCH = 1_546_300_800
 """2019-01-01, from which OPEN_DRONE_ID counts seconds."""
 _ANYONE = bytes(20)
@@ -33,14 +31,14 @@ def _autopilot_version(px4: SimulatedPx4) -> m.AutopilotVersion:
     )
 
 
-def _protocol_version(_: SimulatedPx4) -> ProtocolVersion:
-    return ProtocolVersion.of(200, 100, 203, bytes(8), _LIBRARY_HASH)
+def _protocol_version(_: SimulatedPx4) -> m.ProtocolVersion:
+    return m.ProtocolVersion(200, 100, 203, bytes(8), _LIBRARY_HASH)
 
 
 def _storage_information(px4: SimulatedPx4) -> m.StorageInformation:
     free = _CAPACITY_MIB - _USED_MIB
     return m.StorageInformation(
-        px4.time_boot_ms, 1, 1, _STATUS_READY, _CAPACITY_MIB, _USED_MIB, free, 0.0, 0.0
+        px4.time_boot_ms, 1, 1, StorageStatus.READY, _CAPACITY_MIB, _USED_MIB, free, 0.0, 0.0
     )
 
 
@@ -50,12 +48,12 @@ def _flight_information(px4: SimulatedPx4) -> m.FlightInformation:
     return m.FlightInformation(px4.time_boot_ms, since, 0 if px4.is_landed else since, 0)
 
 
-def _component_metadata(px4: SimulatedPx4) -> ComponentMetadata:
-    return ComponentMetadata.of(px4.time_boot_ms, _METADATA_CRC, _METADATA_URI)
+def _component_metadata(px4: SimulatedPx4) -> m.ComponentMetadata:
+    return m.ComponentMetadata(px4.time_boot_ms, _METADATA_CRC, _METADATA_URI)
 
 
-def _component_information(px4: SimulatedPx4) -> ComponentInformation:
-    return ComponentInformation.of(px4.time_boot_ms, _METADATA_CRC, 0, _METADATA_URI, b"")
+def _component_information(px4: SimulatedPx4) -> m.ComponentInformation:
+    return m.ComponentInformation(px4.time_boot_ms, _METADATA_CRC, _METADATA_URI, 0, "")
 
 
 def _mag_cal_report(_: SimulatedPx4) -> m.MagCalReport:
@@ -100,7 +98,8 @@ def _high_latency(px4: SimulatedPx4) -> m.HighLatency2:
 
 
 def _basic_id(px4: SimulatedPx4) -> m.OpenDroneIdBasicId:
-    kind = 1 if px4.VEHICLE_TYPE == 1 else 2
+    is_plane = px4.VEHICLE_TYPE == MavType.FIXED_WING
+    kind = MavOdidUaType.AEROPLANE if is_plane else MavOdidUaType.HELICOPTER_OR_MULTIROTOR
     return m.OpenDroneIdBasicId(0, 0, _ANYONE, 1, kind, b"1006554d49534954414\0")
 
 
@@ -163,9 +162,9 @@ IDENTITY_BUILDERS: dict[int, Callable[[SimulatedPx4], Message | None]] = {
     m.HighLatency2.ID: _high_latency,
     m.StorageInformation.ID: _storage_information,
     m.FlightInformation.ID: _flight_information,
-    ProtocolVersion.ID: _protocol_version,
-    ComponentInformation.ID: _component_information,
-    ComponentMetadata.ID: _component_metadata,
+    m.ProtocolVersion.ID: _protocol_version,
+    m.ComponentInformation.ID: _component_information,
+    m.ComponentMetadata.ID: _component_metadata,
     m.OpenDroneIdBasicId.ID: _basic_id,
     m.OpenDroneIdLocation.ID: _remote_location,
     m.OpenDroneIdSystem.ID: _remote_system,

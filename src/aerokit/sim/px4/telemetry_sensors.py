@@ -7,9 +7,9 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import MavLandedState
 from aerokit.sim.motion import GRAVITY_M_S2
 from aerokit.sim.px4.modes import ORBIT
-from aerokit.sim.px4.wire_messages import LinkNodeStatus, TimeEstimateToTarget
 from aerokit.sim.rotations import quaternion_from_euler
 
 if TYPE_CHECKING:
@@ -26,7 +26,6 @@ _COVARIANCE = tuple([math.nan] * 21)
 _UNUSED_CHANNEL = 65535
 _OUTPUTS = 16
 _DISARMED_US = 900
-_LANDED, _IN_AIR = 1, 2
 _CLIMB_M_S, _DESCENT_M_S = 3.0, 0.7
 
 
@@ -142,7 +141,7 @@ def _state_for_gimbal(px4: SimulatedPx4) -> m.AutopilotStateForGimbalDevice:
     o = px4.motion
     q = quaternion_from_euler(o.roll, o.pitch, o.yaw)
     velocity = (o.velocity_north, o.velocity_east, o.velocity_down)
-    landed = _LANDED if px4.is_landed else _IN_AIR
+    landed = MavLandedState.ON_GROUND if px4.is_landed else MavLandedState.IN_AIR
     return m.AutopilotStateForGimbalDevice(
         0,
         0,
@@ -184,23 +183,23 @@ def _orbit_status(px4: SimulatedPx4) -> m.OrbitExecutionStatus | None:
     return px4.flight.orbit.status() if px4.mode == ORBIT else None
 
 
-def _time_estimate(px4: SimulatedPx4) -> TimeEstimateToTarget:
+def _time_estimate(px4: SimulatedPx4) -> m.TimeEstimateToTarget:
     """Only the return is estimated: up or down to its height, back, down."""
     if px4.is_landed:
-        return TimeEstimateToTarget.of(-1, -1, -1, -1, -1)
+        return m.TimeEstimateToTarget(-1, -1, -1, -1, -1)
     motion, flight = px4.motion, px4.flight
     height = max(px4.parameters["RTL_RETURN_ALT"], px4.altitude_m)
     away = math.hypot(motion.north - px4.home[0], motion.east - px4.home[1])
     seconds = (height - px4.altitude_m) / _CLIMB_M_S + away / flight.cruise_speed_m_s + height / _DESCENT_M_S
-    return TimeEstimateToTarget.of(round(seconds), -1, -1, -1, -1)
+    return m.TimeEstimateToTarget(round(seconds), -1, -1, -1, -1)
 
 
-def _link_status(px4: SimulatedPx4) -> LinkNodeStatus:
-    return LinkNodeStatus.of(px4.time_boot_us, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
+def _link_status(px4: SimulatedPx4) -> m.LinkNodeStatus:
+    return m.LinkNodeStatus(px4.time_boot_us, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
 
 
 SENSOR_BUILDERS: dict[int, Callable[[SimulatedPx4], Message | None]] = {
-    LinkNodeStatus.ID: _link_status,
+    m.LinkNodeStatus.ID: _link_status,
     m.ScaledImu.ID: _scaled_imu,
     m.ScaledPressure.ID: _scaled_pressure,
     m.RcChannels.ID: _rc_channels,
@@ -213,6 +212,6 @@ SENSOR_BUILDERS: dict[int, Callable[[SimulatedPx4], Message | None]] = {
     m.Odometry.ID: _odometry,
     m.OrbitExecutionStatus.ID: _orbit_status,
     m.ActuatorOutputStatus.ID: _actuator_outputs,
-    TimeEstimateToTarget.ID: _time_estimate,
+    m.TimeEstimateToTarget.ID: _time_estimate,
 }
 """Message id → what to send now, or None."""

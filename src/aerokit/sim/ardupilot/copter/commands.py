@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from aerokit.mavlink.enums import (
     CopterMode,
     MavCmd,
+    MavDoRepositionFlags,
     MavFrame,
     MavResult,
     SpeedType,
@@ -21,8 +22,6 @@ if TYPE_CHECKING:
     from aerokit.sim.ardupilot.copter.vehicle import SimulatedCopter
 
 __all__ = ["copter_commands"]
-
-_CHANGE_MODE = 1
 
 
 def copter_commands(copter: SimulatedCopter) -> dict[int, CommandHandler]:
@@ -76,7 +75,7 @@ class _Flight:
         copter = self._copter
         if command.is_long:
             return MavResult.UNSUPPORTED
-        may_change_mode = whole(command.param2) & _CHANGE_MODE
+        may_change_mode = whole(command.param2) & MavDoRepositionFlags.CHANGE_MODE
         if copter.mode is not copter.guided and not may_change_mode:
             return MavResult.DENIED
         point = copter.point(*command.place(), command.z, command.altitude_frame)

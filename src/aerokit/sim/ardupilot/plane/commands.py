@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from aerokit.mavlink.enums import MavCmd, MavResult, PlaneMode, SpeedType
+from aerokit.mavlink.enums import MavCmd, MavDoRepositionFlags, MavResult, PlaneMode, SpeedType
 from aerokit.sim.ardupilot.plane.guided import guided_commands
 from aerokit.sim.ardupilot.plane.modes import NavigatingMode
 from aerokit.sim.ardupilot.vehicle_commands import common_commands
@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from aerokit.sim.commands import Command, CommandHandler
 
 __all__ = ["plane_commands"]
-
-_CHANGE_MODE = 1
 
 
 def plane_commands(plane: SimulatedPlane) -> dict[int, CommandHandler]:
@@ -60,7 +58,7 @@ class _Flight:
         point = plane.point(*command.place(), command.z, command.altitude_frame)
         if point is None:
             return MavResult.DENIED
-        if plane.mode is not plane.guided and not whole(command.param2) & _CHANGE_MODE:
+        if plane.mode is not plane.guided and not whole(command.param2) & MavDoRepositionFlags.CHANGE_MODE:
             return MavResult.FAILED
         if not plane.set_mode(PlaneMode.GUIDED):
             return MavResult.FAILED

@@ -1,0 +1,25 @@
+"""What kind of component a HEARTBEAT comes from."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from aerokit.mavlink.messages import Heartbeat
+
+__all__ = ["MAV_AUTOPILOT_INVALID", "MAV_TYPE_GCS", "is_autopilot"]
+
+MAV_TYPE_GCS = 6
+"""A ground station."""
+MAV_AUTOPILOT_INVALID = 8
+"""No flight controller."""
+NO_AUTOPILOTS = frozenset((MAV_TYPE_GCS, 18, 26, 27, *range(30, 35), *range(36, 43), 44, 48))
+"""Types of other components: onboard controller, gimbal, ADS-B, camera, servo, battery, … (MAV_TYPE)."""
+
+
+def is_autopilot(heartbeat: Heartbeat) -> bool:
+    """Whether it comes from an autopilot: not from a ground station, a gimbal, a camera or an ADS-B receiver.
+
+    Some of those call their autopilot GENERIC instead of INVALID, so their type counts too.
+    """
+    return heartbeat.autopilot != MAV_AUTOPILOT_INVALID and heartbeat.type not in NO_AUTOPILOTS

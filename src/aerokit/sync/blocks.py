@@ -1,0 +1,253 @@
+"""What the generated twins are made of: how each is opened, entered, iterated and left."""
+
+from __future__ import annotations
+
+import contextlib
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
+
+from aerokit.errors import ConnectionClosed
+from aerokit.sync.blocking_block import BlockingBlock
+from aerokit.sync.loop_thread import Held, LoopThread
+from aerokit.vehicle.connect import tell_how_it_is_left
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from contextlib import AbstractAsyncContextManager, AbstractContextManager
+    from types import TracebackType
+
+    from typing_extensions import Self
+
+    from aerokit.runtime.cells import Changes, StateCell  # noqa: F401 - named in the base classes below
+    from aerokit.runtime.connection import Connection
+    from aerokit.runtime.subscription import Subscription  # noqa: F401
+    from aerokit.vehicle.orders.guided import SetpointStream  # noqa: F401
+    from aerokit.vehicle.parameters.results import ParameterWrite
+    from aerokit.vehicle.parameters.transaction import Temporarily, Transaction  # noqa: F401
+    from aerokit.vehicle.vehicle import Vehicle
+
+__all__ = [
+    "CellTwin",
+    "ChangesTwin",
+    "ConnectionTwin",
+    "StreamTwin",
+    "SubscriptionTwin",
+    "TemporarilyTwin",
+    "TransactionTwin",
+    "TwinOf",
+    "VehicleTwin",
+    "opened",
+]
+
+A = TypeVar("A")
+T = TypeVar("T")
+TwinT = TypeVar("TwinT", bound="ConnectionTwin | VehicleTwin")
+
+
+class TwinOf(Generic[A]):
+    """A twin: the loop that it calls, and the asynchronous object that it stands for."""
+
+    def __init__(self, loop: LoopThread, aio: A) -> None:
+        self._loop = loop
+        self.aio: A = aio
+        """The asynchronous object, for code that runs on the loop."""
+
+    @contextmanager
+    def _block(self, block: AbstractContextManager[T]) -> Iterator[T]:
+        """Enter and leave a block of the loop's."""
+        entered = self._loop.enter_at_once(block)
+        try:
+            yield entered
+        finally:
+            with contextlib.suppress(ConnectionClosed):
+                self._loop.call(block.__exit__, None, None, None)
+
+
+class CellTwin(TwinOf["StateCell[T]"], Generic[T]):
+    """Reading takes a snapshot on the caller's thread: it neither talks to the vehicle nor waits for the loop."""
+
+    def __repr__(self) -> str:
+        return repr(self.aio)
+
+    def __bool__(self) -> bool:
+        return bool(self.aio)  # which says what to write instead
+
+
+class ChangesTwin(TwinOf["Changes[T]"], Generic[T]):
+    """An iterator."""
+
+    def __iter__(self) -> Self:
+        return self
+
+    def __next__(self) -> T:
+        return self._loop.run(self.aio.__anext__)
+
+
+class SubscriptionTwin(TwinOf["Subscription[T]"], Generic[T]):
+    """Registered on entry of its ``with``, gone at its exit; an iterator."""
+
+    def __enter__(self) -> Self:
+        self._loop.enter_at_once(self.aio)
+        return self
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        with contextlib.suppress(ConnectionClosed):  # then it has been closed already
+            self._loop.call(self.aio.close)
+
+    def __iter__(self) -> Self:
+        return self
+
+    def __next__(self) -> T:
+        found = self._loop.run(self._next)
+        if not found:
+            raise StopIteration
+        return found[0]
+
+    async def _next(self) -> tuple[T, ...]:
+        """StopAsyncIteration cannot leave a coroutine."""
+        try:
+            return (await self.aio.__anext__(),)
+        except StopAsyncIteration:
+            return ()
+
+
+class StreamTwin(TwinOf["SetpointStream[T]"], Generic[T]):
+    """Set-points are sent while its ``with`` lasts."""
+
+    def __enter__(self) -> Self:
+        self._loop.enter(self.aio)
+        return self
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._loop.run(self.aio.__aexit__, exc_type, exc, traceback)
+
+
+class TemporarilyTwin(TwinOf["Temporarily"]):
+    """Its ``with`` gives the results of the writes; the values before are put back, whatever comes."""
+
+    def __enter__(self) -> dict[str, ParameterWrite]:
+        return self._loop.enter(self.aio)
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._loop.run_to_its_end(self.aio.__aexit__, exc_type, exc, traceback)
+
+
+class TransactionTwin(TwinOf["Transaction"]):
+    """Taken back at the end of its ``with`` if an error leaves it, whatever comes."""
+
+    def __enter__(self) -> Self:
+        self._loop.enter(self.aio)
+        return self
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._loop.run_to_its_end(self.aio.__aexit__, exc_type, exc, traceback)
+
+
+class ConnectionTwin(TwinOf["Connection"], BlockingBlock):
+    """A context manager; the loop's thread ends with it if it was opened for it."""
+
+    _opened_by = "open_connection"
+
+    def __init__(self, loop: LoopThread, aio: Connection, held: Held[Connection] | None = None) -> None:
+        super().__init__(loop, aio)
+        self._held = held
+
+    def close(self) -> None:
+        """End it, its link, its loop and its thread; idempotent. Calls that wait raise ConnectionClosed.
+
+        The connection of a vehicle that was connected by an address is closed with the vehicle.
+        """
+        if self._held is not None:
+            try:
+                self._held.close()
+            finally:
+                self._loop.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+class VehicleTwin(TwinOf["Vehicle"], BlockingBlock):
+    """A context manager. The connection that it is on is closed with it if it was opened for it."""
+
+    _opened_by = "connect"
+
+    def __init__(self, loop: LoopThread, held: Held[Vehicle], *, owns_loop: bool) -> None:
+        super().__init__(loop, held.value)
+        self._held, self._owns_loop = held, owns_loop
+
+    def close(self) -> None:
+        """Let the vehicle go: link, loop and thread end, calls that wait raise ConnectionClosed. Idempotent.
+
+        Nothing is sent: a vehicle in the air goes on with what it does. A connection that was handed in stays open.
+        """
+        try:
+            self._held.close()
+        finally:
+            if self._owns_loop:
+                self._loop.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        was_told = self.aio.is_told_to_hold
+        self.close()
+        if exc is not None and not was_told:  # the loop's side knows of no exception
+            tell_how_it_is_left(self.aio)
+
+    def __repr__(self) -> str:
+        return repr(self.aio).removesuffix(">") + ", blocking>"
+
+
+def opened(
+    twin: type[TwinT],
+    open_async: Callable[..., AbstractAsyncContextManager[Any]],
+    address: Any,
+    **options: Any,
+) -> TwinT:
+    """Open a block on a loop of its own, or on that of the connection that is given as the address."""
+    is_connection = isinstance(address, ConnectionTwin)
+    loop = address._loop if is_connection else LoopThread()
+    try:
+        held: Held[Any] = loop.hold_open(open_async(address.aio if is_connection else address, **options))
+    except BaseException:
+        if not is_connection:
+            loop.close()
+        raise
+    if issubclass(twin, VehicleTwin):
+        return twin(loop, held, owns_loop=not is_connection)
+    return twin(loop, held.value, held)

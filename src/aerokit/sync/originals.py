@@ -1,0 +1,220 @@
+"""The classes of which twins are made, and their members as they stand in the sources."""
+
+from __future__ import annotations
+
+import ast
+import copy
+import importlib
+import inspect
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, ForwardRef, get_args, get_origin
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+__all__ = ["TWINS", "Member", "Twin", "decorators_of", "function_node", "imports_of", "members_of"]
+
+
+@dataclass(frozen=True)
+class Twin:
+    """One class to be made: ``base`` is what is written by hand for it, in ``blocks.py``.
+
+    ``only``: these members alone; ``without``: all but these. ``direct``: methods that only read, and are called on
+    the thread of the program; ``called``: properties that are read on the loop.
+    """
+
+    path: str
+    base: str = "TwinOf"
+    only: frozenset[str] = frozenset()
+    without: frozenset[str] = frozenset()
+    direct: frozenset[str] = frozenset()
+    called: frozenset[str] = frozenset()
+    parameter: str = ""
+
+    @property
+    def name(self) -> str:
+        """Of the class; both have the same."""
+        return self.path.rpartition(".")[2]
+
+    @property
+    def module(self) -> str:
+        """Where the original is."""
+        return self.path.rpartition(".")[0]
+
+
+def _names(text: str) -> frozenset[str]:
+    return frozenset(text.split())
+
+
+TWINS = (
+    Twin(
+        "aerokit.runtime.cells.StateCell",
+        "CellTwin",
+        without=_names("observe set forget close"),
+        direct=_names("fresh"),
+        parameter="T",
+    ),
+    Twin("aerokit.runtime.cells.Changes", "ChangesTwin", parameter="T"),
+    Twin("aerokit.runtime.subscription.Subscription", "SubscriptionTwin", parameter="ItemT"),
+    Twin(
+        "aerokit.runtime.connection.Connection",
+        "ConnectionTwin",
+        only=_names("send subscribe link_state signing unsent_bytes discard_unsent is_open now counts"),
+        direct=_names("now"),
+        called=_names("unsent_bytes"),
+    ),
+    Twin("aerokit.vehicle.orders.guided.SetpointStream", "StreamTwin", parameter="SetpointT"),
+    Twin("aerokit.vehicle.orders.guided.Guided"),
+    Twin("aerokit.vehicle.files.files.Files"),
+    Twin("aerokit.vehicle.files.logs.Logs"),
+    Twin("aerokit.vehicle.parameters.transaction.Temporarily", "TemporarilyTwin"),
+    Twin("aerokit.vehicle.parameters.transaction.Transaction", "TransactionTwin"),
+    Twin("aerokit.vehicle.parameters.parameters.Parameters", direct=_names("load_metadata")),
+    Twin("aerokit.vehicle.plans.mission.MissionControl"),
+    Twin("aerokit.vehicle.plans.fence.FenceControl"),
+    Twin("aerokit.vehicle.plans.rally.RallyControl"),
+    Twin(
+        "aerokit.vehicle.vehicle.Vehicle",
+        "VehicleTwin",
+        without=_names("telemetry"),
+        direct=_names("distance_to describe_now"),
+    ),
+)
+"""The classes that programs without ``async`` use, each below those that it gives."""
+
+
+@cache
+def tree(module: str) -> ast.Module:
+    return ast.parse(Path(inspect.getfile(importlib.import_module(module))).read_text(encoding="utf-8"))
+
+
+@cache
+def imports_of(module: str) -> dict[str, tuple[str, str]]:
+    """Name in this module → where it is imported from, and by which name."""
+    found: dict[str, tuple[str, str]] = {}
+    for node in ast.walk(tree(module)):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            found |= {each.asname or each.name: (node.module, each.name) for each in node.names}
+        elif isinstance(node, ast.Import):
+            found |= {each.asname or each.name: (each.name, "") for each in node.names}
+    return found
+
+
+def _class_node(cls: type) -> ast.ClassDef:
+    return next(
+        node
+        for node in tree(cls.__module__).body
+        if isinstance(node, ast.ClassDef) and node.name == cls.__name__
+    )
+
+
+def function_node(module: str, name: str) -> ast.AsyncFunctionDef:
+    """A function that opens a block."""
+    return next(
+        node for node in tree(module).body if isinstance(node, ast.AsyncFunctionDef) and node.name == name
+    )
+
+
+@dataclass
+class Member:
+    """One member of a twin, and the modules that its annotations are to be understood in."""
+
+    name: str
+    module: tuple[str, ...]
+    node: ast.FunctionDef | ast.AsyncFunctionDef | None
+    returns: ast.expr | None
+    text: str | None
+    is_cell: bool = False
+    """A declared state."""
+
+
+def members_of(twin: Twin) -> list[Member]:
+    """Those of the class and of what it inherits, each once, in the order of the oldest definition."""
+    cls = getattr(importlib.import_module(twin.module), twin.name)
+    found: dict[str, Member] = {}
+    filled = _filled(cls)
+    for each in reversed(cls.__mro__):
+        if each.__module__.startswith("aerokit."):
+            found |= {member.name: filled(member) for member in _own(each)}
+    wanted = twin.only or frozenset(found)
+    return [each for name, each in found.items() if name in wanted and name not in twin.without]
+
+
+def _filled(cls: type) -> Callable[[Member], Member]:
+    """Puts what a class gives its generic base into the place of the base's type variable."""
+    given: dict[str, str] = {}
+    for base in getattr(cls, "__orig_bases__", ()):
+        names = [each.__name__ for each in getattr(get_origin(base), "__parameters__", ())]
+        values = [each.__forward_arg__ for each in get_args(base) if isinstance(each, ForwardRef)]
+        given |= dict(zip(names, values))  # noqa: B905 - none of them where it is no forward reference
+
+    class Fill(ast.NodeTransformer):
+        def visit_Name(self, node: ast.Name) -> ast.Name:
+            return ast.Name(given.get(node.id, node.id))
+
+    def fill(member: Member) -> Member:
+        if not given or member.node is None:
+            return member
+        node = Fill().visit(copy.deepcopy(member.node))
+        return replace(member, node=node, returns=node.returns, module=(*member.module, cls.__module__))
+
+    return fill
+
+
+def _own(cls: type) -> Iterator[Member]:
+    body = _class_node(cls).body
+    for index, node in enumerate(body):
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+            if node.name == "__init__" and isinstance(node, ast.FunctionDef):
+                yield from _attributes(node, (cls.__module__,))
+            elif not node.name.startswith("_") and not _is_setter(node):
+                yield Member(node.name, (cls.__module__,), node, node.returns, ast.get_docstring(node))
+        elif isinstance(node, ast.AnnAssign) and _is_told(node.annotation):
+            assert isinstance(node.target, ast.Name)
+            assert isinstance(node.annotation, ast.Subscript)
+            kind = ast.Subscript(ast.Name("StateCell"), node.annotation.slice)
+            yield Member(
+                node.target.id, (cls.__module__,), None, kind, _text_below(body, index), is_cell=True
+            )
+
+
+def _attributes(init: ast.FunctionDef, module: tuple[str, ...]) -> Iterator[Member]:
+    """Public attributes, with their documentation below them; the type is annotated, or the class that is called."""
+    for index, node in enumerate(init.body):
+        target: ast.expr | None = node.target if isinstance(node, ast.AnnAssign) else None
+        if isinstance(node, ast.Assign) and len(node.targets) == 1:
+            target = node.targets[0]
+        if not isinstance(target, ast.Attribute) or target.attr.startswith("_"):
+            continue
+        kind: ast.expr | None = None
+        if isinstance(node, ast.AnnAssign):
+            kind = node.annotation
+        elif isinstance(node, ast.Assign) and isinstance(node.value, ast.Call):
+            kind = node.value.func
+        yield Member(target.attr, module, None, kind, _text_below(init.body, index))
+
+
+def _text_below(body: Sequence[ast.stmt], index: int) -> str | None:
+    below = body[index + 1] if index + 1 < len(body) else None
+    if isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant):
+        return inspect.cleandoc(str(below.value.value))
+    return None
+
+
+def _is_told(annotation: ast.expr) -> bool:
+    return (
+        isinstance(annotation, ast.Subscript)
+        and isinstance(annotation.value, ast.Name)
+        and annotation.value.id == "Told"
+    )
+
+
+def decorators_of(node: ast.FunctionDef | ast.AsyncFunctionDef) -> set[str]:
+    """Their texts."""
+    return {ast.unparse(each) for each in node.decorator_list}
+
+
+def _is_setter(node: ast.FunctionDef | ast.AsyncFunctionDef) -> bool:
+    return any(each.endswith(".setter") for each in decorators_of(node))

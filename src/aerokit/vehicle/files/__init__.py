@@ -1,0 +1,1 @@
+"""Files and flight logs on a vehicle."""

@@ -1,0 +1,53 @@
+"""`Bridge`: what all actions of one vehicle share, and how it begins and ends."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from aerokit.vehicle.orders.health import Health
+from aerokit.vehicle.orders.helm import Helm
+from aerokit.vehicle.orders.holding import Holding
+from aerokit.vehicle.orders.late_arming import LateArming
+from aerokit.vehicle.orders.orders import Orders
+from aerokit.vehicle.orders.whereabouts import Whereabouts
+
+if TYPE_CHECKING:
+    from aerokit.vehicle.talk.talk import Talk
+
+__all__ = ["Bridge"]
+
+
+class Bridge:
+    """The talk with the vehicle, the helm, and what gives orders by them."""
+
+    def __init__(self, talk: Talk) -> None:
+        self.talk = talk
+        self.helm = Helm(talk.connection.now, talk.telemetry)
+        self.orders = Orders(talk, self.helm)
+        self.holding = Holding(talk, self.helm, self.orders)
+        self.late_arming = LateArming(talk, self.helm, self.orders)
+        self.health = Health(talk)
+        self.where = Whereabouts(talk)
+        talk.detach.append(self.helm.close)
+        talk.on_reboot.append(self.helm.note_reboot)
+
+    async def finish(self) -> bool:
+        """At the end of everything: what was given up is told to hold, as far as that can be; whether there was any."""
+        self.holding.end_flights()
+        is_given_up = self.holding.is_told_to_hold
+        await self.holding.finish()
+        await self.late_arming.finish()
+        return is_given_up
+
+    def describe_now(self) -> str:
+        """What the vehicle does, as far as it was heard."""
+        autopilot, telemetry = self.talk.autopilot, self.talk.telemetry
+        hold, mode = autopilot.mode_for("hold", is_vtol=telemetry.is_vtol), telemetry.mode.latest
+        disarmed = "disarmed" if telemetry.is_surely_disarmed else "perhaps armed"
+        position = telemetry.position.latest
+        height = None if position is None else position.altitude_relative_m
+        return (
+            f"{'holding in' if mode is not None and mode == hold else 'in'} {telemetry.mode_name},"
+            f" {'still armed' if telemetry.is_armed else disarmed},"
+            f" {'' if height is None else f'{height:.1f} m above home, '}heard {self.talk.heartbeat_age:.1f} s ago"
+        )

@@ -1,0 +1,181 @@
+"""``Helm``: who steers: the program's newest order, and a pilot or a failsafe before all orders."""
+
+from __future__ import annotations
+
+import math
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from aerokit.errors import CommandRejected
+from aerokit.vehicle.orders.order import Order, Sending
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Iterator
+
+    from aerokit.autopilots import Mode
+    from aerokit.vehicle.state.telemetry import Telemetry
+
+__all__ = ["KNOWN_S", "MODE_GRACE_S", "Helm"]
+
+MODE_GRACE_S = 3.0
+"""How long HEARTBEAT, at 1 Hz, may lag behind an accepted command that changes the mode."""
+KNOWN_S = 2.5
+"""What a vehicle does is known while its last HEARTBEAT is not older: two may be missing. No failsafe of ArduPilot or
+PX4 that minds a silent ground station acts sooner (FS_GCS_TIMEOUT 5 s, COM_DL_LOSS_T 10 s)."""
+
+
+class Helm:
+    """Keeps the orders of one vehicle, and tells each what HEARTBEAT says.
+
+    An order ends when a newer one is given, and when the mode becomes one that it does not explain or the vehicle
+    disarms: that is for good, also if the mode comes back.
+    """
+
+    def __init__(self, now: Callable[[], float], telemetry: Telemetry) -> None:
+        self._now, self._telemetry = now, telemetry
+        self.newest: Order | None = None
+        """The last order that steers."""
+        self.arming_orders = 0
+        """How many orders to arm or disarm were sent."""
+        self.mode_is_in_doubt = False
+        """An order that changes the mode is out and its end is not known: the mode told may be about to change."""
+        self.mode_settles_at = -math.inf
+        """Until then HEARTBEAT may tell the mode of an order that was given up."""
+        self._any_mode_until = -math.inf
+        self._orders: list[Order] = []
+        self._sendings: list[Sending] = []
+        self._on_new: list[Callable[[], None]] = []
+        self._detach = (
+            telemetry.mode.observe(self._on_mode, every_arrival=True),
+            telemetry.armed.observe(self._on_armed, every_arrival=True),
+        )
+
+    def close(self) -> None:
+        """Stop listening."""
+        for detach in self._detach:
+            detach()
+
+    # ------------------------------------------------------------------------------- orders
+
+    def order(self, *modes: Mode) -> Order:
+        """A new order that steers, and may bring about these modes: the one before ends."""
+        for each in self._on_new:
+            each()
+        order = self._new(modes, lambda order: order is self.newest)
+        order.is_given = self._steers()
+        self.newest = order
+        self._orders = [order]
+        return order
+
+    def order_of_the_programs_own(self) -> Order:
+        """The program sends one by itself: which modes that brings about is not known."""
+        order = self.order()
+        self._any_mode_until = self._now() + MODE_GRACE_S
+        return order
+
+    def note_reboot(self) -> None:
+        """The vehicle has rebooted: all orders end."""
+        for order in self._orders:
+            order.note_reboot()
+
+    @contextmanager
+    def aside(self) -> Iterator[Order]:
+        """An order that does not steer (speed, home, arming …), for the time of the block."""
+        steering = self.newest
+        modes = () if steering is None else steering.modes
+        order = self._new(modes, lambda _: self.newest is steering)
+        self._orders.append(order)
+        try:
+            yield order
+        finally:
+            self._orders = [each for each in self._orders if each is not order]
+
+    def on_new(self, callback: Callable[[], None]) -> None:
+        """Have this called before each new order that steers."""
+        self._on_new.append(callback)
+
+    @contextmanager
+    def sending(
+        self,
+        order: Order,
+        *,
+        modes: Collection[Mode] = (),
+        armed: bool | None = None,
+        is_done: Callable[[], bool] = lambda: False,
+    ) -> Iterator[Sending]:
+        """Watch what becomes of one command of this order, for the time of the block; see :class:`Sending`."""
+        sending = Sending(
+            order,
+            mode_now=self._telemetry.mode.latest,
+            armed_now=self._telemetry.armed.latest,
+            modes=modes,
+            armed=armed,
+            is_done=is_done,
+        )
+        self.arming_orders += armed is not None
+        for each in self._sendings:
+            each.note_newer(armed)
+        self._sendings.append(sending)
+        try:
+            yield sending
+        finally:
+            self._sendings.remove(sending)
+
+    # --------------------------------------------------------------------------------- doubts
+
+    @property
+    def is_known(self) -> bool:
+        """Whether the vehicle has told lately what it does."""
+        return self._telemetry.armed.age <= KNOWN_S
+
+    @contextmanager
+    def changing_mode(self) -> Iterator[None]:
+        """Until the vehicle's answer is known, which it is not when this is cancelled or times out, trust no mode."""
+        self.mode_is_in_doubt = True
+        try:
+            yield
+        except CommandRejected:
+            self.mode_is_in_doubt = False
+            raise
+        except BaseException:
+            self.doubt_mode()
+            raise
+        self.mode_is_in_doubt = False
+
+    def doubt_mode(self) -> None:
+        """An order that changes the mode is out and nobody waits for what comes of it."""
+        self.mode_is_in_doubt = True
+        self.mode_settles_at = self._now() + MODE_GRACE_S
+
+    # --------------------------------------------------------------------------------- inside
+
+    def _new(self, modes: Collection[Mode], is_newest: Callable[[Order], bool]) -> Order:
+        before, mode = self.newest, self._telemetry.mode.latest
+        is_under_way = before is not None and mode is not None and before.is_own(mode)
+        is_unsettled = is_under_way or self.mode_is_in_doubt or self._now() < self.mode_settles_at
+        return Order(
+            self._now(),
+            mode_before=mode,
+            modes=modes,
+            expected=before.modes if is_unsettled and before is not None else (),
+            armed_before=self._telemetry.armed.latest,
+            is_newest=is_newest,
+            settles_at=self.mode_settles_at,
+            any_until=self._any_mode_until,
+        )
+
+    def _steers(self) -> bool:
+        """Whether the vehicle is in a mode of the newest order, and nobody has taken it from that."""
+        order, mode = self.newest, self._telemetry.mode.latest
+        return order is not None and mode is not None and order.is_own(mode) and not order.taken_by
+
+    def _on_mode(self, _: Mode | None, mode: Mode) -> None:
+        for each in self._followers():
+            each.note_mode(mode, self._telemetry.mode.updated_at)
+
+    def _on_armed(self, _: bool | None, armed: bool) -> None:
+        for each in self._followers():
+            each.note_armed(armed, self._telemetry.armed.updated_at)
+
+    def _followers(self) -> tuple[Order | Sending, ...]:
+        return (*self._orders, *self._sendings)

@@ -1,0 +1,53 @@
+"""Actions that change the mode alone: modes by name, and holding."""
+
+from __future__ import annotations
+
+from aerokit.arguments import checks_arguments
+from aerokit.vehicle.checks import check_seconds
+from aerokit.vehicle.orders.part import Part
+
+__all__ = ["ModeActions"]
+
+
+@checks_arguments
+class ModeActions(Part):
+    """Changing the flight mode; stopping."""
+
+    async def set_mode(self, mode: str | int, *, timeout: float = 6.0) -> None:
+        """Change the flight mode and wait until HEARTBEAT tells it.
+
+        Args:
+            mode: a name as the autopilot's own documentation spells it (``"GUIDED"``, ``"POSCTL"``; case does not
+                matter), or the number in HEARTBEAT.custom_mode.
+            timeout: seconds for the whole of it.
+
+        Sends MAV_CMD_DO_SET_MODE, and SET_MODE to a vehicle that does not know that command
+        (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_MODE).
+
+        Raises:
+            LocalProtocolError: this vehicle has no such mode; the text lists those it has. Nothing was sent.
+            CommandRejected: the vehicle refused; ``reasons`` has what it said meanwhile.
+            OperationRejected: a pilot or a failsafe has chosen another mode meanwhile.
+            OperationTimeout: it accepted and stayed in another mode, or did not answer.
+        """
+        check_seconds("timeout", timeout)
+        wanted = self.autopilot.find_mode(mode, self.telemetry.mode_names)
+        await self._orders.change_mode(wanted, self._helm.order(wanted), timeout)
+
+    async def hold(self) -> None:
+        """Stop and stay (a fixed wing circles); returns when HEARTBEAT tells the autopilot's mode for that.
+
+        Copter BRAKE, Plane LOITER, Rover HOLD (a boat LOITER), Sub POSHOLD; PX4 LOITER where it comes to a stop.
+
+        Raises:
+            NotSupported: this vehicle has no mode for it. Nothing was sent.
+            CommandRejected: the vehicle refused; ``reasons`` has what it said meanwhile.
+            OperationRejected: a pilot or a failsafe has chosen another mode meanwhile.
+            OperationTimeout: it accepted and stayed in another mode, or did not answer.
+        """
+        await self._holding.hold()
+
+    @property
+    def is_told_to_hold(self) -> bool:
+        """Whether a flight was given up, and the order to hold that followed is not confirmed yet."""
+        return self._holding.is_told_to_hold

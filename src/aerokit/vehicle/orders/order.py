@@ -1,0 +1,143 @@
+"""Orders: what has been heard since one was given, and so whether it may be sent again or still be meant.
+
+docs/reliability.md has the table of all orders; nothing is sent again that is not in it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection
+
+    from aerokit.autopilots import Mode
+
+__all__ = ["COMPONENT_ARM_DISARM", "MOVING_COMMANDS", "QUESTIONS", "Order", "Sending"]
+
+COMPONENT_ARM_DISARM = 400
+MOVING_COMMANDS = frozenset((16, 17, 18, 19, 20, 21, 22, 84, 85, 176, 185, 192, 193, 252, 300, 400))
+"""MAV_CMDs by which a program steers past the actions: what an action left to be done must not come after them."""
+QUESTIONS = frozenset((401, 510, 511, 512, 519, 520, 521, 522, 525, 527, 528))
+"""MAV_CMDs that ask for something and change nothing but streams: they are sent again until they are answered."""
+
+
+class Order:
+    """One order of the program, from when it is given until it is done, overruled or taken over.
+
+    ``mode_before`` is the mode that it was given in, ``modes`` are those that it may bring about, ``expected`` others
+    that may still be told because the program had ordered them just before, and until ``settles_at`` in any order;
+    until ``any_until`` every mode may, since the program had sent an order of its own making. Any other mode is a
+    pilot's or a failsafe's doing.
+    """
+
+    def __init__(
+        self,
+        given_at: float,
+        *,
+        mode_before: Mode | None,
+        modes: Collection[Mode],
+        expected: Collection[Mode],
+        armed_before: bool | None,
+        is_newest: Callable[[Order], bool],
+        settles_at: float = -math.inf,
+        any_until: float = -math.inf,
+    ) -> None:
+        self.given_at = given_at
+        self.modes = tuple(modes)
+        self.taken_by = ""
+        """What somebody else has done, as a clause; empty: nothing that was told."""
+        self.is_given = False
+        """Whether the vehicle may move by it, or moves by what the program had ordered before: given up, it is held."""
+        late = {each.custom_mode for each in expected}
+        self._before = set() if mode_before is None else {mode_before.custom_mode} - late
+        self._allowed = self._before | late
+        self._own = {each.custom_mode for each in modes}
+        self._is_mode_known = mode_before is not None
+        self._was_armed = armed_before
+        self._is_newest = is_newest
+        self._settles_at, self._any_until = settles_at, any_until
+
+    @property
+    def end(self) -> str:
+        """Why it has nothing to say any more, as a clause; empty while it has."""
+        return self.taken_by or ("" if self._is_newest(self) else "another order was given")
+
+    def is_own(self, mode: Mode) -> bool:
+        """Whether this mode is one that the order may bring about."""
+        return mode.custom_mode in self._own
+
+    def note_mode(self, mode: Mode, at: float) -> None:
+        """The vehicle tells its mode. Once it was in one of the order's, the mode before is somebody else's, too."""
+        if self.is_own(mode):
+            self._allowed -= self._allowed if at >= self._settles_at else self._before
+        elif not self._is_mode_known or at < self._any_until:
+            self._allowed.add(mode.custom_mode)
+        elif mode.custom_mode not in self._allowed:
+            self.taken_by = self.taken_by or f"the mode changed to {mode}"
+        self._is_mode_known = True
+
+    def note_armed(self, armed: bool, at: float) -> None:
+        """The vehicle tells whether it is armed."""
+        if self._was_armed and not armed:
+            self.taken_by = self.taken_by or "the vehicle disarmed"
+        self._was_armed = armed
+
+    def note_reboot(self) -> None:
+        """The vehicle has rebooted: nothing that was ordered before is meant any more."""
+        self.taken_by = self.taken_by or "the vehicle rebooted"
+
+
+class Sending:
+    """One command of an order, from its first sending on: whether it may be sent again.
+
+    It may while what was heard since speaks neither of its effect nor of somebody else's doing. ``modes`` and
+    ``armed`` are effects that HEARTBEAT tells, if they are not there already; ``is_done`` tells any other one.
+    """
+
+    def __init__(
+        self,
+        order: Order,
+        *,
+        mode_now: Mode | None,
+        armed_now: bool | None,
+        modes: Collection[Mode] = (),
+        armed: bool | None = None,
+        is_done: Callable[[], bool] = lambda: False,
+    ) -> None:
+        self.order = order
+        self.told_at = -math.inf
+        """When HEARTBEAT came last."""
+        self._was_told = False
+        is_there = None if mode_now is None else mode_now.custom_mode
+        self._modes = {each.custom_mode for each in modes} - {is_there}
+        self._armed = None if armed is armed_now else armed
+        self._arms, self._is_overruled = armed, False
+        self._is_done = is_done
+
+    @property
+    def has_worked(self) -> bool:
+        """Whether its effect has been told, whatever came after it."""
+        self._was_told = self._was_told or self._is_done()
+        return self._was_told
+
+    @property
+    def end(self) -> str:
+        """Why it must not be sent again, as a clause; empty while it may."""
+        if self.has_worked:
+            return "its effect was told"
+        return self.order.end or ("another order was given" if self._is_overruled else "")
+
+    def note_newer(self, armed: bool | None) -> None:
+        """Another command is given: one to disarm ends one to arm, and the other way round."""
+        if armed is not None and self._arms is not None and armed is not self._arms:
+            self._is_overruled = True
+
+    def note_mode(self, mode: Mode, at: float) -> None:
+        """The vehicle tells its mode."""
+        self._was_told = self._was_told or mode.custom_mode in self._modes
+
+    def note_armed(self, armed: bool, at: float) -> None:
+        """The vehicle tells whether it is armed, which ends a HEARTBEAT."""
+        self._was_told = self._was_told or (self._armed is not None and armed is self._armed)
+        self.told_at = at

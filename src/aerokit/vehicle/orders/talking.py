@@ -1,0 +1,307 @@
+"""Talking to a vehicle past its actions: any command, any message, and how well it is heard."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from aerokit.arguments import checks_arguments
+from aerokit.errors import CommandRejected
+from aerokit.mavlink.message import Message
+from aerokit.mavlink.messages import CommandAck, CommandInt, CommandLong, SetMode
+from aerokit.runtime.cells import Source, StateCell
+from aerokit.runtime.subscription import Overflow, Subscription
+from aerokit.vehicle.orders.order import COMPONENT_ARM_DISARM, MOVING_COMMANDS, QUESTIONS
+from aerokit.vehicle.orders.part import Part
+from aerokit.vehicle.talk.rates import check_rate, subscription_rate_hz
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Iterator
+
+    from aerokit.protocols.command import Standing
+    from aerokit.runtime.bus import Detach, Sink
+    from aerokit.runtime.events import Event
+    from aerokit.runtime.link_state import LinkState
+    from aerokit.vehicle.orders.bridge import Bridge
+    from aerokit.vehicle.orders.order import Order
+
+__all__ = ["TalkActions"]
+
+ItemT = TypeVar("ItemT", bound="Message | Event")
+MessageT = TypeVar("MessageT", bound=Message)
+
+
+@checks_arguments
+class TalkActions(Part):
+    """Commands, messages, subscriptions; what is known of the vehicle beside its cells."""
+
+    def __init__(self, bridge: Bridge) -> None:
+        super().__init__(bridge)
+        self._messages: dict[type[Message], StateCell[Any]] = {}
+        self._message_rates: dict[type[Message], Detach] = {}
+
+    # ---------------------------------------------------------------------------- commands
+
+    async def command(
+        self,
+        command: int,
+        *params: float,
+        component_id: int | None = None,
+        attempts: int = 4,
+        attempt_timeout: float = 1.0,
+        progress_timeout: float = 10.0,
+        on_progress: Callable[[int | None], None] | None = None,
+        standing: Standing | None = None,
+    ) -> CommandAck:
+        """Send any MAV_CMD as COMMAND_LONG and return its ACCEPTED ack.
+
+        Args:
+            command: the number, or a member of ``enums.MavCmd``.
+            params: param1 to param7; missing ones are 0, NaN where the command says so.
+            component_id: to another component than the autopilot; 0: to all, and the autopilot's answer counts.
+            attempts: how often it is sent at most; ``confirmation`` rises with each. What changes something is sent
+                again only right after a HEARTBEAT that tells of no other mode, and no newer order; see
+                docs/reliability.md.
+            attempt_timeout: seconds to wait for an ack after each, and at least two measured round trips.
+            progress_timeout: seconds to wait after each IN_PROGRESS for the next answer; calibrations can take long.
+            on_progress: called with 0–100, or None, for each IN_PROGRESS.
+            standing: says whether it may be sent again, instead of these rules: for programs that keep orders of their
+                own. The order is no newer one then.
+
+        See https://mavlink.io/en/services/command.html.
+
+        Raises:
+            LocalProtocolError: a parameter is no number or does not fit. Nothing was sent.
+            CommandRejected: any other result; ``reasons`` has the status texts seen meanwhile.
+            CommandTimeout: no ack; the text names attempts, seconds, the last heartbeat and the loss.
+        """
+        return await self._answered(
+            self._talk.commands.send_long,
+            command,
+            *params,
+            component_id=component_id,
+            attempts=attempts,
+            attempt_timeout=attempt_timeout,
+            progress_timeout=progress_timeout,
+            on_progress=on_progress,
+            standing=standing,
+        )
+
+    async def command_int(
+        self,
+        command: int,
+        *params: float,
+        frame: int,
+        x: int = 0,
+        y: int = 0,
+        z: float = 0.0,
+        component_id: int | None = None,
+        attempts: int = 4,
+        attempt_timeout: float = 1.0,
+        progress_timeout: float = 10.0,
+        on_progress: Callable[[int | None], None] | None = None,
+        standing: Standing | None = None,
+    ) -> CommandAck:
+        """Send any MAV_CMD as COMMAND_INT: param1 to param4, ``x``, ``y``, ``z`` in ``frame`` (MAV_FRAME).
+
+        ``x`` and ``y`` are latitude and longitude in 1e-7 degrees, or 1e-4 m in local frames; ``z`` metres. The rest
+        is as for :meth:`command`.
+        """
+        return await self._answered(
+            self._talk.commands.send_int,
+            command,
+            *params,
+            frame=frame,
+            x=x,
+            y=y,
+            z=z,
+            component_id=component_id,
+            attempts=attempts,
+            attempt_timeout=attempt_timeout,
+            progress_timeout=progress_timeout,
+            on_progress=on_progress,
+            standing=standing,
+        )
+
+    def send(self, message: Message) -> None:
+        """Send one message as it is, once; never blocks. Its ``target_system`` is yours to set.
+
+        A command that steers (as by :meth:`command`) and SET_MODE are newer orders: those of the actions end.
+
+        Raises:
+            LocalProtocolError: a field is out of range; nothing was sent.
+            ConnectionClosed, LinkLost: the connection has ended, or the block of this vehicle was left.
+        """
+        self._talk.send(message)
+        is_command = isinstance(message, (CommandInt, CommandLong)) and message.command in MOVING_COMMANDS
+        if is_command or isinstance(message, SetMode):
+            self._helm.order_of_the_programs_own()
+
+    # ----------------------------------------------------------------------- subscriptions
+
+    def subscribe(
+        self,
+        *types: type[ItemT],
+        capacity: int = 1,
+        overflow: Overflow = "drop_oldest",
+        rate_hz: float | None = None,
+    ) -> Subscription[ItemT]:
+        """Return a stream of messages or events of this vehicle, for use in a ``with`` block.
+
+        ``capacity=1`` gives the latest only, ``missed`` counts the others.
+
+        Subscribing is the rate request: while the block lasts, the vehicle is asked to send these messages at
+        ``rate_hz`` (above 0, at most 1000), or faster if others want it. None means the default rate of a message that
+        comes in a stream; one that is sent when there is need (HEARTBEAT, STATUSTEXT, acks) is not asked for.
+
+        Raises:
+            LocalProtocolError: no type, a rate out of range, or a message that the dialect does not hold.
+        """
+        self.connection.check_types(types)
+        messages: list[type[Message]] = [each for each in types if issubclass(each, Message)]
+        if rate_hz is not None:
+            for message in messages:
+                check_rate(message, rate_hz)
+
+        def attach(sink: Sink) -> list[Detach]:
+            detach = self.connection.attach(types, sink, system_id=self.system_id)
+            detach.append(self.connection.on_end(subscription.close))
+            for each in messages:
+                hz = subscription_rate_hz(each) if rate_hz is None else rate_hz
+                if hz is not None:
+                    detach.append(self._talk.rates.want(each, hz))
+            return detach
+
+        subscription: Subscription[ItemT] = Subscription(attach, capacity=capacity, overflow=overflow)
+        return subscription
+
+    @contextmanager
+    def rate(self, message_type: type[Message], rate_hz: float) -> Iterator[None]:
+        """Have the vehicle send ``message_type`` at ``rate_hz`` or faster for the time of the ``with`` block."""
+        release = self._talk.rates.want(message_type, rate_hz)
+        try:
+            yield
+        finally:
+            release()
+
+    # ------------------------------------------------------------------------------- state
+
+    def message(self, message_type: type[MessageT], *, rate_hz: float | None = None) -> StateCell[MessageT]:
+        """The latest message of a kind as it came, in a cell: ``vehicle.message(messages.RawImu).value.xacc``.
+
+        The first call registers it, and has the vehicle send it at ``rate_hz`` (None: the default rate of a message
+        that comes in a stream) for as long as the vehicle object lives; later calls give the same cell, and may change
+        the rate. Only messages of the autopilot count.
+
+        Raises:
+            LocalProtocolError: the rate is out of range, or the dialect does not hold the message.
+        """
+        cell = self._messages.get(message_type)
+        if cell is None:
+            self.connection.check_types((message_type,))
+            cell = self._messages[message_type] = self._message_cell(message_type)
+            self._talk.cells.append(cell)
+            self._talk.on_reboot.append(cell.forget)
+            rate_hz = subscription_rate_hz(message_type) if rate_hz is None else rate_hz
+        if rate_hz is not None:
+            release = self._message_rates.pop(message_type, None)
+            self._message_rates[message_type] = self._talk.rates.want(message_type, rate_hz)
+            if release is not None:
+                release()
+        return cell
+
+    def _message_cell(self, message_type: type[Message]) -> StateCell[Any]:
+        arrived_at = 0.0
+        cell: StateCell[Any] = StateCell(
+            message_type.NAME, self.connection.now, message_type.NAME, stamp=lambda: arrived_at
+        )
+        source = Source(self.system_id, self.component_id, message_type.NAME)
+
+        def take(message: Message) -> None:
+            nonlocal arrived_at
+            frame = message.received_frame
+            if frame is not None and self.telemetry.accepts(frame):
+                arrived_at = frame.received_at
+                cell.set(message, source)
+
+        self._talk.detach.append(self.connection.bus.attach(message_type, take, system_id=self.system_id))
+        return cell
+
+    @property
+    def mode_name(self) -> str:
+        """Name of the flight mode, ``"unknown"`` before the first heartbeat."""
+        return self.telemetry.mode_name
+
+    @property
+    def is_armed(self) -> bool:
+        """Whether the last heartbeat says armed; False before the first, and after a reboot until the next one."""
+        return self.telemetry.is_armed
+
+    @property
+    def is_surely_disarmed(self) -> bool:
+        """Whether the last heartbeat says disarmed; False while it is not known."""
+        return self.telemetry.is_surely_disarmed
+
+    @property
+    def is_vtol(self) -> bool:
+        """Whether it can hover and cruise on wings: EXTENDED_SYS_STATE tells a VTOL state."""
+        return self.telemetry.is_vtol
+
+    @property
+    def heartbeat_age(self) -> float:
+        """Seconds since the last heartbeat of the autopilot."""
+        return self._talk.heartbeat_age
+
+    @property
+    def is_silent(self) -> bool:
+        """Whether no heartbeat comes: none for more than 3.5 seconds, or the link has gone."""
+        return self._talk.watch.is_silent
+
+    @property
+    def link_state(self) -> StateCell[LinkState]:
+        """CONNECTED, SILENT (no heartbeat for more than 3.5 seconds) or LOST (the link has gone)."""
+        return self._talk.watch.link_state
+
+    def describe_link(self) -> str:
+        """One line on how well the vehicle is heard, for error texts."""
+        return self._talk.describe_link()
+
+    def describe_now(self) -> str:
+        """What it does, as far as it was heard: ``holding in BRAKE, still armed, 9 m above home, heard 0.3 s ago``."""
+        return self._bridge.describe_now()
+
+    def texts_since(self, at: float) -> tuple[str, ...]:
+        """What the vehicle said (STATUSTEXT) since this time on the loop's clock, oldest first."""
+        return self._talk.texts_since(at)
+
+    # ------------------------------------------------------------------------------ inside
+
+    async def _answered(
+        self,
+        send: Callable[..., Awaitable[CommandAck]],
+        command: int,
+        *params: float,
+        standing: Standing | None,
+        **options: Any,
+    ) -> CommandAck:
+        """What the commands of the program itself have in common; ``send`` is one of the command sender's."""
+        started = self.connection.now()
+        try:
+            if standing is not None or command in QUESTIONS:
+                return await send(command, *params, standing=standing, **options)
+            with self._own_order(command) as order:
+                armed = params[0] == 1 if command == COMPONENT_ARM_DISARM and params else None
+                with self._helm.sending(order, armed=armed) as sending:
+                    return await send(command, *params, standing=sending, **options)
+        except CommandRejected as error:
+            await self._talk.settle()
+            raise self._talk.explained(error, started) from None
+
+    @contextmanager
+    def _own_order(self, command: int) -> Iterator[Order]:
+        """A program that steers past the actions gives a new order, which ends theirs."""
+        if command in MOVING_COMMANDS:
+            yield self._helm.order_of_the_programs_own()
+        else:
+            with self._helm.aside() as order:
+                yield order

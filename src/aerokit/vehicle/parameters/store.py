@@ -1,0 +1,131 @@
+"""``ParameterStore``: what is known of a vehicle's parameters, kept up to date by every PARAM_VALUE."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from aerokit.mavlink.messages import ParamValue
+from aerokit.parameters import Parameter, ParameterTable
+from aerokit.parameters.encoding import parameter_of
+from aerokit.parameters.parameter import MOST_PARAMETERS, same_value
+from aerokit.parameters.px4_hash import HASH_NAME
+from aerokit.protocols.parameter_update import updated
+from aerokit.runtime.events import ParameterChanged
+
+if TYPE_CHECKING:
+    from aerokit.runtime.bus import Detach
+    from aerokit.vehicle.talk.transfers import Transfers
+
+__all__ = ["ParameterStore"]
+
+
+UNDER_WAY_S = 1.0
+
+
+class ParameterStore:
+    """Name → parameter. Publishes :class:`ParameterChanged` when a value that was known becomes another one."""
+
+    def __init__(self, transfers: Transfers) -> None:
+        self._transfers = transfers
+        self._known: dict[str, Parameter] = {}
+        self._table: ParameterTable | None = ParameterTable()
+        self.is_complete = False
+        """Whether the whole list has come since the vehicle started."""
+        self.updates = 0
+        """Counts the values that have come in messages."""
+        self.count: int | None = None
+        """How many there are by the last message; the vehicle may show and hide some at any time."""
+        self._updated_at: dict[str, int] = {}
+        self._replaced: dict[str, tuple[int | float, float]] = {}
+
+    @property
+    def table(self) -> ParameterTable:
+        """All that is known, as a value."""
+        if self._table is None:
+            self._table = ParameterTable(self._known.values())
+        return self._table
+
+    @property
+    def bytewise(self) -> bool:
+        """How integers travel."""
+        transfers = self._transfers
+        return transfers.autopilot.encodes_parameters_bytewise(transfers.known_capabilities)
+
+    def get(self, name: str) -> Parameter | None:
+        """What is known of one of them."""
+        return self._known.get(name)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._known
+
+    def distrust(self, name: str, value: float) -> None:
+        """This value has just been replaced: a message that still tells it was under way, and does not count.
+
+        ArduPilot answers PARAM_SET at once, but reads up to a tenth of a second after it looked the value up.
+        """
+        self._replaced[name] = value, self._transfers.connection.now() + UNDER_WAY_S
+
+    def trust(self, name: str) -> None:
+        """Take whatever comes: it is being written."""
+        self._replaced.pop(name, None)
+
+    def distrusted(self, name: str) -> int | float | None:
+        """The value that it had a moment ago."""
+        value, until = self._replaced.get(name, (0, 0.0))
+        return value if self._transfers.connection.now() < until else None
+
+    def attach(self) -> Detach:
+        """Begin to listen."""
+        transfers = self._transfers
+        return transfers.connection.bus.attach(ParamValue, self._take, system_id=transfers.system_id)
+
+    def forget(self) -> None:
+        """The vehicle has started anew: nothing is known."""
+        self._known.clear()
+        self._updated_at.clear()
+        self._replaced.clear()
+        self._table, self.is_complete, self.count = None, False, None
+
+    def replace(self, table: ParameterTable, *, since: int) -> None:
+        """Take a whole list that was begun when ``updates`` was ``since``; messages that came later are newer."""
+        newer = {name for name, at in self._updated_at.items() if at > since}
+        before, self._known = self._known, {}
+        for name, parameter in table.items():
+            known = before.get(name)
+            if known is not None and name in newer:
+                parameter = updated(parameter, known, self.bytewise)
+            self._known[name] = parameter
+        for name in newer - self._known.keys():
+            self._known[name] = before[name]
+        self._table, self.is_complete = None, True
+        for name, parameter in self._known.items():
+            self._publish(before.get(name), parameter)
+
+    def _take(self, message: ParamValue) -> None:
+        frame = message.received_frame
+        if frame is None or frame.component_id != self._transfers.component_id:
+            return
+        if message.param_id == HASH_NAME or not message.param_id:
+            return
+        told = parameter_of(message, self.bytewise)
+        known, old = self._known.get(told.name), self.distrusted(told.name)
+        if known is None and len(self._known) >= MOST_PARAMETERS:
+            return
+        if known is not None and old is not None and same_value(told.value, old):
+            return
+        after = told if known is None else updated(known, told, self.bytewise)
+        self._known[told.name], self._table = after, None
+        self.updates += 1
+        self.count = message.param_count
+        self._updated_at[told.name] = self.updates
+        self._publish(known, after)
+
+    def _publish(self, before: Parameter | None, after: Parameter) -> None:
+        if before is None or same_value(before.value, after.value):
+            return
+        transfers = self._transfers
+        transfers.connection.bus.publish(
+            ParameterChanged(
+                transfers.connection.now(), transfers.system_id, after.name, before.value, after.value
+            )
+        )

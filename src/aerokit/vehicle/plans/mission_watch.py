@@ -1,0 +1,159 @@
+"""``MissionWatch``: how far a vehicle is in its mission, by MISSION_CURRENT and MISSION_ITEM_REACHED."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from aerokit.errors import ConnectionClosed
+from aerokit.runtime.cells import Source, StateCell
+from aerokit.runtime.events import MissionCurrentChanged, MissionFinished, MissionItemReached
+from aerokit.vehicle.state.condition import MissionProgress
+
+if TYPE_CHECKING:
+    from aerokit.vehicle.talk.talk import Talk
+
+__all__ = ["MissionWatch"]
+
+STATE_NO_MISSION, STATE_ACTIVE, STATE_COMPLETE = 1, 3, 5
+TWICE_S = 0.3
+"""The same item reached again so soon is one message that came twice."""
+AGAIN_S = 1.0
+LAST_S = 3.0
+"""How long before it disarms a vehicle that has landed may have left its last item."""
+STALE_S = 3.0
+"""How long a vehicle that starts its mission anew may go on saying that it is complete."""
+
+
+class MissionWatch:
+    """Cells and events. Items are counted without home.
+
+    An ArduCopter that lands at the end disarms and goes back to its first item, and never says that it is complete.
+    PX4 says so until the next mission is under way, says that it is active in its landing mode too, and tells each item
+    reached ten times over.
+    """
+
+    def __init__(self, talk: Talk) -> None:
+        self._talk = talk
+        self._offset = int(talk.autopilot.home_is_item_0)
+        self._repeats = talk.autopilot.repeats_item_reached
+        now = talk.connection.now
+        self.current: StateCell[int | None] = StateCell("mission.current", now, "MISSION_CURRENT")
+        self.count: StateCell[int] = StateCell("mission.count", now, "MISSION_CURRENT with a number of items")
+        self.progress: StateCell[MissionProgress] = StateCell("mission.progress", now, "MISSION_CURRENT")
+        self.reached: int | None = None
+        """The item that was reached last."""
+        self.is_complete = False
+        """Whether the mission that was flown last came to its end."""
+        self._reached_at = self._at_last_at = -math.inf
+        self._may_repeat = False
+        self._was_active = False
+        self._stale_until = -math.inf
+        telemetry = talk.telemetry
+        talk.detach += [
+            telemetry.mission_current.observe(self._on_current, every_arrival=True),
+            telemetry.mission_reached.observe(self._on_reached, every_arrival=True),
+            telemetry.armed.observe(self._on_armed),
+            talk.connection.on_end(self.close),
+            lambda: self.close(ConnectionClosed("the block of this vehicle was left")),
+        ]
+
+    @property
+    def last(self) -> int | None:
+        """The last item, None when it is not known how many there are."""
+        count = self.count.latest
+        return count - 1 if count else None
+
+    @property
+    def is_at_last(self) -> bool:
+        """Whether it goes for the last item, or did so a moment ago."""
+        return self._talk.connection.now() - self._at_last_at <= LAST_S
+
+    def counted(self, count: int) -> None:
+        """A transfer has told how many items there are."""
+        self._set_count(count, "MISSION_COUNT")
+
+    def start(self) -> None:
+        """The mission is flown from now on; what is told of the one before does not count."""
+        self.is_complete = self._was_active = False
+        self._stale_until = self._talk.connection.now() + STALE_S
+
+    def forget(self) -> None:
+        """The vehicle has rebooted."""
+        for cell in (self.current, self.count, self.progress):
+            cell.forget()
+        self.reached, self._was_active, self.is_complete = None, False, False
+
+    def close(self, error: Exception) -> None:
+        """Nothing more will come."""
+        for cell in (self.current, self.count, self.progress):
+            cell.close(error)
+
+    # ----------------------------------------------------------------------------------- messages
+
+    def _on_current(self, _: MissionProgress | None, told: MissionProgress) -> None:
+        before = self.current.latest
+        current = None if told.current is None or told.current < self._offset else told.current - self._offset
+        if told.total is None and told.state == STATE_NO_MISSION:
+            current = None
+            self._set_count(0, "MISSION_CURRENT")
+        elif told.total is not None:
+            self._set_count(told.total, "MISSION_CURRENT")
+        self.progress.set(
+            MissionProgress(current, self.count.latest, told.state), self._source("MISSION_CURRENT")
+        )
+        self.current.set(current, self._source("MISSION_CURRENT"))
+        if current is not None and current == self.last:
+            self._at_last_at = self._talk.connection.now()
+        if current != before:
+            self._note_return(before, current)
+            self._talk.publish(MissionCurrentChanged, before, current)
+        self._on_state(told.state)
+
+    def _note_return(self, before: int | None, current: int | None) -> None:
+        """Going for an item again that was reached before; PX4 may tell that it is reached before it is the current."""
+        if current is not None and current == self.reached:
+            is_long_ago = self._talk.connection.now() - self._reached_at > AGAIN_S
+            self._may_repeat = self._may_repeat or is_long_ago or (before is not None and before > current)
+
+    def _on_state(self, state: int) -> None:
+        if state != STATE_COMPLETE:
+            self._stale_until = -math.inf
+            if state == STATE_ACTIVE and self._is_in_mission_mode and self._talk.telemetry.is_armed:
+                self._was_active, self.is_complete = True, False
+        elif self._talk.connection.now() >= self._stale_until:
+            self._complete()
+
+    def _on_armed(self, _: bool | None, is_armed: bool) -> None:
+        if not is_armed and self._was_active and self.is_at_last and self._is_in_mission_mode:
+            self._complete()
+
+    def _on_reached(self, _: int | None, seq: int) -> None:
+        """ArduPilot tells item 0, home, when it has come to a guided target."""
+        item, now = seq - self._offset, self._talk.connection.now()
+        is_again = item == self.reached and (
+            not self._may_repeat if self._repeats else now - self._reached_at < TWICE_S
+        )
+        if item < 0 or is_again:
+            return
+        self.reached, self._reached_at, self._may_repeat = item, now, False
+        self._talk.publish(MissionItemReached, item)
+
+    # ------------------------------------------------------------------------------------ inside
+
+    def _complete(self) -> None:
+        self.is_complete = True
+        if self._was_active:
+            self._was_active = False
+            self._talk.publish(MissionFinished)
+
+    @property
+    def _is_in_mission_mode(self) -> bool:
+        mode = self._talk.autopilot.mode_for("mission", is_vtol=self._talk.telemetry.is_vtol)
+        return mode is not None and self._talk.telemetry.is_in(mode)
+
+    def _set_count(self, count: int, message: str) -> None:
+        self.count.set(count, self._source(message))
+
+    def _source(self, message: str) -> Source:
+        return Source(self._talk.system_id, self._talk.component_id, message)

@@ -1,0 +1,261 @@
+"""What a vehicle does and how it fares: mode, health, mission, texts."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from aerokit.autopilots import is_armed
+from aerokit.autopilots.modes import Mode
+from aerokit.autopilots.version import AutopilotVersion
+from aerokit.mavlink.enums import MavLandedState, MavProtocolCapability, MavState, MavVtolState, MissionState
+from aerokit.snapshot import Snapshot
+from aerokit.vehicle.state.reading import U16, Context, finite, member, unless
+
+if TYPE_CHECKING:
+    from aerokit.mavlink import messages
+
+__all__ = [
+    "EstimatorHealth",
+    "MissionProgress",
+    "SensorHealth",
+    "StatusText",
+    "SystemTime",
+    "armed",
+    "capabilities",
+    "current_mode",
+    "ekf_health",
+    "estimator_health",
+    "landed_state",
+    "landed_state_of_heartbeat",
+    "mission_progress",
+    "mission_reached",
+    "mode",
+    "sensor_health",
+    "system_status",
+    "system_time",
+    "version",
+    "vtol_state",
+]
+
+MAV_SEVERITY_ERROR = 3
+SEVERITIES = ("EMERGENCY", "ALERT", "CRITICAL", "ERROR", "WARNING", "NOTICE", "INFO", "DEBUG")
+EARLIEST_UNIX_S = 1_000_000_000
+
+
+class SystemTime(Snapshot):
+    """``unix_s`` is UTC in seconds since 1970, None while the vehicle does not know it."""
+
+    unix_s: float | None
+    since_boot_s: float
+
+
+class SensorHealth(Snapshot):
+    """SYS_STATUS (https://mavlink.io/en/messages/common.html#SYS_STATUS).
+
+    ``present``, ``enabled`` and ``healthy`` are MAV_SYS_STATUS_SENSOR bits. ``failing`` names what should
+    work and does not. ``prearm_checks_pass`` is None where the vehicle does not say. ``load_percent`` is the
+    processor's.
+    """
+
+    present: int
+    enabled: int
+    healthy: int
+    failing: tuple[str, ...]
+    prearm_checks_pass: bool | None
+    load_percent: float
+
+    @property
+    def blocks_arming(self) -> tuple[str, ...]:
+        """What is failing, unless the checks pass all the same: then the vehicle does not mind."""
+        return () if self.prearm_checks_pass else self.failing
+
+
+class EstimatorHealth(Snapshot):
+    """What the state estimator says of itself: EKF_STATUS_REPORT (ArduPilot) or ESTIMATOR_STATUS (PX4).
+
+    ``message`` is the name of the message, ``flags`` its flags, ``missing`` what a flight by position still
+    needs, in words. Ratios are innovations by their limits: below 1 is good. Accuracies are in metres, one
+    standard deviation.
+    """
+
+    message: str
+    flags: int
+    missing: tuple[str, ...]
+    velocity_ratio: float | None = None
+    horizontal_position_ratio: float | None = None
+    vertical_position_ratio: float | None = None
+    compass_ratio: float | None = None
+    terrain_ratio: float | None = None
+    airspeed_ratio: float | None = None
+    horizontal_accuracy_m: float | None = None
+    vertical_accuracy_m: float | None = None
+
+    @property
+    def has_attitude(self) -> bool:
+        """Whether the attitude is good."""
+        return bool(self.flags & 1)
+
+    @property
+    def has_horizontal_velocity(self) -> bool:
+        """Whether the horizontal velocity is good."""
+        return bool(self.flags & 2)
+
+    @property
+    def has_relative_position(self) -> bool:
+        """Whether the position relative to where it began is good."""
+        return bool(self.flags & 8)
+
+    @property
+    def has_absolute_position(self) -> bool:
+        """Whether the position on the globe is good."""
+        return bool(self.flags & 16)
+
+    @property
+    def has_altitude(self) -> bool:
+        """Whether the altitude is good."""
+        return bool(self.flags & 32)
+
+
+class MissionProgress(Snapshot):
+    """The current mission item, counted from 0, and how many there are; None: not told, or no mission.
+
+    ``state`` is a MISSION_STATE (1 no mission, 2 not started, 3 active, 4 paused, 5 complete), 0 unknown.
+    """
+
+    current: int | None
+    total: int | None = None
+    state: int = 0
+
+
+class StatusText(Snapshot):
+    """What the vehicle said; ``severity`` is a MAV_SEVERITY, 0 emergency to 7 debug. "…" is a lost part."""
+
+    severity: int
+    text: str
+    at: float = 0.0
+    """When it was complete, in seconds on the event loop's clock."""
+
+    @property
+    def is_error(self) -> bool:
+        """Whether it is an error or worse."""
+        return self.severity <= MAV_SEVERITY_ERROR
+
+    def __str__(self) -> str:
+        name = SEVERITIES[self.severity] if self.severity < len(SEVERITIES) else str(self.severity)
+        return f"{name}: {self.text}"
+
+
+def mode(message: messages.Heartbeat, context: Context) -> Mode:
+    """The flight mode."""
+    return context.autopilot.mode_of(message, context.mode_names)
+
+
+def current_mode(message: messages.CurrentMode, context: Context) -> Mode | None:
+    """The same sooner; it lacks what HEARTBEAT says beside the number."""
+    if not message.custom_mode or context.before is None:
+        return None
+    return context.autopilot.mode(message.custom_mode, context.base_mode, context.mode_names)
+
+
+def armed(message: messages.Heartbeat) -> bool:
+    """Whether the motors are armed."""
+    return is_armed(message.base_mode)
+
+
+def system_status(message: messages.Heartbeat) -> int:
+    """MAV_STATE."""
+    return member(MavState, message.system_status)
+
+
+def vtol_state(message: messages.ExtendedSysState) -> int:
+    """MAV_VTOL_STATE."""
+    return member(MavVtolState, message.vtol_state)
+
+
+def landed_state(message: messages.ExtendedSysState) -> int | None:
+    """MAV_LANDED_STATE."""
+    if message.landed_state == MavLandedState.UNDEFINED:
+        return None
+    return member(MavLandedState, message.landed_state)
+
+
+def landed_state_of_heartbeat(message: messages.Heartbeat, context: Context) -> int | None:
+    """What some autopilots' HEARTBEAT says of it."""
+    told = context.autopilot.landed_state_of(message)
+    return None if told is None else MavLandedState(told)
+
+
+def version(message: messages.AutopilotVersion, context: Context) -> AutopilotVersion:
+    """Firmware and hardware."""
+    return context.autopilot.version_of(message)
+
+
+def capabilities(message: messages.AutopilotVersion) -> int:
+    """MAV_PROTOCOL_CAPABILITY."""
+    return MavProtocolCapability(message.capabilities)
+
+
+def system_time(message: messages.SystemTime) -> SystemTime:
+    """UTC, unless it still lies in the last century, and time since boot."""
+    unix_s = message.time_unix_usec / 1e6
+    return SystemTime(unix_s if unix_s > EARLIEST_UNIX_S else None, message.time_boot_ms / 1e3)
+
+
+def sensor_health(message: messages.SysStatus, context: Context) -> SensorHealth:
+    """What works and what does not, in the autopilot's reading of the bits."""
+    bits = (
+        message.onboard_control_sensors_present,
+        message.onboard_control_sensors_enabled,
+        message.onboard_control_sensors_health,
+    )
+    return SensorHealth(
+        *bits,
+        context.autopilot.failing_sensors(*bits),
+        context.autopilot.prearm_checks_pass(*bits),
+        message.load / 10,
+    )
+
+
+def ekf_health(message: messages.EkfStatusReport, context: Context) -> EstimatorHealth:
+    """ArduPilot's estimator."""
+    return EstimatorHealth(
+        message.NAME,
+        message.flags,
+        context.autopilot.missing_estimates(message.flags),
+        finite(message.velocity_variance),
+        finite(message.pos_horiz_variance),
+        finite(message.pos_vert_variance),
+        finite(message.compass_variance),
+        finite(message.terrain_alt_variance),
+        finite(message.airspeed_variance),
+    )
+
+
+def estimator_health(message: messages.EstimatorStatus, context: Context) -> EstimatorHealth:
+    """PX4's estimator."""
+    return EstimatorHealth(
+        message.NAME,
+        message.flags,
+        context.autopilot.missing_estimates(message.flags),
+        finite(message.vel_ratio),
+        finite(message.pos_horiz_ratio),
+        finite(message.pos_vert_ratio),
+        finite(message.mag_ratio),
+        finite(message.hagl_ratio),
+        finite(message.tas_ratio),
+        finite(message.pos_horiz_accuracy),
+        finite(message.pos_vert_accuracy),
+    )
+
+
+def mission_progress(message: messages.MissionCurrent) -> MissionProgress:
+    """Without a mission ``total`` is UINT16_MAX; 0 means that the vehicle does not tell it."""
+    state = member(MissionState, message.mission_state)
+    if message.total == U16:
+        return MissionProgress(None, None, state)
+    return MissionProgress(unless(message.seq, U16), unless(message.total, 0), state)
+
+
+def mission_reached(message: messages.MissionItemReached) -> int:
+    """The number of the item."""
+    return message.seq

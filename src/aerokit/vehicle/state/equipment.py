@@ -1,0 +1,268 @@
+"""What a vehicle has on board: receivers, batteries, range finders, outputs."""
+
+from __future__ import annotations
+
+from operator import attrgetter
+from typing import TYPE_CHECKING, Any
+
+from aerokit.mavlink.enums import GpsFixType, MavBatteryChargeState, MavPowerStatus
+from aerokit.snapshot import Snapshot
+from aerokit.vehicle.state.movement import place
+from aerokit.vehicle.state.reading import I16, U8, U16, Context, finite, member, scaled, unless
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from aerokit.autopilots import Autopilot
+    from aerokit.mavlink import messages
+
+__all__ = [
+    "Battery",
+    "GpsReceiver",
+    "Power",
+    "RangeFinder",
+    "RcChannels",
+    "ServoOutputs",
+    "Vibration",
+    "batteries",
+    "current",
+    "distance_sensors",
+    "first_gps",
+    "main_battery",
+    "power",
+    "range_finder",
+    "rc_channels",
+    "second_gps",
+    "servo_outputs",
+    "vibration",
+]
+
+_CHANNELS = attrgetter(*(f"chan{number}_raw" for number in range(1, 19)))
+_SERVOS = attrgetter(*(f"servo{number}_raw" for number in range(1, 17)))
+NORTH_CDEG = 36000
+LOOKING_DOWN = 25
+GPS_FIX_TYPE_3D = 3
+FULL_CELL = 0xFFFE
+"""The most a cell can say; a pack of more than 65.5 V fills several "cells" with it."""
+INVALID_QUALITY = 1
+OUTPUTS_PER_PORT = 16
+
+
+class RangeFinder(Snapshot):
+    """One distance sensor. ``distance_m`` is None when the reading is invalid.
+
+    ``orientation`` is a MAV_SENSOR_ORIENTATION, 25 looks down. ``quality_percent`` None: not told.
+    """
+
+    id: int
+    distance_m: float | None
+    orientation: int
+    min_distance_m: float | None = None
+    max_distance_m: float | None = None
+    quality_percent: int | None = None
+
+
+class GpsReceiver(Snapshot):
+    """One satellite receiver: 0 is GPS_RAW_INT, 1 is GPS2_RAW.
+
+    ``fix_type`` is a GPS_FIX_TYPE (0 no receiver, 1 no fix, 2 2D, 3 3D, 4 DGPS, 5 RTK float, 6 RTK fixed).
+    The place is None before a fix. Accuracies are one standard deviation.
+    """
+
+    index: int
+    fix_type: int
+    satellites: int | None = None
+    hdop: float | None = None
+    vdop: float | None = None
+    latitude_deg: float | None = None
+    longitude_deg: float | None = None
+    altitude_amsl_m: float | None = None
+    ground_speed_m_s: float | None = None
+    course_deg: float | None = None
+    horizontal_accuracy_m: float | None = None
+    vertical_accuracy_m: float | None = None
+    speed_accuracy_m_s: float | None = None
+    yaw_deg: float | None = None
+
+    @property
+    def has_3d_fix(self) -> bool:
+        """Whether it has a fix in three dimensions, or a better one."""
+        return GPS_FIX_TYPE_3D <= self.fix_type <= 8
+
+
+class Battery(Snapshot):
+    """One battery. ``cell_voltages_v`` is empty when cells are not measured one by one.
+
+    ``charge_state`` is a MAV_BATTERY_CHARGE_STATE (1 OK, 2 low, 3 critical …), 0 when it is not told.
+    """
+
+    id: int
+    voltage_v: float | None = None
+    current_a: float | None = None
+    remaining_percent: int | None = None
+    cell_voltages_v: tuple[float, ...] = ()
+    temperature_c: float | None = None
+    consumed_mah: int | None = None
+    consumed_wh: float | None = None
+    time_remaining_s: int | None = None
+    charge_state: int = 0
+
+
+class Power(Snapshot):
+    """The supply of the board and of its servos in volts, and MAV_POWER_STATUS bits; None: not measured."""
+
+    board_v: float | None
+    servos_v: float | None
+    flags: int
+
+
+class RcChannels(Snapshot):
+    """Pulse widths from the remote control in µs, None: channel unused; ``rssi`` 0 to 254, None: unknown."""
+
+    channels_us: tuple[int | None, ...]
+    rssi: int | None = None
+
+
+class ServoOutputs(Snapshot):
+    """Pulse widths to motors and servos in µs; ``outputs_us[0]`` is output 1, 0 means no pulses."""
+
+    outputs_us: tuple[int, ...]
+
+
+class Vibration(Snapshot):
+    """Vibration levels in m/s² and how often each accelerometer reached its limit since boot."""
+
+    x_m_s2: float
+    y_m_s2: float
+    z_m_s2: float
+    clippings: tuple[int, int, int]
+
+
+def distance_sensors(message: messages.DistanceSensor, context: Context) -> tuple[RangeFinder, ...]:
+    """Those known before, with this one in its place."""
+    quality = message.signal_quality
+    is_valid = quality != INVALID_QUALITY
+    sensor = RangeFinder(
+        message.id,
+        message.current_distance / 100 if is_valid else None,
+        message.orientation,
+        message.min_distance / 100,
+        message.max_distance / 100,
+        quality if quality > INVALID_QUALITY else None,
+    )
+    return _with(context.before, sensor, _id_of)
+
+
+def range_finder(message: messages.Rangefinder, context: Context) -> tuple[RangeFinder, ...]:
+    """ArduPilot's older message about the one that looks down."""
+    return _with(context.before, RangeFinder(0, finite(message.distance), LOOKING_DOWN), _id_of)
+
+
+def first_gps(message: messages.GpsRawInt, context: Context) -> tuple[GpsReceiver, ...]:
+    """The receivers known before, with the first in its place."""
+    return _with(context.before, _gps_receiver(message, 0), _index_of)
+
+
+def second_gps(message: messages.Gps2Raw, context: Context) -> tuple[GpsReceiver, ...]:
+    """The receivers known before, with the second in its place."""
+    return _with(context.before, _gps_receiver(message, 1), _index_of)
+
+
+def _gps_receiver(message: messages.GpsRawInt | messages.Gps2Raw, index: int) -> GpsReceiver:
+    where = place(message.lat, message.lon) if message.fix_type >= GpsFixType.TYPE_2D_FIX else None
+    latitude, longitude = where or (None, None)
+    return GpsReceiver(
+        index,
+        member(GpsFixType, message.fix_type),
+        unless(message.satellites_visible, U8),
+        scaled(message.eph, U16, 100),
+        scaled(message.epv, U16, 100),
+        latitude,
+        longitude,
+        message.alt / 1e3 if where else None,
+        scaled(message.vel, U16, 100),
+        scaled(message.cog, U16, 100),
+        scaled(message.h_acc, 0, 1000),
+        scaled(message.v_acc, 0, 1000),
+        scaled(message.vel_acc, 0, 1000),
+        None if message.yaw in (0, U16) else message.yaw % NORTH_CDEG / 100,
+    )
+
+
+def batteries(message: messages.BatteryStatus, context: Context) -> tuple[Battery, ...]:
+    """Those known before, with this one in its place; cells 11 to 14 are 0 where there are none."""
+    cells = [mv for mv in message.voltages if mv != U16]
+    cells += [mv for mv in message.voltages_ext if mv not in (0, U16)]
+    is_pack = len(cells) == 1 or FULL_CELL in cells
+    battery = Battery(
+        message.id,
+        sum(cells) / 1e3 if cells else None,
+        current(message.current_battery, context.autopilot),
+        unless(message.battery_remaining, -1),
+        () if is_pack else tuple(mv / 1e3 for mv in cells),
+        scaled(message.temperature, I16, 100),
+        message.current_consumed if message.current_consumed >= 0 else None,
+        message.energy_consumed / 36 if message.energy_consumed >= 0 else None,
+        unless(message.time_remaining, 0),
+        member(MavBatteryChargeState, message.charge_state),
+    )
+    return _with(context.before, battery, _id_of)
+
+
+def main_battery(message: messages.SysStatus, context: Context) -> tuple[Battery, ...] | None:
+    """The little that SYS_STATUS says of the first battery; None when that is nothing."""
+    voltage = None if message.voltage_battery in (0, U16) else message.voltage_battery / 1e3
+    remaining = unless(message.battery_remaining, -1)
+    if voltage is None and remaining is None:
+        return None
+    battery = Battery(0, voltage, current(message.current_battery, context.autopilot), remaining)
+    return _with(context.before, battery, _id_of)
+
+
+def current(centiampere: int, autopilot: Autopilot) -> float | None:
+    """Amperes, None for what this autopilot sends when it does not know."""
+    return None if centiampere in autopilot.unknown_currents_ca else centiampere / 100
+
+
+def power(message: messages.PowerStatus) -> Power:
+    """Supply voltages; 0 stands for none."""
+    return Power(
+        scaled(message.Vcc, 0, 1000), scaled(message.Vservo, 0, 1000), member(MavPowerStatus, message.flags)
+    )
+
+
+def rc_channels(message: messages.RcChannels) -> RcChannels:
+    """As many channels as the receiver has."""
+    count = min(message.chancount, 18)
+    channels = _CHANNELS(message)[:count]
+    return RcChannels(tuple([None if us == U16 else us for us in channels]), unless(message.rssi, U8))
+
+
+def servo_outputs(message: messages.ServoOutputRaw, context: Context) -> ServoOutputs:
+    """Those known before, with the sixteen of this port in their place, or eight in MAVLink 1."""
+    frame = message.received_frame
+    outputs: tuple[int, ...] = _SERVOS(message)[: 8 if frame is not None and frame.version == 1 else 16]
+    before: tuple[int, ...] = () if context.before is None else context.before.outputs_us
+    begin = message.port * OUTPUTS_PER_PORT
+    head = (*before[:begin], *(0,) * (begin - len(before)))
+    return ServoOutputs((*head, *outputs, *before[begin + len(outputs) :]))
+
+
+def vibration(message: messages.Vibration) -> Vibration:
+    """Levels and clipping counters."""
+    clippings = (message.clipping_0, message.clipping_1, message.clipping_2)
+    return Vibration(message.vibration_x, message.vibration_y, message.vibration_z, clippings)
+
+
+def _with(items: tuple[Any, ...] | None, item: Any, key: Callable[[Any], int]) -> tuple[Any, ...]:
+    """The items in the order of their numbers, with this one in the place of the former of its number."""
+    number = key(item)
+    return tuple(sorted((item, *(each for each in items or () if key(each) != number)), key=key))
+
+
+def _id_of(item: Battery | RangeFinder) -> int:
+    return item.id
+
+
+def _index_of(receiver: GpsReceiver) -> int:
+    return receiver.index

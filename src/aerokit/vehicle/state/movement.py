@@ -1,0 +1,261 @@
+"""Where a vehicle is and how it moves."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from aerokit import geo
+from aerokit.position import Position
+from aerokit.snapshot import Snapshot
+from aerokit.vehicle.state.reading import U16, Context, finite
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+    from aerokit.mavlink import messages
+
+__all__ = [
+    "Attitude",
+    "Home",
+    "LocalPosition",
+    "Velocity",
+    "Wind",
+    "air_speed_m_s",
+    "attitude",
+    "attitude_of_quaternion",
+    "climb_m_s",
+    "global_velocity",
+    "ground_speed_m_s",
+    "heading_deg",
+    "heading_of_hud",
+    "home",
+    "local_position",
+    "local_velocity",
+    "origin",
+    "place",
+    "position",
+    "throttle_percent",
+    "wind",
+    "wind_of_covariance",
+]
+
+NOWHERE = 100_000
+"""Within 0.01 degrees of 0°N 0°E nothing is believed."""
+SAME_ALTITUDE_MM = 100
+
+
+class Home(Snapshot):
+    """Where the vehicle returns to (HOME_POSITION); ``north_m`` … are from the origin, None: not told."""
+
+    latitude_deg: float
+    longitude_deg: float
+    altitude_amsl_m: float
+    north_m: float | None = None
+    east_m: float | None = None
+    down_m: float | None = None
+
+    @property
+    def position(self) -> Position:
+        """The place as a target without an altitude, so that going there keeps the present one."""
+        return Position(self.latitude_deg, self.longitude_deg)
+
+
+class LocalPosition(Snapshot):
+    """Metres from the estimator's origin, and velocity in m/s (LOCAL_POSITION_NED)."""
+
+    north_m: float
+    east_m: float
+    down_m: float
+    north_m_s: float
+    east_m_s: float
+    down_m_s: float
+
+
+class Velocity(Snapshot):
+    """Velocity over ground in m/s."""
+
+    north_m_s: float
+    east_m_s: float
+    down_m_s: float
+
+    @property
+    def ground_speed_m_s(self) -> float:
+        """Horizontal speed."""
+        return math.hypot(self.north_m_s, self.east_m_s)
+
+    @property
+    def course_deg(self) -> float:
+        """Direction of the horizontal movement, 0 to 360."""
+        return geo.wrap_360(math.degrees(math.atan2(self.east_m_s, self.north_m_s)))
+
+
+class Attitude(Snapshot):
+    """Attitude in degrees and turn rates about the body's axes in degrees per second.
+
+    ``roll_deg`` right side down, ``pitch_deg`` nose up, ``yaw_deg`` −180 to 180 clockwise from north; a rate
+    is None when it is not told.
+    """
+
+    roll_deg: float
+    pitch_deg: float
+    yaw_deg: float
+    roll_rate_deg_s: float | None = None
+    pitch_rate_deg_s: float | None = None
+    yaw_rate_deg_s: float | None = None
+
+    @classmethod
+    def from_quaternion(
+        cls,
+        w: float,
+        x: float,
+        y: float,
+        z: float,
+        rates_deg_s: tuple[float | None, float | None, float | None],
+    ) -> Self:
+        """The attitude of a quaternion from earth (north, east, down) to body axes, w first."""
+        roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+        pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
+        yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        return cls(math.degrees(roll), math.degrees(pitch), math.degrees(yaw), *rates_deg_s)
+
+    @property
+    def quaternion(self) -> tuple[float, float, float, float]:
+        """The same attitude as w, x, y, z."""
+        halves = (math.radians(angle) / 2 for angle in (self.roll_deg, self.pitch_deg, self.yaw_deg))
+        (cr, sr), (cp, sp), (cy, sy) = ((math.cos(half), math.sin(half)) for half in halves)
+        return (
+            cr * cp * cy + sr * sp * sy,
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+        )
+
+
+class Wind(Snapshot):
+    """``direction_deg`` is where it comes from, 0 to 360; speeds in m/s, ``down_m_s`` None when not told."""
+
+    speed_m_s: float
+    direction_deg: float
+    down_m_s: float | None = None
+
+
+def place(latitude: int, longitude: int) -> tuple[float, float] | None:
+    """Degrees from 1e-7 degrees; None where there is no fix yet, and for what is no place on earth.
+
+    Without a fix, autopilots say 0, 0, or a place near it: ArduPlane was seen to reckon its way from there.
+    """
+    if abs(latitude) < NOWHERE and abs(longitude) < NOWHERE:
+        return None
+    if abs(latitude) > 900_000_000 or abs(longitude) > 1_800_000_000:
+        return None
+    return latitude / 1e7, longitude / 1e7
+
+
+def position(message: messages.GlobalPositionInt, context: Context) -> Position | None:
+    """The position, None before the first fix.
+
+    Until home is set, ``relative_alt`` is no more than the altitude above the sea once again.
+    """
+    where = place(message.lat, message.lon)
+    if where is None:
+        return None
+    is_known = context.home_is_known() or abs(message.relative_alt - message.alt) > SAME_ALTITUDE_MM
+    return Position(*where, message.alt / 1e3, message.relative_alt / 1e3 if is_known else None)
+
+
+def global_velocity(message: messages.GlobalPositionInt) -> Velocity | None:
+    """Velocity over ground, None before the first fix."""
+    if place(message.lat, message.lon) is None:
+        return None
+    return Velocity(message.vx / 100, message.vy / 100, message.vz / 100)
+
+
+def heading_deg(message: messages.GlobalPositionInt) -> float | None:
+    """Where the nose points, 0 to below 360."""
+    return None if message.hdg == U16 else message.hdg / 100 % 360
+
+
+def local_position(message: messages.LocalPositionNed) -> LocalPosition:
+    """Position and velocity in the local frame."""
+    return LocalPosition(message.x, message.y, message.z, message.vx, message.vy, message.vz)
+
+
+def local_velocity(message: messages.LocalPositionNed) -> Velocity:
+    """The velocity alone."""
+    return Velocity(message.vx, message.vy, message.vz)
+
+
+def heading_of_hud(message: messages.VfrHud) -> float:
+    """The same in whole degrees."""
+    return float(message.heading % 360)
+
+
+def ground_speed_m_s(message: messages.VfrHud) -> float:
+    """Ground speed."""
+    return message.groundspeed
+
+
+def air_speed_m_s(message: messages.VfrHud) -> float | None:
+    """Air speed; PX4 without a sensor says NaN."""
+    return finite(message.airspeed)
+
+
+def climb_m_s(message: messages.VfrHud) -> float:
+    """Climb rate."""
+    return message.climb
+
+
+def throttle_percent(message: messages.VfrHud) -> float:
+    """Throttle."""
+    return float(message.throttle)
+
+
+def attitude(message: messages.Attitude) -> Attitude:
+    """Euler angles and rates."""
+    degrees = math.degrees
+    return Attitude(
+        degrees(message.roll),
+        degrees(message.pitch),
+        degrees(message.yaw),
+        degrees(message.rollspeed),
+        degrees(message.pitchspeed),
+        degrees(message.yawspeed),
+    )
+
+
+def attitude_of_quaternion(message: messages.AttitudeQuaternion) -> Attitude:
+    """The same from a quaternion."""
+    rates = (
+        math.degrees(message.rollspeed),
+        math.degrees(message.pitchspeed),
+        math.degrees(message.yawspeed),
+    )
+    return Attitude.from_quaternion(message.q1, message.q2, message.q3, message.q4, rates)
+
+
+def home(message: messages.HomePosition) -> Home | None:
+    """Where it returns to."""
+    where = place(message.latitude, message.longitude)
+    if where is None:
+        return None
+    return Home(*where, message.altitude / 1e3, finite(message.x), finite(message.y), finite(message.z))
+
+
+def origin(message: messages.GpsGlobalOrigin) -> Position | None:
+    """Where the local frame has its zero."""
+    where = place(message.latitude, message.longitude)
+    return None if where is None else Position(*where, message.altitude / 1e3)
+
+
+def wind(message: messages.Wind) -> Wind:
+    """ArduPilot tells where the wind comes from."""
+    return Wind(message.speed, geo.wrap_360(message.direction), finite(message.speed_z))
+
+
+def wind_of_covariance(message: messages.WindCov) -> Wind | None:
+    """PX4 tells the wind's own vector, which points where it goes."""
+    if not (math.isfinite(message.wind_x) and math.isfinite(message.wind_y)):
+        return None
+    comes_from = math.degrees(math.atan2(-message.wind_y, -message.wind_x))
+    return Wind(math.hypot(message.wind_x, message.wind_y), geo.wrap_360(comes_from), finite(message.wind_z))

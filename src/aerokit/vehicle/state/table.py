@@ -1,0 +1,63 @@
+"""The table of all states in docs/states.md: ``python -m aerokit.vehicle.state.table > docs/states.md``."""
+
+from __future__ import annotations
+
+import ast
+import sys
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from aerokit.vehicle.state import states
+from aerokit.vehicle.state.told import message_type
+
+if TYPE_CHECKING:
+    from aerokit.vehicle.state.told import Told
+
+__all__ = ["documentation", "rendered"]
+
+HEAD = """# What a vehicle tells
+
+Each is a cell of the vehicle: `vehicle.position.value`, `.latest`, `.age`, `.source`, `.fresh(within=1)`,
+`await vehicle.position.wait_until(…)`, `async for … in vehicle.position.changes()`. Values are in SI units and
+degrees; their classes are in [vehicle/state](../src/aerokit/vehicle/state). The messages are named with the best
+source first, and with the rate at which the vehicle is asked for them unless `connect(rates=…)` says otherwise.
+
+| State | Type | What it is | Messages |
+|---|---|---|---|
+"""
+
+
+def documentation() -> dict[str, tuple[str, str]]:
+    """Name → type and documentation of each state, as they stand in the source."""
+    (body,) = (
+        node.body
+        for node in ast.parse(Path(states.__file__).read_text(encoding="utf-8")).body
+        if isinstance(node, ast.ClassDef)
+    )
+    found: dict[str, tuple[str, str]] = {}
+    for node, below in pairwise(body):
+        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+            is_text = isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant)
+            text = str(below.value.value) if is_text else ""  # type: ignore[attr-defined]
+            kind = ast.unparse(node.annotation).removeprefix("Told[").removesuffix("]")
+            found[node.target.id] = (kind, text)
+    return found
+
+
+def rendered() -> str:
+    """The whole page."""
+    texts = documentation()
+    return HEAD + "".join(_row(name, *texts[name], told) for name, told in states.STATES.items())
+
+
+def _row(name: str, kind: str, text: str, told: Told[Any]) -> str:
+    sources = ", ".join(
+        f"{message_type(each.message).NAME}{f' at {each.hz:g} Hz' if each.hz else ''}"
+        for each in told.sources
+    )
+    return f"| `{name}` | `{kind}` | {text.partition(' (')[0].rstrip('.')} | {sources} |\n"
+
+
+if __name__ == "__main__":
+    sys.stdout.write(rendered())

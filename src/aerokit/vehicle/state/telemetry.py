@@ -1,0 +1,285 @@
+"""`Telemetry`: the state cells of one vehicle, and what each message does to them."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+from aerokit.autopilots import Autopilot, autopilot_for
+from aerokit.mavlink.message import offset_of
+from aerokit.runtime.cells import Source, StateCell
+from aerokit.runtime.components import is_autopilot
+from aerokit.vehicle.state.reading import Context
+from aerokit.vehicle.state.states import DEFAULT_RATES_HZ, LAZY, SOURCES, STATES, States
+from aerokit.vehicle.state.status_text import StatusTextAssembler
+from aerokit.vehicle.state.streamed import StreamedMessage
+from aerokit.vehicle.state.told import MESSAGE_IDS, By, message_type
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from aerokit.autopilots.modes import Mode
+    from aerokit.mavlink import messages
+    from aerokit.mavlink.frame import Frame
+    from aerokit.mavlink.message import Message
+    from aerokit.vehicle.state.condition import StatusText
+
+__all__ = ["Telemetry"]
+
+BETTER_SOURCE_S = 2.0
+"""For so long the second-best source of a value keeps quiet after the best one."""
+MOST_MODE_NAMES = 256
+
+Handler = Callable[[Any, Source], None]
+
+
+class Telemetry(States):
+    """All state cells of one vehicle, and what each message does to them.
+
+    Only messages of system ``system_id``, component ``component_id`` (the autopilot) change anything; messages that
+    the program built itself are let through. ``handles`` has the entry point for each message id, ``streams`` those
+    that frames of streamed messages are given to. ``clock`` gives seconds; without ``autopilot`` the first HEARTBEAT
+    says which it is.
+    """
+
+    def __init__(
+        self,
+        clock: Callable[[], float],
+        *,
+        system_id: int = 1,
+        component_id: int = 1,
+        autopilot: Autopilot | None = None,
+    ) -> None:
+        self.system_id, self.component_id = system_id, component_id
+        self.autopilot = autopilot or Autopilot(0)
+        self._knows_autopilot = autopilot is not None
+        self._clock = clock
+        self._lock = threading.RLock()  # any thread may look, and what is looked at is worked out then
+        self._arrived_at: float | None = None
+        self._texts = StatusTextAssembler()
+        self._mode_names: dict[int, str] = {}
+        self._context = Context(self.autopilot, self._mode_names, lambda: self.home.is_known)
+        self._cells: dict[str, StateCell[Any]] = {
+            name: StateCell(name, clock, told.waits_for(self.autopilot), stamp=self._time_of_arrival)
+            for name, told in STATES.items()
+        }
+        handlers = {name: self._handler(name) for name in (*SOURCES, "AvailableModes")}
+        self._handlers = {MESSAGE_IDS[name]: self._entry(name, each) for name, each in handlers.items()}
+        self._streams = {MESSAGE_IDS[name]: self._streamed(name, handlers[name]) for name in LAZY}
+        for cell_name, cell in self._cells.items():
+            feeding = (each.message for each in STATES[cell_name].sources if each.message in LAZY)
+            cell._feed_from(*(self._streams[MESSAGE_IDS[name]] for name in feeding))
+
+    # ------------------------------------------------------------------------------- feeding
+
+    @property
+    def handles(self) -> Mapping[int, Callable[[Any], None]]:
+        """Message id → what takes a message of this kind."""
+        return self._handlers
+
+    @property
+    def streams(self) -> Mapping[int, StreamedMessage]:
+        """Message id → what takes frames of this kind: they are worked out when somebody looks at their cells."""
+        return self._streams
+
+    def accepts(self, frame: Frame) -> bool:
+        """Whether this is the vehicle's own autopilot talking."""
+        return frame.system_id == self.system_id and frame.component_id == self.component_id
+
+    def receive(self, message: Message) -> None:
+        """Take any message; those that say nothing about the state are passed over."""
+        handler = self._handlers.get(message.ID)
+        if handler is not None:
+            handler(message)
+
+    def expire(self, now: float) -> None:
+        """Tell status texts whose ends have not come; call it about once a second."""
+        self._tell(self._texts.expire(now), self._source("Statustext"))
+
+    def forget(self) -> None:
+        """Make everything unknown again, as after a reboot; texts are remembered."""
+        for stream in self._streams.values():
+            stream.forget()
+        for cell in self._cells.values():
+            cell.forget()
+
+    def close(self, error: BaseException) -> None:
+        """Nothing will come any more: whoever waits gets ``error``."""
+        for cell in self._cells.values():
+            cell.close(error)
+
+    # ------------------------------------------------------------------------------- reading
+
+    @property
+    def cells(self) -> Mapping[str, StateCell[Any]]:
+        """Name → cell."""
+        return self._cells
+
+    @property
+    def mode_names(self) -> Mapping[int, str]:
+        """custom_mode → name of the modes that the vehicle told by AVAILABLE_MODES and no table knows."""
+        return self._mode_names
+
+    @property
+    def default_rates(self) -> Mapping[type[Message], float]:
+        """Message class → Hz, for a program that asks for nothing special."""
+        known = {message_type(name): hz for name, hz in DEFAULT_RATES_HZ.items()}
+        return {message: hz for message, hz in known.items() if self.autopilot.sends(message)}
+
+    def required_messages(self, name: str) -> tuple[type[Message], ...]:
+        """The messages to ask for when a program wants the cell of this name."""
+        return tuple(STATES[name].asked_of(self.autopilot))
+
+    @property
+    def is_armed(self) -> bool:
+        """Whether the last heartbeat says armed; False before the first, and after a reboot until the next one."""
+        return self.armed.latest is True
+
+    @property
+    def is_surely_disarmed(self) -> bool:
+        """Whether the last heartbeat says disarmed; False while it is not known."""
+        return self.armed.latest is False
+
+    @property
+    def is_vtol(self) -> bool:
+        """Whether it can hover and cruise on wings: EXTENDED_SYS_STATE tells a VTOL state."""
+        return bool(self.vtol_state.latest)
+
+    @property
+    def mode_name(self) -> str:
+        """Name of the flight mode, ``"unknown"`` before the first heartbeat."""
+        mode = self.mode.latest
+        return "unknown" if mode is None else mode.name
+
+    def is_in(self, mode: Mode) -> bool:
+        """Whether the last heartbeat told this mode."""
+        latest = self.mode.latest
+        return latest is not None and latest.custom_mode == mode.custom_mode
+
+    def texts_since(self, at: float) -> tuple[StatusText, ...]:
+        """What the vehicle said since then (64 texts at most), oldest first."""
+        return self._texts.recent(at)
+
+    # -------------------------------------------------------------------------- the machinery
+
+    def _cell_of(self, name: str) -> StateCell[Any]:
+        return self._cells[name]
+
+    def _time_of_arrival(self) -> float:
+        """Of the message that is being worked out."""
+        return self._clock() if self._arrived_at is None else self._arrived_at
+
+    def _source(self, class_name: str) -> Source:
+        return Source(self.system_id, self.component_id, message_type(class_name).NAME)
+
+    def _entry(self, class_name: str, handler: Handler) -> Callable[[Any], None]:
+        source = self._source(class_name)
+        system_id, component_id = self.system_id, self.component_id
+
+        def take(message: Message) -> None:
+            frame = message.received_frame
+            if frame is None or (frame.system_id == system_id and frame.component_id == component_id):
+                with self._lock:
+                    handler(message, source)
+
+        return take
+
+    def _handler(self, class_name: str) -> Handler:
+        """What a message of this class does."""
+        by_itself: Mapping[str, Handler] = {
+            "AvailableModes": self._on_available_modes,
+            "Statustext": self._on_status_text,
+        }
+        if class_name in by_itself:
+            return by_itself[class_name]
+        tellers = [self._teller(self._cells[told.name], each) for told, each in SOURCES[class_name]]
+
+        def handler(message: Any, source: Source) -> None:
+            for teller in tellers:
+                teller(message, source)
+
+        def on_heartbeat(message: Any, source: Source) -> None:
+            if self._is_of_autopilot(message):
+                handler(message, source)
+
+        return on_heartbeat if class_name == "Heartbeat" else tellers[0] if len(tellers) == 1 else handler
+
+    def _teller(self, cell: StateCell[Any], by: By[Any]) -> Handler:
+        """What one message says of one thing; None when it does not know it."""
+        decode, context = by.decode, self._context
+        assert decode is not None
+
+        def tell(message: Any, source: Source) -> None:
+            value = decode(message)
+            if value is not None:
+                cell.set(value, source)
+
+        def tell_knowing(message: Any, source: Source) -> None:
+            if by.second_best and self._has_better(cell, source):
+                return
+            if by.knowing:
+                context.before = cell.latest
+                value = decode(message, context)
+            else:
+                value = decode(message)
+            if value is not None:
+                cell.set(value, source)
+
+        return tell_knowing if by.knowing or by.second_best else tell
+
+    def _streamed(self, class_name: str, handler: Handler) -> StreamedMessage:
+        source, kind = self._source(class_name), message_type(class_name)
+        decode = kind.decode_body
+
+        def apply(frame: Frame, message: Message | None) -> None:
+            before, self._arrived_at = self._arrived_at, frame.received_at
+            try:
+                handler(decode(frame.body, frame) if message is None else message, source)
+            finally:
+                self._arrived_at = before
+
+        rows = SOURCES[class_name]
+        cells = [self._cells[told.name] for told, _ in rows]
+        one_of = next((each.one_of for _, each in rows if each.one_of is not None), None)
+        number_at = None if one_of is None else offset_of(kind, one_of)
+        return StreamedMessage(self.component_id, cells, number_at, apply, self._lock)
+
+    def _has_better(self, cell: StateCell[Any], source: Source) -> bool:
+        """Whether another message has told this value lately; that one is the better source."""
+        return (
+            cell.source is not None
+            and cell.source.message != source.message
+            and self._time_of_arrival() - cell.updated_at < BETTER_SOURCE_S
+        )
+
+    # ------------------------------------------------------------------- what is not one value
+
+    def _is_of_autopilot(self, heartbeat: messages.Heartbeat) -> bool:
+        """Whether it is not of a ground station or a companion that took the autopilot's ids."""
+        if not is_autopilot(heartbeat):
+            return False
+        if not self._knows_autopilot:
+            self._learn_autopilot(heartbeat)
+        self._context.base_mode = heartbeat.base_mode
+        return True
+
+    def _learn_autopilot(self, heartbeat: messages.Heartbeat) -> None:
+        self.autopilot = self._context.autopilot = autopilot_for(heartbeat)
+        self._knows_autopilot = True
+        for name, cell in self._cells.items():
+            cell.waits_for = STATES[name].waits_for(self.autopilot)
+
+    def _on_available_modes(self, message: messages.AvailableModes, source: Source) -> None:
+        name = self.autopilot.learn_mode_name(message.custom_mode, message.mode_name)
+        if name is not None and (
+            message.custom_mode in self._mode_names or len(self._mode_names) < MOST_MODE_NAMES
+        ):
+            self._mode_names[message.custom_mode] = name
+
+    def _on_status_text(self, message: messages.Statustext, source: Source) -> None:
+        self._tell(self._texts.receive(message, self._clock()), source)
+
+    def _tell(self, texts: Iterable[StatusText], source: Source) -> None:
+        for text in texts:
+            self.status_text.set(text, source)

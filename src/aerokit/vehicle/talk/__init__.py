@@ -1,0 +1,1 @@
+"""Talking to one vehicle: commands, rates, transfers, silence, keys."""

@@ -1,0 +1,249 @@
+"""`Talk`: what is sent to one vehicle and heard of it, under one address."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import anyio
+
+from aerokit.autopilots import autopilot_for
+from aerokit.errors import CommandRejected, ConnectionClosed
+from aerokit.mavlink.messages import CommandAck
+from aerokit.runtime.background import Background
+from aerokit.runtime.cells import Source, StateCell
+from aerokit.runtime.events import (
+    ArmedChanged,
+    LandedStateChanged,
+    LinkReport,
+    LinkRestored,
+    ModeChanged,
+    StatusTextReceived,
+)
+from aerokit.vehicle.state.telemetry import Telemetry
+from aerokit.vehicle.talk.commands import CommandSender
+from aerokit.vehicle.talk.constants import learn_constants
+from aerokit.vehicle.talk.rates import MessageRates
+from aerokit.vehicle.talk.transfers import Transfers
+from aerokit.vehicle.talk.watch import LinkWatch, VehicleWatch
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+
+    from aerokit.autopilots import Autopilot
+    from aerokit.mavlink.message import Message
+    from aerokit.mavlink.messages import Heartbeat
+    from aerokit.runtime.bus import Detach
+    from aerokit.runtime.connection import Connection
+    from aerokit.runtime.events import Event
+
+__all__ = ["Talk"]
+
+SETTLE_S = 0.3
+"""How long after a refusal the vehicle's texts about it are waited for."""
+ACTION_HZ = 4.0
+"""How fast an action wants to be told what it waits for."""
+RESULT_ACCEPTED = 0
+RESULTS_OF_REFUSAL = (1, 2, 4)
+
+
+class Talk:
+    """The autopilot of one remote system: its address, its state, its commands, rates and transfers, and its silence.
+
+    ``detach`` are called when the vehicle is let go, ``on_reboot`` after the vehicle has rebooted.
+    """
+
+    def __init__(
+        self, connection: Connection, system_id: int, component_id: int, heartbeat: Heartbeat
+    ) -> None:
+        self.connection, self.system_id, self.component_id = connection, system_id, component_id
+        self.vehicle_type: int = heartbeat.type
+        self.autopilot: Autopilot = autopilot_for(heartbeat)
+        self.telemetry = Telemetry(
+            connection.now, system_id=system_id, component_id=component_id, autopilot=self.autopilot
+        )
+        self.link_quality: StateCell[LinkReport] = StateCell(
+            "link_quality", connection.now, "second of traffic"
+        )
+        self.commands = CommandSender(
+            connection, system_id, component_id, self.describe_link, lambda: self.link_watch.round_trip_s
+        )
+        self.rates = MessageRates(
+            connection, self.commands, system_id, component_id, self.autopilot.stream_groups
+        )
+        self.watch = VehicleWatch(connection, system_id, component_id, self._note_reboot)
+        self.link_watch = LinkWatch(
+            connection, system_id, component_id, self._on_link_report, self.watch.note_answer
+        )
+        self.background = Background(connection.fail)
+        self.transfers = Transfers(
+            connection,
+            system_id,
+            component_id,
+            autopilot=self.autopilot,
+            version=self.telemetry.version,
+            background=self.background,
+            describe=self.describe_link,
+            round_trip_s=lambda: self.link_watch.round_trip_s,
+            send_command=self.commands.send_long,
+        )
+        self.is_closed = False
+        self.cells: list[StateCell[Any]] = [self.link_quality]
+        """Cells that end with the talk, beside those of the telemetry."""
+        self.detach: list[Detach] = []
+        self.on_reboot: list[Callable[[], None]] = [self.rates.ask_again]
+        self._attach_telemetry()
+
+    # ------------------------------------------------------------------------- begin and end
+
+    def start(self, heartbeat: Heartbeat, rates: Mapping[type[Message], float] | None) -> None:
+        """Take the first heartbeat, ask for streams and constants, and watch."""
+        self.telemetry.receive(heartbeat)
+        for message_type, hz in (self.telemetry.default_rates if rates is None else rates).items():
+            self.rates.want(message_type, hz, is_optional=rates is None)
+        for function in (self.rates.run, self.rates.watch, self._run_link_watch, self._learn_constants):
+            self.background.start(function, f"aerokit {function.__qualname__}")
+
+    def close(self) -> None:
+        """Say and hear nothing more; who waits gets ConnectionClosed."""
+        self.is_closed = self.transfers.is_closed = True
+        self._on_end(ConnectionClosed("the block of this vehicle was left"))
+        for detach in self.detach:
+            detach()
+        self.commands.close()
+        self.watch.close()
+        self.link_watch.close()
+        self.rates.close()
+
+    def send(self, message: Message) -> None:
+        """Send one message as it is; ConnectionClosed after :meth:`close`."""
+        if self.is_closed:
+            raise ConnectionClosed("the block of this vehicle was left; nothing was sent")
+        self.connection.send(message)
+
+    # ------------------------------------------------------------------------------- hearing
+
+    @contextmanager
+    def streaming(self, *names: str) -> Iterator[None]:
+        """Have what tells these states sent, also when the program asked for no rates of its own."""
+        releases = [
+            self.rates.want(message_type, ACTION_HZ, is_optional=True)
+            for name in names
+            for message_type in self.telemetry.required_messages(name)
+        ]
+        try:
+            yield
+        finally:
+            for release in releases:
+                release()
+
+    @contextmanager
+    def refusals_of(self, command: int) -> Iterator[list[CommandAck]]:
+        """Collect later acks of a command that refuse what an earlier one accepted (PX4 acks some twice)."""
+        refusals: list[CommandAck] = []
+
+        def note(ack: CommandAck) -> None:
+            frame = ack.received_frame
+            is_its = frame is not None and frame.component_id == self.component_id
+            if ack.command != command or not is_its or not self.commands.is_for_us(ack):
+                return
+            if ack.result == RESULT_ACCEPTED:
+                refusals.clear()
+            elif ack.result in RESULTS_OF_REFUSAL:
+                refusals.append(ack)
+
+        detach = self.connection.bus.attach(CommandAck, note, system_id=self.system_id)
+        try:
+            yield refusals
+        finally:
+            detach()
+
+    async def settle(self) -> None:
+        """Give the vehicle's texts the time to come."""
+        await anyio.sleep(SETTLE_S)
+
+    def explained(
+        self, error: CommandRejected, since: float, reasons: tuple[str, ...] = ()
+    ) -> CommandRejected:
+        """The same refusal with what the vehicle has said since then, and these reasons."""
+        texts = tuple(text for text in self.texts_since(since) if text not in reasons)
+        return CommandRejected(
+            str(error), command=error.command, result=error.result, reasons=(*texts, *reasons)
+        )
+
+    def texts_since(self, at: float) -> tuple[str, ...]:
+        """What the vehicle said (STATUSTEXT) since this time on the loop's clock, oldest first."""
+        return tuple(each.text for each in self.telemetry.texts_since(at))
+
+    @property
+    def heartbeat_age(self) -> float:
+        """Seconds since the last heartbeat of the autopilot."""
+        return self.connection.now() - self.watch.last_heartbeat_at
+
+    def describe_link(self) -> str:
+        """One line on how well the vehicle is heard, for error texts."""
+        received, lost = self.connection.counts(self.system_id)
+        loss = (
+            f"{100 * lost / (received + lost):.0f} % of its frames lost"
+            if received + lost
+            else "nothing heard"
+        )
+        if signatures := self.connection.describe_signatures(self.system_id, self.component_id):
+            loss = f"{loss}, {signatures}"
+        texts = self.texts_since(self.connection.now() - 10.0)
+        said = f", it said: {'; '.join(texts[-3:])}" if texts else ""
+        return f"last heartbeat {self.heartbeat_age:.1f} s ago, {loss}{said}"
+
+    # -------------------------------------------------------------------------------- events
+
+    def publish(self, event_type: type[Event], *fields: Any) -> None:
+        """Tell who listens to events of this vehicle."""
+        self.connection.bus.publish(event_type(self.connection.now(), self.system_id, *fields))
+
+    def _attach_telemetry(self) -> None:
+        bus, streams = self.connection.bus, self.telemetry.streams
+        for message_id, handler in self.telemetry.handles.items():
+            message_type = bus.dialect.get(message_id)
+            if message_type is None:
+                continue
+            if message_id in streams:
+                detach = bus.attach_lazily(message_type, streams[message_id].take, system_id=self.system_id)
+            else:
+                detach = bus.attach(message_type, handler, system_id=self.system_id)
+            self.detach.append(detach)
+        telemetry, publish = self.telemetry, self.publish
+        self.detach += [
+            telemetry.mode.observe(lambda old, new: publish(ModeChanged, old and old.name, new.name)),
+            telemetry.armed.observe(lambda _, new: publish(ArmedChanged, new)),
+            telemetry.landed_state.observe(lambda old, new: publish(LandedStateChanged, old, new)),
+            telemetry.status_text.observe(
+                lambda _, new: publish(StatusTextReceived, new.severity, new.text), every_arrival=True
+            ),
+            bus.attach_event(LinkRestored, lambda _: self.rates.ask_again()),
+            self.connection.on_end(self._on_end),
+        ]
+
+    def _on_link_report(self, report: LinkReport) -> None:
+        self.link_quality.set(report, Source(self.system_id, self.component_id, "link"))
+
+    async def _run_link_watch(self) -> None:
+        await self.link_watch.run(self._on_second)
+
+    def _on_second(self) -> None:
+        self.watch.check()
+        self.telemetry.expire(self.connection.now())
+
+    async def _learn_constants(self) -> None:
+        await learn_constants(self.connection, self.commands, self.telemetry)
+
+    def _note_reboot(self) -> None:
+        self.telemetry.forget()
+        for each in self.on_reboot:
+            each()
+
+    def _on_end(self, error: Exception) -> None:
+        self.background.cancel()
+        self.watch.end(error)
+        self.telemetry.close(error)
+        for cell in self.cells:
+            cell.close(error)

@@ -1,0 +1,78 @@
+"""The recipes of CONTRIBUTING.md are followed to the letter, on a copy of the sources."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+TEXT = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+WHERE = r"In `(?P<path>[^`]+)`, (?P<how>at the end of|at the end|before|anew)(?: `(?P<anchor>[^\n]*)`)?"
+STEP = re.compile(
+    rf"^ *(?:\d\. )?(?:(?P<then>Then)|{WHERE}):\n\n(?P<indent> *)```python\n(?P<code>.*?)\n(?P=indent)```$",
+    re.MULTILINE | re.DOTALL,
+)
+RECIPES = re.findall(r"^## (.*)$", TEXT, re.MULTILINE)
+
+
+def steps_until(recipe: str) -> list[re.Match[str]]:
+    """Those of the recipes up to this one: a later one may go on where an earlier one ended."""
+    end = TEXT.find("\n## ", TEXT.index(f"## {recipe}") + 1)
+    return list(STEP.finditer(TEXT[: None if end < 0 else end]))
+
+
+def apply(step: re.Match[str], sources: Path) -> None:
+    file = sources / step["path"].removeprefix("src/")
+    code = textwrap.dedent("\n".join(line[len(step["indent"]) :] for line in step["code"].split("\n")))
+    body = "\n".join(line[len(step["indent"]) :] for line in step["code"].split("\n"))
+    if step["how"] == "anew":
+        file.write_text(code + "\n")
+        return
+    text = file.read_text(encoding="utf-8")
+    if step["how"] == "at the end":
+        text = f"{text}\n\n{body}\n"
+    elif step["how"] == "at the end of":
+        begin = text.index(step["anchor"])
+        end = re.search(r"\n\n\n|\Z", text[begin:])
+        assert end is not None
+        at = begin + end.start()
+        text = f"{text[:at].rstrip()}\n{body}\n{text[at:]}"
+    else:
+        assert text.count(step["anchor"]) >= 1, step["anchor"]
+        text = text.replace(step["anchor"], f"{body}\n{step['anchor']}", 1)
+    file.write_text(text, encoding="utf-8")
+
+
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_the_recipe_works(recipe: str, tmp_path: Path) -> None:
+    shutil.copytree(
+        ROOT / "src" / "aerokit", tmp_path / "aerokit", ignore=shutil.ignore_patterns("__pycache__")
+    )
+    steps = steps_until(recipe)
+    for step in steps:
+        if not step["then"]:
+            apply(step, tmp_path)
+    check = textwrap.dedent(steps[-1]["code"])
+    assert steps[-1]["then"]
+    environment = os.environ | {"PYTHONPATH": str(tmp_path)}
+    done = subprocess.run(
+        [sys.executable, "-c", check],
+        env=environment,
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_there_are_four_recipes_of_several_steps() -> None:
+    assert len(RECIPES) == 4
+    assert [len(steps_until(recipe)) for recipe in RECIPES] == [3, 5, 9, 11]

@@ -1,0 +1,63 @@
+"""States are declared once: rates, errors of a declaration, the attribute on both vehicles, the page in docs/."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import aerokit
+import aerokit.sync
+from aerokit.mavlink import messages
+from aerokit.mavlink.enums import MavPowerStatus
+from aerokit.vehicle.state.equipment import Power
+from aerokit.vehicle.state.states import DEFAULT_RATES_HZ, STATES
+from aerokit.vehicle.state.table import documentation, rendered
+from aerokit.vehicle.state.telemetry import Telemetry
+from aerokit.vehicle.state.told import By, Told
+from aerokit.vehicle.talk.rates import subscription_rate_hz
+
+
+def test_default_rates() -> None:
+    by_rate: dict[float, set[str]] = {}
+    for name, hz in DEFAULT_RATES_HZ.items():
+        by_rate.setdefault(hz, set()).add(name)
+    assert by_rate == {
+        10.0: {"Attitude", "GlobalPositionInt", "LocalPositionNed"},
+        5.0: {"VfrHud", "ExtendedSysState", "DistanceSensor"},
+        2.0: {"SysStatus", "GpsRawInt", "EkfStatusReport", "EstimatorStatus", "RcChannels", "ServoOutputRaw"},
+        1.0: {
+            *("BatteryStatus", "MissionCurrent", "SystemTime", "Vibration", "Wind", "WindCov", "CurrentMode"),
+            "PowerStatus",
+        },
+    }
+    kinds = (messages.Attitude, messages.RawImu, messages.Odometry, messages.Statustext)
+    assert [subscription_rate_hz(kind) for kind in kinds] == [10.0, 4.0, 4.0, None]
+
+
+def test_power() -> None:
+    telemetry = Telemetry(lambda: 0.0)
+    assert telemetry.power.waits_for == "POWER_STATUS"
+    telemetry.receive(messages.PowerStatus(5012, 0, MavPowerStatus.BRICK_VALID))
+    assert telemetry.power.value == Power(5.012, None, MavPowerStatus.BRICK_VALID)
+
+
+def test_a_declaration_that_cannot_be_right_is_an_error_at_once() -> None:
+    with pytest.raises(ValueError, match="needs a message"):
+        Told[int]()
+    with pytest.raises(ValueError, match="Heartbeet is no message class"):
+        By("Heartbeet", lambda message: 1)
+
+
+@pytest.mark.parametrize("name", STATES)
+def test_both_vehicles_have_it_and_it_is_documented(name: str) -> None:
+    assert hasattr(aerokit.Vehicle, name)
+    assert hasattr(aerokit.sync.Vehicle, name)
+    assert documentation()[name][1].endswith(".")
+
+
+def test_the_page_is_that_of_the_declarations() -> None:
+    page = Path(__file__).parents[2] / "docs" / "states.md"
+    assert page.read_text(encoding="utf-8") == rendered(), (
+        "python -m aerokit.vehicle.state.table > docs/states.md"
+    )
