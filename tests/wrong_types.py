@@ -65,6 +65,7 @@ WRONG: dict[str, tuple[object, ...]] = {
     "Callable[[T], object]": (*NOTHING, *TEXT, *NUMBER, [print]),
     "Callable[[T | None, T], None]": (*NOTHING, *TEXT, *NUMBER, [print]),
     "Signing | None": (*STRANGE, *TEXT, *NUMBER, bytes(32)),
+    "Standing | None": (*STRANGE, *TEXT, *NUMBER),
     "Peers | None": (*STRANGE, 1.5, b"10.0.0.7"),
     "Dialect": (*NOTHING, *STRANGE, *TEXT, *NUMBER),
     "LogEntry | int": (*NOTHING, *STRANGE, *TEXT, 1.5),

@@ -123,6 +123,18 @@ def row_35_parameter_listeners(stage: Stage) -> Any:
     return one, every, decorated
 
 
+@scenario([("MINE", 1.5), ("MINE", 1.5), ("MINE", 2.5)])
+def parameters_told_by_the_program(stage: Stage) -> Any:
+    told: list[tuple[str, float]] = []
+    parameters = stage.vehicle.parameters
+    parameters.on_attribute(attr_name="mine")(lambda _, name, value: told.append((name, value)))
+    for value in (1.5, 1.5):
+        parameters.notify_attribute_listeners("mine", value)
+    for value in (2.5, 2.5):
+        parameters.notify_attribute_listeners("mine", value, cache=True)
+    return told
+
+
 @scenario((1, True), prepare=lambda fc: fc.parameters.lost_once.add("BAR"))
 def parameters_lost_on_the_way(stage: Stage) -> Any:
     stage.vehicle.parameters.wait_ready()

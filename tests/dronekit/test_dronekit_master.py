@@ -293,7 +293,7 @@ def test_a_mode_is_set_by_the_vehicle_if_there_is_one(connected: Connected) -> N
 
     master, _ = connected
     known: Any = Known()
-    master.vehicle = known
+    master._connection.vehicle = known
     master.set_mode("LOITER")
     assert known.mode == "LOITER"
     master.set_mode(14)

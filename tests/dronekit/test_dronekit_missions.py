@@ -284,3 +284,13 @@ def test_a_home_that_the_vehicle_refuses_is_not_its_home() -> None:
         controller.results[179] = 4
         vehicle.home_location = LocationGlobal(10, 20, 30)
         vehicle.wait_for(lambda: str(vehicle.home_location) == before, timeout=LIMIT_S, interval=0.01)
+
+
+def test_next_is_sent_once_where_it_is_not_confirmed(three: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A message that is not answered could be repeated against a pilot: the order that follows has an answer."""
+    monkeypatch.setattr("aerokit.dronekit.current_command.CONFIRMED_S", 2.5)
+    controller, cmds = three
+    controller.answers["MISSION_SET_CURRENT"] = lambda frame: None
+    cmds.next = 2
+    controller.wait_for_command(224)
+    assert len(controller.received("MISSION_SET_CURRENT")) == 1

@@ -271,7 +271,36 @@ def test_names_of_listeners_are_upper_cased_and_may_be_a_list(
     assert seen == ["FOO", "BAR"]
     parameters.notify_attribute_listeners("foo", 17.0)
     parameters.notify_attribute_listeners("foo", 17.0)
-    assert seen == ["FOO", "BAR", "FOO"]
+    assert seen == ["FOO", "BAR", "FOO", "FOO"]
+    parameters.notify_attribute_listeners("foo", 18.0, cache=True)
+    parameters.notify_attribute_listeners("foo", 18.0, True)
+    assert seen == ["FOO", "BAR", *["FOO"] * 3]
+
+
+def test_the_decorators_argument_is_called_as_with_dronekit(
+    vehicle: dronekit.Vehicle, fc: FlightController
+) -> None:
+    seen: list[str] = []
+    vehicle.parameters.on_attribute(attr_name="foo")(lambda _, name, value: seen.append(name))
+    told(vehicle, fc, "FOO", 2.0)
+    assert seen == ["FOO"]
+
+
+def test_names_of_the_dronekit_years_are_found_on_newer_firmware(fc: FlightController) -> None:
+    fc.parameters.values = {"LOIT_SPEED": 500.0, "MOT_SPIN_MIN": 0.125, "GPS1_TYPE": 1.0}
+    with connected(fc, wait_ready=["parameters"]) as vehicle:
+        for name, value, new in [
+            ("WPNAV_LOIT_SPEED", 500, "LOIT_SPEED_MS"),
+            ("THR_MIN", 125, "MOT_SPIN_MIN"),
+            ("GPS_TYPE", 1, "GPS1_TYPE"),
+        ]:
+            with pytest.warns(ParameterRenamedWarning, match=new):
+                assert vehicle.parameters[name] == value
+        with pytest.warns(ParameterRenamedWarning, match="MOT_SPIN_MIN"):
+            vehicle.parameters["THR_MIN"] = 250
+        assert fc.parameters.values["MOT_SPIN_MIN"] == 0.25
+        with pytest.raises(KeyError, match="FLOW_ENABLE: replaced by FLOW_TYPE"):
+            vehicle.parameters["FLOW_ENABLE"]
 
 
 def test_without_listeners_nothing_is_queued(fc: FlightController) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 from dronekit_stage import Stage, on_stage
@@ -84,3 +86,28 @@ def test_types_are_written_by_programs(stage: Stage) -> None:
     stage.vehicle._vehicle_type, stage.vehicle._autopilot_type = 6, 8
     assert stage.vehicle._is_mode_available(0) in (True, False)
     assert str(stage.vehicle.version).startswith("UnknownAutoPilotUnknownVehicleType6-")
+
+
+def test_what_master_knows_of_messages_and_parameters(stage: Stage) -> None:
+    master = stage.vehicle._master
+    stage.vehicle.wait_ready("parameters")
+    assert (master.param("FOO"), master.param("foo", 7), master.param("NOPE", 7)) == (1.0, 1.0, 7)
+    assert master.field("ATTITUDE", "yaw", 5) == 5
+    assert master.time_since("VFR_HUD") >= 0
+    stage.tell("ATTITUDE", yaw=0.25)
+    assert master.field("ATTITUDE", "yaw") == 0.25
+    assert master.field("ATTITUDE", "nonsense", 5) == 5
+    assert 0 <= master.time_since("ATTITUDE") <= master.time_since("VFR_HUD")
+
+
+@pytest.mark.parametrize(("is_relative", "alt"), [(False, 600.0), (True, 16.5)])
+def test_where_master_says_it_is(stage: Stage, is_relative: bool, alt: float) -> None:
+    found: list[Any] = []
+    asking = threading.Thread(target=lambda: found.append(stage.vehicle._master.location(is_relative)))
+    asking.start()
+    while asking.is_alive():  # what was said before the question does not count
+        stage.tell("GPS_RAW_INT", fix_type=2, lat=1, lon=1)
+        stage.tell("GPS_RAW_INT", fix_type=3, lat=-350000000, lon=1490000000)
+        stage.tell("VFR_HUD", alt=600.0, heading=271)
+        stage.tell("GLOBAL_POSITION_INT", relative_alt=16500)
+    assert (found[0].lat, found[0].lng, found[0].alt, found[0].heading) == (-35.0, 149.0, alt, 271)

@@ -15,9 +15,11 @@ from aerokit.parameters import (
     Renamed,
     find_rename,
     other_names,
+    replacement_of,
     to_known,
     translate_values,
 )
+from aerokit.parameters.older_names import OLDER, ONE_WAY, REPLACED
 from aerokit.parameters.parameter import check_name, to_float32
 from aerokit.parameters.rename_table import GROUPS
 
@@ -170,3 +172,70 @@ def test_the_warning_can_be_told_from_others() -> None:
     assert "still called WPNAV_SPEED" in known("WP_SPD", "WPNAV_SPEED").warning
     assert "values were converted" in known("WP_SPD", "WPNAV_SPEED").warning
     assert "converted" not in known("SYSID_THISMAV", "MAV_SYSID").warning
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "old_value", "new_value"),
+    [
+        ("GPS_TYPE", "GPS1_TYPE", 1, 1),
+        ("THR_MID", "MOT_THST_HOVER", 350, 0.35),
+        ("STB_RLL_P", "ATC_ANG_RLL_P", 4.5, 4.5),
+        ("POS_XY_P", "PSC_NE_POS_P", 1.0, 1.0),
+        ("ACCEL_Z_P", "PSC_D_ACC_P", 0.5, 0.05),
+        ("ACCEL_Z_FILT_HZ", "PSC_ACCZ_FLTE", 20, 20),
+        ("WPNAV_LOIT_SPEED", "LOIT_SPEED", 500, 500),
+        ("WPNAV_LOIT_SPEED", "LOIT_SPEED_MS", 500, 5),
+        ("WPNAV_LOIT_MAXA", "LOIT_ACC_MAX_M", 250, 2.5),
+        ("PILOT_VELZ_MAX", "PILOT_SPD_UP", 250, 2.5),
+        ("RNGFND_MAX_CM", "RNGFND1_MAX_CM", 700, 700),
+        ("RNGFND_MAX_CM", "RNGFND1_MAX", 700, 7),
+        ("FS_BATT_VOLTAGE", "BATT_LOW_VOLT", 10.5, 10.5),
+        ("ARMING_VOLT_MIN", "BATT_ARM_VOLT", 10.5, 10.5),
+        ("CH7_OPT", "RC7_OPTION", 18, 18),
+        ("RC9_FUNCTION", "SERVO9_FUNCTION", 6, 6),
+        ("GND_ABS_PRESS", "BARO1_GND_PRESS", 94500, 94500),
+        ("MNT_ANGMIN_TIL", "MNT1_PITCH_MIN", -9000, -90),
+        ("CAM_MIN_INTERVAL", "CAM1_INTRVAL_MIN", 500, 0.5),
+        ("TRIM_ARSPD_CM", "AIRSPEED_CRUISE", 1200, 12),
+        ("ALT_HOLD_RTL", "RTL_ALTITUDE", 10000, 100),
+        ("LIM_ROLL_CD", "ROLL_LIMIT_DEG", 6500, 65),
+        ("FENCE_MAXALT", "FENCE_ALT_MAX", 120, 120),
+        ("Q_VELZ_MAX", "Q_PILOT_SPD_UP", 250, 2.5),
+        ("TURN_MAX_G", "ATC_TURN_MAX_G", 0.6, 0.6),
+    ],
+)
+def test_pairs_from_before(old: str, new: str, old_value: float, new_value: float) -> None:
+    up, down = known(old, new), known(new, old)
+    assert up.to_vehicle(old_value) == down.to_asked(old_value) == new_value
+    assert down.to_vehicle(new_value) == up.to_asked(new_value) == old_value
+    assert old in up.warning
+    assert new in up.warning
+    assert ("converted" in up.warning) == (old_value != new_value)
+
+
+def test_a_name_that_others_use_otherwise_is_found_one_way_only() -> None:
+    """ArduPlane's THR_MIN is in percent."""
+    assert known("THR_MIN", "MOT_SPIN_MIN").to_vehicle(130) == 0.13
+    assert known("THR_MIN", "MOT_THR_MIN").to_vehicle(5) == 5
+    assert to_known("MOT_SPIN_MIN", {"THR_MIN"}) is None
+    assert to_known("THR_MIN", {"THR_MIN", "MOT_SPIN_MIN"}) is None
+
+
+def test_the_older_names_are_sound() -> None:
+    rows = [pair for _, _, _, text in (*OLDER, *ONE_WAY) for pair in text.split()]
+    assert len(rows) == len({*rows})
+    old, new = ({pair.split(">")[place] for pair in rows} for place in (0, 1))
+    for name in (*old, *new, *REPLACED):
+        check_name(name)
+    assert not old & REPLACED.keys()
+    assert not any(find_rename(name) for name in REPLACED)
+    for name in old:
+        assert find_rename(name) is not None
+        assert name not in other_names(name)
+
+
+def test_what_has_no_successor_says_what_replaced_it() -> None:
+    assert replacement_of("FLOW_ENABLE").startswith("FLOW_TYPE")
+    assert replacement_of("RATE_RLL_P").startswith("ATC_RAT_RLL_P")
+    assert replacement_of("MNT_RC_IN_TILT").startswith("RCn_OPTION")
+    assert replacement_of("WP_SPD") == replacement_of("NOPE") == ""

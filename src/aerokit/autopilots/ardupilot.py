@@ -58,6 +58,7 @@ class ArduPilot(Autopilot):
     firmware = "ArduPilot"
     home_is_item_0 = True
     runs_prearm_checks = True
+    calibrates_compasses_by_command = True
     parameter_interval_s = 0.02
     mission_storage = "ardupilot"
     mission_upload_window = 6

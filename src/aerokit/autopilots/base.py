@@ -99,6 +99,8 @@ class Autopilot:
     firmware = "unknown"
     """The firmware for this vehicle type, ``"ArduCopter"``."""
     modes = ModeTable({})
+    modes_are_numbered = True
+    """Whether users know a mode by its plain number, too."""
     purposes: ClassVar[Mapping[str, str]] = {}
     """Purpose → name of the mode that serves it."""
     setpoints = SetpointRules(*[False] * 5)
@@ -110,6 +112,10 @@ class Autopilot:
     """Where SETUP_SIGNING is obeyed, in words, if that is not everywhere."""
     runs_prearm_checks = False
     """Whether MAV_CMD_RUN_PREARM_CHECKS (401) repeats the failing checks as status texts."""
+    calibrates_compasses_by_command = False
+    """Whether MAV_CMD_DO_START_MAG_CAL (42424) calibrates the compasses; else it is a pre-flight calibration."""
+    roi_altitude_is_amsl = False
+    """Whether MAV_CMD_DO_SET_ROI_LOCATION (195) takes every altitude for one above the sea, whatever the frame says."""
     condition_yaw = False
     """Whether MAV_CMD_CONDITION_YAW (115) turns the vehicle in its mode for set-points."""
     reposition_purpose: Purpose = "setpoint"
@@ -231,6 +237,11 @@ class Autopilot:
     def landed_state_of(self, heartbeat: messages.Heartbeat) -> int | None:
         """MAV_LANDED_STATE as far as HEARTBEAT.system_status alone tells it; None when it does not."""
         return None
+
+    @property
+    def repositions_amsl(self) -> bool:
+        """Whether MAV_CMD_DO_REPOSITION (192) takes altitudes above the sea only."""
+        return self.reposition is not None and not self.reposition.relative_altitude
 
     # -------------------------------------------------------------------------------- health
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import threading
 from typing import TYPE_CHECKING, Any
 
-from aerokit.autopilots.px4 import Px4
+from aerokit.dronekit.core import VehicleCore
 from aerokit.dronekit.modes import mode_name
-from aerokit.dronekit.observers import HasObservers
 from aerokit.dronekit.reception import Latest, Stream
 from aerokit.dronekit.shadowable import Shadowable
 from aerokit.dronekit.values import (
@@ -29,7 +28,6 @@ if TYPE_CHECKING:
     from aerokit.dronekit.exceptions import APIException
     from aerokit.dronekit.locations import Locations
     from aerokit.mavlink.message import Message
-    from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
 __all__ = ["VehicleAttributes"]
 
@@ -43,13 +41,12 @@ LOOKING_DOWN = 25
 NO_MODE = (None, "INITIALISING", "MAV")
 
 
-class VehicleAttributes(HasObservers):
+class VehicleAttributes(VehicleCore):
     """State as DroneKit's attributes. Reading takes what came last, on the caller's thread, and never waits.
 
     A message is kept by one assignment, so what is read together belongs to one message.
     """
 
-    _dk_aio: AsyncVehicle | None
     _location: Locations
     _dk_heartbeat: m.Heartbeat | None = None
     _flightmode: str = "UNKNOWN"
@@ -81,7 +78,11 @@ class VehicleAttributes(HasObservers):
             self._dk_on(message_type, handler)
 
     def _dk_on(self, message_type: type[Message], handler: Callable[[Any], None]) -> None:
-        raise NotImplementedError
+        stream = self._dk_streams.get(message_type)
+        if stream is None:
+            super()._dk_on(message_type, handler)
+        else:
+            stream.add(handler)
 
     def _dk_handlers(self) -> dict[type[Message], Callable[[Any], None]]:
         return {
@@ -174,7 +175,7 @@ class VehicleAttributes(HasObservers):
         """
         if self._flightmode in NO_MODE or self._dk_heartbeat is None:
             return False
-        if isinstance(getattr(self._dk_aio, "autopilot", None), Px4):
+        if self._dk_aio is not None and self._dk_aio.autopilot.judges_by_mode:
             status = self._dk_sys_status
             return status is not None and bool(status.onboard_control_sensors_health & PREARM_CHECK)
         gps = self._dk_gps
@@ -220,7 +221,7 @@ class VehicleAttributes(HasObservers):
             message.base_mode,
         ):
             assert self._dk_aio is not None
-            self._flightmode = mode_name(self._dk_aio, message.base_mode, message.custom_mode)
+            self._flightmode = mode_name(self._dk_aio, message.custom_mode)
         self._dk_tell("armed", self._armed, cache=True)
         self._dk_tell("mode", VehicleMode(self._flightmode), cache=True)
         self._dk_tell("system_status", self.system_status, cache=True)

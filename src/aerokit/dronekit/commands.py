@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple, overload
 
 from aerokit.dronekit.command import Command, command_from, is_home_row, values_of
 from aerokit.dronekit.command_items import commands_of, home_command, mission_of
-from aerokit.dronekit.current_command import CurrentCommand
 from aerokit.dronekit.exceptions import APIException, TimeoutError  # noqa: A004 - DroneKit's name
 from aerokit.errors import AerokitError, OperationTimeout
 from aerokit.sync.reply import reply_of
@@ -49,8 +48,7 @@ class CommandSequence:
         self._downloads = 0
         self._download: concurrent.futures.Future[None] | None = None
         self._failure: APIException | None = None
-        self._current = CurrentCommand(vehicle)
-        vehicle._dk_mark_ready("commands")
+        self._current = vehicle._dk_current_command
 
     # ------------------------------------------------------------------- from and to the vehicle
 

@@ -95,15 +95,22 @@ def connect(
 
     Raises:
         OSError: the link cannot be opened (ConnectionRefusedError, socket.gaierror, serial.SerialException …).
-        ValueError: an argument is wrong.
+        ValueError: an argument is wrong; a connection string that names no link is an OSError, too.
         APIException: no vehicle was heard in time; the text says what was heard instead.
         TimeoutError: ``wait_ready`` was not satisfied in time. Whatever fails, nothing stays open.
     """
     from aerokit.dronekit.mavlink import MAVConnection
 
-    handler = MAVConnection(
-        ip, baud=baud, source_system=source_system, source_component=source_component, use_native=use_native
-    )
+    try:
+        handler = MAVConnection(
+            ip,
+            baud=baud,
+            source_system=source_system,
+            source_component=source_component,
+            use_native=use_native,
+        )
+    except (OSError, ValueError) as error:
+        raise error.with_traceback(None) from None  # where in here it came from says nothing to a program
     try:
         from aerokit.dronekit.vehicle import Vehicle  # the link hears meanwhile: this takes a while
 

@@ -5,17 +5,19 @@ from __future__ import annotations
 import operator
 from typing import TYPE_CHECKING
 
-from aerokit.errors import CommandRejected, LocalProtocolError, OperationTimeout
-from aerokit.mavlink.messages import MissionCurrent
+import anyio
+
+from aerokit.errors import LocalProtocolError
+from aerokit.mavlink.messages import MissionCurrent, MissionSetCurrent
 
 if TYPE_CHECKING:
     from aerokit.dronekit.vehicle import Vehicle
-    from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
 __all__ = ["CurrentCommand"]
 
 DO_SET_MISSION_CURRENT = 224
-CONFIRMED_S = 5.0
+CONFIRMED_S = 1.5
+"""So long MISSION_CURRENT is waited for before it is ordered by command."""
 MOST = 0xFFFF
 STATE_COMPLETE = 5
 NO_MISSION = 0xFFFF
@@ -70,24 +72,17 @@ class CurrentCommand:
         return is_at_an_end and not self._vehicle._armed
 
     async def _choose(self, seq: int) -> None:
+        """By the message that DroneKit sends, once; what is not heard is ordered by the rules of all orders."""
         aio = self._vehicle._dk_vehicle
         if not aio.autopilot.home_is_item_0:
-            await aio.mission._set_current_by_message(max(seq - 1, 0), CONFIRMED_S)
+            await aio.mission.set_current(max(seq - 1, 0))
             self._chosen = seq - 1
             return
-        try:
-            await aio.mission._set_current_by_message(seq, CONFIRMED_S)
-        except OperationTimeout as error:
-            await _choose_by_command(aio, seq, error)
-
-
-async def _choose_by_command(vehicle: AsyncVehicle, seq: int, before: OperationTimeout) -> None:
-    """The message is to be given up by firmware to come; the command also tells why it is refused."""
-    if not vehicle.autopilot.sets_current_by_command:
-        raise before
-    try:
-        await vehicle.command(DO_SET_MISSION_CURRENT, seq)
-    except CommandRejected as error:
-        if error.result == 3:
-            raise before from None
-        raise
+        aio.send(MissionSetCurrent(aio.system_id, aio.component_id, seq))
+        with anyio.move_on_after(CONFIRMED_S):
+            await aio.telemetry.mission_current.wait_until(lambda progress: progress.current == seq)
+            return
+        if seq == 0:
+            await aio.command(DO_SET_MISSION_CURRENT, 0)
+        else:
+            await aio.mission.set_current(seq - 1)

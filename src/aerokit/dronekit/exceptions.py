@@ -8,7 +8,7 @@ __all__ = ["APIException", "TimeoutError"]
 
 
 class APIException(Exception):
-    """Any failure of the vehicle or its link; the aerokit error behind it is its `__cause__`."""
+    """Any failure of the vehicle or its link; an aerokit error behind it is its `__cause__` or `__context__`."""
 
 
 class TimeoutError(APIException, builtins.TimeoutError):  # noqa: A001 - the name is DroneKit's

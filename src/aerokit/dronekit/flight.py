@@ -8,28 +8,26 @@ import math
 import time
 from typing import TYPE_CHECKING, Any
 
-from aerokit.autopilots.px4 import Px4
 from aerokit.dronekit.attributes import VehicleAttributes
 from aerokit.dronekit.exceptions import APIException, TimeoutError  # noqa: A004 - DroneKit's name
 from aerokit.dronekit.flight_orders import (
     change_armed,
     check_speed,
     checked_place,
+    flies_to_places_in,
     go_to,
     refuse,
     set_home,
     take_off,
 )
-from aerokit.dronekit.modes import Order, change_mode, mode_name, mode_order, told_as
+from aerokit.dronekit.modes import change_mode, mode_named
 from aerokit.dronekit.values import LocationGlobal, LocationGlobalRelative, VehicleMode
 from aerokit.errors import CommandRejected, OperationTimeout
 from aerokit.mavlink.messages import HomePosition
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
+    from collections.abc import Callable
 
-    from aerokit.dronekit.mavlink import MAVConnection
-    from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
 __all__ = ["FlightMethods"]
 
@@ -37,8 +35,6 @@ NAV_TAKEOFF, DO_CHANGE_SPEED = 22, 178
 AIRSPEED, GROUNDSPEED = 0, 1
 REQUEST_MESSAGE = 512
 HOME_TIMEOUT_S = 10.0
-PX4_TAKEOFF, PX4_LOITER = 4 << 16 | 2 << 24, 4 << 16 | 3 << 24
-PX4_FLIES_TO_PLACES_IN = ("LOITER", "TAKEOFF")
 POLL_S = 0.1
 
 
@@ -48,16 +44,6 @@ class FlightMethods(VehicleAttributes):
     """
 
     _dk_arming: tuple[bool, concurrent.futures.Future[None]] | None = None
-
-    if TYPE_CHECKING:
-        _handler: MAVConnection
-
-        def _dk_check_link(self) -> AsyncVehicle: ...
-        def _dk_run(self, function: Callable[..., Awaitable[Any]], *args: Any, **kwargs: Any) -> Any: ...
-        def _dk_order(
-            self, kind: str, function: Callable[..., Awaitable[object]], *args: Any, **kwargs: Any
-        ) -> concurrent.futures.Future[None]: ...
-        def _dk_pause(self, seconds: float) -> None: ...
 
     # --------------------------------------------------------------------------------- modes
 
@@ -78,11 +64,11 @@ class FlightMethods(VehicleAttributes):
     def mode(self, value: VehicleMode | str | int) -> None:
         self._dk_set_mode(value)
 
-    def _dk_set_mode(self, value: VehicleMode | str | int) -> tuple[Order, concurrent.futures.Future[None]]:
+    def _dk_set_mode(self, value: VehicleMode | str | int) -> tuple[str, concurrent.futures.Future[None]]:
         aio = self._dk_check_link()
-        order = mode_order(aio, value.name if isinstance(value, VehicleMode) else value)
-        standing = self._handler.given.order("mode", "motion", mode=told_as(aio, order))
-        return order, self._dk_order("mode", change_mode, aio, order, standing)
+        wanted = mode_named(aio, value.name if isinstance(value, VehicleMode) else value)
+        standing = self._handler.given.order("mode", "motion", mode=wanted.custom_mode)
+        return wanted.name, self._dk_order("mode", change_mode, aio, wanted, standing)
 
     def wait_for_mode(self, mode: VehicleMode | str | int, timeout: float | None = None) -> None:
         """Set the mode and wait until the vehicle is in it.
@@ -91,9 +77,7 @@ class FlightMethods(VehicleAttributes):
             TimeoutError: it is not within ``timeout`` seconds, or, sooner, the vehicle has refused it.
             KeyError: this vehicle has no such mode.
         """
-        wanted, done = self._dk_set_mode(mode)
-        aio = self._dk_check_link()
-        name = mode_name(aio, wanted[0], told_as(aio, wanted))
+        name, done = self._dk_set_mode(mode)
         self._dk_wait_for_order(done, lambda: self._flightmode == name, timeout, "failed to set flight mode")
 
     # -------------------------------------------------------------------------------- arming
@@ -173,12 +157,15 @@ class FlightMethods(VehicleAttributes):
         if not math.isfinite(altitude):
             raise ValueError("Altitude was NaN or Infinity. Please provide a real number")
         aio = self._dk_check_link()
-        if isinstance(aio.autopilot, Px4):  # it counts from the sea
+        if aio.autopilot.repositions_amsl:  # as it does take-offs
             home = self._dk_known_home().alt
-            plan = aio.autopilot.take_off(altitude, home, is_vtol=aio.is_vtol)
-            if plan is None or plan.command is None:
+            plan, mode = (
+                aio.autopilot.take_off(altitude, home, is_vtol=aio.is_vtol),
+                aio.autopilot.mode_for("take_off"),
+            )
+            if plan is None or plan.command is None or mode is None:
                 raise APIException("this vehicle cannot take off by a command")
-            standing = self._handler.given.order("motion", mode=PX4_TAKEOFF)
+            standing = self._handler.given.order("motion", mode=mode.custom_mode)
             return self._dk_order("takeoff", take_off, aio, standing, plan.command, *plan.params)
         standing = self._handler.given.order("motion")
         return self._dk_order("takeoff", take_off, aio, standing, NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude)
@@ -217,13 +204,13 @@ class FlightMethods(VehicleAttributes):
             ValueError: it is no such location, or one of its numbers is missing or wrong. Nothing was sent.
         """
         aio = self._dk_check_link()
-        is_px4 = isinstance(aio.autopilot, Px4)
-        place = self._dk_place(location, is_relative=not is_px4)
+        flies_in = flies_to_places_in(aio)
+        place = self._dk_place(location, is_relative=not flies_in)
         for name, speed in (("airspeed", airspeed), ("groundspeed", groundspeed)):
             check_speed(name, speed)
-        standing = self._handler.given.order("motion", mode=PX4_LOITER if is_px4 else None)
-        if is_px4 and self._flightmode not in PX4_FLIES_TO_PLACES_IN:
-            self._dk_order("goto", refuse, f"not in {self._flightmode}: set the mode LOITER first")
+        standing = self._handler.given.order("motion", mode=flies_in[0].custom_mode if flies_in else None)
+        if flies_in and self._flightmode not in map(str, flies_in):
+            self._dk_order("goto", refuse, f"not in {self._flightmode}: set the mode {flies_in[0]} first")
         else:
             self._dk_order("goto", go_to, aio, standing, *place)
         if airspeed is not None:

@@ -5,18 +5,27 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from aerokit.autopilots.px4 import Px4
 from aerokit.dronekit.exceptions import APIException
-from aerokit.dronekit.standing import send_while_standing
+from aerokit.dronekit.standing import until_answered
 from aerokit.errors import CommandRejected, LocalProtocolError, OperationTimeout
 from aerokit.mavlink.messages import SetPositionTargetGlobalInt
 
 if TYPE_CHECKING:
+    from aerokit.autopilots import Mode, Purpose
     from aerokit.dronekit.standing import Standing
     from aerokit.dronekit.values import LocationGlobal, LocationGlobalRelative
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
-__all__ = ["change_armed", "check_speed", "checked_place", "go_to", "refuse", "set_home", "take_off"]
+__all__ = [
+    "change_armed",
+    "check_speed",
+    "checked_place",
+    "flies_to_places_in",
+    "go_to",
+    "refuse",
+    "set_home",
+    "take_off",
+]
 
 COMPONENT_ARM_DISARM, DO_SET_HOME, DO_REPOSITION = 400, 179, 192
 GLOBAL, GLOBAL_INT, GLOBAL_RELATIVE_ALT_INT = 0, 5, 6
@@ -30,8 +39,8 @@ async def change_armed(vehicle: AsyncVehicle, standing: Standing, value: bool) -
     """Arm or disarm, and wait until HEARTBEAT says so."""
     try:
         with standing.watching(vehicle):
-            send = vehicle._talk.commands.send_long
-            await send_while_standing(vehicle, standing, send, COMPONENT_ARM_DISARM, float(value))
+            sending = vehicle.command(COMPONENT_ARM_DISARM, float(value), component_id=0, standing=standing)
+            await until_answered(sending, standing)
             await vehicle.telemetry.armed.wait_until(
                 lambda armed: armed is value or standing.is_done,
                 timeout=ARMED_IS_TOLD_S,
@@ -45,7 +54,7 @@ async def change_armed(vehicle: AsyncVehicle, standing: Standing, value: bool) -
 async def take_off(vehicle: AsyncVehicle, standing: Standing, command: int, *params: float) -> None:
     """Send the command to take off."""
     with standing.watching(vehicle):
-        await send_while_standing(vehicle, standing, vehicle._talk.commands.send_long, command, *params)
+        await until_answered(vehicle.command(command, *params, component_id=0, standing=standing), standing)
 
 
 async def go_to(
@@ -53,29 +62,38 @@ async def go_to(
 ) -> None:
     """DO_REPOSITION, which is answered; and the message for a vehicle that does not know it.
 
-    The altitude is above home, with PX4 above the sea.
+    The altitude is above home, or above the sea where the autopilot repositions so (PX4).
     """
-    is_px4 = isinstance(vehicle.autopilot, Px4)
+    is_amsl = vehicle.autopilot.repositions_amsl
     try:
         with standing.watching(vehicle):
-            await send_while_standing(
-                vehicle,
-                standing,
-                vehicle._talk.commands.send_int,
+            sending = vehicle.command_int(
                 DO_REPOSITION,
-                *(-1, CHANGE_MODE if is_px4 else 0, 0, math.nan),
-                frame=GLOBAL_INT if is_px4 else GLOBAL_RELATIVE_ALT_INT,
+                *(-1, CHANGE_MODE if is_amsl else 0, 0, math.nan),
+                frame=GLOBAL_INT if is_amsl else GLOBAL_RELATIVE_ALT_INT,
                 x=latitude,
                 y=longitude,
                 z=altitude,
+                component_id=0,
+                standing=standing,
             )
+            await until_answered(sending, standing)
     except CommandRejected as error:
-        if is_px4:
-            raise
-        if error.result != RESULT_UNSUPPORTED:
+        if is_amsl or error.result != RESULT_UNSUPPORTED:
             raise
         target = (vehicle.system_id, 0, GLOBAL_RELATIVE_ALT_INT, POSITION_ONLY)
         vehicle.send(SetPositionTargetGlobalInt(0, *target, latitude, longitude, altitude, *(0.0,) * 8))
+
+
+def flies_to_places_in(aio: AsyncVehicle) -> tuple[Mode, ...]:
+    """Where the order to fly to a place changes the mode itself: those in which the program meant it to; the first is
+    the one that the order brings about. Empty where the mode stays what it is, and the vehicle refuses in a wrong one.
+    """
+    if not aio.autopilot.repositions_amsl:
+        return ()
+    purposes: tuple[Purpose, ...] = (aio.autopilot.reposition_purpose, "take_off")
+    modes = map(aio.autopilot.mode_for, purposes)
+    return tuple(mode for mode in modes if mode is not None)
 
 
 async def set_home(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: float) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from aerokit.autopilots.px4 import Px4
 from aerokit.dronekit.exceptions import APIException
 from aerokit.dronekit.flight_orders import checked_place
 from aerokit.dronekit.gimbal_attitude import from_device, from_orientation, from_status
@@ -222,9 +221,7 @@ class Gimbal(GimbalPrivates):
         self, aio: AsyncVehicle, is_absolute: bool, latitude: int, longitude: int, altitude: float
     ) -> None:
         frame = GLOBAL_INT if is_absolute else GLOBAL_RELATIVE_ALT_INT
-        if (
-            isinstance(aio.autopilot, Px4) and not is_absolute
-        ):  # it takes every altitude for one above the sea
+        if aio.autopilot.roi_altitude_is_amsl and not is_absolute:
             frame, altitude = GLOBAL_INT, altitude + await _home_altitude(aio)
         if DO_SET_ROI_LOCATION not in self._unknown:
             try:

@@ -13,7 +13,6 @@ from aerokit.dronekit.pymavlink_messages import message_of
 from aerokit.dronekit.weakly import weakly
 from aerokit.errors import LocalProtocolError
 from aerokit.mavlink.dialect import STANDARD
-from aerokit.runtime.components import is_autopilot
 
 if TYPE_CHECKING:
     from aerokit.dronekit.mavlink import MAVConnection
@@ -63,6 +62,14 @@ class Inbox(Mapping[str, Any]):
             if (names is None or message.get_type() in names) and condition(message):
                 return message
 
+    def age_s(self, name: str) -> float:
+        """Seconds since a message of this type came, or since the first question."""
+        self._start()
+        frame = self._latest.get(_id_of(name))
+        if frame is None:
+            return time.monotonic() - (self._started or 0.0)
+        return self._connection.connection.now() - frame.received_at
+
     def __getitem__(self, name: str) -> Any:
         self._start()
         message_id = _id_of(name)
@@ -90,7 +97,7 @@ class Inbox(Mapping[str, Any]):
         with self._came:
             is_first, self._started = self._started is None, self._started or time.monotonic()
         if is_first:
-            loop, tap = self._connection.loop, self._connection._tap
+            loop, tap = self._connection.loop, self._connection.tap
             if loop.is_current:
                 tap(weakly(self._take))
             else:
@@ -98,22 +105,16 @@ class Inbox(Mapping[str, Any]):
 
     def _waits(self) -> bool:
         is_young = self._started is not None and time.monotonic() < self._started + FIRST_S
-        return is_young and self._connection._alive and not self._connection.loop.is_current
+        return is_young and self._connection.connection.is_open and not self._connection.loop.is_current
 
     def _take(self, frame: Frame, peer: Peer) -> None:
         """On the loop's thread."""
-        if self._is_of_another_vehicle(frame.system_id):
+        if self._connection.is_of_another_vehicle(frame.system_id):
             return
         with self._came:
             self._latest[frame.message_id] = frame
             self._frames.append(frame)
             self._came.notify_all()
-
-    def _is_of_another_vehicle(self, system_id: int) -> bool:
-        if system_id == self._connection.target_system:
-            return False
-        heard = self._connection.connection.heard
-        return any(source[0] == system_id and is_autopilot(heartbeat) for source, heartbeat in heard.items())
 
     def _pop(self, end: float | None) -> Frame | None:
         """The oldest frame that is not too old; None when the time is over."""
@@ -132,7 +133,7 @@ class Inbox(Mapping[str, Any]):
                     return None
 
     def _check(self) -> None:
-        if self._connection.is_closed or not self._connection._alive:
+        if self._connection.is_closed or not self._connection.connection.is_open:
             raise APIException("the connection was closed")
 
 

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from aerokit.autopilots.ardupilot import ArduPilot
+from aerokit.dronekit.core import VehicleCore
 from aerokit.dronekit.exceptions import APIException
 from aerokit.errors import LocalProtocolError
 from aerokit.mavlink.messages import PlayTune
 from aerokit.protocols.command import command_long
 
 if TYPE_CHECKING:
-    import concurrent.futures
-    from collections.abc import Awaitable, Callable
-
-    from aerokit.mavlink.message import Message
-    from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
+    pass
 
 __all__ = ["Maintenance"]
 
@@ -27,18 +23,8 @@ REBOOT_ATTEMPTS, REBOOT_S = 2, 1.5
 TUNE_SIZES = (30, 200)
 
 
-class Maintenance:
+class Maintenance(VehicleCore):
     """Orders for a vehicle on the ground. They return at once; a refusal is a warning of the logger ``dronekit``."""
-
-    if TYPE_CHECKING:
-
-        @property
-        def _dk_target_system(self) -> int: ...
-        def _dk_check_link(self) -> AsyncVehicle: ...
-        def _dk_order(
-            self, kind: str, function: Callable[..., Awaitable[object]], *args: Any, **kwargs: Any
-        ) -> concurrent.futures.Future[None]: ...
-        def _dk_send(self, message: Message) -> None: ...
 
     # -------------------------------------------------------------------------- calibrations
 
@@ -48,7 +34,7 @@ class Maintenance:
 
     def send_calibrate_magnetometer(self) -> None:
         """Calibrate the compasses: turn the vehicle about all axes until it says that it is done."""
-        if isinstance(self._dk_check_link().autopilot, ArduPilot):
+        if self._dk_check_link().autopilot.calibrates_compasses_by_command:
             self._dk_calibrate(DO_START_MAG_CAL, 0, 1, 1)  # all compasses; retry; save by itself
         else:
             self._dk_calibrate(PREFLIGHT_CALIBRATION, 0, 1)

@@ -14,7 +14,6 @@ from aerokit.runtime.components import is_autopilot
 
 if TYPE_CHECKING:
     from aerokit.dronekit.mavlink import MAVConnection
-    from aerokit.dronekit.vehicle import Vehicle
     from aerokit.mavlink.messages import Heartbeat
 
 __all__ = ["Master", "MessageFactory"]
@@ -34,8 +33,6 @@ class Master:
 
     def __init__(self, connection: MAVConnection) -> None:
         self._connection = connection
-        self.vehicle: Vehicle | None = None
-        """The vehicle of this connection, once there is one."""
         ours = connection.connection
         self.mav = MessageFactory(self._send, ours.source_system, ours.source_component)
         """Makes and sends messages."""
@@ -97,8 +94,9 @@ class Master:
         """
         heartbeat = self._heard()[1]
         is_px4 = heartbeat is not None and heartbeat.autopilot == PX4
-        if self.vehicle is not None and (isinstance(mode, str) or not is_px4):
-            self.vehicle.mode = mode
+        vehicle = self._connection.vehicle
+        if vehicle is not None and (isinstance(mode, str) or not is_px4):
+            vehicle.mode = mode
             return
         order = (self.mode_mapping() or {})[mode] if isinstance(mode, str) else mode
         if is_px4 and not isinstance(mode, str):
@@ -200,6 +198,30 @@ class Master:
     def wait_heartbeat(self, blocking: bool = True, timeout: float | None = None) -> Any:
         """The next HEARTBEAT; None when there is none in ``timeout`` seconds."""
         return self.recv_match(type="HEARTBEAT", blocking=blocking, timeout=timeout)
+
+    def field(self, type: str, field: str, default: Any = None) -> Any:  # noqa: A002 - pymavlink's word
+        """A field of the last message of a type; ``default`` when there is none."""
+        return getattr(self.messages.get(type), field, default)
+
+    def time_since(self, mtype: str) -> float:
+        """Seconds since the last message of a type, or, while there is none, since messages were first asked for."""
+        return self.messages.age_s(mtype)
+
+    def param(self, name: str, default: float | None = None) -> float | None:
+        """A parameter as far as it is known; ``default`` while it is not."""
+        vehicle = self._connection.vehicle
+        return default if vehicle is None else vehicle.parameters.get(name, False, default=default)
+
+    def location(self, relative_alt: bool = False) -> Any:
+        """``lat``, ``lon`` (degrees), ``alt`` (metres) and ``heading`` (degrees), of messages that come from now on.
+
+        Waits for a GPS fix in three dimensions. The altitude is above home (``relative_alt``) or the sea.
+        """
+        gps = self.recv_match(condition="GPS_RAW_INT.fix_type>=3", type="GPS_RAW_INT", blocking=True)
+        hud = self.recv_match(type="VFR_HUD", blocking=True)
+        position = self.recv_match(type="GLOBAL_POSITION_INT", blocking=True)
+        alt = position.relative_alt * 1e-3 if relative_alt else hud.alt
+        return mavutil.location(gps.lat * 1e-7, gps.lon * 1e-7, alt, hud.heading)
 
     @staticmethod
     def probably_vehicle_heartbeat(msg: Any) -> bool:

@@ -17,22 +17,26 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from aerokit.dronekit.exceptions import APIException
 from aerokit.dronekit.listener_thread import ListenerThread
+from aerokit.dronekit.mav_writer import MAVWriter
 from aerokit.dronekit.orders import Orders
 from aerokit.dronekit.standing import Given
 from aerokit.dronekit.weakly import weakly
 from aerokit.errors import AerokitError, ConnectionClosed, LinkOpenError, LocalProtocolError
-from aerokit.links.address import ACCEPTED_FORMS
+from aerokit.links.address import ACCEPTED_FORMS, parse_address
 from aerokit.links.reconnecting import ReconnectingLink
-from aerokit.sync.twins import open_connection
+from aerokit.runtime.components import is_autopilot
+from aerokit.runtime.opening import open_connection
+from aerokit.sync.loop_thread import LoopThread
 
 if TYPE_CHECKING:
     from aerokit.dronekit.master import Master
+    from aerokit.dronekit.vehicle import Vehicle
     from aerokit.links.link import Peer
     from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.message import Message
     from aerokit.runtime.bus import Detach
     from aerokit.runtime.connection import Connection
-    from aerokit.sync.twins import Connection as SyncConnection
+    from aerokit.sync.loop_thread import Held
 
 __all__ = ["MAVConnection", "MAVWriter", "mavudpin_multi"]
 
@@ -71,9 +75,11 @@ class MAVConnection:
         """System id of the vehicle, 0 before it was heard."""
         self.listener_thread = ListenerThread()
         """Where the callbacks of the program run."""
-        self._sync = _open(ip, baud, source_system, source_component)
-        self.loop = self._sync._loop
+        self.loop = LoopThread()
         """The event loop's thread."""
+        self._held = _open(self.loop, ip, baud, source_system, source_component)
+        self.connection = self._held.value
+        """The asynchronous connection, for code that runs on its loop."""
         self.orders = Orders(self.loop)
         """What was ordered without waiting."""
         self.given = Given()
@@ -85,6 +91,8 @@ class MAVConnection:
         """Whether the vehicle has said that it understands MAVLink 2, whichever version it speaks so far."""
         self._at_close: list[Callable[[], object]] = []
         self._master: Master | None = None
+        self.vehicle: Vehicle | None = None
+        """The vehicle of this connection, once there is one."""
         self.loop_listeners: list[Callable[[MAVConnection], object]] = []
         """Functions that are called about 20 times a second; see :meth:`forward_loop`."""
         self.message_listeners: list[Callable[[MAVConnection, Any], object]] = []
@@ -99,11 +107,6 @@ class MAVConnection:
             made.add(self)
 
     # ------------------------------------------------------------------------------- sending
-
-    @property
-    def connection(self) -> Connection:
-        """The asynchronous connection, for code that runs on its loop."""
-        return self._sync.aio
 
     def send(self, message: Message, *, to: int | None = None) -> None:
         """Send a message, in the order of the calls; from any thread, never blocks.
@@ -149,7 +152,7 @@ class MAVConnection:
         """
         self.message_listeners.append(fn)
         if len(self.message_listeners) == 1:
-            self.loop.call_soon(self._tap, self._forward)
+            self.loop.call_soon(self.tap, self._forward)
         return fn
 
     def forward_loop(self, fn: FunctionT) -> FunctionT:
@@ -162,8 +165,8 @@ class MAVConnection:
     def pipe(self, target: MAVConnection) -> MAVConnection:
         """Pass everything on that comes here to ``target``, and the other way round; returns ``target``."""
         target.target_system = self.target_system
-        self.loop.call_soon(self._tap, lambda frame, peer: target._pass_on(frame))
-        target.loop.call_soon(target._tap, lambda frame, peer: self._pass_on(frame))
+        self.loop.call_soon(self.tap, lambda frame, peer: target._pass_on(frame))
+        target.loop.call_soon(target.tap, lambda frame, peer: self._pass_on(frame))
         return target
 
     # ---------------------------------------------------------------------------- life cycle
@@ -196,7 +199,10 @@ class MAVConnection:
             self.orders.wait(ORDERS_END_S)
         finally:
             self.listener_thread.stop()
-            self._sync.close()
+            try:
+                self._held.close()
+            finally:
+                self.loop.close()
             self.listener_thread.join()
             for function in self._at_close:
                 function()
@@ -220,11 +226,23 @@ class MAVConnection:
 
     @property
     def _accept_input(self) -> bool:
-        return self._alive
+        return self._alive and "bytes_received" not in vars(self.connection)
+
+    @_accept_input.setter
+    def _accept_input(self, value: bool) -> None:
+        """False: as if nothing came, which is how programs try what they do then. What comes meanwhile is lost."""
+        if value:
+            vars(self.connection).pop("bytes_received", None)
+        else:
+            vars(self.connection)["bytes_received"] = lambda data, peer: None
 
     @property
     def _death_error(self) -> Exception | None:
-        return self.connection._error
+        try:
+            self.connection.raise_if_ended()
+        except AerokitError as error:
+            return error
+        return None
 
     @property
     def out_queue(self) -> queue.Queue[bytes]:
@@ -233,7 +251,8 @@ class MAVConnection:
 
     # ------------------------------------------------------------------------------- inside
 
-    def _tap(self, sink: Callable[[Frame, Peer], None]) -> None:
+    def tap(self, sink: Callable[[Frame, Peer], None]) -> None:
+        """Have a function called with every frame that comes, until the connection is closed (loop thread)."""
         self._detach.append(self.connection.tap(sink))
 
     def _forward(self, frame: Frame, peer: Peer) -> None:
@@ -268,6 +287,13 @@ class MAVConnection:
     def _write_raw(self, frame: Frame) -> None:
         with contextlib.suppress(AerokitError):
             self.connection.write_raw(frame.raw)
+
+    def is_of_another_vehicle(self, system_id: int) -> bool:
+        """Whether this system has an autopilot of its own and is not the connected vehicle."""
+        heard = self.connection.heard
+        return system_id != self.target_system and any(
+            source[0] == system_id and is_autopilot(heartbeat) for source, heartbeat in heard.items()
+        )
 
     def follow_version(self, heartbeat: Message) -> None:
         """Speak the version of MAVLink that the vehicle speaks: old firmware knows no other one (loop thread)."""
@@ -306,20 +332,42 @@ def connections_made() -> Iterator[weakref.WeakSet[MAVConnection]]:
         _made.reset(token)
 
 
-def _open(ip: str, baud: int, source_system: int, source_component: int) -> SyncConnection:
+def _open(
+    loop: LoopThread, ip: str, baud: int, source_system: int, source_component: int
+) -> Held[Connection]:
     """Open it; what refuses at first may be a simulator that the program has just started."""
+    try:
+        _check_address(ip)
+        for attempt in range(ATTEMPTS):
+            try:
+                return loop.hold_open(
+                    open_connection(
+                        ip,
+                        baud=baud,
+                        source_system=source_system,
+                        source_component=source_component,
+                        reconnect=True,
+                    )
+                )
+            except LinkOpenError as error:
+                if attempt == ATTEMPTS - 1 or not isinstance(error.__cause__, ConnectionRefusedError):
+                    _raise_classic(error)
+                time.sleep(BETWEEN_ATTEMPTS_S)
+        raise AssertionError
+    except BaseException:
+        loop.close()
+        raise
+
+
+def _check_address(ip: object) -> None:
     if not isinstance(ip, str):
         raise LocalProtocolError(f"ip = {ip!r} is no connection string; accepted are\n{ACCEPTED_FORMS}")
-    for attempt in range(ATTEMPTS):
-        try:
-            return open_connection(
-                ip, baud=baud, source_system=source_system, source_component=source_component, reconnect=True
-            )
-        except LinkOpenError as error:
-            if attempt == ATTEMPTS - 1 or not isinstance(error.__cause__, ConnectionRefusedError):
-                _raise_classic(error)
-            time.sleep(BETWEEN_ATTEMPTS_S)
-    raise AssertionError
+    try:
+        parse_address(ip)
+    except LocalProtocolError as error:
+        from aerokit.links.address_error import AddressError
+
+        raise AddressError(str(error)) from None
 
 
 def _raise_classic(error: LinkOpenError) -> NoReturn:
@@ -337,22 +385,3 @@ def _raise_classic(error: LinkOpenError) -> NoReturn:
 def mavudpin_multi(device: str, baud: int | None = None, **_: Any) -> MAVConnection:
     """Listen for UDP and answer everybody heard: any connection that listens does."""
     return MAVConnection(f"udpin:{device}")
-
-
-class MAVWriter:
-    """A file-like object whose ``write`` puts bytes into a queue, as programs that build their own MAVLink use it."""
-
-    def __init__(self, queue: queue.Queue[bytes]) -> None:
-        self.queue = queue
-
-    def write(self, pkt: bytes) -> None:
-        """Put them there."""
-        self.queue.put(pkt)
-
-    def read(self) -> NoReturn:
-        """Nothing can be read.
-
-        Raises:
-            RuntimeError: always.
-        """
-        raise RuntimeError("a MAVWriter is for writing")

@@ -8,9 +8,7 @@ import threading
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from aerokit.dronekit.pymavlink_messages import message_of
 from aerokit.errors import AerokitError
-from aerokit.runtime.components import is_autopilot
 
 if TYPE_CHECKING:
     from aerokit.dronekit.mavlink import MAVConnection
@@ -30,7 +28,7 @@ EVERY_NAME = "*"
 
 
 class MessageListeners:
-    """The message listeners of one vehicle, called on its listener thread.
+    """The message listeners of one vehicle, called on its listener thread. pymavlink is imported for the first of them.
 
     They hear what the vehicle's system says, every component of it, and what comes from radios, ground stations and
     the like; not what other vehicles on the link say.
@@ -42,10 +40,13 @@ class MessageListeners:
         self._detach: dict[str, Detach] = {}
         self._lock = threading.Lock()
         self._is_started = False
+        self._message_of: Callable[[Frame], Any]
 
     def add(self, name: str, listener: MessageListener) -> None:
         """Have it called for every message of this name, or for every message (``'*'``); not twice."""
-        name = str(name)
+        from aerokit.dronekit.pymavlink_messages import message_of
+
+        name, self._message_of = str(name), message_of
         with self._lock:
             present = self._listeners.get(name, ())
             if listener in present:
@@ -121,14 +122,10 @@ class MessageListeners:
             self._take_frame(message.received_frame, None)
 
     def _take_frame(self, frame: Frame, peer: Peer) -> None:
-        if frame.system_id == self._handler.target_system or not self._is_of_another_vehicle(frame.system_id):
+        if not self._handler.is_of_another_vehicle(frame.system_id):
             self._handler.listener_thread.offer(self._deliver, frame)
 
-    def _is_of_another_vehicle(self, system_id: int) -> bool:
-        heard = self._handler.connection.heard
-        return any(source[0] == system_id and is_autopilot(heartbeat) for source, heartbeat in heard.items())
-
     def _deliver(self, frame: Frame) -> None:
-        message = message_of(frame)
+        message = self._message_of(frame)
         if message is not None:
             self.notify(message.get_type(), message)

@@ -4,29 +4,21 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from aerokit.dronekit.core import VehicleCore
 from aerokit.dronekit.message_listeners import MessageListener, MessageListeners
-from aerokit.dronekit.pymavlink_messages import sendable
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from aerokit.dronekit.master import MessageFactory
-    from aerokit.dronekit.mavlink import MAVConnection
 
 __all__ = ["MessageMethods"]
 
 
-class MessageMethods:
+class MessageMethods(VehicleCore):
     """What the vehicle says, as objects of pymavlink; and to the vehicle whatever pymavlink can make."""
 
-    _handler: MAVConnection
     _message_listeners: MessageListeners
-
-    if TYPE_CHECKING:
-
-        @property
-        def _dk_target_system(self) -> int: ...
-        def _dk_check_link(self) -> object: ...
 
     def add_message_listener(self, name: str, fn: MessageListener) -> None:
         """Have ``fn(vehicle, name, message)`` called for every message of this name (``'*'``: every message).
@@ -69,5 +61,7 @@ class MessageMethods:
             LocalProtocolError: a ValueError; a field is wrong. Nothing was sent.
             APIException: the link is down.
         """
+        from aerokit.dronekit.sendable_messages import sendable
+
         self._dk_check_link()
         self._handler.send(sendable(message, self._dk_target_system), to=self._dk_target_system)

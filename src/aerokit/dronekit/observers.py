@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 if TYPE_CHECKING:
     from aerokit.dronekit.listener_thread import ListenerThread
 
-__all__ = ["AttributeListener", "HasObservers"]
+__all__ = ["AttributeListener", "HasObservers", "ListenerT"]
 
 logger = logging.getLogger("dronekit")
 

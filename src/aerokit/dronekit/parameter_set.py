@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, SupportsFloat, SupportsIndex
 
-from aerokit.errors import AerokitError, LocalProtocolError, ParameterRejected
-from aerokit.parameters import Parameter, checked_value
-from aerokit.vehicle.parameters.names import Found
-from aerokit.vehicle.parameters.results import outcome_of
+from aerokit.errors import AerokitError, LocalProtocolError, ParameterRejected, ParameterTimeout
+from aerokit.parameters import checked_value
 
 if TYPE_CHECKING:
     from aerokit.parameters import ParameterType
@@ -45,23 +43,15 @@ async def set_parameter(aio: AsyncVehicle, name: str, value: float, retries: int
     A fraction given for an integer parameter is cut off, as by ArduPilot itself. A vehicle that answers nothing
     is sent PARAM_SET once, then asked what it has, for ``retries`` + 1 tries in all.
     """
-    access, names = aio.parameters._access, aio.parameters._names
     patience_s = (retries + LAST_TRY) * _try_s(aio)
     try:
-        found = (await names.find([name], patience_s))[name]
-        if not isinstance(found, Found):
-            return found
-        type_ = found.parameter.type
-        wanted = Parameter(found.name, as_held(found.name, found.to_vehicle(value), type_), type_)
-        answers = await access.write([wanted], patience_s)
-    except LocalProtocolError as error:
+        known = aio.parameters.known(name) or await aio.parameters.read(name, patience_s=patience_s)
+        wanted = as_held(name, value, known.type)
+        done = await aio.parameters.set(name, wanted, patience_s=patience_s)
+    except (LocalProtocolError, ParameterRejected, ParameterTimeout) as error:
         return error
-    answer = answers[found.name]
-    outcome = outcome_of(wanted, found.parameter, answer)
-    if isinstance(outcome, AerokitError):
-        return outcome
-    if outcome == "clamped" and isinstance(answer, Parameter):
-        return ParameterRejected(f"the vehicle made it {answer.value:g}", name=found.name)
+    if done.outcome == "clamped":
+        return ParameterRejected(f"the vehicle made it {done.value:g}", name=name)
     return None
 
 
@@ -73,4 +63,5 @@ def as_held(name: str, value: float, type: ParameterType) -> int | float:  # noq
 
 
 def _try_s(aio: AsyncVehicle) -> float:
-    return max(TRY_S, ROUND_TRIPS * (aio.parameters._access._transfers.round_trip.smoothed_s or 0.0))
+    report = aio.link_quality.latest
+    return max(TRY_S, ROUND_TRIPS * ((report and report.round_trip_s) or 0.0))

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import ItemsView, Iterator, KeysView, MutableMapping, ValuesView
+from collections.abc import Callable, ItemsView, Iterator, KeysView, MutableMapping, ValuesView
+from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
 import anyio
 
 from aerokit.dronekit.exceptions import APIException, TimeoutError  # noqa: A004 - DroneKit's name
-from aerokit.dronekit.observers import AttributeListener, HasObservers
+from aerokit.dronekit.observers import AttributeListener, HasObservers, ListenerT
 from aerokit.dronekit.parameter_reading import ParameterReading
 from aerokit.dronekit.parameter_set import number_of, set_parameter
 from aerokit.dronekit.parameter_values import ParameterValues
@@ -37,7 +38,7 @@ class Parameters(MutableMapping[str, float], HasObservers):
     Reading a value that has not come yet asks the vehicle for that one, so it seldom waits for the whole list;
     iterating does, :func:`len` tells how many have come. A value that is known is read without waiting.
 
-    Names from before ArduPilot 4.7 and since are taken by both, and values converted, with a warning.
+    Names from before and after ArduPilot renamed a parameter are taken by both, and values converted, with a warning.
 
     Listeners get ``(parameters, name, value)``, when a value has changed or has come for the first time.
     """
@@ -46,6 +47,8 @@ class Parameters(MutableMapping[str, float], HasObservers):
         HasObservers.__init__(self, vehicle._dk_listener_thread)
         self._vehicle = vehicle
         self._values = ParameterValues()
+        self._count = 0
+        """How many there are by the last message."""
         self._reading = ParameterReading(vehicle, self._take_all)
         vehicle._dk_on(ParamValue, self._on_value)
         vehicle._dk_at_start(self._start)
@@ -56,7 +59,7 @@ class Parameters(MutableMapping[str, float], HasObservers):
     def __getitem__(self, name: str) -> float:
         value = self.get(name)
         if value is None:
-            raise KeyError(name.upper() if isinstance(name, str) else name)
+            raise KeyError(_described(name.upper()) if isinstance(name, str) else name)
         return value
 
     def get(  # type: ignore[override]
@@ -194,9 +197,15 @@ class Parameters(MutableMapping[str, float], HasObservers):
         """
         super().remove_attribute_listener(attr_name.upper(), observer)
 
-    def notify_attribute_listeners(self, attr_name: str, value: Any, cache: bool = True) -> None:
-        """Tell the listeners of a parameter a value, unless it is the one told before, whatever ``cache`` says."""
-        super().notify_attribute_listeners(attr_name.upper(), value, cache=True)
+    def notify_attribute_listeners(self, attr_name: str, value: Any, cache: bool = False) -> None:
+        """Tell the listeners of a parameter a value; with ``cache`` only when it is not the one told before."""
+        super().notify_attribute_listeners(attr_name.upper(), value, cache)
+
+    def on_attribute(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self, attr_name: str | list[str] | tuple[str, ...]
+    ) -> Callable[[ListenerT], ListenerT]:
+        """Decorate a listener with the name, or the list of names, of parameters. It cannot be removed by name then."""
+        return super().on_attribute(attr_name)
 
     # ------------------------------------------------------------------------------- inside
 
@@ -215,10 +224,7 @@ class Parameters(MutableMapping[str, float], HasObservers):
     @property
     def _is_settled(self) -> bool:
         """Whether the vehicle has nothing but what is known: the whole list has come, and is as long as it says."""
-        if not self._reading.is_complete:
-            return False
-        count = self._vehicle._dk_vehicle.parameters._access.store.count
-        return count is None or count <= len(self._values)
+        return self._reading.is_complete and self._count <= len(self._values)
 
     async def _wait_for(self, name: str) -> None:
         with anyio.move_on_after(READY_S) as waiting:
@@ -231,14 +237,15 @@ class Parameters(MutableMapping[str, float], HasObservers):
             self.wait_ready()
         return self._values.copy()
 
-    def _start(self) -> None:
-        aio = self._vehicle._dk_vehicle
-        aio._talk.detach.append(aio.connection.bus.attach_event(ParameterChanged, weakly(self._on_changed)))
+    def _start(self, ends: ExitStack) -> None:
+        bus = self._vehicle._dk_vehicle.connection.bus
+        ends.callback(bus.attach_event(ParameterChanged, weakly(self._on_changed)))
         self._reading.begin()
 
     def _on_value(self, message: ParamValue) -> None:
         """The table underneath has taken it already: there, integers are what they are."""
-        told = self._vehicle._dk_vehicle.parameters._access.store.get(message.param_id)
+        self._count = message.param_count
+        told = self._vehicle._dk_vehicle.parameters.known(message.param_id)
         if told is not None:
             self._take(told.name, float(told.value))
 
@@ -278,6 +285,13 @@ def _upper(name: str) -> str:
     if not isinstance(name, str):
         raise LocalProtocolError(f"parameter name = {name!r} is no text")
     return name.upper()
+
+
+def _described(name: str) -> str:
+    from aerokit.parameters.renames import replacement_of
+
+    replaced = replacement_of(name)
+    return f"{name}: replaced by {replaced}" if replaced else name
 
 
 def _is_possible(name: str) -> bool:

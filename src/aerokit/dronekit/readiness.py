@@ -6,10 +6,10 @@ import math
 import time
 from typing import TYPE_CHECKING, Any
 
+from aerokit.dronekit.attributes import VehicleAttributes
 from aerokit.dronekit.exceptions import APIException, TimeoutError  # noqa: A004 - DroneKit's name
 
 if TYPE_CHECKING:
-    import threading
     from collections.abc import Callable
 
 __all__ = ["DEFAULT_ATTRIBUTES", "Readiness"]
@@ -20,16 +20,8 @@ LONGEST_WAIT_S = 0.2
 """Waits are cut into slices: Ctrl-C and the end of the link are noticed between them."""
 
 
-class Readiness:
+class Readiness(VehicleAttributes):
     """What is ready is what was told at least once."""
-
-    if TYPE_CHECKING:
-        _ready_attrs: set[str]
-        _dk_failures: dict[str, APIException]
-        _dk_became_ready: threading.Condition
-        _dk_seekers: dict[str, Callable[[], None]]
-
-        def _dk_check_link(self) -> object: ...
 
     def wait_ready(
         self,

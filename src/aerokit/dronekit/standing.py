@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from aerokit.mavlink.messages import CommandAck
     from aerokit.vehicle.vehicle import Vehicle
 
-__all__ = ["Given", "Standing", "send_while_standing"]
+__all__ = ["Given", "Standing", "until_answered"]
 
 ARMED = 128
 OWN_MODES_S = 10.0
@@ -149,26 +149,18 @@ class Standing:
             self.is_done = True
 
 
-async def send_while_standing(
-    vehicle: Vehicle,
-    standing: Standing,
-    send: Callable[..., Awaitable[CommandAck]],
-    command: int,
-    *params: float,
-    **options: Any,
-) -> None:
-    """Send a command until it is answered, its effect was told, or it does not stand any more.
+async def until_answered(sending: Awaitable[CommandAck], standing: Standing) -> None:
+    """Await a command of an order: its answer, or that its effect was told.
 
     Raises:
         CommandRejected: the vehicle refused.
         CommandTimeout: there was no answer; the text says so when it was not sent again for a reason.
     """
     try:
-        await vehicle._answered(send, command, *params, component_id=0, standing=standing, **options)
+        await sending
     except CommandTimeout:
-        if standing.is_done:
-            return
-        raise
+        if not standing.is_done:
+            raise
 
 
 def _state(heartbeat: Heartbeat) -> tuple[int, bool]:

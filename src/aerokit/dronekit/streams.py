@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
 import anyio
@@ -43,7 +44,11 @@ async def request_streams(vehicle: Vehicle, rate: float) -> None:
     if not vehicle.autopilot.stream_groups:
         await _request_missing(vehicle, rate)
         return
-    heard = _Heard(vehicle)
+    with ExitStack() as ends:
+        await _keep_asking(vehicle, rate, _Heard(vehicle, ends))
+
+
+async def _keep_asking(vehicle: Vehicle, rate: float, heard: _Heard) -> None:
     patience_s = COMES_WITHIN_S
     while True:
         _request(vehicle, rate)
@@ -64,25 +69,25 @@ def _request(vehicle: Vehicle, rate: float) -> None:
 
 async def _request_missing(vehicle: Vehicle, rate: float) -> None:
     await anyio.sleep(COMES_WITHIN_S)
-    for name in NEEDED:
-        if not vehicle.telemetry.cells[name].is_known:
-            for message_type in vehicle.telemetry.required_messages(name):
-                vehicle._talk.rates.want(message_type, rate, is_optional=True)
+    missing = [name for name in NEEDED if not vehicle.telemetry.cells[name].is_known]
+    required = vehicle.telemetry.required_messages
+    with ExitStack() as rates:
+        for message_type in dict.fromkeys(each for name in missing for each in required(name)):
+            rates.enter_context(vehicle.rate(message_type, rate))
+        await anyio.sleep_forever()
 
 
 class _Heard:
     """Whether streamed messages have come, and whether streams are to be asked for again."""
 
-    def __init__(self, vehicle: Vehicle) -> None:
+    def __init__(self, vehicle: Vehicle, ends: ExitStack) -> None:
         self.something = False
         self.is_to_be_asked = asyncio.Event()
         bus = vehicle.connection.bus
         for message_type in STREAMED:
-            vehicle._talk.detach.append(
-                bus.attach(message_type, self._on_message, system_id=vehicle.system_id)
-            )
+            ends.callback(bus.attach(message_type, self._on_message, system_id=vehicle.system_id))
         for event_type in (LinkRestored, VehicleBack, VehicleRebooted):
-            vehicle._talk.detach.append(bus.attach_event(event_type, self._on_event))
+            ends.callback(bus.attach_event(event_type, self._on_event))
         self._system_id = vehicle.system_id
 
     def forget(self) -> None:

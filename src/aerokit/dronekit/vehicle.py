@@ -5,14 +5,14 @@ from __future__ import annotations
 import logging
 import threading
 import weakref
-from contextlib import asynccontextmanager
+from contextlib import ExitStack, asynccontextmanager
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import anyio
 
-from aerokit import sync
 from aerokit.dronekit.channels import Channels
-from aerokit.dronekit.commands import CommandSequence, WaypointLoader
+from aerokit.dronekit.current_command import CurrentCommand
 from aerokit.dronekit.exceptions import APIException, TimeoutError  # noqa: A004 - DroneKit's name
 from aerokit.dronekit.flight import FlightMethods
 from aerokit.dronekit.gimbal import Gimbal
@@ -28,23 +28,24 @@ from aerokit.dronekit.readiness import Readiness
 from aerokit.dronekit.shadowable import Shadowable
 from aerokit.dronekit.streams import request_streams
 from aerokit.dronekit.weakly import weakly
-from aerokit.errors import AerokitError, ConnectFailed, LocalProtocolError, OperationTimeout
+from aerokit.errors import AerokitError, ConnectFailed
 from aerokit.mavlink.messages import CommandLong
 from aerokit.runtime.background import Background
 from aerokit.runtime.components import is_autopilot
 from aerokit.vehicle.connect import connect as connect_async
 
 if TYPE_CHECKING:
-    import concurrent.futures
     from collections.abc import AsyncIterator, Awaitable, Callable
     from types import TracebackType
 
     from typing_extensions import Self
 
+    from aerokit import sync
+    from aerokit.dronekit.commands import CommandSequence, WaypointLoader
     from aerokit.dronekit.master import Master
     from aerokit.dronekit.mavlink import MAVConnection
-    from aerokit.mavlink.message import Message
     from aerokit.runtime.connection import Connection
+    from aerokit.sync.loop_thread import Held
     from aerokit.vehicle.state.condition import StatusText
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
@@ -71,17 +72,10 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, Readiness, VehiclePriv
     """
 
     def __init__(self, handler: MAVConnection) -> None:
-        super().__init__(handler.listener_thread)
-        self._handler = handler
-        self._logger = logging.getLogger("dronekit")
-        self._autopilot_logger = logging.getLogger("autopilot")
-        self._dk_aio: AsyncVehicle | None = None
+        super().__init__(handler)
+        self._dk_held: Held[AsyncVehicle] | None = None
         self._dk_sync: sync.Vehicle | None = None
-        self._dk_heartbeat_limit: float = 0.0
-        self._dk_message_handlers: list[tuple[type[Message], Callable[[Any], None], bool]] = []
-        self._dk_starters: list[Callable[[], None]] = []
         self._dk_initializing = threading.Lock()
-        self._dk_tasks: Background | None = None
         self._message_listeners = MessageListeners(self, handler)
         self._dk_make_streams()
         self._location = Locations(self)
@@ -89,7 +83,8 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, Readiness, VehiclePriv
         self._channels = Channels(self, 8)
         self._gimbal = Gimbal(self)
         self._parameters = Parameters(self)
-        self._commands = CommandSequence(self)
+        self._dk_current_command = CurrentCommand(self)
+        self._dk_mark_ready("commands")
 
     # --------------------------------------------------------------------------------- parts
 
@@ -118,6 +113,15 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, Readiness, VehiclePriv
         """The autopilot's parameters, as a mapping of names to values."""
         return self._parameters
 
+    @cached_property
+    def _commands(self) -> CommandSequence:
+        from aerokit.dronekit.commands import (
+            CommandSequence,  # with pymavlink: programs without missions do without
+        )
+
+        made: CommandSequence = self.__dict__.setdefault("_commands", CommandSequence(self))
+        return made
+
     @property
     def commands(self) -> CommandSequence:
         """The mission: download, change, upload."""
@@ -129,6 +133,8 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, Readiness, VehiclePriv
 
     @property
     def _wploader(self) -> WaypointLoader:
+        from aerokit.dronekit.commands import WaypointLoader
+
         return WaypointLoader(self._commands)
 
     def flush(self) -> None:
@@ -156,8 +162,12 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, Readiness, VehiclePriv
         Raises:
             APIException: the vehicle is not connected.
         """
-        if self._dk_sync is None:
+        if self._dk_held is None:
             raise APIException("the vehicle is not connected yet: call initialize()")
+        if self._dk_sync is None:
+            from aerokit.sync import Vehicle  # for programs that use it
+
+            self._dk_sync = Vehicle(self._handler.loop, self._dk_held, owns_loop=False)
         return self._dk_sync
 
     def run(self, function: Callable[..., Awaitable[Any]], /, *args: Any, **kwargs: Any) -> Any:
@@ -186,17 +196,16 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, Readiness, VehiclePriv
                 return
             self._dk_heartbeat_limit = max(heartbeat_timeout or 0.0, 0.0)
             timeout = self._dk_heartbeat_limit or CONNECT_S
-            loop = self._handler.loop
             try:
-                held = loop.hold_open(_found(self._handler.connection, timeout, weakly(self._dk_begin), rate))
-                self._dk_sync = sync.Vehicle(loop, held, owns_loop=False)
+                found = _found(self._handler.connection, timeout, weakly(self._dk_begin), rate)
+                self._dk_held = self._handler.loop.hold_open(found)
                 self._dk_wait_until_booted(timeout)
                 if rate is not None:
                     Readiness.wait_ready(self, *FIRST_VALUES, timeout=FIRST_VALUES_S, raise_exception=False)
             except ConnectFailed as error:
-                raise APIException(f"Timeout in initializing connection. {error}") from error
+                raise APIException(f"Timeout in initializing connection. {error}") from None
             except AerokitError as error:
-                raise APIException(str(error)) from error
+                raise APIException(str(error)) from None
 
     def close(self) -> None:
         """End it: what was ordered a moment before gets the time to be answered, then link and threads end.
@@ -222,101 +231,27 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, Readiness, VehiclePriv
         return self._handler.master
 
     def _is_mode_available(self, mode_code: int, base_mode: int = 0) -> bool:
-        return not mode_name(self._dk_vehicle, base_mode or 1, mode_code).endswith(f" {mode_code}")
-
-    @property
-    def _dk_target_system(self) -> int:
-        return self._handler.target_system
-
-    # -------------------------------------------------------------------- for the other parts
-    # `_dk_`: names that no subclass in the classic style takes for its own things.
-
-    @property
-    def _dk_vehicle(self) -> AsyncVehicle:
-        if self._dk_aio is None:
-            raise APIException("the vehicle is not connected yet: call initialize()")
-        return self._dk_aio
-
-    def _dk_on(self, message_type: type[Message], handler: Callable[[Any], None]) -> None:
-        stream = self._dk_streams.get(message_type)
-        if stream is None:
-            self._dk_message_handlers.append((message_type, handler, True))
-        else:
-            stream.add(handler)
-
-    def _dk_on_any_component(self, message_type: type[Message], handler: Callable[[Any], None]) -> None:
-        self._dk_message_handlers.append((message_type, handler, False))
-
-    def _dk_at_start(self, function: Callable[[], None]) -> None:
-        self._dk_starters.append(function)
-
-    def _dk_background(self, function: Callable[[], Awaitable[None]]) -> None:
-        if self._dk_tasks is not None:
-            self._dk_tasks.start(function, f"dronekit {getattr(function, '__name__', 'task')}")
-
-    def _dk_check_link(self) -> AsyncVehicle:
-        """The asynchronous vehicle, if it can be talked to."""
-        aio = self._dk_vehicle
-        if self._handler.is_closed:
-            raise APIException("the vehicle was closed")
-        try:
-            aio.connection.raise_if_ended()
-        except AerokitError as error:
-            raise APIException(str(error)) from error
-        age = aio.heartbeat_age
-        if self._dk_heartbeat_limit and age > self._dk_heartbeat_limit:
-            raise APIException(f"no heartbeat of the vehicle for {age:.0f} s")
-        return aio
-
-    def _dk_run(self, function: Callable[..., Awaitable[Any]], *args: Any, **kwargs: Any) -> Any:
-        self._dk_check_link()
-        try:
-            return self._handler.loop.run(function, *args, **kwargs)
-        except LocalProtocolError:
-            raise
-        except OperationTimeout as error:
-            raise TimeoutError(str(error)) from error
-        except AerokitError as error:
-            raise APIException(str(error)) from error
-
-    def _dk_order(
-        self, kind: str, function: Callable[..., Awaitable[object]], *args: Any, **kwargs: Any
-    ) -> concurrent.futures.Future[None]:
-        self._dk_check_link()
-        try:
-            return self._handler.orders.give(kind, function, *args, **kwargs)
-        except AerokitError as error:
-            raise APIException(str(error)) from error
-
-    def _dk_send(self, message: Message) -> None:
-        self._dk_check_link()
-        self._handler.send(message)
-
-    def _dk_pause(self, seconds: float) -> None:
-        """Sleep, unless the vehicle is closed meanwhile."""
-        self._handler.wait_closed(seconds)
+        return not mode_name(self._dk_vehicle, mode_code).endswith(f" {mode_code}")
 
     # ------------------------------------------------------------------------------- inside
 
-    def _dk_begin(self, aio: AsyncVehicle, tasks: Background, rate: float | None) -> None:
+    def _dk_begin(self, aio: AsyncVehicle, tasks: Background, ends: ExitStack, rate: float | None) -> None:
         """On the loop, in the turn in which the vehicle was found; the loop gets weak references only."""
         self._dk_aio, self._dk_tasks = aio, tasks
         self._handler.target_system = aio.system_id
-        self._handler.master.vehicle = self
+        self._handler.vehicle = self
         self._handler.orders.describe = self._dk_describe
         for message_type, stream in self._dk_streams.items():
             stream.begin(aio.component_id)
             detach = aio.connection.bus.attach_frames(
                 message_type, weakly(stream.take), system_id=aio.system_id
             )
-            aio._talk.detach.append(detach)
+            ends.callback(detach)
         for message_type, handler, only_autopilot in self._dk_message_handlers:
             take = weakly(handler)
             take = _only_of(aio.component_id, take) if only_autopilot else take
-            aio._talk.detach.append(aio.connection.bus.attach(message_type, take, system_id=aio.system_id))
-        aio._talk.detach.append(
-            aio.telemetry.status_text.observe(weakly(self._dk_on_status_text), every_arrival=True)
-        )
+            ends.callback(aio.connection.bus.attach(message_type, take, system_id=aio.system_id))
+        ends.callback(aio.telemetry.status_text.observe(weakly(self._dk_on_status_text), every_arrival=True))
         first = aio.connection.heard.get((aio.system_id, aio.component_id))
         if first is not None:
             self._handler.follow_version(first)
@@ -328,7 +263,7 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, Readiness, VehiclePriv
         itself = weakref.ref(self)
         self._dk_background(lambda: watch_link(itself, aio))
         for starter in self._dk_starters:
-            starter()
+            starter(ends)
 
     def _dk_on_heartbeat(self, message: Any) -> None:
         if not is_autopilot(message):  # a ground station or a companion that took the autopilot's ids
@@ -365,8 +300,9 @@ async def _found(
     async with connect_async(connection, timeout=timeout, rates={}) as aio:
         tasks = Background(connection.fail)
         try:
-            begin(aio, tasks, rate)
-            yield aio
+            with ExitStack() as ends:
+                begin(aio, tasks, ends, rate)
+                yield aio
         finally:
             await tasks.aclose()
 

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
         Renamed,
         find_rename,
         other_names,
+        replacement_of,
         to_known,
         translate_values,
     )
@@ -54,6 +55,7 @@ __all__ = [
     "parse_metadata",
     "parse_parameter_file",
     "read_parameter_file",
+    "replacement_of",
     "to_known",
     "translate_values",
     "unpack_parameters",
@@ -65,7 +67,8 @@ _HOMES = {
     "files": "FileFormat ParameterFile parse_parameter_file read_parameter_file write_parameter_file",
     "metadata": "Metadata ParameterMetadata load_metadata parse_metadata",
     "pack": "pack_parameters unpack_parameters",
-    "renames": "ParameterRenamedWarning Rename Renamed find_rename other_names to_known translate_values",
+    "renames": "ParameterRenamedWarning Rename Renamed find_rename other_names replacement_of to_known"
+    " translate_values",
 }
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names.split()}
 

@@ -1,8 +1,8 @@
-"""Parameters that ArduPilot renamed for version 4.7, mostly to give them SI units: old names on new firmware and back.
+"""Parameters that ArduPilot renamed since 2015, most of them for version 4.7: old names on new firmware and back.
 
 The vehicle converts its own values when it is updated; programs and files with the old names are what this is for.
-What cannot be said one to one is left out: SYSID_ENFORCE became one bit of MAV_OPTIONS, and autorotation (AROT_*) got
-other controllers. See :mod:`aerokit.parameters.rename_table` for the facts.
+What cannot be said one to one is not converted: :func:`replacement_of` says what does its work now. The facts are in
+:mod:`aerokit.parameters.rename_table` (4.7, SI units) and :mod:`aerokit.parameters.older_names` (before).
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from functools import lru_cache
 from types import MappingProxyType
 
 from aerokit.parameters.number_text import number_text
+from aerokit.parameters.older_names import OLDER, ONE_WAY, REPLACED
 from aerokit.parameters.parameter import Parameter, ParameterType, to_float32
 from aerokit.parameters.rename_table import GROUPS, INVERTED, OTHER_NEW_NAMES
 from aerokit.snapshot import Snapshot
@@ -23,6 +24,7 @@ __all__ = [
     "Renamed",
     "find_rename",
     "other_names",
+    "replacement_of",
     "to_known",
     "translate_values",
 ]
@@ -45,7 +47,8 @@ class Rename(Snapshot):
 
     ``divisor`` is what the old value is divided by to become the new one: 100 for centimetres that became metres.
     ``is_inverted`` is true for ARMING_CHECK (checks to make, 1 for all) and ARMING_SKIPCHK (checks to leave out).
-    ``vehicles`` are the vehicle types that have it; ``also`` are names it had between the two.
+    ``vehicles`` are the vehicle types that have it. ``also`` are other names in the new units, ``older`` other names
+    in the old ones. It has its new name ``since`` a version of ArduPilot.
     """
 
     old: str
@@ -54,11 +57,18 @@ class Rename(Snapshot):
     is_inverted: bool = False
     vehicles: tuple[str, ...] = ()
     also: tuple[str, ...] = ()
+    older: tuple[str, ...] = ()
+    since: str = "4.7"
 
     @property
     def names(self) -> tuple[str, ...]:
         """All names, the newest first."""
-        return (self.new, *self.also, self.old)
+        return (self.new, *self.also, *self.old_names)
+
+    @property
+    def old_names(self) -> tuple[str, ...]:
+        """The names in the old units."""
+        return (self.old, *self.older)
 
     @property
     def factor(self) -> float:
@@ -87,18 +97,18 @@ class Renamed(Snapshot):
 
     def to_vehicle(self, value: float, type: ParameterType | None = None) -> int | float:  # noqa: A002
         """What the program means, as the vehicle counts; rounded when ``type``, the vehicle's, is an integer type."""
-        converted = self._convert(value, self.asked, self.name)
+        converted = self._convert(value, self.asked)
         return round(converted) if type is not None and type.is_integer else converted
 
     def to_asked(self, value: float) -> int | float:
         """What the vehicle has, as the program counts."""
-        return self._convert(value, self.name, self.asked)
+        return self._convert(value, self.name)
 
     def parameter(self, parameter: Parameter) -> Parameter:
         """The vehicle's parameter under the name that was asked for, in its units; a scaled one is a REAL32."""
         default = None if parameter.default is None else self.to_asked(parameter.default)
         changed = parameter.replace(name=self.asked, value=self.to_asked(parameter.value), default=default)
-        if self.rename.divisor == 1:
+        if self.rename.divisor == 1 or not self._is_of_other_units:
             return changed
         default = None if default is None else to_float32(default)
         return changed.replace(value=to_float32(changed.value), default=default, type=ParameterType.REAL32)
@@ -107,32 +117,47 @@ class Renamed(Snapshot):
     def warning(self) -> str:
         """What to tell the user, once: it names the new name."""
         new = self.rename.new
-        if self.asked == self.rename.old:
+        if self.asked in self.rename.old_names:
             text = f"{self.asked} is called {self.name} by this vehicle's firmware"
         else:
             text = f"{self.asked} is still called {self.name} by this vehicle's firmware"
-        if self.rename.is_inverted:
+        if not self._is_of_other_units:
+            pass
+        elif self.rename.is_inverted:
             text += "; the meaning of its bits is inverted, which was taken into account"
         elif self.rename.divisor != 1:
-            text += f"; values were converted ({self.rename.old} = {self.rename.divisor} × {new})"
-        return text + f". Use {new}, its name since ArduPilot 4.7."
+            old, other = sorted((self.asked, self.name), key=lambda name: name not in self.rename.old_names)
+            text += f"; values were converted ({old} = {self.rename.divisor} × {other})"
+        return text + f". Use {new}, its name since ArduPilot {self.rename.since}."
 
-    def _convert(self, value: float, source: str, target: str) -> int | float:
-        was_old, becomes_old = source == self.rename.old, target == self.rename.old
-        if was_old == becomes_old:
+    def _convert(self, value: float, source: str) -> int | float:
+        if not self._is_of_other_units:
             return value
-        return self.rename.to_new(value) if was_old else self.rename.to_old(value)
+        is_old = source in self.rename.old_names
+        return self.rename.to_new(value) if is_old else self.rename.to_old(value)
+
+    @property
+    def _is_of_other_units(self) -> bool:
+        old_names = self.rename.old_names
+        return (self.asked in old_names) != (self.name in old_names)
 
 
-def find_rename(name: str) -> Rename | None:
-    """What is known of a parameter that was renamed, by any of its names; None for all others."""
-    return _by_name().get(name)
+def find_rename(name: str, other: str = "") -> Rename | None:
+    """What is known of a parameter that was renamed, by any of its names; None for all others.
+
+    Few names became different ones by the type of vehicle: ``other`` says which one is meant.
+    """
+    return next((row for row in _by_name().get(name, ()) if not other or other in row.names), None)
 
 
 def other_names(name: str) -> tuple[str, ...]:
     """The other names of that parameter, the newest first; empty for one that was never renamed."""
-    rename = find_rename(name)
-    return () if rename is None else tuple(other for other in rename.names if other != name)
+    return tuple(other for row in _by_name().get(name, ()) for other in row.names if other != name)
+
+
+def replacement_of(name: str) -> str:
+    """What does the work of a parameter that has no successor of the same meaning, as a clause; empty if not known."""
+    return REPLACED.get(name, "")
 
 
 def to_known(name: str, known: Container[str]) -> Renamed | None:
@@ -144,7 +169,7 @@ def to_known(name: str, known: Container[str]) -> Renamed | None:
         return None
     for other in other_names(name):
         if other in known:
-            rename = find_rename(name)
+            rename = find_rename(name, other)
             return None if rename is None else Renamed(name, other, rename)
     return None
 
@@ -194,11 +219,25 @@ def _checks_to_make(skipped: int) -> int:
 
 
 @lru_cache(maxsize=1)
-def _by_name() -> Mapping[str, Rename]:
-    found: dict[str, Rename] = {}
+def _by_name() -> Mapping[str, tuple[Rename, ...]]:
+    rows: dict[str, Rename] = {}
     for vehicles, divisor, pairs in GROUPS:
-        for pair in pairs.split():
-            old, new = pair.split(">")
+        for old, new in _pairs(pairs):
             row = Rename(old, new, divisor, old in INVERTED, vehicles, OTHER_NEW_NAMES.get(new, ()))
-            found.update(dict.fromkeys(row.names, row))
+            rows.update(dict.fromkeys(row.names, row))
+    for since, vehicles, divisor, pairs in OLDER:
+        for old, new in _pairs(pairs):
+            row = rows.get(new) or Rename(old, new, divisor, vehicles=vehicles, since=since)
+            if old not in row.names:  # its new name is the old one of a later renaming, in the same unit
+                row = row.replace(older=(*row.older, old))
+            rows.update(dict.fromkeys(row.names, row))
+    found: dict[str, tuple[Rename, ...]] = {name: (row,) for name, row in rows.items()}
+    for since, vehicles, divisor, pairs in ONE_WAY:
+        for old, new in _pairs(pairs):
+            row = Rename(old, new, divisor, vehicles=vehicles, since=since)
+            found[old] = (*found.get(old, ()), row)
     return MappingProxyType(found)
+
+
+def _pairs(text: str) -> list[list[str]]:
+    return [pair.split(">") for pair in text.split()]

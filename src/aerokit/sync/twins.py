@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from aerokit.missions import Fence, Mission, RallyPoints
     from aerokit.parameters import Metadata, Parameter, ParameterDifference, ParameterTable
     from aerokit.position import Position
+    from aerokit.protocols.command import Standing
     from aerokit.protocols.transfer import OnProgress
     from aerokit.runtime.cells import Source
     from aerokit.runtime.events import Event, LinkReport
@@ -846,6 +847,10 @@ class Parameters(TwinOf["AsyncParameters"]):
     def table(self) -> ParameterTable:
         """What is known now, in the vehicle's order; empty before anything was read, and after a reboot."""
         return self.aio.table
+
+    def known(self, name: str) -> Parameter | None:
+        """What was told last of the parameter that the vehicle calls so; as ``table.get(name)``, but makes no table."""
+        return self._loop.call(self.aio.known, name)
 
     @property
     def is_complete(self) -> bool:
@@ -1656,6 +1661,7 @@ class Vehicle(VehicleTwin):
         attempt_timeout: float = 1.0,
         progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
+        standing: Standing | None = None,
     ) -> CommandAck:
         """Send any MAV_CMD as COMMAND_LONG and return its ACCEPTED ack.
 
@@ -1669,6 +1675,8 @@ class Vehicle(VehicleTwin):
             attempt_timeout: seconds to wait for an ack after each, and at least two measured round trips.
             progress_timeout: seconds to wait after each IN_PROGRESS for the next answer; calibrations can take long.
             on_progress: called with 0–100, or None, for each IN_PROGRESS.
+            standing: says whether it may be sent again, instead of these rules: for programs that keep orders of their
+                own. The order is no newer one then.
 
         See https://mavlink.io/en/services/command.html.
 
@@ -1686,6 +1694,7 @@ class Vehicle(VehicleTwin):
             attempt_timeout=attempt_timeout,
             progress_timeout=progress_timeout,
             on_progress=on_progress,
+            standing=standing,
         )
 
     def command_int(
@@ -1701,6 +1710,7 @@ class Vehicle(VehicleTwin):
         attempt_timeout: float = 1.0,
         progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
+        standing: Standing | None = None,
     ) -> CommandAck:
         """Send any MAV_CMD as COMMAND_INT: param1 to param4, ``x``, ``y``, ``z`` in ``frame`` (MAV_FRAME).
 
@@ -1720,6 +1730,7 @@ class Vehicle(VehicleTwin):
             attempt_timeout=attempt_timeout,
             progress_timeout=progress_timeout,
             on_progress=on_progress,
+            standing=standing,
         )
 
     def send(self, message: Message) -> None:

@@ -18,6 +18,7 @@ from aerokit.vehicle.talk.rates import check_rate, subscription_rate_hz
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterator
 
+    from aerokit.protocols.command import Standing
     from aerokit.runtime.bus import Detach, Sink
     from aerokit.runtime.events import Event
     from aerokit.runtime.link_state import LinkState
@@ -50,6 +51,7 @@ class TalkActions(Part):
         attempt_timeout: float = 1.0,
         progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
+        standing: Standing | None = None,
     ) -> CommandAck:
         """Send any MAV_CMD as COMMAND_LONG and return its ACCEPTED ack.
 
@@ -63,6 +65,8 @@ class TalkActions(Part):
             attempt_timeout: seconds to wait for an ack after each, and at least two measured round trips.
             progress_timeout: seconds to wait after each IN_PROGRESS for the next answer; calibrations can take long.
             on_progress: called with 0–100, or None, for each IN_PROGRESS.
+            standing: says whether it may be sent again, instead of these rules: for programs that keep orders of their
+                own. The order is no newer one then.
 
         See https://mavlink.io/en/services/command.html.
 
@@ -80,6 +84,7 @@ class TalkActions(Part):
             attempt_timeout=attempt_timeout,
             progress_timeout=progress_timeout,
             on_progress=on_progress,
+            standing=standing,
         )
 
     async def command_int(
@@ -95,6 +100,7 @@ class TalkActions(Part):
         attempt_timeout: float = 1.0,
         progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
+        standing: Standing | None = None,
     ) -> CommandAck:
         """Send any MAV_CMD as COMMAND_INT: param1 to param4, ``x``, ``y``, ``z`` in ``frame`` (MAV_FRAME).
 
@@ -114,6 +120,7 @@ class TalkActions(Part):
             attempt_timeout=attempt_timeout,
             progress_timeout=progress_timeout,
             on_progress=on_progress,
+            standing=standing,
         )
 
     def send(self, message: Message) -> None:
@@ -270,13 +277,18 @@ class TalkActions(Part):
     # ------------------------------------------------------------------------------ inside
 
     async def _answered(
-        self, send: Callable[..., Awaitable[CommandAck]], command: int, *params: float, **options: Any
+        self,
+        send: Callable[..., Awaitable[CommandAck]],
+        command: int,
+        *params: float,
+        standing: Standing | None,
+        **options: Any,
     ) -> CommandAck:
         """What the commands of the program itself have in common; ``send`` is one of the command sender's."""
         started = self.connection.now()
         try:
-            if "standing" in options or command in QUESTIONS:
-                return await send(command, *params, **options)
+            if standing is not None or command in QUESTIONS:
+                return await send(command, *params, standing=standing, **options)
             with self._own_order(command) as order:
                 armed = params[0] == 1 if command == COMPONENT_ARM_DISARM and params else None
                 with self._helm.sending(order, armed=armed) as sending:

@@ -116,20 +116,21 @@ class ParameterNames:
 
         for other in other_names(name):
             answer = answers.get(other, self._access.store.get(other))
-            rename = find_rename(name)
+            rename = find_rename(name, other)
             if isinstance(answer, Parameter) and rename is not None:
                 return Found(name, answer, other in answers, Renamed(name, other, rename))
         return self._with_hint(own or ParameterRejected(f"the vehicle has no parameter {name}", name=name))
 
     def _with_hint(self, answer: NotFound) -> NotFound:
         """The same, and what was perhaps meant, by the names that are known."""
-        hint = (
-            did_you_mean(answer.name, self._access.store.table)
-            if isinstance(answer, ParameterRejected)
-            else ""
-        )
-        if not hint or not isinstance(answer, ParameterRejected):
+        if not isinstance(answer, ParameterRejected):
             return answer
+        from aerokit.parameters.renames import replacement_of
+
+        replaced = replacement_of(answer.name)
+        hint = (
+            f"; replaced by {replaced}" if replaced else did_you_mean(answer.name, self._access.store.table)
+        )
         return ParameterRejected(f"{answer}{hint}", name=answer.name, code=answer.code)
 
 

@@ -64,6 +64,10 @@ class Parameters:
         """What is known now, in the vehicle's order; empty before anything was read, and after a reboot."""
         return self._access.store.table
 
+    def known(self, name: str) -> Parameter | None:
+        """What was told last of the parameter that the vehicle calls so; as ``table.get(name)``, but makes no table."""
+        return self._access.store.get(name)
+
     @property
     def is_complete(self) -> bool:
         """Whether the whole list was downloaded since the vehicle started."""

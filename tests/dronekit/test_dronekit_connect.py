@@ -1,0 +1,125 @@
+"""``connect``: what it imports, how its errors are caught, and how much of a traceback they show."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import traceback
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import serial
+from flight_controller import FlightController
+
+import aerokit.dronekit as dronekit
+from aerokit.dronekit import mavlink
+
+SOURCES = Path(__file__).parent.parent.parent / "src"
+MOST_LINES = 10
+
+
+@pytest.fixture
+def fc() -> Iterator[FlightController]:
+    with FlightController() as each:
+        yield each
+
+
+def test_a_program_that_only_flies_imports_neither_pymavlink_nor_the_blocking_twin(
+    fc: FlightController,
+) -> None:
+    program = f"""
+import sys
+from aerokit.dronekit import VehicleMode, connect
+vehicle = connect({fc.address!r}, wait_ready=['mode'])
+vehicle.mode = VehicleMode('GUIDED')
+vehicle.armed = True
+vehicle.close()
+print([each for each in ('pymavlink', 'aerokit.sync.twins', 'argparse') if each in sys.modules])
+"""
+    ran = subprocess.run(
+        [sys.executable, "-c", program],
+        env={**os.environ, "PYTHONPATH": str(SOURCES)},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert ran.stdout == "[]\n", ran.stderr
+
+
+@pytest.mark.parametrize("caught_as", [OSError, serial.SerialException, ValueError])
+def test_a_connection_string_that_is_none_is_caught_as_with_dronekit(caught_as: type[Exception]) -> None:
+    with pytest.raises(caught_as, match="'nonsense' is not a link address"):
+        dronekit.connect("nonsense")
+
+
+def refused() -> None:
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        port = listener.getsockname()[1]
+    dronekit.connect(f"tcp:127.0.0.1:{port}")
+
+
+def nobody() -> None:
+    dronekit.connect("udpin:127.0.0.1:0", heartbeat_timeout=0.1)
+
+
+@pytest.mark.parametrize("failing", [refused, nobody])
+def test_a_failure_shows_few_lines(failing: object, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mavlink, "BETWEEN_ATTEMPTS_S", 0.0)
+    assert callable(failing)
+    with pytest.raises((OSError, dronekit.APIException)) as caught:
+        failing()
+    assert caught.tb.tb_next is not None
+    shown = "".join(traceback.format_exception(caught.type, caught.value, caught.tb.tb_next))
+    assert shown.count("\n") <= MOST_LINES, shown
+
+
+def test_an_error_of_the_programs_own_class_is_shown_whole(fc: FlightController) -> None:
+    def broken(handler: mavlink.MAVConnection) -> dronekit.Vehicle:
+        raise ValueError("a mistake in here")
+
+    with pytest.raises(ValueError, match="in here") as caught:
+        dronekit.connect(fc.address, vehicle_class=broken)
+    assert caught.traceback[-1].name == "broken"
+
+
+@pytest.mark.parametrize("wrong", ["guided", "Guided", "5", "alt_hold"])
+def test_modes_are_spelled_in_capitals(fc: FlightController, wrong: str) -> None:
+    with dronekit.connect(fc.address, rate=None) as vehicle:
+        since = fc.mark()
+        with pytest.raises(KeyError, match=wrong):
+            vehicle.mode = wrong
+        vehicle.mode = "GUIDED"
+        vehicle.wait_for_mode("GUIDED", timeout=20)
+        assert {frame.param2 for frame in fc.commands(since=since)} == {4}
+
+
+def test_a_vehicle_of_an_unknown_autopilot_has_the_modes_of_ardupilot() -> None:
+    """iNav calls itself generic."""
+    with FlightController(autopilot=0, mode=4) as fc, dronekit.connect(fc.address, rate=None) as vehicle:
+        assert vehicle.mode.name == "GUIDED"
+        vehicle.wait_for_mode("LOITER", timeout=20)
+
+
+def test_input_can_be_turned_off_and_on(fc: FlightController) -> None:
+    """Programs play a link that has gone by it."""
+    with dronekit.connect(fc.address, rate=None) as vehicle:
+        handler = vehicle._handler
+        assert handler._accept_input
+        handler._accept_input = False
+        assert not handler._accept_input
+        before = vehicle.last_heartbeat
+        fc.custom_mode = 5
+        for _ in range(3):
+            fc.beat()
+        with pytest.raises(dronekit.TimeoutError):
+            vehicle.wait_for(lambda: vehicle.mode == "LOITER", timeout=0.2)
+        assert vehicle.last_heartbeat > before
+        handler._accept_input = True
+        fc.beat()
+        vehicle.wait_for(lambda: vehicle.mode == "LOITER", timeout=20)
+    assert not handler._accept_input
