@@ -71,7 +71,7 @@ TWINS = (
     Twin("aerokit.vehicle.files.logs.Logs"),
     Twin("aerokit.vehicle.parameters.transaction.Temporarily", "TemporarilyTwin"),
     Twin("aerokit.vehicle.parameters.transaction.Transaction", "TransactionTwin"),
-    Twin("aerokit.vehicle.parameters.parameters.Parameters", direct=_names("load_metadata")),
+    Twin("aerokit.vehicle.parameters.parameters.Parameters", direct=_names("load_metadata known")),
     Twin("aerokit.vehicle.plans.mission.MissionControl"),
     Twin("aerokit.vehicle.plans.fence.FenceControl"),
     Twin("aerokit.vehicle.plans.rally.RallyControl"),

@@ -850,7 +850,7 @@ class Parameters(TwinOf["AsyncParameters"]):
 
     def known(self, name: str) -> Parameter | None:
         """What was told last of the parameter that the vehicle calls so; as ``table.get(name)``, but makes no table."""
-        return self._loop.call(self.aio.known, name)
+        return self.aio.known(name)
 
     @property
     def is_complete(self) -> bool:
