@@ -194,5 +194,5 @@ def test_what_somebody_else_has_had_decoded_is_not_decoded_again(telemetry: Tele
     for at in (100.0, 100.5):
         bus.deliver(frame_of(ANYTHING["Attitude"], at))
     (pending,) = stream.pending.values()
-    assert pending[1] is seen[1]
+    assert pending is seen[1]
     assert telemetry.attitude.value.yaw_deg == pytest.approx(17.19, abs=0.01)

@@ -60,11 +60,11 @@ class Bus:
     def attach_lazily(
         self,
         message_type: type[Message],
-        sink: Callable[[Frame, Message | None], None],
+        sink: Callable[..., None],
         *,
         system_id: int = EVERY_SYSTEM,
     ) -> Detach:
-        """As :meth:`attach_frames`; ``sink`` gets the message, too, if somebody else has had it decoded anyway."""
+        """As :meth:`attach_frames`; ``sink`` gets the message as a second argument if somebody else has it decoded."""
         return self._attach((system_id, message_type.ID), (BOTH, sink))
 
     def attach_event(self, event_type: type[EventT], sink: Callable[[EventT], None]) -> Detach:
@@ -78,7 +78,14 @@ class Bus:
             is_read, entries = self._plans[frame.system_id << 24 | frame.message_id]
         except KeyError:
             is_read, entries = self._plan(frame)
-        message = self.dialect.decode(frame) if is_read else None
+        if not is_read:  # nearly always: who takes frames, or both, takes the frame alone
+            for _, sink in entries:
+                try:
+                    sink(frame)
+                except Exception:
+                    _report(sink)
+            return
+        message = self.dialect.decode(frame)
         for kind, sink in entries:
             try:
                 if kind == MESSAGE:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+from aerokit.mavlink.frame import Frame
+
 if TYPE_CHECKING:
     import threading
     from collections.abc import Callable, Sequence
 
-    from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.message import Message
     from aerokit.runtime.cells import StateCell
 
@@ -53,7 +54,7 @@ class StreamedMessage:
         self._number_at = None if number_at is None else number_at + _HEADER_LENGTH
         self._look_at = -math.inf
         self._is_watched = False
-        self.pending: dict[int, tuple[Frame, Message | None]] = {}
+        self.pending: dict[int, Frame | Message] = {}
         """The frames that were not worked out yet, by the number of what they speak of."""
 
     def take(self, frame: Frame, message: Message | None = None) -> None:
@@ -68,16 +69,20 @@ class StreamedMessage:
             return
         number_at = self._number_at
         if number_at is None:
-            self.pending[0] = frame, message
+            self.pending[0] = frame if message is None else message
         else:
             number = frame.body[number_at] if len(frame.body) > number_at else 0
-            self.pending[number] = frame, message
+            self.pending[number] = frame if message is None else message
 
     def catch_up(self) -> None:
         """Work out what has come."""
         with self._lock:
             while self.pending:
-                self._apply(*self.pending.popitem()[1])
+                came = self.pending.popitem()[1]
+                if isinstance(came, Frame):
+                    self._apply(came, None)
+                elif came.received_frame is not None:
+                    self._apply(came.received_frame, came)
 
     def watchers_changed(self) -> None:
         """Somebody begins or ends to wait for what is in the cells."""
