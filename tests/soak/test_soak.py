@@ -12,7 +12,7 @@ from soak_rounds import Left, fly_round, left
 MINUTES = float(os.environ.get("AEROKIT_SOAK_MINUTES", "0"))
 pytestmark = [pytest.mark.anyio, pytest.mark.timeout(120 + 120 * MINUTES)]
 WARM, ROUNDS = 2, 4
-OBJECTS, OBJECTS_A_ROUND, KB_A_ROUND = 120, 0.3, 4
+OBJECTS, OBJECTS_A_ROUND, KB_A_ROUND = 300, 0.3, 4
 """The interpreter wanders, and pytest keeps what is logged in a short run; one object more in each round is a leak."""
 
 
