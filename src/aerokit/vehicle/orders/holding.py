@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import asyncio
 import logging
 import math
 from contextlib import contextmanager
+from functools import partial
 from typing import TYPE_CHECKING
 
-import anyio
-
 from aerokit.errors import AerokitError, OperationTimeout
-from aerokit.runtime.cancellation import Cancellation
+from aerokit.vehicle.orders.leftover import Leftover
 from aerokit.vehicle.orders.orders import CHANGE_MODE, DO_REPOSITION, DO_SET_MODE
 
 if TYPE_CHECKING:
@@ -47,9 +45,8 @@ class Holding:
         self._talk, self._helm, self._orders = talk, helm, orders
         self.end_stream: Callable[[str], None] | None = None
         self._flight: Order | None = None
-        self._scope: Cancellation | None = None
-        self._is_over: asyncio.Event | None = None
-        helm.on_new(self.drop)
+        self._leftover = Leftover(talk, "aerokit hold", "before it confirmed that it holds")
+        helm.on_new(self._leftover.drop)  # what an earlier order left is not confirmed any more
 
     async def hold(self) -> None:
         """Order it, as :meth:`aerokit.Vehicle.hold` says."""
@@ -104,17 +101,7 @@ class Holding:
             self._send_hold(mode)
             order = self._helm.order(*order.modes, mode)
             self._helm.doubt_mode()
-        scope, is_over = Cancellation(), asyncio.Event()
-        self._scope, self._is_over = scope, is_over
-
-        async def finish() -> None:
-            with scope:
-                await self._hold_when_known(mode, order, is_sent=is_sent)
-            if self._scope is scope:
-                self._scope = None
-            is_over.set()
-
-        self._talk.background.start(finish, "aerokit hold")
+        self._leftover.start(partial(self._hold_when_known, mode, order, is_sent=is_sent))
         return True
 
     def _send_hold(self, mode: Mode) -> None:
@@ -131,7 +118,8 @@ class Holding:
                     return
                 await self._hear()
                 if not order.end and not self._talk.telemetry.is_surely_disarmed:
-                    order = self._order_to_hold(mode, order)
+                    with self._leftover.spared():  # it is this task that gives the newer order
+                        order = self._helm.order(*order.modes, mode)
                     await self.stop_in(mode, order)
                 return
             except OperationTimeout as error:
@@ -142,41 +130,19 @@ class Holding:
                     logger.warning("the vehicle was told to hold and does not: %s", error)
                 return
 
-    def _order_to_hold(self, mode: Mode, order: Order) -> Order:
-        """It is this task that gives it: it must not be dropped by it."""
-        scope, self._scope = self._scope, None
-        order = self._helm.order(*order.modes, mode)
-        self._scope = scope
-        return order
-
     async def _hear(self) -> None:
         """Until the vehicle tells what it does."""
         armed, since = self._talk.telemetry.armed, self._talk.connection.now()
         await armed.wait_until(lambda _: armed.updated_at > since, description="what the vehicle does now")
 
-    def drop(self) -> None:
-        """A newer order is given: what an earlier one left to be confirmed is not confirmed any more."""
-        if self._scope is not None:
-            self._scope.cancel()
-            self._scope = None
-
     @property
     def is_told_to_hold(self) -> bool:
         """Whether a flight was given up and the hold that was ordered is not confirmed yet."""
-        return self._scope is not None
+        return self._leftover.is_open
 
     async def finish(self) -> None:
         """At the end of everything: give an order to hold the time to be answered, or to be given again."""
-        if self._scope is None or self._is_over is None or not self._talk.connection.is_open:
-            return
-        if self._helm.is_known:
-            with anyio.CancelScope(shield=True), anyio.move_on_after(HOLD_AT_END_S):
-                await self._is_over.wait()
-        if self._scope is not None:
-            logger.warning(
-                "the block of this vehicle was left before it confirmed that it holds: %s",
-                self._talk.describe_link(),
-            )
+        await self._leftover.finish(HOLD_AT_END_S if self._helm.is_known else 0)
 
     @contextmanager
     def flying(self, order: Order) -> Iterator[None]:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import asyncio
 import logging
+from functools import partial
 from typing import TYPE_CHECKING
 
 import anyio
 
 from aerokit.errors import AerokitError
-from aerokit.runtime.cancellation import Cancellation
+from aerokit.vehicle.orders.leftover import Leftover
 from aerokit.vehicle.orders.order import COMPONENT_ARM_DISARM
 
 if TYPE_CHECKING:
@@ -40,8 +40,8 @@ class LateArming:
 
     def __init__(self, talk: Talk, helm: Helm, orders: Orders) -> None:
         self._talk, self._helm, self._orders = talk, helm, orders
-        self._scope: Cancellation | None = None
-        self._is_over: asyncio.Event | None = None
+        unsure = "while an order to arm may still be carried out"
+        self._leftover = Leftover(talk, "aerokit late arming", unsure)
 
     def text(self) -> str:
         """What an error says of an order to arm that may still arrive."""
@@ -52,18 +52,11 @@ class LateArming:
     def watch(self, was_armed: bool) -> None:
         """The order to arm was given up; it may have been heard, or may still arrive."""
         self._talk.connection.discard_unsent()
-        count = self._helm.arming_orders
-        scope, is_over = Cancellation(), asyncio.Event()
-        self._scope, self._is_over = scope, is_over
+        self._leftover.start(partial(self._look, was_armed, self._helm.arming_orders))
 
-        async def look() -> None:
-            with scope, anyio.move_on_after(LATE_S):
-                await self._disarm_again(was_armed, count)
-            if self._scope is scope:
-                self._scope = None
-            is_over.set()
-
-        self._talk.background.start(look, "aerokit late arming")
+    async def _look(self, was_armed: bool, count: int) -> None:
+        with anyio.move_on_after(LATE_S):
+            await self._disarm_again(was_armed, count)
 
     async def _disarm_again(self, was_armed: bool, count: int) -> None:
         """What was armed before the order is left alone, until it has been heard disarmed."""
@@ -89,18 +82,8 @@ class LateArming:
 
     def stop(self) -> None:
         """Another order about arming is given."""
-        if self._scope is not None:
-            self._scope.cancel()
-            self._scope = None
+        self._leftover.drop()
 
     async def finish(self) -> None:
         """At the end of everything: an order to arm that was given up is answered, or is said to be out."""
-        if self._scope is None or self._is_over is None or not self._talk.connection.is_open:
-            return
-        with anyio.CancelScope(shield=True), anyio.move_on_after(ARMING_AT_END_S):
-            await self._is_over.wait()
-        if self._scope is not None:
-            logger.warning(
-                "the block of this vehicle was left while an order to arm may still be carried out: %s",
-                self._talk.describe_link(),
-            )
+        await self._leftover.finish(ARMING_AT_END_S)
