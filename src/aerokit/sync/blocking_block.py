@@ -4,6 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NoReturn
 
+if TYPE_CHECKING:
+    from types import TracebackType
+
+    from typing_extensions import Self
+
 __all__ = ["BlockingBlock"]
 
 
@@ -16,6 +21,17 @@ class BlockingBlock:
     def close(self) -> None:
         """End it; idempotent."""
         raise NotImplementedError
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
 
     if not TYPE_CHECKING:  # type checkers know that they are not there
 

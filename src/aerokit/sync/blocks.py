@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from aerokit.runtime.subscription import Subscription  # noqa: F401
     from aerokit.vehicle.orders.guided import SetpointStream  # noqa: F401
     from aerokit.vehicle.parameters.results import ParameterWrite
-    from aerokit.vehicle.parameters.transaction import Temporarily, Transaction  # noqa: F401
+    from aerokit.vehicle.parameters.transaction import Temporarily, Transaction
     from aerokit.vehicle.vehicle import Vehicle
 
 __all__ = [
@@ -41,6 +41,7 @@ __all__ = [
 
 A = TypeVar("A")
 T = TypeVar("T")
+BlockT = TypeVar("BlockT", bound="Temporarily | Transaction")
 TwinT = TypeVar("TwinT", bound="ConnectionTwin | VehicleTwin")
 
 
@@ -132,35 +133,31 @@ class StreamTwin(TwinOf["SetpointStream[T]"], Generic[T]):
         self._loop.run(self.aio.__aexit__, exc_type, exc, traceback)
 
 
-class TemporarilyTwin(TwinOf["Temporarily"]):
+class ToItsEndTwin(TwinOf[BlockT]):
+    """Its ``with`` is left to the end, whatever comes: a Ctrl-C does not leave half of it."""
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._loop.run_to_its_end(self.aio.__aexit__, exc_type, exc, traceback)
+
+
+class TemporarilyTwin(ToItsEndTwin["Temporarily"]):
     """Its ``with`` gives the results of the writes; the values before are put back, whatever comes."""
 
     def __enter__(self) -> dict[str, ParameterWrite]:
         return self._loop.enter(self.aio)
 
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self._loop.run_to_its_end(self.aio.__aexit__, exc_type, exc, traceback)
 
-
-class TransactionTwin(TwinOf["Transaction"]):
+class TransactionTwin(ToItsEndTwin["Transaction"]):
     """Taken back at the end of its ``with`` if an error leaves it, whatever comes."""
 
     def __enter__(self) -> Self:
         self._loop.enter(self.aio)
         return self
-
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self._loop.run_to_its_end(self.aio.__aexit__, exc_type, exc, traceback)
 
 
 class ConnectionTwin(TwinOf["Connection"], BlockingBlock):
@@ -183,17 +180,6 @@ class ConnectionTwin(TwinOf["Connection"], BlockingBlock):
             finally:
                 self._loop.close()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
-
 
 class VehicleTwin(TwinOf["Vehicle"], BlockingBlock):
     """A context manager. The connection that it is on is closed with it if it was opened for it."""
@@ -214,9 +200,6 @@ class VehicleTwin(TwinOf["Vehicle"], BlockingBlock):
         finally:
             if self._owns_loop:
                 self._loop.close()
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(
         self,
