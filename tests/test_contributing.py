@@ -30,10 +30,9 @@ def steps_until(recipe: str) -> list[re.Match[str]]:
 
 def apply(step: re.Match[str], sources: Path) -> None:
     file = sources / step["path"].removeprefix("src/")
-    code = textwrap.dedent("\n".join(line[len(step["indent"]) :] for line in step["code"].split("\n")))
     body = "\n".join(line[len(step["indent"]) :] for line in step["code"].split("\n"))
     if step["how"] == "anew":
-        file.write_text(code + "\n")
+        file.write_text(textwrap.dedent(body) + "\n")
         return
     text = file.read_text(encoding="utf-8")
     if step["how"] == "at the end":

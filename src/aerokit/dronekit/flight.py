@@ -24,6 +24,7 @@ from aerokit.dronekit.modes import change_mode, mode_named
 from aerokit.dronekit.values import LocationGlobal, LocationGlobalRelative, VehicleMode
 from aerokit.errors import CommandRejected, OperationTimeout
 from aerokit.mavlink.messages import HomePosition
+from aerokit.vehicle.talk.constants import REQUEST_MESSAGE
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -33,7 +34,6 @@ __all__ = ["FlightMethods"]
 
 NAV_TAKEOFF, DO_CHANGE_SPEED = 22, 178
 AIRSPEED, GROUNDSPEED = 0, 1
-REQUEST_MESSAGE = 512
 HOME_TIMEOUT_S = 10.0
 POLL_S = 0.1
 

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from aerokit.dronekit.core import VehicleCore
 from aerokit.dronekit.exceptions import APIException
 from aerokit.errors import LocalProtocolError
 from aerokit.mavlink.messages import PlayTune
 from aerokit.protocols.command import command_long
-
-if TYPE_CHECKING:
-    pass
 
 __all__ = ["Maintenance"]
 

@@ -115,9 +115,8 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, Readiness, VehiclePriv
 
     @cached_property
     def _commands(self) -> CommandSequence:
-        from aerokit.dronekit.commands import (
-            CommandSequence,  # with pymavlink: programs without missions do without
-        )
+        # with pymavlink: programs without missions do without
+        from aerokit.dronekit.commands import CommandSequence
 
         made: CommandSequence = self.__dict__.setdefault("_commands", CommandSequence(self))
         return made

@@ -130,9 +130,8 @@ class LogDownload(Transfer[int]):
             self._latest = offset
             self._received += 1
             self._is_streaming = offset + LOG_BLOCK < self._until
-        length = min(
-            message.count, max(0, self._size - offset)
-        )  # PX4 sends whole blocks of a log that has grown
+        # PX4 sends whole blocks of a log that has grown
+        length = min(message.count, max(0, self._size - offset))
         if into.add(offset, bytes(message.data[:length])):
             self._move(now, into.done, self._size)
         self._requests.answered(offset, now)

@@ -21,6 +21,7 @@ from aerokit.vehicle.checks import check_range, check_seconds
 from aerokit.vehicle.orders.orders import CHANGE_MODE, DO_REPOSITION, RESULT_UNSUPPORTED
 from aerokit.vehicle.orders.part import Part
 from aerokit.vehicle.orders.progress import LONGEST_SILENCE_S, Stillness, await_progress
+from aerokit.vehicle.talk.constants import HOME_POSITION, REQUEST_MESSAGE
 
 if TYPE_CHECKING:
     from aerokit.autopilots import Mode
@@ -33,7 +34,6 @@ DO_CHANGE_SPEED = 178
 DO_SET_HOME = 179
 DO_SET_ROI_LOCATION = 195
 DO_SET_ROI_NONE = 197
-REQUEST_MESSAGE, HOME_POSITION = 512, 242
 MAV_FRAME_GLOBAL = 0
 MAV_FRAME_GLOBAL_INT = 5
 MAV_FRAME_GLOBAL_RELATIVE_ALT_INT = 6

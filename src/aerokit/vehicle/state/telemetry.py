@@ -216,17 +216,18 @@ class Telemetry(States):
                 cell.set(value, source)
 
         def tell_knowing(message: Any, source: Source) -> None:
-            if by.second_best and self._has_better(cell, source):
-                return
-            if by.knowing:
-                context.before = cell.latest
-                value = decode(message, context)
-            else:
-                value = decode(message)
+            context.before = cell.latest
+            value = decode(message, context)
             if value is not None:
                 cell.set(value, source)
 
-        return tell_knowing if by.knowing or by.second_best else tell
+        teller = tell_knowing if by.knowing else tell
+
+        def tell_unless_better(message: Any, source: Source) -> None:
+            if not self._has_better(cell, source):
+                teller(message, source)
+
+        return tell_unless_better if by.second_best else teller
 
     def _streamed(self, class_name: str, handler: Handler) -> StreamedMessage:
         source, kind = self._source(class_name), message_type(class_name)

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.state.telemetry import Telemetry
     from aerokit.vehicle.talk.commands import CommandSender
 
-__all__ = ["learn_constants"]
+__all__ = ["HOME_POSITION", "REQUEST_MESSAGE", "learn_constants"]
 
 REQUEST_MESSAGE = 512
 AUTOPILOT_VERSION, HOME_POSITION, GPS_GLOBAL_ORIGIN, AVAILABLE_MODES = 148, 242, 49, 435
