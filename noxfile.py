@@ -149,6 +149,13 @@ def soak(session: nox.Session) -> None:
 
 
 @nox.session
+def diaries(session: nox.Session) -> None:
+    """Keep what goes over the wire in each test (tests/wire_diary.py), after a change of it that is meant."""
+    session.install("-e", ".[test,fast]")
+    session.run("python", "tests/keep_diaries.py")
+
+
+@nox.session
 def mutants(session: nox.Session) -> None:
     """Change one thing at a time: does a test notice? `nox -s mutants -- [PATH …] [--sample N] [--seed S]`; an hour."""
     session.install("-e", ".[test]", "coverage>=7.6", "cosmic-ray>=8.3")

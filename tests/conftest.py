@@ -10,8 +10,21 @@ import pytest
 from flight_harness import Flight, in_the_air, open_flight
 from hypothesis import settings
 from recorded import headline
+from wire_diary import (
+    pytest_addoption,
+    pytest_collection_modifyitems,
+    pytest_pyfunc_call,
+    pytest_runtest_protocol,
+)
 
 from aerokit.testing.clock import VirtualClockLoop
+
+__all__ = [
+    "pytest_addoption",
+    "pytest_collection_modifyitems",
+    "pytest_pyfunc_call",
+    "pytest_runtest_protocol",
+]
 
 if (
     signal.getsignal(signal.SIGINT) is signal.SIG_IGN
