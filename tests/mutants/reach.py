@@ -61,7 +61,7 @@ def _run(test_file: Path, result: Path) -> None:
     environment = os.environ | {
         "AEROKIT_REACH_SOURCE": str(SOURCE),
         "AEROKIT_REACH_RESULT": str(result),
-        "PYTHONPATH": str(HERE),
+        "PYTHONPATH": os.pathsep.join(filter(None, (str(HERE), os.environ.get("PYTHONPATH")))),
     }
     command = [sys.executable, "-m", "pytest", "-p", "reach_plugin", *PYTEST, "--timeout=0", str(test_file)]
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
