@@ -6,6 +6,7 @@ import math
 from typing import TYPE_CHECKING, Protocol
 
 from aerokit.errors import CommandRejected, CommandTimeout, LocalProtocolError
+from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.mavlink.messages import CommandAck, CommandInt, CommandLong
 from aerokit.protocols.exchange import Exchange
 
@@ -16,7 +17,6 @@ if TYPE_CHECKING:
 
 __all__ = ["CommandExchange", "Standing", "command_int", "command_long", "command_name", "result_name"]
 
-ACCEPTED, IN_PROGRESS = 0, 5  # of MAV_RESULT, which every import would have to make
 BROADCAST = 0
 FLOAT32_MAX = 3.4028234663852886e38
 LOOK_S = 0.05
@@ -155,12 +155,12 @@ class CommandExchange(Exchange[CommandAck]):
         if self.done or not isinstance(message, CommandAck) or not self._is_ours(message):
             return
         is_earlier = self._sent == 1 < self._attempts and self._answers < self._answers_before_ours
-        self._answers += message.result != IN_PROGRESS
+        self._answers += message.result != MavResult.IN_PROGRESS
         if is_earlier:
             return
-        if message.result == IN_PROGRESS:
+        if message.result == MavResult.IN_PROGRESS:
             self._report_progress(message, now)
-        elif message.result == ACCEPTED:
+        elif message.result == MavResult.ACCEPTED:
             self._finish(message)
         else:
             self._fail(rejection(message.command, message.result))
@@ -250,8 +250,6 @@ def rejection(command: int, result: int) -> CommandRejected:
 
 def command_name(command: int) -> str:
     """``MAV_CMD_NAV_TAKEOFF`` for 22; ``MAV_CMD 12345`` for what the dialects do not know."""
-    from aerokit.mavlink.enums import MavCmd
-
     try:
         return f"MAV_CMD_{MavCmd(command).name}"
     except ValueError:
@@ -260,20 +258,18 @@ def command_name(command: int) -> str:
 
 def result_name(result: int) -> str:
     """``DENIED`` for 2; ``MAV_RESULT 99`` for what the dialects do not know."""
-    from aerokit.mavlink.enums import MavResult
-
     try:
         return MavResult(result).name
     except ValueError:
         return f"MAV_RESULT {result}"
 
 
-_HINTS = {
-    1: " (the vehicle says: not now, later perhaps)",
-    2: " (the vehicle says: never with these parameters)",
-    3: " (this firmware does not know the command)",
-    7: " (it has to be sent as COMMAND_LONG)",
-    8: " (it has to be sent as COMMAND_INT)",
+_HINTS: dict[int, str] = {
+    MavResult.TEMPORARILY_REJECTED: " (the vehicle says: not now, later perhaps)",
+    MavResult.DENIED: " (the vehicle says: never with these parameters)",
+    MavResult.UNSUPPORTED: " (this firmware does not know the command)",
+    MavResult.COMMAND_LONG_ONLY: " (it has to be sent as COMMAND_LONG)",
+    MavResult.COMMAND_INT_ONLY: " (it has to be sent as COMMAND_INT)",
 }
 
 

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from aerokit.mavlink.enums import MavAutopilot, MavType
+
 if TYPE_CHECKING:
     from aerokit.mavlink.messages import Heartbeat
 
-__all__ = ["MAV_AUTOPILOT_INVALID", "MAV_TYPE_GCS", "is_autopilot"]
+__all__ = ["is_autopilot"]
 
-MAV_TYPE_GCS = 6
-"""A ground station."""
-MAV_AUTOPILOT_INVALID = 8
-"""No flight controller."""
-NO_AUTOPILOTS = frozenset((MAV_TYPE_GCS, 18, 26, 27, *range(30, 35), *range(36, 43), 44, 48))
+NO_AUTOPILOTS = frozenset((MavType.GCS, 18, 26, 27, *range(30, 35), *range(36, 43), 44, 48))
 """Types of other components: onboard controller, gimbal, ADS-B, camera, servo, battery, … (MAV_TYPE)."""
 
 
@@ -22,4 +20,4 @@ def is_autopilot(heartbeat: Heartbeat) -> bool:
 
     Some of those call their autopilot GENERIC instead of INVALID, so their type counts too.
     """
-    return heartbeat.autopilot != MAV_AUTOPILOT_INVALID and heartbeat.type not in NO_AUTOPILOTS
+    return heartbeat.autopilot != MavAutopilot.INVALID and heartbeat.type not in NO_AUTOPILOTS

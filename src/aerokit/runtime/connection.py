@@ -14,13 +14,14 @@ from aerokit.errors import AerokitError, BusyError, ConnectionClosed, LinkLost, 
 from aerokit.links.link import Link
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.enums import MavAutopilot, MavComponent, MavState, MavType
 from aerokit.mavlink.frame import SIGNED, Frame, is_whole_frame
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import Heartbeat
 from aerokit.runtime.background import Background
 from aerokit.runtime.bus import Bus, once
 from aerokit.runtime.cells import StateCell
-from aerokit.runtime.components import MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS, is_autopilot
+from aerokit.runtime.components import is_autopilot
 from aerokit.runtime.deadlines import Deadlines
 from aerokit.runtime.endings import raisable
 from aerokit.runtime.events import (
@@ -55,14 +56,12 @@ if TYPE_CHECKING:
 
     Tap = Callable[[Frame, Peer], object]
 
-__all__ = ["MAV_COMP_ID_MISSIONPLANNER", "Connection"]
+__all__ = ["Connection"]
 
 logger = logging.getLogger("aerokit")
 
 ItemT = TypeVar("ItemT", bound="Message | Event")
 
-MAV_STATE_ACTIVE = 4  # no enums here: they would take two milliseconds of every connect
-MAV_COMP_ID_MISSIONPLANNER = 190
 """The component id that ground stations take."""
 HEARTBEAT_PERIOD_S = 1.0
 
@@ -80,7 +79,7 @@ class Connection:
         link: Link,
         *,
         source_system: int = 255,
-        source_component: int = MAV_COMP_ID_MISSIONPLANNER,
+        source_component: int = MavComponent.MISSIONPLANNER,
         dialect: Dialect = STANDARD,
         mavlink_version: int = 2,
         signing: Signing | None = None,
@@ -419,7 +418,7 @@ class Connection:
         self.bus.publish(LoopBlocked(self._clock(), 0, seconds))
 
     async def _send_heartbeats(self) -> None:
-        heartbeat = Heartbeat(MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID, 0, 0, MAV_STATE_ACTIVE, 3)
+        heartbeat = Heartbeat(MavType.GCS, MavAutopilot.INVALID, 0, 0, MavState.ACTIVE, 3)
         while self.is_open:
             self.send(heartbeat)
             self._gate.tell_keeping()

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from aerokit.runtime.components import MAV_TYPE_GCS, is_autopilot
+from aerokit.mavlink.enums import MavType
+from aerokit.runtime.components import is_autopilot
 
 if TYPE_CHECKING:
     from aerokit.runtime.connection import Connection
@@ -73,6 +74,6 @@ class _Diagnosis:
             names = ", ".join(map(str, autopilots))
             return f"vehicles with other system ids were heard: {names} (wanted: {self._wanted})"
         names = ", ".join(f"{system}/{component}" for system, component in sorted(self._heard))
-        if all(beat.type == MAV_TYPE_GCS for beat in self._heard.values()):
+        if all(beat.type == MavType.GCS for beat in self._heard.values()):
             return f"only ground stations were heard ({names})"
         return f"only components that are no autopilot were heard ({names})"

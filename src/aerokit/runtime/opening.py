@@ -12,7 +12,8 @@ from aerokit.async_block import async_block
 from aerokit.errors import LocalProtocolError
 from aerokit.links import ReconnectingLink, create_link
 from aerokit.mavlink.dialect import STANDARD
-from aerokit.runtime.connection import MAV_COMP_ID_MISSIONPLANNER, Connection
+from aerokit.mavlink.enums import MavComponent
+from aerokit.runtime.connection import Connection
 
 if TYPE_CHECKING:
     import os
@@ -34,7 +35,7 @@ async def open_connection(
     address: str | Link,
     *,
     source_system: int = 255,
-    source_component: int = MAV_COMP_ID_MISSIONPLANNER,
+    source_component: int = MavComponent.MISSIONPLANNER,
     baud: int = 57600,
     dialect: Dialect = STANDARD,
     mavlink_version: int = 2,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING
 
+from aerokit.mavlink.enums import MavComponent
 from aerokit.runtime.claims import Claim, boot_time_ms
 from aerokit.runtime.events import HeardTwice, MoveRefused, VehicleMoved
 
@@ -32,7 +33,6 @@ MOST_ROUTES = 1024
 MOST_CLAIMS = 256
 """So many peers that speak in the name of others are remembered; of the first, it is told again."""
 SWEEP_AFTER_S = 1.0
-MAV_COMP_ID_AUTOPILOT1 = 1
 EVERY_PEER: tuple[Peer, ...] = (None,)
 
 
@@ -176,7 +176,7 @@ class Routes:
 
     def _doubles_of(self, system_id: int) -> set[Peer]:
         """Peers that speak in the name of this system's autopilot, and are not believed."""
-        autopilot = system_id, MAV_COMP_ID_AUTOPILOT1
+        autopilot = system_id, MavComponent.AUTOPILOT1
         return {
             peer for (source, peer), claim in self._claims.items() if source == autopilot and claim.is_told
         }

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, TypeVar
 
 from aerokit.arguments import checked
 from aerokit.mavlink.dialect import STANDARD
+from aerokit.mavlink.enums import MavComponent
 from aerokit.protocols.transfer import PATIENCE_S
-from aerokit.runtime.connection import MAV_COMP_ID_MISSIONPLANNER
 from aerokit.runtime.opening import open_connection as open_connection_async
 from aerokit.sync.blocks import (
     CellTwin,
@@ -2221,7 +2221,7 @@ def open_connection(
     address: str | Link,
     *,
     source_system: int = 255,
-    source_component: int = MAV_COMP_ID_MISSIONPLANNER,
+    source_component: int = MavComponent.MISSIONPLANNER,
     baud: int = 57600,
     dialect: Dialect = STANDARD,
     mavlink_version: int = 2,
@@ -2287,7 +2287,7 @@ def connect(
     timeout: float = 30.0,
     rates: Mapping[type[Message], float] | None = None,
     source_system: int = 255,
-    source_component: int = MAV_COMP_ID_MISSIONPLANNER,
+    source_component: int = MavComponent.MISSIONPLANNER,
     baud: int = 57600,
     dialect: Dialect = STANDARD,
     mavlink_version: int = 2,

@@ -14,9 +14,10 @@ from aerokit.async_block import async_block
 from aerokit.errors import BusyError, ConnectFailed, LocalProtocolError
 from aerokit.links.link import Link
 from aerokit.mavlink.dialect import STANDARD
+from aerokit.mavlink.enums import MavComponent
 from aerokit.mavlink.messages import Heartbeat
 from aerokit.runtime.components import is_autopilot
-from aerokit.runtime.connection import MAV_COMP_ID_MISSIONPLANNER, Connection
+from aerokit.runtime.connection import Connection
 from aerokit.runtime.diagnosis import no_vehicle_reason
 from aerokit.runtime.endings import raisable
 from aerokit.runtime.opening import open_connection
@@ -42,7 +43,6 @@ logger = logging.getLogger("aerokit")
 
 FRESH_HEARTBEAT_S = 2.0
 """A heartbeat heard longer ago says nothing about now: the next one is waited for."""
-MAV_COMP_ID_AUTOPILOT1 = 1
 HEARTBEATS_ALONE = 3
 """So many heartbeats of another component and none of component 1 make it the vehicle's autopilot."""
 
@@ -56,7 +56,7 @@ async def connect(
     timeout: float = 30.0,
     rates: Mapping[type[Message], float] | None = None,
     source_system: int = 255,
-    source_component: int = MAV_COMP_ID_MISSIONPLANNER,
+    source_component: int = MavComponent.MISSIONPLANNER,
     baud: int = 57600,
     dialect: Dialect = STANDARD,
     mavlink_version: int = 2,
@@ -235,7 +235,7 @@ class _Search:
         frame = heartbeat.received_frame
         if frame is None or self._ended.is_set() or not self._is_wanted(frame, heartbeat):
             return
-        if frame.component_id != MAV_COMP_ID_AUTOPILOT1 and not self._is_alone(frame):
+        if frame.component_id != MavComponent.AUTOPILOT1 and not self._is_alone(frame):
             return
         try:
             if frame.system_id in self._connection.attached:

@@ -16,6 +16,7 @@ from aerokit.errors import (
     NotSupported,
     RemoteProtocolError,
 )
+from aerokit.mavlink.enums import MavCmd, MavFtpErr, MavProtocolCapability
 from aerokit.mavlink.messages import FileTransferProtocol, ParamValue
 from aerokit.parameters import Parameter, ParameterTable
 from aerokit.parameters.parameter import same_value
@@ -39,12 +40,10 @@ UploadMethod = Literal["auto", "ftp", "set"]
 CacheChoice = bool | str | os.PathLike[str]
 """False: no cache; True: the one of this user; or a directory."""
 
-CAPABILITY_FTP = 0x20
-NO_SESSIONS_AVAILABLE = 4
 FIRST_ANSWER_S, FIRST_ATTEMPTS = 2.0, 3
 """Silent for so long, and for so many sendings, MAVFTP is not there, whatever the vehicle says."""
 ANSWER_S = 0.1
-SET_MESSAGE_INTERVAL, AS_BEFORE = 511, 0
+AS_BEFORE = 0
 ECHOES_S = 3.0
 """How long after a write late and repeated answers to it may still come."""
 FEW_READS = 5
@@ -126,7 +125,7 @@ class ParameterAccess:
                 if method == "ftp":
                     raise
                 is_for_now = isinstance(error, RemoteProtocolError) or (
-                    isinstance(error, FileError) and error.code == NO_SESSIONS_AVAILABLE
+                    isinstance(error, FileError) and error.code == MavFtpErr.NOSESSIONSAVAILABLE
                 )
                 self._has_pack = None if is_for_now else False
         await self._download_list(patience_s, on_progress)
@@ -157,7 +156,7 @@ class ParameterAccess:
         if self._has_pack is not None:
             return self._has_pack
         capabilities = await self._transfers.capabilities()
-        return bool(capabilities and capabilities & CAPABILITY_FTP)
+        return bool(capabilities and capabilities & MavProtocolCapability.FTP)
 
     async def _download_pack(self, patience_s: float, on_progress: OnProgress | None) -> None:
         """Read the file, again when it does not hold together.
@@ -243,13 +242,15 @@ class ParameterAccess:
             return
         self._attending += 1
         if self._attending == 1:
-            self._transfers.command_in_background(SET_MESSAGE_INTERVAL, ParamValue.ID, interval_s * 1e6)
+            self._transfers.command_in_background(
+                MavCmd.SET_MESSAGE_INTERVAL, ParamValue.ID, interval_s * 1e6
+            )
         try:
             yield
         finally:
             self._attending -= 1
             if not self._attending:
-                self._transfers.command_in_background(SET_MESSAGE_INTERVAL, ParamValue.ID, AS_BEFORE)
+                self._transfers.command_in_background(MavCmd.SET_MESSAGE_INTERVAL, ParamValue.ID, AS_BEFORE)
 
     async def write(
         self,

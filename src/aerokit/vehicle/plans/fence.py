@@ -5,14 +5,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from aerokit.arguments import checks_arguments
+from aerokit.mavlink.enums import MavCmd
 from aerokit.vehicle.plans.held import HeldPlan
 
 if TYPE_CHECKING:
     from aerokit.missions import Fence
 
 __all__ = ["FenceControl"]
-
-DO_FENCE_ENABLE = 207
 
 
 @checks_arguments
@@ -32,7 +31,7 @@ class FenceControl(HeldPlan["Fence"]):
             CommandRejected: the vehicle refused; PX4 does not know the command.
             CommandTimeout: it did not answer.
         """
-        await self._context.bridge.orders.command_aside(DO_FENCE_ENABLE, float(on))
+        await self._context.bridge.orders.command_aside(MavCmd.DO_FENCE_ENABLE, float(on))
 
     def _plan_type(self) -> type[Fence]:
         from aerokit.missions import Fence

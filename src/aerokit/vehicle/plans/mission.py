@@ -8,6 +8,7 @@ import anyio
 
 from aerokit.arguments import checks_arguments
 from aerokit.errors import CommandRejected, LocalProtocolError, OperationRejected, OperationTimeout
+from aerokit.mavlink.enums import MavCmd
 from aerokit.vehicle.checks import check_seconds
 from aerokit.vehicle.orders.orders import RESULT_UNSUPPORTED
 from aerokit.vehicle.orders.progress import LONGEST_SILENCE_S, await_progress
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
 
 __all__ = ["MissionControl"]
 
-DO_SET_MISSION_CURRENT, MISSION_START = 224, 300
 MODE_TIMEOUT_S = 6.0
 LAST_ITEM = 0xFFFF - 1
 
@@ -213,7 +213,7 @@ class MissionControl(HeldPlan["Mission"]):
         if talk.autopilot.sets_current_by_command:
             try:
                 await bridge.orders.command_of(
-                    order, DO_SET_MISSION_CURRENT, 0 if item == 0 and not goes_on else seq
+                    order, MavCmd.DO_SET_MISSION_CURRENT, 0 if item == 0 and not goes_on else seq
                 )
             except CommandRejected as error:
                 if error.result != RESULT_UNSUPPORTED:
@@ -262,7 +262,7 @@ class MissionControl(HeldPlan["Mission"]):
             return
         try:
             with bridge.helm.changing_mode():
-                await bridge.orders.give(order, talk.commands.send_long, MISSION_START, modes=(mode,))
+                await bridge.orders.give(order, talk.commands.send_long, MavCmd.MISSION_START, modes=(mode,))
                 await bridge.orders.await_mode(mode, order, [], timeout, order.given_at)
         except CommandRejected as error:
             if error.result != RESULT_UNSUPPORTED:

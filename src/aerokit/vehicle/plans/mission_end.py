@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from aerokit.mavlink.enums import MavCmd, MavLandedState, MissionState
 from aerokit.position import Position
 from aerokit.vehicle.orders.helm import MODE_GRACE_S
 
@@ -18,12 +19,9 @@ if TYPE_CHECKING:
 
 __all__ = ["MissionEnd"]
 
-NAV_RETURN_TO_LAUNCH, NAV_LAND, NAV_VTOL_LAND = 20, 21, 85
-LANDINGS = (NAV_RETURN_TO_LAUNCH, NAV_LAND, NAV_VTOL_LAND)
-STATE_UNKNOWN = 0
+LANDINGS = (MavCmd.NAV_RETURN_TO_LAUNCH, MavCmd.NAV_LAND, MavCmd.NAV_VTOL_LAND)
 END_GRACE_S = 2.0
 """MISSION_CURRENT comes at 1 Hz or faster, and may be lost."""
-LANDED_ON_GROUND = 1
 BACK_AT_LAST_S = 300.0
 """A return may go to a rally point, which is not known here: so long after its mission is complete it is over."""
 
@@ -46,7 +44,7 @@ class MissionEnd:
         self._order = bridge.helm.newest
         last = items[-1].command if items else None
         self._ends_by_landing = last in LANDINGS
-        self._stays_up = last == NAV_RETURN_TO_LAUNCH and not talk.autopilot.lands_after_return
+        self._stays_up = last == MavCmd.NAV_RETURN_TO_LAUNCH and not talk.autopilot.lands_after_return
         self._complete_since: float | None = None
         self._landing_modes = tuple(
             talk.autopilot.mode_for(purpose, is_vtol=talk.telemetry.is_vtol) for purpose in ("return", "land")
@@ -63,7 +61,7 @@ class MissionEnd:
         if self._talk.telemetry.is_surely_disarmed and self._is_landing:
             return True
         progress = self._watch.progress.latest
-        tells_state = progress is not None and progress.state != STATE_UNKNOWN
+        tells_state = progress is not None and progress.state != MissionState.UNKNOWN
         return not tells_state and self._watch.last is not None and self._watch.reached == self._watch.last
 
     def trouble(self, order: Order | None, *, is_paused: bool) -> str | None:
@@ -121,4 +119,4 @@ class MissionEnd:
     @property
     def _is_down(self) -> bool:
         landed = self._talk.telemetry.landed_state.latest
-        return self._talk.telemetry.is_surely_disarmed or landed == LANDED_ON_GROUND
+        return self._talk.telemetry.is_surely_disarmed or landed == MavLandedState.ON_GROUND

@@ -6,6 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 from aerokit.errors import ConnectionClosed
+from aerokit.mavlink.enums import MissionState
 from aerokit.runtime.cells import Source, StateCell
 from aerokit.runtime.events import MissionCurrentChanged, MissionFinished, MissionItemReached
 from aerokit.vehicle.state.condition import MissionProgress
@@ -15,7 +16,6 @@ if TYPE_CHECKING:
 
 __all__ = ["MissionWatch"]
 
-STATE_NO_MISSION, STATE_ACTIVE, STATE_COMPLETE = 1, 3, 5
 TWICE_S = 0.3
 """The same item reached again so soon is one message that came twice."""
 AGAIN_S = 1.0
@@ -94,7 +94,7 @@ class MissionWatch:
     def _on_current(self, _: MissionProgress | None, told: MissionProgress) -> None:
         before = self.current.latest
         current = None if told.current is None or told.current < self._offset else told.current - self._offset
-        if told.total is None and told.state == STATE_NO_MISSION:
+        if told.total is None and told.state == MissionState.NO_MISSION:
             current = None
             self._set_count(0, "MISSION_CURRENT")
         elif told.total is not None:
@@ -117,9 +117,9 @@ class MissionWatch:
             self._may_repeat = self._may_repeat or is_long_ago or (before is not None and before > current)
 
     def _on_state(self, state: int) -> None:
-        if state != STATE_COMPLETE:
+        if state != MissionState.COMPLETE:
             self._stale_until = -math.inf
-            if state == STATE_ACTIVE and self._is_in_mission_mode and self._talk.telemetry.is_armed:
+            if state == MissionState.ACTIVE and self._is_in_mission_mode and self._talk.telemetry.is_armed:
                 self._was_active, self.is_complete = True, False
         elif self._talk.connection.now() >= self._stale_until:
             self._complete()

@@ -7,7 +7,14 @@ from typing import TYPE_CHECKING
 from aerokit.autopilots import is_armed
 from aerokit.autopilots.modes import Mode
 from aerokit.autopilots.version import AutopilotVersion
-from aerokit.mavlink.enums import MavLandedState, MavProtocolCapability, MavState, MavVtolState, MissionState
+from aerokit.mavlink.enums import (
+    MavLandedState,
+    MavProtocolCapability,
+    MavSeverity,
+    MavState,
+    MavVtolState,
+    MissionState,
+)
 from aerokit.snapshot import Snapshot
 from aerokit.vehicle.state.reading import U16, Context, finite, member, unless
 
@@ -37,7 +44,6 @@ __all__ = [
     "vtol_state",
 ]
 
-MAV_SEVERITY_ERROR = 3
 SEVERITIES = ("EMERGENCY", "ALERT", "CRITICAL", "ERROR", "WARNING", "NOTICE", "INFO", "DEBUG")
 EARLIEST_UNIX_S = 1_000_000_000
 
@@ -138,7 +144,7 @@ class StatusText(Snapshot):
     @property
     def is_error(self) -> bool:
         """Whether it is an error or worse."""
-        return self.severity <= MAV_SEVERITY_ERROR
+        return self.severity <= MavSeverity.ERROR
 
     def __str__(self) -> str:
         name = SEVERITIES[self.severity] if self.severity < len(SEVERITIES) else str(self.severity)

@@ -7,6 +7,7 @@ from collections import defaultdict
 from typing import TYPE_CHECKING
 
 from aerokit.errors import CommandTimeout, ConnectionClosed
+from aerokit.mavlink.enums import MavResult
 from aerokit.mavlink.messages import CommandAck
 from aerokit.protocols.command import CommandExchange, command_int, command_long, command_name
 from aerokit.runtime.driver import ExchangeRun
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
 
 __all__ = ["CommandSender"]
 
-IN_PROGRESS = 5
 ROUND_TRIPS = 2
 """Nothing is sent again before so many measured round trips: the answer is still under way."""
 LONGEST_ATTEMPT_S = 5.0
@@ -202,7 +202,7 @@ class CommandSender:
         run = self._runs.get(key)
         if run is not None:
             run.receive(ack)
-        elif key in self._under_way and ack.result != IN_PROGRESS:
+        elif key in self._under_way and ack.result != MavResult.IN_PROGRESS:
             self._under_way[key].pop(0)
             if not self._under_way[key]:
                 del self._under_way[key]

@@ -11,6 +11,7 @@ import anyio
 
 from aerokit.autopilots.streams import STREAMED
 from aerokit.errors import CommandRejected, CommandTimeout, LocalProtocolError
+from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.mavlink.messages import RequestDataStream
 from aerokit.protocols.command import result_name
 from aerokit.runtime.events import StreamSlow, StreamUnavailable
@@ -26,8 +27,6 @@ if TYPE_CHECKING:
 
 __all__ = ["MessageRates"]
 
-SET_MESSAGE_INTERVAL = 511
-RESULT_UNSUPPORTED = 3
 WATCH_PERIOD_S = 1.0
 WATCH_WINDOW = 5
 """A rate is judged over this many watch periods."""
@@ -202,10 +201,10 @@ class MessageRates:
         times_forgotten = self._times_forgotten
         try:
             await self._commands.send_long(
-                SET_MESSAGE_INTERVAL, stream.message_type.ID, interval_us, attempts=1
+                MavCmd.SET_MESSAGE_INTERVAL, stream.message_type.ID, interval_us, attempts=1
             )
         except CommandRejected as error:
-            if error.result == RESULT_UNSUPPORTED:
+            if error.result == MavResult.UNSUPPORTED:
                 self._ask_by_group_from_now_on()
                 return
             self._was_refused(stream, error)

@@ -9,6 +9,7 @@ import anyio
 
 from aerokit.autopilots import autopilot_for
 from aerokit.errors import CommandRejected, ConnectionClosed
+from aerokit.mavlink.enums import MavResult
 from aerokit.mavlink.messages import CommandAck
 from aerokit.runtime.background import Background
 from aerokit.runtime.cells import Source, StateCell
@@ -43,8 +44,7 @@ SETTLE_S = 0.3
 """How long after a refusal the vehicle's texts about it are waited for."""
 ACTION_HZ = 4.0
 """How fast an action wants to be told what it waits for."""
-RESULT_ACCEPTED = 0
-RESULTS_OF_REFUSAL = (1, 2, 4)
+RESULTS_OF_REFUSAL = (MavResult.TEMPORARILY_REJECTED, MavResult.DENIED, MavResult.FAILED)
 
 
 class Talk:
@@ -147,7 +147,7 @@ class Talk:
             is_its = frame is not None and frame.component_id == self.component_id
             if ack.command != command or not is_its or not self.commands.is_for_us(ack):
                 return
-            if ack.result == RESULT_ACCEPTED:
+            if ack.result == MavResult.ACCEPTED:
                 refusals.clear()
             elif ack.result in RESULTS_OF_REFUSAL:
                 refusals.append(ack)
