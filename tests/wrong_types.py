@@ -6,6 +6,7 @@ A type hint that is not listed here is an error, so that what is added to the li
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Callable, Iterator
 from decimal import Decimal
 from functools import partial
@@ -145,9 +146,19 @@ def misuses_of(function: Callable[..., Any], name: str) -> Iterator[Misuse]:
     ]
     for parameter in parameters.values():
         others = [each for each in needed if each is not parameter]
-        for value in WRONG[str(parameter.annotation)]:
+        for value in (*WRONG[str(parameter.annotation)], *_impossible(name, parameter)):
             args, kwargs = _arguments(parameter, value, others)
             yield Misuse(name, parameter.name, value, partial(function, *args, **kwargs))
+
+
+def _impossible(method: str, parameter: inspect.Parameter) -> tuple[object, ...]:
+    """Of the right type, but no time that can be waited. Cells and subscriptions may be asked without waiting."""
+    name = parameter.name
+    is_time = name == "timeout" or (name.endswith("_s") and not name.endswith(("m_s", "deg_s")))
+    is_for_vehicles = not method.startswith(("StateCell.", "Subscription."))
+    return (
+        (math.nan, -1.0, 0.0) if is_time and is_for_vehicles and "float" in str(parameter.annotation) else ()
+    )
 
 
 def _arguments(

@@ -1,8 +1,8 @@
 """``checks_arguments``: public methods refuse an argument of a wrong type before they do anything.
 
 What is allowed is what the annotations say; they are read as text, so that nothing is imported for it. A class of ours
-is known by its name, callables, mappings and iterables by what they can do. Ranges, and whatever else a method knows
-better, are its own business.
+is known by its name, callables, mappings and iterables by what they can do. What is called a time by its name is above
+zero. Other ranges, and whatever else a method knows better, are its own business.
 """
 
 from __future__ import annotations
@@ -47,17 +47,26 @@ _SIMPLE: dict[str, Rule] = {
 }
 
 
+_SECONDS: dict[str, Rule] = {
+    "float": (lambda value: isinstance(value, Real) and float(value) > 0, "seconds above 0"),
+    "float | None": (
+        lambda value: value is None or (isinstance(value, Real) and float(value) > 0),
+        "seconds above 0, or None",
+    ),
+}
+
+
 def checks_arguments(cls: type[ClassT]) -> type[ClassT]:
     """Have all public methods of a class check their arguments; LocalProtocolError names the first wrong one."""
     for name, member in list(vars(cls).items()):
         if not name.startswith("_") and inspect.isfunction(member):
-            setattr(cls, name, checked(member))
+            setattr(cls, name, checked(member, times_are_above_zero=True))
     return cls
 
 
-def checked(function: FunctionT) -> FunctionT:
-    """The same of one function or method."""
-    rules = _Rules(inspect.unwrap(function))
+def checked(function: FunctionT, *, times_are_above_zero: bool = False) -> FunctionT:
+    """The same of one function or method; a time of zero may mean there: do not wait."""
+    rules = _Rules(inspect.unwrap(function), times_are_above_zero)
     if inspect.iscoroutinefunction(function):
 
         @wraps(function)
@@ -78,8 +87,8 @@ def checked(function: FunctionT) -> FunctionT:
 class _Rules:
     """What the arguments of one function may be; worked out at its first call."""
 
-    def __init__(self, function: Callable[..., Any]) -> None:
-        self._function = function
+    def __init__(self, function: Callable[..., Any], times_are_above_zero: bool) -> None:
+        self._function, self._times_are_above_zero = function, times_are_above_zero
         self._by_name: dict[str, Rule] | None = None
         self._in_order: tuple[str, ...] = ()
         self._rest = ""
@@ -98,15 +107,22 @@ class _Rules:
 
     def _read(self) -> dict[str, Rule]:
         parameters = inspect.signature(self._function).parameters.values()
-        rules = {
-            each.name: _rule(ast.parse(str(each.annotation), mode="eval").body, self._function.__globals__)
-            for each in parameters
-            if each.annotation is not each.empty
-        }
+        rules = {each.name: self._rule(each) for each in parameters if each.annotation is not each.empty}
         self._in_order = tuple(each.name for each in parameters if each.kind is each.POSITIONAL_OR_KEYWORD)
         self._rest = next((each.name for each in parameters if each.kind is each.VAR_POSITIONAL), "")
         self._by_name = rules
         return rules
+
+    def _rule(self, parameter: inspect.Parameter) -> Rule:
+        if self._times_are_above_zero and _is_time(parameter):
+            return _SECONDS[str(parameter.annotation)]
+        return _rule(ast.parse(str(parameter.annotation), mode="eval").body, self._function.__globals__)
+
+
+def _is_time(parameter: inspect.Parameter) -> bool:
+    """Seconds to wait, by its name: not metres or degrees a second."""
+    name, is_speed = parameter.name, parameter.name.endswith(("m_s", "deg_s"))
+    return str(parameter.annotation) in _SECONDS and name.endswith(("timeout", "_s")) and not is_speed
 
 
 def _complain_unless(rule: Rule, name: str, value: object) -> None:

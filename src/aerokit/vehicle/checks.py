@@ -5,7 +5,7 @@ from __future__ import annotations
 from aerokit.errors import LocalProtocolError
 from aerokit.wording import one, shown
 
-__all__ = ["check_kind", "check_range", "check_seconds"]
+__all__ = ["check_kind", "check_range"]
 
 
 def check_kind(name: str, value: object, kind: type) -> None:
@@ -23,12 +23,3 @@ def check_range(name: str, value: float, lowest: float, highest: float, *, above
     if not is_allowed:
         begin = f"above {lowest:g}" if above else f"{lowest:g}"
         raise LocalProtocolError(f"{name} = {shown(value)} is not allowed: {begin} to {highest:g}")
-
-
-def check_seconds(name: str, value: float | None, *, none_is_allowed: bool = False) -> None:
-    """Raise LocalProtocolError unless ``value`` is a number of seconds above 0, inf allowed."""
-    if value is None and none_is_allowed:
-        return
-    if not isinstance(value, (int, float)) or not value > 0:
-        allowed = "above 0, or None" if none_is_allowed else "above 0"
-        raise LocalProtocolError(f"{name} = {shown(value)} is not allowed: seconds {allowed}")

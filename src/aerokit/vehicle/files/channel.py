@@ -11,7 +11,6 @@ import anyio
 from aerokit.errors import AerokitError, ConnectionClosed, FileError, FileTimeout, LinkError, OperationTimeout
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
 from aerokit.protocols.ftp import FtpClient, FtpRequest, FtpSessionLost, path_bytes
-from aerokit.vehicle.checks import check_seconds
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable
@@ -70,8 +69,6 @@ class FileChannel:
         Raises:
             FileTimeout: all of it has taken more than ``timeout`` seconds; ``missing()`` gives its ranges.
         """
-        check_seconds("timeout", timeout, none_is_allowed=True)
-        check_seconds("patience_s", patience_s)
         try:
             with anyio.fail_after(timeout):
                 async with self._lock:

@@ -17,7 +17,6 @@ from aerokit.protocols.log_list import LogList
 from aerokit.protocols.logs import LOG_BLOCK, LogDownload, LogEnd
 from aerokit.protocols.reassembly import Reassembly
 from aerokit.protocols.transfer import PATIENCE_S, OnProgress
-from aerokit.vehicle.checks import check_seconds
 from aerokit.vehicle.files.log_entry import LogEntry
 from aerokit.vehicle.files.log_growth import GrowthWatch
 from aerokit.vehicle.files.log_paths import listed_logs, log_path
@@ -163,7 +162,6 @@ class Logs:
         Raises:
             FileTimeout: there are still logs of before.
         """
-        check_seconds("patience_s", patience_s)
         async with self._operation("erase logs", timeout, patience_s):
             before = {(entry.time_utc, entry.size) for entry in await self._entries(PATIENCE_S)}
             until = self._transfers.connection.now() + patience_s
@@ -300,8 +298,6 @@ class Logs:
         missing: Callable[[], tuple[tuple[int, int], ...]] = tuple,
     ) -> AsyncIterator[None]:
         """Wait for one's turn; tell the vehicle to stop when it ends before its end."""
-        check_seconds("timeout", timeout, none_is_allowed=True)
-        check_seconds("patience_s", patience_s)
         try:
             with anyio.fail_after(timeout):
                 async with self._lock:

@@ -17,7 +17,6 @@ from aerokit.errors import (
     OperationRejected,
     OperationTimeout,
 )
-from aerokit.vehicle.checks import check_seconds
 from aerokit.vehicle.orders.late_arming import LATE_S, give_arm
 from aerokit.vehicle.orders.part import Part
 from aerokit.vehicle.orders.progress import LONGEST_SILENCE_S, Arrivals, await_progress
@@ -70,7 +69,6 @@ class ArmingActions(Part):
             OperationTimeout: not within ``timeout`` seconds; the text says what is still missing, and what the vehicle
                 said of it lately.
         """
-        check_seconds("timeout", timeout)
         told = self.telemetry
         cells = (told.sensors, told.estimator, told.position, told.home, told.armed)
         with (
@@ -121,8 +119,6 @@ class ArmingActions(Part):
             HeartbeatTimeout: the vehicle has been silent for ``max_silence_s`` seconds.
             OperationTimeout: it accepted and did not arm.
         """
-        check_seconds("timeout", timeout)
-        check_seconds("max_silence_s", max_silence_s, none_is_allowed=True)
         wanted = self._mode_to_arm_in(mode)
         if wanted is not None:
             await self._go_to_arming_mode(wanted)
@@ -162,8 +158,6 @@ class ArmingActions(Part):
             HeartbeatTimeout: the vehicle has been silent for ``max_silence_s`` seconds.
             OperationTimeout: it accepted and did not disarm.
         """
-        check_seconds("timeout", timeout)
-        check_seconds("max_silence_s", max_silence_s, none_is_allowed=True)
         self._late_arming.stop()
         started = self.connection.now()
         with self._helm.aside() as order:
@@ -247,7 +241,6 @@ class ArmingActions(Part):
             LinkLost: the link goes down with the vehicle (USB, TCP); connect again.
             OperationTimeout: it did not come back.
         """
-        check_seconds("timeout", timeout)
         if not force and not self.telemetry.is_surely_disarmed:
             state = "armed" if self.telemetry.is_armed else "not known to be disarmed"
             raise OperationRejected(f"reboot: the vehicle is {state}; nothing was sent")

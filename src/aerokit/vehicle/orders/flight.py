@@ -10,7 +10,7 @@ import anyio
 from aerokit.arguments import checks_arguments
 from aerokit.errors import CommandRejected, NotSupported, OperationRejected, OperationTimeout
 from aerokit.position import Position
-from aerokit.vehicle.checks import check_range, check_seconds
+from aerokit.vehicle.checks import check_range
 from aerokit.vehicle.orders.helm import MODE_GRACE_S
 from aerokit.vehicle.orders.part import Part
 from aerokit.vehicle.orders.progress import LONGEST_SILENCE_S, OLD_POSITION_S, Stillness, await_progress
@@ -67,8 +67,6 @@ class FlightActions(Part):
             ValueUnknownError: home is not known, and PX4 needs its altitude.
         """
         check_range("altitude_m", altitude_m, 0, 10_000, above=True)
-        check_seconds("timeout", timeout)
-        check_seconds("max_silence_s", max_silence_s, none_is_allowed=True)
         plan = self._take_off_plan(altitude_m)
         if not self.telemetry.is_armed:
             raise OperationRejected("take_off: the vehicle is not armed: arm() comes first; nothing was sent")
@@ -181,8 +179,6 @@ class FlightActions(Part):
             HeartbeatTimeout: the vehicle has been silent for ``max_silence_s`` seconds.
             OperationTimeout: not on the ground in time.
         """
-        check_seconds("timeout", timeout, none_is_allowed=True)
-        check_seconds("max_silence_s", max_silence_s, none_is_allowed=True)
         mode = self._orders.mode_for("land", "land")
         if self.autopilot.landing_ends_in is None:
             order = self._helm.order(mode)
@@ -202,8 +198,6 @@ class FlightActions(Part):
 
         Raises as :meth:`land`.
         """
-        check_seconds("timeout", timeout, none_is_allowed=True)
-        check_seconds("max_silence_s", max_silence_s, none_is_allowed=True)
         mode = self._orders.mode_for("return_to_launch", "return")
         order = self._helm.order(mode)
         await self._orders.change_mode(mode, order, told_since=order.given_at)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from aerokit.arguments import checks_arguments
-from aerokit.vehicle.checks import check_seconds
 from aerokit.vehicle.orders.part import Part
 
 __all__ = ["ModeActions"]
@@ -30,7 +29,6 @@ class ModeActions(Part):
             OperationRejected: a pilot or a failsafe has chosen another mode meanwhile.
             OperationTimeout: it accepted and stayed in another mode, or did not answer.
         """
-        check_seconds("timeout", timeout)
         wanted = self.autopilot.find_mode(mode, self.telemetry.mode_names)
         await self._orders.change_mode(wanted, self._helm.order(wanted), timeout)
 

@@ -17,7 +17,7 @@ from aerokit.errors import (
 )
 from aerokit.mavlink.messages import SetPositionTargetGlobalInt
 from aerokit.position import Position
-from aerokit.vehicle.checks import check_range, check_seconds
+from aerokit.vehicle.checks import check_range
 from aerokit.vehicle.orders.orders import CHANGE_MODE, DO_REPOSITION, RESULT_UNSUPPORTED
 from aerokit.vehicle.orders.part import Part
 from aerokit.vehicle.orders.progress import LONGEST_SILENCE_S, Stillness, await_progress
@@ -84,7 +84,6 @@ class TravelActions(Part):
         """
         latitude, longitude, altitude, is_relative = self._where.global_target(target)
         _check_travel(speed_m_s, heading_deg, tolerance_m, timeout)
-        check_seconds("max_silence_s", max_silence_s, none_is_allowed=True)
         near_m = self.autopilot.arrival_radius_m if tolerance_m is None else tolerance_m
         self._check_can_turn(heading_deg)
         if not self.telemetry.is_armed:
@@ -232,8 +231,6 @@ class TravelActions(Part):
         check_range("heading_deg", heading_deg, -360, 360)
         check_range("rate_deg_s", rate_deg_s, 0, 360)
         check_range("tolerance_deg", tolerance_deg, 0, 180, above=True)
-        check_seconds("timeout", timeout)
-        check_seconds("max_silence_s", max_silence_s, none_is_allowed=True)
         self._check_can_turn(heading_deg)
         mode = self._orders.mode_for("set_heading", self.autopilot.reposition_purpose)
         goal = (heading_deg + (self.telemetry.heading_deg.value if relative else 0)) % 360
@@ -304,7 +301,6 @@ class TravelActions(Part):
             CommandTimeout: there was no answer.
             OperationTimeout: it accepted, and HOME_POSITION did not tell it.
         """
-        check_seconds("timeout", timeout)
         if place is not None and place.altitude_amsl_m is None:
             raise LocalProtocolError("place has no altitude_amsl_m: home needs one above mean sea level")
         home = self.telemetry.home
@@ -354,4 +350,3 @@ def _check_travel(
         check_range("heading_deg", heading_deg, 0, 360)
     if tolerance_m is not None:
         check_range("tolerance_m", tolerance_m, 0, 100_000, above=True)
-    check_seconds("timeout", timeout, none_is_allowed=True)

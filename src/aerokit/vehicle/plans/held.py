@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Generic, Literal, TypeVar
 
 from aerokit.arguments import checks_arguments
 from aerokit.errors import LocalProtocolError
-from aerokit.vehicle.checks import check_kind, check_seconds
+from aerokit.vehicle.checks import check_kind
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -150,8 +150,6 @@ class HeldPlan(Generic[PlanT]):
 
         if method not in METHODS:
             raise LocalProtocolError(f"method = {method!r} is not allowed: {', '.join(METHODS)}")
-        check_seconds("patience_s", patience_s)
-        check_seconds("timeout", timeout, none_is_allowed=True)
         context = self._context
         transfer = PlanTransfer(context, self._plan_type(), patience_s=patience_s, on_progress=on_progress)
         with context.transfers.limit(timeout):

@@ -9,7 +9,6 @@ import anyio
 from aerokit.arguments import checks_arguments
 from aerokit.errors import CommandRejected, LocalProtocolError, OperationRejected, OperationTimeout
 from aerokit.mavlink.enums import MavCmd
-from aerokit.vehicle.checks import check_seconds
 from aerokit.vehicle.orders.orders import RESULT_UNSUPPORTED
 from aerokit.vehicle.orders.progress import LONGEST_SILENCE_S, await_progress
 from aerokit.vehicle.plans.held import HeldPlan
@@ -84,7 +83,6 @@ class MissionControl(HeldPlan["Mission"]):
             OperationTimeout: MISSION_CURRENT did not confirm it.
         """
         self._check_item(item)
-        check_seconds("timeout", timeout)
         with self._bridge.helm.aside() as order:
             await self._set_current(item, timeout, order)
 
@@ -104,7 +102,6 @@ class MissionControl(HeldPlan["Mission"]):
             NotSupported: this type of vehicle has no mode for missions.
         """
         self._check_item(item)
-        check_seconds("timeout", timeout)
         bridge, talk = self._bridge, self._talk
         mode = bridge.orders.mode_for("mission.start", "mission")
         if not talk.telemetry.is_armed:
@@ -142,7 +139,6 @@ class MissionControl(HeldPlan["Mission"]):
 
         ArduPilot begins anew if its parameter MIS_RESTART is 1. Raises as :meth:`start`.
         """
-        check_seconds("timeout", timeout)
         bridge, talk = self._bridge, self._talk
         mode = bridge.orders.mode_for("mission.resume", "mission")
         if not talk.telemetry.is_armed:
@@ -173,8 +169,6 @@ class MissionControl(HeldPlan["Mission"]):
             OperationTimeout: not finished in time.
             HeartbeatTimeout: the vehicle has been silent for ``max_silence_s`` seconds.
         """
-        check_seconds("timeout", timeout, none_is_allowed=True)
-        check_seconds("max_silence_s", max_silence_s, none_is_allowed=True)
         bridge, talk = self._bridge, self._talk
         mode = bridge.orders.mode_for("mission.wait_finished", "mission")
         end = MissionEnd(bridge, self._watch, mode, self._context.memories[0].items)

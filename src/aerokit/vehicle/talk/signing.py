@@ -8,7 +8,6 @@ import anyio
 
 from aerokit.errors import NotSupported, OperationRejected, OperationTimeout
 from aerokit.mavlink.messages import SetupSigning
-from aerokit.vehicle.checks import check_seconds
 
 if TYPE_CHECKING:
     from aerokit.mavlink.signing import Signing
@@ -26,7 +25,6 @@ frames would be taken for replayed ones."""
 
 async def set_up_signing(talk: Talk, signing: Signing | None, timeout: float) -> None:
     """See :meth:`aerokit.Vehicle.setup_signing`."""
-    check_seconds("timeout", timeout)
     _check_vehicle(talk)
     connection, started = talk.connection, talk.connection.now()
     with connection._gate.handing_over(signing, talk.system_id, talk.component_id) as taken:

@@ -10,7 +10,6 @@ import anyio
 from aerokit.errors import AerokitError, ConnectionClosed, OperationTimeout
 from aerokit.protocols.round_trip import RoundTrip
 from aerokit.runtime.driver import run_exchange
-from aerokit.vehicle.checks import check_seconds
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterator
@@ -80,7 +79,6 @@ class Transfers:
     @contextmanager
     def limit(self, timeout: float | None) -> Iterator[None]:
         """Seconds for all of a block; then :class:`OperationTimeout`. None: no limit."""
-        check_seconds("timeout", timeout, none_is_allowed=True)
         try:
             with anyio.fail_after(timeout):
                 yield
