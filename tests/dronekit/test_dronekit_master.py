@@ -16,9 +16,9 @@ from pymavlink import mavutil
 from aerokit.dronekit.exceptions import APIException
 from aerokit.dronekit.master import Master, MessageFactory
 from aerokit.dronekit.mavlink import MAVConnection
-from aerokit.dronekit.pymavlink_messages import sendable
 from aerokit.errors import LocalProtocolError
 from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.from_pymavlink import from_pymavlink
 
 v10: Any = import_module("pymavlink.dialects.v10.ardupilotmega")
 v20: Any = import_module("pymavlink.dialects.v20.ardupilotmega")
@@ -33,7 +33,7 @@ class Sent(list[Any]):
 
     def bytes(self) -> bytes:
         encoder = FrameEncoder(SYSTEM, COMPONENT)
-        return b"".join(encoder.encode(sendable(message)) for message in self)
+        return b"".join(encoder.encode(from_pymavlink(message)) for message in self)
 
 
 class Buffer:
@@ -99,7 +99,7 @@ def test_arguments_of_mavlink_1_are_enough(factory: MessageFactory, sent: Sent) 
     mav = v10.MAVLink(theirs, SYSTEM, COMPONENT)
     for message in expected:
         mav.send(message)
-    assert b"".join(encoder.encode(sendable(message)) for message in sent) == theirs.data
+    assert b"".join(encoder.encode(from_pymavlink(message)) for message in sent) == theirs.data
 
 
 def test_floats_and_texts_are_taken(factory: MessageFactory, sent: Sent) -> None:
@@ -107,7 +107,7 @@ def test_floats_and_texts_are_taken(factory: MessageFactory, sent: Sent) -> None
     factory.param_set_send(1, 1, param_id="WPNAV_SPEED", param_value=500, param_type=9.0)
     factory.play_tune_send(1, 1, bytearray(b"CDE"))
     factory.statustext_send(6, "gr\u00fc\u00df")
-    mount, param, tune, text = (sendable(message) for message in sent)
+    mount, param, tune, text = (from_pymavlink(message) for message in sent)
     assert (mount.to_dict()["input_a"], mount.to_dict()["input_c"]) == (-9050, 1000)
     assert (param.to_dict()["param_id"], param.to_dict()["param_type"]) == ("WPNAV_SPEED", 9)
     assert tune.to_dict()["tune"] == "CDE"
@@ -117,7 +117,7 @@ def test_floats_and_texts_are_taken(factory: MessageFactory, sent: Sent) -> None
 def test_wrong_values_are_found_when_they_are_sent(factory: MessageFactory) -> None:
     message = factory.mission_set_current_encode(1, 1, None)
     with pytest.raises(LocalProtocolError, match=r"MISSION_SET_CURRENT\.seq"):
-        sendable(message)
+        from_pymavlink(message)
     with pytest.raises(LocalProtocolError, match="play_tune_encode: a text must be"):
         factory.play_tune_encode(1, 1, None)
     with pytest.raises(TypeError):

@@ -20,13 +20,14 @@ from hypothesis import strategies as st
 from pymavlink import mavutil
 
 from aerokit import messages
-from aerokit.dronekit.pymavlink_messages import message_of, sendable
+from aerokit.dronekit.pymavlink_messages import message_of
 from aerokit.errors import LocalProtocolError
 from aerokit.mavlink.checksum import x25
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.framer import Framer
+from aerokit.mavlink.from_pymavlink import from_pymavlink
 
 v10: Any = import_module("pymavlink.dialects.v10.ardupilotmega")
 v10_common: Any = import_module("pymavlink.dialects.v10.common")
@@ -204,7 +205,7 @@ def packed(message: Any, module: Any = v20) -> bytes:
 
 
 def encoded(message: Any, *, version: int = 2, target_system: int | None = None) -> bytes:
-    return FrameEncoder(SYSTEM, COMPONENT, version=version).encode(sendable(message, target_system))
+    return FrameEncoder(SYSTEM, COMPONENT, version=version).encode(from_pymavlink(message, target_system))
 
 
 def arguments(message: Any) -> list[Any]:
@@ -222,7 +223,7 @@ def test_every_message_is_sent_as_pymavlink_packs_it() -> None:
             expected = packed(message, module)
             assert encoded(message) == expected
             assert encoded(message_of(Frame.parse(raw))) == expected, "what was received can be sent on"
-            assert isinstance(sendable(message), STANDARD[message_id])
+            assert isinstance(from_pymavlink(message), STANDARD[message_id])
 
 
 def test_messages_of_mavlink_1_classes_go_out_in_both_versions() -> None:
@@ -260,24 +261,24 @@ def test_messages_of_other_dialects(monkeypatch: pytest.MonkeyPatch, dialect: An
 
 def test_the_target_is_written_into_the_programs_message() -> None:
     message = v20.MAVLink_command_long_message(0, 17, 400, 0, 1, 0, 0, 0, 0, 0, 0)
-    sent = sendable(message, 9)
+    sent = from_pymavlink(message, 9)
     assert (type(sent), sent.ID) == (messages.CommandLong, 76)
     assert sent.to_dict() == {**sent.to_dict(), "target_system": 9, "target_component": 17, "param1": 1}
     assert (message.target_system, message.target_component) == (9, 17)
-    assert sendable(message, 0) == sendable(message) == sent
+    assert from_pymavlink(message, 0) == from_pymavlink(message) == sent
     message.param1 = 0
     assert sent.to_dict()["param1"] == 1, "changed after it was sent"
 
 
 def test_a_message_without_a_target_gets_none() -> None:
     message = v20.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3)
-    sendable(message, 9)
+    from_pymavlink(message, 9)
     assert not hasattr(message, "target_system")
 
 
 def test_aerokits_own_messages() -> None:
     message = messages.CommandLong(0, 1, 400, 0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    sent = sendable(message, 9)
+    sent = from_pymavlink(message, 9)
     assert (sent, message.target_system) == (messages.CommandLong(9, 1, 400, 0, 1, 0, 0, 0, 0, 0, 0), 0)
     assert encoded(messages.Heartbeat(6, 8, 0, 0, 0, 3)) == packed(
         v20.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3)
@@ -289,7 +290,7 @@ def test_a_subclass_of_a_program() -> None:
         def __init__(self, x: float, y: float, z: float) -> None:
             super().__init__(0, 0, 1, 3, 16, 0, 1, 0, 0, 0, 0, x, y, z)
 
-    sent = sendable(Item(-35.5, 149.25, 30), 1)
+    sent = from_pymavlink(Item(-35.5, 149.25, 30), 1)
     assert isinstance(sent, messages.MissionItem)
     assert (sent.x, sent.y, sent.z, sent.mission_type) == (-35.5, 149.25, 30, 0)
 
@@ -301,7 +302,7 @@ def test_anything_with_the_fields_of_a_message() -> None:
         def get_type(self) -> str:
             return "PING"
 
-    assert sendable(Ping(), 3) == messages.Ping(1, 2, 3, 0)
+    assert from_pymavlink(Ping(), 3) == messages.Ping(1, 2, 3, 0)
 
 
 # ---------------------------------------------------------------------------------------- values
@@ -319,7 +320,7 @@ class Number:
     [(3, 3), (3.0, 3), (2.6, 3), (-0.4, 0), (True, 1), (Number(), 3), (decimal.Decimal("2.7"), 3)],
 )
 def test_numbers_for_integer_fields_are_rounded(given: Any, expected: int) -> None:
-    sent = sendable(v20.MAVLink_mission_set_current_message(1, 1, given))
+    sent = from_pymavlink(v20.MAVLink_mission_set_current_message(1, 1, given))
     assert isinstance(sent, messages.MissionSetCurrent)
     assert sent.seq == expected
     assert type(sent.seq) is int
@@ -329,7 +330,7 @@ def test_numbers_for_real_fields() -> None:
     message = v20.MAVLink_command_long_message(
         1, 1, 22, 0, True, Number(), decimal.Decimal("1.5"), 3, math.nan, 0, 0
     )
-    sent = sendable(message)
+    sent = from_pymavlink(message)
     assert isinstance(sent, messages.CommandLong)
     assert (sent.param1, sent.param2, sent.param3, sent.param4) == (1, 2.6, 1.5, 3)
     assert math.isnan(sent.param5)
@@ -339,23 +340,23 @@ def test_numbers_for_real_fields() -> None:
 def test_texts_are_str_or_bytes(text: Any) -> None:
     message = v20.MAVLink_play_tune_message(1, 1, b"")
     message.tune = text
-    assert sendable(message) == messages.PlayTune(1, 1, "MFT240")
+    assert from_pymavlink(message) == messages.PlayTune(1, 1, "MFT240")
 
 
 def test_texts_that_are_no_utf_8_are_sent_as_they_are() -> None:
     message = v20.MAVLink_play_tune_message(1, 1, b"\xff\xfe")
     assert encoded(message) == packed(message)
     message.tune = "é"
-    assert sendable(message) == messages.PlayTune(1, 1, "é")
+    assert from_pymavlink(message) == messages.PlayTune(1, 1, "é")
 
 
 def test_arrays_take_any_sequence_and_are_filled_up() -> None:
     for data in ([1, 2.0], (1, 2), b"\1\2", bytearray(b"\1\2"), range(1, 3), [True, 2.4]):
         message = v20.MAVLink_file_transfer_protocol_message(0, 1, 1, data)
-        assert sendable(message) == messages.FileTransferProtocol(0, 1, 1, b"\1\2")
+        assert from_pymavlink(message) == messages.FileTransferProtocol(0, 1, 1, b"\1\2")
     q = v20.MAVLink_set_attitude_target_message(0, 1, 1, 0, (1, 0, Number()), 0, 0, 0, 0.5)
-    assert sendable(q).to_dict()["q"] == (1, 0, 2.6)
-    assert sendable(q).encode()[4:20] == struct.pack("<4f", 1, 0, 2.6, 0), "missing elements are 0"
+    assert from_pymavlink(q).to_dict()["q"] == (1, 0, 2.6)
+    assert from_pymavlink(q).encode()[4:20] == struct.pack("<4f", 1, 0, 2.6, 0), "missing elements are 0"
 
 
 def command(**wrong: Any) -> Any:
@@ -403,7 +404,7 @@ def tune(text: Any) -> Any:
 )
 def test_nonsense_is_refused(message: Any, said: str) -> None:
     with pytest.raises(LocalProtocolError, match=said) as caught:
-        sendable(message, 1)
+        from_pymavlink(message, 1)
     assert isinstance(caught.value, ValueError)
 
 
@@ -411,4 +412,4 @@ def test_a_missing_field_is_named() -> None:
     message = command()
     del message.param3
     with pytest.raises(LocalProtocolError, match=r"COMMAND_LONG.param3 .*missing"):
-        sendable(message)
+        from_pymavlink(message)

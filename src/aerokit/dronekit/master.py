@@ -9,7 +9,8 @@ from pymavlink import mavutil
 
 from aerokit.dronekit.inbox import Inbox
 from aerokit.dronekit.message_factory import MessageFactory
-from aerokit.dronekit.pymavlink_messages import message_of, sendable
+from aerokit.dronekit.pymavlink_messages import message_of
+from aerokit.mavlink.from_pymavlink import from_pymavlink
 from aerokit.runtime.components import is_autopilot
 
 if TYPE_CHECKING:
@@ -232,7 +233,7 @@ class Master:
 
     def _send(self, message: Any) -> None:
         target = self._connection.target_system
-        self._connection.send(sendable(message, target), to=target or None)
+        self._connection.send(from_pymavlink(message, target), to=target or None)
 
     def _heard(self) -> tuple[int, Heartbeat | None]:
         """Component id and last heartbeat of the vehicle's autopilot."""

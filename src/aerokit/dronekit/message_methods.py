@@ -61,7 +61,8 @@ class MessageMethods(VehicleCore):
             LocalProtocolError: a ValueError; a field is wrong. Nothing was sent.
             APIException: the link is down.
         """
-        from aerokit.dronekit.sendable_messages import sendable
+        from aerokit.mavlink.from_pymavlink import from_pymavlink
 
         self._dk_check_link()
-        self._handler.send(sendable(message, self._dk_target_system), to=self._dk_target_system)
+        target = self._dk_target_system
+        self._handler.send(from_pymavlink(message, target), to=target)

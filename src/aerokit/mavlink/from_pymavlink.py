@@ -1,4 +1,4 @@
-"""Any message object of a program, pymavlink's above all, made into one of aerokit's, which a connection can send."""
+"""`from_pymavlink`: any message object of a program, pymavlink's above all, as one that a connection can send."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from aerokit.mavlink.runtime_dialect import class_from_pymavlink
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Field
 
-__all__ = ["sendable"]
+__all__ = ["from_pymavlink"]
 
 REAL_TYPES = ("float", "double")
 
 
-def sendable(message: Any, target_system: int | None = None) -> Message:
-    """A copy of a message, checked, for ``Connection.send``; later changes to ``message`` do not change it.
+def from_pymavlink(message: Any, target_system: int | None = None) -> Message:
+    """A copy of a message, checked, for ``vehicle.send``; later changes to ``message`` do not change it.
 
     Args:
         message: of any pymavlink dialect, for MAVLink 1 or 2, a subclass of such a class, anything with ``get_type()``
