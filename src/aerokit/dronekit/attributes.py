@@ -25,7 +25,6 @@ from aerokit.mavlink import messages as m
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from aerokit.dronekit.exceptions import APIException
     from aerokit.dronekit.locations import Locations
     from aerokit.mavlink.message import Message
 
@@ -66,23 +65,13 @@ class VehicleAttributes(VehicleCore):
     _dk_told_home: LocationGlobal | None = None
 
     def _dk_make_streams(self) -> None:
-        self._dk_streams = {kind.message_type: Stream(self, kind, names) for kind, names in STREAMS}
+        for kind, names in STREAMS:
+            self._dk.streams[kind.message_type] = Stream(self, kind, names)
         self._dk_reviewing = threading.Lock()
 
     def _dk_attach_attributes(self) -> None:
-        self._ready_attrs: set[str] = set()
-        self._dk_failures: dict[str, APIException] = {}
-        self._dk_became_ready = threading.Condition()
-        self._dk_seekers: dict[str, Callable[[], None]] = {}
         for message_type, handler in self._dk_handlers().items():
-            self._dk_on(message_type, handler)
-
-    def _dk_on(self, message_type: type[Message], handler: Callable[[Any], None]) -> None:
-        stream = self._dk_streams.get(message_type)
-        if stream is None:
-            super()._dk_on(message_type, handler)
-        else:
-            stream.add(handler)
+            self._dk.on(message_type, handler)
 
     def _dk_handlers(self) -> dict[type[Message], Callable[[Any], None]]:
         return {
@@ -270,41 +259,20 @@ class VehicleAttributes(VehicleCore):
         """Messages are looked at when they come only as long as somebody listens; from any thread."""
         with self._dk_reviewing:
             listened, heeds_places = self._attribute_listeners, bool(self._location._attribute_listeners)
-            for message_type, stream in self._dk_streams.items():
+            for message_type, stream in self._dk.streams.items():
                 stream.review(self._ready_attrs, listened, heeds_places and message_type in PLACES)
 
     def _dk_announce(self, name: str) -> None:
         """Tell an attribute's value, which is made only when somebody listens."""
         if name not in self._ready_attrs:
-            self._dk_mark_ready(name)
+            self._dk.ready.mark(name)
         listeners = self._attribute_listeners
         if name in listeners or "*" in listeners:
             self._dk_offer(name, getattr(self, name))
 
     def _dk_note(self, attr_name: str) -> None:
         if attr_name not in self._ready_attrs:
-            self._dk_mark_ready(attr_name)
-
-    def _dk_mark_ready(self, name: str) -> None:
-        """The attribute has a value: whoever waits for it goes on."""
-        with self._dk_became_ready:
-            self._dk_failures.pop(name, None)
-            self._ready_attrs.add(name)
-            self._dk_became_ready.notify_all()
-        self._dk_review()
-
-    def _dk_unready(self, name: str) -> None:
-        """The attribute will get a new value, and is to be waited for."""
-        with self._dk_became_ready:
-            self._dk_failures.pop(name, None)
-            self._ready_attrs.discard(name)
-        self._dk_review()
-
-    def _dk_fail(self, name: str, error: APIException) -> None:
-        """The attribute will get no value: whoever waits for it is told why."""
-        with self._dk_became_ready:
-            self._dk_failures[name] = error
-            self._dk_became_ready.notify_all()
+            self._dk.ready.mark(attr_name)
 
 
 STREAMS: tuple[tuple[Latest[Any], tuple[str, ...]], ...] = (

@@ -63,6 +63,6 @@ class MessageMethods(VehicleCore):
         """
         from aerokit.mavlink.from_pymavlink import from_pymavlink
 
-        self._dk_check_link()
-        target = self._dk_target_system
+        self._dk.check_link()
+        target = self._dk.target_system
         self._handler.send(from_pymavlink(message, target), to=target)

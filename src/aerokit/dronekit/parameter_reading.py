@@ -15,7 +15,7 @@ from aerokit.parameters import Parameter
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from aerokit.dronekit.vehicle import Vehicle
+    from aerokit.dronekit.core import Core
     from aerokit.parameters import ParameterTable
     from aerokit.vehicle.parameters.access import DownloadMethod
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
@@ -36,8 +36,8 @@ class ParameterReading:
     Whoever waits for it then has it tried again and again; nobody else does.
     """
 
-    def __init__(self, vehicle: Vehicle, take_all: Callable[[ParameterTable], None]) -> None:
-        self._vehicle, self._take_all = vehicle, take_all
+    def __init__(self, core: Core, take_all: Callable[[ParameterTable], None]) -> None:
+        self._core, self._take_all = core, take_all
         self.is_complete = False
         """Whether the whole list has come since the connection was made; it stays true when the vehicle reboots."""
         self._ended: asyncio.Event | None = None
@@ -47,15 +47,15 @@ class ParameterReading:
         """Begin the download, unless it is under way or done (loop thread)."""
         if self._ended is None and not self.is_complete:
             self._ended = asyncio.Event()
-            aio, take = self._vehicle._dk_vehicle, weakly(self._take)
+            aio, take = self._core.aio, weakly(self._take_all)
             fail, end = weakly(self._warn), weakly(self._end)
-            self._vehicle._dk_background(lambda: _download(aio, take, fail, end))
+            self._core.background(lambda: _download(aio, take, fail, end))
 
     def seek(self) -> None:
         """As :meth:`begin`, from any thread; silent when the connection is closed."""
         if self._ended is None and not self.is_complete:
             with contextlib.suppress(AerokitError):
-                self._vehicle._handler.orders.post(self.begin)
+                self._core.handler.orders.post(self.begin)
 
     async def find(self, name: str) -> None:
         """Return when the parameter has come, by itself or with the list, or when it is certain that there is none."""
@@ -80,11 +80,6 @@ class ParameterReading:
             if self._ended is not None:
                 await self._ended.wait()
 
-    def _take(self, table: ParameterTable) -> None:
-        self._take_all(table)
-        self.is_complete = True
-        self._vehicle._dk_tell("parameters", self._vehicle.parameters)
-
     def _end(self) -> None:
         ended, self._ended = self._ended, None
         if ended is not None:
@@ -93,7 +88,7 @@ class ParameterReading:
     def _warn(self, error: AerokitError) -> None:
         if not self._has_warned:
             self._has_warned = True
-            self._vehicle._logger.warning("the parameters could not be downloaded: %s", error)
+            self._core.logger.warning("the parameters could not be downloaded: %s", error)
 
     async def _read(self, name: str) -> bool:
         """Ask for one parameter, under all its names; says whether the vehicle has given it, or said it has none.
@@ -103,7 +98,7 @@ class ParameterReading:
         from aerokit.parameters.renames import other_names
 
         names = (name, *other_names(name))
-        access = self._vehicle._dk_vehicle.parameters._access
+        access = self._core.aio.parameters._access
         try:
             answers = (await access.read(names, PATIENCE_S, are_doubtful=True)).values()
         except AerokitError:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import anyio
 
+from aerokit.dronekit.core import core_of
 from aerokit.dronekit.exceptions import APIException, TimeoutError  # noqa: A004 - DroneKit's name
 from aerokit.dronekit.observers import AttributeListener, HasObservers, ListenerT
 from aerokit.dronekit.parameter_reading import ParameterReading
@@ -20,8 +21,8 @@ from aerokit.parameters import check_name
 from aerokit.runtime.events import ParameterChanged
 
 if TYPE_CHECKING:
+    from aerokit.dronekit.core import VehicleCore
     from aerokit.dronekit.parameter_values import KnownParameter
-    from aerokit.dronekit.vehicle import Vehicle
     from aerokit.parameters import ParameterTable
 
 __all__ = ["Parameters"]
@@ -43,16 +44,17 @@ class Parameters(MutableMapping[str, float], HasObservers):
     Listeners get ``(parameters, name, value)``, when a value has changed or has come for the first time.
     """
 
-    def __init__(self, vehicle: Vehicle) -> None:
-        HasObservers.__init__(self, vehicle._dk_listener_thread)
-        self._vehicle = vehicle
+    def __init__(self, vehicle: VehicleCore) -> None:
+        self._vehicle, self._core = vehicle, core_of(vehicle)
+        core = self._core
+        HasObservers.__init__(self, core.handler.listener_thread)
         self._values = ParameterValues()
         self._count = 0
         """How many there are by the last message."""
-        self._reading = ParameterReading(vehicle, self._take_all)
-        vehicle._dk_on(ParamValue, self._on_value)
-        vehicle._dk_at_start(self._start)
-        vehicle._dk_seekers["parameters"] = self._reading.seek
+        self._reading = ParameterReading(core, self._take_all)
+        core.on(ParamValue, self._on_value)
+        core.at_start(self._start)
+        core.ready.seekers["parameters"] = self._reading.seek
 
     # ------------------------------------------------------------------------------- reading
 
@@ -88,7 +90,7 @@ class Parameters(MutableMapping[str, float], HasObservers):
         return len(self._values)
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._all())
+        return iter(self.all_values())
 
     def items(self) -> ItemsView[str, float]:
         """Names and values; iterating waits for the download, and goes through what is known then."""
@@ -172,15 +174,15 @@ class Parameters(MutableMapping[str, float], HasObservers):
         own, told = (name, number) if known is None else (known.name, known.to_vehicle(number))
         if known is not None:
             known.warn()
-        vehicle = self._vehicle
+        core = self._core
         if retries <= 0:
-            vehicle._dk_order(f"parameter {own}", set_parameter, vehicle._dk_vehicle, own, told, 0)
+            core.order(f"parameter {own}", set_parameter, core.aio, own, told, 0)
             return False
-        failure = vehicle._dk_run(set_parameter, vehicle._dk_vehicle, own, told, retries)
+        failure = core.run(set_parameter, core.aio, own, told, retries)
         if isinstance(failure, ParameterTimeout):
-            vehicle._logger.error("timeout setting parameter %s to %f", name, number)
+            core.logger.error("timeout setting parameter %s to %f", name, number)
         elif failure is not None:
-            vehicle._logger.error("could not set parameter %s to %f: %s", name, number, failure)
+            core.logger.error("could not set parameter %s to %f: %s", name, number, failure)
         return failure is None
 
     # ----------------------------------------------------------------------------- listeners
@@ -217,7 +219,7 @@ class Parameters(MutableMapping[str, float], HasObservers):
         is_settled = self._is_settled  # before looking: the list may come meanwhile
         known = self._values.find(name)
         if known is None and waits and not is_settled and _is_possible(name):
-            self._vehicle._dk_run(self._wait_for, name)
+            self._core.run(self._wait_for, name)
             known = self._values.find(name)
         return known
 
@@ -232,26 +234,31 @@ class Parameters(MutableMapping[str, float], HasObservers):
         if waiting.cancelled_caught:
             raise TimeoutError(f"wait_ready experienced a timeout after {READY_S:.0f} seconds.")
 
-    def _all(self) -> dict[str, float]:
+    def known_values(self) -> dict[str, float]:
+        """What is known now, without waiting."""
+        return self._values.copy()
+
+    def all_values(self) -> dict[str, float]:
+        """All of them; waits for the download."""
         if not self._reading.is_complete:
             self.wait_ready()
         return self._values.copy()
 
     def _start(self, ends: ExitStack) -> None:
-        bus = self._vehicle._dk_vehicle.connection.bus
+        bus = self._core.aio.connection.bus
         ends.callback(bus.attach_event(ParameterChanged, weakly(self._on_changed)))
         self._reading.begin()
 
     def _on_value(self, message: ParamValue) -> None:
         """The table underneath has taken it already: there, integers are what they are."""
         self._count = message.param_count
-        told = self._vehicle._dk_vehicle.parameters.known(message.param_id)
+        told = self._core.aio.parameters.known(message.param_id)
         if told is not None:
             self._take(told.name, float(told.value))
 
     def _on_changed(self, event: ParameterChanged) -> None:
         """Also by a download that a program has begun by itself."""
-        if event.system_id == self._vehicle._dk_target_system:
+        if event.system_id == self._core.target_system:
             self._take(event.name, float(event.after))
 
     def _take(self, name: str, value: float) -> None:
@@ -265,20 +272,22 @@ class Parameters(MutableMapping[str, float], HasObservers):
                 self._dk_tell(name.upper(), value, cache=True)
         else:
             self._attribute_cache.update(news)
+        self._reading.is_complete = True
+        self._core.tell("parameters", self)
 
 
 class _Items(ItemsView[str, float]):
     _mapping: Parameters
 
     def __iter__(self) -> Iterator[tuple[str, float]]:
-        return iter(self._mapping._all().items())
+        return iter(self._mapping.all_values().items())
 
 
 class _Values(ValuesView[float]):
     _mapping: Parameters
 
     def __iter__(self) -> Iterator[float]:
-        return iter(self._mapping._all().values())
+        return iter(self._mapping.all_values().values())
 
 
 def _upper(name: str) -> str:

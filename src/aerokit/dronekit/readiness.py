@@ -1,90 +1,95 @@
-"""``wait_ready``: waiting until attributes have values."""
+"""``Readiness``: which attributes have values, and waiting until they do."""
 
 from __future__ import annotations
 
 import math
+import threading
 import time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from aerokit.dronekit.attributes import VehicleAttributes
 from aerokit.dronekit.exceptions import APIException, TimeoutError  # noqa: A004 - DroneKit's name
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = ["DEFAULT_ATTRIBUTES", "Readiness"]
+__all__ = ["Readiness"]
 
-DEFAULT_ATTRIBUTES = ("parameters", "gps_0", "armed", "mode", "attitude")
-"""What ``wait_ready(True)`` waits for."""
 LONGEST_WAIT_S = 0.2
 """Waits are cut into slices: Ctrl-C and the end of the link are noticed between them."""
 
 
-class Readiness(VehicleAttributes):
-    """What is ready is what was told at least once."""
+class Readiness:
+    """What is ready is what was told at least once. Any thread may use it.
 
-    def wait_ready(
+    ``check`` raises when nothing will come any more, ``review`` is called when something else has become ready.
+    """
+
+    def __init__(self, check: Callable[[], object], review: Callable[[], None]) -> None:
+        self._check, self._review = check, review
+        self.names: set[str] = set()
+        """What has values."""
+        self.seekers: dict[str, Callable[[], None]] = {}
+        """What is called while somebody waits for a name that does not come by itself."""
+        self._failures: dict[str, APIException] = {}
+        self._changed = threading.Condition()
+
+    def mark(self, name: str) -> None:
+        """The attribute has a value: whoever waits for it goes on."""
+        with self._changed:
+            self._failures.pop(name, None)
+            self.names.add(name)
+            self._changed.notify_all()
+        self._review()
+
+    def unmark(self, name: str) -> None:
+        """The attribute will get a new value, and is to be waited for."""
+        with self._changed:
+            self._failures.pop(name, None)
+            self.names.discard(name)
+        self._review()
+
+    def fail(self, name: str, error: APIException) -> None:
+        """The attribute will get no value: whoever waits for it is told why."""
+        with self._changed:
+            self._failures[name] = error
+            self._changed.notify_all()
+
+    def wait(
         self,
-        *types: str | bool,
-        timeout: float | None = 30,
-        raise_exception: bool = True,
-        still_waiting_callback: Callable[[set[str]], object] | None = None,
-        still_waiting_interval: float = 1,
-        **_: Any,
+        wanted: set[str],
+        timeout: float | None,
+        raise_exception: bool,
+        tell_missing: Callable[[set[str]], object] | None,
+        interval: float,
     ) -> bool:
-        """Wait until these attributes have values; without names, or with True, for those that most programs need.
-
-        Args:
-            types: names of attributes, your own too; ``wait_ready(True)`` is ``'parameters'``, ``'gps_0'``,
-                ``'armed'``, ``'mode'`` and ``'attitude'``.
-            timeout: seconds; None waits as long as the link lives.
-            raise_exception: whether to raise when the time is over.
-            still_waiting_callback: called with the names that are missing.
-            still_waiting_interval: how often, in seconds.
-
-        Returns:
-            Whether all of them have values.
-
-        Raises:
-            TimeoutError: they have not in time, and ``raise_exception`` is true.
-            ValueError: a name is no text.
-            APIException: the link is down, or what is waited for has failed.
-        """
-        names = DEFAULT_ATTRIBUTES if not types or types == (True,) else types
-        if not all(isinstance(name, str) for name in names):
-            raise ValueError("wait_ready expects one or more string arguments.")
-        wanted = {str(name) for name in names}
+        """See ``Vehicle.wait_ready``."""
         started = told_at = time.monotonic()
         deadline = math.inf if timeout is None else started + timeout
-        while missing := wanted - self._ready_attrs:
+        while missing := wanted - self.names:
             now = time.monotonic()
             if now >= deadline:
                 if raise_exception:
                     error = TimeoutError(f"wait_ready experienced a timeout after {timeout} seconds.")
                     raise error from LookupError(f"never told: {', '.join(sorted(missing))}")
                 return False
-            self._dk_check_link()
-            if (failure := self._dk_failure_of(missing)) is not None:
+            self._check()
+            if (failure := self._failure_of(missing)) is not None:
                 if raise_exception:
                     raise type(failure)(str(failure)) from failure.__cause__
                 return False
-            self._dk_seek(missing)
-            if still_waiting_callback is not None and now >= told_at + still_waiting_interval:
+            for name in self.seekers.keys() & missing:
+                self.seekers[name]()
+            if tell_missing is not None and now >= told_at + interval:
                 told_at = now
-                still_waiting_callback(missing)
-            self._dk_wait_a_little(wanted, deadline - now)
+                tell_missing(missing)
+            self._wait_a_little(wanted, deadline - now)
         return True
 
-    def _dk_seek(self, names: set[str]) -> None:
-        """Have what is not coming by itself fetched."""
-        for name in self._dk_seekers.keys() & names:
-            self._dk_seekers[name]()
+    def _failure_of(self, names: set[str]) -> APIException | None:
+        return next((self._failures[name] for name in names if name in self._failures), None)
 
-    def _dk_failure_of(self, names: set[str]) -> APIException | None:
-        return next((self._dk_failures[name] for name in names if name in self._dk_failures), None)
-
-    def _dk_wait_a_little(self, wanted: set[str], at_most_s: float) -> None:
-        with self._dk_became_ready:
-            missing = wanted - self._ready_attrs
-            if missing and self._dk_failure_of(missing) is None:
-                self._dk_became_ready.wait(min(LONGEST_WAIT_S, at_most_s))
+    def _wait_a_little(self, wanted: set[str], at_most_s: float) -> None:
+        with self._changed:
+            missing = wanted - self.names
+            if missing and self._failure_of(missing) is None:
+                self._changed.wait(min(LONGEST_WAIT_S, at_most_s))

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import anyio
 
 from aerokit.dronekit.channels import Channels
+from aerokit.dronekit.core import VehicleCore
 from aerokit.dronekit.current_command import CurrentCommand
 from aerokit.dronekit.exceptions import APIException, TimeoutError  # noqa: A004 - DroneKit's name
 from aerokit.dronekit.flight import FlightMethods
@@ -24,7 +25,6 @@ from aerokit.dronekit.message_methods import MessageMethods
 from aerokit.dronekit.modes import mode_name
 from aerokit.dronekit.parameters import Parameters
 from aerokit.dronekit.privates import VehiclePrivates
-from aerokit.dronekit.readiness import Readiness
 from aerokit.dronekit.shadowable import Shadowable
 from aerokit.dronekit.streams import request_streams
 from aerokit.dronekit.weakly import weakly
@@ -63,7 +63,7 @@ LEVELS = (logging.CRITICAL,) * 3 + (logging.ERROR, logging.WARNING, logging.INFO
 """MAV_SEVERITY → level of the logger ``autopilot``."""
 
 
-class Vehicle(FlightMethods, MessageMethods, Maintenance, Readiness, VehiclePrivates):
+class Vehicle(FlightMethods, MessageMethods, Maintenance, VehiclePrivates):
     """A vehicle: attributes to read and to listen to, orders, parameters, missions.
 
     Made by :func:`connect`, or of a subclass by ``connect(…, vehicle_class=…)``: the subclass passes on the one
@@ -84,7 +84,7 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, Readiness, VehiclePriv
         self._gimbal = Gimbal(self)
         self._parameters = Parameters(self)
         self._dk_current_command = CurrentCommand(self)
-        self._dk_mark_ready("commands")
+        self._dk.ready.mark("commands")
 
     # --------------------------------------------------------------------------------- parts
 
@@ -128,7 +128,7 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, Readiness, VehiclePriv
 
     @property
     def _params_map(self) -> dict[str, float]:
-        return self._parameters._values.copy()
+        return self._parameters.known_values()
 
     @property
     def _wploader(self) -> WaypointLoader:
@@ -150,7 +150,7 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, Readiness, VehiclePriv
         Raises:
             APIException: the vehicle is not connected.
         """
-        return self._dk_vehicle
+        return self._dk.aio
 
     @Shadowable
     def sync(self) -> sync.Vehicle:
@@ -190,17 +190,17 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, Readiness, VehiclePriv
             APIException: no vehicle was heard in time; the text says what was heard instead.
         """
         with self._dk_initializing:
-            if self._dk_aio is not None:
+            if self._dk.is_connected:
                 self._dk_wait_until_booted(timeout=max(heartbeat_timeout or 0.0, 0.0) or CONNECT_S)
                 return
-            self._dk_heartbeat_limit = max(heartbeat_timeout or 0.0, 0.0)
-            timeout = self._dk_heartbeat_limit or CONNECT_S
+            self._dk.heartbeat_limit_s = max(heartbeat_timeout or 0.0, 0.0)
+            timeout = self._dk.heartbeat_limit_s or CONNECT_S
             try:
                 found = _found(self._handler.connection, timeout, weakly(self._dk_begin), rate)
                 self._dk_held = self._handler.loop.hold_open(found)
                 self._dk_wait_until_booted(timeout)
                 if rate is not None:
-                    Readiness.wait_ready(self, *FIRST_VALUES, timeout=FIRST_VALUES_S, raise_exception=False)
+                    VehicleCore.wait_ready(self, *FIRST_VALUES, timeout=FIRST_VALUES_S, raise_exception=False)
             except ConnectFailed as error:
                 raise APIException(f"Timeout in initializing connection. {error}") from None
             except AerokitError as error:
@@ -230,26 +230,17 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, Readiness, VehiclePriv
         return self._handler.master
 
     def _is_mode_available(self, mode_code: int, base_mode: int = 0) -> bool:
-        return not mode_name(self._dk_vehicle, mode_code).endswith(f" {mode_code}")
+        return not mode_name(self._dk.aio, mode_code).endswith(f" {mode_code}")
 
     # ------------------------------------------------------------------------------- inside
 
     def _dk_begin(self, aio: AsyncVehicle, tasks: Background, ends: ExitStack, rate: float | None) -> None:
         """On the loop, in the turn in which the vehicle was found; the loop gets weak references only."""
-        self._dk_aio, self._dk_tasks = aio, tasks
-        self._handler.target_system = aio.system_id
+        core = self._dk
+        core.begin(aio, tasks)
         self._handler.vehicle = self
         self._handler.orders.describe = self._dk_describe
-        for message_type, stream in self._dk_streams.items():
-            stream.begin(aio.component_id)
-            detach = aio.connection.bus.attach_frames(
-                message_type, weakly(stream.take), system_id=aio.system_id
-            )
-            ends.callback(detach)
-        for message_type, handler, only_autopilot in self._dk_message_handlers:
-            take = weakly(handler)
-            take = _only_of(aio.component_id, take) if only_autopilot else take
-            ends.callback(aio.connection.bus.attach(message_type, take, system_id=aio.system_id))
+        core.hear(ends)
         ends.callback(aio.telemetry.status_text.observe(weakly(self._dk_on_status_text), every_arrival=True))
         first = aio.connection.heard.get((aio.system_id, aio.component_id))
         if first is not None:
@@ -257,12 +248,11 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, Readiness, VehiclePriv
             self._dk_on_heartbeat(first)
         self._message_listeners.start()
         if rate is not None:
-            self._dk_background(lambda: request_streams(aio, rate))
-        self._dk_background(lambda: _request_capabilities(aio))
+            core.background(lambda: request_streams(aio, rate))
+        core.background(lambda: _request_capabilities(aio))
         itself = weakref.ref(self)
-        self._dk_background(lambda: watch_link(itself, aio))
-        for starter in self._dk_starters:
-            starter(ends)
+        core.background(lambda: watch_link(itself, aio))
+        core.start_parts(ends)
 
     def _dk_on_heartbeat(self, message: Any) -> None:
         if not is_autopilot(message):  # a ground station or a companion that took the autopilot's ids
@@ -313,13 +303,3 @@ async def _request_capabilities(aio: AsyncVehicle) -> None:
             return
         aio.send(CommandLong(aio.system_id, 0, REQUEST_AUTOPILOT_CAPABILITIES, 0, 1, *(0.0,) * 6))
         await anyio.sleep(1.0)
-
-
-def _only_of(component_id: int, handler: Callable[[Any], None]) -> Callable[[Any], None]:
-    """Other components of the system (gimbals, companions) have no say in the autopilot's state."""
-
-    def take(message: Any) -> None:
-        if message.received_frame.component_id == component_id:
-            handler(message)
-
-    return take
