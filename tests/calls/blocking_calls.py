@@ -146,6 +146,11 @@ def _rate(stage: Any) -> None:
         pass
 
 
+def _streams(stage: Any) -> None:
+    with stage.vehicle.streams(5.0):
+        pass
+
+
 WRITTEN: dict[str, Do] = {
     "connect": _connect,
     "open_connection": _open_connection,
@@ -153,6 +158,7 @@ WRITTEN: dict[str, Do] = {
     "Vehicle.setup_signing": lambda s: s.vehicle.setup_signing(Signing(KEY)),
     "Vehicle.subscribe": _subscribe,
     "Vehicle.rate": _rate,
+    "Vehicle.streams": _streams,
     "Vehicle.message": lambda s: s.vehicle.message(messages.ScaledPressure),
     "Vehicle.describe_link": lambda s: s.vehicle.describe_link(),
     "Vehicle.texts_since": lambda s: s.vehicle.texts_since(0.0),

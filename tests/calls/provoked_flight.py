@@ -39,6 +39,11 @@ def _method(name: str, *args: Any, **options: Any) -> Do:
     return lambda stage: getattr(stage.vehicle, name)(*args, **options)
 
 
+def _stream_never(stage: Stage) -> None:
+    with stage.vehicle.streams(0.0):
+        pass
+
+
 def _now(function: Callable[[Stage], object]) -> Do:
     """What does not wait."""
 
@@ -118,6 +123,7 @@ def _actions() -> Table:
         ("Vehicle.send", "ConnectionClosed"): _ended(lambda s: s.vehicle.send(messages.Ping(0, 0, 0, 0))),
         ("Vehicle.send", "LinkLost"): _ended(lambda s: s.vehicle.send(messages.Ping(0, 0, 0, 0)), lost),
         ("Vehicle.subscribe", "LocalProtocolError"): P(_now(lambda s: s.vehicle.subscribe())),
+        ("Vehicle.streams", "LocalProtocolError"): P(_now(_stream_never)),
         ("Vehicle.message", "LocalProtocolError"): P(
             _now(lambda s: s.vehicle.message(messages.Attitude, rate_hz=5000))
         ),

@@ -26,7 +26,6 @@ from aerokit.dronekit.modes import mode_name
 from aerokit.dronekit.parameters import Parameters
 from aerokit.dronekit.privates import VehiclePrivates
 from aerokit.dronekit.shadowable import Shadowable
-from aerokit.dronekit.streams import request_streams
 from aerokit.dronekit.weakly import weakly
 from aerokit.errors import AerokitError, ConnectFailed
 from aerokit.mavlink.messages import CommandLong
@@ -59,6 +58,7 @@ FIRST_VALUES_S = 1.0
 """So long they are waited for: programs that read them as soon as they are connected expect values."""
 CONNECT_S = 30.0
 """How long a vehicle is waited for when the program sets no limit."""
+MOST_HZ = 1000.0
 LEVELS = (logging.CRITICAL,) * 3 + (logging.ERROR, logging.WARNING, logging.INFO, logging.INFO, logging.DEBUG)
 """MAV_SEVERITY → level of the logger ``autopilot``."""
 
@@ -248,7 +248,7 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, VehiclePrivates):
             self._dk_on_heartbeat(first)
         self._message_listeners.start()
         if rate is not None:
-            core.background(lambda: request_streams(aio, rate))
+            ends.enter_context(aio.streams(min(rate, MOST_HZ) if rate > 0 else 1.0))
         core.background(lambda: _request_capabilities(aio))
         itself = weakref.ref(self)
         core.background(lambda: watch_link(itself, aio))

@@ -1768,6 +1768,19 @@ class Vehicle(VehicleTwin):
         """Have the vehicle send ``message_type`` at ``rate_hz`` or faster for the time of the ``with`` block."""
         return self._block(self.aio.rate(message_type, rate_hz))
 
+    def streams(self, rate_hz: float) -> AbstractContextManager[None]:
+        """Have the vehicle send all that it streams at ``rate_hz`` for the time of the ``with`` block: for recordings,
+        ground stations and firmware that knows no rates of single messages.
+
+        ArduPilot is asked by REQUEST_DATA_STREAM, again after a reboot or a silence and while nothing comes; it goes on
+        streaming afterwards. Others stream by themselves: of them, what is missing of the common states is asked for
+        as by :meth:`rate`.
+
+        Raises:
+            LocalProtocolError: the rate is not above 0 and at most 1000. Nothing was sent.
+        """
+        return self._block(self.aio.streams(rate_hz))
+
     def message(
         self,
         message_type: type[MessageT],

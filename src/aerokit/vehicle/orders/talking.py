@@ -13,6 +13,7 @@ from aerokit.runtime.cells import Source, StateCell
 from aerokit.runtime.subscription import Overflow, Subscription
 from aerokit.vehicle.orders.order import COMPONENT_ARM_DISARM, MOVING_COMMANDS, QUESTIONS
 from aerokit.vehicle.orders.part import Part
+from aerokit.vehicle.talk.every_stream import every_stream
 from aerokit.vehicle.talk.rates import check_rate, subscription_rate_hz
 
 if TYPE_CHECKING:
@@ -183,6 +184,21 @@ class TalkActions(Part):
             yield
         finally:
             release()
+
+    @contextmanager
+    def streams(self, rate_hz: float) -> Iterator[None]:
+        """Have the vehicle send all that it streams at ``rate_hz`` for the time of the ``with`` block: for recordings,
+        ground stations and firmware that knows no rates of single messages.
+
+        ArduPilot is asked by REQUEST_DATA_STREAM, again after a reboot or a silence and while nothing comes; it goes on
+        streaming afterwards. Others stream by themselves: of them, what is missing of the common states is asked for
+        as by :meth:`rate`.
+
+        Raises:
+            LocalProtocolError: the rate is not above 0 and at most 1000. Nothing was sent.
+        """
+        with every_stream(self._talk, rate_hz):
+            yield
 
     # ------------------------------------------------------------------------------- state
 
