@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Any, TypeVar, overload
+from typing import TYPE_CHECKING, Any, cast
 
 from aerokit.dronekit.util import ErrprinterHandler
 
 if TYPE_CHECKING:
+    from typing_extensions import TypeVar
+
     from aerokit.dronekit.mavlink import MAVConnection
     from aerokit.dronekit.vehicle import Vehicle
 
-VehicleT = TypeVar("VehicleT", bound="Vehicle")
+    VehicleT = TypeVar("VehicleT", bound=Vehicle, default=Vehicle)
 
 __all__ = ["connect", "default_still_waiting_callback"]
 
@@ -22,41 +24,6 @@ def default_still_waiting_callback(atts: Iterable[str]) -> None:
     logging.getLogger("dronekit").debug("Still waiting for data from vehicle: %s", ",".join(sorted(atts)))
 
 
-@overload
-def connect(
-    ip: str,
-    _initialize: bool = True,
-    wait_ready: bool | str | Iterable[str] | None = None,
-    timeout: float = 30,
-    still_waiting_callback: Callable[[Any], object] = default_still_waiting_callback,
-    still_waiting_interval: float = 1,
-    status_printer: Callable[[str], object] | None = None,
-    vehicle_class: None = None,
-    rate: float | None = 4,
-    baud: int = 115200,
-    heartbeat_timeout: float = 30,
-    source_system: int = 255,
-    source_component: int = 0,
-    use_native: bool = False,
-) -> Vehicle: ...
-@overload
-def connect(
-    ip: str,
-    _initialize: bool = True,
-    wait_ready: bool | str | Iterable[str] | None = None,
-    timeout: float = 30,
-    still_waiting_callback: Callable[[Any], object] = default_still_waiting_callback,
-    still_waiting_interval: float = 1,
-    status_printer: Callable[[str], object] | None = None,
-    *,
-    vehicle_class: Callable[[MAVConnection], VehicleT],
-    rate: float | None = 4,
-    baud: int = 115200,
-    heartbeat_timeout: float = 30,
-    source_system: int = 255,
-    source_component: int = 0,
-    use_native: bool = False,
-) -> VehicleT: ...
 def connect(
     ip: str,
     _initialize: bool = True,
@@ -72,7 +39,7 @@ def connect(
     source_system: int = 255,
     source_component: int = 0,
     use_native: bool = False,
-) -> Vehicle | VehicleT:
+) -> VehicleT:
     """Connect to a vehicle and return it once it was heard.
 
     Args:
@@ -114,7 +81,7 @@ def connect(
     try:
         from aerokit.dronekit.vehicle import Vehicle  # the link hears meanwhile: this takes a while
 
-        vehicle: Vehicle | VehicleT = Vehicle(handler) if vehicle_class is None else vehicle_class(handler)
+        vehicle = cast("VehicleT", Vehicle(handler)) if vehicle_class is None else vehicle_class(handler)
         if status_printer is not None:
             _print_texts(handler, status_printer)
             handler.listener_thread.keep(vehicle, has_listeners=True)
