@@ -35,7 +35,7 @@ def emptied(thread: ListenerThread) -> None:
 
 def told(observed: HasObservers, thread: ListenerThread, *values: Any, name: str = "x", **more: Any) -> None:
     for value in values:
-        observed._dk_tell(name, value, **more)
+        observed._dk_listeners.tell(name, value, **more)
     emptied(thread)
 
 
@@ -229,13 +229,13 @@ def test_without_a_thread_listeners_run_where_they_are_told() -> None:
     observed, seen = HasObservers(), list[Any]()
     observed.add_attribute_listener("x", lambda *_: seen.append(threading.current_thread()))
     observed.notify_attribute_listeners("x", 1)
-    observed._dk_tell("x", 1)
+    observed._dk_listeners.tell("x", 1)
     assert seen == [threading.current_thread()] * 2
 
 
 def test_telling_nobody_does_not_start_the_thread() -> None:
     thread = ListenerThread("unused")
-    HasObservers(thread)._dk_tell("x", 1)
+    HasObservers(thread)._dk_listeners.tell("x", 1)
     assert all(each.name != "unused" for each in threading.enumerate())
 
 
@@ -248,7 +248,7 @@ def test_a_blocked_listener_keeps_nobody_from_telling(thread: ListenerThread) ->
 
     observed.add_attribute_listener("x", block)
     for number in range(10):
-        observed._dk_tell("x", number)
+        observed._dk_listeners.tell("x", number)
     assert not seen
     may_go_on.set()
     emptied(thread)

@@ -48,7 +48,7 @@ def heard(vehicle: dronekit.Vehicle) -> None:
     """All listeners have been told of what came before."""
     vehicle._handler.loop.call(lambda: None)
     done = threading.Event()
-    vehicle._dk_listener_thread.post(done.set)  # type: ignore[union-attr]
+    vehicle._handler.listener_thread.post(done.set)
     assert done.wait(LIMIT_S)
 
 
@@ -305,7 +305,7 @@ def test_names_of_the_dronekit_years_are_found_on_newer_firmware(fc: FlightContr
 
 def test_without_listeners_nothing_is_queued(fc: FlightController) -> None:
     with connected(fc, wait_ready=["parameters"]) as vehicle:
-        assert vehicle._dk_listener_thread._thread is None  # type: ignore[union-attr]
+        assert vehicle._handler.listener_thread._thread is None
 
 
 def test_parameters_of_others_do_not_count(vehicle: dronekit.Vehicle, fc: FlightController) -> None:

@@ -6,7 +6,7 @@ import itertools
 
 import anyio
 import pytest
-from flight_harness import Flight, open_flight, open_px4
+from flight_harness import Flight, Px4Flight, open_flight, open_px4
 
 from aerokit import messages as m
 from aerokit.errors import LocalProtocolError
@@ -21,7 +21,7 @@ def interval(flight: Flight, kind: type[Message]) -> float:
     return flight.copter.channels[0].streams.interval(kind.ID)
 
 
-def requests(flight: Flight) -> list[tuple[int, int, int, int]]:
+def requests(flight: Flight | Px4Flight) -> list[tuple[int, int, int, int]]:
     return [
         (each.target_component, each.req_stream_id, each.req_message_rate, each.start_stop)
         for each in flight.wire.all(m.RequestDataStream)

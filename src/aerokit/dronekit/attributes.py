@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from typing import TYPE_CHECKING, Any
 
 from aerokit.dronekit.core import VehicleCore
@@ -35,7 +34,6 @@ STATES = ("UNINIT", "BOOT", "CALIBRATING", "STANDBY", "ACTIVE", "CRITICAL", "EME
 POS_HORIZ_ABS, CONST_POS_MODE, PRED_POS_HORIZ_ABS = 16, 128, 512
 """Flags of EKF_STATUS_REPORT and of ESTIMATOR_STATUS, which agree in these."""
 PREARM_CHECK = 1 << 28
-PLACES = (m.GlobalPositionInt, m.LocalPositionNed)
 LOOKING_DOWN = 25
 NO_MODE = (None, "INITIALISING", "MAV")
 
@@ -50,8 +48,6 @@ class VehicleAttributes(VehicleCore):
     _dk_heartbeat: m.Heartbeat | None = None
     _flightmode: str = "UNKNOWN"
     _dk_attitude = Latest(m.Attitude)
-    _dk_global_position = Latest(m.GlobalPositionInt)
-    _dk_local_position = Latest(m.LocalPositionNed)
     _dk_vfr_hud = Latest(m.VfrHud)
     _dk_gps = Latest(m.GpsRawInt)
     _dk_sys_status = Latest(m.SysStatus)
@@ -64,10 +60,18 @@ class VehicleAttributes(VehicleCore):
     _home_location: LocationGlobal | None = None
     _dk_told_home: LocationGlobal | None = None
 
+    _dk_told_by: tuple[tuple[Latest[Any], tuple[str, ...]], ...] = (
+        (_dk_attitude, ("attitude",)),
+        (_dk_vfr_hud, ("heading", "airspeed", "groundspeed")),
+        (_dk_gps, ("gps_0",)),
+        (_dk_sys_status, ("battery",)),
+        (_dk_wind, ("wind",)),
+    )
+    """The messages that come in streams, and what they tell of."""
+
     def _dk_make_streams(self) -> None:
-        for kind, names in STREAMS:
+        for kind, names in self._dk_told_by:
             self._dk.streams[kind.message_type] = Stream(self, kind, names)
-        self._dk_reviewing = threading.Lock()
 
     def _dk_attach_attributes(self) -> None:
         for message_type, handler in self._dk_handlers().items():
@@ -76,16 +80,16 @@ class VehicleAttributes(VehicleCore):
     def _dk_handlers(self) -> dict[type[Message], Callable[[Any], None]]:
         return {
             m.Heartbeat: self._dk_on_heartbeat,
-            m.GlobalPositionInt: lambda _: self._dk_announce("velocity"),
+            m.GlobalPositionInt: lambda _: self._dk.listeners.announce("velocity"),
             m.VfrHud: self._dk_on_vfr_hud,
-            m.Attitude: lambda _: self._dk_announce("attitude"),
-            m.SysStatus: lambda _: self._dk_announce("battery"),
-            m.GpsRawInt: lambda _: self._dk_announce("gps_0"),
+            m.Attitude: lambda _: self._dk.listeners.announce("attitude"),
+            m.SysStatus: lambda _: self._dk.listeners.announce("battery"),
+            m.GpsRawInt: lambda _: self._dk.listeners.announce("gps_0"),
             m.Rangefinder: self._dk_on_rangefinder,
             m.DistanceSensor: self._dk_on_distance_sensor,
             m.EkfStatusReport: self._dk_on_ekf_status,
             m.EstimatorStatus: self._dk_on_ekf_status,
-            m.Wind: lambda _: self._dk_announce("wind"),
+            m.Wind: lambda _: self._dk.listeners.announce("wind"),
             m.HomePosition: self._dk_on_home,
             m.AutopilotVersion: self._dk_on_version,
         }
@@ -111,7 +115,7 @@ class VehicleAttributes(VehicleCore):
     @property
     def velocity(self) -> list[float | Any]:
         """``[vx, vy, vz]`` in m/s: north, east, down (GLOBAL_POSITION_INT)."""
-        message = self._dk_global_position
+        message = self._location.global_position
         if message is None:
             return [None, None, None]
         return [message.vx / 100.0, message.vy / 100.0, message.vz / 100.0]
@@ -211,25 +215,25 @@ class VehicleAttributes(VehicleCore):
         ):
             assert self._dk_aio is not None
             self._flightmode = mode_name(self._dk_aio, message.custom_mode)
-        self._dk_tell("armed", self._armed, cache=True)
-        self._dk_tell("mode", VehicleMode(self._flightmode), cache=True)
-        self._dk_tell("system_status", self.system_status, cache=True)
-        self._dk_note("last_heartbeat")
+        self._dk.listeners.tell("armed", self._armed, cache=True)
+        self._dk.listeners.tell("mode", VehicleMode(self._flightmode), cache=True)
+        self._dk.listeners.tell("system_status", self.system_status, cache=True)
+        self._dk.ready.note("last_heartbeat")
 
     def _dk_on_vfr_hud(self, message: m.VfrHud) -> None:
-        self._dk_announce("heading")
-        self._dk_announce("airspeed")
-        self._dk_announce("groundspeed")
+        self._dk.listeners.announce("heading")
+        self._dk.listeners.announce("airspeed")
+        self._dk.listeners.announce("groundspeed")
 
     def _dk_on_rangefinder(self, message: m.Rangefinder) -> None:
         self._dk_has_rangefinder_message = True
         self._dk_rangefinder = (message.distance, message.voltage)
-        self._dk_announce("rangefinder")
+        self._dk.listeners.announce("rangefinder")
 
     def _dk_on_distance_sensor(self, message: m.DistanceSensor) -> None:
         if message.orientation == LOOKING_DOWN and not self._dk_has_rangefinder_message:
             self._dk_rangefinder = (message.current_distance / 100.0, None)
-            self._dk_announce("rangefinder")
+            self._dk.listeners.announce("rangefinder")
 
     def _dk_on_ekf_status(self, message: m.EkfStatusReport | m.EstimatorStatus) -> None:
         flags = self._dk_ekf_flags = message.flags
@@ -237,54 +241,18 @@ class VehicleAttributes(VehicleCore):
             self._dk_ekf_ok = bool(flags & POS_HORIZ_ABS) and not flags & CONST_POS_MODE
         else:
             self._dk_ekf_ok = bool(flags & (POS_HORIZ_ABS | PRED_POS_HORIZ_ABS))
-        self._dk_tell("ekf_ok", self._dk_ekf_ok, cache=True)
+        self._dk.listeners.tell("ekf_ok", self._dk_ekf_ok, cache=True)
 
     def _dk_on_home(self, message: m.HomePosition) -> None:
         self._dk_set_home(message.latitude / 1.0e7, message.longitude / 1.0e7, message.altitude / 1000.0)
-        self._dk_tell("home_location", self._home_location)
+        self._dk.listeners.tell("home_location", self._home_location)
 
     def _dk_on_version(self, message: m.AutopilotVersion) -> None:
         self._dk_version = message
-        self._dk_note("version")
-        self._dk_note("capabilities")
-        self._dk_tell("autopilot_version", message.flight_sw_version)
+        self._dk.ready.note("version")
+        self._dk.ready.note("capabilities")
+        self._dk.listeners.tell("autopilot_version", message.flight_sw_version)
 
     def _dk_set_home(self, lat: float, lon: float, alt: float | None) -> None:
         """Where home is as the vehicle told it, in degrees and metres above the sea; from any thread."""
         self._home_location = self._dk_told_home = LocationGlobal(lat, lon, alt)
-
-    # ------------------------------------------------------------------------------- telling
-
-    def _dk_review(self) -> None:
-        """Messages are looked at when they come only as long as somebody listens; from any thread."""
-        with self._dk_reviewing:
-            listened, heeds_places = self._attribute_listeners, bool(self._location._attribute_listeners)
-            for message_type, stream in self._dk.streams.items():
-                stream.review(self._ready_attrs, listened, heeds_places and message_type in PLACES)
-
-    def _dk_announce(self, name: str) -> None:
-        """Tell an attribute's value, which is made only when somebody listens."""
-        if name not in self._ready_attrs:
-            self._dk.ready.mark(name)
-        listeners = self._attribute_listeners
-        if name in listeners or "*" in listeners:
-            self._dk_offer(name, getattr(self, name))
-
-    def _dk_note(self, attr_name: str) -> None:
-        if attr_name not in self._ready_attrs:
-            self._dk.ready.mark(attr_name)
-
-
-STREAMS: tuple[tuple[Latest[Any], tuple[str, ...]], ...] = (
-    (VehicleAttributes._dk_attitude, ("attitude",)),
-    (
-        VehicleAttributes._dk_global_position,
-        ("location.global_relative_frame", "location.global_frame", "location", "velocity"),
-    ),
-    (VehicleAttributes._dk_local_position, ("location.local_frame", "location")),
-    (VehicleAttributes._dk_vfr_hud, ("heading", "airspeed", "groundspeed")),
-    (VehicleAttributes._dk_gps, ("gps_0",)),
-    (VehicleAttributes._dk_sys_status, ("battery",)),
-    (VehicleAttributes._dk_wind, ("wind",)),
-)
-"""The messages that come in streams, and what they tell of."""

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import logging
+import threading
 from typing import TYPE_CHECKING, Any
 
 from aerokit.dronekit.exceptions import APIException, TimeoutError  # noqa: A004 - DroneKit's name
-from aerokit.dronekit.observers import HasObservers
+from aerokit.dronekit.observers import AttributeListeners, HasObservers
 from aerokit.dronekit.readiness import Readiness
 from aerokit.dronekit.weakly import weakly
 from aerokit.errors import AerokitError, LocalProtocolError, OperationTimeout
@@ -31,18 +32,20 @@ DEFAULT_ATTRIBUTES = ("parameters", "gps_0", "armed", "mode", "attitude")
 class Core:
     """What is sent, waited for and heard by way of the asynchronous vehicle, once there is one, and what is told of it.
 
-    The parts of a vehicle know this, and not the vehicle. ``tell(name, value, cache=False)`` tells the listeners of an
-    attribute of the vehicle without waiting; ``review`` is called when something else has become ready.
+    The parts of a vehicle know this, and not the vehicle.
     """
 
-    def __init__(self, handler: MAVConnection, tell: Callable[..., None], review: Callable[[], None]) -> None:
-        self.handler, self.tell = handler, tell
+    def __init__(self, handler: MAVConnection, owner: object) -> None:
+        self.handler = handler
         self.logger = logging.getLogger("dronekit")
-        self.ready = Readiness(self.check_link, review)
+        self.ready = Readiness(self.check_link, self.review)
+        self.listeners = AttributeListeners(owner, handler.listener_thread, self.ready.note, self.review)
+        """Of the vehicle's attributes."""
         self.heartbeat_limit_s = 0.0
         """Longer silences are errors; 0: none is."""
         self.streams: dict[type[Message], Stream] = {}
         """What comes again and again."""
+        self._reviewing = threading.Lock()
         self._aio: AsyncVehicle | None = None
         self._tasks: Background | None = None
         self._sinks: list[tuple[type[Message], Callable[[Any], None], bool]] = []
@@ -96,6 +99,12 @@ class Core:
             self._sinks.append((message_type, handler, of_any_component))
         else:
             stream.add(handler)
+
+    def review(self) -> None:
+        """Messages are looked at when they come only as long as somebody listens; from any thread."""
+        with self._reviewing:
+            for stream in self.streams.values():
+                stream.review(self.ready.names, self.listeners.by_name)
 
     def at_start(self, function: Callable[[ExitStack], None]) -> None:
         """Have a function called on the loop when the vehicle is found; what it puts into the stack is its end."""
@@ -168,9 +177,9 @@ class VehicleCore(HasObservers):
     """
 
     def __init__(self, handler: MAVConnection) -> None:
-        super().__init__(handler.listener_thread)
         self._handler = handler
-        self._dk = Core(handler, self._dk_tell, self._dk_review)
+        self._dk = Core(handler, self)
+        self._dk_observe(self._dk.listeners)
         self._logger = self._dk.logger
         self._ready_attrs = self._dk.ready.names
         self._autopilot_logger = logging.getLogger("autopilot")
@@ -179,7 +188,7 @@ class VehicleCore(HasObservers):
         self._dk_on, self._dk_check_link, self._dk_run = core.on, core.check_link, core.run
         self._dk_order, self._dk_send, self._dk_pause = core.order, core.send, core.pause
         self._dk_mark_ready, self._dk_unready = core.ready.mark, core.ready.unmark
-        self._dk_fail = core.ready.fail
+        self._dk_fail, self._dk_tell = core.ready.fail, core.listeners.tell
 
     @property
     def _dk_aio(self) -> AsyncVehicle | None:

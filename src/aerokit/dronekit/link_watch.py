@@ -9,7 +9,7 @@ import anyio
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from aerokit.dronekit.vehicle import Vehicle
+    from aerokit.dronekit.core import Core
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
 __all__ = ["watch_link"]
@@ -21,35 +21,33 @@ LOOK_S = 0.5
 """How often it is looked whether somebody listens by now."""
 
 
-async def watch_link(vehicle: Callable[[], Vehicle | None], aio: AsyncVehicle) -> None:
+async def watch_link(core: Callable[[], Core | None], aio: AsyncVehicle) -> None:
     """Tell ``last_heartbeat`` 20 times a second to those who listen, and log the link's loss and its return.
 
-    ``vehicle`` is a weak reference, which nothing here follows while it waits.
+    ``core`` is a weak reference, which nothing here follows while it waits.
     """
     is_lost = False
     while True:
         age = aio.heartbeat_age
         if (age > SILENT_AFTER_S) != is_lost:
             is_lost = not is_lost
-            _log(vehicle(), is_lost)
-        await anyio.sleep(TICK_S if _tell(vehicle(), age) else LOOK_S)
+            _log(core(), is_lost)
+        await anyio.sleep(TICK_S if _tell(core(), age) else LOOK_S)
 
 
-def _tell(vehicle: Vehicle | None, age: float) -> bool:
+def _tell(core: Core | None, age: float) -> bool:
     """Says whether somebody listens."""
-    if vehicle is None or not (
-        "last_heartbeat" in vehicle._attribute_listeners or "*" in vehicle._attribute_listeners
-    ):
+    if core is None or not core.listeners.heed("last_heartbeat"):
         return False
-    vehicle._dk_tell("last_heartbeat", age)
+    core.listeners.tell("last_heartbeat", age)
     return True
 
 
-def _log(vehicle: Vehicle | None, is_lost: bool) -> None:
+def _log(core: Core | None, is_lost: bool) -> None:
     """On the listener thread: the program's log handlers may take their time."""
-    if vehicle is None:
+    if core is None:
         return
-    post, logger = vehicle._handler.listener_thread.post, vehicle._logger
+    post, logger = core.handler.listener_thread.post, core.logger
     if is_lost:
         post(logger.warning, "Link timeout, no heartbeat in last %d seconds", SILENT_AFTER_S)
     else:

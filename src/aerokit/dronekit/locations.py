@@ -4,21 +4,20 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from aerokit.dronekit.attributes import VehicleAttributes
-from aerokit.dronekit.observers import HasObservers
+from aerokit.dronekit.core import core_of
+from aerokit.dronekit.observers import AttributeListeners, HasObservers
 from aerokit.dronekit.privates import LocationPrivates
+from aerokit.dronekit.reception import Latest, Stream
 from aerokit.dronekit.values import LocationGlobal, LocationGlobalRelative, LocationLocal
 from aerokit.mavlink.messages import GlobalPositionInt, LocalPositionNed
 from aerokit.vehicle.state.movement import place
 
 if TYPE_CHECKING:
-    from aerokit.dronekit.vehicle import Vehicle
+    from aerokit.dronekit.core import VehicleCore
 
 __all__ = ["Locations"]
 
 UNKNOWN = (None, None)
-HELD = VehicleAttributes._dk_global_position.key
-"""Where a vehicle keeps the frame or message of its global position."""
 
 _Numbers = tuple[object, "float | None", "float | None", "float | None", "float | None"]
 """What they were worked out of, latitude and longitude in degrees, metres above the sea and above home."""
@@ -30,13 +29,24 @@ class Locations(HasObservers, LocationPrivates):
     Listeners get this object as their first argument. The three numbers of a location belong to one message.
     """
 
-    def __init__(self, vehicle: Vehicle) -> None:
-        super().__init__(vehicle._dk_listener_thread)
-        self._vehicle = vehicle
+    global_position = Latest(GlobalPositionInt)
+    local_position = Latest(LocalPositionNed)
+
+    def __init__(self, vehicle: VehicleCore) -> None:
+        self._core = core = core_of(vehicle)
+        listeners = AttributeListeners(self, core.handler.listener_thread, on_change=core.review)
+        self._dk_observe(listeners)
         self._has_altitude = False
         self._dk_numbers: _Numbers = (None, None, None, None, None)
-        vehicle._dk_on(GlobalPositionInt, self._on_global_position)
-        vehicle._dk_on(LocalPositionNed, self._on_local_position)
+        told = ("location.global_relative_frame", "location.global_frame", "location", "velocity")
+        core.streams[GlobalPositionInt] = Stream(self, Locations.global_position, told)
+        core.streams[LocalPositionNed] = Stream(
+            self, Locations.local_position, ("location.local_frame", "location")
+        )
+        for message_type in (GlobalPositionInt, LocalPositionNed):
+            core.streams[message_type].heed_also(listeners.by_name)
+        core.on(GlobalPositionInt, self._on_global_position)
+        core.on(LocalPositionNed, self._on_local_position)
 
     @property
     def global_frame(self) -> LocationGlobal:
@@ -56,7 +66,7 @@ class Locations(HasObservers, LocationPrivates):
     @property
     def local_frame(self) -> LocationLocal:
         """Metres north, east and down from the estimator's origin (LOCAL_POSITION_NED)."""
-        message = self._vehicle._dk_local_position
+        message = self.local_position
         if message is None:
             return LocationLocal(None, None, None)
         return LocationLocal(message.x, message.y, message.z)
@@ -65,10 +75,10 @@ class Locations(HasObservers, LocationPrivates):
 
     def _dk_global_numbers(self) -> _Numbers:
         """Of the latest GLOBAL_POSITION_INT, worked out when it is read first; all from one message."""
-        held = self._vehicle.__dict__.get(HELD)
+        held = self.__dict__.get(Locations.global_position.key)
         numbers = self._dk_numbers
         if numbers[0] is not held:
-            message = self._vehicle._dk_global_position  # may be a later one by now
+            message = self.global_position  # may be a later one by now
             assert message is not None
             lat, lon = place(message.lat, message.lon) or UNKNOWN
             numbers = held, lat, lon, message.alt / 1000.0, message.relative_alt / 1000.0
@@ -76,27 +86,23 @@ class Locations(HasObservers, LocationPrivates):
         return numbers
 
     def _on_global_position(self, message: GlobalPositionInt) -> None:
-        self._vehicle._dk_global_position = message
+        self.global_position = message
         self._has_altitude = self._has_altitude or message.alt != 0
-        self._dk_announce("global_relative_frame", "location.global_relative_frame")
+        self._tell_both("global_relative_frame", "location.global_relative_frame")
         if self._has_altitude:
-            self._dk_announce("global_frame", "location.global_frame")
-        self._vehicle._dk_announce("location")
+            self._tell_both("global_frame", "location.global_frame")
+        self._core.listeners.announce("location")
 
     def _on_local_position(self, message: LocalPositionNed) -> None:
-        self._dk_announce("local_frame", "location.local_frame")
-        self._vehicle._dk_announce("location")
+        self._tell_both("local_frame", "location.local_frame")
+        self._core.listeners.announce("location")
 
-    def _dk_announce(self, frame: str, name: str) -> None:
+    def _tell_both(self, frame: str, name: str) -> None:
         """Tell those who listen here, then those who listen to the vehicle, which has another name for it."""
-        vehicle = self._vehicle
-        listened = vehicle._attribute_listeners
-        if self._attribute_listeners or name in listened or "*" in listened:
+        listeners = self._core.listeners
+        if self._attribute_listeners or listeners.heed(name):
             value = getattr(self, frame)
-            self._dk_tell(frame, value)
-            vehicle._dk_tell(name, value)
+            self._dk_listeners.tell(frame, value)
+            listeners.tell(name, value)
         else:
-            vehicle._dk_note(name)
-
-    def _dk_review(self) -> None:
-        self._vehicle._dk_review()
+            self._core.ready.note(name)

@@ -1,4 +1,4 @@
-"""``HasObservers``: attributes whose changes a program can listen to."""
+"""Attributes whose changes a program can listen to: ``AttributeListeners``, and ``HasObservers``, who has some."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 if TYPE_CHECKING:
     from aerokit.dronekit.listener_thread import ListenerThread
 
-__all__ = ["AttributeListener", "HasObservers", "ListenerT"]
+__all__ = ["AttributeListener", "AttributeListeners", "HasObservers", "ListenerT"]
 
 logger = logging.getLogger("dronekit")
 
@@ -25,18 +25,130 @@ _changing = threading.Lock()
 """Held while listeners are added and removed."""
 
 
-class HasObservers:
-    """An object with attributes that can be listened to.
+class AttributeListeners:
+    """Who listens to which attribute of an object. Any thread may use it.
 
-    Listeners run on the vehicle's listener thread, in the order in which values came, those of a name before those
-    of ``'*'``; they may block, raise, remove themselves and call whatever blocks. Without a listener thread they run
-    on the thread that notifies.
+    Listeners run on the listener thread, in the order in which values came, those of a name before those of ``'*'``;
+    they may block, raise, remove themselves and call whatever blocks. Without a listener thread they run on the thread
+    that tells. ``on_value(name)`` is called for every value, whoever listens, ``on_change()`` when listeners have come
+    or gone.
     """
 
+    def __init__(
+        self,
+        owner: object,
+        thread: ListenerThread | None,
+        on_value: Callable[[str], None] | None = None,
+        on_change: Callable[[], None] | None = None,
+    ) -> None:
+        self._owner, self._thread = owner, thread
+        self._on_value, self._on_change = on_value, on_change
+        self.by_name: dict[str, tuple[AttributeListener, ...]] = {}
+        self.told: dict[str, Any] = {}
+        """The last values of attributes that are told when they change."""
+
+    def add(self, name: str, listener: AttributeListener) -> None:
+        """Have it called; not twice."""
+        with _changing:
+            present = self.by_name.get(name, ())
+            if listener in present:
+                return
+            self.by_name[name] = (*present, listener)
+            self._stay()
+        self._review()
+
+    def remove(self, name: str, listener: AttributeListener) -> None:
+        """Call it no more; ValueError when others listen to the name, but this one does not."""
+        with _changing:
+            present = self.by_name.get(name)
+            if present is None:
+                return
+            if listener not in present:
+                raise ValueError(f"{listener!r} does not listen to {name!r}")
+            left = tuple(each for each in present if each != listener)
+            if left:
+                self.by_name[name] = left
+            else:
+                del self.by_name[name]
+                self._stay()
+        self._review()
+
+    def heed(self, name: str) -> bool:
+        """Whether somebody listens to this attribute."""
+        return name in self.by_name or EVERY_NAME in self.by_name
+
+    def tell(self, name: str, value: Any, cache: bool = False) -> None:
+        """Tell a value without waiting, for the loop thread; with ``cache`` only when it is not the one told before."""
+        if cache and self._is_told(name, value):
+            return
+        if self._on_value is not None:
+            self._on_value(name)
+        if self.by_name and self.heed(name):
+            self.offer(name, value, comes_again=not cache)
+
+    def announce(self, name: str) -> None:
+        """As :meth:`tell`; the value is the owner's attribute, which is read only when somebody listens."""
+        if self._on_value is not None:
+            self._on_value(name)
+        if self.heed(name):
+            self.offer(name, getattr(self._owner, name))
+
+    def offer(self, name: str, value: Any, *, comes_again: bool = True) -> None:
+        """Have the listeners called; what comes again anyway may be dropped."""
+        if self._thread is None:
+            self._deliver(name, value)
+        else:
+            (self._thread.offer if comes_again else self._thread.post)(self._deliver, name, value)
+
+    def notify(self, name: str, value: Any, cache: bool) -> None:
+        """As :meth:`tell`, and return when the listeners have run."""
+        if cache and self._is_told(name, value):
+            return
+        if self._on_value is not None:
+            self._on_value(name)
+        if self.heed(name):
+            if self._thread is None:
+                self._deliver(name, value)
+            else:
+                self._thread.call(self._deliver, name, value)
+
+    def _is_told(self, name: str, value: Any) -> bool:
+        """Whether this was the last value told; if not, it is now."""
+        if name in self.told and self.told[name] == value:
+            return True
+        self.told[name] = value
+        return False
+
+    def _stay(self) -> None:
+        """With listeners the owner stays, even when the program has dropped it."""
+        if self._thread is not None:
+            self._thread.keep(self._owner, has_listeners=bool(self.by_name))
+
+    def _review(self) -> None:
+        if self._on_change is not None:
+            self._on_change()
+
+    def _deliver(self, attr_name: str, value: Any) -> None:
+        """Call the listeners, those that are there by now."""
+        for name in (attr_name, EVERY_NAME):
+            for listener in self.by_name.get(name, ()):
+                try:
+                    listener(self._owner, attr_name, value)
+                except (
+                    BaseException
+                ):  # sys.exit() too: it would end the callbacks of everybody, and nothing else
+                    logger.exception("Exception in attribute handler for %s", attr_name)
+
+
+class HasObservers:
+    """An object with attributes that can be listened to; see :class:`AttributeListeners`."""
+
     def __init__(self, listener_thread: ListenerThread | None = None) -> None:
-        self._dk_listener_thread = listener_thread
-        self._attribute_listeners: dict[str, tuple[AttributeListener, ...]] = {}
-        self._attribute_cache: dict[str, Any] = {}
+        self._dk_observe(AttributeListeners(self, listener_thread))
+
+    def _dk_observe(self, listeners: AttributeListeners) -> None:
+        self._dk_listeners = listeners
+        self._attribute_listeners, self._attribute_cache = listeners.by_name, listeners.told
 
     def add_attribute_listener(self, attr_name: str, observer: AttributeListener) -> None:
         """Have ``observer(self, attr_name, value)`` called when the attribute is updated.
@@ -45,13 +157,7 @@ class HasObservers:
         they change. ``'*'`` is every name. A listener that is there already is not added again; names are not checked,
         since programs tell of attributes of their own.
         """
-        with _changing:
-            present = self._attribute_listeners.get(attr_name, ())
-            if observer in present:
-                return
-            self._attribute_listeners[attr_name] = (*present, observer)
-            self._dk_stay()
-        self._dk_review()
+        self._dk_listeners.add(attr_name, observer)
 
     def remove_attribute_listener(self, attr_name: str, observer: AttributeListener) -> None:
         """Call it no more. Silent when nobody listens to the name.
@@ -59,19 +165,7 @@ class HasObservers:
         Raises:
             ValueError: others listen to the name, but this one does not.
         """
-        with _changing:
-            present = self._attribute_listeners.get(attr_name)
-            if present is None:
-                return
-            if observer not in present:
-                raise ValueError(f"{observer!r} does not listen to {attr_name!r}")
-            left = tuple(each for each in present if each != observer)
-            if left:
-                self._attribute_listeners[attr_name] = left
-            else:
-                del self._attribute_listeners[attr_name]
-                self._dk_stay()
-        self._dk_review()
+        self._dk_listeners.remove(attr_name, observer)
 
     def on_attribute(self, name: str | list[str] | tuple[str, ...]) -> Callable[[ListenerT], ListenerT]:
         """Decorate a listener with the name, or the list of names, it listens to. It cannot be removed by name then."""
@@ -88,61 +182,4 @@ class HasObservers:
 
         Call it from message listeners for attributes of your own. Returns when the listeners have run.
         """
-        if cache and self._dk_is_told(attr_name, value):
-            return
-        self._dk_note(attr_name)
-        if attr_name in self._attribute_listeners or EVERY_NAME in self._attribute_listeners:
-            if self._dk_listener_thread is None:
-                self._dk_deliver(attr_name, value)
-            else:
-                self._dk_listener_thread.call(self._dk_deliver, attr_name, value)
-
-    # ------------------------------------------------------------------------------- inside
-
-    def _dk_tell(self, attr_name: str, value: Any, cache: bool = False) -> None:
-        """As :meth:`notify_attribute_listeners` without waiting, for the loop thread."""
-        if cache and self._dk_is_told(attr_name, value):
-            return
-        self._dk_note(attr_name)
-        listeners = self._attribute_listeners
-        if listeners and (attr_name in listeners or EVERY_NAME in listeners):
-            if cache and self._dk_listener_thread is not None:
-                self._dk_listener_thread.post(self._dk_deliver, attr_name, value)
-            else:
-                self._dk_offer(attr_name, value)
-
-    def _dk_offer(self, attr_name: str, value: Any) -> None:
-        """Have the listeners told of what comes again and again."""
-        if self._dk_listener_thread is None:
-            self._dk_deliver(attr_name, value)
-        else:
-            self._dk_listener_thread.offer(self._dk_deliver, attr_name, value)
-
-    def _dk_is_told(self, attr_name: str, value: Any) -> bool:
-        """Whether this was the last value told; if not, it is now."""
-        if attr_name in self._attribute_cache and self._attribute_cache[attr_name] == value:
-            return True
-        self._attribute_cache[attr_name] = value
-        return False
-
-    def _dk_stay(self) -> None:
-        """With listeners it stays, even when the program has dropped it."""
-        if self._dk_listener_thread is not None:
-            self._dk_listener_thread.keep(self, has_listeners=bool(self._attribute_listeners))
-
-    def _dk_review(self) -> None:
-        """Who listens to what has changed."""
-
-    def _dk_note(self, attr_name: str) -> None:
-        """An attribute has a value: what waits for it is told here."""
-
-    def _dk_deliver(self, attr_name: str, value: Any) -> None:
-        """Call the listeners, those that are there by now."""
-        for name in (attr_name, EVERY_NAME):
-            for listener in self._attribute_listeners.get(name, ()):
-                try:
-                    listener(self, attr_name, value)
-                except (
-                    BaseException
-                ):  # sys.exit() too: it would end the callbacks of everybody, and nothing else
-                    logger.exception("Exception in attribute handler for %s", attr_name)
+        self._dk_listeners.notify(attr_name, value, cache)

@@ -263,17 +263,17 @@ class Parameters(MutableMapping[str, float], HasObservers):
 
     def _take(self, name: str, value: float) -> None:
         if self._values.take(name, value):
-            self._dk_tell(name.upper(), value, cache=True)
+            self._dk_listeners.tell(name.upper(), value, cache=True)
 
     def _take_all(self, table: ParameterTable) -> None:
         news = self._values.replace(table.values_by_name())
         if self._attribute_listeners:
             for name, value in news.items():
-                self._dk_tell(name.upper(), value, cache=True)
+                self._dk_listeners.tell(name.upper(), value, cache=True)
         else:
             self._attribute_cache.update(news)
         self._reading.is_complete = True
-        self._core.tell("parameters", self)
+        self._core.listeners.tell("parameters", self)
 
 
 class _Items(ItemsView[str, float]):

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
+from aerokit.dronekit.core import core_of
 from aerokit.dronekit.shadowable import Shadowable
 
 if TYPE_CHECKING:
-    from aerokit.dronekit.vehicle import Vehicle
+    from aerokit.dronekit.core import VehicleCore
 
 __all__ = ["GimbalPrivates", "LocationPrivates", "VehiclePrivates"]
 
@@ -19,9 +21,10 @@ SILENCE_S = 5.0
 
 def _of(owner: str, name: str, scale: float = 1) -> Shadowable[Any]:
     """A field of the message that an object keeps; None while there is none."""
+    owner_of = attrgetter(owner)
 
     def read(instance: Any) -> Any:
-        message = getattr(instance, owner)
+        message = owner_of(instance)
         if message is None:
             return None
         value = getattr(message, name)
@@ -34,9 +37,17 @@ def _read(function: Callable[[Any], Any]) -> Shadowable[Any]:
     return Shadowable(function)
 
 
-def _heard_at(vehicle: Vehicle) -> float:
+def _heard_at(vehicle: Any) -> float:
     age = vehicle.last_heartbeat
     return 0.0 if age is None else time.monotonic() - age
+
+
+def _is_ready(vehicle: VehicleCore, name: str) -> bool:
+    return name in core_of(vehicle).ready.names
+
+
+def _modes(vehicle: VehicleCore) -> dict[str, Any] | None:
+    return core_of(vehicle).handler.master.mode_mapping()
 
 
 class VehiclePrivates:
@@ -46,7 +57,7 @@ class VehiclePrivates:
     _pitchspeed, _yawspeed, _rollspeed = (
         _of("_dk_attitude", name) for name in ("pitchspeed", "yawspeed", "rollspeed")
     )
-    _vx, _vy, _vz = (_of("_dk_global_position", name, 100.0) for name in ("vx", "vy", "vz"))
+    _vx, _vy, _vz = (_of("location.global_position", name, 100.0) for name in ("vx", "vy", "vz"))
     _heading, _airspeed, _groundspeed = (
         _of("_dk_vfr_hud", name) for name in ("heading", "airspeed", "groundspeed")
     )
@@ -72,17 +83,17 @@ class VehiclePrivates:
     """Whether the link is silent: a flag, not a number of seconds."""
 
     _heartbeat_lastreceived = _read(_heard_at)
-    _params_loaded = _read(lambda vehicle: "parameters" in vehicle._ready_attrs)
-    _params_count = _read(lambda vehicle: len(vehicle.parameters) if vehicle._params_loaded else -1)
+    _params_loaded = _read(lambda vehicle: _is_ready(vehicle, "parameters"))
+    _params_count = _read(lambda vehicle: len(vehicle.parameters) if _is_ready(vehicle, "parameters") else -1)
     """How many there are, -1 while that is not known."""
     _current_waypoint = _read(lambda vehicle: vehicle.commands.next)
-    _wp_loaded = _read(lambda vehicle: "commands" in vehicle._ready_attrs)
+    _wp_loaded = _read(lambda vehicle: _is_ready(vehicle, "commands"))
     _wp_uploaded = None
     _wpts_dirty = False
 
-    _mode_mapping = _read(lambda vehicle: vehicle._master.mode_mapping())
+    _mode_mapping = _read(lambda vehicle: _modes(vehicle))
     _mode_mapping_bynumber = _read(
-        lambda vehicle: {number: name for name, number in (vehicle._mode_mapping or {}).items()}
+        lambda vehicle: {number: name for name, number in (_modes(vehicle) or {}).items()}
     )
 
 

@@ -41,6 +41,11 @@ class Readiness:
             self._changed.notify_all()
         self._review()
 
+    def note(self, name: str) -> None:
+        """The attribute has a value, as it may have had before."""
+        if name not in self.names:
+            self.mark(name)
+
     def unmark(self, name: str) -> None:
         """The attribute will get a new value, and is to be waited for."""
         with self._changed:

@@ -8,7 +8,7 @@ from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.message import Message
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
 __all__ = ["Latest", "Stream"]
 
@@ -62,6 +62,7 @@ class Stream:
         "_handlers",
         "_key",
         "_names",
+        "_others",
         "_store",
         "is_heard",
     )
@@ -70,6 +71,7 @@ class Stream:
         self._store, self._key = owner.__dict__, attribute.key
         self._decode: Callable[[bytes, Frame], Any] = attribute.message_type.decode_body
         self._names = names
+        self._others: Mapping[str, object] = {}
         self._handlers: list[Callable[[Any], None]] = []
         self._component_id = 0
         self.is_heard = True
@@ -78,6 +80,10 @@ class Stream:
     def add(self, handler: Callable[[Any], None]) -> None:
         """Have a handler called with the messages, after those added before."""
         self._handlers.append(handler)
+
+    def heed_also(self, listeners: Mapping[str, object]) -> None:
+        """Run the handlers while there are any of these, too."""
+        self._others = listeners
 
     def begin(self, component_id: int) -> None:
         """Only messages of this component count."""
@@ -95,10 +101,10 @@ class Stream:
         for handler in self._handlers:
             handler(message)
 
-    def review(self, ready: set[str], listened: dict[str, Any], others_listen: bool) -> None:
+    def review(self, ready: set[str], listened: Mapping[str, object]) -> None:
         """Who listens, or what has been told, has changed."""
         self.is_heard = (
-            others_listen
+            bool(self._others)
             or "*" in listened
             or any(name in listened or name not in ready for name in self._names)
         )

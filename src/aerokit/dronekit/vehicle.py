@@ -250,8 +250,8 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, VehiclePrivates):
         if rate is not None:
             ends.enter_context(aio.streams(min(rate, MOST_HZ) if rate > 0 else 1.0))
         core.background(lambda: _request_capabilities(aio))
-        itself = weakref.ref(self)
-        core.background(lambda: watch_link(itself, aio))
+        weak_core = weakref.ref(core)
+        core.background(lambda: watch_link(weak_core, aio))
         core.start_parts(ends)
 
     def _dk_on_heartbeat(self, message: Any) -> None:
