@@ -24,6 +24,7 @@ from aerokit.mavlink import messages as m
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from aerokit.dronekit.current_command import CurrentCommand
     from aerokit.dronekit.locations import Locations
     from aerokit.mavlink.message import Message
 
@@ -45,6 +46,7 @@ class VehicleAttributes(VehicleCore):
     """
 
     _location: Locations
+    _dk_current_command: CurrentCommand
     _dk_heartbeat: m.Heartbeat | None = None
     _flightmode: str = "UNKNOWN"
     _dk_attitude = Latest(m.Attitude)

@@ -4,25 +4,27 @@ from __future__ import annotations
 
 import operator
 import threading
-from typing import TYPE_CHECKING, Any, NamedTuple, overload
+from typing import TYPE_CHECKING, Any, overload
 
 from aerokit.dronekit.command import Command, command_from, is_home_row, values_of
 from aerokit.dronekit.command_items import commands_of, home_command, mission_of
+from aerokit.dronekit.core import core_of
 from aerokit.dronekit.exceptions import APIException, TimeoutError  # noqa: A004 - DroneKit's name
 from aerokit.errors import AerokitError, OperationTimeout
+from aerokit.snapshot import Snapshot
 from aerokit.sync.reply import reply_of
 
 if TYPE_CHECKING:
     import concurrent.futures
     from collections.abc import Iterator
 
-    from aerokit.dronekit.vehicle import Vehicle
+    from aerokit.dronekit.attributes import VehicleAttributes
     from aerokit.missions import Mission
 
 __all__ = ["Command", "CommandSequence", "WaypointLoader"]
 
 
-class Held(NamedTuple):
+class Held(Snapshot):
     """What the sequence consists of, replaced as a whole."""
 
     items: tuple[Command, ...] = ()
@@ -39,8 +41,8 @@ class CommandSequence:
     assignment; commands may be edited in place. Any thread may use it.
     """
 
-    def __init__(self, vehicle: Vehicle) -> None:
-        self._vehicle = vehicle
+    def __init__(self, vehicle: VehicleAttributes) -> None:
+        self._vehicle, self._core = vehicle, core_of(vehicle)
         self._lock = threading.Lock()
         self._held = Held()
         self._uploaded: tuple[tuple[Any, ...], ...] = ()
@@ -61,13 +63,12 @@ class CommandSequence:
         Raises:
             APIException: the link is down.
         """
-        vehicle = self._vehicle
-        vehicle._dk_check_link()
+        self._core.check_link()
         with self._lock:
             self._downloads += 1
             self._failure = None
-            vehicle._dk_unready("commands")
-            self._download = vehicle._dk_order("commands.download", self._read, self._downloads)
+            self._core.ready.unmark("commands")
+            self._download = self._core.order("commands.download", self._read, self._downloads)
 
     def wait_ready(self, **kwargs: Any) -> bool:
         """Wait for the end of the download; arguments and result as of :meth:`Vehicle.wait_ready`.
@@ -97,14 +98,13 @@ class CommandSequence:
             values = values_of(self._held.items)
             if not self._held.is_changed and values == self._uploaded:
                 return
-            held = self._held = self._held._replace(is_changed=True)  # until it is known to be there
-        vehicle = self._vehicle
-        aio = vehicle._dk_check_link()
-        vehicle._dk_run(aio.mission.upload, mission_of(held.items, aio), timeout=timeout)
+            held = self._held = self._held.replace(is_changed=True)  # until it is known to be there
+        aio = self._core.check_link()
+        self._core.run(aio.mission.upload, mission_of(held.items, aio), timeout=timeout)
         with self._lock:
             self._uploaded = values
             if self._held is held:
-                self._held = held._replace(is_changed=False)
+                self._held = held.replace(is_changed=False)
 
     @property
     def next(self) -> int:
@@ -126,7 +126,7 @@ class CommandSequence:
         with self._lock:
             if self._failure is not None:
                 self._failure = None
-                self._vehicle._dk_mark_ready("commands")
+                self._core.ready.mark("commands")
             self._held = Held((), self._held.home, is_changed=True)
 
     def add(self, cmd: Any) -> None:
@@ -143,9 +143,9 @@ class CommandSequence:
         """
         self._settle()
         added = command_from(cmd)
-        cmd.target_system = added.target_system = self._vehicle._dk_target_system
+        cmd.target_system = added.target_system = self._core.target_system
         if self._append(added) == 0:
-            self._vehicle._logger.info("the first command is home, as in a waypoint file: %s", added)
+            self._core.logger.info("the first command is home, as in a waypoint file: %s", added)
 
     @property
     def count(self) -> int:
@@ -176,7 +176,14 @@ class CommandSequence:
             at = len(items) if index == len(items) else _checked(index, len(items))
             command.seq = at + 1
             items[at : at + 1] = [command]
-            self._held = self._held._replace(items=tuple(items), is_changed=True)
+            self._held = self._held.replace(items=tuple(items), is_changed=True)
+
+    def rows(self) -> tuple[Command, ...]:
+        """As a waypoint file has them: home first, all zeros if not known; empty as long as nothing is known."""
+        held = self._held
+        if not held.items and held.home is None:
+            return ()
+        return (held.home or home_command(None, (0, 0)), *held.items)
 
     # ------------------------------------------------------------------------------- inside
 
@@ -186,15 +193,15 @@ class CommandSequence:
             held = self._held
             if not held.items and is_home_row(cmd, self._vehicle._home_location):
                 cmd.seq = seq = 0
-                self._held = held._replace(home=cmd, is_changed=True)
+                self._held = held.replace(home=cmd, is_changed=True)
             else:
                 cmd.seq = seq = len(held.items) + 1
-                self._held = held._replace(items=(*held.items, cmd), is_changed=True)
+                self._held = held.replace(items=(*held.items, cmd), is_changed=True)
             return seq
 
     async def _read(self, number: int) -> None:
         try:
-            mission = await self._vehicle._dk_vehicle.mission.download()
+            mission = await self._core.aio.mission.download()
         except AerokitError as error:
             self._note_failure(number, error)
             raise
@@ -202,8 +209,7 @@ class CommandSequence:
 
     def _take(self, number: int, mission: Mission) -> None:
         """On the loop thread: what was downloaded is the sequence from now on."""
-        vehicle, home = self._vehicle, mission.home
-        connection = vehicle._dk_vehicle.connection
+        home, connection = mission.home, self._core.aio.connection
         own_ids = connection.source_system, connection.source_component
         items = commands_of(mission.items, own_ids)
         with self._lock:
@@ -212,8 +218,8 @@ class CommandSequence:
             self._held = Held(items, home_command(home, own_ids))
             self._uploaded = values_of(items)
         if home is not None and home.altitude_amsl_m is not None:
-            vehicle._dk_set_home(home.latitude_deg, home.longitude_deg, home.altitude_amsl_m)
-        vehicle._dk_tell("commands", self)
+            self._vehicle._dk_set_home(home.latitude_deg, home.longitude_deg, home.altitude_amsl_m)
+        self._core.listeners.tell("commands", self)
 
     def _note_failure(self, number: int, error: AerokitError) -> None:
         kind = TimeoutError if isinstance(error, OperationTimeout) else APIException
@@ -222,7 +228,7 @@ class CommandSequence:
         with self._lock:
             if number == self._downloads:
                 self._failure = failure
-                self._vehicle._dk_fail("commands", failure)
+                self._core.ready.fail("commands", failure)
 
     def _settle(self) -> None:
         """Wait until it is known what there is to change."""
@@ -234,7 +240,7 @@ class CommandSequence:
         """As DroneKit does: what is cleared or added after download() comes after it. Its end is bounded."""
         while (download := self._download) is not None and not download.done():
             try:
-                self._vehicle._handler.loop.wait_for(reply_of(download))
+                self._core.handler.loop.wait_for(reply_of(download))
             except AerokitError as error:
                 raise APIException(str(error)) from error
 
@@ -247,8 +253,7 @@ class WaypointLoader:
 
     def count(self) -> int:
         """How many there are, home included; 0 as long as nothing is known."""
-        held = self._commands._held
-        return len(held.items) + 1 if held.items or held.home is not None else 0
+        return len(self._commands.rows())
 
     def wp(self, i: int) -> Command:
         """Command ``i``; 0 is home, all zeros when it is not known.
@@ -256,9 +261,7 @@ class WaypointLoader:
         Raises:
             IndexError: there is none.
         """
-        held = self._commands._held
-        home = home_command(None, (0, 0)) if held.home is None else held.home
-        return ((home, *held.items) if self.count() else ())[i]
+        return self._commands.rows()[i]
 
 
 def _checked(index: Any, count: int) -> int:

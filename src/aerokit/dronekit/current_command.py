@@ -11,7 +11,9 @@ from aerokit.errors import LocalProtocolError
 from aerokit.mavlink.messages import MissionCurrent, MissionSetCurrent
 
 if TYPE_CHECKING:
-    from aerokit.dronekit.vehicle import Vehicle
+    from collections.abc import Callable
+
+    from aerokit.dronekit.core import Core
 
 __all__ = ["CurrentCommand"]
 
@@ -30,12 +32,12 @@ class CurrentCommand:
     here, and 0 as long as it does not fly.
     """
 
-    def __init__(self, vehicle: Vehicle) -> None:
-        self._vehicle = vehicle
+    def __init__(self, core: Core, is_armed: Callable[[], bool]) -> None:
+        self._core, self._is_armed = core, is_armed
         self._message: MissionCurrent | None = None
         self._chosen: int | None = None
         """What PX4 was told to fly next and has not gone past."""
-        vehicle._dk_on(MissionCurrent, self._on_current)
+        core.on(MissionCurrent, self._on_current)
 
     @property
     def seq(self) -> int:
@@ -43,7 +45,7 @@ class CurrentCommand:
         message = self._message
         if message is None:
             return 0
-        if self._vehicle._dk_vehicle.autopilot.home_is_item_0:
+        if self._core.aio.autopilot.home_is_item_0:
             return int(message.seq)
         if message.total == NO_MISSION or (self._is_over(message) and message.seq != self._chosen):
             return 0
@@ -58,7 +60,7 @@ class CurrentCommand:
         """
         if not 0 <= operator.index(seq) <= MOST:
             raise LocalProtocolError(f"next = {seq!r} is not allowed, but 0 to {MOST}")
-        self._vehicle._dk_order("commands.next", self._choose, operator.index(seq))
+        self._core.order("commands.next", self._choose, operator.index(seq))
 
     # ------------------------------------------------------------------------------- inside
 
@@ -69,11 +71,11 @@ class CurrentCommand:
 
     def _is_over(self, message: MissionCurrent) -> bool:
         is_at_an_end = message.seq == 0 or message.mission_state == STATE_COMPLETE
-        return is_at_an_end and not self._vehicle._armed
+        return is_at_an_end and not self._is_armed()
 
     async def _choose(self, seq: int) -> None:
         """By the message that DroneKit sends, once; what is not heard is ordered by the rules of all orders."""
-        aio = self._vehicle._dk_vehicle
+        aio = self._core.aio
         if not aio.autopilot.home_is_item_0:
             await aio.mission.set_current(max(seq - 1, 0))
             self._chosen = seq - 1

@@ -83,7 +83,7 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, VehiclePrivates):
         self._channels = Channels(self, 8)
         self._gimbal = Gimbal(self)
         self._parameters = Parameters(self)
-        self._dk_current_command = CurrentCommand(self)
+        self._dk_current_command = CurrentCommand(self._dk, lambda: self._armed)
         self._dk.ready.mark("commands")
 
     # --------------------------------------------------------------------------------- parts
