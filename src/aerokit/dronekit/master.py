@@ -211,7 +211,10 @@ class Master:
     def param(self, name: str, default: float | None = None) -> float | None:
         """A parameter as far as it is known; ``default`` while it is not."""
         vehicle = self._connection.vehicle
-        return default if vehicle is None else vehicle.parameters.get(name, False, default=default)
+        if vehicle is None:
+            return default
+        value: float | None = vehicle.parameters.get(name, False, default=default)
+        return value
 
     def location(self, relative_alt: bool = False) -> Any:
         """``lat``, ``lon`` (degrees), ``alt`` (metres) and ``heading`` (degrees), of messages that come from now on.

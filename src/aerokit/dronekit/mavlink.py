@@ -13,7 +13,7 @@ import time
 import weakref
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
-from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, Protocol, TypeVar
 
 from aerokit.dronekit.exceptions import APIException
 from aerokit.dronekit.listener_thread import ListenerThread
@@ -30,7 +30,6 @@ from aerokit.sync.loop_thread import LoopThread
 
 if TYPE_CHECKING:
     from aerokit.dronekit.master import Master
-    from aerokit.dronekit.vehicle import Vehicle
     from aerokit.links.link import Peer
     from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.message import Message
@@ -48,6 +47,16 @@ ORDERS_END_S = 2.0
 """How long closing waits for what was ordered a moment before to be answered."""
 TICK_S = 0.05
 ATTEMPTS, BETWEEN_ATTEMPTS_S = 3, 1.0
+
+
+class Steered(Protocol):
+    """What the connection needs of its vehicle."""
+
+    mode: Any
+
+    @property
+    def parameters(self) -> Any:
+        """The autopilot's parameters."""
 
 
 class MAVConnection:
@@ -91,7 +100,7 @@ class MAVConnection:
         """Whether the vehicle has said that it understands MAVLink 2, whichever version it speaks so far."""
         self._at_close: list[Callable[[], object]] = []
         self._master: Master | None = None
-        self.vehicle: Vehicle | None = None
+        self.vehicle: Steered | None = None
         """The vehicle of this connection, once there is one."""
         self.loop_listeners: list[Callable[[MAVConnection], object]] = []
         """Functions that are called about 20 times a second; see :meth:`forward_loop`."""
