@@ -7,7 +7,7 @@ import threading
 from typing import TYPE_CHECKING, Any
 
 from aerokit.dronekit.exceptions import APIException, TimeoutError  # noqa: A004 - DroneKit's name
-from aerokit.dronekit.observers import AttributeListeners, HasObservers
+from aerokit.dronekit.observers import HasObservers, Listeners
 from aerokit.dronekit.readiness import Readiness
 from aerokit.dronekit.weakly import weakly
 from aerokit.errors import AerokitError, LocalProtocolError, OperationTimeout
@@ -39,7 +39,7 @@ class Core:
         self.handler = handler
         self.logger = logging.getLogger("dronekit")
         self.ready = Readiness(self.check_link, self.review)
-        self.listeners = AttributeListeners(owner, handler.listener_thread, self.ready.note, self.review)
+        self.listeners = Listeners(owner, handler.listener_thread, self.ready.note, self.review)
         """Of the vehicle's attributes."""
         self.heartbeat_limit_s = 0.0
         """Longer silences are errors; 0: none is."""

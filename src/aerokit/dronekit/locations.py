@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from aerokit.dronekit.core import core_of
-from aerokit.dronekit.observers import AttributeListeners, HasObservers
+from aerokit.dronekit.observers import HasObservers, Listeners
 from aerokit.dronekit.privates import LocationPrivates
 from aerokit.dronekit.reception import Latest, Stream
 from aerokit.dronekit.values import LocationGlobal, LocationGlobalRelative, LocationLocal
@@ -34,7 +34,7 @@ class Locations(HasObservers, LocationPrivates):
 
     def __init__(self, vehicle: VehicleCore) -> None:
         self._core = core = core_of(vehicle)
-        listeners = AttributeListeners(self, core.handler.listener_thread, on_change=core.review)
+        listeners = Listeners(self, core.handler.listener_thread, on_change=core.review)
         self._dk_observe(listeners)
         self._has_altitude = False
         self._dk_numbers: _Numbers = (None, None, None, None, None)

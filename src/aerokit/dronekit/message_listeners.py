@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import threading
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+from aerokit.dronekit.observers import EVERY_NAME, Listeners
 from aerokit.errors import AerokitError
 
 if TYPE_CHECKING:
@@ -24,8 +24,6 @@ logger = logging.getLogger("dronekit")
 MessageListener = Callable[[Any, str, Any], object]
 """``listener(vehicle, message_name, message)``; the message is pymavlink's."""
 
-EVERY_NAME = "*"
-
 
 class MessageListeners:
     """The message listeners of one vehicle, called on its listener thread. pymavlink is imported for the first of them.
@@ -35,10 +33,11 @@ class MessageListeners:
     """
 
     def __init__(self, owner: object, handler: MAVConnection) -> None:
-        self._owner, self._handler = owner, handler
-        self._listeners: dict[str, tuple[MessageListener, ...]] = {}
+        self._handler = handler
+        self._listeners = Listeners(
+            owner, handler.listener_thread, on_change=self._attach_now, kind="message"
+        )
         self._detach: dict[str, Detach] = {}
-        self._lock = threading.Lock()
         self._is_started = False
         self._message_of: Callable[[Frame], Any]
 
@@ -46,45 +45,22 @@ class MessageListeners:
         """Have it called for every message of this name, or for every message (``'*'``); not twice."""
         from aerokit.dronekit.pymavlink_messages import message_of
 
-        name, self._message_of = str(name), message_of
-        with self._lock:
-            present = self._listeners.get(name, ())
-            if listener in present:
-                return
-            self._listeners[name] = (*present, listener)
-            self._stay()
-        self._attach_now()
+        self._message_of = message_of
+        self._listeners.add(str(name), listener)
 
     def remove(self, name: str, listener: MessageListener) -> None:
         """Call it no more; silent when it does not listen."""
-        with self._lock:
-            left = tuple(each for each in self._listeners.get(name, ()) if each != listener)
-            if left:
-                self._listeners[name] = left
-                return
-            was_there = self._listeners.pop(name, None) is not None
-            self._stay()
-        if was_there:
-            self._attach_now()
+        with contextlib.suppress(ValueError):
+            self._listeners.remove(name, listener)
 
     def notify(self, name: str, message: Any) -> None:
-        """Call the listeners of a message: those of its name, then those of every message."""
-        for key in (name, EVERY_NAME):
-            for listener in self._listeners.get(key, ()):
-                try:
-                    listener(self._owner, name, message)
-                except (
-                    BaseException
-                ):  # sys.exit() too: it would end the callbacks of everybody, and nothing else
-                    logger.exception("Exception in message handler for %s", name)
+        """Call the listeners of a message: of its name, then of every message; returns when they have run."""
+        self._handler.listener_thread.call(self._listeners.deliver, name, message)
 
     def start(self) -> None:
         """The vehicle was found: hear what comes from now on (loop thread)."""
         self._is_started = True
         self._attach()
-
-    def _stay(self) -> None:
-        self._handler.listener_thread.keep(self, has_listeners=bool(self._listeners))
 
     def _attach_now(self) -> None:
         """Wait for it, so that whatever comes once a listener was added is heard."""
@@ -97,7 +73,8 @@ class MessageListeners:
 
     def _attach(self) -> None:
         """Hear what is listened to: everything, or the messages of these names."""
-        wanted = [EVERY_NAME] if EVERY_NAME in self._listeners else list(self._listeners)
+        names = self._listeners.by_name.copy()
+        wanted = [EVERY_NAME] if EVERY_NAME in names else list(names)
         for name in set(self._detach).difference(wanted):
             self._detach.pop(name)()
         for name in wanted:
@@ -128,4 +105,4 @@ class MessageListeners:
     def _deliver(self, frame: Frame) -> None:
         message = self._message_of(frame)
         if message is not None:
-            self.notify(message.get_type(), message)
+            self._listeners.deliver(message.get_type(), message)

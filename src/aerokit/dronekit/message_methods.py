@@ -45,7 +45,7 @@ class MessageMethods(VehicleCore):
 
     def notify_message_listeners(self, name: str, msg: Any) -> None:
         """Call the listeners of a message, as if it had come; returns when they have run."""
-        self._handler.listener_thread.call(self._message_listeners.notify, name, msg)
+        self._message_listeners.notify(name, msg)
 
     @property
     def message_factory(self) -> MessageFactory:

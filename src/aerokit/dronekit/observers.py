@@ -1,4 +1,4 @@
-"""Attributes whose changes a program can listen to: ``AttributeListeners``, and ``HasObservers``, who has some."""
+"""Attributes whose changes a program can listen to: ``Listeners``, and ``HasObservers``, who has some."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 if TYPE_CHECKING:
     from aerokit.dronekit.listener_thread import ListenerThread
 
-__all__ = ["AttributeListener", "AttributeListeners", "HasObservers", "ListenerT"]
+__all__ = ["AttributeListener", "HasObservers", "ListenerT", "Listeners"]
 
 logger = logging.getLogger("dronekit")
 
@@ -25,13 +25,13 @@ _changing = threading.Lock()
 """Held while listeners are added and removed."""
 
 
-class AttributeListeners:
-    """Who listens to which attribute of an object. Any thread may use it.
+class Listeners:
+    """Who listens to which attribute, or message, of an object. Any thread may use it.
 
     Listeners run on the listener thread, in the order in which values came, those of a name before those of ``'*'``;
     they may block, raise, remove themselves and call whatever blocks. Without a listener thread they run on the thread
     that tells. ``on_value(name)`` is called for every value, whoever listens, ``on_change()`` when listeners have come
-    or gone.
+    or gone; ``kind`` is what the log calls them.
     """
 
     def __init__(
@@ -40,8 +40,9 @@ class AttributeListeners:
         thread: ListenerThread | None,
         on_value: Callable[[str], None] | None = None,
         on_change: Callable[[], None] | None = None,
+        kind: str = "attribute",
     ) -> None:
-        self._owner, self._thread = owner, thread
+        self._owner, self._thread, self._kind = owner, thread, kind
         self._on_value, self._on_change = on_value, on_change
         self.by_name: dict[str, tuple[AttributeListener, ...]] = {}
         self.told: dict[str, Any] = {}
@@ -96,9 +97,9 @@ class AttributeListeners:
     def offer(self, name: str, value: Any, *, comes_again: bool = True) -> None:
         """Have the listeners called; what comes again anyway may be dropped."""
         if self._thread is None:
-            self._deliver(name, value)
+            self.deliver(name, value)
         else:
-            (self._thread.offer if comes_again else self._thread.post)(self._deliver, name, value)
+            (self._thread.offer if comes_again else self._thread.post)(self.deliver, name, value)
 
     def notify(self, name: str, value: Any, cache: bool) -> None:
         """As :meth:`tell`, and return when the listeners have run."""
@@ -108,9 +109,20 @@ class AttributeListeners:
             self._on_value(name)
         if self.heed(name):
             if self._thread is None:
-                self._deliver(name, value)
+                self.deliver(name, value)
             else:
-                self._thread.call(self._deliver, name, value)
+                self._thread.call(self.deliver, name, value)
+
+    def deliver(self, attr_name: str, value: Any) -> None:
+        """Call the listeners, those that are there by now, where the caller is."""
+        for name in (attr_name, EVERY_NAME):
+            for listener in self.by_name.get(name, ()):
+                try:
+                    listener(self._owner, attr_name, value)
+                except (
+                    BaseException
+                ):  # sys.exit() too: it would end the callbacks of everybody, and nothing else
+                    logger.exception("Exception in %s handler for %s", self._kind, attr_name)
 
     def _is_told(self, name: str, value: Any) -> bool:
         """Whether this was the last value told; if not, it is now."""
@@ -128,25 +140,14 @@ class AttributeListeners:
         if self._on_change is not None:
             self._on_change()
 
-    def _deliver(self, attr_name: str, value: Any) -> None:
-        """Call the listeners, those that are there by now."""
-        for name in (attr_name, EVERY_NAME):
-            for listener in self.by_name.get(name, ()):
-                try:
-                    listener(self._owner, attr_name, value)
-                except (
-                    BaseException
-                ):  # sys.exit() too: it would end the callbacks of everybody, and nothing else
-                    logger.exception("Exception in attribute handler for %s", attr_name)
-
 
 class HasObservers:
-    """An object with attributes that can be listened to; see :class:`AttributeListeners`."""
+    """An object with attributes that can be listened to; see :class:`Listeners`."""
 
     def __init__(self, listener_thread: ListenerThread | None = None) -> None:
-        self._dk_observe(AttributeListeners(self, listener_thread))
+        self._dk_observe(Listeners(self, listener_thread))
 
-    def _dk_observe(self, listeners: AttributeListeners) -> None:
+    def _dk_observe(self, listeners: Listeners) -> None:
         self._dk_listeners = listeners
         self._attribute_listeners, self._attribute_cache = listeners.by_name, listeners.told
 

@@ -42,40 +42,38 @@ class Attitude(_Value):
         return f"Attitude:pitch={self.pitch},yaw={self.yaw},roll={self.roll}"
 
 
-class LocationGlobal(_Value):
+class _Place(_Value):
+    """Two of them are equal only if they are the same object."""
+
+    local_frame: Any = None
+    global_frame: Any = None
+    _kind: str
+
+    def __init__(self, lat: float | Any, lon: float | Any, alt: float | Any = None) -> None:
+        self.lat = lat
+        self.lon = lon
+        self.alt = alt
+
+    def __str__(self) -> str:
+        return f"{self._kind}:lat={self.lat},lon={self.lon},alt={self.alt}"
+
+
+class LocationGlobal(_Place):
     """A place on earth: ``lat`` and ``lon`` in degrees (WGS 84), ``alt`` in metres above mean sea level.
 
     Two of them are equal only if they are the same object.
     """
 
-    local_frame: Any = None
-    global_frame: Any = None
-
-    def __init__(self, lat: float | Any, lon: float | Any, alt: float | Any = None) -> None:
-        self.lat = lat
-        self.lon = lon
-        self.alt = alt
-
-    def __str__(self) -> str:
-        return f"LocationGlobal:lat={self.lat},lon={self.lon},alt={self.alt}"
+    _kind = "LocationGlobal"
 
 
-class LocationGlobalRelative(_Value):
+class LocationGlobalRelative(_Place):
     """A place on earth: ``lat`` and ``lon`` in degrees (WGS 84), ``alt`` in metres above home.
 
     Two of them are equal only if they are the same object.
     """
 
-    local_frame: Any = None
-    global_frame: Any = None
-
-    def __init__(self, lat: float | Any, lon: float | Any, alt: float | Any = None) -> None:
-        self.lat = lat
-        self.lon = lon
-        self.alt = alt
-
-    def __str__(self) -> str:
-        return f"LocationGlobalRelative:lat={self.lat},lon={self.lon},alt={self.alt}"
+    _kind = "LocationGlobalRelative"
 
 
 class LocationLocal(_Value):
