@@ -13,6 +13,7 @@ from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import AvailableModes, Heartbeat, ParamRequestRead, ParamValue, Statustext
+from aerokit.parameters import Parameter, ParameterType
 from aerokit.parameters.parameter import MOST_PARAMETERS
 from aerokit.protocols.parameter_list import ParameterList
 from aerokit.protocols.round_trip import RoundTrip
@@ -69,9 +70,9 @@ async def test_mode_names() -> None:
 def test_classic_parameters() -> None:
     values = ParameterValues()
     for number in range(MOST_PARAMETERS + 100):
-        values.take(f"p{number}", 1.0)
+        values.take(Parameter(f"p{number}", 1.0, ParameterType.REAL32))
     assert len(values) == MOST_PARAMETERS
-    assert values.take("p5", 2.0)
+    assert values.take(Parameter("p5", 2.0, ParameterType.REAL32))
 
 
 def test_texts_under_way() -> None:

@@ -19,11 +19,12 @@ from aerokit.errors import LocalProtocolError, ParameterTimeout
 from aerokit.mavlink.messages import ParamValue
 from aerokit.parameters import check_name
 from aerokit.runtime.events import ParameterChanged
+from aerokit.vehicle.parameters.names import warn_of_rename
 
 if TYPE_CHECKING:
     from aerokit.dronekit.core import VehicleCore
-    from aerokit.dronekit.parameter_values import KnownParameter
-    from aerokit.parameters import ParameterTable
+    from aerokit.parameters import Parameter, ParameterTable
+    from aerokit.vehicle.parameters.names import Found
 
 __all__ = ["Parameters"]
 
@@ -77,11 +78,11 @@ class Parameters(MutableMapping[str, float], HasObservers):
         """
         if isinstance(name, str) and (value := self._values.get(name.upper())) is not None:
             return value
-        known = self._find(name, waits=bool(wait_ready))
-        if known is None:
+        found = self._find(name, waits=bool(wait_ready))
+        if found is None:
             return default
-        known.warn()
-        return known.value_asked
+        _warn(found)
+        return float(found.in_terms_asked(found.parameter).value)
 
     def __contains__(self, name: object) -> bool:
         return self._find(name) is not None
@@ -170,10 +171,11 @@ class Parameters(MutableMapping[str, float], HasObservers):
         name, number = _upper(name), number_of(name, value)
         if wait_ready:
             self.wait_ready()
-        known = self._values.find(name)
-        own, told = (name, number) if known is None else (known.name, known.to_vehicle(number))
-        if known is not None:
-            known.warn()
+        found = self._values.find(name)
+        own, told = name, number
+        if found is not None:
+            own, told = found.name, _told(found, number)
+            _warn(found)
         core = self._core
         if retries <= 0:
             core.order(f"parameter {own}", set_parameter, core.aio, own, told, 0)
@@ -211,7 +213,7 @@ class Parameters(MutableMapping[str, float], HasObservers):
 
     # ------------------------------------------------------------------------------- inside
 
-    def _find(self, name: object, *, waits: bool = True) -> KnownParameter | None:
+    def _find(self, name: object, *, waits: bool = True) -> Found | None:
         """Waited for if need be; None when the vehicle has no such parameter."""
         if not isinstance(name, str):
             return None
@@ -254,19 +256,20 @@ class Parameters(MutableMapping[str, float], HasObservers):
         self._count = message.param_count
         told = self._core.aio.parameters.known(message.param_id)
         if told is not None:
-            self._take(told.name, float(told.value))
+            self._take(told)
 
     def _on_changed(self, event: ParameterChanged) -> None:
         """Also by a download that a program has begun by itself."""
-        if event.system_id == self._core.target_system:
-            self._take(event.name, float(event.after))
+        told = self._core.aio.parameters.known(event.name)
+        if event.system_id == self._core.target_system and told is not None:
+            self._take(told)
 
-    def _take(self, name: str, value: float) -> None:
-        if self._values.take(name, value):
-            self._dk_listeners.tell(name.upper(), value, cache=True)
+    def _take(self, told: Parameter) -> None:
+        if self._values.take(told):
+            self._dk_listeners.tell(told.name.upper(), float(told.value), cache=True)
 
     def _take_all(self, table: ParameterTable) -> None:
-        news = self._values.replace(table.values_by_name())
+        news = self._values.replace(table)
         if self._attribute_listeners:
             for name, value in news.items():
                 self._dk_listeners.tell(name.upper(), value, cache=True)
@@ -294,6 +297,16 @@ def _upper(name: str) -> str:
     if not isinstance(name, str):
         raise LocalProtocolError(f"parameter name = {name!r} is no text")
     return name.upper()
+
+
+def _warn(found: Found) -> None:
+    if found.renamed is not None:
+        warn_of_rename(found.renamed)
+
+
+def _told(found: Found, number: float) -> float:
+    """A number in the vehicle's unit, not rounded: how integers are made of fractions is the same for all names."""
+    return number if found.renamed is None else found.renamed.to_vehicle(number)
 
 
 def _described(name: str) -> str:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from aerokit.protocols.parameter_requests import Answer
     from aerokit.vehicle.parameters.access import ParameterAccess
 
-__all__ = ["Found", "NotFound", "ParameterNames", "warn_of_rename"]
+__all__ = ["Found", "NotFound", "ParameterNames", "found_among", "warn_of_rename"]
 
 NotFound = ParameterRejected | ParameterTimeout
 
@@ -49,6 +49,16 @@ class Found(Snapshot):
     def in_terms_asked(self, parameter: Parameter) -> Parameter:
         """A parameter of the vehicle under the name and in the unit that was asked for."""
         return parameter if self.renamed is None else self.renamed.parameter(parameter)
+
+
+def found_among(name: str, known: Mapping[str, Parameter]) -> Found | None:
+    """A parameter under any of its names, among those that are known."""
+    if name in known:
+        return Found(name, known[name], False)
+    from aerokit.parameters.renames import to_known
+
+    renamed = to_known(name, known)
+    return None if renamed is None else Found(name, known[renamed.name], False, renamed)
 
 
 class ParameterNames:
