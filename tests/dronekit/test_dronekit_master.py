@@ -361,3 +361,10 @@ def test_closing_ends_the_waiting(connected: Connected) -> None:
     assert len(ended) == 1
     with pytest.raises(APIException):
         master.arducopter_arm()
+
+
+def test_the_port_is_there_to_be_closed(connected: Connected) -> None:
+    master, _ = connected
+    master.port.close()
+    with pytest.raises(APIException, match="closed"):
+        master.arducopter_arm()

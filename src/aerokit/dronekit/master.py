@@ -66,6 +66,11 @@ class Master:
         return self._connection.connection.link.address
 
     @property
+    def port(self) -> Master:
+        """What programs close: :meth:`close`. It is no socket and no serial port."""
+        return self
+
+    @property
     def flightmode(self) -> str:
         """Name of the flight mode, ``UNKNOWN`` before it was heard."""
         heartbeat = self._heard()[1]
