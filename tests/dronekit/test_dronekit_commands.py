@@ -63,7 +63,8 @@ def test_what_is_downloaded_are_commands_counted_without_home(
     assert (len(cmds), cmds.count, [each.seq for each in cmds]) == (3, 3, [1, 2, 3])
     assert (first.x, first.y, first.z, first.frame, first.autocontinue) == (-35.5, 149.25, 20.0, 3, 1)
     assert (first.target_system, first.target_component) == (255, 0)
-    assert str(cmds._vehicle.home_location) == "LocationGlobal:lat=-35.363261,lon=149.16523,alt=584.0"
+    vehicle: Any = cmds._vehicle
+    assert str(vehicle.home_location) == "LocationGlobal:lat=-35.363261,lon=149.16523,alt=584.0"
 
 
 def test_it_is_a_list(three: Pair) -> None:
@@ -89,7 +90,8 @@ def test_nothing_is_there_before_a_download_and_nothing_is_waited_for(
     with pytest.raises(IndexError, match=r"^Index 0 out of range.$"):
         cmds[0]
     cmds.upload()
-    cmds._vehicle.flush()
+    vehicle: Any = cmds._vehicle
+    vehicle.flush()
     assert transfers(controller, before) == []  # programs call flush() after anything
 
 

@@ -231,7 +231,8 @@ def test_px4_is_given_what_ardupilot_works_out_by_itself(px4: tuple[FlightContro
 
 def test_the_waypoint_loader_counts_home(three: Pair) -> None:
     _, cmds = three
-    loader = cmds._vehicle._wploader
+    vehicle: Any = cmds._vehicle
+    loader = vehicle._wploader
     assert (loader.count(), loader.wp(0).z, loader.wp(3).z) == (4, 584.0, 22.0)
     with pytest.raises(IndexError):
         loader.wp(4)

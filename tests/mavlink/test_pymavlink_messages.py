@@ -26,8 +26,8 @@ def test_there_and_back() -> None:
 def test_its_time_and_dialect_are_the_programs() -> None:
     assert to_pymavlink(ATTITUDE)._timestamp == 0.0
     theirs = to_pymavlink(ATTITUDE, dialect=common, timestamp=12.5)
-    assert isinstance(theirs, common.MAVLink_attitude_message)
     assert theirs._timestamp == 12.5
+    assert isinstance(theirs, common.MAVLink_attitude_message)
 
 
 def test_what_is_wrong_is_named() -> None:

@@ -29,8 +29,8 @@ class Locations(HasObservers, LocationPrivates):
     Listeners get this object as their first argument. The three numbers of a location belong to one message.
     """
 
-    global_position = Latest(GlobalPositionInt)
-    local_position = Latest(LocalPositionNed)
+    global_position: Latest[GlobalPositionInt] = Latest(GlobalPositionInt)
+    local_position: Latest[LocalPositionNed] = Latest(LocalPositionNed)
 
     def __init__(self, vehicle: VehicleCore) -> None:
         self._core = core = core_of(vehicle)
