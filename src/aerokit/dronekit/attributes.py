@@ -170,7 +170,7 @@ class VehicleAttributes(VehicleCore):
         """
         if self._flightmode in NO_MODE or self._dk_heartbeat is None:
             return False
-        if self._dk_aio is not None and self._dk_aio.autopilot.judges_by_mode:
+        if self._dk.is_connected and self._dk.aio.autopilot.judges_by_mode:
             status = self._dk_sys_status
             return status is not None and bool(status.onboard_control_sensors_health & PREARM_CHECK)
         gps = self._dk_gps
@@ -192,7 +192,7 @@ class VehicleAttributes(VehicleCore):
     @property
     def last_heartbeat(self) -> float | Any:
         """Seconds since the autopilot's last HEARTBEAT; None before the first."""
-        return None if self._dk_aio is None else self._dk_aio.heartbeat_age
+        return self._dk.aio.heartbeat_age if self._dk.is_connected else None
 
     @Shadowable
     def _autopilot_type(self) -> int | None:
@@ -215,8 +215,7 @@ class VehicleAttributes(VehicleCore):
             message.custom_mode,
             message.base_mode,
         ):
-            assert self._dk_aio is not None
-            self._flightmode = mode_name(self._dk_aio, message.custom_mode)
+            self._flightmode = mode_name(self._dk.aio, message.custom_mode)
         self._dk.listeners.tell("armed", self._armed, cache=True)
         self._dk.listeners.tell("mode", VehicleMode(self._flightmode), cache=True)
         self._dk.listeners.tell("system_status", self.system_status, cache=True)

@@ -184,15 +184,10 @@ class VehicleCore(HasObservers):
         self._ready_attrs = self._dk.ready.names
         self._autopilot_logger = logging.getLogger("autopilot")
 
-        core = self._dk  # what follows: names of the parts that do not take a core yet
-        self._dk_on, self._dk_check_link, self._dk_run = core.on, core.check_link, core.run
-        self._dk_order, self._dk_send, self._dk_pause = core.order, core.send, core.pause
-        self._dk_mark_ready, self._dk_unready = core.ready.mark, core.ready.unmark
-        self._dk_fail, self._dk_tell = core.ready.fail, core.listeners.tell
-
-    @property
-    def _dk_aio(self) -> AsyncVehicle | None:
-        return self._dk.aio if self._dk.is_connected else None
+        core = self._dk  # what follows: names for the parts that do not take a core yet
+        self._dk_on, self._dk_at_start, self._dk_check_link = core.on, core.at_start, core.check_link
+        self._dk_run, self._dk_order, self._dk_send = core.run, core.order, core.send
+        self._dk_pause, self._dk_tell = core.pause, core.listeners.tell
 
     @property
     def _dk_vehicle(self) -> AsyncVehicle:
