@@ -174,8 +174,8 @@ class MAVConnection:
     def pipe(self, target: MAVConnection) -> MAVConnection:
         """Pass everything on that comes here to ``target``, and the other way round; returns ``target``."""
         target.target_system = self.target_system
-        self.loop.call_soon(self.tap, lambda frame, peer: target._pass_on(frame))
-        target.loop.call_soon(target.tap, lambda frame, peer: self._pass_on(frame))
+        self.loop.call_soon(self.tap, lambda frame, peer: target.pass_on(frame))
+        target.loop.call_soon(target.tap, lambda frame, peer: self.pass_on(frame))
         return target
 
     # ---------------------------------------------------------------------------- life cycle
@@ -289,7 +289,8 @@ class MAVConnection:
         except BaseException:
             logger.exception("Exception in a listener of the connection")
 
-    def _pass_on(self, frame: Frame) -> None:
+    def pass_on(self, frame: Frame) -> None:
+        """Write a frame as it is; from any thread, silent when the connection is closed."""
         with contextlib.suppress(ConnectionClosed):
             self.loop.call_soon(self._write_raw, frame)
 
