@@ -15,7 +15,7 @@ from aerokit.errors import LocalProtocolError
 from aerokit.mavlink.dialect import STANDARD
 
 if TYPE_CHECKING:
-    from aerokit.dronekit.mavlink import MAVConnection
+    from aerokit.dronekit.line import Line
     from aerokit.links.link import Peer
     from aerokit.mavlink.frame import Frame
 
@@ -37,7 +37,7 @@ class Inbox(Mapping[str, Any]):
     radios and ground stations; not other vehicles.
     """
 
-    def __init__(self, connection: MAVConnection) -> None:
+    def __init__(self, connection: Line) -> None:
         self._connection = connection
         self._latest: dict[int, Frame] = {}
         self._frames: deque[Frame] = deque(maxlen=MOST_KEPT)

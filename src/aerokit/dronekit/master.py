@@ -14,7 +14,7 @@ from aerokit.mavlink.from_pymavlink import from_pymavlink
 from aerokit.runtime.components import is_autopilot
 
 if TYPE_CHECKING:
-    from aerokit.dronekit.mavlink import MAVConnection
+    from aerokit.dronekit.line import Line
     from aerokit.mavlink.messages import Heartbeat
 
 __all__ = ["Master", "MessageFactory"]
@@ -32,7 +32,7 @@ class Master:
     Everything that sends returns at once, and says nothing of what becomes of it.
     """
 
-    def __init__(self, connection: MAVConnection) -> None:
+    def __init__(self, connection: Line) -> None:
         self._connection = connection
         ours = connection.connection
         self.mav = MessageFactory(self._send, ours.source_system, ours.source_component)

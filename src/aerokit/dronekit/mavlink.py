@@ -13,7 +13,7 @@ import time
 import weakref
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
-from typing import TYPE_CHECKING, Any, NoReturn, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from aerokit.dronekit.exceptions import APIException
 from aerokit.dronekit.listener_thread import ListenerThread
@@ -29,6 +29,7 @@ from aerokit.runtime.opening import open_connection
 from aerokit.sync.loop_thread import LoopThread
 
 if TYPE_CHECKING:
+    from aerokit.dronekit.line import Steered
     from aerokit.dronekit.master import Master
     from aerokit.links.link import Peer
     from aerokit.mavlink.frame import Frame
@@ -47,16 +48,6 @@ ORDERS_END_S = 2.0
 """How long closing waits for what was ordered a moment before to be answered."""
 TICK_S = 0.05
 ATTEMPTS, BETWEEN_ATTEMPTS_S = 3, 1.0
-
-
-class Steered(Protocol):
-    """What the connection needs of its vehicle."""
-
-    mode: Any
-
-    @property
-    def parameters(self) -> Any:
-        """The autopilot's parameters."""
 
 
 class MAVConnection:
