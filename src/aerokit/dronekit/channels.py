@@ -8,12 +8,13 @@ from collections.abc import ItemsView, Iterable, Iterator, KeysView, Mapping, Va
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any, NoReturn
 
+from aerokit.dronekit.core import core_of
 from aerokit.dronekit.exceptions import APIException
 from aerokit.errors import LocalProtocolError
 from aerokit.mavlink.messages import RcChannels, RcChannelsOverride, RcChannelsRaw
 
 if TYPE_CHECKING:
-    from aerokit.dronekit.vehicle import Vehicle
+    from aerokit.dronekit.core import VehicleCore
 
 __all__ = ["Channels", "ChannelsOverride"]
 
@@ -95,15 +96,15 @@ class Channels(_ChannelDict):
     :attr:`count`. Read only, except for :attr:`overrides`.
     """
 
-    def __init__(self, vehicle: Vehicle, count: int) -> None:
+    def __init__(self, vehicle: VehicleCore, count: int) -> None:
         super().__init__()
-        self._vehicle = vehicle
+        self._core = core = core_of(vehicle)
         self._count = 0
         self._changing = threading.Lock()
         self._overrides = ChannelsOverride(vehicle)
         self._grow(count)
-        vehicle._dk_on(RcChannels, self._on_channels)
-        vehicle._dk_on(RcChannelsRaw, self._on_raw)
+        core.on(RcChannels, self._on_channels)
+        core.on(RcChannelsRaw, self._on_raw)
 
     @property
     def count(self) -> int:
@@ -186,10 +187,10 @@ class Channels(_ChannelDict):
             numbers = NUMBERS[first : self._count]
             values = (None if value == UNUSED else value for value in heard)
             dict.update(self, dict(zip(numbers, values, strict=False)))  # readers see all of it or nothing
-        self._vehicle._dk_tell("channels", self)
+        self._core.listeners.tell("channels", self)
 
     def _grow(self, count: int) -> None:
-        self._count = self._overrides._count = count
+        self._count = self._overrides.count = count
         dict.update(self, {number: self.get(number) for number in NUMBERS[:count]})
 
 
@@ -205,10 +206,11 @@ class ChannelsOverride(_ChannelDict):
     (``connect(source_system=)`` and MAV_GCS_SYSID, 255).
     """
 
-    def __init__(self, vehicle: Vehicle) -> None:
+    def __init__(self, vehicle: VehicleCore) -> None:
         super().__init__()
-        self._vehicle = vehicle
-        self._count = FEWEST
+        self._core = core_of(vehicle)
+        self.count = FEWEST
+        """How many channels there are to override."""
         self._given_back: set[str] = set()
         self._changing = threading.RLock()
 
@@ -288,20 +290,20 @@ class ChannelsOverride(_ChannelDict):
         checked: dict[str, int] = {}
         for channel, value in overrides.items():
             number = int(channel)
-            if not 1 <= number <= self._count:
+            if not 1 <= number <= self.count:
                 raise KeyError(f"Invalid channel index {channel}")
             checked[str(number)] = _checked_value(number, value)
         return checked
 
     def _send(self, active: dict[str, int], given_back: set[str]) -> None:
-        aio = self._vehicle._dk_check_link()
+        aio = self._core.check_link()
         if aio.connection.mavlink_version == 1 and any(int(channel) > FEWEST for channel in active):
             raise APIException("channels above 8 cannot be overridden: this vehicle speaks MAVLink 1")
         values = [active.get(number, 0) for number in NUMBERS]
         for channel in given_back:
             if int(channel) > FEWEST:
                 values[int(channel) - 1] = RELEASE_UPPER
-        self._vehicle._dk_send(RcChannelsOverride(self._vehicle._dk_target_system, 0, *values))
+        self._core.send(RcChannelsOverride(self._core.target_system, 0, *values))
 
 
 def _checked_value(number: int, value: Any) -> int:
