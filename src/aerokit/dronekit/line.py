@@ -37,6 +37,7 @@ class Line(Protocol):
     @property
     def is_closed(self) -> bool:
         """Whether the program has closed it."""
+        ...
 
     def send(self, message: Message, *, to: int | None = None) -> None:
         """Send a message."""
@@ -46,6 +47,7 @@ class Line(Protocol):
 
     def is_of_another_vehicle(self, system_id: int) -> bool:
         """Whether this system is neither the vehicle nor one without an autopilot."""
+        ...
 
     def close(self) -> None:
         """Close it."""
