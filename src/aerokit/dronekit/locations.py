@@ -30,7 +30,9 @@ class Locations(HasObservers, LocationPrivates):
     """
 
     global_position: Latest[GlobalPositionInt] = Latest(GlobalPositionInt)
+    """The latest message, of ``aerokit.messages``; None before the first."""
     local_position: Latest[LocalPositionNed] = Latest(LocalPositionNed)
+    """The latest message; None before the first."""
 
     def __init__(self, vehicle: VehicleCore) -> None:
         self._core = core = core_of(vehicle)
