@@ -183,6 +183,33 @@ def test_a_message_listener_keeps_it_until_it_is_removed(address: str, name: str
     eventually(lambda: not own_threads())
 
 
+@pytest.mark.parametrize("left", ["attribute", "message"])
+def test_each_kind_of_listener_keeps_it_when_the_other_is_removed(address: str, left: str) -> None:
+    told = threading.Event()
+
+    def to_attribute(_: object, name: str, value: object) -> None:
+        if left == "attribute":
+            told.set()
+
+    def to_message(_: object, name: str, message: object) -> None:
+        if left == "message":
+            told.set()
+
+    vehicle = dronekit.connect(address)
+    vehicle.add_attribute_listener("attitude", to_attribute)
+    vehicle.add_message_listener("ATTITUDE", to_message)
+    if left == "attribute":
+        vehicle.remove_message_listener("ATTITUDE", to_message)
+    else:
+        vehicle.remove_attribute_listener("attitude", to_attribute)
+    dropped = weakref.ref(vehicle)
+    del vehicle
+    for _ in range(3):
+        assert not is_gone(dropped)
+        told.clear()
+        assert told.wait(LIMIT_S)
+
+
 def test_a_listener_to_a_parameter_keeps_it(address: str) -> None:
     told = threading.Event()
     vehicle = dronekit.connect(address, wait_ready=["parameters"])

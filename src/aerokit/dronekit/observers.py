@@ -134,7 +134,7 @@ class Listeners:
     def _stay(self) -> None:
         """With listeners the owner stays, even when the program has dropped it."""
         if self._thread is not None:
-            self._thread.keep(self._owner, has_listeners=bool(self.by_name))
+            self._thread.keep(self, has_listeners=bool(self.by_name))
 
     def _review(self) -> None:
         if self._on_change is not None:
