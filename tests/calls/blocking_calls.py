@@ -30,6 +30,7 @@ Do = Callable[[Any], object]
 CLASSES: tuple[type, ...] = (
     twins.Vehicle,
     twins.Guided,
+    twins.Gimbal,
     twins.SetpointStream,
     twins.Parameters,
     twins.Transaction,

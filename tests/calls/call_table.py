@@ -164,6 +164,10 @@ async def _sign(stage: Stage) -> None:
     await stage.vehicle.setup_signing(Signing(KEY))
 
 
+def _with_gimbal(stage: Stage) -> None:
+    stage.simulated.parameters["MNT1_TYPE"] = 1.0
+
+
 def _fail_checks(stage: Stage) -> None:
     stage.simulated.faults.prearm_failures.append("Compass not healthy")
 
@@ -208,6 +212,9 @@ CALLS: dict[str, Call] = {
     "Guided.position": _stream("position", lambda s: PositionSetpoint(s.target())),
     "Guided.attitude": _stream("attitude", lambda _: AttitudeSetpoint(0, 2, 0, thrust=0.5)),
     "SetpointStream.fly": Call(_fly, airborne),
+    # ------------------------------------------------------------------------------------- Gimbal
+    "Gimbal.point": Call(lambda s: s.vehicle.gimbal.point(-45, 90), on=COPTER, before=_with_gimbal),
+    "Gimbal.release": Call(lambda s: s.vehicle.gimbal.release(), on=COPTER, before=_with_gimbal),
     # --------------------------------------------------------------------------------- Parameters
     "Parameters.download": Call(lambda s: s.vehicle.parameters.download(refresh=True)),
     "Parameters.diff": Call(lambda s: s.vehicle.parameters.diff({s.parameter: 1.0})),

@@ -13,6 +13,7 @@ from aerokit.runtime.connection import Connection
 from aerokit.runtime.subscription import Subscription
 from aerokit.vehicle.files.files import Files
 from aerokit.vehicle.files.logs import Logs
+from aerokit.vehicle.orders.gimbal import Gimbal
 from aerokit.vehicle.orders.guided import Guided, SetpointStream
 from aerokit.vehicle.parameters.parameters import Parameters
 from aerokit.vehicle.parameters.transaction import Temporarily, Transaction
@@ -26,6 +27,7 @@ CLASSES: tuple[type, ...] = (
     aerokit.Vehicle,
     Guided,
     SetpointStream,
+    Gimbal,
     Parameters,
     Temporarily,
     Transaction,

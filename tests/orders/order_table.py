@@ -163,6 +163,13 @@ ROWS = (
     Row("set_speed", lambda v: v.set_speed(2.0), int(MavCmd.DO_CHANGE_SPEED), steers=False),
     Row("set_home", lambda v: v.set_home(), int(MavCmd.DO_SET_HOME), steers=False),
     Row("look_at", lambda v: v.look_at(north(v, 50.0)), int(MavCmd.DO_SET_ROI_LOCATION), steers=False),
+    Row(
+        "gimbal.point",
+        lambda v: v.gimbal.point(-45.0, 90.0),
+        int(MavCmd.DO_GIMBAL_MANAGER_PITCHYAW),
+        steers=False,
+    ),
+    Row("gimbal.release", lambda v: v.gimbal.release(), int(MavCmd.DO_MOUNT_CONTROL), steers=False),
     Row("command", _gimbal_up, int(MavCmd.DO_SET_SERVO), steers=False, on=("ardupilot",)),
     Row("parameters.set", _set(("WP_YAW_BEHAVIOR", "NAV_ACC_RAD")), 0, steers=False),
     Row("mission.upload", upload, 0, steers=False),

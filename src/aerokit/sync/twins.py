@@ -62,6 +62,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.files.files import FileEntry, Files as AsyncFiles
     from aerokit.vehicle.files.log_entry import LogEntry
     from aerokit.vehicle.files.logs import LogMethod, Logs as AsyncLogs
+    from aerokit.vehicle.orders.gimbal import Gimbal as AsyncGimbal
     from aerokit.vehicle.orders.guided import Guided as AsyncGuided
     from aerokit.vehicle.orders.setpoints import (
         AttitudeSetpoint,
@@ -94,6 +95,7 @@ if TYPE_CHECKING:
         ServoOutputs,
         Vibration,
     )
+    from aerokit.vehicle.state.gimbal import GimbalAttitude
     from aerokit.vehicle.state.movement import Attitude, Home, LocalPosition, Velocity, Wind
 
 __all__ = [
@@ -101,6 +103,7 @@ __all__ = [
     "Connection",
     "FenceControl",
     "Files",
+    "Gimbal",
     "Guided",
     "Logs",
     "MissionControl",
@@ -483,6 +486,49 @@ class Guided(TwinOf["AsyncGuided"]):
             valid_for_s=valid_for_s,
             max_lag_s=max_lag_s,
         ))
+
+
+class Gimbal(TwinOf["AsyncGimbal"]):
+    """The gimbal that the autopilot manages, or its mount; of several the first.
+
+    Places are looked at by :meth:`aerokit.Vehicle.look_at`.
+    """
+
+    @cached_property
+    def attitude(self) -> StateCell[GimbalAttitude]:
+        """Where it points, as it tells by itself: nothing is asked for (GIMBAL_DEVICE_ATTITUDE_STATUS of any component
+        of the vehicle, MOUNT_ORIENTATION, MOUNT_STATUS).
+        """
+        return StateCell(self._loop, self.aio.attitude)
+
+    def point(self, pitch_deg: float, yaw_deg: float, *, roll_deg: float=0.0) -> None:
+        """Turn it and keep it there, however the vehicle moves; returns when that was accepted, not when it is there.
+
+        Args:
+            pitch_deg: from the horizon, −360 to 360: 0 is level, −90 straight down.
+            yaw_deg: clockwise from north, −360 to 360.
+            roll_deg: from the horizon, −360 to 360. If it is not 0, only the mount's command can do it, which turns the
+                camera with the vehicle: ``yaw_deg`` is right at the moment of the order.
+
+        Sends MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW (https://mavlink.io/en/services/gimbal_v2.html); control is claimed
+        when that is denied, until :meth:`release`. MAV_CMD_DO_MOUNT_CONTROL to a vehicle without a gimbal manager, and
+        MOUNT_CONTROL, which has no answer, to one that does not know that either.
+
+        Raises:
+            LocalProtocolError: an angle is out of range. Nothing was sent.
+            CommandRejected: the vehicle refused.
+            CommandTimeout: there was no answer.
+        """
+        self._loop.run(self.aio.point, pitch_deg, yaw_deg, roll_deg=roll_deg)
+
+    def release(self) -> None:
+        """Give it back to the pilot's sticks, and the control that was claimed to whoever wants it.
+
+        Raises:
+            CommandRejected: the vehicle refused.
+            CommandTimeout: there was no answer.
+        """
+        self._loop.run(self.aio.release)
 
 
 class Files(TwinOf["AsyncFiles"]):
@@ -1965,6 +2011,28 @@ class Vehicle(VehicleTwin):
         """
         self._loop.run(self.aio.reboot, force=force, timeout=timeout)
 
+    def look_at(self, target: Position) -> None:
+        """Make nose or gimbal point at a place, until :meth:`stop_looking`; without an altitude, at its own.
+
+        Sends MAV_CMD_DO_SET_ROI_LOCATION (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_ROI_LOCATION), and
+        MAV_CMD_DO_SET_ROI to old firmware, which knows no other.
+
+        Raises:
+            ValueUnknownError: home is not known and is needed here.
+            CommandRejected: the vehicle refused.
+            CommandTimeout: there was no answer.
+        """
+        self._loop.run(self.aio.look_at, target)
+
+    def stop_looking(self) -> None:
+        """End :meth:`look_at` (MAV_CMD_DO_SET_ROI_NONE; MAV_CMD_DO_SET_ROI to old firmware).
+
+        Raises:
+            CommandRejected: the vehicle refused.
+            CommandTimeout: there was no answer.
+        """
+        self._loop.run(self.aio.stop_looking)
+
     def go_to(
         self,
         target: Position,
@@ -2063,14 +2131,6 @@ class Vehicle(VehicleTwin):
             max_silence_s=max_silence_s,
         )
 
-    def look_at(self, target: Position) -> None:
-        """Make nose or gimbal point at a place (MAV_CMD_DO_SET_ROI_LOCATION), until :meth:`stop_looking`."""
-        self._loop.run(self.aio.look_at, target)
-
-    def stop_looking(self) -> None:
-        """End :meth:`look_at` (MAV_CMD_DO_SET_ROI_NONE)."""
-        self._loop.run(self.aio.stop_looking)
-
     def set_home(self, place: Position | None=None, *, timeout: float=5.0) -> None:
         """Have the vehicle return to another place, or to where it is now, and wait until HOME_POSITION tells it.
 
@@ -2078,7 +2138,8 @@ class Vehicle(VehicleTwin):
             place: latitude, longitude and an altitude above mean sea level; None: where it is now.
             timeout: seconds until HOME_POSITION tells it.
 
-        Sends MAV_CMD_DO_SET_HOME (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_HOME).
+        Sends MAV_CMD_DO_SET_HOME (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_HOME), as COMMAND_LONG to
+        old firmware, which does not know it as COMMAND_INT: to within a metre then.
 
         Raises:
             LocalProtocolError: the place has no altitude above mean sea level. Nothing was sent.
@@ -2164,6 +2225,11 @@ class Vehicle(VehicleTwin):
     def guided(self) -> Guided:
         """Set-point streams: velocity, position, acceleration, attitude."""
         return Guided(self._loop, self.aio.guided)
+
+    @cached_property
+    def gimbal(self) -> Gimbal:
+        """The gimbal: where it points, and orders to it."""
+        return Gimbal(self._loop, self.aio.gimbal)
 
     @cached_property
     def files(self) -> Files:
