@@ -64,6 +64,22 @@ def _release_gimbal(stage: Stage) -> Any:
     return stage.vehicle.gimbal.release()
 
 
+async def _post(stage: Stage, subjects: list[Any], command: int = 400, **options: Any) -> None:
+    with stage.vehicle.posted(*subjects, **options) as order:
+        await order.command(command, 1)
+        await order.until_told(2)
+
+
+async def _post_int(stage: Stage, frame: int = 0) -> None:
+    with stage.vehicle.posted("motion") as order:
+        await order.command_int(Cmd.DO_SET_HOME, 0, frame=frame, x=1, y=1, z=1)
+
+
+def _deny_arming(stage: Stage) -> None:
+    own = stage.vehicle.connection.source_component
+    stage.simulated.send(messages.CommandAck(400, 2, 0, 0, 255, own))
+
+
 def _does_not_move(stage: Stage) -> None:
     stage.simulated.faults.motor_failed = True
 
@@ -154,6 +170,19 @@ def _actions() -> Table:
         ),
         ("Vehicle.stop_looking", "CommandTimeout"): P(
             _method("stop_looking"), grounded, ignored(Cmd.DO_SET_ROI_NONE)
+        ),
+        ("Vehicle.posted", "LocalProtocolError"): P(lambda s: _post(s, [])),
+        ("PostedOrder.command", "LocalProtocolError"): P(lambda s: _post(s, ["arm"], -1)),
+        ("PostedOrder.command", "CommandRejected"): P(lambda s: _post(s, ["arm"]), grounded, refused(arm)),
+        ("PostedOrder.command", "CommandTimeout"): P(lambda s: _post(s, ["arm"]), grounded, ignored(arm)),
+        ("PostedOrder.command_int", "LocalProtocolError"): P(lambda s: _post_int(s, 999)),
+        ("PostedOrder.command_int", "CommandRejected"): P(_post_int, before=refused(Cmd.DO_SET_HOME)),
+        ("PostedOrder.command_int", "CommandTimeout"): P(_post_int, grounded, ignored(Cmd.DO_SET_HOME)),
+        ("PostedOrder.until_told", "OperationTimeout"): P(
+            lambda s: _post(s, ["arm"], armed=True), grounded, accepted(arm)
+        ),
+        ("PostedOrder.until_told", "CommandRejected"): later(
+            lambda s: _post(s, ["arm"], armed=True), _deny_arming, 0.5, grounded, before=accepted(arm)
         ),
         ("Gimbal.point", "LocalProtocolError"): P(_point(999)),
         ("Gimbal.point", "CommandRejected"): P(_point(0), before=refused(Cmd.DO_GIMBAL_MANAGER_PITCHYAW)),

@@ -15,6 +15,7 @@ from aerokit.vehicle.files.files import Files
 from aerokit.vehicle.files.logs import Logs
 from aerokit.vehicle.orders.gimbal import Gimbal
 from aerokit.vehicle.orders.guided import Guided, SetpointStream
+from aerokit.vehicle.orders.posting import PostedOrder
 from aerokit.vehicle.parameters.parameters import Parameters
 from aerokit.vehicle.parameters.transaction import Temporarily, Transaction
 from aerokit.vehicle.plans.fence import FenceControl
@@ -28,6 +29,7 @@ CLASSES: tuple[type, ...] = (
     Guided,
     SetpointStream,
     Gimbal,
+    PostedOrder,
     Parameters,
     Temporarily,
     Transaction,

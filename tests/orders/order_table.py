@@ -54,6 +54,13 @@ def _gimbal_up(vehicle: aerokit.Vehicle) -> Awaitable[object]:
     return vehicle.command(MavCmd.DO_SET_SERVO, 9, 1500)
 
 
+async def _post_place(vehicle: aerokit.Vehicle) -> None:
+    place = north(vehicle, 12.0)
+    x, y = round(place.latitude_deg * 1e7), round(place.longitude_deg * 1e7)
+    with vehicle.posted("motion", modes=(vehicle.autopilot.find_mode("GUIDED"),)) as order:
+        await order.command_int(MavCmd.DO_REPOSITION, -1, 1, frame=6, x=x, y=y, z=10)
+
+
 def _set(name: tuple[str, str]) -> Give:
     async def give(vehicle: aerokit.Vehicle) -> Any:
         which = name[vehicle.autopilot.name == "PX4"]
@@ -170,6 +177,7 @@ ROWS = (
         steers=False,
     ),
     Row("gimbal.release", lambda v: v.gimbal.release(), int(MavCmd.DO_MOUNT_CONTROL), steers=False),
+    Row("posted", _post_place, REPOSITION, modes=(("GUIDED",), ("LOITER",)), on=("ardupilot",)),
     Row("command", _gimbal_up, int(MavCmd.DO_SET_SERVO), steers=False, on=("ardupilot",)),
     Row("parameters.set", _set(("WP_YAW_BEHAVIOR", "NAV_ACC_RAD")), 0, steers=False),
     Row("mission.upload", upload, 0, steers=False),

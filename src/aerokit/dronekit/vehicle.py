@@ -238,7 +238,7 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, Readiness, VehiclePriv
         """On the loop, in the turn in which the vehicle was found; the loop gets weak references only."""
         self._dk_aio, self._dk_tasks = aio, tasks
         self._handler.target_system = aio.system_id
-        self._handler.vehicle = self
+        self._handler.vehicle, self._handler.note_sent = self, aio.note_sent
         self._handler.orders.describe = self._dk_describe
         for message_type, stream in self._dk_streams.items():
             stream.begin(aio.component_id)
