@@ -57,7 +57,9 @@ def blocking_names() -> Iterator[str]:
             function = inspect.getattr_static(cls, name)
             if not name.startswith("_") and isinstance(function, FunctionType):
                 code = inspect.unwrap(function).__code__
-                if {"_loop", "_block", "_twin_block"} & set(code.co_names) and f"{cls.__name__}.{name}" not in CLOSING:
+                if {"_loop", "_block", "_twin_block"} & set(
+                    code.co_names
+                ) and f"{cls.__name__}.{name}" not in CLOSING:
                     yield f"{cls.__name__}.{name}"
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit.arguments import checks_arguments
 from aerokit.errors import CommandRejected
+from aerokit.mavlink.enums import GimbalManagerFlags, MavCmd, MavMountMode, MavResult
 from aerokit.mavlink.messages import (
     GimbalDeviceAttitudeStatus,
     MountConfigure,
@@ -16,7 +17,6 @@ from aerokit.mavlink.messages import (
 )
 from aerokit.runtime.cells import Source, StateCell
 from aerokit.vehicle.checks import check_range
-from aerokit.vehicle.orders.orders import RESULT_UNSUPPORTED
 from aerokit.vehicle.state.gimbal import GimbalAttitude, from_device, from_orientation, from_status
 
 if TYPE_CHECKING:
@@ -27,12 +27,10 @@ if TYPE_CHECKING:
 
 __all__ = ["Gimbal"]
 
-PITCHYAW, CONFIGURE, MOUNT_CONTROL = 1000, 1001, 205
-LOCKED = 4 | 8 | 16
-"""GIMBAL_MANAGER_FLAGS: roll and pitch from the horizon, yaw from north."""
-MAVLINK_TARGETING, RC_TARGETING = 2, 3
+PITCHYAW, CONFIGURE = MavCmd.DO_GIMBAL_MANAGER_PITCHYAW, MavCmd.DO_GIMBAL_MANAGER_CONFIGURE
+LOCKED = GimbalManagerFlags.ROLL_LOCK | GimbalManagerFlags.PITCH_LOCK | GimbalManagerFlags.YAW_LOCK
+"""Roll and pitch from the horizon, yaw from north."""
 RELEASE = -3
-RESULT_DENIED = 2
 
 
 @checks_arguments
@@ -89,7 +87,7 @@ class Gimbal:
         try:
             await self._orders.command_aside(PITCHYAW, *params)
         except CommandRejected as error:
-            if error.result == RESULT_UNSUPPORTED:
+            if error.result == MavResult.UNSUPPORTED:
                 await self._control_mount(pitch_deg, roll_deg, yaw_deg)
             elif self._claim_if_denied():
                 await self._orders.command_aside(PITCHYAW, *params)
@@ -103,7 +101,7 @@ class Gimbal:
             CommandRejected: the vehicle refused.
             CommandTimeout: there was no answer.
         """
-        await self._command_mount(0, 0, 0, 0, 0, 0, RC_TARGETING)
+        await self._command_mount(0, 0, 0, 0, 0, 0, MavMountMode.RC_TARGETING)
         if self._has_claimed:
             self._has_claimed = False
             await self._orders.command_aside(CONFIGURE, RELEASE, RELEASE)
@@ -111,7 +109,7 @@ class Gimbal:
     def _claim_if_denied(self) -> bool:
         """Say that we are in control, if the last answer denied us something, whoever waited for it."""
         commands, connection = self._talk.commands, self._talk.connection
-        if commands.last_result(PITCHYAW) != RESULT_DENIED:
+        if commands.last_result(PITCHYAW) != MavResult.DENIED:
             return False
         commands.forget_result(PITCHYAW)
         commands.send_unconfirmed(CONFIGURE, connection.source_system, connection.source_component)
@@ -120,17 +118,17 @@ class Gimbal:
 
     async def _control_mount(self, pitch: float, roll: float, yaw: float) -> None:
         relative = math.remainder(yaw - (self._heading() or 0.0), 360.0)
-        if not await self._command_mount(pitch, roll, relative, 0, 0, 0, MAVLINK_TARGETING):
-            angles = (round(each * 100) for each in (pitch, roll, yaw))
-            self._talk.send(MountControl(self._talk.system_id, self._talk.component_id, *angles, 0))
+        if not await self._command_mount(pitch, roll, relative, 0, 0, 0, MavMountMode.MAVLINK_TARGETING):
+            a, b, c = (round(each * 100) for each in (pitch, roll, yaw))
+            self._talk.send(MountControl(self._talk.system_id, self._talk.component_id, a, b, c, 0))
 
     async def _command_mount(self, *params: float) -> bool:
         """DO_MOUNT_CONTROL; False for firmware that is older, and was told the mode by a message without an answer."""
-        if not self._talk.commands.is_unknown(MOUNT_CONTROL):
+        if not self._talk.commands.is_unknown(MavCmd.DO_MOUNT_CONTROL):
             try:
-                await self._orders.command_aside(MOUNT_CONTROL, *params)
+                await self._orders.command_aside(MavCmd.DO_MOUNT_CONTROL, *params)
             except CommandRejected as error:
-                if error.result != RESULT_UNSUPPORTED:
+                if error.result != MavResult.UNSUPPORTED:
                     raise
             else:
                 return True

@@ -87,7 +87,8 @@ class Helm:
 
     def note_reboot(self) -> None:
         """The vehicle has rebooted: all orders end."""
-        for order in (*self._orders, *self._posted):
+        orders: tuple[Order | Posted, ...] = (*self._orders, *self._posted)
+        for order in orders:
             order.note_reboot()
 
     @contextmanager

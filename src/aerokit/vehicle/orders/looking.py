@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit.arguments import checks_arguments
 from aerokit.errors import CommandRejected, CommandTimeout
-from aerokit.vehicle.orders.orders import RESULT_UNSUPPORTED
+from aerokit.mavlink.enums import MavCmd, MavFrame, MavProtocolCapability, MavResult
 from aerokit.vehicle.orders.part import Part
 
 if TYPE_CHECKING:
@@ -14,9 +14,7 @@ if TYPE_CHECKING:
 
 __all__ = ["LookActions"]
 
-DO_SET_ROI_LOCATION, DO_SET_ROI_NONE, DO_SET_ROI = 195, 197, 201
-GLOBAL_INT, GLOBAL_RELATIVE_ALT_INT = 5, 6
-MAV_PROTOCOL_CAPABILITY_COMMAND_INT = 8
+LOCATION = MavCmd.DO_SET_ROI_LOCATION
 
 
 @checks_arguments
@@ -35,26 +33,26 @@ class LookActions(Part):
             CommandTimeout: there was no answer.
         """
         latitude, longitude, altitude, is_relative = self._where.global_target(target)
-        if not self._talk.commands.is_unknown(DO_SET_ROI_LOCATION):
-            frame = GLOBAL_RELATIVE_ALT_INT if is_relative else GLOBAL_INT
+        if not self._talk.commands.is_unknown(LOCATION):
+            frame = MavFrame.GLOBAL_RELATIVE_ALT_INT if is_relative else MavFrame.GLOBAL_INT
             if await self._set_roi_location({"frame": frame, "x": latitude, "y": longitude, "z": altitude}):
                 return
         above_home = altitude if is_relative else altitude - self._where.home_altitude()
         place = (latitude * 1e-7, longitude * 1e-7, above_home)
-        await self._orders.command_aside(DO_SET_ROI, 0, 0, 0, 0, *place)
+        await self._orders.command_aside(MavCmd.DO_SET_ROI, 0, 0, 0, 0, *place)
 
     async def _set_roi_location(self, place: dict[str, Any]) -> bool:
         """False for firmware that does not know it, or no COMMAND_INT at all: that says nothing."""
         try:
             with self._helm.aside() as order:
-                await self._orders.give(order, self._talk.commands.send_int, DO_SET_ROI_LOCATION, **place)
+                await self._orders.give(order, self._talk.commands.send_int, LOCATION, **place)
         except CommandTimeout:
-            knows_int = (self.telemetry.capabilities.latest or 0) & MAV_PROTOCOL_CAPABILITY_COMMAND_INT
+            knows_int = (self.telemetry.capabilities.latest or 0) & MavProtocolCapability.COMMAND_INT
             if knows_int or not self._helm.is_known:
                 raise
             return False
         except CommandRejected:
-            if not self._talk.commands.is_unknown(DO_SET_ROI_LOCATION):
+            if not self._talk.commands.is_unknown(LOCATION):
                 raise
             return False
         return True
@@ -67,8 +65,8 @@ class LookActions(Part):
             CommandTimeout: there was no answer.
         """
         try:
-            await self._orders.command_aside(DO_SET_ROI_NONE)
+            await self._orders.command_aside(MavCmd.DO_SET_ROI_NONE)
         except CommandRejected as error:
-            if error.result != RESULT_UNSUPPORTED:
+            if error.result != MavResult.UNSUPPORTED:
                 raise
-            await self._orders.command_aside(DO_SET_ROI)
+            await self._orders.command_aside(MavCmd.DO_SET_ROI)

@@ -10,7 +10,6 @@ import anyio
 from aerokit.arguments import checks_arguments
 from aerokit.errors import CommandRejected, CommandTimeout, OperationTimeout
 from aerokit.protocols.command import rejection
-from aerokit.vehicle.checks import check_seconds
 from aerokit.vehicle.orders.progress import Arrivals
 
 if TYPE_CHECKING:
@@ -89,7 +88,6 @@ class PostedOrder:
             CommandRejected: the vehicle took its acceptance back, as PX4 does.
             OperationTimeout: it was not told within ``timeout`` seconds.
         """
-        check_seconds("timeout", timeout)
         telemetry = self._talk.telemetry
         with (
             Arrivals(self._talk, telemetry.mode, telemetry.armed, every_arrival=True) as news,

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from aerokit.arguments import checks_arguments
 from aerokit.errors import CommandRejected, LocalProtocolError
+from aerokit.mavlink.enums import MavFrame
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import CommandAck, CommandInt, CommandLong, SetMode
 from aerokit.runtime.cells import Source, StateCell
@@ -20,7 +21,6 @@ from aerokit.vehicle.orders.order import (
 )
 from aerokit.vehicle.orders.part import Part
 from aerokit.vehicle.orders.posting import PostedOrder
-from aerokit.vehicle.talk.commands import MAV_FRAME_GLOBAL
 from aerokit.vehicle.talk.rates import check_rate, subscription_rate_hz
 
 if TYPE_CHECKING:
@@ -112,7 +112,7 @@ class TalkActions(Part):
         ``or_long``, firmware that does not know it so is sent a COMMAND_LONG with degrees, in frame 0 only. The
         rest is as for :meth:`command`.
         """
-        if or_long and frame != MAV_FRAME_GLOBAL:
+        if or_long and frame != MavFrame.GLOBAL:
             raise LocalProtocolError(f"frame = {frame} is not allowed with or_long: MAV_FRAME_GLOBAL (0)")
         kind = {} if or_long else {"frame": frame}
         return await self._answered(

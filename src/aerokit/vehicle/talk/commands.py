@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from aerokit.protocols.command import Standing
     from aerokit.runtime.connection import Connection
 
-__all__ = ["MAV_FRAME_GLOBAL", "CommandSender"]
+__all__ = ["CommandSender"]
 
 UNKNOWN = (MavResult.UNSUPPORTED, MavResult.COMMAND_LONG_ONLY)
 """What firmware says that does not know a command, or not in the form that it had."""
