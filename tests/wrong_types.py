@@ -66,7 +66,8 @@ WRONG: dict[str, tuple[object, ...]] = {
     "Callable[[T], object]": (*NOTHING, *TEXT, *NUMBER, [print]),
     "Callable[[T | None, T], None]": (*NOTHING, *TEXT, *NUMBER, [print]),
     "Signing | None": (*STRANGE, *TEXT, *NUMBER, bytes(32)),
-    "Standing | None": (*STRANGE, *TEXT, *NUMBER),
+    "bool | None": (*STRANGE, "no", 2),
+    "tuple[Mode, ...]": (*NOTHING, _Anything(), [PLACE], (47.0, 8.0), 1j, *TEXT, *NUMBER),
     "Peers | None": (*STRANGE, 1.5, b"10.0.0.7"),
     "Dialect": (*NOTHING, *STRANGE, *TEXT, *NUMBER),
     "LogEntry | int": (*NOTHING, *STRANGE, *TEXT, 1.5),
@@ -83,7 +84,7 @@ WRONG["type[ItemT]"] = WRONG["type[MessageT]"] = WRONG["type[Message]"]
 for _setpoint in ("Velocity", "BodyVelocity", "Acceleration", "LocalPosition", "Position", "Attitude"):
     WRONG[f"{_setpoint}Setpoint"] = (*NOTHING, *STRANGE, *TEXT, *NUMBER, PLACE)
 WRONG["CacheChoice"] = (*NOTHING, *STRANGE, *NUMBER)
-for _literal in ("DownloadMethod", "UploadMethod", "PlanMethod", "LogMethod", "Overflow"):
+for _literal in ("DownloadMethod", "UploadMethod", "PlanMethod", "LogMethod", "Overflow", "Subject"):
     WRONG[_literal] = (*STRANGE, *NUMBER, "quick")
 
 RIGHT: dict[str, object] = {

@@ -39,10 +39,6 @@ _SIMPLE: dict[str, Rule] = {
     "Callable": (callable, "a function"),
     "OnProgress": (callable, "a function"),
     "Peers": (lambda _: True, "addresses and networks"),  # links know better, and say so
-    "Standing": (
-        lambda value: hasattr(value, "end") and hasattr(value, "told_at"),
-        "what says whether it stands",
-    ),
     "PathLike": (lambda value: isinstance(value, os.PathLike), "a path"),
 }
 

@@ -21,6 +21,7 @@ from aerokit import (
     VelocitySetpoint,
     messages,
 )
+from aerokit.mavlink.enums import MavCmd
 from aerokit.sync import twins
 
 __all__ = ["blocking_calls", "blocking_names"]
@@ -30,6 +31,8 @@ Do = Callable[[Any], object]
 CLASSES: tuple[type, ...] = (
     twins.Vehicle,
     twins.Guided,
+    twins.Gimbal,
+    twins.PostedOrder,
     twins.SetpointStream,
     twins.Parameters,
     twins.Transaction,
@@ -54,7 +57,9 @@ def blocking_names() -> Iterator[str]:
             function = inspect.getattr_static(cls, name)
             if not name.startswith("_") and isinstance(function, FunctionType):
                 code = inspect.unwrap(function).__code__
-                if {"_loop", "_block"} & set(code.co_names) and f"{cls.__name__}.{name}" not in CLOSING:
+                if {"_loop", "_block", "_twin_block"} & set(
+                    code.co_names
+                ) and f"{cls.__name__}.{name}" not in CLOSING:
                     yield f"{cls.__name__}.{name}"
 
 
@@ -141,6 +146,19 @@ def _directory(stage: Any) -> None:
     stage.vehicle.files.remove_directory(path)
 
 
+def _post(stage: Any) -> None:
+    with stage.vehicle.posted("arm", armed=True) as order:
+        order.command(MavCmd.COMPONENT_ARM_DISARM, 1)
+        order.until_told(2)
+
+
+def _post_place(stage: Any) -> None:
+    place = stage.target()
+    x, y = round(place.latitude_deg * 1e7), round(place.longitude_deg * 1e7)
+    with stage.vehicle.posted("motion") as order:
+        order.command_int(MavCmd.DO_REPOSITION, -1, 1, frame=6, x=x, y=y, z=10)
+
+
 def _rate(stage: Any) -> None:
     with stage.vehicle.rate(messages.RawImu, 5.0):
         pass
@@ -164,6 +182,11 @@ WRITTEN: dict[str, Do] = {
     "Vehicle.texts_since": lambda s: s.vehicle.texts_since(0.0),
     "Vehicle.missing_for_flight": lambda s: s.vehicle.missing_for_flight(),
     "Vehicle.send": lambda s: s.vehicle.send(messages.Ping(0, 0, 0, 0)),
+    "Vehicle.note_sent": lambda s: s.vehicle.note_sent(messages.Ping(0, 0, 0, 0)),
+    "Vehicle.posted": _post,
+    "PostedOrder.command": _post,
+    "PostedOrder.command_int": _post_place,
+    "PostedOrder.until_told": _post,
     "Guided.velocity": _stream("velocity", lambda _: VelocitySetpoint(north_m_s=1.0)),
     "Guided.body_velocity": _stream("body_velocity", lambda _: BodyVelocitySetpoint(forward_m_s=1.0)),
     "Guided.acceleration": _stream("acceleration", lambda _: AccelerationSetpoint(north_m_s2=0.2)),

@@ -109,6 +109,20 @@ async def _fly(stage: Stage) -> None:
         await stream.fly(VelocitySetpoint(north_m_s=1.0), 1.0)
 
 
+async def _post_arm(stage: Stage) -> None:
+    with stage.vehicle.posted("arm", armed=True) as order:
+        await order.command(MavCmd.COMPONENT_ARM_DISARM, 1)
+        await order.until_told(5)
+
+
+async def _post_place(stage: Stage) -> None:
+    place = stage.target()
+    x, y = round(place.latitude_deg * 1e7), round(place.longitude_deg * 1e7)
+    with stage.vehicle.posted("motion") as order:
+        z = stage.vehicle.home.value.altitude_amsl_m + 10
+        await order.command_int(MavCmd.DO_REPOSITION, -1, 1, 0, float("nan"), frame=5, x=x, y=y, z=z)
+
+
 async def _temporarily(stage: Stage) -> None:
     async with stage.vehicle.parameters.temporarily({stage.parameter: stage.other_value()}):
         await anyio.sleep(0.5)
@@ -164,6 +178,10 @@ async def _sign(stage: Stage) -> None:
     await stage.vehicle.setup_signing(Signing(KEY))
 
 
+def _with_gimbal(stage: Stage) -> None:
+    stage.simulated.parameters["MNT1_TYPE"] = 1.0
+
+
 def _fail_checks(stage: Stage) -> None:
     stage.simulated.faults.prearm_failures.append("Compass not healthy")
 
@@ -208,6 +226,13 @@ CALLS: dict[str, Call] = {
     "Guided.position": _stream("position", lambda s: PositionSetpoint(s.target())),
     "Guided.attitude": _stream("attitude", lambda _: AttitudeSetpoint(0, 2, 0, thrust=0.5)),
     "SetpointStream.fly": Call(_fly, airborne),
+    # ------------------------------------------------------------------------------------- Gimbal
+    "Gimbal.point": Call(lambda s: s.vehicle.gimbal.point(-45, 90), on=COPTER, before=_with_gimbal),
+    "Gimbal.release": Call(lambda s: s.vehicle.gimbal.release(), on=COPTER, before=_with_gimbal),
+    # -------------------------------------------------------------------------------- PostedOrder
+    "PostedOrder.command": Call(_post_arm, grounded),
+    "PostedOrder.command_int": Call(_post_place, airborne),
+    "PostedOrder.until_told": Call(_post_arm, grounded),
     # --------------------------------------------------------------------------------- Parameters
     "Parameters.download": Call(lambda s: s.vehicle.parameters.download(refresh=True)),
     "Parameters.diff": Call(lambda s: s.vehicle.parameters.diff({s.parameter: 1.0})),

@@ -57,6 +57,34 @@ def _go(stage: Stage, **options: Any) -> Any:
     return stage.vehicle.go_to(stage.target(), **options)
 
 
+def _look_north(stage: Stage) -> Any:
+    return stage.vehicle.look_at(stage.target().replace(altitude_amsl_m=None, altitude_relative_m=5.0))
+
+
+def _point(pitch_deg: float) -> Do:
+    return lambda stage: stage.vehicle.gimbal.point(pitch_deg, 0)
+
+
+def _release_gimbal(stage: Stage) -> Any:
+    return stage.vehicle.gimbal.release()
+
+
+async def _post(stage: Stage, subjects: list[Any], command: int = 400, **options: Any) -> None:
+    with stage.vehicle.posted(*subjects, **options) as order:
+        await order.command(command, 1)
+        await order.until_told(2)
+
+
+async def _post_int(stage: Stage, frame: int = 0) -> None:
+    with stage.vehicle.posted("motion") as order:
+        await order.command_int(Cmd.DO_SET_HOME, 0, frame=frame, x=1, y=1, z=1)
+
+
+def _deny_arming(stage: Stage) -> None:
+    own = stage.vehicle.connection.source_component
+    stage.simulated.send(messages.CommandAck(400, 2, 0, 0, 255, own))
+
+
 def _does_not_move(stage: Stage) -> None:
     stage.simulated.faults.motor_failed = True
 
@@ -140,6 +168,33 @@ def _actions() -> Table:
             _method("set_home", timeout=1),
             before=lambda s: [accepted(each)(s) for each in (Cmd.DO_SET_HOME, Cmd.REQUEST_MESSAGE)],
         ),
+        ("Vehicle.look_at", "ValueUnknownError"): P(_look_north, airborne, _forget("home"), on="px4"),
+        ("Vehicle.look_at", "CommandRejected"): P(_look_north, before=refused(Cmd.DO_SET_ROI_LOCATION)),
+        ("Vehicle.look_at", "CommandTimeout"): P(_look_north, grounded, ignored(Cmd.DO_SET_ROI_LOCATION)),
+        ("Vehicle.stop_looking", "CommandRejected"): P(
+            _method("stop_looking"), before=refused(Cmd.DO_SET_ROI_NONE)
+        ),
+        ("Vehicle.stop_looking", "CommandTimeout"): P(
+            _method("stop_looking"), grounded, ignored(Cmd.DO_SET_ROI_NONE)
+        ),
+        ("Vehicle.posted", "LocalProtocolError"): P(lambda s: _post(s, [])),
+        ("PostedOrder.command", "LocalProtocolError"): P(lambda s: _post(s, ["arm"], -1)),
+        ("PostedOrder.command", "CommandRejected"): P(lambda s: _post(s, ["arm"]), grounded, refused(arm)),
+        ("PostedOrder.command", "CommandTimeout"): P(lambda s: _post(s, ["arm"]), grounded, ignored(arm)),
+        ("PostedOrder.command_int", "LocalProtocolError"): P(lambda s: _post_int(s, 999)),
+        ("PostedOrder.command_int", "CommandRejected"): P(_post_int, before=refused(Cmd.DO_SET_HOME)),
+        ("PostedOrder.command_int", "CommandTimeout"): P(_post_int, grounded, ignored(Cmd.DO_SET_HOME)),
+        ("PostedOrder.until_told", "OperationTimeout"): P(
+            lambda s: _post(s, ["arm"], armed=True), grounded, accepted(arm)
+        ),
+        ("PostedOrder.until_told", "CommandRejected"): later(
+            lambda s: _post(s, ["arm"], armed=True), _deny_arming, 0.5, grounded, before=accepted(arm)
+        ),
+        ("Gimbal.point", "LocalProtocolError"): P(_point(999)),
+        ("Gimbal.point", "CommandRejected"): P(_point(0), before=refused(Cmd.DO_GIMBAL_MANAGER_PITCHYAW)),
+        ("Gimbal.point", "CommandTimeout"): P(_point(0), grounded, ignored(Cmd.DO_GIMBAL_MANAGER_PITCHYAW)),
+        ("Gimbal.release", "CommandRejected"): P(_release_gimbal, before=refused(Cmd.DO_MOUNT_CONTROL)),
+        ("Gimbal.release", "CommandTimeout"): P(_release_gimbal, grounded, ignored(Cmd.DO_MOUNT_CONTROL)),
         ("Vehicle.set_heading", "HeartbeatTimeout"): later(
             _method("set_heading", 179, relative=True, rate_deg_s=1), falls_silent, 3.0
         ),

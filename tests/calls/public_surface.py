@@ -13,7 +13,9 @@ from aerokit.runtime.connection import Connection
 from aerokit.runtime.subscription import Subscription
 from aerokit.vehicle.files.files import Files
 from aerokit.vehicle.files.logs import Logs
+from aerokit.vehicle.orders.gimbal import Gimbal
 from aerokit.vehicle.orders.guided import Guided, SetpointStream
+from aerokit.vehicle.orders.posting import PostedOrder
 from aerokit.vehicle.parameters.parameters import Parameters
 from aerokit.vehicle.parameters.transaction import Temporarily, Transaction
 from aerokit.vehicle.plans.fence import FenceControl
@@ -26,6 +28,8 @@ CLASSES: tuple[type, ...] = (
     aerokit.Vehicle,
     Guided,
     SetpointStream,
+    Gimbal,
+    PostedOrder,
     Parameters,
     Temporarily,
     Transaction,

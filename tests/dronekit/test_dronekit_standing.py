@@ -1,4 +1,7 @@
-"""Orders that get no answer are sent again, but not against a newer order, a pilot, or what they have brought about."""
+"""Orders that get no answer are sent again, but not against a newer order, a pilot, or what they have brought about.
+
+The rules by themselves are in tests/vehicle/test_posted.py.
+"""
 
 from __future__ import annotations
 
@@ -11,12 +14,9 @@ import pytest
 from flight_controller import FlightController, Received
 
 import aerokit.dronekit as dronekit
-from aerokit.dronekit.standing import Given
-from aerokit.mavlink import messages as m
 
-GUIDED, LOITER, RTL = 4, 5, 6
-ARM, SET_MODE, TAKEOFF, REPOSITION = 400, 176, 22, 192
-PX4_POSCTL, PX4_TAKEOFF, PX4_LOITER = 3 << 16, 4 << 16 | 2 << 24, 4 << 16 | 3 << 24
+LOITER = 5
+ARM, SET_MODE, REPOSITION = 400, 176, 192
 ARMED = 128
 LIMIT_S = 10.0
 
@@ -136,61 +136,28 @@ def test_what_is_not_waited_for_any_more_is_not_ordered_again(
     assert len(copter.commands()) == 1
 
 
-# ------------------------------------------------------------------------------------------ the rules
+def test_a_raw_set_point_is_newer_than_a_place_that_was_posted(
+    copter: FlightController, vehicle: dronekit.Vehicle, caplog: pytest.LogCaptureFixture
+) -> None:
+    lose_answers(copter, REPOSITION, does=False)
+    vehicle.simple_goto(dronekit.LocationGlobalRelative(-35.0, 149.0, 20.0))
+    copter.wait_for("COMMAND_INT", lambda frame: frame.command == REPOSITION)
+    vehicle.send_mavlink(
+        vehicle.message_factory.set_position_target_local_ned_encode(
+            0, 0, 0, 8, 0x0DC7, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0
+        )
+    )
+    copter.wait_for("SET_POSITION_TARGET_LOCAL_NED", lambda _: True)
+    copter.beat()
+    vehicle._handler.orders.wait(LIMIT_S)
+    assert [each.command for each in copter.commands()] == [REPOSITION]
+    assert "not sent again: a newer order was given meanwhile" in caplog.text
 
 
-def heartbeat(mode: int, armed: bool = False) -> Any:
-    return m.Heartbeat(2, 3, ARMED if armed else 0, mode, 3, 3)
-
-
-def told(standing: Any, *states: tuple[int, bool]) -> Any:
-    for mode, armed in states:
-        standing._take(mode, armed)
-    return standing
-
-
-def test_an_effect_is_a_change_to_it() -> None:
-    assert told(Given().order("mode", mode=GUIDED), (0, False), (GUIDED, False)).is_done
-    assert told(Given().order("mode", mode=GUIDED), (GUIDED, False), (GUIDED, False)).holds()
-    assert told(Given().order("arm", armed=True), (0, False), (0, True), (0, False)).is_done
-    assert told(Given().order("arm", armed=True), (0, False), (0, False)).holds()
-
-
-def test_a_mode_that_nobody_here_ordered_is_somebody_elses() -> None:
-    assert not told(Given().order("motion"), (GUIDED, False), (LOITER, False)).holds()
-    assert not told(Given().order("arm", armed=True), (GUIDED, False), (LOITER, False)).holds()
-    assert told(Given().order("arm", armed=False), (GUIDED, True), (LOITER, True)).holds()
-    given = Given()
-    mode, motion = given.order("mode", "motion", mode=GUIDED), given.order("motion")
-    assert told(motion, (0, False), (GUIDED, False)).holds()
-    assert told(mode, (0, False), (0, False)).holds()
-
-
-def test_a_newer_order_overrules_those_of_its_subject() -> None:
-    given = Given()
-    going, mode = given.order("motion"), given.order("mode", "motion")
-    assert (going.holds(), mode.holds()) == (False, True)
-    again = given.order("motion")
-    assert (mode.holds(), again.holds()) == (True, True)
-
-
-@pytest.mark.parametrize(
-    ("message", "overruled"),
-    [
-        (m.SetMode(1, 1, LOITER), {"mode", "motion"}),
-        (m.CommandLong(1, 0, SET_MODE, 0, 1, 5, 0, 0, 0, 0, 0), {"mode", "motion"}),
-        (m.CommandLong(1, 0, 21, 0, 0, 0, 0, 0, 0, 0, 0), {"mode", "motion"}),
-        *((m.CommandLong(1, 0, each, 0, 0, 0, 0, 0, 0, 0, 0), {"motion"}) for each in (17, 18, 19, 193)),
-        (m.CommandLong(1, 0, ARM, 0, 0, 0, 0, 0, 0, 0, 0), {"arm"}),
-        (m.CommandLong(1, 0, 178, 0, 0, 5, 0, 0, 0, 0, 0), set()),
-        (m.SetPositionTargetLocalNed(0, 1, 0, 8, 0x0DC7, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0), {"motion"}),
-        (m.MissionItemInt(1, 0, 0, 6, 16, 2, 0, 0, 0, 0, 0, 0, 0, 10), {"motion"}),
-        (m.MissionItemInt(1, 0, 0, 6, 16, 0, 1, 0, 0, 0, 0, 0, 0, 10), set()),
-        (heartbeat(0), set()),
-    ],
-)
-def test_what_the_program_sends_by_itself_counts(message: Any, overruled: set[str]) -> None:
-    given = Given()
-    orders = {subject: given.order(subject) for subject in ("mode", "motion", "arm")}
-    given.note(message)
-    assert {subject for subject, order in orders.items() if not order.holds()} == overruled
+def test_a_place_that_is_posted_ends_the_flight_of_the_new_api(
+    copter: FlightController, vehicle: dronekit.Vehicle
+) -> None:
+    order = vehicle.aio._helm.order()
+    vehicle.simple_goto(dronekit.LocationGlobalRelative(-35.0, 149.0, 20.0))
+    vehicle._handler.orders.wait(LIMIT_S)
+    assert order.end == "another order was given"

@@ -165,6 +165,8 @@ def _set_up(case: Case) -> Simulated:
     copter = SimulatedCopter(boot_time_s=0.0)
     copter.parameters["FS_GCS_ENABLE"] = 1.0 * case.station_failsafe
     copter.parameters["DISARM_DELAY"] = 0.0
+    if case.row.name.startswith("gimbal"):
+        copter.parameters["MNT1_TYPE"] = 1.0
     return copter
 
 

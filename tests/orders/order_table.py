@@ -54,6 +54,13 @@ def _gimbal_up(vehicle: aerokit.Vehicle) -> Awaitable[object]:
     return vehicle.command(MavCmd.DO_SET_SERVO, 9, 1500)
 
 
+async def _post_place(vehicle: aerokit.Vehicle) -> None:
+    place = north(vehicle, 12.0)
+    x, y = round(place.latitude_deg * 1e7), round(place.longitude_deg * 1e7)
+    with vehicle.posted("motion", modes=(vehicle.autopilot.find_mode("GUIDED"),)) as order:
+        await order.command_int(MavCmd.DO_REPOSITION, -1, 1, frame=6, x=x, y=y, z=10)
+
+
 def _set(name: tuple[str, str]) -> Give:
     async def give(vehicle: aerokit.Vehicle) -> Any:
         which = name[vehicle.autopilot.name == "PX4"]
@@ -163,6 +170,14 @@ ROWS = (
     Row("set_speed", lambda v: v.set_speed(2.0), int(MavCmd.DO_CHANGE_SPEED), steers=False),
     Row("set_home", lambda v: v.set_home(), int(MavCmd.DO_SET_HOME), steers=False),
     Row("look_at", lambda v: v.look_at(north(v, 50.0)), int(MavCmd.DO_SET_ROI_LOCATION), steers=False),
+    Row(
+        "gimbal.point",
+        lambda v: v.gimbal.point(-45.0, 90.0),
+        int(MavCmd.DO_GIMBAL_MANAGER_PITCHYAW),
+        steers=False,
+    ),
+    Row("gimbal.release", lambda v: v.gimbal.release(), int(MavCmd.DO_MOUNT_CONTROL), steers=False),
+    Row("posted", _post_place, REPOSITION, modes=(("GUIDED",), ("LOITER",)), on=("ardupilot",)),
     Row("command", _gimbal_up, int(MavCmd.DO_SET_SERVO), steers=False, on=("ardupilot",)),
     Row("parameters.set", _set(("WP_YAW_BEHAVIOR", "NAV_ACC_RAD")), 0, steers=False),
     Row("mission.upload", upload, 0, steers=False),

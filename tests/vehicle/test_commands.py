@@ -111,19 +111,6 @@ async def while_it_talks(flight: Flight, call: Awaitable[object]) -> None:
     await call
 
 
-class Overruled:
-    """An order of the program's own reckoning that has ended."""
-
-    end, told_at = "the program thinks so", math.inf
-
-
-async def test_a_program_may_say_itself_whether_a_command_is_sent_again(grounded: Flight) -> None:
-    grounded.copter.faults.ignore(SERVO)
-    with pytest.raises(CommandTimeout, match="not sent again: the program thinks so"):
-        await grounded.vehicle.command(SERVO, 9, 1500, standing=Overruled())
-    assert len(grounded.wire.commands(SERVO)) == 1
-
-
 async def test_no_answer_at_all_says_what_was_seen_meanwhile(grounded: Flight) -> None:
     grounded.copter.faults.ignore(BANNER)
     started = now()

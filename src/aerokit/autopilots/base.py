@@ -114,8 +114,6 @@ class Autopilot:
     """Whether MAV_CMD_RUN_PREARM_CHECKS (401) repeats the failing checks as status texts."""
     calibrates_compasses_by_command = False
     """Whether MAV_CMD_DO_START_MAG_CAL (42424) calibrates the compasses; else it is a pre-flight calibration."""
-    roi_altitude_is_amsl = False
-    """Whether MAV_CMD_DO_SET_ROI_LOCATION (195) takes every altitude for one above the sea, whatever the frame says."""
     condition_yaw = False
     """Whether MAV_CMD_CONDITION_YAW (115) turns the vehicle in its mode for set-points."""
     reposition_purpose: Purpose = "setpoint"

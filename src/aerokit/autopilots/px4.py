@@ -91,7 +91,6 @@ class Px4(Autopilot):
     keys_are_taken = "PX4 takes a key on its USB port only, and before 1.17 nowhere"
     modes = MODES
     modes_are_numbered = False
-    roi_altitude_is_amsl = True
     setpoints = SetpointRules(before_mode=True)
     reposition = Reposition(relative_altitude=False, yaw=True, speed=True)
     log_suffix = ".ulg"

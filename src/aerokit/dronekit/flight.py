@@ -17,7 +17,6 @@ from aerokit.dronekit.flight_orders import (
     flies_to_places_in,
     go_to,
     refuse,
-    set_home,
     take_off,
 )
 from aerokit.dronekit.modes import change_mode, mode_named
@@ -32,7 +31,8 @@ if TYPE_CHECKING:
 
 __all__ = ["FlightMethods"]
 
-NAV_TAKEOFF, DO_CHANGE_SPEED = 22, 178
+NAV_TAKEOFF, DO_CHANGE_SPEED, DO_SET_HOME = 22, 178, 179
+GLOBAL = 0
 AIRSPEED, GROUNDSPEED = 0, 1
 HOME_TIMEOUT_S = 10.0
 POLL_S = 0.1
@@ -67,8 +67,7 @@ class FlightMethods(VehicleAttributes):
     def _dk_set_mode(self, value: VehicleMode | str | int) -> tuple[str, concurrent.futures.Future[None]]:
         aio = self._dk_check_link()
         wanted = mode_named(aio, value.name if isinstance(value, VehicleMode) else value)
-        standing = self._handler.given.order("mode", "motion", mode=wanted.custom_mode)
-        return wanted.name, self._dk_order("mode", change_mode, aio, wanted, standing)
+        return wanted.name, self._dk_order("mode", change_mode, aio, wanted)
 
     def wait_for_mode(self, mode: VehicleMode | str | int, timeout: float | None = None) -> None:
         """Set the mode and wait until the vehicle is in it.
@@ -100,9 +99,7 @@ class FlightMethods(VehicleAttributes):
 
     def _dk_set_armed(self, value: bool) -> concurrent.futures.Future[None]:
         aio = self._dk_check_link()
-        overruled = () if value else ("motion",)
-        standing = self._handler.given.order("arm", *overruled, armed=value)
-        order = self._dk_order("arm" if value else "disarm", change_armed, aio, standing, value)
+        order = self._dk_order("arm" if value else "disarm", change_armed, aio, value)
         self._dk_arming = value, order
         return order
 
@@ -165,10 +162,8 @@ class FlightMethods(VehicleAttributes):
             )
             if plan is None or plan.command is None or mode is None:
                 raise APIException("this vehicle cannot take off by a command")
-            standing = self._handler.given.order("motion", mode=mode.custom_mode)
-            return self._dk_order("takeoff", take_off, aio, standing, plan.command, *plan.params)
-        standing = self._handler.given.order("motion")
-        return self._dk_order("takeoff", take_off, aio, standing, NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude)
+            return self._dk_order("takeoff", take_off, aio, (mode,), plan.command, *plan.params)
+        return self._dk_order("takeoff", take_off, aio, (), NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude)
 
     def wait_simple_takeoff(
         self, alt: float | None = None, epsilon: float = 0.1, timeout: float | None = None
@@ -208,11 +203,10 @@ class FlightMethods(VehicleAttributes):
         place = self._dk_place(location, is_relative=not flies_in)
         for name, speed in (("airspeed", airspeed), ("groundspeed", groundspeed)):
             check_speed(name, speed)
-        standing = self._handler.given.order("motion", mode=flies_in[0].custom_mode if flies_in else None)
         if flies_in and self._flightmode not in map(str, flies_in):
             self._dk_order("goto", refuse, f"not in {self._flightmode}: set the mode {flies_in[0]} first")
         else:
-            self._dk_order("goto", go_to, aio, standing, *place)
+            self._dk_order("goto", go_to, aio, *place)
         if airspeed is not None:
             self.airspeed = airspeed
         if groundspeed is not None:
@@ -279,7 +273,10 @@ class FlightMethods(VehicleAttributes):
             raise ValueError("Expecting home_location to be set to a LocationGlobal.")
         latitude, longitude, altitude = checked_place(pos)
         aio = self._dk_check_link()
-        order = self._dk_order("home", set_home, aio, latitude, longitude, altitude)
+        place = {"x": latitude, "y": longitude, "z": altitude}
+        order = self._dk_order(
+            "home", aio.command_int, DO_SET_HOME, 0, frame=GLOBAL, **place, component_id=0, or_long=True
+        )
         self._home_location = LocationGlobal(pos.lat, pos.lon, altitude)
         order.add_done_callback(self._dk_home_is_set)
 

@@ -6,14 +6,13 @@ import math
 from typing import TYPE_CHECKING
 
 from aerokit.dronekit.exceptions import APIException
-from aerokit.dronekit.standing import until_answered
 from aerokit.errors import CommandRejected, LocalProtocolError, OperationTimeout
 from aerokit.mavlink.messages import SetPositionTargetGlobalInt
 
 if TYPE_CHECKING:
     from aerokit.autopilots import Mode, Purpose
-    from aerokit.dronekit.standing import Standing
     from aerokit.dronekit.values import LocationGlobal, LocationGlobalRelative
+    from aerokit.vehicle.orders.order import Subject
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
 __all__ = [
@@ -23,51 +22,44 @@ __all__ = [
     "flies_to_places_in",
     "go_to",
     "refuse",
-    "set_home",
     "take_off",
 ]
 
-COMPONENT_ARM_DISARM, DO_SET_HOME, DO_REPOSITION = 400, 179, 192
-GLOBAL, GLOBAL_INT, GLOBAL_RELATIVE_ALT_INT = 0, 5, 6
+COMPONENT_ARM_DISARM, DO_REPOSITION = 400, 192
+GLOBAL_INT, GLOBAL_RELATIVE_ALT_INT = 5, 6
 POSITION_ONLY = 0x0DF8
 RESULT_UNSUPPORTED = 3
 CHANGE_MODE = 1
 ARMED_IS_TOLD_S = 10.0
 
 
-async def change_armed(vehicle: AsyncVehicle, standing: Standing, value: bool) -> None:
-    """Arm or disarm, and wait until HEARTBEAT says so."""
+async def change_armed(vehicle: AsyncVehicle, value: bool) -> None:
+    """Arm or disarm, and wait until HEARTBEAT says so. To disarm ends what was ordered about motion."""
+    subjects: tuple[Subject, ...] = ("arm",) if value else ("arm", "motion")
     try:
-        with standing.watching(vehicle):
-            sending = vehicle.command(COMPONENT_ARM_DISARM, float(value), component_id=0, standing=standing)
-            await until_answered(sending, standing)
-            await vehicle.telemetry.armed.wait_until(
-                lambda armed: armed is value or standing.is_done,
-                timeout=ARMED_IS_TOLD_S,
-                description="armed" if value else "disarmed",
-            )
+        with vehicle.posted(*subjects, armed=value) as order:
+            await order.command(COMPONENT_ARM_DISARM, float(value), component_id=0)
+            await order.until_told(ARMED_IS_TOLD_S)
     except OperationTimeout as error:
         error.args = (f"{error}; it may still be carried out, and nobody watches for that",)
         raise
 
 
-async def take_off(vehicle: AsyncVehicle, standing: Standing, command: int, *params: float) -> None:
-    """Send the command to take off."""
-    with standing.watching(vehicle):
-        await until_answered(vehicle.command(command, *params, component_id=0, standing=standing), standing)
+async def take_off(vehicle: AsyncVehicle, modes: tuple[Mode, ...], command: int, *params: float) -> None:
+    """Send the command to take off, which brings about these modes."""
+    with vehicle.posted("motion", modes=modes) as order:
+        await order.command(command, *params, component_id=0)
 
 
-async def go_to(
-    vehicle: AsyncVehicle, standing: Standing, latitude: int, longitude: int, altitude: float
-) -> None:
+async def go_to(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: float) -> None:
     """DO_REPOSITION, which is answered; and the message for a vehicle that does not know it.
 
     The altitude is above home, or above the sea where the autopilot repositions so (PX4).
     """
     is_amsl = vehicle.autopilot.repositions_amsl
     try:
-        with standing.watching(vehicle):
-            sending = vehicle.command_int(
+        with vehicle.posted("motion", modes=flies_to_places_in(vehicle)[:1]) as order:
+            await order.command_int(
                 DO_REPOSITION,
                 *(-1, CHANGE_MODE if is_amsl else 0, 0, math.nan),
                 frame=GLOBAL_INT if is_amsl else GLOBAL_RELATIVE_ALT_INT,
@@ -75,9 +67,7 @@ async def go_to(
                 y=longitude,
                 z=altitude,
                 component_id=0,
-                standing=standing,
             )
-            await until_answered(sending, standing)
     except CommandRejected as error:
         if is_amsl or error.result != RESULT_UNSUPPORTED:
             raise
@@ -94,19 +84,6 @@ def flies_to_places_in(aio: AsyncVehicle) -> tuple[Mode, ...]:
     purposes: tuple[Purpose, ...] = (aio.autopilot.reposition_purpose, "take_off")
     modes = map(aio.autopilot.mode_for, purposes)
     return tuple(mode for mode in modes if mode is not None)
-
-
-async def set_home(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: float) -> None:
-    """DO_SET_HOME by COMMAND_INT, or COMMAND_LONG where that is not known; 1e-7 degrees, metres above the sea."""
-    try:
-        await vehicle.command_int(
-            DO_SET_HOME, 0, frame=GLOBAL, x=latitude, y=longitude, z=altitude, component_id=0
-        )
-    except CommandRejected as error:
-        if error.result != RESULT_UNSUPPORTED:
-            raise
-        place = (latitude * 1e-7, longitude * 1e-7, altitude)
-        await vehicle.command(DO_SET_HOME, 0, 0, 0, 0, *place, component_id=0)
 
 
 async def refuse(reason: str) -> None:

@@ -19,7 +19,6 @@ from aerokit.dronekit.exceptions import APIException
 from aerokit.dronekit.listener_thread import ListenerThread
 from aerokit.dronekit.mav_writer import MAVWriter
 from aerokit.dronekit.orders import Orders
-from aerokit.dronekit.standing import Given
 from aerokit.dronekit.weakly import weakly
 from aerokit.errors import AerokitError, ConnectionClosed, LinkOpenError, LocalProtocolError
 from aerokit.links.address import ACCEPTED_FORMS, parse_address
@@ -82,8 +81,6 @@ class MAVConnection:
         """The asynchronous connection, for code that runs on its loop."""
         self.orders = Orders(self.loop)
         """What was ordered without waiting."""
-        self.given = Given()
-        """Which order is the newest."""
         self._is_closed = threading.Event()
         self._closing = threading.Lock()
         self._detach: list[Detach] = []
@@ -91,6 +88,8 @@ class MAVConnection:
         """Whether the vehicle has said that it understands MAVLink 2, whichever version it speaks so far."""
         self._at_close: list[Callable[[], object]] = []
         self._master: Master | None = None
+        self.note_sent: Callable[[Message], None] = lambda message: None
+        """Is told what has been sent, on the loop's thread: what steers is a newer order."""
         self.vehicle: Steered | None = None
         """The vehicle of this connection, once there is one."""
         self.loop_listeners: list[Callable[[MAVConnection], object]] = []
@@ -118,7 +117,6 @@ class MAVConnection:
         message.encode()  # so that what is wrong with it is told to who made it
         try:
             self.connection.raise_if_ended()
-            self.given.note(message)
             self.orders.post(self._send, message, to)
         except AerokitError as error:
             raise APIException(str(error)) from error
@@ -126,6 +124,7 @@ class MAVConnection:
     def _send(self, message: Message, to: int | None) -> None:
         try:
             self.connection.send(message, to=to)
+            self.note_sent(message)
         except AerokitError as error:
             logger.warning("%s was not sent: %s", message.NAME, error)
 

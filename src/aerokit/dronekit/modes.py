@@ -8,14 +8,12 @@ import anyio
 
 from aerokit.autopilots import autopilot_for
 from aerokit.autopilots.modes import CUSTOM_MODE_ENABLED, Mode
-from aerokit.dronekit.standing import until_answered
-from aerokit.errors import CommandRejected, LocalProtocolError, OperationTimeout
+from aerokit.errors import CommandRejected, LocalProtocolError
 from aerokit.mavlink.messages import Heartbeat, SetMode
-from aerokit.protocols.command import result_name
 
 if TYPE_CHECKING:
     from aerokit.autopilots import Autopilot
-    from aerokit.dronekit.standing import Standing
+    from aerokit.vehicle.orders.posting import PostedOrder
     from aerokit.vehicle.vehicle import Vehicle
 
 __all__ = ["change_mode", "mode_name", "mode_named"]
@@ -25,7 +23,6 @@ ARDUPILOTMEGA = 3
 RESULT_UNSUPPORTED = 3
 RESULT_TEMPORARILY_REJECTED = 1
 MODE_IS_TOLD_S = 5.0
-LOOK_S = 0.05
 ATTEMPTS, ASK_AGAIN_S = 4, 0.5
 
 
@@ -66,7 +63,7 @@ def _as_known(vehicle: Vehicle) -> Autopilot:
     return autopilot_for(Heartbeat(vehicle.vehicle_type, ARDUPILOTMEGA, 0, 0, 0, 0))
 
 
-async def change_mode(vehicle: Vehicle, wanted: Mode, standing: Standing) -> None:
+async def change_mode(vehicle: Vehicle, wanted: Mode) -> None:
     """Send MAV_CMD_DO_SET_MODE, or SET_MODE to a vehicle that does not know it, and wait until HEARTBEAT tells it.
 
     Asked again where the vehicle says that it is too early, as PX4 does while it checks a mission just uploaded, and as
@@ -76,56 +73,26 @@ async def change_mode(vehicle: Vehicle, wanted: Mode, standing: Standing) -> Non
         CommandRejected: the vehicle refused.
         OperationTimeout: it did not answer, or it accepted and stays in another mode.
     """
-    with standing.watching(vehicle):
+    with vehicle.posted("mode", "motion", modes=(wanted,)) as order:
         for attempts_left in reversed(range(ATTEMPTS)):
             try:
-                await _change_mode(vehicle, wanted, standing)
+                await _request(vehicle, wanted, order)
+                await order.until_told(MODE_IS_TOLD_S)
             except CommandRejected as error:
                 if error.result != RESULT_TEMPORARILY_REJECTED or not attempts_left:
                     raise
                 await anyio.sleep(ASK_AGAIN_S)
-                if not standing.holds():
+                if order.end:
                     raise
             else:
                 return
 
 
-async def _change_mode(vehicle: Vehicle, wanted: Mode, standing: Standing) -> None:
-    """PX4 acks twice: the first ack is always ACCEPTED, the second one may take it back."""
-    started = vehicle.connection.now()
-    with vehicle._talk.refusals_of(DO_SET_MODE) as refusals:
-        await _request(vehicle, wanted, standing)
-        with anyio.move_on_after(MODE_IS_TOLD_S):
-            while not (standing.is_done or _is_in(vehicle, wanted)):
-                if refusals:
-                    raise _refused(vehicle, refusals[-1].result, started)
-                await anyio.sleep(LOOK_S)
-            return
-    raise OperationTimeout(f"{wanted} was accepted, and the vehicle stays in {vehicle.mode.latest}")
-
-
-async def _request(vehicle: Vehicle, wanted: Mode, standing: Standing) -> None:
-    order = vehicle.autopilot.mode_order(wanted)
-    params = (wanted.base_mode, *order.params[1:])
+async def _request(vehicle: Vehicle, wanted: Mode, order: PostedOrder) -> None:
+    params = (wanted.base_mode, *vehicle.autopilot.mode_order(wanted).params[1:])
     try:
-        await until_answered(
-            vehicle.command(DO_SET_MODE, *params, component_id=0, standing=standing), standing
-        )
+        await order.command(DO_SET_MODE, *params, component_id=0)
     except CommandRejected as error:
         if error.result != RESULT_UNSUPPORTED:
             raise
-        vehicle.send(SetMode(vehicle.system_id, wanted.base_mode, wanted.custom_mode))
-
-
-def _is_in(vehicle: Vehicle, wanted: Mode) -> bool:
-    mode = vehicle.telemetry.mode.latest
-    return mode is not None and mode.custom_mode == wanted.custom_mode
-
-
-def _refused(vehicle: Vehicle, result: int, since: float) -> CommandRejected:
-    return CommandRejected(
-        f"MAV_CMD_DO_SET_MODE was refused: {result_name(result)}",
-        command=DO_SET_MODE,
-        result=result,
-        reasons=vehicle.texts_since(since),
-    )
+        vehicle.connection.send(SetMode(vehicle.system_id, wanted.base_mode, wanted.custom_mode))

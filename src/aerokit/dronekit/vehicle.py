@@ -238,7 +238,7 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, VehiclePrivates):
         """On the loop, in the turn in which the vehicle was found; the loop gets weak references only."""
         core = self._dk
         core.begin(aio, tasks)
-        self._handler.vehicle = self
+        self._handler.vehicle, self._handler.note_sent = self, aio.note_sent
         self._handler.orders.describe = self._dk_describe
         core.hear(ends)
         ends.callback(aio.telemetry.status_text.observe(weakly(self._dk_on_status_text), every_arrival=True))

@@ -15,7 +15,15 @@ if TYPE_CHECKING:
 
     from aerokit.mavlink.message import Message
 
-__all__ = ["CommandExchange", "Standing", "command_int", "command_long", "command_name", "result_name"]
+__all__ = [
+    "CommandExchange",
+    "Standing",
+    "command_int",
+    "command_long",
+    "command_name",
+    "rejection",
+    "result_name",
+]
 
 BROADCAST = 0
 FLOAT32_MAX = 3.4028234663852886e38

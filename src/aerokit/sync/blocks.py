@@ -41,6 +41,7 @@ __all__ = [
 
 A = TypeVar("A")
 T = TypeVar("T")
+EnteredT = TypeVar("EnteredT")
 BlockT = TypeVar("BlockT", bound="Temporarily | Transaction")
 TwinT = TypeVar("TwinT", bound="ConnectionTwin | VehicleTwin")
 
@@ -62,6 +63,14 @@ class TwinOf(Generic[A]):
         finally:
             with contextlib.suppress(ConnectionClosed):
                 self._loop.call(block.__exit__, None, None, None)
+
+    @contextmanager
+    def _twin_block(
+        self, twin: Callable[[LoopThread, T], EnteredT], block: AbstractContextManager[T]
+    ) -> Iterator[EnteredT]:
+        """A block that gives something that has a twin."""
+        with self._block(block) as entered:
+            yield twin(self._loop, entered)
 
 
 class CellTwin(TwinOf["StateCell[T]"], Generic[T]):

@@ -97,7 +97,13 @@ class Page:
             self.for_types.add(("contextlib", "AbstractContextManager"))
             inner = node.returns.slice if isinstance(node.returns, ast.Subscript) else ast.Constant(None)
             kind = ast.Subscript(ast.Name("AbstractContextManager"), inner)
-            body = f"return self._block(self.aio.{name}({', '.join(arguments)}))"
+            block = f"self.aio.{name}({', '.join(arguments)})"
+            is_twin = _outer(inner) in self._twins
+            body = (
+                f"return self._twin_block({_outer(inner)}, {block})"
+                if is_twin
+                else f"return self._block({block})"
+            )
             return _function(node, kind, member.text, body)
         called = f"self.aio.{name}({', '.join(arguments)})"
         if name not in twin.direct:

@@ -67,6 +67,8 @@ TWINS = (
     ),
     Twin("aerokit.vehicle.orders.guided.SetpointStream", "StreamTwin", parameter="SetpointT"),
     Twin("aerokit.vehicle.orders.guided.Guided"),
+    Twin("aerokit.vehicle.orders.gimbal.Gimbal"),
+    Twin("aerokit.vehicle.orders.posting.PostedOrder"),
     Twin("aerokit.vehicle.files.files.Files"),
     Twin("aerokit.vehicle.files.logs.Logs"),
     Twin("aerokit.vehicle.parameters.transaction.Temporarily", "TemporarilyTwin"),

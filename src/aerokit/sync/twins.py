@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
     from contextlib import AbstractContextManager
     import os
-    from aerokit.autopilots import Autopilot
+    from aerokit.autopilots import Autopilot, Mode
     from aerokit.autopilots.modes import Mode
     from aerokit.autopilots.version import AutopilotVersion
     from aerokit.links.allowed import Peers
@@ -53,7 +53,6 @@ if TYPE_CHECKING:
     from aerokit.missions import Fence, Mission, RallyPoints
     from aerokit.parameters import Metadata, Parameter, ParameterDifference, ParameterTable
     from aerokit.position import Position
-    from aerokit.protocols.command import Standing
     from aerokit.protocols.transfer import OnProgress
     from aerokit.runtime.cells import Source
     from aerokit.runtime.events import Event, LinkReport
@@ -62,7 +61,10 @@ if TYPE_CHECKING:
     from aerokit.vehicle.files.files import FileEntry, Files as AsyncFiles
     from aerokit.vehicle.files.log_entry import LogEntry
     from aerokit.vehicle.files.logs import LogMethod, Logs as AsyncLogs
+    from aerokit.vehicle.orders.gimbal import Gimbal as AsyncGimbal
     from aerokit.vehicle.orders.guided import Guided as AsyncGuided
+    from aerokit.vehicle.orders.order import Subject
+    from aerokit.vehicle.orders.posting import PostedOrder as AsyncPostedOrder
     from aerokit.vehicle.orders.setpoints import (
         AttitudeSetpoint,
         LocalPositionSetpoint,
@@ -94,6 +96,7 @@ if TYPE_CHECKING:
         ServoOutputs,
         Vibration,
     )
+    from aerokit.vehicle.state.gimbal import GimbalAttitude
     from aerokit.vehicle.state.movement import Attitude, Home, LocalPosition, Velocity, Wind
 
 __all__ = [
@@ -101,10 +104,12 @@ __all__ = [
     "Connection",
     "FenceControl",
     "Files",
+    "Gimbal",
     "Guided",
     "Logs",
     "MissionControl",
     "Parameters",
+    "PostedOrder",
     "RallyControl",
     "SetpointStream",
     "StateCell",
@@ -483,6 +488,107 @@ class Guided(TwinOf["AsyncGuided"]):
             valid_for_s=valid_for_s,
             max_lag_s=max_lag_s,
         ))
+
+
+class Gimbal(TwinOf["AsyncGimbal"]):
+    """The gimbal that the autopilot manages, or its mount; of several the first.
+
+    Places are looked at by :meth:`aerokit.Vehicle.look_at`.
+    """
+
+    @cached_property
+    def attitude(self) -> StateCell[GimbalAttitude]:
+        """Where it points, as it tells by itself: nothing is asked for (GIMBAL_DEVICE_ATTITUDE_STATUS of any component
+        of the vehicle, MOUNT_ORIENTATION, MOUNT_STATUS).
+        """
+        return StateCell(self._loop, self.aio.attitude)
+
+    def point(self, pitch_deg: float, yaw_deg: float, *, roll_deg: float=0.0) -> None:
+        """Turn it and keep it there, however the vehicle moves; returns when that was accepted, not when it is there.
+
+        Args:
+            pitch_deg: from the horizon, −360 to 360: 0 is level, −90 straight down.
+            yaw_deg: clockwise from north, −360 to 360.
+            roll_deg: from the horizon, −360 to 360. If it is not 0, only the mount's command can do it, which turns the
+                camera with the vehicle: ``yaw_deg`` is right at the moment of the order.
+
+        Sends MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW (https://mavlink.io/en/services/gimbal_v2.html); control is claimed
+        when that is denied, until :meth:`release`. MAV_CMD_DO_MOUNT_CONTROL to a vehicle without a gimbal manager, and
+        MOUNT_CONTROL, which has no answer, to one that does not know that either.
+
+        Raises:
+            LocalProtocolError: an angle is out of range. Nothing was sent.
+            CommandRejected: the vehicle refused.
+            CommandTimeout: there was no answer.
+        """
+        self._loop.run(self.aio.point, pitch_deg, yaw_deg, roll_deg=roll_deg)
+
+    def release(self) -> None:
+        """Give it back to the pilot's sticks, and the control that was claimed to whoever wants it.
+
+        Raises:
+            CommandRejected: the vehicle refused.
+            CommandTimeout: there was no answer.
+        """
+        self._loop.run(self.aio.release)
+
+
+class PostedOrder(TwinOf["AsyncPostedOrder"]):
+    """An order that others may follow before it is answered; made by :meth:`aerokit.Vehicle.posted`."""
+
+    @property
+    def end(self) -> str:
+        """Why nothing of it is sent again, as a clause; empty while it may be."""
+        return self.aio.end
+
+    def command(self, command: int, *params: float, component_id: int | None=None) -> None:
+        """Send a COMMAND_LONG of this order; return when it is answered, or the order's effect is told.
+
+        Args:
+            command: the MAV_CMD.
+            params: param1 to param7; missing ones are 0.
+            component_id: to another component than the autopilot; 0: to all, and the autopilot's answer counts.
+
+        Raises:
+            LocalProtocolError: a parameter is no number or does not fit. Nothing was sent.
+            CommandRejected: the vehicle refused; ``reasons`` has what it said.
+            CommandTimeout: there was no answer; the text says so when it was not sent again for a reason.
+        """
+        self._loop.run(self.aio.command, command, *params, component_id=component_id)
+
+    def command_int(
+        self,
+        command: int,
+        *params: float,
+        frame: int,
+        x: int = 0,
+        y: int = 0,
+        z: float = 0.0,
+        component_id: int | None = None,
+    ) -> None:
+        """The same as COMMAND_INT: param1 to param4, ``x`` and ``y`` in 1e-7 degrees, ``z`` metres in ``frame``.
+
+        The rest is as for :meth:`command`.
+        """
+        self._loop.run(
+            self.aio.command_int,
+            command,
+            *params,
+            frame=frame,
+            x=x,
+            y=y,
+            z=z,
+            component_id=component_id,
+        )
+
+    def until_told(self, timeout: float) -> None:
+        """Wait until HEARTBEAT tells the order's effect, or that it was there before.
+
+        Raises:
+            CommandRejected: the vehicle took its acceptance back, as PX4 does.
+            OperationTimeout: it was not told within ``timeout`` seconds.
+        """
+        self._loop.run(self.aio.until_told, timeout)
 
 
 class Files(TwinOf["AsyncFiles"]):
@@ -1661,7 +1767,6 @@ class Vehicle(VehicleTwin):
         attempt_timeout: float = 1.0,
         progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
-        standing: Standing | None = None,
     ) -> CommandAck:
         """Send any MAV_CMD as COMMAND_LONG and return its ACCEPTED ack.
 
@@ -1675,8 +1780,6 @@ class Vehicle(VehicleTwin):
             attempt_timeout: seconds to wait for an ack after each, and at least two measured round trips.
             progress_timeout: seconds to wait after each IN_PROGRESS for the next answer; calibrations can take long.
             on_progress: called with 0–100, or None, for each IN_PROGRESS.
-            standing: says whether it may be sent again, instead of these rules: for programs that keep orders of their
-                own. The order is no newer one then.
 
         See https://mavlink.io/en/services/command.html.
 
@@ -1694,7 +1797,6 @@ class Vehicle(VehicleTwin):
             attempt_timeout=attempt_timeout,
             progress_timeout=progress_timeout,
             on_progress=on_progress,
-            standing=standing,
         )
 
     def command_int(
@@ -1710,12 +1812,13 @@ class Vehicle(VehicleTwin):
         attempt_timeout: float = 1.0,
         progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
-        standing: Standing | None = None,
+        or_long: bool = False,
     ) -> CommandAck:
         """Send any MAV_CMD as COMMAND_INT: param1 to param4, ``x``, ``y``, ``z`` in ``frame`` (MAV_FRAME).
 
-        ``x`` and ``y`` are latitude and longitude in 1e-7 degrees, or 1e-4 m in local frames; ``z`` metres. The rest
-        is as for :meth:`command`.
+        ``x`` and ``y`` are latitude and longitude in 1e-7 degrees, or 1e-4 m in local frames; ``z`` metres. With
+        ``or_long``, firmware that does not know it so is sent a COMMAND_LONG with degrees, in frame 0 only. The
+        rest is as for :meth:`command`.
         """
         return self._loop.run(
             self.aio.command_int,
@@ -1730,19 +1833,48 @@ class Vehicle(VehicleTwin):
             attempt_timeout=attempt_timeout,
             progress_timeout=progress_timeout,
             on_progress=on_progress,
-            standing=standing,
+            or_long=or_long,
         )
 
     def send(self, message: Message) -> None:
         """Send one message as it is, once; never blocks. Its ``target_system`` is yours to set.
 
-        A command that steers (as by :meth:`command`) and SET_MODE are newer orders: those of the actions end.
+        A command that steers (as by :meth:`command`) and SET_MODE are newer orders: those of the actions end. A
+        set-point is newer than what was :meth:`posted` about motion.
 
         Raises:
             LocalProtocolError: a field is out of range; nothing was sent.
             ConnectionClosed, LinkLost: the connection has ended, or the block of this vehicle was left.
         """
         self._loop.call(self.aio.send, message)
+
+    def note_sent(self, message: Message) -> None:
+        """The program has sent this to the vehicle past it (``connection.send``): it counts as by :meth:`send`."""
+        self._loop.call(self.aio.note_sent, message)
+
+    def posted(
+        self,
+        *subjects: Subject,
+        modes: tuple[Mode, ...] = (),
+        armed: bool | None = None,
+    ) -> AbstractContextManager[PostedOrder]:
+        """An order that the next one need not wait for: mode, arming and take-off go out one after another.
+
+        Within the block, its commands are sent again right after a HEARTBEAT until they are answered, or their effect
+        is told; not when an order about the same subject has followed, nor when HEARTBEAT tells a mode that neither
+        this order nor another of the last ten seconds brings about. Nothing is held when it is given up, and nobody
+        watches for an order to arm that comes late: the actions do that.
+
+        Args:
+            subjects: what it is about, ``"mode"``, ``"motion"`` or ``"arm"``; orders about any more that are named are
+                ended by it, too. One about mode or motion ends the action under way.
+            modes: the modes that it brings about.
+            armed: whether it arms or disarms.
+
+        Raises:
+            LocalProtocolError: no subject. Nothing was sent.
+        """
+        return self._twin_block(PostedOrder, self.aio.posted(*subjects, modes=modes, armed=armed))
 
     def subscribe(
         self,
@@ -1978,6 +2110,28 @@ class Vehicle(VehicleTwin):
         """
         self._loop.run(self.aio.reboot, force=force, timeout=timeout)
 
+    def look_at(self, target: Position) -> None:
+        """Make nose or gimbal point at a place, until :meth:`stop_looking`; without an altitude, at its own.
+
+        Sends MAV_CMD_DO_SET_ROI_LOCATION (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_ROI_LOCATION), and
+        MAV_CMD_DO_SET_ROI to old firmware, which knows no other.
+
+        Raises:
+            ValueUnknownError: home is not known and is needed here.
+            CommandRejected: the vehicle refused.
+            CommandTimeout: there was no answer.
+        """
+        self._loop.run(self.aio.look_at, target)
+
+    def stop_looking(self) -> None:
+        """End :meth:`look_at` (MAV_CMD_DO_SET_ROI_NONE; MAV_CMD_DO_SET_ROI to old firmware).
+
+        Raises:
+            CommandRejected: the vehicle refused.
+            CommandTimeout: there was no answer.
+        """
+        self._loop.run(self.aio.stop_looking)
+
     def go_to(
         self,
         target: Position,
@@ -2076,14 +2230,6 @@ class Vehicle(VehicleTwin):
             max_silence_s=max_silence_s,
         )
 
-    def look_at(self, target: Position) -> None:
-        """Make nose or gimbal point at a place (MAV_CMD_DO_SET_ROI_LOCATION), until :meth:`stop_looking`."""
-        self._loop.run(self.aio.look_at, target)
-
-    def stop_looking(self) -> None:
-        """End :meth:`look_at` (MAV_CMD_DO_SET_ROI_NONE)."""
-        self._loop.run(self.aio.stop_looking)
-
     def set_home(self, place: Position | None=None, *, timeout: float=5.0) -> None:
         """Have the vehicle return to another place, or to where it is now, and wait until HOME_POSITION tells it.
 
@@ -2091,7 +2237,8 @@ class Vehicle(VehicleTwin):
             place: latitude, longitude and an altitude above mean sea level; None: where it is now.
             timeout: seconds until HOME_POSITION tells it.
 
-        Sends MAV_CMD_DO_SET_HOME (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_HOME).
+        Sends MAV_CMD_DO_SET_HOME (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_HOME), as COMMAND_LONG to
+        old firmware, which does not know it as COMMAND_INT: to within a metre then.
 
         Raises:
             LocalProtocolError: the place has no altitude above mean sea level. Nothing was sent.
@@ -2177,6 +2324,11 @@ class Vehicle(VehicleTwin):
     def guided(self) -> Guided:
         """Set-point streams: velocity, position, acceleration, attitude."""
         return Guided(self._loop, self.aio.guided)
+
+    @cached_property
+    def gimbal(self) -> Gimbal:
+        """The gimbal: where it points, and orders to it."""
+        return Gimbal(self._loop, self.aio.gimbal)
 
     @cached_property
     def files(self) -> Files:

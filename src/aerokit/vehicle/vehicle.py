@@ -9,7 +9,9 @@ from aerokit.vehicle.files.files import Files
 from aerokit.vehicle.files.logs import Logs
 from aerokit.vehicle.orders.arming import ArmingActions
 from aerokit.vehicle.orders.flight import FlightActions
+from aerokit.vehicle.orders.gimbal import Gimbal
 from aerokit.vehicle.orders.guided import Guided
+from aerokit.vehicle.orders.looking import LookActions
 from aerokit.vehicle.orders.modes import ModeActions
 from aerokit.vehicle.orders.talking import TalkActions
 from aerokit.vehicle.orders.travel import TravelActions
@@ -28,7 +30,7 @@ __all__ = ["Vehicle"]
 
 
 @checks_arguments
-class Vehicle(FlightActions, TravelActions, ArmingActions, ModeActions, TalkActions):
+class Vehicle(FlightActions, TravelActions, LookActions, ArmingActions, ModeActions, TalkActions):
     """One vehicle. Coroutines talk to it, properties never do; everything has a deadline and can be cancelled.
 
     Made by :func:`aerokit.connect`. State is in cells (``vehicle.position.value``, ``.age``, ``.fresh(within=1)``,
@@ -40,6 +42,8 @@ class Vehicle(FlightActions, TravelActions, ArmingActions, ModeActions, TalkActi
         transfers = bridge.talk.transfers
         self.guided = Guided(bridge)
         """Set-point streams: velocity, position, acceleration, attitude."""
+        self.gimbal = Gimbal(bridge)
+        """The gimbal: where it points, and orders to it."""
         self.files = Files(transfers)
         """The files on it, by MAVFTP."""
         self.logs = Logs(transfers, self.files)

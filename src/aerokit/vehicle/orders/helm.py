@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections import deque
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from aerokit.errors import CommandRejected
 from aerokit.vehicle.orders.order import Order, Sending
+from aerokit.vehicle.orders.posted import OWN_MODES_S, Posted
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator
+    from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 
     from aerokit.autopilots import Mode
+    from aerokit.vehicle.orders.order import Subject
     from aerokit.vehicle.state.telemetry import Telemetry
 
 __all__ = ["KNOWN_S", "MODE_GRACE_S", "Helm"]
@@ -44,6 +48,10 @@ class Helm:
         self._any_mode_until = -math.inf
         self._orders: list[Order] = []
         self._sendings: list[Sending] = []
+        self._posted: list[Posted] = []
+        self._numbers = itertools.count(1)
+        self._newest_about: dict[Subject, int] = {}
+        self._modes_ordered: deque[tuple[float, int]] = deque(maxlen=16)
         self._on_new: list[Callable[[], None]] = []
         self._detach = (
             telemetry.mode.observe(self._on_mode, every_arrival=True),
@@ -57,25 +65,30 @@ class Helm:
 
     # ------------------------------------------------------------------------------- orders
 
-    def order(self, *modes: Mode) -> Order:
-        """A new order that steers, and may bring about these modes: the one before ends."""
+    def order(self, *modes: Mode, subjects: Iterable[Subject] = ("mode", "motion")) -> Order:
+        """A new order that steers, and may bring about these modes: the one before ends, and what was posted about
+        these subjects.
+        """
         for each in self._on_new:
             each()
+        self.note_newer(subjects)
+        self._modes_ordered.extend((self._now(), each.custom_mode) for each in modes)
         order = self._new(modes, lambda order: order is self.newest)
         order.is_given = self._steers()
         self.newest = order
         self._orders = [order]
         return order
 
-    def order_of_the_programs_own(self) -> Order:
+    def order_of_the_programs_own(self, subjects: Iterable[Subject] = ("mode", "motion")) -> Order:
         """The program sends one by itself: which modes that brings about is not known."""
-        order = self.order()
+        order = self.order(subjects=subjects)
         self._any_mode_until = self._now() + MODE_GRACE_S
         return order
 
     def note_reboot(self) -> None:
         """The vehicle has rebooted: all orders end."""
-        for order in self._orders:
+        orders: tuple[Order | Posted, ...] = (*self._orders, *self._posted)
+        for order in orders:
             order.note_reboot()
 
     @contextmanager
@@ -112,14 +125,59 @@ class Helm:
             armed=armed,
             is_done=is_done,
         )
-        self.arming_orders += armed is not None
-        for each in self._sendings:
-            each.note_newer(armed)
+        self._note_arming(armed)
         self._sendings.append(sending)
         try:
             yield sending
         finally:
             self._sendings.remove(sending)
+
+    # --------------------------------------------------------------------------------- posted
+
+    @contextmanager
+    def posting(
+        self, subjects: Sequence[Subject], *, modes: Collection[Mode] = (), armed: bool | None = None
+    ) -> Iterator[Posted]:
+        """An order about the first of these subjects that is given without waiting, for the time of the block.
+
+        It ends what was posted about any of them before, and if it steers, the order of an action.
+        """
+        if "arm" not in subjects[:1]:
+            for each in self._on_new:
+                each()
+            if self.newest is not None:
+                self.newest.note_newer()
+        self._note_arming(armed)
+        number, now = self.note_newer(subjects), self._now()
+        own_modes = {mode for at, mode in self._modes_ordered if at > now - OWN_MODES_S}
+        self._modes_ordered.extend((now, each.custom_mode) for each in modes)
+        posted = Posted(
+            lambda: self._newest_about[subjects[0]] == number,
+            modes=modes,
+            own_modes=own_modes,
+            armed=armed,
+            mode_now=self._telemetry.mode.latest,
+            armed_now=self._telemetry.armed.latest,
+        )
+        self._posted.append(posted)
+        try:
+            yield posted
+        finally:
+            self._posted.remove(posted)
+
+    def note_newer(self, subjects: Iterable[Subject]) -> int:
+        """A newer order about these is given: what was posted about them before ends; the number of it."""
+        number = next(self._numbers)
+        self._newest_about.update(dict.fromkeys(subjects, number))
+        return number
+
+    def _note_arming(self, armed: bool | None) -> None:
+        if armed is None:
+            return
+        self.arming_orders += 1
+        self.note_newer(("arm",))
+        for each in self._sendings:
+            each.note_newer(armed)
 
     # --------------------------------------------------------------------------------- doubts
 
@@ -177,5 +235,5 @@ class Helm:
         for each in self._followers():
             each.note_armed(armed, self._telemetry.armed.updated_at)
 
-    def _followers(self) -> tuple[Order | Sending, ...]:
-        return (*self._orders, *self._sendings)
+    def _followers(self) -> tuple[Order | Sending | Posted, ...]:
+        return (*self._orders, *self._sendings, *self._posted)

@@ -6,20 +6,61 @@ docs/reliability.md has the table of all orders; nothing is sent again that is n
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection
+    from collections.abc import Callable, Collection, Mapping
 
     from aerokit.autopilots import Mode
+    from aerokit.mavlink.message import Message
 
-__all__ = ["COMPONENT_ARM_DISARM", "MOVING_COMMANDS", "QUESTIONS", "Order", "Sending"]
+__all__ = [
+    "CHANGED_BY_COMMAND",
+    "COMPONENT_ARM_DISARM",
+    "MOVING_COMMANDS",
+    "QUESTIONS",
+    "Order",
+    "Sending",
+    "Subject",
+    "subjects_of",
+]
+
+Subject = Literal["mode", "motion", "arm"]
+"""What an order is about."""
 
 COMPONENT_ARM_DISARM = 400
-MOVING_COMMANDS = frozenset((16, 17, 18, 19, 20, 21, 22, 84, 85, 176, 185, 192, 193, 252, 300, 400))
+_MODE: tuple[Subject, ...] = ("mode", "motion")
+_MOTION: tuple[Subject, ...] = ("motion",)
+_ARM: tuple[Subject, ...] = ("arm",)
+CHANGED_BY_COMMAND: Mapping[int, tuple[Subject, ...]] = {
+    **dict.fromkeys((20, 21, 84, 85, 176, 185, 252, 300), _MODE),
+    **dict.fromkeys((16, 17, 18, 19, 22, 34, 192, 193), _MOTION),
+    COMPONENT_ARM_DISARM: _ARM,
+}
+"""MAV_CMD → what a program changes that sends it by itself."""
+CHANGED_BY_MESSAGE: Mapping[str, tuple[Subject, ...]] = {
+    "SET_MODE": _MODE,
+    "SET_ATTITUDE_TARGET": _MOTION,
+    "SET_POSITION_TARGET_LOCAL_NED": _MOTION,
+    "SET_POSITION_TARGET_GLOBAL_INT": _MOTION,
+    "MISSION_SET_CURRENT": _MOTION,
+}
+GUIDED_ITEM = (2, 3)
+"""MISSION_ITEM.current of one that is flown to at once."""
+MOVING_COMMANDS = frozenset(CHANGED_BY_COMMAND)
 """MAV_CMDs by which a program steers past the actions: what an action left to be done must not come after them."""
 QUESTIONS = frozenset((401, 510, 511, 512, 519, 520, 521, 522, 525, 527, 528))
 """MAV_CMDs that ask for something and change nothing but streams: they are sent again until they are answered."""
+
+
+def subjects_of(message: Message) -> tuple[Subject, ...]:
+    """What a program changes that sends this message by itself."""
+    fields: Any = message
+    if message.NAME in ("COMMAND_LONG", "COMMAND_INT"):
+        return CHANGED_BY_COMMAND.get(fields.command, ())
+    if message.NAME in ("MISSION_ITEM", "MISSION_ITEM_INT"):
+        return _MOTION if fields.current in GUIDED_ITEM else ()
+    return CHANGED_BY_MESSAGE.get(message.NAME, ())
 
 
 class Order:
@@ -57,11 +98,17 @@ class Order:
         self._was_armed = armed_before
         self._is_newest = is_newest
         self._settles_at, self._any_until = settles_at, any_until
+        self._is_overruled = False
 
     @property
     def end(self) -> str:
         """Why it has nothing to say any more, as a clause; empty while it has."""
-        return self.taken_by or ("" if self._is_newest(self) else "another order was given")
+        is_over = self._is_overruled or not self._is_newest(self)
+        return self.taken_by or ("another order was given" if is_over else "")
+
+    def note_newer(self) -> None:
+        """A newer order steers, which is none of these."""
+        self._is_overruled = True
 
     def is_own(self, mode: Mode) -> bool:
         """Whether this mode is one that the order may bring about."""

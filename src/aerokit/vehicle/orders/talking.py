@@ -6,20 +6,28 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from aerokit.arguments import checks_arguments
-from aerokit.errors import CommandRejected
+from aerokit.errors import CommandRejected, LocalProtocolError
+from aerokit.mavlink.enums import MavFrame
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import CommandAck, CommandInt, CommandLong, SetMode
 from aerokit.runtime.cells import Source, StateCell
 from aerokit.runtime.subscription import Overflow, Subscription
-from aerokit.vehicle.orders.order import COMPONENT_ARM_DISARM, MOVING_COMMANDS, QUESTIONS
+from aerokit.vehicle.orders.order import (
+    CHANGED_BY_COMMAND,
+    COMPONENT_ARM_DISARM,
+    QUESTIONS,
+    Subject,
+    subjects_of,
+)
 from aerokit.vehicle.orders.part import Part
+from aerokit.vehicle.orders.posting import PostedOrder
 from aerokit.vehicle.talk.every_stream import every_stream
 from aerokit.vehicle.talk.rates import check_rate, subscription_rate_hz
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterator
 
-    from aerokit.protocols.command import Standing
+    from aerokit.autopilots import Mode
     from aerokit.runtime.bus import Detach, Sink
     from aerokit.runtime.events import Event
     from aerokit.runtime.link_state import LinkState
@@ -52,7 +60,6 @@ class TalkActions(Part):
         attempt_timeout: float = 1.0,
         progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
-        standing: Standing | None = None,
     ) -> CommandAck:
         """Send any MAV_CMD as COMMAND_LONG and return its ACCEPTED ack.
 
@@ -66,8 +73,6 @@ class TalkActions(Part):
             attempt_timeout: seconds to wait for an ack after each, and at least two measured round trips.
             progress_timeout: seconds to wait after each IN_PROGRESS for the next answer; calibrations can take long.
             on_progress: called with 0–100, or None, for each IN_PROGRESS.
-            standing: says whether it may be sent again, instead of these rules: for programs that keep orders of their
-                own. The order is no newer one then.
 
         See https://mavlink.io/en/services/command.html.
 
@@ -85,7 +90,6 @@ class TalkActions(Part):
             attempt_timeout=attempt_timeout,
             progress_timeout=progress_timeout,
             on_progress=on_progress,
-            standing=standing,
         )
 
     async def command_int(
@@ -101,18 +105,22 @@ class TalkActions(Part):
         attempt_timeout: float = 1.0,
         progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
-        standing: Standing | None = None,
+        or_long: bool = False,
     ) -> CommandAck:
         """Send any MAV_CMD as COMMAND_INT: param1 to param4, ``x``, ``y``, ``z`` in ``frame`` (MAV_FRAME).
 
-        ``x`` and ``y`` are latitude and longitude in 1e-7 degrees, or 1e-4 m in local frames; ``z`` metres. The rest
-        is as for :meth:`command`.
+        ``x`` and ``y`` are latitude and longitude in 1e-7 degrees, or 1e-4 m in local frames; ``z`` metres. With
+        ``or_long``, firmware that does not know it so is sent a COMMAND_LONG with degrees, in frame 0 only. The
+        rest is as for :meth:`command`.
         """
+        if or_long and frame != MavFrame.GLOBAL:
+            raise LocalProtocolError(f"frame = {frame} is not allowed with or_long: MAV_FRAME_GLOBAL (0)")
+        kind = {} if or_long else {"frame": frame}
         return await self._answered(
-            self._talk.commands.send_int,
+            self._talk.commands.send_place if or_long else self._talk.commands.send_int,
             command,
             *params,
-            frame=frame,
+            **kind,
             x=x,
             y=y,
             z=z,
@@ -121,22 +129,56 @@ class TalkActions(Part):
             attempt_timeout=attempt_timeout,
             progress_timeout=progress_timeout,
             on_progress=on_progress,
-            standing=standing,
         )
 
     def send(self, message: Message) -> None:
         """Send one message as it is, once; never blocks. Its ``target_system`` is yours to set.
 
-        A command that steers (as by :meth:`command`) and SET_MODE are newer orders: those of the actions end.
+        A command that steers (as by :meth:`command`) and SET_MODE are newer orders: those of the actions end. A
+        set-point is newer than what was :meth:`posted` about motion.
 
         Raises:
             LocalProtocolError: a field is out of range; nothing was sent.
             ConnectionClosed, LinkLost: the connection has ended, or the block of this vehicle was left.
         """
         self._talk.send(message)
-        is_command = isinstance(message, (CommandInt, CommandLong)) and message.command in MOVING_COMMANDS
-        if is_command or isinstance(message, SetMode):
-            self._helm.order_of_the_programs_own()
+        self.note_sent(message)
+
+    def note_sent(self, message: Message) -> None:
+        """The program has sent this to the vehicle past it (``connection.send``): it counts as by :meth:`send`."""
+        subjects = subjects_of(message)
+        if subjects and isinstance(message, (CommandInt, CommandLong, SetMode)):
+            self._helm.order_of_the_programs_own(subjects)
+        elif subjects:
+            self._helm.note_newer(subjects)
+
+    @contextmanager
+    def posted(
+        self, *subjects: Subject, modes: tuple[Mode, ...] = (), armed: bool | None = None
+    ) -> Iterator[PostedOrder]:
+        """An order that the next one need not wait for: mode, arming and take-off go out one after another.
+
+        Within the block, its commands are sent again right after a HEARTBEAT until they are answered, or their effect
+        is told; not when an order about the same subject has followed, nor when HEARTBEAT tells a mode that neither
+        this order nor another of the last ten seconds brings about. Nothing is held when it is given up, and nobody
+        watches for an order to arm that comes late: the actions do that.
+
+        Args:
+            subjects: what it is about, ``"mode"``, ``"motion"`` or ``"arm"``; orders about any more that are named are
+                ended by it, too. One about mode or motion ends the action under way.
+            modes: the modes that it brings about.
+            armed: whether it arms or disarms.
+
+        Raises:
+            LocalProtocolError: no subject. Nothing was sent.
+        """
+        if not subjects:
+            raise LocalProtocolError("posted: no subject is named: mode, motion or arm")
+        with (
+            self._helm.posting(subjects, modes=modes, armed=armed) as posted,
+            PostedOrder(self._talk, posted, modes, armed) as order,
+        ):
+            yield order
 
     # ----------------------------------------------------------------------- subscriptions
 
@@ -297,14 +339,13 @@ class TalkActions(Part):
         send: Callable[..., Awaitable[CommandAck]],
         command: int,
         *params: float,
-        standing: Standing | None,
         **options: Any,
     ) -> CommandAck:
         """What the commands of the program itself have in common; ``send`` is one of the command sender's."""
         started = self.connection.now()
         try:
-            if standing is not None or command in QUESTIONS:
-                return await send(command, *params, standing=standing, **options)
+            if command in QUESTIONS:
+                return await send(command, *params, **options)
             with self._own_order(command) as order:
                 armed = params[0] == 1 if command == COMPONENT_ARM_DISARM and params else None
                 with self._helm.sending(order, armed=armed) as sending:
@@ -316,8 +357,8 @@ class TalkActions(Part):
     @contextmanager
     def _own_order(self, command: int) -> Iterator[Order]:
         """A program that steers past the actions gives a new order, which ends theirs."""
-        if command in MOVING_COMMANDS:
-            yield self._helm.order_of_the_programs_own()
+        if command in CHANGED_BY_COMMAND:
+            yield self._helm.order_of_the_programs_own(CHANGED_BY_COMMAND[command])
         else:
             with self._helm.aside() as order:
                 yield order

@@ -32,9 +32,6 @@ __all__ = ["TravelActions"]
 CONDITION_YAW = 115
 DO_CHANGE_SPEED = 178
 DO_SET_HOME = 179
-DO_SET_ROI_LOCATION = 195
-DO_SET_ROI_NONE = 197
-MAV_FRAME_GLOBAL = 0
 MAV_FRAME_GLOBAL_INT = 5
 MAV_FRAME_GLOBAL_RELATIVE_ALT_INT = 6
 POSITION_ONLY = 0x0DF8
@@ -43,7 +40,7 @@ RESEND_S = 1.0
 
 @checks_arguments
 class TravelActions(Part):
-    """Going to a place, turning, looking."""
+    """Going to a place, turning; home."""
 
     async def go_to(
         self,
@@ -274,18 +271,6 @@ class TravelActions(Part):
                 max_silence_s=max_silence_s,
             )
 
-    async def look_at(self, target: Position) -> None:
-        """Make nose or gimbal point at a place (MAV_CMD_DO_SET_ROI_LOCATION), until :meth:`stop_looking`."""
-        latitude, longitude, altitude, is_relative = self._where.global_target(target)
-        frame = MAV_FRAME_GLOBAL_RELATIVE_ALT_INT if is_relative else MAV_FRAME_GLOBAL_INT
-        place: dict[str, Any] = {"frame": frame, "x": latitude, "y": longitude, "z": altitude}
-        with self._helm.aside() as order:
-            await self._orders.give(order, self._talk.commands.send_int, DO_SET_ROI_LOCATION, **place)
-
-    async def stop_looking(self) -> None:
-        """End :meth:`look_at` (MAV_CMD_DO_SET_ROI_NONE)."""
-        await self._orders.command_aside(DO_SET_ROI_NONE)
-
     async def set_home(self, place: Position | None = None, *, timeout: float = 5.0) -> None:
         """Have the vehicle return to another place, or to where it is now, and wait until HOME_POSITION tells it.
 
@@ -293,7 +278,8 @@ class TravelActions(Part):
             place: latitude, longitude and an altitude above mean sea level; None: where it is now.
             timeout: seconds until HOME_POSITION tells it.
 
-        Sends MAV_CMD_DO_SET_HOME (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_HOME).
+        Sends MAV_CMD_DO_SET_HOME (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_HOME), as COMMAND_LONG to
+        old firmware, which does not know it as COMMAND_INT: to within a metre then.
 
         Raises:
             LocalProtocolError: the place has no altitude above mean sea level. Nothing was sent.
@@ -309,9 +295,8 @@ class TravelActions(Part):
                 await self._orders.give(order, self._talk.commands.send_long, DO_SET_HOME, 1)
             else:
                 latitude, longitude, altitude, _ = self._where.global_target(place)
-                where: dict[str, Any] = {"frame": MAV_FRAME_GLOBAL, "x": latitude, "y": longitude}
-                send = self._talk.commands.send_int
-                await self._orders.give(order, send, DO_SET_HOME, 0, z=altitude, **where)
+                where: dict[str, Any] = {"x": latitude, "y": longitude, "z": altitude}
+                await self._orders.give(order, self._talk.commands.send_place, DO_SET_HOME, 0, **where)
         asked_at = self.connection.now()
         await self._talk.commands.send_long(REQUEST_MESSAGE, HOME_POSITION)
         await home.wait_until(lambda _: home.updated_at >= asked_at, timeout=timeout, description="set_home")

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import asyncio
 from collections import defaultdict
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from aerokit.errors import CommandTimeout, ConnectionClosed
-from aerokit.mavlink.enums import MavResult
+from aerokit.errors import CommandRejected, CommandTimeout, ConnectionClosed
+from aerokit.mavlink.enums import MavFrame, MavResult
 from aerokit.mavlink.messages import CommandAck
 from aerokit.protocols.command import CommandExchange, command_int, command_long, command_name
 from aerokit.runtime.driver import ExchangeRun
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 __all__ = ["CommandSender"]
 
+UNKNOWN = (MavResult.UNSUPPORTED, MavResult.COMMAND_LONG_ONLY)
+"""What firmware says that does not know a command, or not in the form that it had."""
 ROUND_TRIPS = 2
 """Nothing is sent again before so many measured round trips: the answer is still under way."""
 LONGEST_ATTEMPT_S = 5.0
@@ -56,6 +58,7 @@ class CommandSender:
         self._standings: dict[_Key, Standing | None] = {}
         """Of those that run."""
         self._under_way: dict[_Key, list[float]] = {}
+        self._results: dict[_Key, int] = {}
         self._is_closed = False
         self._detach = (
             connection.bus.attach(CommandAck, self._on_ack, system_id=system_id),
@@ -109,6 +112,29 @@ class CommandSender:
             message, attempts, attempt_timeout, progress_timeout, on_progress, standing, False
         )
 
+    async def send_place(
+        self,
+        command: int,
+        *params: float,
+        x: int,
+        y: int,
+        z: float,
+        standing: Standing | None = None,
+        **options: Any,
+    ) -> CommandAck:
+        """Send a command with a place above the sea: as COMMAND_INT, or COMMAND_LONG where that is not known."""
+        try:
+            return await self.send_int(
+                command, *params, frame=MavFrame.GLOBAL, x=x, y=y, z=z, standing=standing, **options
+            )
+        except CommandRejected as error:
+            is_known = error.result not in UNKNOWN
+            if is_known or (standing is not None and standing.end):
+                raise
+        place = (x * 1e-7, y * 1e-7, z)
+        fill = (0.0,) * (4 - len(params))
+        return await self.send_long(command, *params, *fill, *place, standing=standing, **options)
+
     def send_unconfirmed(self, command: int, *params: float) -> None:
         """Send a COMMAND_LONG once and do not wait: for ends of blocks, which must not await."""
         self._connection.send(command_long(self._system_id, self._component_id, command, params))
@@ -120,6 +146,18 @@ class CommandSender:
             0,
             self._connection.source_component,
         )
+
+    def last_result(self, command: int) -> int | None:
+        """What the autopilot answered last to a command of ours (MAV_RESULT), also if nobody waited any more."""
+        return self._results.get((self._component_id, command))
+
+    def is_unknown(self, command: int) -> bool:
+        """Whether the autopilot has said that it does not know a command, or not in the form that it had."""
+        return self.last_result(command) in UNKNOWN
+
+    def forget_result(self, command: int) -> None:
+        """What was answered does not count any more."""
+        self._results.pop((self._component_id, command), None)
 
     def awaits_answer(self, command: int) -> bool:
         """Whether an answer of the autopilot to what was sent unconfirmed may still come."""
@@ -198,6 +236,8 @@ class CommandSender:
         frame = ack.received_frame
         key = (0 if frame is None else frame.component_id, ack.command)
         run = self._runs.get(key)
+        if (run is not None or key in self._under_way) and ack.result != MavResult.IN_PROGRESS:
+            self._results[key] = ack.result
         if run is not None:
             run.receive(ack)
         elif key in self._under_way and ack.result != MavResult.IN_PROGRESS:

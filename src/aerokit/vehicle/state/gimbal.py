@@ -1,29 +1,41 @@
-"""Where a gimbal points, from the three messages that tell it: pitch and roll from the horizon, yaw from north."""
+"""Where a gimbal points, from the three messages that tell it."""
 
 from __future__ import annotations
 
 import math
 from typing import TYPE_CHECKING
 
+from aerokit.snapshot import Snapshot
+
 if TYPE_CHECKING:
     from aerokit.mavlink.messages import GimbalDeviceAttitudeStatus, MountOrientation, MountStatus
 
-__all__ = ["Angles", "from_device", "from_orientation", "from_status"]
-
-Angles = tuple["float | None", "float | None", "float | None"]
-"""Pitch, roll, yaw in degrees."""
+__all__ = ["GimbalAttitude", "from_device", "from_orientation", "from_status"]
 
 YAW_LOCK, YAW_IN_VEHICLE_FRAME, YAW_IN_EARTH_FRAME = 16, 32, 64
 STRAIGHT = 0.99999
 """Sine of a pitch at which roll and yaw turn about the same axis."""
 
 
-def from_status(message: MountStatus) -> Angles:
+class GimbalAttitude(Snapshot):
+    """Where it points, in degrees, None for what is not told: ``pitch_deg`` (0 level, −90 straight down) and
+    ``roll_deg`` from the horizon, ``yaw_deg`` 0 to 360 clockwise from north.
+
+    While the vehicle's heading is not known, the yaw of a gimbal that tells it so is from the nose; of MOUNT_STATUS
+    (ArduPilot before 4.3) it is that number, whatever it counts from.
+    """
+
+    pitch_deg: float | None
+    roll_deg: float | None
+    yaw_deg: float | None
+
+
+def from_status(message: MountStatus) -> GimbalAttitude:
     """Of MOUNT_STATUS: the numbers as they are."""
-    return message.pointing_a / 100.0, message.pointing_b / 100.0, message.pointing_c / 100.0
+    return GimbalAttitude(message.pointing_a / 100.0, message.pointing_b / 100.0, message.pointing_c / 100.0)
 
 
-def from_orientation(message: MountOrientation, heading: float | None) -> Angles:
+def from_orientation(message: MountOrientation, heading: float | None) -> GimbalAttitude:
     """Of MOUNT_ORIENTATION; its yaw is the vehicle's, and the one from north may be missing in it.
 
     ``heading``: where the vehicle's nose points, degrees; while it is not known, yaw is from there.
@@ -34,10 +46,10 @@ def from_orientation(message: MountOrientation, heading: float | None) -> Angles
         yaw = _compass(message.yaw + heading)
     else:
         yaw = _known(message.yaw)
-    return _known(message.pitch), _known(message.roll), yaw
+    return GimbalAttitude(_known(message.pitch), _known(message.roll), yaw)
 
 
-def from_device(message: GimbalDeviceAttitudeStatus, heading: float | None) -> Angles:
+def from_device(message: GimbalDeviceAttitudeStatus, heading: float | None) -> GimbalAttitude:
     """Of GIMBAL_DEVICE_ATTITUDE_STATUS.
 
     ``heading``: where the vehicle's nose points, degrees, for a gimbal that tells its yaw from there and does not
@@ -51,8 +63,8 @@ def from_device(message: GimbalDeviceAttitudeStatus, heading: float | None) -> A
         elif heading is not None:
             yaw += heading
         else:
-            return _known(pitch), _known(roll), _known(yaw)
-    return _known(pitch), _known(roll), _compass(yaw)
+            return GimbalAttitude(_known(pitch), _known(roll), _known(yaw))
+    return GimbalAttitude(_known(pitch), _known(roll), _compass(yaw))
 
 
 def _is_from_nose(flags: int) -> bool:

@@ -1,0 +1,73 @@
+"""`Posted`: an order that others may follow before it is answered, and whether it may still be sent again then."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection
+
+    from aerokit.autopilots import Mode
+
+__all__ = ["OWN_MODES_S", "Posted"]
+
+OWN_MODES_S = 10.0
+"""A mode that the program ordered so long ago may be told only now: that is nobody who takes over."""
+
+
+class Posted:
+    """Whether one posted order still stands: its effect has not been told yet, no newer one is of its subject, and
+    nobody else, a pilot or a failsafe, has changed the mode since.
+
+    ``modes`` and ``armed`` are its effects: a change to them, as HEARTBEAT tells it. ``own_modes`` are others that the
+    program has ordered lately. To disarm is meant whatever the mode.
+    """
+
+    def __init__(
+        self,
+        is_newest: Callable[[], bool],
+        *,
+        modes: Collection[Mode],
+        own_modes: Collection[int],
+        armed: bool | None,
+        mode_now: Mode | None,
+        armed_now: bool | None,
+    ) -> None:
+        self.has_worked = False
+        """Whether HEARTBEAT has told its effect."""
+        self.told_at = -math.inf
+        """When HEARTBEAT came last."""
+        self._is_newest, self._taken_by = is_newest, ""
+        self._modes, self._own_modes = {each.custom_mode for each in modes}, set(own_modes)
+        self._armed = armed
+        self._mode_before = None if mode_now is None else mode_now.custom_mode
+        self._armed_before = armed_now
+
+    @property
+    def end(self) -> str:
+        """Why it must not be sent again, as a clause; empty while it may."""
+        if self.has_worked:
+            return "its effect was told"
+        return self._taken_by if self._is_newest() else "a newer order was given meanwhile"
+
+    def note_mode(self, mode: Mode, at: float) -> None:
+        """The vehicle tells its mode."""
+        before, self._mode_before = self._mode_before, mode.custom_mode
+        if before is None or before == mode.custom_mode:
+            return
+        if mode.custom_mode in self._modes:
+            self.has_worked = True
+        elif self._armed is not False and mode.custom_mode not in self._own_modes:
+            self._taken_by = self._taken_by or "the vehicle was put into another mode meanwhile"
+
+    def note_armed(self, armed: bool, at: float) -> None:
+        """The vehicle tells whether it is armed, which ends a HEARTBEAT."""
+        before, self._armed_before = self._armed_before, armed
+        if before is not None and before is not armed and armed is self._armed:
+            self.has_worked = True
+        self.told_at = at
+
+    def note_reboot(self) -> None:
+        """The vehicle has rebooted: nothing that was ordered before is meant any more."""
+        self._taken_by = self._taken_by or "the vehicle rebooted"

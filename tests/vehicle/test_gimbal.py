@@ -1,0 +1,185 @@
+"""`vehicle.gimbal` and what is looked at: which firmware is told what, and what it tells; on virtual time."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import anyio
+import pytest
+from flight_harness import Flight, Wire, in_the_air, open_flight
+
+import aerokit
+from aerokit import Position
+from aerokit import messages as m
+from aerokit.errors import CommandRejected, CommandTimeout, LocalProtocolError
+from aerokit.mavlink.enums import MavCmd, MavResult
+from aerokit.mavlink.message import Message
+from aerokit.runtime.cells import Source
+from aerokit.sim import SimulatedCopter, SimulatedGimbal, SimulatedPx4, simulated_link
+from aerokit.sim.commands import CommandHandler
+
+pytestmark = pytest.mark.anyio
+
+PITCHYAW, MOUNT = MavCmd.DO_GIMBAL_MANAGER_PITCHYAW, MavCmd.DO_MOUNT_CONTROL
+CONFIGURE, ROI = MavCmd.DO_GIMBAL_MANAGER_CONFIGURE, MavCmd.DO_SET_ROI
+UNSUPPORTED, DENIED = MavResult.UNSUPPORTED, MavResult.DENIED
+
+
+def with_gimbal() -> SimulatedCopter:
+    copter = SimulatedCopter(boot_time_s=0.0)
+    copter.parameters["MNT1_TYPE"] = 1.0
+    return copter
+
+
+def place(flight: Flight, **altitudes: float) -> Position:
+    home = flight.vehicle.home.value
+    return Position(home.latitude_deg + 0.001, home.longitude_deg, **altitudes)
+
+
+def params(message: Message) -> tuple[int, ...]:
+    fields: Any = message
+    return tuple(round(getattr(fields, f"param{number}")) for number in (1, 2, 3, 7))
+
+
+async def test_it_points_where_it_is_told_and_tells_so() -> None:
+    async with in_the_air(copter=with_gimbal()) as flight:
+        gimbal = flight.vehicle.gimbal
+        with flight.vehicle.rate(m.GimbalDeviceAttitudeStatus, 10.0):
+            await gimbal.point(-45.0, 90.0)
+            told = await gimbal.attitude.wait_until(
+                lambda each: abs((each.pitch_deg or 0.0) + 45) < 1, timeout=5
+            )
+            assert told.yaw_deg == pytest.approx(90, abs=2)
+            assert gimbal.attitude.source == Source(1, 1, "GIMBAL_DEVICE_ATTITUDE_STATUS")
+        (command,) = flight.wire.commands(PITCHYAW)
+        assert (command.target_component, command.param5) == (1, 28)  # type: ignore[union-attr]
+        await gimbal.release()
+        (released,) = flight.wire.commands(MOUNT)
+        assert params(released)[-1] == 3
+
+
+async def test_roll_is_the_mounts_whose_yaw_is_the_vehicles() -> None:
+    async with in_the_air(copter=with_gimbal()) as flight:
+        await flight.vehicle.set_heading(90.0, tolerance_deg=1.0)
+        flight.wire.forget()
+        await flight.vehicle.gimbal.point(-45.0, 80.0, roll_deg=5.0)
+        (command,) = flight.wire.commands(MOUNT)
+        assert params(command) == pytest.approx((-45, 5, -10, 2), abs=2)
+        assert not flight.wire.commands(PITCHYAW)
+
+
+async def test_a_manager_that_denies_is_claimed_and_given_back() -> None:
+    async with open_flight() as flight:
+        flight.copter.faults.refuse(PITCHYAW, DENIED)
+        with pytest.raises(CommandRejected):
+            await flight.vehicle.gimbal.point(-45.0, 0.0)
+        assert [len(flight.wire.commands(each)) for each in (PITCHYAW, CONFIGURE)] == [2, 1]
+        assert params(flight.wire.commands(CONFIGURE)[0])[:2] == (
+            255,
+            flight.vehicle.connection.source_component,
+        )
+        flight.copter.faults.refuse(MOUNT, MavResult.ACCEPTED)
+        flight.copter.faults.refuse(CONFIGURE, MavResult.ACCEPTED)
+        for _ in range(2):
+            await flight.vehicle.gimbal.release()
+        assert [params(each)[:2] for each in flight.wire.commands(CONFIGURE)[1:]] == [(-3, -3)]
+
+
+async def test_firmware_without_commands_gets_messages_and_is_not_asked_again() -> None:
+    async with open_flight() as flight:
+        for each in (PITCHYAW, MOUNT):
+            flight.copter.faults.refuse(each, UNSUPPORTED)
+        for _ in range(2):
+            await flight.vehicle.gimbal.point(-45.5, 90.0)
+        assert [len(flight.wire.commands(each)) for each in (PITCHYAW, MOUNT)] == [1, 1]
+        control = flight.wire.all(m.MountControl)
+        assert [(each.input_a, each.input_b, each.input_c) for each in control] == [(-4550, 0, 9000)] * 2
+        assert [each.mount_mode for each in flight.wire.all(m.MountConfigure)] == [2, 2]
+
+
+async def test_a_stand_alone_gimbal_of_the_vehicle_tells_too_and_the_first_counts() -> None:
+    copter = SimulatedCopter(boot_time_s=0.0, components=[SimulatedGimbal(171), SimulatedGimbal(154)])
+    async with open_flight(copter) as flight:
+        attitude = flight.vehicle.gimbal.attitude
+        await attitude.wait_until(lambda _: True, timeout=3)
+        await anyio.sleep(1.0)
+        assert attitude.source is not None
+        assert attitude.source.component_id == 154
+        assert attitude.value.pitch_deg == 0.0
+
+
+async def test_a_reboot_forgets_it() -> None:
+    async with open_flight(with_gimbal()) as flight:
+        vehicle = flight.vehicle
+        with vehicle.rate(m.GimbalDeviceAttitudeStatus, 10.0):
+            await vehicle.gimbal.attitude.wait_until(lambda _: True, timeout=5)
+        flight.copter.reboot(0.5)
+        await vehicle.home.wait_until(lambda _: not vehicle.gimbal.attitude.is_known, timeout=20)
+
+
+@pytest.mark.parametrize("wrong", [math.nan, math.inf, 361.0])
+async def test_angles_out_of_range_send_nothing(wrong: float, grounded: Flight) -> None:
+    gimbal = grounded.vehicle.gimbal
+    for pitch, yaw, roll in ((wrong, 0.0, 0.0), (0.0, wrong, 0.0), (0.0, 0.0, wrong)):
+        with pytest.raises(LocalProtocolError, match=r"_deg = .* is not allowed"):
+            await gimbal.point(pitch, yaw, roll_deg=roll)
+    assert not [each for kind in (PITCHYAW, MOUNT) for each in grounded.wire.commands(kind)]
+
+
+# ------------------------------------------------------------------------------------------------ places
+
+
+@pytest.mark.parametrize("result", [UNSUPPORTED, MavResult.COMMAND_LONG_ONLY])
+async def test_old_firmware_is_told_the_old_region_of_interest(flying: Flight, result: int) -> None:
+    flying.copter.faults.refuse(MavCmd.DO_SET_ROI_LOCATION, result)
+    flying.copter.faults.refuse(MavCmd.DO_SET_ROI_NONE, UNSUPPORTED)
+    home = flying.vehicle.home.value.altitude_amsl_m
+    await flying.vehicle.look_at(place(flying, altitude_relative_m=10.0))
+    await flying.vehicle.look_at(place(flying, altitude_amsl_m=home + 20.0))
+    assert len(flying.wire.commands(MavCmd.DO_SET_ROI_LOCATION)) == 1
+    above, sea = flying.wire.commands(ROI)
+    assert (params(above)[-1], params(sea)[-1]) == (10, 20)
+    await flying.vehicle.stop_looking()
+    assert params(flying.wire.commands(ROI)[-1]) == (0, 0, 0, 0)
+
+
+async def test_who_knows_command_int_and_does_not_answer_is_not_told_the_old_one(flying: Flight) -> None:
+    flying.copter.faults.ignore(MavCmd.DO_SET_ROI_LOCATION)
+    with pytest.raises(CommandTimeout):
+        await flying.vehicle.look_at(place(flying, altitude_relative_m=10.0))
+    assert not flying.wire.commands(ROI)
+    flying.vehicle.capabilities.forget()
+    await flying.vehicle.look_at(place(flying, altitude_relative_m=10.0))
+    assert len(flying.wire.commands(ROI)) == 1
+
+
+async def test_px4_looks_at_altitudes_above_the_sea() -> None:
+    async with simulated_link(SimulatedPx4(boot_time_s=1.0)) as link:
+        wire = Wire(link)
+        async with aerokit.connect(wire) as vehicle:
+            await vehicle.wait_ready()
+            home = vehicle.home.value
+            target = Position(home.latitude_deg, home.longitude_deg, altitude_relative_m=5.0)
+            await vehicle.look_at(target)
+            command: Any = wire.commands(MavCmd.DO_SET_ROI_LOCATION)[0]
+            assert (command.frame, command.z) == (5, pytest.approx(home.altitude_amsl_m + 5.0))
+
+
+class WithoutCommandInt(SimulatedCopter):
+    """Firmware that knows home's command as COMMAND_LONG alone."""
+
+    def make_commands(self) -> dict[int, CommandHandler]:
+        commands = super().make_commands()
+        knows = commands[MavCmd.DO_SET_HOME]
+        commands[MavCmd.DO_SET_HOME] = lambda command: knows(command) if command.is_long else UNSUPPORTED
+        return commands
+
+
+async def test_home_is_set_where_no_command_int_is_known() -> None:
+    async with in_the_air(copter=WithoutCommandInt(boot_time_s=0.0)) as flight:
+        wanted = place(flight, altitude_amsl_m=flight.vehicle.home.value.altitude_amsl_m)
+        await flight.vehicle.set_home(wanted)
+        assert flight.vehicle.home.value.position.distance_to(wanted) < 1.0  # 32 bits of a float
+        kinds = [type(each) for each in flight.wire.commands(MavCmd.DO_SET_HOME)]
+        assert kinds == [m.CommandInt, m.CommandLong]

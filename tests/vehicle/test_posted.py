@@ -1,0 +1,299 @@
+"""Orders that others may follow before they are answered: when they are sent again, and what ends what."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from types import SimpleNamespace
+from typing import Any, cast
+
+import anyio
+import pytest
+from flight_harness import Flight, in_the_air, now
+
+from aerokit import messages as m
+from aerokit.autopilots import Mode
+from aerokit.errors import (
+    CommandRejected,
+    CommandTimeout,
+    LocalProtocolError,
+    OperationRejected,
+    OperationTimeout,
+)
+from aerokit.mavlink.enums import MavCmd, MavResult
+from aerokit.runtime.cells import Source, StateCell
+from aerokit.vehicle.orders.helm import Helm
+from aerokit.vehicle.orders.order import Subject, subjects_of
+from aerokit.vehicle.orders.posted import OWN_MODES_S, Posted
+from aerokit.vehicle.state.telemetry import Telemetry
+
+HEARTBEAT = Source(1, 1, "HEARTBEAT")
+STABILIZE, GUIDED, LOITER = (
+    Mode(name, number) for number, name in ((0, "STABILIZE"), (4, "GUIDED"), (5, "LOITER"))
+)
+ARM, TAKEOFF, SET_MODE = MavCmd.COMPONENT_ARM_DISARM, MavCmd.NAV_TAKEOFF, MavCmd.DO_SET_MODE
+TAKEN, NEWER, TOLD = (
+    "the vehicle was put into another mode meanwhile",
+    "a newer order was given meanwhile",
+    "its effect was told",
+)
+
+
+class Stage:
+    """A helm, heartbeats at the test's word, and orders that stay posted."""
+
+    def __init__(self, mode: Mode = STABILIZE, armed: bool = False) -> None:
+        self.now, self._open = 0.0, ExitStack()
+        self.mode = StateCell[Mode]("mode", lambda: self.now, "HEARTBEAT")
+        self.armed = StateCell[bool]("armed", lambda: self.now, "HEARTBEAT")
+        told = cast("Telemetry", SimpleNamespace(mode=self.mode, armed=self.armed))
+        self.helm = Helm(lambda: self.now, told)
+        self.tell(mode, armed)
+
+    def tell(self, mode: Mode, armed: bool = False) -> None:
+        self.now += 1.0
+        self.mode.set(mode, HEARTBEAT)
+        self.armed.set(armed, HEARTBEAT)
+
+    def post(self, *subjects: Subject, mode: Mode | None = None, armed: bool | None = None) -> Posted:
+        modes = () if mode is None else (mode,)
+        return self._open.enter_context(self.helm.posting(subjects, modes=modes, armed=armed))
+
+
+# ------------------------------------------------------------------------------------------ the rules
+
+
+def test_an_effect_is_a_change_to_it() -> None:
+    stage = Stage()
+    order = stage.post("mode", "motion", mode=GUIDED)
+    stage.tell(STABILIZE)
+    assert (order.end, order.told_at) == ("", stage.now)
+    stage.tell(GUIDED)
+    stage.tell(STABILIZE)
+    assert order.end == TOLD
+    there = Stage(GUIDED).post("mode", "motion", mode=GUIDED)
+    assert there.end == ""
+    stage = Stage()
+    arm, again = stage.post("arm", armed=True), None
+    stage.tell(STABILIZE, True)
+    again = stage.post("arm", armed=True)
+    stage.tell(STABILIZE, True)
+    assert (arm.end, again.end) == (TOLD, "")
+
+
+def test_a_mode_that_nobody_here_ordered_is_somebody_elses() -> None:
+    stage = Stage(GUIDED, True)
+    motion, disarm = stage.post("motion"), stage.post("arm", armed=False)
+    stage.tell(LOITER, True)
+    stage.tell(GUIDED, True)
+    assert (motion.end, disarm.end) == (TAKEN, "")
+
+
+def test_a_mode_that_was_ordered_lately_is_the_programs() -> None:
+    stage = Stage()
+    mode, motion = stage.post("mode", "motion", mode=GUIDED), stage.post("motion")
+    assert (mode.end, motion.end) == ("", "")
+    stage.tell(GUIDED)
+    assert motion.end == ""
+    stage.now += OWN_MODES_S
+    late = stage.post("motion")
+    stage.tell(STABILIZE)
+    stage.tell(GUIDED)
+    assert late.end == TAKEN
+    stage = Stage()
+    stage.helm.order(GUIDED)
+    of_an_action = stage.post("arm", armed=True)
+    stage.tell(GUIDED)
+    assert of_an_action.end == ""
+
+
+def test_a_newer_order_ends_those_of_its_subjects() -> None:
+    stage = Stage()
+    going, mode = stage.post("motion"), stage.post("mode", "motion")
+    assert (going.end, mode.end) == (NEWER, "")
+    again = stage.post("motion")
+    assert (mode.end, again.end) == ("", "")
+    arm = stage.post("arm", armed=True)
+    stage.post("arm", "motion", armed=False)
+    assert (arm.end, again.end, mode.end) == (NEWER, NEWER, "")
+
+
+def test_actions_and_posted_orders_end_each_other() -> None:
+    stage, dropped = Stage(), list[str]()
+    stage.helm.on_new(lambda: dropped.append("left over"))
+    action = stage.helm.order(GUIDED)
+    assert stage.post("arm", armed=True).end == ""
+    assert (action.end, len(dropped)) == ("", 1)
+    motion = stage.post("motion")
+    assert (action.end, len(dropped)) == ("another order was given", 2)
+    mode = stage.post("mode", mode=LOITER)
+    stage.helm.order(LOITER)
+    assert (motion.end, mode.end) == (NEWER, NEWER)
+
+
+def test_arming_ends_what_was_posted_of_it_and_the_other_way_round() -> None:
+    stage = Stage()
+    posted = stage.post("arm", armed=True)
+    with stage.helm.aside() as order, stage.helm.sending(order, armed=True) as sending:
+        assert posted.end == NEWER
+        stage.post("arm", armed=False)
+        assert sending.end == "another order was given"
+    assert stage.helm.arming_orders == 3
+
+
+def test_a_reboot_ends_them() -> None:
+    stage = Stage()
+    order = stage.post("arm", armed=True)
+    stage.helm.note_reboot()
+    assert order.end == "the vehicle rebooted"
+
+
+def long(command: int) -> m.CommandLong:
+    return m.CommandLong(1, 0, command, *(0,) * 8)
+
+
+@pytest.mark.parametrize(
+    ("message", "subjects"),
+    [
+        (m.SetMode(1, 1, 5), {"mode", "motion"}),
+        *((long(each), {"mode", "motion"}) for each in (SET_MODE, 20, 21, 84, 85, 185, 252, 300)),
+        *((long(each), {"motion"}) for each in (16, 17, 18, 19, 22, 34, 192, 193)),
+        (long(ARM), {"arm"}),
+        (long(178), set()),
+        (m.CommandInt(1, 0, 6, 192, *(0,) * 9), {"motion"}),
+        (m.SetPositionTargetLocalNed(0, 1, 0, 8, 0x0DC7, *(0,) * 11), {"motion"}),
+        (m.MissionSetCurrent(1, 1, 3), {"motion"}),
+        (m.MissionItemInt(1, 0, 0, 6, 16, 2, 0, 0, 0, 0, 0, 0, 0, 10), {"motion"}),
+        (m.MissionItemInt(1, 0, 0, 6, 16, 0, 1, 0, 0, 0, 0, 0, 0, 10), set()),
+        (m.Heartbeat(2, 3, 0, 0, 3, 3), set()),
+    ],
+)
+def test_what_the_program_sends_by_itself_is_about_something(message: Any, subjects: set[str]) -> None:
+    assert set(subjects_of(message)) == subjects
+
+
+# ------------------------------------------------------------------------------------------ in flight
+
+
+@pytest.mark.anyio
+async def test_mode_arming_and_take_off_without_waiting(grounded: Flight) -> None:
+    """Each goes out at once, while the one before is not answered; lost answers are made good."""
+    vehicle, wire = grounded.vehicle, grounded.wire
+    for each in (SET_MODE, ARM):
+        grounded.copter.faults.lose_ack(each, times=1)
+    guided = vehicle.autopilot.find_mode("GUIDED")
+
+    async def mode() -> None:
+        with vehicle.posted("mode", "motion", modes=(guided,)) as order:
+            await order.command(SET_MODE, *vehicle.autopilot.mode_order(guided).params)
+            await order.until_told(5)
+
+    async def arm() -> None:
+        with vehicle.posted("arm", armed=True) as order:
+            await order.command(ARM, 1)
+            await order.until_told(5)
+
+    async def take_off() -> None:
+        with vehicle.posted("motion") as order:
+            await order.command(TAKEOFF, 0, 0, 0, 0, 0, 0, 5)
+
+    started = now()
+    async with anyio.create_task_group() as tasks:
+        for each_of in (mode, arm, take_off):
+            tasks.start_soon(each_of)
+    sent = [
+        at for each in (SET_MODE, ARM, TAKEOFF) for at, message in wire.sent if message in wire.commands(each)
+    ]
+    assert sent == [started] * 3  # once each: HEARTBEAT told what was not answered
+    await vehicle.position.wait_until(lambda here: (here.altitude_relative_m or 0) > 4.5, timeout=20)
+
+
+@pytest.mark.anyio
+async def test_a_pilot_ends_it_and_a_newer_one_too(flying: Flight) -> None:
+    vehicle, faults = flying.vehicle, flying.copter.faults
+    faults.ignore(MavCmd.DO_REPOSITION)
+    with vehicle.posted("motion") as order:
+        flying.pilot_takes_over()
+        with pytest.raises(CommandTimeout, match=f"not sent again: {TAKEN}"):
+            await order.command_int(MavCmd.DO_REPOSITION, -1, frame=6, x=1, y=1, z=20)
+        assert order.end == TAKEN
+    await vehicle.set_mode("GUIDED")
+    with vehicle.posted("motion") as order:
+        vehicle.send(m.SetPositionTargetLocalNed(0, 1, 1, 1, 0x0DC7, *(0,) * 11))
+        with pytest.raises(CommandTimeout, match=f"not sent again: {NEWER}"):
+            await order.command_int(MavCmd.DO_REPOSITION, -1, frame=6, x=1, y=1, z=20)
+    assert len(flying.wire.commands(MavCmd.DO_REPOSITION)) == 2
+
+
+@pytest.mark.anyio
+async def test_it_ends_the_flight_under_way_which_is_not_held_then() -> None:
+    async with in_the_air() as flight:
+        vehicle, errors = flight.vehicle, list[str]()
+
+        async def fly() -> None:
+            try:
+                await vehicle.go_to(vehicle.position.value.offset(north_m=200))
+            except OperationRejected as error:
+                errors.append(str(error))
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(fly)
+            await anyio.sleep(3)
+            with vehicle.posted("motion") as order:
+                here = vehicle.position.value
+                x, y = round(here.latitude_deg * 1e7), round(here.longitude_deg * 1e7)
+                await order.command_int(MavCmd.DO_REPOSITION, -1, frame=6, x=x, y=y, z=20)
+        assert len(errors) == 1
+        assert "another order was given" in errors[0]
+        await anyio.sleep(3)
+        assert not flight.wire.mode_orders()
+
+
+@pytest.mark.anyio
+async def test_what_is_refused_or_not_done_says_so(grounded: Flight) -> None:
+    vehicle, faults = grounded.vehicle, grounded.copter.faults
+    faults.refuse(ARM, MavResult.FAILED, "PreArm: Compass not healthy")
+    with (
+        vehicle.posted("arm", armed=True) as order,
+        pytest.raises(CommandRejected, match="Compass not healthy"),
+    ):
+        await order.command(ARM, 1)
+    faults.refuse(ARM, MavResult.ACCEPTED)
+    with vehicle.posted("arm", armed=True) as order:
+        await order.command(ARM, 1)
+        with pytest.raises(OperationTimeout, match=r"not done within 2 s: .* in STABILIZE, not armed"):
+            await order.until_told(2)
+        grounded.copter.send(
+            m.CommandAck(ARM, MavResult.DENIED, 0, 0, 255, vehicle.connection.source_component)
+        )
+        with pytest.raises(CommandRejected, match="DENIED"):  # taken back
+            await order.until_told(2)
+    with pytest.raises(LocalProtocolError, match="no subject is named"), vehicle.posted():
+        pass
+
+
+@pytest.mark.anyio
+async def test_a_command_int_may_fall_back_to_command_long(flying: Flight) -> None:
+    flying.copter.faults.refuse(MavCmd.DO_SET_HOME, MavResult.COMMAND_LONG_ONLY)
+    place: dict[str, Any] = {"x": 10_000_000, "y": 20_000_000, "z": 30.0}
+    with pytest.raises(CommandRejected):
+        await flying.vehicle.command_int(MavCmd.DO_SET_HOME, 0, frame=0, **place, or_long=True)
+    first, second = flying.wire.commands(MavCmd.DO_SET_HOME)
+    assert isinstance(first, m.CommandInt)
+    assert isinstance(second, m.CommandLong)
+    assert (second.param5, second.param6, second.param7) == (1.0, 2.0, 30.0)
+    with pytest.raises(LocalProtocolError, match="frame = 6 is not allowed with or_long"):
+        await flying.vehicle.command_int(MavCmd.DO_SET_HOME, 0, frame=6, **place, or_long=True)
+
+
+@pytest.mark.anyio
+async def test_an_arming_that_is_posted_is_not_undone_by_one_that_was_given_up(grounded: Flight) -> None:
+    """`arm()` is watched for 15 s after it was given up: what the program has posted since is meant."""
+    vehicle, faults = grounded.vehicle, grounded.copter.faults
+    await vehicle.set_mode("GUIDED")
+    faults.ignore(ARM, times=4)
+    with pytest.raises(CommandTimeout):
+        await vehicle.arm()
+    with vehicle.posted("arm", armed=True) as order:
+        await order.command(ARM, 1)
+    await anyio.sleep(5)
+    assert vehicle.is_armed
