@@ -275,7 +275,7 @@ def test_an_order_under_way_keeps_it_and_is_carried_out(address: str) -> None:
 
     vehicle = dronekit.connect(address)
     dropped = weakref.ref(vehicle)
-    vehicle._dk_order("test", order)
+    vehicle._dk.order("test", order)
     del vehicle
     for _ in range(3):
         assert not is_gone(dropped)

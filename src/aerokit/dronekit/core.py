@@ -48,7 +48,7 @@ class Core:
         self._reviewing = threading.Lock()
         self._aio: AsyncVehicle | None = None
         self._tasks: Background | None = None
-        self._sinks: list[tuple[type[Message], Callable[[Any], None], bool]] = []
+        self._sinks: list[tuple[type[Message], Callable[[Any], None]]] = []
         self._starters: list[Callable[[ExitStack], None]] = []
 
     # --------------------------------------------------------------------------------- state
@@ -86,17 +86,11 @@ class Core:
 
     # ------------------------------------------------------------------------------- hearing
 
-    def on(
-        self,
-        message_type: type[Message],
-        handler: Callable[[Any], None],
-        *,
-        of_any_component: bool = False,
-    ) -> None:
-        """Have a handler called with messages of the autopilot, or of the whole system (loop thread, weakly)."""
+    def on(self, message_type: type[Message], handler: Callable[[Any], None]) -> None:
+        """Have a handler called with messages of the autopilot (loop thread, weakly)."""
         stream = self.streams.get(message_type)
         if stream is None:
-            self._sinks.append((message_type, handler, of_any_component))
+            self._sinks.append((message_type, handler))
         else:
             stream.add(handler)
 
@@ -122,8 +116,8 @@ class Core:
         for message_type, stream in self.streams.items():
             stream.begin(own)
             ends.callback(bus.attach_frames(message_type, weakly(stream.take), system_id=aio.system_id))
-        for message_type, handler, of_any_component in self._sinks:
-            take = weakly(handler) if of_any_component else _only_of(own, weakly(handler))
+        for message_type, handler in self._sinks:
+            take = _only_of(own, weakly(handler))
             ends.callback(bus.attach(message_type, take, system_id=aio.system_id))
 
     def start_parts(self, ends: ExitStack) -> None:
@@ -183,22 +177,6 @@ class VehicleCore(HasObservers):
         self._logger = self._dk.logger
         self._ready_attrs = self._dk.ready.names
         self._autopilot_logger = logging.getLogger("autopilot")
-
-        core = self._dk  # what follows: names for the parts that do not take a core yet
-        self._dk_on, self._dk_at_start, self._dk_check_link = core.on, core.at_start, core.check_link
-        self._dk_run, self._dk_order, self._dk_send = core.run, core.order, core.send
-        self._dk_pause, self._dk_tell = core.pause, core.listeners.tell
-
-    @property
-    def _dk_vehicle(self) -> AsyncVehicle:
-        return self._dk.aio
-
-    @property
-    def _dk_target_system(self) -> int:
-        return self._dk.target_system
-
-    def _dk_on_any_component(self, message_type: type[Message], handler: Callable[[Any], None]) -> None:
-        self._dk.on(message_type, handler, of_any_component=True)
 
     def wait_ready(
         self,

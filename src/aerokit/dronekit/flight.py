@@ -65,9 +65,9 @@ class FlightMethods(VehicleAttributes):
         self._dk_set_mode(value)
 
     def _dk_set_mode(self, value: VehicleMode | str | int) -> tuple[str, concurrent.futures.Future[None]]:
-        aio = self._dk_check_link()
+        aio = self._dk.check_link()
         wanted = mode_named(aio, value.name if isinstance(value, VehicleMode) else value)
-        return wanted.name, self._dk_order("mode", change_mode, aio, wanted)
+        return wanted.name, self._dk.order("mode", change_mode, aio, wanted)
 
     def wait_for_mode(self, mode: VehicleMode | str | int, timeout: float | None = None) -> None:
         """Set the mode and wait until the vehicle is in it.
@@ -95,11 +95,11 @@ class FlightMethods(VehicleAttributes):
         if bool(value) != self._armed or self._dk_is_changing_to(not value):
             self._dk_set_armed(bool(value))
         else:
-            self._dk_check_link()
+            self._dk.check_link()
 
     def _dk_set_armed(self, value: bool) -> concurrent.futures.Future[None]:
-        aio = self._dk_check_link()
-        order = self._dk_order("arm" if value else "disarm", change_armed, aio, value)
+        aio = self._dk.check_link()
+        order = self._dk.order("arm" if value else "disarm", change_armed, aio, value)
         self._dk_arming = value, order
         return order
 
@@ -126,7 +126,7 @@ class FlightMethods(VehicleAttributes):
     def _dk_change_armed(self, value: bool, wait: bool, timeout: float | None, text: str) -> None:
         is_overruling = self._dk_is_changing_to(not value)
         if self._armed == value and not is_overruling:
-            self._dk_check_link()
+            self._dk.check_link()
             return
         order = self._dk_set_armed(value)
         if wait:
@@ -153,7 +153,7 @@ class FlightMethods(VehicleAttributes):
         """Altitude above home in metres."""
         if not math.isfinite(altitude):
             raise ValueError("Altitude was NaN or Infinity. Please provide a real number")
-        aio = self._dk_check_link()
+        aio = self._dk.check_link()
         if aio.autopilot.repositions_amsl:  # as it does take-offs
             home = self._dk_known_home().alt
             plan, mode = (
@@ -162,8 +162,8 @@ class FlightMethods(VehicleAttributes):
             )
             if plan is None or plan.command is None or mode is None:
                 raise APIException("this vehicle cannot take off by a command")
-            return self._dk_order("takeoff", take_off, aio, (mode,), plan.command, *plan.params)
-        return self._dk_order("takeoff", take_off, aio, (), NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude)
+            return self._dk.order("takeoff", take_off, aio, (mode,), plan.command, *plan.params)
+        return self._dk.order("takeoff", take_off, aio, (), NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude)
 
     def wait_simple_takeoff(
         self, alt: float | None = None, epsilon: float = 0.1, timeout: float | None = None
@@ -198,15 +198,15 @@ class FlightMethods(VehicleAttributes):
         Raises:
             ValueError: it is no such location, or one of its numbers is missing or wrong. Nothing was sent.
         """
-        aio = self._dk_check_link()
+        aio = self._dk.check_link()
         flies_in = flies_to_places_in(aio)
         place = self._dk_place(location, is_relative=not flies_in)
         for name, speed in (("airspeed", airspeed), ("groundspeed", groundspeed)):
             check_speed(name, speed)
         if flies_in and self._flightmode not in map(str, flies_in):
-            self._dk_order("goto", refuse, f"not in {self._flightmode}: set the mode {flies_in[0]} first")
+            self._dk.order("goto", refuse, f"not in {self._flightmode}: set the mode {flies_in[0]} first")
         else:
-            self._dk_order("goto", go_to, aio, *place)
+            self._dk.order("goto", go_to, aio, *place)
         if airspeed is not None:
             self.airspeed = airspeed
         if groundspeed is not None:
@@ -250,8 +250,8 @@ class FlightMethods(VehicleAttributes):
 
     def _dk_change_speed(self, name: str, kind: int, speed: float) -> None:
         check_speed(name, speed)
-        aio = self._dk_check_link()
-        self._dk_order(name, aio.command, DO_CHANGE_SPEED, kind, float(speed), -1, component_id=0)
+        aio = self._dk.check_link()
+        self._dk.order(name, aio.command, DO_CHANGE_SPEED, kind, float(speed), -1, component_id=0)
 
     # ---------------------------------------------------------------------------------- home
 
@@ -272,9 +272,9 @@ class FlightMethods(VehicleAttributes):
         if not isinstance(pos, LocationGlobal):
             raise ValueError("Expecting home_location to be set to a LocationGlobal.")
         latitude, longitude, altitude = checked_place(pos)
-        aio = self._dk_check_link()
+        aio = self._dk.check_link()
         place = {"x": latitude, "y": longitude, "z": altitude}
-        order = self._dk_order(
+        order = self._dk.order(
             "home", aio.command_int, DO_SET_HOME, 0, frame=GLOBAL, **place, component_id=0, or_long=True
         )
         self._home_location = LocationGlobal(pos.lat, pos.lon, altitude)
@@ -287,7 +287,7 @@ class FlightMethods(VehicleAttributes):
 
     def _dk_known_home(self) -> LocationGlobal:
         if self._home_location is None:
-            self._dk_run(self._dk_fetch_home)
+            self._dk.run(self._dk_fetch_home)
         home = self.home_location
         if home is None:
             raise APIException(
@@ -296,7 +296,7 @@ class FlightMethods(VehicleAttributes):
         return home
 
     async def _dk_fetch_home(self) -> None:
-        aio = self._dk_check_link()
+        aio = self._dk.check_link()
         with contextlib.suppress(CommandRejected):
             await aio.command(REQUEST_MESSAGE, HomePosition.ID)
         await aio.telemetry.home.wait_until(lambda _: True, timeout=HOME_TIMEOUT_S, description="home")
@@ -318,10 +318,10 @@ class FlightMethods(VehicleAttributes):
         """
         deadline = math.inf if not timeout else time.monotonic() + timeout
         while not condition():
-            self._dk_check_link()
+            self._dk.check_link()
             if time.monotonic() >= deadline:
                 raise TimeoutError(errmsg or f"what was waited for was not true within {timeout:g} s")
-            self._dk_pause(min(interval, max(deadline - time.monotonic(), 0.0)))
+            self._dk.pause(min(interval, max(deadline - time.monotonic(), 0.0)))
 
     def wait_for_armable(self, timeout: float | None = None) -> None:
         """Wait until :attr:`is_armable`; TimeoutError after ``timeout`` seconds."""
@@ -383,12 +383,12 @@ class FlightMethods(VehicleAttributes):
     ) -> None:
         deadline = math.inf if not timeout else time.monotonic() + timeout
         while not is_done():
-            self._dk_check_link()
+            self._dk.check_link()
             if order.done() and order.exception() is not None and not is_done():
                 raise TimeoutError(f"{text}: {order.exception()}") from order.exception()
             if time.monotonic() >= deadline:
                 raise TimeoutError(text)
             if order.done():
-                self._dk_pause(min(POLL_S, max(deadline - time.monotonic(), 0.0)))
+                self._dk.pause(min(POLL_S, max(deadline - time.monotonic(), 0.0)))
             else:
                 concurrent.futures.wait([order], min(POLL_S, max(deadline - time.monotonic(), 0.0)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+from aerokit.dronekit.core import core_of
 from aerokit.dronekit.flight_orders import checked_place
 from aerokit.dronekit.privates import GimbalPrivates
 from aerokit.dronekit.values import LocationGlobal, LocationGlobalRelative
@@ -16,7 +17,7 @@ from aerokit.vehicle.state.gimbal import GimbalAttitude
 if TYPE_CHECKING:
     from contextlib import ExitStack
 
-    from aerokit.dronekit.vehicle import Vehicle
+    from aerokit.dronekit.core import VehicleCore
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
 __all__ = ["Gimbal"]
@@ -32,10 +33,10 @@ class Gimbal(GimbalPrivates):
     a newer one replaces one that is not answered yet, and a refusal becomes a warning of the logger ``dronekit``.
     """
 
-    def __init__(self, vehicle: Vehicle) -> None:
-        self._vehicle = vehicle
+    def __init__(self, vehicle: VehicleCore) -> None:
+        self._core = core_of(vehicle)
         self._attitude = NOT_TOLD
-        vehicle._dk_at_start(self._begin)
+        self._core.at_start(self._begin)
 
     @property
     def pitch(self) -> float | None:
@@ -81,8 +82,8 @@ class Gimbal(GimbalPrivates):
             APIException: the link is down.
         """
         angles = [_checked(name, value) for name, value in (("pitch", pitch), ("yaw", yaw), ("roll", roll))]
-        gimbal = self._vehicle._dk_check_link().gimbal
-        self._vehicle._dk_order("gimbal", gimbal.point, *angles[:2], roll_deg=angles[2])
+        gimbal = self._core.check_link().gimbal
+        self._core.order("gimbal", gimbal.point, *angles[:2], roll_deg=angles[2])
 
     def target_location(self, roi: LocationGlobalRelative | LocationGlobal) -> None:
         """Keep the camera on a place; a copter without a gimbal that turns does so itself. Returns at once.
@@ -96,16 +97,14 @@ class Gimbal(GimbalPrivates):
         if not isinstance(roi, (LocationGlobal, LocationGlobalRelative)):
             raise LocalProtocolError("Expecting roi to be LocationGlobal or LocationGlobalRelative.")
         is_a_place = any(checked_place(roi))
-        aio = self._vehicle._dk_check_link()
+        aio = self._core.check_link()
         if not is_a_place:
-            self._vehicle._dk_order("gimbal", aio.stop_looking)
+            self._core.order("gimbal", aio.stop_looking)
         elif isinstance(roi, LocationGlobal):
-            self._vehicle._dk_order(
-                "gimbal", aio.look_at, Position(roi.lat, roi.lon, altitude_amsl_m=roi.alt)
-            )
+            self._core.order("gimbal", aio.look_at, Position(roi.lat, roi.lon, altitude_amsl_m=roi.alt))
         else:
             place = Position(roi.lat, roi.lon, altitude_relative_m=roi.alt)
-            self._vehicle._dk_order("gimbal", _look_above_home, aio, place)
+            self._core.order("gimbal", _look_above_home, aio, place)
 
     def release(self) -> None:
         """Give the gimbal back to the pilot's sticks; returns at once.
@@ -113,23 +112,23 @@ class Gimbal(GimbalPrivates):
         Raises:
             APIException: the link is down.
         """
-        self._vehicle._dk_order("gimbal", self._vehicle._dk_check_link().gimbal.release)
+        self._core.order("gimbal", self._core.check_link().gimbal.release)
 
     # ----------------------------------------------------------------------------- receiving
 
     def _begin(self, ends: ExitStack) -> None:
-        told = self._vehicle._dk_vehicle.gimbal.attitude
+        told = self._core.aio.gimbal.attitude
         ends.callback(told.observe(weakly(self._on_attitude), every_arrival=True))
 
     def _on_attitude(self, _: GimbalAttitude | None, attitude: GimbalAttitude) -> None:
         self._attitude = attitude
-        vehicle = self._vehicle
-        source = vehicle._dk_vehicle.gimbal.attitude.source
+        core = self._core
+        source = core.aio.gimbal.attitude.source
         if (
             source is not None and source.message != "MOUNT_ORIENTATION"
         ):  # which DroneKit does not tell as ``mount``
-            vehicle._dk_tell("mount", self.mount_status)
-        vehicle._dk_tell("gimbal", self)
+            core.listeners.tell("mount", self.mount_status)
+        core.listeners.tell("gimbal", self)
 
 
 async def _look_above_home(aio: AsyncVehicle, place: Position) -> None:

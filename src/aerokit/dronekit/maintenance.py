@@ -31,7 +31,7 @@ class Maintenance(VehicleCore):
 
     def send_calibrate_magnetometer(self) -> None:
         """Calibrate the compasses: turn the vehicle about all axes until it says that it is done."""
-        if self._dk_check_link().autopilot.calibrates_compasses_by_command:
+        if self._dk.check_link().autopilot.calibrates_compasses_by_command:
             self._dk_calibrate(DO_START_MAG_CAL, 0, 1, 1)  # all compasses; retry; save by itself
         else:
             self._dk_calibrate(PREFLIGHT_CALIBRATION, 0, 1)
@@ -49,9 +49,9 @@ class Maintenance(VehicleCore):
         self._dk_calibrate(PREFLIGHT_CALIBRATION, 0, 0, 0, 0, 4 if simple else 1)
 
     def _dk_calibrate(self, command: int, *params: float) -> None:
-        self._dk_order(
+        self._dk.order(
             "calibration",
-            self._dk_check_link().command,
+            self._dk.check_link().command,
             command,
             *params,
             component_id=0,
@@ -73,16 +73,16 @@ class Maintenance(VehicleCore):
             APIException: the link is down, or the vehicle speaks MAVLink 1, which has no such message.
         """
         text = _tune_text(tune)
-        if self._dk_check_link().connection.mavlink_version == 1:
+        if self._dk.check_link().connection.mavlink_version == 1:
             raise APIException("play_tune needs MAVLink 2, which this vehicle does not speak")
         first = TUNE_SIZES[0]
-        self._dk_send(PlayTune(self._dk_target_system, 0, text[:first], text[first:]))
+        self._dk.send(PlayTune(self._dk.target_system, 0, text[:first], text[first:]))
 
     def reboot(self) -> None:
         """Reboot the autopilot. It is away for some seconds, and then boots anew. Refused while it is armed."""
-        self._dk_order(
+        self._dk.order(
             "reboot",
-            self._dk_check_link().command,
+            self._dk.check_link().command,
             PREFLIGHT_REBOOT_SHUTDOWN,
             1,
             component_id=0,
@@ -92,8 +92,8 @@ class Maintenance(VehicleCore):
 
     def send_capabilities_request(self, vehicle: Any, name: str, m: Any) -> None:
         """Ask for AUTOPILOT_VERSION once. Has the arguments of a message listener, and uses none of them."""
-        self._dk_check_link()
-        self._dk_send(command_long(self._dk_target_system, 0, REQUEST_AUTOPILOT_CAPABILITIES, (1,)))
+        self._dk.check_link()
+        self._dk.send(command_long(self._dk.target_system, 0, REQUEST_AUTOPILOT_CAPABILITIES, (1,)))
 
     def send_capabilties_request(self, vehicle: Any, name: str, m: Any) -> None:
         """As :meth:`send_capabilities_request`; this spelling was the first."""
