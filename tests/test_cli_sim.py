@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import os
 import sys
 from pathlib import Path
@@ -13,13 +12,8 @@ from recorded import SHORT
 from aerokit.cli import main
 from aerokit.cli.places import EACH_ITS_OWN, each_with_its_own, place_of
 from aerokit.cli.vehicles import HOME, simulated_fleet
-from aerokit.errors import LinkLost, LinkOpenError
-from aerokit.links import Peer, PtyLink, parse_address
 from aerokit.sim import SimulatedCopter, SimulatedPx4
 from aerokit.sim.track import true_point
-
-posix_only = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
-
 
 # ---------------------------------------------------------------------------------------- addresses
 
@@ -115,7 +109,7 @@ def test_sim_ends_after_its_duration_with_a_picture(
     assert picture.read_text().count("<polyline") == 4
 
 
-@posix_only
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
 def test_sim_tells_the_name_of_the_other_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     port = tmp_path / "ttyV0"
     assert main(["sim", f"pty:{port}", "--speedup", "100", "--duration", "1"]) == 0
@@ -130,70 +124,3 @@ def test_a_recording_is_served(capsys: pytest.CaptureFixture[str]) -> None:
     assert "system 1 on udpout:" in capsys.readouterr().out
     assert main(["sim", *arguments, "--count", "2"]) == 2
     assert main(["sim", *arguments, "--picture", "track.svg"]) == 2
-
-
-# --------------------------------------------------------------------------------- pseudo-terminals
-
-
-class Heard:
-    """The receiver of a test."""
-
-    def __init__(self) -> None:
-        self.data = b""
-        self.came = asyncio.Event()
-
-    def bytes_received(self, data: bytes, peer: Peer) -> None:
-        self.data += data
-        self.came.set()
-
-    def link_lost(self, error: LinkLost) -> None:
-        raise error
-
-
-def test_addresses_of_pseudo_terminals() -> None:
-    assert str(parse_address("pty")) == "pty"
-    assert parse_address("pty:/tmp/ttyV0").path == "/tmp/ttyV0"
-    assert str(parse_address("pty:/tmp/ttyV0")) == "pty:/tmp/ttyV0"
-
-
-@posix_only
-def test_bytes_go_through_a_pseudo_terminal_unchanged() -> None:
-    async def both_ways() -> None:
-        link, heard = PtyLink(), Heard()
-        await link.open(heard)
-        other = os.open(link.address.removeprefix("pty:"), os.O_RDWR | os.O_NOCTTY)
-        every_byte = bytes(range(256))
-        os.write(other, every_byte)
-        while len(heard.data) < 256:
-            heard.came.clear()
-            await heard.came.wait()
-        link.write(every_byte)
-        assert (heard.data, os.read(other, 1000)) == (every_byte, every_byte)
-        os.close(other)
-        link.close()
-        await link.wait_closed()
-
-    asyncio.run(both_ways())
-
-
-@posix_only
-def test_what_nobody_reads_is_dropped_and_files_are_left_alone(tmp_path: Path) -> None:
-    taken, dead = tmp_path / "taken", tmp_path / "dead"
-    taken.write_text("precious")
-    dead.symlink_to("/dev/pts/no-such")
-
-    async def run() -> None:
-        with pytest.raises(LinkOpenError, match="exists"):
-            await PtyLink(str(taken)).open(Heard())
-        link = PtyLink(str(dead))
-        await link.open(Heard())
-        for _ in range(100):
-            link.write(bytes(1000))
-        assert link.dropped_writes > 10
-        link.close()
-        link.write(b"late")
-        await link.wait_closed()
-
-    asyncio.run(run())
-    assert taken.read_text() == "precious"
-    assert not os.path.lexists(dead)

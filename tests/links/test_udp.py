@@ -11,7 +11,7 @@ import pytest
 from link_harness import LOOPS, Recorder, each_loop, each_of, each_traffic
 
 from aerokit.errors import BusyError, ConnectionClosed, LinkOpenError
-from aerokit.links import UdpBroadcast, UdpConnect, UdpListen, udp
+from aerokit.links import TcpConnect, TcpListen, UdpBroadcast, UdpConnect, UdpListen, udp
 
 HOSTS = pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
 
@@ -297,3 +297,9 @@ def test_close_works_when_the_loop_is_not_running_or_gone() -> None:
     loop.close()
     gone.close()
     UdpListen("127.0.0.1", 0).close()
+
+
+@pytest.mark.parametrize("kind", [UdpListen, UdpConnect, UdpBroadcast, TcpListen, TcpConnect])
+def test_a_peer_stays_the_same_host_whatever_its_port(kind: Any) -> None:
+    link = kind("127.0.0.1", 14550)
+    assert (link.host_of(("10.0.0.7", 14550)), link.host_of(None)) == ("10.0.0.7", None)

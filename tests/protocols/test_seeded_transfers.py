@@ -113,7 +113,7 @@ def read_log(trouble: Trouble) -> bool:
 
 
 def list_parameters(trouble: Trouble) -> bool:
-    table = table_of(trouble.dice.choice((1, 9, 60, 140)))
+    table = table_of(trouble.dice.choice((1, 2, 9, 60, 140)))
     exchange = ParameterList(1, 1, bytewise=trouble.is_bytewise, **trouble.options)
     return list(trouble.channel(table).run(exchange).values()) == table
 

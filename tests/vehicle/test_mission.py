@@ -20,11 +20,12 @@ from aerokit.errors import (
     OperationRejected,
     OperationTimeout,
 )
-from aerokit.mavlink.enums import CopterMode, MavCmd
+from aerokit.mavlink.enums import CopterMode, MavCmd, MissionState
 from aerokit.missions import Mission, MissionItem
 from aerokit.missions.actions import jump
 from aerokit.missions.navigation import return_to_launch
 from aerokit.runtime.subscription import Subscription
+from aerokit.sim.ardupilot.mission_run import MissionRun
 
 pytestmark = pytest.mark.anyio
 
@@ -82,6 +83,21 @@ async def test_from_the_ground_to_the_end(opened: Any, end: MissionItem | None) 
         current = [event.after for event in seen if isinstance(event, events.MissionCurrentChanged)]
         assert [item for item in current if item][:2] == [1, 2]
         assert sum(isinstance(event, events.MissionFinished) for event in seen) == 1
+
+
+async def test_of_firmware_that_tells_no_state_the_last_item_is_the_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """ArduPilot before 4.3: MISSION_CURRENT has the item alone."""
+    monkeypatch.setattr(MissionRun, "state", property(lambda _: MissionState.UNKNOWN))
+    async with armed(open_flight) as flight:
+        mission = flight.vehicle.mission
+        await mission.start()
+        with pytest.raises(OperationTimeout):
+            await mission.wait_finished(timeout=5)
+        with flight.vehicle.subscribe(m.MissionItemReached) as reached:
+            await mission.wait_finished(timeout=200)
+        assert all_of(reached)[-1].seq == mission.count.value
 
 
 async def test_a_pause_is_waited_through() -> None:

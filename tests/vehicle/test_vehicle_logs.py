@@ -102,6 +102,10 @@ async def test_in_flight_only_mavftp_reads_them(ardupilot: Bench) -> None:
     await ardupilot.vehicle.wait_ready()
     await ardupilot.vehicle.arm()
     assert await ardupilot.logs.read(entries[0]) == ardupilot.content(0)
+    ardupilot.wire.forget()
+    with pytest.raises(FileTimeout, match="does not answer"):
+        await ardupilot.logs.read(entries[0], method="log", patience_s=2.0)
+    assert not ardupilot.wire.all(m.FileTransferProtocol)
     with pytest.raises(FileTimeout, match="does not answer"):
         await ardupilot.logs.list(patience_s=2.0)
 

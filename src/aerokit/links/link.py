@@ -111,7 +111,7 @@ class Link(ABC):
 
     def host_of(self, peer: Peer) -> object:
         """What stays the same when a peer changes its port: its IP address. Of other links the peer itself."""
-        return peer
+        return peer[0] if isinstance(peer, tuple) else peer
 
     def has_peer(self, peer: Peer) -> bool:
         """Whether a peer that was heard could still be written to: not a client that has gone."""

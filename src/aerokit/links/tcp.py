@@ -194,10 +194,6 @@ class TcpListen(_TcpLink):
         """See `Link.forget_peer`: it may be turned away for another one."""
         self._kept.discard(peer)
 
-    def host_of(self, peer: Peer) -> object:
-        """See `Link.host_of`."""
-        return peer[0] if isinstance(peer, tuple) else peer
-
     def has_peer(self, peer: Peer) -> bool:
         """See `Link.has_peer`."""
         return peer in self._clients

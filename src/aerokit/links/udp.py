@@ -179,10 +179,6 @@ class UdpListen(_UdpLink):
         """See `Link.forget_peer`."""
         self._peers.pop(peer, None)
 
-    def host_of(self, peer: Peer) -> object:
-        """See `Link.host_of`."""
-        return peer[0] if isinstance(peer, tuple) else peer
-
     def has_peer(self, peer: Peer) -> bool:
         """See `Link.has_peer`."""
         return peer in self._peers
@@ -256,10 +252,6 @@ class UdpBroadcast(_UdpLink):
     def keep_peer(self, peer: Peer) -> None:
         """See `Link.keep_peer`."""
         self._remote, self._heard_at = peer, self._now()
-
-    def host_of(self, peer: Peer) -> object:
-        """See `Link.host_of`."""
-        return peer[0] if isinstance(peer, tuple) else peer
 
     def _now(self) -> float:
         return 0.0 if self._loop is None else self._loop.time()

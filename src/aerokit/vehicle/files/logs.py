@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 __all__ = ["LogEntry", "LogMethod", "Logs"]
 
 LogMethod = Literal["auto", "ftp", "log"]
-METHODS = ("auto", "ftp", "log")
 SILENT_REQUESTS = 4
 """So many unanswered requests for the list, and a PX4 is asked by MAVFTP whether it has any logs."""
 LARGEST_ID = 0xFFFF
@@ -107,7 +106,7 @@ class Logs:
             FileTimeout: it did not arrive; ``missing`` has the ranges.
             OSError: the file cannot be written here.
         """
-        _check(log, method)
+        _check(log)
         path, entry = await self._find(log, method, patience_s, timeout)
         growth = GrowthWatch(entry if isinstance(log, int) else log, on_progress)
         if path is not None:
@@ -141,7 +140,7 @@ class Logs:
             FileError: there is no such log, or it cannot be reached by MAVFTP when that was asked for.
             FileTimeout: it did not arrive; ``missing`` has the ranges.
         """
-        _check(log, method)
+        _check(log)
         path, entry = await self._find(log, method, patience_s, timeout)
         growth = GrowthWatch(entry if isinstance(log, int) else log, on_progress)
         if path is not None:
@@ -336,9 +335,7 @@ class Logs:
             self._transfers.background.start(confirm, "aerokit end of logs")
 
 
-def _check(log: LogEntry | int, method: str) -> None:
-    if method not in METHODS:
-        raise LocalProtocolError(f"method = {method!r} is not allowed: {', '.join(METHODS)}")
+def _check(log: LogEntry | int) -> None:
     log_id = log.id if isinstance(log, LogEntry) else log
     if not isinstance(log_id, int) or not 0 <= log_id <= LARGEST_ID:
         raise LocalProtocolError(f"log = {log!r} is not allowed: an entry, or an id from 0 to {LARGEST_ID}")

@@ -12,7 +12,6 @@ import anyio
 from aerokit.errors import (
     FileError,
     FileTimeout,
-    LocalProtocolError,
     NotSupported,
     RemoteProtocolError,
 )
@@ -97,7 +96,6 @@ class ParameterAccess:
         on_progress: OnProgress | None,
     ) -> ParameterTable:
         """The whole table; see :meth:`Parameters.download`."""
-        _check_method("method", method, ("auto", "ftp", "list"))
         async with self._downloading:
             if self.store.is_complete and not refresh:
                 return self.store.table
@@ -306,7 +304,6 @@ class ParameterAccess:
         on_progress: OnProgress | None,
     ) -> dict[str, Answer]:
         """As :meth:`write`, all in one file where that works; what did not arrive that way is set one by one."""
-        _check_method("method", method, ("auto", "ftp", "set"))
         wanted = tuple(wanted)
         if method == "set" or (
             method == "auto" and (len(wanted) < LEAST_TO_PACK or not await self.has_pack())
@@ -386,8 +383,3 @@ class _Keeper:
 
 def _names(parameters: Iterable[Parameter]) -> list[str]:
     return [each.name for each in parameters]
-
-
-def _check_method(field: str, method: str, allowed: tuple[str, ...]) -> None:
-    if method not in allowed:
-        raise LocalProtocolError(f"{field} = {method!r} is not allowed: {', '.join(allowed)}")

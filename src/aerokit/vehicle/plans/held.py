@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Generic, Literal, TypeVar
 
 from aerokit.arguments import checks_arguments
-from aerokit.errors import LocalProtocolError
 from aerokit.vehicle.checks import check_kind
 
 if TYPE_CHECKING:
@@ -20,7 +19,6 @@ __all__ = ["HeldPlan", "PlanMethod"]
 PlanT = TypeVar("PlanT", bound="Plan")
 ResultT = TypeVar("ResultT")
 PlanMethod = Literal["auto", "ftp", "items"]
-METHODS = ("auto", "ftp", "items")
 
 
 @checks_arguments
@@ -148,8 +146,6 @@ class HeldPlan(Generic[PlanT]):
     ) -> ResultT:
         from aerokit.vehicle.plans.transfer import PlanTransfer
 
-        if method not in METHODS:
-            raise LocalProtocolError(f"method = {method!r} is not allowed: {', '.join(METHODS)}")
         context = self._context
         transfer = PlanTransfer(context, self._plan_type(), patience_s=patience_s, on_progress=on_progress)
         with context.transfers.limit(timeout):

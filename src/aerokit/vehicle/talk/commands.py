@@ -224,10 +224,8 @@ class CommandSender:
             self._under_way.setdefault(key, []).extend([self._connection.now()] * count)
 
     def _take_answers_under_way(self, key: _Key) -> int:
-        if key not in self._under_way:
-            return 0
         oldest = self._connection.now() - UNDER_WAY_S
-        return sum(at >= oldest for at in self._under_way.pop(key))
+        return sum(at >= oldest for at in self._under_way.pop(key, ()))
 
     def _abort(self, error: Exception) -> None:
         for run in tuple(self._runs.values()):

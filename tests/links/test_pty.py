@@ -1,0 +1,81 @@
+"""Pseudo-terminals: a serial port without hardware."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from aerokit.errors import LinkLost, LinkOpenError
+from aerokit.links import Peer, PtyLink, parse_address
+
+posix_only = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
+
+
+class Heard:
+    """The receiver of a test."""
+
+    def __init__(self) -> None:
+        self.data = b""
+        self.came = asyncio.Event()
+
+    def bytes_received(self, data: bytes, peer: Peer) -> None:
+        self.data += data
+        self.came.set()
+
+    def link_lost(self, error: LinkLost) -> None:
+        raise error
+
+
+def test_addresses_of_pseudo_terminals() -> None:
+    assert str(parse_address("pty")) == "pty"
+    assert parse_address("pty:/tmp/ttyV0").path == "/tmp/ttyV0"
+    assert str(parse_address("pty:/tmp/ttyV0")) == "pty:/tmp/ttyV0"
+
+
+@posix_only
+def test_bytes_go_through_a_pseudo_terminal_unchanged() -> None:
+    async def both_ways() -> None:
+        link, heard = PtyLink(), Heard()
+        await link.open(heard)
+        other = os.open(link.address.removeprefix("pty:"), os.O_RDWR | os.O_NOCTTY)
+        every_byte = bytes(range(256))
+        os.write(other, every_byte)
+        while len(heard.data) < 256:
+            heard.came.clear()
+            await heard.came.wait()
+        link.write(every_byte)
+        assert (heard.data, os.read(other, 1000)) == (every_byte, every_byte)
+        os.close(other)
+        link.close()
+        await link.wait_closed()
+
+    asyncio.run(both_ways())
+
+
+@posix_only
+def test_what_nobody_reads_is_dropped_and_files_are_left_alone(tmp_path: Path) -> None:
+    taken, dead = tmp_path / "taken", tmp_path / "dead"
+    taken.write_text("precious")
+    dead.symlink_to("/dev/pts/no-such")
+
+    async def run() -> None:
+        link = PtyLink(str(taken))
+        with pytest.raises(LinkOpenError, match="exists"):
+            await link.open(Heard())
+        link.close()
+        link = PtyLink(str(dead))
+        await link.open(Heard())
+        for _ in range(100):
+            link.write(bytes(1000))
+        assert link.dropped_writes > 10
+        link.close()
+        link.write(b"late")
+        await link.wait_closed()
+
+    asyncio.run(run())
+    assert taken.read_text() == "precious"
+    assert not os.path.lexists(dead)
