@@ -22,6 +22,7 @@ from aerokit.autopilots.base import Autopilot, ModeOrder, Purpose, Reposition, S
 from aerokit.autopilots.modes import Mode, ModeTable, is_armed
 from aerokit.autopilots.px4 import Px4, px4_custom_mode
 from aerokit.autopilots.version import AutopilotVersion
+from aerokit.mavlink.enums import MavAutopilot
 
 if TYPE_CHECKING:
     from aerokit.mavlink.messages import Heartbeat
@@ -49,13 +50,11 @@ __all__ = [
     "px4_custom_mode",
 ]
 
-MAV_AUTOPILOT_ARDUPILOTMEGA, MAV_AUTOPILOT_PX4 = 3, 12
-
 
 def autopilot_for(heartbeat: Heartbeat) -> Autopilot:
     """The autopilot and vehicle type that a HEARTBEAT tells; a cautious general one for all others."""
-    if heartbeat.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA:
+    if heartbeat.autopilot == MavAutopilot.ARDUPILOTMEGA:
         return ardupilot_for(heartbeat.type)
-    if heartbeat.autopilot == MAV_AUTOPILOT_PX4:
+    if heartbeat.autopilot == MavAutopilot.PX4:
         return Px4(heartbeat.type)
     return Autopilot(heartbeat.type)

@@ -6,18 +6,10 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, ClassVar
 
 from aerokit.autopilots import ardupilot_modes
-from aerokit.autopilots.base import (
-    LANDED_STATE_IN_AIR,
-    LANDED_STATE_ON_GROUND,
-    NAV_TAKEOFF,
-    Autopilot,
-    Purpose,
-    Reposition,
-    SetpointRules,
-    TakeOff,
-)
+from aerokit.autopilots.base import Autopilot, Purpose, Reposition, SetpointRules, TakeOff
 from aerokit.autopilots.health import names_of
 from aerokit.autopilots.streams import ARDUPILOT_GROUPS
+from aerokit.mavlink.enums import EkfStatusFlags, MavCmd, MavLandedState, MavState, MavType
 
 if TYPE_CHECKING:
     from aerokit.mavlink.messages import Heartbeat
@@ -33,22 +25,18 @@ __all__ = [
     "ardupilot_for",
 ]
 
-MAV_STATE_STANDBY, MAV_STATE_ACTIVE = 3, 4
-EKF_ATTITUDE, EKF_POS_HORIZ_ABS, EKF_POS_VERT_ABS, EKF_PRED_POS_HORIZ_ABS = 1, 16, 32, 512
 EKF_PROBLEMS: Mapping[int, str] = {1024: "initialisation", 32768: "GPS without glitches"}
-FIXED_WING, SURFACE_BOAT, SUBMARINE, GROUND_ROVER, ANTENNA_TRACKER, AIRSHIP = 1, 11, 12, 10, 5, 7
 VTOLS = range(19, 26)
-QUADROTOR, COAXIAL, HELICOPTER, HEXAROTOR, OCTOROTOR, TRICOPTER, DODECAROTOR, DECAROTOR = (
-    2,
-    3,
-    4,
-    13,
-    14,
-    15,
-    29,
-    35,
+COPTERS = (
+    MavType.QUADROTOR,
+    MavType.COAXIAL,
+    MavType.HELICOPTER,
+    MavType.HEXAROTOR,
+    MavType.OCTOROTOR,
+    MavType.TRICOPTER,
+    MavType.DODECAROTOR,
+    MavType.DECAROTOR,
 )
-COPTERS = (QUADROTOR, COAXIAL, HELICOPTER, HEXAROTOR, OCTOROTOR, TRICOPTER, DODECAROTOR, DECAROTOR)
 
 
 class ArduPilot(Autopilot):
@@ -84,8 +72,8 @@ class ArduPilot(Autopilot):
         return (
             *self._missing_estimates(
                 flags,
-                required=EKF_ATTITUDE | EKF_POS_VERT_ABS,
-                horizontal=EKF_POS_HORIZ_ABS | EKF_PRED_POS_HORIZ_ABS,
+                required=EkfStatusFlags.ATTITUDE.value | EkfStatusFlags.POS_VERT_ABS.value,
+                horizontal=EkfStatusFlags.POS_HORIZ_ABS.value | EkfStatusFlags.PRED_POS_HORIZ_ABS.value,
             ),
             *names_of(flags, EKF_PROBLEMS),
         )
@@ -143,7 +131,7 @@ class ArduCopter(ArduPilot):
     ) -> TakeOff:
         """GUIDED, arm, NAV_TAKEOFF with the altitude above home; it stays in GUIDED."""
         guided = self.modes.find("GUIDED")
-        return TakeOff(guided, NAV_TAKEOFF, (0, 0, 0, 0, 0, 0, altitude_relative_m), None)
+        return TakeOff(guided, MavCmd.NAV_TAKEOFF, (0, 0, 0, 0, 0, 0, altitude_relative_m), None)
 
     def landed_state_of(self, heartbeat: Heartbeat) -> int | None:
         """STANDBY is said on the ground only, ACTIVE in the air only; a failsafe (CRITICAL) hides both."""
@@ -180,7 +168,7 @@ class ArduPlane(ArduPilot):
         """A QuadPlane rises in GUIDED; a plane armed in TAKEOFF climbs to its parameter TKOFF_ALT."""
         if self._can_hover(is_vtol):
             params = (0, 0, 0, 0, 0, 0, altitude_relative_m)
-            return TakeOff(self.modes.find("GUIDED"), NAV_TAKEOFF, params, None)
+            return TakeOff(self.modes.find("GUIDED"), MavCmd.NAV_TAKEOFF, params, None)
         return TakeOff(self.modes.find("TAKEOFF"), None, (), None)
 
     def landed_state_of(self, heartbeat: Heartbeat) -> int | None:
@@ -213,7 +201,7 @@ class ArduRover(ArduPilot):
     unarmable_modes = frozenset(("RTL", "SMART_RTL", "INITIALISING"))
 
     def _purpose_name(self, purpose: Purpose, is_vtol: bool) -> str | None:
-        if purpose == "hold" and self.vehicle_type == SURFACE_BOAT:
+        if purpose == "hold" and self.vehicle_type == MavType.SURFACE_BOAT:
             return "LOITER"  # in HOLD the motors are off and a boat drifts away
         return super()._purpose_name(purpose, is_vtol)
 
@@ -252,12 +240,12 @@ class AntennaTracker(ArduPilot):
 
 
 _BY_TYPE: Mapping[int, type[ArduPilot]] = {
-    FIXED_WING: ArduPlane,
-    GROUND_ROVER: ArduRover,
-    SURFACE_BOAT: ArduRover,
-    SUBMARINE: ArduSub,
-    ANTENNA_TRACKER: AntennaTracker,
-    AIRSHIP: Blimp,
+    MavType.FIXED_WING: ArduPlane,
+    MavType.GROUND_ROVER: ArduRover,
+    MavType.SURFACE_BOAT: ArduRover,
+    MavType.SUBMARINE: ArduSub,
+    MavType.ANTENNA_TRACKER: AntennaTracker,
+    MavType.AIRSHIP: Blimp,
     **dict.fromkeys(VTOLS, ArduPlane),
     **dict.fromkeys(COPTERS, ArduCopter),
 }
@@ -269,9 +257,9 @@ def ardupilot_for(vehicle_type: int) -> ArduPilot:
 
 
 def _landed_state(heartbeat: Heartbeat) -> int | None:
-    if heartbeat.system_status == MAV_STATE_STANDBY:
-        return LANDED_STATE_ON_GROUND
-    return LANDED_STATE_IN_AIR if heartbeat.system_status == MAV_STATE_ACTIVE else None
+    if heartbeat.system_status == MavState.STANDBY:
+        return MavLandedState.ON_GROUND
+    return MavLandedState.IN_AIR if heartbeat.system_status == MavState.ACTIVE else None
 
 
 def _after(text: str, *prefixes: str) -> str | None:

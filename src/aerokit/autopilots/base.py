@@ -10,6 +10,7 @@ from aerokit.autopilots.health import ESTIMATES, PREARM_CHECK, SENSORS, names_of
 from aerokit.autopilots.modes import CUSTOM_MODE_ENABLED, NO_MODES, Mode, ModeTable, base_mode_name
 from aerokit.autopilots.version import AutopilotVersion, version_text
 from aerokit.mavlink import messages
+from aerokit.mavlink.enums import MavProtocolCapability
 from aerokit.snapshot import Snapshot
 
 if TYPE_CHECKING:
@@ -18,9 +19,6 @@ if TYPE_CHECKING:
 __all__ = ["Autopilot", "ModeOrder", "Purpose", "Reposition", "SetpointRules", "TakeOff"]
 
 NAN = math.nan
-NAV_TAKEOFF = 22
-PARAM_ENCODE_C_CAST, PARAM_ENCODE_BYTEWISE = 0x2_0000, 0x10
-LANDED_STATE_ON_GROUND, LANDED_STATE_IN_AIR = 1, 2
 
 Purpose = Literal["hold", "land", "return", "setpoint", "take_off", "mission"]
 """What a program wants a mode for."""
@@ -289,8 +287,10 @@ class Autopilot:
 
     def encodes_parameters_bytewise(self, capabilities: int | None) -> bool:
         """Whether integer parameters travel as their bytes instead of as a number in a float."""
-        if capabilities is not None and capabilities & (PARAM_ENCODE_BYTEWISE | PARAM_ENCODE_C_CAST):
-            return bool(capabilities & PARAM_ENCODE_BYTEWISE)
+        if capabilities is not None and capabilities & (
+            MavProtocolCapability.PARAM_ENCODE_BYTEWISE | MavProtocolCapability.PARAM_ENCODE_C_CAST
+        ):
+            return bool(capabilities & MavProtocolCapability.PARAM_ENCODE_BYTEWISE)
         return self._bytewise_by_default
 
     _bytewise_by_default = False

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from aerokit.mavlink.enums import MavSysStatusSensor
+
 __all__ = [
     "ESTIMATES",
     "PREARM_CHECK",
@@ -11,7 +13,7 @@ __all__ = [
     "names_of",
 ]
 
-PREARM_CHECK = 0x1000_0000
+PREARM_CHECK = MavSysStatusSensor.MAV_SYS_STATUS_PREARM_CHECK.value
 """MAV_SYS_STATUS_PREARM_CHECK: the summary of all checks, not a sensor."""
 
 SENSORS: Mapping[int, str] = {

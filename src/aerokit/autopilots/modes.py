@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from aerokit.errors import LocalProtocolError
+from aerokit.mavlink.enums import MavModeFlag
 from aerokit.snapshot import Snapshot
 from aerokit.wording import did_you_mean, shown
 
 __all__ = ["CUSTOM_MODE_ENABLED", "Mode", "ModeTable", "base_mode_name", "is_armed"]
 
-CUSTOM_MODE_ENABLED = 1
-"""MAV_MODE_FLAG_CUSTOM_MODE_ENABLED: ``custom_mode`` tells the mode."""
-SAFETY_ARMED = 128
-"""MAV_MODE_FLAG_SAFETY_ARMED."""
+CUSTOM_MODE_ENABLED = MavModeFlag.CUSTOM_MODE_ENABLED.value
+"""``custom_mode`` tells the mode."""
+SAFETY_ARMED = MavModeFlag.SAFETY_ARMED.value
 
 NO_MODES: Mapping[int, str] = {}
 """No modes beside the built-in ones."""

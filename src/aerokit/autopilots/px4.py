@@ -5,25 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import ClassVar
 
-from aerokit.autopilots.base import (
-    NAN,
-    NAV_TAKEOFF,
-    Autopilot,
-    ModeOrder,
-    Purpose,
-    Reposition,
-    SetpointRules,
-    TakeOff,
-)
+from aerokit.autopilots.base import NAN, Autopilot, ModeOrder, Purpose, Reposition, SetpointRules, TakeOff
 from aerokit.autopilots.health import PREARM_CHECK, SENSORS, names_of
 from aerokit.autopilots.modes import CUSTOM_MODE_ENABLED, NO_MODES, Mode, ModeTable
 from aerokit.errors import LocalProtocolError
+from aerokit.mavlink.enums import EstimatorStatusFlags, MavCmd, MavType
 
 __all__ = ["Px4", "px4_custom_mode"]
 
 MAIN_POSCTL, MAIN_AUTO = 3, 4
-FIXED_WING, GROUND_ROVER, SURFACE_BOAT, SUBMARINE = 1, 10, 11, 12
-ESTIMATES_REQUIRED, POS_HORIZ_ABS = 0x01 | 0x02 | 0x04 | 0x20, 0x10
+ESTIMATES_REQUIRED, POS_HORIZ_ABS = 0x01 | 0x02 | 0x04 | 0x20, EstimatorStatusFlags.POS_HORIZ_ABS.value
 ESTIMATOR_PROBLEMS: Mapping[int, str] = {1024: "GPS without glitches", 2048: "accelerometer without errors"}
 
 
@@ -124,9 +115,9 @@ class Px4(Autopilot):
 
     def __init__(self, vehicle_type: int) -> None:
         super().__init__(vehicle_type)
-        self.stays_on_the_ground = vehicle_type in (GROUND_ROVER, SURFACE_BOAT)
-        self.lands_after_return = not self._stays_down and vehicle_type != FIXED_WING
-        if vehicle_type == FIXED_WING:
+        self.stays_on_the_ground = vehicle_type in (MavType.GROUND_ROVER, MavType.SURFACE_BOAT)
+        self.lands_after_return = not self._stays_down and vehicle_type != MavType.FIXED_WING
+        if vehicle_type == MavType.FIXED_WING:
             self.arrival_radius_m = 120.0  # it circles at NAV_LOITER_RAD, 80 m by default
 
     def mode(self, custom_mode: int, base_mode: int, extra: Mapping[int, str] = NO_MODES) -> Mode:
@@ -165,7 +156,7 @@ class Px4(Autopilot):
         if home_altitude_amsl_m is None:
             raise LocalProtocolError("take-off on PX4 needs the altitude of home: it counts from the sea")
         params = (NAN, 0, 0, NAN, NAN, NAN, home_altitude_amsl_m + altitude_relative_m)
-        return TakeOff(None, NAV_TAKEOFF, params, self.modes.find("LOITER"))
+        return TakeOff(None, MavCmd.NAV_TAKEOFF, params, self.modes.find("LOITER"))
 
     def take_off_needs_home(self) -> bool:
         """True: param7 of NAV_TAKEOFF is above the sea."""
@@ -202,7 +193,7 @@ class Px4(Autopilot):
 
     @property
     def _stays_down(self) -> bool:
-        return self.vehicle_type in (GROUND_ROVER, SURFACE_BOAT, SUBMARINE)
+        return self.vehicle_type in (MavType.GROUND_ROVER, MavType.SURFACE_BOAT, MavType.SUBMARINE)
 
     def _git_hash(self, custom_version: bytes) -> str:
         """The commit stands backwards, behind three bytes for the vendor's own version."""

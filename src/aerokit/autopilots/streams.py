@@ -4,23 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from aerokit.mavlink.enums import MavDataStream
 from aerokit.mavlink.messages import INDEX
 
 __all__ = ["ARDUPILOT_GROUPS", "STREAMED"]
 
-RAW_SENSORS, EXTENDED_STATUS, RC_CHANNELS, RAW_CONTROLLER, POSITION, EXTRA1, EXTRA2, EXTRA3 = (
-    1,
-    2,
-    3,
-    4,
-    6,
-    10,
-    11,
-    12,
-)
 
 _GROUPS: Mapping[int, tuple[str, ...]] = {
-    RAW_SENSORS: (
+    MavDataStream.RAW_SENSORS: (
         "RawImu",
         "ScaledImu2",
         "ScaledImu3",
@@ -29,7 +20,7 @@ _GROUPS: Mapping[int, tuple[str, ...]] = {
         "ScaledPressure3",
         "Airspeed",
     ),
-    EXTENDED_STATUS: (
+    MavDataStream.EXTENDED_STATUS: (
         "SysStatus",
         "PowerStatus",
         "McuStatus",
@@ -43,12 +34,12 @@ _GROUPS: Mapping[int, tuple[str, ...]] = {
         "FenceStatus",
         "PositionTargetGlobalInt",
     ),
-    POSITION: ("GlobalPositionInt", "LocalPositionNed"),
-    RAW_CONTROLLER: ("RcChannelsScaled",),
-    RC_CHANNELS: ("ServoOutputRaw", "RcChannels", "RcChannelsRaw"),
-    EXTRA1: ("Attitude", "Simstate", "Ahrs2", "Rpm", "AoaSsa", "PidTuning", "EscTelemetry1To4"),
-    EXTRA2: ("VfrHud",),
-    EXTRA3: (
+    MavDataStream.POSITION: ("GlobalPositionInt", "LocalPositionNed"),
+    MavDataStream.RAW_CONTROLLER: ("RcChannelsScaled",),
+    MavDataStream.RC_CHANNELS: ("ServoOutputRaw", "RcChannels", "RcChannelsRaw"),
+    MavDataStream.EXTRA1: ("Attitude", "Simstate", "Ahrs2", "Rpm", "AoaSsa", "PidTuning", "EscTelemetry1To4"),
+    MavDataStream.EXTRA2: ("VfrHud",),
+    MavDataStream.EXTRA3: (
         "Ahrs",
         "Wind",
         "Rangefinder",

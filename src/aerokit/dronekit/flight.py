@@ -22,8 +22,8 @@ from aerokit.dronekit.flight_orders import (
 from aerokit.dronekit.modes import change_mode, mode_named
 from aerokit.dronekit.values import LocationGlobal, LocationGlobalRelative, VehicleMode
 from aerokit.errors import CommandRejected, OperationTimeout
+from aerokit.mavlink.enums import MavCmd
 from aerokit.mavlink.messages import HomePosition
-from aerokit.vehicle.talk.constants import REQUEST_MESSAGE
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -298,7 +298,7 @@ class FlightMethods(VehicleAttributes):
     async def _dk_fetch_home(self) -> None:
         aio = self._dk.check_link()
         with contextlib.suppress(CommandRejected):
-            await aio.command(REQUEST_MESSAGE, HomePosition.ID)
+            await aio.command(MavCmd.REQUEST_MESSAGE, HomePosition.ID)
         await aio.telemetry.home.wait_until(lambda _: True, timeout=HOME_TIMEOUT_S, description="home")
 
     # ------------------------------------------------------------------------------- waiting

@@ -17,6 +17,7 @@ from aerokit.errors import (
     OperationRejected,
     OperationTimeout,
 )
+from aerokit.mavlink.enums import MavCmd
 from aerokit.vehicle.orders.late_arming import LATE_S, give_arm
 from aerokit.vehicle.orders.part import Part
 from aerokit.vehicle.orders.progress import LONGEST_SILENCE_S, Arrivals, await_progress
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
 
 __all__ = ["ArmingActions"]
 
-PREFLIGHT_REBOOT_SHUTDOWN = 246
 FORCE_REBOOT = 20190226
 SAID_AGAIN_S = 35.0
 """ArduPilot says every 30 s why it would not arm."""
@@ -265,7 +265,7 @@ class ArmingActions(Part):
         options: dict[str, Any] = {"attempts": 1, "attempt_timeout": REBOOT_ANSWER_S}
         with self._helm.aside() as order:
             await self._orders.give(
-                order, self._talk.commands.send_long, PREFLIGHT_REBOOT_SHUTDOWN, *params, **options
+                order, self._talk.commands.send_long, MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, *params, **options
             )
 
     async def _await_reboot(self, reboots: int) -> None:

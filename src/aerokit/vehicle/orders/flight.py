@@ -9,6 +9,7 @@ import anyio
 
 from aerokit.arguments import checks_arguments
 from aerokit.errors import CommandRejected, NotSupported, OperationRejected, OperationTimeout
+from aerokit.mavlink.enums import MavLandedState
 from aerokit.position import Position
 from aerokit.vehicle.checks import check_range
 from aerokit.vehicle.orders.helm import MODE_GRACE_S
@@ -23,8 +24,11 @@ if TYPE_CHECKING:
 
 __all__ = ["FlightActions"]
 
-LANDED_ON_GROUND, LANDED_IN_AIR, TAKING_OFF = 1, 2, 3
-IN_THE_AIR: dict[int | None, str] = {LANDED_IN_AIR: "in the air", TAKING_OFF: "taking off", 4: "landing"}
+IN_THE_AIR: dict[int | None, str] = {
+    MavLandedState.IN_AIR: "in the air",
+    MavLandedState.TAKEOFF: "taking off",
+    MavLandedState.LANDING: "landing",
+}
 """MAV_LANDED_STATE."""
 FLYING_M = 2.0
 """So far above home, who says nothing of it is taken to fly."""
@@ -71,7 +75,7 @@ class FlightActions(Part):
         if not self.telemetry.is_armed:
             raise OperationRejected("take_off: the vehicle is not armed: arm() comes first; nothing was sent")
         landed = self.telemetry.landed_state
-        if landed.latest == LANDED_IN_AIR and landed.age <= OLD_POSITION_S:
+        if landed.latest == MavLandedState.IN_AIR and landed.age <= OLD_POSITION_S:
             raise OperationRejected(
                 "take_off: the vehicle flies already: go_to() climbs too; nothing was sent"
             )
@@ -132,7 +136,10 @@ class FlightActions(Part):
         state_before = landed.latest
 
         def is_rising() -> bool:
-            is_told = landed.latest != state_before and landed.latest in (LANDED_IN_AIR, TAKING_OFF)
+            is_told = landed.latest != state_before and landed.latest in (
+                MavLandedState.IN_AIR,
+                MavLandedState.TAKEOFF,
+            )
             return is_told or self._where.altitude_relative() > begins_at + RISEN_M
 
         return is_rising
@@ -215,7 +222,7 @@ class FlightActions(Part):
 
         def is_down() -> bool:
             is_disarmed = self.telemetry.is_surely_disarmed and armed.updated_at > order.given_at
-            is_landed = landed.latest == LANDED_ON_GROUND and landed.updated_at > order.given_at
+            is_landed = landed.latest == MavLandedState.ON_GROUND and landed.updated_at > order.given_at
             return is_disarmed or is_landed or (is_over() and not is_deep())
 
         def is_over() -> bool:

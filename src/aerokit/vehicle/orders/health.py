@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import anyio
 
 from aerokit.errors import CommandRejected, CommandTimeout
+from aerokit.mavlink.enums import MavCmd
 from aerokit.runtime.link_state import LinkState
 
 if TYPE_CHECKING:
@@ -16,7 +17,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Health"]
 
-RUN_PREARM_CHECKS = 401
 TEXTS_S = 1.0
 """How long texts are collected after the vehicle was asked to run its checks."""
 FRESH_S = 5.0
@@ -88,7 +88,7 @@ class Health:
 
     async def _run_prearm_checks(self) -> None:
         try:
-            await self._talk.commands.send_long(RUN_PREARM_CHECKS, attempts=2)
+            await self._talk.commands.send_long(MavCmd.RUN_PREARM_CHECKS, attempts=2)
         except (CommandRejected, CommandTimeout):
             return
         await anyio.sleep(TEXTS_S)

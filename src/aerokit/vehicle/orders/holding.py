@@ -9,8 +9,8 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from aerokit.errors import AerokitError, OperationTimeout
+from aerokit.mavlink.enums import MavCmd, MavDoRepositionFlags
 from aerokit.vehicle.orders.leftover import Leftover
-from aerokit.vehicle.orders.orders import CHANGE_MODE, DO_REPOSITION, DO_SET_MODE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -31,7 +31,7 @@ ROUNDS = 3
 """So often it is told to hold when it is heard again."""
 ANSWER_S, ATTEMPTS_TO_HOLD = 0.5, 10
 """An order to hold that was sent in passing is given again when it is not answered."""
-STOP_HERE = (DO_REPOSITION, -1, CHANGE_MODE, 0, *(math.nan,) * 4)
+STOP_HERE = (MavCmd.DO_REPOSITION, -1, MavDoRepositionFlags.CHANGE_MODE, 0, *(math.nan,) * 4)
 """A place that is no number means: here, with the way it takes to brake."""
 
 
@@ -63,7 +63,7 @@ class Holding:
 
     async def _confirm_hold(self, mode: Mode, order: Order) -> None:
         """What :meth:`_send_hold` has sent is answered, or sent again."""
-        by_mode = (DO_SET_MODE, *self._talk.autopilot.mode_order(mode).params)
+        by_mode = (MavCmd.DO_SET_MODE, *self._talk.autopilot.mode_order(mode).params)
         command, *params = STOP_HERE if self._holds_by_reposition else by_mode
         await self._orders.give(
             order,
@@ -108,7 +108,9 @@ class Holding:
         if self._holds_by_reposition:
             self._talk.commands.send_unconfirmed(*STOP_HERE)
         else:
-            self._talk.commands.send_unconfirmed(DO_SET_MODE, *self._talk.autopilot.mode_order(mode).params)
+            self._talk.commands.send_unconfirmed(
+                MavCmd.DO_SET_MODE, *self._talk.autopilot.mode_order(mode).params
+            )
 
     async def _hold_when_known(self, mode: Mode, order: Order, *, is_sent: bool) -> None:
         for _ in range(ROUNDS):

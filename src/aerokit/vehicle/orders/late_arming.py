@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import anyio
 
 from aerokit.errors import AerokitError
+from aerokit.mavlink.enums import MavCmd
 from aerokit.vehicle.orders.leftover import Leftover
-from aerokit.vehicle.orders.order import COMPONENT_ARM_DISARM
 
 if TYPE_CHECKING:
     from aerokit.vehicle.orders.helm import Helm
@@ -32,7 +32,7 @@ logger = logging.getLogger("aerokit")
 async def give_arm(talk: Talk, orders: Orders, order: Order, armed: bool, *, force: bool = False) -> None:
     """Order it to arm or disarm."""
     params = (float(armed), FORCE if force else 0)
-    await orders.give(order, talk.commands.send_long, COMPONENT_ARM_DISARM, *params, armed=armed)
+    await orders.give(order, talk.commands.send_long, MavCmd.COMPONENT_ARM_DISARM, *params, armed=armed)
 
 
 class LateArming:

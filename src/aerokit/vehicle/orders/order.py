@@ -8,6 +8,8 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any, Literal
 
+from aerokit.mavlink.enums import MavCmd
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping
 
@@ -16,7 +18,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "CHANGED_BY_COMMAND",
-    "COMPONENT_ARM_DISARM",
     "MOVING_COMMANDS",
     "QUESTIONS",
     "Order",
@@ -28,14 +29,13 @@ __all__ = [
 Subject = Literal["mode", "motion", "arm"]
 """What an order is about."""
 
-COMPONENT_ARM_DISARM = 400
 _MODE: tuple[Subject, ...] = ("mode", "motion")
 _MOTION: tuple[Subject, ...] = ("motion",)
 _ARM: tuple[Subject, ...] = ("arm",)
 CHANGED_BY_COMMAND: Mapping[int, tuple[Subject, ...]] = {
     **dict.fromkeys((20, 21, 84, 85, 176, 185, 252, 300), _MODE),
     **dict.fromkeys((16, 17, 18, 19, 22, 34, 192, 193), _MOTION),
-    COMPONENT_ARM_DISARM: _ARM,
+    MavCmd.COMPONENT_ARM_DISARM: _ARM,
 }
 """MAV_CMD → what a program changes that sends it by itself."""
 CHANGED_BY_MESSAGE: Mapping[str, tuple[Subject, ...]] = {

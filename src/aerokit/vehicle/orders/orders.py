@@ -6,6 +6,7 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from aerokit.errors import CommandRejected, CommandTimeout, NotSupported, OperationRejected
+from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.vehicle.orders.helm import KNOWN_S, MODE_GRACE_S
 from aerokit.vehicle.orders.order import MOVING_COMMANDS
 from aerokit.vehicle.orders.progress import await_progress
@@ -19,12 +20,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.orders.order import Order
     from aerokit.vehicle.talk.talk import Talk
 
-__all__ = ["CHANGE_MODE", "DO_REPOSITION", "DO_SET_MODE", "RESULT_UNSUPPORTED", "Orders"]
-
-DO_SET_MODE = 176
-DO_REPOSITION = 192
-CHANGE_MODE = 1
-RESULT_UNSUPPORTED = 3
+__all__ = ["Orders"]
 
 
 class Orders:
@@ -84,7 +80,7 @@ class Orders:
         """Order the mode and wait until it is told, by a message that came after ``told_since``."""
         started = self._talk.connection.now()
         was_in_doubt = self._helm.mode_is_in_doubt
-        with self._talk.refusals_of(DO_SET_MODE) as refusals, self._helm.changing_mode():
+        with self._talk.refusals_of(MavCmd.DO_SET_MODE) as refusals, self._helm.changing_mode():
             await self.request_mode(wanted, order, timeout)
             told_since = self._talk.connection.now() if was_in_doubt else told_since
             left = timeout - (self._talk.connection.now() - started)
@@ -98,13 +94,13 @@ class Orders:
             await self.give(
                 order,
                 self._talk.commands.send_long,
-                DO_SET_MODE,
+                MavCmd.DO_SET_MODE,
                 *params,
                 modes=(wanted,),
                 attempt_timeout=min(1.0, timeout / 4),
             )
         except CommandRejected as error:
-            if error.result != RESULT_UNSUPPORTED:
+            if error.result != MavResult.UNSUPPORTED:
                 raise
             self.raise_if_over(order)
             self._talk.connection.send(self._talk.autopilot.mode_order(wanted).legacy(self._talk.system_id))

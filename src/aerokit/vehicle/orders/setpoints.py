@@ -9,6 +9,7 @@ import math
 from typing import TYPE_CHECKING
 
 from aerokit.errors import LocalProtocolError
+from aerokit.mavlink.enums import MavFrame
 from aerokit.mavlink.messages import (
     SetAttitudeTarget,
     SetPositionTargetGlobalInt,
@@ -33,10 +34,6 @@ __all__ = [
     "wants_motion",
 ]
 
-MAV_FRAME_LOCAL_NED = 1
-MAV_FRAME_GLOBAL_INT = 5
-MAV_FRAME_GLOBAL_RELATIVE_ALT_INT = 6
-MAV_FRAME_BODY_NED = 8
 IGNORE_POSITION, IGNORE_VELOCITY, IGNORE_ACCELERATION = 0x007, 0x038, 0x1C0
 IGNORE_YAW, IGNORE_YAW_RATE = 0x400, 0x800
 IGNORE_BODY_RATES = 0x07
@@ -134,7 +131,7 @@ class SetpointEncoder:
     def velocity(self, s: VelocitySetpoint) -> Message:
         """SET_POSITION_TARGET_LOCAL_NED with a velocity in MAV_FRAME_LOCAL_NED."""
         vector = (s.north_m_s, s.east_m_s, s.down_m_s)
-        return self._local(MAV_FRAME_LOCAL_NED, IGNORE_VELOCITY, vector, s.yaw_deg, s.yaw_rate_deg_s)
+        return self._local(MavFrame.LOCAL_NED, IGNORE_VELOCITY, vector, s.yaw_deg, s.yaw_rate_deg_s)
 
     def body_velocity(self, s: BodyVelocitySetpoint) -> Message:
         """SET_POSITION_TARGET_LOCAL_NED with a velocity in MAV_FRAME_BODY_NED.
@@ -144,22 +141,22 @@ class SetpointEncoder:
         """
         vector = (s.forward_m_s, s.right_m_s, s.down_m_s)
         if s.yaw_deg is None or not self._talk.autopilot.setpoints.body_yaw_is_relative:
-            return self._local(MAV_FRAME_BODY_NED, IGNORE_VELOCITY, vector, s.yaw_deg, s.yaw_rate_deg_s)
+            return self._local(MavFrame.BODY_NED, IGNORE_VELOCITY, vector, s.yaw_deg, s.yaw_rate_deg_s)
         heading = math.radians(self._talk.telemetry.heading_deg.value)
         north = s.forward_m_s * math.cos(heading) - s.right_m_s * math.sin(heading)
         east = s.forward_m_s * math.sin(heading) + s.right_m_s * math.cos(heading)
         vector = (north, east, s.down_m_s)
-        return self._local(MAV_FRAME_LOCAL_NED, IGNORE_VELOCITY, vector, s.yaw_deg, s.yaw_rate_deg_s)
+        return self._local(MavFrame.LOCAL_NED, IGNORE_VELOCITY, vector, s.yaw_deg, s.yaw_rate_deg_s)
 
     def acceleration(self, s: AccelerationSetpoint) -> Message:
         """SET_POSITION_TARGET_LOCAL_NED with an acceleration in MAV_FRAME_LOCAL_NED."""
         vector = (s.north_m_s2, s.east_m_s2, s.down_m_s2)
-        return self._local(MAV_FRAME_LOCAL_NED, IGNORE_ACCELERATION, vector, s.yaw_deg, s.yaw_rate_deg_s)
+        return self._local(MavFrame.LOCAL_NED, IGNORE_ACCELERATION, vector, s.yaw_deg, s.yaw_rate_deg_s)
 
     def local_position(self, s: LocalPositionSetpoint) -> Message:
         """SET_POSITION_TARGET_LOCAL_NED with a place in MAV_FRAME_LOCAL_NED."""
         vector = (s.north_m, s.east_m, s.down_m)
-        return self._local(MAV_FRAME_LOCAL_NED, IGNORE_POSITION, vector, s.yaw_deg, s.yaw_rate_deg_s)
+        return self._local(MavFrame.LOCAL_NED, IGNORE_POSITION, vector, s.yaw_deg, s.yaw_rate_deg_s)
 
     def _local(
         self,
@@ -196,7 +193,7 @@ class SetpointEncoder:
             self._time_ms(),
             self._talk.system_id,
             self._talk.component_id,
-            MAV_FRAME_GLOBAL_RELATIVE_ALT_INT if is_relative else MAV_FRAME_GLOBAL_INT,
+            MavFrame.GLOBAL_RELATIVE_ALT_INT if is_relative else MavFrame.GLOBAL_INT,
             IGNORE_VELOCITY | IGNORE_ACCELERATION | mask,
             latitude,
             longitude,

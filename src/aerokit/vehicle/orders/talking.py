@@ -7,18 +7,12 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from aerokit.arguments import checks_arguments
 from aerokit.errors import CommandRejected, LocalProtocolError
-from aerokit.mavlink.enums import MavFrame
+from aerokit.mavlink.enums import MavCmd, MavFrame
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import CommandAck, CommandInt, CommandLong, SetMode
 from aerokit.runtime.cells import Source, StateCell
 from aerokit.runtime.subscription import Overflow, Subscription
-from aerokit.vehicle.orders.order import (
-    CHANGED_BY_COMMAND,
-    COMPONENT_ARM_DISARM,
-    QUESTIONS,
-    Subject,
-    subjects_of,
-)
+from aerokit.vehicle.orders.order import CHANGED_BY_COMMAND, QUESTIONS, Subject, subjects_of
 from aerokit.vehicle.orders.part import Part
 from aerokit.vehicle.orders.posting import PostedOrder
 from aerokit.vehicle.talk.every_stream import every_stream
@@ -347,7 +341,7 @@ class TalkActions(Part):
             if command in QUESTIONS:
                 return await send(command, *params, **options)
             with self._own_order(command) as order:
-                armed = params[0] == 1 if command == COMPONENT_ARM_DISARM and params else None
+                armed = params[0] == 1 if command == MavCmd.COMPONENT_ARM_DISARM and params else None
                 with self._helm.sending(order, armed=armed) as sending:
                     return await send(command, *params, standing=sending, **options)
         except CommandRejected as error:

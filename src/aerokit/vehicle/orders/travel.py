@@ -15,13 +15,12 @@ from aerokit.errors import (
     OperationRejected,
     OperationTimeout,
 )
-from aerokit.mavlink.messages import SetPositionTargetGlobalInt
+from aerokit.mavlink.enums import MavCmd, MavDoRepositionFlags, MavFrame, MavResult
+from aerokit.mavlink.messages import HomePosition, SetPositionTargetGlobalInt
 from aerokit.position import Position
 from aerokit.vehicle.checks import check_range
-from aerokit.vehicle.orders.orders import CHANGE_MODE, DO_REPOSITION, RESULT_UNSUPPORTED
 from aerokit.vehicle.orders.part import Part
 from aerokit.vehicle.orders.progress import LONGEST_SILENCE_S, Stillness, await_progress
-from aerokit.vehicle.talk.constants import HOME_POSITION, REQUEST_MESSAGE
 
 if TYPE_CHECKING:
     from aerokit.autopilots import Mode
@@ -29,11 +28,6 @@ if TYPE_CHECKING:
 
 __all__ = ["TravelActions"]
 
-CONDITION_YAW = 115
-DO_CHANGE_SPEED = 178
-DO_SET_HOME = 179
-MAV_FRAME_GLOBAL_INT = 5
-MAV_FRAME_GLOBAL_RELATIVE_ALT_INT = 6
 POSITION_ONLY = 0x0DF8
 RESEND_S = 1.0
 
@@ -96,9 +90,9 @@ class TravelActions(Part):
             under_way = True
             if speed_m_s is not None and not self._speeds_by_reposition:
                 # ArduPilot obeys it only once it is under way
-                await self._orders.command_of(order, DO_CHANGE_SPEED, 1, speed_m_s, -1)
+                await self._orders.command_of(order, MavCmd.DO_CHANGE_SPEED, 1, speed_m_s, -1)
             if heading_deg is not None and math.isnan(yaw):
-                await self._orders.command_of(order, CONDITION_YAW, heading_deg % 360)
+                await self._orders.command_of(order, MavCmd.CONDITION_YAW, heading_deg % 360)
             with self._holding.flying(order):
                 await self._await_arrival(target, near_m, timeout, max_silence_s, order, mode, resend)
         except (anyio.get_cancelled_exc_class(), OperationTimeout):  # it may have heard the order
@@ -120,18 +114,18 @@ class TravelActions(Part):
         speed_m_s: float | None,
     ) -> SetPositionTargetGlobalInt | None:
         """Order it; what has to be sent again for as long as it is under way, because it has no answer."""
-        frame = MAV_FRAME_GLOBAL_RELATIVE_ALT_INT if is_relative else MAV_FRAME_GLOBAL_INT
+        frame = MavFrame.GLOBAL_RELATIVE_ALT_INT if is_relative else MavFrame.GLOBAL_INT
         speed = speed_m_s if speed_m_s is not None and self._speeds_by_reposition else -1
-        params = (speed, CHANGE_MODE, 0, yaw)
+        params = (speed, MavDoRepositionFlags.CHANGE_MODE, 0, yaw)
         place: dict[str, Any] = {"frame": frame, "x": latitude, "y": longitude, "z": altitude}
         modes = (self._orders.mode_for("go_to", self.autopilot.reposition_purpose),)
         try:
             with self._helm.changing_mode():
                 await self._orders.give(
-                    order, self._talk.commands.send_int, DO_REPOSITION, *params, modes=modes, **place
+                    order, self._talk.commands.send_int, MavCmd.DO_REPOSITION, *params, modes=modes, **place
                 )
         except CommandRejected as error:
-            if error.result != RESULT_UNSUPPORTED:
+            if error.result != MavResult.UNSUPPORTED:
                 raise
             await self._orders.ensure_mode(self._orders.mode_for("go_to", "setpoint"), order)
             self._orders.raise_if_over(order)
@@ -193,7 +187,7 @@ class TravelActions(Part):
             CommandRejected: the vehicle refused.
         """
         check_range("speed_m_s", speed_m_s, 0, 1000, above=True)
-        await self._orders.command_aside(DO_CHANGE_SPEED, 1, speed_m_s, -1)
+        await self._orders.command_aside(MavCmd.DO_CHANGE_SPEED, 1, speed_m_s, -1)
 
     async def set_heading(
         self,
@@ -234,15 +228,15 @@ class TravelActions(Part):
         order = self._helm.order(mode)
         if self._turns_by_reposition:
             yaw = math.remainder(math.radians(goal), 2 * math.pi)
-            params = (-1, CHANGE_MODE, 0, yaw, *(math.nan,) * 3)
+            params = (-1, MavDoRepositionFlags.CHANGE_MODE, 0, yaw, *(math.nan,) * 3)
             await self._orders.give(
-                order, self._talk.commands.send_long, DO_REPOSITION, *params, modes=(mode,)
+                order, self._talk.commands.send_long, MavCmd.DO_REPOSITION, *params, modes=(mode,)
             )
         else:
             await self._orders.ensure_mode(mode, order)
             # a goal, not an angle: sent again, it does not turn it further
             direction = (1 if heading_deg >= 0 else -1) if relative else 0
-            await self._orders.command_of(order, CONDITION_YAW, goal, rate_deg_s, direction, 0)
+            await self._orders.command_of(order, MavCmd.CONDITION_YAW, goal, rate_deg_s, direction, 0)
         await self._await_heading(goal, tolerance_deg, timeout, max_silence_s, order, mode)
 
     async def _await_heading(
@@ -292,13 +286,13 @@ class TravelActions(Part):
         home = self.telemetry.home
         with self._helm.aside() as order:
             if place is None:
-                await self._orders.give(order, self._talk.commands.send_long, DO_SET_HOME, 1)
+                await self._orders.give(order, self._talk.commands.send_long, MavCmd.DO_SET_HOME, 1)
             else:
                 latitude, longitude, altitude, _ = self._where.global_target(place)
                 where: dict[str, Any] = {"x": latitude, "y": longitude, "z": altitude}
-                await self._orders.give(order, self._talk.commands.send_place, DO_SET_HOME, 0, **where)
+                await self._orders.give(order, self._talk.commands.send_place, MavCmd.DO_SET_HOME, 0, **where)
         asked_at = self.connection.now()
-        await self._talk.commands.send_long(REQUEST_MESSAGE, HOME_POSITION)
+        await self._talk.commands.send_long(MavCmd.REQUEST_MESSAGE, HomePosition.ID)
         await home.wait_until(lambda _: home.updated_at >= asked_at, timeout=timeout, description="set_home")
 
     def distance_to(self, target: Position) -> float:

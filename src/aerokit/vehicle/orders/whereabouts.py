@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from aerokit import geo
 from aerokit.errors import LocalProtocolError
+from aerokit.mavlink.enums import MavLandedState
 from aerokit.position import Position
 from aerokit.vehicle.checks import check_range
 from aerokit.vehicle.orders.progress import OLD_POSITION_S
@@ -14,9 +15,7 @@ from aerokit.vehicle.orders.progress import OLD_POSITION_S
 if TYPE_CHECKING:
     from aerokit.vehicle.talk.talk import Talk
 
-__all__ = ["LANDED_ON_GROUND", "Whereabouts"]
-
-LANDED_ON_GROUND = 1
+__all__ = ["Whereabouts"]
 
 
 class Whereabouts:
@@ -90,7 +89,7 @@ class Whereabouts:
         """Whether it was told just now that a vehicle which flies is on the ground."""
         landed = self._telemetry.landed_state
         flies = self._autopilot.mode_for("take_off", is_vtol=self._telemetry.is_vtol) is not None
-        return flies and landed.latest == LANDED_ON_GROUND and landed.age <= OLD_POSITION_S
+        return flies and landed.latest == MavLandedState.ON_GROUND and landed.age <= OLD_POSITION_S
 
     @property
     def takes_relative_altitude(self) -> bool:

@@ -8,8 +8,7 @@ import anyio
 
 from aerokit.arguments import checks_arguments
 from aerokit.errors import CommandRejected, LocalProtocolError, OperationRejected, OperationTimeout
-from aerokit.mavlink.enums import MavCmd
-from aerokit.vehicle.orders.orders import RESULT_UNSUPPORTED
+from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.vehicle.orders.progress import LONGEST_SILENCE_S, await_progress
 from aerokit.vehicle.plans.held import HeldPlan
 from aerokit.vehicle.plans.mission_end import MissionEnd
@@ -210,7 +209,7 @@ class MissionControl(HeldPlan["Mission"]):
                     order, MavCmd.DO_SET_MISSION_CURRENT, 0 if item == 0 and not goes_on else seq
                 )
             except CommandRejected as error:
-                if error.result != RESULT_UNSUPPORTED:
+                if error.result != MavResult.UNSUPPORTED:
                     raise
             else:
                 return
@@ -259,6 +258,6 @@ class MissionControl(HeldPlan["Mission"]):
                 await bridge.orders.give(order, talk.commands.send_long, MavCmd.MISSION_START, modes=(mode,))
                 await bridge.orders.await_mode(mode, order, [], timeout, order.given_at)
         except CommandRejected as error:
-            if error.result != RESULT_UNSUPPORTED:
+            if error.result != MavResult.UNSUPPORTED:
                 raise
             await bridge.orders.change_mode(mode, order, timeout, told_since=order.given_at)
