@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from aerokit.autopilots.health import PREARM_CHECK
 from aerokit.dronekit.core import VehicleCore
 from aerokit.dronekit.modes import mode_name
 from aerokit.dronekit.reception import Latest, Stream
@@ -20,6 +21,7 @@ from aerokit.dronekit.values import (
 )
 from aerokit.dronekit.version import Capabilities, Version
 from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import EkfStatusFlags, MavModeFlag
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -30,11 +32,14 @@ if TYPE_CHECKING:
 
 __all__ = ["VehicleAttributes"]
 
-ARMED = 128
+ARMED = MavModeFlag.SAFETY_ARMED.value
 STATES = ("UNINIT", "BOOT", "CALIBRATING", "STANDBY", "ACTIVE", "CRITICAL", "EMERGENCY", "POWEROFF")
-POS_HORIZ_ABS, CONST_POS_MODE, PRED_POS_HORIZ_ABS = 16, 128, 512
+POS_HORIZ_ABS, CONST_POS_MODE, PRED_POS_HORIZ_ABS = (
+    EkfStatusFlags.POS_HORIZ_ABS.value,
+    EkfStatusFlags.CONST_POS_MODE.value,
+    EkfStatusFlags.PRED_POS_HORIZ_ABS.value,
+)
 """Flags of EKF_STATUS_REPORT and of ESTIMATOR_STATUS, which agree in these."""
-PREARM_CHECK = 1 << 28
 LOOKING_DOWN = 25
 NO_MODE = (None, "INITIALISING", "MAV")
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from pymavlink.dialects.v20.ardupilotmega import MAVLink_mission_item_message
 
+from aerokit.mavlink.enums import MavCmd
 from aerokit.missions.item import MissionItem
 from aerokit.missions.wire import in_degrees
 
@@ -22,7 +23,6 @@ FIELDS: list[str] = MAVLink_mission_item_message.fieldnames[:14]
 """Those of MAVLink 1: ``mission_type``, which came later, is no part of a command's text."""
 CONTENT = ("frame", "command", "autocontinue", *FIELDS[7:])
 """The fields that make a mission another one when they are changed."""
-NAV_WAYPOINT = 16
 ABOVE_SEA = (0, 5)
 """MAV_FRAME_GLOBAL and its _INT twin."""
 AT_HOME_DEG, AT_HOME_M = 1e-4, 2.0
@@ -98,7 +98,7 @@ def is_home_row(cmd: Command, home: LocationGlobal | None) -> bool:
 
     That is a waypoint above the sea without parameters which has ``current`` set, is all zeros, or is where home is.
     """
-    if cmd.command != NAV_WAYPOINT or cmd.frame not in ABOVE_SEA:
+    if cmd.command != MavCmd.NAV_WAYPOINT or cmd.frame not in ABOVE_SEA:
         return False
     if any((cmd.param1, cmd.param2, cmd.param3, cmd.param4)):
         return False

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import anyio
 
 from aerokit.errors import LocalProtocolError
+from aerokit.mavlink.enums import MavCmd, MissionState
 from aerokit.mavlink.messages import MissionCurrent, MissionSetCurrent
 
 if TYPE_CHECKING:
@@ -17,11 +18,9 @@ if TYPE_CHECKING:
 
 __all__ = ["CurrentCommand"]
 
-DO_SET_MISSION_CURRENT = 224
 CONFIRMED_S = 1.5
 """So long MISSION_CURRENT is waited for before it is ordered by command."""
 MOST = 0xFFFF
-STATE_COMPLETE = 5
 NO_MISSION = 0xFFFF
 
 
@@ -70,7 +69,7 @@ class CurrentCommand:
         self._message = message
 
     def _is_over(self, message: MissionCurrent) -> bool:
-        is_at_an_end = message.seq == 0 or message.mission_state == STATE_COMPLETE
+        is_at_an_end = message.seq == 0 or message.mission_state == MissionState.COMPLETE
         return is_at_an_end and not self._is_armed()
 
     async def _choose(self, seq: int) -> None:
@@ -85,6 +84,6 @@ class CurrentCommand:
             await aio.telemetry.mission_current.wait_until(lambda progress: progress.current == seq)
             return
         if seq == 0:
-            await aio.command(DO_SET_MISSION_CURRENT, 0)
+            await aio.command(MavCmd.DO_SET_MISSION_CURRENT, 0)
         else:
             await aio.mission.set_current(seq - 1)

@@ -22,7 +22,7 @@ from aerokit.dronekit.flight_orders import (
 from aerokit.dronekit.modes import change_mode, mode_named
 from aerokit.dronekit.values import LocationGlobal, LocationGlobalRelative, VehicleMode
 from aerokit.errors import CommandRejected, OperationTimeout
-from aerokit.mavlink.enums import MavCmd
+from aerokit.mavlink.enums import MavCmd, MavFrame, SpeedType
 from aerokit.mavlink.messages import HomePosition
 
 if TYPE_CHECKING:
@@ -31,9 +31,6 @@ if TYPE_CHECKING:
 
 __all__ = ["FlightMethods"]
 
-NAV_TAKEOFF, DO_CHANGE_SPEED, DO_SET_HOME = 22, 178, 179
-GLOBAL = 0
-AIRSPEED, GROUNDSPEED = 0, 1
 HOME_TIMEOUT_S = 10.0
 POLL_S = 0.1
 
@@ -163,7 +160,7 @@ class FlightMethods(VehicleAttributes):
             if plan is None or plan.command is None or mode is None:
                 raise APIException("this vehicle cannot take off by a command")
             return self._dk.order("takeoff", take_off, aio, (mode,), plan.command, *plan.params)
-        return self._dk.order("takeoff", take_off, aio, (), NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude)
+        return self._dk.order("takeoff", take_off, aio, (), MavCmd.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude)
 
     def wait_simple_takeoff(
         self, alt: float | None = None, epsilon: float = 0.1, timeout: float | None = None
@@ -236,7 +233,7 @@ class FlightMethods(VehicleAttributes):
 
     @airspeed.setter
     def airspeed(self, speed: float) -> None:
-        self._dk_change_speed("airspeed", AIRSPEED, speed)
+        self._dk_change_speed("airspeed", SpeedType.AIRSPEED, speed)
 
     @property
     def groundspeed(self) -> float | Any:
@@ -246,12 +243,12 @@ class FlightMethods(VehicleAttributes):
 
     @groundspeed.setter
     def groundspeed(self, speed: float) -> None:
-        self._dk_change_speed("groundspeed", GROUNDSPEED, speed)
+        self._dk_change_speed("groundspeed", SpeedType.GROUNDSPEED, speed)
 
     def _dk_change_speed(self, name: str, kind: int, speed: float) -> None:
         check_speed(name, speed)
         aio = self._dk.check_link()
-        self._dk.order(name, aio.command, DO_CHANGE_SPEED, kind, float(speed), -1, component_id=0)
+        self._dk.order(name, aio.command, MavCmd.DO_CHANGE_SPEED, kind, float(speed), -1, component_id=0)
 
     # ---------------------------------------------------------------------------------- home
 
@@ -275,7 +272,14 @@ class FlightMethods(VehicleAttributes):
         aio = self._dk.check_link()
         place = {"x": latitude, "y": longitude, "z": altitude}
         order = self._dk.order(
-            "home", aio.command_int, DO_SET_HOME, 0, frame=GLOBAL, **place, component_id=0, or_long=True
+            "home",
+            aio.command_int,
+            MavCmd.DO_SET_HOME,
+            0,
+            frame=MavFrame.GLOBAL,
+            **place,
+            component_id=0,
+            or_long=True,
         )
         self._home_location = LocationGlobal(pos.lat, pos.lon, altitude)
         order.add_done_callback(self._dk_home_is_set)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from aerokit.dronekit.exceptions import APIException
 from aerokit.errors import CommandRejected, LocalProtocolError, OperationTimeout
+from aerokit.mavlink.enums import MavCmd, MavDoRepositionFlags, MavFrame, MavResult
 from aerokit.mavlink.messages import SetPositionTargetGlobalInt
 
 if TYPE_CHECKING:
@@ -25,11 +26,7 @@ __all__ = [
     "take_off",
 ]
 
-COMPONENT_ARM_DISARM, DO_REPOSITION = 400, 192
-GLOBAL_INT, GLOBAL_RELATIVE_ALT_INT = 5, 6
 POSITION_ONLY = 0x0DF8
-RESULT_UNSUPPORTED = 3
-CHANGE_MODE = 1
 ARMED_IS_TOLD_S = 10.0
 
 
@@ -38,7 +35,7 @@ async def change_armed(vehicle: AsyncVehicle, value: bool) -> None:
     subjects: tuple[Subject, ...] = ("arm",) if value else ("arm", "motion")
     try:
         with vehicle.posted(*subjects, armed=value) as order:
-            await order.command(COMPONENT_ARM_DISARM, float(value), component_id=0)
+            await order.command(MavCmd.COMPONENT_ARM_DISARM, float(value), component_id=0)
             await order.until_told(ARMED_IS_TOLD_S)
     except OperationTimeout as error:
         error.args = (f"{error}; it may still be carried out, and nobody watches for that",)
@@ -60,18 +57,18 @@ async def go_to(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: 
     try:
         with vehicle.posted("motion", modes=flies_to_places_in(vehicle)[:1]) as order:
             await order.command_int(
-                DO_REPOSITION,
-                *(-1, CHANGE_MODE if is_amsl else 0, 0, math.nan),
-                frame=GLOBAL_INT if is_amsl else GLOBAL_RELATIVE_ALT_INT,
+                MavCmd.DO_REPOSITION,
+                *(-1, MavDoRepositionFlags.CHANGE_MODE if is_amsl else 0, 0, math.nan),
+                frame=MavFrame.GLOBAL_INT if is_amsl else MavFrame.GLOBAL_RELATIVE_ALT_INT,
                 x=latitude,
                 y=longitude,
                 z=altitude,
                 component_id=0,
             )
     except CommandRejected as error:
-        if is_amsl or error.result != RESULT_UNSUPPORTED:
+        if is_amsl or error.result != MavResult.UNSUPPORTED:
             raise
-        target = (vehicle.system_id, 0, GLOBAL_RELATIVE_ALT_INT, POSITION_ONLY)
+        target = (vehicle.system_id, 0, MavFrame.GLOBAL_RELATIVE_ALT_INT, POSITION_ONLY)
         vehicle.send(SetPositionTargetGlobalInt(0, *target, latitude, longitude, altitude, *(0.0,) * 8))
 
 

@@ -7,13 +7,12 @@ from typing import Any
 from aerokit.dronekit.core import VehicleCore
 from aerokit.dronekit.exceptions import APIException
 from aerokit.errors import LocalProtocolError
+from aerokit.mavlink.enums import MavCmd
 from aerokit.mavlink.messages import PlayTune
 from aerokit.protocols.command import command_long
 
 __all__ = ["Maintenance"]
 
-PREFLIGHT_CALIBRATION, PREFLIGHT_REBOOT_SHUTDOWN = 241, 246
-REQUEST_AUTOPILOT_CAPABILITIES, DO_START_MAG_CAL = 520, 42424
 CALIBRATION_ATTEMPTS, CALIBRATION_S = 2, 35.0
 """ArduPilot answers when it is done, half a minute if it is not held still, and calibrates again for each resend."""
 REBOOT_ATTEMPTS, REBOOT_S = 2, 1.5
@@ -27,26 +26,26 @@ class Maintenance(VehicleCore):
 
     def send_calibrate_gyro(self) -> None:
         """Calibrate the gyroscopes: keep the vehicle still."""
-        self._dk_calibrate(PREFLIGHT_CALIBRATION, 1)
+        self._dk_calibrate(MavCmd.PREFLIGHT_CALIBRATION, 1)
 
     def send_calibrate_magnetometer(self) -> None:
         """Calibrate the compasses: turn the vehicle about all axes until it says that it is done."""
         if self._dk.check_link().autopilot.calibrates_compasses_by_command:
-            self._dk_calibrate(DO_START_MAG_CAL, 0, 1, 1)  # all compasses; retry; save by itself
+            self._dk_calibrate(MavCmd.DO_START_MAG_CAL, 0, 1, 1)  # all compasses; retry; save by itself
         else:
-            self._dk_calibrate(PREFLIGHT_CALIBRATION, 0, 1)
+            self._dk_calibrate(MavCmd.PREFLIGHT_CALIBRATION, 0, 1)
 
     def send_calibrate_vehicle_level(self) -> None:
         """Take the attitude of this moment for level."""
-        self._dk_calibrate(PREFLIGHT_CALIBRATION, 0, 0, 0, 0, 2)
+        self._dk_calibrate(MavCmd.PREFLIGHT_CALIBRATION, 0, 0, 0, 0, 2)
 
     def send_calibrate_barometer(self) -> None:
         """Take the pressure of this moment for altitude 0."""
-        self._dk_calibrate(PREFLIGHT_CALIBRATION, 0, 0, 1)
+        self._dk_calibrate(MavCmd.PREFLIGHT_CALIBRATION, 0, 0, 1)
 
     def send_calibrate_accelerometer(self, simple: bool = False) -> None:
         """Calibrate the accelerometers: in the six attitudes it asks for by texts, or, ``simple``, standing level."""
-        self._dk_calibrate(PREFLIGHT_CALIBRATION, 0, 0, 0, 0, 4 if simple else 1)
+        self._dk_calibrate(MavCmd.PREFLIGHT_CALIBRATION, 0, 0, 0, 0, 4 if simple else 1)
 
     def _dk_calibrate(self, command: int, *params: float) -> None:
         self._dk.order(
@@ -83,7 +82,7 @@ class Maintenance(VehicleCore):
         self._dk.order(
             "reboot",
             self._dk.check_link().command,
-            PREFLIGHT_REBOOT_SHUTDOWN,
+            MavCmd.PREFLIGHT_REBOOT_SHUTDOWN,
             1,
             component_id=0,
             attempts=REBOOT_ATTEMPTS,
@@ -93,7 +92,7 @@ class Maintenance(VehicleCore):
     def send_capabilities_request(self, vehicle: Any, name: str, m: Any) -> None:
         """Ask for AUTOPILOT_VERSION once. Has the arguments of a message listener, and uses none of them."""
         self._dk.check_link()
-        self._dk.send(command_long(self._dk.target_system, 0, REQUEST_AUTOPILOT_CAPABILITIES, (1,)))
+        self._dk.send(command_long(self._dk.target_system, 0, MavCmd.REQUEST_AUTOPILOT_CAPABILITIES, (1,)))
 
     def send_capabilties_request(self, vehicle: Any, name: str, m: Any) -> None:
         """As :meth:`send_capabilities_request`; this spelling was the first."""

@@ -10,6 +10,7 @@ from pymavlink import mavutil
 from aerokit.dronekit.inbox import Inbox
 from aerokit.dronekit.message_factory import MessageFactory
 from aerokit.dronekit.pymavlink_messages import message_of
+from aerokit.mavlink.enums import MavAutopilot, MavCmd, MavModeFlag, MavParamType
 from aerokit.mavlink.from_pymavlink import from_pymavlink
 from aerokit.runtime.components import is_autopilot
 
@@ -18,12 +19,6 @@ if TYPE_CHECKING:
     from aerokit.mavlink.messages import Heartbeat
 
 __all__ = ["Master", "MessageFactory"]
-
-DO_SET_MODE, DO_SET_SERVO, COMPONENT_ARM_DISARM = 176, 183, 400
-CUSTOM_MODE_ENABLED = 1
-PX4 = 12
-ARMED = 128
-REAL32 = 9
 
 
 class Master:
@@ -89,7 +84,11 @@ class Master:
         heartbeat = self._heard()[1]
         if heartbeat is None:
             return None
-        modes = mavutil.px4_map if heartbeat.autopilot == PX4 else mavutil.mode_mapping_byname(heartbeat.type)
+        modes = (
+            mavutil.px4_map
+            if heartbeat.autopilot == MavAutopilot.PX4
+            else mavutil.mode_mapping_byname(heartbeat.type)
+        )
         return dict(modes) if modes is not None else None
 
     def set_mode(self, mode: str | int, custom_mode: int | None = 0, custom_sub_mode: int | None = 0) -> None:
@@ -99,7 +98,7 @@ class Master:
             KeyError: the vehicle has no mode of this name; nothing was sent.
         """
         heartbeat = self._heard()[1]
-        is_px4 = heartbeat is not None and heartbeat.autopilot == PX4
+        is_px4 = heartbeat is not None and heartbeat.autopilot == MavAutopilot.PX4
         vehicle = self._connection.vehicle
         if vehicle is not None and (isinstance(mode, str) or not is_px4):
             vehicle.mode = mode
@@ -107,8 +106,8 @@ class Master:
         order = (self.mode_mapping() or {})[mode] if isinstance(mode, str) else mode
         if is_px4 and not isinstance(mode, str):
             order = (mode, custom_mode or 0, custom_sub_mode or 0)
-        numbers = order if isinstance(order, tuple) else (CUSTOM_MODE_ENABLED, order, 0)
-        self._command(DO_SET_MODE, *numbers)
+        numbers = order if isinstance(order, tuple) else (MavModeFlag.CUSTOM_MODE_ENABLED.value, order, 0)
+        self._command(MavCmd.DO_SET_MODE, *numbers)
 
     set_mode_apm = set_mode_px4 = set_mode
 
@@ -116,16 +115,16 @@ class Master:
 
     def arducopter_arm(self) -> None:
         """Ask for armed motors: **propellers may start to turn**."""
-        self._command(COMPONENT_ARM_DISARM, 1)
+        self._command(MavCmd.COMPONENT_ARM_DISARM, 1)
 
     def arducopter_disarm(self) -> None:
         """Ask for disarmed motors."""
-        self._command(COMPONENT_ARM_DISARM, 0)
+        self._command(MavCmd.COMPONENT_ARM_DISARM, 0)
 
     def motors_armed(self) -> bool:
         """Whether the last HEARTBEAT says armed."""
         heartbeat = self._heard()[1]
-        return heartbeat is not None and bool(heartbeat.base_mode & ARMED)
+        return heartbeat is not None and bool(heartbeat.base_mode & MavModeFlag.SAFETY_ARMED.value)
 
     def motors_armed_wait(self) -> None:
         """Wait until HEARTBEAT says armed, however long that takes."""
@@ -139,7 +138,7 @@ class Master:
 
     def set_servo(self, channel: int, pwm: int) -> None:
         """Set an output (MAV_CMD_DO_SET_SERVO) to so many microseconds."""
-        self._command(DO_SET_SERVO, channel, pwm)
+        self._command(MavCmd.DO_SET_SERVO, channel, pwm)
 
     def _command(self, command: int, *params: float) -> None:
         filled = (*params, *(0,) * (7 - len(params)))
@@ -153,7 +152,7 @@ class Master:
 
     def param_set_send(self, parm_name: str | bytes, parm_value: float, parm_type: int | None = None) -> None:
         """Set a parameter, without a look at the answer; ``vehicle.parameters`` looks."""
-        kind = REAL32 if parm_type is None else parm_type
+        kind = MavParamType.REAL32 if parm_type is None else parm_type
         self.mav.param_set_send(self.target_system, self.target_component, parm_name, parm_value, kind)
 
     def waypoint_clear_all_send(self) -> None:

@@ -9,6 +9,7 @@ import anyio
 from aerokit.autopilots import autopilot_for
 from aerokit.autopilots.modes import CUSTOM_MODE_ENABLED, Mode
 from aerokit.errors import CommandRejected, LocalProtocolError
+from aerokit.mavlink.enums import MavAutopilot, MavCmd, MavResult
 from aerokit.mavlink.messages import Heartbeat, SetMode
 
 if TYPE_CHECKING:
@@ -18,10 +19,6 @@ if TYPE_CHECKING:
 
 __all__ = ["change_mode", "mode_name", "mode_named"]
 
-DO_SET_MODE = 176
-ARDUPILOTMEGA = 3
-RESULT_UNSUPPORTED = 3
-RESULT_TEMPORARILY_REJECTED = 1
 MODE_IS_TOLD_S = 5.0
 ATTEMPTS, ASK_AGAIN_S = 4, 0.5
 
@@ -60,7 +57,7 @@ def _as_known(vehicle: Vehicle) -> Autopilot:
     """An autopilot of which nothing is known (iNav is one) has ArduPilot's numbers, as with pymavlink."""
     if vehicle.autopilot.modes.numbers:
         return vehicle.autopilot
-    return autopilot_for(Heartbeat(vehicle.vehicle_type, ARDUPILOTMEGA, 0, 0, 0, 0))
+    return autopilot_for(Heartbeat(vehicle.vehicle_type, MavAutopilot.ARDUPILOTMEGA, 0, 0, 0, 0))
 
 
 async def change_mode(vehicle: Vehicle, wanted: Mode) -> None:
@@ -79,7 +76,7 @@ async def change_mode(vehicle: Vehicle, wanted: Mode) -> None:
                 await _request(vehicle, wanted, order)
                 await order.until_told(MODE_IS_TOLD_S)
             except CommandRejected as error:
-                if error.result != RESULT_TEMPORARILY_REJECTED or not attempts_left:
+                if error.result != MavResult.TEMPORARILY_REJECTED or not attempts_left:
                     raise
                 await anyio.sleep(ASK_AGAIN_S)
                 if order.end:
@@ -91,8 +88,8 @@ async def change_mode(vehicle: Vehicle, wanted: Mode) -> None:
 async def _request(vehicle: Vehicle, wanted: Mode, order: PostedOrder) -> None:
     params = (wanted.base_mode, *vehicle.autopilot.mode_order(wanted).params[1:])
     try:
-        await order.command(DO_SET_MODE, *params, component_id=0)
+        await order.command(MavCmd.DO_SET_MODE, *params, component_id=0)
     except CommandRejected as error:
-        if error.result != RESULT_UNSUPPORTED:
+        if error.result != MavResult.UNSUPPORTED:
             raise
         vehicle.connection.send(SetMode(vehicle.system_id, wanted.base_mode, wanted.custom_mode))

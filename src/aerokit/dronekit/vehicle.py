@@ -28,6 +28,7 @@ from aerokit.dronekit.privates import VehiclePrivates
 from aerokit.dronekit.shadowable import Shadowable
 from aerokit.dronekit.weakly import weakly
 from aerokit.errors import AerokitError, ConnectFailed
+from aerokit.mavlink.enums import MavCmd
 from aerokit.mavlink.messages import CommandLong
 from aerokit.runtime.background import Background
 from aerokit.runtime.components import is_autopilot
@@ -50,7 +51,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Vehicle"]
 
-REQUEST_AUTOPILOT_CAPABILITIES = 520
 MAVLINK_2 = 8192
 """Bit of AUTOPILOT_VERSION.capabilities."""
 FIRST_VALUES = ("attitude", "location.global_relative_frame", "heading", "gps_0", "battery")
@@ -301,5 +301,5 @@ async def _request_capabilities(aio: AsyncVehicle) -> None:
     for _ in range(5):
         if aio.telemetry.version.is_known:
             return
-        aio.send(CommandLong(aio.system_id, 0, REQUEST_AUTOPILOT_CAPABILITIES, 0, 1, *(0.0,) * 6))
+        aio.send(CommandLong(aio.system_id, 0, MavCmd.REQUEST_AUTOPILOT_CAPABILITIES, 0, 1, *(0.0,) * 6))
         await anyio.sleep(1.0)

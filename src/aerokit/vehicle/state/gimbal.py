@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+from aerokit.mavlink.enums import GimbalDeviceFlags
 from aerokit.snapshot import Snapshot
 
 if TYPE_CHECKING:
@@ -12,7 +13,9 @@ if TYPE_CHECKING:
 
 __all__ = ["GimbalAttitude", "from_device", "from_orientation", "from_status"]
 
-YAW_LOCK, YAW_IN_VEHICLE_FRAME, YAW_IN_EARTH_FRAME = 16, 32, 64
+YAW_LOCK = GimbalDeviceFlags.YAW_LOCK.value
+YAW_IN_VEHICLE_FRAME = GimbalDeviceFlags.YAW_IN_VEHICLE_FRAME.value
+YAW_IN_EARTH_FRAME = GimbalDeviceFlags.YAW_IN_EARTH_FRAME.value
 STRAIGHT = 0.99999
 """Sine of a pitch at which roll and yaw turn about the same axis."""
 
