@@ -190,7 +190,11 @@ async def test_who_says_nothing_makes_room_for_another_client(monkeypatch: pytes
     await third.open(third_heard)
     await third_heard.until_lost()
     assert vehicle_heard.losses == []
-    for each in (mute, vehicle, third, link):
+    link.forget_peer(link.peers[0])
+    fourth = TcpConnect(*link.local_address)
+    await fourth.open(Recorder())
+    await vehicle_heard.until_lost()
+    for each in (mute, vehicle, third, fourth, link):
         each.close()
         await each.wait_closed()
 

@@ -5,6 +5,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 from link_harness import Recorder, each_loop
@@ -152,3 +153,18 @@ def test_the_address_tells_the_speed() -> None:
     assert Replay("flight.tlog").address == "replay:flight.tlog"
     assert Replay("flight.tlog", 2.0).address == "replay:flight.tlog?speed=2"
     assert Replay("flight.tlog", None).address == "replay:flight.tlog?speed=inf"
+
+
+def test_closed_between_two_frames_it_waits_for_nothing_more(tmp_path: Path) -> None:
+    async def main() -> float:
+        link = Replay(recording(tmp_path, [0.0, 1000.0]), 1.0)
+        await link.open(Recorder())
+        await asyncio.sleep(0.1)
+        link.close()
+        await link.wait_closed()
+        left = asyncio.all_tasks() - {asyncio.current_task()}
+        assert not left
+        loop: Any = asyncio.get_running_loop()
+        return len([each for each in loop._scheduled if not each.cancelled()])
+
+    assert run_virtual(main()) == 0

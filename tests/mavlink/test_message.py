@@ -187,3 +187,9 @@ def test_any_payload_can_be_decoded(payload: bytes, message_class: type[Message]
 
 def test_field_is_public() -> None:
     assert all(isinstance(field, Field) for message_class in STANDARD for field in message_class.FIELDS)
+
+
+def test_the_wrong_field_is_named_and_none_that_holds_its_greatest_or_least_value() -> None:
+    for value in (0, 255):
+        with pytest.raises(LocalProtocolError, match=r"target_component = 300"):
+            messages.CommandLong(value, 300, 400, 0, 0, 0, 0, 0, 0, 0, 0).encode()

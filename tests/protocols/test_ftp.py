@@ -155,8 +155,11 @@ def test_an_answer_to_an_older_request_of_this_number_gets_a_new_number() -> Non
         if again:
             assert again[0].sequence == sent.sequence + 1
             sent, stale = again[0], stale.replace(sequence=again[0].sequence + 1)
-    request.receive(as_message(reply_to(sent)), 0.2)
+    request.receive(as_message(reply_to(sent)), 0.25)
     assert request.done
+    assert request.round_trip.smoothed_s == pytest.approx(
+        0.1 + 0.05 / 8
+    )  # from the sending that was answered
 
 
 def test_closing_what_is_closed_is_no_failure() -> None:

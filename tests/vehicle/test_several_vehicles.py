@@ -12,7 +12,7 @@ from flight_harness import Wire, now
 
 import aerokit
 from aerokit import messages as m
-from aerokit.errors import BusyError, CommandTimeout
+from aerokit.errors import BusyError, CommandTimeout, ConnectFailed
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import CopterMode, MavAutopilot, MavCmd, MavResult, MavState, MavType
 from aerokit.runtime.events import ArmedChanged, ModeChanged, StatusTextReceived, VehicleFound, VehicleSilent
@@ -329,3 +329,22 @@ async def test_each_autopilot_is_told_of_once_whether_it_is_connected_to_or_not(
             told = [await found.get(timeout=1.0), await found.get(timeout=1.0)]
             assert [(each.system_id, each.component_id) for each in told] == [(1, 1), (2, 1)]
             assert found.get_nowait() is None
+
+
+@pytest.mark.parametrize(("silent_s", "is_found"), [(1.5, True), (2.5, False)])
+async def test_a_vehicle_that_was_heard_lately_is_there_one_heard_before_is_waited_for(
+    silent_s: float, is_found: bool
+) -> None:
+    copter = SimulatedCopter(boot_time_s=0.0)
+    async with simulated_link(copter) as link, open_connection(link) as connection:
+        await anyio.sleep(3.2)
+        copter.faults.silent = True
+        heard_at = max(
+            each.received_frame.received_at for each in connection.heard.values() if each.received_frame
+        )
+        await anyio.sleep(heard_at + silent_s - now())
+        try:
+            async with aerokit.connect(connection, timeout=1.0):
+                assert is_found
+        except ConnectFailed:
+            assert not is_found

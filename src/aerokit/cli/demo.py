@@ -12,6 +12,7 @@ from aerokit.cli.report import FlightReport
 from aerokit.cli.signing import signing_of
 from aerokit.cli.vehicles import simulated_vehicle
 from aerokit.errors import AerokitError, NotSupported, OperationRejected
+from aerokit.mavlink.enums import MavLandedState
 from aerokit.vehicle.connect import connect
 
 if TYPE_CHECKING:
@@ -26,7 +27,6 @@ DONE, FAILED, INTERRUPTED = 0, 1, 130
 CORNERS = (("north-west", 1, 0), ("north-east", 1, 1), ("south-east", 0, 1), ("south-west", 0, 0))
 """Of the square: its name, and how many sides north and east of the start it is."""
 READY_TIMEOUT_S = 120.0
-ON_GROUND = 1
 
 
 async def run_demo(options: argparse.Namespace) -> int:
@@ -184,7 +184,7 @@ class _Flight:
         vehicle = self._vehicle
         if not vehicle.is_armed:
             return DONE
-        if vehicle.landed_state.latest == ON_GROUND:
+        if vehicle.landed_state.latest == MavLandedState.ON_GROUND:
             self._say("on the ground and armed; disarming")
             await vehicle.disarm()
             return DONE

@@ -129,7 +129,7 @@ def _message(cls: Any) -> MessageDefinition:
         array_length = int(cls.array_lengths[order.index(name)])
         units = getattr(cls, "fieldunits_by_name", {}).get(name, "")
         enum = getattr(cls, "fieldenums_by_name", {}).get(name, "")
-        default = 3 if cls.id == 0 and name == "mavlink_version" else None
+        default = 3 if name == "mavlink_version" else None
         fields.append(FieldDefinition(name, kind, array_length, units, enum, default=default))
     name = getattr(cls, "msgname", None) or cls.name
     description = " ".join((cls.__doc__ or "").split())

@@ -175,7 +175,7 @@ class SetpointStream(Generic[SetpointT]):
         if not 2 <= rate_hz <= 100:
             raise LocalProtocolError(f"rate_hz = {rate_hz!r} is not allowed: 2 to 100")
         for name, value in (("valid_for_s", valid_for_s), ("max_lag_s", max_lag_s)):
-            if not 0 < value <= 60:
+            if value > 60:
                 raise LocalProtocolError(f"{name} = {value!r} is not allowed: above 0, at most 60")
         self._bridge, self._talk, self._holding = bridge, bridge.talk, bridge.holding
         self._encode = encode

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -263,7 +264,7 @@ class TalkActions(Part):
         return cell
 
     def _message_cell(self, message_type: type[Message]) -> StateCell[Any]:
-        arrived_at = 0.0
+        arrived_at = math.nan
         cell: StateCell[Any] = StateCell(
             message_type.NAME, self.connection.now, message_type.NAME, stamp=lambda: arrived_at
         )
