@@ -26,7 +26,15 @@ __all__ = [
 ]
 
 EKF_PROBLEMS: Mapping[int, str] = {1024: "initialisation", 32768: "GPS without glitches"}
-VTOLS = range(19, 26)
+VTOLS = (
+    MavType.VTOL_TAILSITTER_DUOROTOR,
+    MavType.VTOL_TAILSITTER_QUADROTOR,
+    MavType.VTOL_TILTROTOR,
+    MavType.VTOL_FIXEDROTOR,
+    MavType.VTOL_TAILSITTER,
+    MavType.VTOL_TILTWING,
+    MavType.VTOL_RESERVED5,
+)
 COPTERS = (
     MavType.QUADROTOR,
     MavType.COAXIAL,

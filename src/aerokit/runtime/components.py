@@ -11,7 +11,28 @@ if TYPE_CHECKING:
 
 __all__ = ["is_autopilot"]
 
-NO_AUTOPILOTS = frozenset((MavType.GCS, 18, 26, 27, *range(30, 35), *range(36, 43), 44, 48))
+NO_AUTOPILOTS = frozenset(
+    (
+        MavType.GCS,
+        MavType.ONBOARD_CONTROLLER,
+        MavType.GIMBAL,
+        MavType.ADSB,
+        MavType.CAMERA,
+        MavType.CHARGING_STATION,
+        MavType.FLARM,
+        MavType.SERVO,
+        MavType.ODID,
+        MavType.BATTERY,
+        MavType.PARACHUTE,
+        MavType.LOG,
+        MavType.OSD,
+        MavType.IMU,
+        MavType.GPS,
+        MavType.WINCH,
+        MavType.ILLUMINATOR,
+        MavType.GRIPPER,
+    )
+)
 """Types of other components: onboard controller, gimbal, ADS-B, camera, servo, battery, … (MAV_TYPE)."""
 
 

@@ -33,8 +33,22 @@ _MODE: tuple[Subject, ...] = ("mode", "motion")
 _MOTION: tuple[Subject, ...] = ("motion",)
 _ARM: tuple[Subject, ...] = ("arm",)
 CHANGED_BY_COMMAND: Mapping[int, tuple[Subject, ...]] = {
-    **dict.fromkeys((20, 21, 84, 85, 176, 185, 252, 300), _MODE),
-    **dict.fromkeys((16, 17, 18, 19, 22, 34, 192, 193), _MOTION),
+    MavCmd.NAV_RETURN_TO_LAUNCH: _MODE,
+    MavCmd.NAV_LAND: _MODE,
+    MavCmd.NAV_VTOL_TAKEOFF: _MODE,
+    MavCmd.NAV_VTOL_LAND: _MODE,
+    MavCmd.DO_SET_MODE: _MODE,
+    MavCmd.DO_FLIGHTTERMINATION: _MODE,
+    MavCmd.OVERRIDE_GOTO: _MODE,
+    MavCmd.MISSION_START: _MODE,
+    MavCmd.NAV_WAYPOINT: _MOTION,
+    MavCmd.NAV_LOITER_UNLIM: _MOTION,
+    MavCmd.NAV_LOITER_TURNS: _MOTION,
+    MavCmd.NAV_LOITER_TIME: _MOTION,
+    MavCmd.NAV_TAKEOFF: _MOTION,
+    MavCmd.DO_ORBIT: _MOTION,
+    MavCmd.DO_REPOSITION: _MOTION,
+    MavCmd.DO_PAUSE_CONTINUE: _MOTION,
     MavCmd.COMPONENT_ARM_DISARM: _ARM,
 }
 """MAV_CMD → what a program changes that sends it by itself."""
@@ -49,7 +63,21 @@ GUIDED_ITEM = (2, 3)
 """MISSION_ITEM.current of one that is flown to at once."""
 MOVING_COMMANDS = frozenset(CHANGED_BY_COMMAND)
 """MAV_CMDs by which a program steers past the actions: what an action left to be done must not come after them."""
-QUESTIONS = frozenset((401, 510, 511, 512, 519, 520, 521, 522, 525, 527, 528))
+QUESTIONS = frozenset(
+    (
+        MavCmd.RUN_PREARM_CHECKS,
+        MavCmd.GET_MESSAGE_INTERVAL,
+        MavCmd.SET_MESSAGE_INTERVAL,
+        MavCmd.REQUEST_MESSAGE,
+        MavCmd.REQUEST_PROTOCOL_VERSION,
+        MavCmd.REQUEST_AUTOPILOT_CAPABILITIES,
+        MavCmd.REQUEST_CAMERA_INFORMATION,
+        MavCmd.REQUEST_CAMERA_SETTINGS,
+        MavCmd.REQUEST_STORAGE_INFORMATION,
+        MavCmd.REQUEST_CAMERA_CAPTURE_STATUS,
+        MavCmd.REQUEST_FLIGHT_INFORMATION,
+    )
+)
 """MAV_CMDs that ask for something and change nothing but streams: they are sent again until they are answered."""
 
 
