@@ -173,6 +173,8 @@ FIELD = '<field type="uint8_t" name="a">Text</field>'
         (entries("9**99999999999"), "is no value of an enum"),
         (entries("2**-1"), "is no value of an enum"),
         (entries("0x1" + "0" * 20), "beyond 64 bits"),
+        (entries(str(1 << 64)), "beyond 64 bits"),
+        (entries(str(-(1 << 63) - 1)), "beyond 64 bits"),
         (entries("9" * 5000), "is not a MAVLink dialect"),
         (dialect('<enums><enum name="E"><entry name="E_A"/><entry name="E_A"/></enum></enums>'), "enum E of"),
         (dialect('<enums><enum name="E"><entry name="E__X_"/></enum></enums>'), "enum E of"),

@@ -191,11 +191,17 @@ async def test_setup_is_refused_beforehand_and_by_the_vehicle() -> None:
     async with connected(copter) as vehicle:
         await vehicle.wait_ready()
         vehicle.connection.mavlink_version = 1
-        with pytest.raises(NotSupported, match="MAVLink 1"):
+        with pytest.raises(NotSupported, match="our frames are MAVLink 1"):
             await vehicle.setup_signing(Signing(KEY))
         with pytest.raises(LocalProtocolError, match="mavlink_version = 1"):
             vehicle.connection.signing = Signing(KEY)
         vehicle.connection.mavlink_version = 2
+        beat = vehicle.connection.heard[1, 1]
+        (frame,) = Framer().receive(FrameEncoder(1, 1, version=1).encode(beat))
+        vehicle.connection.heard[1, 1] = Heartbeat.decode(frame.payload, frame)
+        with pytest.raises(NotSupported, match="the vehicle's frames are MAVLink 1"):
+            await vehicle.setup_signing(Signing(KEY))
+        vehicle.connection.heard[1, 1] = beat
         await vehicle.arm()
         with pytest.raises(OperationRejected, match="armed; nothing was sent"):
             await vehicle.setup_signing(Signing(KEY))

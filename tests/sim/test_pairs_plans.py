@@ -80,7 +80,7 @@ def test_the_current_item_is_the_one_that_was_wanted(
 ) -> None:
     vehicle = vehicle_of(kind)
     items = plan_of(MISSION, [(47_390_0000, 8_540_0000 + n) for n in range(6)])
-    assert Pair(vehicle).run(MissionUpload(1, 1, items)).is_sure
+    assert Pair(vehicle).run(MissionUpload(1, 1, items, window=1)).is_sure
     pair = Pair(vehicle, radio, seed)
     vehicle.channels[0].streams.set_interval(MissionCurrent.ID, 1.0, pair.now)
     pair.run(MissionSetCurrent(1, 1, seq, patience_s=60))

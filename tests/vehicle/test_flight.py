@@ -20,6 +20,7 @@ from aerokit.errors import (
 from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult
 from aerokit.runtime.cells import Source
 from aerokit.sim import SimulatedCopter
+from aerokit.vehicle.orders import flight
 from aerokit.vehicle.orders.setpoints import VelocitySetpoint
 
 pytestmark = pytest.mark.anyio
@@ -604,5 +605,14 @@ async def test_a_take_off_that_is_refused_in_the_air_says_so(flying: Flight) -> 
     flying.vehicle.telemetry.landed_state.forget()
     with pytest.raises(
         CommandRejected, match=r"it is in the air, 10\.\d m above home: it takes off from the ground only"
+    ):
+        await flying.vehicle.take_off(20)
+
+
+async def test_also_when_only_its_height_tells(flying: Flight, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(flight, "IN_THE_AIR", {})
+    flying.vehicle.telemetry.landed_state.forget()
+    with pytest.raises(
+        CommandRejected, match=r"it is in the air, it seems, 10\.\d m above home: it takes off"
     ):
         await flying.vehicle.take_off(20)

@@ -61,7 +61,7 @@ class MissionDownload(MissionExchange[Downloaded]):
         target_system: int,
         target_component: int,
         *,
-        window: int = 1,
+        window: int,
         only: Sequence[int] | None = None,
         gives_int: bool = True,
         **options: Any,

@@ -69,7 +69,7 @@ class MissionUpload(MissionExchange[UploadEnd]):
         items: Sequence[MissionItem],
         *,
         first: int | None = None,
-        window: int = 1,
+        window: int,
         takes_int: bool = True,
         **options: Any,
     ) -> None:
