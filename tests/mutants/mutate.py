@@ -21,7 +21,7 @@ from reach import ROOT, SOURCE, Reach, measure
 from trial import NOTICED, SURVIVED, TOO_LONG, Trials
 
 PACKAGES = ("autopilots", "links", "mavlink", "protocols", "runtime", "vehicle")
-TESTS = (*PACKAGES, "orders")
+TESTS = (*PACKAGES, "orders", "calls", "parameters", "missions", "test_hostile_files.py")
 GENERATED = ("mavlink/messages", "mavlink/enums")
 EQUIVALENT = Path(__file__).with_name("equivalent.json")
 GOAL = 0.9
