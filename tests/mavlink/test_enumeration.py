@@ -1,0 +1,41 @@
+"""Enums are made in a quick way where Python has one: they are the same as those made in the usual way."""
+
+from __future__ import annotations
+
+import pickle
+from enum import IntFlag
+from typing import Any
+
+import pytest
+
+from aerokit import enums
+from aerokit.mavlink import enumeration
+from aerokit.mavlink.enumeration import make_enum
+
+NAMES = [name for name in dir(enums) if isinstance(getattr(enums, name), type)]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_both_ways_make_the_same(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    quick: Any = getattr(enums, name)
+    members = [(each, int(value)) for each, value in quick.__members__.items()]
+    monkeypatch.setattr(enumeration, "_QUICKLY", None)
+    usual: Any = make_enum(quick.__module__, name, issubclass(quick, IntFlag), quick.__doc__, members)
+    assert [(*each,) for each in usual.__members__.items()] == [
+        (*each,) for each in quick.__members__.items()
+    ]
+    assert [repr(each) for each in usual] == [repr(each) for each in quick]
+    assert (usual.__doc__, usual.__mro__[1:]) == (quick.__doc__, quick.__mro__[1:])
+    for each in quick:
+        assert pickle.loads(pickle.dumps(each)) is each
+        assert (quick(each.value), hash(each), f"{each}") == (each, hash(int(each)), str(int(each)))
+
+
+def test_bits_that_nobody_has_named_are_kept() -> None:
+    flags = enums.MavModeFlag(128 | 1 << 20)
+    assert (int(flags), flags & enums.MavModeFlag.SAFETY_ARMED) == (
+        128 | 1 << 20,
+        enums.MavModeFlag.SAFETY_ARMED,
+    )
+    with pytest.raises(ValueError, match="is not a valid MavResult"):
+        enums.MavResult(99)
