@@ -160,6 +160,20 @@ async def test_jumps_lead_to_the_item_that_is_meant() -> None:
             assert [event.item for event in all_of(told)] == [0, 1, 2, 1, 2]
 
 
+async def test_an_item_that_is_flown_to_again_is_reached_again() -> None:
+    """PX4 tells each that is reached several times; it counts once, unless the vehicle went for it again."""
+    async with armed(open_px4) as flight:
+        mission = flight.vehicle.mission
+        with flight.vehicle.subscribe(events.MissionItemReached, capacity=50) as told:
+            await mission.start()
+            while (await told.get(timeout=60)).item != 1:
+                pass
+            await mission.current.wait_until(lambda current: current == 2, timeout=5)
+            await mission.set_current(1)
+            assert (await told.get(timeout=60)).item == 1
+            assert (await told.get(timeout=60)).item == 2
+
+
 async def test_count_and_current_without_a_mission() -> None:
     async with open_flight() as flight:
         await flight.vehicle.mission.count.wait_until(lambda count: count == 0, timeout=5)
