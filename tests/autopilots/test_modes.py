@@ -180,7 +180,7 @@ def test_an_unknown_autopilot_is_described_by_its_base_mode() -> None:
     assert names == {"PREFLIGHT", "AUTO", "GUIDED", "STABILIZE", "MANUAL"}
     assert other.mode(5, 1).name == "MODE 5"
     assert other.mode_for("hold") is None
-    assert other.take_off(10, None) is None
+    assert other.take_off(10, None, is_vtol=False) is None
 
 
 def test_an_ardupilot_of_unknown_type_still_is_ardupilot() -> None:

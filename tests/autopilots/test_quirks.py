@@ -28,7 +28,7 @@ copter, px4, plane = autopilot(3), autopilot(12), autopilot(3, 1)
 
 
 def test_copter_takes_off_in_guided_above_home() -> None:
-    plan = copter.take_off(20, None)
+    plan = copter.take_off(20, None, is_vtol=False)
     assert plan is not None
     assert plan.mode is not None
     assert (plan.mode.name, plan.command, plan.params[6], plan.mode_after) == ("GUIDED", 22, 20, None)
@@ -36,7 +36,7 @@ def test_copter_takes_off_in_guided_above_home() -> None:
 
 
 def test_px4_takes_off_above_the_sea_and_loiters() -> None:
-    plan = px4.take_off(20, 488)
+    plan = px4.take_off(20, 488, is_vtol=False)
     assert plan is not None
     assert plan.mode is None
     assert plan.params[6] == 508
@@ -44,23 +44,23 @@ def test_px4_takes_off_above_the_sea_and_loiters() -> None:
     assert plan.mode_after == px4.find_mode("LOITER")
     assert px4.take_off_needs_home()
     with pytest.raises(LocalProtocolError, match="altitude of home"):
-        px4.take_off(20, None)
+        px4.take_off(20, None, is_vtol=False)
 
 
 def test_planes_take_off_in_their_own_mode_unless_they_hover() -> None:
-    plan = plane.take_off(50, None)
+    plan = plane.take_off(50, None, is_vtol=False)
     assert plan is not None
     assert plan.mode is not None
     assert (plan.mode.name, plan.command) == ("TAKEOFF", None)
     hovering = plane.take_off(50, None, is_vtol=True)
-    assert hovering == autopilot(3, 20).take_off(50, None)
+    assert hovering == autopilot(3, 20).take_off(50, None, is_vtol=False)
     assert hovering is not None
     assert (hovering.command, hovering.params[6]) == (22, 50)
 
 
 @pytest.mark.parametrize(("number", "vehicle_type"), [(3, 10), (3, 12), (3, 5), (12, 10), (12, 12), (0, 2)])
 def test_what_stays_down_stays_down(number: int, vehicle_type: int) -> None:
-    assert autopilot(number, vehicle_type).take_off(10, 0) is None
+    assert autopilot(number, vehicle_type).take_off(10, 0, is_vtol=False) is None
 
 
 @pytest.mark.parametrize(("status", "landed"), [(3, 1), (4, 2), (5, None), (0, None)])

@@ -136,10 +136,10 @@ def test_the_summary_of_the_checks_is_its_own_bit_alone() -> None:
 
 def test_take_off_asks_for_an_altitude_and_nothing_else() -> None:
     for vehicle_type in (2, 20):
-        plan = of(3, vehicle_type).take_off(7.0, None)
+        plan = of(3, vehicle_type).take_off(7.0, None, is_vtol=False)
         assert plan is not None
         assert plan.params == (0, 0, 0, 0, 0, 0, 7.0)
-    plan = of(12, 2).take_off(7.0, 500.0)
+    plan = of(12, 2).take_off(7.0, 500.0, is_vtol=False)
     assert plan is not None
     assert [param for param in plan.params if not math.isnan(param)] == [0, 0, 507.0]
     assert [place for place, param in enumerate(plan.params) if math.isnan(param)] == [0, 3, 4, 5]

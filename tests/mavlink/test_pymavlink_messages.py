@@ -6,7 +6,7 @@ import subprocess
 import sys
 
 import pytest
-from pymavlink.dialects.v20 import ardupilotmega, common
+from pymavlink.dialects.v20 import ardupilotmega, common, matrixpilot
 
 from aerokit.errors import LocalProtocolError
 from aerokit.mavlink import Frame, FrameEncoder, messages
@@ -40,3 +40,11 @@ def test_pymavlink_is_imported_when_it_is_used() -> None:
     program = f"import sys, {modules}; print('pymavlink' in sys.modules)"
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert result.stdout == "False\n"
+
+
+def test_what_the_standard_has_not_is_checked_by_the_programs_dialect() -> None:
+    theirs = matrixpilot.MAVLink_serial_udb_extra_f13_message(1, 2, 3, 4)
+    raw = bytearray(theirs.pack(matrixpilot.MAVLink(None, srcSystem=1, srcComponent=1)))
+    assert to_pymavlink(Frame.parse(bytes(raw)), dialect=matrixpilot).get_type() == "SERIAL_UDB_EXTRA_F13"
+    raw[-1] ^= 1
+    assert to_pymavlink(Frame.parse(bytes(raw)), dialect=matrixpilot).get_type().startswith("UNKNOWN")

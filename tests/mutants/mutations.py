@@ -93,15 +93,25 @@ class Mutation:
 def mutations_of(path: str, source: str) -> list[Mutation]:
     """Every change of the file."""
     counts, found = dict.fromkeys(OPERATORS, 0), list[Mutation]()
-    statements = _statements(source)
+    statements, never_run = _statements(source), _for_type_checkers(source)
     for node in ast_nodes(get_ast(source)):
         for name, operator in OPERATORS.items():
             positions: Any = operator().mutation_positions(node)
             for (line, _), _ in positions:
-                if not _is_marker(node):
+                if not _is_marker(node) and line not in never_run:
                     found.append(Mutation(path, name, counts[name], *statements.get(line, ((line,), True))))
                 counts[name] += 1
     return found
+
+
+def _for_type_checkers(source: str) -> set[int]:
+    """The lines below ``if TYPE_CHECKING``."""
+    blocks = [
+        each
+        for each in ast.walk(ast.parse(source))
+        if isinstance(each, ast.If) and isinstance(each.test, ast.Name) and each.test.id == "TYPE_CHECKING"
+    ]
+    return {line for each in blocks for line in range(each.lineno, (each.body[-1].end_lineno or 0) + 1)}
 
 
 def _is_marker(node: Any) -> bool:

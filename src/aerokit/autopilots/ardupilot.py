@@ -135,7 +135,7 @@ class ArduCopter(ArduPilot):
     )
 
     def take_off(
-        self, altitude_relative_m: float, home_altitude_amsl_m: float | None, *, is_vtol: bool = False
+        self, altitude_relative_m: float, home_altitude_amsl_m: float | None, *, is_vtol: bool
     ) -> TakeOff:
         """GUIDED, arm, NAV_TAKEOFF with the altitude above home; it stays in GUIDED."""
         guided = self.modes.find("GUIDED")
@@ -171,7 +171,7 @@ class ArduPlane(ArduPilot):
         return super()._purpose_name(purpose, is_vtol)
 
     def take_off(
-        self, altitude_relative_m: float, home_altitude_amsl_m: float | None, *, is_vtol: bool = False
+        self, altitude_relative_m: float, home_altitude_amsl_m: float | None, *, is_vtol: bool
     ) -> TakeOff:
         """A QuadPlane rises in GUIDED; a plane armed in TAKEOFF climbs to its parameter TKOFF_ALT."""
         if self._can_hover(is_vtol):

@@ -221,7 +221,7 @@ class Autopilot:
     # ------------------------------------------------------------------------------ take-off
 
     def take_off(
-        self, altitude_relative_m: float, home_altitude_amsl_m: float | None, *, is_vtol: bool = False
+        self, altitude_relative_m: float, home_altitude_amsl_m: float | None, *, is_vtol: bool
     ) -> TakeOff | None:
         """How to take off to this altitude above home; None: this vehicle cannot."""
         return None

@@ -145,7 +145,7 @@ class Px4(Autopilot):
         return super().learn_mode_name(custom_mode, name)
 
     def take_off(
-        self, altitude_relative_m: float, home_altitude_amsl_m: float | None, *, is_vtol: bool = False
+        self, altitude_relative_m: float, home_altitude_amsl_m: float | None, *, is_vtol: bool
     ) -> TakeOff | None:
         """NAV_TAKEOFF with the altitude above the sea, here, with the present heading; then LOITER.
 

@@ -138,11 +138,6 @@ class MessageRates:
 
         return release
 
-    def achieved_hz(self, message_type: type[Message]) -> float | None:
-        """The rate at which a wanted message came lately, in Hz; None when it is not watched."""
-        stream = self._streams.get(message_type.ID)
-        return stream.achieved_hz() if stream is not None and len(stream.counts) > 1 else None
-
     def ask_again(self) -> None:
         """Forget what was asked, as after a reboot, and ask for everything again."""
         for stream in self._streams.values():
