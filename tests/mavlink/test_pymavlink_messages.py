@@ -43,8 +43,8 @@ def test_pymavlink_is_imported_when_it_is_used() -> None:
 
 
 def test_what_the_standard_has_not_is_checked_by_the_programs_dialect() -> None:
-    theirs = matrixpilot.MAVLink_serial_udb_extra_f13_message(1, 2, 3, 4)
+    theirs = matrixpilot.MAVLink_serial_udb_extra_f21_message(1, 2, 3, 4, 5, 6)
     raw = bytearray(theirs.pack(matrixpilot.MAVLink(None, srcSystem=1, srcComponent=1)))
-    assert to_pymavlink(Frame.parse(bytes(raw)), dialect=matrixpilot).get_type() == "SERIAL_UDB_EXTRA_F13"
+    assert to_pymavlink(Frame.parse(bytes(raw)), dialect=matrixpilot).get_type() == "SERIAL_UDB_EXTRA_F21"
     raw[-1] ^= 1
     assert to_pymavlink(Frame.parse(bytes(raw)), dialect=matrixpilot).get_type().startswith("UNKNOWN")
