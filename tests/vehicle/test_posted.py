@@ -225,6 +225,23 @@ async def test_a_pilot_ends_it_and_a_newer_one_too(flying: Flight) -> None:
 
 
 @pytest.mark.anyio
+async def test_what_is_left_of_an_order_that_was_lost_is_not_sent(flying: Flight) -> None:
+    vehicle, place = flying.vehicle, {"frame": 6, "x": 1, "y": 1, "z": 20.0}
+    with vehicle.posted("motion") as order:
+        await order.command(MavCmd.DO_SET_ROI_NONE)
+        flying.pilot_takes_over()
+        await anyio.sleep(2)
+        with pytest.raises(CommandTimeout, match=f"DO_REPOSITION was not sent: {TAKEN}"):
+            await order.command_int(MavCmd.DO_REPOSITION, -1, **place)
+    with vehicle.posted("motion") as order:
+        await order.command(MavCmd.DO_SET_ROI_NONE)
+        await vehicle.set_mode("GUIDED")
+        with pytest.raises(CommandTimeout, match=f"DO_REPOSITION was not sent: {NEWER}"):
+            await order.command_int(MavCmd.DO_REPOSITION, -1, **place)
+    assert not flying.wire.commands(MavCmd.DO_REPOSITION)
+
+
+@pytest.mark.anyio
 async def test_it_ends_the_flight_under_way_which_is_not_held_then() -> None:
     async with in_the_air() as flight:
         vehicle, errors = flight.vehicle, list[str]()

@@ -544,6 +544,8 @@ class PostedOrder(TwinOf["AsyncPostedOrder"]):
     def command(self, command: int, *params: float, component_id: int | None=None) -> None:
         """Send a COMMAND_LONG of this order; return when it is answered, or the order's effect is told.
 
+        A second one is not sent when a newer order is about its subject, or somebody else has changed the mode, since.
+
         Args:
             command: the MAV_CMD.
             params: param1 to param7; missing ones are 0.
@@ -552,7 +554,7 @@ class PostedOrder(TwinOf["AsyncPostedOrder"]):
         Raises:
             LocalProtocolError: a parameter is no number or does not fit. Nothing was sent.
             CommandRejected: the vehicle refused; ``reasons`` has what it said.
-            CommandTimeout: there was no answer; the text says so when it was not sent again for a reason.
+            CommandTimeout: there was no answer; the text says so when it was not sent, or not again, for a reason.
         """
         self._loop.run(self.aio.command, command, *params, component_id=component_id)
 

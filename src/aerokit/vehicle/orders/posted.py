@@ -47,8 +47,11 @@ class Posted:
     @property
     def end(self) -> str:
         """Why it must not be sent again, as a clause; empty while it may."""
-        if self.has_worked:
-            return "its effect was told"
+        return "its effect was told" if self.has_worked else self.lost
+
+    @property
+    def lost(self) -> str:
+        """Why nothing of it may be sent any more, as a clause: another order or somebody else has the vehicle."""
         return self._taken_by if self._is_newest() else "a newer order was given meanwhile"
 
     def note_mode(self, mode: Mode, at: float) -> None:
