@@ -106,6 +106,14 @@ def test_a_mode_that_was_ordered_lately_is_the_programs() -> None:
     assert of_an_action.end == ""
 
 
+def test_disarming_ends_what_was_posted_about_motion() -> None:
+    stage = Stage(GUIDED, True)
+    motion, mode, arm = stage.post("motion"), stage.post("mode"), stage.post("arm", armed=True)
+    stage.tell(GUIDED, False)
+    stage.tell(GUIDED, True)
+    assert (motion.end, mode.end, arm.end) == ("the vehicle disarmed", "", TOLD)
+
+
 def test_a_newer_order_ends_those_of_its_subjects() -> None:
     stage = Stage()
     going, mode = stage.post("motion"), stage.post("mode", "motion")

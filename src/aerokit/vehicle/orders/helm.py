@@ -158,6 +158,7 @@ class Helm:
             armed=armed,
             mode_now=self._telemetry.mode.latest,
             armed_now=self._telemetry.armed.latest,
+            moves=subjects[0] == "motion",
         )
         self._posted.append(posted)
         try:

@@ -18,10 +18,10 @@ OWN_MODES_S = 10.0
 
 class Posted:
     """Whether one posted order still stands: its effect has not been told yet, no newer one is of its subject, and
-    nobody else, a pilot or a failsafe, has changed the mode since.
+    nobody else, a pilot or a failsafe, has changed the mode since; nor, if it ``moves`` the vehicle, disarmed it.
 
     ``modes`` and ``armed`` are its effects: a change to them, as HEARTBEAT tells it. ``own_modes`` are others that the
-    program has ordered lately. To disarm is meant whatever the mode.
+    program had ordered shortly before. To disarm is meant whatever the mode.
     """
 
     def __init__(
@@ -33,6 +33,7 @@ class Posted:
         armed: bool | None,
         mode_now: Mode | None,
         armed_now: bool | None,
+        moves: bool = False,
     ) -> None:
         self.has_worked = False
         """Whether HEARTBEAT has told its effect."""
@@ -40,7 +41,7 @@ class Posted:
         """When HEARTBEAT came last."""
         self._is_newest, self._taken_by = is_newest, ""
         self._modes, self._own_modes = {each.custom_mode for each in modes}, set(own_modes)
-        self._armed = armed
+        self._armed, self._moves = armed, moves
         self._mode_before = None if mode_now is None else mode_now.custom_mode
         self._armed_before = armed_now
 
@@ -69,6 +70,8 @@ class Posted:
         before, self._armed_before = self._armed_before, armed
         if before is not None and before is not armed and armed is self._armed:
             self.has_worked = True
+        elif before and not armed and self._moves:
+            self._taken_by = self._taken_by or "the vehicle disarmed"
         self.told_at = at
 
     def note_reboot(self) -> None:
