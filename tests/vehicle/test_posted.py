@@ -274,6 +274,30 @@ async def test_it_ends_the_flight_under_way_which_is_not_held_then() -> None:
 
 
 @pytest.mark.anyio
+async def test_a_mode_that_was_posted_before_is_not_held_against_a_flight() -> None:
+    """The flight is ordered before HEARTBEAT tells the mode: nobody has taken it over, and it is looked after."""
+    async with in_the_air(latency_s=0.5) as flight:
+        vehicle, told = flight.vehicle, flight.vehicle.telemetry.armed
+        loiter = vehicle.autopilot.find_mode("LOITER")
+
+        async def post() -> None:
+            with vehicle.posted("mode", "motion", modes=(loiter,)) as order:
+                await order.command(SET_MODE, *vehicle.autopilot.mode_order(loiter).params)
+                await order.until_told(5)
+
+        before = told.updated_at
+        await told.wait_until(lambda _: told.updated_at > before, timeout=5)
+        await anyio.sleep(0.45)
+        seen = list[Any]()
+        flight.vehicle.telemetry.mode.observe(lambda _, mode: seen.append(str(mode)))
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(post)
+            await anyio.sleep(0.6)
+            await vehicle.go_to(vehicle.position.value.offset(north_m=30))
+        assert seen == ["LOITER", "GUIDED"]
+
+
+@pytest.mark.anyio
 async def test_what_is_refused_or_not_done_says_so(grounded: Flight) -> None:
     vehicle, faults = grounded.vehicle, grounded.copter.faults
     faults.refuse(ARM, MavResult.FAILED, "PreArm: Compass not healthy")

@@ -40,6 +40,8 @@ class Posted:
         self.told_at = -math.inf
         """When HEARTBEAT came last."""
         self._is_newest, self._taken_by = is_newest, ""
+        self.modes = tuple(modes)
+        """Those that it brings about."""
         self._modes, self._own_modes = {each.custom_mode for each in modes}, set(own_modes)
         self._armed, self._moves = armed, moves
         self._mode_before = None if mode_now is None else mode_now.custom_mode
