@@ -183,3 +183,16 @@ async def test_home_is_set_where_no_command_int_is_known() -> None:
         assert flight.vehicle.home.value.position.distance_to(wanted) < 1.0  # 32 bits of a float
         kinds = [type(each) for each in flight.wire.commands(MavCmd.DO_SET_HOME)]
         assert kinds == [m.CommandInt, m.CommandLong]
+
+
+async def test_what_another_station_is_denied_is_no_reason_to_claim_control() -> None:
+    async with in_the_air(copter=with_gimbal()) as flight:
+        flight.copter.faults.ignore(PITCHYAW, times=1)
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(flight.vehicle.gimbal.point, -10.0, 0.0)
+            await anyio.sleep(0.1)
+            flight.copter.send(m.CommandAck(PITCHYAW, DENIED, 0, 0, 254, 190))
+            await anyio.sleep(0.1)
+            assert flight.vehicle._talk.commands.last_result(PITCHYAW) is None
+        await flight.vehicle.gimbal.point(-20.0, 0.0)
+        assert not flight.wire.commands(CONFIGURE)

@@ -236,7 +236,8 @@ class CommandSender:
         frame = ack.received_frame
         key = (0 if frame is None else frame.component_id, ack.command)
         run = self._runs.get(key)
-        if (run is not None or key in self._under_way) and ack.result != MavResult.IN_PROGRESS:
+        is_answer = (run is not None or key in self._under_way) and self.is_for_us(ack)
+        if is_answer and ack.result != MavResult.IN_PROGRESS:
             self._results[key] = ack.result
         if run is not None:
             run.receive(ack)
