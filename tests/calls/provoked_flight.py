@@ -171,6 +171,12 @@ def _actions() -> Table:
         ("Vehicle.look_at", "ValueUnknownError"): P(_look_north, airborne, _forget("home"), on="px4"),
         ("Vehicle.look_at", "CommandRejected"): P(_look_north, before=refused(Cmd.DO_SET_ROI_LOCATION)),
         ("Vehicle.look_at", "CommandTimeout"): P(_look_north, grounded, ignored(Cmd.DO_SET_ROI_LOCATION)),
+        ("Vehicle.look_at", "OperationRejected"): later(
+            _look_north, pilot, 0.3, before=ignored(Cmd.DO_SET_ROI_LOCATION)
+        ),
+        ("Vehicle.stop_looking", "OperationRejected"): later(
+            _method("stop_looking"), pilot, 0.3, before=ignored(Cmd.DO_SET_ROI_NONE)
+        ),
         ("Vehicle.stop_looking", "CommandRejected"): P(
             _method("stop_looking"), before=refused(Cmd.DO_SET_ROI_NONE)
         ),

@@ -2123,6 +2123,7 @@ class Vehicle(VehicleTwin):
             ValueUnknownError: home is not known and is needed here.
             CommandRejected: the vehicle refused.
             CommandTimeout: there was no answer.
+            OperationRejected: the mode changed, or a newer order was given, before there was an answer.
         """
         self._loop.run(self.aio.look_at, target)
 
@@ -2132,6 +2133,7 @@ class Vehicle(VehicleTwin):
         Raises:
             CommandRejected: the vehicle refused.
             CommandTimeout: there was no answer.
+            OperationRejected: the mode changed, or a newer order was given, before there was an answer.
         """
         self._loop.run(self.aio.stop_looking)
 

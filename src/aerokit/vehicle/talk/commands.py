@@ -159,6 +159,10 @@ class CommandSender:
         """What was answered does not count any more."""
         self._results.pop((self._component_id, command), None)
 
+    def forget_results(self) -> None:
+        """The vehicle has rebooted: what it knows may be other commands."""
+        self._results.clear()
+
     def awaits_answer(self, command: int) -> bool:
         """Whether an answer of the autopilot to what was sent unconfirmed may still come."""
         oldest = self._connection.now() - UNDER_WAY_S
