@@ -184,9 +184,13 @@ def _actions() -> Table:
             _method("stop_looking"), grounded, ignored(Cmd.DO_SET_ROI_NONE)
         ),
         ("Vehicle.posted", "LocalProtocolError"): P(lambda s: _post(s, [])),
-        ("PostedOrder.command", "LocalProtocolError"): P(lambda s: _post(s, ["arm"], -1)),
-        ("PostedOrder.command", "CommandRejected"): P(lambda s: _post(s, ["arm"]), grounded, refused(arm)),
-        ("PostedOrder.command", "CommandTimeout"): P(lambda s: _post(s, ["arm"]), grounded, ignored(arm)),
+        ("PostedOrder.command", "LocalProtocolError"): P(lambda s: _post(s, ["arm"], -1, armed=True)),
+        ("PostedOrder.command", "CommandRejected"): P(
+            lambda s: _post(s, ["arm"], armed=True), grounded, refused(arm)
+        ),
+        ("PostedOrder.command", "CommandTimeout"): P(
+            lambda s: _post(s, ["arm"], armed=True), grounded, ignored(arm)
+        ),
         ("PostedOrder.command_int", "LocalProtocolError"): P(lambda s: _post_int(s, 999)),
         ("PostedOrder.command_int", "CommandRejected"): P(_post_int, before=refused(Cmd.DO_SET_HOME)),
         ("PostedOrder.command_int", "CommandTimeout"): P(_post_int, grounded, ignored(Cmd.DO_SET_HOME)),

@@ -318,6 +318,12 @@ async def test_what_is_refused_or_not_done_says_so(grounded: Flight) -> None:
             await order.until_told(2)
     with pytest.raises(LocalProtocolError, match="no subject is named"), vehicle.posted():
         pass
+    grounded.wire.forget()
+    with pytest.raises(LocalProtocolError, match="needs armed=True or armed=False"), vehicle.posted("arm"):
+        pass
+    with pytest.raises(LocalProtocolError, match="the block of this order was left"):
+        await order.command(ARM, 1)
+    assert not grounded.wire.commands(ARM)
 
 
 @pytest.mark.anyio

@@ -552,7 +552,7 @@ class PostedOrder(TwinOf["AsyncPostedOrder"]):
             component_id: to another component than the autopilot; 0: to all, and the autopilot's answer counts.
 
         Raises:
-            LocalProtocolError: a parameter is no number or does not fit. Nothing was sent.
+            LocalProtocolError: a parameter is no number or does not fit, or the block was left. Nothing was sent.
             CommandRejected: the vehicle refused; ``reasons`` has what it said.
             CommandTimeout: there was no answer; the text says so when it was not sent, or not again, for a reason.
         """
@@ -1872,10 +1872,10 @@ class Vehicle(VehicleTwin):
             subjects: what it is about, ``"mode"``, ``"motion"`` or ``"arm"``; orders about any more that are named are
                 ended by it, too. One about mode or motion ends the action under way.
             modes: the modes that it brings about.
-            armed: whether it arms or disarms.
+            armed: whether it arms or disarms; one about ``"arm"`` has to say.
 
         Raises:
-            LocalProtocolError: no subject. Nothing was sent.
+            LocalProtocolError: no subject, or one about ``"arm"`` without ``armed``. Nothing was sent.
         """
         return self._twin_block(PostedOrder, self.aio.posted(*subjects, modes=modes, armed=armed))
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import anyio
 
 from aerokit.arguments import checks_arguments
-from aerokit.errors import CommandRejected, CommandTimeout, OperationTimeout
+from aerokit.errors import CommandRejected, CommandTimeout, LocalProtocolError, OperationTimeout
 from aerokit.protocols.command import command_name, rejection
 from aerokit.vehicle.orders.progress import Arrivals
 
@@ -37,12 +37,13 @@ class PostedOrder:
         self._ends = ExitStack()
         self._started = talk.connection.now()
         self._refusals: list[CommandAck] = []
-        self._has_begun = False
+        self._has_begun = self._is_over = False
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._is_over = True
         self._ends.close()
 
     @property
@@ -61,7 +62,7 @@ class PostedOrder:
             component_id: to another component than the autopilot; 0: to all, and the autopilot's answer counts.
 
         Raises:
-            LocalProtocolError: a parameter is no number or does not fit. Nothing was sent.
+            LocalProtocolError: a parameter is no number or does not fit, or the block was left. Nothing was sent.
             CommandRejected: the vehicle refused; ``reasons`` has what it said.
             CommandTimeout: there was no answer; the text says so when it was not sent, or not again, for a reason.
         """
@@ -117,6 +118,10 @@ class PostedOrder:
     async def _give(
         self, send: Callable[..., Awaitable[CommandAck]], command: int, *params: float, **options: Any
     ) -> None:
+        if self._is_over:
+            raise LocalProtocolError(
+                f"the block of this order was left: {command_name(command)} was not sent"
+            )
         if self._has_begun and self._posted.lost:
             raise CommandTimeout(f"{command_name(command)} was not sent: {self._posted.lost}")
         self._has_begun, self._started = True, self._talk.connection.now()

@@ -163,13 +163,15 @@ class TalkActions(Part):
             subjects: what it is about, ``"mode"``, ``"motion"`` or ``"arm"``; orders about any more that are named are
                 ended by it, too. One about mode or motion ends the action under way.
             modes: the modes that it brings about.
-            armed: whether it arms or disarms.
+            armed: whether it arms or disarms; one about ``"arm"`` has to say.
 
         Raises:
-            LocalProtocolError: no subject. Nothing was sent.
+            LocalProtocolError: no subject, or one about ``"arm"`` without ``armed``. Nothing was sent.
         """
         if not subjects:
             raise LocalProtocolError("posted: no subject is named: mode, motion or arm")
+        if "arm" in subjects and armed is None:
+            raise LocalProtocolError("posted: an order about arm needs armed=True or armed=False")
         with (
             self._helm.posting(subjects, modes=modes, armed=armed) as posted,
             PostedOrder(self._talk, posted, modes, armed) as order,
