@@ -43,12 +43,16 @@ _SIMPLE: dict[str, Rule] = {
 }
 
 
+def _is_above_zero(value: Any) -> bool:
+    try:
+        return isinstance(value, Real) and float(value) > 0
+    except OverflowError:
+        return False
+
+
 _SECONDS: dict[str, Rule] = {
-    "float": (lambda value: isinstance(value, Real) and float(value) > 0, "seconds above 0"),
-    "float | None": (
-        lambda value: value is None or (isinstance(value, Real) and float(value) > 0),
-        "seconds above 0, or None",
-    ),
+    "float": (_is_above_zero, "seconds above 0"),
+    "float | None": (lambda value: value is None or _is_above_zero(value), "seconds above 0, or None"),
 }
 
 

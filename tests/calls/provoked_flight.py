@@ -171,6 +171,12 @@ def _actions() -> Table:
         ("Vehicle.look_at", "ValueUnknownError"): P(_look_north, airborne, _forget("home"), on="px4"),
         ("Vehicle.look_at", "CommandRejected"): P(_look_north, before=refused(Cmd.DO_SET_ROI_LOCATION)),
         ("Vehicle.look_at", "CommandTimeout"): P(_look_north, grounded, ignored(Cmd.DO_SET_ROI_LOCATION)),
+        ("Vehicle.look_at", "OperationRejected"): later(
+            _look_north, pilot, 0.3, before=ignored(Cmd.DO_SET_ROI_LOCATION)
+        ),
+        ("Vehicle.stop_looking", "OperationRejected"): later(
+            _method("stop_looking"), pilot, 0.3, before=ignored(Cmd.DO_SET_ROI_NONE)
+        ),
         ("Vehicle.stop_looking", "CommandRejected"): P(
             _method("stop_looking"), before=refused(Cmd.DO_SET_ROI_NONE)
         ),
@@ -178,9 +184,13 @@ def _actions() -> Table:
             _method("stop_looking"), grounded, ignored(Cmd.DO_SET_ROI_NONE)
         ),
         ("Vehicle.posted", "LocalProtocolError"): P(lambda s: _post(s, [])),
-        ("PostedOrder.command", "LocalProtocolError"): P(lambda s: _post(s, ["arm"], -1)),
-        ("PostedOrder.command", "CommandRejected"): P(lambda s: _post(s, ["arm"]), grounded, refused(arm)),
-        ("PostedOrder.command", "CommandTimeout"): P(lambda s: _post(s, ["arm"]), grounded, ignored(arm)),
+        ("PostedOrder.command", "LocalProtocolError"): P(lambda s: _post(s, ["arm"], -1, armed=True)),
+        ("PostedOrder.command", "CommandRejected"): P(
+            lambda s: _post(s, ["arm"], armed=True), grounded, refused(arm)
+        ),
+        ("PostedOrder.command", "CommandTimeout"): P(
+            lambda s: _post(s, ["arm"], armed=True), grounded, ignored(arm)
+        ),
         ("PostedOrder.command_int", "LocalProtocolError"): P(lambda s: _post_int(s, 999)),
         ("PostedOrder.command_int", "CommandRejected"): P(_post_int, before=refused(Cmd.DO_SET_HOME)),
         ("PostedOrder.command_int", "CommandTimeout"): P(_post_int, grounded, ignored(Cmd.DO_SET_HOME)),

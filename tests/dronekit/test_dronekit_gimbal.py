@@ -293,3 +293,11 @@ def test_after_closing_orders_raise(stage: Stage) -> None:
     ):
         with pytest.raises(dronekit.APIException):
             order()
+
+
+def test_angles_beyond_a_turn_are_the_same_direction(stage: Stage) -> None:
+    """Programs add them up: a heading of 359 and 90 degrees to the right."""
+    sent = commands(stage, lambda: stage.vehicle.gimbal.rotate(-10, 0, 449))
+    assert sent == [(PITCHYAW, (-10, 89, None, None, 28))]
+    sent = commands(stage, lambda: stage.vehicle.gimbal.rotate(0, 0, 360))
+    assert sent == [(PITCHYAW, (0, 360, None, None, 28))]

@@ -17,6 +17,7 @@ import aerokit.dronekit as dronekit
 
 LOITER = 5
 ARM, SET_MODE, REPOSITION = 400, 176, 192
+UNSUPPORTED = 3
 ARMED = 128
 LIMIT_S = 10.0
 
@@ -161,3 +162,24 @@ def test_a_place_that_is_posted_ends_the_flight_of_the_new_api(
     vehicle.simple_goto(dronekit.LocationGlobalRelative(-35.0, 149.0, 20.0))
     vehicle._handler.orders.wait(LIMIT_S)
     assert order.end == "another order was given"
+
+
+def test_what_is_sent_to_old_firmware_instead_is_part_of_the_order(
+    copter: FlightController, vehicle: dronekit.Vehicle
+) -> None:
+    """What has no answer and follows the refusal does not follow a newer order, nor a pilot."""
+    copter.results = {REPOSITION: UNSUPPORTED, SET_MODE: UNSUPPORTED}
+    vehicle.simple_goto(dronekit.LocationGlobalRelative(-35.0, 149.0, 20.0))
+    copter.wait_for("COMMAND_INT", lambda frame: frame.command == REPOSITION)
+    stop = (0, 0, 0, 8, 0x0DC7, *(0,) * 11)
+    vehicle.send_mavlink(vehicle.message_factory.set_position_target_local_ned_encode(*stop))
+    vehicle.mode = "AUTO"
+    copter.wait_for_command(SET_MODE)
+    copter.custom_mode = LOITER
+    copter.beat()
+    vehicle._handler.orders.wait(LIMIT_S)
+    assert not copter.received("SET_POSITION_TARGET_GLOBAL_INT", "SET_MODE")
+    vehicle.mode = "GUIDED"
+    copter.wait_for("SET_MODE", lambda frame: frame.custom_mode == 4)
+    vehicle.simple_goto(dronekit.LocationGlobalRelative(-35.0, 149.0, 20.0))
+    copter.wait_for("SET_POSITION_TARGET_GLOBAL_INT", lambda _: True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import gc
+import inspect
 import threading
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
@@ -81,6 +82,15 @@ async def test_our_heartbeat_is_that_of_a_ground_station() -> None:
         (frame,) = Framer().receive(ear.data)
         assert (frame.version, frame.system_id, frame.component_id) == (2, 255, 190)
         assert STANDARD.decode(frame) == Heartbeat(6, 8, 0, 0, 4, 3)
+
+
+async def test_our_ids_are_plain_numbers() -> None:
+    """Python 3.10 writes members of enums by their names: ``MavComponent.MISSIONPLANNER``."""
+    link, _ = memory_link_pair()
+    connection = Connection(link)
+    assert (type(connection.source_system), type(connection.source_component)) == (int, int)
+    for opening in (connect, open_connection):
+        assert type(inspect.signature(opening).parameters["source_component"].default) is int
 
 
 async def test_what_the_dialect_does_not_know_cannot_be_subscribed_to() -> None:

@@ -12,7 +12,7 @@ from flight_harness import Flight, Wire, in_the_air, open_flight
 import aerokit
 from aerokit import Position
 from aerokit import messages as m
-from aerokit.errors import CommandRejected, CommandTimeout, LocalProtocolError
+from aerokit.errors import CommandRejected, CommandTimeout, LocalProtocolError, OperationRejected
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.mavlink.message import Message
 from aerokit.runtime.cells import Source
@@ -183,3 +183,52 @@ async def test_home_is_set_where_no_command_int_is_known() -> None:
         assert flight.vehicle.home.value.position.distance_to(wanted) < 1.0  # 32 bits of a float
         kinds = [type(each) for each in flight.wire.commands(MavCmd.DO_SET_HOME)]
         assert kinds == [m.CommandInt, m.CommandLong]
+
+
+async def test_what_another_station_is_denied_is_no_reason_to_claim_control() -> None:
+    async with in_the_air(copter=with_gimbal()) as flight:
+        flight.copter.faults.ignore(PITCHYAW, times=1)
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(flight.vehicle.gimbal.point, -10.0, 0.0)
+            await anyio.sleep(0.1)
+            flight.copter.send(m.CommandAck(PITCHYAW, DENIED, 0, 0, 254, 190))
+            await anyio.sleep(0.1)
+            assert flight.vehicle._talk.commands.last_result(PITCHYAW) is None
+        await flight.vehicle.gimbal.point(-20.0, 0.0)
+        assert not flight.wire.commands(CONFIGURE)
+
+
+@pytest.mark.parametrize("newer", ["stop_looking", "go_to"])
+async def test_what_is_looked_at_with_old_firmware_is_no_order_after_a_newer_one(newer: str) -> None:
+    async with in_the_air() as flight:
+        vehicle, target = flight.vehicle, place(flight, altitude_relative_m=5.0)
+        flight.copter.faults.ignore(MavCmd.DO_SET_ROI_LOCATION)
+        flight.copter.send(m.AutopilotVersion(1, 0, 0, 0, 0, b"", b"", b"", 0, 0, 0))
+        await anyio.sleep(0.5)
+
+        async def look() -> None:
+            with pytest.raises(OperationRejected, match="another order was given"):
+                await vehicle.look_at(target)
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(look)
+            await anyio.sleep(0.3)
+            if newer == "go_to":
+                await vehicle.go_to(vehicle.position.value.offset(north_m=20.0))
+            else:
+                await vehicle.stop_looking()
+        assert len(flight.wire.commands(MavCmd.DO_SET_ROI_LOCATION)) == 1
+        assert not flight.wire.commands(ROI)
+
+
+async def test_after_a_reboot_the_vehicle_may_know_more() -> None:
+    """As with a mount that is there from the next boot on."""
+    async with open_flight(copter=with_gimbal()) as flight:
+        vehicle, sent = flight.vehicle, flight.wire.commands
+        await vehicle.wait_ready()
+        flight.copter.faults.refuse(PITCHYAW, UNSUPPORTED, times=1)
+        await vehicle.gimbal.point(-10.0, 0.0)
+        assert (len(sent(PITCHYAW)), len(sent(MOUNT))) == (1, 1)
+        await vehicle.reboot()
+        await vehicle.gimbal.point(-20.0, 0.0)
+        assert (len(sent(PITCHYAW)), len(sent(MOUNT))) == (2, 1)

@@ -106,6 +106,14 @@ def test_a_mode_that_was_ordered_lately_is_the_programs() -> None:
     assert of_an_action.end == ""
 
 
+def test_disarming_ends_what_was_posted_about_motion() -> None:
+    stage = Stage(GUIDED, True)
+    motion, mode, arm = stage.post("motion"), stage.post("mode"), stage.post("arm", armed=True)
+    stage.tell(GUIDED, False)
+    stage.tell(GUIDED, True)
+    assert (motion.end, mode.end, arm.end) == ("the vehicle disarmed", "", TOLD)
+
+
 def test_a_newer_order_ends_those_of_its_subjects() -> None:
     stage = Stage()
     going, mode = stage.post("motion"), stage.post("mode", "motion")
@@ -225,6 +233,23 @@ async def test_a_pilot_ends_it_and_a_newer_one_too(flying: Flight) -> None:
 
 
 @pytest.mark.anyio
+async def test_what_is_left_of_an_order_that_was_lost_is_not_sent(flying: Flight) -> None:
+    vehicle, place = flying.vehicle, {"frame": 6, "x": 1, "y": 1, "z": 20.0}
+    with vehicle.posted("motion") as order:
+        await order.command(MavCmd.DO_SET_ROI_NONE)
+        flying.pilot_takes_over()
+        await anyio.sleep(2)
+        with pytest.raises(CommandTimeout, match=f"DO_REPOSITION was not sent: {TAKEN}"):
+            await order.command_int(MavCmd.DO_REPOSITION, -1, **place)
+    with vehicle.posted("motion") as order:
+        await order.command(MavCmd.DO_SET_ROI_NONE)
+        await vehicle.set_mode("GUIDED")
+        with pytest.raises(CommandTimeout, match=f"DO_REPOSITION was not sent: {NEWER}"):
+            await order.command_int(MavCmd.DO_REPOSITION, -1, **place)
+    assert not flying.wire.commands(MavCmd.DO_REPOSITION)
+
+
+@pytest.mark.anyio
 async def test_it_ends_the_flight_under_way_which_is_not_held_then() -> None:
     async with in_the_air() as flight:
         vehicle, errors = flight.vehicle, list[str]()
@@ -249,6 +274,30 @@ async def test_it_ends_the_flight_under_way_which_is_not_held_then() -> None:
 
 
 @pytest.mark.anyio
+async def test_a_mode_that_was_posted_before_is_not_held_against_a_flight() -> None:
+    """The flight is ordered before HEARTBEAT tells the mode: nobody has taken it over, and it is looked after."""
+    async with in_the_air(latency_s=0.5) as flight:
+        vehicle, told = flight.vehicle, flight.vehicle.telemetry.armed
+        loiter = vehicle.autopilot.find_mode("LOITER")
+
+        async def post() -> None:
+            with vehicle.posted("mode", "motion", modes=(loiter,)) as order:
+                await order.command(SET_MODE, *vehicle.autopilot.mode_order(loiter).params)
+                await order.until_told(5)
+
+        before = told.updated_at
+        await told.wait_until(lambda _: told.updated_at > before, timeout=5)
+        await anyio.sleep(0.45)
+        seen = list[Any]()
+        flight.vehicle.telemetry.mode.observe(lambda _, mode: seen.append(str(mode)))
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(post)
+            await anyio.sleep(0.6)
+            await vehicle.go_to(vehicle.position.value.offset(north_m=30))
+        assert seen == ["LOITER", "GUIDED"]
+
+
+@pytest.mark.anyio
 async def test_what_is_refused_or_not_done_says_so(grounded: Flight) -> None:
     vehicle, faults = grounded.vehicle, grounded.copter.faults
     faults.refuse(ARM, MavResult.FAILED, "PreArm: Compass not healthy")
@@ -269,6 +318,12 @@ async def test_what_is_refused_or_not_done_says_so(grounded: Flight) -> None:
             await order.until_told(2)
     with pytest.raises(LocalProtocolError, match="no subject is named"), vehicle.posted():
         pass
+    grounded.wire.forget()
+    with pytest.raises(LocalProtocolError, match="needs armed=True or armed=False"), vehicle.posted("arm"):
+        pass
+    with pytest.raises(LocalProtocolError, match="the block of this order was left"):
+        await order.command(ARM, 1)
+    assert not grounded.wire.commands(ARM)
 
 
 @pytest.mark.anyio

@@ -103,3 +103,10 @@ async def test_values_of_parameters(values: Any) -> None:
             with pytest.raises(LocalProtocolError):
                 await call(values)
         assert [message for _, message in flight.wire.sent if not isinstance(message, m.Heartbeat)] == []
+
+
+async def test_a_time_that_no_clock_has() -> None:
+    async with quiet_flight() as flight:
+        with pytest.raises(LocalProtocolError, match=r"timeout = .* is not allowed: seconds above 0"):
+            await flight.vehicle.set_mode("LOITER", timeout=10**400)
+        assert not flight.wire.mode_orders()

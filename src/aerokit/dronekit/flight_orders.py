@@ -54,8 +54,8 @@ async def go_to(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: 
     The altitude is above home, or above the sea where the autopilot repositions so (PX4).
     """
     is_amsl = vehicle.autopilot.repositions_amsl
-    try:
-        with vehicle.posted("motion", modes=flies_to_places_in(vehicle)[:1]) as order:
+    with vehicle.posted("motion", modes=flies_to_places_in(vehicle)[:1]) as order:
+        try:
             await order.command_int(
                 MavCmd.DO_REPOSITION,
                 *(-1, MavDoRepositionFlags.CHANGE_MODE if is_amsl else 0, 0, math.nan),
@@ -65,11 +65,11 @@ async def go_to(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: 
                 z=altitude,
                 component_id=0,
             )
-    except CommandRejected as error:
-        if is_amsl or error.result != MavResult.UNSUPPORTED:
-            raise
-        target = (vehicle.system_id, 0, MavFrame.GLOBAL_RELATIVE_ALT_INT, POSITION_ONLY)
-        vehicle.send(SetPositionTargetGlobalInt(0, *target, latitude, longitude, altitude, *(0.0,) * 8))
+        except CommandRejected as error:
+            if is_amsl or error.result != MavResult.UNSUPPORTED or order.end:
+                raise
+            target = (vehicle.system_id, 0, MavFrame.GLOBAL_RELATIVE_ALT_INT, POSITION_ONLY)
+            vehicle.send(SetPositionTargetGlobalInt(0, *target, latitude, longitude, altitude, *(0.0,) * 8))
 
 
 def flies_to_places_in(aio: AsyncVehicle) -> tuple[Mode, ...]:

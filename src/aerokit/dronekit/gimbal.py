@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 __all__ = ["Gimbal"]
 
 HOME_TIMEOUT_S = 10.0
+MOST_DEG = 360.0
+"""What ``vehicle.aio.gimbal`` takes: programs add angles, and mean the same direction."""
 NOT_TOLD = GimbalAttitude(None, None, None)
 
 
@@ -145,4 +147,4 @@ def _checked(name: str, value: float) -> float:
         number = math.nan
     if not math.isfinite(number):
         raise LocalProtocolError(f"{name} = {value!r} is not allowed: a finite number of degrees")
-    return number
+    return number if abs(number) <= MOST_DEG else math.remainder(number, 360.0)

@@ -90,6 +90,7 @@ async def _request(vehicle: Vehicle, wanted: Mode, order: PostedOrder) -> None:
     try:
         await order.command(MavCmd.DO_SET_MODE, *params, component_id=0)
     except CommandRejected as error:
-        if error.result != MavResult.UNSUPPORTED:
+        if error.result != MavResult.UNSUPPORTED or (order.end and not vehicle.telemetry.is_in(wanted)):
             raise
-        vehicle.connection.send(SetMode(vehicle.system_id, wanted.base_mode, wanted.custom_mode))
+        if not order.end:
+            vehicle.connection.send(SetMode(vehicle.system_id, wanted.base_mode, wanted.custom_mode))

@@ -62,7 +62,6 @@ logger = logging.getLogger("aerokit")
 
 ItemT = TypeVar("ItemT", bound="Message | Event")
 
-"""The component id that ground stations take."""
 HEARTBEAT_PERIOD_S = 1.0
 
 
@@ -79,7 +78,7 @@ class Connection:
         link: Link,
         *,
         source_system: int = 255,
-        source_component: int = MavComponent.MISSIONPLANNER,
+        source_component: int = MavComponent.MISSIONPLANNER.value,
         dialect: Dialect = STANDARD,
         mavlink_version: int = 2,
         signing: Signing | None = None,

@@ -35,7 +35,7 @@ async def open_connection(
     address: str | Link,
     *,
     source_system: int = 255,
-    source_component: int = MavComponent.MISSIONPLANNER,
+    source_component: int = MavComponent.MISSIONPLANNER.value,
     baud: int = 57600,
     dialect: Dialect = STANDARD,
     mavlink_version: int = 2,

@@ -544,15 +544,17 @@ class PostedOrder(TwinOf["AsyncPostedOrder"]):
     def command(self, command: int, *params: float, component_id: int | None=None) -> None:
         """Send a COMMAND_LONG of this order; return when it is answered, or the order's effect is told.
 
+        A second one is not sent when a newer order is about its subject, or somebody else has changed the mode, since.
+
         Args:
             command: the MAV_CMD.
             params: param1 to param7; missing ones are 0.
             component_id: to another component than the autopilot; 0: to all, and the autopilot's answer counts.
 
         Raises:
-            LocalProtocolError: a parameter is no number or does not fit. Nothing was sent.
+            LocalProtocolError: a parameter is no number or does not fit, or the block was left. Nothing was sent.
             CommandRejected: the vehicle refused; ``reasons`` has what it said.
-            CommandTimeout: there was no answer; the text says so when it was not sent again for a reason.
+            CommandTimeout: there was no answer; the text says so when it was not sent, or not again, for a reason.
         """
         self._loop.run(self.aio.command, command, *params, component_id=component_id)
 
@@ -1862,17 +1864,18 @@ class Vehicle(VehicleTwin):
 
         Within the block, its commands are sent again right after a HEARTBEAT until they are answered, or their effect
         is told; not when an order about the same subject has followed, nor when HEARTBEAT tells a mode that neither
-        this order nor another of the last ten seconds brings about. Nothing is held when it is given up, and nobody
+        this order nor one of the ten seconds before it brings about, or, if it is about motion first of all, that the
+        vehicle has disarmed. Nothing is held when it is given up, and nobody
         watches for an order to arm that comes late: the actions do that.
 
         Args:
             subjects: what it is about, ``"mode"``, ``"motion"`` or ``"arm"``; orders about any more that are named are
                 ended by it, too. One about mode or motion ends the action under way.
             modes: the modes that it brings about.
-            armed: whether it arms or disarms.
+            armed: whether it arms or disarms; one about ``"arm"`` has to say.
 
         Raises:
-            LocalProtocolError: no subject. Nothing was sent.
+            LocalProtocolError: no subject, or one about ``"arm"`` without ``armed``. Nothing was sent.
         """
         return self._twin_block(PostedOrder, self.aio.posted(*subjects, modes=modes, armed=armed))
 
@@ -2120,6 +2123,7 @@ class Vehicle(VehicleTwin):
             ValueUnknownError: home is not known and is needed here.
             CommandRejected: the vehicle refused.
             CommandTimeout: there was no answer.
+            OperationRejected: the mode changed, or a newer order was given, before there was an answer.
         """
         self._loop.run(self.aio.look_at, target)
 
@@ -2129,6 +2133,7 @@ class Vehicle(VehicleTwin):
         Raises:
             CommandRejected: the vehicle refused.
             CommandTimeout: there was no answer.
+            OperationRejected: the mode changed, or a newer order was given, before there was an answer.
         """
         self._loop.run(self.aio.stop_looking)
 
@@ -2386,7 +2391,7 @@ def open_connection(
     address: str | Link,
     *,
     source_system: int = 255,
-    source_component: int = MavComponent.MISSIONPLANNER,
+    source_component: int = MavComponent.MISSIONPLANNER.value,
     baud: int = 57600,
     dialect: Dialect = STANDARD,
     mavlink_version: int = 2,
@@ -2452,7 +2457,7 @@ def connect(
     timeout: float = 30.0,
     rates: Mapping[type[Message], float] | None = None,
     source_system: int = 255,
-    source_component: int = MavComponent.MISSIONPLANNER,
+    source_component: int = MavComponent.MISSIONPLANNER.value,
     baud: int = 57600,
     dialect: Dialect = STANDARD,
     mavlink_version: int = 2,

@@ -56,7 +56,7 @@ async def connect(
     timeout: float = 30.0,
     rates: Mapping[type[Message], float] | None = None,
     source_system: int = 255,
-    source_component: int = MavComponent.MISSIONPLANNER,
+    source_component: int = MavComponent.MISSIONPLANNER.value,
     baud: int = 57600,
     dialect: Dialect = STANDARD,
     mavlink_version: int = 2,

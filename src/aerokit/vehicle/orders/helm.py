@@ -73,6 +73,8 @@ class Helm:
             each()
         self.note_newer(subjects)
         self._modes_ordered.extend((self._now(), each.custom_mode) for each in modes)
+        if self._posted_modes():
+            self.doubt_mode()
         order = self._new(modes, lambda order: order is self.newest)
         order.is_given = self._steers()
         self.newest = order
@@ -158,6 +160,7 @@ class Helm:
             armed=armed,
             mode_now=self._telemetry.mode.latest,
             armed_now=self._telemetry.armed.latest,
+            moves=subjects[0] == "motion",
         )
         self._posted.append(posted)
         try:
@@ -211,16 +214,21 @@ class Helm:
         before, mode = self.newest, self._telemetry.mode.latest
         is_under_way = before is not None and mode is not None and before.is_own(mode)
         is_unsettled = is_under_way or self.mode_is_in_doubt or self._now() < self.mode_settles_at
+        expected = before.modes if is_unsettled and before is not None else ()
         return Order(
             self._now(),
             mode_before=mode,
             modes=modes,
-            expected=before.modes if is_unsettled and before is not None else (),
+            expected=(*expected, *self._posted_modes()),
             armed_before=self._telemetry.armed.latest,
             is_newest=is_newest,
             settles_at=self.mode_settles_at,
             any_until=self._any_mode_until,
         )
+
+    def _posted_modes(self) -> tuple[Mode, ...]:
+        """What was posted may still bring these about, also when it has been overruled."""
+        return tuple(mode for each in self._posted if not each.has_worked for mode in each.modes)
 
     def _steers(self) -> bool:
         """Whether the vehicle is in a mode of the newest order, and nobody has taken it from that."""

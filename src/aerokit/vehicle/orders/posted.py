@@ -18,10 +18,10 @@ OWN_MODES_S = 10.0
 
 class Posted:
     """Whether one posted order still stands: its effect has not been told yet, no newer one is of its subject, and
-    nobody else, a pilot or a failsafe, has changed the mode since.
+    nobody else, a pilot or a failsafe, has changed the mode since; nor, if it ``moves`` the vehicle, disarmed it.
 
     ``modes`` and ``armed`` are its effects: a change to them, as HEARTBEAT tells it. ``own_modes`` are others that the
-    program has ordered lately. To disarm is meant whatever the mode.
+    program had ordered shortly before. To disarm is meant whatever the mode.
     """
 
     def __init__(
@@ -33,22 +33,28 @@ class Posted:
         armed: bool | None,
         mode_now: Mode | None,
         armed_now: bool | None,
+        moves: bool = False,
     ) -> None:
         self.has_worked = False
         """Whether HEARTBEAT has told its effect."""
         self.told_at = -math.inf
         """When HEARTBEAT came last."""
         self._is_newest, self._taken_by = is_newest, ""
+        self.modes = tuple(modes)
+        """Those that it brings about."""
         self._modes, self._own_modes = {each.custom_mode for each in modes}, set(own_modes)
-        self._armed = armed
+        self._armed, self._moves = armed, moves
         self._mode_before = None if mode_now is None else mode_now.custom_mode
         self._armed_before = armed_now
 
     @property
     def end(self) -> str:
         """Why it must not be sent again, as a clause; empty while it may."""
-        if self.has_worked:
-            return "its effect was told"
+        return "its effect was told" if self.has_worked else self.lost
+
+    @property
+    def lost(self) -> str:
+        """Why nothing of it may be sent any more, as a clause: another order or somebody else has the vehicle."""
         return self._taken_by if self._is_newest() else "a newer order was given meanwhile"
 
     def note_mode(self, mode: Mode, at: float) -> None:
@@ -66,6 +72,8 @@ class Posted:
         before, self._armed_before = self._armed_before, armed
         if before is not None and before is not armed and armed is self._armed:
             self.has_worked = True
+        elif before and not armed and self._moves:
+            self._taken_by = self._taken_by or "the vehicle disarmed"
         self.told_at = at
 
     def note_reboot(self) -> None:

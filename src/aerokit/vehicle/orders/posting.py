@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import anyio
 
 from aerokit.arguments import checks_arguments
-from aerokit.errors import CommandRejected, CommandTimeout, OperationTimeout
-from aerokit.protocols.command import rejection
+from aerokit.errors import CommandRejected, CommandTimeout, LocalProtocolError, OperationTimeout
+from aerokit.protocols.command import command_name, rejection
 from aerokit.vehicle.orders.progress import Arrivals
 
 if TYPE_CHECKING:
@@ -37,11 +37,13 @@ class PostedOrder:
         self._ends = ExitStack()
         self._started = talk.connection.now()
         self._refusals: list[CommandAck] = []
+        self._has_begun = self._is_over = False
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._is_over = True
         self._ends.close()
 
     @property
@@ -52,15 +54,17 @@ class PostedOrder:
     async def command(self, command: int, *params: float, component_id: int | None = None) -> None:
         """Send a COMMAND_LONG of this order; return when it is answered, or the order's effect is told.
 
+        A second one is not sent when a newer order is about its subject, or somebody else has changed the mode, since.
+
         Args:
             command: the MAV_CMD.
             params: param1 to param7; missing ones are 0.
             component_id: to another component than the autopilot; 0: to all, and the autopilot's answer counts.
 
         Raises:
-            LocalProtocolError: a parameter is no number or does not fit. Nothing was sent.
+            LocalProtocolError: a parameter is no number or does not fit, or the block was left. Nothing was sent.
             CommandRejected: the vehicle refused; ``reasons`` has what it said.
-            CommandTimeout: there was no answer; the text says so when it was not sent again for a reason.
+            CommandTimeout: there was no answer; the text says so when it was not sent, or not again, for a reason.
         """
         await self._give(self._talk.commands.send_long, command, *params, component_id=component_id)
 
@@ -114,7 +118,13 @@ class PostedOrder:
     async def _give(
         self, send: Callable[..., Awaitable[CommandAck]], command: int, *params: float, **options: Any
     ) -> None:
-        self._started = self._talk.connection.now()
+        if self._is_over:
+            raise LocalProtocolError(
+                f"the block of this order was left: {command_name(command)} was not sent"
+            )
+        if self._has_begun and self._posted.lost:
+            raise CommandTimeout(f"{command_name(command)} was not sent: {self._posted.lost}")
+        self._has_begun, self._started = True, self._talk.connection.now()
         self._ends.close()
         self._refusals = self._ends.enter_context(self._talk.refusals_of(command))
         try:

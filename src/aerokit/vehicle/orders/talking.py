@@ -155,20 +155,23 @@ class TalkActions(Part):
 
         Within the block, its commands are sent again right after a HEARTBEAT until they are answered, or their effect
         is told; not when an order about the same subject has followed, nor when HEARTBEAT tells a mode that neither
-        this order nor another of the last ten seconds brings about. Nothing is held when it is given up, and nobody
+        this order nor one of the ten seconds before it brings about, or, if it is about motion first of all, that the
+        vehicle has disarmed. Nothing is held when it is given up, and nobody
         watches for an order to arm that comes late: the actions do that.
 
         Args:
             subjects: what it is about, ``"mode"``, ``"motion"`` or ``"arm"``; orders about any more that are named are
                 ended by it, too. One about mode or motion ends the action under way.
             modes: the modes that it brings about.
-            armed: whether it arms or disarms.
+            armed: whether it arms or disarms; one about ``"arm"`` has to say.
 
         Raises:
-            LocalProtocolError: no subject. Nothing was sent.
+            LocalProtocolError: no subject, or one about ``"arm"`` without ``armed``. Nothing was sent.
         """
         if not subjects:
             raise LocalProtocolError("posted: no subject is named: mode, motion or arm")
+        if "arm" in subjects and armed is None:
+            raise LocalProtocolError("posted: an order about arm needs armed=True or armed=False")
         with (
             self._helm.posting(subjects, modes=modes, armed=armed) as posted,
             PostedOrder(self._talk, posted, modes, armed) as order,

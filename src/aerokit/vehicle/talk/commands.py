@@ -159,6 +159,10 @@ class CommandSender:
         """What was answered does not count any more."""
         self._results.pop((self._component_id, command), None)
 
+    def forget_results(self) -> None:
+        """The vehicle has rebooted: what it knows may be other commands."""
+        self._results.clear()
+
     def awaits_answer(self, command: int) -> bool:
         """Whether an answer of the autopilot to what was sent unconfirmed may still come."""
         oldest = self._connection.now() - UNDER_WAY_S
@@ -236,7 +240,8 @@ class CommandSender:
         frame = ack.received_frame
         key = (0 if frame is None else frame.component_id, ack.command)
         run = self._runs.get(key)
-        if (run is not None or key in self._under_way) and ack.result != MavResult.IN_PROGRESS:
+        is_answer = (run is not None or key in self._under_way) and self.is_for_us(ack)
+        if is_answer and ack.result != MavResult.IN_PROGRESS:
             self._results[key] = ack.result
         if run is not None:
             run.receive(ack)

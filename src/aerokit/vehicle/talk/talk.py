@@ -91,7 +91,10 @@ class Talk:
         self.cells: list[StateCell[Any]] = [self.link_quality]
         """Cells that end with the talk, beside those of the telemetry."""
         self.detach: list[Detach] = []
-        self.on_reboot: list[Callable[[], None]] = [self.rates.ask_again]
+        self.on_reboot: list[Callable[[], None]] = [
+            self.rates.ask_again,
+            self.commands.forget_results,
+        ]
         self._attach_telemetry()
 
     # ------------------------------------------------------------------------- begin and end
