@@ -39,3 +39,13 @@ def test_bits_that_nobody_has_named_are_kept() -> None:
     )
     with pytest.raises(ValueError, match="is not a valid MavResult"):
         enums.MavResult(99)
+
+
+def test_mixes_of_bits_are_not_kept() -> None:
+    known = len(enums.MavProtocolCapability._value2member_map_)
+    for value in range(3000):
+        assert int(enums.MavProtocolCapability(value)) == value
+    assert len(enums.MavProtocolCapability._value2member_map_) == known
+    mix = enums.MavProtocolCapability.FTP | enums.MavProtocolCapability.MAVLINK2
+    assert (mix, {mix: 1}[enums.MavProtocolCapability(int(mix))]) == (int(mix), 1)
+    assert len(enums.MavProtocolCapability._value2member_map_) == known

@@ -234,7 +234,8 @@ async def test_a_pilot_ends_it_and_a_newer_one_too(flying: Flight) -> None:
 
 @pytest.mark.anyio
 async def test_what_is_left_of_an_order_that_was_lost_is_not_sent(flying: Flight) -> None:
-    vehicle, place = flying.vehicle, {"frame": 6, "x": 1, "y": 1, "z": 20.0}
+    vehicle = flying.vehicle
+    place: dict[str, Any] = {"frame": 6, "x": 1, "y": 1, "z": 20.0}
     with vehicle.posted("motion") as order:
         await order.command(MavCmd.DO_SET_ROI_NONE)
         flying.pilot_takes_over()

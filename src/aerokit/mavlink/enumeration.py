@@ -12,11 +12,21 @@ _QUICKLY: Any = getattr(enum, "_simple_enum", None)
 """How the standard library makes its own long enums since Python 3.11: the same enum in half the time."""
 
 
+class _Flags(enum.IntFlag):
+    """Bits in any mix. Python would keep each mix that it has met, and they come off the air."""
+
+    @classmethod
+    def _missing_(cls, value: object) -> Any:
+        made = super()._missing_(value)
+        cls._value2member_map_.pop(value, None)
+        return made
+
+
 def make_enum(
     module: str, name: str, bitmask: bool, doc: str, members: Iterable[tuple[str, int]]
 ) -> type[Any]:
     """An ``IntFlag`` for a bitmask, else an ``IntEnum``; two names for one value are aliases."""
-    base: Any = enum.IntFlag if bitmask else enum.IntEnum
+    base: Any = _Flags if bitmask else enum.IntEnum
     made: type[Any]
     if _QUICKLY is not None:
         body = {"__module__": module, "__qualname__": name, "__doc__": doc, **dict(members)}
