@@ -50,20 +50,20 @@ class LookActions(Part):
 
     async def _set_roi_location(self, place: dict[str, Any]) -> bool:
         """False for firmware that does not know it, or no COMMAND_INT at all: that says nothing."""
-        try:
-            with self._newest() as order:
+        with self._newest() as order:
+            try:
                 await self._orders.give(order, self._talk.commands.send_int, LOCATION, **place)
-        except CommandTimeout:
-            knows_int = (self.telemetry.capabilities.latest or 0) & MavProtocolCapability.COMMAND_INT
-            if knows_int or not self._helm.is_known:
-                raise
-            self._raise_if_overruled(order)
-            return False
-        except CommandRejected:
-            if not self._talk.commands.is_unknown(LOCATION):
-                raise
-            self._raise_if_overruled(order)
-            return False
+            except CommandTimeout:
+                knows_int = (self.telemetry.capabilities.latest or 0) & MavProtocolCapability.COMMAND_INT
+                if knows_int or not self._helm.is_known:
+                    raise
+                self._raise_if_overruled(order)
+                return False
+            except CommandRejected:
+                if not self._talk.commands.is_unknown(LOCATION):
+                    raise
+                self._raise_if_overruled(order)
+                return False
         return True
 
     async def _give(self, command: int, *params: float) -> None:
@@ -91,11 +91,12 @@ class LookActions(Part):
             CommandTimeout: there was no answer.
             OperationRejected: the mode changed, or a newer order was given, before there was an answer.
         """
-        try:
-            with self._newest() as order:
+        with self._newest() as order:
+            try:
                 await self._orders.give(order, self._talk.commands.send_long, MavCmd.DO_SET_ROI_NONE)
-        except CommandRejected as error:
-            if error.result != MavResult.UNSUPPORTED:
-                raise
-            self._raise_if_overruled(order)
-            await self._give(MavCmd.DO_SET_ROI)
+                return
+            except CommandRejected as error:
+                if error.result != MavResult.UNSUPPORTED:
+                    raise
+                self._raise_if_overruled(order)
+        await self._give(MavCmd.DO_SET_ROI)
