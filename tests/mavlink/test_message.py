@@ -13,6 +13,7 @@ from wire_samples import samples
 
 from aerokit.errors import LocalProtocolError
 from aerokit.mavlink import STANDARD, Field, FrameEncoder, Framer, Message, messages
+from aerokit.mavlink.message import INTEGER_RANGES
 
 EVERY = [pytest.param(message_class, id=message_class.NAME) for message_class in STANDARD]
 ATTITUDE = messages.Attitude(1000, 0.25, 0.5, 0.75, -1.25, -1.5, -1.75)
@@ -193,3 +194,16 @@ def test_the_wrong_field_is_named_and_none_that_holds_its_greatest_or_least_valu
     for value in (0, 255):
         with pytest.raises(LocalProtocolError, match=r"target_component = 300"):
             messages.CommandLong(value, 300, 400, 0, 0, 0, 0, 0, 0, 0, 0).encode()
+
+
+def test_what_integers_hold() -> None:
+    assert INTEGER_RANGES == {
+        "int8_t": (-128, 127),
+        "uint8_t": (0, 255),
+        "int16_t": (-32768, 32767),
+        "uint16_t": (0, 65535),
+        "int32_t": (-2147483648, 2147483647),
+        "uint32_t": (0, 4294967295),
+        "int64_t": (-9223372036854775808, 9223372036854775807),
+        "uint64_t": (0, 18446744073709551615),
+    }

@@ -141,10 +141,16 @@ def test_a_reader_that_stops_early_closes_the_file(tmp_path: Path) -> None:
     records.close()  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize("when", [-1.0, 1e14])
+@pytest.mark.parametrize("when", [-1.0, 1.9e13, 1e14])
 def test_time_stamps_must_fit(when: float) -> None:
     with pytest.raises(LocalProtocolError, match=r"timestamp_s = .* must be seconds since 1970"):
         TlogWriter(io.BytesIO()).write(b"", when)
+
+
+def test_a_time_stamp_may_have_all_its_bits() -> None:
+    file = io.BytesIO()
+    TlogWriter(file).write(b"x", 1.8e13)
+    assert file.getvalue() == int(1.8e19).to_bytes(8, "big") + b"x"
 
 
 def test_a_missing_file_is_an_os_error(tmp_path: Path) -> None:
