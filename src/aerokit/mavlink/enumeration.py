@@ -23,12 +23,22 @@ class _Flags(enum.IntFlag):
 
 
 def make_enum(
-    module: str, name: str, bitmask: bool, doc: str, members: Iterable[tuple[str, int]]
+    module: str,
+    name: str,
+    bitmask: bool,
+    doc: str,
+    members: Iterable[tuple[str, int]],
+    *,
+    is_from_outside: bool = False,
 ) -> type[Any]:
-    """An ``IntFlag`` for a bitmask, else an ``IntEnum``; two names for one value are aliases."""
+    """An ``IntFlag`` for a bitmask, else an ``IntEnum``; two names for one value are aliases.
+
+    Raises:
+        TypeError, ValueError: of one ``is_from_outside``: a name stands there twice, or Python keeps it for itself.
+    """
     base: Any = _Flags if bitmask else enum.IntEnum
     made: type[Any]
-    if _QUICKLY is not None:
+    if _QUICKLY is not None and not is_from_outside:
         body = {"__module__": module, "__qualname__": name, "__doc__": doc, **dict(members)}
         made = _QUICKLY(base)(type(name, (), body))
     else:

@@ -92,7 +92,14 @@ def _dialect(name: str, definitions: Iterable[MessageDefinition], enums: Iterabl
 def _enum_type(dialect: str, enum: EnumDefinition) -> type[Any]:
     members = [(member, entry.value) for member, entry in enum.members()]
     try:
-        return make_enum(f"{__name__}.{dialect}", enum.class_name, enum.bitmask, enum.description, members)
+        return make_enum(
+            f"{__name__}.{dialect}",
+            enum.class_name,
+            enum.bitmask,
+            enum.description,
+            members,
+            is_from_outside=True,
+        )
     except (TypeError, ValueError) as error:  # two of a name, names that Python keeps for itself
         raise LocalProtocolError(f"enum {enum.name} of {enum.origin or dialect}: {error}") from error
 
