@@ -30,6 +30,8 @@ from aerokit.sim import SimulatedCopter
 LATER = 4
 """Interrupted a second time at this await, if it comes there, and a third time when it has ended."""
 REBOOTING_S = 2.0
+ENDURING_MAH = 1e6
+"""It flies by the clock of the wall, twenty times as fast, until this machine is through with all calls."""
 PATIENCE_S = 40.0
 """For what is left to go: an order to arm is watched, and answered."""
 
@@ -44,7 +46,13 @@ class BlockingStage(Stage):
 @pytest.fixture(scope="module")
 def stages(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[BlockingStage, Stage]]:
     """For the twin's calls, and for what is done on its loop."""
-    copter, folder = SimulatedCopter(boot_time_s=0.0, logs=LOGS), tmp_path_factory.mktemp("calls")
+    copter = SimulatedCopter(
+        boot_time_s=0.0,
+        logs=LOGS,
+        battery_capacity_mah=ENDURING_MAH,
+        parameters={"BATT_CAPACITY": ENDURING_MAH},
+    )
+    folder = tmp_path_factory.mktemp("calls")
     with (
         served([copter], "tcpin:127.0.0.1:0", "tcpin:127.0.0.1:0") as address,
         aerokit.sync.connect(address) as vehicle,
