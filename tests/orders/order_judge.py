@@ -21,7 +21,7 @@ from aerokit.mavlink.messages import (
     SetPositionTargetGlobalInt,
     SetPositionTargetLocalNed,
 )
-from aerokit.vehicle.orders.order import MOVING_COMMANDS, QUESTIONS
+from aerokit.vehicle.orders.order import CHANGED_BY_COMMAND, QUESTIONS
 
 KNOWN_S = 2.6
 SETPOINTS = (SetPositionTargetLocalNed, SetPositionTargetGlobalInt, SetAttitudeTarget)
@@ -115,7 +115,9 @@ def _taken_back(flown: Flown) -> Iterator[str]:
         return
     for each in flown.air.sent:
         command = getattr(each.message, "command", None)
-        steers = command in MOVING_COMMANDS - {ARM} or isinstance(each.message, (SetMode, *SETPOINTS))
+        steers = command in CHANGED_BY_COMMAND.keys() - {ARM} or isinstance(
+            each.message, (SetMode, *SETPOINTS)
+        )
         if steers and each.number > taken.number:
             yield f"{_s(flown, each)} was sent after somebody else's mode: {_s(flown, taken)}"
 

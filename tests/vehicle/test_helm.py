@@ -14,7 +14,7 @@ from aerokit.errors import CommandRejected, CommandTimeout
 from aerokit.mavlink.enums import MavCmd
 from aerokit.runtime.cells import Source, StateCell
 from aerokit.vehicle.orders.helm import KNOWN_S, MODE_GRACE_S, Helm
-from aerokit.vehicle.orders.order import MOVING_COMMANDS, QUESTIONS, Order, Sending
+from aerokit.vehicle.orders.order import CHANGED_BY_COMMAND, QUESTIONS, Order, Sending
 from aerokit.vehicle.state.telemetry import Telemetry
 
 HEARTBEAT = Source(1, 1, "HEARTBEAT")
@@ -291,7 +291,7 @@ def test_a_sending_knows_when_the_vehicle_told_last_until_its_block_ends() -> No
 
 
 def test_orders_know_what_moves_and_what_only_asks() -> None:
-    assert {MavCmd(each).name for each in MOVING_COMMANDS} == {
+    assert {MavCmd(each).name for each in CHANGED_BY_COMMAND} == {
         *("NAV_WAYPOINT", "NAV_LOITER_UNLIM", "NAV_LOITER_TURNS", "NAV_LOITER_TIME", "NAV_RETURN_TO_LAUNCH"),
         *("NAV_LAND", "NAV_TAKEOFF", "NAV_VTOL_TAKEOFF", "NAV_VTOL_LAND", "DO_SET_MODE", "DO_REPOSITION"),
         *("DO_FLIGHTTERMINATION", "DO_ORBIT", "DO_PAUSE_CONTINUE", "OVERRIDE_GOTO", "MISSION_START"),

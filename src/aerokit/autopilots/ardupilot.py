@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from aerokit.autopilots import ardupilot_modes
 from aerokit.autopilots.base import Autopilot, Purpose, Reposition, SetpointRules, TakeOff
-from aerokit.autopilots.health import names_of
+from aerokit.autopilots.health import ATTITUDE_AND_HEIGHT, POS_HORIZ_ABS, names_of
 from aerokit.autopilots.streams import ARDUPILOT_GROUPS
 from aerokit.mavlink.enums import EkfStatusFlags, MavCmd, MavLandedState, MavState, MavType
 
@@ -80,8 +80,8 @@ class ArduPilot(Autopilot):
         return (
             *self._missing_estimates(
                 flags,
-                required=EkfStatusFlags.ATTITUDE.value | EkfStatusFlags.POS_VERT_ABS.value,
-                horizontal=EkfStatusFlags.POS_HORIZ_ABS.value | EkfStatusFlags.PRED_POS_HORIZ_ABS.value,
+                required=ATTITUDE_AND_HEIGHT,
+                horizontal=POS_HORIZ_ABS | EkfStatusFlags.PRED_POS_HORIZ_ABS.value,
             ),
             *names_of(flags, EKF_PROBLEMS),
         )

@@ -6,7 +6,14 @@ import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, ClassVar, Literal
 
-from aerokit.autopilots.health import ESTIMATES, PREARM_CHECK, SENSORS, names_of
+from aerokit.autopilots.health import (
+    ATTITUDE_AND_HEIGHT,
+    ESTIMATES,
+    POS_HORIZ_ABS,
+    PREARM_CHECK,
+    SENSORS,
+    names_of,
+)
 from aerokit.autopilots.modes import CUSTOM_MODE_ENABLED, NO_MODES, Mode, ModeTable, base_mode_name
 from aerokit.autopilots.version import AutopilotVersion, version_text
 from aerokit.mavlink import messages
@@ -19,6 +26,8 @@ if TYPE_CHECKING:
 __all__ = ["Autopilot", "ModeOrder", "Purpose", "Reposition", "SetpointRules", "TakeOff"]
 
 NAN = math.nan
+_BYTEWISE = MavProtocolCapability.PARAM_ENCODE_BYTEWISE.value
+_C_CAST = MavProtocolCapability.PARAM_ENCODE_C_CAST.value
 
 Purpose = Literal["hold", "land", "return", "setpoint", "take_off", "mission"]
 """What a program wants a mode for."""
@@ -254,7 +263,7 @@ class Autopilot:
 
         ``flags`` are those of EKF_STATUS_REPORT or ESTIMATOR_STATUS.
         """
-        return self._missing_estimates(flags, required=0x01 | 0x20, horizontal=0x10)
+        return self._missing_estimates(flags, required=ATTITUDE_AND_HEIGHT, horizontal=POS_HORIZ_ABS)
 
     def arming_reason(self, text: str) -> str | None:
         """The reason in a status text about why the vehicle cannot be armed, or None for any other text."""
@@ -267,7 +276,7 @@ class Autopilot:
     @staticmethod
     def _missing_estimates(flags: int, *, required: int, horizontal: int) -> tuple[str, ...]:
         missing = names_of(required & ~flags, ESTIMATES)
-        return missing if flags & horizontal else (*missing, ESTIMATES[0x10])
+        return missing if flags & horizontal else (*missing, ESTIMATES[POS_HORIZ_ABS])
 
     # ------------------------------------------------------------------------------- version
 
@@ -287,10 +296,8 @@ class Autopilot:
 
     def encodes_parameters_bytewise(self, capabilities: int | None) -> bool:
         """Whether integer parameters travel as their bytes instead of as a number in a float."""
-        if capabilities is not None and capabilities & (
-            MavProtocolCapability.PARAM_ENCODE_BYTEWISE | MavProtocolCapability.PARAM_ENCODE_C_CAST
-        ):
-            return bool(capabilities & MavProtocolCapability.PARAM_ENCODE_BYTEWISE)
+        if capabilities is not None and capabilities & (_BYTEWISE | _C_CAST):
+            return bool(capabilities & _BYTEWISE)
         return self._bytewise_by_default
 
     _bytewise_by_default = False

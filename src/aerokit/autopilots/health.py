@@ -4,64 +4,70 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from aerokit.mavlink.enums import MavSysStatusSensor
+from aerokit.mavlink.enums import EstimatorStatusFlags, MavSysStatusSensor
 
 __all__ = [
+    "ATTITUDE_AND_HEIGHT",
     "ESTIMATES",
+    "POS_HORIZ_ABS",
     "PREARM_CHECK",
     "SENSORS",
     "names_of",
 ]
 
-PREARM_CHECK = MavSysStatusSensor.MAV_SYS_STATUS_PREARM_CHECK.value
+_E, _S = EstimatorStatusFlags, MavSysStatusSensor
+PREARM_CHECK = _S.MAV_SYS_STATUS_PREARM_CHECK.value
 """MAV_SYS_STATUS_PREARM_CHECK: the summary of all checks, not a sensor."""
+POS_HORIZ_ABS = _E.POS_HORIZ_ABS.value
+ATTITUDE_AND_HEIGHT = _E.ATTITUDE.value | _E.POS_VERT_ABS.value
+"""What arming in a mode that needs a position takes at least, besides the position itself."""
 
 SENSORS: Mapping[int, str] = {
-    0x0000_0001: "gyroscope",
-    0x0000_0002: "accelerometer",
-    0x0000_0004: "compass",
-    0x0000_0008: "barometer",
-    0x0000_0010: "airspeed sensor",
-    0x0000_0020: "GPS",
-    0x0000_0040: "optical flow",
-    0x0000_0080: "vision position",
-    0x0000_0100: "range finder",
-    0x0000_0200: "external ground truth",
-    0x0000_0400: "rate control",
-    0x0000_0800: "attitude stabilisation",
-    0x0000_1000: "yaw control",
-    0x0000_2000: "altitude control",
-    0x0000_4000: "horizontal position control",
-    0x0000_8000: "motor outputs",
-    0x0001_0000: "RC receiver",
-    0x0002_0000: "second gyroscope",
-    0x0004_0000: "second accelerometer",
-    0x0008_0000: "second compass",
-    0x0010_0000: "geofence",
-    0x0020_0000: "attitude and heading estimate",
-    0x0040_0000: "terrain data",
-    0x0080_0000: "reversed motors",
-    0x0100_0000: "logging",
-    0x0200_0000: "battery",
-    0x0400_0000: "proximity sensor",
-    0x0800_0000: "satellite link",
-    0x1000_0000: "pre-arm checks",
-    0x2000_0000: "obstacle avoidance",
-    0x4000_0000: "propulsion",
+    _S.SENSOR_3D_GYRO.value: "gyroscope",
+    _S.SENSOR_3D_ACCEL.value: "accelerometer",
+    _S.SENSOR_3D_MAG.value: "compass",
+    _S.ABSOLUTE_PRESSURE.value: "barometer",
+    _S.DIFFERENTIAL_PRESSURE.value: "airspeed sensor",
+    _S.GPS.value: "GPS",
+    _S.OPTICAL_FLOW.value: "optical flow",
+    _S.VISION_POSITION.value: "vision position",
+    _S.LASER_POSITION.value: "range finder",
+    _S.EXTERNAL_GROUND_TRUTH.value: "external ground truth",
+    _S.ANGULAR_RATE_CONTROL.value: "rate control",
+    _S.ATTITUDE_STABILIZATION.value: "attitude stabilisation",
+    _S.YAW_POSITION.value: "yaw control",
+    _S.Z_ALTITUDE_CONTROL.value: "altitude control",
+    _S.XY_POSITION_CONTROL.value: "horizontal position control",
+    _S.MOTOR_OUTPUTS.value: "motor outputs",
+    _S.RC_RECEIVER.value: "RC receiver",
+    _S.SENSOR_3D_GYRO2.value: "second gyroscope",
+    _S.SENSOR_3D_ACCEL2.value: "second accelerometer",
+    _S.SENSOR_3D_MAG2.value: "second compass",
+    _S.MAV_SYS_STATUS_GEOFENCE.value: "geofence",
+    _S.MAV_SYS_STATUS_AHRS.value: "attitude and heading estimate",
+    _S.MAV_SYS_STATUS_TERRAIN.value: "terrain data",
+    _S.MAV_SYS_STATUS_REVERSE_MOTOR.value: "reversed motors",
+    _S.MAV_SYS_STATUS_LOGGING.value: "logging",
+    _S.BATTERY.value: "battery",
+    _S.PROXIMITY.value: "proximity sensor",
+    _S.SATCOM.value: "satellite link",
+    _S.MAV_SYS_STATUS_PREARM_CHECK.value: "pre-arm checks",
+    _S.MAV_SYS_STATUS_OBSTACLE_AVOIDANCE.value: "obstacle avoidance",
+    _S.PROPULSION.value: "propulsion",
 }
 """MAV_SYS_STATUS_SENSOR (https://mavlink.io/en/messages/common.html#MAV_SYS_STATUS_SENSOR) in words."""
 
 ESTIMATES: Mapping[int, str] = {
-    1: "attitude",
-    2: "horizontal velocity",
-    4: "vertical velocity",
-    8: "relative horizontal position",
-    16: "absolute horizontal position",
-    32: "absolute altitude",
-    64: "altitude above ground",
-    128: "constant position mode",
-    256: "predicted relative horizontal position",
-    512: "predicted absolute horizontal position",
+    _E.ATTITUDE.value: "attitude",
+    _E.VELOCITY_HORIZ.value: "horizontal velocity",
+    _E.VELOCITY_VERT.value: "vertical velocity",
+    _E.POS_HORIZ_REL.value: "relative horizontal position",
+    _E.POS_HORIZ_ABS.value: "absolute horizontal position",
+    _E.POS_VERT_ABS.value: "absolute altitude",
+    _E.POS_VERT_AGL.value: "altitude above ground",
+    _E.CONST_POS_MODE.value: "constant position mode",
+    _E.PRED_POS_HORIZ_REL.value: "predicted relative horizontal position",
+    _E.PRED_POS_HORIZ_ABS.value: "predicted absolute horizontal position",
 }
 """The bits that EKF_STATUS_FLAGS and ESTIMATOR_STATUS_FLAGS have in common, in words."""
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import ClassVar
 
 from aerokit.autopilots.base import NAN, Autopilot, ModeOrder, Purpose, Reposition, SetpointRules, TakeOff
-from aerokit.autopilots.health import PREARM_CHECK, SENSORS, names_of
+from aerokit.autopilots.health import ATTITUDE_AND_HEIGHT, POS_HORIZ_ABS, PREARM_CHECK, SENSORS, names_of
 from aerokit.autopilots.modes import CUSTOM_MODE_ENABLED, NO_MODES, Mode, ModeTable
 from aerokit.errors import LocalProtocolError
 from aerokit.mavlink.enums import EstimatorStatusFlags, MavCmd, MavType
@@ -14,8 +14,12 @@ from aerokit.mavlink.enums import EstimatorStatusFlags, MavCmd, MavType
 __all__ = ["Px4", "px4_custom_mode"]
 
 MAIN_POSCTL, MAIN_AUTO = 3, 4
-ESTIMATES_REQUIRED, POS_HORIZ_ABS = 0x01 | 0x02 | 0x04 | 0x20, EstimatorStatusFlags.POS_HORIZ_ABS.value
-ESTIMATOR_PROBLEMS: Mapping[int, str] = {1024: "GPS without glitches", 2048: "accelerometer without errors"}
+_E = EstimatorStatusFlags
+ESTIMATES_REQUIRED = ATTITUDE_AND_HEIGHT | _E.VELOCITY_HORIZ.value | _E.VELOCITY_VERT.value
+ESTIMATOR_PROBLEMS: Mapping[int, str] = {
+    _E.GPS_GLITCH.value: "GPS without glitches",
+    _E.ACCEL_ERROR.value: "accelerometer without errors",
+}
 
 
 def px4_custom_mode(main: int, sub: int = 0) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from aerokit.autopilots.health import PREARM_CHECK
+from aerokit.autopilots.modes import is_armed
 from aerokit.dronekit.core import VehicleCore
 from aerokit.dronekit.modes import mode_name
 from aerokit.dronekit.reception import Latest, Stream
@@ -21,7 +22,7 @@ from aerokit.dronekit.values import (
 )
 from aerokit.dronekit.version import Capabilities, Version
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import EkfStatusFlags, MavModeFlag
+from aerokit.mavlink.enums import EkfStatusFlags
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
 
 __all__ = ["VehicleAttributes"]
 
-ARMED = MavModeFlag.SAFETY_ARMED.value
 STATES = ("UNINIT", "BOOT", "CALIBRATING", "STANDBY", "ACTIVE", "CRITICAL", "EMERGENCY", "POWEROFF")
 POS_HORIZ_ABS, CONST_POS_MODE, PRED_POS_HORIZ_ABS = (
     EkfStatusFlags.POS_HORIZ_ABS.value,
@@ -210,7 +210,7 @@ class VehicleAttributes(VehicleCore):
     @property
     def _armed(self) -> bool:
         heartbeat = self._dk_heartbeat
-        return heartbeat is not None and bool(heartbeat.base_mode & ARMED)
+        return heartbeat is not None and is_armed(heartbeat.base_mode)
 
     # ----------------------------------------------------------------------------- receiving
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from pymavlink import mavutil
 
+from aerokit.autopilots.modes import is_armed
 from aerokit.dronekit.inbox import Inbox
 from aerokit.dronekit.message_factory import MessageFactory
 from aerokit.dronekit.pymavlink_messages import message_of
@@ -124,7 +125,7 @@ class Master:
     def motors_armed(self) -> bool:
         """Whether the last HEARTBEAT says armed."""
         heartbeat = self._heard()[1]
-        return heartbeat is not None and bool(heartbeat.base_mode & MavModeFlag.SAFETY_ARMED.value)
+        return heartbeat is not None and is_armed(heartbeat.base_mode)
 
     def motors_armed_wait(self) -> None:
         """Wait until HEARTBEAT says armed, however long that takes."""

@@ -1865,8 +1865,8 @@ class Vehicle(VehicleTwin):
         Within the block, its commands are sent again right after a HEARTBEAT until they are answered, or their effect
         is told; not when an order about the same subject has followed, nor when HEARTBEAT tells a mode that neither
         this order nor one of the ten seconds before it brings about, or, if it is about motion first of all, that the
-        vehicle has disarmed. Nothing is held when it is given up, and nobody
-        watches for an order to arm that comes late: the actions do that.
+        vehicle has disarmed. Nothing is held when it is given up, and nobody watches for an order to arm that comes
+        late: the actions do that.
 
         Args:
             subjects: what it is about, ``"mode"``, ``"motion"`` or ``"arm"``; orders about any more that are named are

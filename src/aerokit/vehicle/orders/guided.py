@@ -16,12 +16,11 @@ import anyio
 from aerokit.arguments import checks_arguments
 from aerokit.errors import (
     BusyError,
-    LocalProtocolError,
     NotSupported,
     OperationRejected,
     SetpointStreamStopped,
 )
-from aerokit.vehicle.checks import check_kind
+from aerokit.vehicle.checks import check_kind, check_range
 from aerokit.vehicle.orders.progress import Stillness
 from aerokit.vehicle.orders.setpoints import (
     AccelerationSetpoint,
@@ -172,11 +171,9 @@ class SetpointStream(Generic[SetpointT]):
         valid_for_s: float,
         max_lag_s: float,
     ) -> None:
-        if not 2 <= rate_hz <= 100:
-            raise LocalProtocolError(f"rate_hz = {rate_hz!r} is not allowed: 2 to 100")
-        for name, value in (("valid_for_s", valid_for_s), ("max_lag_s", max_lag_s)):
-            if value > 60:
-                raise LocalProtocolError(f"{name} = {value!r} is not allowed: above 0, at most 60")
+        check_range("rate_hz", rate_hz, 2, 100)
+        check_range("valid_for_s", valid_for_s, 0, 60, above=True)
+        check_range("max_lag_s", max_lag_s, 0, 60, above=True)
         self._bridge, self._talk, self._holding = bridge, bridge.talk, bridge.holding
         self._encode = encode
         self._period_s, self._valid_for_s, self._max_lag_s = 1 / rate_hz, valid_for_s, max_lag_s

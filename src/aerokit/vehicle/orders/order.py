@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "CHANGED_BY_COMMAND",
-    "MOVING_COMMANDS",
     "QUESTIONS",
     "Order",
     "Sending",
@@ -51,7 +50,7 @@ CHANGED_BY_COMMAND: Mapping[int, tuple[Subject, ...]] = {
     MavCmd.DO_PAUSE_CONTINUE: _MOTION,
     MavCmd.COMPONENT_ARM_DISARM: _ARM,
 }
-"""MAV_CMD → what a program changes that sends it by itself."""
+"""MAV_CMD → what a program changes that sends it by itself: what an action left to be done must not come after it."""
 CHANGED_BY_MESSAGE: Mapping[str, tuple[Subject, ...]] = {
     "SET_MODE": _MODE,
     "SET_ATTITUDE_TARGET": _MOTION,
@@ -61,8 +60,6 @@ CHANGED_BY_MESSAGE: Mapping[str, tuple[Subject, ...]] = {
 }
 GUIDED_ITEM = (2, 3)
 """MISSION_ITEM.current of one that is flown to at once."""
-MOVING_COMMANDS = frozenset(CHANGED_BY_COMMAND)
-"""MAV_CMDs by which a program steers past the actions: what an action left to be done must not come after them."""
 QUESTIONS = frozenset(
     (
         MavCmd.RUN_PREARM_CHECKS,

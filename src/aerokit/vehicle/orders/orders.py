@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from aerokit.errors import CommandRejected, CommandTimeout, NotSupported, OperationRejected
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.vehicle.orders.helm import KNOWN_S, MODE_GRACE_S
-from aerokit.vehicle.orders.order import MOVING_COMMANDS
+from aerokit.vehicle.orders.order import CHANGED_BY_COMMAND
 from aerokit.vehicle.orders.progress import await_progress
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ class Orders:
             CommandTimeout: there was no answer; the text says so when it was not sent again for a reason.
         """
         self.raise_if_over(order)
-        order.is_given = order.is_given or command in MOVING_COMMANDS
+        order.is_given = order.is_given or command in CHANGED_BY_COMMAND
         started = self._talk.connection.now()
         with self._helm.sending(order, modes=modes, armed=armed, is_done=is_done) as sending:
             try:

@@ -42,8 +42,9 @@ class Posted:
         self._is_newest, self._taken_by = is_newest, ""
         self.modes = tuple(modes)
         """Those that it brings about."""
-        self._modes, self._own_modes = {each.custom_mode for each in modes}, set(own_modes)
-        self._armed, self._moves = armed, moves
+        self.armed = armed
+        """Whether it arms or disarms."""
+        self._own_modes, self._moves = set(own_modes), moves
         self._mode_before = None if mode_now is None else mode_now.custom_mode
         self._armed_before = armed_now
 
@@ -62,15 +63,15 @@ class Posted:
         before, self._mode_before = self._mode_before, mode.custom_mode
         if before is None or before == mode.custom_mode:
             return
-        if mode.custom_mode in self._modes:
+        if any(mode.custom_mode == each.custom_mode for each in self.modes):
             self.has_worked = True
-        elif self._armed is not False and mode.custom_mode not in self._own_modes:
+        elif self.armed is not False and mode.custom_mode not in self._own_modes:
             self._taken_by = self._taken_by or "the vehicle was put into another mode meanwhile"
 
     def note_armed(self, armed: bool, at: float) -> None:
         """The vehicle tells whether it is armed, which ends a HEARTBEAT."""
         before, self._armed_before = self._armed_before, armed
-        if before is not None and before is not armed and armed is self._armed:
+        if before is not None and before is not armed and armed is self.armed:
             self.has_worked = True
         elif before and not armed and self._moves:
             self._taken_by = self._taken_by or "the vehicle disarmed"

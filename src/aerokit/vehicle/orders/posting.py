@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
     from typing_extensions import Self
 
-    from aerokit.autopilots import Mode
     from aerokit.mavlink.messages import CommandAck
     from aerokit.vehicle.orders.posted import Posted
     from aerokit.vehicle.talk.talk import Talk
@@ -31,9 +30,8 @@ LOOK_S = 0.05
 class PostedOrder:
     """An order that others may follow before it is answered; made by :meth:`aerokit.Vehicle.posted`."""
 
-    def __init__(self, talk: Talk, posted: Posted, modes: tuple[Mode, ...], armed: bool | None) -> None:
+    def __init__(self, talk: Talk, posted: Posted) -> None:
         self._talk, self._posted = talk, posted
-        self._modes, self._armed = modes, armed
         self._ends = ExitStack()
         self._started = talk.connection.now()
         self._refusals: list[CommandAck] = []
@@ -109,11 +107,11 @@ class PostedOrder:
         )
 
     def _is_done(self) -> bool:
-        telemetry = self._talk.telemetry
-        is_there = any(map(telemetry.is_in, self._modes)) or (
-            self._armed is not None and telemetry.armed.latest is self._armed
+        telemetry, posted = self._talk.telemetry, self._posted
+        is_there = any(map(telemetry.is_in, posted.modes)) or (
+            posted.armed is not None and telemetry.armed.latest is posted.armed
         )
-        return is_there or self._posted.has_worked
+        return is_there or posted.has_worked
 
     async def _give(
         self, send: Callable[..., Awaitable[CommandAck]], command: int, *params: float, **options: Any

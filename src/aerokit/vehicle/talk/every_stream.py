@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import anyio
 
-from aerokit.errors import LocalProtocolError
 from aerokit.mavlink import messages as m
 from aerokit.runtime.background import Background
 from aerokit.runtime.events import Event, LinkRestored, VehicleBack, VehicleRebooted
+from aerokit.vehicle.checks import check_range
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -41,8 +41,7 @@ NEEDED = (
 @contextmanager
 def every_stream(talk: Talk, rate_hz: float) -> Iterator[None]:
     """See ``Vehicle.streams``."""
-    if not 0 < rate_hz <= 1000:
-        raise LocalProtocolError(f"rate_hz = {rate_hz!r} is not allowed: above 0, at most 1000")
+    check_range("rate_hz", rate_hz, 0, 1000, above=True)
     tasks = Background(talk.connection.fail)
     with ExitStack() as ends:
         if talk.autopilot.stream_groups:

@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING
 import anyio
 
 from aerokit.autopilots.streams import STREAMED
-from aerokit.errors import CommandRejected, CommandTimeout, LocalProtocolError
+from aerokit.errors import CommandRejected, CommandTimeout
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.mavlink.messages import RequestDataStream
 from aerokit.protocols.command import result_name
 from aerokit.runtime.events import StreamSlow, StreamUnavailable
+from aerokit.vehicle.checks import check_range
 from aerokit.vehicle.state.states import DEFAULT_RATES_HZ
 
 if TYPE_CHECKING:
@@ -47,10 +48,7 @@ def subscription_rate_hz(message_type: type[Message]) -> float | None:
 
 def check_rate(message_type: type[Message], hz: float) -> None:
     """Raise LocalProtocolError unless such a message can be asked for at ``hz``: above 0, at most 1000."""
-    if not 0 < hz <= 1000:
-        raise LocalProtocolError(
-            f"rate_hz = {hz!r} of {message_type.NAME} is not allowed: above 0, at most 1000"
-        )
+    check_range(f"rate_hz of {message_type.NAME}", hz, 0, 1000, above=True)
 
 
 class _Stream:
