@@ -10,6 +10,8 @@ from typing import Any
 import anyio
 from call_stage import Stage
 
+from aerokit.runtime import loop_watch
+
 __all__ = ["SETTLED_S", "look", "what_is_left"]
 
 SETTLED_S = 20.0
@@ -82,11 +84,13 @@ def _tasks() -> Iterator[str]:
 
 
 def _timers() -> Iterator[str]:
-    """Those of sleeping tasks and of the simulator come and go; the tasks are counted."""
+    """Those of sleeping tasks and of the simulator come and go; the tasks are counted. The loop's own watch is always
+    under way, and in the list of timers but for the turn in which it is due."""
     loop: Any = asyncio.get_running_loop()
     for timer in loop._scheduled:
         module = getattr(timer._callback, "__module__", "")
-        if not timer.cancelled() and module.startswith(("aerokit.vehicle", "aerokit.runtime")):
+        is_ours = module.startswith(("aerokit.vehicle", "aerokit.runtime")) and module != loop_watch.__name__
+        if is_ours and not timer.cancelled():
             yield f"timer {timer._callback.__qualname__}"
 
 
