@@ -233,6 +233,22 @@ async def test_a_pilot_ends_it_and_a_newer_one_too(flying: Flight) -> None:
 
 
 @pytest.mark.anyio
+async def test_what_is_sent_to_another_system_is_no_order_to_this_one(flying: Flight) -> None:
+    vehicle = flying.vehicle
+    others = (
+        m.CommandLong(vehicle.system_id + 1, 1, MavCmd.NAV_LAND, 0, *(0,) * 7),
+        m.SetMode(vehicle.system_id + 1, 1, 9),
+        m.SetPositionTargetLocalNed(0, vehicle.system_id + 1, 1, 1, 0x0DC7, *(0,) * 11),
+    )
+    with vehicle.posted("motion") as order:
+        for each in others:
+            vehicle.send(each)
+            assert (each.NAME, order.end) == (each.NAME, "")
+        vehicle.send(m.SetPositionTargetLocalNed(0, 0, 0, 1, 0x0DC7, *(0,) * 11))  # to everybody
+        assert order.end == NEWER
+
+
+@pytest.mark.anyio
 async def test_what_is_left_of_an_order_that_was_lost_is_not_sent(flying: Flight) -> None:
     vehicle = flying.vehicle
     place: dict[str, Any] = {"frame": 6, "x": 1, "y": 1, "z": 20.0}

@@ -1842,7 +1842,7 @@ class Vehicle(VehicleTwin):
         """Send one message as it is, once; never blocks. Its ``target_system`` is yours to set.
 
         A command that steers (as by :meth:`command`) and SET_MODE are newer orders: those of the actions end. A
-        set-point is newer than what was :meth:`posted` about motion.
+        set-point is newer than what was :meth:`posted` about motion. Neither is, to another system than this vehicle.
 
         Raises:
             LocalProtocolError: a field is out of range; nothing was sent.
@@ -1907,9 +1907,9 @@ class Vehicle(VehicleTwin):
         """Have the vehicle send all that it streams at ``rate_hz`` for the time of the ``with`` block: for recordings,
         ground stations and firmware that knows no rates of single messages.
 
-        ArduPilot is asked by REQUEST_DATA_STREAM, again after a reboot or a silence and while nothing comes; it goes on
-        streaming afterwards. Others stream by themselves: of them, what is missing of the common states is asked for
-        as by :meth:`rate`.
+        ArduPilot is asked by REQUEST_DATA_STREAM (whole Hz, 1 at least), again after a reboot or a silence and while
+        nothing comes; it goes on streaming afterwards. Others stream by themselves: of them, what is missing of the
+        common states is asked for as by :meth:`rate`.
 
         Raises:
             LocalProtocolError: the rate is not above 0 and at most 1000. Nothing was sent.

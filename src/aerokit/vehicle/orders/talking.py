@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 
 __all__ = ["TalkActions"]
 
+EVERYBODY = 0
+"""``target_system`` of a message to all systems."""
 ItemT = TypeVar("ItemT", bound="Message | Event")
 MessageT = TypeVar("MessageT", bound=Message)
 
@@ -130,7 +132,7 @@ class TalkActions(Part):
         """Send one message as it is, once; never blocks. Its ``target_system`` is yours to set.
 
         A command that steers (as by :meth:`command`) and SET_MODE are newer orders: those of the actions end. A
-        set-point is newer than what was :meth:`posted` about motion.
+        set-point is newer than what was :meth:`posted` about motion. Neither is, to another system than this vehicle.
 
         Raises:
             LocalProtocolError: a field is out of range; nothing was sent.
@@ -141,7 +143,8 @@ class TalkActions(Part):
 
     def note_sent(self, message: Message) -> None:
         """The program has sent this to the vehicle past it (``connection.send``): it counts as by :meth:`send`."""
-        subjects = subjects_of(message)
+        target = getattr(message, "target_system", self.system_id)
+        subjects = subjects_of(message) if target in (EVERYBODY, self.system_id) else ()
         if subjects and isinstance(message, (CommandInt, CommandLong, SetMode)):
             self._helm.order_of_the_programs_own(subjects)
         elif subjects:
@@ -230,9 +233,9 @@ class TalkActions(Part):
         """Have the vehicle send all that it streams at ``rate_hz`` for the time of the ``with`` block: for recordings,
         ground stations and firmware that knows no rates of single messages.
 
-        ArduPilot is asked by REQUEST_DATA_STREAM, again after a reboot or a silence and while nothing comes; it goes on
-        streaming afterwards. Others stream by themselves: of them, what is missing of the common states is asked for
-        as by :meth:`rate`.
+        ArduPilot is asked by REQUEST_DATA_STREAM (whole Hz, 1 at least), again after a reboot or a silence and while
+        nothing comes; it goes on streaming afterwards. Others stream by themselves: of them, what is missing of the
+        common states is asked for as by :meth:`rate`.
 
         Raises:
             LocalProtocolError: the rate is not above 0 and at most 1000. Nothing was sent.
