@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import signal
 from collections.abc import AsyncIterator
 from typing import Any
@@ -37,6 +38,13 @@ settings.load_profile("aerokit")
 @pytest.fixture
 def anyio_backend() -> tuple[str, dict[str, Any]]:
     return "asyncio", {"loop_factory": VirtualClockLoop}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def what_was_there_before_is_no_garbage() -> None:
+    """Collections that go through ten thousand tests keep all threads waiting, the simulated vehicles' among them."""
+    gc.collect()
+    gc.freeze()
 
 
 def pytest_report_header() -> str:
