@@ -196,7 +196,7 @@ def test_the_numbers_of_a_location_belong_to_one_message(vehicle: dronekit.Vehic
     def feed() -> None:
         for number in range(1, 81):
             degrees, millimetres = number * 10_000_000, number * 1000
-            location._on_global_position(GlobalPositionInt(0, degrees, degrees, millimetres, 0, 0, 0, 0, 0))
+            location._global.receive(GlobalPositionInt(0, degrees, degrees, millimetres, 0, 0, 0, 0, 0))
 
     vehicle._handler.loop.call(feed)
     reader.start()

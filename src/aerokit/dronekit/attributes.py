@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 from aerokit.autopilots.health import PREARM_CHECK
 from aerokit.autopilots.modes import is_armed
 from aerokit.dronekit.core import VehicleCore
-from aerokit.dronekit.modes import mode_name
-from aerokit.dronekit.reception import Latest, Stream
-from aerokit.dronekit.shadowable import Shadowable
+from aerokit.dronekit.current_command import CurrentCommand
+from aerokit.dronekit.flight_orders import mode_name
+from aerokit.dronekit.locations import Locations
+from aerokit.dronekit.privates import Shadowable
 from aerokit.dronekit.values import (
     Attitude,
     Battery,
@@ -22,14 +23,11 @@ from aerokit.dronekit.values import (
 )
 from aerokit.dronekit.version import Capabilities, Version
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import EkfStatusFlags
+from aerokit.mavlink.enums import EkfStatusFlags, MavProtocolCapability
+from aerokit.runtime.components import is_autopilot
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from aerokit.dronekit.current_command import CurrentCommand
-    from aerokit.dronekit.locations import Locations
-    from aerokit.mavlink.message import Message
+    from aerokit.dronekit.mavlink import MAVConnection
 
 __all__ = ["VehicleAttributes"]
 
@@ -50,58 +48,39 @@ class VehicleAttributes(VehicleCore):
     A message is kept by one assignment, so what is read together belongs to one message.
     """
 
-    _location: Locations
-    _dk_current_command: CurrentCommand
     _dk_heartbeat: m.Heartbeat | None = None
     _flightmode: str = "UNKNOWN"
-    _dk_attitude = Latest(m.Attitude)
-    _dk_vfr_hud = Latest(m.VfrHud)
-    _dk_gps = Latest(m.GpsRawInt)
-    _dk_sys_status = Latest(m.SysStatus)
-    _dk_rangefinder: tuple[float | None, float | None] = (None, None)
-    _dk_has_rangefinder_message = False
+    _dk_distance_down: float | None = None
     _dk_ekf_flags: int | None = None
     _dk_ekf_ok = False
-    _dk_wind = Latest(m.Wind)
-    _dk_version: m.AutopilotVersion | None = None
     _home_location: LocationGlobal | None = None
     _dk_told_home: LocationGlobal | None = None
 
-    _dk_told_by: tuple[tuple[Latest[Any], tuple[str, ...]], ...] = (
-        (_dk_attitude, ("attitude",)),
-        (_dk_vfr_hud, ("heading", "airspeed", "groundspeed")),
-        (_dk_gps, ("gps_0",)),
-        (_dk_sys_status, ("battery",)),
-        (_dk_wind, ("wind",)),
-    )
-    """The messages that come in streams, and what they tell of."""
-
-    def _dk_make_streams(self) -> None:
-        for kind, names in self._dk_told_by:
-            self._dk.streams[kind.message_type] = Stream(self, kind, names)
-
-    def _dk_attach_attributes(self) -> None:
-        for message_type, handler in self._dk_handlers().items():
-            self._dk.on(message_type, handler)
-
-    def _dk_handlers(self) -> dict[type[Message], Callable[[Any], None]]:
-        return {
-            m.Heartbeat: self._dk_on_heartbeat,
-            m.GlobalPositionInt: lambda _: self._dk.listeners.announce("velocity"),
-            m.VfrHud: self._dk_on_vfr_hud,
-            m.Attitude: lambda _: self._dk.listeners.announce("attitude"),
-            m.SysStatus: lambda _: self._dk.listeners.announce("battery"),
-            m.GpsRawInt: lambda _: self._dk.listeners.announce("gps_0"),
-            m.Rangefinder: self._dk_on_rangefinder,
-            m.DistanceSensor: self._dk_on_distance_sensor,
-            m.EkfStatusReport: self._dk_on_ekf_status,
-            m.EstimatorStatus: self._dk_on_ekf_status,
-            m.Wind: lambda _: self._dk.listeners.announce("wind"),
-            m.HomePosition: self._dk_on_home,
-            m.AutopilotVersion: self._dk_on_version,
-        }
+    def __init__(self, handler: MAVConnection) -> None:
+        super().__init__(handler)
+        core = self._dk
+        self._location = Locations(self)
+        core.on(m.Heartbeat, self._dk_on_heartbeat)
+        self._dk_position = core.announce(m.GlobalPositionInt, "velocity")
+        self._dk_vfr_hud = core.announce(m.VfrHud, "heading", "airspeed", "groundspeed")
+        self._dk_attitude = core.announce(m.Attitude, "attitude")
+        self._dk_sys_status = core.announce(m.SysStatus, "battery")
+        self._dk_gps = core.announce(m.GpsRawInt, "gps_0")
+        self._dk_wind = core.announce(m.Wind, "wind")
+        self._dk_rangefinder = core.announce(m.Rangefinder, "rangefinder")
+        core.on(m.DistanceSensor, self._dk_on_distance_sensor)
+        core.on(m.EkfStatusReport, self._dk_on_ekf_status)
+        core.on(m.EstimatorStatus, self._dk_on_ekf_status)
+        core.on(m.HomePosition, self._dk_on_home)
+        self._dk_version = core.on(m.AutopilotVersion, self._dk_on_version)
+        self._dk_current_command = CurrentCommand(core)
 
     # ------------------------------------------------------------------------------- reading
+
+    @property
+    def location(self) -> Locations:
+        """Where it is: ``.global_frame``, ``.global_relative_frame``, ``.local_frame``."""
+        return self._location
 
     @property
     def system_status(self) -> SystemStatus | Any:
@@ -114,37 +93,28 @@ class VehicleAttributes(VehicleCore):
     @property
     def attitude(self) -> Attitude:
         """Pitch, yaw and roll in radians (ATTITUDE)."""
-        message = self._dk_attitude
-        if message is None:
-            return Attitude(None, None, None)
-        return Attitude(message.pitch, message.yaw, message.roll)
+        return Attitude(*self._dk_attitude.values("pitch", "yaw", "roll"))
 
     @property
     def velocity(self) -> list[float | Any]:
         """``[vx, vy, vz]`` in m/s: north, east, down (GLOBAL_POSITION_INT)."""
-        message = self._location.global_position
-        if message is None:
-            return [None, None, None]
-        return [message.vx / 100.0, message.vy / 100.0, message.vz / 100.0]
+        speeds = self._dk_position.values("vx", "vy", "vz")
+        return [None if speed is None else speed / 100.0 for speed in speeds]
 
     @property
     def heading(self) -> int | Any:
         """Where the nose points, 0 to 360 degrees clockwise from north (VFR_HUD)."""
-        message = self._dk_vfr_hud
-        return None if message is None else message.heading
+        return self._dk_vfr_hud.values("heading")[0]
 
     @property
     def gps_0(self) -> GPSInfo:
         """The first GPS receiver (GPS_RAW_INT)."""
-        message = self._dk_gps
-        if message is None:
-            return GPSInfo(None, None, None, None)
-        return GPSInfo(message.eph, message.epv, message.fix_type, message.satellites_visible)
+        return GPSInfo(*self._dk_gps.values("eph", "epv", "fix_type", "satellites_visible"))
 
     @property
     def battery(self) -> Battery | Any:
         """Voltage, current and level of the main battery (SYS_STATUS); None before the first."""
-        message = self._dk_sys_status
+        message = self._dk_sys_status.message
         if message is None:
             return None
         return Battery(message.voltage_battery, message.current_battery, message.battery_remaining)
@@ -152,15 +122,14 @@ class VehicleAttributes(VehicleCore):
     @property
     def rangefinder(self) -> Rangefinder:
         """Distance in metres and voltage (RANGEFINDER; of others DISTANCE_SENSOR that looks down)."""
-        return Rangefinder(*self._dk_rangefinder)
+        if self._dk_rangefinder.message is None:
+            return Rangefinder(self._dk_distance_down, None)
+        return Rangefinder(*self._dk_rangefinder.values("distance", "voltage"))
 
     @Shadowable
     def wind(self) -> Wind:
         """Direction it comes from in degrees and speed in m/s (WIND of ArduPilot)."""
-        message = self._dk_wind
-        if message is None:
-            return Wind(None, None, None)
-        return Wind(message.direction, message.speed, message.speed_z)
+        return Wind(*self._dk_wind.values("direction", "speed", "speed_z"))
 
     @property
     def ekf_ok(self) -> bool:
@@ -175,29 +144,27 @@ class VehicleAttributes(VehicleCore):
         """
         if self._flightmode in NO_MODE or self._dk_heartbeat is None:
             return False
-        if self._dk.is_connected and self._dk.aio.autopilot.judges_by_mode:
-            status = self._dk_sys_status
+        if self._dk.found is not None and self._dk.found.autopilot.judges_by_mode:
+            status = self._dk_sys_status.message
             return status is not None and bool(status.onboard_control_sensors_health & PREARM_CHECK)
-        gps = self._dk_gps
+        gps = self._dk_gps.message
         return gps is not None and gps.fix_type > 1 and bool((self._dk_ekf_flags or 0) & PRED_POS_HORIZ_ABS)
 
     @property
     def version(self) -> Version:
         """The firmware: version and type (AUTOPILOT_VERSION, HEARTBEAT)."""
-        version = self._dk_version
-        raw = None if version is None else version.flight_sw_version
+        (raw,) = self._dk_version.values("flight_sw_version")
         return Version(raw, self._autopilot_type, self._vehicle_type)
 
     @property
     def capabilities(self) -> Capabilities:
         """What the autopilot understands (AUTOPILOT_VERSION)."""
-        version = self._dk_version
-        return Capabilities(None if version is None else version.capabilities)
+        return Capabilities(*self._dk_version.values("capabilities"))
 
     @property
     def last_heartbeat(self) -> float | Any:
         """Seconds since the autopilot's last HEARTBEAT; None before the first."""
-        return self._dk.aio.heartbeat_age if self._dk.is_connected else None
+        return None if self._dk.found is None else self._dk.found.heartbeat_age
 
     @Shadowable
     def _autopilot_type(self) -> int | None:
@@ -215,30 +182,19 @@ class VehicleAttributes(VehicleCore):
     # ----------------------------------------------------------------------------- receiving
 
     def _dk_on_heartbeat(self, message: m.Heartbeat) -> None:
-        before, self._dk_heartbeat = self._dk_heartbeat, message
-        if before is None or (before.custom_mode, before.base_mode) != (
-            message.custom_mode,
-            message.base_mode,
-        ):
-            self._flightmode = mode_name(self._dk.aio, message.custom_mode)
+        if not is_autopilot(message):  # a ground station or a companion that took the autopilot's ids
+            return
+        self._handler.follow_version(message)
+        self._dk_heartbeat = message
+        self._flightmode = mode_name(self._dk.aio, message.custom_mode)
         self._dk.listeners.tell("armed", self._armed, cache=True)
         self._dk.listeners.tell("mode", VehicleMode(self._flightmode), cache=True)
         self._dk.listeners.tell("system_status", self.system_status, cache=True)
         self._dk.ready.note("last_heartbeat")
 
-    def _dk_on_vfr_hud(self, message: m.VfrHud) -> None:
-        self._dk.listeners.announce("heading")
-        self._dk.listeners.announce("airspeed")
-        self._dk.listeners.announce("groundspeed")
-
-    def _dk_on_rangefinder(self, message: m.Rangefinder) -> None:
-        self._dk_has_rangefinder_message = True
-        self._dk_rangefinder = (message.distance, message.voltage)
-        self._dk.listeners.announce("rangefinder")
-
     def _dk_on_distance_sensor(self, message: m.DistanceSensor) -> None:
-        if message.orientation == LOOKING_DOWN and not self._dk_has_rangefinder_message:
-            self._dk_rangefinder = (message.current_distance / 100.0, None)
+        if message.orientation == LOOKING_DOWN and self._dk_rangefinder.message is None:
+            self._dk_distance_down = message.current_distance / 100.0
             self._dk.listeners.announce("rangefinder")
 
     def _dk_on_ekf_status(self, message: m.EkfStatusReport | m.EstimatorStatus) -> None:
@@ -254,7 +210,7 @@ class VehicleAttributes(VehicleCore):
         self._dk.listeners.tell("home_location", self._home_location)
 
     def _dk_on_version(self, message: m.AutopilotVersion) -> None:
-        self._dk_version = message
+        self._handler.knows_mavlink_2 = bool(message.capabilities & MavProtocolCapability.MAVLINK2)
         self._dk.ready.note("version")
         self._dk.ready.note("capabilities")
         self._dk.listeners.tell("autopilot_version", message.flight_sw_version)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import ItemsView, Iterable, Iterator, KeysView, Mapping, ValuesView
+from collections.abc import ItemsView, Iterable, KeysView, Mapping, ValuesView
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from aerokit.dronekit.core import core_of
 from aerokit.dronekit.exceptions import APIException
+from aerokit.dronekit.python2 import Python2Mapping
 from aerokit.errors import LocalProtocolError
 from aerokit.mavlink.messages import RcChannels, RcChannelsOverride, RcChannelsRaw
 
@@ -29,8 +30,8 @@ FIRST_VALUES = attrgetter(*(f"chan{number}_raw" for number in NUMBERS[:FEWEST]))
 MISSING: Any = object()
 
 
-class _ChannelDict(dict[Any, Any]):
-    """Channels by number, as a text or an integer, with the methods that dictionaries had in Python 2."""
+class _ChannelDict(dict[Any, Any], Python2Mapping[Any]):
+    """Channels by number, as a text or an integer."""
 
     def __getitem__(self, channel: str | int) -> Any:
         return super().__getitem__(str(channel))
@@ -41,10 +42,6 @@ class _ChannelDict(dict[Any, Any]):
     def get(self, channel: str | int, default: Any = None) -> Any:
         """The value of a channel, or ``default``."""
         return super().get(str(channel), default)
-
-    def has_key(self, channel: str | int) -> bool:
-        """As ``channel in channels``."""
-        return channel in self
 
     def items(self) -> ItemsView[str, Any]:  # type: ignore[override]
         """Pairs of number and value as they are at this moment."""
@@ -58,34 +55,20 @@ class _ChannelDict(dict[Any, Any]):
         """The values at this moment."""
         return self.copy().values()
 
-    def iteritems(self) -> Iterator[tuple[str, Any]]:
-        """An iterator over :meth:`items`."""
-        return iter(self.items())
-
-    def iterkeys(self) -> Iterator[str]:
-        """An iterator over :meth:`keys`."""
-        return iter(self.keys())
-
-    def itervalues(self) -> Iterator[Any]:
-        """An iterator over :meth:`values`."""
-        return iter(self.values())
-
-    def viewitems(self) -> ItemsView[str, Any]:
-        """As :meth:`items`."""
-        return self.items()
-
-    def viewkeys(self) -> KeysView[str]:
-        """As :meth:`keys`."""
-        return self.keys()
-
-    def viewvalues(self) -> ValuesView[Any]:
-        """As :meth:`values`."""
-        return self.values()
-
     @classmethod
     def fromkeys(cls, channels: Iterable[Any], value: Any = None) -> dict[Any, Any]:
         """A plain dictionary with these keys."""
         return dict.fromkeys(channels, value)
+
+
+def _refused(name: str) -> Any:
+    """A method that the channels do not have: they are the vehicle's to change."""
+
+    def refuse(*_: object, **__: object) -> NoReturn:
+        raise TypeError(f"{name} is not supported on Channels object")
+
+    refuse.__name__, refuse.__doc__ = name, "Raises TypeError: channels are the vehicle's to change."
+    return refuse
 
 
 class Channels(_ChannelDict):
@@ -140,34 +123,9 @@ class Channels(_ChannelDict):
 
     # ------------------------------------------------------------------------- not for programs
 
-    def __setitem__(self, channel: object, value: object) -> NoReturn:
-        raise TypeError("__setitem__ is not supported on Channels object")
-
-    def __delitem__(self, channel: object) -> NoReturn:
-        raise TypeError("__delitem__ is not supported on Channels object")
-
-    def __ior__(self, other: object) -> NoReturn:  # type: ignore[misc]
-        raise TypeError("__ior__ is not supported on Channels object")
-
-    def clear(self) -> NoReturn:
-        """Raises TypeError: channels are the vehicle's to change."""
-        raise TypeError("clear is not supported on Channels object")
-
-    def pop(self, *_: object) -> NoReturn:
-        """Raises TypeError: channels are the vehicle's to change."""
-        raise TypeError("pop is not supported on Channels object")
-
-    def popitem(self) -> NoReturn:
-        """Raises TypeError: channels are the vehicle's to change."""
-        raise TypeError("popitem is not supported on Channels object")
-
-    def setdefault(self, *_: object) -> NoReturn:
-        """Raises TypeError: channels are the vehicle's to change."""
-        raise TypeError("setdefault is not supported on Channels object")
-
-    def update(self, *_: object, **__: object) -> NoReturn:
-        """Raises TypeError: channels are the vehicle's to change."""
-        raise TypeError("update is not supported on Channels object")
+    __setitem__, __delitem__, __ior__ = _refused("__setitem__"), _refused("__delitem__"), _refused("__ior__")
+    clear, pop, popitem = _refused("clear"), _refused("pop"), _refused("popitem")
+    setdefault, update = _refused("setdefault"), _refused("update")
 
     # ------------------------------------------------------------------------------- inside
 
@@ -218,10 +176,7 @@ class ChannelsOverride(_ChannelDict):
         self._change({channel: value})
 
     def __delitem__(self, channel: str | int) -> None:
-        with self._changing:
-            if channel not in self:
-                raise KeyError(str(channel))
-            self._change({channel: None})
+        self.pop(channel)
 
     def __ior__(self, other: Any) -> ChannelsOverride:  # type: ignore[misc]
         self.update(other)

@@ -6,10 +6,17 @@ import operator
 import threading
 from typing import TYPE_CHECKING, Any, overload
 
-from aerokit.dronekit.command import Command, command_from, is_home_row, values_of
-from aerokit.dronekit.command_items import commands_of, home_command, mission_of
+from aerokit.dronekit.command import (
+    Command,
+    command_from,
+    commands_of,
+    home_command,
+    is_home_row,
+    mission_of,
+    values_of,
+)
 from aerokit.dronekit.core import core_of
-from aerokit.dronekit.exceptions import APIException, TimeoutError  # noqa: A004 - DroneKit's name
+from aerokit.dronekit.exceptions import APIException, TimeoutError, classic_errors  # noqa: A004 - DroneKit's name
 from aerokit.errors import AerokitError, OperationTimeout
 from aerokit.snapshot import Snapshot
 from aerokit.sync.reply import reply_of
@@ -49,7 +56,6 @@ class CommandSequence:
         """What the commands said when the vehicle had them last."""
         self._downloads = 0
         self._download: concurrent.futures.Future[None] | None = None
-        self._failure: APIException | None = None
         self._current = vehicle._dk_current_command
 
     # ------------------------------------------------------------------- from and to the vehicle
@@ -66,7 +72,6 @@ class CommandSequence:
         self._core.check_link()
         with self._lock:
             self._downloads += 1
-            self._failure = None
             self._core.ready.unmark("commands")
             self._download = self._core.order("commands.download", self._read, self._downloads)
 
@@ -124,8 +129,7 @@ class CommandSequence:
         """Remove all commands; the vehicle is told by :meth:`upload`. Waits for the end of a download under way."""
         self._wait_for_download()
         with self._lock:
-            if self._failure is not None:
-                self._failure = None
+            if self._core.ready.failure_of({"commands"}) is not None:
                 self._core.ready.mark("commands")
             self._held = Held((), self._held.home, is_changed=True)
 
@@ -227,22 +231,19 @@ class CommandSequence:
         failure.__cause__ = error
         with self._lock:
             if number == self._downloads:
-                self._failure = failure
                 self._core.ready.fail("commands", failure)
 
     def _settle(self) -> None:
         """Wait until it is known what there is to change."""
         self._wait_for_download()
-        if (failure := self._failure) is not None:
+        if (failure := self._core.ready.failure_of({"commands"})) is not None:
             raise type(failure)(f"{failure}; download() again, or clear()") from failure.__cause__
 
     def _wait_for_download(self) -> None:
         """As DroneKit does: what is cleared or added after download() comes after it. Its end is bounded."""
         while (download := self._download) is not None and not download.done():
-            try:
+            with classic_errors():
                 self._core.handler.loop.wait_for(reply_of(download))
-            except AerokitError as error:
-                raise APIException(str(error)) from error
 
 
 class WaypointLoader:

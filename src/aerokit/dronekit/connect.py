@@ -88,7 +88,7 @@ def connect(
         if _initialize:
             vehicle.initialize(rate=rate, heartbeat_timeout=heartbeat_timeout)
         if wait_ready:
-            names = _names(wait_ready)
+            names = (wait_ready,) if isinstance(wait_ready, (bool, str)) else wait_ready
             vehicle.wait_ready(
                 *names,
                 timeout=timeout,
@@ -99,12 +99,6 @@ def connect(
         handler.close()
         raise
     return vehicle
-
-
-def _names(wait_ready: bool | str | Iterable[str]) -> tuple[str | bool, ...]:
-    if isinstance(wait_ready, (bool, str)):
-        return (wait_ready,)
-    return tuple(wait_ready)
 
 
 def _print_texts(handler: MAVConnection, status_printer: Callable[[str], object]) -> None:

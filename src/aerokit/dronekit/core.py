@@ -2,31 +2,85 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
+import math
 import threading
-from typing import TYPE_CHECKING, Any
+import time
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from aerokit.dronekit.exceptions import APIException, TimeoutError  # noqa: A004 - DroneKit's name
+from aerokit.dronekit.exceptions import APIException, TimeoutError, classic_errors  # noqa: A004 - DroneKit's name
 from aerokit.dronekit.observers import HasObservers, Listeners
-from aerokit.dronekit.readiness import Readiness
+from aerokit.dronekit.reception import Latest
 from aerokit.dronekit.weakly import weakly
-from aerokit.errors import AerokitError, LocalProtocolError, OperationTimeout
+from aerokit.mavlink.message import Message
 
 if TYPE_CHECKING:
     import concurrent.futures
     from collections.abc import Awaitable, Callable
-    from contextlib import ExitStack
 
     from aerokit.dronekit.mavlink import MAVConnection
-    from aerokit.dronekit.reception import Stream
-    from aerokit.mavlink.message import Message
     from aerokit.runtime.background import Background
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
-__all__ = ["Core", "VehicleCore", "core_of"]
+__all__ = ["Core", "Readiness", "VehicleCore", "core_of"]
 
 DEFAULT_ATTRIBUTES = ("parameters", "gps_0", "armed", "mode", "attitude")
 """What ``wait_ready(True)`` waits for."""
+
+LONGEST_WAIT_S = 0.2
+"""Waits are cut into slices: Ctrl-C and the end of the link are noticed between them."""
+SILENT_AFTER_S = 5
+TICK_S = 0.05
+
+MessageT = TypeVar("MessageT", bound=Message)
+
+
+class Readiness:
+    """What is ready is what was told at least once. Any thread may use it."""
+
+    def __init__(self) -> None:
+        self.names: set[str] = set()
+        """What has values."""
+        self.seekers: dict[str, Callable[[], None]] = {}
+        """What is called while somebody waits for a name that does not come by itself."""
+        self._failures: dict[str, APIException] = {}
+        self._changed = threading.Condition()
+
+    def mark(self, name: str) -> None:
+        """The attribute has a value: whoever waits for it goes on."""
+        with self._changed:
+            self._failures.pop(name, None)
+            self.names.add(name)
+            self._changed.notify_all()
+
+    def note(self, name: str) -> None:
+        """The attribute has a value, as it may have had before."""
+        if name not in self.names:
+            self.mark(name)
+
+    def unmark(self, name: str) -> None:
+        """The attribute will get a new value, and is to be waited for."""
+        with self._changed:
+            self._failures.pop(name, None)
+            self.names.discard(name)
+
+    def fail(self, name: str, error: APIException) -> None:
+        """The attribute will get no value: whoever waits for it is told why."""
+        with self._changed:
+            self._failures[name] = error
+            self._changed.notify_all()
+
+    def failure_of(self, names: set[str]) -> APIException | None:
+        """Why one of these will get no value, if that is known."""
+        return next(filter(None, map(self._failures.get, names)), None)
+
+    def wait_a_little(self, wanted: set[str], at_most_s: float) -> None:
+        """Wait until something may have happened to these, as long as one of them is missing."""
+        with self._changed:
+            missing = wanted - self.names
+            if missing and self.failure_of(missing) is None:
+                self._changed.wait(min(LONGEST_WAIT_S, at_most_s))
 
 
 class Core:
@@ -38,18 +92,17 @@ class Core:
     def __init__(self, handler: MAVConnection, owner: object) -> None:
         self.handler = handler
         self.logger = logging.getLogger("dronekit")
-        self.ready = Readiness(self.check_link, self.review)
-        self.listeners = Listeners(owner, handler.listener_thread, self.ready.note, self.review)
+        self.ready = Readiness()
+        self.listeners = Listeners(owner, handler.listener_thread, self.ready.note)
         """Of the vehicle's attributes."""
         self.heartbeat_limit_s = 0.0
         """Longer silences are errors; 0: none is."""
-        self.streams: dict[type[Message], Stream] = {}
-        """What comes again and again."""
-        self._reviewing = threading.Lock()
-        self._aio: AsyncVehicle | None = None
+        self.found: AsyncVehicle | None = None
+        """The asynchronous vehicle, once it was found."""
         self._tasks: Background | None = None
-        self._sinks: list[tuple[type[Message], Callable[[Any], None]]] = []
-        self._starters: list[Callable[[ExitStack], None]] = []
+        self._latest: dict[type[Message], Latest[Any]] = {}
+        self._starters: list[Callable[[], None]] = []
+        self._is_silent = False
 
     # --------------------------------------------------------------------------------- state
 
@@ -59,26 +112,19 @@ class Core:
         return self.handler.target_system
 
     @property
-    def is_connected(self) -> bool:
-        """Whether the vehicle was found."""
-        return self._aio is not None
-
-    @property
     def aio(self) -> AsyncVehicle:
         """The asynchronous vehicle; APIException before it was found."""
-        if self._aio is None:
+        if self.found is None:
             raise APIException("the vehicle is not connected yet: call initialize()")
-        return self._aio
+        return self.found
 
     def check_link(self) -> AsyncVehicle:
         """The asynchronous vehicle; APIException unless it can be talked to."""
         aio = self.aio
         if self.handler.is_closed:
             raise APIException("the vehicle was closed")
-        try:
+        with classic_errors():
             aio.connection.raise_if_ended()
-        except AerokitError as error:
-            raise APIException(str(error)) from error
         age = aio.heartbeat_age
         if self.heartbeat_limit_s and age > self.heartbeat_limit_s:
             raise APIException(f"no heartbeat of the vehicle for {age:.0f} s")
@@ -86,44 +132,68 @@ class Core:
 
     # ------------------------------------------------------------------------------- hearing
 
-    def on(self, message_type: type[Message], handler: Callable[[Any], None]) -> None:
-        """Have a handler called with messages of the autopilot (loop thread, weakly)."""
-        stream = self.streams.get(message_type)
-        if stream is None:
-            self._sinks.append((message_type, handler))
-        else:
-            stream.add(handler)
+    def on(
+        self,
+        message_type: type[MessageT],
+        handler: Callable[[MessageT], object],
+        *names: str,
+        listeners: Listeners | None = None,
+    ) -> Latest[MessageT]:
+        """Have a handler called with messages of the autopilot (loop thread, weakly); returns what has the latest one.
 
-    def review(self) -> None:
-        """Messages are looked at when they come only as long as somebody listens; from any thread."""
-        with self._reviewing:
-            for stream in self.streams.values():
-                stream.review(self.ready.names, self.listeners.by_name)
+        Args:
+            message_type: of which kind.
+            handler: if it does nothing but tell ``names``, it is called only where somebody may want to know.
+            names: of the vehicle's attributes.
+            listeners: others, whom it tells, too.
+        """
+        if message_type not in self._latest:
+            self._latest[message_type] = Latest(message_type, self.ready.names, self.listeners)
+        latest = self._latest[message_type]
+        latest.add(handler, names, listeners)
+        return latest
 
-    def at_start(self, function: Callable[[ExitStack], None]) -> None:
-        """Have a function called on the loop when the vehicle is found; what it puts into the stack is its end."""
+    def announce(self, message_type: type[MessageT], *names: str) -> Latest[MessageT]:
+        """Have messages of this kind told as these attributes; returns what has the latest one."""
+
+        def announce(_: MessageT) -> None:
+            for name in names:
+                self.listeners.announce(name)
+
+        return self.on(message_type, announce, *names)
+
+    def at_start(self, function: Callable[[], None]) -> None:
+        """Have a function called on the loop when the vehicle is found."""
         self._starters.append(function)
 
     def begin(self, aio: AsyncVehicle, tasks: Background) -> None:
-        """The vehicle was found (loop thread)."""
-        self._aio, self._tasks = aio, tasks
+        """The vehicle was found (loop thread): hear what the parts want to; the loop gets weak references only."""
+        self.found, self._tasks = aio, tasks
         self.handler.target_system = aio.system_id
+        for message_type, latest in self._latest.items():
+            latest.component_id = aio.component_id
+            aio.connection.bus.attach_lazily(message_type, weakly(latest.take), system_id=aio.system_id)
 
-    def hear(self, ends: ExitStack) -> None:
-        """Begin to hear what the parts want to; the loop gets weak references only."""
-        aio = self.aio
-        bus, own = aio.connection.bus, aio.component_id
-        for message_type, stream in self.streams.items():
-            stream.begin(own)
-            ends.callback(bus.attach_frames(message_type, weakly(stream.take), system_id=aio.system_id))
-        for message_type, handler in self._sinks:
-            take = _only_of(own, weakly(handler))
-            ends.callback(bus.attach(message_type, take, system_id=aio.system_id))
-
-    def start_parts(self, ends: ExitStack) -> None:
+    def start_parts(self) -> None:
         """Call what waits for the vehicle (loop thread)."""
         for starter in self._starters:
-            starter(ends)
+            starter()
+
+    def watch_link(self) -> None:
+        """Tell 20 times a second how old the last heartbeat is; log it when they stay away and when they are back."""
+        aio = self.aio
+        if not aio.connection.is_open:
+            return
+        age = aio.heartbeat_age
+        self.listeners.tell("last_heartbeat", age)
+        if (age > SILENT_AFTER_S) != self._is_silent:
+            self._is_silent = not self._is_silent
+            post = self.handler.listener_thread.post  # the program's log handlers may take their time
+            if self._is_silent:
+                post(self.logger.warning, "Link timeout, no heartbeat in last %d seconds", SILENT_AFTER_S)
+            else:
+                post(self.logger.info, "...link restored.")
+        asyncio.get_running_loop().call_later(TICK_S, weakly(self.watch_link))
 
     def background(self, function: Callable[[], Awaitable[None]]) -> None:
         """Run a coroutine function for as long as the vehicle is connected (loop thread)."""
@@ -135,33 +205,27 @@ class Core:
     def run(self, function: Callable[..., Awaitable[Any]], *args: Any, **kwargs: Any) -> Any:
         """Wait for a coroutine function on the loop; what it raises becomes DroneKit's errors."""
         self.check_link()
-        try:
+        with classic_errors():
             return self.handler.loop.run(function, *args, **kwargs)
-        except LocalProtocolError:
-            raise
-        except OperationTimeout as error:
-            raise TimeoutError(str(error)) from error
-        except AerokitError as error:
-            raise APIException(str(error)) from error
 
     def order(
         self, kind: str, function: Callable[..., Awaitable[object]], *args: Any, **kwargs: Any
     ) -> concurrent.futures.Future[None]:
         """Give an order without waiting; a newer one of its kind replaces it."""
         self.check_link()
-        try:
+        with classic_errors():
             return self.handler.orders.give(kind, function, *args, **kwargs)
-        except AerokitError as error:
-            raise APIException(str(error)) from error
+
+    def command(
+        self, kind: str, command: int, *params: float, **options: Any
+    ) -> concurrent.futures.Future[None]:
+        """Order that a command is sent to all components, of which the autopilot's answer counts."""
+        return self.order(kind, self.check_link().command, command, *params, component_id=0, **options)
 
     def send(self, message: Message) -> None:
         """Send a message once, in the order of the calls."""
         self.check_link()
         self.handler.send(message)
-
-    def pause(self, seconds: float) -> None:
-        """Sleep, unless the vehicle is closed meanwhile."""
-        self.handler.wait_closed(seconds)
 
 
 class VehicleCore(HasObservers):
@@ -209,21 +273,30 @@ class VehicleCore(HasObservers):
         if not all(isinstance(name, str) for name in names):
             raise ValueError("wait_ready expects one or more string arguments.")
         wanted = {str(name) for name in names}
-        return self._dk.ready.wait(
-            wanted, timeout, raise_exception, still_waiting_callback, still_waiting_interval
-        )
+        ready = self._dk.ready
+        started = told_at = time.monotonic()
+        deadline = math.inf if timeout is None else started + timeout
+        while missing := wanted - ready.names:
+            now = time.monotonic()
+            if now >= deadline:
+                if raise_exception:
+                    error = TimeoutError(f"wait_ready experienced a timeout after {timeout} seconds.")
+                    raise error from LookupError(f"never told: {', '.join(sorted(missing))}")
+                return False
+            self._dk.check_link()
+            if (failure := ready.failure_of(missing)) is not None:
+                if raise_exception:
+                    raise type(failure)(str(failure)) from failure.__cause__
+                return False
+            for name in ready.seekers.keys() & missing:
+                ready.seekers[name]()
+            if still_waiting_callback is not None and now >= told_at + still_waiting_interval:
+                told_at = now
+                still_waiting_callback(missing)
+            ready.wait_a_little(wanted, deadline - now)
+        return True
 
 
 def core_of(vehicle: VehicleCore) -> Core:
     """The core of a vehicle, for its parts: their constructors have DroneKit's argument."""
     return vehicle._dk
-
-
-def _only_of(component_id: int, handler: Callable[[Any], None]) -> Callable[[Any], None]:
-    """Other components of the system (gimbals, companions) have no say in the autopilot's state."""
-
-    def take(message: Any) -> None:
-        if message.received_frame.component_id == component_id:
-            handler(message)
-
-    return take

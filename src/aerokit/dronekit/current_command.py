@@ -12,8 +12,6 @@ from aerokit.mavlink.enums import MavCmd, MissionState
 from aerokit.mavlink.messages import MissionCurrent, MissionSetCurrent
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from aerokit.dronekit.core import Core
 
 __all__ = ["CurrentCommand"]
@@ -31,17 +29,16 @@ class CurrentCommand:
     here, and 0 as long as it does not fly.
     """
 
-    def __init__(self, core: Core, is_armed: Callable[[], bool]) -> None:
-        self._core, self._is_armed = core, is_armed
-        self._message: MissionCurrent | None = None
+    def __init__(self, core: Core) -> None:
+        self._core = core
         self._chosen: int | None = None
         """What PX4 was told to fly next and has not gone past."""
-        core.on(MissionCurrent, self._on_current)
+        self._latest = core.on(MissionCurrent, self._on_current)
 
     @property
     def seq(self) -> int:
         """The command that the vehicle flies or will fly next; 0 before its first MISSION_CURRENT."""
-        message = self._message
+        message = self._latest.message
         if message is None:
             return 0
         if self._core.aio.autopilot.home_is_item_0:
@@ -66,11 +63,10 @@ class CurrentCommand:
     def _on_current(self, message: MissionCurrent) -> None:
         if message.seq != self._chosen:
             self._chosen = None
-        self._message = message
 
     def _is_over(self, message: MissionCurrent) -> bool:
         is_at_an_end = message.seq == 0 or message.mission_state == MissionState.COMPLETE
-        return is_at_an_end and not self._is_armed()
+        return is_at_an_end and not self._core.aio.is_armed
 
     async def _choose(self, seq: int) -> None:
         """By the message that DroneKit sends, once; what is not heard is ordered by the rules of all orders."""

@@ -1,10 +1,14 @@
-"""The two errors of the DroneKit API."""
+"""The two errors of the DroneKit API, and how errors of aerokit become such."""
 
 from __future__ import annotations
 
 import builtins
+from collections.abc import Iterator
+from contextlib import contextmanager
 
-__all__ = ["APIException", "TimeoutError"]
+from aerokit.errors import AerokitError, LocalProtocolError, OperationTimeout
+
+__all__ = ["APIException", "TimeoutError", "classic_errors"]
 
 
 class APIException(Exception):
@@ -13,3 +17,16 @@ class APIException(Exception):
 
 class TimeoutError(APIException, builtins.TimeoutError):  # noqa: A001 - the name is DroneKit's
     """The awaited answer or state did not come in time; the built-in `TimeoutError` catches it too."""
+
+
+@contextmanager
+def classic_errors() -> Iterator[None]:
+    """What aerokit raises in the block becomes one of these; what is wrong with an argument stays a ValueError."""
+    try:
+        yield
+    except LocalProtocolError:
+        raise
+    except OperationTimeout as error:
+        raise TimeoutError(str(error)) from error
+    except AerokitError as error:
+        raise APIException(str(error)) from error

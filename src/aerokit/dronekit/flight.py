@@ -12,14 +12,15 @@ from aerokit.dronekit.attributes import VehicleAttributes
 from aerokit.dronekit.exceptions import APIException, TimeoutError  # noqa: A004 - DroneKit's name
 from aerokit.dronekit.flight_orders import (
     change_armed,
+    change_mode,
     check_speed,
     checked_place,
     flies_to_places_in,
     go_to,
+    mode_named,
     refuse,
     take_off,
 )
-from aerokit.dronekit.modes import change_mode, mode_named
 from aerokit.dronekit.values import LocationGlobal, LocationGlobalRelative, VehicleMode
 from aerokit.errors import CommandRejected, OperationTimeout
 from aerokit.mavlink.enums import MavCmd, MavFrame, SpeedType
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 __all__ = ["FlightMethods"]
 
 HOME_TIMEOUT_S = 10.0
-POLL_S = 0.1
+ORDERS_LOOK_S = 0.02
 
 
 class FlightMethods(VehicleAttributes):
@@ -228,8 +229,8 @@ class FlightMethods(VehicleAttributes):
 
         Setting it asks for this speed (MAV_CMD_DO_CHANGE_SPEED).
         """
-        message = self._dk_vfr_hud
-        return None if message is None or math.isnan(message.airspeed) else message.airspeed
+        speed = self._dk_vfr_hud.values("airspeed")[0]
+        return None if speed is None or math.isnan(speed) else speed
 
     @airspeed.setter
     def airspeed(self, speed: float) -> None:
@@ -238,8 +239,7 @@ class FlightMethods(VehicleAttributes):
     @property
     def groundspeed(self) -> float | Any:
         """Speed over ground in m/s (VFR_HUD). Setting it asks for this speed (MAV_CMD_DO_CHANGE_SPEED)."""
-        message = self._dk_vfr_hud
-        return None if message is None else message.groundspeed
+        return self._dk_vfr_hud.values("groundspeed")[0]
 
     @groundspeed.setter
     def groundspeed(self, speed: float) -> None:
@@ -247,8 +247,7 @@ class FlightMethods(VehicleAttributes):
 
     def _dk_change_speed(self, name: str, kind: int, speed: float) -> None:
         check_speed(name, speed)
-        aio = self._dk.check_link()
-        self._dk.order(name, aio.command, MavCmd.DO_CHANGE_SPEED, kind, float(speed), -1, component_id=0)
+        self._dk.command(name, MavCmd.DO_CHANGE_SPEED, kind, float(speed), -1)
 
     # ---------------------------------------------------------------------------------- home
 
@@ -325,7 +324,7 @@ class FlightMethods(VehicleAttributes):
             self._dk.check_link()
             if time.monotonic() >= deadline:
                 raise TimeoutError(errmsg or f"what was waited for was not true within {timeout:g} s")
-            self._dk.pause(min(interval, max(deadline - time.monotonic(), 0.0)))
+            self._handler.wait_closed(min(interval, max(deadline - time.monotonic(), 0.0)))
 
     def wait_for_armable(self, timeout: float | None = None) -> None:
         """Wait until :attr:`is_armable`; TimeoutError after ``timeout`` seconds."""
@@ -347,19 +346,15 @@ class FlightMethods(VehicleAttributes):
 
         def is_there() -> bool:
             nonlocal start
-            now = self._dk_altitude(is_relative)
+            location = self.location
+            frame = location.global_relative_frame if is_relative else location.global_frame
+            now: float | None = frame.alt
             if now is None:
                 return False
             start = now if start is None else start
             return abs(now - alt) <= epsilon or (start < alt <= now) or (now <= alt < start)
 
         return is_there
-
-    def _dk_altitude(self, is_relative: bool) -> float | None:
-        location: Any = self.location  # type: ignore[attr-defined]
-        frame = location.global_relative_frame if is_relative else location.global_frame
-        altitude: float | None = frame.alt
-        return altitude
 
     def _dk_wait_for_order(
         self,
@@ -368,31 +363,21 @@ class FlightMethods(VehicleAttributes):
         timeout: float | None,
         text: str,
     ) -> None:
-        """Wait for the end of an order; that it failed is known before the time is over.
+        """Wait for what an order is to bring about; that it failed is known before the time is over.
 
         A program that stops waiting takes it for failed: it is not sent again then.
         """
+
+        def is_over() -> bool:
+            if is_done():
+                return True
+            if order.done() and order.exception() is not None and not is_done():
+                self._dk.check_link()
+                raise TimeoutError(f"{text}: {order.exception()}") from order.exception()
+            return False
+
         try:
-            self._dk_await_order(order, is_done, timeout, text)
+            self.wait_for(is_over, timeout, ORDERS_LOOK_S, text)
         except BaseException:
             self._handler.orders.withdraw(order)
             raise
-
-    def _dk_await_order(
-        self,
-        order: concurrent.futures.Future[None],
-        is_done: Callable[[], bool],
-        timeout: float | None,
-        text: str,
-    ) -> None:
-        deadline = math.inf if not timeout else time.monotonic() + timeout
-        while not is_done():
-            self._dk.check_link()
-            if order.done() and order.exception() is not None and not is_done():
-                raise TimeoutError(f"{text}: {order.exception()}") from order.exception()
-            if time.monotonic() >= deadline:
-                raise TimeoutError(text)
-            if order.done():
-                self._dk.pause(min(POLL_S, max(deadline - time.monotonic(), 0.0)))
-            else:
-                concurrent.futures.wait([order], min(POLL_S, max(deadline - time.monotonic(), 0.0)))

@@ -15,8 +15,6 @@ from aerokit.position import Position
 from aerokit.vehicle.state.gimbal import GimbalAttitude
 
 if TYPE_CHECKING:
-    from contextlib import ExitStack
-
     from aerokit.dronekit.core import VehicleCore
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
@@ -118,9 +116,8 @@ class Gimbal(GimbalPrivates):
 
     # ----------------------------------------------------------------------------- receiving
 
-    def _begin(self, ends: ExitStack) -> None:
-        told = self._core.aio.gimbal.attitude
-        ends.callback(told.observe(weakly(self._on_attitude), every_arrival=True))
+    def _begin(self) -> None:
+        self._core.aio.gimbal.attitude.observe(weakly(self._on_attitude), every_arrival=True)
 
     def _on_attitude(self, _: GimbalAttitude | None, attitude: GimbalAttitude) -> None:
         self._attitude = attitude

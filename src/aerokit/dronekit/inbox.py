@@ -54,13 +54,11 @@ class Inbox(Mapping[str, Any]):
         """
         self._start()
         end = None if timeout is None else time.monotonic() + timeout
-        while True:
-            frame = self._pop(end)
-            if frame is None:
-                return None
+        while (frame := self._pop(end)) is not None:
             message = message_of(frame)
             if (names is None or message.get_type() in names) and condition(message):
                 return message
+        return None
 
     def age_s(self, name: str) -> float:
         """Seconds since a message of this type came, or since the first question."""
@@ -73,12 +71,9 @@ class Inbox(Mapping[str, Any]):
     def __getitem__(self, name: str) -> Any:
         self._start()
         message_id = _id_of(name)
-        frame = self._latest.get(message_id)
-        while frame is None and self._waits():
+        while (frame := self._latest.get(message_id)) is None and self._waits():
             with self._came:
-                if message_id not in self._latest:
-                    self._came.wait(SLICE_S / 10)
-            frame = self._latest.get(message_id)
+                self._came.wait(SLICE_S / 10)
         if frame is None:
             raise KeyError(name)
         return message_of(frame)
@@ -97,7 +92,7 @@ class Inbox(Mapping[str, Any]):
         with self._came:
             is_first, self._started = self._started is None, self._started or time.monotonic()
         if is_first:
-            loop, tap = self._connection.loop, self._connection.tap
+            loop, tap = self._connection.loop, self._connection.connection.tap
             if loop.is_current:
                 tap(weakly(self._take))
             else:

@@ -31,15 +31,17 @@ class ListenerThread:
         self._calls: queue.SimpleQueue[tuple[Callable[..., object], tuple[Any, ...]]] = queue.SimpleQueue()
         self._thread: threading.Thread | None = None
         self._lock = threading.Lock()
-        self._is_stopped = False
-        self._dropped = 0
+        self.is_stopped = False
+        """Whether nothing is called any more."""
+        self.dropped = 0
+        """How many calls were dropped because a listener did not come back."""
         self._kept: dict[int, object] = {}
 
     def post(self, function: Callable[..., object], *args: Any) -> None:
         """Have ``function(*args)`` called; from any thread, never blocks. Nothing happens once it is stopped."""
         if self._thread is None:
             self._start()
-        if not self._is_stopped:
+        if not self.is_stopped:
             self._calls.put((function, args))
 
     def offer(self, function: Callable[..., object], *args: Any) -> None:
@@ -47,9 +49,9 @@ class ListenerThread:
         if self._calls.qsize() < MOST_WAITING:
             self.post(function, *args)
             return
-        if not self._dropped:
+        if not self.dropped:
             logger.warning("a listener does not come back; values are dropped that it would be told of")
-        self._dropped += 1
+        self.dropped += 1
 
     def call(self, function: Callable[..., object], *args: Any) -> None:
         """Have it called, and wait until it was: at once on this thread itself and when the thread has ended.
@@ -57,7 +59,7 @@ class ListenerThread:
         Not waited for on the threads of event loops and of other listeners, which callbacks may be waiting for, and for
         two seconds at most elsewhere: the caller may hold what a callback wants.
         """
-        if self.is_current or self._is_stopped:
+        if self.is_current or self.is_stopped:
             function(*args)
             return
         if _must_not_wait():
@@ -79,30 +81,20 @@ class ListenerThread:
 
     def keep(self, owner: object, *, has_listeners: bool) -> None:
         """Keep an object for as long as it has listeners: a program may have nothing else of it any more."""
-        if has_listeners and not self._is_stopped:
+        if has_listeners and not self.is_stopped:
             self._kept[id(owner)] = owner
         else:
             self._kept.pop(id(owner), None)
-
-    @property
-    def is_stopped(self) -> bool:
-        """Whether nothing is called any more."""
-        return self._is_stopped
 
     @property
     def is_current(self) -> bool:
         """Whether the caller is on this thread."""
         return threading.current_thread() is self._thread
 
-    @property
-    def dropped(self) -> int:
-        """How many calls were dropped because a listener did not come back."""
-        return self._dropped
-
     def stop(self) -> None:
         """Call nothing more. Idempotent; never blocks."""
         with self._lock:
-            self._is_stopped = True
+            self.is_stopped = True
         self._kept.clear()
         self._calls.put((_nothing, ()))
 
@@ -113,19 +105,19 @@ class ListenerThread:
 
     def _start(self) -> None:
         with self._lock:
-            if self._thread is None and not self._is_stopped:
+            if self._thread is None and not self.is_stopped:
                 thread = _Thread(target=self._run, name=self._name, daemon=True)
                 try:
                     thread.start()
                 except RuntimeError:  # the interpreter is ending: there is nobody left to be called
-                    self._is_stopped = True
+                    self.is_stopped = True
                 else:
                     self._thread = thread
 
     def _run(self) -> None:
         while True:
             function, args = self._calls.get()
-            if self._is_stopped:
+            if self.is_stopped:
                 return
             try:
                 function(*args)

@@ -48,12 +48,10 @@ class Maintenance(VehicleCore):
         self._dk_calibrate(MavCmd.PREFLIGHT_CALIBRATION, 0, 0, 0, 0, 4 if simple else 1)
 
     def _dk_calibrate(self, command: int, *params: float) -> None:
-        self._dk.order(
+        self._dk.command(
             "calibration",
-            self._dk.check_link().command,
             command,
             *params,
-            component_id=0,
             attempts=CALIBRATION_ATTEMPTS,
             attempt_timeout=CALIBRATION_S,
             progress_timeout=CALIBRATION_S,
@@ -79,15 +77,8 @@ class Maintenance(VehicleCore):
 
     def reboot(self) -> None:
         """Reboot the autopilot. It is away for some seconds, and then boots anew. Refused while it is armed."""
-        self._dk.order(
-            "reboot",
-            self._dk.check_link().command,
-            MavCmd.PREFLIGHT_REBOOT_SHUTDOWN,
-            1,
-            component_id=0,
-            attempts=REBOOT_ATTEMPTS,
-            attempt_timeout=REBOOT_S,
-        )
+        shutdown = MavCmd.PREFLIGHT_REBOOT_SHUTDOWN
+        self._dk.command("reboot", shutdown, 1, attempts=REBOOT_ATTEMPTS, attempt_timeout=REBOOT_S)
 
     def send_capabilities_request(self, vehicle: Any, name: str, m: Any) -> None:
         """Ask for AUTOPILOT_VERSION once. Has the arguments of a message listener, and uses none of them."""

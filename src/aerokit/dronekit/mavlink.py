@@ -3,53 +3,42 @@
 from __future__ import annotations
 
 import asyncio
-import atexit
 import contextlib
-import functools
 import logging
 import queue
-import threading
 import time
 import weakref
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from aerokit.dronekit.exceptions import APIException
-from aerokit.dronekit.listener_thread import ListenerThread
-from aerokit.dronekit.mav_writer import MAVWriter
-from aerokit.dronekit.orders import Orders
-from aerokit.dronekit.weakly import weakly
+from aerokit.dronekit.line import Line
 from aerokit.errors import AerokitError, ConnectionClosed, LinkOpenError, LocalProtocolError
 from aerokit.links.address import ACCEPTED_FORMS, parse_address
 from aerokit.links.reconnecting import ReconnectingLink
-from aerokit.runtime.components import is_autopilot
 from aerokit.runtime.opening import open_connection
 from aerokit.sync.loop_thread import LoopThread
 
 if TYPE_CHECKING:
-    from aerokit.dronekit.line import Steered
     from aerokit.dronekit.master import Master
     from aerokit.links.link import Peer
     from aerokit.mavlink.frame import Frame
-    from aerokit.mavlink.message import Message
-    from aerokit.runtime.bus import Detach
     from aerokit.runtime.connection import Connection
     from aerokit.sync.loop_thread import Held
 
-__all__ = ["MAVConnection", "MAVWriter", "mavudpin_multi"]
+__all__ = ["APIException", "MAVConnection", "MAVWriter", "mavudpin_multi"]
 
-logger, of_vehicles = logging.getLogger("dronekit.mavlink"), logging.getLogger("dronekit")
+logger = logging.getLogger("dronekit.mavlink")
 
 FunctionT = TypeVar("FunctionT", bound=Callable[..., object])
 
-ORDERS_END_S = 2.0
-"""How long closing waits for what was ordered a moment before to be answered."""
 TICK_S = 0.05
 ATTEMPTS, BETWEEN_ATTEMPTS_S = 3, 1.0
 
 
-class MAVConnection:
+class MAVConnection(Line):
     """A link, open until it is closed, with an event loop on a thread of its own.
 
     ``ip`` is any connection string of DroneKit and pymavlink (a bare ``host:port`` and ``udp:`` listen), or of aerokit.
@@ -70,77 +59,27 @@ class MAVConnection:
         source_component: int = 0,
         use_native: bool = False,
     ) -> None:
-        self.target_system = target_system
-        """System id of the vehicle, 0 before it was heard."""
-        self.listener_thread = ListenerThread()
-        """Where the callbacks of the program run."""
-        self.loop = LoopThread()
-        """The event loop's thread."""
-        self._held = _open(self.loop, ip, baud, source_system, source_component)
-        self.connection = self._held.value
-        """The asynchronous connection, for code that runs on its loop."""
-        self.orders = Orders(self.loop)
-        """What was ordered without waiting."""
-        self._is_closed = threading.Event()
-        self._closing = threading.Lock()
-        self._detach: list[Detach] = []
-        self.knows_mavlink_2 = False
-        """Whether the vehicle has said that it understands MAVLink 2, whichever version it speaks so far."""
-        self._at_close: list[Callable[[], object]] = []
-        self._master: Master | None = None
-        self.note_sent: Callable[[Message], None] = lambda message: None
-        """Is told what has been sent, on the loop's thread: what steers is a newer order."""
-        self.vehicle: Steered | None = None
-        """The vehicle of this connection, once there is one."""
+        loop = LoopThread()
+        super().__init__(ip, loop, _open(loop, ip, baud, source_system, source_component), target_system)
         self.loop_listeners: list[Callable[[MAVConnection], object]] = []
         """Functions that are called about 20 times a second; see :meth:`forward_loop`."""
         self.message_listeners: list[Callable[[MAVConnection, Any], object]] = []
         """Functions that get every message; see :meth:`forward_message`."""
-        self._at_exit = weakly(self.close)
-        atexit.register(self._at_exit)
-        self.loop.when_dropped(
-            functools.partial(_let_go, ip, self._at_exit, self.listener_thread, self._at_close)
-        )
         made = _made.get()
         if made is not None:
             made.add(self)
-
-    # ------------------------------------------------------------------------------- sending
-
-    def send(self, message: Message, *, to: int | None = None) -> None:
-        """Send a message, in the order of the calls; from any thread, never blocks.
-
-        Raises:
-            LocalProtocolError: a field is out of range; nothing was sent.
-            APIException: the connection is closed.
-        """
-        message.encode()  # so that what is wrong with it is told to who made it
-        try:
-            self.connection.raise_if_ended()
-            self.orders.post(self._send, message, to)
-        except AerokitError as error:
-            raise APIException(str(error)) from error
-
-    def _send(self, message: Message, to: int | None) -> None:
-        try:
-            self.connection.send(message, to=to)
-            self.note_sent(message)
-        except AerokitError as error:
-            logger.warning("%s was not sent: %s", message.NAME, error)
 
     def fix_targets(self, message: Any) -> None:
         """Write the vehicle's system id into ``message.target_system``, if the message has such a field."""
         if hasattr(message, "target_system"):
             message.target_system = self.target_system
 
-    @property
+    @cached_property
     def master(self) -> Master:
         """What DroneKit programs use of pymavlink's connection object."""
-        if self._master is None:
-            from aerokit.dronekit.master import Master
+        from aerokit.dronekit.master import Master
 
-            self._master = Master(self)
-        return self._master
+        return Master(self)
 
     # ----------------------------------------------------------------------------- receiving
 
@@ -151,7 +90,7 @@ class MAVConnection:
         """
         self.message_listeners.append(fn)
         if len(self.message_listeners) == 1:
-            self.loop.call_soon(self.tap, self._forward)
+            self.loop.call_soon(self.connection.tap, self._forward)
         return fn
 
     def forward_loop(self, fn: FunctionT) -> FunctionT:
@@ -164,8 +103,8 @@ class MAVConnection:
     def pipe(self, target: MAVConnection) -> MAVConnection:
         """Pass everything on that comes here to ``target``, and the other way round; returns ``target``."""
         target.target_system = self.target_system
-        self.loop.call_soon(self.tap, lambda frame, peer: target.pass_on(frame))
-        target.loop.call_soon(target.tap, lambda frame, peer: self.pass_on(frame))
+        self.loop.call_soon(self.connection.tap, lambda frame, peer: target.pass_on(frame))
+        target.loop.call_soon(target.connection.tap, lambda frame, peer: self.pass_on(frame))
         return target
 
     # ---------------------------------------------------------------------------- life cycle
@@ -183,41 +122,6 @@ class MAVConnection:
     def stop_threads(self) -> None:
         """As :meth:`close`."""
         self.close()
-
-    def close(self) -> None:
-        """Wait shortly for the answers to what was ordered, then close the link and end the threads.
-
-        Idempotent; from any thread, callbacks included, at the interpreter's exit and after the link was lost.
-        """
-        with self._closing:
-            if self._is_closed.is_set():
-                return
-            self._is_closed.set()
-        atexit.unregister(self._at_exit)
-        try:
-            self.orders.wait(ORDERS_END_S)
-        finally:
-            self.listener_thread.stop()
-            try:
-                self._held.close()
-            finally:
-                self.loop.close()
-            self.listener_thread.join()
-            for function in self._at_close:
-                function()
-
-    def on_close(self, function: Callable[[], object]) -> None:
-        """Have a function called when the connection is closed."""
-        self._at_close.append(function)
-
-    def wait_closed(self, timeout: float) -> bool:
-        """Wait at most ``timeout`` seconds for the connection to be closed by the program; says whether it is."""
-        return self._is_closed.wait(timeout)
-
-    @property
-    def is_closed(self) -> bool:
-        """Whether it was closed by the program."""
-        return self._is_closed.is_set()
 
     @property
     def _alive(self) -> bool:
@@ -250,34 +154,25 @@ class MAVConnection:
 
     # ------------------------------------------------------------------------------- inside
 
-    def tap(self, sink: Callable[[Frame, Peer], None]) -> None:
-        """Have a function called with every frame that comes, until the connection is closed (loop thread)."""
-        self._detach.append(self.connection.tap(sink))
-
     def _forward(self, frame: Frame, peer: Peer) -> None:
         self.listener_thread.offer(self._deliver, frame)
 
     def _deliver(self, frame: Frame) -> None:
         from aerokit.dronekit.pymavlink_messages import message_of
 
-        message = message_of(frame)
-        for listener in tuple(self.message_listeners):
-            self._call(listener, message)
+        self._call(self.message_listeners, message_of(frame))
 
     def _tick(self) -> None:
         if self.connection.is_open:
-            self.listener_thread.offer(self._tell_loop_listeners)
+            self.listener_thread.offer(self._call, self.loop_listeners)
             asyncio.get_running_loop().call_later(TICK_S, self._tick)
 
-    def _tell_loop_listeners(self) -> None:
-        for listener in tuple(self.loop_listeners):
-            self._call(listener)
-
-    def _call(self, listener: Callable[..., object], *args: Any) -> None:
-        try:
-            listener(self, *args)
-        except BaseException:
-            logger.exception("Exception in a listener of the connection")
+    def _call(self, listeners: list[Callable[..., object]], *args: Any) -> None:
+        for listener in tuple(listeners):
+            try:
+                listener(self, *args)
+            except BaseException:
+                logger.exception("Exception in a listener of the connection")
 
     def pass_on(self, frame: Frame) -> None:
         """Write a frame as it is; from any thread, silent when the connection is closed."""
@@ -287,35 +182,6 @@ class MAVConnection:
     def _write_raw(self, frame: Frame) -> None:
         with contextlib.suppress(AerokitError):
             self.connection.write_raw(frame.raw)
-
-    def is_of_another_vehicle(self, system_id: int) -> bool:
-        """Whether this system has an autopilot of its own and is not the connected vehicle."""
-        heard = self.connection.heard
-        return system_id != self.target_system and any(
-            source[0] == system_id and is_autopilot(heartbeat) for source, heartbeat in heard.items()
-        )
-
-    def follow_version(self, heartbeat: Message) -> None:
-        """Speak the version of MAVLink that the vehicle speaks: old firmware knows no other one (loop thread)."""
-        frame = heartbeat.received_frame
-        if frame is not None:
-            version = 2 if self.knows_mavlink_2 else frame.version
-            if version != self.connection.mavlink_version:
-                self.connection.mavlink_version = version
-
-
-def _let_go(
-    address: str,
-    at_exit: Callable[[], None],
-    listener_thread: ListenerThread,
-    at_close: list[Callable[[], object]],
-) -> None:
-    """On the loop, which ends then: nobody can reach the connection any more, or has anything called by it."""
-    of_vehicles.warning("the vehicle at %s is closed: the program has dropped it without close()", address)
-    atexit.unregister(at_exit)
-    listener_thread.stop()
-    for function in at_close:
-        function()
 
 
 _made: ContextVar[weakref.WeakSet[MAVConnection] | None] = ContextVar("connections_made", default=None)
@@ -385,3 +251,22 @@ def _raise_classic(error: LinkOpenError) -> NoReturn:
 def mavudpin_multi(device: str, baud: int | None = None, **_: Any) -> MAVConnection:
     """Listen for UDP and answer everybody heard: any connection that listens does."""
     return MAVConnection(f"udpin:{device}")
+
+
+class MAVWriter:
+    """A file-like object whose ``write`` puts bytes into a queue, as programs that build their own MAVLink use it."""
+
+    def __init__(self, queue: queue.Queue[bytes]) -> None:
+        self.queue = queue
+
+    def write(self, pkt: bytes) -> None:
+        """Put them there."""
+        self.queue.put(pkt)
+
+    def read(self) -> NoReturn:
+        """Nothing can be read.
+
+        Raises:
+            RuntimeError: always.
+        """
+        raise RuntimeError("a MAVWriter is for writing")

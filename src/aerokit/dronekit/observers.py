@@ -5,12 +5,13 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
     from aerokit.dronekit.listener_thread import ListenerThread
 
-__all__ = ["AttributeListener", "HasObservers", "ListenerT", "Listeners"]
+__all__ = ["EVERY_NAME", "AttributeListener", "HasObservers", "ListenerT", "Listeners", "decorator_of"]
 
 logger = logging.getLogger("dronekit")
 
@@ -20,6 +21,7 @@ AttributeListener = Callable[[Any, str, Any], object]
 ListenerT = TypeVar("ListenerT", bound=AttributeListener)
 
 EVERY_NAME = "*"
+"""Who listens to it listens to all of them."""
 
 _changing = threading.Lock()
 """Held while listeners are added and removed."""
@@ -30,20 +32,16 @@ class Listeners:
 
     Listeners run on the listener thread, in the order in which values came, those of a name before those of ``'*'``;
     they may block, raise, remove themselves and call whatever blocks. Without a listener thread they run on the thread
-    that tells. ``on_value(name)`` is called for every value, whoever listens, ``on_change()`` when listeners have come
-    or gone; ``kind`` is what the log calls them.
+    that tells. ``on_value(name)`` is called for every value, whoever listens.
     """
 
+    kind = "attribute"
+    """What the log calls it."""
+
     def __init__(
-        self,
-        owner: object,
-        thread: ListenerThread | None,
-        on_value: Callable[[str], None] | None = None,
-        on_change: Callable[[], None] | None = None,
-        kind: str = "attribute",
+        self, owner: object, thread: ListenerThread | None, on_value: Callable[[str], None] | None = None
     ) -> None:
-        self._owner, self._thread, self._kind = owner, thread, kind
-        self._on_value, self._on_change = on_value, on_change
+        self._owner, self._thread, self._on_value = owner, thread, on_value
         self.by_name: dict[str, tuple[AttributeListener, ...]] = {}
         self.told: dict[str, Any] = {}
         """The last values of attributes that are told when they change."""
@@ -56,7 +54,6 @@ class Listeners:
                 return
             self.by_name[name] = (*present, listener)
             self._stay()
-        self._review()
 
     def remove(self, name: str, listener: AttributeListener) -> None:
         """Call it no more; ValueError when others listen to the name, but this one does not."""
@@ -72,46 +69,36 @@ class Listeners:
             else:
                 del self.by_name[name]
                 self._stay()
-        self._review()
 
     def heed(self, name: str) -> bool:
         """Whether somebody listens to this attribute."""
         return name in self.by_name or EVERY_NAME in self.by_name
 
-    def tell(self, name: str, value: Any, cache: bool = False) -> None:
-        """Tell a value without waiting, for the loop thread; with ``cache`` only when it is not the one told before."""
+    def tell(self, name: str, value: Any, cache: bool = False, *, waits: bool = False) -> None:
+        """Tell a value; with ``cache`` only when it is not the one told before.
+
+        Waits for nobody, and may be dropped when it comes again anyway; with ``waits`` it returns when the listeners
+        have run.
+        """
         if cache and self._is_told(name, value):
             return
         if self._on_value is not None:
             self._on_value(name)
-        if self.by_name and self.heed(name):
-            self.offer(name, value, comes_again=not cache)
+        if not self.heed(name):
+            return
+        thread = self._thread
+        if thread is None:
+            self.deliver(name, value)
+        else:
+            hand_over = thread.call if waits else thread.post if cache else thread.offer
+            hand_over(self.deliver, name, value)
 
     def announce(self, name: str) -> None:
         """As :meth:`tell`; the value is the owner's attribute, which is read only when somebody listens."""
-        if self._on_value is not None:
-            self._on_value(name)
         if self.heed(name):
-            self.offer(name, getattr(self._owner, name))
-
-    def offer(self, name: str, value: Any, *, comes_again: bool = True) -> None:
-        """Have the listeners called; what comes again anyway may be dropped."""
-        if self._thread is None:
-            self.deliver(name, value)
-        else:
-            (self._thread.offer if comes_again else self._thread.post)(self.deliver, name, value)
-
-    def notify(self, name: str, value: Any, cache: bool) -> None:
-        """As :meth:`tell`, and return when the listeners have run."""
-        if cache and self._is_told(name, value):
-            return
-        if self._on_value is not None:
+            self.tell(name, attrgetter(name)(self._owner))
+        elif self._on_value is not None:
             self._on_value(name)
-        if self.heed(name):
-            if self._thread is None:
-                self.deliver(name, value)
-            else:
-                self._thread.call(self.deliver, name, value)
 
     def deliver(self, attr_name: str, value: Any) -> None:
         """Call the listeners, those that are there by now, where the caller is."""
@@ -122,7 +109,7 @@ class Listeners:
                 except (
                     BaseException
                 ):  # sys.exit() too: it would end the callbacks of everybody, and nothing else
-                    logger.exception("Exception in %s handler for %s", self._kind, attr_name)
+                    logger.exception("Exception in %s handler for %s", self.kind, attr_name)
 
     def _is_told(self, name: str, value: Any) -> bool:
         """Whether this was the last value told; if not, it is now."""
@@ -136,9 +123,18 @@ class Listeners:
         if self._thread is not None:
             self._thread.keep(self, has_listeners=bool(self.by_name))
 
-    def _review(self) -> None:
-        if self._on_change is not None:
-            self._on_change()
+
+def decorator_of(
+    add: Callable[[str, AttributeListener], object], name: str | list[str] | tuple[str, ...]
+) -> Callable[[ListenerT], ListenerT]:
+    """What adds the function it decorates under a name, or several."""
+
+    def decorate(listener: ListenerT) -> ListenerT:
+        for each in (name,) if isinstance(name, str) else name:
+            add(each, listener)
+        return listener
+
+    return decorate
 
 
 class HasObservers:
@@ -170,17 +166,11 @@ class HasObservers:
 
     def on_attribute(self, name: str | list[str] | tuple[str, ...]) -> Callable[[ListenerT], ListenerT]:
         """Decorate a listener with the name, or the list of names, it listens to. It cannot be removed by name then."""
-
-        def decorate(listener: ListenerT) -> ListenerT:
-            for each in (name,) if isinstance(name, str) else name:
-                self.add_attribute_listener(each, listener)
-            return listener
-
-        return decorate
+        return decorator_of(self.add_attribute_listener, name)
 
     def notify_attribute_listeners(self, attr_name: str, value: Any, cache: bool = False) -> None:
         """Tell the listeners of an attribute its value; with ``cache`` only when it is not the one told before.
 
         Call it from message listeners for attributes of your own. Returns when the listeners have run.
         """
-        self._dk_listeners.notify(attr_name, value, cache)
+        self._dk_listeners.tell(attr_name, value, cache, waits=True)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import asyncio
 import concurrent.futures
 import contextlib
+import functools
 import logging
-import threading
 from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any
 
@@ -33,10 +33,8 @@ class Orders:
 
     def __init__(self, loop: LoopThread) -> None:
         self._loop = loop
-        self._tasks: dict[str, asyncio.Task[None]] = {}
-        self._running: dict[concurrent.futures.Future[None], asyncio.Task[None]] = {}
+        self._newest: dict[str, tuple[concurrent.futures.Future[None], asyncio.Task[None]]] = {}
         self._pending: set[concurrent.futures.Future[None]] = set()
-        self._lock = threading.Lock()
         self.describe: Callable[[], str] | None = None
         """What to say of the vehicle when it has refused an order."""
 
@@ -47,13 +45,9 @@ class Orders:
             ConnectionClosed: the connection was closed.
         """
         future: concurrent.futures.Future[None] = concurrent.futures.Future()
-        with self._lock:
-            self._pending.add(future)
-        future.add_done_callback(self._forget)
-
-        async def work() -> None:
-            await function(*args, **kwargs)
-
+        self._pending.add(future)
+        future.add_done_callback(self._pending.discard)
+        work = functools.partial(function, *args, **kwargs)
         try:
             self._loop.call_soon(self._begin, kind, work, future)
         except ConnectionClosed:
@@ -71,39 +65,36 @@ class Orders:
         if self._loop.is_current:
             function(*args)
         else:
-            self._loop.call_soon(self._call_next, function, *args)
+            self._loop.call_soon(_call_next, function, *args)
 
     def wait(self, timeout: float) -> None:
         """Wait until all that were given have ended, at most so many seconds."""
-        with self._lock:
-            pending = tuple(self._pending)
+        pending = self._pending.copy()
         if pending and not self._loop.is_current:
             concurrent.futures.wait(pending, timeout)
 
     # ------------------------------------------------------------------------------- inside
 
     def _begin(
-        self, kind: str, work: Callable[[], Awaitable[None]], future: concurrent.futures.Future[None]
+        self, kind: str, work: Callable[[], Awaitable[object]], future: concurrent.futures.Future[None]
     ) -> None:
         place = REPLACES.get(kind, kind)
-        before = self._tasks.get(place)
-        if before is not None:
-            before.cancel()
+        if place in self._newest:
+            self._newest[place][1].cancel()
         if not future.set_running_or_notify_cancel():
             return
         task = asyncio.get_running_loop().create_task(self._run(work, future, kind), name=f"dronekit {kind}")
-        self._tasks[place] = self._running[future] = task
-        task.add_done_callback(lambda ended: self._end(place, ended, future))
+        self._newest[place] = future, task
+        task.add_done_callback(lambda _: self._end(place, future))
 
     def _withdraw(self, order: concurrent.futures.Future[None]) -> None:
-        task = self._running.get(order)
-        if task is not None:
-            task.cancel()
+        for future, task in self._newest.values():
+            if future is order:
+                task.cancel()
 
-    def _end(self, kind: str, task: asyncio.Task[None], future: concurrent.futures.Future[None]) -> None:
-        self._running.pop(future, None)
-        if self._tasks.get(kind) is task:
-            del self._tasks[kind]
+    def _end(self, kind: str, future: concurrent.futures.Future[None]) -> None:
+        if kind in self._newest and self._newest[kind][0] is future:
+            del self._newest[kind]
         if not future.done():  # it was cancelled before its first step, or while it waited
             future.set_exception(
                 ConnectionClosed(
@@ -112,28 +103,21 @@ class Orders:
             )
 
     async def _run(
-        self, work: Callable[[], Awaitable[None]], future: concurrent.futures.Future[None], kind: str
+        self, work: Callable[[], Awaitable[object]], future: concurrent.futures.Future[None], kind: str
     ) -> None:
         try:
             await work()
         except Exception as error:
             if not isinstance(error, ConnectionClosed):
                 text = str(error)  # who keeps log records keeps no frames, and so no vehicle
-                logger.warning("%s: %s%s", kind, text, self._state_at(error))
+                if isinstance(error, CommandRejected) and self.describe is not None:
+                    text += f" ({self.describe()})"  # most refusals are for what the vehicle does not say
+                logger.warning("%s: %s", kind, text)
             future.set_exception(error)
         else:
             future.set_result(None)
 
-    def _state_at(self, error: Exception) -> str:
-        """Most refusals are for not being armed, or for the mode: which the vehicle does not say."""
-        if self.describe is None or not isinstance(error, CommandRejected):
-            return ""
-        return f" ({self.describe()})"
 
-    def _call_next(self, function: Callable[..., object], *args: Any) -> None:
-        """In the turn in which tasks begun before take their first step."""
-        asyncio.get_running_loop().call_soon(function, *args)
-
-    def _forget(self, future: concurrent.futures.Future[None]) -> None:
-        with self._lock:
-            self._pending.discard(future)
+def _call_next(function: Callable[..., object], *args: Any) -> None:
+    """In the turn in which tasks begun before take their first step."""
+    asyncio.get_running_loop().call_soon(function, *args)

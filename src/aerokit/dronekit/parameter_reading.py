@@ -53,9 +53,8 @@ class ParameterReading:
 
     def seek(self) -> None:
         """As :meth:`begin`, from any thread; silent when the connection is closed."""
-        if self._ended is None and not self.is_complete:
-            with contextlib.suppress(AerokitError):
-                self._core.handler.orders.post(self.begin)
+        with contextlib.suppress(AerokitError):
+            self._core.handler.orders.post(self.begin)
 
     async def find(self, name: str) -> None:
         """Return when the parameter has come, by itself or with the list, or when it is certain that there is none."""

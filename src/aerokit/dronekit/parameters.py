@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, ItemsView, Iterator, KeysView, MutableMapping, ValuesView
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, MutableMapping
 from typing import TYPE_CHECKING, Any
 
 import anyio
@@ -12,8 +11,8 @@ from aerokit.dronekit.core import core_of
 from aerokit.dronekit.exceptions import APIException, TimeoutError  # noqa: A004 - DroneKit's name
 from aerokit.dronekit.observers import AttributeListener, HasObservers, ListenerT
 from aerokit.dronekit.parameter_reading import ParameterReading
-from aerokit.dronekit.parameter_set import number_of, set_parameter
-from aerokit.dronekit.parameter_values import ParameterValues
+from aerokit.dronekit.parameter_values import ParameterValues, number_of, set_parameter
+from aerokit.dronekit.python2 import Python2Mapping
 from aerokit.dronekit.weakly import weakly
 from aerokit.errors import LocalProtocolError, ParameterTimeout
 from aerokit.mavlink.messages import ParamValue
@@ -23,7 +22,7 @@ from aerokit.vehicle.parameters.names import warn_of_rename
 
 if TYPE_CHECKING:
     from aerokit.dronekit.core import VehicleCore
-    from aerokit.parameters import Parameter, ParameterTable
+    from aerokit.parameters import ParameterTable
     from aerokit.vehicle.parameters.names import Found
 
 __all__ = ["Parameters"]
@@ -32,7 +31,7 @@ READY_S = 30.0
 """How long reading waits."""
 
 
-class Parameters(MutableMapping[str, float], HasObservers):
+class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers):
     """Name → value: ``vehicle.parameters['RTL_ALT']``, ``vehicle.parameters['RTL_ALT'] = 30``.
 
     Names are upper-cased, values are floats. The list is downloaded in the background from the moment at which the
@@ -81,7 +80,8 @@ class Parameters(MutableMapping[str, float], HasObservers):
         found = self._find(name, waits=bool(wait_ready))
         if found is None:
             return default
-        _warn(found)
+        if found.renamed is not None:
+            warn_of_rename(found.renamed)
         return float(found.in_terms_asked(found.parameter).value)
 
     def __contains__(self, name: object) -> bool:
@@ -91,43 +91,9 @@ class Parameters(MutableMapping[str, float], HasObservers):
         return len(self._values)
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self.all_values())
-
-    def items(self) -> ItemsView[str, float]:
-        """Names and values; iterating waits for the download, and goes through what is known then."""
-        return _Items(self)
-
-    def values(self) -> ValuesView[float]:
-        """Values; iterating waits for the download, and goes through what is known then."""
-        return _Values(self)
-
-    def iteritems(self) -> Iterator[tuple[str, float]]:
-        """As ``iter(items())``, for programs from the days of Python 2."""
-        return iter(self.items())
-
-    def iterkeys(self) -> Iterator[str]:
-        """As ``iter(keys())``."""
-        return iter(self)
-
-    def itervalues(self) -> Iterator[float]:
-        """As ``iter(values())``."""
-        return iter(self.values())
-
-    def viewitems(self) -> ItemsView[str, float]:
-        """As :meth:`items`."""
-        return self.items()
-
-    def viewkeys(self) -> KeysView[str]:
-        """As ``keys()``."""
-        return self.keys()
-
-    def viewvalues(self) -> ValuesView[float]:
-        """As :meth:`values`."""
-        return self.values()
-
-    def has_key(self, name: str) -> bool:
-        """As ``name in parameters``."""
-        return name in self
+        if not self._reading.is_complete:
+            self.wait_ready()
+        return iter(self._values.copy())
 
     def wait_ready(self, **kwargs: Any) -> None:
         """Wait until all parameters are there: arguments as of ``Vehicle.wait_ready``.
@@ -172,10 +138,10 @@ class Parameters(MutableMapping[str, float], HasObservers):
         if wait_ready:
             self.wait_ready()
         found = self._values.find(name)
-        own, told = name, number
-        if found is not None:
-            own, told = found.name, _told(found, number)
-            _warn(found)
+        own, told = name if found is None else found.name, number
+        if found is not None and found.renamed is not None:
+            told = found.renamed.to_vehicle(number)  # not rounded: integers are made of fractions in one way
+            warn_of_rename(found.renamed)
         core = self._core
         if retries <= 0:
             core.order(f"parameter {own}", set_parameter, core.aio, own, told, 0)
@@ -240,73 +206,36 @@ class Parameters(MutableMapping[str, float], HasObservers):
         """What is known now, without waiting."""
         return self._values.copy()
 
-    def all_values(self) -> dict[str, float]:
-        """All of them; waits for the download."""
-        if not self._reading.is_complete:
-            self.wait_ready()
-        return self._values.copy()
-
-    def _start(self, ends: ExitStack) -> None:
-        bus = self._core.aio.connection.bus
-        ends.callback(bus.attach_event(ParameterChanged, weakly(self._on_changed)))
+    def _start(self) -> None:
+        self._core.aio.connection.bus.attach_event(ParameterChanged, weakly(self._on_changed))
         self._reading.begin()
 
     def _on_value(self, message: ParamValue) -> None:
         """The table underneath has taken it already: there, integers are what they are."""
         self._count = message.param_count
-        told = self._core.aio.parameters.known(message.param_id)
-        if told is not None:
-            self._take(told)
+        self._take(message.param_id)
 
     def _on_changed(self, event: ParameterChanged) -> None:
         """Also by a download that a program has begun by itself."""
-        told = self._core.aio.parameters.known(event.name)
-        if event.system_id == self._core.target_system and told is not None:
-            self._take(told)
+        if event.system_id == self._core.target_system:
+            self._take(event.name)
 
-    def _take(self, told: Parameter) -> None:
-        if self._values.take(told):
+    def _take(self, name: str) -> None:
+        told = self._core.aio.parameters.known(name)
+        if told is not None and self._values.take(told):
             self._dk_listeners.tell(told.name.upper(), float(told.value), cache=True)
 
     def _take_all(self, table: ParameterTable) -> None:
-        news = self._values.replace(table)
-        if self._attribute_listeners:
-            for name, value in news.items():
-                self._dk_listeners.tell(name.upper(), value, cache=True)
-        else:
-            self._attribute_cache.update(news)
+        for name in table:
+            self._take(name)
         self._reading.is_complete = True
         self._core.listeners.tell("parameters", self)
-
-
-class _Items(ItemsView[str, float]):
-    _mapping: Parameters
-
-    def __iter__(self) -> Iterator[tuple[str, float]]:
-        return iter(self._mapping.all_values().items())
-
-
-class _Values(ValuesView[float]):
-    _mapping: Parameters
-
-    def __iter__(self) -> Iterator[float]:
-        return iter(self._mapping.all_values().values())
 
 
 def _upper(name: str) -> str:
     if not isinstance(name, str):
         raise LocalProtocolError(f"parameter name = {name!r} is no text")
     return name.upper()
-
-
-def _warn(found: Found) -> None:
-    if found.renamed is not None:
-        warn_of_rename(found.renamed)
-
-
-def _told(found: Found, number: float) -> float:
-    """A number in the vehicle's unit, not rounded: how integers are made of fractions is the same for all names."""
-    return number if found.renamed is None else found.renamed.to_vehicle(number)
 
 
 def _described(name: str) -> str:

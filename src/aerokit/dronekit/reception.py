@@ -1,110 +1,88 @@
-"""Streamed messages as attributes: a frame is kept, and made a message of when the attribute is read or listened to."""
+"""What the autopilot said last: a frame is kept, and made a message of when somebody reads it or listens to it."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Generic, TypeVar, overload
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
+from aerokit.dronekit.observers import EVERY_NAME
 from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.message import Message
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable
 
-__all__ = ["Latest", "Stream"]
+    from aerokit.dronekit.observers import Listeners
+
+__all__ = ["Latest"]
 
 MessageT = TypeVar("MessageT", bound=Message)
 
 
 class Latest(Generic[MessageT]):
-    """An attribute of a class that is the latest message of a kind, or None before the first.
+    """The latest message of a kind that the autopilot sent, and who is given each of them.
 
-    What is assigned is the message, or its frame: then the message is made by the first who reads it, on any thread.
+    ``ready`` are the names of what was told at least once, ``listeners`` those of the vehicle.
     """
 
-    def __init__(self, message_type: type[MessageT]) -> None:
-        self.message_type = message_type
+    def __init__(self, message_type: type[MessageT], ready: set[str], listeners: Listeners) -> None:
+        self._decode: Callable[[bytes, Frame], MessageT] = message_type.decode_body
+        self._ready = ready
+        self._listeners = [listeners]
+        self._names: set[str] = set()
+        self._handlers: list[Callable[[MessageT], object]] = []
+        self._held: Frame | MessageT | None = None
+        self._made: MessageT | None = None
+        self.component_id = 0
+        """Of the autopilot: nobody else counts."""
 
-    def __set_name__(self, owner: type, name: str) -> None:
-        self.key, self._made = f"{name} held", f"{name} made"  # no program's own attributes are called so
-
-    @overload
-    def __get__(self, instance: None, owner: type) -> Latest[MessageT]: ...
-
-    @overload
-    def __get__(self, instance: object, owner: type) -> MessageT | None: ...
-
-    def __get__(self, instance: object | None, owner: type) -> Latest[MessageT] | MessageT | None:
-        if instance is None:
-            return self
-        store = instance.__dict__
-        held: Any = store.get(self.key)
-        if held.__class__ is not Frame:
-            return held  # type: ignore[no-any-return]  # a message, or None
-        made: MessageT | None = store.get(self._made)
+    @property
+    def message(self) -> MessageT | None:
+        """The message, None before the first; made by the first who reads it, on any thread."""
+        held = self._held
+        if not isinstance(held, Frame):
+            return held
+        made = self._made
         if made is None or made.received_frame is not held:
-            made = store[self._made] = self.message_type.decode_body(held.body, held)
+            made = self._made = self._decode(held.body, held)
         return made
 
-    def __set__(self, instance: object, value: MessageT | Frame | None) -> None:
-        instance.__dict__[self.key] = value
+    def values(self, *fields: str) -> tuple[Any, ...]:
+        """Fields of one message, None before the first."""
+        message = self.message
+        return tuple([None if message is None else getattr(message, field) for field in fields])
 
-
-class Stream:
-    """One kind of message of a vehicle: keeps the latest frame; its handlers run while someone listens.
-
-    ``names`` are those that the handlers tell of; until each has been told once, they run in any case.
-    """
-
-    __slots__ = (
-        "__weakref__",
-        "_component_id",
-        "_decode",
-        "_handlers",
-        "_key",
-        "_names",
-        "_others",
-        "_store",
-        "is_heard",
-    )
-
-    def __init__(self, owner: object, attribute: Latest[Any], names: tuple[str, ...]) -> None:
-        self._store, self._key = owner.__dict__, attribute.key
-        self._decode: Callable[[bytes, Frame], Any] = attribute.message_type.decode_body
-        self._names = names
-        self._others: Mapping[str, object] = {}
-        self._handlers: list[Callable[[Any], None]] = []
-        self._component_id = 0
-        self.is_heard = True
-        """Whether the handlers run."""
-
-    def add(self, handler: Callable[[Any], None]) -> None:
-        """Have a handler called with the messages, after those added before."""
+    def add(
+        self, handler: Callable[[MessageT], object], names: tuple[str, ...], listeners: Listeners | None
+    ) -> None:
+        """Have a handler called, after those added before: with each message, or, with ``names``, only as long as not
+        all of them were told, or somebody listens to one of them, or has any of the other ``listeners``.
+        """
         self._handlers.append(handler)
+        self._names.update(names)
+        if listeners is not None:
+            self._listeners.append(listeners)
 
-    def heed_also(self, listeners: Mapping[str, object]) -> None:
-        """Run the handlers while there are any of these, too."""
-        self._others = listeners
-
-    def begin(self, component_id: int) -> None:
-        """Only messages of this component count."""
-        self._component_id = component_id
-
-    def take(self, frame: Frame) -> None:
-        """Take a frame of the vehicle's system (loop thread)."""
-        if frame.component_id != self._component_id:
+    def take(self, frame: Frame, message: MessageT | None = None) -> None:
+        """Take a frame of the vehicle's system (loop thread), and its message if that was made already."""
+        if frame.component_id != self.component_id:
             return
-        if not self.is_heard:
-            self._store[self._key] = frame
-            return
-        message = self._decode(frame.body, frame)
-        self._store[self._key] = message
+        if self._is_wanted():
+            self.receive(self._decode(frame.body, frame) if message is None else message)
+        else:
+            self._held = frame
+
+    def receive(self, message: MessageT) -> None:
+        """Keep it, and give it to the handlers."""
+        self._held = message
         for handler in self._handlers:
             handler(message)
 
-    def review(self, ready: set[str], listened: Mapping[str, object]) -> None:
-        """Who listens, or what has been told, has changed."""
-        self.is_heard = (
-            bool(self._others)
-            or "*" in listened
-            or any(name in listened or name not in ready for name in self._names)
-        )
+    def _is_wanted(self) -> bool:
+        names = self._names
+        if not names or not names <= self._ready:
+            return True
+        for each in self._listeners:
+            listened = each.by_name
+            if listened and (EVERY_NAME in listened or not names.isdisjoint(listened)):
+                return True
+        return False

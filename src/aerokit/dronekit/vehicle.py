@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
-import weakref
-from contextlib import ExitStack, asynccontextmanager
+from contextlib import asynccontextmanager, nullcontext
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -13,30 +12,23 @@ import anyio
 
 from aerokit.dronekit.channels import Channels
 from aerokit.dronekit.core import VehicleCore
-from aerokit.dronekit.current_command import CurrentCommand
 from aerokit.dronekit.exceptions import APIException, TimeoutError  # noqa: A004 - DroneKit's name
 from aerokit.dronekit.flight import FlightMethods
+from aerokit.dronekit.flight_orders import mode_name
 from aerokit.dronekit.gimbal import Gimbal
-from aerokit.dronekit.link_watch import watch_link
-from aerokit.dronekit.locations import Locations
 from aerokit.dronekit.maintenance import Maintenance
-from aerokit.dronekit.message_listeners import MessageListeners
-from aerokit.dronekit.message_methods import MessageMethods
-from aerokit.dronekit.modes import mode_name
+from aerokit.dronekit.message_listeners import MessageListeners, MessageMethods
 from aerokit.dronekit.parameters import Parameters
-from aerokit.dronekit.privates import VehiclePrivates
-from aerokit.dronekit.shadowable import Shadowable
+from aerokit.dronekit.privates import Shadowable, VehiclePrivates
 from aerokit.dronekit.weakly import weakly
 from aerokit.errors import AerokitError, ConnectFailed
 from aerokit.mavlink.enums import MavCmd
 from aerokit.mavlink.messages import CommandLong
 from aerokit.runtime.background import Background
-from aerokit.runtime.components import is_autopilot
 from aerokit.vehicle.connect import connect as connect_async
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable
-    from types import TracebackType
 
     from typing_extensions import Self
 
@@ -51,8 +43,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Vehicle"]
 
-MAVLINK_2 = 8192
-"""Bit of AUTOPILOT_VERSION.capabilities."""
 FIRST_VALUES = ("attitude", "location.global_relative_frame", "heading", "gps_0", "battery")
 FIRST_VALUES_S = 1.0
 """So long they are waited for: programs that read them as soon as they are connected expect values."""
@@ -77,21 +67,12 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, VehiclePrivates):
         self._dk_sync: sync.Vehicle | None = None
         self._dk_initializing = threading.Lock()
         self._message_listeners = MessageListeners(self, handler)
-        self._dk_make_streams()
-        self._location = Locations(self)
-        self._dk_attach_attributes()
         self._channels = Channels(self, 8)
         self._gimbal = Gimbal(self)
         self._parameters = Parameters(self)
-        self._dk_current_command = CurrentCommand(self._dk, lambda: self._armed)
         self._dk.ready.mark("commands")
 
     # --------------------------------------------------------------------------------- parts
-
-    @property
-    def location(self) -> Locations:
-        """Where it is: ``.global_frame``, ``.global_relative_frame``, ``.local_frame``."""
-        return self._location
 
     @property
     def channels(self) -> Channels:
@@ -190,7 +171,7 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, VehiclePrivates):
             APIException: no vehicle was heard in time; the text says what was heard instead.
         """
         with self._dk_initializing:
-            if self._dk.is_connected:
+            if self._dk.found is not None:
                 self._dk_wait_until_booted(timeout=max(heartbeat_timeout or 0.0, 0.0) or CONNECT_S)
                 return
             self._dk.heartbeat_limit_s = max(heartbeat_timeout or 0.0, 0.0)
@@ -217,12 +198,7 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, VehiclePrivates):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     @property
@@ -234,35 +210,20 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, VehiclePrivates):
 
     # ------------------------------------------------------------------------------- inside
 
-    def _dk_begin(self, aio: AsyncVehicle, tasks: Background, ends: ExitStack, rate: float | None) -> None:
+    def _dk_begin(self, aio: AsyncVehicle, tasks: Background) -> None:
         """On the loop, in the turn in which the vehicle was found; the loop gets weak references only."""
         core = self._dk
         core.begin(aio, tasks)
         self._handler.vehicle, self._handler.note_sent = self, aio.note_sent
         self._handler.orders.describe = self._dk_describe
-        core.hear(ends)
-        ends.callback(aio.telemetry.status_text.observe(weakly(self._dk_on_status_text), every_arrival=True))
+        aio.telemetry.status_text.observe(weakly(self._dk_on_status_text), every_arrival=True)
         first = aio.connection.heard.get((aio.system_id, aio.component_id))
         if first is not None:
-            self._handler.follow_version(first)
             self._dk_on_heartbeat(first)
         self._message_listeners.start()
-        if rate is not None:
-            ends.enter_context(aio.streams(min(rate, MOST_HZ) if rate > 0 else 1.0))
         core.background(lambda: _request_capabilities(aio))
-        weak_core = weakref.ref(core)
-        core.background(lambda: watch_link(weak_core, aio))
-        core.start_parts(ends)
-
-    def _dk_on_heartbeat(self, message: Any) -> None:
-        if not is_autopilot(message):  # a ground station or a companion that took the autopilot's ids
-            return
-        self._handler.follow_version(message)
-        super()._dk_on_heartbeat(message)
-
-    def _dk_on_version(self, message: Any) -> None:
-        self._handler.knows_mavlink_2 = bool(message.capabilities & MAVLINK_2)
-        super()._dk_on_version(message)
+        core.watch_link()
+        core.start_parts()
 
     def _dk_on_status_text(self, before: StatusText | None, text: StatusText) -> None:
         level = LEVELS[min(text.severity, len(LEVELS) - 1)]
@@ -288,9 +249,10 @@ async def _found(
     """Held open by the loop: nothing of the classic vehicle is in here."""
     async with connect_async(connection, timeout=timeout, rates={}) as aio:
         tasks = Background(connection.fail)
+        hz = None if rate is None else min(rate, MOST_HZ) if rate > 0 else 1.0
         try:
-            with ExitStack() as ends:
-                begin(aio, tasks, ends, rate)
+            begin(aio, tasks)
+            with nullcontext() if hz is None else aio.streams(hz):
                 yield aio
         finally:
             await tasks.aclose()
