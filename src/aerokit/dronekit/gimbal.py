@@ -123,9 +123,8 @@ class Gimbal(GimbalPrivates):
         self._attitude = attitude
         core = self._core
         source = core.aio.gimbal.attitude.source
-        if (
-            source is not None and source.message != "MOUNT_ORIENTATION"
-        ):  # which DroneKit does not tell as ``mount``
+        # DroneKit does not tell MOUNT_ORIENTATION as ``mount``
+        if source is not None and source.message != "MOUNT_ORIENTATION":
             core.listeners.tell("mount", self.mount_status)
         core.listeners.tell("gimbal", self)
 

@@ -106,9 +106,8 @@ class Listeners:
             for listener in self.by_name.get(name, ()):
                 try:
                     listener(self._owner, attr_name, value)
-                except (
-                    BaseException
-                ):  # sys.exit() too: it would end the callbacks of everybody, and nothing else
+                except BaseException:
+                    # sys.exit() too: it would end the callbacks of everybody, and nothing else
                     logger.exception("Exception in %s handler for %s", self.kind, attr_name)
 
     def _is_told(self, name: str, value: Any) -> bool:

@@ -107,9 +107,8 @@ class SerialLink(BaseLink):
             )
         except (OSError, ValueError, OverflowError) as error:
             raise _open_error(self.address, error) from error
-        except (
-            _TermiosError
-        ) as error:  # it vanished while it was being opened: pyserial lets this one through
+        except _TermiosError as error:
+            # it vanished while it was being opened: pyserial lets this one through
             failed = serial.SerialException(*error.args)
             failed.__cause__ = error
             raise _open_error(self.address, failed) from failed

@@ -154,9 +154,8 @@ class MissionUpload(MissionExchange[UploadEnd]):
     # ------------------------------------------------------------------------------- requests
 
     def _take_request(self, seq: int, now: float) -> None:
-        if (
-            seq > self._sent
-        ):  # left over from another transfer: nobody needs an item before he has the one before it
+        # left over from another transfer: nobody needs an item before he has the one before it
+        if seq > self._sent:
             return
         if not self._is_asked:
             self._is_asked = self.was_begun = True
@@ -313,8 +312,7 @@ class MissionUpload(MissionExchange[UploadEnd]):
 
     def _is_under_way(self, seq: int, now: float) -> bool:
         sent_at, round_trip_s = self._sent_at.get(seq), self.round_trip.smoothed_s
-        if (
-            round_trip_s is None
-        ):  # without any limit an item sent in vain would bring forth a window of others
+        # without any limit an item sent in vain would bring forth a window of others
+        if round_trip_s is None:
             round_trip_s = self.round_trip.timeout_s()
         return sent_at is not None and now - sent_at < STILL_UNDER_WAY * round_trip_s

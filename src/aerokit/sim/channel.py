@@ -68,9 +68,8 @@ class Channel:
             encoder.signing = self.signing
         try:
             return encoder.encode(message)
-        except (
-            LocalProtocolError
-        ):  # NaN of a parameter, a place beyond the world: whatever made it, vehicles go on
+        except LocalProtocolError:
+            # NaN of a parameter, a place beyond the world: whatever made it, vehicles go on
             return encoder.encode(fitted(message))
 
     def write(self, data: bytes) -> None:

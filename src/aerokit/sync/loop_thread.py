@@ -67,9 +67,8 @@ class LoopThread:
             atexit.register(self._calls.finish, self._thread)
         except (OSError, RuntimeError) as error:
             self._give_up()
-            if isinstance(
-                error.__context__, KeyboardInterrupt
-            ):  # Thread.start waits at a Condition: see Reply
+            # Thread.start waits at a Condition: see Reply
+            if isinstance(error.__context__, KeyboardInterrupt):
                 raise error.__context__ from None
             raise _not_started(error) from error
         except BaseException:

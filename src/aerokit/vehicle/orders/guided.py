@@ -332,9 +332,8 @@ class SetpointStream(Generic[SetpointT]):
             return f"the event loop was blocked for {lag:.1f} s"
         if age > self._valid_for_s:
             return f"no new set-point came for {age:.1f} s (valid_for_s = {self._valid_for_s:g})"
-        if (
-            self._talk.watch.is_silent and self._talk.connection.is_open
-        ):  # else sending tells what has ended it
+        # on a connection that has ended, sending tells why
+        if self._talk.watch.is_silent and self._talk.connection.is_open:
             return f"the vehicle has been silent for {self._talk.heartbeat_age:.1f} s"
         if self._mode is None or not wants_motion(self._setpoint, self._bridge):
             self._stillness = Stillness(self._talk)

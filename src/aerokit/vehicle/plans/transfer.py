@@ -179,9 +179,8 @@ class PlanTransfer(Generic[PlanT]):
         if autopilot.tells_mission_checksum:
             told = self._context.id_of(self._type, self._memory.learned_at)
             checksum = mission_checksum(items)
-            if told == checksum and await self._context.is_called(
-                self._type, checksum
-            ):  # still, not a moment ago
+            # still, not a moment ago
+            if told == checksum and await self._context.is_called(self._type, checksum):
                 return True
         if not autopilot.writes_partial_missions or not self._is_short(self._changes(items), len(items)):
             return False
