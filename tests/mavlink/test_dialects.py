@@ -126,6 +126,21 @@ def test_a_private_message_is_like_the_standards(private: Dialect) -> None:
     assert [name for name, field in fields.items() if field.extension] == ["history", "letter"]
 
 
+def test_fields_behind_one_that_the_standard_fills_in_are_given_by_name(tmp_path: Path) -> None:
+    """As mavlink_version is, which a private message may have in front."""
+    fields = "".join(
+        f'<field type="{kind}" name="{name}">N.</field>'
+        for kind, name in (("uint8_t_mavlink_version", "version"), ("uint8_t", "one"), ("uint8_t", "two"))
+    )
+    path = tmp_path / "versioned.xml"
+    path.write_text(f'<mavlink><messages><message id="7" name="MINE">{fields}</message></messages></mavlink>')
+    mine: Any = Dialect.from_xml(path)[7]
+    assert (mine(one=1, two=2).version, mine(4, one=1, two=2).version) == (3, 4)
+    assert mine(one=1, two=2).encode() == b"\3\1\2"
+    with pytest.raises(TypeError, match="positional argument"):
+        mine(3, 1, 2)
+
+
 def test_a_private_message_goes_over_the_wire(private: Dialect) -> None:
     message = winch(private, history=(0.5,) * 6, letter="x")
     raw = FrameEncoder(1, 1).encode(message)

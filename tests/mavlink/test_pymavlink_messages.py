@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
+import copy
+import math
+import random
 import subprocess
 import sys
+from decimal import Decimal
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
+from pymavlink.dialects.v10 import ardupilotmega as version_1
 from pymavlink.dialects.v20 import ardupilotmega, common, matrixpilot
+from wire_samples import random_message
 
 from aerokit.errors import LocalProtocolError
-from aerokit.mavlink import Frame, FrameEncoder, messages
+from aerokit.mavlink import Frame, FrameEncoder, Message, messages
 from aerokit.mavlink.from_pymavlink import from_pymavlink
+from aerokit.mavlink.signing import Signing, SigningKey
 from aerokit.mavlink.to_pymavlink import to_pymavlink
 
 ATTITUDE = Frame.parse(FrameEncoder(1, 1).encode(messages.Attitude(7, 0.5, 0.25, 1.0, 0.0, 0.0, 0.0)))
@@ -48,3 +57,137 @@ def test_what_the_standard_has_not_is_checked_by_the_programs_dialect() -> None:
     assert to_pymavlink(Frame.parse(bytes(raw)), dialect=matrixpilot).get_type() == "SERIAL_UDB_EXTRA_F21"
     raw[-1] ^= 1
     assert to_pymavlink(Frame.parse(bytes(raw)), dialect=matrixpilot).get_type().startswith("UNKNOWN")
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        messages.BatteryStatus,
+        messages.FileTransferProtocol,
+        messages.ParamValue,
+        messages.Statustext,
+        messages.GimbalDeviceAttitudeStatus,
+        messages.Wind,
+        messages.SystemTime,
+    ],
+)
+def test_arrays_and_texts_there_and_back(kind: type[Message]) -> None:
+    """Arrays of numbers, of bytes, texts, and messages with neither: all values, and a copy that is pymavlink's own."""
+    for how in ("zeros", "extremes", "random"):
+        message = random_message(kind, random.Random(7), how)
+        frame = Frame.parse(FrameEncoder(1, 1).encode(message))
+        theirs = to_pymavlink(frame)
+        assert from_pymavlink(theirs).encode() == message.encode()
+        whole = ardupilotmega.MAVLink(None).parse_char(frame.raw)
+        assert str(theirs) == str(whole)
+        assert (theirs.get_payload(), theirs.get_crc()) == (whole.get_payload(), whole.get_crc())
+        plain = copy.copy(theirs)
+        assert (plain.get_msgbuf(), plain.get_seq()) == (whole.get_msgbuf(), whole.get_seq())
+        assert not hasattr(plain, "_frame")
+
+
+def test_the_payload_of_a_signed_frame_ends_before_its_signature() -> None:
+    encoder = FrameEncoder(1, 1)
+    encoder.signing = Signing(SigningKey(bytes(range(32))))
+    theirs = to_pymavlink(Frame.parse(encoder.encode(messages.Attitude(7, 0.5, 0.25, 1.0, 0.0, 0.0, 0.0))))
+    assert theirs.get_payload() == to_pymavlink(ATTITUDE).get_payload()
+
+
+def test_what_it_has_not_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="'MAVLink_attitude_message' object has no attribute 'height'"):
+        to_pymavlink(ATTITUDE).height  # noqa: B018
+
+
+@pytest.mark.parametrize(("target", "told"), [(9, 9), (0, 1), (None, 1)])
+def test_the_target_is_written_into_theirs_and_into_a_copy_of_ours(target: int | None, told: int) -> None:
+    theirs: Any = ardupilotmega.MAVLink_command_long_message(1, 2, 400, 0, 1, 0, 0, 0, 0, 0, 0)
+    copied: Any = from_pymavlink(theirs, target)
+    assert (copied.target_system, copied.target_component, theirs.target_system) == (told, 2, told)
+    ours = messages.CommandLong(1, 2, 400, 0, 1, 0, 0, 0, 0, 0, 0)
+    again: Any = from_pymavlink(ours, target)
+    assert (again.target_system, ours.target_system) == (told, 1)
+    assert from_pymavlink(messages.SystemTime(1, 2), target) == messages.SystemTime(1, 2)
+    plain: Any = ardupilotmega.MAVLink_system_time_message(1, 2)
+    assert from_pymavlink(plain, target) == messages.SystemTime(1, 2)
+    assert not hasattr(plain, "target_system")
+
+
+def looks_like(name: str, **fields: Any) -> Any:
+    return SimpleNamespace(get_type=lambda: name, **fields)
+
+
+def test_anything_with_a_type_and_fields_is_a_message() -> None:
+    numbers = {
+        "time_boot_ms": Decimal("6.6"),
+        "roll": Decimal("0.5"),
+        "pitch": True,
+        "yaw": 3,
+        "rollspeed": 0,
+    }
+    given = looks_like("ATTITUDE", **numbers, pitchspeed=0, yawspeed=0)
+    assert from_pymavlink(given) == messages.Attitude(7, 0.5, 1.0, 3.0, 0.0, 0.0, 0.0)
+    text = looks_like("STATUSTEXT", severity=3, text=b"ab\xff\0\0", id=7)
+    assert from_pymavlink(text).encode()[1:6] == b"ab\xff\0\0"
+    assert from_pymavlink(text).encode()[51:53] == b"\7\0"
+
+
+def test_of_pymavlinks_classes_an_id_is_no_field_of_version_1() -> None:
+    """Each of them has one, and STATUSTEXT has an extension field of this name."""
+    theirs = version_1.MAVLink_statustext_message(3, b"hello\0")
+    assert from_pymavlink(theirs) == messages.Statustext(3, "hello")
+    assert from_pymavlink(ardupilotmega.MAVLink_statustext_message(3, b"hello", 8, 1)) == messages.Statustext(
+        3, "hello", 8, 1
+    )
+
+
+def test_texts_are_bytes_or_text_and_the_later_one_counts() -> None:
+    theirs: Any = ardupilotmega.MAVLink_statustext_message(3, "gr\xfc\xdf".encode())
+    assert from_pymavlink(theirs) == messages.Statustext(3, "gr\xfc\xdf")
+    theirs.text = "changed\0"
+    assert from_pymavlink(theirs) == messages.Statustext(3, "changed")
+
+
+@pytest.mark.parametrize(
+    ("given", "complaint"),
+    [
+        (object(), "is no MAVLink message"),
+        (looks_like("ATTITUDE", time_boot_ms=1), "ATTITUDE.roll cannot be sent: it is missing"),
+        (looks_like("PLAY_TUNE", target_system=1, target_component=1, tune=5), "PLAY_TUNE.tune = 5"),
+        (
+            looks_like("SYSTEM_TIME", time_unix_usec=math.nan, time_boot_ms=0),
+            "SYSTEM_TIME.time_unix_usec = nan",
+        ),
+        (looks_like("SYSTEM_TIME", time_unix_usec="no", time_boot_ms=0), "SYSTEM_TIME.time_unix_usec = 'no'"),
+        (
+            looks_like("GPS_INJECT_DATA", target_system=1, target_component=1, len=2, data=[1, 256]),
+            r"GPS_INJECT_DATA.data = \[1, 256\] cannot be sent: element 1 must be in 0..255",
+        ),
+        (
+            looks_like("GPS_INJECT_DATA", target_system=1, target_component=1, len=2, data=[-1, 255]),
+            r"element 0 must be in 0..255",
+        ),
+        (
+            looks_like("GPS_INJECT_DATA", target_system=1, target_component=1, len=2, data=[0, 255, "x"]),
+            r"element 2 must be in 0..255",
+        ),
+        (
+            looks_like("GPS_INJECT_DATA", target_system=1, target_component=1, len=2, data=7),
+            "GPS_INJECT_DATA.data = 7 cannot be sent: must be a sequence of at most 110 numbers",
+        ),
+        (
+            looks_like("GPS_INJECT_DATA", target_system=1, target_component=1, len=2, data="ab"),
+            "GPS_INJECT_DATA.data = 'ab' cannot be sent: must be a sequence",
+        ),
+        (ardupilotmega.MAVLink_unknown(60_000, b""), "MAVLink_unknown is nothing that can be sent"),
+    ],
+    ids=str,
+)
+def test_what_cannot_be_sent_is_named(given: Any, complaint: str) -> None:
+    with pytest.raises(LocalProtocolError, match=complaint):
+        from_pymavlink(given)
+
+
+@pytest.mark.parametrize("data", [[1, 2], b"\1\2", bytearray(b"\1\2"), memoryview(b"\1\2"), (1, Decimal(2))])
+def test_bytes_in_any_form(data: Any) -> None:
+    given = looks_like("GPS_INJECT_DATA", target_system=1, target_component=1, len=2, data=data)
+    assert from_pymavlink(given) == messages.GpsInjectData(1, 1, 2, b"\1\2")

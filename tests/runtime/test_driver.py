@@ -7,6 +7,7 @@ from collections.abc import AsyncIterator
 
 import anyio
 import pytest
+from flight_harness import block_loop
 
 from aerokit import open_connection
 from aerokit.errors import CommandTimeout, ConnectionClosed, LinkLost, LocalProtocolError
@@ -124,6 +125,19 @@ async def test_it_gives_up_when_the_exchange_does(pair: Pair) -> None:
         await pair.run(Counting())
     assert anyio.current_time() == pytest.approx(started + 5)
     assert len(pair.far.questions) == 5
+
+
+async def test_once_it_has_ended_its_deadline_does_not_ring(pair: Pair) -> None:
+    """The answer and the deadline wait for a loop that was blocked; the answer comes first."""
+    exchange = Counting()
+
+    def answer_and_block() -> None:
+        pair.far.answer()
+        block_loop(1.0)
+
+    later(0.5, answer_and_block)
+    assert await pair.run(exchange) == 1
+    assert exchange.asked == 1
 
 
 async def test_other_systems_are_not_heard(pair: Pair) -> None:

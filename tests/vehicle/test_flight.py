@@ -18,7 +18,7 @@ from aerokit.errors import (
     OperationTimeout,
 )
 from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult
-from aerokit.runtime.cells import Source
+from aerokit.runtime.cells import Source, StateCell
 from aerokit.sim import SimulatedCopter
 from aerokit.vehicle.orders import flight
 from aerokit.vehicle.orders.setpoints import VelocitySetpoint
@@ -147,6 +147,19 @@ async def test_a_state_of_the_last_flight_is_no_effect_of_a_take_off(grounded: F
     grounded.copter.faults.refuse(MavCmd.NAV_TAKEOFF, MavResult.FAILED, "No")
     with pytest.raises(CommandRejected, match="MAV_CMD_NAV_TAKEOFF was refused"):
         await grounded.vehicle.take_off(10.0)
+
+
+async def test_rising_is_the_effect_of_a_take_off(grounded: Flight, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a vehicle that tells no landed state: sent again while it stands, no time-out once it has risen."""
+    vehicle = grounded.vehicle
+    await vehicle.wait_ready()
+    await vehicle.set_mode("GUIDED")
+    await vehicle.arm()
+    cell = StateCell[int]("landed_state", now, "nothing")
+    monkeypatch.setattr(vehicle.telemetry, "landed_state", cell)
+    grounded.copter.faults.lose_ack(MavCmd.NAV_TAKEOFF, times=9)
+    await vehicle.take_off(1.0)
+    assert len(grounded.wire.commands(MavCmd.NAV_TAKEOFF)) == 4
 
 
 async def test_a_flight_of_long_ago_does_not_forbid_a_take_off(grounded: Flight) -> None:

@@ -19,7 +19,7 @@ from aerokit import (
     connect,
 )
 from aerokit.errors import OperationRejected, OperationTimeout, SetpointStreamStopped
-from aerokit.mavlink.enums import SubMode
+from aerokit.mavlink.enums import MavResult, SubMode
 from aerokit.mavlink.messages import SetPositionTargetLocalNed
 from aerokit.sim import SimulatedRover, SimulatedSub, SimulatedVehicle, simulated_link
 
@@ -87,6 +87,16 @@ async def test_a_submarine_that_is_taken_over_in_the_deep_has_not_landed() -> No
         tasks.start_soon(take_over)
         with pytest.raises(OperationRejected, match=r"the mode changed to ALT_HOLD at -1\d\.\d m"):
             await vehicle.land(timeout=120)
+
+
+async def test_a_submarine_that_accepts_to_land_and_does_not_is_told_after_three_seconds() -> None:
+    sub = SimulatedSub(boot_time_s=1.0)
+    async with guided(sub) as vehicle:
+        sub.set_mode_from = lambda *_: MavResult.ACCEPTED  # type: ignore[method-assign]
+        started = anyio.current_time()
+        with pytest.raises(OperationRejected, match="the vehicle stayed in GUIDED"):
+            await vehicle.land(timeout=60)
+        assert 3.0 < anyio.current_time() - started < 4.5
 
 
 @pytest.mark.parametrize("kind", ["local", "global"])

@@ -332,12 +332,13 @@ async def test_the_vehicle_lands_and_disarms(flying: Flight) -> None:
 
 
 async def test_the_connection_is_lost(flying: Flight) -> None:
-    with pytest.raises(SetpointStreamStopped, match="cable was pulled out"):
+    with pytest.raises(SetpointStreamStopped, match="cable was pulled out") as caught:
         async with flying.vehicle.guided.velocity() as stream:
             await stream.fly(NORTH, 1.0)
             flying.wire.lose()
             await anyio.sleep(1.0)
             assert not stream.is_running
+    assert "told to hold" not in str(caught.value)
 
 
 async def test_the_vehicle_falls_silent(flying: Flight) -> None:

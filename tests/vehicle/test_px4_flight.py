@@ -13,6 +13,7 @@ from aerokit import Position, geo
 from aerokit import messages as m
 from aerokit.errors import CommandRejected, OperationRejected, OperationTimeout
 from aerokit.mavlink.enums import MavCmd, MavResult
+from aerokit.runtime.cells import StateCell
 from aerokit.sim.px4.modes import POSITION
 
 pytestmark = pytest.mark.anyio
@@ -50,12 +51,18 @@ async def test_take_off_gives_the_altitude_above_the_sea_and_ends_in_loiter() ->
         await flight.vehicle.mode.wait_until(lambda mode: mode.name == "LOITER", timeout=10.0)
 
 
-async def test_take_off_is_not_sent_again_once_its_mode_was_told() -> None:
+@pytest.mark.parametrize("tells_landed_state", [True, False])
+async def test_take_off_is_not_sent_again_once_its_mode_was_told(
+    monkeypatch: pytest.MonkeyPatch, tells_landed_state: bool
+) -> None:
     """It starts in LOITER, where it also ends, and stands for a second while the motors spin up."""
     async with open_px4() as flight:
         await flight.vehicle.wait_ready()
         await flight.vehicle.set_mode("LOITER")
         await flight.vehicle.arm()
+        if not tells_landed_state:
+            cell = StateCell[int]("landed_state", now, "nothing")
+            monkeypatch.setattr(flight.vehicle.telemetry, "landed_state", cell)
         flight.px4.faults.motor_failed = True  # it does not rise
         flight.px4.faults.lose_ack(MavCmd.NAV_TAKEOFF, times=9)
         with pytest.raises(OperationTimeout):

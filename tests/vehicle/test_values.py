@@ -9,9 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from aerokit import enums, messages
 from aerokit.errors import LocalProtocolError
 from aerokit.position import Position
-from aerokit.vehicle.state.condition import SensorHealth
+from aerokit.vehicle.state import gimbal
+from aerokit.vehicle.state.condition import EstimatorHealth, SensorHealth
 from aerokit.vehicle.state.equipment import GpsReceiver
 from aerokit.vehicle.state.movement import Attitude, Home, Velocity
 
@@ -91,3 +93,115 @@ def test_fix(fix_type: int, has_fix: bool) -> None:
 @pytest.mark.parametrize(("passes", "blocking"), [(True, ()), (False, ("GPS",)), (None, ("GPS",))])
 def test_what_fails_blocks_unless_the_checks_pass(passes: bool | None, blocking: tuple[str, ...]) -> None:
     assert SensorHealth(0, 0, 0, ("GPS",), passes, 0.0).blocks_arming == blocking
+
+
+@pytest.mark.parametrize(
+    ("name", "flag"),
+    [
+        ("has_attitude", enums.EstimatorStatusFlags.ATTITUDE),
+        ("has_horizontal_velocity", enums.EstimatorStatusFlags.VELOCITY_HORIZ),
+        ("has_relative_position", enums.EstimatorStatusFlags.POS_HORIZ_REL),
+        ("has_absolute_position", enums.EstimatorStatusFlags.POS_HORIZ_ABS),
+        ("has_altitude", enums.EstimatorStatusFlags.POS_VERT_ABS),
+    ],
+)
+def test_each_flag_of_an_estimator_has_its_property(name: str, flag: int) -> None:
+    assert getattr(EstimatorHealth("ESTIMATOR_STATUS", flag, ()), name) is True
+    assert getattr(EstimatorHealth("ESTIMATOR_STATUS", 0xFFFF & ~flag, ()), name) is False
+
+
+# ----------------------------------------------------------------------------------- gimbals
+
+FROM_NOSE, FROM_NORTH, LOCK = (
+    enums.GimbalDeviceFlags.YAW_IN_VEHICLE_FRAME,
+    enums.GimbalDeviceFlags.YAW_IN_EARTH_FRAME,
+    enums.GimbalDeviceFlags.YAW_LOCK,
+)
+
+
+def test_a_mount_tells_hundredths_of_degrees() -> None:
+    told = gimbal.from_status(messages.MountStatus(1, 1, -4512, 150, 9001))
+    assert told == gimbal.GimbalAttitude(-45.12, 1.5, 90.01)
+
+
+@pytest.mark.parametrize(
+    ("yaw", "absolute", "heading", "told"),
+    [
+        (10.0, 0.0, 355.0, 5.0),
+        (10.0, -90.0, 355.0, 270.0),
+        (10.0, math.nan, 355.0, 5.0),
+        (-10.0, 0.0, None, -10.0),
+        (math.nan, 0.0, None, None),
+    ],
+)
+def test_a_mount_turns_with_the_vehicle(
+    yaw: float, absolute: float, heading: float | None, told: float | None
+) -> None:
+    message = messages.MountOrientation(0, 1.25, -30.5, yaw, absolute)
+    assert gimbal.from_orientation(message, heading) == gimbal.GimbalAttitude(-30.5, 1.25, told)
+
+
+def pointing(q: tuple[float, ...], flags: int = 0, delta_yaw: float = 0.0) -> Any:
+    return messages.GimbalDeviceAttitudeStatus(0, 0, 0, flags, q, 0, 0, 0, 0, delta_yaw)
+
+
+def turned(roll_deg: float, pitch_deg: float, yaw_deg: float) -> tuple[float, ...]:
+    """The quaternion of yaw, then pitch, then roll."""
+    (sr, cr), (sp, cp), (sy, cy) = (
+        (math.sin(math.radians(each) / 2), math.cos(math.radians(each) / 2))
+        for each in (roll_deg, pitch_deg, yaw_deg)
+    )
+    return (
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    )
+
+
+@pytest.mark.parametrize(
+    ("flags", "delta_deg", "heading", "yaw_deg"),
+    [
+        (FROM_NORTH, 0.0, 100.0, 30.0),
+        (FROM_NORTH, 50.0, 100.0, 30.0),
+        (FROM_NOSE, 50.0, 100.0, 80.0),
+        (FROM_NOSE, 0.0, 100.0, 130.0),
+        (FROM_NOSE, math.nan, 100.0, 130.0),
+        (FROM_NOSE | LOCK, 0.0, 100.0, 130.0),
+        (FROM_NOSE, 0.0, None, 30.0),
+        (LOCK, 50.0, 100.0, 30.0),
+        (0, 50.0, 100.0, 130.0),
+    ],
+)
+def test_a_gimbal_tells_its_yaw_from_the_nose_or_from_north(
+    flags: int, delta_deg: float, heading: float | None, yaw_deg: float
+) -> None:
+    message = pointing(turned(10, -20, 30), flags, math.radians(delta_deg))
+    told = gimbal.from_device(message, heading)
+    assert told == gimbal.GimbalAttitude(-20.0, 10.0, yaw_deg)
+
+
+@given(angles, st.floats(-89, 89), angles, st.floats(0.1, 10))
+def test_a_gimbals_angles_are_those_it_was_turned_by(
+    roll: float, pitch: float, yaw: float, length: float
+) -> None:
+    """Whatever the length of its quaternion."""
+    q = tuple(length * each for each in turned(roll, pitch, yaw))
+    told = gimbal.from_device(pointing(q, FROM_NORTH), None)
+    assert told.pitch_deg == pytest.approx(pitch, abs=0.02)
+    assert told.roll_deg == pytest.approx(roll, abs=0.02)
+    assert math.remainder((told.yaw_deg or 0.0) - yaw, 360) == pytest.approx(0, abs=0.02)
+
+
+@pytest.mark.parametrize("pitch_deg", [-90.0, 90.0])
+@pytest.mark.parametrize("roll_deg", [0.0, 25.0])
+def test_of_a_camera_that_looks_straight_up_or_down_all_turning_is_yaw(
+    pitch_deg: float, roll_deg: float
+) -> None:
+    told = gimbal.from_device(pointing(turned(roll_deg, pitch_deg, 40), FROM_NORTH), None)
+    assert told == gimbal.GimbalAttitude(pitch_deg, 0.0, 40.0 - math.copysign(roll_deg, pitch_deg))
+
+
+def test_a_quaternion_of_zeros_points_nowhere() -> None:
+    told = gimbal.from_device(pointing((0.0, 0.0, 0.0, 0.0), FROM_NORTH), None)
+    assert told == gimbal.GimbalAttitude(None, None, None)

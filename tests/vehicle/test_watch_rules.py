@@ -140,6 +140,7 @@ def test_an_earlier_time_that_stands_still_is_no_reboot() -> None:
 def test_other_components_tell_nothing_of_the_autopilot() -> None:
     stage = Watched()
     stage.clock(100_000)
+    stage.hear(Timesync(100_000_000_000, 5))
     for count in range(10):
         stage.at += 0.1
         stage.hear(attitude(100 * count + 1), component_id=154)
@@ -169,6 +170,15 @@ def test_a_reboot_that_was_ordered_is_seen_at_once() -> None:
         assert stage.clock(7000, after=4.0) == 1
         assert stage.clock(7100, after=9.0) == 1  # it was that one
     assert stage.clock(7200, after=10.0) == 1
+
+
+def test_a_question_tells_no_time() -> None:
+    stage = Watched()
+    stage.hear(Timesync(100_000_000_000, 5))
+    with stage.watch.expecting_reboot():
+        stage.at += 1.0
+        stage.hear(Timesync(0, 6))
+    assert stage.watch.reboots == 0
 
 
 def test_an_answer_with_an_earlier_time_is_a_reboot_unless_it_was_asked_before() -> None:

@@ -179,7 +179,7 @@ class SourceStatistics:
         return LATE if was_first else OTHERS
 
     def _swap(self, sequence: int, now: float, count: int, other_count: int) -> None:
-        self.lost -= self._skipped_over
+        self.lost = max(0, self.lost - self._skipped_over)  # of those skipped some may have come late
         self._other, self._other_count, self._other_at = self.expected & 0xFF, count, now
         self._since, self._returns = self.received - other_count, 0
         self._go_on_at(sequence)

@@ -180,7 +180,7 @@ class CommandExchange(Exchange[CommandAck]):
 
     def expire(self, now: float) -> None:
         """Send again, or give up after the last attempt or when a command in progress has gone silent."""
-        if self.done or self.deadline is None or now < self.deadline:
+        if self.deadline is None or now < self.deadline:
             return
         if self._in_progress:
             self._fail(CommandTimeout(self._timeout_text(now)))

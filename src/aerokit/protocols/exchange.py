@@ -41,7 +41,7 @@ class Exchange(ABC, Generic[ResultT]):
 
     @abstractmethod
     def expire(self, now: float) -> None:
-        """The deadline has come: send again or give up."""
+        """The deadline has come: send again or give up. Not called once it is ``done``."""
 
     def abort(self, error: Exception) -> None:
         """End at once with this error, unless the end was there before."""

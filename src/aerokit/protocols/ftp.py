@@ -204,8 +204,6 @@ class FtpRequest(FtpExchange[FtpMessage]):
 
     def expire(self, now: float) -> None:
         """Send it again, or give up."""
-        if self.done:
-            return
         if self._is_out_of_patience(now):
             self._fail(FileTimeout(f"{self._operation} {self._path}: no answer to {self.attempts} requests"))
         else:

@@ -128,8 +128,6 @@ class FtpDownload(FtpExchange[int]):
 
     def expire(self, now: float) -> None:
         """Ask again for what is overdue, or give up."""
-        if self.done:
-            return
         if self._is_out_of_patience(now):
             self._fail(self._timed_out())
             return
@@ -375,8 +373,6 @@ class FtpUpload(FtpExchange[None]):
 
     def expire(self, now: float) -> None:
         """Send again what is overdue, or give up."""
-        if self.done:
-            return
         if self._is_out_of_patience(now):
             missing = tuple((offset, len(self._block(offset))) for offset in self._unwritten)
             self._fail(

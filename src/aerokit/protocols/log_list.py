@@ -85,8 +85,6 @@ class LogList(Transfer[tuple[LogEntry, ...]]):
 
     def expire(self, now: float) -> None:
         """Ask again for those that are missing, or give up."""
-        if self.done:
-            return
         self._stream.fails += 1
         is_unanswered = self._missing is None and self._stream.fails == self._most_unanswered
         if is_unanswered or self._is_out_of_patience(now):

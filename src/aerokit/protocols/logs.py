@@ -101,8 +101,6 @@ class LogDownload(Transfer[int]):
 
     def expire(self, now: float) -> None:
         """Ask again for what is overdue, or give up."""
-        if self.done:
-            return
         if self._is_out_of_patience(now):
             missing = self._into.missing(self._size)
             self._fail(
@@ -259,8 +257,6 @@ class LogEnd(Transfer[None]):
 
     def expire(self, now: float) -> None:
         """Send it again when the vehicle has gone on, else be content."""
-        if self.done:
-            return
         if not self._is_heard or self._is_out_of_patience(now):
             self._finish(None)
             return

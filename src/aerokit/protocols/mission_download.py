@@ -121,7 +121,7 @@ class MissionDownload(MissionExchange[Downloaded]):
         if self._count is None:
             if self._attempt == 1 and not self._restarts and self._window > 1:  # PX4 repeats it by itself
                 self.round_trip.measured(now - self._list_at)
-            if self._items and (not opaque_id or opaque_id != self._opaque_id):
+            if not opaque_id or opaque_id != self._opaque_id:
                 self._items.clear()
         elif message.count == self._count and opaque_id == self._opaque_id:
             return  # PX4 repeats it until the first item is asked for

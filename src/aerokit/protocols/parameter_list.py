@@ -117,7 +117,7 @@ class ParameterList(Transfer[ParameterTable]):
 
     def expire(self, now: float) -> None:
         """Something is overdue: the beginning of the list, the rest of it, or an answer."""
-        if self.done or self.deadline is None or now < self.deadline:
+        if self.deadline is None or now < self.deadline:
             return
         if self._is_out_of_patience(now):
             self._fail(ParameterTimeout(self._timeout_text(), missing=self._missing()))

@@ -97,7 +97,7 @@ class ParameterRequests(Transfer[dict[str, Answer]]):
 
     def expire(self, now: float) -> None:
         """An answer is overdue."""
-        if self.done or self.deadline is None or now < self.deadline:
+        if self.deadline is None or now < self.deadline:
             return
         if self._is_out_of_patience(now):
             for name in self._names:

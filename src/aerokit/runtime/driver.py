@@ -90,6 +90,7 @@ class ExchangeRun(Generic[ResultT]):
         except Exception as error:  # nobody else would tell the one who waits
             exchange.abort(error)
         if exchange.done:
+            self._connection.deadlines.take_back(self._expire)
             if not self._ended.done():
                 self._ended.set_result(None)
         elif exchange.deadline is not None and exchange.deadline != self._deadline:

@@ -118,14 +118,13 @@ class FlightActions(Part):
             await self._orders.ensure_mode(plan.mode, order)
         if plan.command is not None:
             is_rising = self._rises_from_here()
-            modes = () if plan.mode_after is None else order.modes
             with self._talk.streaming("position", "landed_state"):
                 await self._orders.give(
                     order,
                     self._talk.commands.send_long,
                     plan.command,
                     *plan.params,
-                    modes=modes,
+                    modes=order.modes,
                     is_done=is_rising,
                 )
 

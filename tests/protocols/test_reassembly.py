@@ -1,0 +1,51 @@
+"""A file out of blocks that come in any order."""
+
+from __future__ import annotations
+
+from aerokit.protocols.reassembly import Reassembly
+
+
+def blocks(start: int = 0, **options: int) -> tuple[Reassembly, bytearray]:
+    written = bytearray()
+    return Reassembly(written.extend, block_size=4, start=start, **options), written
+
+
+def test_blocks_ahead_wait_for_those_before() -> None:
+    into, written = blocks()
+    assert into.add(4, b"efgh")
+    assert (into.missing(12), bytes(written)) == (((0, 4), (8, 4)), b"")
+    assert not into.add(4, b"efgh")
+    assert into.add(0, b"abcd")
+    assert (bytes(written), into.position, into.done) == (b"abcdefgh", 8, 8)
+    assert into.missing() == ((8, 0),)
+
+
+def test_a_short_block_is_the_end_and_what_is_behind_it_is_not_of_the_file() -> None:
+    into, written = blocks()
+    into.add(12, b"mnop")
+    into.add(8, b"ijkl")
+    assert into.done == 8
+    into.add(4, b"ef")
+    assert (into.end, into.done, into.missing()) == (6, 2, ((0, 4),))
+    assert not into.add(8, b"ijkl")
+    assert not into.add(6, b"")
+    into.add(0, b"abcd")
+    assert (bytes(written), into.missing()) == (b"abcdef", ())
+
+
+def test_of_several_ends_the_first_counts() -> None:
+    into, _ = blocks()
+    into.end_at(10)
+    assert into.missing() == ((0, 10),)
+    into.end_at(12)
+    assert into.end == 10
+    into.end_at(4)
+    assert (into.end, into.missing()) == (4, ((0, 4),))
+
+
+def test_it_goes_on_where_it_was_left() -> None:
+    into, written = blocks(start=4)
+    assert not into.add(0, b"abcd")
+    into.add(4, b"efgh")
+    into.end_at(8)
+    assert (bytes(written), into.missing(), into.done) == (b"efgh", (), 8)
