@@ -288,6 +288,22 @@ async def test_cancelled_at_any_turn_nothing_is_left_behind() -> None:
 
 
 @each_loop
+async def test_a_client_that_comes_while_the_link_closes_is_closed_too() -> None:
+    """The system had accepted it already."""
+    async with listening() as (listener, heard):
+        pass
+    ours, theirs = socket.socketpair()
+    theirs.setblocking(False)
+    with theirs:
+        loop = asyncio.get_running_loop()
+        await loop.connect_accepted_socket(lambda: tcp._Stream(listener), ours)
+        with anyio.fail_after(5.0):
+            assert await loop.sock_recv(theirs, 1) == b""
+            await listener.wait_closed()
+    assert (listener.peers, heard.losses) == ((), [])
+
+
+@each_loop
 async def test_a_taken_port_is_an_error_with_a_hint() -> None:
     async with listening() as (listener, _):
         second = TcpListen(*listener.local_address)

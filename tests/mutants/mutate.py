@@ -25,6 +25,8 @@ TESTS = (*PACKAGES, "orders", "calls", "parameters", "missions", "test_hostile_f
 GENERATED = ("mavlink/messages", "mavlink/enums")
 EQUIVALENT = Path(__file__).with_name("equivalent.json")
 GOAL = 0.9
+READS_DEFAULTS = "test_signatures.py"
+"""Looks at all public calls and runs none of their lines."""
 
 
 def main() -> int:
@@ -111,8 +113,9 @@ def _tests_of(mutation: Mutation, reach: Reach, seconds: float) -> list[str]:
     near = reach.by_file.get(mutation.path, set())
     chosen, left = [], seconds
 
-    def distance(test: str) -> tuple[int, bool, float]:
-        return -sum(word in test for word in words), test not in near, reach.seconds[test]
+    def distance(test: str) -> tuple[bool, int, bool, float]:
+        reads = mutation.at_import and READS_DEFAULTS in test
+        return not reads, -sum(word in test for word in words), test not in near, reach.seconds[test]
 
     tests = set(reach.seconds) if mutation.at_import else reach.tests_of(mutation.path, mutation.lines)
     for test in sorted(tests, key=distance):

@@ -89,6 +89,12 @@ async def test_wait_ready_names_a_failing_check_and_a_silent_vehicle(grounded: F
 # ------------------------------------------------------------------------------------- take-off
 
 
+async def test_take_off_in_the_air_sends_nothing(flying: Flight) -> None:
+    with pytest.raises(OperationRejected, match="flies already"):
+        await flying.vehicle.take_off(20.0)
+    assert not flying.wire.commands(MavCmd.NAV_TAKEOFF)
+
+
 async def test_take_off_disarmed_sends_nothing(grounded: Flight) -> None:
     await grounded.vehicle.set_mode("GUIDED")
     grounded.wire.forget()
@@ -411,6 +417,15 @@ async def test_go_to_with_nonsense_sends_nothing(flying: Flight, name: str, valu
     await anyio.sleep(1.0)
     assert not flying.wire.commands(MavCmd.DO_REPOSITION)
     assert not flying.wire.mode_orders()
+
+
+async def test_go_to_without_an_altitude_from_a_place_without_one_sends_nothing(flying: Flight) -> None:
+    here = flying.vehicle.position.value
+    low = Position(here.latitude_deg, here.longitude_deg, altitude_amsl_m=594.0)
+    flying.vehicle.telemetry.position.set(low, Source(1, 1, "GLOBAL_POSITION_INT"))
+    with pytest.raises(LocalProtocolError, match="has no altitude, and the vehicle's own is not known"):
+        await flying.vehicle.go_to(Position(here.latitude_deg, here.longitude_deg))
+    assert not flying.wire.commands(MavCmd.DO_REPOSITION)
 
 
 async def test_go_to_disarmed_sends_nothing(grounded: Flight) -> None:

@@ -13,6 +13,7 @@ import aerokit
 from aerokit import Position
 from aerokit import messages as m
 from aerokit.errors import CommandRejected, CommandTimeout, LocalProtocolError, OperationRejected
+from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.mavlink.message import Message
 from aerokit.runtime.cells import Source
@@ -106,6 +107,21 @@ async def test_a_stand_alone_gimbal_of_the_vehicle_tells_too_and_the_first_count
         await anyio.sleep(1.0)
         assert attitude.source is not None
         assert attitude.source.component_id == 154
+        assert attitude.value.pitch_deg == 0.0
+
+
+async def test_what_the_mount_tells_counts_until_a_gimbal_tells() -> None:
+    async with open_flight() as flight:
+        attitude, deliver = flight.vehicle.gimbal.attitude, flight.wire.deliver
+        heading = (await flight.vehicle.attitude.wait_until(lambda _: True, timeout=5)).yaw_deg
+        deliver(FrameEncoder(1, 1).encode(m.MountOrientation(0, 1.0, -30.0, 10.0)))
+        assert attitude.value.pitch_deg == -30.0
+        assert attitude.value.yaw_deg == pytest.approx((heading + 10.0) % 360.0, abs=0.1)
+        deliver(
+            FrameEncoder(1, 154).encode(m.GimbalDeviceAttitudeStatus(0, 0, 0, 32, (1, 0, 0, 0), 0, 0, 0, 0))
+        )
+        assert attitude.value.pitch_deg == 0.0
+        deliver(FrameEncoder(1, 1).encode(m.MountOrientation(0, 1.0, -40.0, 10.0)))
         assert attitude.value.pitch_deg == 0.0
 
 

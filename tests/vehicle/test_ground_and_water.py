@@ -145,3 +145,18 @@ async def test_a_vehicle_that_does_not_move_although_it_should_is_told() -> None
         with pytest.raises(SetpointStreamStopped, match=r"not moved for 1[23] s"):
             async with vehicle.guided.velocity() as stream:
                 await stream.fly(VelocitySetpoint(north_m_s=1.0), 30.0)
+
+
+async def test_a_rover_has_returned_when_it_is_at_home() -> None:
+    """It does not land there, and stays armed."""
+    rover = SimulatedRover(boot_time_s=1.0)
+    async with guided(rover) as vehicle:
+        home = vehicle.home.value.position
+        await vehicle.go_to(vehicle.position.value.offset(north_m=30), timeout=60)
+        await vehicle.return_to_launch(timeout=60)
+        assert home.distance_to(vehicle.position.value) <= vehicle.autopilot.arrival_radius_m
+        assert vehicle.is_armed
+        await vehicle.set_mode("GUIDED")
+        await vehicle.go_to(vehicle.position.value.offset(north_m=30), timeout=60)
+        with pytest.raises(OperationTimeout, match=r"return_to_launch: .*; it is \d+\.\d m from home"):
+            await vehicle.return_to_launch(timeout=2)

@@ -14,6 +14,7 @@ from flight_harness import Flight, Px4Flight, block_loop, in_the_air, now, open_
 from aerokit import Position, missions
 from aerokit import messages as m
 from aerokit.errors import (
+    BusyError,
     CommandRejected,
     CommandTimeout,
     LocalProtocolError,
@@ -401,6 +402,25 @@ BAD: list[Callable[[Any], object]] = [
 async def test_wrong_arguments(grounded: Flight, make: Callable[[Any], object]) -> None:
     with pytest.raises(LocalProtocolError, match="is not allowed"):
         make(grounded.vehicle.guided)
+
+
+async def test_there_is_one_stream_at_a_time(flying: Flight) -> None:
+    async with flying.vehicle.guided.velocity() as stream:
+        with pytest.raises(BusyError, match="another set-point stream is open"):
+            async with flying.vehicle.guided.body_velocity():
+                raise AssertionError("entered")
+        assert stream.is_running
+
+
+async def test_left_after_a_silence_it_says_that_nothing_was_sent(flying: Flight) -> None:
+    """Too short a silence to stop it, and too long a one to know who steers."""
+    with pytest.raises(SetpointStreamStopped, match=r"silent for (2\.[5-9]|3\.\d) s"):
+        async with flying.vehicle.guided.velocity() as stream:
+            flying.copter.faults.silent = True
+            while flying.vehicle.heartbeat_age <= 2.6:
+                await stream.fly(NORTH, 0.1)
+            flying.wire.forget()
+    assert not flying.wire.mode_orders()
 
 
 async def test_wrong_setpoints_are_refused_before_anything_is_sent(flying: Flight) -> None:

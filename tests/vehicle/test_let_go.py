@@ -7,8 +7,11 @@ import pytest
 from flight_harness import in_the_air, open_flight
 
 import aerokit
-from aerokit.errors import AerokitError, ConnectionClosed, OperationRejected
+from aerokit.errors import AerokitError, ConnectionClosed, OperationRejected, SetpointStreamStopped
+from aerokit.mavlink.enums import CopterMode
+from aerokit.mavlink.messages import Heartbeat
 from aerokit.sim import SimulatedCopter, simulated_link
+from aerokit.vehicle.orders.setpoints import VelocitySetpoint
 
 pytestmark = pytest.mark.anyio
 
@@ -39,6 +42,23 @@ async def test_nothing_is_said_on_the_ground_or_when_it_was_meant(caplog: pytest
     async with in_the_air():
         pass
     assert "let go" not in caplog.text
+
+
+async def test_the_block_is_left_while_a_stream_is_open_elsewhere() -> None:
+    """It ends, says why, and the vehicle holds; whoever feeds it is told."""
+    copter = SimulatedCopter(boot_time_s=0.0)
+    async with simulated_link(copter) as link:
+        async with aerokit.connect(link) as vehicle:
+            await vehicle.wait_ready()
+            await vehicle.arm()
+            await vehicle.take_off(10.0)
+            stream = await vehicle.guided.velocity().__aenter__()
+        with pytest.raises(SetpointStreamStopped, match="the block of its vehicle was left"):
+            stream.set(VelocitySetpoint())
+        with pytest.raises(ConnectionClosed, match="the block of this vehicle was left; nothing was sent"):
+            vehicle.send(Heartbeat(6, 8, 0, 0, 4))
+        await anyio.sleep(1.0)
+        assert copter.mode.number == CopterMode.BRAKE
 
 
 async def test_the_block_is_left_while_another_task_flies(caplog: pytest.LogCaptureFixture) -> None:

@@ -130,6 +130,16 @@ def test_late_messages_of_different_times_are_no_reboot() -> None:
             assert stage.clock(seconds * 1000 - 8000, after=0.0) == 0
 
 
+def test_of_several_earlier_times_the_earliest_has_to_run() -> None:
+    """Late messages may tell of another time than the rebooted vehicle does."""
+    stage = Watched()
+    stage.clock(100_000)
+    assert stage.clock(90_000) == 0
+    assert stage.clock(50, after=1.0) == 0
+    assert stage.clock(150) == 0
+    assert stage.clock(350, after=0.21) == 1
+
+
 def test_an_earlier_time_that_stands_still_is_no_reboot() -> None:
     stage = Watched()
     stage.clock(100_000)

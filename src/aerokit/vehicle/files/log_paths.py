@@ -95,5 +95,5 @@ def _numbered_path(
     if entry is None or entry.size is None:
         return None
     may_be_larger = has_grown or number == max(entries)
-    is_it = entry.size == log.size or (may_be_larger and entry.size > log.size)
+    is_it = entry.size >= log.size if may_be_larger else entry.size == log.size
     return f"{directory}/{entry.name}" if is_it else None
