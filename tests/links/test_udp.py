@@ -303,3 +303,26 @@ def test_close_works_when_the_loop_is_not_running_or_gone() -> None:
 def test_a_peer_stays_the_same_host_whatever_its_port(kind: Any) -> None:
     link = kind("127.0.0.1", 14550)
     assert (link.host_of(("10.0.0.7", 14550)), link.host_of(None)) == ("10.0.0.7", None)
+
+
+@each_loop
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (ConnectionRefusedError(errno.ECONNREFUSED, "refused"), []),
+        (OSError(errno.ENETUNREACH, "no network"), []),
+        (OSError(errno.EMSGSIZE, "too long"), []),
+        (OSError(errno.ENODEV, "gone"), ["the socket failed: gone"]),
+        (OSError("without a number"), ["the socket failed: without a number"]),
+        (ValueError("a mistake of the loop's"), []),
+    ],
+    ids=str,
+)
+async def test_only_what_does_not_pass_ends_a_udp_link(error: Exception, told: list[str]) -> None:
+    link, heard = UdpListen("127.0.0.1", 0), Recorder()
+    await link.open(heard)
+    udp._DatagramProtocol(link).error_received(error)
+    await asyncio.sleep(0)
+    assert [str(each) for each in heard.losses] == [f"{link.address}: {each}" for each in told]
+    link.close()
+    await link.wait_closed()

@@ -49,6 +49,16 @@ def test_one_name_for_two_messages_is_refused(tmp_path: Path) -> None:
         generator.generate(tmp_path)
 
 
+def test_without_the_check_it_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "messages").mkdir()
+    (tmp_path / "messages" / "one.py").write_text("before")
+    files = {"messages/one.py": "a\n\xe4\n", "enums/two.py": "b\n"}
+    monkeypatch.setattr(generator, "generate", lambda folder=None: files)
+    monkeypatch.setattr(generator, "FOLDER", tmp_path)
+    assert generator.main([]) == 0
+    assert {path: (tmp_path / path).read_bytes().decode() for path in files} == files
+
+
 @pytest.mark.parametrize("other", [False, True])
 def test_the_check(other: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     if other:

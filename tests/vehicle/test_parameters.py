@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import struct
+import sys
 import warnings
 from pathlib import Path
 from typing import Any
@@ -24,11 +25,13 @@ from aerokit.errors import (
 )
 from aerokit.links import FaultModel, FaultyLink
 from aerokit.mavlink.encoder import FrameEncoder
-from aerokit.parameters import ParameterRenamedWarning, ParameterType
+from aerokit.parameters import Parameter, ParameterRenamedWarning, ParameterType
 from aerokit.protocols.transfer import Progress
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.vehicle.connect import connect
 from aerokit.vehicle.files.files import Files
+from aerokit.vehicle.parameters.cache import default_directory
+from aerokit.vehicle.parameters.names import Found, found_among
 from aerokit.vehicle.parameters.parameters import Parameters
 
 pytestmark = pytest.mark.anyio
@@ -605,6 +608,39 @@ async def test_a_change_makes_the_cache_worthless(tmp_path: Path) -> None:
         assert not flight.wire.all(messages.ParamRequestList)
         await flight.vehicle.parameters.download(cache=tmp_path, refresh=True)
         assert len(flight.wire.all(messages.ParamRequestList)) == 1
+
+
+@pytest.mark.parametrize(
+    ("platform", "environment", "folder"),
+    [
+        ("linux", {}, "home/.cache"),
+        ("linux", {"XDG_CACHE_HOME": "relative"}, "home/.cache"),
+        ("darwin", {}, "home/Library/Caches"),
+        ("win32", {}, "home/AppData/Local"),
+        ("win32", {"LOCALAPPDATA": "/local"}, "/local"),
+        ("win32", {"LOCALAPPDATA": "/local", "XDG_CACHE_HOME": "/cache"}, "/cache"),
+    ],
+)
+def test_where_caches_are_kept(
+    monkeypatch: pytest.MonkeyPatch, platform: str, environment: dict[str, str], folder: str
+) -> None:
+    for name in ("XDG_CACHE_HOME", "LOCALAPPDATA"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr(sys, "platform", platform)
+    monkeypatch.setattr(Path, "home", lambda: Path("home"))
+    assert default_directory() == Path(folder) / "aerokit" / "parameters"
+
+
+def test_a_parameter_is_found_under_its_names() -> None:
+    old, new = Parameter("SYSID_THISMAV", 3.0), Parameter("MAV_SYSID", 3.0)
+    assert found_among("MAV_SYSID", {"MAV_SYSID": new}) == Found("MAV_SYSID", new, False)
+    renamed = found_among("SYSID_THISMAV", {"MAV_SYSID": new})
+    assert renamed is not None
+    assert (renamed.asked, renamed.parameter, renamed.is_fresh) == ("SYSID_THISMAV", new, False)
+    assert renamed.note == "MAV_SYSID on this vehicle"
+    assert found_among("OTHER", {"SYSID_THISMAV": old}) is None
 
 
 async def test_nothing_is_written_to_disk_unless_asked_for(
