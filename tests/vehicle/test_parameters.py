@@ -634,7 +634,7 @@ def test_where_caches_are_kept(
 
 
 def test_a_parameter_is_found_under_its_names() -> None:
-    old, new = Parameter("SYSID_THISMAV", 3.0), Parameter("MAV_SYSID", 3.0)
+    old, new = (Parameter(name, 3, ParameterType.INT16) for name in ("SYSID_THISMAV", "MAV_SYSID"))
     assert found_among("MAV_SYSID", {"MAV_SYSID": new}) == Found("MAV_SYSID", new, False)
     renamed = found_among("SYSID_THISMAV", {"MAV_SYSID": new})
     assert renamed is not None
