@@ -278,6 +278,55 @@ def test_a_parameter_inserted_before_the_place_of_the_stream_is_found() -> None:
     assert list(table) == list(vehicle.parameters)
 
 
+@pytest.mark.parametrize(
+    ("count", "names", "asked"),
+    [
+        (3, ["SAME"], [2, 0, 1, 0, 1, 2]),
+        (4, ["SAME", "PARAM_0002", "PARAM_0003"], [2, 0, 1, 0, 1, 2]),
+        (5, ["SAME", "PARAM_0002", "PARAM_0003"], [2, 0, 1, 3, 1, 2, 1]),
+    ],
+)
+def test_a_vehicle_that_never_settles_is_believed_after_three_rounds(
+    count: int, names: list[str], asked: list[int]
+) -> None:
+    """Two of its names are one, and it tells another number of parameters with each answer."""
+
+    class Restless(FakeVehicle):
+        answers = 0
+
+        def value(self, name: str, index: int | None) -> m.ParamValue:
+            told = super().value(name, index)
+            name = "SAME" if index in (0, 1) else told.param_id
+            number = told.param_count - self.answers % 2
+            return m.ParamValue(name, told.param_value, told.param_type, number, told.param_index)
+
+        def on_read(self, request: m.ParamRequestRead) -> None:
+            self.answers += 1
+            super().on_read(request)
+
+    channel = Channel(Restless(table_of(count)))
+    lose_once(channel, 2)
+    table: ParameterTable = channel.run(listing())
+    assert list(table) == names
+    assert asked_again(channel) == asked
+
+
+def test_a_parameter_that_is_shown_after_the_stream_is_asked_for() -> None:
+    """The answer to what was lost tells the new number."""
+
+    class Late(FakeVehicle):
+        def on_read(self, request: m.ParamRequestRead) -> None:
+            self.parameters.setdefault("SHOWN", Parameter("SHOWN", 1, ParameterType.INT8))
+            super().on_read(request)
+
+    channel = Channel(Late(table_of(20)))
+    lose_once(channel, 19)
+    table: ParameterTable = channel.run(listing())
+    assert list(table)[-1] == "SHOWN"
+    assert asked_again(channel)[:2] == [19, 20]
+    assert channel.now < 2.0
+
+
 def test_a_list_that_becomes_shorter_ends() -> None:
     class Shrinking(FakeVehicle):
         refuses = True

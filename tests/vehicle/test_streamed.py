@@ -12,7 +12,6 @@ from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.message import offset_of
 from aerokit.runtime.bus import Bus
 from aerokit.vehicle.state.states import LAZY, SOURCES
-from aerokit.vehicle.state.streamed import LOOK_S
 from aerokit.vehicle.state.telemetry import Telemetry
 from aerokit.vehicle.state.told import MESSAGE_IDS, message_type
 
@@ -139,6 +138,15 @@ def test_the_better_of_two_sources_goes_first_whatever_is_looked_at_when(telemet
     assert telemetry.heading_deg.value == 271.0
 
 
+def test_what_nobody_looks_at_is_worked_out_every_five_seconds(telemetry: Telemetry) -> None:
+    streamed = telemetry.streams[messages.GlobalPositionInt.ID]
+    waits = []
+    for number in range(21):
+        take(telemetry, ANYTHING["GlobalPositionInt"], 100.0 + number / 2)
+        waits.append(bool(streamed.pending))
+    assert waits == [number % 10 != 0 for number in range(21)]
+
+
 def test_a_position_without_a_fix_leaves_the_one_before(telemetry: Telemetry) -> None:
     """Also when nobody looked: it is worked out every few seconds."""
     place, nowhere = ANYTHING["GlobalPositionInt"], messages.GlobalPositionInt(0, 0, 0, 0, 0, 0, 0, 0, 9000)
@@ -147,7 +155,7 @@ def test_a_position_without_a_fix_leaves_the_one_before(telemetry: Telemetry) ->
     take(telemetry, nowhere, 113.0)
     position = telemetry.position.value
     assert position.latitude_deg == pytest.approx(47.3977)
-    assert 112.25 - telemetry.position.updated_at <= LOOK_S
+    assert 112.25 - telemetry.position.updated_at <= 5.0
 
 
 def test_a_reboot_forgets_what_waits(telemetry: Telemetry) -> None:

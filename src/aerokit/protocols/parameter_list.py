@@ -254,7 +254,7 @@ class ParameterList(Transfer[ParameterTable]):
 
     def _drop_shifted(self, count: int) -> bool:
         """Forget what came under another count, a few times at most; whether there was any."""
-        shifted = [index for index, slot in self._slots.items() if slot.count != count]
+        shifted = [index for index in range(count) if self._slots[index].count != count]
         if not shifted or self._rounds >= ROUNDS:
             return False
         self._rounds += 1

@@ -42,7 +42,7 @@ class Plan(Protocol):
 
     MISSION_TYPE: ClassVar[int]
 
-    def check(self, *, home_is_item_0: bool = False) -> None:
+    def check(self, *, home_is_item_0: bool) -> None:
         """Raise LocalProtocolError unless it can be sent."""
 
     def to_items(self, *, home_is_item_0: bool = False) -> tuple[MissionItem, ...]:
@@ -50,7 +50,7 @@ class Plan(Protocol):
         ...
 
     @classmethod
-    def from_items(cls, items: Sequence[MissionItem], *, home_is_item_0: bool = False) -> Self:
+    def from_items(cls, items: Sequence[MissionItem], *, home_is_item_0: bool) -> Self:
         """The plan of these items."""
         ...
 
