@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 from flight_harness import Flight
 
-from aerokit.errors import FileError, RemoteProtocolError
+from aerokit.errors import FileError, LocalProtocolError, RemoteProtocolError
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
 from aerokit.mavlink.messages import FileTransferProtocol
 from aerokit.protocols.ftp_message import DATA_SIZE, FtpMessage
+from aerokit.vehicle.files import files
 
 pytestmark = pytest.mark.anyio
 
@@ -137,3 +139,84 @@ async def test_a_server_without_checksums_is_believed(grounded: Flight, code: Ma
     serve(grounded, answer)
     await grounded.vehicle.files.write("/APM/a.txt", b"written")
     assert MavFtpOpcode.CALCFILECRC in asked
+
+
+async def test_what_the_first_sending_has_opened_is_closed_and_opened_anew(grounded: Flight) -> None:
+    """Its answer was lost, and the server has one session and no memory of who opened it."""
+    asked: list[MavFtpOpcode] = []
+
+    def answer(request: FtpMessage) -> Iterator[FtpMessage]:
+        opcode = MavFtpOpcode(request.opcode)
+        asked.append(opcode)
+        is_open = MavFtpOpcode.TERMINATESESSION not in asked
+        if opcode == MavFtpOpcode.OPENFILERO and is_open:
+            if len(asked) > 1:
+                yield nak(request, MavFtpErr.FAIL)
+        elif opcode == MavFtpOpcode.OPENFILERO:
+            yield ack(request, (3).to_bytes(4, "little"))
+        elif opcode == MavFtpOpcode.BURSTREADFILE:
+            yield ack(request, b"abc")
+        else:
+            yield ack(request)
+
+    serve(grounded, answer)
+    assert await grounded.vehicle.files.read("/a") == b"abc"
+    opens = [at for at, opcode in enumerate(asked) if opcode == MavFtpOpcode.OPENFILERO]
+    assert asked[opens[1] : opens[2]] == [MavFtpOpcode.OPENFILERO, MavFtpOpcode.TERMINATESESSION]
+
+
+async def test_a_refusal_of_the_first_sending_closes_nothing_of_others(grounded: Flight) -> None:
+    asked: list[int] = []
+
+    def answer(request: FtpMessage) -> Iterator[FtpMessage]:
+        asked.append(request.opcode)
+        yield nak(request, MavFtpErr.FAIL)
+
+    serve(grounded, answer)
+    with pytest.raises(FileError):
+        await grounded.vehicle.files.read("/a")
+    assert asked == [MavFtpOpcode.OPENFILERO]
+
+
+@pytest.mark.parametrize("code", [MavFtpErr.FAIL, MavFtpErr.UNKNOWNCOMMAND, MavFtpErr.FILENOTFOUND])
+async def test_without_checksums_the_beginning_of_a_file_is_believed_too(
+    grounded: Flight, tmp_path: Path, code: MavFtpErr
+) -> None:
+    content = b"x" * 500
+
+    def answer(request: FtpMessage) -> Iterator[FtpMessage]:
+        if request.opcode == MavFtpOpcode.OPENFILERO:
+            yield ack(request, len(content).to_bytes(4, "little"))
+        elif request.opcode in (MavFtpOpcode.BURSTREADFILE, MavFtpOpcode.READFILE):
+            data = content[request.offset : request.offset + DATA_SIZE]
+            yield ack(request, data) if data else nak(request, MavFtpErr.EOF)
+        elif request.opcode == MavFtpOpcode.CALCFILECRC:
+            yield nak(request, code)
+        else:
+            yield ack(request)
+
+    serve(grounded, answer)
+    (tmp_path / "to.part").write_bytes(b"y" * DATA_SIZE)
+    if code == MavFtpErr.FILENOTFOUND:
+        with pytest.raises(FileError, match="no such file"):
+            await grounded.vehicle.files.download("/a", tmp_path / "to", resume=True)
+    else:
+        await grounded.vehicle.files.download("/a", tmp_path / "to", resume=True)
+        assert (tmp_path / "to").read_bytes() == b"y" * DATA_SIZE + content[DATA_SIZE:]
+
+
+async def test_more_than_a_file_holds_is_refused_before_anything_is_sent(
+    grounded: Flight, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(files, "LARGEST", 10)
+    asked: list[int] = []
+
+    def answer(request: FtpMessage) -> Iterator[FtpMessage]:
+        asked.append(request.opcode)
+        yield ack(request)
+
+    serve(grounded, answer)
+    with pytest.raises(LocalProtocolError, match="data of 11 bytes is not allowed: at most 10"):
+        await grounded.vehicle.files.write("/a", bytes(11))
+    assert asked == []
+    await grounded.vehicle.files.write("/a", bytes(10), verify=False)

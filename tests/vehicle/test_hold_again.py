@@ -7,7 +7,7 @@ import pytest
 from flight_harness import Flight, in_the_air, now, open_px4
 
 from aerokit import messages as m
-from aerokit.mavlink.enums import CopterMode, MavCmd
+from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult
 
 pytestmark = pytest.mark.anyio
 
@@ -64,3 +64,13 @@ async def test_to_a_vehicle_that_does_not_obey_it_is_told_in_three_rounds(
         flight.wire.forget()
         await anyio.sleep(60.0)
         assert not flight.wire.mode_orders()
+
+
+async def test_a_refused_hold_is_told_of_once(caplog: pytest.LogCaptureFixture) -> None:
+    async with in_the_air() as flight:
+        flight.copter.faults.refuse(MavCmd.DO_SET_MODE, MavResult.DENIED)
+        await give_up(flight)
+        await anyio.sleep(10.0)
+        (record,) = [each for each in caplog.records if "told to hold" in each.message]
+        assert record.message.startswith("the vehicle was told to hold and does not: ")
+        assert flight.wire.mode_orders() == [BRAKE]

@@ -7,7 +7,7 @@ import pytest
 from flight_harness import Flight
 
 from aerokit.errors import CommandTimeout
-from aerokit.mavlink.enums import MavCmd
+from aerokit.mavlink.enums import MavCmd, MavResult
 
 pytestmark = pytest.mark.anyio
 
@@ -55,3 +55,17 @@ async def test_who_was_armed_before_is_left_alone(flying: Flight, ends: str) -> 
             await flying.vehicle.arm()
     await anyio.sleep(20.0)
     assert ordered(flying).count(0) == 0
+
+
+async def test_who_cannot_be_disarmed_again_is_told_of(
+    grounded: Flight, caplog: pytest.LogCaptureFixture
+) -> None:
+    await grounded.vehicle.set_mode("GUIDED")
+    with anyio.move_on_after(0.0):
+        await grounded.vehicle.arm()
+    await grounded.vehicle.armed.wait_until(bool, timeout=5)
+    grounded.copter.faults.refuse(ARM, MavResult.FAILED)
+    await anyio.sleep(5.0)
+    (record,) = [each for each in caplog.records if each.levelname == "ERROR"]
+    assert "the vehicle armed after the order was given up, and could not be disarmed" in record.message
+    assert grounded.copter.is_armed
