@@ -21,7 +21,15 @@ from aerokit import (
 from aerokit.errors import OperationRejected, OperationTimeout, SetpointStreamStopped
 from aerokit.mavlink.enums import MavResult, SubMode
 from aerokit.mavlink.messages import SetPositionTargetLocalNed
-from aerokit.sim import SimulatedRover, SimulatedSub, SimulatedVehicle, simulated_link
+from aerokit.missions import Mission
+from aerokit.missions.navigation import return_to_launch, take_off, waypoint
+from aerokit.sim import (
+    SimulatedPx4Plane,
+    SimulatedRover,
+    SimulatedSub,
+    SimulatedVehicle,
+    simulated_link,
+)
 
 pytestmark = pytest.mark.anyio
 
@@ -160,3 +168,32 @@ async def test_a_rover_has_returned_when_it_is_at_home() -> None:
         await vehicle.go_to(vehicle.position.value.offset(north_m=30), timeout=60)
         with pytest.raises(OperationTimeout, match=r"return_to_launch: .*; it is \d+\.\d m from home"):
             await vehicle.return_to_launch(timeout=2)
+
+
+async def test_a_mission_of_a_rover_that_ends_in_a_return_ends_at_home() -> None:
+    async with guided(SimulatedRover(boot_time_s=1.0)) as vehicle:
+        home = vehicle.home.value.position
+        far = home.offset(north_m=25)
+        there = waypoint(far.latitude_deg, far.longitude_deg, altitude_relative_m=0)
+        await vehicle.mission.upload(Mission([there, there, return_to_launch()]))
+        await vehicle.mission.start()
+        await vehicle.mission.wait_finished(timeout=120)
+        assert home.distance_to(vehicle.position.value) <= vehicle.autopilot.arrival_radius_m
+
+
+async def test_a_mission_of_a_px4_plane_that_ends_in_a_return_ends_above_home() -> None:
+    async with simulated_link(SimulatedPx4Plane()) as link, connect(link) as vehicle:
+        await vehicle.wait_ready()
+        await vehicle.parameters.set("MIS_TKO_LAND_REQ", 0)
+        await vehicle.arm()
+        await vehicle.take_off(40)
+        home = vehicle.home.value.position
+        far = home.offset(north_m=400)
+        up = take_off(home.latitude_deg, home.longitude_deg, altitude_relative_m=40)
+        there = waypoint(far.latitude_deg, far.longitude_deg, altitude_relative_m=40)
+        await vehicle.mission.upload(Mission([up, there, return_to_launch()]))
+        await vehicle.mission.start()
+        await vehicle.position.wait_until(lambda place: home.distance_to(place) > 300, timeout=120)
+        await vehicle.mission.wait_finished(timeout=200)
+        assert home.distance_to(vehicle.position.value) < 150
+        assert vehicle.is_armed
