@@ -1,0 +1,55 @@
+"""What is out of range is refused by name, with what is allowed, before anything is sent."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+import pytest
+from flight_harness import Flight
+
+from aerokit import Position
+from aerokit import messages as m
+from aerokit.errors import LocalProtocolError
+
+pytestmark = pytest.mark.anyio
+
+
+def place(vehicle: Any, **altitudes: float) -> Position:
+    home = vehicle.home.value
+    return Position(home.latitude_deg, home.longitude_deg, **altitudes)
+
+
+async def entered(block: Any) -> None:
+    with block:
+        raise AssertionError("entered")
+
+
+REFUSED: dict[str, Callable[[Any], Awaitable[object]]] = {
+    "altitude_m = -1 is not allowed: above 0 to 10000": lambda v: v.take_off(-1),
+    "altitude = 200000 is not allowed: -12000 to 100000": lambda v: v.go_to(
+        place(v, altitude_relative_m=200_000)
+    ),
+    "speed_m_s = -1 is not allowed: above 0 to 1000": lambda v: v.set_speed(-1),
+    "speed_m_s = -2 is not allowed: above 0 to 1000": lambda v: v.go_to(place(v), speed_m_s=-2),
+    "heading_deg = -1 is not allowed: 0 to 360": lambda v: v.go_to(place(v), heading_deg=-1),
+    "tolerance_m = -1 is not allowed: above 0 to 100000": lambda v: v.go_to(place(v), tolerance_m=-1),
+    "heading_deg = 999 is not allowed: -360 to 360": lambda v: v.set_heading(999),
+    "rate_deg_s = -1 is not allowed: 0 to 360": lambda v: v.set_heading(0, rate_deg_s=-1),
+    "tolerance_deg = -1 is not allowed: above 0 to 180": lambda v: v.set_heading(0, tolerance_deg=-1),
+    "pitch_deg = 999 is not allowed: -360 to 360": lambda v: v.gimbal.point(999, 0),
+    "rate_hz = 1 is not allowed: 2 to 100": lambda v: entered(v.guided.velocity(rate_hz=1)),
+    "valid_for_s = 61 is not allowed: above 0 to 60": lambda v: entered(v.guided.velocity(valid_for_s=61)),
+    "max_lag_s = 61 is not allowed: above 0 to 60": lambda v: entered(v.guided.velocity(max_lag_s=61)),
+    "rate_hz of ATTITUDE = -1 is not allowed: above 0 to 1000": lambda v: entered(v.rate(m.Attitude, -1)),
+    "rate_hz = -1 is not allowed: above 0 to 1000": lambda v: entered(v.streams(-1)),
+}
+
+
+async def test_out_of_range(flying: Flight) -> None:
+    for text, call in REFUSED.items():
+        with pytest.raises(LocalProtocolError, match=f"^{re.escape(text)}$"):
+            await call(flying.vehicle)
+    kinds = (m.CommandLong, m.CommandInt, m.SetPositionTargetGlobalInt)
+    assert not [message for kind in kinds for message in flying.wire.all(kind)]
