@@ -25,11 +25,13 @@ from aerokit.errors import (
 )
 from aerokit.links import FaultModel, FaultyLink
 from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.enums import MavFtpErr
 from aerokit.parameters import Parameter, ParameterRenamedWarning, ParameterType
 from aerokit.protocols.transfer import Progress
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.vehicle.connect import connect
 from aerokit.vehicle.files.files import Files
+from aerokit.vehicle.parameters.access import LEAST_TO_PACK, MOST_TO_READ_BACK
 from aerokit.vehicle.parameters.cache import default_directory
 from aerokit.vehicle.parameters.names import Found, found_among
 from aerokit.vehicle.parameters.parameters import Parameters
@@ -477,6 +479,46 @@ async def test_what_a_file_does_not_bring_about_is_set() -> None:
         ]
         assert result.outcome in ("clamped", "set")
         assert result.value == simulated.parameters["LAND_SPEED"]
+
+
+@pytest.mark.parametrize("method", ["ftp", "auto"])
+async def test_a_file_that_is_not_taken_is_an_error_or_set_one_by_one(
+    monkeypatch: pytest.MonkeyPatch, method: Any
+) -> None:
+    """As it was asked for."""
+
+    async def refused(*_: Any, **__: Any) -> None:
+        raise FileError("write: not today", path="@PARAM/param.pck", code=MavFtpErr.FAIL)
+
+    async with open_flight(copter()) as flight:
+        parameters = flight.vehicle.parameters
+        names = list(await parameters.download())[:LEAST_TO_PACK]
+        monkeypatch.setattr(Files, "write", refused)
+        wanted = dict.fromkeys(names, 1)
+        if method == "ftp":
+            with pytest.raises(FileError, match="not today"):
+                await parameters.upload(wanted, method=method)
+            assert sent_writes(flight) == []
+        else:
+            results = await parameters.upload(wanted, method=method)
+            changed = [name for name, each in results.items() if each.outcome != "unchanged"]
+            assert sorted(set(sent_writes(flight))) == sorted(changed) != []
+
+
+@pytest.mark.parametrize("more", [0, 1])
+async def test_up_to_a_hundred_are_read_back_one_by_one_and_more_as_a_list(more: int) -> None:
+    """What is read back is what the vehicle has, whichever way it comes."""
+    async with open_flight(copter(400)) as flight:
+        parameters = flight.vehicle.parameters
+        table = await parameters.download()
+        wanted = {each.name: each.value + 1 for each in table.values() if each.type == ParameterType.REAL32}
+        wanted = dict(list(wanted.items())[: MOST_TO_READ_BACK + more])
+        assert len(wanted) == MOST_TO_READ_BACK + more
+        flight.wire.forget()
+        results = await parameters.upload(wanted, method="ftp")
+        assert {each.outcome for each in results.values()} == {"set"}
+        assert {name: each.value for name, each in results.items()} == pytest.approx(wanted, rel=1e-6)
+        assert (reads_and_lists(flight) >= MOST_TO_READ_BACK) is not bool(more)
 
 
 async def test_what_was_changed() -> None:
