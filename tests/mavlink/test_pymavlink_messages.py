@@ -180,7 +180,7 @@ def test_texts_are_bytes_or_text_and_the_later_one_counts() -> None:
         ),
         (ardupilotmega.MAVLink_unknown(60_000, b""), "MAVLink_unknown is nothing that can be sent"),
     ],
-    ids=str,
+    ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_what_cannot_be_sent_is_named(given: Any, complaint: str) -> None:
     with pytest.raises(LocalProtocolError, match=complaint):
