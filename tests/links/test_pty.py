@@ -79,3 +79,18 @@ def test_what_nobody_reads_is_dropped_and_files_are_left_alone(tmp_path: Path) -
     asyncio.run(run())
     assert taken.read_text() == "precious"
     assert not os.path.lexists(dead)
+
+
+@posix_only
+def test_closed_the_loop_does_not_look_at_it_any_more() -> None:
+    """Another file may have the number soon."""
+
+    async def close() -> None:
+        link = PtyLink()
+        await link.open(Heard())
+        ours = link._ends[0]
+        link.close()
+        await link.wait_closed()
+        assert not asyncio.get_running_loop().remove_reader(ours)
+
+    asyncio.run(close())

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from log_vehicle import LogVehicle, content, run
+from parameter_channel import framed
 
 from aerokit.errors import FileTimeout, RemoteProtocolError
 from aerokit.mavlink.messages import LogData, LogEntry, LogRequestData, LogRequestEnd
@@ -215,3 +216,16 @@ def test_many_entries_that_do_not_come_are_named_shortly() -> None:
         exchange.result()
     assert len(str(raised.value)) < 300
     assert len(raised.value.missing) == 65_535 - 60
+
+
+@pytest.mark.parametrize(("blocks_ahead", "is_taken"), [(0, True), (39_999, True), (40_000, False)])
+def test_blocks_far_behind_all_others_are_not_taken_wherever_those_are(
+    blocks_ahead: int, is_taken: bool
+) -> None:
+    start = 30_000 * LOG_BLOCK
+    into = Reassembly(lambda data: None, block_size=LOG_BLOCK, start=start)
+    exchange = LogDownload(1, 1, 1, 100_000 * LOG_BLOCK, into)
+    exchange.start(0.0)
+    offset = start + blocks_ahead * LOG_BLOCK
+    exchange.receive(framed(LogData(1, offset, LOG_BLOCK, bytes(LOG_BLOCK))), 0.1)
+    assert (into.done > start) is is_taken

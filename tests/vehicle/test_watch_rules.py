@@ -17,7 +17,15 @@ from aerokit.runtime.connection import Connection
 from aerokit.runtime.events import LinkReport, VehicleBack, VehicleRebooted, VehicleSilent
 from aerokit.vehicle.orders.bridge import Bridge
 from aerokit.vehicle.orders.progress import Stillness
-from aerokit.vehicle.orders.setpoints import SLOW_M_S, BodyVelocitySetpoint, VelocitySetpoint, wants_motion
+from aerokit.vehicle.orders.setpoints import (
+    FAR,
+    SLOW_M_S,
+    BodyVelocitySetpoint,
+    LocalPositionSetpoint,
+    VelocitySetpoint,
+    wants_motion,
+)
+from aerokit.vehicle.state.movement import LocalPosition
 from aerokit.vehicle.talk.talk import Talk
 from aerokit.vehicle.talk.watch import LinkWatch, VehicleWatch
 
@@ -343,3 +351,18 @@ def test_who_is_told_to_move_at_0_3_m_s_should_move(speed_m_s: float, wanted: bo
     nobody = cast("Bridge", None)  # a velocity alone says it
     assert wants_motion(VelocitySetpoint(east_m_s=speed_m_s), nobody) is wanted
     assert wants_motion(BodyVelocitySetpoint(right_m_s=speed_m_s), nobody) is wanted
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize(("off_m", "wanted"), [(0.0, False), (2.9, False), (3.1, True), (-3.1, True)])
+def test_who_is_told_a_place_moves_when_it_is_far(axis: int, off_m: float, wanted: bool) -> None:
+    """By what it is away from where it is, along each axis."""
+    here = LocalPosition(-5.0, 7.0, -10.0, 0.0, 0.0, 0.0)
+    telemetry = SimpleNamespace(local_position=SimpleNamespace(latest=here))
+    talk = SimpleNamespace(autopilot=SimpleNamespace(arrival_radius_m=3.0 / FAR), telemetry=telemetry)
+    place = [here.north_m, here.east_m, here.down_m]
+    place[axis] += off_m
+    bridge = cast("Bridge", SimpleNamespace(talk=talk))
+    assert wants_motion(LocalPositionSetpoint(*place), bridge) is wanted
+    telemetry.local_position.latest = None
+    assert wants_motion(LocalPositionSetpoint(*place), bridge) is False

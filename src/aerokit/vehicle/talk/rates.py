@@ -233,7 +233,7 @@ class MessageRates:
             stream.was_asked(self._connection.now(), stream.wanted_hz)
         for group, hz in wanted.items():
             if hz > 0:  # what nobody here wants any more may have been running before, for somebody else
-                rate = min(math.ceil(hz), 0xFFFF)
+                rate = math.ceil(hz)
                 self._connection.send(RequestDataStream(self._system_id, self._component_id, group, rate, 1))
 
     def _fastest_of(self, group: int) -> float:
