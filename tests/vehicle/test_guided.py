@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import itertools
 import math
 from collections.abc import Callable
@@ -500,6 +501,17 @@ async def test_px4_refuses_offboard() -> None:
         await anyio.sleep(5.0)
         assert not flight.wire.setpoints()
         assert flight.vehicle.mode_name == "LOITER"
+
+
+async def test_px4_stream_that_stopped_while_offboard_was_asked_for_is_not_entered() -> None:
+    async with open_px4() as flight:
+        await flight.take_off()
+        asyncio.get_running_loop().call_later(1.005, block_loop, 1.5)
+        with pytest.raises(
+            SetpointStreamStopped, match=r"event loop was blocked for 1\.\d s; .* told to hold"
+        ):
+            async with flight.vehicle.guided.velocity(NORTH, valid_for_s=5):
+                raise AssertionError("entered")
 
 
 async def test_px4_block_left_by_an_error() -> None:

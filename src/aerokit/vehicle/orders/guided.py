@@ -287,6 +287,7 @@ class SetpointStream(Generic[SetpointT]):
         finally:
             self._is_entering = False
             self._set_at = self._now()
+        self._raise_if_stopped()
 
     # ---------------------------------------------------------------------------- the stream
 
