@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 import signal
 from collections.abc import AsyncIterator
 from typing import Any
@@ -45,6 +46,12 @@ def what_was_there_before_is_no_garbage() -> None:
     """Collections that go through ten thousand tests keep all threads waiting, the simulated vehicles' among them."""
     gc.collect()
     gc.freeze()
+
+
+@pytest.hookimpl(optionalhook=True)  # of pytest-xdist
+def pytest_xdist_auto_num_workers() -> int:
+    """One more than there are processors: many tests wait for sockets and other processes."""
+    return 1 + (os.cpu_count() or 1)
 
 
 def pytest_report_header() -> str:
