@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import errno
+import linecache
 import os
 import subprocess
 import sys
@@ -14,6 +15,7 @@ from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import Any
 
+import anyio
 import pytest
 
 from aerokit.errors import ConnectionClosed, LinkOpenError
@@ -202,7 +204,9 @@ async def fail() -> None:
 Place = tuple[str, int]
 
 
-def interrupted_at(place: Place | None) -> set[Place]:
+def interrupted_at(
+    place: Place | None, use: Callable[[list[LoopThread]], object] = uses_of_the_loop
+) -> set[Place]:
     """Raise KeyboardInterrupt where the main thread first comes to this place; the places where it has been."""
     seen: set[Place] = set()
 
@@ -218,12 +222,47 @@ def interrupted_at(place: Place | None) -> set[Place]:
     before, loops = sys.gettrace(), list[LoopThread]()
     sys.settrace(trace)
     try:
-        uses_of_the_loop(loops)
+        use(loops)
     finally:
         sys.settrace(before)
         for loop in loops:  # where closing was interrupted, it can be closed again
             loop.close()
     return seen
+
+
+def test_what_is_run_to_its_end_is_run_wherever_ctrl_c_comes() -> None:
+    """At every line of ours but those before it can be noticed: the calls themselves."""
+    done: list[int] = []
+
+    async def work() -> None:
+        with anyio.CancelScope(shield=True):  # as what puts values back
+            await asyncio.sleep(0)
+            done.append(1)
+
+    def use(loops: list[LoopThread]) -> None:
+        loops[0].run_to_its_end(work)
+
+    def interrupted(place: Place | None) -> set[Place]:
+        loop = LoopThread()
+        try:
+            return interrupted_at(place, lambda _: use([loop]))
+        finally:
+            loop.close()
+
+    places = {place for place in interrupted(None) if place[0].endswith(("loop_thread.py", "reply.py"))}
+    assert len(places) > 20
+    left_undone = set()
+    for place in places:
+        done.clear()
+        with pytest.raises(KeyboardInterrupt):
+            interrupted(place)
+        if not done:
+            left_undone.add(linecache.getline(*place).strip())
+    assert left_undone == {
+        "return self._run(None, function, *args, **kwargs)",
+        "call: _Call[T] | None = None",
+        "try:",
+    }
 
 
 def test_ctrl_c_is_never_lost_and_leaves_nothing_behind() -> None:

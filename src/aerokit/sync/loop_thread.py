@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Generic, ParamSpec, TypeVar
 
 import anyio
 
-from aerokit.errors import BusyError, ConnectionClosed, LinkOpenError
+from aerokit.errors import AerokitError, BusyError, ConnectionClosed, LinkOpenError
 from aerokit.runtime.cancellation import Cancellation
 from aerokit.sync.reply import Reply
 
@@ -102,15 +102,21 @@ class LoopThread:
         **kwargs: P.kwargs,
     ) -> T:
         """``patience_s``: how long to wait for the end of an interrupted call; None: as long as it takes."""
-        call = _Call(functools.partial(function, *args, **kwargs))
+        call: _Call[T] | None = None
         try:
+            call = _Call(functools.partial(function, *args, **kwargs))
             self._start(call)
             self.wait_for(call)
-        except BaseException:
-            self._cancel(call)
-            while call.was_started and not call.wait(WAKE_S if patience_s is None else patience_s):
-                if patience_s is not None or not self._thread.is_alive():
-                    break
+        except BaseException as error:
+            if patience_s is None and isinstance(error, KeyboardInterrupt):  # it may not have begun
+                call = call or _Call(functools.partial(function, *args, **kwargs))
+                with contextlib.suppress(AerokitError):
+                    self._start(call)
+            if call is not None:
+                self._cancel(call)
+                while call.was_started and not call.wait(WAKE_S if patience_s is None else patience_s):
+                    if patience_s is not None or not self._thread.is_alive():
+                        break
             raise
         return call.result()
 
@@ -306,7 +312,10 @@ class _Calls:
         return self._process == os.getpid()
 
     def begin(self, call: _Call[Any]) -> None:
-        """Await it in a task."""
+        """Await it in a task; asked for twice, once."""
+        if call.has_begun:
+            return
+        call.has_begun = True
         task = asyncio.get_running_loop().create_task(call.live())
         self._tasks[task] = call
         task.add_done_callback(self._end_of)
@@ -357,6 +366,9 @@ class _Call(Reply[T]):
         self._function = function
         self._cancellation = Cancellation()
         self.was_started = False
+        """Whether the loop was asked to run it."""
+        self.has_begun = False
+        """Whether the loop runs it, or has."""
 
     def cancel(self) -> None:
         """Cancel it (loop thread); idempotent."""
