@@ -10,7 +10,8 @@ from typing import Any
 
 import pytest
 from flight_harness import Flight, in_the_air, open_flight
-from hypothesis import settings
+from hypothesis import given, settings, strategies
+from late_loop import LateLoop
 from recorded import headline
 from wire_diary import (
     pytest_addoption,
@@ -18,8 +19,6 @@ from wire_diary import (
     pytest_pyfunc_call,
     pytest_runtest_protocol,
 )
-
-from aerokit.testing.clock import VirtualClockLoop
 
 __all__ = [
     "pytest_addoption",
@@ -38,11 +37,17 @@ settings.load_profile("aerokit")
 
 @pytest.fixture
 def anyio_backend() -> tuple[str, dict[str, Any]]:
-    return "asyncio", {"loop_factory": VirtualClockLoop}
+    return "asyncio", {"loop_factory": LateLoop}
+
+
+@pytest.fixture(scope="session", autouse=True)
+def hypothesis_has_begun() -> None:
+    """At its first example it looks for who refers to its generators, and finds nobody who is frozen."""
+    given(strategies.none())(lambda _: None)()
 
 
 @pytest.fixture(scope="module", autouse=True)
-def what_was_there_before_is_no_garbage() -> None:
+def what_was_there_before_is_no_garbage(hypothesis_has_begun: None) -> None:
     """Collections that go through ten thousand tests keep all threads waiting, the simulated vehicles' among them."""
     gc.collect()
     gc.freeze()

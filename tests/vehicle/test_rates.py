@@ -253,9 +253,9 @@ async def test_old_firmware_takes_the_fastest_wish_of_a_group_and_gives_it_back(
         await anyio.sleep(2.0)
         flight.wire.forget()
         with flight.vehicle.rate(m.Ahrs2, 30.0):
-            await anyio.sleep(2.0)
+            await anyio.sleep(1.5)
             assert group_requests(flight) == {MavDataStream.EXTRA1: [(30, 1)]}
-        await anyio.sleep(2.0)
+        await anyio.sleep(1.5)
         assert group_requests(flight) == {MavDataStream.EXTRA1: [(30, 1), (10, 1)]}
 
 
