@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import inspect
 import pickle
 
 import pytest
@@ -48,6 +49,19 @@ def test_fields_by_place_by_name_and_by_default() -> None:
     assert (Point(1).x, Point(1).y, Point(y=5, x=4).to_dict()) == (1, 2.0, {"x": 4, "y": 5})
     with pytest.raises(TypeError):
         Point()  # type: ignore[call-arg]
+
+
+def test_what_is_shown_of_a_class_are_its_fields_before_and_after_the_first_value() -> None:
+    class Late(Heard):
+        """Of which none was made."""
+
+        of: str = "it"
+
+    shown = "(at, text, loudness=1.0, of='it')"
+    assert str(inspect.signature(Late)) == shown
+    Late(1.0, "a")
+    assert str(inspect.signature(Late)) == shown
+    assert str(inspect.signature(HeardAgain)) == "(at, text, loudness=1.0)"
 
 
 def test_it_cannot_be_changed_and_has_no_other_attributes() -> None:

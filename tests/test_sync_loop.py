@@ -251,13 +251,16 @@ def test_what_is_run_to_its_end_is_run_wherever_ctrl_c_comes() -> None:
 
     places = {place for place in interrupted(None) if place[0].endswith(("loop_thread.py", "reply.py"))}
     assert len(places) > 20
-    left_undone = set()
+    left_undone, was_come_to = set(), set()
     for place in places:
         done.clear()
-        with pytest.raises(KeyboardInterrupt):
-            interrupted(place)
-        if not done:
-            left_undone.add(linecache.getline(*place).strip())
+        try:
+            interrupted(place)  # this time it may not come there: which thread is quicker decides
+        except KeyboardInterrupt:
+            was_come_to.add(place)
+            if not done:
+                left_undone.add(linecache.getline(*place).strip())
+    assert len(was_come_to) > 20
     assert left_undone == {
         "return self._run(None, function, *args, **kwargs)",
         "call: _Call[T] | None = None",

@@ -1,7 +1,7 @@
 """``Snapshot``: an immutable value with named fields, like a dataclass, but quick to define and to make.
 
 Thirty frozen, slotted dataclasses cost more to import than the rest of the package. This writes the one
-method that must be written, ``__init__``, and shares the others.
+method that must be written, ``__init__``, for the first value that is made, and shares the others.
 """
 
 from __future__ import annotations
@@ -10,6 +10,9 @@ from operator import attrgetter
 from typing import TYPE_CHECKING, Any, ClassVar
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+    from inspect import Signature
+
     from typing_extensions import Self, dataclass_transform
 else:  # importing typing_extensions would cost more than everything else here
 
@@ -33,14 +36,33 @@ class _SnapshotType(type):
         fields = (*(field for base in bases for field in getattr(base, "__match_args__", ())), *own)
         cls = super().__new__(mcs, name, bases, {**namespace, "__slots__": own, "__match_args__": fields})
         if own:
-            _write_init(cls, fields, defaults)
+            type.__setattr__(cls, "__init__", _init_later(cls))
         type.__setattr__(cls, "_defaults", defaults)
         type.__setattr__(cls, "_values", attrgetter(*(fields or ("__class__",))))
         return cls
 
+    @property
+    def __signature__(cls) -> Signature:
+        """What editors and notebooks show of a class before the first value of it is made."""
+        from inspect import signature
 
-def _write_init(cls: type, fields: tuple[str, ...], defaults: dict[str, Any]) -> None:
+        return signature(_written_init(cls).__get__(object()))
+
+
+def _init_later(cls: Any) -> Callable[..., None]:
+    """What writes ``__init__`` when it is first called: a program makes few of all the kinds of values there are."""
+
+    def write_and_call(self: object, *args: Any, **kwargs: Any) -> None:
+        init = _written_init(cls)
+        type.__setattr__(cls, "__init__", init)
+        init(self, *args, **kwargs)
+
+    return write_and_call
+
+
+def _written_init(cls: Any) -> Any:
     """``def __init__(self, a, b=default)``, which sets the slots directly, behind __setattr__'s back."""
+    fields, defaults = cls.__match_args__, cls._defaults
     scope: dict[str, Any] = {f"_set_{field}": getattr(cls, field).__set__ for field in fields}
     scope.update({f"_default_{field}": value for field, value in defaults.items()})
     arguments = [f"{field}=_default_{field}" if field in defaults else field for field in fields]
@@ -50,7 +72,7 @@ def _write_init(cls: type, fields: tuple[str, ...], defaults: dict[str, Any]) ->
     exec("\n".join(lines), scope)
     init = scope["__init__"]
     init.__qualname__ = f"{cls.__qualname__}.__init__"
-    type.__setattr__(cls, "__init__", init)
+    return init
 
 
 class Snapshot(metaclass=_SnapshotType):

@@ -5,23 +5,23 @@ Only this package touches sockets and ports.
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import TYPE_CHECKING
 
-from .address import ACCEPTED_FORMS, LinkAddress, parse_address
-from .create import create_link
-from .link import DrainListener, Link, Peer, PeerKeeper, Receiver
-from .memory import MemoryLink, memory_link_pair
-from .pty import PtyLink
-from .reconnecting import Interruptible, ReconnectingLink
-from .replay import Replay
-from .serial import SerialLink
-from .tcp import TcpConnect, TcpListen
-from .udp import UdpBroadcast, UdpConnect, UdpListen
+from aerokit.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from .address import ACCEPTED_FORMS, LinkAddress, parse_address
+    from .create import create_link
     from .fault_model import FaultModel
     from .faulty import FaultyLink
+    from .link import DrainListener, Link, Peer, PeerKeeper, Receiver
+    from .memory import MemoryLink, memory_link_pair
+    from .pty import PtyLink
+    from .reconnecting import Interruptible, ReconnectingLink
+    from .replay import Replay
+    from .serial import SerialLink
+    from .tcp import TcpConnect, TcpListen
+    from .udp import UdpBroadcast, UdpConnect, UdpListen
 
 __all__ = [
     "ACCEPTED_FORMS",
@@ -49,12 +49,31 @@ __all__ = [
     "parse_address",
 ]
 
-# Imported when first asked for: only tests want them, and `random` is dear.
-_HOMES = {"FaultModel": "aerokit.links.fault_model", "FaultyLink": "aerokit.links.faulty"}
+# Imported when first asked for: a program has one link, of one kind.
+_HOMES = {
+    "ACCEPTED_FORMS": "aerokit.links.address",
+    "DrainListener": "aerokit.links.link",
+    "FaultModel": "aerokit.links.fault_model",
+    "FaultyLink": "aerokit.links.faulty",
+    "Interruptible": "aerokit.links.reconnecting",
+    "Link": "aerokit.links.link",
+    "LinkAddress": "aerokit.links.address",
+    "MemoryLink": "aerokit.links.memory",
+    "Peer": "aerokit.links.link",
+    "PeerKeeper": "aerokit.links.link",
+    "PtyLink": "aerokit.links.pty",
+    "Receiver": "aerokit.links.link",
+    "ReconnectingLink": "aerokit.links.reconnecting",
+    "Replay": "aerokit.links.replay",
+    "SerialLink": "aerokit.links.serial",
+    "TcpConnect": "aerokit.links.tcp",
+    "TcpListen": "aerokit.links.tcp",
+    "UdpBroadcast": "aerokit.links.udp",
+    "UdpConnect": "aerokit.links.udp",
+    "UdpListen": "aerokit.links.udp",
+    "create_link": "aerokit.links.create",
+    "memory_link_pair": "aerokit.links.memory",
+    "parse_address": "aerokit.links.address",
+}
 
-
-def __getattr__(name: str) -> object:
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = globals()[name] = getattr(import_module(_HOMES[name]), name)
-    return value
+__getattr__, __dir__ = lazy_names(__name__, _HOMES, __all__)

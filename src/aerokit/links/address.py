@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import ipaddress
 import math
 import re
 from typing import Literal, NoReturn
-from urllib.parse import quote, unquote
 
 from aerokit.errors import LocalProtocolError
 from aerokit.snapshot import Snapshot
@@ -161,7 +159,7 @@ class _Parser:
             return self.serial(rest, options, decode=True)
         if kind == "replay":
             drive = scheme == "file" and re.match(r"/[a-z]:[/\\]", rest, re.IGNORECASE)
-            return self.replay(unquote(rest[1:] if drive else rest), options)
+            return self.replay(_unquote(rest[1:] if drive else rest), options)
         return self.network(kind, rest.removesuffix("/"), options)
 
     def bare(self, text: str) -> LinkAddress:
@@ -221,7 +219,7 @@ class _Parser:
         else:
             device, rate = text, None
         given = options.pop("baud", rate)
-        device = unquote(device) if decode else device
+        device = _unquote(device) if decode else device
         if not device.strip("/"):
             self.fail("the serial port is missing")
         baud = None if given is None else self.whole_number("the baud rate", given)
@@ -283,6 +281,10 @@ class _Parser:
 
 
 def _is_ipv6(text: str) -> bool:
+    if ":" not in text:
+        return False
+    import ipaddress  # as urllib below: few addresses need it
+
     try:
         ipaddress.IPv6Address(text)
     except ValueError:
@@ -292,7 +294,15 @@ def _is_ipv6(text: str) -> bool:
 
 def _quote(text: str) -> str:
     """Percent-encodes only what would be misread: ``%``, ``?`` and white space."""
+    from urllib.parse import quote
+
     return re.sub(r"[%?\s]", lambda match: quote(match[0], safe=""), text)
+
+
+def _unquote(text: str) -> str:
+    from urllib.parse import unquote
+
+    return unquote(text)
 
 
 def _quote_device(device: str) -> str:

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from aerokit.errors import LocalProtocolError
 
 from .address import LinkAddress, parse_address
-from .allowed import Peers
-from .link import Link
-from .pty import PtyLink
-from .replay import Replay
-from .serial import SerialLink
-from .tcp import CONNECT_TIMEOUT_S, TcpConnect, TcpListen
-from .udp import UdpBroadcast, UdpConnect, UdpListen
+
+if TYPE_CHECKING:
+    from .allowed import Peers
+    from .link import Link
 
 __all__ = ["create_link"]
 
@@ -29,16 +28,34 @@ def create_link(address: str | LinkAddress, *, baud: int = 57600, peers: Peers |
             f"peers = … is not allowed with {where}: nobody else can send there (allowed: udpin, udpbcast, tcpin)"
         )
     if where.kind == "serial":
+        from .serial import SerialLink  # each kind when it is wanted: a program has one link
+
         return SerialLink(where.device, where.baud or baud, rtscts=where.option("rtscts") == "1")
     if where.kind == "replay":
+        from .replay import Replay
+
         return Replay(where.path, float(where.option("speed") or 1.0))
     if where.kind == "pty":
+        from .pty import PtyLink
+
         return PtyLink(where.path)
-    if where.kind == "tcp":
-        timeout = float(where.option("timeout") or CONNECT_TIMEOUT_S)
-        return TcpConnect(where.host, where.port, connect_timeout_s=timeout)
+    if where.kind in ("tcp", "tcpin"):
+        return _tcp(where, peers)
+    return _udp(where, peers)
+
+
+def _tcp(where: LinkAddress, peers: Peers | None) -> Link:
+    from .tcp import CONNECT_TIMEOUT_S, TcpConnect, TcpListen
+
     if where.kind == "tcpin":
         return TcpListen(where.host, where.port, peers=peers)
+    timeout = float(where.option("timeout") or CONNECT_TIMEOUT_S)
+    return TcpConnect(where.host, where.port, connect_timeout_s=timeout)
+
+
+def _udp(where: LinkAddress, peers: Peers | None) -> Link:
+    from .udp import UdpBroadcast, UdpConnect, UdpListen
+
     if where.kind == "udpin":
         return UdpListen(where.host, where.port, peers=peers)
     if where.kind == "udpbcast":

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from aerokit.mavlink.dialect import STANDARD
@@ -66,6 +66,27 @@ class Bus:
     ) -> Detach:
         """As :meth:`attach_frames`; ``sink`` gets the message as a second argument if somebody else has it decoded."""
         return self._attach((system_id, message_type.ID), (BOTH, sink))
+
+    def attach_first(
+        self, message_ids: Iterable[int], make: Callable[[], object], *, system_id: int = EVERY_SYSTEM
+    ) -> Detach:
+        """Call ``make()``, once, when the first of these messages comes; what it attaches to that kind gets it."""
+
+        def first(frame: Frame) -> None:
+            detach_all()
+            before = self._plan(frame)[1]
+            make()
+            for kind, sink in self._plan(frame)[1]:
+                if (kind, sink) not in before:
+                    sink(self.dialect.decode(frame) if kind == MESSAGE else frame)
+
+        attached = [self._attach((system_id, each), (FRAME, first)) for each in message_ids]
+
+        def detach_all() -> None:
+            for detach in attached:
+                detach()
+
+        return detach_all
 
     def attach_event(self, event_type: type[EventT], sink: Callable[[EventT], None]) -> Detach:
         """Have every event of this class and of its subclasses delivered to ``sink``."""

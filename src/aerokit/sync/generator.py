@@ -86,7 +86,7 @@ class Page:
         """The lines of one member."""
         self.need(member.returns, member.module)
         node, name = member.node, member.name
-        if node is None or "property" in decorators_of(node):
+        if node is None or not {"property", "cached_property"}.isdisjoint(decorators_of(node)):
             return self._value(twin, member)
         for argument in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs, node.args.vararg):
             self.need(argument.annotation if argument else None, member.module)

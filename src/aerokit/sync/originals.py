@@ -82,6 +82,7 @@ TWINS = (
         "VehicleTwin",
         without=_names("telemetry"),
         direct=_names("distance_to describe_now"),
+        called=_names("guided gimbal files logs parameters mission fence rally"),
     ),
 )
 """The classes that programs without ``async`` use, each below those that it gives."""

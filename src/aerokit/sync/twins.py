@@ -2328,42 +2328,42 @@ class Vehicle(VehicleTwin):
     @cached_property
     def guided(self) -> Guided:
         """Set-point streams: velocity, position, acceleration, attitude."""
-        return Guided(self._loop, self.aio.guided)
+        return Guided(self._loop, self._loop.call(lambda: self.aio.guided))
 
     @cached_property
     def gimbal(self) -> Gimbal:
         """The gimbal: where it points, and orders to it."""
-        return Gimbal(self._loop, self.aio.gimbal)
+        return Gimbal(self._loop, self._loop.call(lambda: self.aio.gimbal))
 
     @cached_property
     def files(self) -> Files:
         """The files on it, by MAVFTP."""
-        return Files(self._loop, self.aio.files)
+        return Files(self._loop, self._loop.call(lambda: self.aio.files))
 
     @cached_property
     def logs(self) -> Logs:
         """Its flight logs."""
-        return Logs(self._loop, self.aio.logs)
+        return Logs(self._loop, self._loop.call(lambda: self.aio.logs))
 
     @cached_property
     def parameters(self) -> Parameters:
         """The autopilot's parameters: download, get, set, transactions, what was changed."""
-        return Parameters(self._loop, self.aio.parameters)
+        return Parameters(self._loop, self._loop.call(lambda: self.aio.parameters))
 
     @cached_property
     def mission(self) -> MissionControl:
         """The mission it holds: upload, download, start, pause, wait until it is finished."""
-        return MissionControl(self._loop, self.aio.mission)
+        return MissionControl(self._loop, self._loop.call(lambda: self.aio.mission))
 
     @cached_property
     def fence(self) -> FenceControl:
         """The fence it holds."""
-        return FenceControl(self._loop, self.aio.fence)
+        return FenceControl(self._loop, self._loop.call(lambda: self.aio.fence))
 
     @cached_property
     def rally(self) -> RallyControl:
         """The rally points it holds."""
-        return RallyControl(self._loop, self.aio.rally)
+        return RallyControl(self._loop, self._loop.call(lambda: self.aio.rally))
 
     def setup_signing(self, signing: Signing | None, *, timeout: float=5.0) -> None:
         """Give the vehicle a key (SETUP_SIGNING), and sign and check with it from then on; None takes the key away.

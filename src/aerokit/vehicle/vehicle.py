@@ -2,31 +2,36 @@
 
 from __future__ import annotations
 
+from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
 from aerokit.arguments import checks_arguments
-from aerokit.vehicle.files.files import Files
-from aerokit.vehicle.files.logs import Logs
+from aerokit.mavlink.messages import ParamValue
 from aerokit.vehicle.orders.arming import ArmingActions
 from aerokit.vehicle.orders.flight import FlightActions
-from aerokit.vehicle.orders.gimbal import Gimbal
-from aerokit.vehicle.orders.guided import Guided
 from aerokit.vehicle.orders.looking import LookActions
 from aerokit.vehicle.orders.modes import ModeActions
 from aerokit.vehicle.orders.talking import TalkActions
 from aerokit.vehicle.orders.travel import TravelActions
-from aerokit.vehicle.parameters.parameters import Parameters
 from aerokit.vehicle.plans.context import PlanContext
-from aerokit.vehicle.plans.fence import FenceControl
-from aerokit.vehicle.plans.mission import MissionControl
-from aerokit.vehicle.plans.rally import RallyControl
-from aerokit.vehicle.talk.signing import set_up_signing
+from aerokit.vehicle.state.told import MESSAGE_IDS
 
 if TYPE_CHECKING:
     from aerokit.mavlink.signing import Signing
+    from aerokit.vehicle.files.files import Files
+    from aerokit.vehicle.files.logs import Logs
     from aerokit.vehicle.orders.bridge import Bridge
+    from aerokit.vehicle.orders.gimbal import Gimbal
+    from aerokit.vehicle.orders.guided import Guided
+    from aerokit.vehicle.parameters.parameters import Parameters
+    from aerokit.vehicle.plans.fence import FenceControl
+    from aerokit.vehicle.plans.mission import MissionControl
+    from aerokit.vehicle.plans.rally import RallyControl
 
 __all__ = ["Vehicle"]
+
+TELL_OF_GIMBALS = ("GimbalDeviceAttitudeStatus", "MountStatus", "MountOrientation")
+"""By their names: few vehicles send one of them, and no other program needs their classes."""
 
 
 @checks_arguments
@@ -39,24 +44,70 @@ class Vehicle(FlightActions, TravelActions, LookActions, ArmingActions, ModeActi
 
     def __init__(self, bridge: Bridge) -> None:
         super().__init__(bridge)
-        transfers = bridge.talk.transfers
-        self.guided = Guided(bridge)
+        self._plans = PlanContext(bridge, lambda: self.files)
+        first = partial(self.connection.bus.attach_first, system_id=self.system_id)
+        bridge.talk.at_close(
+            first(map(MESSAGE_IDS.__getitem__, TELL_OF_GIMBALS), lambda: self.gimbal),
+            first([ParamValue.ID], lambda: self.parameters),
+        )
+
+    # Parts are made, and imported, when they are first used, or when the vehicle first says what they listen to.
+
+    @cached_property
+    def guided(self) -> Guided:
         """Set-point streams: velocity, position, acceleration, attitude."""
-        self.gimbal = Gimbal(bridge)
+        from aerokit.vehicle.orders.guided import Guided
+
+        return Guided(self._bridge)
+
+    @cached_property
+    def gimbal(self) -> Gimbal:
         """The gimbal: where it points, and orders to it."""
-        self.files = Files(transfers)
+        from aerokit.vehicle.orders.gimbal import Gimbal
+
+        return Gimbal(self._bridge)
+
+    @cached_property
+    def files(self) -> Files:
         """The files on it, by MAVFTP."""
-        self.logs = Logs(transfers, self.files)
+        from aerokit.vehicle.files.files import Files
+
+        return Files(self._talk.transfers)
+
+    @cached_property
+    def logs(self) -> Logs:
         """Its flight logs."""
-        self.parameters = Parameters(bridge.talk, self.files)
+        from aerokit.vehicle.files.logs import Logs
+
+        return Logs(self._talk.transfers, self.files)
+
+    @cached_property
+    def parameters(self) -> Parameters:
         """The autopilot's parameters: download, get, set, transactions, what was changed."""
-        plans = PlanContext(bridge, self.files)
-        self.mission = MissionControl(plans)
+        from aerokit.vehicle.parameters.parameters import Parameters
+
+        return Parameters(self._talk, self.files)
+
+    @cached_property
+    def mission(self) -> MissionControl:
         """The mission it holds: upload, download, start, pause, wait until it is finished."""
-        self.fence = FenceControl(plans)
+        from aerokit.vehicle.plans.mission import MissionControl
+
+        return MissionControl(self._plans)
+
+    @cached_property
+    def fence(self) -> FenceControl:
         """The fence it holds."""
-        self.rally = RallyControl(plans)
+        from aerokit.vehicle.plans.fence import FenceControl
+
+        return FenceControl(self._plans)
+
+    @cached_property
+    def rally(self) -> RallyControl:
         """The rally points it holds."""
+        from aerokit.vehicle.plans.rally import RallyControl
+
+        return RallyControl(self._plans)
 
     def __repr__(self) -> str:
         return f"<Vehicle {self.system_id}/{self.component_id} {self.autopilot.firmware}, {self.describe_link()}>"
@@ -79,4 +130,6 @@ class Vehicle(FlightActions, TravelActions, LookActions, ArmingActions, ModeActi
             OperationTimeout: it went on as before; the text has what it said.
             BusyError: another vehicle on this connection is just being given a key. Nothing was sent.
         """
+        from aerokit.vehicle.talk.signing import set_up_signing
+
         await set_up_signing(self._talk, signing, timeout)

@@ -49,7 +49,7 @@ class FileChannel:
             transfers.component_id,
             source_system=connection.source_system,
             source_component=connection.source_component,
-            first_sequence=int(connection.now() * 1000.0),
+            first_sequence=int(transfers.began_at * 1000.0),
         )
         """Addresses and numbers."""
         self._lock = asyncio.Lock()

@@ -51,7 +51,7 @@ class Gimbal:
         )
         """Where it points, as it tells by itself: nothing is asked for (GIMBAL_DEVICE_ATTITUDE_STATUS of any component
         of the vehicle, MOUNT_ORIENTATION, MOUNT_STATUS)."""
-        bridge.talk.cells.append(self.attitude)
+        bridge.talk.keep(self.attitude)
         bridge.talk.on_reboot.append(self._forget)
         self._listen(GimbalDeviceAttitudeStatus, self._on_device)
         self._listen(MountStatus, lambda message: self._tell(message, from_status(message)))
@@ -139,9 +139,9 @@ class Gimbal:
     # ----------------------------------------------------------------------------- receiving
 
     def _listen(self, message_type: type[Message], take: Callable[[Any], None]) -> None:
-        bus, detach = self._talk.connection.bus, self._talk.detach
+        bus = self._talk.connection.bus
         if bus.dialect.get(message_type.ID) is not None:
-            detach.append(bus.attach(message_type, take, system_id=self._talk.system_id))
+            self._talk.at_close(bus.attach(message_type, take, system_id=self._talk.system_id))
 
     def _on_device(self, message: GimbalDeviceAttitudeStatus) -> None:
         frame = message.received_frame
@@ -166,4 +166,3 @@ class Gimbal:
 
     def _forget(self) -> None:
         self._first = None
-        self.attitude.forget()

@@ -259,8 +259,7 @@ class TalkActions(Part):
         if cell is None:
             self.connection.check_types((message_type,))
             cell = self._messages[message_type] = self._message_cell(message_type)
-            self._talk.cells.append(cell)
-            self._talk.on_reboot.append(cell.forget)
+            self._talk.keep(cell)
             rate_hz = subscription_rate_hz(message_type) if rate_hz is None else rate_hz
         if rate_hz is not None:
             release = self._message_rates.pop(message_type, None)
@@ -283,7 +282,7 @@ class TalkActions(Part):
                 arrived_at = frame.received_at
                 cell.set(message, source)
 
-        self._talk.detach.append(self.connection.bus.attach(message_type, take, system_id=self.system_id))
+        self._talk.at_close(self.connection.bus.attach(message_type, take, system_id=self.system_id))
         return cell
 
     @property

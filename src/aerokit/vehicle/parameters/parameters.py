@@ -50,7 +50,7 @@ class Parameters:
     def __init__(self, talk: Talk, files: Files) -> None:
         self._transfers = transfers = talk.transfers
         self._access = ParameterAccess(transfers, files)
-        talk.detach.append(self._access.store.attach())
+        talk.at_close(self._access.store.attach())
         talk.on_reboot.append(self._access.forget)
         self._names = ParameterNames(self._access)
         self._metadata: Metadata | None = None

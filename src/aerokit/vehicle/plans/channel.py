@@ -92,20 +92,16 @@ class PlanChannel:
 
     async def has_ftp(self) -> bool:
         """Whether the vehicle has file transfer at all."""
-        return self._context.files is not None and await self._has(
-            MavProtocolCapability.FTP, by_default=False
-        )
+        return await self._has(MavProtocolCapability.FTP, by_default=False)
 
     async def write_file(self, items: Sequence[MissionItem]) -> None:
         """Write the file. ArduPilot looks at it when it is closed, and does not tell what it thinks of it."""
-        assert self._context.files is not None
-        await self._context.files.write(self._path, pack_items(items, self.mission_type), **self._options)
+        await self._context.files().write(self._path, pack_items(items, self.mission_type), **self._options)
         self._has_changed = True
 
     async def read_file(self) -> tuple[MissionItem, ...]:
         """Read the file; RemoteProtocolError when it is none of this kind."""
-        assert self._context.files is not None
-        data = await self._context.files.read(self._path, **self._options)
+        data = await self._context.files().read(self._path, **self._options)
         return self._tidy(unpack_items(data, self.mission_type))
 
     # ------------------------------------------------------------------------------------ inside

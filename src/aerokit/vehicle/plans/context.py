@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Protocol
 import anyio
 
 from aerokit.mavlink.messages import MissionCurrent
+from aerokit.vehicle.plans.mission_watch import MissionWatch
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from aerokit.mavlink.frame import Frame
     from aerokit.missions.item import MissionItem
@@ -57,9 +58,13 @@ class PlanMemory:
 
 
 class PlanContext:
-    """One lock, since autopilots have one state for the transfers of all three; what MISSION_CURRENT calls them."""
+    """One lock, since autopilots have one state for the transfers of all three; what MISSION_CURRENT calls them, and
+    how far the mission is.
 
-    def __init__(self, bridge: Bridge, files: PlanFiles | None) -> None:
+    ``files``: gives the vehicle's files when they are needed.
+    """
+
+    def __init__(self, bridge: Bridge, files: Callable[[], PlanFiles]) -> None:
         self.bridge, self.talk, self.files = bridge, bridge.talk, files
         self.transfers = bridge.talk.transfers
         self.autopilot = bridge.talk.autopilot
@@ -68,9 +73,10 @@ class PlanContext:
         """By MAV_MISSION_TYPE."""
         self._current: Frame | None = None
         talk = bridge.talk
-        talk.detach.append(
+        talk.at_close(
             talk.connection.bus.attach_frames(MissionCurrent, self._note_current, system_id=talk.system_id)
         )
+        self.watch = MissionWatch(talk)
 
     def now(self) -> float:
         """Seconds on the loop's clock."""

@@ -12,7 +12,6 @@ from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.vehicle.orders.progress import LONGEST_SILENCE_S, await_progress
 from aerokit.vehicle.plans.held import HeldPlan
 from aerokit.vehicle.plans.mission_end import MissionEnd
-from aerokit.vehicle.plans.mission_watch import MissionWatch
 
 if TYPE_CHECKING:
     from aerokit.autopilots.modes import Mode
@@ -39,8 +38,7 @@ class MissionControl(HeldPlan["Mission"]):
     def __init__(self, context: PlanContext) -> None:
         super().__init__(context)
         self._bridge, self._talk = context.bridge, context.talk
-        self._watch = MissionWatch(context.talk)
-        context.talk.on_reboot.append(self._watch.forget)
+        self._watch = context.watch
         self._order: Order | None = None
         """The last one given here."""
         self._is_paused = False

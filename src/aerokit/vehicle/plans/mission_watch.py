@@ -50,13 +50,14 @@ class MissionWatch:
         self._was_active = False
         self._stale_until = -math.inf
         telemetry = talk.telemetry
-        talk.detach += [
+        talk.at_close(
             telemetry.mission_current.observe(self._on_current, every_arrival=True),
             telemetry.mission_reached.observe(self._on_reached, every_arrival=True),
             telemetry.armed.observe(self._on_armed),
             talk.connection.on_end(self.close),
             lambda: self.close(ConnectionClosed("the block of this vehicle was left")),
-        ]
+        )
+        talk.on_reboot.append(self.forget)
 
     @property
     def last(self) -> int | None:

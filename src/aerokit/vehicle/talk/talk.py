@@ -50,7 +50,7 @@ RESULTS_OF_REFUSAL = (MavResult.TEMPORARILY_REJECTED, MavResult.DENIED, MavResul
 class Talk:
     """The autopilot of one remote system: its address, its state, its commands, rates and transfers, and its silence.
 
-    ``detach`` are called when the vehicle is let go, ``on_reboot`` after the vehicle has rebooted.
+    ``on_reboot`` are called after the vehicle has rebooted.
     """
 
     def __init__(
@@ -88,9 +88,9 @@ class Talk:
             send_command=self.commands.send_long,
         )
         self.is_closed = False
-        self.cells: list[StateCell[Any]] = [self.link_quality]
-        """Cells that end with the talk, beside those of the telemetry."""
-        self.detach: list[Detach] = []
+        self._cells: list[StateCell[Any]] = [self.link_quality]
+        self._detach: list[Detach] = []
+        self._ended_by: Exception | None = None
         self.on_reboot: list[Callable[[], None]] = [
             self.rates.ask_again,
             self.commands.forget_results,
@@ -111,12 +111,26 @@ class Talk:
         """Say and hear nothing more; who waits gets ConnectionClosed."""
         self.is_closed = self.transfers.is_closed = True
         self._on_end(ConnectionClosed("the block of this vehicle was left"))
-        for detach in self.detach:
+        for detach in self._detach:
             detach()
         self.commands.close()
         self.watch.close()
         self.link_watch.close()
         self.rates.close()
+
+    def at_close(self, *functions: Detach) -> None:
+        """Have these called when the vehicle is let go; at once if it was."""
+        self._detach += functions
+        if self.is_closed:
+            for function in functions:
+                function()
+
+    def keep(self, cell: StateCell[Any]) -> None:
+        """Have a cell end with the talk, and be forgotten when the vehicle has rebooted."""
+        self._cells.append(cell)
+        self.on_reboot.append(cell.forget)
+        if self._ended_by is not None:
+            cell.close(self._ended_by)
 
     def send(self, message: Message) -> None:
         """Send one message as it is; ConnectionClosed after :meth:`close`."""
@@ -213,9 +227,9 @@ class Talk:
                 detach = bus.attach_lazily(message_type, streams[message_id].take, system_id=self.system_id)
             else:
                 detach = bus.attach(message_type, handler, system_id=self.system_id)
-            self.detach.append(detach)
+            self._detach.append(detach)
         telemetry, publish = self.telemetry, self.publish
-        self.detach += [
+        self._detach += [
             telemetry.mode.observe(lambda old, new: publish(ModeChanged, old and old.name, new.name)),
             telemetry.armed.observe(lambda _, new: publish(ArmedChanged, new)),
             telemetry.landed_state.observe(lambda old, new: publish(LandedStateChanged, old, new)),
@@ -248,5 +262,6 @@ class Talk:
         self.background.cancel()
         self.watch.end(error)
         self.telemetry.close(error)
-        for cell in self.cells:
+        self._ended_by = error
+        for cell in self._cells:
             cell.close(error)

@@ -46,6 +46,8 @@ class Transfers:
         send_command: Callable[..., Awaitable[object]] | None = None,
     ) -> None:
         self.connection = connection
+        self.began_at = connection.now()
+        """When the talk with the vehicle began: numbers that must not be those of a program before count from here."""
         self.system_id, self.component_id = system_id, component_id
         self.autopilot = autopilot
         self.background = background
