@@ -33,6 +33,20 @@ MODULES = {
 }
 """Committed module → the XML files whose definitions it holds."""
 
+EVERYDAY = """
+    Attitude AttitudeQuaternion AvailableModes BatteryStatus CommandAck CommandInt CommandLong CurrentMode
+    DistanceSensor EstimatorStatus ExtendedSysState FileTransferProtocol GpsGlobalOrigin GpsRawInt Gps2Raw HomePosition
+    LocalPositionNed MissionAck MissionClearAll MissionCount MissionCurrent MissionItemInt MissionItemReached
+    MissionRequest MissionRequestInt MissionRequestList MissionSetCurrent MissionWritePartialList ParamError
+    ParamRequestList ParamRequestRead ParamSet ParamValue PowerStatus RcChannels RequestDataStream ServoOutputRaw
+    SetAttitudeTarget SetMode SetPositionTargetGlobalInt SetPositionTargetLocalNed Statustext SysStatus SystemTime
+    Timesync VfrHud Vibration WindCov
+"""
+"""The messages of ``common.xml`` that ``common.py`` holds: those of every flight. Two hundred others, which would take
+most of the time of an import, are in ``common_more.py``."""
+
+COMMON_MORE = "common_more"
+
 FOLDER = Path(__file__).parent
 
 _MARK = "XML fingerprint: "
@@ -192,9 +206,11 @@ def generate(folder: Path | None = None) -> dict[str, str]:
     files: dict[str, str] = {}
     files["messages/__init__.py"], files["messages/__init__.pyi"] = _messages_init(messages)
     files["enums/__init__.py"], files["enums/__init__.pyi"] = _enums_init(enums)
+    for module in (*MODULES, COMMON_MORE):
+        own_messages = [each for each in messages if _module_of(each) == module]
+        files[f"messages/{module}.py"] = _messages_module(module, own_messages)
     for module, stems in MODULES.items():
         own = [enum for enum in enums if enum.origin in stems]
-        files[f"messages/{module}.py"] = _messages_module(module, [m for m in messages if m.origin in stems])
         files[f"enums/{module}.py"] = _enums_module(module, stems, own)
         files[f"enums/{module}.pyi"] = _enums_stub(module, own)
     header = _HEADER.format(fingerprint(folder))
@@ -246,6 +262,12 @@ def _stems() -> list[str]:
     return [stem for stems in MODULES.values() for stem in stems]
 
 
+def _module_of(message: MessageDefinition) -> str:
+    if message.origin == "common" and message.class_name not in EVERYDAY.split():
+        return COMMON_MORE
+    return next(module for module, stems in MODULES.items() if message.origin in stems)
+
+
 def _read(path: str) -> str:
     return (FOLDER / path).read_text(encoding="utf-8")
 
@@ -257,19 +279,19 @@ def _more(stems: Sequence[str]) -> str:
 def _messages_module(module: str, messages: Sequence[MessageDefinition]) -> str:
     text = "\n\n".join(render_message(message) for message in messages)
     helpers = "".join(f", {name}" for name in ("pack_bytes", "pack_items", "pack_text") if f"{name}(" in text)
-    head = _MESSAGES_HEAD.format(name=module, more=_more(MODULES[module]), helpers=helpers)
+    stems = MODULES.get(module, MODULES["common"])
+    head = _MESSAGES_HEAD.format(name=stems[0], more=_more(stems), helpers=helpers)
     if "Sequence[" not in text:
         head = head.replace("    from collections.abc import Sequence\n\n", "")
     return head + _all(message.class_name for message in messages) + "\n" + text
 
 
 def _messages_init(messages: Sequence[MessageDefinition]) -> tuple[str, str]:
-    modules = {stem: module for module, stems in MODULES.items() for stem in stems}
     rows = ""
     for message in sorted(messages, key=lambda message: message.id):
         numbers = f"{message.crc_extra}, {message.base_length}, {message.length}"
-        rows += f'    {message.id}: ("{message.class_name}", "{modules[message.origin]}", {numbers}),\n'
-    names = {message.class_name: modules[message.origin] for message in messages}
+        rows += f'    {message.id}: ("{message.class_name}", "{_module_of(message)}", {numbers}),\n'
+    names = {message.class_name: _module_of(message) for message in messages}
     stub = _reexports("messages", names) + "\nINDEX: dict[int, tuple[str, str, int, int, int]]\n"
     return _MESSAGES_INIT.format(rows=rows), stub
 

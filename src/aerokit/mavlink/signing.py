@@ -11,10 +11,13 @@ from enum import Enum
 from hashlib import sha256
 from hmac import compare_digest
 from os import PathLike
+from typing import TYPE_CHECKING
 
 from aerokit.errors import LocalProtocolError
 from aerokit.mavlink.frame import SIGNATURE_LENGTH, SIGNED, Frame
-from aerokit.mavlink.timestamp_file import TimestampFile
+
+if TYPE_CHECKING:
+    from aerokit.mavlink.timestamp_file import TimestampFile
 
 __all__ = ["Refusal", "Signing", "SigningKey", "is_signed_with_a_key", "timestamp_at"]
 
@@ -168,8 +171,11 @@ class Signing:
         self.allow_unsigned = allow_unsigned
         self.refused: dict[Refusal, int] = dict.fromkeys(Refusal, 0)
         """How many frames were refused, for each reason."""
-        self._kept = None if keep is None else TimestampFile(keep, LAST_TIMESTAMP)
-        if self._kept is not None:
+        self._kept: TimestampFile | None = None
+        if keep is not None:
+            from aerokit.mavlink.timestamp_file import TimestampFile  # with pathlib: few programs need it
+
+            self._kept = TimestampFile(keep, LAST_TIMESTAMP)
             self.timestamp = max(self.timestamp, self._kept.timestamp)
         self._keyed = sha256(key.secret)
         self.streams: dict[tuple[int, int, int], int] = {}
