@@ -22,8 +22,8 @@ PYTHONS = [f"3.{minor}" for minor in range(10, 15)]
 
 @nox.session(python=[version for version in PYTHONS if shutil.which(f"python{version}")] or None)
 def tests(session: nox.Session) -> None:
-    """Run the tests; on Python with the extras of `fast`, so that uvloop is tested too."""
-    session.install("-e", ".[test,fast]")
+    """Run the tests, on stock asyncio and on uvloop."""
+    session.install("-e", ".[test]")
     session.run("pytest", *session.posargs)
 
 
@@ -46,13 +46,13 @@ def lowest(session: nox.Session) -> None:
 @nox.session
 def beside_trio(session: nox.Session) -> None:
     """Run them with trio and sniffio installed: anyio does not take asyncio for granted then."""
-    session.install("-e", ".[test,fast]", "trio", "sniffio")
+    session.install("-e", ".[test]", "trio", "sniffio")
     session.run("pytest", "-q", *(session.posargs or MEETS_OTHERS))
 
 
 def _install_lowest(session: nox.Session) -> None:
     session.install("uv>=0.5")
-    session.run("uv", "pip", "install", "-q", "--resolution", "lowest-direct", "-e", ".[test,fast]")
+    session.run("uv", "pip", "install", "-q", "--resolution", "lowest-direct", "-e", ".[test]")
 
 
 @nox.session
@@ -85,7 +85,7 @@ def docs(session: nox.Session) -> None:
 @nox.session
 def bench(session: nox.Session) -> None:
     """Measure beside pymavlink and MAVSDK, print the table, write bench.json."""
-    session.install("-e", ".[fast]", "mavsdk>=4")
+    session.install("-e", ".", "mavsdk>=4")
     session.run("python", "benchmarks/run.py", *session.posargs)
 
 
@@ -99,7 +99,7 @@ def bench_transfers(session: nox.Session) -> None:
 @nox.session
 def bench_dronekit(session: nox.Session) -> None:
     """Run DroneKit programs on aerokit, DroneKit 2.9.2 and dronekit2, half an hour. Writes bench-dronekit.json."""
-    session.install("-e", ".[fast]")
+    session.install("-e", ".")
     pythons = {}
     for name, packages in {
         "dronekit": ("dronekit==2.9.2", "future"),
@@ -151,7 +151,7 @@ def soak(session: nox.Session) -> None:
 @nox.session
 def diaries(session: nox.Session) -> None:
     """Keep what goes over the wire in each test (tests/wire_diary.py), after a change of it that is meant."""
-    session.install("-e", ".[test,fast]")
+    session.install("-e", ".[test]")
     session.run("python", "tests/keep_diaries.py")
 
 

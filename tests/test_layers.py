@@ -39,7 +39,7 @@ ALLOWED_BESIDE = {("sim", "autopilots"), ("sim", "links")}
 REEXPORTED = {"messages": "mavlink", "enums": "mavlink", "events": "runtime", "__version__": "errors"}
 SANS_IO = ("mavlink", "parameters", "missions", "protocols", "autopilots")
 NO_IO = {"asyncio", "anyio", "socket", "threading", "time", "logging", "select", "selectors", "subprocess"}
-SOCKETS = {"socket", "serial", "serial_asyncio", "serial_asyncio_fast"}
+SOCKETS = {"socket", "serial", "serial_asyncio"}
 
 
 def floor_of(package: str) -> int:

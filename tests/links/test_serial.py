@@ -20,21 +20,6 @@ from aerokit.links import SerialLink, serial
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="needs pseudo-terminals")
 
-PACKAGES = [
-    pytest.param(
-        name,
-        marks=pytest.mark.skipif(importlib.util.find_spec(name) is None, reason=f"{name} is not installed"),
-    )
-    for name in ("serial_asyncio", "serial_asyncio_fast")
-]
-
-
-@pytest.fixture(params=PACKAGES, autouse=True)
-def package(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every test here runs on either package."""
-    module = importlib.import_module(request.param)
-    monkeypatch.setattr(serial, "_transports", lambda: module)
-
 
 @each_loop
 @each_traffic

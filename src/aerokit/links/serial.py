@@ -1,13 +1,11 @@
-"""Serial ports, by pyserial-asyncio-fast where it is installed and by pyserial-asyncio where not.
+"""Serial ports, by pyserial-asyncio.
 
-Either is used for its transport alone, with the port's own calls replaced, because of what was seen:
+It is used for its transport alone, with the port's own calls replaced, because of what was seen:
 
-* They wait in ``tcdrain`` when they close, 0.6 on the loop itself: a port that is held up blocks everything.
+* It waits in ``tcdrain`` on the loop itself when it closes: a port that is held up blocks everything.
 * pyserial's ``write`` spins while the device takes nothing; its ``read`` fails above file descriptor 1023.
 * A write to an unplugged device goes to the loop's exception handler too; a read from one is told only when
   what is left to write has gone.
-* pyserial-asyncio-fast 0.16 keeps its writer on the loop when a partial write has been completed, and fails
-  an assertion at every turn from then on.
 """
 
 from __future__ import annotations
@@ -20,7 +18,6 @@ import os
 import sys
 from collections.abc import Callable
 from functools import partial
-from types import ModuleType
 from typing import Any
 
 from .address import LinkAddress
@@ -84,11 +81,12 @@ class SerialLink(BaseLink):
     async def _connect(self) -> None:
         """Without an await in it: there is no half-way at which it could be cancelled."""
         self._loop = asyncio.get_running_loop()
-        transports = _transports()
         self._port = port = self._open_port()
         self._released.clear()
-        self._transport = transports.SerialTransport(self._loop, _SerialProtocol(self), port)
-        _replace_calls(port, self._transport, self._device_failed)
+        self._transport = importlib.import_module("serial_asyncio").SerialTransport(
+            self._loop, _SerialProtocol(self), port
+        )
+        _replace_calls(port, self._device_failed)
         limit = max(4096, int(self._baud / 10 * _SECONDS_HELD_BACK))
         self._transport.set_write_buffer_limits(high=0)  # what the driver does not take waits in the outbox
         self._outbox = Outbox(
@@ -180,21 +178,14 @@ class _SerialProtocol(asyncio.Protocol):
         self._link._lose(f"the device is gone: {exc}", exc)
 
 
-def _transports() -> ModuleType:
-    try:
-        return importlib.import_module("serial_asyncio_fast")
-    except ImportError:
-        return importlib.import_module("serial_asyncio")
-
-
-def _replace_calls(port: Any, transport: Any, failed: _Failed) -> None:
+def _replace_calls(port: Any, failed: _Failed) -> None:
     """Gives a port calls that never wait and report a lost device to ``failed``."""
     port.flush = lambda: None
     if os.name == "posix":
         port.read = partial(_read, port.fileno(), failed)
-        port.write = partial(_write, partial(os.write, port.fileno()), transport, failed)
+        port.write = partial(_write, partial(os.write, port.fileno()), failed)
     else:
-        port.write = partial(_write, port.write, transport, failed)
+        port.write = partial(_write, port.write, failed)
 
 
 def _read(fd: int, failed: _Failed, _size: int) -> bytes:
@@ -210,17 +201,14 @@ def _read(fd: int, failed: _Failed, _size: int) -> bytes:
     return data
 
 
-def _write(write: Callable[[bytes], int], transport: Any, failed: _Failed, data: bytes) -> int:
+def _write(write: Callable[[bytes], int], failed: _Failed, data: bytes) -> int:
     try:
-        written = write(data)
+        return write(data)
     except (BlockingIOError, InterruptedError):
         raise  # the transport keeps it for later
     except OSError as error:
         failed(error)
-        written = len(data)
-    if written == len(data):
-        transport.flush()  # takes back its wish to write
-    return written
+        return len(data)
 
 
 def _open_error(address: str, error: Exception) -> OSError:
