@@ -82,8 +82,8 @@ class Framer:
 
         Never raises, whatever the bytes.
         """
-        # The loop is long and repeats `_examine` on purpose: it runs for every frame on the air. What is neither an
-        # unsigned frame of MAVLink 2 whose message is known nor another good frame takes the slow path.
+        # The loop is long and repeats `_examine` on purpose: it runs for every frame on the air. What is no good frame
+        # of MAVLink 2 whose message is known takes the slow path.
         if type(data) is not bytes:
             data = bytes(data)
         size = len(data)
@@ -102,10 +102,10 @@ class Framer:
         while begin < size:
             try:
                 magic, length, flags, sequence, key, message_id = _HEADER_V2(data, begin)
-                if good := magic == MAGIC_V2 and not flags:
+                if good := magic == MAGIC_V2 and (not flags or (flags == SIGNED and begin + 25 + length <= size)):
                     message_id &= 0xFFFFFF
                     upto = begin + 10 + length
-                    end = upto + 2
+                    end = upto + 15 if flags else upto + 2
                     body = data[begin + 1 : upto]
                     (checksum,) = _CHECKSUM(data, upto)
                     good = x25(body + extras[message_id]) == checksum
@@ -143,6 +143,8 @@ class Framer:
                     frame.system_id = source.system_id
                     frame.component_id = source.component_id
                     frame.received_at = now
+                    if flags:
+                        frame._raw = data[begin:end]
                 else:
                     frame = Frame.parse(data[begin:end], now)
                 frames.append(frame)
