@@ -1,62 +1,104 @@
-"""A recorded flight through a whole connection, with a vehicle's telemetry attached: frames per second.
+"""A recorded flight through a whole connection: frames per second of processor time.
 
     python benchmarks/deliver.py
 
-Datagram by datagram: framed, checked, decoded where a state cell wants the message, and kept in the cells with units
-converted. pymavlink's counterpart is what ``recv_match`` does with bytes it has read: ``parse_buffer`` and
-``post_message``, which keeps the latest message of each type.
+``deliver_telemetry``: a vehicle's telemetry is attached. Datagram by datagram: framed, checked, decoded where a state
+cell wants the message, and kept in the cells with units converted. ``deliver_async_for``: a program subscribes to every
+kind of message and reads them by ``async for``, in pieces of 1 kB, as TCP and serial ports bring them and as busy UDP
+ports do; after each piece the loop takes a turn. pymavlink's counterpart is what ``recv_match`` does with bytes it has
+read: ``parse_buffer`` and ``post_message``, which keeps the latest message of each type.
 """
 
 from __future__ import annotations
 
+import asyncio
 import json
 import statistics
 import sys
 import time
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Awaitable, Callable
 from typing import Any
 
 import anyio
-from decode import recording
+import anyio.lowlevel
+import decode
 from pymavlink import mavutil
 from table import Row, row
 
 import aerokit
 from aerokit.links.base import BaseLink
-from aerokit.mavlink import read_tlog
+from aerokit.mavlink import STANDARD, Frame
 
 __all__ = ["rows"]
 
 AUTOPILOT = (1, 1)
+FLIGHT = next(iter(decode.RECORDINGS))
 
 
-def rows(rounds: int = 7, path: Path | None = None) -> list[Row]:
-    """``deliver_telemetry``; ``path`` is another recording than the copter's flight."""
-    frames = [raw for _, raw in read_tlog(path or recording())]
-    own, peer = anyio.run(_in_turns, frames, rounds)
+def rows(rounds: int = 7, recording: str = FLIGHT) -> list[Row]:
+    """Both rows; ``recording`` is another one than the copter's flight."""
+    frames = decode.frames_of(decode.RECORDINGS[recording])
+    pieces = decode.in_pieces(frames)
+    peer_name = "pymavlink parse_buffer + post_message"
+    telemetry, peer = anyio.run(_in_turns, _telemetry, frames, frames, rounds)
+    read, peer_of_read = anyio.run(_in_turns, _async_for, frames, pieces, rounds)
     return [
         row(
-            "deliver_telemetry",
-            own,
-            peer,
-            "pymavlink parse_buffer + post_message",
+            "deliver_telemetry", telemetry, peer, peer_name, unit="frames/s", ratio=telemetry / peer, aim=2.0
+        ),
+        row(
+            "deliver_async_for",
+            read,
+            peer_of_read,
+            peer_name,
             unit="frames/s",
-            ratio=own / peer,
+            ratio=read / peer_of_read,
             aim=2.0,
-        )
+        ),
     ]
 
 
-async def _in_turns(frames: list[bytes], rounds: int) -> tuple[float, float]:
+async def _in_turns(
+    own_way: Callable[[list[bytes], list[bytes]], Awaitable[float]],
+    frames: list[bytes],
+    pieces: list[bytes],
+    rounds: int,
+) -> tuple[float, float]:
     own, peer = [], []
     for _ in range(rounds):
-        own.append(await _aerokit(frames))
-        peer.append(_pymavlink(frames))
+        own.append(await own_way(frames, pieces))
+        peer.append(_pymavlink(len(frames), pieces))
     return statistics.median(own), statistics.median(peer)
 
 
-async def _aerokit(frames: list[bytes]) -> float:
+async def _async_for(frames: list[bytes], pieces: list[bytes]) -> float:
+    kinds = {STANDARD[Frame.parse(raw).message_id] for raw in frames}
+    seen = 0
+
+    async def read(subscription: Any) -> None:
+        nonlocal seen
+        async for _ in subscription:
+            seen += 1
+
+    async with (
+        aerokit.open_connection(_FedLink("recording")) as connection,
+        anyio.create_task_group() as group,
+    ):
+        with connection.subscribe(*kinds, capacity=1000) as subscription:
+            group.start_soon(read, subscription)
+            await anyio.lowlevel.checkpoint()
+            started = time.process_time()
+            for piece in pieces:
+                connection.bytes_received(piece, None)
+                await asyncio.sleep(0)
+            taken = time.process_time() - started
+            group.cancel_scope.cancel()
+            if seen != len(frames):
+                raise AssertionError(f"{seen} of {len(frames)} messages were read")
+    return seen / taken
+
+
+async def _telemetry(frames: list[bytes], pieces: list[bytes]) -> float:
     link = _FedLink("recording")
     async with aerokit.open_connection(link) as connection:
         for raw in frames:
@@ -64,13 +106,13 @@ async def _aerokit(frames: list[bytes]) -> float:
             if AUTOPILOT in connection.heard:
                 break
         async with aerokit.connect(connection, rates={}) as vehicle:
-            rate = _rate(frames, lambda raw: connection.bytes_received(raw, None))
+            rate = _rate(len(frames), pieces, lambda raw: connection.bytes_received(raw, None))
             if not vehicle.attitude.is_known:
                 raise AssertionError("the telemetry saw nothing")
     return rate
 
 
-def _pymavlink(frames: list[bytes]) -> float:
+def _pymavlink(count: int, pieces: list[bytes]) -> float:
     master: Any = mavutil.mavfile(None, "recording")
     master.mav.robust_parsing = True
 
@@ -78,14 +120,14 @@ def _pymavlink(frames: list[bytes]) -> float:
         for message in master.mav.parse_buffer(raw) or ():
             master.post_message(message)
 
-    return _rate(frames, feed)
+    return _rate(count, pieces, feed)
 
 
-def _rate(frames: list[bytes], feed: Callable[[bytes], None]) -> float:
-    started = time.perf_counter()
-    for raw in frames:
+def _rate(count: int, pieces: list[bytes], feed: Callable[[bytes], None]) -> float:
+    started = time.process_time()
+    for raw in pieces:
         feed(raw)
-    return len(frames) / (time.perf_counter() - started)
+    return count / (time.process_time() - started)
 
 
 class _FedLink(BaseLink):

@@ -25,13 +25,18 @@ from table import Row
 Measure = Callable[[bool], list[Row]]
 """Gives rows; with True in few rounds."""
 
-SHORT = decode.RECORDINGS[-1]
+SHORT = "copter_short"
+DECODE = tuple(decode.RECORDINGS)
 
 MEASURES: dict[tuple[str, ...], Measure] = {
-    ("decode_skip", "decode_typed", "decode_skip_stream", "decode_typed_stream"): lambda quick: (
-        decode.rows(1, SHORT) if quick else decode.rows()
+    (
+        *("decode_skip", "decode_typed", "decode_floor", "decode_floor_typed"),
+        *("decode_skip_stream", "decode_typed_stream"),
+        *(f"decode_{kind}_{name}" for name in DECODE[1:] for kind in ("skip", "typed")),
+    ): lambda quick: decode.rows(1, [SHORT, "quad_short"]) if quick else decode.rows(),
+    ("deliver_telemetry", "deliver_async_for"): lambda quick: (
+        deliver.rows(1, SHORT) if quick else deliver.rows()
     ),
-    ("deliver_telemetry",): lambda quick: deliver.rows(1, SHORT) if quick else deliver.rows(),
     ("command_rtt_pymavlink", "command_rtt_mavsdk"): lambda quick: (
         command_rtt.rows(1, 20) if quick else command_rtt.rows()
     ),

@@ -14,8 +14,8 @@ import pytest
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
 HAS_MAVSDK = importlib.util.find_spec("mavsdk") is not None
 AIMS = {
-    "decode_skip": 8.0,
-    "decode_typed": 5.0,
+    "decode_skip": 10.0,
+    "decode_typed": 6.0,
     "command_rtt_pymavlink": 0.667,
     "command_rtt_mavsdk": 1.667,
     "import": 0.667,

@@ -90,6 +90,36 @@ class Framer:
         self.statistics.bytes += size
         if self.late or self.foreign:
             self.late, self.foreign = [], []
+        elif size >= _SHORTEST_V2 and not self._rest:
+            # Most datagrams are one good frame, the next one of its sender: a sixth quicker than by the loop.
+            magic, length, flags, sequence, key, message_id = _HEADER_V2(data)
+            upto = 10 + length
+            end = upto + 15 if flags else upto + 2
+            if magic == MAGIC_V2 and flags <= SIGNED and end == size:
+                message_id &= 0xFFFFFF
+                try:
+                    source = self._sources[key]
+                    body = data[1:upto]
+                    (checksum,) = _CHECKSUM(data, upto)
+                    if (
+                        source.expected & 0xFF == sequence
+                        and x25(body + self._extras[message_id]) == checksum
+                    ):
+                        source.expected += 1
+                        if self.wanted is not None and message_id not in self.wanted:
+                            return []
+                        frame = Frame()
+                        frame.body = body
+                        frame.checksum = checksum
+                        frame.message_id = message_id
+                        frame.system_id = source.system_id
+                        frame.component_id = source.component_id
+                        frame.received_at = now
+                        if flags:
+                            frame._raw = data
+                        return [frame]
+                except KeyError:
+                    pass
         known = _NOTHING_KNOWN
         if self._rest:
             known, data, self._rest = self._known, self._rest + data, b""
@@ -102,13 +132,13 @@ class Framer:
         while begin < size:
             try:
                 magic, length, flags, sequence, key, message_id = _HEADER_V2(data, begin)
-                if good := magic == MAGIC_V2 and (not flags or (flags == SIGNED and begin + 25 + length <= size)):
+                if good := magic == MAGIC_V2 and flags <= SIGNED:
                     message_id &= 0xFFFFFF
                     upto = begin + 10 + length
                     end = upto + 15 if flags else upto + 2
                     body = data[begin + 1 : upto]
                     (checksum,) = _CHECKSUM(data, upto)
-                    good = x25(body + extras[message_id]) == checksum
+                    good = end <= size and x25(body + extras[message_id]) == checksum
             except (StructError, KeyError):
                 good, body = False, b""
                 end = sequence = key = message_id = checksum = 0
