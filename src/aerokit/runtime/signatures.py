@@ -8,7 +8,6 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from aerokit.errors import BusyError, LocalProtocolError
-from aerokit.mavlink.signing import is_signed_with_a_key
 from aerokit.runtime.events import FrameRefused
 
 if TYPE_CHECKING:
@@ -95,7 +94,7 @@ class SignatureGate:
         if signing is None:
             return True
         try:
-            if is_of_handover and not is_signed_with_a_key(frame):
+            if is_of_handover and not _has_key(frame):
                 return signing.may_be_unsigned(frame)  # neither told nor counted
             refusal = signing.check(frame, self._unix_time())
         except Exception:
@@ -131,8 +130,14 @@ class SignatureGate:
             refused = "; ".join(f"{n}: {why.value}" for why, n in signing.refused.items() if n)
             return f"frames were refused ({refused}) by {signing.key!r}" if refused else ""
         frame = None if heartbeat is None else heartbeat.received_frame
-        is_signed = frame is not None and is_signed_with_a_key(frame)
+        is_signed = frame is not None and _has_key(frame)
         return "its frames are signed and ours are not (signing=…)" if is_signed else ""
+
+
+def _has_key(frame: Frame) -> bool:
+    from aerokit.mavlink.signing import is_signed_with_a_key  # with hashlib: few programs come to this
+
+    return is_signed_with_a_key(frame)
 
 
 class _Handover:
@@ -151,7 +156,7 @@ class _Handover:
         """Whether this frame shows that the component has the key; for None: that it has none."""
         if self.signing is not None:
             return self.signing.would_accept(frame, unix_time_s)
-        if is_signed_with_a_key(frame):
+        if _has_key(frame):
             self._unsigned = 0
             return False
         self._unsigned += 1
