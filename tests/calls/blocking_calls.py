@@ -152,6 +152,12 @@ def _post(stage: Any) -> None:
         order.until_told(2)
 
 
+def _post_mode(stage: Any) -> None:
+    mode = stage.vehicle.autopilot.find_mode("LOITER")
+    with stage.vehicle.posted("mode", modes=(mode,)) as order:
+        order.set_mode(mode, timeout=2)
+
+
 def _post_place(stage: Any) -> None:
     place = stage.target()
     x, y = round(place.latitude_deg * 1e7), round(place.longitude_deg * 1e7)
@@ -186,6 +192,7 @@ WRITTEN: dict[str, Do] = {
     "Vehicle.posted": _post,
     "PostedOrder.command": _post,
     "PostedOrder.command_int": _post_place,
+    "PostedOrder.set_mode": _post_mode,
     "PostedOrder.until_told": _post,
     "Guided.velocity": _stream("velocity", lambda _: VelocitySetpoint(north_m_s=1.0)),
     "Guided.body_velocity": _stream("body_velocity", lambda _: BodyVelocitySetpoint(forward_m_s=1.0)),

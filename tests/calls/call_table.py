@@ -115,6 +115,12 @@ async def _post_arm(stage: Stage) -> None:
         await order.until_told(5)
 
 
+async def _post_mode(stage: Stage) -> None:
+    mode = stage.vehicle.autopilot.find_mode("LOITER")
+    with stage.vehicle.posted("mode", modes=(mode,)) as order:
+        await order.set_mode(mode)
+
+
 async def _post_place(stage: Stage) -> None:
     place = stage.target()
     x, y = round(place.latitude_deg * 1e7), round(place.longitude_deg * 1e7)
@@ -232,6 +238,7 @@ CALLS: dict[str, Call] = {
     # -------------------------------------------------------------------------------- PostedOrder
     "PostedOrder.command": Call(_post_arm, grounded),
     "PostedOrder.command_int": Call(_post_place, airborne),
+    "PostedOrder.set_mode": Call(_post_mode, grounded),
     "PostedOrder.until_told": Call(_post_arm, grounded),
     # --------------------------------------------------------------------------------- Parameters
     "Parameters.download": Call(lambda s: s.vehicle.parameters.download(refresh=True)),

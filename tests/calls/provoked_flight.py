@@ -80,6 +80,12 @@ async def _post_int(stage: Stage, frame: int = 0) -> None:
         await order.command_int(Cmd.DO_SET_HOME, 0, frame=frame, x=1, y=1, z=1)
 
 
+async def _post_mode(stage: Stage, posted: str = "LOITER") -> None:
+    mode = stage.vehicle.autopilot.find_mode("LOITER")
+    with stage.vehicle.posted("mode", modes=(stage.vehicle.autopilot.find_mode(posted),)) as order:
+        await order.set_mode(mode, timeout=2)
+
+
 def _deny_arming(stage: Stage) -> None:
     own = stage.vehicle.connection.source_component
     stage.simulated.send(messages.CommandAck(400, 2, 0, 0, 255, own))
@@ -194,6 +200,10 @@ def _actions() -> Table:
         ("PostedOrder.command_int", "LocalProtocolError"): P(lambda s: _post_int(s, 999)),
         ("PostedOrder.command_int", "CommandRejected"): P(_post_int, before=refused(Cmd.DO_SET_HOME)),
         ("PostedOrder.command_int", "CommandTimeout"): P(_post_int, grounded, ignored(Cmd.DO_SET_HOME)),
+        ("PostedOrder.set_mode", "LocalProtocolError"): P(lambda s: _post_mode(s, "GUIDED")),
+        ("PostedOrder.set_mode", "CommandRejected"): P(_post_mode, before=refused(Cmd.DO_SET_MODE)),
+        ("PostedOrder.set_mode", "CommandTimeout"): P(_post_mode, grounded, ignored(Cmd.DO_SET_MODE)),
+        ("PostedOrder.set_mode", "OperationTimeout"): P(_post_mode, grounded, accepted(Cmd.DO_SET_MODE)),
         ("PostedOrder.until_told", "OperationTimeout"): P(
             lambda s: _post(s, ["arm"], armed=True), grounded, accepted(arm)
         ),

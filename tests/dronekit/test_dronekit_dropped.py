@@ -19,7 +19,7 @@ import pytest
 from served_copter import served_copter
 
 import aerokit.dronekit as dronekit
-from aerokit.dronekit import mavlink, parameter_reading
+from aerokit.dronekit import mavlink, parameter_transfers
 from aerokit.links import tcp
 
 LIMIT_S = 20.0
@@ -123,7 +123,7 @@ def test_what_it_was_used_for_does_not_keep_it(
 
 
 def test_a_download_of_parameters_does_not_keep_it(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parameter_reading, "_method", lambda _: anyio.sleep_forever())
+    monkeypatch.setattr(parameter_transfers, "_method", lambda _: anyio.sleep_forever())
     vehicle = dronekit.connect(address)
     dropped = weakref.ref(vehicle)
     del vehicle

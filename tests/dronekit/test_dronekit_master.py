@@ -14,11 +14,12 @@ import pytest
 from pymavlink import mavutil
 
 from aerokit.dronekit.exceptions import APIException
-from aerokit.dronekit.master import Master, MessageFactory
+from aerokit.dronekit.master import Master
 from aerokit.dronekit.mavlink import MAVConnection
 from aerokit.errors import LocalProtocolError
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.from_pymavlink import from_pymavlink
+from aerokit.mavlink.message_factory import MessageFactory
 
 v10: Any = import_module("pymavlink.dialects.v10.ardupilotmega")
 v20: Any = import_module("pymavlink.dialects.v20.ardupilotmega")

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from pymavlink import mavutil
 
 from aerokit import messages
-from aerokit.dronekit.pymavlink_messages import message_of
+from aerokit.dronekit.observers import message_of
 from aerokit.errors import LocalProtocolError
 from aerokit.mavlink.checksum import x25
 from aerokit.mavlink.dialect import STANDARD

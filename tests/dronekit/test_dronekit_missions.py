@@ -162,7 +162,7 @@ def test_next_is_told_and_chosen(three: Pair) -> None:
 def test_next_is_chosen_by_command_where_the_message_is_not_heard(
     three: Pair, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("aerokit.dronekit.current_command.CONFIRMED_S", 0.3)
+    monkeypatch.setattr("aerokit.dronekit.flight_orders.CONFIRMED_S", 0.3)
     controller, cmds = three
     controller.answers["MISSION_SET_CURRENT"] = lambda frame: None
     cmds.next = 2
@@ -289,7 +289,7 @@ def test_a_home_that_the_vehicle_refuses_is_not_its_home() -> None:
 
 def test_next_is_sent_once_where_it_is_not_confirmed(three: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
     """A message that is not answered could be repeated against a pilot: the order that follows has an answer."""
-    monkeypatch.setattr("aerokit.dronekit.current_command.CONFIRMED_S", 2.5)
+    monkeypatch.setattr("aerokit.dronekit.flight_orders.CONFIRMED_S", 2.5)
     controller, cmds = three
     controller.answers["MISSION_SET_CURRENT"] = lambda frame: None
     cmds.next = 2

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from aerokit.dronekit.orders import Orders
+from aerokit.dronekit.line import Orders
 from aerokit.errors import ConnectionClosed
 from aerokit.sync.loop_thread import LoopThread
 

@@ -14,6 +14,7 @@ from aerokit.dronekit.util import ErrprinterHandler, errprinter, logger
 from aerokit.dronekit.values import (
     Attitude,
     Battery,
+    Capabilities,
     GPSInfo,
     LocationGlobal,
     LocationGlobalRelative,
@@ -21,9 +22,9 @@ from aerokit.dronekit.values import (
     Rangefinder,
     SystemStatus,
     VehicleMode,
+    Version,
     Wind,
 )
-from aerokit.dronekit.version import Capabilities, Version
 
 ARDUPILOT, PX4, OTHER = 3, 12, 8
 PLANE, QUAD, ROVER, HEXA = 1, 2, 10, 13

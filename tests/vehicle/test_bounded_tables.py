@@ -8,7 +8,7 @@ from __future__ import annotations
 import pytest
 from flight_harness import Flight, open_flight
 
-from aerokit.dronekit.parameter_values import ParameterValues
+from aerokit.dronekit.parameter_transfers import ParameterValues
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.message import Message

@@ -24,6 +24,7 @@ from aerokit.runtime.cells import Source, StateCell
 from aerokit.vehicle.orders.helm import Helm
 from aerokit.vehicle.orders.order import Subject, subjects_of
 from aerokit.vehicle.orders.posted import OWN_MODES_S, Posted
+from aerokit.vehicle.orders.posting import MODE_ATTEMPTS
 from aerokit.vehicle.state.telemetry import Telemetry
 
 HEARTBEAT = Source(1, 1, "HEARTBEAT")
@@ -369,3 +370,42 @@ async def test_an_arming_that_is_posted_is_not_undone_by_one_that_was_given_up(g
         await order.command(ARM, 1)
     await anyio.sleep(5)
     assert vehicle.is_armed
+
+
+@pytest.mark.anyio
+async def test_a_mode_is_asked_for_as_the_vehicle_knows_it_and_when_it_can(grounded: Flight) -> None:
+    vehicle, wire, faults = grounded.vehicle, grounded.wire, grounded.copter.faults
+    guided, loiter = map(vehicle.autopilot.find_mode, ("GUIDED", "LOITER"))
+    faults.refuse(SET_MODE, MavResult.UNSUPPORTED)
+    with vehicle.posted("mode", modes=(guided,)) as order:
+        with pytest.raises(LocalProtocolError, match="mode = LOITER is not allowed"):
+            await order.set_mode(loiter)
+        await order.set_mode(guided)
+    assert (vehicle.mode_name, len(wire.all(m.SetMode)), len(wire.commands(SET_MODE))) == ("GUIDED", 1, 1)
+    faults.refuse(SET_MODE, MavResult.TEMPORARILY_REJECTED, times=2)
+    with vehicle.posted("mode", modes=(loiter,)) as order:
+        await order.set_mode(loiter)
+    assert (vehicle.mode_name, len(wire.commands(SET_MODE))) == ("LOITER", 4)
+    faults.refuse(SET_MODE, MavResult.TEMPORARILY_REJECTED)
+    with vehicle.posted("mode", modes=(guided,)) as order, pytest.raises(CommandRejected):
+        await order.set_mode(guided)
+    assert len(wire.commands(SET_MODE)) == 4 + MODE_ATTEMPTS
+
+
+@pytest.mark.anyio
+async def test_a_mode_is_not_asked_for_again_once_there_is_a_newer_order(grounded: Flight) -> None:
+    vehicle, wire = grounded.vehicle, grounded.wire
+    guided, loiter = map(vehicle.autopilot.find_mode, ("GUIDED", "LOITER"))
+    grounded.copter.faults.refuse(SET_MODE, MavResult.TEMPORARILY_REJECTED, times=1)
+
+    async def post() -> None:
+        with vehicle.posted("mode", modes=(guided,)) as order, pytest.raises(CommandRejected):
+            await order.set_mode(guided)
+
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(post)
+        await anyio.sleep(0.3)
+        with vehicle.posted("mode", modes=(loiter,)) as newer:
+            await newer.set_mode(loiter)
+    assert wire.mode_orders() == [guided.custom_mode, loiter.custom_mode]
+    assert vehicle.mode_name == "LOITER"

@@ -36,6 +36,7 @@ from aerokit.dronekit.util import ErrprinterHandler
 from aerokit.dronekit.values import (
     Attitude,
     Battery,
+    Capabilities,
     GPSInfo,
     LocationGlobal,
     LocationGlobalRelative,
@@ -43,9 +44,9 @@ from aerokit.dronekit.values import (
     Rangefinder,
     SystemStatus,
     VehicleMode,
+    Version,
     Wind,
 )
-from aerokit.dronekit.version import Capabilities, Version
 from aerokit.lazy import lazy_names
 
 if TYPE_CHECKING:
@@ -53,10 +54,10 @@ if TYPE_CHECKING:
     from pymavlink.dialects.v10 import ardupilotmega
 
     from aerokit.dronekit import _mavutil as mavutil
+    from aerokit.dronekit.attributes import Locations
     from aerokit.dronekit.channels import Channels, ChannelsOverride
     from aerokit.dronekit.commands import Command, CommandSequence
     from aerokit.dronekit.gimbal import Gimbal
-    from aerokit.dronekit.locations import Locations
     from aerokit.dronekit.parameters import Parameters
     from aerokit.dronekit.vehicle import Vehicle
 
@@ -111,7 +112,7 @@ _LATER = {
     "Command": "aerokit.dronekit.commands",
     "CommandSequence": "aerokit.dronekit.commands",
     "Gimbal": "aerokit.dronekit.gimbal",
-    "Locations": "aerokit.dronekit.locations",
+    "Locations": "aerokit.dronekit.attributes",
     "Parameters": "aerokit.dronekit.parameters",
     "Vehicle": "aerokit.dronekit.vehicle",
     "ardupilotmega": "pymavlink.dialects.v10.ardupilotmega",

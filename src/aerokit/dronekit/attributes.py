@@ -1,4 +1,4 @@
-"""The attributes of a vehicle: what each message does to them, and who is told in which order."""
+"""The attributes of a vehicle, its location among them: what each message does to them, and who is told when."""
 
 from __future__ import annotations
 
@@ -6,30 +6,33 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit.autopilots.health import PREARM_CHECK
 from aerokit.autopilots.modes import is_armed
-from aerokit.dronekit.core import VehicleCore
-from aerokit.dronekit.current_command import CurrentCommand
-from aerokit.dronekit.flight_orders import mode_name
-from aerokit.dronekit.locations import Locations
-from aerokit.dronekit.privates import Shadowable
+from aerokit.dronekit.core import VehicleCore, core_of
+from aerokit.dronekit.flight_orders import CurrentCommand, mode_name
+from aerokit.dronekit.observers import HasObservers
+from aerokit.dronekit.privates import LocationPrivates, Shadowable, read_of
 from aerokit.dronekit.values import (
     Attitude,
     Battery,
+    Capabilities,
     GPSInfo,
     LocationGlobal,
+    LocationGlobalRelative,
+    LocationLocal,
     Rangefinder,
     SystemStatus,
     VehicleMode,
+    Version,
     Wind,
 )
-from aerokit.dronekit.version import Capabilities, Version
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import EkfStatusFlags, MavProtocolCapability
 from aerokit.runtime.components import is_autopilot
+from aerokit.vehicle.state.movement import place
 
 if TYPE_CHECKING:
     from aerokit.dronekit.mavlink import MAVConnection
 
-__all__ = ["VehicleAttributes"]
+__all__ = ["Locations", "VehicleAttributes"]
 
 STATES = ("UNINIT", "BOOT", "CALIBRATING", "STANDBY", "ACTIVE", "CRITICAL", "EMERGENCY", "POWEROFF")
 POS_HORIZ_ABS, CONST_POS_MODE, PRED_POS_HORIZ_ABS = (
@@ -40,6 +43,70 @@ POS_HORIZ_ABS, CONST_POS_MODE, PRED_POS_HORIZ_ABS = (
 """Flags of EKF_STATUS_REPORT and of ESTIMATOR_STATUS, which agree in these."""
 LOOKING_DOWN = 25
 NO_MODE = (None, "INITIALISING", "MAV")
+"""What is told while it boots."""
+GLOBAL_FRAMES = ("location.global_relative_frame", "location.global_frame")
+LOCAL_FRAME = "location.local_frame"
+
+
+class Locations(HasObservers, LocationPrivates):
+    """The vehicle's location in global, global relative and local frames; each of them can be listened to.
+
+    Listeners get this object as their first argument. The three numbers of a location belong to one message.
+    """
+
+    def __init__(self, vehicle: VehicleCore) -> None:
+        self._core = core = core_of(vehicle)
+        super().__init__(core.handler.listener_thread)
+        self._has_altitude = False
+        here, on_global, on_local = self._dk_listeners, self._on_global_position, self._on_local_position
+        self._global = core.on(m.GlobalPositionInt, on_global, "location", *GLOBAL_FRAMES, listeners=here)
+        self._local = core.on(m.LocalPositionNed, on_local, "location", LOCAL_FRAME, listeners=here)
+
+    @property
+    def global_frame(self) -> LocationGlobal:
+        """Latitude, longitude in degrees and altitude above mean sea level in metres (GLOBAL_POSITION_INT).
+
+        A new object each time. Latitude and longitude are None without a fix, the altitude is None until one is known.
+        """
+        message = self._global.message
+        if message is None:
+            return LocationGlobal(None, None, None)
+        altitude = message.alt / 1000.0
+        return LocationGlobal(*_place_of(message), altitude if altitude or self._has_altitude else None)
+
+    @property
+    def global_relative_frame(self) -> LocationGlobalRelative:
+        """Latitude, longitude in degrees and altitude above home in metres (GLOBAL_POSITION_INT)."""
+        message = self._global.message
+        if message is None:
+            return LocationGlobalRelative(None, None, None)
+        return LocationGlobalRelative(*_place_of(message), message.relative_alt / 1000.0)
+
+    @property
+    def local_frame(self) -> LocationLocal:
+        """Metres north, east and down from the estimator's origin (LOCAL_POSITION_NED)."""
+        return LocationLocal(*self._local.values("x", "y", "z"))
+
+    def _on_global_position(self, message: m.GlobalPositionInt) -> None:
+        self._has_altitude = self._has_altitude or message.alt != 0
+        self._announce("global_relative_frame")
+        if self._has_altitude:
+            self._announce("global_frame")
+        self._core.listeners.announce("location")
+
+    def _on_local_position(self, _: m.LocalPositionNed) -> None:
+        self._announce("local_frame")
+        self._core.listeners.announce("location")
+
+    def _announce(self, frame: str) -> None:
+        """To those who listen here, then to those who listen to the vehicle, which has another name for it."""
+        self._dk_listeners.announce(frame)
+        self._core.listeners.announce(f"location.{frame}")
+
+
+def _place_of(message: m.GlobalPositionInt) -> tuple[float | None, float | None]:
+    """Latitude and longitude in degrees, None without a fix."""
+    return place(message.lat, message.lon) or (None, None)
 
 
 class VehicleAttributes(VehicleCore):
@@ -49,6 +116,7 @@ class VehicleAttributes(VehicleCore):
     """
 
     _dk_heartbeat: m.Heartbeat | None = None
+    _autopilot_type, _vehicle_type = read_of("_dk_heartbeat.autopilot"), read_of("_dk_heartbeat.type")
     _flightmode: str = "UNKNOWN"
     _dk_distance_down: float | None = None
     _dk_ekf_flags: int | None = None
@@ -166,14 +234,6 @@ class VehicleAttributes(VehicleCore):
         """Seconds since the autopilot's last HEARTBEAT; None before the first."""
         return None if self._dk.found is None else self._dk.found.heartbeat_age
 
-    @Shadowable
-    def _autopilot_type(self) -> int | None:
-        return None if self._dk_heartbeat is None else self._dk_heartbeat.autopilot
-
-    @Shadowable
-    def _vehicle_type(self) -> int | None:
-        return None if self._dk_heartbeat is None else self._dk_heartbeat.type
-
     @property
     def _armed(self) -> bool:
         heartbeat = self._dk_heartbeat
@@ -190,7 +250,7 @@ class VehicleAttributes(VehicleCore):
         self._dk.listeners.tell("armed", self._armed, cache=True)
         self._dk.listeners.tell("mode", VehicleMode(self._flightmode), cache=True)
         self._dk.listeners.tell("system_status", self.system_status, cache=True)
-        self._dk.ready.note("last_heartbeat")
+        self._dk.ready.mark("last_heartbeat")
 
     def _dk_on_distance_sensor(self, message: m.DistanceSensor) -> None:
         if message.orientation == LOOKING_DOWN and self._dk_rangefinder.message is None:
@@ -211,8 +271,8 @@ class VehicleAttributes(VehicleCore):
 
     def _dk_on_version(self, message: m.AutopilotVersion) -> None:
         self._handler.knows_mavlink_2 = bool(message.capabilities & MavProtocolCapability.MAVLINK2)
-        self._dk.ready.note("version")
-        self._dk.ready.note("capabilities")
+        self._dk.ready.mark("version")
+        self._dk.ready.mark("capabilities")
         self._dk.listeners.tell("autopilot_version", message.flight_sw_version)
 
     def _dk_set_home(self, lat: float, lon: float, alt: float | None) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from aerokit.dronekit.core import core_of
 from aerokit.dronekit.exceptions import APIException
-from aerokit.dronekit.python2 import Python2Mapping
+from aerokit.dronekit.privates import Python2Mapping
 from aerokit.errors import LocalProtocolError
 from aerokit.mavlink.messages import RcChannels, RcChannelsOverride, RcChannelsRaw
 
@@ -91,11 +91,7 @@ class Channels(_ChannelDict):
 
     @property
     def count(self) -> int:
-        """How many channels are here. Set it to more than 8, at most 18, to read and override those too.
-
-        Raises:
-            ValueError: it is not 8 to 18.
-        """
+        """How many channels are here. Set it to more than 8, at most 18 (else ValueError), to have those too."""
         return self._count
 
     @count.setter
@@ -109,12 +105,7 @@ class Channels(_ChannelDict):
 
     @property
     def overrides(self) -> ChannelsOverride:
-        """The channels that are overridden, see :class:`ChannelsOverride`. Assigning a mapping replaces all of them.
-
-        Raises:
-            KeyError: there is no such channel; nothing was changed or sent.
-            ValueError: a channel's number or value is wrong; nothing was changed or sent.
-        """
+        """The channels that are overridden, see :class:`ChannelsOverride`. Assigning a mapping replaces all of them."""
         return self._overrides
 
     @overrides.setter
@@ -126,8 +117,6 @@ class Channels(_ChannelDict):
     __setitem__, __delitem__, __ior__ = _refused("__setitem__"), _refused("__delitem__"), _refused("__ior__")
     clear, pop, popitem = _refused("clear"), _refused("pop"), _refused("popitem")
     setdefault, update = _refused("setdefault"), _refused("update")
-
-    # ------------------------------------------------------------------------------- inside
 
     def _on_channels(self, message: RcChannels) -> None:
         self._take(0, ALL_VALUES(message))
@@ -157,6 +146,7 @@ class ChannelsOverride(_ChannelDict):
 
     Set a channel to 1000–2000 (whatever fits into 16 bits is sent), and to None or 0, or delete it, to give it back
     to the radio. Channels that are not in here are the radio's; those above 8 are left as others have set them.
+    KeyError for a channel that is none, ValueError for a value that is none: nothing was changed or sent.
 
     **Nothing is repeated**: a vehicle takes a channel back on its own when it has heard nothing for a while
     (ArduPilot: RC_OVERRIDE_TIME, 3 s), which is what makes it safe that a program may hang. A program that keeps a
@@ -191,11 +181,7 @@ class ChannelsOverride(_ChannelDict):
         self._replace({})
 
     def pop(self, channel: str | int, default: Any = MISSING) -> Any:
-        """Give a channel back to the radio and return its value.
-
-        Raises:
-            KeyError: it is not overridden, and there is no ``default``.
-        """
+        """Give a channel back to the radio and return its value; ``default``, or KeyError, if it is not overridden."""
         with self._changing:
             if channel in self:
                 value = self[channel]
@@ -219,8 +205,6 @@ class ChannelsOverride(_ChannelDict):
             if channel not in self:
                 self._change({channel: default})
             return self.get(channel)
-
-    # ------------------------------------------------------------------------------- inside
 
     def _replace(self, overrides: Mapping[Any, float | None]) -> None:
         with self._changing:
@@ -262,11 +246,7 @@ class ChannelsOverride(_ChannelDict):
 
 
 def _checked_value(number: int, value: Any) -> int:
-    """Microseconds; 0 gives the channel back.
-
-    Raises:
-        LocalProtocolError: a ValueError, which names the channel.
-    """
+    """Microseconds, 0 to give the channel back; LocalProtocolError, a ValueError, names the channel."""
     if value is None:
         return 0
     with contextlib.suppress(TypeError, ValueError, OverflowError):

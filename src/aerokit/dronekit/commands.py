@@ -1,34 +1,88 @@
-"""``vehicle.commands``: the mission of a vehicle, as DroneKit programs read and write it."""
+"""``vehicle.commands``: the mission of a vehicle, as DroneKit programs read and write it, and its ``Command``s.
+
+Programs count commands as ArduPilot does, whatever the vehicle: item 0 is home, ``commands[0]`` has ``seq`` 1. Items of
+a :class:`aerokit.missions.Mission` are counted from 0 without home, so jumps are one apart.
+"""
 
 from __future__ import annotations
 
+import copy
+import math
 import operator
 import threading
 from typing import TYPE_CHECKING, Any, overload
 
-from aerokit.dronekit.command import (
-    Command,
-    command_from,
-    commands_of,
-    home_command,
-    is_home_row,
-    mission_of,
-    values_of,
-)
+from pymavlink.dialects.v20.ardupilotmega import MAVLink_mission_item_message
+
 from aerokit.dronekit.core import core_of
 from aerokit.dronekit.exceptions import APIException, TimeoutError, classic_errors  # noqa: A004 - DroneKit's name
-from aerokit.errors import AerokitError, OperationTimeout
+from aerokit.errors import AerokitError, LocalProtocolError, OperationTimeout
+from aerokit.mavlink.enums import MavCmd
+from aerokit.missions import Mission
+from aerokit.missions.ardupilot_habits import written_out
+from aerokit.missions.commands import canonical_frame
+from aerokit.missions.item import MissionItem
+from aerokit.missions.wire import from_degrees, in_degrees, shift_jumps, to_wire_float
 from aerokit.snapshot import Snapshot
 from aerokit.sync.reply import reply_of
 
 if TYPE_CHECKING:
-    import concurrent.futures
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator, Sequence
 
     from aerokit.dronekit.attributes import VehicleAttributes
-    from aerokit.missions import Mission
+    from aerokit.dronekit.line import Order
+    from aerokit.dronekit.values import LocationGlobal
+    from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
 __all__ = ["Command", "CommandSequence", "WaypointLoader"]
+
+FIELDS: list[str] = MAVLink_mission_item_message.fieldnames[:14]
+"""Those of MAVLink 1: ``mission_type``, which came later, is no part of a command's text."""
+PARAMS = FIELDS[7:11]
+CONTENT = ("frame", "command", "autocontinue", *FIELDS[7:])
+"""The fields that make a mission another one when they are changed."""
+ABOVE_SEA = (0, 5)
+"""MAV_FRAME_GLOBAL and its _INT twin."""
+AT_HOME_DEG, AT_HOME_M = 1e-4, 2.0
+"""How near to home the home row of a file may be: about ten metres, two in height."""
+
+
+class Command(MAVLink_mission_item_message):  # type: ignore[misc]
+    """A waypoint, or another item of a mission, of ``vehicle.commands``: a MISSION_ITEM of pymavlink.
+
+    Args:
+        target_system, target_component, seq: anything; they are filled in when it is added.
+        frame: MAV_FRAME: what ``z`` is above; 0: the sea, 3: home, 10: the terrain.
+        command: MAV_CMD.
+        current: not used; 1 in the first row of a waypoint file, which is home.
+        autocontinue: 0 makes PX4 stay at the item; ArduPilot goes on in any case.
+        param1, param2, param3, param4: the command's.
+        x, y: latitude and longitude in degrees, or the command's parameters 5 and 6; metres in a local frame.
+        z: altitude in metres, or parameter 7.
+    """
+
+    def __init__(
+        self,
+        target_system: int,
+        target_component: int,
+        seq: int,
+        frame: int,
+        command: int,
+        current: int,
+        autocontinue: int,
+        param1: float,
+        param2: float,
+        param3: float,
+        param4: float,
+        x: float,
+        y: float,
+        z: float,
+    ) -> None:
+        numbers = (param1, param2, param3, param4, x, y, z)
+        super().__init__(
+            target_system, target_component, seq, frame, command, current, autocontinue, *numbers
+        )
+        self._fieldnames = FIELDS
 
 
 class Held(Snapshot):
@@ -55,7 +109,7 @@ class CommandSequence:
         self._uploaded: tuple[tuple[Any, ...], ...] = ()
         """What the commands said when the vehicle had them last."""
         self._downloads = 0
-        self._download: concurrent.futures.Future[None] | None = None
+        self._download: Order | None = None
         self._current = vehicle._dk_current_command
 
     # ------------------------------------------------------------------- from and to the vehicle
@@ -64,10 +118,7 @@ class CommandSequence:
         """Begin to read the vehicle's mission; :meth:`wait_ready` waits until it is there.
 
         Until then the sequence stays what it was. A download under way is begun anew. When it is there, listeners to
-        ``'commands'`` are told; ``vehicle.home_location`` is set if the mission has it.
-
-        Raises:
-            APIException: the link is down.
+        ``'commands'`` are told; ``vehicle.home_location`` is set if the mission has it. APIException: the link is down.
         """
         self._core.check_link()
         with self._lock:
@@ -76,11 +127,9 @@ class CommandSequence:
             self._download = self._core.order("commands.download", self._read, self._downloads)
 
     def wait_ready(self, **kwargs: Any) -> bool:
-        """Wait for the end of the download; arguments and result as of :meth:`Vehicle.wait_ready`.
+        """Wait for the end of the download; arguments, result and errors as of :meth:`Vehicle.wait_ready`.
 
-        Raises:
-            APIException: the download failed; the text says why. The next one may succeed.
-            TimeoutError: it has not ended in time, 30 seconds by default.
+        When the download has failed the APIException says why; the next one may succeed.
         """
         return self._vehicle.wait_ready("commands", **kwargs)
 
@@ -100,12 +149,12 @@ class CommandSequence:
         """
         self._settle()
         with self._lock:
-            values = values_of(self._held.items)
+            values = _values_of(self._held.items)
             if not self._held.is_changed and values == self._uploaded:
                 return
             held = self._held = self._held.replace(is_changed=True)  # until it is known to be there
         aio = self._core.check_link()
-        self._core.run(aio.mission.upload, mission_of(held.items, aio), timeout=timeout)
+        self._core.run(aio.mission.upload, _mission_of(held.items, aio), timeout=timeout)
         with self._lock:
             self._uploaded = values
             if self._held is held:
@@ -136,17 +185,12 @@ class CommandSequence:
     def add(self, cmd: Any) -> None:
         """Append a copy of a command; the vehicle is told by :meth:`upload`. Waits for the end of a download under way.
 
-        The first row of a waypoint file, which is home, is kept apart as such: vehicles have a home of their own.
-
-        Args:
-            cmd: a :class:`Command`, or a MISSION_ITEM of pymavlink. Its ``target_system`` becomes the vehicle's.
-
-        Raises:
-            TypeError: it is neither.
-            APIException: the download before has failed, so that there is nothing to append to.
+        ``cmd`` is a :class:`Command` or a MISSION_ITEM of pymavlink (else TypeError); its ``target_system`` becomes the
+        vehicle's. The first row of a waypoint file, which is home, is kept apart: vehicles have a home of their own.
+        APIException: the download before has failed, so that there is nothing to append to.
         """
         self._settle()
-        added = command_from(cmd)
+        added = _command_from(cmd)
         cmd.target_system = added.target_system = self._core.target_system
         if self._append(added) == 0:
             self._core.logger.info("the first command is home, as in a waypoint file: %s", added)
@@ -174,7 +218,7 @@ class CommandSequence:
 
     def __setitem__(self, index: int, value: Any) -> None:
         self._settle()
-        command = value if isinstance(value, Command) else command_from(value)
+        command = value if isinstance(value, Command) else _command_from(value)
         with self._lock:
             items = list(self._held.items)
             at = len(items) if index == len(items) else _checked(index, len(items))
@@ -187,15 +231,13 @@ class CommandSequence:
         held = self._held
         if not held.items and held.home is None:
             return ()
-        return (held.home or home_command(None, (0, 0)), *held.items)
-
-    # ------------------------------------------------------------------------------- inside
+        return (*(_commands_of(Mission(), (0, 0)) if held.home is None else (held.home,)), *held.items)
 
     def _append(self, cmd: Command) -> int:
         """Append it, as home if that is what it is; returns its number."""
         with self._lock:
             held = self._held
-            if not held.items and is_home_row(cmd, self._vehicle._home_location):
+            if not held.items and _is_home_row(cmd, self._vehicle._home_location):
                 cmd.seq = seq = 0
                 self._held = held.replace(home=cmd, is_changed=True)
             else:
@@ -215,12 +257,12 @@ class CommandSequence:
         """On the loop thread: what was downloaded is the sequence from now on."""
         home, connection = mission.home, self._core.aio.connection
         own_ids = connection.source_system, connection.source_component
-        items = commands_of(mission.items, own_ids)
+        at_home, *items = _commands_of(mission, own_ids)
         with self._lock:
             if number != self._downloads:
                 return
-            self._held = Held(items, home_command(home, own_ids))
-            self._uploaded = values_of(items)
+            self._held = Held(tuple(items), at_home)
+            self._uploaded = _values_of(items)
         if home is not None and home.altitude_amsl_m is not None:
             self._vehicle._dk_set_home(home.latitude_deg, home.longitude_deg, home.altitude_amsl_m)
         self._core.listeners.tell("commands", self)
@@ -257,11 +299,7 @@ class WaypointLoader:
         return len(self._commands.rows())
 
     def wp(self, i: int) -> Command:
-        """Command ``i``; 0 is home, all zeros when it is not known.
-
-        Raises:
-            IndexError: there is none.
-        """
+        """Command ``i``; 0 is home, all zeros when it is not known. IndexError if there is none."""
         return self._commands.rows()[i]
 
 
@@ -273,3 +311,86 @@ def _checked(index: Any, count: int) -> int:
     if not -count <= at < count:
         raise IndexError(f"Index {at} out of range.")
     return at % count
+
+
+def _command_from(cmd: Any) -> Command:
+    """A copy of a command, or what a MISSION_ITEM or MISSION_ITEM_INT of pymavlink stands for; TypeError else."""
+    if isinstance(cmd, Command):
+        return copy.copy(cmd)
+    try:
+        fields = {name: getattr(cmd, name) for name in FIELDS}
+    except AttributeError:
+        raise TypeError(f"{cmd!r} is not allowed: a Command") from None
+    if hasattr(cmd, "get_type") and cmd.get_type() == "MISSION_ITEM_INT":
+        fields["x"], fields["y"] = in_degrees(MissionItem(cmd.command, cmd.frame, x=cmd.x, y=cmd.y))
+    return Command(**fields)
+
+
+def _values_of(commands: Iterable[Command]) -> tuple[tuple[Any, ...], ...]:
+    """What the commands say by now, to be compared; NaN is equal to NaN."""
+    return tuple(
+        tuple("NaN" if value != value else value for value in (getattr(each, name) for name in CONTENT))
+        for each in commands
+    )
+
+
+def _is_home_row(cmd: Command, home: LocationGlobal | None) -> bool:
+    """Whether a command is not to be flown but is the first row of a waypoint file: where home was.
+
+    That is a waypoint above the sea without parameters which has ``current`` set, is all zeros, or is where home is.
+    """
+    if cmd.command != MavCmd.NAV_WAYPOINT or cmd.frame not in ABOVE_SEA:
+        return False
+    if any((cmd.param1, cmd.param2, cmd.param3, cmd.param4)):
+        return False
+    return cmd.current == 1 or not any((cmd.x, cmd.y, cmd.z)) or _is_at(cmd, home)
+
+
+def _is_at(cmd: Command, home: LocationGlobal | None) -> bool:
+    if home is None or home.lat is None or home.lon is None or home.alt is None:
+        return False
+    try:
+        away = max(abs(cmd.x - home.lat), abs(cmd.y - home.lon) * math.cos(math.radians(home.lat)))
+        return bool(away <= AT_HOME_DEG and abs(cmd.z - home.alt) <= AT_HOME_M)
+    except TypeError:  # no numbers: told when it is uploaded
+        return False
+
+
+def _mission_of(commands: Sequence[Command], vehicle: AsyncVehicle) -> Mission:
+    """The mission of these commands for this vehicle; LocalProtocolError names a field that is no number."""
+    items: Iterable[MissionItem] = [_item(each, index) for index, each in enumerate(commands)]
+    if not vehicle.autopilot.home_is_item_0:
+        here = vehicle.telemetry.position.latest or vehicle.telemetry.home.latest
+        items = written_out(items, None if here is None else (here.latitude_deg, here.longitude_deg))
+    return Mission(shift_jumps(items, -1))
+
+
+def _commands_of(mission: Mission, own_ids: tuple[int, int]) -> tuple[Command, ...]:
+    """Home, all zeros when it is not known, and the commands of a mission, sent to ``own_ids`` (system, component)."""
+    items = mission.to_items(home_is_item_0=True)
+    return tuple(_command(item, seq, own_ids) for seq, item in enumerate(items))
+
+
+def _item(cmd: Command, index: int) -> MissionItem:
+    try:
+        command, frame = int(cmd.command), int(cmd.frame)
+        one, two, three, four = (float(getattr(cmd, name)) for name in PARAMS)
+        x, y = (_wire_number(value, command, frame) for value in (cmd.x, cmd.y))
+        z, autocontinue = float(cmd.z), bool(cmd.autocontinue)
+        return MissionItem(command, frame, one, two, three, four, x, y, z, autocontinue)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise LocalProtocolError(f"commands[{index}] is not allowed: {error}, in {cmd}") from None
+
+
+def _wire_number(value: Any, command: int, frame: int) -> int | float:
+    """What MISSION_ITEM_INT has for x or y. A fraction of what is no place is cut off, as ArduPilot does."""
+    number = from_degrees(float(value), command, frame)
+    return int(number) if isinstance(number, float) and abs(number) < 1e9 else number
+
+
+def _command(item: MissionItem, seq: int, own_ids: tuple[int, int]) -> Command:
+    item = item.replace(
+        frame=int(canonical_frame(item.frame))
+    )  # those of MISSION_ITEM, which is what a command is
+    message = to_wire_float(item, seq, target_system=own_ids[0], target_component=own_ids[1])
+    return Command(*(getattr(message, name) for name in FIELDS))

@@ -1,4 +1,4 @@
-"""``Core``: the connection underneath a classic vehicle, as all its parts use it."""
+"""``Core``: the connection underneath a classic vehicle, as all its parts use it, and what was received on it."""
 
 from __future__ import annotations
 
@@ -7,23 +7,23 @@ import logging
 import math
 import threading
 import time
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from aerokit.dronekit.exceptions import APIException, TimeoutError, classic_errors  # noqa: A004 - DroneKit's name
-from aerokit.dronekit.observers import HasObservers, Listeners
-from aerokit.dronekit.reception import Latest
-from aerokit.dronekit.weakly import weakly
+from aerokit.dronekit.line import weakly
+from aerokit.dronekit.observers import EVERY_NAME, HasObservers, Listeners
+from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.message import Message
 
 if TYPE_CHECKING:
-    import concurrent.futures
     from collections.abc import Awaitable, Callable
 
+    from aerokit.dronekit.line import Order, Work
     from aerokit.dronekit.mavlink import MAVConnection
     from aerokit.runtime.background import Background
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
-__all__ = ["Core", "Readiness", "VehicleCore", "core_of"]
+__all__ = ["Core", "Latest", "Readiness", "VehicleCore", "core_of"]
 
 DEFAULT_ATTRIBUTES = ("parameters", "gps_0", "armed", "mode", "attitude")
 """What ``wait_ready(True)`` waits for."""
@@ -48,16 +48,13 @@ class Readiness:
         self._changed = threading.Condition()
 
     def mark(self, name: str) -> None:
-        """The attribute has a value: whoever waits for it goes on."""
+        """The attribute has a value, as it may have had before: whoever waits for it goes on."""
+        if name in self.names and name not in self._failures:
+            return
         with self._changed:
             self._failures.pop(name, None)
             self.names.add(name)
             self._changed.notify_all()
-
-    def note(self, name: str) -> None:
-        """The attribute has a value, as it may have had before."""
-        if name not in self.names:
-            self.mark(name)
 
     def unmark(self, name: str) -> None:
         """The attribute will get a new value, and is to be waited for."""
@@ -83,6 +80,73 @@ class Readiness:
                 self._changed.wait(min(LONGEST_WAIT_S, at_most_s))
 
 
+class Latest(Generic[MessageT]):
+    """The latest message of a kind that the autopilot sent, and who is given each of them."""
+
+    def __init__(self, message_type: type[MessageT], ready: set[str], listeners: Listeners) -> None:
+        self._decode: Callable[[bytes, Frame], MessageT] = message_type.decode_body
+        self._ready = ready
+        self._listeners = [listeners]
+        self._names: set[str] = set()
+        self._handlers: list[Callable[[MessageT], object]] = []
+        self._held: Frame | MessageT | None = None
+        self._made: MessageT | None = None
+        self.component_id = 0
+        """Of the autopilot: nobody else counts."""
+
+    @property
+    def message(self) -> MessageT | None:
+        """The message, None before the first; made by the first who reads it, on any thread."""
+        held = self._held
+        if not isinstance(held, Frame):
+            return held
+        made = self._made
+        if made is None or made.received_frame is not held:
+            made = self._made = self._decode(held.body, held)
+        return made
+
+    def values(self, *fields: str) -> tuple[Any, ...]:
+        """Fields of one message, None before the first."""
+        message = self.message
+        return tuple([None if message is None else getattr(message, field) for field in fields])
+
+    def add(
+        self, handler: Callable[[MessageT], object], names: tuple[str, ...], listeners: Listeners | None
+    ) -> None:
+        """Have a handler called, after those added before: with each message, or, with ``names``, only as long as not
+        all of them were told, or somebody listens to one of them, or has any of the other ``listeners``.
+        """
+        self._handlers.append(handler)
+        self._names.update(names)
+        if listeners is not None:
+            self._listeners.append(listeners)
+
+    def take(self, frame: Frame, message: MessageT | None = None) -> None:
+        """Take a frame of the vehicle's system (loop thread), and its message if that was made already."""
+        if frame.component_id != self.component_id:
+            return
+        if self._is_wanted():
+            self.receive(self._decode(frame.body, frame) if message is None else message)
+        else:
+            self._held = frame
+
+    def receive(self, message: MessageT) -> None:
+        """Keep it, and give it to the handlers."""
+        self._held = message
+        for handler in self._handlers:
+            handler(message)
+
+    def _is_wanted(self) -> bool:
+        names = self._names
+        if not names or not names <= self._ready:
+            return True
+        for each in self._listeners:
+            listened = each.by_name
+            if listened and (EVERY_NAME in listened or not names.isdisjoint(listened)):
+                return True
+        return False
+
+
 class Core:
     """What is sent, waited for and heard by way of the asynchronous vehicle, once there is one, and what is told of it.
 
@@ -93,7 +157,7 @@ class Core:
         self.handler = handler
         self.logger = logging.getLogger("dronekit")
         self.ready = Readiness()
-        self.listeners = Listeners(owner, handler.listener_thread, self.ready.note)
+        self.listeners = Listeners(owner, handler.listener_thread, self.ready.mark)
         """Of the vehicle's attributes."""
         self.heartbeat_limit_s = 0.0
         """Longer silences are errors; 0: none is."""
@@ -101,7 +165,8 @@ class Core:
         """The asynchronous vehicle, once it was found."""
         self._tasks: Background | None = None
         self._latest: dict[type[Message], Latest[Any]] = {}
-        self._starters: list[Callable[[], None]] = []
+        self.at_start: list[Callable[[], None]] = []
+        """What is called on the loop when the vehicle is found."""
         self._is_silent = False
 
     # --------------------------------------------------------------------------------- state
@@ -141,11 +206,8 @@ class Core:
     ) -> Latest[MessageT]:
         """Have a handler called with messages of the autopilot (loop thread, weakly); returns what has the latest one.
 
-        Args:
-            message_type: of which kind.
-            handler: if it does nothing but tell ``names``, it is called only where somebody may want to know.
-            names: of the vehicle's attributes.
-            listeners: others, whom it tells, too.
+        If it does nothing but tell ``names``, attributes of the vehicle, and to ``listeners`` of others, it is called
+        only where somebody may want to know.
         """
         if message_type not in self._latest:
             self._latest[message_type] = Latest(message_type, self.ready.names, self.listeners)
@@ -162,10 +224,6 @@ class Core:
 
         return self.on(message_type, announce, *names)
 
-    def at_start(self, function: Callable[[], None]) -> None:
-        """Have a function called on the loop when the vehicle is found."""
-        self._starters.append(function)
-
     def begin(self, aio: AsyncVehicle, tasks: Background) -> None:
         """The vehicle was found (loop thread): hear what the parts want to; the loop gets weak references only."""
         self.found, self._tasks = aio, tasks
@@ -173,11 +231,6 @@ class Core:
         for message_type, latest in self._latest.items():
             latest.component_id = aio.component_id
             aio.connection.bus.attach_lazily(message_type, weakly(latest.take), system_id=aio.system_id)
-
-    def start_parts(self) -> None:
-        """Call what waits for the vehicle (loop thread)."""
-        for starter in self._starters:
-            starter()
 
     def watch_link(self) -> None:
         """Tell 20 times a second how old the last heartbeat is; log it when they stay away and when they are back."""
@@ -208,17 +261,13 @@ class Core:
         with classic_errors():
             return self.handler.loop.run(function, *args, **kwargs)
 
-    def order(
-        self, kind: str, function: Callable[..., Awaitable[object]], *args: Any, **kwargs: Any
-    ) -> concurrent.futures.Future[None]:
+    def order(self, kind: str, function: Work, *args: Any, **kwargs: Any) -> Order:
         """Give an order without waiting; a newer one of its kind replaces it."""
         self.check_link()
         with classic_errors():
             return self.handler.orders.give(kind, function, *args, **kwargs)
 
-    def command(
-        self, kind: str, command: int, *params: float, **options: Any
-    ) -> concurrent.futures.Future[None]:
+    def command(self, kind: str, command: int, *params: float, **options: Any) -> Order:
         """Order that a command is sent to all components, of which the autopilot's answer counts."""
         return self.order(kind, self.check_link().command, command, *params, component_id=0, **options)
 
@@ -229,10 +278,7 @@ class Core:
 
 
 class VehicleCore(HasObservers):
-    """A vehicle and its core.
-
-    ``_dk``: names that no subclass in the classic style takes for its own things.
-    """
+    """A vehicle and its core. ``_dk``: names that no subclass in the classic style takes for its own things."""
 
     def __init__(self, handler: MAVConnection) -> None:
         self._handler = handler

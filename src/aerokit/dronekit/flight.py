@@ -2,25 +2,15 @@
 
 from __future__ import annotations
 
-import concurrent.futures
 import contextlib
+import functools
 import math
 import time
 from typing import TYPE_CHECKING, Any
 
+from aerokit.dronekit import flight_orders
 from aerokit.dronekit.attributes import VehicleAttributes
 from aerokit.dronekit.exceptions import APIException, TimeoutError  # noqa: A004 - DroneKit's name
-from aerokit.dronekit.flight_orders import (
-    change_armed,
-    change_mode,
-    check_speed,
-    checked_place,
-    flies_to_places_in,
-    go_to,
-    mode_named,
-    refuse,
-    take_off,
-)
 from aerokit.dronekit.values import LocationGlobal, LocationGlobalRelative, VehicleMode
 from aerokit.errors import CommandRejected, OperationTimeout
 from aerokit.mavlink.enums import MavCmd, MavFrame, SpeedType
@@ -28,20 +18,24 @@ from aerokit.mavlink.messages import HomePosition
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from concurrent.futures import Future
 
+    from aerokit.dronekit.line import Order
 
 __all__ = ["FlightMethods"]
 
 HOME_TIMEOUT_S = 10.0
 ORDERS_LOOK_S = 0.02
+ARMING = ("disarm", "arm")
 
 
 class FlightMethods(VehicleAttributes):
     """Setters and the ``simple_…`` methods return at once: the order is sent, repeated until it is answered, and a
     refusal becomes a warning of the logger ``dronekit``. The ``wait_…`` methods, :meth:`arm` and :meth:`disarm` wait.
+    All of them raise APIException while the link is down.
     """
 
-    _dk_arming: tuple[bool, concurrent.futures.Future[None]] | None = None
+    _dk_arming: Order | None = None
 
     # --------------------------------------------------------------------------------- modes
 
@@ -50,11 +44,8 @@ class FlightMethods(VehicleAttributes):
         """The flight mode by HEARTBEAT, by pymavlink's name for it; ``UNKNOWN`` before the first.
 
         Set it to a :class:`VehicleMode`, to a name, or on ArduPilot to a number: the order is sent at once
-        (MAV_CMD_DO_SET_MODE, and SET_MODE where that is not known). :meth:`wait_for_mode` waits.
-
-        Raises:
-            KeyError: this vehicle has no such mode; nothing was sent.
-            APIException: the link is down.
+        (MAV_CMD_DO_SET_MODE, and SET_MODE where that is not known). :meth:`wait_for_mode` waits. KeyError, and nothing
+        sent: this vehicle has no such mode.
         """
         return VehicleMode(self._flightmode)
 
@@ -62,17 +53,15 @@ class FlightMethods(VehicleAttributes):
     def mode(self, value: VehicleMode | str | int) -> None:
         self._dk_set_mode(value)
 
-    def _dk_set_mode(self, value: VehicleMode | str | int) -> tuple[str, concurrent.futures.Future[None]]:
+    def _dk_set_mode(self, value: VehicleMode | str | int) -> tuple[str, Order]:
         aio = self._dk.check_link()
-        wanted = mode_named(aio, value.name if isinstance(value, VehicleMode) else value)
-        return wanted.name, self._dk.order("mode", change_mode, aio, wanted)
+        wanted = flight_orders.mode_named(aio, value.name if isinstance(value, VehicleMode) else value)
+        return wanted.name, self._dk.order("mode", flight_orders.change_mode, aio, wanted)
 
     def wait_for_mode(self, mode: VehicleMode | str | int, timeout: float | None = None) -> None:
         """Set the mode and wait until the vehicle is in it.
 
-        Raises:
-            TimeoutError: it is not within ``timeout`` seconds, or, sooner, the vehicle has refused it.
-            KeyError: this vehicle has no such mode.
+        TimeoutError: not within ``timeout`` seconds, or, sooner, the vehicle has refused it.
         """
         name, done = self._dk_set_mode(mode)
         self._dk_wait_for_order(done, lambda: self._flightmode == name, timeout, "failed to set flight mode")
@@ -82,9 +71,7 @@ class FlightMethods(VehicleAttributes):
     @property
     def armed(self) -> bool:
         """Whether the motors are armed, by HEARTBEAT. Setting it sends the order, if it is another value than told, or
-        than ordered a moment before.
-
-        **Propellers may start to turn.** :meth:`arm` waits, and tells why the vehicle refuses.
+        than ordered a moment before: **propellers may start to turn**. :meth:`arm` waits, and tells why it is refused.
         """
         return self._armed
 
@@ -95,30 +82,25 @@ class FlightMethods(VehicleAttributes):
         else:
             self._dk.check_link()
 
-    def _dk_set_armed(self, value: bool) -> concurrent.futures.Future[None]:
+    def _dk_set_armed(self, value: bool) -> Order:
         aio = self._dk.check_link()
-        order = self._dk.order("arm" if value else "disarm", change_armed, aio, value)
-        self._dk_arming = value, order
+        self._dk_arming = order = self._dk.order(ARMING[value], flight_orders.change_armed, aio, value)
         return order
 
     def _dk_is_changing_to(self, value: bool) -> bool:
         """Whether an order to arm or disarm has not ended yet."""
-        return self._dk_arming is not None and self._dk_arming[0] == value and not self._dk_arming[1].done()
+        order = self._dk_arming
+        return order is not None and order.kind == ARMING[value] and not order.done()
 
     def arm(self, wait: bool = True, timeout: float | None = None) -> None:
         """Arm the motors: **propellers may start to turn**; with ``wait`` until HEARTBEAT says armed.
 
-        Raises:
-            TimeoutError: not within ``timeout`` seconds, or, sooner, the vehicle has refused; the text has its reasons.
+        TimeoutError: not within ``timeout`` seconds, or, sooner, the vehicle has refused; the text has its reasons.
         """
         self._dk_change_armed(True, wait, timeout, "failed to arm vehicle")
 
     def disarm(self, wait: bool = True, timeout: float | None = None) -> None:
-        """Stop the motors; with ``wait`` until HEARTBEAT says disarmed.
-
-        Raises:
-            TimeoutError: not within ``timeout`` seconds, or, sooner, the vehicle has refused, as it does in the air.
-        """
+        """Stop the motors; as :meth:`arm`. In the air the vehicle refuses."""
         self._dk_change_armed(False, wait, timeout, "failed to disarm vehicle")
 
     def _dk_change_armed(self, value: bool, wait: bool, timeout: float | None, text: str) -> None:
@@ -139,39 +121,29 @@ class FlightMethods(VehicleAttributes):
     def simple_takeoff(self, alt: float | None = None) -> None:
         """Take off and climb to ``alt`` metres above home; returns at once. Copters, armed and in GUIDED mode.
 
-        Without an altitude nothing is sent.
-
-        Raises:
-            ValueError: the altitude is not a finite number.
+        Without an altitude nothing is sent. ValueError: it is not a finite number.
         """
         if alt is not None:
             self._dk_take_off(float(alt))
 
-    def _dk_take_off(self, altitude: float) -> concurrent.futures.Future[None]:
+    def _dk_take_off(self, altitude: float) -> Order:
         """Altitude above home in metres."""
         if not math.isfinite(altitude):
             raise ValueError("Altitude was NaN or Infinity. Please provide a real number")
         aio = self._dk.check_link()
-        if aio.autopilot.repositions_amsl:  # as it does take-offs
-            home = self._dk_known_home().alt
-            plan, mode = (
-                aio.autopilot.take_off(altitude, home, is_vtol=aio.is_vtol),
-                aio.autopilot.mode_for("take_off"),
-            )
-            if plan is None or plan.command is None or mode is None:
-                raise APIException("this vehicle cannot take off by a command")
-            return self._dk.order("takeoff", take_off, aio, (mode,), plan.command, *plan.params)
-        return self._dk.order("takeoff", take_off, aio, (), MavCmd.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude)
+        give = functools.partial(self._dk.order, "takeoff", flight_orders.take_off, aio)
+        if not aio.autopilot.repositions_amsl:  # as it does take-offs
+            return give((), MavCmd.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude)
+        plan = aio.autopilot.take_off(altitude, self._dk_known_home().alt, is_vtol=aio.is_vtol)
+        mode = aio.autopilot.mode_for("take_off")
+        if plan is None or plan.command is None or mode is None:
+            raise APIException("this vehicle cannot take off by a command")
+        return give((mode,), plan.command, *plan.params)
 
     def wait_simple_takeoff(
         self, alt: float | None = None, epsilon: float = 0.1, timeout: float | None = None
     ) -> None:
-        """:meth:`simple_takeoff`, then wait as :meth:`wait_for_alt` does.
-
-        Raises:
-            ValueError: the altitude is not a finite number.
-            TimeoutError: not within ``timeout`` seconds, or, sooner, the vehicle has refused.
-        """
+        """:meth:`simple_takeoff`, then wait as :meth:`wait_for_alt` does; TimeoutError at once when it has refused."""
         if alt is not None:
             order = self._dk_take_off(float(alt))
             is_there = self._dk_passes(float(alt), epsilon, is_relative=True)
@@ -197,14 +169,15 @@ class FlightMethods(VehicleAttributes):
             ValueError: it is no such location, or one of its numbers is missing or wrong. Nothing was sent.
         """
         aio = self._dk.check_link()
-        flies_in = flies_to_places_in(aio)
+        flies_in = flight_orders.flies_to_places_in(aio)
         place = self._dk_place(location, is_relative=not flies_in)
         for name, speed in (("airspeed", airspeed), ("groundspeed", groundspeed)):
-            check_speed(name, speed)
+            flight_orders.check_speed(name, speed)
         if flies_in and self._flightmode not in map(str, flies_in):
-            self._dk.order("goto", refuse, f"not in {self._flightmode}: set the mode {flies_in[0]} first")
+            reason = f"not in {self._flightmode}: set the mode {flies_in[0]} first"
+            self._dk.order("goto", flight_orders.refuse, reason)
         else:
-            self._dk.order("goto", go_to, aio, *place)
+            self._dk.order("goto", flight_orders.go_to, aio, *place)
         if airspeed is not None:
             self.airspeed = airspeed
         if groundspeed is not None:
@@ -214,7 +187,7 @@ class FlightMethods(VehicleAttributes):
         """Latitude and longitude in 1e-7 degrees, altitude above home or above the sea."""
         if not isinstance(location, (LocationGlobal, LocationGlobalRelative)):
             raise ValueError("Expecting location to be LocationGlobal or LocationGlobalRelative.")
-        latitude, longitude, altitude = checked_place(location)
+        latitude, longitude, altitude = flight_orders.checked_place(location)
         if is_relative and isinstance(location, LocationGlobal):
             altitude -= self._dk_known_home().alt or 0.0
         elif not is_relative and not isinstance(location, LocationGlobal):
@@ -225,10 +198,7 @@ class FlightMethods(VehicleAttributes):
 
     @property
     def airspeed(self) -> float | Any:
-        """Speed through the air in m/s (VFR_HUD), None where nobody knows it.
-
-        Setting it asks for this speed (MAV_CMD_DO_CHANGE_SPEED).
-        """
+        """Speed through the air in m/s (VFR_HUD), None where nobody knows it. Set as :attr:`groundspeed`."""
         speed = self._dk_vfr_hud.values("airspeed")[0]
         return None if speed is None or math.isnan(speed) else speed
 
@@ -246,7 +216,7 @@ class FlightMethods(VehicleAttributes):
         self._dk_change_speed("groundspeed", SpeedType.GROUNDSPEED, speed)
 
     def _dk_change_speed(self, name: str, kind: int, speed: float) -> None:
-        check_speed(name, speed)
+        flight_orders.check_speed(name, speed)
         self._dk.command(name, MavCmd.DO_CHANGE_SPEED, kind, float(speed), -1)
 
     # ---------------------------------------------------------------------------------- home
@@ -255,10 +225,8 @@ class FlightMethods(VehicleAttributes):
     def home_location(self) -> LocationGlobal | Any:
         """Where it returns to, a new object each time; None until HOME_POSITION or a mission told it.
 
-        Setting it sends MAV_CMD_DO_SET_HOME, and the attribute has the new place at once.
-
-        Raises:
-            ValueError: not a LocationGlobal, or one of its numbers is missing or wrong. Nothing was sent.
+        Setting it sends MAV_CMD_DO_SET_HOME, and the attribute has the new place at once; ValueError, and nothing sent:
+        it is no LocationGlobal, or one of its numbers is missing or wrong.
         """
         home = self._home_location
         return None if home is None else LocationGlobal(home.lat, home.lon, home.alt)
@@ -267,23 +235,16 @@ class FlightMethods(VehicleAttributes):
     def home_location(self, pos: LocationGlobal) -> None:
         if not isinstance(pos, LocationGlobal):
             raise ValueError("Expecting home_location to be set to a LocationGlobal.")
-        latitude, longitude, altitude = checked_place(pos)
+        latitude, longitude, altitude = flight_orders.checked_place(pos)
         aio = self._dk.check_link()
-        place = {"x": latitude, "y": longitude, "z": altitude}
+        place = {"frame": MavFrame.GLOBAL, "x": latitude, "y": longitude, "z": altitude}
         order = self._dk.order(
-            "home",
-            aio.command_int,
-            MavCmd.DO_SET_HOME,
-            0,
-            frame=MavFrame.GLOBAL,
-            **place,
-            component_id=0,
-            or_long=True,
+            "home", aio.command_int, MavCmd.DO_SET_HOME, 0, **place, component_id=0, or_long=True
         )
         self._home_location = LocationGlobal(pos.lat, pos.lon, altitude)
         order.add_done_callback(self._dk_home_is_set)
 
-    def _dk_home_is_set(self, order: concurrent.futures.Future[None]) -> None:
+    def _dk_home_is_set(self, order: Future[None]) -> None:
         """A place that the vehicle refused is not its home: what it told last is."""
         if not order.cancelled() and isinstance(order.exception(), (CommandRejected, OperationTimeout)):
             self._home_location = self._dk_told_home
@@ -315,9 +276,7 @@ class FlightMethods(VehicleAttributes):
     ) -> None:
         """Wait until ``condition()`` is true, asked every ``interval`` seconds on the caller's thread.
 
-        Raises:
-            TimeoutError: it is not within ``timeout`` seconds (None: as long as it takes); the text is ``errmsg``.
-            APIException: the link is down.
+        TimeoutError: it is not within ``timeout`` seconds (None: as long as it takes); the text is ``errmsg``.
         """
         deadline = math.inf if not timeout else time.monotonic() + timeout
         while not condition():
@@ -358,7 +317,7 @@ class FlightMethods(VehicleAttributes):
 
     def _dk_wait_for_order(
         self,
-        order: concurrent.futures.Future[None],
+        order: Order,
         is_done: Callable[[], bool],
         timeout: float | None,
         text: str,

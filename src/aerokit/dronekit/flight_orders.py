@@ -6,6 +6,7 @@ Flight modes have the names that DroneKit programs know: pymavlink's, which are 
 from __future__ import annotations
 
 import math
+import operator
 from typing import TYPE_CHECKING
 
 import anyio
@@ -14,17 +15,25 @@ from aerokit.autopilots import autopilot_for
 from aerokit.autopilots.modes import CUSTOM_MODE_ENABLED, Mode
 from aerokit.dronekit.exceptions import APIException
 from aerokit.errors import CommandRejected, LocalProtocolError, OperationTimeout
-from aerokit.mavlink.enums import MavAutopilot, MavCmd, MavDoRepositionFlags, MavFrame, MavResult
-from aerokit.mavlink.messages import Heartbeat, SetMode, SetPositionTargetGlobalInt
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import (
+    MavAutopilot,
+    MavCmd,
+    MavDoRepositionFlags,
+    MavFrame,
+    MavResult,
+    MissionState,
+)
 
 if TYPE_CHECKING:
     from aerokit.autopilots import Autopilot, Purpose
+    from aerokit.dronekit.core import Core
     from aerokit.dronekit.values import LocationGlobal, LocationGlobalRelative
     from aerokit.vehicle.orders.order import Subject
-    from aerokit.vehicle.orders.posting import PostedOrder
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
 __all__ = [
+    "CurrentCommand",
     "change_armed",
     "change_mode",
     "check_speed",
@@ -39,8 +48,10 @@ __all__ = [
 
 POSITION_ONLY = 0x0DF8
 ARMED_IS_TOLD_S = 10.0
-MODE_IS_TOLD_S = 5.0
-ATTEMPTS, ASK_AGAIN_S = 4, 0.5
+CONFIRMED_S = 1.5
+"""So long MISSION_CURRENT is waited for before it is ordered by command."""
+MOST = 0xFFFF
+NO_MISSION = 0xFFFF
 
 
 def mode_name(vehicle: AsyncVehicle, custom_mode: int) -> str:
@@ -49,11 +60,7 @@ def mode_name(vehicle: AsyncVehicle, custom_mode: int) -> str:
 
 
 def mode_named(vehicle: AsyncVehicle, mode: str | int) -> Mode:
-    """The mode of a name in capitals, of one that the vehicle itself has told, or on ArduPilot of a number.
-
-    Raises:
-        KeyError: the vehicle has no such mode.
-    """
+    """The mode of a name in capitals or as the vehicle told it, or on ArduPilot of a number; KeyError: none such."""
     autopilot = _as_known(vehicle)
     if isinstance(mode, int) and autopilot.modes_are_numbered:
         return Mode(mode_name(vehicle, mode), mode)
@@ -77,43 +84,13 @@ def _as_known(vehicle: AsyncVehicle) -> Autopilot:
     """An autopilot of which nothing is known (iNav is one) has ArduPilot's numbers, as with pymavlink."""
     if vehicle.autopilot.modes.numbers:
         return vehicle.autopilot
-    return autopilot_for(Heartbeat(vehicle.vehicle_type, MavAutopilot.ARDUPILOTMEGA, 0, 0, 0, 0))
+    return autopilot_for(m.Heartbeat(vehicle.vehicle_type, MavAutopilot.ARDUPILOTMEGA, 0, 0, 0, 0))
 
 
 async def change_mode(vehicle: AsyncVehicle, wanted: Mode) -> None:
-    """Send MAV_CMD_DO_SET_MODE, or SET_MODE to a vehicle that does not know it, and wait until HEARTBEAT tells it.
-
-    Asked again where the vehicle says that it is too early, as PX4 does while it checks a mission just uploaded, and as
-    long as the order stands.
-
-    Raises:
-        CommandRejected: the vehicle refused.
-        OperationTimeout: it did not answer, or it accepted and stays in another mode.
-    """
+    """Order a mode, and wait until HEARTBEAT tells it."""
     with vehicle.posted("mode", "motion", modes=(wanted,)) as order:
-        for attempts_left in reversed(range(ATTEMPTS)):
-            try:
-                await _request(vehicle, wanted, order)
-                await order.until_told(MODE_IS_TOLD_S)
-            except CommandRejected as error:
-                if error.result != MavResult.TEMPORARILY_REJECTED or not attempts_left:
-                    raise
-                await anyio.sleep(ASK_AGAIN_S)
-                if order.end:
-                    raise
-            else:
-                return
-
-
-async def _request(vehicle: AsyncVehicle, wanted: Mode, order: PostedOrder) -> None:
-    params = (wanted.base_mode, *vehicle.autopilot.mode_order(wanted).params[1:])
-    try:
-        await order.command(MavCmd.DO_SET_MODE, *params, component_id=0)
-    except CommandRejected as error:
-        if error.result != MavResult.UNSUPPORTED or (order.end and not vehicle.telemetry.is_in(wanted)):
-            raise
-        if not order.end:
-            vehicle.connection.send(SetMode(vehicle.system_id, wanted.base_mode, wanted.custom_mode))
+        await order.set_mode(wanted, component_id=0)
 
 
 async def change_armed(vehicle: AsyncVehicle, value: bool) -> None:
@@ -155,7 +132,7 @@ async def go_to(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: 
             if is_amsl or error.result != MavResult.UNSUPPORTED or order.end:
                 raise
             target = (vehicle.system_id, 0, MavFrame.GLOBAL_RELATIVE_ALT_INT, POSITION_ONLY)
-            vehicle.send(SetPositionTargetGlobalInt(0, *target, latitude, longitude, altitude, *(0.0,) * 8))
+            vehicle.send(m.SetPositionTargetGlobalInt(0, *target, latitude, longitude, altitude, *(0.0,) * 8))
 
 
 def flies_to_places_in(aio: AsyncVehicle) -> tuple[Mode, ...]:
@@ -175,11 +152,7 @@ async def refuse(reason: str) -> None:
 
 
 def checked_place(location: LocationGlobal | LocationGlobalRelative) -> tuple[int, int, float]:
-    """Latitude and longitude in 1e-7 degrees, altitude in metres.
-
-    Raises:
-        LocalProtocolError: a ValueError, which names the number that is missing or wrong.
-    """
+    """Latitude and longitude in 1e-7 degrees, altitude in metres; LocalProtocolError names what is missing or wrong."""
     for name, limit in (("lat", 90.0), ("lon", 180.0), ("alt", math.inf)):
         value = getattr(location, name)
         try:
@@ -196,3 +169,59 @@ def check_speed(name: str, speed: float | None) -> None:
     """LocalProtocolError, a ValueError, unless it is a number of m/s or None."""
     if speed is not None and not math.isfinite(speed):
         raise LocalProtocolError(f"{name} = {speed!r} is not allowed: a number of m/s")
+
+
+class CurrentCommand:
+    """MISSION_CURRENT and MISSION_SET_CURRENT of one vehicle.
+
+    ArduPilot counts home as 0, and is at 0 before it flies its mission. PX4 counts the first item as 0: that is 1
+    here, and 0 as long as it does not fly.
+    """
+
+    def __init__(self, core: Core) -> None:
+        self._core = core
+        self._chosen: int | None = None
+        """What PX4 was told to fly next and has not gone past."""
+        self._latest = core.on(m.MissionCurrent, self._on_current)
+
+    @property
+    def seq(self) -> int:
+        """The command that the vehicle flies or will fly next; 0 before its first MISSION_CURRENT."""
+        message = self._latest.message
+        if message is None:
+            return 0
+        if self._core.aio.autopilot.home_is_item_0:
+            return int(message.seq)
+        if message.total == NO_MISSION or (self._is_over(message) and message.seq != self._chosen):
+            return 0
+        return int(message.seq) + 1
+
+    def choose(self, seq: int) -> None:
+        """Have the vehicle fly this one next; does not wait. LocalProtocolError: it is not from 0 to 65,535."""
+        if not 0 <= operator.index(seq) <= MOST:
+            raise LocalProtocolError(f"next = {seq!r} is not allowed, but 0 to {MOST}")
+        self._core.order("commands.next", self._choose, operator.index(seq))
+
+    def _on_current(self, message: m.MissionCurrent) -> None:
+        if message.seq != self._chosen:
+            self._chosen = None
+
+    def _is_over(self, message: m.MissionCurrent) -> bool:
+        is_at_an_end = message.seq == 0 or message.mission_state == MissionState.COMPLETE
+        return is_at_an_end and not self._core.aio.is_armed
+
+    async def _choose(self, seq: int) -> None:
+        """By the message that DroneKit sends, once; what is not heard is ordered by the rules of all orders."""
+        aio = self._core.aio
+        if not aio.autopilot.home_is_item_0:
+            await aio.mission.set_current(max(seq - 1, 0))
+            self._chosen = seq - 1
+            return
+        aio.send(m.MissionSetCurrent(aio.system_id, aio.component_id, seq))
+        with anyio.move_on_after(CONFIRMED_S):
+            await aio.telemetry.mission_current.wait_until(lambda progress: progress.current == seq)
+            return
+        if seq == 0:
+            await aio.command(MavCmd.DO_SET_MISSION_CURRENT, 0)
+        else:
+            await aio.mission.set_current(seq - 1)

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 from aerokit.dronekit.core import core_of
 from aerokit.dronekit.flight_orders import checked_place
+from aerokit.dronekit.line import weakly
 from aerokit.dronekit.privates import GimbalPrivates
 from aerokit.dronekit.values import LocationGlobal, LocationGlobalRelative
-from aerokit.dronekit.weakly import weakly
 from aerokit.errors import LocalProtocolError
 from aerokit.position import Position
 from aerokit.vehicle.state.gimbal import GimbalAttitude
@@ -31,12 +31,13 @@ class Gimbal(GimbalPrivates):
 
     :attr:`pitch`, :attr:`roll` and :attr:`yaw` are None until the vehicle has told of a gimbal. Orders return at once;
     a newer one replaces one that is not answered yet, and a refusal becomes a warning of the logger ``dronekit``.
+    ValueError, and nothing sent: a number or a place is none; APIException: the link is down.
     """
 
     def __init__(self, vehicle: VehicleCore) -> None:
         self._core = core_of(vehicle)
         self._attitude = NOT_TOLD
-        self._core.at_start(self._begin)
+        self._core.at_start.append(self._begin)
 
     @property
     def pitch(self) -> float | None:
@@ -69,31 +70,20 @@ class Gimbal(GimbalPrivates):
     __repr__ = __str__
 
     def rotate(self, pitch: float, roll: float, yaw: float) -> None:
-        """Turn the gimbal and keep it there, however the vehicle moves; returns at once.
+        """Turn the gimbal and keep it there, however the vehicle moves.
 
         Args:
             pitch: degrees from the horizon: 0 is level, -90 straight down.
             roll: degrees from the horizon. If it is not 0, the order can only be given by a command that turns the
                 camera with the vehicle: ``yaw`` is right at the moment of the order.
             yaw: degrees clockwise from north.
-
-        Raises:
-            ValueError: one of them is not a finite number. Nothing was sent.
-            APIException: the link is down.
         """
         angles = [_checked(name, value) for name, value in (("pitch", pitch), ("yaw", yaw), ("roll", roll))]
         gimbal = self._core.check_link().gimbal
         self._core.order("gimbal", gimbal.point, *angles[:2], roll_deg=angles[2])
 
     def target_location(self, roi: LocationGlobalRelative | LocationGlobal) -> None:
-        """Keep the camera on a place; a copter without a gimbal that turns does so itself. Returns at once.
-
-        Latitude, longitude and altitude 0 give it up.
-
-        Raises:
-            ValueError: it is no such location, or one of its numbers is missing or wrong. Nothing was sent.
-            APIException: the link is down.
-        """
+        """Keep the camera on a place; a copter without a gimbal that turns does so itself. All zeros give it up."""
         if not isinstance(roi, (LocationGlobal, LocationGlobalRelative)):
             raise LocalProtocolError("Expecting roi to be LocationGlobal or LocationGlobalRelative.")
         is_a_place = any(checked_place(roi))
@@ -107,14 +97,8 @@ class Gimbal(GimbalPrivates):
             self._core.order("gimbal", _look_above_home, aio, place)
 
     def release(self) -> None:
-        """Give the gimbal back to the pilot's sticks; returns at once.
-
-        Raises:
-            APIException: the link is down.
-        """
+        """Give the gimbal back to the pilot's sticks."""
         self._core.order("gimbal", self._core.check_link().gimbal.release)
-
-    # ----------------------------------------------------------------------------- receiving
 
     def _begin(self) -> None:
         self._core.aio.gimbal.attitude.observe(weakly(self._on_attitude), every_arrival=True)

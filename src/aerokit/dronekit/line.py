@@ -1,19 +1,21 @@
-"""``Line``: a link that is open until it is closed, with the threads of the classic API."""
+"""``Line``: a link that is open until it is closed, with the threads of the classic API, and what is ordered there."""
 
 from __future__ import annotations
 
+import asyncio
 import atexit
+import concurrent.futures
+import contextlib
 import functools
 import logging
 import threading
-from collections.abc import Callable
+import weakref
+from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any
 
 from aerokit.dronekit.exceptions import classic_errors
 from aerokit.dronekit.listener_thread import ListenerThread
-from aerokit.dronekit.orders import Orders
-from aerokit.dronekit.weakly import weakly
-from aerokit.errors import AerokitError
+from aerokit.errors import AerokitError, CommandRejected, ConnectionClosed
 from aerokit.runtime.components import is_autopilot
 
 if TYPE_CHECKING:
@@ -21,12 +23,17 @@ if TYPE_CHECKING:
     from aerokit.runtime.connection import Connection
     from aerokit.sync.loop_thread import Held, LoopThread
 
-__all__ = ["Line"]
+__all__ = ["Line", "Order", "Orders", "Work", "weakly"]
 
 logger, of_vehicles = logging.getLogger("dronekit.mavlink"), logging.getLogger("dronekit")
 
 ORDERS_END_S = 2.0
 """How long closing waits for what was ordered a moment before to be answered."""
+
+REPLACES = {"disarm": "arm"}
+"""Kinds that are one: the newer replaces the older."""
+
+Work = Callable[..., Awaitable[object]]
 
 
 class Line:
@@ -62,9 +69,7 @@ class Line:
     def send(self, message: Message, *, to: int | None = None) -> None:
         """Send a message, in the order of the calls; from any thread, never blocks.
 
-        Raises:
-            LocalProtocolError: a field is out of range; nothing was sent.
-            APIException: the connection is closed.
+        LocalProtocolError: a field is out of range; APIException: the connection is closed.
         """
         message.encode()  # so that what is wrong with it is told to who made it
         with classic_errors():
@@ -141,3 +146,111 @@ def _let_go(
     listener_thread.stop()
     for function in at_close:
         function()
+
+
+class Order(concurrent.futures.Future[None]):
+    """What was ordered: done when it has ended, with its failure."""
+
+    def __init__(self, kind: str) -> None:
+        super().__init__()
+        self.kind = kind
+        self.task: asyncio.Task[None] | None = None
+
+
+class Orders:
+    """Runs coroutine functions on the loop in the background, one of each kind at a time: a newer one replaces it.
+
+    A failure becomes one warning, too.
+    """
+
+    def __init__(self, loop: LoopThread) -> None:
+        self._loop = loop
+        self._newest: dict[str, Order] = {}
+        self._pending: set[Order] = set()
+        self.describe: Callable[[], str] | None = None
+        """What to say of the vehicle when it has refused an order."""
+
+    def give(self, kind: str, function: Work, *args: Any, **kwargs: Any) -> Order:
+        """Start it; what it sends first goes out in the order of these calls. Never blocks; from any thread.
+
+        ConnectionClosed when the connection was closed.
+        """
+        order = Order(kind)
+        self._pending.add(order)
+        order.add_done_callback(self._pending.discard)
+        try:
+            self._loop.call_soon(self._begin, order, functools.partial(function, *args, **kwargs))
+        except ConnectionClosed:
+            order.cancel()
+            raise
+        return order
+
+    def withdraw(self, order: Order) -> None:
+        """What :meth:`give` returned is not wanted any more: it is not sent again. Never blocks; from any thread."""
+        with contextlib.suppress(ConnectionClosed):
+            self._loop.call_soon(self._withdraw, order)
+
+    def post(self, function: Callable[..., object], *args: Any) -> None:
+        """Call a function that neither waits nor raises on the loop; in order with other calls and :meth:`give`."""
+        if self._loop.is_current:
+            function(*args)
+        else:
+            self._loop.call_soon(_call_next, function, *args)
+
+    def wait(self, timeout: float) -> None:
+        """Wait until all that were given have ended, at most so many seconds."""
+        pending = self._pending.copy()
+        if pending and not self._loop.is_current:
+            concurrent.futures.wait(pending, timeout)
+
+    def _begin(self, order: Order, work: Work) -> None:
+        place = REPLACES.get(order.kind, order.kind)
+        if place in self._newest:
+            self._withdraw(self._newest[place])
+        if order.set_running_or_notify_cancel():
+            name = f"dronekit {order.kind}"
+            order.task = asyncio.get_running_loop().create_task(self._run(order, work), name=name)
+            order.task.add_done_callback(lambda _: self._end(place, order))
+            self._newest[place] = order
+
+    def _withdraw(self, order: Order) -> None:
+        if order.task is not None and order in self._newest.values():
+            order.task.cancel()
+
+    def _end(self, place: str, order: Order) -> None:
+        if self._newest.get(place) is order:
+            del self._newest[place]
+        if not order.done():  # it was cancelled before its first step, or while it waited
+            why = "a newer order replaced it, it was withdrawn, or the connection was closed"
+            order.set_exception(ConnectionClosed(f"{order.kind}: {why}"))
+
+    async def _run(self, order: Order, work: Work) -> None:
+        try:
+            await work()
+        except Exception as error:
+            if not isinstance(error, ConnectionClosed):
+                text = str(error)  # who keeps log records keeps no frames, and so no vehicle
+                if isinstance(error, CommandRejected) and self.describe is not None:
+                    text += f" ({self.describe()})"  # most refusals are for what the vehicle does not say
+                of_vehicles.warning("%s: %s", order.kind, text)
+            order.set_exception(error)
+        else:
+            order.set_result(None)
+
+
+def _call_next(function: Callable[..., object], *args: Any) -> None:
+    """In the turn in which tasks begun before take their first step."""
+    asyncio.get_running_loop().call_soon(function, *args)
+
+
+def weakly(method: Callable[..., object]) -> Callable[..., None]:
+    """A function that calls a bound method for as long as its object, which it does not keep, is there."""
+    bound: Any = method
+    owner, function = weakref.ref(bound.__self__), bound.__func__
+
+    def call(*args: object) -> None:
+        present = owner()
+        if present is not None:
+            function(present, *args)
+
+    return call

@@ -11,6 +11,8 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from aerokit.sync.reply import Reply
+
 __all__ = ["ListenerThread"]
 
 logger = logging.getLogger("dronekit")
@@ -65,19 +67,18 @@ class ListenerThread:
         if _must_not_wait():
             self.post(function, *args)
             return
-        called = threading.Event()
+        called: Reply[None] = Reply()
 
         def call_and_tell() -> None:
             try:
                 function(*args)
             finally:
-                called.set()
+                called.end()
 
         self.post(call_and_tell)
-        end = time.monotonic() + CALL_S
-        while not called.wait(0.2) and not self.is_stopped:  # in slices, for Ctrl-C on every system
-            if time.monotonic() > end:
-                break
+        end = time.monotonic() + CALL_S  # waited for in slices, for Ctrl-C on every system
+        while not called.wait(0.2) and not self.is_stopped and time.monotonic() <= end:
+            pass
 
     def keep(self, owner: object, *, has_listeners: bool) -> None:
         """Keep an object for as long as it has listeners: a program may have nothing else of it any more."""

@@ -62,12 +62,8 @@ class Maintenance(VehicleCore):
     def play_tune(self, tune: str | bytes) -> None:
         """Play a tune on the vehicle's buzzer: notes as ``"AAAA"``, in the format of the autopilot (PLAY_TUNE).
 
-        Args:
-            tune: at most 230 characters of ASCII; ArduPilot plays the first 99.
-
-        Raises:
-            ValueError: it is too long, or not ASCII. Nothing was sent.
-            APIException: the link is down, or the vehicle speaks MAVLink 1, which has no such message.
+        At most 230 characters of ASCII (else ValueError); ArduPilot plays the first 99. APIException: the link is down,
+        or the vehicle speaks MAVLink 1, which has no such message.
         """
         text = _tune_text(tune)
         if self._dk.check_link().connection.mavlink_version == 1:

@@ -2,24 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import threading
+import time
+from collections import deque
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 from pymavlink import mavutil
 
 from aerokit.autopilots.modes import is_armed
-from aerokit.dronekit.inbox import Inbox
-from aerokit.dronekit.message_factory import MessageFactory
-from aerokit.dronekit.pymavlink_messages import message_of
+from aerokit.dronekit.exceptions import APIException
+from aerokit.dronekit.line import weakly
+from aerokit.dronekit.observers import message_of
+from aerokit.errors import LocalProtocolError
+from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.enums import MavAutopilot, MavCmd, MavModeFlag, MavParamType
 from aerokit.mavlink.from_pymavlink import from_pymavlink
+from aerokit.mavlink.message_factory import MessageFactory
 from aerokit.runtime.components import is_autopilot
 
 if TYPE_CHECKING:
     from aerokit.dronekit.line import Line
+    from aerokit.links.link import Peer
+    from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.messages import Heartbeat
 
-__all__ = ["Master", "MessageFactory"]
+__all__ = ["Inbox", "Master"]
+
+MOST_KEPT = 1000
+OLDEST_S = 5.0
+"""A program that asks rarely gets what came lately, not what came when it asked last."""
+FIRST_S = 1.0
+"""How long the first look-ups wait for a message: nothing was kept before."""
+SLICE_S = 0.2
+"""Ctrl-C and the end of the connection are noticed between waits of this length."""
 
 
 class Master:
@@ -31,6 +47,8 @@ class Master:
     def __init__(self, connection: Line) -> None:
         self._connection = connection
         ours = connection.connection
+        self.source_system, self.source_component = ours.source_system, ours.source_component
+        """Our own ids."""
         self.mav = MessageFactory(self._send, ours.source_system, ours.source_component)
         """Makes and sends messages."""
         self.messages = Inbox(connection)
@@ -45,16 +63,6 @@ class Master:
     def target_component(self) -> int:
         """Component id of its autopilot, 0 before it was heard."""
         return self._heard()[0]
-
-    @property
-    def source_system(self) -> int:
-        """Our own system id."""
-        return self._connection.connection.source_system
-
-    @property
-    def source_component(self) -> int:
-        """Our own component id."""
-        return self._connection.connection.source_component
 
     @property
     def address(self) -> str:
@@ -93,11 +101,7 @@ class Master:
         return dict(modes) if modes is not None else None
 
     def set_mode(self, mode: str | int, custom_mode: int | None = 0, custom_sub_mode: int | None = 0) -> None:
-        """Set a mode by its name or number; PX4 takes the three numbers of :meth:`mode_mapping`, too.
-
-        Raises:
-            KeyError: the vehicle has no mode of this name; nothing was sent.
-        """
+        """Set a mode by its name (KeyError: none such) or number, or PX4's by the three of :meth:`mode_mapping`."""
         heartbeat = self._heard()[1]
         is_px4 = heartbeat is not None and heartbeat.autopilot == MavAutopilot.PX4
         vehicle = self._connection.vehicle
@@ -189,9 +193,7 @@ class Master:
 
         Nothing is lost between calls, up to the last five seconds and 1,000 messages; it begins with the first call.
         Without ``blocking``, None when there is none yet; with it, None after ``timeout`` seconds (None: never).
-
-        Raises:
-            APIException: the connection was closed.
+        APIException: the connection was closed.
         """
         names = {type} if isinstance(type, str) else None if type is None else set(type)
 
@@ -237,8 +239,6 @@ class Master:
         """Whether a HEARTBEAT is an autopilot's: not a gimbal's, a camera's or a ground station's."""
         return is_autopilot(msg)
 
-    # -------------------------------------------------------------------------------- inside
-
     def _send(self, message: Any) -> None:
         target = self._connection.target_system
         self._connection.send(from_pymavlink(message, target), to=target or None)
@@ -249,3 +249,104 @@ class Master:
             if source[0] == self.target_system and is_autopilot(heartbeat):
                 return source[1], heartbeat
         return 0, None
+
+
+class Inbox(Mapping[str, Any]):
+    """The last message of every type by its name, and what came since it was asked before, as pymavlink's objects.
+
+    It begins with the first question; the first look-ups of a second wait for their message. It hears the vehicle,
+    radios and ground stations; not other vehicles.
+    """
+
+    def __init__(self, connection: Line) -> None:
+        self._connection = connection
+        self._latest: dict[int, Frame] = {}
+        self._frames: deque[Frame] = deque(maxlen=MOST_KEPT)
+        self._came = threading.Condition()
+        self._started: float | None = None
+
+    def next_match(self, names: Collection[str] | None, condition: Any, timeout: float | None) -> Any:
+        """The next message of one of these types that meets ``condition(message)``; the rest as :meth:`recv_match`."""
+        self._start()
+        end = None if timeout is None else time.monotonic() + timeout
+        while (frame := self._pop(end)) is not None:
+            message = message_of(frame)
+            if (names is None or message.get_type() in names) and condition(message):
+                return message
+        return None
+
+    def age_s(self, name: str) -> float:
+        """Seconds since a message of this type came, or since the first question."""
+        self._start()
+        frame = self._latest.get(_id_of(name))
+        if frame is None:
+            return time.monotonic() - (self._started or 0.0)
+        return self._connection.connection.now() - frame.received_at
+
+    def __getitem__(self, name: str) -> Any:
+        self._start()
+        message_id = _id_of(name)
+        while (frame := self._latest.get(message_id)) is None and self._waits():
+            with self._came:
+                self._came.wait(SLICE_S / 10)
+        if frame is None:
+            raise KeyError(name)
+        return message_of(frame)
+
+    def __iter__(self) -> Iterator[str]:
+        self._start()
+        return iter([message_of(frame).get_type() for frame in self._latest.copy().values()])
+
+    def __len__(self) -> int:
+        self._start()
+        return len(self._latest)
+
+    def _start(self) -> None:
+        with self._came:
+            is_first, self._started = self._started is None, self._started or time.monotonic()
+        if is_first:
+            loop, tap = self._connection.loop, self._connection.connection.tap
+            if loop.is_current:
+                tap(weakly(self._take))
+            else:
+                loop.call(tap, weakly(self._take))  # which waits: what comes after the first question is kept
+
+    def _waits(self) -> bool:
+        is_young = self._started is not None and time.monotonic() < self._started + FIRST_S
+        return is_young and self._connection.connection.is_open and not self._connection.loop.is_current
+
+    def _take(self, frame: Frame, peer: Peer) -> None:
+        """On the loop's thread."""
+        if self._connection.is_of_another_vehicle(frame.system_id):
+            return
+        with self._came:
+            self._latest[frame.message_id] = frame
+            self._frames.append(frame)
+            self._came.notify_all()
+
+    def _pop(self, end: float | None) -> Frame | None:
+        """The oldest frame that is not too old; None when the time is over."""
+        now = self._connection.connection.now
+        while True:
+            with self._came:
+                while self._frames:
+                    frame = self._frames.popleft()
+                    if now() - frame.received_at < OLDEST_S:
+                        return frame
+                left = SLICE_S if end is None else min(end - time.monotonic(), SLICE_S)
+                if left > 0:
+                    self._check()
+                    self._came.wait(left)
+                elif not self._frames:
+                    return None
+
+    def _check(self) -> None:
+        if self._connection.is_closed or not self._connection.connection.is_open:
+            raise APIException("the connection was closed")
+
+
+def _id_of(name: str) -> int:
+    try:
+        return STANDARD.by_name(name).ID
+    except LocalProtocolError:
+        raise KeyError(name) from None

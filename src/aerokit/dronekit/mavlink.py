@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from aerokit.dronekit.exceptions import APIException
 from aerokit.dronekit.line import Line
+from aerokit.dronekit.observers import message_of
 from aerokit.errors import AerokitError, ConnectionClosed, LinkOpenError, LocalProtocolError
 from aerokit.links.address import ACCEPTED_FORMS, parse_address
 from aerokit.links.reconnecting import ReconnectingLink
@@ -84,17 +85,14 @@ class MAVConnection(Line):
     # ----------------------------------------------------------------------------- receiving
 
     def forward_message(self, fn: FunctionT) -> FunctionT:
-        """Have ``fn(connection, message)`` called on the listener thread for every message (pymavlink's classes).
-
-        Usable as a decorator.
-        """
+        """Have ``fn(connection, message)`` called on the listener thread for every message, pymavlink's. Decorator."""
         self.message_listeners.append(fn)
         if len(self.message_listeners) == 1:
             self.loop.call_soon(self.connection.tap, self._forward)
         return fn
 
     def forward_loop(self, fn: FunctionT) -> FunctionT:
-        """Have ``fn(connection)`` called on the listener thread about 20 times a second. Usable as a decorator."""
+        """Have ``fn(connection)`` called on the listener thread about 20 times a second. Decorator."""
         self.loop_listeners.append(fn)
         if len(self.loop_listeners) == 1:
             self.loop.call_soon(self._tick)
@@ -152,14 +150,10 @@ class MAVConnection(Line):
         """Always empty: what is sent does not wait."""
         return queue.Queue()
 
-    # ------------------------------------------------------------------------------- inside
-
     def _forward(self, frame: Frame, peer: Peer) -> None:
         self.listener_thread.offer(self._deliver, frame)
 
     def _deliver(self, frame: Frame) -> None:
-        from aerokit.dronekit.pymavlink_messages import message_of
-
         self._call(self.message_listeners, message_of(frame))
 
     def _tick(self) -> None:
@@ -202,19 +196,12 @@ def _open(
     loop: LoopThread, ip: str, baud: int, source_system: int, source_component: int
 ) -> Held[Connection]:
     """Open it; what refuses at first may be a simulator that the program has just started."""
+    ids: dict[str, Any] = {"source_system": source_system, "source_component": source_component}
     try:
         _check_address(ip)
         for attempt in range(ATTEMPTS):
             try:
-                return loop.hold_open(
-                    open_connection(
-                        ip,
-                        baud=baud,
-                        source_system=source_system,
-                        source_component=source_component,
-                        reconnect=True,
-                    )
-                )
+                return loop.hold_open(open_connection(ip, baud=baud, reconnect=True, **ids))
             except LinkOpenError as error:
                 if attempt == ATTEMPTS - 1 or not isinstance(error.__cause__, ConnectionRefusedError):
                     _raise_classic(error)
@@ -264,9 +251,5 @@ class MAVWriter:
         self.queue.put(pkt)
 
     def read(self) -> NoReturn:
-        """Nothing can be read.
-
-        Raises:
-            RuntimeError: always.
-        """
+        """Nothing can be read: always RuntimeError."""
         raise RuntimeError("a MAVWriter is for writing")

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, MutableMapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, SupportsFloat, SupportsIndex
 
 import anyio
 
 from aerokit.dronekit.core import core_of
 from aerokit.dronekit.exceptions import APIException, TimeoutError  # noqa: A004 - DroneKit's name
-from aerokit.dronekit.observers import AttributeListener, HasObservers, ListenerT
-from aerokit.dronekit.parameter_reading import ParameterReading
-from aerokit.dronekit.parameter_values import ParameterValues, number_of, set_parameter
-from aerokit.dronekit.python2 import Python2Mapping
-from aerokit.dronekit.weakly import weakly
+from aerokit.dronekit.line import weakly
+from aerokit.dronekit.observers import HasObservers, ListenerT
+from aerokit.dronekit.parameter_transfers import ParameterReading, ParameterValues, set_parameter
+from aerokit.dronekit.privates import Python2Mapping
 from aerokit.errors import LocalProtocolError, ParameterTimeout
 from aerokit.mavlink.messages import ParamValue
 from aerokit.parameters import check_name
@@ -40,8 +39,8 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
     iterating does, :func:`len` tells how many have come. A value that is known is read without waiting.
 
     Names from before and after ArduPilot renamed a parameter are taken by both, and values converted, with a warning.
-
-    Listeners get ``(parameters, name, value)``, when a value has changed or has come for the first time.
+    Listeners get ``(parameters, name, value)``, when a value has changed or has come for the first time. What waits
+    raises APIException while the link is down, and TimeoutError after 30 seconds.
     """
 
     def __init__(self, vehicle: VehicleCore) -> None:
@@ -53,7 +52,7 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
         """How many there are by the last message."""
         self._reading = ParameterReading(core, self._take_all)
         core.on(ParamValue, self._on_value)
-        core.at_start(self._start)
+        core.at_start.append(self._start)
         core.ready.seekers["parameters"] = self._reading.seek
 
     # ------------------------------------------------------------------------------- reading
@@ -70,10 +69,6 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
         """Return a value; ``default`` when the vehicle has no such parameter.
 
         The second argument is no default: false, it is what is known now that counts, and nothing is waited for.
-
-        Raises:
-            TimeoutError: it did not come within 30 seconds.
-            APIException: the link is down, and the value is not known.
         """
         if isinstance(name, str) and (value := self._values.get(name.upper())) is not None:
             return value
@@ -96,14 +91,7 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
         return iter(self._values.copy())
 
     def wait_ready(self, **kwargs: Any) -> None:
-        """Wait until all parameters are there: arguments as of ``Vehicle.wait_ready``.
-
-        A download that has failed is begun again.
-
-        Raises:
-            TimeoutError: they are not in time, 30 seconds by default.
-            APIException: the link is down.
-        """
+        """Wait until all parameters are there, as ``Vehicle.wait_ready``. A download that has failed is begun again."""
         self._vehicle.wait_ready("parameters", **kwargs)
 
     # ------------------------------------------------------------------------------- writing
@@ -130,11 +118,9 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
             Whether the vehicle holds the value now. If not, the reason is logged as an error: no answer, no such
             parameter, a value that the vehicle or the parameter's type does not take.
 
-        Raises:
-            LocalProtocolError: a ValueError; the name is no text, or the value no number.
-            APIException: the link is down.
+        LocalProtocolError, a ValueError: the name is no text, or the value no number.
         """
-        name, number = _upper(name), number_of(name, value)
+        name, number = _upper(name), _number(name, value)
         if wait_ready:
             self.wait_ready()
         found = self._values.find(name)
@@ -153,31 +139,15 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
             core.logger.error("could not set parameter %s to %f: %s", name, number, failure)
         return failure is None
 
-    # ----------------------------------------------------------------------------- listeners
-
-    def add_attribute_listener(self, attr_name: str, observer: AttributeListener) -> None:
-        """Have ``observer(parameters, name, value)`` called when this parameter (``'*'``: any) changes."""
-        super().add_attribute_listener(attr_name.upper(), observer)
-
-    def remove_attribute_listener(self, attr_name: str, observer: AttributeListener) -> None:
-        """Call it no more. Silent when nobody listens to the name.
-
-        Raises:
-            ValueError: others listen to the name, but this one does not.
-        """
-        super().remove_attribute_listener(attr_name.upper(), observer)
-
-    def notify_attribute_listeners(self, attr_name: str, value: Any, cache: bool = False) -> None:
-        """Tell the listeners of a parameter a value; with ``cache`` only when it is not the one told before."""
-        super().notify_attribute_listeners(attr_name.upper(), value, cache)
-
     def on_attribute(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, attr_name: str | list[str] | tuple[str, ...]
     ) -> Callable[[ListenerT], ListenerT]:
         """Decorate a listener with the name, or the list of names, of parameters. It cannot be removed by name then."""
         return super().on_attribute(attr_name)
 
-    # ------------------------------------------------------------------------------- inside
+    @staticmethod
+    def _dk_spelled(attr_name: str) -> str:
+        return attr_name.upper()
 
     def _find(self, name: object, *, waits: bool = True) -> Found | None:
         """Waited for if need be; None when the vehicle has no such parameter."""
@@ -236,6 +206,17 @@ def _upper(name: str) -> str:
     if not isinstance(name, str):
         raise LocalProtocolError(f"parameter name = {name!r} is no text")
     return name.upper()
+
+
+def _number(name: str, value: object) -> int | float:
+    """The value, when it is a number: of Python, numpy or alike; else LocalProtocolError, a ValueError."""
+    if isinstance(value, (int, float)):
+        return value
+    if isinstance(value, SupportsIndex):
+        return value.__index__()
+    if isinstance(value, SupportsFloat):
+        return float(value)
+    raise LocalProtocolError(f"{name} = {value!r} is no number")
 
 
 def _described(name: str) -> str:

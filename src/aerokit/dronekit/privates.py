@@ -1,16 +1,15 @@
-"""DroneKit's own private names that programs read, above all where it has no public one for them."""
+"""What old programs use beside DroneKit's public names: its private ones, and what mappings had in Python 2."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, ItemsView, Iterator, KeysView, Mapping, ValuesView
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, overload
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-
-__all__ = ["GimbalPrivates", "LocationPrivates", "Shadowable", "VehiclePrivates"]
+__all__ = ["GimbalPrivates", "LocationPrivates", "Python2Mapping", "Shadowable", "VehiclePrivates", "read_of"]
 
 T = TypeVar("T")
 
@@ -36,7 +35,7 @@ class Shadowable(Generic[T]):
         return self if instance is None else self._getter(instance)
 
 
-def _of(path: str) -> Shadowable[Any]:
+def read_of(path: str) -> Shadowable[Any]:
     """What is found there (``gimbal.pitch``); None where something is None on the way."""
     names = path.split(".")
 
@@ -55,7 +54,7 @@ def _velocity(index: int) -> Shadowable[Any]:
 
 def _message_of(latest: str, *fields: str) -> tuple[Shadowable[Any], ...]:
     """Fields of the message that the vehicle has there."""
-    return tuple(_of(f"{latest}.message.{field}") for field in fields)
+    return tuple(read_of(f"{latest}.message.{field}") for field in fields)
 
 
 def _heard_at(vehicle: Any) -> float:
@@ -77,14 +76,18 @@ class VehiclePrivates:
     _voltage, _current, _level = _message_of(
         "_dk_sys_status", "voltage_battery", "current_battery", "battery_remaining"
     )
-    _system_status = _of("_dk_heartbeat.system_status")
+    _system_status = read_of("_dk_heartbeat.system_status")
     _raw_version, _capabilities = _message_of("_dk_version", "flight_sw_version", "capabilities")
-    _rngfnd_distance, _rngfnd_voltage = _of("rangefinder.distance"), _of("rangefinder.voltage")
-    _mount_pitch, _mount_yaw, _mount_roll = _of("gimbal.pitch"), _of("gimbal.yaw"), _of("gimbal.roll")
+    _rngfnd_distance, _rngfnd_voltage = read_of("rangefinder.distance"), read_of("rangefinder.voltage")
+    _mount_pitch, _mount_yaw, _mount_roll = (
+        read_of("gimbal.pitch"),
+        read_of("gimbal.yaw"),
+        read_of("gimbal.roll"),
+    )
 
-    _last_heartbeat = _of("last_heartbeat")
+    _last_heartbeat = read_of("last_heartbeat")
     _heartbeat_started = Shadowable(lambda vehicle: vehicle.last_heartbeat is not None)
-    _heartbeat_system = _of("_handler.target_system")
+    _heartbeat_system = read_of("_handler.target_system")
     _heartbeat_timeout = Shadowable(lambda vehicle: (vehicle.last_heartbeat or 0.0) >= SILENCE_S)
     """Whether the link is silent: a flag, not a number of seconds."""
 
@@ -94,7 +97,7 @@ class VehiclePrivates:
         lambda vehicle: len(vehicle.parameters) if "parameters" in vehicle._ready_attrs else -1
     )
     """How many there are, -1 while that is not known."""
-    _current_waypoint = _of("commands.next")
+    _current_waypoint = read_of("commands.next")
     _wp_loaded = Shadowable(lambda vehicle: "commands" in vehicle._ready_attrs)
     _wp_uploaded = None
     _wpts_dirty = False
@@ -108,12 +111,48 @@ class VehiclePrivates:
 class LocationPrivates:
     """What DroneKit's locations keep, to read."""
 
-    _lat, _lon = _of("global_relative_frame.lat"), _of("global_relative_frame.lon")
-    _alt, _relative_alt = _of("global_frame.alt"), _of("global_relative_frame.alt")
-    _north, _east, _down = _of("local_frame.north"), _of("local_frame.east"), _of("local_frame.down")
+    _lat, _lon = read_of("global_relative_frame.lat"), read_of("global_relative_frame.lon")
+    _alt, _relative_alt = read_of("global_frame.alt"), read_of("global_relative_frame.alt")
+    _north, _east, _down = (
+        read_of("local_frame.north"),
+        read_of("local_frame.east"),
+        read_of("local_frame.down"),
+    )
 
 
 class GimbalPrivates:
     """What DroneKit's gimbal keeps, to read."""
 
-    _pitch, _roll, _yaw = _of("pitch"), _of("roll"), _of("yaw")
+    _pitch, _roll, _yaw = read_of("pitch"), read_of("roll"), read_of("yaw")
+
+
+class Python2Mapping(Mapping[str, T]):
+    """Adds those methods to what a mapping has in Python 3."""
+
+    def has_key(self, name: object) -> bool:
+        """As ``name in mapping``."""
+        return name in self
+
+    def iteritems(self) -> Iterator[tuple[str, T]]:
+        """As ``iter(items())``."""
+        return iter(self.items())
+
+    def iterkeys(self) -> Iterator[str]:
+        """As ``iter(keys())``."""
+        return iter(self.keys())
+
+    def itervalues(self) -> Iterator[T]:
+        """As ``iter(values())``."""
+        return iter(self.values())
+
+    def viewitems(self) -> ItemsView[str, T]:
+        """As ``items()``."""
+        return self.items()
+
+    def viewkeys(self) -> KeysView[str]:
+        """As ``keys()``."""
+        return self.keys()
+
+    def viewvalues(self) -> ValuesView[T]:
+        """As ``values()``."""
+        return self.values()

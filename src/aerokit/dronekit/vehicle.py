@@ -10,17 +10,18 @@ from typing import TYPE_CHECKING, Any
 
 import anyio
 
+from aerokit.dronekit.attributes import NO_MODE
 from aerokit.dronekit.channels import Channels
 from aerokit.dronekit.core import VehicleCore
 from aerokit.dronekit.exceptions import APIException, TimeoutError  # noqa: A004 - DroneKit's name
 from aerokit.dronekit.flight import FlightMethods
 from aerokit.dronekit.flight_orders import mode_name
 from aerokit.dronekit.gimbal import Gimbal
+from aerokit.dronekit.line import weakly
 from aerokit.dronekit.maintenance import Maintenance
-from aerokit.dronekit.message_listeners import MessageListeners, MessageMethods
+from aerokit.dronekit.observers import MessageListeners, decorator_of
 from aerokit.dronekit.parameters import Parameters
 from aerokit.dronekit.privates import Shadowable, VehiclePrivates
-from aerokit.dronekit.weakly import weakly
 from aerokit.errors import AerokitError, ConnectFailed
 from aerokit.mavlink.enums import MavCmd
 from aerokit.mavlink.messages import CommandLong
@@ -36,6 +37,8 @@ if TYPE_CHECKING:
     from aerokit.dronekit.commands import CommandSequence, WaypointLoader
     from aerokit.dronekit.master import Master
     from aerokit.dronekit.mavlink import MAVConnection
+    from aerokit.dronekit.observers import AttributeListener
+    from aerokit.mavlink.message_factory import MessageFactory
     from aerokit.runtime.connection import Connection
     from aerokit.sync.loop_thread import Held
     from aerokit.vehicle.state.condition import StatusText
@@ -53,7 +56,7 @@ LEVELS = (logging.CRITICAL,) * 3 + (logging.ERROR, logging.WARNING, logging.INFO
 """MAV_SEVERITY → level of the logger ``autopilot``."""
 
 
-class Vehicle(FlightMethods, MessageMethods, Maintenance, VehiclePrivates):
+class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
     """A vehicle: attributes to read and to listen to, orders, parameters, missions.
 
     Made by :func:`connect`, or of a subclass by ``connect(…, vehicle_class=…)``: the subclass passes on the one
@@ -125,11 +128,8 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, VehiclePrivates):
     def aio(self) -> AsyncVehicle:
         """The asynchronous vehicle (:class:`aerokit.Vehicle`) underneath, for coroutines on its own loop.
 
-        Its state cells (``vehicle.aio.position.latest``) may be read from any thread; coroutines are run by
-        :meth:`run`.
-
-        Raises:
-            APIException: the vehicle is not connected.
+        Its state cells (``vehicle.aio.position.latest``) may be read from any thread; :meth:`run` runs coroutines.
+        APIException as long as the vehicle is not connected.
         """
         return self._dk.aio
 
@@ -137,10 +137,8 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, VehiclePrivates):
     def sync(self) -> sync.Vehicle:
         """The blocking twin of the new API (:class:`aerokit.sync.Vehicle`) on the same connection.
 
-        A program moves over function by function: ``vehicle.sync.take_off(10)`` returns at altitude.
-
-        Raises:
-            APIException: the vehicle is not connected.
+        A program moves over function by function: ``vehicle.sync.take_off(10)`` returns at altitude. APIException as
+        long as the vehicle is not connected.
         """
         if self._dk_held is None:
             raise APIException("the vehicle is not connected yet: call initialize()")
@@ -156,6 +154,46 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, VehiclePrivates):
         What it raises comes out as it is.
         """
         return self._handler.loop.run(function, *args, **kwargs)
+
+    # ------------------------------------------------------------------------------ messages
+
+    def add_message_listener(self, name: str, fn: AttributeListener) -> None:
+        """Have ``fn(vehicle, name, message)`` called for every message of this name (``'*'``: every message).
+
+        Messages are objects of pymavlink. Attributes hold what the message says by the time it is called.
+        """
+        self._message_listeners.add(name, fn)
+
+    def remove_message_listener(self, name: str, fn: AttributeListener) -> None:
+        """Call it no more; silent when it does not listen."""
+        self._message_listeners.remove(name, fn)
+
+    def on_message(
+        self, name: str | list[str] | tuple[str, ...]
+    ) -> Callable[[AttributeListener], AttributeListener]:
+        """Decorate a message listener with the name, or the list of names, of messages it listens to."""
+        return decorator_of(self.add_message_listener, name)
+
+    def notify_message_listeners(self, name: str, msg: Any) -> None:
+        """Call the listeners of a message, as if it had come; returns when they have run."""
+        self._message_listeners.tell(name, msg, waits=True)
+
+    @property
+    def message_factory(self) -> MessageFactory:
+        """Makes pymavlink messages: ``vehicle.message_factory.command_long_encode(…)``, for :meth:`send_mavlink`."""
+        return self._handler.master.mav
+
+    def send_mavlink(self, message: Any) -> None:
+        """Send a message made by :attr:`message_factory`, by pymavlink or of ``aerokit.messages``, once.
+
+        ``target_system`` becomes this vehicle's, in the message itself; ``target_component`` stays. Never blocks.
+        LocalProtocolError, a ValueError: a field is wrong; APIException: the link is down. Nothing was sent.
+        """
+        from aerokit.mavlink.from_pymavlink import from_pymavlink
+
+        self._dk.check_link()
+        target = self._dk.target_system
+        self._handler.send(from_pymavlink(message, target), to=target)
 
     # ---------------------------------------------------------------------------- life cycle
 
@@ -208,8 +246,6 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, VehiclePrivates):
     def _is_mode_available(self, mode_code: int, base_mode: int = 0) -> bool:
         return not mode_name(self._dk.aio, mode_code).endswith(f" {mode_code}")
 
-    # ------------------------------------------------------------------------------- inside
-
     def _dk_begin(self, aio: AsyncVehicle, tasks: Background) -> None:
         """On the loop, in the turn in which the vehicle was found; the loop gets weak references only."""
         core = self._dk
@@ -223,7 +259,8 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, VehiclePrivates):
         self._message_listeners.start()
         core.background(lambda: _request_capabilities(aio))
         core.watch_link()
-        core.start_parts()
+        for function in core.at_start:
+            function()
 
     def _dk_on_status_text(self, before: StatusText | None, text: StatusText) -> None:
         level = LEVELS[min(text.severity, len(LEVELS) - 1)]
@@ -235,7 +272,7 @@ class Vehicle(FlightMethods, MessageMethods, Maintenance, VehiclePrivates):
 
     def _dk_wait_until_booted(self, timeout: float) -> None:
         try:
-            self.wait_for(lambda: self._flightmode not in (None, "INITIALISING", "MAV"), timeout)
+            self.wait_for(lambda: self._flightmode not in NO_MODE, timeout)
         except TimeoutError:
             raise APIException(
                 f"Timeout in initializing connection. The vehicle is still in mode {self._flightmode}"

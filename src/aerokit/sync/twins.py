@@ -583,6 +583,25 @@ class PostedOrder(TwinOf["AsyncPostedOrder"]):
             component_id=component_id,
         )
 
+    def set_mode(self, mode: Mode, *, timeout: float=5.0, component_id: int | None=None) -> None:
+        """Order a mode, and wait until HEARTBEAT tells the order's effect.
+
+        Sends MAV_CMD_DO_SET_MODE, and SET_MODE to a vehicle that does not know that command. As long as the order
+        stands it is asked again where the vehicle says that it is too early, as PX4 does while it checks a mission.
+
+        Args:
+            mode: one of those that the order was posted with; its ``base_mode`` is sent with it.
+            timeout: seconds for HEARTBEAT to tell it after each answer.
+            component_id: as for :meth:`command`.
+
+        Raises:
+            LocalProtocolError: the order was not posted with it, or the block was left. Nothing was sent.
+            CommandRejected: the vehicle refused; ``reasons`` has what it said.
+            CommandTimeout: there was no answer.
+            OperationTimeout: it accepted, and stays in another mode.
+        """
+        self._loop.run(self.aio.set_mode, mode, timeout=timeout, component_id=component_id)
+
     def until_told(self, timeout: float) -> None:
         """Wait until HEARTBEAT tells the order's effect, or that it was there before.
 

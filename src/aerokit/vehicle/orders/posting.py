@@ -9,6 +9,8 @@ import anyio
 
 from aerokit.arguments import checks_arguments
 from aerokit.errors import CommandRejected, CommandTimeout, LocalProtocolError, OperationTimeout
+from aerokit.mavlink.enums import MavCmd, MavResult
+from aerokit.mavlink.messages import SetMode
 from aerokit.protocols.command import command_name, rejection
 from aerokit.vehicle.orders.progress import Arrivals
 
@@ -17,6 +19,7 @@ if TYPE_CHECKING:
 
     from typing_extensions import Self
 
+    from aerokit.autopilots import Mode
     from aerokit.mavlink.messages import CommandAck
     from aerokit.vehicle.orders.posted import Posted
     from aerokit.vehicle.talk.talk import Talk
@@ -24,6 +27,7 @@ if TYPE_CHECKING:
 __all__ = ["PostedOrder"]
 
 LOOK_S = 0.05
+MODE_ATTEMPTS, ASK_AGAIN_S = 4, 0.5
 
 
 @checks_arguments
@@ -82,6 +86,49 @@ class PostedOrder:
         """
         place: dict[str, Any] = {"frame": frame, "x": x, "y": y, "z": z}
         await self._give(self._talk.commands.send_int, command, *params, component_id=component_id, **place)
+
+    async def set_mode(self, mode: Mode, *, timeout: float = 5.0, component_id: int | None = None) -> None:
+        """Order a mode, and wait until HEARTBEAT tells the order's effect.
+
+        Sends MAV_CMD_DO_SET_MODE, and SET_MODE to a vehicle that does not know that command. As long as the order
+        stands it is asked again where the vehicle says that it is too early, as PX4 does while it checks a mission.
+
+        Args:
+            mode: one of those that the order was posted with; its ``base_mode`` is sent with it.
+            timeout: seconds for HEARTBEAT to tell it after each answer.
+            component_id: as for :meth:`command`.
+
+        Raises:
+            LocalProtocolError: the order was not posted with it, or the block was left. Nothing was sent.
+            CommandRejected: the vehicle refused; ``reasons`` has what it said.
+            CommandTimeout: there was no answer.
+            OperationTimeout: it accepted, and stays in another mode.
+        """
+        if mode not in self._posted.modes:
+            raise LocalProtocolError(f"mode = {mode} is not allowed: the order was not posted with it")
+        for attempts_left in reversed(range(MODE_ATTEMPTS)):
+            try:
+                await self._request_mode(mode, component_id)
+                await self.until_told(timeout)
+            except CommandRejected as error:
+                if error.result != MavResult.TEMPORARILY_REJECTED or not attempts_left:
+                    raise
+                await anyio.sleep(ASK_AGAIN_S)
+                if self.end:
+                    raise
+            else:
+                return
+
+    async def _request_mode(self, mode: Mode, component_id: int | None) -> None:
+        talk = self._talk
+        params = (mode.base_mode, *talk.autopilot.mode_order(mode).params[1:])
+        try:
+            await self.command(MavCmd.DO_SET_MODE, *params, component_id=component_id)
+        except CommandRejected as error:
+            if error.result != MavResult.UNSUPPORTED or (self.end and not talk.telemetry.is_in(mode)):
+                raise
+            if not self.end:
+                talk.connection.send(SetMode(talk.system_id, mode.base_mode, mode.custom_mode))
 
     async def until_told(self, timeout: float) -> None:
         """Wait until HEARTBEAT tells the order's effect, or that it was there before.

@@ -1,4 +1,4 @@
-"""``vehicle.message_factory``: pymavlink's maker of messages, whose ``…_send`` send over our connection."""
+"""``MessageFactory``: pymavlink's maker of messages, whose ``…_send`` send by whatever a program gives it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ class MessageFactory(_MAVLink):  # type: ignore[misc]
 
     The messages are those of pymavlink's ardupilotmega dialect for MAVLink 2; those that only the dialect of the
     program has (``mavutil.mavlink``) are made by that. Values are checked when the message is sent, not before:
-    texts may be ``str`` or bytes, and numbers for integer fields are rounded.
+    texts may be ``str`` or bytes, and numbers for integer fields are rounded, by :func:`from_pymavlink`:
+    ``MessageFactory(lambda message: vehicle.send(from_pymavlink(message, vehicle.system_id)), 255, 0)``.
     """
 
     seq: int
@@ -35,13 +36,9 @@ class MessageFactory(_MAVLink):  # type: ignore[misc]
         self._connection_send = connection_send
 
     def send(self, mavmsg: Any, force_mavlink1: bool = False) -> None:
-        """Send a message; its ``target_system`` becomes the vehicle's. Never blocks.
+        """Send a message; what cannot be sent raises what ``connection_send`` raises, and is not counted.
 
         ``force_mavlink1`` means nothing: the link speaks the version that the vehicle understands.
-
-        Raises:
-            LocalProtocolError: a ValueError; a field is wrong. Nothing was sent.
-            APIException: the connection is closed.
         """
         self._connection_send(mavmsg)
         self.seq = (self.seq + 1) % 256

@@ -1,0 +1,42 @@
+"""Missions made for ArduPilot, written out for other autopilots."""
+
+from __future__ import annotations
+
+from aerokit.mavlink.enums import MavCmd, MavFrame
+from aerokit.missions.ardupilot_habits import written_out
+from aerokit.missions.commands import DEFAULT_XY
+from aerokit.missions.item import MissionItem
+
+RELATIVE, MISSION = MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.MISSION
+
+
+def item(command: int, x: int = 0, y: int = 0, frame: int = RELATIVE) -> MissionItem:
+    return MissionItem(command, frame, x=x, y=y, z=10.0)
+
+
+def test_commands_without_a_place_come_in_the_frame_of_missions() -> None:
+    speed, local = item(MavCmd.DO_CHANGE_SPEED), item(MavCmd.DO_CHANGE_SPEED, frame=MavFrame.LOCAL_NED)
+    roi, unknown = item(MavCmd.DO_SET_ROI), item(60_000)
+    assert [each.frame for each in written_out([speed, local, roi, unknown], None)] == [
+        MISSION,
+        MavFrame.LOCAL_NED,
+        RELATIVE,
+        RELATIVE,
+    ]
+
+
+def test_zero_is_where_the_item_before_leads() -> None:
+    items = [
+        item(MavCmd.NAV_TAKEOFF),
+        item(MavCmd.NAV_WAYPOINT, 470_000_000, 80_000_000),
+        item(MavCmd.NAV_LOITER_UNLIM, DEFAULT_XY, DEFAULT_XY),
+        item(MavCmd.DO_SET_ROI),
+        item(MavCmd.NAV_LAND),
+        item(MavCmd.NAV_WAYPOINT, 0, 5),
+        item(MavCmd.NAV_LAND, frame=MavFrame.LOCAL_NED),
+    ]
+    places = [(each.x, each.y) for each in written_out(items, (46.5, 8.25))]
+    assert places[0] == (465_000_000, 82_500_000)
+    assert places[1:4] == [(470_000_000, 80_000_000), (DEFAULT_XY, DEFAULT_XY), (0, 0)]
+    assert places[4:] == [(470_000_000, 80_000_000), (0, 5), (0, 0)]
+    assert next(iter(written_out(items, None))) == items[0]
