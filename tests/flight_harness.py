@@ -157,6 +157,12 @@ def speed_of(copter: SimulatedCopter) -> float:
     return math.hypot(motion.velocity_north, motion.velocity_east, motion.velocity_down)
 
 
+def make_parts(vehicle: aerokit.Vehicle) -> None:
+    """Parts that listen are made when they are first used, and stay for as long as the vehicle: nothing was left."""
+    for name in ("parameters", "gimbal", "mission"):
+        getattr(vehicle, name)
+
+
 def attached_sinks(connection: Connection) -> int:
     """How many callbacks hang on a connection: sinks of messages and events, and what ends with it."""
     bus = connection.bus

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import anyio
-from flight_harness import Wire, attached_sinks, waiting_on_cells
+from flight_harness import Wire, attached_sinks, make_parts, waiting_on_cells
 
 import aerokit
 from aerokit import messages as m
@@ -162,6 +162,7 @@ async def open_program(
         async with aerokit.connect(wire, rates={}, system_id=simulated.system_id) as vehicle:
             await vehicle.version.wait_until(lambda _: True)
             await anyio.sleep(0.5)
+            make_parts(vehicle)
             yield Program(vehicle, simulated, wire, radio, opened_at)
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import anyio
 from call_stage import Stage
+from flight_harness import make_parts
 
 from aerokit.runtime import loop_watch
 
@@ -36,6 +37,7 @@ async def what_is_left(stage: Stage, before: Counter[str]) -> Counter[str]:
 def _all(stage: Stage) -> Iterator[str]:
     vehicle: Any = stage.vehicle
     connection = vehicle.connection
+    make_parts(vehicle)
     yield from _tasks()
     yield from _timers()
     counters = [

@@ -228,6 +228,7 @@ class Core:
         """The vehicle was found (loop thread): hear what the parts want to; the loop gets weak references only."""
         self.found, self._tasks = aio, tasks
         self.handler.target_system = aio.system_id
+        _ = aio.parameters  # made first: its table takes a value before the parts here are told of it
         for message_type, latest in self._latest.items():
             latest.component_id = aio.component_id
             aio.connection.bus.attach_lazily(message_type, weakly(latest.take), system_id=aio.system_id)
