@@ -246,6 +246,7 @@ CALLS: dict[str, Call] = {
     "Parameters.changed_from_default": Call(lambda s: s.vehicle.parameters.changed_from_default(), on=COPTER),
     "Parameters.get": Call(lambda s: s.vehicle.parameters.get(s.parameter)),
     "Parameters.read": Call(lambda s: s.vehicle.parameters.read(s.parameter)),
+    "Parameters.probe": Call(lambda s: s.vehicle.parameters.probe(s.parameter, "NOSUCH_PARAM")),
     "Parameters.set": Call(lambda s: s.vehicle.parameters.set(s.parameter, s.other_value())),
     "Parameters.set_many": Call(lambda s: s.vehicle.parameters.set_many({s.parameter: s.other_value()})),
     "Parameters.upload": Call(lambda s: s.vehicle.parameters.upload({s.parameter: s.other_value()})),

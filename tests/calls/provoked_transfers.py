@@ -129,6 +129,7 @@ def _parameters() -> Table:
         ("set", (_name, Stage.other_value), (_name, math.nan), ("NOSUCH_PARAM", 1.0)),
         ("set_many", (lambda s: {s.parameter: s.other_value()},), ({"": 1.0},), None),
         ("upload", (lambda s: {s.parameter: s.other_value()},), ({"": 1.0},), None),
+        ("probe", (_name,), ("",), None),
         ("diff", ({"A": 1.0},), None, None),
         ("changed_from_default", (), None, None),
         ("download", (), None, None),
@@ -143,6 +144,7 @@ def _parameters() -> Table:
         if unknown is not None:
             rows[key, "ParameterRejected"] = P(do(*unknown))
     del rows["Parameters.set_many", "ParameterTimeout"]  # it is in the results
+    del rows["Parameters.probe", "ParameterTimeout"]  # here, too
     return rows
 
 

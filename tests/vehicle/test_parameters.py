@@ -310,6 +310,22 @@ async def test_unknown_names(errors: bool) -> None:
     assert not sent_writes(flight)
 
 
+@pytest.mark.parametrize("errors", [False, True])
+async def test_several_are_asked_for_by_exactly_these_names(errors: bool) -> None:
+    simulated = copter(parameter_errors=errors)
+    async with open_flight(simulated) as flight:
+        answers = await flight.vehicle.parameters.probe("RTL_ALT", "NO_SUCH_ONE", "WPNAV_SPEED")
+        told = {name: getattr(answer, "value", None) for name, answer in answers.items()}
+        assert told == {"RTL_ALT": 1500, "NO_SUCH_ONE": None, "WPNAV_SPEED": 1000.0}
+        missing = answers["NO_SUCH_ONE"]
+        assert isinstance(missing, ParameterRejected)
+        assert (missing.name, missing.code) == ("NO_SUCH_ONE", 1 if errors else None)
+        assert await flight.vehicle.parameters.probe() == {}
+        simulated.faults.silent = True
+        silent = (await flight.vehicle.parameters.probe("RTL_ALT", patience_s=2.0))["RTL_ALT"]
+        assert isinstance(silent, ParameterTimeout)
+
+
 async def test_a_silent_vehicle_is_a_timeout() -> None:
     simulated = copter()
     async with open_flight(simulated) as flight:
@@ -325,6 +341,7 @@ async def test_impossible_names_are_refused_before_anything_is_sent(name: str) -
         parameters = flight.vehicle.parameters
         for attempt in (
             parameters.get(name),
+            parameters.probe("RTL_ALT", name),
             parameters.set(name, 1),
             parameters.set_many({"RTL_ALT": 1, name: 1}),
         ):

@@ -112,9 +112,8 @@ class ParameterReading:
         from aerokit.parameters.renames import other_names
 
         names = (name, *other_names(name))
-        access = self._core.aio.parameters._access
         try:
-            answers = (await access.read(names, PATIENCE_S, are_doubtful=True)).values()
+            answers = (await self._core.aio.parameters.probe(*names, patience_s=PATIENCE_S)).values()
         except AerokitError:
             return False
         return any(isinstance(each, Parameter) for each in answers) or all(

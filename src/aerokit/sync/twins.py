@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from aerokit.autopilots import Autopilot, Mode
     from aerokit.autopilots.modes import Mode
     from aerokit.autopilots.version import AutopilotVersion
+    from aerokit.errors import ParameterRejected, ParameterTimeout
     from aerokit.links.allowed import Peers
     from aerokit.links.link import Link
     from aerokit.mavlink.dialect import Dialect
@@ -1063,6 +1064,25 @@ class Parameters(TwinOf["AsyncParameters"]):
             ParameterTimeout: no answer.
         """
         return self._loop.run(self.aio.read, name, patience_s=patience_s, timeout=timeout)
+
+    def probe(
+        self,
+        *names: str,
+        patience_s: float = PATIENCE_S,
+        timeout: float | None = None,
+    ) -> dict[str, Parameter | ParameterRejected | ParameterTimeout]:
+        """Ask the vehicle for parameters that it may not have, all at once and by exactly these names.
+
+        So it is found which of several names a firmware has; where ArduPilot renamed one, :meth:`get` does that.
+
+        Returns:
+            For each name the parameter, or what :meth:`get` would have raised; its ``code`` is None when the vehicle
+            did not say itself that it has none, but answered others and not this one.
+
+        Raises:
+            LocalProtocolError: a name is none, or longer than 16 characters. Nothing was sent.
+        """
+        return self._loop.run(self.aio.probe, *names, patience_s=patience_s, timeout=timeout)
 
     def set(
         self,

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from aerokit.arguments import checks_arguments
 from aerokit.errors import NotSupported, ParameterRejected, ParameterTimeout
-from aerokit.parameters import Parameter, ParameterTable
+from aerokit.parameters import Parameter, ParameterTable, check_name
 from aerokit.protocols.transfer import PATIENCE_S
 from aerokit.vehicle.parameters.access import CacheChoice, DownloadMethod, ParameterAccess, UploadMethod
 from aerokit.vehicle.parameters.names import Found, ParameterNames
@@ -149,6 +149,23 @@ class Parameters:
                 return found.in_terms_asked(found.parameter)
             answer = _parameter((await self._access.read([found.name], patience_s))[found.name])
             return found.in_terms_asked(answer)
+
+    async def probe(
+        self, *names: str, patience_s: float = PATIENCE_S, timeout: float | None = None
+    ) -> dict[str, Parameter | ParameterRejected | ParameterTimeout]:
+        """Ask the vehicle for parameters that it may not have, all at once and by exactly these names.
+
+        So it is found which of several names a firmware has; where ArduPilot renamed one, :meth:`get` does that.
+
+        Returns:
+            For each name the parameter, or what :meth:`get` would have raised; its ``code`` is None when the vehicle
+            did not say itself that it has none, but answered others and not this one.
+
+        Raises:
+            LocalProtocolError: a name is none, or longer than 16 characters. Nothing was sent.
+        """
+        with self._transfers.limit(timeout):
+            return await self._access.read(map(check_name, names), patience_s, are_doubtful=True)
 
     # -------------------------------------------------------------------------------- writing
 
