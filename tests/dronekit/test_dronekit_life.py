@@ -343,10 +343,20 @@ def test_a_subclass_calls_its_own_things_what_it_likes(address: str) -> None:
 
 def test_connecting_waits_for_the_first_values(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(vehicle_module, "FIRST_VALUES_S", LIMIT_S)
+    monkeypatch.setattr(vehicle_module, "NO_MORE_S", LIMIT_S)
     with dronekit.connect(address) as vehicle:
         assert vehicle.location.global_relative_frame.alt is not None
         assert vehicle.attitude.yaw is not None
         assert vehicle.battery.voltage is not None
+
+
+def test_connecting_does_not_wait_for_what_does_not_come(
+    address: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(vehicle_module, "FIRST_VALUES", ("attitude", "what this vehicle never tells"))
+    monkeypatch.setattr(vehicle_module, "FIRST_VALUES_S", 1e6)
+    monkeypatch.setattr(vehicle_module, "NO_MORE_S", 0.05)
+    dronekit.connect(address).close()
 
 
 @pytest.mark.parametrize("wrong", [None, 14550, b"udp:127.0.0.1:14550"])

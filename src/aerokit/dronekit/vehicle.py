@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from contextlib import asynccontextmanager, nullcontext
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -12,7 +13,6 @@ import anyio
 
 from aerokit.dronekit.attributes import NO_MODE
 from aerokit.dronekit.channels import Channels
-from aerokit.dronekit.core import VehicleCore
 from aerokit.dronekit.exceptions import APIException, TimeoutError  # noqa: A004 - DroneKit's name
 from aerokit.dronekit.flight import FlightMethods
 from aerokit.dronekit.flight_orders import mode_name
@@ -47,8 +47,9 @@ if TYPE_CHECKING:
 __all__ = ["Vehicle"]
 
 FIRST_VALUES = ("attitude", "location.global_relative_frame", "heading", "gps_0", "battery")
-FIRST_VALUES_S = 1.0
-"""So long they are waited for: programs that read them as soon as they are connected expect values."""
+FIRST_VALUES_S, NO_MORE_S = 1.0, 0.4
+"""So long they are waited for, as long as one comes within the second time after the other: programs that read them as
+soon as they are connected expect values, but not every vehicle has all of them."""
 CONNECT_S = 30.0
 """How long a vehicle is waited for when the program sets no limit."""
 MOST_HZ = 1000.0
@@ -219,7 +220,7 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
                 self._dk_held = self._handler.loop.hold_open(found)
                 self._dk_wait_until_booted(timeout)
                 if rate is not None:
-                    VehicleCore.wait_ready(self, *FIRST_VALUES, timeout=FIRST_VALUES_S, raise_exception=False)
+                    self._dk_wait_for_first_values()
             except ConnectFailed as error:
                 raise APIException(f"Timeout in initializing connection. {error}") from None
             except AerokitError as error:
@@ -269,6 +270,16 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
 
     def _dk_describe(self) -> str:
         return f"the vehicle is {'armed' if self._armed else 'disarmed'}, in {self._flightmode}"
+
+    def _dk_wait_for_first_values(self) -> None:
+        wanted, ready = set(FIRST_VALUES), self._dk.ready
+        now = time.monotonic()
+        end, no_more_at = now + FIRST_VALUES_S, now + NO_MORE_S
+        while (missing := wanted - ready.names) and now < min(end, no_more_at):
+            ready.wait_a_little(wanted, min(end, no_more_at) - now)
+            now = time.monotonic()
+            if wanted - ready.names < missing:
+                no_more_at = now + NO_MORE_S
 
     def _dk_wait_until_booted(self, timeout: float) -> None:
         try:
