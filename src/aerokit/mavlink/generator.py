@@ -35,12 +35,13 @@ MODULES = {
 
 EVERYDAY = """
     Attitude AttitudeQuaternion AvailableModes BatteryStatus CommandAck CommandInt CommandLong CurrentMode
-    DistanceSensor EstimatorStatus ExtendedSysState FileTransferProtocol GpsGlobalOrigin GpsRawInt Gps2Raw HomePosition
-    LocalPositionNed MissionAck MissionClearAll MissionCount MissionCurrent MissionItemInt MissionItemReached
-    MissionRequest MissionRequestInt MissionRequestList MissionSetCurrent MissionWritePartialList ParamError
-    ParamRequestList ParamRequestRead ParamSet ParamValue PowerStatus RcChannels RequestDataStream ServoOutputRaw
-    SetAttitudeTarget SetMode SetPositionTargetGlobalInt SetPositionTargetLocalNed Statustext SysStatus SystemTime
-    Timesync VfrHud Vibration WindCov
+    DistanceSensor EstimatorStatus ExtendedSysState FileTransferProtocol Gps2Raw GpsGlobalOrigin GpsRawInt
+    HomePosition LocalPositionNed MissionAck MissionClearAll MissionCount MissionCurrent MissionItemInt
+    MissionItemReached MissionRequest MissionRequestInt MissionRequestList MissionSetCurrent MissionWritePartialList
+    ParamError ParamRequestList ParamRequestRead ParamSet ParamValue PlayTune PowerStatus RcChannels
+    RcChannelsOverride RcChannelsRaw RequestDataStream ServoOutputRaw SetAttitudeTarget SetMode
+    SetPositionTargetGlobalInt SetPositionTargetLocalNed Statustext SysStatus SystemTime Timesync VfrHud Vibration
+    WindCov
 """
 """The messages of ``common.xml`` that ``common.py`` holds: those of every flight. Two hundred others, which would take
 most of the time of an import, are in ``common_more.py``."""

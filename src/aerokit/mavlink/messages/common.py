@@ -32,6 +32,7 @@ __all__ = [
     "Attitude",
     "AttitudeQuaternion",
     "LocalPositionNed",
+    "RcChannelsRaw",
     "ServoOutputRaw",
     "MissionWritePartialList",
     "MissionRequest",
@@ -46,6 +47,7 @@ __all__ = [
     "MissionRequestInt",
     "RcChannels",
     "RequestDataStream",
+    "RcChannelsOverride",
     "MissionItemInt",
     "VfrHud",
     "CommandInt",
@@ -66,6 +68,7 @@ __all__ = [
     "HomePosition",
     "ExtendedSysState",
     "Statustext",
+    "PlayTune",
     "ParamError",
     "AvailableModes",
     "CurrentMode",
@@ -1039,6 +1042,119 @@ class LocalPositionNed(Message):
     def encode(self) -> bytes:
         try:
             return _S32.pack(self.time_boot_ms, self.x, self.y, self.z, self.vx, self.vy, self.vz)
+        except PACK_ERRORS:
+            raise self._encode_error() from None
+
+
+_S35 = Struct('<IHHHHHHHHBB')
+
+
+class RcChannelsRaw(Message):
+    """RC_CHANNELS_RAW (35): The RAW values of the RC channels received. The standard PPM modulation is as
+    follows: 1000 microseconds: 0%, 2000 microseconds: 100%. A value of UINT16_MAX implies the channel
+    is unused. Individual receivers/transmitters might violate this specification.
+
+    https://mavlink.io/en/messages/common.html#RC_CHANNELS_RAW
+    """
+
+    __slots__ = (
+        "time_boot_ms", "port", "chan1_raw", "chan2_raw", "chan3_raw", "chan4_raw", "chan5_raw", "chan6_raw",
+        "chan7_raw", "chan8_raw", "rssi",
+    )
+    __match_args__ = (
+        "time_boot_ms", "port", "chan1_raw", "chan2_raw", "chan3_raw", "chan4_raw", "chan5_raw", "chan6_raw",
+        "chan7_raw", "chan8_raw", "rssi",
+    )
+    ID = 35
+    NAME = "RC_CHANNELS_RAW"
+    CRC_EXTRA = 244
+    LENGTH = 22
+    BASE_LENGTH = 22
+    _FIELDS = (
+        ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot).", False),
+        ("port", "uint8_t", 0, "", "", "", "Servo output port (set of 8 outputs = 1 port). Flight stacks running on Pixhawk should use: 0 = MAIN, 1 = AUX.", False),
+        ("chan1_raw", "uint16_t", 0, "us", "", "UINT16_MAX", "RC channel 1 value.", False),
+        ("chan2_raw", "uint16_t", 0, "us", "", "UINT16_MAX", "RC channel 2 value.", False),
+        ("chan3_raw", "uint16_t", 0, "us", "", "UINT16_MAX", "RC channel 3 value.", False),
+        ("chan4_raw", "uint16_t", 0, "us", "", "UINT16_MAX", "RC channel 4 value.", False),
+        ("chan5_raw", "uint16_t", 0, "us", "", "UINT16_MAX", "RC channel 5 value.", False),
+        ("chan6_raw", "uint16_t", 0, "us", "", "UINT16_MAX", "RC channel 6 value.", False),
+        ("chan7_raw", "uint16_t", 0, "us", "", "UINT16_MAX", "RC channel 7 value.", False),
+        ("chan8_raw", "uint16_t", 0, "us", "", "UINT16_MAX", "RC channel 8 value.", False),
+        ("rssi", "uint8_t", 0, "", "", "UINT8_MAX", "Receive signal strength indicator in device-dependent units/scale. Values: [0-254], 255: invalid/unknown.", False),
+    )
+
+    time_boot_ms: int
+    """Timestamp (time since system boot). Type: uint32_t. Unit: ms."""
+
+    port: int
+    """Servo output port (set of 8 outputs = 1 port). Flight stacks running on Pixhawk should use: 0 =
+    MAIN, 1 = AUX. Type: uint8_t.
+    """
+
+    chan1_raw: int
+    """RC channel 1 value. Type: uint16_t. Unit: us. Unknown: UINT16_MAX."""
+
+    chan2_raw: int
+    """RC channel 2 value. Type: uint16_t. Unit: us. Unknown: UINT16_MAX."""
+
+    chan3_raw: int
+    """RC channel 3 value. Type: uint16_t. Unit: us. Unknown: UINT16_MAX."""
+
+    chan4_raw: int
+    """RC channel 4 value. Type: uint16_t. Unit: us. Unknown: UINT16_MAX."""
+
+    chan5_raw: int
+    """RC channel 5 value. Type: uint16_t. Unit: us. Unknown: UINT16_MAX."""
+
+    chan6_raw: int
+    """RC channel 6 value. Type: uint16_t. Unit: us. Unknown: UINT16_MAX."""
+
+    chan7_raw: int
+    """RC channel 7 value. Type: uint16_t. Unit: us. Unknown: UINT16_MAX."""
+
+    chan8_raw: int
+    """RC channel 8 value. Type: uint16_t. Unit: us. Unknown: UINT16_MAX."""
+
+    rssi: int
+    """Receive signal strength indicator in device-dependent units/scale. Values: [0-254], 255:
+    invalid/unknown. Type: uint8_t. Unknown: UINT8_MAX.
+    """
+
+    def __init__(
+        self, time_boot_ms: int, port: int, chan1_raw: int, chan2_raw: int, chan3_raw: int, chan4_raw: int,
+        chan5_raw: int, chan6_raw: int, chan7_raw: int, chan8_raw: int, rssi: int,
+    ) -> None:
+        self.time_boot_ms = time_boot_ms
+        self.port = port
+        self.chan1_raw = chan1_raw
+        self.chan2_raw = chan2_raw
+        self.chan3_raw = chan3_raw
+        self.chan4_raw = chan4_raw
+        self.chan5_raw = chan5_raw
+        self.chan6_raw = chan6_raw
+        self.chan7_raw = chan7_raw
+        self.chan8_raw = chan8_raw
+        self.rssi = rssi
+        self.received_frame = None
+
+    @classmethod
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> RcChannelsRaw:
+        body = body.ljust(31, b"\0")
+        self = _new(cls)
+        self.received_frame = frame
+        (
+            self.time_boot_ms, self.chan1_raw, self.chan2_raw, self.chan3_raw, self.chan4_raw, self.chan5_raw,
+            self.chan6_raw, self.chan7_raw, self.chan8_raw, self.port, self.rssi,
+        ) = _S35.unpack_from(body, 9)
+        return self
+
+    def encode(self) -> bytes:
+        try:
+            return _S35.pack(
+                self.time_boot_ms, self.chan1_raw, self.chan2_raw, self.chan3_raw, self.chan4_raw,
+                self.chan5_raw, self.chan6_raw, self.chan7_raw, self.chan8_raw, self.port, self.rssi,
+            )
         except PACK_ERRORS:
             raise self._encode_error() from None
 
@@ -2148,6 +2264,216 @@ class RequestDataStream(Message):
             return _S66.pack(
                 self.req_message_rate, self.target_system, self.target_component, self.req_stream_id,
                 self.start_stop,
+            )
+        except PACK_ERRORS:
+            raise self._encode_error() from None
+
+
+_S70 = Struct('<HHHHHHHHBBHHHHHHHHHH')
+
+
+class RcChannelsOverride(Message):
+    """RC_CHANNELS_OVERRIDE (70): The RAW values of the RC channels sent to the MAV to override info
+    received from the RC radio. The standard PPM modulation is as follows: 1000 microseconds: 0%, 2000
+    microseconds: 100%. Individual receivers/transmitters might violate this specification. Note
+    carefully the semantic differences between the first 8 channels and the subsequent channels
+
+    https://mavlink.io/en/messages/common.html#RC_CHANNELS_OVERRIDE
+    """
+
+    __slots__ = (
+        "target_system", "target_component", "chan1_raw", "chan2_raw", "chan3_raw", "chan4_raw", "chan5_raw",
+        "chan6_raw", "chan7_raw", "chan8_raw", "chan9_raw", "chan10_raw", "chan11_raw", "chan12_raw",
+        "chan13_raw", "chan14_raw", "chan15_raw", "chan16_raw", "chan17_raw", "chan18_raw",
+    )
+    __match_args__ = (
+        "target_system", "target_component", "chan1_raw", "chan2_raw", "chan3_raw", "chan4_raw", "chan5_raw",
+        "chan6_raw", "chan7_raw", "chan8_raw", "chan9_raw", "chan10_raw", "chan11_raw", "chan12_raw",
+        "chan13_raw", "chan14_raw", "chan15_raw", "chan16_raw", "chan17_raw", "chan18_raw",
+    )
+    ID = 70
+    NAME = "RC_CHANNELS_OVERRIDE"
+    CRC_EXTRA = 124
+    LENGTH = 38
+    BASE_LENGTH = 18
+    _FIELDS = (
+        ("target_system", "uint8_t", 0, "", "", "", "System ID", False),
+        ("target_component", "uint8_t", 0, "", "", "", "Component ID", False),
+        ("chan1_raw", "uint16_t", 0, "us", "", "UINT16_MAX", "RC channel 1 value. A value of UINT16_MAX means to ignore this field. A value of 0 means to release this channel back to the RC radio.", False),
+        ("chan2_raw", "uint16_t", 0, "us", "", "UINT16_MAX", "RC channel 2 value. A value of UINT16_MAX means to ignore this field. A value of 0 means to release this channel back to the RC radio.", False),
+        ("chan3_raw", "uint16_t", 0, "us", "", "UINT16_MAX", "RC channel 3 value. A value of UINT16_MAX means to ignore this field. A value of 0 means to release this channel back to the RC radio.", False),
+        ("chan4_raw", "uint16_t", 0, "us", "", "UINT16_MAX", "RC channel 4 value. A value of UINT16_MAX means to ignore this field. A value of 0 means to release this channel back to the RC radio.", False),
+        ("chan5_raw", "uint16_t", 0, "us", "", "UINT16_MAX", "RC channel 5 value. A value of UINT16_MAX means to ignore this field. A value of 0 means to release this channel back to the RC radio.", False),
+        ("chan6_raw", "uint16_t", 0, "us", "", "UINT16_MAX", "RC channel 6 value. A value of UINT16_MAX means to ignore this field. A value of 0 means to release this channel back to the RC radio.", False),
+        ("chan7_raw", "uint16_t", 0, "us", "", "UINT16_MAX", "RC channel 7 value. A value of UINT16_MAX means to ignore this field. A value of 0 means to release this channel back to the RC radio.", False),
+        ("chan8_raw", "uint16_t", 0, "us", "", "UINT16_MAX", "RC channel 8 value. A value of UINT16_MAX means to ignore this field. A value of 0 means to release this channel back to the RC radio.", False),
+        ("chan9_raw", "uint16_t", 0, "us", "", "0", "RC channel 9 value. A value of 0 or UINT16_MAX means to ignore this field. A value of UINT16_MAX-1 means to release this channel back to the RC radio.", True),
+        ("chan10_raw", "uint16_t", 0, "us", "", "0", "RC channel 10 value. A value of 0 or UINT16_MAX means to ignore this field. A value of UINT16_MAX-1 means to release this channel back to the RC radio.", True),
+        ("chan11_raw", "uint16_t", 0, "us", "", "0", "RC channel 11 value. A value of 0 or UINT16_MAX means to ignore this field. A value of UINT16_MAX-1 means to release this channel back to the RC radio.", True),
+        ("chan12_raw", "uint16_t", 0, "us", "", "0", "RC channel 12 value. A value of 0 or UINT16_MAX means to ignore this field. A value of UINT16_MAX-1 means to release this channel back to the RC radio.", True),
+        ("chan13_raw", "uint16_t", 0, "us", "", "0", "RC channel 13 value. A value of 0 or UINT16_MAX means to ignore this field. A value of UINT16_MAX-1 means to release this channel back to the RC radio.", True),
+        ("chan14_raw", "uint16_t", 0, "us", "", "0", "RC channel 14 value. A value of 0 or UINT16_MAX means to ignore this field. A value of UINT16_MAX-1 means to release this channel back to the RC radio.", True),
+        ("chan15_raw", "uint16_t", 0, "us", "", "0", "RC channel 15 value. A value of 0 or UINT16_MAX means to ignore this field. A value of UINT16_MAX-1 means to release this channel back to the RC radio.", True),
+        ("chan16_raw", "uint16_t", 0, "us", "", "0", "RC channel 16 value. A value of 0 or UINT16_MAX means to ignore this field. A value of UINT16_MAX-1 means to release this channel back to the RC radio.", True),
+        ("chan17_raw", "uint16_t", 0, "us", "", "0", "RC channel 17 value. A value of 0 or UINT16_MAX means to ignore this field. A value of UINT16_MAX-1 means to release this channel back to the RC radio.", True),
+        ("chan18_raw", "uint16_t", 0, "us", "", "0", "RC channel 18 value. A value of 0 or UINT16_MAX means to ignore this field. A value of UINT16_MAX-1 means to release this channel back to the RC radio.", True),
+    )
+
+    target_system: int
+    """System ID. Type: uint8_t."""
+
+    target_component: int
+    """Component ID. Type: uint8_t."""
+
+    chan1_raw: int
+    """RC channel 1 value. A value of UINT16_MAX means to ignore this field. A value of 0 means to release
+    this channel back to the RC radio. Type: uint16_t. Unit: us. Unknown: UINT16_MAX.
+    """
+
+    chan2_raw: int
+    """RC channel 2 value. A value of UINT16_MAX means to ignore this field. A value of 0 means to release
+    this channel back to the RC radio. Type: uint16_t. Unit: us. Unknown: UINT16_MAX.
+    """
+
+    chan3_raw: int
+    """RC channel 3 value. A value of UINT16_MAX means to ignore this field. A value of 0 means to release
+    this channel back to the RC radio. Type: uint16_t. Unit: us. Unknown: UINT16_MAX.
+    """
+
+    chan4_raw: int
+    """RC channel 4 value. A value of UINT16_MAX means to ignore this field. A value of 0 means to release
+    this channel back to the RC radio. Type: uint16_t. Unit: us. Unknown: UINT16_MAX.
+    """
+
+    chan5_raw: int
+    """RC channel 5 value. A value of UINT16_MAX means to ignore this field. A value of 0 means to release
+    this channel back to the RC radio. Type: uint16_t. Unit: us. Unknown: UINT16_MAX.
+    """
+
+    chan6_raw: int
+    """RC channel 6 value. A value of UINT16_MAX means to ignore this field. A value of 0 means to release
+    this channel back to the RC radio. Type: uint16_t. Unit: us. Unknown: UINT16_MAX.
+    """
+
+    chan7_raw: int
+    """RC channel 7 value. A value of UINT16_MAX means to ignore this field. A value of 0 means to release
+    this channel back to the RC radio. Type: uint16_t. Unit: us. Unknown: UINT16_MAX.
+    """
+
+    chan8_raw: int
+    """RC channel 8 value. A value of UINT16_MAX means to ignore this field. A value of 0 means to release
+    this channel back to the RC radio. Type: uint16_t. Unit: us. Unknown: UINT16_MAX.
+    """
+
+    chan9_raw: int
+    """RC channel 9 value. A value of 0 or UINT16_MAX means to ignore this field. A value of UINT16_MAX-1
+    means to release this channel back to the RC radio. Type: uint16_t. Unit: us. Unknown: 0. Extension,
+    absent in MAVLink 1.
+    """
+
+    chan10_raw: int
+    """RC channel 10 value. A value of 0 or UINT16_MAX means to ignore this field. A value of UINT16_MAX-1
+    means to release this channel back to the RC radio. Type: uint16_t. Unit: us. Unknown: 0. Extension,
+    absent in MAVLink 1.
+    """
+
+    chan11_raw: int
+    """RC channel 11 value. A value of 0 or UINT16_MAX means to ignore this field. A value of UINT16_MAX-1
+    means to release this channel back to the RC radio. Type: uint16_t. Unit: us. Unknown: 0. Extension,
+    absent in MAVLink 1.
+    """
+
+    chan12_raw: int
+    """RC channel 12 value. A value of 0 or UINT16_MAX means to ignore this field. A value of UINT16_MAX-1
+    means to release this channel back to the RC radio. Type: uint16_t. Unit: us. Unknown: 0. Extension,
+    absent in MAVLink 1.
+    """
+
+    chan13_raw: int
+    """RC channel 13 value. A value of 0 or UINT16_MAX means to ignore this field. A value of UINT16_MAX-1
+    means to release this channel back to the RC radio. Type: uint16_t. Unit: us. Unknown: 0. Extension,
+    absent in MAVLink 1.
+    """
+
+    chan14_raw: int
+    """RC channel 14 value. A value of 0 or UINT16_MAX means to ignore this field. A value of UINT16_MAX-1
+    means to release this channel back to the RC radio. Type: uint16_t. Unit: us. Unknown: 0. Extension,
+    absent in MAVLink 1.
+    """
+
+    chan15_raw: int
+    """RC channel 15 value. A value of 0 or UINT16_MAX means to ignore this field. A value of UINT16_MAX-1
+    means to release this channel back to the RC radio. Type: uint16_t. Unit: us. Unknown: 0. Extension,
+    absent in MAVLink 1.
+    """
+
+    chan16_raw: int
+    """RC channel 16 value. A value of 0 or UINT16_MAX means to ignore this field. A value of UINT16_MAX-1
+    means to release this channel back to the RC radio. Type: uint16_t. Unit: us. Unknown: 0. Extension,
+    absent in MAVLink 1.
+    """
+
+    chan17_raw: int
+    """RC channel 17 value. A value of 0 or UINT16_MAX means to ignore this field. A value of UINT16_MAX-1
+    means to release this channel back to the RC radio. Type: uint16_t. Unit: us. Unknown: 0. Extension,
+    absent in MAVLink 1.
+    """
+
+    chan18_raw: int
+    """RC channel 18 value. A value of 0 or UINT16_MAX means to ignore this field. A value of UINT16_MAX-1
+    means to release this channel back to the RC radio. Type: uint16_t. Unit: us. Unknown: 0. Extension,
+    absent in MAVLink 1.
+    """
+
+    def __init__(
+        self, target_system: int, target_component: int, chan1_raw: int, chan2_raw: int, chan3_raw: int,
+        chan4_raw: int, chan5_raw: int, chan6_raw: int, chan7_raw: int, chan8_raw: int, chan9_raw: int = 0,
+        chan10_raw: int = 0, chan11_raw: int = 0, chan12_raw: int = 0, chan13_raw: int = 0,
+        chan14_raw: int = 0, chan15_raw: int = 0, chan16_raw: int = 0, chan17_raw: int = 0,
+        chan18_raw: int = 0,
+    ) -> None:
+        self.target_system = target_system
+        self.target_component = target_component
+        self.chan1_raw = chan1_raw
+        self.chan2_raw = chan2_raw
+        self.chan3_raw = chan3_raw
+        self.chan4_raw = chan4_raw
+        self.chan5_raw = chan5_raw
+        self.chan6_raw = chan6_raw
+        self.chan7_raw = chan7_raw
+        self.chan8_raw = chan8_raw
+        self.chan9_raw = chan9_raw
+        self.chan10_raw = chan10_raw
+        self.chan11_raw = chan11_raw
+        self.chan12_raw = chan12_raw
+        self.chan13_raw = chan13_raw
+        self.chan14_raw = chan14_raw
+        self.chan15_raw = chan15_raw
+        self.chan16_raw = chan16_raw
+        self.chan17_raw = chan17_raw
+        self.chan18_raw = chan18_raw
+        self.received_frame = None
+
+    @classmethod
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> RcChannelsOverride:
+        body = body.ljust(47, b"\0")
+        self = _new(cls)
+        self.received_frame = frame
+        (
+            self.chan1_raw, self.chan2_raw, self.chan3_raw, self.chan4_raw, self.chan5_raw, self.chan6_raw,
+            self.chan7_raw, self.chan8_raw, self.target_system, self.target_component, self.chan9_raw,
+            self.chan10_raw, self.chan11_raw, self.chan12_raw, self.chan13_raw, self.chan14_raw,
+            self.chan15_raw, self.chan16_raw, self.chan17_raw, self.chan18_raw,
+        ) = _S70.unpack_from(body, 9)
+        return self
+
+    def encode(self) -> bytes:
+        try:
+            return _S70.pack(
+                self.chan1_raw, self.chan2_raw, self.chan3_raw, self.chan4_raw, self.chan5_raw,
+                self.chan6_raw, self.chan7_raw, self.chan8_raw, self.target_system, self.target_component,
+                self.chan9_raw, self.chan10_raw, self.chan11_raw, self.chan12_raw, self.chan13_raw,
+                self.chan14_raw, self.chan15_raw, self.chan16_raw, self.chan17_raw, self.chan18_raw,
             )
         except PACK_ERRORS:
             raise self._encode_error() from None
@@ -4319,6 +4645,70 @@ class Statustext(Message):
     def encode(self) -> bytes:
         try:
             return _S253.pack(self.severity, pack_text(self.text, 50), self.id, self.chunk_seq)
+        except PACK_ERRORS:
+            raise self._encode_error() from None
+
+
+_S258 = Struct('<BB30s200s')
+
+
+class PlayTune(Message):
+    """PLAY_TUNE (258): Control vehicle tone generation (buzzer).
+
+    Superseded since 2019-10, replaced by PLAY_TUNE_V2.
+
+    https://mavlink.io/en/messages/common.html#PLAY_TUNE
+    """
+
+    __slots__ = ("target_system", "target_component", "tune", "tune2")
+    __match_args__ = ("target_system", "target_component", "tune", "tune2")
+    ID = 258
+    NAME = "PLAY_TUNE"
+    CRC_EXTRA = 187
+    LENGTH = 232
+    BASE_LENGTH = 32
+    _FIELDS = (
+        ("target_system", "uint8_t", 0, "", "", "", "System ID", False),
+        ("target_component", "uint8_t", 0, "", "", "", "Component ID", False),
+        ("tune", "char", 30, "", "", "", "tune in board specific format", False),
+        ("tune2", "char", 200, "", "", "", "tune extension (appended to tune)", True),
+    )
+
+    target_system: int
+    """System ID. Type: uint8_t."""
+
+    target_component: int
+    """Component ID. Type: uint8_t."""
+
+    tune: str
+    """tune in board specific format. Type: char[30]."""
+
+    tune2: str
+    """tune extension (appended to tune) Type: char[200]. Extension, absent in MAVLink 1."""
+
+    def __init__(self, target_system: int, target_component: int, tune: str, tune2: str = "") -> None:
+        self.target_system = target_system
+        self.target_component = target_component
+        self.tune = tune
+        self.tune2 = tune2
+        self.received_frame = None
+
+    @classmethod
+    def decode_body(cls, body: bytes, frame: Frame | None = None) -> PlayTune:
+        body = body.ljust(241, b"\0")
+        self = _new(cls)
+        self.received_frame = frame
+        (self.target_system, self.target_component, v2, v3) = _S258.unpack_from(body, 9)
+        self.tune = v2.partition(b"\0")[0].decode("utf-8", "replace")
+        self.tune2 = v3.partition(b"\0")[0].decode("utf-8", "replace")
+        return self
+
+    def encode(self) -> bytes:
+        try:
+            return _S258.pack(
+                self.target_system, self.target_component, pack_text(self.tune, 30),
+                pack_text(self.tune2, 200),
+            )
         except PACK_ERRORS:
             raise self._encode_error() from None
 
