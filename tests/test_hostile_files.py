@@ -160,6 +160,23 @@ def entries(*values: str, name: str = "E") -> str:
 FIELD = '<field type="uint8_t" name="a">Text</field>'
 
 
+def test_values_of_an_enum_have_64_bits(tmp_path: Path) -> None:
+    highest = (1 << 64) - 1
+    values = (
+        "0**64",
+        "1&lt;&lt;63",
+        f"{highest}**1",
+        f"{highest}&lt;&lt;0",
+        str(highest),
+        str(-(1 << 63)),
+        "0**0",
+    )
+    path = tmp_path / "own.xml"
+    path.write_text(entries(*values))
+    loaded = Dialect.from_xml(path).enum("E")
+    assert {each.value for each in loaded.__members__.values()} == {0, 1 << 63, highest, -(1 << 63), 1}
+
+
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
@@ -172,6 +189,10 @@ FIELD = '<field type="uint8_t" name="a">Text</field>'
         (entries("1&lt;&lt;99999999999"), "is no value of an enum"),
         (entries("9**99999999999"), "is no value of an enum"),
         (entries("2**-1"), "is no value of an enum"),
+        (entries("2**65"), "is no value of an enum"),
+        (entries("1&lt;&lt;65"), "is no value of an enum"),
+        (entries("1&lt;&lt;64"), "beyond 64 bits"),
+        (entries(f"{1 << 64}**0"), "is no value of an enum"),
         (entries("0x1" + "0" * 20), "beyond 64 bits"),
         (entries(str(1 << 64)), "beyond 64 bits"),
         (entries(str(-(1 << 63) - 1)), "beyond 64 bits"),

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from pymavlink import mavutil
 
 from aerokit.autopilots import Autopilot, Mode, ModeOrder, Purpose, autopilot_for, px4_custom_mode
+from aerokit.autopilots.modes import base_mode_name, is_armed
 from aerokit.errors import LocalProtocolError
 from aerokit.mavlink.messages import Heartbeat
 
@@ -187,3 +188,23 @@ def test_an_ardupilot_of_unknown_type_still_is_ardupilot() -> None:
     other = autopilot_for(heartbeat(200))
     assert other.home_is_item_0
     assert other.mode(5, 1).name == "MODE 5"
+
+
+@pytest.mark.parametrize("others", [0, 1, 2, 32, 128, 1 | 2 | 32 | 128])
+def test_of_the_flags_of_base_mode_the_most_automatic_names_it(others: int) -> None:
+    """AUTO 4, GUIDED 8, STABILIZE 16, MANUAL 64; the others say nothing of the mode."""
+    told = {flags: base_mode_name(flags | others) for flags in (0, 4, 8, 16, 64)}
+    assert told == {0: "PREFLIGHT", 4: "AUTO", 8: "GUIDED", 16: "STABILIZE", 64: "MANUAL"}
+    assert [base_mode_name(flags | others) for flags in (92, 88, 80)] == ["AUTO", "GUIDED", "STABILIZE"]
+
+
+def test_armed_is_one_flag_of_base_mode() -> None:
+    assert [is_armed(flags) for flags in range(256)] == [False] * 128 + [True] * 128
+
+
+@pytest.mark.parametrize("number", [0, (1 << 32) - 1])
+def test_a_custom_mode_has_32_bits(number: int) -> None:
+    assert autopilot_for(heartbeat(2)).find_mode(number).custom_mode == number
+    for wrong in (-1, 1 << 32):
+        with pytest.raises(LocalProtocolError, match=f"mode = {wrong}: .* from 0 to 4294967295"):
+            autopilot_for(heartbeat(2)).find_mode(wrong)

@@ -140,6 +140,15 @@ def test_two_directions_on_one_frequency_take_turns() -> None:
     assert [when for when, _ in there.carry(bytes(100), 0.5)] == [3.0]
 
 
+def test_who_has_no_limit_of_bandwidth_waits_for_the_air_all_the_same() -> None:
+    air = Air()
+    slow, fast = FaultyPath(FaultModel(bandwidth=100.0), air=air), FaultyPath(FaultModel(), air=air)
+    assert [when for when, _ in fast.carry(bytes(100), 0.5)] == [0.5]
+    assert [when for when, _ in slow.carry(bytes(100), 0.5)] == [1.5]
+    assert [when for when, _ in fast.carry(bytes(100), 1.0)] == [1.5]
+    assert [when for when, _ in fast.carry(bytes(100), 2.0)] == [2.0]
+
+
 def test_outages_count_from_the_start() -> None:
     path = FaultyPath(FaultModel(outages=((1.0, 2.0), (5.0, 6.0))))
     path.start(100.0)

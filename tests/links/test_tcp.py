@@ -171,6 +171,19 @@ async def test_a_peer_that_does_not_read_costs_bounded_memory_and_time(
 
 
 @each_loop
+async def test_what_is_written_to_a_connection_that_closes_is_counted_as_dropped() -> None:
+    async with listening() as (listener, heard), connected(listener) as (client, _):
+        client.write(b"x")
+        await heard.until_data(b"x")
+        for end in (client, listener):
+            (stream,) = end._streams
+            assert stream._transport is not None
+            stream._transport.close()
+            end.write(b"too late")
+            assert end.dropped_writes == 1
+
+
+@each_loop
 async def test_what_was_written_before_close_still_arrives() -> None:
     data = bytes(range(256)) * 4096
     async with listening() as (listener, heard), connected(listener) as (client, _):

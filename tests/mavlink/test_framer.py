@@ -23,6 +23,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aerokit.mavlink import STANDARD, Dialect, FrameEncoder, Framer, Message, messages
+from aerokit.mavlink.frame import is_whole_frame
 
 HEARTBEAT = messages.Heartbeat(2, 3, 81, 4, 3)
 ATTITUDE = messages.Attitude(1000, 0.25, 0.5, 0.75, -1.25, -1.5, -1.75)
@@ -413,3 +414,22 @@ def test_senders_are_counted_apart() -> None:
     assert framer.statistics.sources[1, 1].loss == pytest.approx(0.25)
     assert repr(framer.statistics.sources[2, 1]) == "<2/1: 3 received, 1 lost>"
     assert "frames=6" in repr(framer.statistics)
+
+
+@pytest.mark.parametrize(
+    ("head", "size"),
+    [
+        (b"\xfe\x00", 8),
+        (b"\xfe\x01", 9),
+        (b"\xfe\xff", 263),
+        (b"\xfd\x00\x00", 12),
+        (b"\xfd\xff\x00", 267),
+        (b"\xfd\x00\x01", 25),
+        (b"\xfd\xff\x01", 280),
+    ],
+)
+def test_the_form_of_a_frame_is_its_magic_and_its_length(head: bytes, size: int) -> None:
+    sizes = [length for length in range(300) if is_whole_frame(head.ljust(length, b"\0")[:length])]
+    assert sizes == [size]
+    assert not is_whole_frame(b"\xfc" + head[1:].ljust(size - 1, b"\0"))
+    assert not is_whole_frame(head[:2] + b"\x02" + bytes(size - 3)) or head[0] == 0xFE

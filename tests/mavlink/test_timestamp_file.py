@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from aerokit.errors import FileFormatError
+from aerokit.errors import FileFormatError, LocalProtocolError
 from aerokit.mavlink import Frame, FrameEncoder, Framer, timestamp_file
 from aerokit.mavlink.messages import Heartbeat
-from aerokit.mavlink.signing import LAST_TIMESTAMP, ONE_MINUTE, Refusal, Signing, SigningKey
+from aerokit.mavlink.signing import ONE_MINUTE, Refusal, Signing, SigningKey
 from aerokit.whole_file import write_whole
 
 KEY = SigningKey.from_passphrase("ours")
@@ -78,11 +78,21 @@ def test_other_links_with_the_key_share_the_file(path: Path) -> None:
     assert Signing(KEY, keep=path).timestamp > other.timestamp - 1
 
 
-@pytest.mark.parametrize("text", ["", "abc", "-5", "1.5", str(LAST_TIMESTAMP + 1), "9" * 5000, "\u0661"])
+@pytest.mark.parametrize("text", ["", "abc", "-5", "1.5", str(1 << 48), "9" * 5000, "\u0661"])
 def test_another_file_is_not_taken_for_one(path: Path, text: str) -> None:
     path.write_text(text, encoding="utf-8")
     with pytest.raises(FileFormatError, match="holds no time stamp"):
         Signing(KEY, keep=path)
+
+
+def test_a_time_stamp_has_48_bits_all_of_which_may_be_set(path: Path) -> None:
+    last = (1 << 48) - 1
+    assert Signing(KEY, timestamp=last).timestamp == last
+    for wrong in (-1, 1 << 48):
+        with pytest.raises(LocalProtocolError, match=rf"timestamp = {wrong} must be in 0\.\.{last}"):
+            Signing(KEY, timestamp=wrong)
+    path.write_text(str(last))
+    assert Signing(KEY, keep=path).timestamp == last
 
 
 def test_a_place_that_cannot_be_written_is_told_at_once(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from aerokit.errors import FileError, FileTimeout, LocalProtocolError
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
 from aerokit.mavlink.messages import FileTransferProtocol
 from aerokit.protocols.ftp import FtpMessage, FtpRequest, path_bytes
+from aerokit.protocols.ftp_message import ERRNOS, file_error
 from aerokit.protocols.round_trip import RoundTrip
 
 Op = MavFtpOpcode
@@ -129,6 +130,31 @@ def test_every_code_has_its_words(code: int) -> None:
     request.receive(as_message(reply_to(started(request), code=code)), 0.1)
     with pytest.raises(FileError, match="/a: "):
         request.result()
+
+
+NEWLIB = {
+    "EPERM": 1, "ENOENT": 2, "EIO": 5, "EBADF": 9, "EAGAIN": 11, "ENOMEM": 12, "EACCES": 13, "EBUSY": 16, "EEXIST": 17,
+    "ENODEV": 19, "ENOTDIR": 20, "EISDIR": 21, "EINVAL": 22, "ENFILE": 23, "EMFILE": 24, "EFBIG": 27, "ENOSPC": 28,
+    "EROFS": 30, "ENOSYS": 88, "ENOTEMPTY": 90, "ENAMETOOLONG": 91, "EOPNOTSUPP": 95,
+}  # fmt: skip
+"""sys/errno.h of newlib, which ArduPilot is built with."""
+LINUX = {"ENAMETOOLONG": 36, "ENOSYS": 38, "ENOTEMPTY": 39}
+"""Where Linux and NuttX, which PX4 runs on, differ from it."""
+
+
+def test_numbers_of_errors_are_those_of_the_systems() -> None:
+    assert {(name, number) for number, (name, _) in ERRNOS.items()} == {*NEWLIB.items(), *LINUX.items()}
+
+
+@pytest.mark.parametrize(("name", "number"), [*NEWLIB.items(), *LINUX.items()])
+def test_every_number_of_an_error_is_told_by_its_name(name: str, number: int) -> None:
+    error = file_error(MavFtpOpcode.REMOVEFILE, "/a", MavFtpErr.FAILERRNO, number)
+    assert str(error) == f"remove /a: {ERRNOS[number][1]} (FAILERRNO, {name})"
+
+
+def test_an_error_that_no_system_has_is_told_by_its_number() -> None:
+    error = file_error(99, "/a", MavFtpErr.FAILERRNO, 200)
+    assert str(error) == "operation 99 /a: it failed (FAILERRNO, errno 200)"
 
 
 def test_what_is_not_ours_is_ignored() -> None:

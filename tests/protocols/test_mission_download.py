@@ -13,11 +13,12 @@ from aerokit import messages as m
 from aerokit.errors import MissionRejected, MissionTimeout, OperationTimeout
 from aerokit.mavlink.enums import MavMissionResult as Result
 from aerokit.missions import MissionItem
-from aerokit.missions.wire import to_wire_float
+from aerokit.missions.wire import to_wire, to_wire_float
 from aerokit.protocols.mission_current import MissionSetCurrent
 from aerokit.protocols.mission_download import MAX_RESTARTS, MissionDownload
 from aerokit.protocols.missions import MissionClear
 from aerokit.protocols.round_trip import RoundTrip
+from aerokit.protocols.transfer import Progress
 
 HELD = items(50)
 WINDOWS: list[tuple[type[Store], int]] = [(ArduPilotModel, 10), (ArduPilotModel, 1), (Px4Model, 1)]
@@ -49,6 +50,35 @@ def test_a_vehicle_that_gives_up_is_asked_anew_eight_times() -> None:
     assert lists == 1 + MAX_RESTARTS == 9
     with pytest.raises(MissionRejected):
         exchange.result()
+
+
+@pytest.mark.parametrize(
+    ("window", "opaque_id", "asked"),
+    [(10, 7, [1, 2]), (10, 8, [0, 1, 2]), (10, 0, [0, 1, 2]), (1, 7, [0]), (1, 8, [0])],
+)
+def test_asked_anew_what_is_there_is_kept_and_asked_for_again_only_in_sequence(
+    window: int, opaque_id: int, asked: list[int]
+) -> None:
+    """PX4, which is asked one by one, wants to be asked in sequence; another opaque_id is another mission."""
+    told: list[Progress] = []
+    exchange, held = download(window, round_trip=RoundTrip(0.1), on_progress=told.append), HELD[:3]
+
+    def tell(message: m.MissionCount | m.MissionItemInt | m.MissionAck, now: float) -> list[int]:
+        exchange.take_outbox()
+        exchange.receive(message, now)
+        return [each.seq for each in exchange.take_outbox() if isinstance(each, m.MissionRequestInt)]
+
+    exchange.start(100.0)
+    tell(m.MissionCount(*GCS, 3, 0, 7 if opaque_id else 0), 101.0)
+    tell(to_wire(held[0], 0, target_system=GCS[0], target_component=GCS[1], mission_type=0), 102.0)
+    assert tell(m.MissionAck(*GCS, Result.ERROR), 103.0) == []
+    kept = int(opaque_id == 7)
+    assert tell(m.MissionCount(*GCS, 3, 0, opaque_id), 104.0) == asked
+    assert [each.done for each in told] == [0, 1, kept]
+    for seq in range(3):
+        tell(to_wire(held[seq], seq, target_system=GCS[0], target_component=GCS[1], mission_type=0), 105.0)
+    assert list(exchange.result().items) == held
+    assert exchange.result().opaque_id == opaque_id
 
 
 @settings(max_examples=60, deadline=None)

@@ -242,5 +242,24 @@ def test_the_float_form_is_for_those_who_know_no_other() -> None:
 def test_progress_is_told() -> None:
     told: list[Progress] = []
     run(upload(NEW, on_progress=told.append), ArduPilotModel(), Radio())
-    assert [progress.done for progress in told] == sorted(progress.done for progress in told)
-    assert (told[-1].done, told[-1].total) == (40, 40)
+    assert [(each.done, each.total) for each in told] == [(count, 40) for count in range(41)]
+
+
+def test_progress_counts_the_seconds_since_it_began() -> None:
+    told: list[Progress] = []
+    exchange = upload(NEW[:2], window=1, on_progress=told.append)
+    exchange.start(100.0)
+    for message, at in ((m.MissionRequestInt(*GCS, 0), 100.5), (m.MissionRequestInt(*GCS, 1), 101.0)):
+        exchange.receive(message, at)
+    exchange.receive(m.MissionAck(*GCS, Result.ACCEPTED), 102.0)
+    assert [(each.done, each.elapsed_s, each.rate) for each in told] == [
+        (0, 0.5, 0.0),
+        (1, 1.0, 1.0),
+        (2, 2.0, 1.0),
+    ]
+
+
+def test_progress_of_a_part_counts_its_items_alone() -> None:
+    told: list[Progress] = []
+    run(upload(NEW[4:7], first=4, window=1, on_progress=told.append), ArduPilotModel(OLD), Radio())
+    assert [(each.done, each.total) for each in told] == [(count, 3) for count in range(4)]

@@ -13,6 +13,7 @@ from aerokit.errors import ParameterRejected, ParameterTimeout
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.message import Message
 from aerokit.parameters import Parameter, ParameterType
+from aerokit.parameters.encoding import to_wire
 from aerokit.protocols.parameter_read import ParameterReads
 from aerokit.protocols.parameter_requests import Answer, rejection
 from aerokit.protocols.parameter_write import ParameterWrites
@@ -235,6 +236,23 @@ def test_another_type_is_told_after_it_was_read_back() -> None:
     answer = channel.run(writes(Parameter("A", 5, INT32), bytewise=True))["A"]
     assert answer == Parameter("A", 5.0, REAL32)
     assert len(channel.sent) < 6
+
+
+@pytest.mark.parametrize(
+    ("before", "asked"), [([], 1), ([(4, 6)], 2), ([(4, 9)], 2), ([(5, 6)], 0), ([(5, 9)], 1)]
+)
+def test_another_type_is_believed_when_it_comes_twice_in_a_row(
+    before: list[tuple[int, int]], asked: int
+) -> None:
+    """Asked for is an integer of 5 (type 6); a float of 5 (9) comes; ``asked``: how often it is read back."""
+    exchange = writes(Parameter("A", 5, INT32), bytewise=True, before={"A": 0.0})
+    exchange.start(0.0)
+    exchange.take_outbox()
+    for number, (value_, type_) in enumerate([*before, (5, 9)]):
+        if not exchange.done:
+            wire = to_wire(value_, ParameterType(type_), True)
+            exchange.receive(m.ParamValue("A", wire, type_, 1, 0xFFFF), 1.0 + number)
+    assert len(exchange.take_outbox()) == asked
 
 
 def test_a_refusal_is_told_in_words() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from aerokit.protocols.block_requests import BlockRequests
+from aerokit.protocols.block_requests import AdaptiveWindow, BlockRequests
 from aerokit.protocols.request_window import FEW, LONGEST_S, RequestWindow
 from aerokit.protocols.round_trip import RoundTrip
 
@@ -81,3 +81,49 @@ def test_blocks_in_vain_are_asked_for_as_often_five_times_and_then_more_rarely()
         now = requests.deadline
     assert waits == pytest.approx([round_trip.timeout_s(attempt) for attempt in (1, 1, 1, 1, 1, 2, 3, 4)])
     assert waits[6] > 1.4 * waits[5]
+
+
+# ----------------------------------------------------------------------- as many as the link carries
+
+
+def test_it_grows_by_a_half_while_answers_take_as_long_as_the_fastest() -> None:
+    window, sizes = AdaptiveWindow(start=4, lowest=2, highest=6), list[int]()
+    for _ in range(6):
+        window.answered(1.0)
+        sizes.append(window.size)
+    assert sizes == [4, 5, 5, 6, 6, 6]
+
+
+@pytest.mark.parametrize(
+    ("seconds", "size"), [(1.26, 5.0), (1.27, 4.5), (2.05, 4.5), (2.06, 4.25), (None, 4.5)]
+)
+def test_answers_that_take_twice_as_long_make_it_smaller(seconds: float | None, size: float) -> None:
+    window = AdaptiveWindow(start=4)
+    window.answered(1.0)
+    window.answered(seconds)
+    assert window._size == size
+
+
+def test_only_when_most_is_lost_it_is_halved_and_then_waits_for_more() -> None:
+    """By sixteenths: of 22 in a row three quarters count as lost, of a half 11 more do."""
+    window, sizes = AdaptiveWindow(start=40, lowest=8), list[int]()
+    for _ in range(60):
+        window.lost()
+        sizes.append(window.size)
+    assert [sizes.count(size) for size in (40, 20, 10, 8)] == [21, 11, 11, 17]
+
+
+def test_what_is_answered_makes_up_for_what_is_lost() -> None:
+    window = AdaptiveWindow(start=40)
+    for _ in range(500):
+        for _ in range(2):
+            window.lost()
+        window.answered(None)
+    assert window.size == 40
+
+
+@pytest.mark.parametrize(("fit", "size"), [(3.0, 4), (4.0, 4), (9.0, 9), (32.0, 32), (33.0, 32)])
+def test_it_begins_with_what_is_known_to_fit_up_to_half_of_what_may_be(fit: float, size: int) -> None:
+    window = AdaptiveWindow()
+    window.widen(fit)
+    assert window.size == size

@@ -94,6 +94,30 @@ async def test_our_ids_are_plain_numbers() -> None:
         assert type(inspect.signature(opening).parameters["source_component"].default) is int
 
 
+@pytest.mark.parametrize(("system_id", "component_id"), [(1, 0), (255, 255)])
+async def test_our_ids_may_be_all_that_there_are(system_id: int, component_id: int) -> None:
+    async with far_end() as (near, _, ear):
+        async with open_connection(near, source_system=system_id, source_component=component_id):
+            await anyio.sleep(0.5)
+        (frame,) = Framer().receive(ear.data)
+        assert (frame.system_id, frame.component_id) == (system_id, component_id)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "text"),
+    [
+        ({"source_system": 0}, "source_system = 0 is not allowed: 1 to 255"),
+        ({"source_system": 256}, "source_system = 256 is not allowed: 1 to 255"),
+        ({"source_component": -1}, "source_component = -1 is not allowed: 0 to 255"),
+        ({"source_component": 256}, "source_component = 256 is not allowed: 0 to 255"),
+    ],
+)
+async def test_our_ids_are_bytes(wrong: dict[str, int], text: str) -> None:
+    link, _ = memory_link_pair()
+    with pytest.raises(LocalProtocolError, match=f"^{text}$"):
+        Connection(link, **wrong)  # type: ignore[arg-type]
+
+
 async def test_what_the_dialect_does_not_know_cannot_be_subscribed_to() -> None:
     few = Dialect("heartbeats", [Heartbeat])
     async with far_end() as (near, _, _), open_connection(near, dialect=few) as connection:

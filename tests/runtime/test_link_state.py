@@ -9,6 +9,9 @@ from flight_harness import Flight
 from aerokit import LinkState, connect, events, open_connection
 from aerokit.errors import BusyError, ConnectionClosed, LinkLost
 from aerokit.links import memory_link_pair
+from aerokit.runtime.bus import Bus
+from aerokit.runtime.cells import StateCell
+from aerokit.runtime.link_watch import LinkStateWatch
 from aerokit.runtime.subscription import Subscription
 from aerokit.sim import SimulatedCopter, simulated_link
 
@@ -45,6 +48,22 @@ async def test_the_way_from_connected_to_lost_is_a_state_and_an_event(grounded: 
             (one, SILENT, CONNECTED),
             (one, CONNECTED, LOST),
         ]
+
+
+def test_silence_begins_after_three_and_a_half_seconds_without_a_frame() -> None:
+    bus, now = Bus(), 0.0
+    seen: list[events.LinkStateChanged] = []
+    bus.attach_event(events.LinkStateChanged, seen.append)
+    watch = LinkStateWatch(StateCell("link_state", lambda: now, "frame"), bus, system_id=7)
+    states = []
+    for now, frames in ((0.0, 0), (1.0, 0), (9.0, 1), (12.5, 1), (12.6, 1), (99.0, 1), (99.1, 2), (102.6, 2)):
+        watch.count(now, frames)
+        states.append(watch.state)
+    assert states == [None, None, CONNECTED, CONNECTED, SILENT, SILENT, CONNECTED, CONNECTED]
+    assert seen == [
+        events.LinkStateChanged(12.6, 7, CONNECTED, SILENT),
+        events.LinkStateChanged(99.1, 7, SILENT, CONNECTED),
+    ]
 
 
 async def test_after_the_link_is_lost_the_vehicle_is_silent(grounded: Flight) -> None:

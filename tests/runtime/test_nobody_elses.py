@@ -147,6 +147,36 @@ async def test_while_all_places_are_taken_by_the_living_nobody_new_is_heard(link
         assert (len(heard), len(link.kept)) == (1, MOST_PEERS)
 
 
+async def test_who_is_not_listened_to_takes_no_place_among_the_counted(link: KeptPeers) -> None:
+    async with open_connection(link) as connection:
+        for port in range(MOST_PEERS):
+            link.hear(f"{port}@swarm", (1 + port % 250, 1 + port // 250), COPTER)
+        for port in range(MOST_SENDERS):
+            link.hear(f"{port}@late", (251, 1), ATTITUDE)
+        for component_id in range(100, 200):
+            link.hear("0@swarm", (1, component_id), COPTER)
+        counted = [source for each in connection.statistics() for source in each.sources]
+        assert len(counted) == MOST_PEERS + 100
+
+
+async def test_who_is_forgotten_gives_back_its_places_among_the_counted(link: KeptPeers) -> None:
+    async with open_connection(link) as connection:
+        for port in range(MOST_SENDERS // 8):
+            for component_id in range(1, 9):
+                link.hear(f"{port}@swarm", (1 + port % 250, component_id + 8 * (port // 250)), ATTITUDE)
+        for port in range(100):
+            link.hear(f"{port}@new", (251, 1), ATTITUDE)
+        counted = sum(len(each.sources) for each in connection.statistics())
+        assert counted == MOST_SENDERS - 100 * 8 + 99  # the first new one came when all places were taken
+
+
+async def test_of_who_was_pushed_out_nothing_is_kept(link: KeptPeers) -> None:
+    async with open_connection(link) as connection:
+        for port in range(2 * MOST_STRANGERS):
+            connection.bytes_received(b"\xfd", f"{port}@stranger")
+        assert len(connection._peers._limit._statistics) == MOST_STRANGERS
+
+
 async def test_a_frame_in_pieces_makes_a_peer_too(link: KeptPeers) -> None:
     """A bridge between a serial line and UDP cuts frames anywhere."""
     async with open_connection(link) as connection:

@@ -18,6 +18,7 @@ from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.messages import Attitude, Heartbeat
 from aerokit.mavlink.tlog import read_tlog
+from aerokit.runtime.recording import Recording
 from aerokit.sim import SimulatedCopter, simulated_link
 
 pytestmark = pytest.mark.anyio
@@ -172,6 +173,23 @@ async def test_a_file_that_cannot_be_written_is_told_before_anything_is_opened(t
 async def test_a_full_disk_ends_the_recording_and_not_the_flight(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.CRITICAL, "aerokit"):
         await fly(Path("/dev/full"))
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+@pytest.mark.parametrize("end", ["flush", "close", "write"])
+def test_a_full_disk_is_told_of_once_wherever_it_is_noticed(
+    caplog: pytest.LogCaptureFixture, end: str
+) -> None:
+    recording, frame = Recording("/dev/full", 0.0), FrameEncoder(1, 1).encode(HEARTBEAT)
+    for _ in range(100_000 if end == "write" else 1):
+        recording.write(frame, 1.0)
+    if end == "flush":
+        recording.flush()
+    recording.close()
+    recording.write(frame, 2.0)
+    recording.flush()
+    recording.close()
+    assert caplog.messages == ["recording to /dev/full has ended: No space left on device"]
 
 
 async def test_a_connection_that_is_open_has_its_own_recording(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from flight_harness import Flight
+from flight_harness import Flight, now
 
 from aerokit.errors import FileError, LocalProtocolError, RemoteProtocolError
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
@@ -100,6 +100,26 @@ async def test_a_block_far_beyond_the_others_is_not_waited_up_to(grounded: Fligh
         await grounded.vehicle.files.crc32("/a")
     with pytest.raises(Exception, match="0 bytes are there"):
         await grounded.vehicle.files.read("/a", patience_s=2.0)
+
+
+@pytest.mark.parametrize(("patience_s", "waited_s"), [(2.0, 2.0), (10.0, 3.0)])
+async def test_closing_is_not_waited_for_longer_than_three_seconds_when_there_is_an_error_to_tell(
+    grounded: Flight, patience_s: float, waited_s: float
+) -> None:
+    def never_closes(request: FtpMessage) -> Iterator[FtpMessage]:
+        if request.opcode != MavFtpOpcode.TERMINATESESSION:
+            yield opened(request) or nak(request, MavFtpErr.FAIL)
+
+    serve(grounded, never_closes)
+    with pytest.raises(FileError, match="read /any"):
+        await grounded.vehicle.files.read("/any", patience_s=patience_s)
+    closings = [
+        at
+        for at, message in grounded.wire.sent
+        if isinstance(message, FileTransferProtocol)
+        and FtpMessage.decode(message.payload).opcode == MavFtpOpcode.TERMINATESESSION
+    ]
+    assert now() - closings[0] == pytest.approx(waited_s, abs=0.01)
 
 
 @pytest.mark.parametrize("data", [b"Fa\t1\0", b""])

@@ -79,14 +79,6 @@ def test_what_does_not_steer_hears_nothing_after_its_block() -> None:
     assert aside.end == ""
 
 
-def test_a_closed_helm_hears_nothing() -> None:
-    stage = Stage()
-    order = stage.helm.order(GUIDED)
-    stage.helm.close()
-    stage.tell(RTL, armed=False)
-    assert order.end == ""
-
-
 # ------------------------------------------------------------------------------ somebody else
 
 

@@ -28,6 +28,18 @@ async def test_it_goes_out_in_the_same_instant() -> None:
         assert flight.wire.mode_orders() == [BRAKE]
 
 
+async def test_it_is_over_when_the_vehicle_has_confirmed_it() -> None:
+    async with in_the_air() as flight:
+        holding, told = flight.vehicle._bridge.holding, list[bool]()
+        told.append(holding.is_told_to_hold)
+        await give_up(flight)
+        told.append(holding.is_told_to_hold)
+        await anyio.sleep(3.0)
+        told.append(holding.is_told_to_hold)
+        assert flight.copter.mode.number == BRAKE
+        assert told == [False, True, False]
+
+
 async def test_px4_too_is_told_in_the_same_instant() -> None:
     async with open_px4() as flight:
         await flight.take_off()

@@ -8,6 +8,7 @@ from flight_harness import Flight
 
 from aerokit.errors import CommandTimeout
 from aerokit.mavlink.enums import MavCmd, MavResult
+from aerokit.vehicle.orders.late_arming import LATE_S
 
 pytestmark = pytest.mark.anyio
 
@@ -55,6 +56,26 @@ async def test_who_was_armed_before_is_left_alone(flying: Flight, ends: str) -> 
             await flying.vehicle.arm()
     await anyio.sleep(20.0)
     assert ordered(flying).count(0) == 0
+
+
+async def test_disarming_goes_on_when_the_time_to_watch_ends(grounded: Flight) -> None:
+    """It armed in the last moment, and the first order to disarm is lost."""
+    await grounded.vehicle.set_mode("GUIDED")
+    grounded.copter.faults.ignore(ARM)
+    told_at = grounded.vehicle.armed.updated_at
+    await grounded.vehicle.armed.wait_until(lambda _: grounded.vehicle.armed.updated_at > told_at)
+    await anyio.sleep(0.7)  # of the second from one heartbeat to the next
+    with anyio.move_on_after(0.0):
+        await grounded.vehicle.arm()
+    await anyio.sleep(LATE_S - 1.0)
+    assert grounded.copter.arming.arm()
+    await anyio.sleep(1.0)
+    assert grounded.vehicle.is_armed
+    assert ordered(grounded) == [1, 0]
+    grounded.copter.faults.commands.clear()
+    await anyio.sleep(3.0)
+    assert ordered(grounded) == [1, 0, 0]
+    assert not grounded.copter.is_armed
 
 
 async def test_who_cannot_be_disarmed_again_is_told_of(

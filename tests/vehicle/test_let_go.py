@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import anyio
 import pytest
-from flight_harness import in_the_air, open_flight
+from flight_harness import Wire, attached_sinks, in_the_air, open_flight
 
 import aerokit
 from aerokit.errors import AerokitError, ConnectionClosed, OperationRejected, SetpointStreamStopped
@@ -42,6 +42,30 @@ async def test_nothing_is_said_on_the_ground_or_when_it_was_meant(caplog: pytest
     async with in_the_air():
         pass
     assert "let go" not in caplog.text
+
+
+async def test_of_a_vehicle_nothing_is_left_on_a_connection_that_goes_on() -> None:
+    async with simulated_link(SimulatedCopter(boot_time_s=0.0)) as link:
+        wire = Wire(link)
+        async with aerokit.open_connection(wire) as connection:
+            await anyio.sleep(2.0)
+            before = attached_sinks(connection)
+            async with aerokit.connect(connection) as vehicle:
+                await vehicle.wait_ready()
+                await vehicle.parameters.get("RTL_ALT")
+                await vehicle.mission.download()
+                await vehicle.fence.download()
+                await vehicle.logs.list()
+                assert vehicle.gimbal.attitude.latest is None
+                assert vehicle.mission.count.value == 0
+                assert attached_sinks(connection) > before
+                assert connection.boot_clocks
+            await anyio.sleep(2.0)
+            wire.forget()
+            assert attached_sinks(connection) == before
+            assert not connection.boot_clocks
+            await anyio.sleep(5.0)
+            assert {type(message) for _, message in wire.sent} == {Heartbeat}
 
 
 async def test_the_block_is_left_while_a_stream_is_open_elsewhere() -> None:

@@ -221,6 +221,25 @@ async def test_a_vehicle_that_keeps_something_else() -> None:
         await flight.vehicle.mission.upload(long_mission(9), method="items", only_changes=False, verify=False)
 
 
+async def test_a_file_is_compared_to_the_last_digit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Items that go through 32-bit floats are not, and a file does not."""
+    async with open_flight() as flight:
+        items = flight.copter.missions
+        replace = items.replace
+
+        def keep_something_else(type_: int, given: Any, **options: Any) -> Any:
+            return replace(
+                type_, [each.replace(x=each.x + 3 * (each.frame == 3)) for each in given], **options
+            )
+
+        monkeypatch.setattr(items, "replace", keep_something_else)
+        mission = long_mission(1)
+        with pytest.raises(VerificationFailed) as caught:
+            await flight.vehicle.mission.upload(mission, method="ftp")
+        (difference,) = caught.value.differences
+        assert difference == f"item 0 (NAV_WAYPOINT): x is {mission[0].x + 3} instead of {mission[0].x}"
+
+
 async def test_no_files() -> None:
     copter = SimulatedCopter(boot_time_s=0.0)
     copter.faults.no_ftp = True

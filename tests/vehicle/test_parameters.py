@@ -584,7 +584,10 @@ async def test_renamed_names_in_files_and_blocks() -> None:
         warnings.simplefilter("ignore", ParameterRenamedWarning)
         async with open_flight(simulated) as flight:
             parameters = flight.vehicle.parameters
-            differences = await parameters.diff({"WP_SPD": 8.0, "SYSID_THISMAV": 1})
+            with pytest.warns(ParameterRenamedWarning) as warned:
+                differences = await parameters.diff({"WP_SPD": 8.0, "SYSID_THISMAV": 1})
+            assert [str(each.message).split()[0] for each in warned] == ["WP_SPD", "SYSID_THISMAV"]
+            assert {each.filename for each in warned} == {__file__}
             assert [(each.name, each.before, each.after) for each in differences] == [
                 ("WPNAV_SPEED", 1000, 800)
             ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Awaitable, Callable
 from typing import Any
@@ -12,6 +13,7 @@ from flight_harness import Flight
 from aerokit import Position
 from aerokit import messages as m
 from aerokit.errors import LocalProtocolError
+from aerokit.vehicle.checks import check_range
 
 pytestmark = pytest.mark.anyio
 
@@ -45,6 +47,21 @@ REFUSED: dict[str, Callable[[Any], Awaitable[object]]] = {
     "rate_hz of ATTITUDE = -1 is not allowed: above 0 to 1000": lambda v: entered(v.rate(m.Attitude, -1)),
     "rate_hz = -1 is not allowed: above 0 to 1000": lambda v: entered(v.streams(-1)),
 }
+
+
+ALLOWED = [(0, False), (1000, False), (1000, True), (1e-9, True)]
+NOT_ALLOWED = [(0, True), (-1e-9, False), (1000.001, False), (math.nan, False), (math.inf, True)]
+
+
+@pytest.mark.parametrize(("value", "above"), ALLOWED)
+def test_the_ends_of_a_range_belong_to_it(value: float, above: bool) -> None:
+    check_range("it", value, 0, 1000, above=above)
+
+
+@pytest.mark.parametrize(("value", "above"), NOT_ALLOWED)
+def test_what_is_beyond_the_ends_of_a_range_does_not(value: float, above: bool) -> None:
+    with pytest.raises(LocalProtocolError, match=r"^it = .* is not allowed: .*0 to 1000$"):
+        check_range("it", value, 0, 1000, above=above)
 
 
 async def test_out_of_range(flying: Flight) -> None:

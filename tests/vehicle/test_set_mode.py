@@ -66,6 +66,17 @@ async def test_a_silent_vehicle_is_a_timeout_and_is_not_ordered_again(grounded: 
         await grounded.vehicle.set_mode("GUIDED")
 
 
+@pytest.mark.parametrize(("timeout", "waited_s"), [(2.0, 2.0), (4.0, 4.0), (6.0, 4.0), (12.0, 4.0)])
+async def test_the_answer_is_waited_for_as_long_as_there_is_time_and_four_seconds_at_most(
+    grounded: Flight, timeout: float, waited_s: float
+) -> None:
+    grounded.copter.faults.silent = True
+    started = now()
+    with pytest.raises(CommandTimeout, match=f"within {waited_s:.1f} s"):
+        await grounded.vehicle.set_mode("GUIDED", timeout=timeout)
+    assert now() - started == pytest.approx(waited_s)
+
+
 async def test_accepted_but_not_changed_is_a_timeout(grounded: Flight) -> None:
     grounded.copter.set_mode_from = lambda *_: MavResult.ACCEPTED  # type: ignore[method-assign]
     started = now()

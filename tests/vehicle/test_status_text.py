@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from aerokit.mavlink import STANDARD, Frame, FrameEncoder
 from aerokit.mavlink.messages import Statustext
 from aerokit.vehicle.state.condition import StatusText
-from aerokit.vehicle.state.status_text import MOST_OPEN, StatusTextAssembler
+from aerokit.vehicle.state.status_text import LONGEST, MOST_OPEN, StatusTextAssembler
 
 LONG = (
     "A text much longer than the fifty characters which fit into one STATUSTEXT message, and then some more."
@@ -89,7 +89,7 @@ def test_a_missing_beginning_is_marked() -> None:
 def test_a_missing_end_is_told_after_two_seconds() -> None:
     texts = StatusTextAssembler()
     texts.receive(chunks(LONG)[0], 0.0)
-    assert texts.expire(1.9) == []
+    assert texts.expire(2.0) == []
     assert texts.expire(2.1) == [StatusText(4, LONG[:50].rstrip() + "…", 2.1)]
     assert texts.expire(9) == []
 
@@ -137,6 +137,21 @@ def test_garbage_does_not_pile_up() -> None:
     for seq in range(100):
         texts.receive(_received(Statustext(6, "", 7, seq), b"z" * 50), 0.0)
     assert len(texts._open) <= MOST_OPEN
+
+
+def test_sixteen_texts_may_be_under_way_and_the_first_makes_room_for_another_one() -> None:
+    texts = StatusTextAssembler()
+    for number in range(1, MOST_OPEN + 2):
+        texts.receive(chunks("y" * 70, number)[0], 0.0)
+    told = [text.text for number in (2, 1) for text in texts.receive(chunks("y" * 70, number)[1], 0.1)]
+    assert told == ["y" * 70, "…" + "y" * 20]
+
+
+def test_a_text_has_twenty_chunks_at_most() -> None:
+    texts = StatusTextAssembler()
+    told = [texts.receive(_received(Statustext(6, "", 7, seq), b"z" * 50), 0.0) for seq in range(LONGEST)]
+    assert told[:-1] == [[]] * (LONGEST - 1)
+    assert told[-1] == [StatusText(6, "z" * 50 * LONGEST, 0.0)]
 
 
 @given(

@@ -129,6 +129,41 @@ def test_two_batteries_wait_side_by_side(telemetry: Telemetry) -> None:
     assert [each.remaining_percent for each in telemetry.batteries.value] == [80, 79]
 
 
+def test_a_number_that_is_cut_off_is_number_0(telemetry: Telemetry) -> None:
+    """MAVLink 2 cuts off the zeros at the end of a message."""
+    at = offset_of(messages.ServoOutputRaw, "port")
+    for first, ninth in ((1100, 0), (1200, 1500), (1300, 0)):
+        others = 1500, 1500, 1500, 1500, 1500, 1500, 1500
+        message = messages.ServoOutputRaw(0, 0, first, *others, servo9_raw=ninth)
+        assert (len(frame_of(message).body) > 9 + at) is bool(ninth)
+        take(telemetry, message, 100.0)
+    assert telemetry.servo_outputs.value.outputs_us[0] == 1300
+
+
+def battery(number: int, percent: int) -> Message:
+    return messages.BatteryStatus(number, 1, 1, 2500, (12000, *[65535] * 9), 100, 10, 10, percent)
+
+
+@pytest.mark.parametrize("ends", [0, 1, 2])
+def test_what_came_last_says_how_old_it_is(telemetry: Telemetry, clock: Clock, ends: int) -> None:
+    """One of several that is not told of any more does not make the others old."""
+    take(telemetry, battery(0, 80), 100.0)
+    for at in range(101, 105):
+        for number in range(3):
+            if at == 101 or number != ends:
+                take(telemetry, battery(number, 80), float(at))
+    clock.now = 104.5
+    assert telemetry.batteries.fresh(1.0) == telemetry.batteries.value
+    assert telemetry.batteries.updated_at == 104.0
+    assert [each.id for each in telemetry.batteries.value] == [0, 1, 2]
+
+
+def test_as_many_as_there_are_numbers_wait_side_by_side(telemetry: Telemetry) -> None:
+    for number in (0, *range(256)):
+        take(telemetry, battery(number, number % 100), 100.0)
+    assert [each.remaining_percent for each in telemetry.batteries.value] == [n % 100 for n in range(256)]
+
+
 def test_the_better_of_two_sources_goes_first_whatever_is_looked_at_when(telemetry: Telemetry) -> None:
     for at in (100.0, 101.0):
         take(telemetry, ANYTHING["GlobalPositionInt"], at)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -243,6 +243,13 @@ async def test_arguments_that_cannot_be(bench: Bench) -> None:
     with pytest.raises(LocalProtocolError, match="timeout"):
         await logs.list(timeout=-1.0)
     assert bench.sent() == 0
+
+
+@pytest.mark.parametrize("log_id", [0, 65535])
+async def test_every_number_that_a_log_can_have_is_asked_for(bench: Bench, log_id: int) -> None:
+    with suppress(FileError):
+        assert await bench.logs.read(log_id) == bench.content(log_id)
+    assert bench.sent() > 0
 
 
 async def test_erased_logs_are_gone(bench: Bench) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable
 from types import SimpleNamespace
@@ -22,6 +23,7 @@ from aerokit.vehicle.orders.setpoints import (
     SLOW_M_S,
     BodyVelocitySetpoint,
     LocalPositionSetpoint,
+    PositionSetpoint,
     VelocitySetpoint,
     wants_motion,
 )
@@ -351,6 +353,16 @@ def test_who_is_told_to_move_at_0_3_m_s_should_move(speed_m_s: float, wanted: bo
     nobody = cast("Bridge", None)  # a velocity alone says it
     assert wants_motion(VelocitySetpoint(east_m_s=speed_m_s), nobody) is wanted
     assert wants_motion(BodyVelocitySetpoint(right_m_s=speed_m_s), nobody) is wanted
+
+
+@pytest.mark.parametrize(
+    ("away_m", "wanted"), [(0.0, False), (3.0, False), (3.1, True), (1e7, True), (math.inf, False)]
+)
+def test_who_is_told_a_place_on_earth_moves_when_it_is_far(away_m: float, wanted: bool) -> None:
+    talk = SimpleNamespace(autopilot=SimpleNamespace(arrival_radius_m=3.0 / FAR))
+    where = SimpleNamespace(distance_to=lambda _: away_m)  # infinite while the position is unknown
+    bridge = cast("Bridge", SimpleNamespace(talk=talk, where=where))
+    assert wants_motion(PositionSetpoint(HERE), bridge) is wanted
 
 
 @pytest.mark.parametrize("axis", range(3))

@@ -131,7 +131,7 @@ class FaultyPath:
         model, air = self.model, self._air
         begin = max(now, air.busy_until)
         if math.isinf(model.bandwidth):
-            return begin if air.busy_until > now else now
+            return begin
         waiting = (begin - now) * model.bandwidth
         if waiting + size > model.queue_bytes and waiting > 0:
             return None
@@ -159,9 +159,7 @@ def split_frames(data: bytes) -> Sequence[bytes]:
     pieces: list[bytes] = []
     begin, size = 0, len(data)
     while begin < size:
-        end = _end_of_frame(data, begin)
-        if end is None or end > size:
-            end = size
+        end = min(_end_of_frame(data, begin) or size, size)
         pieces.append(data[begin:end])
         begin = end
     return pieces or [data]

@@ -43,7 +43,6 @@ class Replay(BaseLink):
         self._loop: asyncio.AbstractEventLoop | None = None
         self._records: Iterator[tuple[float, bytes]] = iter(())
         self._next: tuple[float, bytes] | None = None
-        self._last_stamp = 0.0
         self._due = 0.0  # of the next frame, on the loop's clock
         self._wake_up: asyncio.Handle | None = None
 
@@ -56,8 +55,6 @@ class Replay(BaseLink):
         self._records = read_tlog(self._path)
         self._due = self._loop.time()
         self._next = next(self._records, None)
-        if self._next is not None:
-            self._last_stamp = self._next[0]
         self._wake_up = self._loop.call_soon(self._play)
 
     def _release(self) -> None:
@@ -76,14 +73,15 @@ class Replay(BaseLink):
             if self._next is None or self._due > now:
                 break
             self.frames += 1
-            self._deliver(self._next[1])
-            self._advance()
+            stamp, frame = self._next
+            self._deliver(frame)
+            self._advance(stamp)
         if self._next is None:  # nothing is lost that the receiver has closed
             self._lose(f"end of recording after {self.frames} frames", kind=RecordingEnded)
         else:
             self._wake_up = self._loop.call_at(max(now, self._due), self._play)
 
-    def _advance(self) -> None:
+    def _advance(self, stamp: float) -> None:
         if self._receiver is None:  # closed by the receiver
             return
         try:
@@ -93,6 +91,5 @@ class Replay(BaseLink):
             self._lose(reason, error, RecordingEnded)
             return
         if self._next is not None:
-            gap = min(max(self._next[0] - self._last_stamp, 0.0), LONGEST_GAP_S)
-            self._last_stamp = self._next[0]
+            gap = min(max(self._next[0] - stamp, 0.0), LONGEST_GAP_S)
             self._due += gap / self._speed

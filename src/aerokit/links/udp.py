@@ -237,12 +237,14 @@ class UdpBroadcast(_UdpLink):
     and networks that are listened to (None: all).
     """
 
+    _heard_at: float
+    # of _remote
+
     def __init__(self, host: str, port: int, *, peers: Peers | None = None) -> None:
         super().__init__("udpbcast", host, port)
         self._allowed = AllowedPeers(peers)
         self._everybody: Any = None
         self._remote: Any = None  # who has answered
-        self._heard_at = 0.0
 
     def write(self, data: bytes, peer: Peer = None) -> None:
         """See `Link.write`."""

@@ -52,6 +52,13 @@ class SourceStatistics:
         "system_id",
     )
 
+    _late_run: int  # of those that came before: so many in a row, with nothing else in between
+    # Once there is another stream in this one's name:
+    _other_count: int  # how many frames of it came
+    _other_at: float
+    _skipped_over: int  # counted as lost when the present one began
+    _returns: int  # frames at the other place, of the stream that was here before
+
     def __init__(self, system_id: int, component_id: int, sequence: int) -> None:
         self.system_id = system_id
         self.component_id = component_id
@@ -64,12 +71,8 @@ class SourceStatistics:
         self._missing = 0  # bit n: the frame n + 1 before `_missing_at` has not come
         self._missing_at = sequence
         self._late_sequence = self._late_at = -1
-        self._late_run = 0  # so many came in a row, with nothing else in between
-        # Another stream in this one's name: where it goes on (-1: there is none), how many frames of it came.
-        self._other, self._other_count, self._other_at = -1, 0, 0.0
+        self._other = -1  # where another stream in this one's name goes on; -1: there is none
         self._since = 0  # value of `received` when the present stream began
-        self._skipped_over = 0  # counted as lost when it began
-        self._returns = 0  # frames at the other place, of the stream that was here before
         self._turns, self._double_at = 0, 0.0
         self._seen, self._moved_at = sequence, 0.0
 

@@ -119,6 +119,10 @@ class CommandExchange(Exchange[CommandAck]):
 
     expects = (CommandAck,)
 
+    _started: float
+    _sent_at: float
+    # from start() on
+
     def __init__(
         self,
         message: CommandLong | CommandInt,
@@ -148,7 +152,6 @@ class CommandExchange(Exchange[CommandAck]):
         self._is_sent = is_sent
         self._sent = 0
         self._answers = 0
-        self._started = self._sent_at = 0.0
         self._in_progress = False
 
     def start(self, now: float) -> None:

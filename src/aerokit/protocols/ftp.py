@@ -152,6 +152,9 @@ class FtpRequest(FtpExchange[FtpMessage]):
         is_sent: it was sent already, outside of this exchange.
     """
 
+    _sent_at: float
+    # from start() on
+
     def __init__(
         self,
         client: FtpClient,
@@ -173,7 +176,6 @@ class FtpRequest(FtpExchange[FtpMessage]):
         )
         self._is_sent = is_sent
         self._renumbered = 0
-        self._sent_at = 0.0
 
     @property
     def message(self) -> FileTransferProtocol:

@@ -64,6 +64,7 @@ ERRNOS = {
     28: ("ENOSPC", "no space left"),
     30: ("EROFS", "read-only file system"),
     36: ("ENAMETOOLONG", "the name is too long"),
+    38: ("ENOSYS", "not implemented"),
     39: ("ENOTEMPTY", "the directory is not empty"),
     88: ("ENOSYS", "not implemented"),
     90: ("ENOTEMPTY", "the directory is not empty"),

@@ -29,6 +29,9 @@ class MissionSetCurrent(Transfer[None]):
 
     expects = (MissionCurrent,)
 
+    _sent_at: float
+    # from start() on
+
     def __init__(
         self,
         target_system: int,
@@ -44,7 +47,6 @@ class MissionSetCurrent(Transfer[None]):
         self._told = told
         self._standing = standing
         self._attempts = 0
-        self._sent_at = 0.0
 
     def start(self, now: float) -> None:
         """Send it."""

@@ -56,6 +56,10 @@ class MissionDownload(MissionExchange[Downloaded]):
 
     expects = (MissionCount, MissionItemInt, MissionItem, MissionAck)
 
+    _list_at: float
+    _heard_at: float
+    # from start() on
+
     def __init__(
         self,
         target_system: int,
@@ -76,8 +80,6 @@ class MissionDownload(MissionExchange[Downloaded]):
         self._next = 0
         self._asked_at: dict[int, float] = {}
         self._askings: dict[int, int] = {}
-        self._list_at = 0.0
-        self._heard_at = 0.0
         self._busy_until: float | None = None
         self._restarts = 0
 

@@ -62,6 +62,11 @@ class MissionUpload(MissionExchange[UploadEnd]):
 
     expects = (MissionRequestInt, MissionRequest, MissionAck)
 
+    _heard_at: float
+    # from start() on
+    _as_float: bool
+    # from the first request on
+
     def __init__(
         self,
         target_system: int,
@@ -79,14 +84,12 @@ class MissionUpload(MissionExchange[UploadEnd]):
         self._first = first or 0
         self._end = self._first + len(items)
         self._window, self._takes_int = window, takes_int
-        self._as_float = False
         self.was_vague = False
         """Whether a refusal may mean any of several items that were under way: then send one at a time to find out."""
         self.was_begun = False
         """Whether the vehicle has asked for an item: then it may have overwritten some."""
         self._restarts = 0
         self._busy_until: float | None = None
-        self._heard_at = 0.0
         self._reset()
 
     def _reset(self) -> None:

@@ -65,6 +65,10 @@ class Transfer(Exchange[ResultT]):
     ``patience_s`` seconds; what did come sets that clock back, so that a long transfer over a bad radio ends well.
     """
 
+    _started_at: float
+    _moved_at: float
+    # from start() on
+
     def __init__(
         self,
         target_system: int,
@@ -81,8 +85,6 @@ class Transfer(Exchange[ResultT]):
         self.round_trip = RoundTrip() if round_trip is None else round_trip
         self._patience_s = patience_s
         self._on_progress = on_progress
-        self._started_at = 0.0
-        self._moved_at = 0.0
 
     def _begin(self, now: float) -> None:
         """Time starts to count."""

@@ -18,12 +18,14 @@ __all__ = ["LinkStateWatch"]
 class LinkStateWatch:
     """Is told what is heard, and looks from time to time for how long nothing was; times on the loop's clock."""
 
+    _heard_at: float
+    # from heard() on
+
     def __init__(
         self, cell: StateCell[LinkState], bus: Bus, *, system_id: int, component_id: int = 0
     ) -> None:
         self._cell, self._bus = cell, bus
         self._source = Source(system_id, component_id, "link")
-        self._heard_at = 0.0
         self._frames = 0
 
     @property

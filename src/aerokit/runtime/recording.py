@@ -33,9 +33,8 @@ class Recording:
     def __init__(self, path: str | os.PathLike[str], now: float) -> None:
         self._path = os.fspath(path)
         self._wall_at_0 = time.time() - now
-        self._writer: TlogWriter | None = None
         try:
-            self._writer = TlogWriter(path)
+            self._writer: TlogWriter | None = TlogWriter(path)
         except OSError as error:
             raise LinkOpenError(f"cannot record to {self._path}: {error.strerror or error}") from error
 

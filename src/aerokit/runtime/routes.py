@@ -39,12 +39,13 @@ EVERY_PEER: tuple[Peer, ...] = (None,)
 class _Route:
     __slots__ = ("counters", "expected", "noted_at", "peer", "rate", "sequence")
 
-    def __init__(self, peer: Peer) -> None:
-        self.peer = peer
-        self.noted_at = 0.0
-        self.sequence = 0  # of the last heartbeat
+    peer: Peer
+    noted_at: float
+    sequence: int  # of the last heartbeat
+    expected: int  # by `counters`, then
+
+    def __init__(self) -> None:
         self.counters: SourceStatistics | None = None  # those of the peer's framer, always up to date
-        self.expected = 0
         self.rate = 0.0  # frames a second
 
 
@@ -91,10 +92,9 @@ class Routes:
         if route is None:
             if len(self._routes) >= MOST_ROUTES and not self._sweep(frame.received_at):
                 return False
-            route = self._routes[source] = _Route(peer)
+            route = self._routes[source] = _Route()
         if counters is not None:
-            elapsed = frame.received_at - route.noted_at
-            if route.counters is counters and elapsed > 0:
+            if route.counters is counters and (elapsed := frame.received_at - route.noted_at) > 0:
                 route.rate = (counters.expected - route.expected) / elapsed
             route.counters, route.expected = counters, counters.expected
         route.peer, route.noted_at, route.sequence = peer, frame.received_at, frame.sequence

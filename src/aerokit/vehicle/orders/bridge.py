@@ -28,7 +28,6 @@ class Bridge:
         self.late_arming = LateArming(talk, self.helm, self.orders)
         self.health = Health(talk)
         self.where = Whereabouts(talk)
-        talk.at_close(self.helm.close)
         talk.on_reboot.append(self.helm.note_reboot)
 
     async def finish(self) -> bool:

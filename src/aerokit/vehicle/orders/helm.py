@@ -53,15 +53,8 @@ class Helm:
         self._newest_about: dict[Subject, int] = {}
         self._modes_ordered: deque[tuple[float, int]] = deque(maxlen=16)
         self._on_new: list[Callable[[], None]] = []
-        self._detach = (
-            telemetry.mode.observe(self._on_mode, every_arrival=True),
-            telemetry.armed.observe(self._on_armed, every_arrival=True),
-        )
-
-    def close(self) -> None:
-        """Stop listening."""
-        for detach in self._detach:
-            detach()
+        telemetry.mode.observe(self._on_mode, every_arrival=True)
+        telemetry.armed.observe(self._on_armed, every_arrival=True)
 
     # ------------------------------------------------------------------------------- orders
 

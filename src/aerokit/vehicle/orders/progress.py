@@ -107,10 +107,12 @@ class Stillness:
     Nothing is said while its position is not heard, nor before ``STILL_S`` seconds: it turns first, or spools up.
     """
 
+    _since: float
+    # together with _from
+
     def __init__(self, talk: Talk) -> None:
         self._talk = talk
         self._from: Position | None = None
-        self._since = 0.0
 
     def __call__(self) -> str | None:
         """How long it has not moved, in words; None: it moves, or that is not known."""

@@ -87,13 +87,14 @@ class StatusTextAssembler:
 
 
 class _OpenText:
-    """The chunks of one text so far."""
+    """The chunks of one text so far; there is one at least."""
+
+    last_chunk: bytes
+    touched_at: float
 
     def __init__(self, severity: int) -> None:
         self.severity = severity
         self.next_seq = 0
-        self.last_chunk = b""
-        self.touched_at = 0.0
         self._parts: list[bytes] = []
 
     def add(self, seq: int, chunk: bytes, now: float) -> None:

@@ -75,20 +75,23 @@ class StreamedMessage:
             self.pending[number] = frame if message is None else message
 
     def catch_up(self) -> None:
-        """Work out what has come."""
+        """Work out what has come, in the order in which it came."""
         with self._lock:
+            waiting: list[tuple[Frame, Message | None]] = []
+            # None is left first: who works one out may look at the value before, and come here again.
             while self.pending:
                 came = self.pending.popitem()[1]
                 if isinstance(came, Frame):
-                    self._apply(came, None)
+                    waiting.append((came, None))
                 elif came.received_frame is not None:
-                    self._apply(came.received_frame, came)
+                    waiting.append((came.received_frame, came))
+            waiting.sort(key=lambda each: each[0].received_at)
+            for frame, message in waiting:
+                self._apply(frame, message)
 
     def watchers_changed(self) -> None:
         """Somebody begins or ends to wait for what is in the cells."""
         self._is_watched = any(cell._is_watched for cell in self._cells)
-        if self.pending:
-            self.catch_up()
 
     def forget(self) -> None:
         """What has come does not count any more."""
