@@ -123,4 +123,4 @@ def _wait(child: int, limit_s: float) -> int:
 
 def _first_failure(said: str) -> str:
     lines = [line for line in said.splitlines() if line.startswith(("FAILED", "ERROR"))]
-    return lines[0][:150] if lines else said[-150:].replace("\n", " ")
+    return lines[0] if lines else said[-150:].replace("\n", " ")

@@ -255,6 +255,19 @@ def test_another_type_is_believed_when_it_comes_twice_in_a_row(
     assert len(exchange.take_outbox()) == asked
 
 
+def test_another_value_is_believed_when_it_comes_twice_with_nothing_else_in_between() -> None:
+    """Of a name that was written a moment ago: an echo of that write comes in between."""
+    exchange = writes(Parameter("A", 5, INT32), bytewise=True, before={"A": 0.0}, recent=["A"])
+    exchange.start(0.0)
+    done = []
+    for number, told in enumerate((4, 5, 4, 4)):
+        exchange.take_outbox()
+        exchange.receive(m.ParamValue("A", to_wire(told, INT32, True), 6, 1, 0xFFFF), 1.0 + number)
+        done.append(exchange.done)
+    assert done == [False, False, False, True]
+    assert value(exchange.result()["A"]) == 4
+
+
 def test_a_refusal_is_told_in_words() -> None:
     vehicle = FakeVehicle([])
     vehicle.refuses = True

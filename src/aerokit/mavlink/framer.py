@@ -307,6 +307,6 @@ class Framer:
 
 def _earliest(hold: int, unknown: int, here: int) -> int:
     """Where what is kept begins when something likely begins here: at what began before, if that is not settled."""
-    if unknown >= 0 and (hold < 0 or unknown < hold):
+    if unknown >= 0:  # before `hold`: it is none when something is held already
         return unknown
     return here if hold < 0 else hold
