@@ -49,9 +49,8 @@ def main() -> int:
                 verdict = "explained"
             counts[verdict] += 1
             took = time.monotonic() - begin
-            _say(
-                f"{number:4} {verdict:9} {took:4.0f} s {len(tests):4} tests  {mutation.path}:{mutation.lines[0]}  {by[:150]}"
-            )
+            where = f"{mutation.path}:{mutation.lines[0]}"
+            _say(f"{number:4} {verdict:9} {took:4.0f} s {len(tests):4} tests  {where}  {by[:150]}")
             if verdict != NOTICED or options.verbose:
                 _say(f"       - {old}\n       + {new}")
     judged = sum(counts.values()) - counts["explained"]
