@@ -62,6 +62,16 @@ def test_what_is_shown_of_a_class_are_its_fields_before_and_after_the_first_valu
     Late(1.0, "a")
     assert str(inspect.signature(Late)) == shown
     assert str(inspect.signature(HeardAgain)) == "(at, text, loudness=1.0)"
+    assert str(inspect.signature(Snapshot)) == "()"
+
+    class OwnWay(Late):
+        """Made of something else."""
+
+        def __init__(self, text: str) -> None:
+            super().__init__(0.0, text)
+
+    assert str(inspect.signature(OwnWay)) == "(text: 'str') -> 'None'"
+    assert OwnWay("a").text == "a"
 
 
 def test_it_cannot_be_changed_and_has_no_other_attributes() -> None:

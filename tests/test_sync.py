@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from typing import Any
 
@@ -440,3 +441,30 @@ def test_an_exception_in_flight_says_what_the_vehicle_does(caplog: pytest.LogCap
         vehicle.take_off(5)
         raise KeyboardInterrupt
     assert "vehicle 1 is let go: in GUIDED, still armed, " in caplog.text
+
+
+# --------------------------------------------------------------------------- parts that are read first
+
+
+def test_a_part_may_be_read_first_by_a_predicate(vehicle: aerokit.sync.Vehicle) -> None:
+    """Which runs on the loop's thread, while another thread reads it first, too."""
+    entered = threading.Event()
+
+    def looks(_: object) -> bool:
+        entered.set()
+        return vehicle.mission.current.latest != 99 and vehicle.gimbal.attitude.latest is None
+
+    with ThreadPoolExecutor(1) as threads:
+        waiting = threads.submit(vehicle.position.wait_until, looks, timeout=60)
+        assert entered.wait(60)
+        assert vehicle.mission is vehicle.mission
+        waiting.result()
+
+
+def test_parts_that_are_read_first_after_the_end_know_nothing(copter: SimulatedCopter) -> None:
+    with served([copter]) as address, aerokit.sync.connect(address) as vehicle:
+        pass
+    assert len(vehicle.parameters.table) == 0
+    assert (vehicle.mission.current.latest, vehicle.gimbal.attitude.latest) == (None, None)
+    with pytest.raises(errors.ConnectionClosed):
+        vehicle.fence.download()

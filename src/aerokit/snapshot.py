@@ -44,9 +44,13 @@ class _SnapshotType(type):
     @property
     def __signature__(cls) -> Signature:
         """What editors and notebooks show of a class before the first value of it is made."""
-        from inspect import signature
+        from inspect import Signature, signature
 
-        return signature(_written_init(cls).__get__(object()))
+        init: Any = getattr(cls, "__init__")  # noqa: B009 - mypy calls the plain access unsound
+        if init is object.__init__:
+            return Signature()
+        to_be_written = getattr(init, "of", None)
+        return signature((init if to_be_written is None else _written_init(to_be_written)).__get__(object()))
 
 
 def _init_later(cls: Any) -> Callable[..., None]:
@@ -57,6 +61,7 @@ def _init_later(cls: Any) -> Callable[..., None]:
         type.__setattr__(cls, "__init__", init)
         init(self, *args, **kwargs)
 
+    setattr(write_and_call, "of", cls)  # noqa: B010 - a plain assignment looks wrong to the type checker
     return write_and_call
 
 

@@ -353,7 +353,7 @@ def test_connecting_waits_for_the_first_values(address: str, monkeypatch: pytest
 def test_connecting_does_not_wait_for_what_does_not_come(
     address: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(vehicle_module, "FIRST_VALUES", ("attitude", "what this vehicle never tells"))
+    monkeypatch.setattr(vehicle_module, "FIRST_VALUES", ("attitude", "heading", "what it never tells"))
     monkeypatch.setattr(vehicle_module, "FIRST_VALUES_S", 1e6)
     monkeypatch.setattr(vehicle_module, "NO_MORE_S", 0.05)
     dronekit.connect(address).close()

@@ -44,6 +44,51 @@ def test_systems_are_kept_apart() -> None:
     assert (len(one), len(two)) == (0, 1)
 
 
+def test_what_is_made_for_the_first_message_gets_it_once() -> None:
+    bus, heard, made = Bus(), list[Message](), list[object]()
+
+    def make() -> None:
+        if not made:
+            made.append(bus.attach(Heartbeat, heard.append))
+
+    bus.attach_first([Attitude.ID, Heartbeat.ID], make, system_id=1)
+    bus.deliver(frame(HEARTBEAT, 2))
+    assert not made
+    for _ in range(2):
+        bus.deliver(frame(HEARTBEAT))
+    assert heard == [HEARTBEAT, HEARTBEAT]
+    assert set(bus.wanted) == {Heartbeat.ID}
+
+
+def test_what_another_sink_makes_meanwhile_gets_the_first_message_too() -> None:
+    bus, heard, made = Bus(), list[Message](), list[object]()
+
+    def make(*_: object) -> None:
+        if not made:
+            made.append(bus.attach(Heartbeat, heard.append))
+
+    bus.attach(Heartbeat, make, system_id=1)
+    bus.attach_first([Heartbeat.ID], make, system_id=1)
+    bus.deliver(frame(HEARTBEAT))
+    bus.deliver(frame(HEARTBEAT))
+    assert heard == [HEARTBEAT, HEARTBEAT]
+
+
+def test_what_could_not_be_made_is_made_for_the_next_message(caplog: pytest.LogCaptureFixture) -> None:
+    bus, heard, failures = Bus(), list[Message](), [MemoryError()]
+
+    def make() -> None:
+        if failures:
+            raise failures.pop()
+        bus.attach(Heartbeat, heard.append)
+
+    bus.attach_first([Heartbeat.ID], make)
+    for _ in range(3):
+        bus.deliver(frame(HEARTBEAT))
+    assert heard == [HEARTBEAT, HEARTBEAT]
+    assert len(caplog.records) == 1
+
+
 def test_wanted_is_live_and_shared_with_the_framer() -> None:
     bus, framer = Bus(), Framer()
     framer.wanted = bus.wanted

@@ -15,6 +15,7 @@ from aerokit.autopilots import Mode
 from aerokit.errors import (
     CommandRejected,
     CommandTimeout,
+    ConnectionClosed,
     LocalProtocolError,
     OperationRejected,
     OperationTimeout,
@@ -390,6 +391,80 @@ async def test_a_mode_is_asked_for_as_the_vehicle_knows_it_and_when_it_can(groun
     with vehicle.posted("mode", modes=(guided,)) as order, pytest.raises(CommandRejected):
         await order.set_mode(guided)
     assert len(wire.commands(SET_MODE)) == 4 + MODE_ATTEMPTS
+
+
+@pytest.mark.anyio
+@pytest.mark.parametrize("is_back", [False, True])
+async def test_a_mode_is_not_asked_for_again_into_a_silence_nor_over_a_pilot(is_back: bool) -> None:
+    """That it was too early, the vehicle said before: who has it now only a HEARTBEAT tells."""
+    async with in_the_air() as flight:
+        vehicle, faults = flight.vehicle, flight.copter.faults
+        land = vehicle.autopilot.find_mode("LAND")
+        faults.refuse(SET_MODE, MavResult.TEMPORARILY_REJECTED, times=1)
+        faults.heartbeats_stopped = True
+        await anyio.sleep(8)
+        flight.wire.forget()
+        flight.pilot_takes_over()
+        async with anyio.create_task_group() as tasks:
+
+            async def back() -> None:
+                await anyio.sleep(2)
+                faults.heartbeats_stopped = False
+
+            if is_back:
+                tasks.start_soon(back)
+            with vehicle.posted("mode", "motion", modes=(land,)) as order, pytest.raises(CommandRejected):
+                await order.set_mode(land)
+        assert flight.wire.mode_orders() == [land.custom_mode]
+
+
+@pytest.mark.anyio
+async def test_a_mode_that_is_told_counts_more_than_a_refusal(grounded: Flight) -> None:
+    vehicle, faults = grounded.vehicle, grounded.copter.faults
+    guided = vehicle.autopilot.find_mode("GUIDED")
+    faults.refuse(SET_MODE, MavResult.TEMPORARILY_REJECTED, times=1)
+    async with anyio.create_task_group() as tasks:
+        with vehicle.posted("mode", modes=(guided,)) as order:
+            tasks.start_soon(order.set_mode, guided)
+            await anyio.sleep(0.1)
+            grounded.copter.set_mode(guided.custom_mode)
+            await anyio.sleep(8)
+    assert grounded.wire.mode_orders() == [guided.custom_mode]
+
+
+@pytest.mark.anyio
+@pytest.mark.parametrize("ends", ["the order", "the vehicle", "silence"])
+async def test_what_old_firmware_wants_is_not_sent_after_the_end_nor_into_a_silence(
+    grounded: Flight, ends: str
+) -> None:
+    vehicle, faults = grounded.vehicle, grounded.copter.faults
+    guided = vehicle.autopilot.find_mode("GUIDED")
+    faults.refuse(SET_MODE, MavResult.UNSUPPORTED)
+    if ends == "silence":
+        faults.heartbeats_stopped = True
+        await anyio.sleep(8)
+        with pytest.raises(CommandRejected):
+            await vehicle.set_mode("GUIDED")
+    failed: list[Exception] = []
+    posted = ExitStack()
+    order = posted.enter_context(vehicle.posted("mode", modes=(guided,)))
+
+    async def set_mode() -> None:
+        try:
+            await order.set_mode(guided)
+        except (CommandRejected, ConnectionClosed) as error:
+            failed.append(error)
+
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(set_mode)
+        await anyio.sleep(0.1)
+        if ends == "the order":
+            posted.close()
+        elif ends == "the vehicle":
+            vehicle._talk.close()
+        await anyio.sleep(2)
+    assert failed
+    assert not grounded.wire.all(m.SetMode)
 
 
 @pytest.mark.anyio

@@ -24,6 +24,7 @@ from aerokit.mavlink.enums import (
     MavResult,
     MissionState,
 )
+from aerokit.vehicle.orders.helm import KNOWN_S
 
 if TYPE_CHECKING:
     from aerokit.autopilots import Autopilot, Purpose
@@ -129,7 +130,12 @@ async def go_to(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: 
                 component_id=0,
             )
         except CommandRejected as error:
-            if is_amsl or error.result != MavResult.UNSUPPORTED or order.end:
+            if (
+                is_amsl
+                or error.result != MavResult.UNSUPPORTED
+                or order.end
+                or vehicle.heartbeat_age > KNOWN_S
+            ):
                 raise
             target = (vehicle.system_id, 0, MavFrame.GLOBAL_RELATIVE_ALT_INT, POSITION_ONLY)
             vehicle.send(m.SetPositionTargetGlobalInt(0, *target, latitude, longitude, altitude, *(0.0,) * 8))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from contextlib import asynccontextmanager, nullcontext
@@ -48,8 +49,8 @@ __all__ = ["Vehicle"]
 
 FIRST_VALUES = ("attitude", "location.global_relative_frame", "heading", "gps_0", "battery")
 FIRST_VALUES_S, NO_MORE_S = 1.0, 0.4
-"""So long they are waited for, as long as one comes within the second time after the other: programs that read them as
-soon as they are connected expect values, but not every vehicle has all of them."""
+"""So long they are waited for: programs that read them as soon as they are connected expect values. Not every vehicle
+has all of them: when one has come, the next is not waited for longer than the second time."""
 CONNECT_S = 30.0
 """How long a vehicle is waited for when the program sets no limit."""
 MOST_HZ = 1000.0
@@ -274,7 +275,7 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
     def _dk_wait_for_first_values(self) -> None:
         wanted, ready = set(FIRST_VALUES), self._dk.ready
         now = time.monotonic()
-        end, no_more_at = now + FIRST_VALUES_S, now + NO_MORE_S
+        end, no_more_at = now + FIRST_VALUES_S, math.inf
         while (missing := wanted - ready.names) and now < min(end, no_more_at):
             ready.wait_a_little(wanted, min(end, no_more_at) - now)
             now = time.monotonic()

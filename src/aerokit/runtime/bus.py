@@ -46,6 +46,7 @@ class Bus:
         self._sinks: dict[tuple[int, int], tuple[_Entry, ...]] = {}
         self._plans: dict[int, _Plan] = {}  # system and message id → all sinks, when needed
         self._event_sinks: dict[type[Event], tuple[Sink, ...]] = {}
+        self._running: tuple[_Entry, ...] = ()  # who gets the frame that is being delivered, or was last
 
     def attach(self, message_type: type[Message], sink: Sink, *, system_id: int = EVERY_SYSTEM) -> Detach:
         """Have every ``message_type`` of ``system_id`` (0: of every system) delivered to ``sink``."""
@@ -73,11 +74,12 @@ class Bus:
         """Call ``make()``, once, when the first of these messages comes; what it attaches to that kind gets it."""
 
         def first(frame: Frame) -> None:
-            detach_all()
-            before = self._plan(frame)[1]
+            had_it = self._running  # who else made it meanwhile is not in there
             make()
-            for kind, sink in self._plan(frame)[1]:
-                if (kind, sink) not in before:
+            detach_all()
+            for entry in self._plan(frame)[1]:
+                if entry not in had_it:
+                    kind, sink = entry
                     sink(self.dialect.decode(frame) if kind == MESSAGE else frame)
 
         attached = [self._attach((system_id, each), (FRAME, first)) for each in message_ids]
@@ -99,6 +101,7 @@ class Bus:
             is_read, entries = self._plans[frame.system_id << 24 | frame.message_id]
         except KeyError:
             is_read, entries = self._plan(frame)
+        self._running = entries
         if not is_read:  # nearly always: who takes frames, or both, takes the frame alone
             for _, sink in entries:
                 try:

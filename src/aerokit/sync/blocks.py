@@ -199,6 +199,22 @@ class VehicleTwin(TwinOf["Vehicle"], BlockingBlock):
         super().__init__(loop, held.value)
         self._held, self._owns_loop = held, owns_loop
 
+    def _part(self, name: str, twin: Callable[[LoopThread, Any], T]) -> T:
+        """A part, made on the loop's thread when it is first read. No lock: what runs there may read it, too."""
+        key = f"_part_{name}"
+        if key not in vars(self):
+
+            def read() -> Any:
+                return getattr(self.aio, name)
+
+            try:
+                original = read() if self._loop.is_current else self._loop.call(read)
+            except ConnectionClosed:
+                original = read()  # nothing runs there any more
+            vars(self).setdefault(key, twin(self._loop, original))
+        made: T = vars(self)[key]
+        return made
+
     def close(self) -> None:
         """Let the vehicle go: link, loop and thread end, calls that wait raise ConnectionClosed. Idempotent.
 

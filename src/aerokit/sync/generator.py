@@ -118,7 +118,9 @@ class Page:
         if name in twin.called:
             read = f"self._loop.call(lambda: {read})"
         wrapped = self.returned(read, member.returns)
-        decorator = "property" if wrapped == read else "cached_property"
+        if name in twin.parts:
+            wrapped = f'self._part("{name}", {_outer(member.returns)})'
+        decorator = "property" if wrapped == read or name in twin.parts else "cached_property"
         if member.returns is None:
             raise ValueError(f"the type of {twin.name}.{name} is not annotated")
         kind = ast.unparse(member.returns)

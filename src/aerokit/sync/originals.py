@@ -22,7 +22,8 @@ class Twin:
     """One class to be made: ``base`` is what is written by hand for it, in ``blocks.py``.
 
     ``only``: these members alone; ``without``: all but these. ``direct``: methods that only read, and are called on
-    the thread of the program; ``called``: properties that are read on the loop.
+    the thread of the program; ``called``: properties that are read on the loop; ``parts``: those that are made
+    there when they are first read.
     """
 
     path: str
@@ -31,6 +32,7 @@ class Twin:
     without: frozenset[str] = frozenset()
     direct: frozenset[str] = frozenset()
     called: frozenset[str] = frozenset()
+    parts: frozenset[str] = frozenset()
     parameter: str = ""
 
     @property
@@ -82,7 +84,7 @@ TWINS = (
         "VehicleTwin",
         without=_names("telemetry"),
         direct=_names("distance_to describe_now"),
-        called=_names("guided gimbal files logs parameters mission fence rally"),
+        parts=_names("guided gimbal files logs parameters mission fence rally"),
     ),
 )
 """The classes that programs without ``async`` use, each below those that it gives."""

@@ -587,8 +587,9 @@ class PostedOrder(TwinOf["AsyncPostedOrder"]):
     def set_mode(self, mode: Mode, *, timeout: float=5.0, component_id: int | None=None) -> None:
         """Order a mode, and wait until HEARTBEAT tells the order's effect.
 
-        Sends MAV_CMD_DO_SET_MODE, and SET_MODE to a vehicle that does not know that command. As long as the order
-        stands it is asked again where the vehicle says that it is too early, as PX4 does while it checks a mission.
+        Sends MAV_CMD_DO_SET_MODE, and SET_MODE to a vehicle that does not know that command. Where the vehicle says
+        that it is too early, as PX4 does while it checks a mission, it is asked again when a HEARTBEAT that has come
+        since says that the order still stands.
 
         Args:
             mode: one of those that the order was posted with; its ``base_mode`` is sent with it.
@@ -1606,7 +1607,8 @@ class Vehicle(VehicleTwin):
     """One vehicle. Coroutines talk to it, properties never do; everything has a deadline and can be cancelled.
 
     Made by :func:`aerokit.connect`. State is in cells (``vehicle.position.value``, ``.age``, ``.fresh(within=1)``,
-    ``await vehicle.mode.wait_until(...)``), SI units and degrees, the unit in the name.
+    ``await vehicle.mode.wait_until(...)``), SI units and degrees, the unit in the name. Other threads may read the
+    cells; the parts (``mission``, ``parameters`` …) are made when they are first used, on the loop's thread.
     """
 
     @cached_property
@@ -2364,45 +2366,45 @@ class Vehicle(VehicleTwin):
         """
         self._loop.run(self.aio.return_to_launch, timeout=timeout, max_silence_s=max_silence_s)
 
-    @cached_property
+    @property
     def guided(self) -> Guided:
         """Set-point streams: velocity, position, acceleration, attitude."""
-        return Guided(self._loop, self._loop.call(lambda: self.aio.guided))
+        return self._part("guided", Guided)
 
-    @cached_property
+    @property
     def gimbal(self) -> Gimbal:
         """The gimbal: where it points, and orders to it."""
-        return Gimbal(self._loop, self._loop.call(lambda: self.aio.gimbal))
+        return self._part("gimbal", Gimbal)
 
-    @cached_property
+    @property
     def files(self) -> Files:
         """The files on it, by MAVFTP."""
-        return Files(self._loop, self._loop.call(lambda: self.aio.files))
+        return self._part("files", Files)
 
-    @cached_property
+    @property
     def logs(self) -> Logs:
         """Its flight logs."""
-        return Logs(self._loop, self._loop.call(lambda: self.aio.logs))
+        return self._part("logs", Logs)
 
-    @cached_property
+    @property
     def parameters(self) -> Parameters:
         """The autopilot's parameters: download, get, set, transactions, what was changed."""
-        return Parameters(self._loop, self._loop.call(lambda: self.aio.parameters))
+        return self._part("parameters", Parameters)
 
-    @cached_property
+    @property
     def mission(self) -> MissionControl:
         """The mission it holds: upload, download, start, pause, wait until it is finished."""
-        return MissionControl(self._loop, self._loop.call(lambda: self.aio.mission))
+        return self._part("mission", MissionControl)
 
-    @cached_property
+    @property
     def fence(self) -> FenceControl:
         """The fence it holds."""
-        return FenceControl(self._loop, self._loop.call(lambda: self.aio.fence))
+        return self._part("fence", FenceControl)
 
-    @cached_property
+    @property
     def rally(self) -> RallyControl:
         """The rally points it holds."""
-        return RallyControl(self._loop, self._loop.call(lambda: self.aio.rally))
+        return self._part("rally", RallyControl)
 
     def setup_signing(self, signing: Signing | None, *, timeout: float=5.0) -> None:
         """Give the vehicle a key (SETUP_SIGNING), and sign and check with it from then on; None takes the key away.

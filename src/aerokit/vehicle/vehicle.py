@@ -39,7 +39,8 @@ class Vehicle(FlightActions, TravelActions, LookActions, ArmingActions, ModeActi
     """One vehicle. Coroutines talk to it, properties never do; everything has a deadline and can be cancelled.
 
     Made by :func:`aerokit.connect`. State is in cells (``vehicle.position.value``, ``.age``, ``.fresh(within=1)``,
-    ``await vehicle.mode.wait_until(...)``), SI units and degrees, the unit in the name.
+    ``await vehicle.mode.wait_until(...)``), SI units and degrees, the unit in the name. Other threads may read the
+    cells; the parts (``mission``, ``parameters`` …) are made when they are first used, on the loop's thread.
     """
 
     def __init__(self, bridge: Bridge) -> None:

@@ -103,7 +103,9 @@ class Orders:
             if error.result != MavResult.UNSUPPORTED:
                 raise
             self.raise_if_over(order)
-            self._talk.connection.send(self._talk.autopilot.mode_order(wanted).legacy(self._talk.system_id))
+            if not self._helm.is_known:
+                raise
+            self._talk.send(self._talk.autopilot.mode_order(wanted).legacy(self._talk.system_id))
 
     async def await_mode(
         self,

@@ -12,6 +12,7 @@ from aerokit.errors import CommandRejected, CommandTimeout, LocalProtocolError, 
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.mavlink.messages import SetMode
 from aerokit.protocols.command import command_name, rejection
+from aerokit.vehicle.orders.helm import KNOWN_S
 from aerokit.vehicle.orders.progress import Arrivals
 
 if TYPE_CHECKING:
@@ -90,8 +91,9 @@ class PostedOrder:
     async def set_mode(self, mode: Mode, *, timeout: float = 5.0, component_id: int | None = None) -> None:
         """Order a mode, and wait until HEARTBEAT tells the order's effect.
 
-        Sends MAV_CMD_DO_SET_MODE, and SET_MODE to a vehicle that does not know that command. As long as the order
-        stands it is asked again where the vehicle says that it is too early, as PX4 does while it checks a mission.
+        Sends MAV_CMD_DO_SET_MODE, and SET_MODE to a vehicle that does not know that command. Where the vehicle says
+        that it is too early, as PX4 does while it checks a mission, it is asked again when a HEARTBEAT that has come
+        since says that the order still stands.
 
         Args:
             mode: one of those that the order was posted with; its ``base_mode`` is sent with it.
@@ -111,13 +113,31 @@ class PostedOrder:
                 await self._request_mode(mode, component_id)
                 await self.until_told(timeout)
             except CommandRejected as error:
+                if self._posted.has_worked:
+                    return
                 if error.result != MavResult.TEMPORARILY_REJECTED or not attempts_left:
                     raise
-                await anyio.sleep(ASK_AGAIN_S)
-                if self.end:
+                if not await self._stands(timeout):
                     raise
             else:
                 return
+
+    async def _stands(self, timeout: float) -> bool:
+        """Whether HEARTBEAT comes, and tells that the order still stands: nothing is sent again before that."""
+        answered_at = self._talk.connection.now()
+        await anyio.sleep(ASK_AGAIN_S)
+        with (
+            Arrivals(self._talk, self._talk.telemetry.armed, every_arrival=True) as news,
+            anyio.move_on_after(timeout),
+        ):
+            while self._posted.told_at <= answered_at or not self._is_heard:
+                await news.next(LOOK_S)
+            return not (self.end or self._is_over)
+        return False
+
+    @property
+    def _is_heard(self) -> bool:
+        return self._talk.telemetry.armed.age <= KNOWN_S
 
     async def _request_mode(self, mode: Mode, component_id: int | None) -> None:
         talk = self._talk
@@ -128,7 +148,9 @@ class PostedOrder:
             if error.result != MavResult.UNSUPPORTED or (self.end and not talk.telemetry.is_in(mode)):
                 raise
             if not self.end:
-                talk.connection.send(SetMode(talk.system_id, mode.base_mode, mode.custom_mode))
+                if self._is_over or not self._is_heard:
+                    raise
+                talk.send(SetMode(talk.system_id, mode.base_mode, mode.custom_mode))
 
     async def until_told(self, timeout: float) -> None:
         """Wait until HEARTBEAT tells the order's effect, or that it was there before.
