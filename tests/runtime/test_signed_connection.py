@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from aerokit.errors import (
     OperationTimeout,
 )
 from aerokit.links import memory_link_pair
-from aerokit.mavlink import Frame, FrameEncoder, Framer, Message, read_tlog
+from aerokit.mavlink import Frame, FrameEncoder, Framer, Message, read_tlog, timestamp_file
 from aerokit.mavlink.messages import Attitude, Heartbeat, RadioStatus, SetupSigning
 from aerokit.mavlink.signing import Refusal
 from aerokit.runtime.connection import Connection
@@ -381,3 +381,27 @@ async def test_time_stamps_go_on_with_the_clock_of_the_connection() -> None:
         assert signing.timestamp - before == pytest.approx(60 * 100_000, abs=110_000)
         stamps = [int.from_bytes(frame.signature[1:7], "little") for frame in far.frames]
         assert stamps == sorted(set(stamps))
+
+
+async def test_a_time_stamp_that_is_not_kept_is_told_once_each_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """From the first heartbeat on; we fly on all the same."""
+
+    def full(target: Path, text: str) -> None:
+        raise OSError(28, "No space left on device")
+
+    signing = Signing(KEY, keep=tmp_path / "stamp")
+    async with AsyncExitStack() as stack:
+        for times in (1, 2):
+            with monkeypatch.context() as broken:
+                broken.setattr(timestamp_file, "write_whole", full)
+                if times == 1:
+                    _, far = await stack.enter_async_context(with_far(signing=signing))
+                await anyio.sleep(100)
+                told = [text for text in caplog.messages if "is not kept: [Errno 28]" in text]
+                assert len(told) == times
+            await anyio.sleep(100)
+            assert signing.keep_error is None
+        assert len(far.frames) == pytest.approx(400, abs=2)
+    assert len(caplog.messages) == 2

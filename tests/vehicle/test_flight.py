@@ -644,3 +644,17 @@ async def test_also_when_only_its_height_tells(flying: Flight, monkeypatch: pyte
         CommandRejected, match=r"it is in the air, it seems, 10\.\d m above home: it takes off"
     ):
         await flying.vehicle.take_off(20)
+
+
+@pytest.mark.parametrize(("altitude_m", "is_said"), [(1.5, False), (2.5, True)])
+async def test_more_than_two_metres_up_it_seems_to_fly(
+    grounded: Flight, monkeypatch: pytest.MonkeyPatch, altitude_m: float, is_said: bool
+) -> None:
+    """Of a vehicle that tells no landed state."""
+    await grounded.take_off(altitude_m)
+    cell = StateCell[int]("landed_state", now, "nothing")
+    monkeypatch.setattr(grounded.vehicle.telemetry, "landed_state", cell)
+    grounded.copter.faults.refuse(MavCmd.NAV_TAKEOFF, MavResult.FAILED)
+    with pytest.raises(CommandRejected) as refusal:
+        await grounded.vehicle.take_off(20)
+    assert (f"in the air, it seems, {altitude_m} m above home" in str(refusal.value)) is is_said

@@ -333,6 +333,17 @@ async def test_the_vehicle_lands_and_disarms(flying: Flight) -> None:
     await stays_quiet(flying)
 
 
+async def test_armed_and_disarmed_while_it_is_open(grounded: Flight) -> None:
+    with pytest.raises(SetpointStreamStopped, match="disarmed"):
+        async with grounded.vehicle.guided.velocity(valid_for_s=60.0) as stream:
+            await grounded.vehicle.arm()
+            await anyio.sleep(3.0)
+            assert stream.is_running
+            grounded.copter.arming.disarm()
+            await stream.fly(VelocitySetpoint(), 3.0)
+    await stays_quiet(grounded)
+
+
 async def test_the_connection_is_lost(flying: Flight) -> None:
     with pytest.raises(SetpointStreamStopped, match="cable was pulled out") as caught:
         async with flying.vehicle.guided.velocity() as stream:
@@ -428,6 +439,7 @@ async def test_wrong_setpoints_are_refused_before_anything_is_sent(flying: Fligh
     guided = flying.vehicle.guided
     for stream in (
         guided.velocity(VelocitySetpoint(math.nan)),
+        guided.velocity(VelocitySetpoint(1e39)),  # finite, and no float of MAVLink
         guided.velocity(VelocitySetpoint(1.0, yaw_deg=1.0, yaw_rate_deg_s=1.0)),
         guided.acceleration(AccelerationSetpoint(math.inf)),
         guided.local_position(LocalPositionSetpoint(0.0, math.nan, 0.0)),
@@ -445,8 +457,9 @@ async def test_wrong_setpoints_are_refused_before_anything_is_sent(flying: Fligh
 async def test_a_wrong_setpoint_leaves_the_one_before_in_force(flying: Flight) -> None:
     async with flying.vehicle.guided.velocity(valid_for_s=5.0) as stream:
         stream.set(NORTH)
-        with pytest.raises(LocalProtocolError):
-            stream.set(VelocitySetpoint(math.nan))
+        for wrong in (math.nan, 1e39):
+            with pytest.raises(LocalProtocolError):
+                stream.set(VelocitySetpoint(wrong))
         flying.wire.forget()
         await anyio.sleep(1.0)
         assert {each.vx for each in flying.wire.all(m.SetPositionTargetLocalNed)} == {3.0}

@@ -129,7 +129,7 @@ class LogDownload(Transfer[int]):
             self._received += 1
             self._is_streaming = offset + LOG_BLOCK < self._until
         # PX4 sends whole blocks of a log that has grown
-        length = min(message.count, max(0, self._size - offset))
+        length = min(message.count, self._size - offset)
         if into.add(offset, bytes(message.data[:length])):
             self._move(now, into.done, self._size)
         self._requests.answered(offset, now)

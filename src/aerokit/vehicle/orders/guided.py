@@ -186,7 +186,6 @@ class SetpointStream(Generic[SetpointT]):
         self._stopped: SetpointStreamStopped | None = None
         self._was_told = self._was_entered = False
         self._is_entering = False
-        self._was_armed = False
         is_place = isinstance(initial, (PositionSetpoint, LocalPositionSetpoint))
         self._is_costly = is_place and bridge.talk.autopilot.setpoints.place_restarts_path
         self._left, self._sent_at = AT_FIRST, -math.inf
@@ -347,9 +346,6 @@ class SetpointStream(Generic[SetpointT]):
             return f"the vehicle left {self._mode} for {mode}"
         if self._order is not None and self._order.end:
             return self._order.end
-        if self._was_armed and self._talk.telemetry.is_surely_disarmed:
-            return "the vehicle disarmed"
-        self._was_armed = self._was_armed or self._talk.telemetry.is_armed
         return None
 
     def _stop(self, reason: str, *, hold: bool = True) -> None:
