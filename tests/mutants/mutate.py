@@ -26,8 +26,8 @@ GENERATED = ("mavlink/messages", "mavlink/enums")
 EQUIVALENT = Path(__file__).with_name("equivalent.json")
 GOAL = 0.9
 NO_SUCH_TEST = "ERROR: not found"
-READS_DEFAULTS = "test_signatures.py"
-"""Looks at all public calls and runs none of their lines."""
+READS_DEFAULTS = ("test_numbers.py", "test_signatures.py")
+"""Look at all calls and constants, and run none of their lines."""
 
 
 def main() -> int:
@@ -137,7 +137,7 @@ def _tests_of(mutation: Mutation, reach: Reach, seconds: float) -> list[str]:
     chosen, left = [], seconds
 
     def distance(test: str) -> tuple[bool, int, bool, float]:
-        reads = mutation.at_import and READS_DEFAULTS in test
+        reads = mutation.at_import and any(name in test for name in READS_DEFAULTS)
         return not reads, -sum(word in test for word in words), test not in near, reach.seconds[test]
 
     tests = set(reach.seconds) if mutation.at_import else reach.tests_of(mutation.path, mutation.lines)
