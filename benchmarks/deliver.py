@@ -73,7 +73,7 @@ async def _in_turns(
 
 async def _async_for(frames: list[bytes], pieces: list[bytes]) -> float:
     kinds = {STANDARD[Frame.parse(raw).message_id] for raw in frames}
-    seen = 0
+    seen, taken = 0, 0.0
 
     async def read(subscription: Any) -> None:
         nonlocal seen

@@ -273,7 +273,7 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
         return f"the vehicle is {'armed' if self._armed else 'disarmed'}, in {self._flightmode}"
 
     def _dk_wait_for_first_values(self) -> None:
-        wanted, ready = set(FIRST_VALUES), self._dk.ready
+        wanted, ready = set[str](FIRST_VALUES), self._dk.ready
         now = time.monotonic()
         end, no_more_at = now + FIRST_VALUES_S, math.inf
         while (missing := wanted - ready.names) and now < min(end, no_more_at):

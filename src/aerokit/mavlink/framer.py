@@ -127,7 +127,7 @@ class Framer:
         extras, sources, wanted = self._extras, self._sources, self.wanted
         frames: list[Frame] = []
         out_of_order: list[tuple[int, int, int]] | None = None
-        begin = end = checksum = 0
+        begin = end = flags = checksum = 0
         body = b""
         while begin < size:
             try:
