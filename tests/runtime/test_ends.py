@@ -221,6 +221,14 @@ async def test_a_mistake_inside_ends_the_connection_and_says_so(
             vehicle.send(COPTER)
 
 
+async def test_an_error_of_our_own_kind_that_nobody_catches_ends_it_too(link: MemoryLink) -> None:
+    """Only once it has ended is such an error what a task was told of that."""
+    async with connect(link) as vehicle:
+        vehicle.connection.fail(LocalProtocolError("from a task"))
+        with pytest.raises(ConnectionClosed, match="from a task"):
+            vehicle.send(COPTER)
+
+
 # ---------------------------------------------------------------------------- closing
 
 

@@ -184,3 +184,16 @@ def test_empty_texts(text: str) -> None:
 
 def test_the_standard_dialect_knows_the_message() -> None:
     assert STANDARD[253] is Statustext
+
+
+def test_another_text_with_the_last_number_is_no_repetition_nor_is_the_same_text_further_back() -> None:
+    """Only the last chunk once more is a frame that came by another way."""
+    texts = StatusTextAssembler()
+    first, second, other = chunks("a" * 50 + "b" * 50 + "c")[:2] + chunks("a" * 50 + "d" * 50)[1:2]
+    assert [text for each in (first, second, second) for text in texts.receive(each, 0.0)] == []
+    cut = texts.receive(other, 1.0)
+    assert [text.text.startswith("a" * 50 + "b" * 50) for text in cut] == [True]
+    texts = StatusTextAssembler()
+    same = chunks("a" * 50 + "a" * 50 + "c")
+    assert [text for each in same[:2] for text in texts.receive(each, 0.0)] == []
+    assert len(texts.receive(same[0], 1.0)) == 1
