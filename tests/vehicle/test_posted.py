@@ -419,6 +419,17 @@ async def test_a_mode_is_not_asked_for_again_into_a_silence_nor_over_a_pilot(is_
 
 
 @pytest.mark.anyio
+async def test_what_was_ordered_before_a_reboot_is_not_meant_after_it(grounded: Flight) -> None:
+    vehicle = grounded.vehicle
+    guided = vehicle.autopilot.find_mode("GUIDED")
+    with vehicle.posted("mode", modes=(guided,)) as order:
+        assert not order.end
+        grounded.copter.reboot(2.0)
+        await anyio.sleep(12)
+        assert order.end == "the vehicle rebooted"
+
+
+@pytest.mark.anyio
 async def test_a_mode_that_is_told_counts_more_than_a_refusal(grounded: Flight) -> None:
     vehicle, faults = grounded.vehicle, grounded.copter.faults
     guided = vehicle.autopilot.find_mode("GUIDED")
