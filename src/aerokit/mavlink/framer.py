@@ -94,7 +94,7 @@ class Framer:
             # Most datagrams are one good frame, the next one of its sender: a sixth quicker than by the loop.
             magic, length, flags, sequence, key, message_id = _HEADER_V2(data)
             upto = 10 + length
-            end = upto + 15 if flags else upto + 2
+            end = upto + (2 + SIGNATURE_LENGTH if flags else 2)
             if magic == MAGIC_V2 and flags <= SIGNED and end == size:
                 message_id &= 0xFFFFFF
                 try:
@@ -135,10 +135,13 @@ class Framer:
                 if good := magic == MAGIC_V2 and flags <= SIGNED:
                     message_id &= 0xFFFFFF
                     upto = begin + 10 + length
-                    end = upto + 15 if flags else upto + 2
+                    end = upto + 2
                     body = data[begin + 1 : upto]
                     (checksum,) = _CHECKSUM(data, upto)
-                    good = end <= size and x25(body + extras[message_id]) == checksum
+                    good = x25(body + extras[message_id]) == checksum
+                    if flags:
+                        end += SIGNATURE_LENGTH
+                        good = good and end <= size
             except (StructError, KeyError):
                 good, body = False, b""
                 end = sequence = key = message_id = checksum = 0
