@@ -102,6 +102,29 @@ async def test_a_block_far_beyond_the_others_is_not_waited_up_to(grounded: Fligh
         await grounded.vehicle.files.read("/a", patience_s=2.0)
 
 
+async def test_a_file_that_is_shorter_when_it_is_opened_again(grounded: Flight) -> None:
+    """What the vehicle makes up as it is read may be: its size says nothing."""
+    openings = 0
+
+    def shrinks(request: FtpMessage) -> Iterator[FtpMessage]:
+        nonlocal openings
+        if request.opcode == MavFtpOpcode.OPENFILERO:
+            openings += 1
+            yield ack(request, (SIZE if openings == 1 else 500).to_bytes(4, "little"))
+        elif opened(request) is not None:
+            yield ack(request)
+        elif openings == 1 and request.offset < 2000:
+            yield ack(request, b"x" * DATA_SIZE)
+        else:
+            yield nak(request, MavFtpErr.INVALIDSESSION if openings == 1 else MavFtpErr.EOF)
+
+    serve(grounded, shrinks)
+    with pytest.raises(RemoteProtocolError, match="became shorter"):
+        await grounded.vehicle.files.read("/a")
+    openings = 0
+    assert 500 < len(await grounded.vehicle.files.read("@PARAM/param.pck")) < SIZE
+
+
 @pytest.mark.parametrize(("patience_s", "waited_s"), [(2.0, 2.0), (10.0, 3.0)])
 async def test_closing_is_not_waited_for_longer_than_three_seconds_when_there_is_an_error_to_tell(
     grounded: Flight, patience_s: float, waited_s: float

@@ -150,6 +150,14 @@ def test_of_several_earlier_times_the_earliest_has_to_run() -> None:
     assert stage.clock(350, after=0.21) == 1
 
 
+def test_an_earlier_time_that_is_told_twice_runs_from_the_first_time_on() -> None:
+    stage = Watched()
+    stage.clock(100_000)
+    assert stage.clock(50) == 0
+    assert stage.clock(50, after=0.15) == 0
+    assert stage.clock(300, after=0.1) == 1
+
+
 def test_an_earlier_time_that_stands_still_is_no_reboot() -> None:
     stage = Watched()
     stage.clock(100_000)
