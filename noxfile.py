@@ -1,4 +1,4 @@
-"""Sessions: tests (each Python that is there), lint, types, docs, bench and bench_…, clients, demo, and the long ones.
+"""Sessions: tests (each Python that is there), lint, types, docs, release, bench and bench_…, demo, long ones.
 
 `nox -l` lists them.
 """
@@ -14,9 +14,6 @@ nox.options.sessions = ["tests", "lint", "types"]
 nox.options.error_on_missing_interpreters = False
 nox.options.default_venv_backend = "venv"
 
-API = ["aerokit", *(f"aerokit.{name}" for name in (
-    "sync", "vehicle", "runtime", "autopilots", "protocols", "links", "mavlink", "sim", "testing", "geo", "snapshot",
-))]  # fmt: skip
 PYTHONS = [f"3.{minor}" for minor in range(10, 15)]
 
 
@@ -34,13 +31,21 @@ MEETS_OTHERS = (
     "tests/parameters", "tests/testing/test_clock.py",
 )  # fmt: skip
 """The tests of what uses other packages: anyio and its threads, serial ports, geodesy, dialects of pymavlink."""
+OF_EXTRAS = (
+    "tests/convert",
+    "tests/flights",
+    "tests/monitor",
+    "tests/report",
+    "tests/serve",
+    "tests/viewers",
+)
 
 
 @nox.session
 def lowest(session: nox.Session) -> None:
     """Run the tests that meet other packages with the lowest versions that pyproject.toml declares."""
     _install_lowest(session)
-    session.run("pytest", "-q", *(session.posargs or MEETS_OTHERS))
+    session.run("pytest", "-q", *(session.posargs or (*MEETS_OTHERS, *OF_EXTRAS)))
 
 
 @nox.session
@@ -72,14 +77,22 @@ def types(session: nox.Session) -> None:
     session.install("-e", ".[dev]")
     session.run("mypy")
     session.run("pyright", "--pythonpath", f"{session.bin}/python")
+    session.run("pyright", "--ignoreexternal", "--verifytypes", "aerokit")  # of the python in the path
 
 
 @nox.session
 def docs(session: nox.Session) -> None:
-    """Build the API reference into `site/`; `-- aerokit.mavlink.messages` adds the messages, which takes minutes."""
-    session.install("-e", ".[dev]")
-    left_out = [f"!aerokit.mavlink.{name}" for name in ("messages", "enums") if not session.posargs]
-    session.run("pdoc", "-d", "google", "-o", "site", *API, *left_out, *session.posargs)
+    """Build the documentation into `site/`; a warning is an error. `-- serve` shows it while it is written."""
+    session.install("-e", ".[docs]")
+    quiet = {"NO_MKDOCS_2_WARNING": "1"}
+    session.run("mkdocs", *(session.posargs or ("build", "--strict")), env=quiet)
+
+
+@nox.session
+def pictures(session: nox.Session) -> None:
+    """Draw the pictures of the documentation anew: `nox -s pictures -- [NAME …]`."""
+    session.install("-e", ".[all]")
+    session.run("python", "docs/pictures.py", *session.posargs)
 
 
 @nox.session
@@ -115,7 +128,7 @@ def bench_dronekit(session: nox.Session) -> None:
 
 @nox.session
 def bench_scale(session: nox.Session) -> None:
-    """Measure a hundred simulated vehicles with clients, and flights on virtual time. Writes bench-scale.json."""
+    """Measure a hundred simulated vehicles, 1 to 500 clients, flights on virtual time. Writes bench-scale.json."""
     session.install("-e", ".")
     session.run("python", "benchmarks/scale.py", *session.posargs)
 
@@ -150,9 +163,9 @@ def soak(session: nox.Session) -> None:
 
 @nox.session
 def diaries(session: nox.Session) -> None:
-    """Keep what goes over the wire in each test (tests/wire_diary.py), after a change of it that is meant."""
+    """Keep what goes over the wire in each test (tests/wire_diary.py), after a change that is meant (`-- PATH …`)."""
     session.install("-e", ".[test]")
-    session.run("python", "tests/keep_diaries.py")
+    session.run("python", "tests/keep_diaries.py", *session.posargs)
 
 
 @nox.session
@@ -190,6 +203,14 @@ def clients(session: nox.Session) -> None:
     """Let MAVProxy, MAVSDK and pymavlink fly the simulated vehicles, and print the table; three minutes."""
     session.install("-e", ".", "MAVProxy", "mavsdk>=4", "pymavlink", "future")
     session.run("python", "tests/clients/fly.py", *session.posargs)
+    session.run("python", "tests/clients/with_mavsdk_camera.py")
+
+
+@nox.session
+def browser(session: nox.Session) -> None:
+    """Fly by the page of `aerokit serve`, and open a report, in headless Chromium (or AEROKIT_CHROMIUM)."""
+    session.install("-e", ".[test]", "playwright>=1.45")
+    session.run("pytest", "-q", "-n", "0", "tests/browser", "tests/report/test_report.py", *session.posargs)
 
 
 @nox.session
@@ -197,3 +218,34 @@ def demo(session: nox.Session) -> None:
     """Fly the demonstration; `nox -s demo -- --connect ADDRESS` flies any vehicle."""
     session.install("-e", ".")
     session.run("aerokit", "demo", *session.posargs)
+
+
+@nox.session
+def release(session: nox.Session) -> None:
+    """Build the wheel and the sdist into `dist/`, check them, and fly the demo from the wheel in an empty environment.
+
+    Publishing is a step of its own, by hand: `twine upload dist/*`.
+    """
+    session.install("build>=1.2", "twine>=6")
+    shutil.rmtree("dist", ignore_errors=True)
+    session.run("python", "-m", "build", "--outdir", "dist")
+    (wheel,), (sdist,) = Path("dist").glob("*.whl"), Path("dist").glob("*.tar.gz")
+    session.run("twine", "check", "--strict", str(wheel), str(sdist))
+    empty = Path(session.create_tmp()).resolve() / "empty"
+    shutil.rmtree(empty, ignore_errors=True)
+    session.run("python", "-m", "venv", str(empty))
+    aerokit = str(empty / "bin" / "aerokit")
+    installed = f"aerokit-mavlink @ {wheel.resolve().as_uri()}"
+    session.run(str(empty / "bin" / "pip"), "install", "-q", installed, external=True)
+    with session.chdir(empty):  # nothing of the clone is in reach there
+        session.run(aerokit, "--version", external=True)
+        session.run(aerokit, "demo", "--speedup", "20", external=True)
+        session.run(
+            aerokit, "report", "demo.tlog", external=True, success_codes=[7]
+        )  # it says what is missing
+        session.run(
+            str(empty / "bin" / "pip"), "install", "-q", installed.replace(" @", "[all] @"), external=True
+        )
+        session.run(aerokit, "report", "demo.tlog", external=True)
+        session.run(aerokit, "convert", "demo.tlog", "flight.gpx", external=True)
+        session.run(aerokit, "serve", "--help", external=True, silent=True)

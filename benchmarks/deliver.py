@@ -29,7 +29,7 @@ import aerokit
 from aerokit.links.base import BaseLink
 from aerokit.mavlink import STANDARD, Frame
 
-__all__ = ["rows"]
+__all__ = ["FedLink", "rows"]
 
 AUTOPILOT = (1, 1)
 FLIGHT = next(iter(decode.RECORDINGS))
@@ -81,7 +81,7 @@ async def _async_for(frames: list[bytes], pieces: list[bytes]) -> float:
             seen += 1
 
     async with (
-        aerokit.open_connection(_FedLink("recording")) as connection,
+        aerokit.open_connection(FedLink("recording")) as connection,
         anyio.create_task_group() as group,
     ):
         with connection.subscribe(*kinds, capacity=1000) as subscription:
@@ -99,7 +99,7 @@ async def _async_for(frames: list[bytes], pieces: list[bytes]) -> float:
 
 
 async def _telemetry(frames: list[bytes], pieces: list[bytes]) -> float:
-    link = _FedLink("recording")
+    link = FedLink("recording")
     async with aerokit.open_connection(link) as connection:
         for raw in frames:
             connection.bytes_received(raw, None)
@@ -130,7 +130,7 @@ def _rate(count: int, pieces: list[bytes], feed: Callable[[bytes], None]) -> flo
     return count / (time.process_time() - started)
 
 
-class _FedLink(BaseLink):
+class FedLink(BaseLink):
     """A link whose bytes the benchmark brings; what is sent is thrown away."""
 
     async def _connect(self) -> None:
@@ -140,7 +140,7 @@ class _FedLink(BaseLink):
         pass
 
     def write(self, data: bytes, peer: object = None) -> None:
-        pass
+        """Nobody is there."""
 
 
 if __name__ == "__main__":

@@ -1,12 +1,13 @@
 """How much of a core a hundred simulated vehicles take, and how long a flight takes on virtual time.
 
-    python benchmarks/scale.py                        # everything, two minutes; writes bench-scale.json
-    python benchmarks/scale.py copter_hundred         # these rows only
+    python benchmarks/scale.py                        # everything, four minutes; writes bench-scale.json
+    python benchmarks/scale.py copter_hundred         # these only
     python benchmarks/scale.py --quick                # few and short: does it run? The figures mean little
 
 ``…_hundred``: 100 vehicles that hover and a client of each, all on one link in memory in one process, in real time,
 with what a client watches at 4 Hz; processor time as a share of one core, and how much of it the vehicles took.
 ``…_flight``: wall time of ten minutes on virtual time, client included: arming, take-off, a mission, the ground.
+``clients``: 1 to 500 clients without simulated vehicles, see ``client_scale.py``.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import Any
 
+import client_scale
 import table
 from table import Row, row
 
@@ -35,7 +37,7 @@ from aerokit.sim import SimulatedCopter, SimulatedPx4, SimulatedVehicle, Simulat
 from aerokit.testing import run_virtual
 from aerokit.vehicle.state.states import DEFAULT_RATES_HZ
 
-NAMES = ("copter_hundred", "px4_hundred", "copter_flight", "px4_flight")
+NAMES = ("copter_hundred", "px4_hundred", "copter_flight", "px4_flight", "clients")
 RATES: Mapping[type[Message], float] = {getattr(messages, name): 4.0 for name in DEFAULT_RATES_HZ}
 HEARTBEAT = messages.Heartbeat(6, 8, 0, 0, 4, 3)
 FLIGHT_S = 600.0
@@ -49,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     wanted = options.names or NAMES
     if not set(wanted) <= set(NAMES):
         parser.error(f"the names are {', '.join(NAMES)}")
-    rows = [_measured(name, options.quick) for name in wanted]
+    rows = [each for name in wanted for each in _measured(name, options.quick)]
     print(table.printed(rows))
     for each in rows:
         print(f"{each['name']}: {each['note']}")
@@ -59,12 +61,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _measured(name: str, quick: bool) -> Row:
+def _measured(name: str, quick: bool) -> list[Row]:
     kind, _, what = name.partition("_")
     print(f"measuring {name} …", file=sys.stderr, flush=True)
     if what == "hundred":
-        return _hundred(name, kind, 5 if quick else 100, 1 if quick else 3)
-    return _flight(name, kind, FLIGHT_S / 10 if quick else FLIGHT_S, 1 if quick else 5)
+        return [_hundred(name, kind, 5 if quick else 100, 1 if quick else 3)]
+    if what == "flight":
+        return [_flight(name, kind, FLIGHT_S / 10 if quick else FLIGHT_S, 1 if quick else 5)]
+    return client_scale.rows((1, 3), turns=2, rounds=1) if quick else client_scale.rows()
 
 
 # ------------------------------------------------------------------------------- a hundred of them

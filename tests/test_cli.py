@@ -101,13 +101,13 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_an_address_where_nobody_listens(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    assert main(["demo", "--connect", "tcp:127.0.0.1:1", "--record", str(tmp_path / "flight.tlog")]) == 1
+    assert main(["demo", "--connect", "tcp:127.0.0.1:1", "--record", str(tmp_path / "flight.tlog")]) == 3
     assert "aerokit: cannot open tcp:127.0.0.1:1" in capsys.readouterr().err
 
 
 def test_an_address_that_is_taken(capsys: pytest.CaptureFixture[str]) -> None:
     with served_copter() as address:
-        assert main(["sim", address.replace("tcp:", "tcpin:")]) == 1
+        assert main(["sim", address.replace("tcp:", "tcpin:")]) == 3
     assert capsys.readouterr().err.startswith("aerokit: cannot ")
 
 

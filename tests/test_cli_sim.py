@@ -11,8 +11,8 @@ from recorded import SHORT
 
 from aerokit.cli import main
 from aerokit.cli.places import EACH_ITS_OWN, each_with_its_own, place_of
-from aerokit.cli.vehicles import HOME, simulated_fleet
-from aerokit.sim import SimulatedCopter, SimulatedPx4
+from aerokit.cli.vehicles import simulated_fleet
+from aerokit.sim import HOME, SimulatedCopter, SimulatedPx4
 from aerokit.sim.track import true_point
 
 # ---------------------------------------------------------------------------------------- addresses
@@ -74,7 +74,7 @@ def test_a_fleet_stands_side_by_side() -> None:
     places = [true_point(vehicle) for vehicle in fleet]
     assert [place.latitude_deg for place in places] == pytest.approx([HOME[0]] * 3)
     east = [(place.longitude_deg - places[0].longitude_deg) * 1e7 for place in places]
-    assert east == pytest.approx([0, 1327, 2654], abs=1)  # 1 m is 132.7 times 1e-7 degrees there
+    assert east == pytest.approx([0, 1102, 2203], abs=1)  # 1 m is 110.2 times 1e-7 degrees there
     assert all(isinstance(vehicle, SimulatedPx4) and vehicle.battery.percent == 50 for vehicle in fleet)
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from PIL import Image
 from served_copter import served_copter
 
 from aerokit.sim import SimulatedCopter, simulated_link
@@ -41,7 +42,7 @@ AS_PROGRAMS: dict[str, list[str]] = {
     "blocking_messages": ["m/s at", "holding in BRAKE"],
 }
 """Example: what it must print, given an address."""
-ON_THEIR_OWN = {"record_and_replay", "signed_link", "web_server"}
+ON_THEIR_OWN = {"record_and_replay", "signed_link", "survey_photos", "web_server"}
 
 
 def test_every_example_is_run() -> None:
@@ -121,3 +122,17 @@ def test_web_server() -> None:
             server.kill()
     assert state["armed"] is False
     assert state["mode"] == "STABILIZE"
+
+
+def test_survey_photos(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    example = runpy.run_path(str(EXAMPLES / "survey_photos.py"))
+    run_virtual(example["simulated"](str(tmp_path)))
+    pictures = sorted(tmp_path.glob("*.jpg"))
+    assert f"{len(pictures)} pictures are in {tmp_path}" in capsys.readouterr().out
+    lines = (tmp_path / "captures.csv").read_text().splitlines()
+    assert len(lines) == len(pictures) + 1 > 15
+    places = set()
+    for path in pictures:
+        with Image.open(path) as image:
+            places.add(image.getexif().get_ifd(0x8825)[2])
+    assert len(places) > 8

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -25,3 +26,38 @@ def test_import_loads_nothing_before_it_is_asked_for() -> None:
     program = "import sys, aerokit; bare = set(sys.modules); aerokit.connect; print('asyncio' in bare)"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout == "False\n"
+
+
+SOURCE = Path(aerokit.__file__).parent
+
+
+def mixed(folder: Path, init: str | None) -> Path:
+    """What is left when the other project called aerokit is installed, too: before ours (None) or after it."""
+    package = folder / "aerokit"
+    package.mkdir()
+    for each in SOURCE.iterdir():
+        if each.name not in ("__pycache__", "__init__.py"):
+            (package / each.name).symlink_to(each)
+    (package / "__init__.py").write_text((SOURCE / "__init__.py").read_text() if init is None else init)
+    (package / "aero").mkdir()
+    (package / "aero" / "__init__.py").touch()
+    return folder
+
+
+def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-B", *arguments], capture_output=True, text=True, cwd=folder, check=False
+    )
+
+
+def test_files_of_the_other_aerokit_are_noticed_at_import(tmp_path: Path) -> None:
+    done = run(mixed(tmp_path, None), "-c", "import aerokit; aerokit.Position")
+    assert done.returncode == 0
+    assert "RuntimeWarning: files of another project called aerokit (aerokit.aero)" in done.stderr
+    assert "pip uninstall aerokit aerokit-mavlink" in done.stderr
+
+
+def test_commands_say_so_when_ours_was_overwritten(tmp_path: Path) -> None:
+    done = run(mixed(tmp_path, '__version__ = "1.5.0"\n'), "-m", "aerokit", "sim", "--help")
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.startswith("aerokit: files of another project")

@@ -26,7 +26,7 @@ from aerokit.missions import Fence, FenceCircle, Mission, waypoint
 from aerokit.runtime.cells import StateCell
 from aerokit.runtime.opening import open_connection
 from aerokit.runtime.subscription import Subscription
-from aerokit.sim import SimulatedCopter
+from aerokit.sim import SimulatedCopter, SimulatedGimbal
 from aerokit.sync.generator import FILE, generate
 from aerokit.vehicle.files.files import Files
 from aerokit.vehicle.files.logs import Logs
@@ -425,6 +425,24 @@ def test_two_vehicles_on_one_connection_share_its_thread() -> None:
             assert heartbeats.get(timeout=10)
 
 
+def test_vehicles_are_found_without_async() -> None:
+    with (
+        served([SimulatedCopter(boot_time_s=0.0)]) as address,
+        aerokit.sync.open_connection(address) as connection,
+    ):
+        first = next(iter(connection.vehicles()))
+        for found in connection.vehicles():
+            with aerokit.sync.connect(connection, system_id=found.system_id) as vehicle:
+                assert vehicle.components.value[0].kind == "autopilot"
+                assert vehicle.component(1).kind == "autopilot"
+                assert vehicle.component(1).files.aio is vehicle.files.aio
+            break
+        search = connection.vehicles()
+        assert next(search).system_id == first.system_id
+    with pytest.raises(errors.ConnectionClosed):
+        next(search)
+
+
 def test_the_asynchronous_vehicle_is_in_reach(vehicle: aerokit.sync.Vehicle) -> None:
     assert isinstance(vehicle.aio, aerokit.Vehicle)
     assert inspect.isasyncgenfunction(inspect.unwrap(open_connection))
@@ -468,3 +486,22 @@ def test_parts_that_are_read_first_after_the_end_know_nothing(copter: SimulatedC
     assert (vehicle.mission.current.latest, vehicle.gimbal.attitude.latest) == (None, None)
     with pytest.raises(errors.ConnectionClosed):
         vehicle.fence.download()
+
+
+def test_gimbals_are_found_and_steered() -> None:
+    gimbal = SimulatedGimbal(171)
+    with (
+        served_copter(parameters={"MNT1_TYPE": 1.0}, components=[gimbal]) as address,
+        aerokit.sync.connect(address) as vehicle,
+    ):
+        assert vehicle.gimbals.discover() == (1, 171)
+        assert [each.device_id for each in vehicle.gimbals] == [1, 171]
+        assert len(vehicle.gimbals) == 2
+        with vehicle.gimbals[171].control() as control:
+            vehicle.gimbals[171].point(-20.0, 0.0, frame="vehicle")
+            was_held = control.is_held
+            with vehicle.gimbals[171].rates(rate_hz=50) as rates:
+                rates.turn(-1.0, 0.0, 0.2)
+        assert (was_held, control.is_held) == (True, False)
+        with pytest.raises(errors.NotSupported):
+            vehicle.gimbal.control(secondary=True).__enter__()

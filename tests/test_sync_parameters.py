@@ -11,8 +11,10 @@ import pytest
 from served_copter import served
 
 import aerokit.sync
-from aerokit.errors import ParameterRejected
-from aerokit.sim import SimulatedCopter
+from aerokit.errors import LocalProtocolError, ParameterRejected
+from aerokit.events import SettingChanged
+from aerokit.sim import SimulatedCamera, SimulatedCopter
+from aerokit.sync.twins import Settings
 
 
 @pytest.fixture
@@ -76,3 +78,24 @@ def test_ctrl_c_while_values_are_put_back_waits_for_it(
         interrupt.start()
     radio.join()
     assert copter.parameters["RTL_ALT"] == 1500
+
+
+def test_settings_of_a_camera() -> None:
+    camera = SimulatedCamera()
+    with (
+        served([SimulatedCopter(boot_time_s=0.0, components=[camera])]) as address,
+        aerokit.sync.connect(address) as vehicle,
+    ):
+        settings = vehicle.component(100).settings
+        assert isinstance(settings, Settings)
+        assert settings.fetch_definition().model == "Simulated camera"
+        assert len(settings.download()) == len(settings.table) == 12
+        assert settings.set("CAM_WBMODE", "Sunny").value == settings.get("CAM_WBMODE") == 4
+        assert settings.options("CAM_WBMODE") == {"Auto": 0, "Sunny": 4, "Cloudy": 5}
+        assert settings.excluded_by("CAM_ISO") == ("CAM_EXPMODE = Auto",)
+        with pytest.raises(LocalProtocolError, match="excluded by"):
+            settings.set("CAM_ISO", 400)
+        with vehicle.subscribe(SettingChanged, capacity=4) as changes:
+            settings.set("CAM_OWNER", "me")
+            assert changes.get(timeout=5).after == "me"
+        assert vehicle.component(100).files.read("/camera_definition.xml").startswith(b"<?xml")

@@ -45,6 +45,9 @@ WRONG: dict[str, tuple[object, ...]] = {
     "bool": (*NOTHING, *STRANGE, "no", 2),
     "str": (*NOTHING, *STRANGE, *NUMBER, b"text"),
     "bytes": (*NOTHING, *STRANGE, *TEXT, *NUMBER),
+    "str | None": (*STRANGE, *NUMBER, b"text"),
+    "float | str | bytes": (*NOTHING, *STRANGE, Decimal(1)),
+    "CameraDefinition | str | os.PathLike[str]": (*NOTHING, *STRANGE, *NUMBER),
     "str | int | None": (*STRANGE, 1.5, b"GUIDED"),
     "str | int": (*NOTHING, *STRANGE, 1.5, b"GUIDED"),
     "str | os.PathLike[str]": (*NOTHING, *STRANGE, *NUMBER),
@@ -84,7 +87,18 @@ WRONG["type[ItemT]"] = WRONG["type[MessageT]"] = WRONG["type[Message]"]
 for _setpoint in ("Velocity", "BodyVelocity", "Acceleration", "LocalPosition", "Position", "Attitude"):
     WRONG[f"{_setpoint}Setpoint"] = (*NOTHING, *STRANGE, *TEXT, *NUMBER, PLACE)
 WRONG["CacheChoice"] = (*NOTHING, *STRANGE, *NUMBER)
-for _literal in ("DownloadMethod", "UploadMethod", "PlanMethod", "LogMethod", "Overflow", "Subject"):
+WRONG["Capture"] = (*NOTHING, *STRANGE, *TEXT, *NUMBER)
+for _literal in (
+    "ModeName",
+    "AutoFocus",
+    "SourceName",
+    "DownloadMethod",
+    "UploadMethod",
+    "PlanMethod",
+    "LogMethod",
+    "Overflow",
+    "Subject",
+):
     WRONG[_literal] = (*STRANGE, *NUMBER, "quick")
 
 RIGHT: dict[str, object] = {
@@ -93,8 +107,10 @@ RIGHT: dict[str, object] = {
     "bool": False,
     "str": "A",
     "bytes": b"",
+    "float | str | bytes": 1.0,
     "str | int": "GUIDED",
     "str | os.PathLike[str]": "/nowhere/at/all",
+    "CameraDefinition | str | os.PathLike[str]": "/nowhere/at/all",
     "str | Link": "udpin:127.0.0.1:0",
     "str | Link | Connection": "udpin:127.0.0.1:0",
     "Position": PLACE,
@@ -110,6 +126,8 @@ RIGHT: dict[str, object] = {
     "Signing | None": None,
     **{kind.__name__: kind() for kind in (Mission, Fence, RallyPoints)},
     "PlanT": Mission(),
+    "SourceName": "rgb",
+    "ModeName": "photo",
     "SetpointT": VelocitySetpoint(),
     "PositionSetpoint": PositionSetpoint(PLACE),
     "LocalPositionSetpoint": LocalPositionSetpoint(0, 0, -5),

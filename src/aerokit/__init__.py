@@ -16,11 +16,14 @@ asyncio.run(main())
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from aerokit.installed import complaint
 from aerokit.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from aerokit import errors, events
     from aerokit.mavlink import enums, messages
     from aerokit.mavlink.dialect import Dialect
@@ -87,4 +90,11 @@ _HOMES = {
     "open_connection": "aerokit.runtime.opening",
 }
 
+if (_mixed := complaint(__path__[0])) is not None:
+    import warnings
+
+    warnings.warn(_mixed, RuntimeWarning, stacklevel=2)
+
+__getattr__: Callable[[str], Any]
+__dir__: Callable[[], list[str]]
 __getattr__, __dir__ = lazy_names(__name__, _HOMES, __all__)

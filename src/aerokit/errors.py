@@ -12,6 +12,7 @@ __all__ = [
     "FileError",
     "FileFormatError",
     "FileTimeout",
+    "GimbalTaken",
     "HeartbeatTimeout",
     "LinkError",
     "LinkLost",
@@ -190,6 +191,15 @@ class FileError(OperationRejected):
 
 class NotSupported(OperationRejected):
     """This vehicle cannot do that; nothing was sent."""
+
+
+class GimbalTaken(OperationRejected):
+    """Control of a gimbal was lost to ``system_id`` and ``component_id``; zeros: nobody has it now."""
+
+    def __init__(self, message: str, *, system_id: int, component_id: int) -> None:
+        super().__init__(message)
+        self.system_id = system_id
+        self.component_id = component_id
 
 
 class SetpointStreamStopped(OperationRejected):

@@ -1,4 +1,4 @@
-"""``write_whole``: a text file that appears whole or not at all; ``read_bounded``: one that is not too long."""
+"""``write_whole``: a text file that appears whole or not at all; ``read_bounded``, ``unpacked``: not too long a one."""
 
 from __future__ import annotations
 
@@ -7,18 +7,24 @@ from pathlib import Path
 
 from aerokit.errors import FileFormatError
 
-__all__ = ["LARGEST_FILE", "read_bounded", "too_large", "write_whole"]
+__all__ = ["LARGEST_FILE", "read_bounded", "too_large", "unpacked", "write_whole"]
 
 LARGEST_FILE = 16 << 20
 """Bytes of the largest file of parameters, metadata, plans or definitions that is read; real ones have 5 MB at most."""
+
+_XZ = b"\xfd7zXZ\x00"
+_MOST_MEMORY = 128 << 20  # xz -9 takes 65 MB
 
 
 def write_whole(path: str | os.PathLike[str], text: str) -> None:
     """Write a file, UTF-8 and with Unix line ends; what was there before stays when that goes wrong (OSError)."""
     target = Path(path)
     part = target.with_name(target.name + ".part")
+    part.unlink(
+        missing_ok=True
+    )  # what was left, or a link to a file of somebody's, through which we would write
     try:
-        with part.open("w", encoding="utf-8", newline="\n") as file:
+        with part.open("x", encoding="utf-8", newline="\n") as file:
             file.write(text)
             file.flush()
             os.fsync(file.fileno())  # else a power cut may leave the new name with nothing in it
@@ -39,3 +45,24 @@ def read_bounded(path: str | os.PathLike[str]) -> bytes:
 def too_large(name: str) -> FileFormatError:
     """The complaint about a file beyond :data:`LARGEST_FILE`."""
     return FileFormatError(f"{name} has more than {LARGEST_FILE >> 20} MB: that is no such file")
+
+
+def unpacked(data: bytes, name: str) -> bytes:
+    """What an ``.xz`` file holds, and other bytes as they are.
+
+    FileFormatError, which begins with ``name``, when it is damaged or holds more than :data:`LARGEST_FILE`.
+    """
+    if not data.startswith(_XZ):
+        return data
+    import lzma  # some builds of Python are without it
+
+    unpacker = lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=_MOST_MEMORY)
+    try:
+        found = unpacker.decompress(data, LARGEST_FILE + 1)
+    except lzma.LZMAError as error:
+        raise FileFormatError(f"{name} is damaged: {error}") from None
+    if len(found) > LARGEST_FILE:
+        raise too_large(name)
+    if not unpacker.eof:
+        raise FileFormatError(f"{name} is damaged: it is cut off")
+    return found

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-__all__ = ["did_you_mean", "one", "shown"]
+__all__ = ["did_you_mean", "in_words", "one", "shown"]
 
 _LONGEST = 100
 
@@ -16,6 +16,14 @@ def shown(value: object) -> str:
     except Exception:  # whatever a stranger's class does
         text = f"<{type(value).__name__}>"
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
+
+
+def in_words(value: object) -> str:
+    """A value of an event for people: the name of an enumeration's member, three digits or so of a number."""
+    if isinstance(value, float):
+        return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+    name = getattr(value, "name", None)
+    return name if isinstance(name, str) else str(value)
 
 
 def one(kind: str) -> str:

@@ -9,6 +9,8 @@ from typing import Any
 
 from call_stage import Stage
 from call_table import CALLS, KEY
+from camera_calls import BLOCKING
+from component_calls import COMPONENTS_BLOCKING
 
 import aerokit.sync
 from aerokit import (
@@ -32,6 +34,12 @@ CLASSES: tuple[type, ...] = (
     twins.Vehicle,
     twins.Guided,
     twins.Gimbal,
+    twins.Component,
+    twins.Settings,
+    twins.Gimbals,
+    twins.GimbalControl,
+    twins.GimbalRates,
+    twins.Camera,
     twins.PostedOrder,
     twins.SetpointStream,
     twins.Parameters,
@@ -165,6 +173,28 @@ def _post_place(stage: Any) -> None:
         order.command_int(MavCmd.DO_REPOSITION, -1, 1, frame=6, x=x, y=y, z=10)
 
 
+def _in_control(do: Callable[[Any], object]) -> Do:
+    def control(stage: Any) -> None:
+        with stage.vehicle.gimbal.control() as block:
+            do(block)
+
+    return control
+
+
+def _until_lost(stage: Any) -> None:
+    """Nobody takes it: the wait is ended by the other thread."""
+    with stage.vehicle.gimbal.control() as block:
+        claim = messages.CommandLong(1, 1, MavCmd.DO_GIMBAL_MANAGER_CONFIGURE, 0, 254, 190, -1, -1, 0, 0, 0)
+        stage.vehicle.send(claim)
+        block.until_lost()
+
+
+def _turn(stage: Any) -> None:
+    with stage.vehicle.gimbal.rates() as stream:
+        stream.set(-1.0, 0.0)
+        stream.turn(-5.0, 5.0, 0.1)
+
+
 def _rate(stage: Any) -> None:
     with stage.vehicle.rate(messages.RawImu, 5.0):
         pass
@@ -176,6 +206,13 @@ def _streams(stage: Any) -> None:
 
 
 WRITTEN: dict[str, Do] = {
+    "Gimbal.control": _in_control(lambda _: None),
+    "GimbalControl.raise_if_taken": _in_control(lambda block: block.raise_if_taken()),
+    "GimbalControl.until_lost": _until_lost,
+    "Gimbal.rates": _turn,
+    "GimbalRates.set": _turn,
+    "GimbalRates.turn": _turn,
+    "Gimbals.get": lambda s: s.vehicle.gimbals.get(1),
     "connect": _connect,
     "open_connection": _open_connection,
     "Vehicle.wait_ready": lambda s: s.vehicle.wait_ready(timeout=0.5),
@@ -228,4 +265,4 @@ WRITTEN: dict[str, Do] = {
 def blocking_calls() -> dict[str, Do]:
     """By name; the rows of the other table that are coroutine functions themselves are not for the twin."""
     shared = {name: call.do for name, call in CALLS.items() if not inspect.iscoroutinefunction(call.do)}
-    return {**shared, **WRITTEN}
+    return {**shared, **WRITTEN, **BLOCKING, **COMPONENTS_BLOCKING}

@@ -14,9 +14,9 @@ from flight_harness import Wire
 import aerokit
 from aerokit import Position, messages
 from aerokit.errors import AerokitError
-from aerokit.mavlink.enums import MavCmd
+from aerokit.mavlink.enums import CameraCapFlags, MavCmd
 from aerokit.missions import Fence, FenceCircle, Mission, RallyPoints, rally_point, waypoint
-from aerokit.sim import SimulatedCopter, SimulatedLog, SimulatedPx4, simulated_link
+from aerokit.sim import SimulatedCamera, SimulatedCopter, SimulatedLog, SimulatedPx4, simulated_link
 
 __all__ = [
     "AUTOPILOTS",
@@ -28,6 +28,7 @@ __all__ = [
     "grounded",
     "on_mission",
     "open_stage",
+    "stage_cameras",
 ]
 
 AUTOPILOTS = ("ardupilot", "px4")
@@ -44,6 +45,8 @@ class Stage:
     wire: Wire
     folder: Path
     """For files of this computer."""
+    camera: SimulatedCamera
+    """The first of its cameras; another one can do nothing."""
     counter: int = field(default=0)
 
     @property
@@ -196,18 +199,31 @@ def _altitude(stage: Stage) -> float:
     return stage.vehicle.position.value.altitude_relative_m or 0.0
 
 
+def stage_cameras() -> list[SimulatedCamera]:
+    """One that can do everything at any time, and one that can do nothing."""
+    both = CameraCapFlags.CAN_CAPTURE_IMAGE_IN_VIDEO_MODE | CameraCapFlags.CAN_CAPTURE_VIDEO_IN_IMAGE_MODE
+    able = SimulatedCamera(
+        capabilities=SimulatedCamera.ALL_CAPABILITIES | both, streams=["rtsp://127.0.0.1/a"]
+    )
+    able.files.put("/DCIM/GIVEN.JPG", DATA)
+    return [able, SimulatedCamera(101, capabilities=CameraCapFlags.HAS_MTI)]
+
+
 @asynccontextmanager
 async def open_stage(autopilot: str, folder: Path) -> AsyncIterator[Stage]:
     """Ready on the ground."""
     simulated: SimulatedCopter | SimulatedPx4
+    cameras = stage_cameras()
     if autopilot == "px4":
-        simulated = SimulatedPx4(boot_time_s=0.0, logs=LOGS)
+        simulated = SimulatedPx4(boot_time_s=0.0, logs=LOGS, components=cameras)
     else:
-        simulated = SimulatedCopter(boot_time_s=0.0, logs=LOGS)
+        simulated = SimulatedCopter(boot_time_s=0.0, logs=LOGS, components=cameras)
     async with simulated_link(simulated) as link:
         wire = Wire(link)
         async with aerokit.connect(wire) as vehicle:
             await vehicle.wait_ready()
-            stage = Stage(simulated, vehicle, wire, folder)
+            stage = Stage(simulated, vehicle, wire, folder, cameras[0])
+            await vehicle.camera.wait_found()
+            vehicle.camera_at(101)
             stage.put(stage.file)
             yield stage

@@ -8,6 +8,9 @@ from typing import Any
 
 import anyio
 from call_stage import DATA, Place, Stage, airborne, anywhere, armed, grounded, on_mission
+from camera_beside import camera_of, settings_of
+from camera_calls import AWAITED
+from component_calls import COMPONENTS_AWAITED
 
 import aerokit
 from aerokit import (
@@ -21,8 +24,10 @@ from aerokit import (
     VelocitySetpoint,
     messages,
 )
+from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavCmd
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
+from aerokit.vehicle.components.settings import Settings
 
 __all__ = ["CALLS", "Call"]
 
@@ -188,6 +193,36 @@ def _with_gimbal(stage: Stage) -> None:
     stage.simulated.parameters["MNT1_TYPE"] = 1.0
 
 
+def _gimbal(do: Callable[[Any, Stage], Any], place: Place = anywhere) -> Call:
+    return Call(lambda s: do(s.vehicle.gimbal, s), place, on=COPTER, before=_with_gimbal)
+
+
+async def _in_control(gimbal: Any, _: Stage) -> None:
+    async with gimbal.control():
+        await gimbal.point(-30, 0)
+
+
+async def _until_lost(gimbal: Any, stage: Stage) -> None:
+    async with gimbal.control() as control:
+        claim = messages.CommandLong(1, 1, MavCmd.DO_GIMBAL_MANAGER_CONFIGURE, 0, -2, -2, -1, -1, 0, 0, 0)
+        stage.simulated.receive(FrameEncoder(254, 190).encode(claim), stage.simulated.now)
+        await control.until_lost()
+
+
+async def _turn(gimbal: Any, _: Stage) -> None:
+    async with gimbal.rates() as stream:
+        await stream.turn(-5, 5, 0.7)
+
+
+def _with_camera(stage: Stage) -> None:
+    camera_of(stage)
+    settings_of(stage)
+
+
+def _settings(do: Callable[[Settings], Awaitable[object]]) -> Call:
+    return Call(lambda s: do(settings_of(s)), before=_with_camera)
+
+
 def _fail_checks(stage: Stage) -> None:
     stage.simulated.faults.prearm_failures.append("Compass not healthy")
 
@@ -232,9 +267,24 @@ CALLS: dict[str, Call] = {
     "Guided.position": _stream("position", lambda s: PositionSetpoint(s.target())),
     "Guided.attitude": _stream("attitude", lambda _: AttitudeSetpoint(0, 2, 0, thrust=0.5)),
     "SetpointStream.fly": Call(_fly, airborne),
+    # ------------------------------------------------------------------------------------- Camera
+    **{name: Call(do) for name, do in AWAITED.items()},
+    # --------------------------------------------------------------------------------- components
+    **{name: Call(do, before=_with_camera) for name, do in COMPONENTS_AWAITED.items()},
     # ------------------------------------------------------------------------------------- Gimbal
-    "Gimbal.point": Call(lambda s: s.vehicle.gimbal.point(-45, 90), on=COPTER, before=_with_gimbal),
-    "Gimbal.release": Call(lambda s: s.vehicle.gimbal.release(), on=COPTER, before=_with_gimbal),
+    "Gimbal.point": _gimbal(lambda g, _: g.point(-45, 90)),
+    "Gimbal.neutral": _gimbal(lambda g, _: g.neutral()),
+    "Gimbal.retract": _gimbal(lambda g, _: g.retract()),
+    "Gimbal.look_at": _gimbal(lambda g, s: g.look_at(s.target()), airborne),
+    "Gimbal.look_at_system": _gimbal(lambda g, _: g.look_at_system(9, wait=False)),
+    "Gimbal.stop_looking": _gimbal(lambda g, _: g.stop_looking()),
+    "Gimbal.release": _gimbal(lambda g, _: g.release()),
+    "Gimbal.information": _gimbal(lambda g, _: g.information()),
+    "Gimbal.control": _gimbal(_in_control),
+    "Gimbal.rates": _gimbal(_turn),
+    "Gimbals.discover": Call(lambda s: s.vehicle.gimbals.discover(timeout=1.0)),
+    "GimbalControl.until_lost": _gimbal(_until_lost),
+    "GimbalRates.turn": _gimbal(_turn),
     # -------------------------------------------------------------------------------- PostedOrder
     "PostedOrder.command": Call(_post_arm, grounded),
     "PostedOrder.command_int": Call(_post_place, airborne),
@@ -250,6 +300,11 @@ CALLS: dict[str, Call] = {
     "Parameters.set": Call(lambda s: s.vehicle.parameters.set(s.parameter, s.other_value())),
     "Parameters.set_many": Call(lambda s: s.vehicle.parameters.set_many({s.parameter: s.other_value()})),
     "Parameters.upload": Call(lambda s: s.vehicle.parameters.upload({s.parameter: s.other_value()})),
+    "Settings.download": _settings(lambda s: s.download(refresh=True)),
+    "Settings.get": _settings(lambda s: s.get("CAM_EV")),
+    "Settings.read": _settings(lambda s: s.read("CAM_OWNER")),
+    "Settings.set": _settings(lambda s: s.set("CAM_EXPMODE", 1)),
+    "Settings.fetch_definition": _settings(lambda s: s.fetch_definition()),
     "Parameters.temporarily": Call(_temporarily),
     "Parameters.transaction": Call(_transaction),
     "Transaction.set": Call(_transaction),

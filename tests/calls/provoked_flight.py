@@ -61,14 +61,6 @@ def _look_north(stage: Stage) -> Any:
     return stage.vehicle.look_at(stage.target().replace(altitude_amsl_m=None, altitude_relative_m=5.0))
 
 
-def _point(pitch_deg: float) -> Do:
-    return lambda stage: stage.vehicle.gimbal.point(pitch_deg, 0)
-
-
-def _release_gimbal(stage: Stage) -> Any:
-    return stage.vehicle.gimbal.release()
-
-
 async def _post(stage: Stage, subjects: list[Any], command: int = 400, **options: Any) -> None:
     with stage.vehicle.posted(*subjects, **options) as order:
         await order.command(command, 1)
@@ -210,11 +202,6 @@ def _actions() -> Table:
         ("PostedOrder.until_told", "CommandRejected"): later(
             lambda s: _post(s, ["arm"], armed=True), _deny_arming, 0.5, grounded, before=accepted(arm)
         ),
-        ("Gimbal.point", "LocalProtocolError"): P(_point(999)),
-        ("Gimbal.point", "CommandRejected"): P(_point(0), before=refused(Cmd.DO_GIMBAL_MANAGER_PITCHYAW)),
-        ("Gimbal.point", "CommandTimeout"): P(_point(0), grounded, ignored(Cmd.DO_GIMBAL_MANAGER_PITCHYAW)),
-        ("Gimbal.release", "CommandRejected"): P(_release_gimbal, before=refused(Cmd.DO_MOUNT_CONTROL)),
-        ("Gimbal.release", "CommandTimeout"): P(_release_gimbal, grounded, ignored(Cmd.DO_MOUNT_CONTROL)),
         ("Vehicle.set_heading", "HeartbeatTimeout"): later(
             _method("set_heading", 179, relative=True, rate_deg_s=1), falls_silent, 3.0
         ),
@@ -445,6 +432,10 @@ def _connections() -> Table:
     }.items():
         rows[f"Connection.{name}", "ConnectionClosed"] = _ended(function)
         rows[f"Connection.{name}", "LinkLost"] = _ended(function, lost)
+    for error, end in (("ConnectionClosed", lambda s: s.vehicle.connection.close()), ("LinkLost", lost)):
+        rows["Connection.vehicles", error] = P(
+            lambda s: anext(s.vehicle.connection.vehicles()), before=end, alone=True
+        )
     return rows
 
 

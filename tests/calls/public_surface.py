@@ -11,9 +11,17 @@ import aerokit
 from aerokit.runtime.cells import Changes, StateCell
 from aerokit.runtime.connection import Connection
 from aerokit.runtime.subscription import Subscription
+from aerokit.vehicle.camera.camera import Camera
+from aerokit.vehicle.camera.part import CameraBlock
+from aerokit.vehicle.camera.shooting import PhotoInterval
+from aerokit.vehicle.components.component import Component
+from aerokit.vehicle.components.settings import Settings
 from aerokit.vehicle.files.files import Files
 from aerokit.vehicle.files.logs import Logs
-from aerokit.vehicle.orders.gimbal import Gimbal
+from aerokit.vehicle.gimbal.control import GimbalControl
+from aerokit.vehicle.gimbal.gimbal import Gimbal
+from aerokit.vehicle.gimbal.gimbals import Gimbals
+from aerokit.vehicle.gimbal.rates import GimbalRates
 from aerokit.vehicle.orders.guided import Guided, SetpointStream
 from aerokit.vehicle.orders.posting import PostedOrder
 from aerokit.vehicle.parameters.parameters import Parameters
@@ -29,10 +37,18 @@ CLASSES: tuple[type, ...] = (
     Guided,
     SetpointStream,
     Gimbal,
+    Component,
+    Gimbals,
+    GimbalControl,
+    GimbalRates,
+    Camera,
+    CameraBlock,
+    PhotoInterval,
     PostedOrder,
     Parameters,
     Temporarily,
     Transaction,
+    Settings,
     MissionControl,
     FenceControl,
     RallyControl,

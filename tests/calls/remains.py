@@ -40,9 +40,9 @@ def _all(stage: Stage) -> Iterator[str]:
     make_parts(vehicle)
     yield from _tasks()
     yield from _timers()
-    counters = [
-        stream.on_message for stream in vehicle._talk.rates._streams.values()
-    ]  # they stay, one for each stream
+    talks = [vehicle._talk, *(each._talk for each in vehicle._components._made.values())]
+    streams = [stream for talk in talks for stream in talk.rates._streams.values()]
+    counters = [stream.on_frame for stream in streams]  # they stay, one for each stream
     for key, sinks in connection.bus._sinks.items():
         yield from _times(f"sink of message {key}", [sink for _, sink in sinks if sink not in counters])
     yield from (
@@ -52,7 +52,7 @@ def _all(stage: Stage) -> Iterator[str]:
     yield from _times("deadline", connection.deadlines._due)
     for cell in (*vehicle.telemetry.cells.values(), vehicle.link_quality):
         yield from _times(f"waiter on {cell.name}", cell._sinks)
-    for stream in vehicle._talk.rates._streams.values():
+    for stream in streams:
         yield from _times(f"wish for {stream.message_type.NAME}", stream.wishes)
     yield from _times(
         "answer under way", [key for key in vehicle._talk.commands._under_way if _is_awaited(vehicle, key)]

@@ -9,16 +9,20 @@ from pathlib import Path
 import anyio
 import pytest
 from call_stage import Stage, open_stage
+from camera_calls import CAMERA
+from component_calls import COMPONENTS
 from documented_errors import NAMES, documented
 from provoked import Provocation
 from provoked_flight import FLIGHT
+from provoked_gimbals import GIMBALS
+from provoked_settings import SETTINGS
 from provoked_transfers import TRANSFERS
 
 from aerokit import errors
 from aerokit.sim.faults import Faults
 from aerokit.testing import run_virtual
 
-PROVOCATIONS = FLIGHT | TRANSFERS
+PROVOCATIONS = FLIGHT | GIMBALS | TRANSFERS | SETTINGS | CAMERA | COMPONENTS
 PROMISED = documented()
 LONGEST_S = 200.0
 
@@ -69,6 +73,7 @@ async def fault_of(stage: Stage, name: str, error: str) -> list[str]:
     finally:
         if not row.alone:
             stage.simulated.faults = Faults()
+            stage.camera.faults = Faults()
             stage.simulated.handlers.update(handlers)
             with anyio.CancelScope(shield=True):
                 await settle(stage)

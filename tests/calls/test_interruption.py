@@ -16,7 +16,7 @@ from typing import Any, cast
 import anyio
 import pytest
 from blocking_calls import blocking_calls, blocking_names
-from call_stage import LOGS, Stage
+from call_stage import LOGS, Stage, stage_cameras
 from call_table import CALLS, Call
 from interrupter import AT_ITS_END, Interrupter
 from remains import look
@@ -51,6 +51,7 @@ def stages(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[BlockingS
         logs=LOGS,
         battery_capacity_mah=ENDURING_MAH,
         parameters={"BATT_CAPACITY": ENDURING_MAH},
+        components=(cameras := stage_cameras()),
     )
     folder = tmp_path_factory.mktemp("calls")
     with (
@@ -58,10 +59,16 @@ def stages(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[BlockingS
         aerokit.sync.connect(address) as vehicle,
     ):
         vehicle.wait_ready()
-        blocking = BlockingStage(copter, cast(Any, vehicle), cast(Any, None), folder, address=address)
+        blocking = BlockingStage(
+            copter, cast(Any, vehicle), cast(Any, None), folder, cameras[0], address=address
+        )
         blocking.put(blocking.file)
         vehicle.message(messages.ScaledPressure)  # for as long as the vehicle lives
-        yield blocking, Stage(copter, vehicle.aio, cast(Any, None), folder)
+        vehicle.camera.wait_found()
+        vehicle.component(100).message(messages.CameraSettings)
+        _ = vehicle.component(100).settings
+        vehicle.camera_at(101)
+        yield blocking, Stage(copter, vehicle.aio, cast(Any, None), folder, cameras[0])
 
 
 def test_each_call_of_the_twin_is_in_the_table() -> None:

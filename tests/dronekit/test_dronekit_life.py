@@ -359,6 +359,15 @@ def test_connecting_does_not_wait_for_what_does_not_come(
     dronekit.connect(address).close()
 
 
+def test_what_came_before_connecting_waited_counts(
+    vehicle: dronekit.Vehicle, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(vehicle_module, "FIRST_VALUES", ("mode", "what it never tells"))
+    monkeypatch.setattr(vehicle_module, "FIRST_VALUES_S", 1e6)
+    monkeypatch.setattr(vehicle_module, "NO_MORE_S", 0.05)
+    vehicle._dk_wait_for_first_values()
+
+
 @pytest.mark.parametrize("wrong", [None, 14550, b"udp:127.0.0.1:14550"])
 def test_what_is_no_connection_string(wrong: Any) -> None:
     with pytest.raises(ValueError, match="is no connection string"):

@@ -138,10 +138,17 @@ def test_other_first_commands_are_commands(three: Pair) -> None:
 
 
 def next_becomes(cmds: CommandSequence, number: int, tell: Callable[[], None]) -> bool:
+    def is_next() -> bool:
+        tell()
+        return cmds.next == number
+
+    return becomes(is_next)
+
+
+def becomes(is_true: Callable[[], bool]) -> bool:
     tried = threading.Event()
     for _ in range(int(LIMIT_S / 0.02)):
-        tell()
-        if cmds.next == number:
+        if is_true():
             return True
         tried.wait(0.02)
     return False
@@ -167,6 +174,19 @@ def test_next_is_chosen_by_command_where_the_message_is_not_heard(
     controller.answers["MISSION_SET_CURRENT"] = lambda frame: None
     cmds.next = 2
     assert controller.wait_for_command(224).param1 == 2
+
+
+def test_next_is_not_ordered_again_into_a_silence(
+    three: Pair, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("aerokit.dronekit.flight_orders.CONFIRMED_S", 0.3)
+    monkeypatch.setattr("aerokit.dronekit.flight_orders.KNOWN_S", 0.2)
+    controller, cmds = three
+    controller.answers["MISSION_SET_CURRENT"] = lambda frame: None
+    controller.heartbeat_s = None
+    cmds.next = 2
+    assert becomes(lambda: "next = 2 is not confirmed" in caplog.text)
+    assert not controller.commands(224)
 
 
 # ---------------------------------------------------------------------------------------- PX4

@@ -159,7 +159,7 @@ def test_help(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as caught:
         aerokit_main(["run", "--help"])
     assert caught.value.code == 0
-    assert "aerokit run [-h] (PROGRAM.py | -m MODULE)" in capsys.readouterr().out
+    assert "aerokit run [-h] [--sim [OPTION ...]] (PROGRAM.py | -m MODULE)" in capsys.readouterr().out
 
 
 # --------------------------------------------------------------------------------- in-process

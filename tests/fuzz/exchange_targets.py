@@ -12,11 +12,12 @@ from target import Target
 from aerokit.errors import AerokitError
 from aerokit.mavlink import Message
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavCmd, MavFrame, MavFtpOpcode
+from aerokit.mavlink.enums import MavCmd, MavFrame, MavFtpOpcode, MavParamExtType
 from aerokit.missions import MissionItem
 from aerokit.parameters import Parameter, ParameterType
 from aerokit.protocols.command import CommandExchange
 from aerokit.protocols.exchange import Exchange
+from aerokit.protocols.extended_parameters import SettingList, SettingReads, SettingWrite
 from aerokit.protocols.ftp import FtpClient, FtpRequest
 from aerokit.protocols.ftp_message import DATA_SIZE, FtpMessage
 from aerokit.protocols.ftp_transfer import FtpDownload, FtpUpload
@@ -116,7 +117,9 @@ class _Talk:
             setattr(
                 message,
                 field.name,
-                near.get(field.name, self._value(field.name, field.type, field.array_length)),
+                near.get(field.name, self._value(field.name, field.type, field.array_length))
+                if field.is_text or field.type != "char"
+                else self.script.take(self.script.byte() % 10),
             )
         return message_class.decode(message.encode())
 
@@ -187,6 +190,9 @@ EXCHANGES: dict[str, Callable[[], Exchange[Any]]] = {
     "parameter_list_bytewise": lambda: ParameterList(1, 1, bytewise=True),
     "parameter_reads": lambda: ParameterReads(1, 1, ["A", "B", "C"], bytewise=False, are_doubtful=True),
     "parameter_writes": lambda: ParameterWrites(1, 1, _WANTED, bytewise=True, before={"A": 0.0}),
+    "setting_list": lambda: SettingList(1, 1),
+    "setting_reads": lambda: SettingReads(1, 1, ["A", "B", "C"]),
+    "setting_write": lambda: SettingWrite(1, 1, "A", 1.5, MavParamExtType.REAL32, before=0.0),
     "log_list": lambda: LogList(1, 1, first_id=1),
     "log_download": lambda: LogDownload(1, 1, 1, 5000, _sink(LOG_BLOCK)),
 }

@@ -17,12 +17,14 @@ from aerokit.missions.plan_file import format_plan, parse_plan
 from aerokit.missions.waypoint_file import format_waypoints, parse_waypoints
 from aerokit.parameters import (
     pack_parameters,
+    parse_definition,
     parse_metadata,
     parse_parameter_file,
     unpack_parameters,
 )
 from aerokit.parameters.files import parameter_file_text
 from aerokit.parameters.pack import HEADER, read_header
+from aerokit.parameters.setting import setting_bytes, setting_value
 
 __all__ = ["FILE_TARGETS"]
 
@@ -98,6 +100,30 @@ def fuzz_metadata(data: bytes) -> None:
         assert name == known.name
 
 
+def fuzz_camera_definition(data: bytes) -> None:
+    """Whatever it says, each setting takes a value or refuses it, while the others have any of their options."""
+    try:
+        camera = parse_definition(data)
+    except FileFormatError:
+        return
+    values = {name: each.options[-1].value for name, each in camera.settings.items() if each.options}
+    for told in ({}, values):
+        for name, each in camera.localized("de").settings.items():
+            assert name not in camera.rulers(name)
+            for value in (
+                0,
+                1.5,
+                "A",
+                b"A",
+                math.nan,
+                1 << 70,
+                *(one.value for one in camera.options(name, told)),
+            ):
+                with suppress(LocalProtocolError):
+                    sent = camera.checked(name, value, told)
+                    assert setting_value(setting_bytes(sent, each.wire_type), each.wire_type) == sent
+
+
 def fuzz_dialect(data: bytes) -> None:
     """A dialect whose messages can be made, sent and read, or our error."""
     with tempfile.TemporaryDirectory() as folder:
@@ -118,5 +144,6 @@ FILE_TARGETS = (
     Target("parameter_file", fuzz_parameter_file, 4096),
     Target("parameter_pack", fuzz_parameter_pack, 2048),
     Target("metadata", fuzz_metadata, 8192),
+    Target("camera_definition", fuzz_camera_definition, 8192),
     Target("dialect", fuzz_dialect, 4096),
 )

@@ -27,7 +27,7 @@ def received(message: Message) -> Message:
 @pytest.mark.parametrize("message_class", EVERY)
 def test_what_every_class_says(message_class: type[Message]) -> None:
     names = tuple(field.name for field in message_class.FIELDS)
-    assert message_class.__match_args__ == names
+    assert vars(message_class)["__match_args__"] == names
     assert message_class.FIELDS is message_class.FIELDS
     assert message_class.BASE_LENGTH <= message_class.LENGTH <= 255
     assert getattr(messages, message_class.__name__) is message_class
@@ -207,3 +207,17 @@ def test_what_integers_hold() -> None:
         "int64_t": (-9223372036854775808, 9223372036854775807),
         "uint64_t": (0, 18446744073709551615),
     }
+
+
+@pytest.mark.parametrize("kind", [messages.ParamExtValue, messages.ParamExtSet, messages.ParamExtAck])
+def test_char_arrays_that_carry_bytes_keep_their_zeros(kind: type[Message]) -> None:
+    (field,) = (each for each in kind.FIELDS if each.name == "param_value")
+    assert (field.type, field.array_length, field.is_text) == ("char", 128, False)
+    number = (1000).to_bytes(8, "little", signed=True)
+    values = {each.name: "A" if each.is_text else 1 for each in kind.FIELDS} | {"param_value": number}
+    told = received(kind(**values))
+    assert told.to_dict()["param_value"] == number.ljust(128, b"\0")
+    assert told.to_dict()["param_id"] == "A"
+    for wrong in ("text", bytes(129), 5):
+        with pytest.raises(LocalProtocolError, match=r"\.param_value = .* cannot be sent"):
+            kind(**values | {"param_value": wrong}).encode()

@@ -65,6 +65,7 @@ def test_what_the_standard_has_not_is_checked_by_the_programs_dialect() -> None:
         messages.BatteryStatus,
         messages.FileTransferProtocol,
         messages.ParamValue,
+        messages.ParamExtValue,
         messages.Statustext,
         messages.GimbalDeviceAttitudeStatus,
         messages.Wind,
@@ -191,3 +192,15 @@ def test_what_cannot_be_sent_is_named(given: Any, complaint: str) -> None:
 def test_bytes_in_any_form(data: Any) -> None:
     given = looks_like("GPS_INJECT_DATA", target_system=1, target_component=1, len=2, data=data)
     assert from_pymavlink(given) == messages.GpsInjectData(1, 1, 2, b"\1\2")
+
+
+@pytest.mark.parametrize("value", [b"\0\x80\xff\0", "long text"])
+def test_numbers_in_char_arrays_come_through_as_bytes(value: bytes | str) -> None:
+    theirs: Any = ardupilotmega.MAVLink_param_ext_set_message(1, 100, b"CAM_EV", b"", 9)
+    if isinstance(value, bytes):
+        theirs = ardupilotmega.MAVLink_param_ext_set_message(1, 100, b"CAM_EV", value, 9)
+    else:
+        theirs.param_value = value
+    ours: Any = from_pymavlink(theirs)
+    wanted = value if isinstance(value, bytes) else value.encode()
+    assert ours.encode() == messages.ParamExtSet(1, 100, "CAM_EV", wanted, 9).encode()

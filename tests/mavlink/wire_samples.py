@@ -51,11 +51,11 @@ def random_message(message_class: type[Message], chance: random.Random, kind: st
 
 
 def _value(field: Field, chance: random.Random, kind: str) -> Any:
-    if field.type == "char":
+    if field.is_text:
         return _text(field.array_length or 1, chance, kind)
     if not field.array_length:
         return _number(field.type, chance, kind)
-    if field.type == "uint8_t":
+    if field.type in ("uint8_t", "char"):
         return bytes(_number("uint8_t", chance, kind) for _ in range(field.array_length))
     return tuple(_number(field.type, chance, kind) for _ in range(field.array_length))
 
@@ -129,7 +129,9 @@ def peer_message(message: Message, version: int) -> tuple[Any, Any]:
 
 def for_peer(field: Field, value: Any) -> Any:
     """A field's value as pymavlink's constructors take it."""
-    if field.type == "char":
+    if field.type == "char" and not field.is_text:
+        return value
+    if field.is_text:
         return value.encode() if field.array_length else value.encode().ljust(1, b"\0")
     return list(value) if field.array_length else value
 
@@ -151,6 +153,8 @@ def _fields_of_other_types(message_id: int) -> tuple[Field, ...]:
 def _from_peer(field: Field, message: Any) -> Any:
     if field.type == "char":
         raw = getattr(message, f"_{field.name}_raw")
+        if not field.is_text:
+            return raw.ljust(field.array_length, b"\0")
         return raw.partition(b"\0")[0].decode(errors="replace")
     value = getattr(message, field.name)
     return bytes(value) if field.type == "uint8_t" else tuple(value)

@@ -184,7 +184,7 @@ def _left_flying(flown: Flown) -> Iterator[str]:
 
 def _sent_afterwards(flown: Flown) -> Iterator[str]:
     """A transfer or a setting that was given up sends nothing more."""
-    if flown.case.row.steers or flown.case.row.name == "arm":
+    if flown.case.row.steers or flown.case.row.ends_later or flown.case.row.name == "arm":
         return
     for each in flown.air.sent:
         is_lasting = each.message.NAME in ("PARAM_SET", "MISSION_COUNT", "MISSION_ITEM_INT", "MISSION_ITEM")

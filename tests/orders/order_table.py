@@ -6,6 +6,8 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Any
 
+import anyio
+
 import aerokit
 from aerokit import missions
 from aerokit.mavlink.enums import MavCmd
@@ -18,7 +20,8 @@ class Row:
     """One order. ``modes`` are those that it may bring about, on ArduCopter and on PX4.
 
     ``steers``: it decides where the vehicle goes; given up, the vehicle is told to hold if ``holds``. ``command`` is
-    the one whose answers and copies get lost. ``place`` is where the vehicle is when it is given.
+    the one whose answers and copies get lost.
+    ``place`` is where the vehicle is when it is given. ``ends_later``: given up, its end is still seen to.
     """
 
     name: str
@@ -28,6 +31,7 @@ class Row:
     modes: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
     steers: bool = True
     holds: bool = False
+    ends_later: bool = False
     on: tuple[str, ...] = ("ardupilot", "px4")
 
 
@@ -54,6 +58,16 @@ def _gimbal_up(vehicle: aerokit.Vehicle) -> Awaitable[object]:
     return vehicle.command(MavCmd.DO_SET_SERVO, 9, 1500)
 
 
+async def _control_gimbal(vehicle: aerokit.Vehicle) -> None:
+    async with vehicle.gimbal.control():
+        await anyio.sleep(5.0)
+
+
+async def _turn_gimbal(vehicle: aerokit.Vehicle) -> None:
+    async with vehicle.gimbal.rates(-2.0, 3.0) as stream:
+        await stream.turn(-2.0, 3.0, 5.0)
+
+
 async def _post_place(vehicle: aerokit.Vehicle) -> None:
     place = north(vehicle, 12.0)
     x, y = round(place.latitude_deg * 1e7), round(place.longitude_deg * 1e7)
@@ -70,6 +84,7 @@ def _set(name: tuple[str, str]) -> Give:
 
 
 SET_MODE = int(MavCmd.DO_SET_MODE)
+PITCHYAW = int(MavCmd.DO_GIMBAL_MANAGER_PITCHYAW)
 REPOSITION = int(MavCmd.DO_REPOSITION)
 ARM = int(MavCmd.COMPONENT_ARM_DISARM)
 REBOOT = int(MavCmd.PREFLIGHT_REBOOT_SHUTDOWN)
@@ -172,10 +187,26 @@ ROWS = (
     Row("look_at", lambda v: v.look_at(north(v, 50.0)), int(MavCmd.DO_SET_ROI_LOCATION), steers=False),
     Row(
         "gimbal.point",
-        lambda v: v.gimbal.point(-45.0, 90.0),
-        int(MavCmd.DO_GIMBAL_MANAGER_PITCHYAW),
+        lambda v: v.gimbal.point(-45.0, 90.0, wait=False),
+        PITCHYAW,
         steers=False,
     ),
+    Row("gimbal.neutral", lambda v: v.gimbal.neutral(), PITCHYAW, steers=False, on=("ardupilot",)),
+    Row(
+        "gimbal.look_at",
+        lambda v: v.gimbal.look_at(north(v, 50.0)),
+        int(MavCmd.DO_SET_ROI_LOCATION),
+        steers=False,
+    ),
+    Row(
+        "gimbal.control",
+        _control_gimbal,
+        int(MavCmd.DO_GIMBAL_MANAGER_CONFIGURE),
+        steers=False,
+        ends_later=True,
+        on=("ardupilot",),
+    ),
+    Row("gimbal.rates", _turn_gimbal, PITCHYAW, steers=False, ends_later=True, on=("ardupilot",)),
     Row("gimbal.release", lambda v: v.gimbal.release(), int(MavCmd.DO_MOUNT_CONTROL), steers=False),
     Row("posted", _post_place, REPOSITION, modes=(("GUIDED",), ("LOITER",)), on=("ardupilot",)),
     Row("command", _gimbal_up, int(MavCmd.DO_SET_SERVO), steers=False, on=("ardupilot",)),

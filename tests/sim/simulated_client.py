@@ -16,6 +16,9 @@ from aerokit.sim import SimulatedCopter, SimulatedVehicle
 M = TypeVar("M", bound=Message)
 STEP_S = 0.05
 
+PX4_HOME = (47.3977432, 8.5455939, 489.4)
+"""Where PX4's own simulations begin, and the recordings of it."""
+
 
 class Client:
     def __init__(self, vehicle: SimulatedVehicle, *, system_id: int = 255, component_id: int = 190) -> None:

@@ -325,3 +325,86 @@ def test_a_stream_that_is_ordered_again_comes_no_faster() -> None:
     client.forget()
     client.run(10.0)
     assert len(client.all(m.CameraCaptureStatus)) == 10
+
+
+def test_zoom_goes_on_until_it_is_stopped_or_at_its_end() -> None:
+    camera, client = fitted()
+    zoom = MavCmd.SET_CAMERA_ZOOM
+    assert client.ask(CAMERA, zoom, 1, 1.0) == DONE
+    client.run(2.0)
+    assert client.ask(CAMERA, zoom, 1, 0.0) == DONE
+    stopped_at = camera.zoom
+    assert stopped_at == pytest.approx(40.0, abs=1.0)
+    client.run(2.0)
+    assert camera.zoom == stopped_at
+    assert client.ask(CAMERA, zoom, 1, -1.0) == DONE
+    client.run(5.0)
+    assert camera.zoom == 0.0
+    assert client.ask(CAMERA, zoom, 3, 45.0) == DONE
+    assert camera.zoom == pytest.approx(100.0)
+    assert camera.lens.focal_length_mm == pytest.approx(45.0)
+    assert client.ask(CAMERA, zoom, 3, 46.0) == DENIED
+    assert client.ask(CAMERA, zoom, 4, 30.0) == DENIED
+    assert client.ask(CAMERA, MavCmd.SET_CAMERA_FOCUS, 3, 30.0) == DONE
+    assert camera.focus == 75.0
+
+
+def test_what_is_tracked_is_told() -> None:
+    _, without = fitted()
+    for command in (MavCmd.CAMERA_TRACK_POINT, MavCmd.CAMERA_TRACK_RECTANGLE, MavCmd.CAMERA_STOP_TRACKING):
+        assert without.ask(CAMERA, command, 0.1, 0.1, 0.2, 0.2) == UNSUPPORTED
+    camera, client = fitted(capabilities=SimulatedCamera.ALL_CAPABILITIES)
+    (status,) = client.request(CAMERA, m.CameraTrackingImageStatus)
+    assert (status.tracking_status, status.tracking_mode) == (0, 0)
+    assert client.ask(CAMERA, MavCmd.CAMERA_TRACK_POINT, 0.5, 1.5, 0.1) == DENIED
+    assert client.ask(CAMERA, MavCmd.CAMERA_TRACK_POINT, 0.5, 0.25, 0.125) == DONE
+    (status,) = client.request(CAMERA, m.CameraTrackingImageStatus)
+    assert (status.tracking_status, status.tracking_mode, status.target_data) == (1, 1, 4)
+    assert (status.point_x, status.point_y, status.radius) == (0.5, 0.25, 0.125)
+    assert math.isnan(status.rec_top_x)
+    camera.tracking.lose()
+    (status,) = client.request(CAMERA, m.CameraTrackingImageStatus)
+    assert status.tracking_status == 2
+    assert client.ask(CAMERA, MavCmd.CAMERA_STOP_TRACKING) == DONE
+    assert client.request(CAMERA, m.CameraTrackingImageStatus)[0].tracking_mode == 0
+    assert client.request(CAMERA, m.CameraTrackingGeoStatus) == [], "it looks to the horizon"
+
+
+def test_a_thermal_one_tells_its_range() -> None:
+    _, without = fitted()
+    assert without.ask(CAMERA, MavCmd.REQUEST_MESSAGE, m.CameraThermalRange.ID) == FAILED
+    assert without.ask(CAMERA, MavCmd.SET_CAMERA_SOURCE, 0, 2) == DENIED
+    _, client = fitted(thermal_celsius=(-10.0, 90.0), streams=["rtsp://a/light", "rtsp://a/warm"])
+    (told,) = client.request(CAMERA, m.CameraThermalRange)
+    assert (told.stream_id, told.min, told.max, told.max_point_x) == (2, -10.0, 90.0, 1.0)
+    light, warm = client.request(CAMERA, m.VideoStreamInformation, 0)
+    assert (light.flags, warm.flags) == (1, 7)
+    assert client.request(CAMERA, m.CameraInformation)[0].flags & CameraCapFlags.HAS_THERMAL_RANGE
+    assert client.ask(CAMERA, MavCmd.SET_CAMERA_SOURCE, 0, 2) == DONE
+
+
+def test_pictures_are_files_until_the_card_is_formatted() -> None:
+    camera, client = fitted(picture=lambda image: b"picture %d" % image.image_index)
+    for _ in range(2):
+        client.ask(CAMERA, START, 0, 0, 1)
+        client.run(0.5)
+    assert [image.file_url for image in client.all(m.CameraImageCaptured)] == [
+        "mftp:///DCIM/IMG_0001.JPG",
+        "mftp:///DCIM/IMG_0002.JPG",
+    ]
+    assert camera.files.get("/DCIM/IMG_0002.JPG") == b"picture 1"
+    client.ask(CAMERA, MavCmd.STORAGE_FORMAT, 1, 1, 1)
+    client.run(3.0)
+    assert camera.files.entries("/DCIM") == []
+
+
+def test_single_messages_are_lost() -> None:
+    camera, client = fitted()
+    camera.faults.lose(m.CameraImageCaptured, times=2)
+    client.ask(CAMERA, START, 0, 0.5, 3)
+    client.run(3.0)
+    assert [image.image_index for image in client.all(m.CameraImageCaptured)] == [2]
+    client.vehicle.faults.lose(m.Heartbeat)
+    client.forget()
+    client.run(3.0)
+    assert len(client.all(m.Heartbeat)) == 5, "one of the two heartbeats of a second"

@@ -9,7 +9,7 @@ from collections import Counter
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from simulated_client import Client
+from simulated_client import PX4_HOME, Client
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavLandedState, MavParamType, MavResult, MavState
@@ -31,7 +31,7 @@ NAN = math.nan
 
 
 def ready_px4(**options: object) -> tuple[SimulatedPx4, Client]:
-    px4 = SimulatedPx4(fast_rate_hz=5.0, **options)  # type: ignore[arg-type]
+    px4 = SimulatedPx4(fast_rate_hz=5.0, home=PX4_HOME, **options)  # type: ignore[arg-type]
     client = Client(px4)
     client.run(5.0)
     client.forget()
@@ -72,7 +72,7 @@ def stream_velocity(client: Client, seconds: float, velocity: tuple[float, float
 
 
 def test_streams_without_being_asked() -> None:
-    client = Client(SimulatedPx4())
+    client = Client(SimulatedPx4(home=PX4_HOME))
     client.run(30.0)
     kinds = Counter(message.NAME for _, message in client.heard)
     assert kinds["ATTITUDE"] == pytest.approx(30 * 50, rel=0.05)
@@ -93,7 +93,7 @@ def test_streams_without_being_asked() -> None:
 
 
 def test_boot_states_flags_and_health_as_recorded() -> None:
-    client = Client(SimulatedPx4())
+    client = Client(SimulatedPx4(home=PX4_HOME))
     client.run(8.0)
     assert list(dict.fromkeys(b.system_status for b in client.all(m.Heartbeat))) == [
         MavState.UNINIT,
@@ -108,7 +108,7 @@ def test_boot_states_flags_and_health_as_recorded() -> None:
 
 
 def test_arming_too_early_is_refused_without_a_text() -> None:
-    client = Client(SimulatedPx4())
+    client = Client(SimulatedPx4(home=PX4_HOME))
     client.run(0.5)
     assert client.command(ARM, 1) == MavResult.TEMPORARILY_REJECTED
     client.run(0.2)

@@ -6,7 +6,7 @@ import math
 from collections import Counter
 
 import pytest
-from simulated_client import Client
+from simulated_client import PX4_HOME, Client
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavResult, MavState
@@ -20,7 +20,7 @@ HOLD, ORBIT, PRECISION_LAND, TERMINATION = (4, 3), (3, 1), (4, 9), (10, 0)
 
 
 def ready(**options: object) -> tuple[SimulatedPx4, Client]:
-    px4 = SimulatedPx4(fast_rate_hz=2.0, boot_time_s=1.0, parameter_count=100, **options)  # type: ignore[arg-type]
+    px4 = SimulatedPx4(fast_rate_hz=2.0, boot_time_s=1.0, parameter_count=100, home=PX4_HOME, **options)  # type: ignore[arg-type]
     client = Client(px4)
     client.run(2.0)
     client.forget()

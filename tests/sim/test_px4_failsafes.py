@@ -33,7 +33,7 @@ def flying(altitude_m: float = 20.0, **parameters: float) -> tuple[SimulatedPx4,
     px4 = SimulatedPx4(fast_rate_hz=1.0, boot_time_s=1.0, parameter_count=150, parameters=parameters)
     station = Station(px4)
     station.run(2.0)
-    station.command(MavCmd.NAV_TAKEOFF, 0, 0, 0, NAN, NAN, NAN, 489.4 + altitude_m)
+    station.command(MavCmd.NAV_TAKEOFF, 0, 0, 0, NAN, NAN, NAN, 584.09 + altitude_m)
     assert station.command(MavCmd.COMPONENT_ARM_DISARM, 1) == MavResult.ACCEPTED
     station.run(30.0)
     assert px4.mode == HOLD

@@ -16,7 +16,7 @@ from mission_client import (
     item,
     upload,
 )
-from simulated_client import Client, flying_copter, ready_copter, set_mode
+from simulated_client import PX4_HOME, Client, flying_copter, ready_copter, set_mode
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult, MissionState
@@ -319,7 +319,7 @@ PX4_CLIMB = item(TAKE_OFF, 6, param4=math.nan, x=PX4_NORTH, y=PX4_EAST, z=10.0)
 
 
 def start_px4(*items: MissionItem) -> tuple[SimulatedPx4, Client]:
-    px4 = SimulatedPx4(fast_rate_hz=1.0, boot_time_s=0.5)
+    px4 = SimulatedPx4(fast_rate_hz=1.0, boot_time_s=0.5, home=PX4_HOME)
     client = Client(px4)
     client.run(2.0)
     assert upload(client, items) == 0
@@ -385,7 +385,7 @@ def test_px4_lands_at_the_end_and_stays_in_the_mode() -> None:
 
 
 def test_px4_starts_only_what_it_has() -> None:
-    px4 = SimulatedPx4(fast_rate_hz=1.0, boot_time_s=0.5)
+    px4 = SimulatedPx4(fast_rate_hz=1.0, boot_time_s=0.5, home=PX4_HOME)
     client = Client(px4)
     client.run(2.0)
     assert client.command(START) == MavResult.DENIED
@@ -447,7 +447,7 @@ def test_px4_climbs_first_when_the_mission_forgets_to() -> None:
     ],
 )
 def test_px4_takes_a_mission_and_rejects_it_afterwards(items: list[MissionItem], reason: str) -> None:
-    px4 = SimulatedPx4(fast_rate_hz=1.0, boot_time_s=0.5)
+    px4 = SimulatedPx4(fast_rate_hz=1.0, boot_time_s=0.5, home=PX4_HOME)
     client = Client(px4)
     client.run(2.0)
     assert upload(client, items) == 0

@@ -326,7 +326,13 @@ def test_importing_it_is_cheap() -> None:
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     own = {name for name in done.stdout.split() if name.startswith("aerokit")}
-    assert own == {"aerokit", "aerokit.lazy", "aerokit.testing", "aerokit.testing.plugin"}
+    assert own == {
+        "aerokit",
+        "aerokit.installed",
+        "aerokit.lazy",
+        "aerokit.testing",
+        "aerokit.testing.plugin",
+    }
     assert "asyncio" not in done.stdout.split()
 
 

@@ -10,6 +10,7 @@ from aerokit import Position, geo
 from aerokit import messages as m
 from aerokit.missions import Mission, MissionItem
 from aerokit.missions.navigation import take_off, waypoint
+from aerokit.sim import HOME as SIMULATED_HOME
 
 PLAN_MESSAGES = (
     m.MissionCount,
@@ -21,7 +22,7 @@ PLAN_MESSAGES = (
     m.MissionClearAll,
     m.FileTransferProtocol,
 )
-HOME = Position(47.397742, 8.545594)
+HOME = Position(*SIMULATED_HOME[:2])
 
 
 def near_home(north_m: float, east_m: float = 0.0, home: Position = HOME) -> tuple[float, float]:

@@ -17,7 +17,7 @@ from aerokit.errors import (
     OperationRejected,
     OperationTimeout,
 )
-from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult
+from aerokit.mavlink.enums import CopterMode, MavCmd, MavLandedState, MavResult
 from aerokit.runtime.cells import Source, StateCell
 from aerokit.sim import SimulatedCopter
 from aerokit.vehicle.orders import flight
@@ -53,9 +53,9 @@ async def cancelled_after(seconds: float, action: object) -> None:
 async def test_wait_ready_says_what_is_missing() -> None:
     async with open_flight(SimulatedCopter(boot_time_s=40.0)) as flight:
         with pytest.raises(OperationTimeout) as caught:
-            await flight.vehicle.wait_ready(timeout=6.0)
+            await flight.vehicle.wait_ready(timeout=6.3)
     text = str(caught.value)
-    assert "not ready within 6 s" in text
+    assert "not ready within 6.3 s" in text
     assert "home (HOME_POSITION has not come)" in text
     assert "position (GLOBAL_POSITION_INT with a fix has not come)" in text
     assert "absolute horizontal position" in text
@@ -93,6 +93,19 @@ async def test_take_off_in_the_air_sends_nothing(flying: Flight) -> None:
     with pytest.raises(OperationRejected, match="flies already"):
         await flying.vehicle.take_off(20.0)
     assert not flying.wire.commands(MavCmd.NAV_TAKEOFF)
+
+
+async def test_a_landing_is_not_ended_by_a_take_off(flying: Flight) -> None:
+    """The take-off would be refused in the air; the mode before it would not, and the vehicle would hover."""
+    vehicle = flying.vehicle
+    await vehicle.set_mode("LAND")
+    await vehicle.landed_state.wait_until(lambda state: state == MavLandedState.LANDING, timeout=10)
+    flying.wire.forget()
+    with pytest.raises(OperationRejected, match=r"flies already \(landing\)"):
+        await vehicle.take_off(20.0)
+    assert not flying.wire.mode_orders()
+    assert not flying.wire.commands(MavCmd.NAV_TAKEOFF)
+    await vehicle.landed_state.wait_until(lambda state: state == MavLandedState.ON_GROUND, timeout=60)
 
 
 async def test_take_off_disarmed_sends_nothing(grounded: Flight) -> None:

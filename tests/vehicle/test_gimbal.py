@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any
 
 import anyio
@@ -47,7 +48,7 @@ async def test_it_points_where_it_is_told_and_tells_so() -> None:
     async with in_the_air(copter=with_gimbal()) as flight:
         gimbal = flight.vehicle.gimbal
         with flight.vehicle.rate(m.GimbalDeviceAttitudeStatus, 10.0):
-            await gimbal.point(-45.0, 90.0)
+            await gimbal.point(-45.0, 90.0, wait=False)
             told = await gimbal.attitude.wait_until(
                 lambda each: abs((each.pitch_deg or 0.0) + 45) < 1, timeout=5
             )
@@ -64,7 +65,7 @@ async def test_roll_is_the_mounts_whose_yaw_is_the_vehicles() -> None:
     async with in_the_air(copter=with_gimbal()) as flight:
         await flight.vehicle.set_heading(90.0, tolerance_deg=1.0)
         flight.wire.forget()
-        await flight.vehicle.gimbal.point(-45.0, 80.0, roll_deg=5.0)
+        await flight.vehicle.gimbal.point(-45.0, 80.0, roll_deg=5.0, wait=False)
         (command,) = flight.wire.commands(MOUNT)
         assert params(command) == pytest.approx((-45, 5, -10, 2), abs=2)
         assert not flight.wire.commands(PITCHYAW)
@@ -74,7 +75,7 @@ async def test_a_manager_that_denies_is_claimed_and_given_back() -> None:
     async with open_flight() as flight:
         flight.copter.faults.refuse(PITCHYAW, DENIED)
         with pytest.raises(CommandRejected):
-            await flight.vehicle.gimbal.point(-45.0, 0.0)
+            await flight.vehicle.gimbal.point(-45.0, 0.0, wait=False)
         assert [len(flight.wire.commands(each)) for each in (PITCHYAW, CONFIGURE)] == [2, 1]
         assert params(flight.wire.commands(CONFIGURE)[0])[:2] == (
             255,
@@ -92,7 +93,7 @@ async def test_firmware_without_commands_gets_messages_and_is_not_asked_again() 
         for each in (PITCHYAW, MOUNT):
             flight.copter.faults.refuse(each, UNSUPPORTED)
         for _ in range(2):
-            await flight.vehicle.gimbal.point(-45.5, 90.0)
+            await flight.vehicle.gimbal.point(-45.5, 90.0, wait=False)
         assert [len(flight.wire.commands(each)) for each in (PITCHYAW, MOUNT)] == [1, 1]
         control = flight.wire.all(m.MountControl)
         assert [(each.input_a, each.input_b, each.input_c) for each in control] == [(-4550, 0, 9000)] * 2
@@ -205,12 +206,12 @@ async def test_what_another_station_is_denied_is_no_reason_to_claim_control() ->
     async with in_the_air(copter=with_gimbal()) as flight:
         flight.copter.faults.ignore(PITCHYAW, times=1)
         async with anyio.create_task_group() as tasks:
-            tasks.start_soon(flight.vehicle.gimbal.point, -10.0, 0.0)
+            tasks.start_soon(partial(flight.vehicle.gimbal.point, -10.0, 0.0, wait=False))
             await anyio.sleep(0.1)
             flight.copter.send(m.CommandAck(PITCHYAW, DENIED, 0, 0, 254, 190))
             await anyio.sleep(0.1)
             assert flight.vehicle._talk.commands.last_result(PITCHYAW) is None
-        await flight.vehicle.gimbal.point(-20.0, 0.0)
+        await flight.vehicle.gimbal.point(-20.0, 0.0, wait=False)
         assert not flight.wire.commands(CONFIGURE)
 
 
@@ -243,8 +244,8 @@ async def test_after_a_reboot_the_vehicle_may_know_more() -> None:
         vehicle, sent = flight.vehicle, flight.wire.commands
         await vehicle.wait_ready()
         flight.copter.faults.refuse(PITCHYAW, UNSUPPORTED, times=1)
-        await vehicle.gimbal.point(-10.0, 0.0)
+        await vehicle.gimbal.point(-10.0, 0.0, wait=False)
         assert (len(sent(PITCHYAW)), len(sent(MOUNT))) == (1, 1)
         await vehicle.reboot()
-        await vehicle.gimbal.point(-20.0, 0.0)
+        await vehicle.gimbal.point(-20.0, 0.0, wait=False)
         assert (len(sent(PITCHYAW)), len(sent(MOUNT))) == (2, 1)

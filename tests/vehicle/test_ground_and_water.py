@@ -24,6 +24,7 @@ from aerokit.mavlink.messages import SetPositionTargetLocalNed
 from aerokit.missions import Mission
 from aerokit.missions.navigation import return_to_launch, take_off, waypoint
 from aerokit.sim import (
+    SimulatedPlane,
     SimulatedPx4Plane,
     SimulatedRover,
     SimulatedSub,
@@ -196,5 +197,22 @@ async def test_a_mission_of_a_px4_plane_that_ends_in_a_return_ends_above_home() 
         await vehicle.mission.start()
         await vehicle.position.wait_until(lambda place: home.distance_to(place) > 300, timeout=120)
         await vehicle.mission.wait_finished(timeout=200)
+        assert home.distance_to(vehicle.position.value) < 150
+        assert vehicle.is_armed
+
+
+async def test_a_mission_of_an_arduplane_that_ends_in_a_return_ends_above_home() -> None:
+    """Its mission does not complete: it changes to RTL, and the mission has stopped."""
+    async with simulated_link(SimulatedPlane(boot_time_s=1.0)) as link, connect(link) as vehicle:
+        await vehicle.wait_ready()
+        home = vehicle.position.value
+        far = home.offset(north_m=600)
+        there = waypoint(far.latitude_deg, far.longitude_deg, altitude_relative_m=60)
+        await vehicle.mission.upload(Mission([take_off(altitude_relative_m=50), there, return_to_launch()]))
+        await vehicle.arm()
+        await vehicle.mission.start()
+        await vehicle.position.wait_until(lambda place: home.distance_to(place) > 500, timeout=120)
+        await vehicle.mission.wait_finished(timeout=200)
+        assert vehicle.mode_name == "RTL"
         assert home.distance_to(vehicle.position.value) < 150
         assert vehicle.is_armed

@@ -176,6 +176,16 @@ async def test_a_stream_that_comes_too_slowly_is_an_event(grounded: Flight) -> N
         assert events.get_nowait() is None  # told once, not every second
 
 
+@pytest.mark.parametrize("boot_time_s", [3.0, 7.6, 12.2])
+async def test_a_stream_that_begins_late_is_not_slow(boot_time_s: float) -> None:
+    """The copter has LOCAL_POSITION_NED from the moment on at which its estimator knows where it is."""
+    async with open_flight(SimulatedCopter(boot_time_s=boot_time_s)) as flight:
+        with flight.vehicle.subscribe(StreamSlow, capacity=20) as events:
+            await flight.vehicle.wait_ready(timeout=60)
+            await anyio.sleep(10.0)
+            assert events.get_nowait() is None
+
+
 @pytest.mark.parametrize(("interval_s", "is_slow"), [(0.54, False), (0.7, True)])
 async def test_half_the_rate_but_one_message_in_five_seconds_is_not_slow_yet(
     interval_s: float, is_slow: bool

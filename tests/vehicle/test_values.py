@@ -138,7 +138,8 @@ def test_a_mount_turns_with_the_vehicle(
     yaw: float, absolute: float, heading: float | None, told: float | None
 ) -> None:
     message = messages.MountOrientation(0, 1.25, -30.5, yaw, absolute)
-    assert gimbal.from_orientation(message, heading) == gimbal.GimbalAttitude(-30.5, 1.25, told)
+    from_nose = yaw if math.isfinite(yaw) else None
+    assert gimbal.from_orientation(message, heading) == gimbal.GimbalAttitude(-30.5, 1.25, told, from_nose)
 
 
 def pointing(q: tuple[float, ...], flags: int = 0, delta_yaw: float = 0.0) -> Any:
@@ -160,25 +161,27 @@ def turned(roll_deg: float, pitch_deg: float, yaw_deg: float) -> tuple[float, ..
 
 
 @pytest.mark.parametrize(
-    ("flags", "delta_deg", "heading", "yaw_deg"),
+    ("flags", "delta_deg", "heading", "yaw_deg", "from_nose_deg"),
     [
-        (FROM_NORTH, 0.0, 100.0, 30.0),
-        (FROM_NORTH, 50.0, 100.0, 30.0),
-        (FROM_NOSE, 50.0, 100.0, 80.0),
-        (FROM_NOSE, 0.0, 100.0, 130.0),
-        (FROM_NOSE, math.nan, 100.0, 130.0),
-        (FROM_NOSE | LOCK, 0.0, 100.0, 130.0),
-        (FROM_NOSE, 0.0, None, 30.0),
-        (LOCK, 50.0, 100.0, 30.0),
-        (0, 50.0, 100.0, 130.0),
+        (FROM_NORTH, 0.0, 100.0, 30.0, -70.0),
+        (FROM_NORTH, 50.0, 100.0, 30.0, -20.0),
+        (FROM_NORTH, math.nan, None, 30.0, None),
+        (FROM_NOSE, 50.0, 100.0, 80.0, 30.0),
+        (FROM_NOSE, 0.0, 100.0, 130.0, 30.0),
+        (FROM_NOSE, math.nan, 100.0, 130.0, 30.0),
+        (FROM_NOSE | LOCK, 0.0, 100.0, 130.0, 30.0),
+        (FROM_NOSE, 0.0, None, 30.0, 30.0),
+        (LOCK, 50.0, 100.0, 30.0, -70.0),
+        (LOCK, 50.0, 250.0, 30.0, 140.0),
+        (0, 50.0, 100.0, 130.0, 30.0),
     ],
 )
 def test_a_gimbal_tells_its_yaw_from_the_nose_or_from_north(
-    flags: int, delta_deg: float, heading: float | None, yaw_deg: float
+    flags: int, delta_deg: float, heading: float | None, yaw_deg: float, from_nose_deg: float | None
 ) -> None:
     message = pointing(turned(10, -20, 30), flags, math.radians(delta_deg))
     told = gimbal.from_device(message, heading)
-    assert told == gimbal.GimbalAttitude(-20.0, 10.0, yaw_deg)
+    assert told == gimbal.GimbalAttitude(-20.0, 10.0, yaw_deg, from_nose_deg)
 
 
 @given(angles, st.floats(-89, 89), angles, st.floats(0.1, 10))

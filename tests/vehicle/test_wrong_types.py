@@ -24,9 +24,11 @@ OWNERS: dict[str, Callable[[aerokit.Vehicle], Any]] = {
     "guided": lambda vehicle: vehicle.guided,
     "stream": lambda vehicle: vehicle.guided.velocity(),
     "parameters": lambda vehicle: vehicle.parameters,
+    "settings": lambda vehicle: vehicle.component(100).settings,
     "mission": lambda vehicle: vehicle.mission,
     "fence": lambda vehicle: vehicle.fence,
     "rally": lambda vehicle: vehicle.rally,
+    "camera": lambda vehicle: vehicle.camera,
     "files": lambda vehicle: vehicle.files,
     "logs": lambda vehicle: vehicle.logs,
     "cell": lambda vehicle: vehicle.position,
@@ -37,7 +39,16 @@ USED_BY_THE_LIBRARY = {
     "cell": frozenset({"set", "forget", "close"}),
     "subscription": frozenset({"close"}),
     "connection": frozenset(name for name in vars(Connection) if name.startswith("link_"))
-    | {"attach", "bytes_received", "check_types", "close", "counts", "describe_signatures", "fail"}
+    | {
+        "attach",
+        "bytes_received",
+        "check_types",
+        "close",
+        "counts",
+        "describe_signatures",
+        "fail",
+        "heard_at",
+    }
     | {"on_end", "record", "tap"},
 }
 """Nobody else calls them."""

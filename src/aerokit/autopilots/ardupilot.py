@@ -6,12 +6,13 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, ClassVar
 
 from aerokit.autopilots import ardupilot_modes
-from aerokit.autopilots.base import Autopilot, Purpose, Reposition, SetpointRules, TakeOff
+from aerokit.autopilots.base import Autopilot, GimbalRules, Purpose, Reposition, SetpointRules, TakeOff
 from aerokit.autopilots.health import ATTITUDE_AND_HEIGHT, POS_HORIZ_ABS, names_of
 from aerokit.autopilots.streams import ARDUPILOT_GROUPS
 from aerokit.mavlink.enums import EkfStatusFlags, MavCmd, MavLandedState, MavState, MavType
 
 if TYPE_CHECKING:
+    from aerokit.autopilots.modes import ModeTable
     from aerokit.mavlink.messages import Heartbeat
 
 __all__ = [
@@ -51,27 +52,31 @@ class ArduPilot(Autopilot):
     """What ArduPilot's vehicles have in common, and all that is said of one whose type is not known."""
 
     name = "ArduPilot"
+    gimbals: GimbalRules = GimbalRules(
+        has_secondary=False, looks_with_each=False, looking_needs_control=False
+    )
     firmware = "ArduPilot"
     home_is_item_0 = True
     runs_prearm_checks = True
     calibrates_compasses_by_command = True
-    parameter_interval_s = 0.02
+    parameter_interval_s: float | None = 0.02
     mission_storage = "ardupilot"
     mission_upload_window = 6
     mission_download_window = 10
     writes_partial_missions = True
-    replaced_as_they_come = frozenset((0, 2))
+    replaced_as_they_come: frozenset[int] = frozenset((0, 2))
     completes_at_home = True
     mission_starts_by_command = True
     sets_current_by_command = True
     takes_file_sessions = True
     has_upper_case_parameters = True
     log_suffix = ".bin"
-    log_directories = ("/APM/LOGS", "/logs")
+    video_by_camera = True
+    log_directories: ClassVar[tuple[str, str]] = ("/APM/LOGS", "/logs")
     first_log_id = 1
     logs_by_messages = True
     stream_groups = ARDUPILOT_GROUPS
-    never_sent = frozenset(("ESTIMATOR_STATUS", "WIND_COV", "ALTITUDE", "CURRENT_MODE")) - {
+    never_sent: frozenset[str] = frozenset(("ESTIMATOR_STATUS", "WIND_COV", "ALTITUDE", "CURRENT_MODE")) - {
         "ATTITUDE_QUATERNION"  # on request
     }
 
@@ -103,7 +108,7 @@ class ArduCopter(ArduPilot):
     """Multicopters and helicopters."""
 
     firmware = "ArduCopter"
-    modes = ardupilot_modes.COPTER
+    modes: ModeTable = ardupilot_modes.COPTER
     purposes: ClassVar[Mapping[str, str]] = {
         "hold": "BRAKE",  # LOITER obeys the throttle stick, which is down or missing when a program flies
         "land": "LAND",
@@ -112,12 +117,12 @@ class ArduCopter(ArduPilot):
         "take_off": "GUIDED",
         "mission": "AUTO",
     }
-    setpoints = SetpointRules(body_yaw_is_relative=True)
-    reposition = Reposition(relative_altitude=True, yaw=False, speed=False)
+    setpoints: SetpointRules = SetpointRules(body_yaw_is_relative=True)
+    reposition: Reposition | None = Reposition(relative_altitude=True, yaw=False, speed=False)
     condition_yaw = True
     lands_after_return = True
-    arming_mode = "GUIDED"
-    unarmable_modes = frozenset(
+    arming_mode: ClassVar[str | None] = "GUIDED"
+    unarmable_modes: frozenset[str] = frozenset(
         (
             *(
                 "AUTOROTATE",
@@ -150,7 +155,7 @@ class ArduPlane(ArduPilot):
     """Planes, and the planes with lifting rotors that ArduPilot calls QuadPlanes."""
 
     firmware = "ArduPlane"
-    modes = ardupilot_modes.PLANE
+    modes: ModeTable = ardupilot_modes.PLANE
     purposes: ClassVar[Mapping[str, str]] = {
         "hold": "LOITER",
         "land": "AUTOLAND",
@@ -159,11 +164,13 @@ class ArduPlane(ArduPilot):
         "take_off": "TAKEOFF",
         "mission": "AUTO",
     }
-    setpoints = SetpointRules(local_position=False, global_position=False, velocity=False, acceleration=False)
-    reposition = Reposition(relative_altitude=True, yaw=False, speed=False)
-    arrival_radius_m = 90.0  # it circles at WP_LOITER_RAD, 60 m by default
-    arming_mode = "FBWA"  # the throttle is the pilot's: armed in TAKEOFF it would start
-    unarmable_modes = frozenset(("AUTOLAND", "INITIALISING", "QLAND", "QRTL", "RTL"))
+    setpoints: SetpointRules = SetpointRules(
+        local_position=False, global_position=False, velocity=False, acceleration=False
+    )
+    reposition: Reposition | None = Reposition(relative_altitude=True, yaw=False, speed=False)
+    arrival_radius_m: float = 90.0  # it circles at WP_LOITER_RAD, 60 m by default
+    arming_mode: ClassVar[str | None] = "FBWA"  # the throttle is the pilot's: armed in TAKEOFF it would start
+    unarmable_modes: frozenset[str] = frozenset(("AUTOLAND", "INITIALISING", "QLAND", "QRTL", "RTL"))
 
     def _purpose_name(self, purpose: Purpose, is_vtol: bool) -> str | None:
         if self._can_hover(is_vtol) and purpose in _QUADPLANE:
@@ -195,18 +202,18 @@ class ArduRover(ArduPilot):
 
     firmware = "Rover"
     stays_on_the_ground = True
-    modes = ardupilot_modes.ROVER
+    modes: ModeTable = ardupilot_modes.ROVER
     purposes: ClassVar[Mapping[str, str]] = {
         "hold": "HOLD",
         "return": "RTL",
         "setpoint": "GUIDED",
         "mission": "AUTO",
     }
-    setpoints = SetpointRules(acceleration=False, body_yaw_is_relative=True)
-    reposition = Reposition(relative_altitude=True, yaw=False, speed=False)
-    arrival_radius_m = 4.0
-    arming_mode = "HOLD"
-    unarmable_modes = frozenset(("RTL", "SMART_RTL", "INITIALISING"))
+    setpoints: SetpointRules = SetpointRules(acceleration=False, body_yaw_is_relative=True)
+    reposition: Reposition | None = Reposition(relative_altitude=True, yaw=False, speed=False)
+    arrival_radius_m: float = 4.0
+    arming_mode: ClassVar[str | None] = "HOLD"
+    unarmable_modes: frozenset[str] = frozenset(("RTL", "SMART_RTL", "INITIALISING"))
 
     def _purpose_name(self, purpose: Purpose, is_vtol: bool) -> str | None:
         if purpose == "hold" and self.vehicle_type == MavType.SURFACE_BOAT:
@@ -218,16 +225,16 @@ class ArduSub(ArduPilot):
     """Remotely operated and autonomous underwater vehicles."""
 
     firmware = "ArduSub"
-    modes = ardupilot_modes.SUB
+    modes: ModeTable = ardupilot_modes.SUB
     purposes: ClassVar[Mapping[str, str]] = {
         "hold": "POSHOLD",
         "land": "SURFACE",
         "setpoint": "GUIDED",
         "mission": "AUTO",
     }
-    setpoints = SetpointRules(acceleration=False, place_restarts_path=True)
-    landing_ends_in = "ALT_HOLD"  # at the surface
-    reposition = Reposition(relative_altitude=True, yaw=False, speed=False)
+    setpoints: SetpointRules = SetpointRules(acceleration=False, place_restarts_path=True)
+    landing_ends_in: ClassVar[str | None] = "ALT_HOLD"  # at the surface
+    reposition: Reposition | None = Reposition(relative_altitude=True, yaw=False, speed=False)
     condition_yaw = True
 
 
@@ -235,7 +242,7 @@ class Blimp(ArduPilot):
     """Airships."""
 
     firmware = "Blimp"
-    modes = ardupilot_modes.BLIMP
+    modes: ModeTable = ardupilot_modes.BLIMP
     purposes: ClassVar[Mapping[str, str]] = {"hold": "LOITER", "land": "LAND", "return": "RTL"}
 
 
@@ -243,7 +250,7 @@ class AntennaTracker(ArduPilot):
     """Antenna trackers."""
 
     firmware = "AntennaTracker"
-    modes = ardupilot_modes.TRACKER
+    modes: ModeTable = ardupilot_modes.TRACKER
     purposes: ClassVar[Mapping[str, str]] = {"hold": "STOP", "setpoint": "GUIDED"}
 
 

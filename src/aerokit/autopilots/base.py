@@ -23,7 +23,7 @@ from aerokit.snapshot import Snapshot
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
 
-__all__ = ["Autopilot", "ModeOrder", "Purpose", "Reposition", "SetpointRules", "TakeOff"]
+__all__ = ["Autopilot", "GimbalRules", "ModeOrder", "Purpose", "Reposition", "SetpointRules", "TakeOff"]
 
 NAN = math.nan
 _BYTEWISE = MavProtocolCapability.PARAM_ENCODE_BYTEWISE.value
@@ -70,6 +70,23 @@ class SetpointRules(Snapshot):
         return tuple(kind.replace("_", " ") for kind in kinds if getattr(self, kind))
 
 
+class GimbalRules(Snapshot):
+    """How a gimbal manager understands the gimbal protocol v2; the defaults are the standard.
+
+    ``has_secondary``: two may be in control at once. ``retracts``: it carries out an order to retract.
+    ``knows_pitchyaw``: rates may come by GIMBAL_MANAGER_SET_PITCHYAW; else by GIMBAL_MANAGER_SET_ATTITUDE.
+    ``looks_at_systems``: it knows MAV_CMD_DO_SET_ROI_SYSID. ``looks_with_each``: a region of interest is for the gimbal
+    that it names; else always for the first. ``looking_needs_control``: one is denied to who is not in control.
+    """
+
+    has_secondary: bool = True
+    retracts: bool = True
+    knows_pitchyaw: bool = True
+    looks_at_systems: bool = True
+    looks_with_each: bool = True
+    looking_needs_control: bool = True
+
+
 class Reposition(Snapshot):
     """How MAV_CMD_DO_REPOSITION (192) is understood here.
 
@@ -105,12 +122,12 @@ class Autopilot:
     """The autopilot's name."""
     firmware = "unknown"
     """The firmware for this vehicle type, ``"ArduCopter"``."""
-    modes = ModeTable({})
+    modes: ModeTable = ModeTable({})
     modes_are_numbered = True
     """Whether users know a mode by its plain number, too."""
     purposes: ClassVar[Mapping[str, str]] = {}
     """Purpose → name of the mode that serves it."""
-    setpoints = SetpointRules(*[False] * 5)
+    setpoints: SetpointRules = SetpointRules(*[False] * 5)
     reposition: Reposition | None = None
     """None: DO_REPOSITION is not known to work."""
     home_is_item_0 = False
@@ -127,7 +144,7 @@ class Autopilot:
     """Which mode DO_REPOSITION puts the vehicle into."""
     lands_after_return = False
     """Whether the mode for returning ends on the ground."""
-    arrival_radius_m = 2.0
+    arrival_radius_m: float = 2.0
     """How near it comes to a place that it was sent to, or circles it, by default."""
     mission_storage = "any"
     """What it keeps of a mission item: a value of :class:`aerokit.missions.Storage`."""
@@ -167,6 +184,8 @@ class Autopilot:
     """What a battery's current in 0.01 A says when it is not known; the standard says −1."""
     stream_groups: ClassVar[Mapping[int, int]] = {}
     """Message id → MAV_DATA_STREAM, for firmware that knows no MAV_CMD_SET_MESSAGE_INTERVAL."""
+    gimbals: GimbalRules = GimbalRules()
+    """What its gimbal manager makes of the protocol."""
     stays_on_the_ground = False
     """Whether it drives or swims on the surface: altitudes mean nothing to it."""
     landing_ends_in: ClassVar[str | None] = None
@@ -175,6 +194,10 @@ class Autopilot:
     """Modes in which the autopilot refuses to arm, or disarms by itself at once."""
     judges_by_mode = False
     """Whether SYS_STATUS tells if it could be armed in its present mode, not if it could be armed at all."""
+    cameras_by_trigger = False
+    """Whether a camera of its own is driven by its trigger alone: DO_DIGICAM_CONTROL and DO_TRIGGER_CONTROL."""
+    video_by_camera = False
+    """Whether VIDEO_START_CAPTURE names the camera behind it where the standard has a stream."""
     arming_mode: ClassVar[str | None] = None
     """The mode to arm in where the present one cannot be armed: one in which nothing begins to move by itself."""
 

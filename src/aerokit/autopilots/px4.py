@@ -5,7 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import ClassVar
 
-from aerokit.autopilots.base import NAN, Autopilot, ModeOrder, Purpose, Reposition, SetpointRules, TakeOff
+from aerokit.autopilots.base import (
+    NAN,
+    Autopilot,
+    GimbalRules,
+    ModeOrder,
+    Purpose,
+    Reposition,
+    SetpointRules,
+    TakeOff,
+)
 from aerokit.autopilots.health import ATTITUDE_AND_HEIGHT, POS_HORIZ_ABS, PREARM_CHECK, SENSORS, names_of
 from aerokit.autopilots.modes import CUSTOM_MODE_ENABLED, NO_MODES, Mode, ModeTable
 from aerokit.errors import LocalProtocolError
@@ -86,18 +95,20 @@ class Px4(Autopilot):
     keys_are_taken = "PX4 takes a key on its USB port only, and before 1.17 nowhere"
     modes = MODES
     modes_are_numbered = False
-    setpoints = SetpointRules(before_mode=True)
-    reposition = Reposition(relative_altitude=False, yaw=True, speed=True)
+    setpoints: SetpointRules = SetpointRules(before_mode=True)
+    reposition: Reposition | None = Reposition(relative_altitude=False, yaw=True, speed=True)
+    gimbals: GimbalRules = GimbalRules(*[False] * 6)
     log_suffix = ".ulg"
-    log_directories = ("/fs/microsd/log", "/log")
+    log_directories: ClassVar[tuple[str, str]] = ("/fs/microsd/log", "/log")
     silent_without_logs = True
     _bytewise_by_default = True
     has_parameter_hash = True
-    unknown_currents_ca = frozenset((-1, -100))  # inside PX4, −1 A is "unknown"
-    reposition_purpose = "hold"
+    unknown_currents_ca: frozenset[int] = frozenset((-1, -100))  # inside PX4, −1 A is "unknown"
+    reposition_purpose: Purpose = "hold"
     judges_by_mode = True
-    arming_mode = "LOITER"
-    unarmable_modes = frozenset(
+    cameras_by_trigger = True
+    arming_mode: ClassVar[str | None] = "LOITER"
+    unarmable_modes: frozenset[str] = frozenset(
         ("LAND", "OFFBOARD", "PRECLAND", "RTL", "TERMINATION")
     )  # OFFBOARD: without set-points
     purposes: ClassVar[Mapping[str, str]] = {
@@ -111,18 +122,18 @@ class Px4(Autopilot):
     mission_storage = "px4"
     mission_upload_window = 6
     tells_mission_checksum = True
-    replaced_as_they_come = frozenset()  # the new items go into a second place
+    replaced_as_they_come: frozenset[int] = frozenset()  # the new items go into a second place
     repeats_item_reached = True
-    never_sent = frozenset(
+    never_sent: frozenset[str] = frozenset(
         ("EKF_STATUS_REPORT", "WIND", "RANGEFINDER", "AHRS", "AHRS2", "MEMINFO", "POWER_STATUS", "RAW_IMU")
     )
 
     def __init__(self, vehicle_type: int) -> None:
         super().__init__(vehicle_type)
-        self.stays_on_the_ground = vehicle_type in (MavType.GROUND_ROVER, MavType.SURFACE_BOAT)
-        self.lands_after_return = not self._stays_down and vehicle_type != MavType.FIXED_WING
+        self.stays_on_the_ground: bool = vehicle_type in (MavType.GROUND_ROVER, MavType.SURFACE_BOAT)
+        self.lands_after_return: bool = not self._stays_down and vehicle_type != MavType.FIXED_WING
         if vehicle_type == MavType.FIXED_WING:
-            self.arrival_radius_m = 120.0  # it circles at NAV_LOITER_RAD, 80 m by default
+            self.arrival_radius_m: float = 120.0  # it circles at NAV_LOITER_RAD, 80 m by default
 
     def mode(self, custom_mode: int, base_mode: int, extra: Mapping[int, str] = NO_MODES) -> Mode:
         """The mode of these numbers; what an external mode calls itself goes before EXTERNAL1 and so on."""

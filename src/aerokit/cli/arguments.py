@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from aerokit import geo
+from aerokit.cli.completers import kinds as kind_names
+from aerokit.cli.completers import offer
 from aerokit.cli.places import place_of
 from aerokit.errors import AerokitError, LocalProtocolError
 from aerokit.links import parse_address
@@ -15,9 +17,11 @@ from aerokit.parameters import ParameterType, check_name, checked_value
 from aerokit.parameters.number_text import parse_number
 
 if TYPE_CHECKING:
+    import argparse
     from collections.abc import Callable
 
 __all__ = [
+    "add_vehicle_kind",
     "address",
     "address_or_form",
     "assignment",
@@ -164,3 +168,11 @@ def directory(text: str) -> Path:
     if not path.is_dir():
         raise ArgumentTypeError(f"{text!r} is no directory that is there")
     return path
+
+
+def add_vehicle_kind(command: argparse.ArgumentParser, kinds: str) -> None:
+    """Add ``--vehicle KIND``; ``kinds`` lists them."""
+    kind = command.add_argument(
+        "--vehicle", type=vehicle_kind, default="copter", metavar="KIND", help=f"simulated: {kinds}"
+    )
+    offer(kind, kind_names)

@@ -2,58 +2,98 @@
 
 from __future__ import annotations
 
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 from typing import TYPE_CHECKING
 
-import anyio
-
-from aerokit.cli.interrupt import on_interrupt
-from aerokit.cli.report import FlightReport
-from aerokit.cli.signing import signing_of
+from aerokit.cli.arguments import add_vehicle_kind, address, number, system_id, writable_file
+from aerokit.cli.completers import addresses, offer
+from aerokit.cli.demo_lines import FlightReport
+from aerokit.cli.exits import DONE, FAILED, INTERRUPTED
+from aerokit.cli.interrupt import Interruptible, on_interrupt
+from aerokit.cli.new_file import add_force, check_new
+from aerokit.cli.output import add_json, tell
+from aerokit.cli.signing import ENVIRONMENT, add_signing_key, signing_of
+from aerokit.cli.vehicle_command import reached
 from aerokit.cli.vehicles import simulated_vehicle
 from aerokit.errors import AerokitError, NotSupported, OperationRejected
 from aerokit.mavlink.enums import MavLandedState
-from aerokit.vehicle.connect import connect
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import AsyncIterator, Awaitable, Callable
+    from collections.abc import AsyncIterator
 
     from aerokit.vehicle.vehicle import Vehicle
 
-__all__ = ["run_demo"]
+__all__ = ["add_arguments", "run_demo"]
 
-DONE, FAILED, INTERRUPTED = 0, 1, 130
 CORNERS = (("north-west", 1, 0), ("north-east", 1, 1), ("south-east", 0, 1), ("south-west", 0, 0))
 """Of the square: its name, and how many sides north and east of the start it is."""
 READY_TIMEOUT_S = 120.0
+OWN_LOG = "demo.tlog"
+
+
+def add_arguments(command: argparse.ArgumentParser) -> None:
+    """The arguments of the command."""
+    command.set_defaults(run=run_demo)
+    place = command.add_argument(
+        "--connect",
+        type=address,
+        metavar="ADDRESS",
+        help="a vehicle: udpin:0.0.0.0:14550, tcp:127.0.0.1:5760, /dev/ttyACM0,57600 …",
+    )
+    offer(place, addresses)
+    add_vehicle_kind(command, "copter, plane (ArduPilot), px4, px4_plane (copter)")
+    command.add_argument(
+        "--altitude", type=number(1, 500), default=10.0, metavar="M", help="metres above home (10)"
+    )
+    command.add_argument(
+        "--side", type=number(1, 5000), default=20.0, metavar="M", help="side of the square in metres (20)"
+    )
+    command.add_argument(
+        "--record",
+        type=writable_file,
+        metavar="FILE",
+        help=f"telemetry log ({OWN_LOG}, which each demonstration replaces)",
+    )
+    add_force(command)
+    command.add_argument(
+        "--speedup", type=number(0.1, 100), default=5.0, metavar="X", help="of the simulated vehicle (5)"
+    )
+    command.add_argument("--system-id", type=system_id, metavar="ID", help="of the vehicle (the only one)")
+    command.add_argument(
+        "--baud", type=int, default=57600, help="of a serial port whose address says none (57600)"
+    )
+    add_signing_key(command, f"of the vehicle of --connect (${ENVIRONMENT})")
+    add_json(command)
 
 
 async def run_demo(options: argparse.Namespace) -> int:
     """Fly the demonstration; 0 when the vehicle is back on the ground."""
-    interruptible = _Interruptible()
+    if options.record is None:
+        options.record = OWN_LOG
+    else:
+        check_new(options.record, options)
+    interruptible = Interruptible()
     with on_interrupt(interruptible.interrupt):
         code = await interruptible.run(lambda: _connect_and_fly(options, interruptible))
     if code is None:
-        print("interrupted")
+        tell(options, "interrupted", {}, "interrupted")
         return INTERRUPTED
     return code
 
 
-async def _connect_and_fly(options: argparse.Namespace, interruptible: _Interruptible) -> int:
-    async with _address(options) as address:
-        print(f"connecting to {address}", flush=True)
-        async with connect(
-            address,
-            system_id=options.system_id,
-            baud=options.baud,
-            record=options.record,
-            signing=signing_of(options) if options.connect else None,
-        ) as vehicle:
-            report = FlightReport(vehicle)
-            async with report.running():
-                code = await _Flight(vehicle, report, interruptible).fly(options.altitude, options.side)
-            report.print_summary(options.record)
+async def _connect_and_fly(options: argparse.Namespace, interruptible: Interruptible) -> int:
+    async with _address(options) as address, AsyncExitStack() as stack:
+        tell(options, "connecting", {"address": address}, f"connecting to {address}")
+        signing = signing_of(options) if options.connect else None
+        is_somebodys = options.connect is not None
+        vehicle = await stack.enter_async_context(
+            reached(options, address, changes=is_somebodys, record=options.record, signing=signing)
+        )
+        report = FlightReport(vehicle, options)
+        async with report.running():
+            code = await _Flight(vehicle, report, interruptible).fly(options.altitude, options.side)
+        report.print_summary(options.record)
     return code
 
 
@@ -70,36 +110,16 @@ async def _address(options: argparse.Namespace) -> AsyncIterator[str]:
     wait_longer([vehicle], options.speedup)
     async with open_simulator(vehicle, "tcpin:127.0.0.1:0", speedup=options.speedup) as simulator:
         address = simulator.addresses[0].replace("tcpin", "tcp")
-        print(f"simulated {options.vehicle}, {options.speedup:g} times real time, on {address}", flush=True)
+        text = f"simulated {options.vehicle}, {options.speedup:g} times real time, on {address}"
+        record = {"system_ids": [vehicle.system_id], "address": address, "speedup": options.speedup}
+        tell(options, "simulated", record, text)
         yield address
-
-
-class _Interruptible:
-    """Runs functions that Ctrl-C ends; each Ctrl-C ends the innermost one only."""
-
-    def __init__(self) -> None:
-        self._scopes: list[anyio.CancelScope] = []
-
-    def interrupt(self) -> None:
-        if self._scopes:
-            self._scopes[-1].cancel()
-
-    async def run(self, function: Callable[[], Awaitable[int]]) -> int | None:
-        """What the function gives, None when it was interrupted."""
-        scope = anyio.CancelScope()
-        with scope:
-            self._scopes.append(scope)
-            try:
-                return await function()
-            finally:
-                self._scopes.remove(scope)
-        return None
 
 
 class _Flight:
     """The square, and what is done when it is interrupted or fails."""
 
-    def __init__(self, vehicle: Vehicle, report: FlightReport, interruptible: _Interruptible) -> None:
+    def __init__(self, vehicle: Vehicle, report: FlightReport, interruptible: Interruptible) -> None:
         self._vehicle, self._say, self._interruptible = vehicle, report.say, interruptible
         self._is_ours = False  # armed by us; what somebody else flies is not ours to land
 

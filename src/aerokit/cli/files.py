@@ -5,19 +5,17 @@ from __future__ import annotations
 import argparse
 from pathlib import Path, PurePosixPath
 
+from aerokit.cli.exits import DONE
+from aerokit.cli.output import tell, tell_done
 from aerokit.cli.progress import file_size, progress_bar
 from aerokit.cli.vehicle_command import add_action, connected
 
-__all__ = ["add_files"]
-
-DONE = 0
+__all__ = ["add_arguments"]
 
 
-def add_files(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command to the parser."""
-    text = "List, fetch and change files on a vehicle by MAVFTP."
-    files = commands.add_parser("files", help="files on a vehicle", description=text)
-    actions = files.add_subparsers(required=True, metavar="ACTION", title="actions")
+def add_arguments(command: argparse.ArgumentParser) -> None:
+    """The actions of the command, and their arguments."""
+    actions = command.add_subparsers(required=True, metavar="ACTION", title="actions")
     listing = add_action(actions, "ls", _list, "List a directory.")
     listing.add_argument("path", nargs="?", default="/", help="directory on the vehicle (/)")
     get = add_action(actions, "get", _get, "Fetch a file; one begun before is continued.")
@@ -42,7 +40,8 @@ async def _list(options: argparse.Namespace) -> int:
     async with connected(options) as vehicle:
         for entry in await vehicle.files.list(options.path, patience_s=options.patience):
             size = "" if entry.size is None else f"{entry.size}"
-            print(f"{size:>12}  {entry.name}{'/' if entry.is_directory else ''}")
+            text = f"{size:>12}  {entry.name}{'/' if entry.is_directory else ''}"
+            tell(options, "file", {"directory": options.path, **entry.to_dict()}, text)
     return DONE
 
 
@@ -53,7 +52,8 @@ async def _get(options: argparse.Namespace) -> int:
             await vehicle.files.download(
                 options.path, to, resume=True, patience_s=options.patience, on_progress=show
             )
-    print(f"{to}: {file_size(to)} bytes")
+    size = file_size(to)
+    tell(options, "fetched", {"path": options.path, "file": to, "bytes": size}, f"{to}: {size} bytes")
     return DONE
 
 
@@ -66,40 +66,46 @@ def _destination(options: argparse.Namespace) -> Path:
 
 async def _put(options: argparse.Namespace) -> int:
     size = file_size(options.file)
-    async with connected(options) as vehicle:
+    async with connected(options, changes=True) as vehicle:
         with progress_bar(Path(options.file).name, "B") as show:
             await vehicle.files.upload(
                 options.file, options.path, patience_s=options.patience, on_progress=show
             )
-    print(f"{options.path}: {size} bytes")
+    record = {"file": options.file, "path": options.path, "bytes": size}
+    tell(options, "sent", record, f"{options.path}: {size} bytes")
     return DONE
 
 
 async def _remove(options: argparse.Namespace) -> int:
-    async with connected(options) as vehicle:
+    async with connected(options, changes=True) as vehicle:
         await vehicle.files.remove(options.path, patience_s=options.patience)
+    tell_done(options, "files rm")
     return DONE
 
 
 async def _remove_directory(options: argparse.Namespace) -> int:
-    async with connected(options) as vehicle:
+    async with connected(options, changes=True) as vehicle:
         await vehicle.files.remove_directory(options.path, patience_s=options.patience)
+    tell_done(options, "files rmdir")
     return DONE
 
 
 async def _make_directory(options: argparse.Namespace) -> int:
-    async with connected(options) as vehicle:
+    async with connected(options, changes=True) as vehicle:
         await vehicle.files.make_directory(options.path, patience_s=options.patience)
+    tell_done(options, "files mkdir")
     return DONE
 
 
 async def _move(options: argparse.Namespace) -> int:
-    async with connected(options) as vehicle:
+    async with connected(options, changes=True) as vehicle:
         await vehicle.files.rename(options.path, options.new_path, patience_s=options.patience)
+    tell_done(options, "files mv")
     return DONE
 
 
 async def _crc(options: argparse.Namespace) -> int:
     async with connected(options) as vehicle:
-        print(f"{await vehicle.files.crc32(options.path, patience_s=options.patience):08x}")
+        crc = f"{await vehicle.files.crc32(options.path, patience_s=options.patience):08x}"
+    tell(options, "crc", {"path": options.path, "crc32": crc}, crc)
     return DONE

@@ -7,21 +7,30 @@ import signal
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+import anyio
+
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Awaitable, Callable, Iterator
 
-__all__ = ["on_interrupt"]
+__all__ = ["Interruptible", "on_interrupt"]
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+def _signals() -> tuple[signal.Signals, ...]:
+    """SIGHUP, the end of the terminal, where there is one and nobody (nohup) has switched it off."""
+    hang_up: signal.Signals | None = getattr(signal, "SIGHUP", None)
+    if hang_up is None or signal.getsignal(hang_up) is signal.SIG_IGN:
+        return signal.SIGINT, signal.SIGTERM
+    return signal.SIGINT, signal.SIGTERM, hang_up
 
 
 @contextmanager
 def on_interrupt(callback: Callable[[], None]) -> Iterator[None]:
-    """While the block lasts, Ctrl-C and SIGTERM call ``callback`` on the running loop and do nothing else."""
+    """While the block lasts, Ctrl-C, SIGTERM and SIGHUP call ``callback`` on the running loop and do nothing else."""
     loop = asyncio.get_running_loop()
-    before = [signal.getsignal(number) for number in SIGNALS]
+    signals = _signals()
+    before = [signal.getsignal(number) for number in signals]
     try:
-        for number in SIGNALS:
+        for number in signals:
             signal.signal(number, lambda *_: loop.call_soon_threadsafe(callback))
     except ValueError:  # not on the main thread, where alone signals can be handled
         yield
@@ -29,5 +38,28 @@ def on_interrupt(callback: Callable[[], None]) -> Iterator[None]:
     try:
         yield
     finally:
-        for number, handler in zip(SIGNALS, before, strict=True):
+        for number, handler in zip(signals, before, strict=True):
             signal.signal(number, handler)
+
+
+class Interruptible:
+    """Runs functions that Ctrl-C ends; each Ctrl-C ends the innermost one only."""
+
+    def __init__(self) -> None:
+        self._scopes: list[anyio.CancelScope] = []
+
+    def interrupt(self) -> None:
+        """End the innermost one that runs."""
+        if self._scopes:
+            self._scopes[-1].cancel()
+
+    async def run(self, function: Callable[[], Awaitable[int]]) -> int | None:
+        """What the function gives, None when it was interrupted."""
+        scope = anyio.CancelScope()
+        with scope:
+            self._scopes.append(scope)
+            try:
+                return await function()
+            finally:
+                self._scopes.remove(scope)
+        return None

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from aerokit.cli.arguments import directory
+from aerokit.cli.exits import DONE, FAILED
+from aerokit.cli.output import tell, tell_done
 from aerokit.cli.progress import file_size, progress_bar
-from aerokit.cli.vehicle_command import add_action, connected
+from aerokit.cli.vehicle_command import add_action, agreed, connected
 from aerokit.errors import LocalProtocolError
 
 if TYPE_CHECKING:
@@ -17,16 +18,12 @@ if TYPE_CHECKING:
 
     from aerokit.vehicle.files.logs import LogEntry
 
-__all__ = ["add_logs"]
-
-DONE, FAILED = 0, 1
+__all__ = ["add_arguments"]
 
 
-def add_logs(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command to the parser."""
-    text = "List, download and erase the flight logs of a vehicle."
-    logs = commands.add_parser("logs", help="flight logs of a vehicle", description=text)
-    actions = logs.add_subparsers(required=True, metavar="ACTION", title="actions")
+def add_arguments(command: argparse.ArgumentParser) -> None:
+    """The actions of the command, and their arguments."""
+    actions = command.add_subparsers(required=True, metavar="ACTION", title="actions")
     add_action(actions, "list", _list, "List the flight logs.")
     get = add_action(actions, "get", _get, "Download flight logs; what was begun before is continued.")
     get.add_argument("ids", nargs="*", type=int, metavar="ID", help="of the logs (the newest)")
@@ -45,7 +42,7 @@ async def _list(options: argparse.Namespace) -> int:
     async with connected(options) as vehicle:
         for entry in await vehicle.logs.list(patience_s=options.patience):
             time = "" if entry.time_utc is None else f"{entry.time_utc:%Y-%m-%d %H:%M:%S}"
-            print(f"{entry.id:>6}  {entry.size:>12}  {time}".rstrip())
+            tell(options, "log", entry.to_dict(), f"{entry.id:>6}  {entry.size:>12}  {time}".rstrip())
     return DONE
 
 
@@ -58,7 +55,8 @@ async def _get(options: argparse.Namespace) -> int:
                 await vehicle.logs.download(
                     entry, to, method=options.method, patience_s=options.patience, on_progress=show
                 )
-            print(f"{to}: {file_size(to)} bytes")
+            size = file_size(to)
+            tell(options, "fetched_log", {"id": entry.id, "file": to, "bytes": size}, f"{to}: {size} bytes")
     return DONE
 
 
@@ -75,17 +73,10 @@ def _chosen(entries: Sequence[LogEntry], options: argparse.Namespace) -> Sequenc
 
 
 async def _erase(options: argparse.Namespace) -> int:
-    if not options.yes and not _agreed():
-        print("nothing was erased")
+    if not options.yes and not agreed("erase all flight logs of the vehicle?"):
+        tell(options, "declined", {"action": "logs erase"}, "nothing was erased")
         return FAILED
-    async with connected(options) as vehicle:
+    async with connected(options, changes=True) as vehicle:
         await vehicle.logs.erase(patience_s=options.patience)
-    print("erased")
+    tell_done(options, "logs erase", "erased")
     return DONE
-
-
-def _agreed() -> bool:
-    """Whether somebody at a terminal says yes; nobody there means no."""
-    if not sys.stdin.isatty():
-        return False
-    return input("erase all flight logs of the vehicle? [y/N] ").strip().lower() in ("y", "yes")

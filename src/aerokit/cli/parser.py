@@ -22,13 +22,26 @@ class Parser(argparse.ArgumentParser):
     def parse_known_args(  # type: ignore[override]  # typeshed has overloads for other namespaces
         self, args: Sequence[str] | None = None, namespace: Any = None
     ) -> tuple[Any, list[str]]:
-        """Refuse unknown options here, where the known ones are known."""
+        """Refuse what is left over here, where the known options and the right usage are known."""
+        if args is not None and self._subparsers is None:
+            self._refuse_unknown_options(args)
         namespace, unknown = super().parse_known_args(args, namespace)
-        options = [each for each in unknown if each.startswith("-")]
-        if options:
-            meant = did_you_mean(options[0].partition("=")[0], self._option_string_actions)
-            self.error(f"unrecognized arguments: {' '.join(unknown)}{meant}")
+        if unknown:
+            self._refuse(unknown)
         return namespace, unknown
+
+    def _refuse_unknown_options(self, args: Sequence[str]) -> None:
+        """Before what stands behind one is taken for an address."""
+        options = list(args[: args.index("--")] if "--" in args else args)
+        names = [each.partition("=")[0] for each in options if each.startswith("--")]
+        for name in names:
+            if not any(known.startswith(name) for known in self._option_string_actions):
+                self._refuse([name])
+
+    def _refuse(self, unknown: Sequence[str]) -> NoReturn:
+        options = [each for each in unknown if each.startswith("-")]
+        meant = did_you_mean(options[0].partition("=")[0] if options else None, self._option_string_actions)
+        self.error(f"unrecognized arguments: {' '.join(unknown)}{meant}")
 
     def error(self, message: str) -> NoReturn:
         """Exit code 2."""

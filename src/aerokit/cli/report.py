@@ -1,118 +1,75 @@
-"""What a flight looks like on a terminal: a line for everything that happens, and a summary."""
+"""``aerokit report``: a flight log, or two compared, as one HTML file."""
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
-import os
-import sys
-from contextlib import asynccontextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-import anyio
-
-from aerokit import events
-from aerokit.errors import AerokitError
+from aerokit.cli.exits import DONE
+from aerokit.cli.extras import need
+from aerokit.cli.output import add_json, tell
+from aerokit.cli.progress import progress_bar
+from aerokit.report.words import clock
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    import argparse
 
-    from aerokit.position import Position
-    from aerokit.vehicle.vehicle import Vehicle
+    from aerokit.report import Report
 
-__all__ = ["FlightReport"]
-
-WARNING = 4
-WAITING_S = 5.0
-"""After so long without news there is a line that says what is waited for or where it is."""
+__all__ = ["add_arguments"]
 
 
-class FlightReport:
-    """Prints what is said and what the vehicle says, and follows where it is."""
+def add_arguments(command: argparse.ArgumentParser) -> None:
+    """The arguments of the command."""
+    command.set_defaults(run=_report)
+    command.add_argument("log", type=Path, metavar="LOG", help=".tlog, .bin (ArduPilot) or .ulg (PX4)")
+    command.add_argument("other", type=Path, nargs="?", metavar="LOG2", help="another log: both are compared")
+    command.add_argument(
+        "-o", "--output", type=Path, metavar="OUT.html", help="the file (the name of the log, with .html)"
+    )
+    command.add_argument(
+        "--system",
+        type=int,
+        metavar="ID",
+        help="whose flight, where a .tlog has several vehicles (the first)",
+    )
+    command.add_argument("--force", action="store_true", help="replace a file that is there already")
+    command.add_argument("--open", action="store_true", help="open it in the browser")
+    add_json(command)
 
-    def __init__(self, vehicle: Vehicle) -> None:
-        self._vehicle = vehicle
-        self._started = self._last_line = vehicle.connection.now()
-        self._highest_m = self._fastest_m_s = self._flown_m = 0.0
-        self._before: Position | None = None
 
-    def say(self, text: str) -> None:
-        """Print a line with the time and the altitude; a reader who has gone does not end the flight."""
-        here = self._vehicle.position.latest
-        altitude = None if here is None else here.altitude_relative_m
-        height = "     -" if altitude is None else f"{round(altitude, 1) + 0.0:6.1f}"
-        self._last_line = self._vehicle.connection.now()
-        self._print(f"{self._last_line - self._started:6.1f} s {height} m  {text}")
+async def _report(options: argparse.Namespace) -> int:
+    need("plotly", "report")
+    logs = [options.log] if options.other is None else [options.log, options.other]
+    if any(log.suffix.lower() == ".ulg" for log in logs):
+        need("pyulog", "report")
+    from aerokit.report import write_report
 
-    @asynccontextmanager
-    async def running(self) -> AsyncIterator[None]:
-        """Print the vehicle's texts and modes, and a sign of life, while the block lasts."""
-        detach = self._vehicle.position.observe(self._on_position)
-        tasks = [asyncio.create_task(each) for each in (self._print_events(), self._print_signs_of_life())]
-        try:
-            yield
-        finally:
-            detach()
-            for task in tasks:
-                task.cancel()
-            with anyio.CancelScope(shield=True):
-                await asyncio.gather(*tasks, return_exceptions=True)
-
-    def print_summary(self, record: str) -> None:
-        """Print what was flown, how well the vehicle was heard, and what is left in the batteries."""
-        vehicle = self._vehicle
-        received, lost = vehicle.connection.counts(vehicle.system_id)
-        seconds = vehicle.connection.now() - self._started
-        version = vehicle.version.latest
-        self._print(
-            f"\n{vehicle.autopilot.firmware} {version or 'of unknown version'}, {seconds:.0f} s:"
-            f" flown {self._flown_m:.0f} m, up to {self._highest_m:.1f} m high and {self._fastest_m_s:.1f} m/s fast"
+    target = options.output or options.log.with_suffix(".html")
+    with progress_bar(options.log.name, "B") as on_progress:
+        made = write_report(
+            options.log,
+            target,
+            compare_with=options.other,
+            system_id=options.system,
+            force=options.force,
+            on_progress=on_progress,
         )
-        for battery in vehicle.batteries.latest or ():
-            self._print(
-                f"battery {battery.id}: {_number(battery.voltage_v, 'V')},"
-                f" {_number(battery.remaining_percent, '%')} left"
-            )
-        self._print(f"{received} frames received, {lost} lost; recorded in {record}")
+    tell(options, "report", {**made.to_dict(), "logs": logs}, _text(made))
+    if options.open:
+        import webbrowser
 
-    # ---------------------------------------------------------------------------------- inside
-
-    async def _print_events(self) -> None:
-        with (
-            self._vehicle.subscribe(events.StatusTextReceived, events.ModeChanged, capacity=100) as news,
-            contextlib.suppress(AerokitError),
-        ):
-            async for event in news:
-                if isinstance(event, events.ModeChanged):
-                    self.say(f"  mode {event.after}")
-                elif isinstance(event, events.StatusTextReceived):
-                    self.say(f"  {'! ' if event.severity <= WARNING else ''}{event.text}")
-
-    async def _print_signs_of_life(self) -> None:
-        vehicle = self._vehicle
-        while vehicle.connection.is_open:
-            await anyio.sleep(WAITING_S / 5)
-            if vehicle.connection.now() - self._last_line < WAITING_S:
-                continue
-            missing = [] if vehicle.is_armed else vehicle.missing_for_flight()
-            if missing:
-                self.say(f"  still missing: {'; '.join(missing)}")
-            else:
-                self.say(f"  {vehicle.mode_name}, {vehicle.ground_speed_m_s.latest or 0.0:.1f} m/s")
-
-    def _on_position(self, before: Position | None, position: Position) -> None:
-        if self._before is not None:
-            self._flown_m += position.distance_to(self._before)
-        self._before = position
-        self._highest_m = max(self._highest_m, position.altitude_relative_m or 0.0)
-        self._fastest_m_s = max(self._fastest_m_s, self._vehicle.ground_speed_m_s.latest or 0.0)
-
-    def _print(self, text: str) -> None:
-        try:
-            print(text, flush=True)
-        except BrokenPipeError:
-            sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - for the rest of the program
+        webbrowser.open(made.target.resolve().as_uri())
+    return DONE
 
 
-def _number(value: float | None, unit: str) -> str:
-    return "unknown" if value is None else f"{value:.4g} {unit}"
+def _text(made: Report) -> str:
+    lines = []
+    for number, (sentences, failsafes) in enumerate(zip(made.summaries, made.failsafes, strict=True)):
+        if len(made.summaries) > 1:
+            lines.append(f"{'AB'[number]}:")
+        lines += sentences
+        for each in failsafes:
+            lines.append(f"{clock(each.time_s)} {each.title}: {each.reaction}")
+            lines += [f"  {fact}" for fact in each.led_to]
+    return "\n".join([*lines, f"{made.target}: {made.bytes / 1e6:.1f} MB"])

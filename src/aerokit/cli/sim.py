@@ -6,12 +6,27 @@ import asyncio
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
+from aerokit.cli.arguments import (
+    add_vehicle_kind,
+    address_or_form,
+    count,
+    home,
+    number,
+    parameter,
+    picture,
+    system_id,
+    wind,
+)
+from aerokit.cli.completers import assignments, offer
 from aerokit.cli.interrupt import on_interrupt
-from aerokit.cli.places import each_with_its_own, place_of
+from aerokit.cli.output import add_json, tell
+from aerokit.cli.places import EACH_ITS_OWN, each_with_its_own, place_of
+from aerokit.cli.signing import add_signing_key
 from aerokit.cli.vehicles import simulated_fleet
 from aerokit.links import create_link
 from aerokit.sim import SimulatedVehicle, SimulatorServer, Wind
 from aerokit.sim.patience import wait_longer
+from aerokit.sim.place import HOME
 
 if TYPE_CHECKING:
     import argparse
@@ -19,10 +34,86 @@ if TYPE_CHECKING:
 
     from aerokit.sim.track import Track
 
-__all__ = ["run_sim"]
+__all__ = ["add_arguments", "run_sim"]
 
 CLIENTS_USE = {"tcpin": "tcp", "udpout": "udpin", "udpbcast": "udpin", "udpin": "udpout"}
 """What a client writes where the simulator writes this."""
+
+
+def add_arguments(command: argparse.ArgumentParser) -> None:
+    """The arguments of the command."""
+    command.set_defaults(run=run_sim)
+    kinds = "copter, plane, rover, sub (ArduPilot), px4, px4_plane; or a recording, flight.tlog (copter)"
+    add_vehicle_kind(command, kinds)
+    command.add_argument(
+        "addresses",
+        nargs="*",
+        type=address_or_form,
+        default=[EACH_ITS_OWN],
+        metavar="ADDRESS",
+        help="where to serve them, one or several: udpout:127.0.0.1:14550, udpin:0.0.0.0:14550, tcpin:0.0.0.0:5760,"
+        " /dev/ttyUSB0,57600, pty (a pseudo-terminal), pty:/tmp/ttyV0. All vehicles are on each address; but a form"
+        " gives each its own: pty:/tmp/ttyV{n}, udpout:127.0.0.1:{14550+n}; n counts from 0, id is the system id"
+        f" ({EACH_ITS_OWN})",
+    )
+    command.add_argument("--count", type=count, default=1, metavar="N", help="so many, 1 to 250 (1)")
+    command.add_argument(
+        "--speedup", type=number(0.1, 100), default=1.0, metavar="X", help="times real time (1)"
+    )
+    command.add_argument(
+        "--system-id", type=system_id, default=1, metavar="ID", help="MAVLink system id of the first (1)"
+    )
+    command.add_argument(
+        "--home",
+        type=home,
+        default=HOME,
+        metavar="LAT,LON,ALT",
+        help=f"of the first, degrees and metres above the sea ({','.join(map(str, HOME))})",
+    )
+    command.add_argument(
+        "--spacing", type=number(0, 1000), default=5.0, metavar="M", help="metres between them, eastwards (5)"
+    )
+    command.add_argument("--seed", type=int, default=0, help="of the noise of the first (0)")
+    _add_conditions(command)
+
+
+def _add_conditions(command: argparse.ArgumentParser) -> None:
+    parameters = command.add_argument(
+        "--parameter",
+        action="append",
+        type=parameter,
+        default=[],
+        dest="parameters",
+        metavar="NAME=VALUE",
+        help="other than its default, several times if need be: MNT1_TYPE=1 fits a gimbal to the copter",
+    )
+    offer(parameters, assignments)
+    command.add_argument(
+        "--wind",
+        type=wind,
+        metavar="NORTH,EAST[,GUSTS]",
+        help="where the air goes in m/s, and how much it changes (no wind); --wind=-3,0 for the first below 0",
+    )
+    command.add_argument(
+        "--battery", type=number(0, 100), metavar="PERCENT", help="charge at the start (100)"
+    )
+    command.add_argument(
+        "--boot-time", type=number(0, 600), metavar="S", help="simulated seconds until it is ready to arm"
+    )
+    add_signing_key(command, "has been set up on them before; ArduPilot's first port needs no signatures")
+    command.add_argument(
+        "--duration",
+        type=number(0.1, 1e6),
+        metavar="S",
+        help="simulated seconds, then it ends (until Ctrl-C)",
+    )
+    command.add_argument(
+        "--picture",
+        type=picture,
+        metavar="FILE",
+        help="of the true tracks, at the end: .svg, or .png with Pillow",
+    )
+    add_json(command)
 
 
 async def run_sim(options: argparse.Namespace) -> int:
@@ -34,15 +125,16 @@ async def run_sim(options: argparse.Namespace) -> int:
     stop = asyncio.Event()
     with on_interrupt(stop.set):
         async with server:
-            _tell(server, options.speedup)
+            _tell(server, options)
             with suppress(asyncio.TimeoutError):
                 await asyncio.wait_for(stop.wait(), options.duration and options.duration / options.speedup)
-    print("stopped")
+    tell(options, "stopped", {}, "stopped")
     if options.picture is not None:
         from aerokit.sim.picture import save_picture
 
         save_picture(tracks, options.picture)
-        print(f"track in {options.picture}")
+        record = {"file": options.picture, "what": "track", "count": len(tracks)}
+        tell(options, "saved", record, f"track in {options.picture}")
     return 0
 
 
@@ -83,16 +175,23 @@ def _server(
     links, vehicles_on = [], []
     for address in addresses:
         groups = [[vehicle] for vehicle in vehicles] if each_with_its_own(address) else [list(vehicles)]
-        for number, group in enumerate(groups):
-            links.append(create_link(place_of(address, number, group[0].system_id)))
+        for place, group in enumerate(groups):
+            links.append(create_link(place_of(address, place, group[0].system_id)))
             vehicles_on.append(group)
     return SimulatorServer(vehicles, links, speedup=speedup, vehicles_on=vehicles_on)
 
 
-def _tell(server: SimulatorServer, speedup: float) -> None:
+def _tell(server: SimulatorServer, options: argparse.Namespace) -> None:
     for address, vehicles in zip(server.addresses, server.vehicles_on, strict=True):
-        print(f"{_systems(vehicles)} on {address}, {speedup:g} times real time")
-    print(f"try: aerokit demo --connect {_client_address(server.addresses[0])}", flush=True)
+        record = {
+            "system_ids": [vehicle.system_id for vehicle in vehicles],
+            "address": address,
+            "speedup": options.speedup,
+        }
+        text = f"{_systems(vehicles)} on {address}, {options.speedup:g} times real time"
+        tell(options, "simulated", record, text)
+    if not options.json:
+        print(f"try: aerokit demo --connect {_client_address(server.addresses[0])}", flush=True)
 
 
 def _systems(vehicles: Sequence[SimulatedVehicle]) -> str:

@@ -8,15 +8,10 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from aerokit.sim import SimulatedVehicle
 
-__all__ = ["HOME", "simulated_fleet", "simulated_vehicle"]
-
-HOME = (47.397742, 8.545594, 488.0)
-"""Where they stand unless told otherwise: latitude, longitude, metres above the sea."""
+__all__ = ["simulated_fleet", "simulated_vehicle"]
 
 
-def simulated_vehicle(
-    name: str, *, home: tuple[float, float, float] = HOME, **options: Any
-) -> SimulatedVehicle:
+def simulated_vehicle(name: str, **options: Any) -> SimulatedVehicle:
     """A vehicle of a kind of `aerokit.sim.kinds`, just switched on; ``options`` are its class's.
 
     LocalProtocolError when it has no such option or parameter. ``boot_text`` is for those that have one.
@@ -30,7 +25,7 @@ def simulated_vehicle(
     for option in options:
         if option not in taken:
             raise LocalProtocolError(f"the simulated {name} has no {option}")
-    return simulated(name, home=home, **options)
+    return simulated(name, **options)
 
 
 def simulated_fleet(
@@ -38,17 +33,18 @@ def simulated_fleet(
     count: int,
     *,
     system_id: int = 1,
-    home: tuple[float, float, float] = HOME,
+    home: tuple[float, float, float] | None = None,
     spacing_m: float = 5.0,
     seed: int = 0,
     **options: Any,
 ) -> list[SimulatedVehicle]:
-    """Vehicles side by side from ``home`` eastwards; system ids and seeds count up.
+    """Vehicles side by side eastwards from ``home``, or `aerokit.sim.HOME`; system ids and seeds count up.
 
     The name of a .tlog file gives the one vehicle of that recording, to which nothing else applies.
     """
     from aerokit.errors import LocalProtocolError
     from aerokit.sim.local_frame import GlobalPoint, LocalFrame
+    from aerokit.sim.place import HOME
 
     if name.endswith(".tlog"):
         return [_recorded(name, count)]
@@ -56,6 +52,7 @@ def simulated_fleet(
         raise LocalProtocolError(
             f"{count} vehicles from system id {system_id} on: the last would be above 255"
         )
+    home = home or HOME
     frame = LocalFrame(GlobalPoint(round(home[0] * 1e7), round(home[1] * 1e7), home[2]))
     places = [frame.to_global(0.0, number * spacing_m, 0.0) for number in range(count)]
     return [

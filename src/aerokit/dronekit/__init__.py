@@ -25,7 +25,7 @@ import logging
 import math
 import struct
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from aerokit.dronekit import monotonic, util
 from aerokit.dronekit.alias import install
@@ -50,6 +50,8 @@ from aerokit.dronekit.values import (
 from aerokit.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from pymavlink import mavwp
     from pymavlink.dialects.v10 import ardupilotmega
 
@@ -61,7 +63,7 @@ if TYPE_CHECKING:
     from aerokit.dronekit.parameters import Parameters
     from aerokit.dronekit.vehicle import Vehicle
 
-basestring = (str, bytes)
+basestring: tuple[type[str], type[bytes]] = (str, bytes)
 """For ``isinstance``, in programs that Python 2 also ran."""
 
 __all__ = [
@@ -121,4 +123,6 @@ _LATER = {
 }
 """Where a name is from that is imported when a program first uses it: what is behind them takes most of the time."""
 
+__getattr__: Callable[[str], Any]
+__dir__: Callable[[], list[str]]
 __getattr__, __dir__ = lazy_names(__name__, _LATER, __all__)

@@ -18,10 +18,13 @@ else:
 __all__ = ["install", "uninstall"]
 
 ALIAS, PACKAGE = "dronekit", "aerokit.dronekit"
+SITL_ALIAS, SITL_MODULE = "dronekit_sitl", "aerokit.dronekit.sitl"
 
 
 def install() -> None:
     """Have ``import dronekit`` and ``from dronekit.lib import …`` mean :mod:`aerokit.dronekit` from now on.
+
+    ``import dronekit_sitl`` means :mod:`aerokit.dronekit.sitl`, unless another one was imported before.
 
     For test runners (in ``conftest.py``) and embedding programs. A DroneKit that is installed, but was not imported
     yet, is not looked for any more. Calling it again changes nothing.
@@ -50,8 +53,15 @@ def uninstall() -> None:
         return
     sys.meta_path[:] = [finder for finder in sys.meta_path if not isinstance(finder, _SubmoduleFinder)]
     for name in list(sys.modules):
-        if name == ALIAS or name.startswith(f"{ALIAS}."):
+        if name == ALIAS or (_own_name(name) and sys.modules[name] is sys.modules.get(_own_name(name) or "")):
             del sys.modules[name]
+
+
+def _own_name(name: str) -> str | None:
+    """What a module is called here; None: it is none of ours."""
+    if name == SITL_ALIAS:
+        return SITL_MODULE
+    return PACKAGE + name.removeprefix(ALIAS) if name.startswith(f"{ALIAS}.") else None
 
 
 class _SubmoduleFinder(MetaPathFinder):
@@ -60,15 +70,16 @@ class _SubmoduleFinder(MetaPathFinder):
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        if not fullname.startswith(f"{ALIAS}."):
+        own_name = _own_name(fullname)
+        if own_name is None:
             return None
-        spec = importlib.util.find_spec(PACKAGE + fullname.removeprefix(ALIAS))
+        spec = importlib.util.find_spec(own_name)
         return None if spec is None else ModuleSpec(fullname, _SubmoduleLoader(), origin=spec.origin)
 
 
 class _SubmoduleLoader(Loader):
     def create_module(self, spec: ModuleSpec) -> ModuleType:
-        module = importlib.import_module(PACKAGE + spec.name.removeprefix(ALIAS))
+        module = importlib.import_module(_own_name(spec.name) or spec.name)
         self._own_spec = module.__spec__
         return module
 

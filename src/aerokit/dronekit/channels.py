@@ -114,9 +114,10 @@ class Channels(_ChannelDict):
 
     # ------------------------------------------------------------------------- not for programs
 
-    __setitem__, __delitem__, __ior__ = _refused("__setitem__"), _refused("__delitem__"), _refused("__ior__")
-    clear, pop, popitem = _refused("clear"), _refused("pop"), _refused("popitem")
-    setdefault, update = _refused("setdefault"), _refused("update")
+    if not TYPE_CHECKING:  # a checker believes that a dictionary can be changed
+        __setitem__, __delitem__, __ior__ = map(_refused, ("__setitem__", "__delitem__", "__ior__"))
+        clear, pop, popitem = map(_refused, ("clear", "pop", "popitem"))
+        setdefault, update = map(_refused, ("setdefault", "update"))
 
     def _on_channels(self, message: RcChannels) -> None:
         self._take(0, ALL_VALUES(message))

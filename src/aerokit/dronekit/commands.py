@@ -38,8 +38,8 @@ __all__ = ["Command", "CommandSequence", "WaypointLoader"]
 
 FIELDS: list[str] = MAVLink_mission_item_message.fieldnames[:14]
 """Those of MAVLink 1: ``mission_type``, which came later, is no part of a command's text."""
-PARAMS = FIELDS[7:11]
-CONTENT = ("frame", "command", "autocontinue", *FIELDS[7:])
+PARAMS: list[str] = FIELDS[7:11]
+CONTENT: tuple[str, ...] = ("frame", "command", "autocontinue", *FIELDS[7:])
 """The fields that make a mission another one when they are changed."""
 ABOVE_SEA = (0, 5)
 """MAV_FRAME_GLOBAL and its _INT twin."""
@@ -47,17 +47,47 @@ AT_HOME_DEG, AT_HOME_M = 1e-4, 2.0
 """How near to home the home row of a file may be: about ten metres, two in height."""
 
 
-class Command(MAVLink_mission_item_message):  # type: ignore[misc]
+if TYPE_CHECKING:  # pymavlink's classes say little to a checker
+
+    class _MissionItem:
+        target_system: int
+        target_component: int
+        seq: int
+        frame: int
+        command: int
+        current: int
+        autocontinue: int
+        param1: float
+        param2: float
+        param3: float
+        param4: float
+        x: float
+        y: float
+        z: float
+
+        def __init__(self, *values: float) -> None: ...
+        def __getattr__(self, name: str) -> Any: ...
+else:
+    _MissionItem = MAVLink_mission_item_message
+
+
+class Command(_MissionItem):
     """A waypoint, or another item of a mission, of ``vehicle.commands``: a MISSION_ITEM of pymavlink.
 
     Args:
-        target_system, target_component, seq: anything; they are filled in when it is added.
+        target_system: anything; it is filled in when it is added.
+        target_component: so is this.
+        seq: and this.
         frame: MAV_FRAME: what ``z`` is above; 0: the sea, 3: home, 10: the terrain.
         command: MAV_CMD.
         current: not used; 1 in the first row of a waypoint file, which is home.
         autocontinue: 0 makes PX4 stay at the item; ArduPilot goes on in any case.
-        param1, param2, param3, param4: the command's.
-        x, y: latitude and longitude in degrees, or the command's parameters 5 and 6; metres in a local frame.
+        param1: the command's first parameter.
+        param2: its second.
+        param3: its third.
+        param4: its fourth.
+        x: latitude in degrees, or the command's parameter 5; metres in a local frame.
+        y: longitude, or its parameter 6.
         z: altitude in metres, or parameter 7.
     """
 
@@ -389,8 +419,7 @@ def _wire_number(value: Any, command: int, frame: int) -> int | float:
 
 
 def _command(item: MissionItem, seq: int, own_ids: tuple[int, int]) -> Command:
-    item = item.replace(
-        frame=int(canonical_frame(item.frame))
-    )  # those of MISSION_ITEM, which is what a command is
+    # The frames of MISSION_ITEM, which is what a command is.
+    item = item.replace(frame=int(canonical_frame(item.frame)))
     message = to_wire_float(item, seq, target_system=own_ids[0], target_component=own_ids[1])
     return Command(*(getattr(message, name) for name in FIELDS))

@@ -32,6 +32,7 @@ LONGEST_WAIT_S = 0.2
 """Waits are cut into slices: Ctrl-C and the end of the link are noticed between them."""
 SILENT_AFTER_S = 5
 TICK_S = 0.05
+IDLE_TICK_S = 1.0
 
 MessageT = TypeVar("MessageT", bound=Message)
 
@@ -155,11 +156,11 @@ class Core:
 
     def __init__(self, handler: MAVConnection, owner: object) -> None:
         self.handler = handler
-        self.logger = logging.getLogger("dronekit")
-        self.ready = Readiness()
-        self.listeners = Listeners(owner, handler.listener_thread, self.ready.mark)
+        self.logger: logging.Logger = logging.getLogger("dronekit")
+        self.ready: Readiness = Readiness()
+        self.listeners: Listeners = Listeners(owner, handler.listener_thread, self.ready.mark)
         """Of the vehicle's attributes."""
-        self.heartbeat_limit_s = 0.0
+        self.heartbeat_limit_s: float = 0.0
         """Longer silences are errors; 0: none is."""
         self.found: AsyncVehicle | None = None
         """The asynchronous vehicle, once it was found."""
@@ -234,7 +235,7 @@ class Core:
             aio.connection.bus.attach_lazily(message_type, weakly(latest.take), system_id=aio.system_id)
 
     def watch_link(self) -> None:
-        """Tell 20 times a second how old the last heartbeat is; log it when they stay away and when they are back."""
+        """Tell how old the last heartbeat is, 20 times a second if somebody listens; log a silence, and its end."""
         aio = self.aio
         if not aio.connection.is_open:
             return
@@ -247,7 +248,10 @@ class Core:
                 post(self.logger.warning, "Link timeout, no heartbeat in last %d seconds", SILENT_AFTER_S)
             else:
                 post(self.logger.info, "...link restored.")
-        asyncio.get_running_loop().call_later(TICK_S, weakly(self.watch_link))
+        # Each tick wakes a sleeping process, which costs as much as a few messages.
+        is_told = self._is_silent or self.listeners.heed("last_heartbeat")
+        wait_s = TICK_S if is_told else max(TICK_S, min(IDLE_TICK_S, SILENT_AFTER_S - age))
+        asyncio.get_running_loop().call_later(wait_s, weakly(self.watch_link))
 
     def background(self, function: Callable[[], Awaitable[None]]) -> None:
         """Run a coroutine function for as long as the vehicle is connected (loop thread)."""

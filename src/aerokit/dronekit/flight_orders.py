@@ -227,6 +227,10 @@ class CurrentCommand:
         with anyio.move_on_after(CONFIRMED_S):
             await aio.telemetry.mission_current.wait_until(lambda progress: progress.current == seq)
             return
+        if aio.heartbeat_age > KNOWN_S:
+            raise APIException(
+                f"next = {seq} is not confirmed, and the vehicle is not heard: it may have been set"
+            )
         if seq == 0:
             await aio.command(MavCmd.DO_SET_MISSION_CURRENT, 0)
         else:

@@ -80,7 +80,7 @@ class Gimbal(GimbalPrivates):
         """
         angles = [_checked(name, value) for name, value in (("pitch", pitch), ("yaw", yaw), ("roll", roll))]
         gimbal = self._core.check_link().gimbal
-        self._core.order("gimbal", gimbal.point, *angles[:2], roll_deg=angles[2])
+        self._core.order("gimbal", gimbal.point, *angles[:2], roll_deg=angles[2], wait=False)
 
     def target_location(self, roi: LocationGlobalRelative | LocationGlobal) -> None:
         """Keep the camera on a place; a copter without a gimbal that turns does so itself. All zeros give it up."""

@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Line", "Order", "Orders", "Work", "weakly"]
 
-logger, of_vehicles = logging.getLogger("dronekit.mavlink"), logging.getLogger("dronekit")
+logger: logging.Logger = logging.getLogger("dronekit.mavlink")
+of_vehicles: logging.Logger = logging.getLogger("dronekit")
 
 ORDERS_END_S = 2.0
 """How long closing waits for what was ordered a moment before to be answered."""
@@ -42,14 +43,14 @@ class Line:
     def __init__(self, address: str, loop: LoopThread, held: Held[Connection], target_system: int) -> None:
         self.target_system = target_system
         """System id of the vehicle, 0 before it was heard."""
-        self.listener_thread = ListenerThread()
+        self.listener_thread: ListenerThread = ListenerThread()
         """Where the callbacks of the program run."""
         self.loop = loop
         """The event loop's thread."""
         self._held = held
-        self.connection = held.value
+        self.connection: Connection = held.value
         """The asynchronous connection, for code that runs on its loop."""
-        self.orders = Orders(loop)
+        self.orders: Orders = Orders(loop)
         """What was ordered without waiting."""
         self.knows_mavlink_2 = False
         """Whether the vehicle has said that it understands MAVLink 2, whichever version it speaks so far."""

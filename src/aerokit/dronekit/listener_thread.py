@@ -15,7 +15,7 @@ from aerokit.sync.reply import Reply
 
 __all__ = ["ListenerThread"]
 
-logger = logging.getLogger("dronekit")
+logger: logging.Logger = logging.getLogger("dronekit")
 
 MOST_WAITING = 10_000
 """What a listener that does not come back lets wait at most; values that come again and again are dropped then."""
@@ -28,12 +28,14 @@ class ListenerThread:
     What a function raises is logged. The thread does not keep the interpreter alive.
     """
 
+    dropped: int
+
     def __init__(self, name: str = "dronekit listeners") -> None:
         self._name = name
         self._calls: queue.SimpleQueue[tuple[Callable[..., object], tuple[Any, ...]]] = queue.SimpleQueue()
         self._thread: threading.Thread | None = None
         self._lock = threading.Lock()
-        self.is_stopped = False
+        self.is_stopped: bool = False
         """Whether nothing is called any more."""
         self.dropped = 0
         """How many calls were dropped because a listener did not come back."""

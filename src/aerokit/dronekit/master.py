@@ -47,11 +47,12 @@ class Master:
     def __init__(self, connection: Line) -> None:
         self._connection = connection
         ours = connection.connection
-        self.source_system, self.source_component = ours.source_system, ours.source_component
+        self.source_system: int = ours.source_system
+        self.source_component: int = ours.source_component
         """Our own ids."""
-        self.mav = MessageFactory(self._send, ours.source_system, ours.source_component)
+        self.mav: MessageFactory = MessageFactory(self._send, ours.source_system, ours.source_component)
         """Makes and sends messages."""
-        self.messages = Inbox(connection)
+        self.messages: Inbox = Inbox(connection)
         """The last message of every type, by its name; begins when it is first asked."""
 
     @property
@@ -114,7 +115,17 @@ class Master:
         numbers = order if isinstance(order, tuple) else (MavModeFlag.CUSTOM_MODE_ENABLED.value, order, 0)
         self._command(MavCmd.DO_SET_MODE, *numbers)
 
-    set_mode_apm = set_mode_px4 = set_mode
+    def set_mode_apm(
+        self, mode: str | int, custom_mode: int | None = 0, custom_sub_mode: int | None = 0
+    ) -> None:
+        """The same."""
+        self.set_mode(mode, custom_mode, custom_sub_mode)
+
+    def set_mode_px4(
+        self, mode: str | int, custom_mode: int | None = 0, custom_sub_mode: int | None = 0
+    ) -> None:
+        """The same."""
+        self.set_mode(mode, custom_mode, custom_sub_mode)
 
     # -------------------------------------------------------------------------------- orders
 

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 __all__ = ["APIException", "MAVConnection", "MAVWriter", "mavudpin_multi"]
 
-logger = logging.getLogger("dronekit.mavlink")
+logger: logging.Logger = logging.getLogger("dronekit.mavlink")
 
 FunctionT = TypeVar("FunctionT", bound=Callable[..., object])
 

@@ -31,7 +31,7 @@ __all__ = [
     "message_of",
 ]
 
-logger = logging.getLogger("dronekit")
+logger: logging.Logger = logging.getLogger("dronekit")
 
 AttributeListener = Callable[[Any, str, Any], object]
 """``listener(object, name, value)``: of an attribute; or of a message, which is pymavlink's."""
@@ -189,7 +189,7 @@ class HasObservers:
 
 
 class MessageListeners(Listeners):
-    """The message listeners of one vehicle, called on its listener thread. pymavlink is imported for the first message.
+    """The message listeners of one vehicle, called on its listener thread. pymavlink is imported for the first of them.
 
     They hear what the vehicle's system says, every component of it, and what comes from radios, ground stations and
     the like; not what other vehicles on the link say.
@@ -205,6 +205,7 @@ class MessageListeners(Listeners):
 
     def add(self, name: str, listener: AttributeListener) -> None:
         """Have it called for every message of this name, or for every message (``'*'``); not twice."""
+        _pymavlink()  # at its first message it would hold up all that comes for 60 ms
         super().add(str(name), listener)
         self._attach_now()
 
@@ -270,7 +271,7 @@ def message_of(frame: Frame) -> Any:
 
 @cache
 def _pymavlink() -> tuple[Any, Callable[..., Any]]:
-    """Imported for the first message that a program wants to read."""
+    """Imported for the first listener to messages."""
     from pymavlink import mavutil
 
     from aerokit.mavlink.to_pymavlink import to_pymavlink

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, MutableMapping
-from typing import TYPE_CHECKING, Any, SupportsFloat, SupportsIndex
+from typing import TYPE_CHECKING, Any
 
 import anyio
 
@@ -16,6 +16,7 @@ from aerokit.dronekit.privates import Python2Mapping
 from aerokit.errors import LocalProtocolError, ParameterTimeout
 from aerokit.mavlink.messages import ParamValue
 from aerokit.parameters import check_name
+from aerokit.parameters.parameter import number_of
 from aerokit.runtime.events import ParameterChanged
 from aerokit.vehicle.parameters.names import warn_of_rename
 
@@ -120,7 +121,7 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
 
         LocalProtocolError, a ValueError: the name is no text, or the value no number.
         """
-        name, number = _upper(name), _number(name, value)
+        name, number = _upper(name), number_of(name, value)
         if wait_ready:
             self.wait_ready()
         found = self._values.find(name)
@@ -206,17 +207,6 @@ def _upper(name: str) -> str:
     if not isinstance(name, str):
         raise LocalProtocolError(f"parameter name = {name!r} is no text")
     return name.upper()
-
-
-def _number(name: str, value: object) -> int | float:
-    """The value, when it is a number: of Python, numpy or alike; else LocalProtocolError, a ValueError."""
-    if isinstance(value, (int, float)):
-        return value
-    if isinstance(value, SupportsIndex):
-        return value.__index__()
-    if isinstance(value, SupportsFloat):
-        return float(value)
-    raise LocalProtocolError(f"{name} = {value!r} is no number")
 
 
 def _described(name: str) -> str:

@@ -6,24 +6,30 @@ import argparse
 import builtins
 import contextlib
 import importlib.machinery
+import importlib.util
 import io
 import os
 import runpy
 import sys
 import types
 import zipfile
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 from aerokit.dronekit.alias import install
 from aerokit.dronekit.util import errprinter
+from aerokit.errors import AerokitError, LocalProtocolError
+from aerokit.wording import did_you_mean
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from types import TracebackType
 
+    from aerokit.dronekit.sitl import ServedVehicle
+
 __all__ = ["main", "parser", "run_script"]
 
-CANNOT_OPEN = 2
+FAILED, CANNOT_OPEN = 1, 2
+WITH_VALUE = ("--vehicle", "--speedup", "--home")
 OF_RUNPY = (runpy.__file__, "<frozen runpy>")
 
 
@@ -63,43 +69,118 @@ def main(arguments: Sequence[str], prog: str = "python -m aerokit.dronekit") -> 
         prog: how this command is called.
 
     Returns:
-        Exit code: 0, or 2 if the program cannot be opened.
+        Exit code: 0, 1 if its own vehicle cannot be served, or 2 if the program cannot be opened.
     """
     own, rest = _split(arguments)
     options = parser(prog).parse_args(own)
     if not options.module and (error := _unreadable(options.program)):
         errprinter(f"{prog}: can't open file {options.program!r}: {error}")
         return CANNOT_OPEN
-    install()
+    try:
+        install()
+        served = _serve(options, prog) if options.sim else None
+    except (AerokitError, ImportError) as error:
+        errprinter(f"{prog}: {error}")
+        return FAILED
+    error_text = _unfindable(options.program) if options.module else _without_main(options.program)
+    if error_text:
+        errprinter(f"{prog}: {error_text}")
+        return FAILED
     sys.excepthook = _print_without_us
     if not getattr(sys.flags, "safe_path", False):
         del sys.path[:1]  # ours: the folder of this command
     run = _run_module if options.module else _run_file
-    run(options.program, rest)
+    try:
+        run(options.program, rest)
+    finally:
+        if served is not None:
+            served.stop()
     return 0
 
 
 def parser(prog: str) -> argparse.ArgumentParser:
     """The arguments in front of the program's own."""
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog=prog,
-        usage=f"{prog} [-h] (PROGRAM.py | -m MODULE) [ARGUMENT ...]",
+        usage=f"{prog} [-h] [--sim [OPTION ...]] (PROGRAM.py | -m MODULE) [ARGUMENT ...]",
         description="Run a DroneKit program unchanged: its 'import dronekit' means aerokit.dronekit.",
     )
     parser.add_argument("-m", dest="module", action="store_true", help="the program is a module, not a file")
     parser.add_argument(
         "program", metavar="PROGRAM", help="a file, or a folder or zip file with a __main__.py"
     )
+    sim = parser.add_argument_group("a vehicle for the program")
+    sim.add_argument(
+        "--sim", action="store_true", help="serve a simulated one on tcp:127.0.0.1:5760 and to UDP port 14550"
+    )
+    sim.add_argument(
+        "--vehicle", default="copter", metavar="KIND", help="copter, plane, rover, sub, px4 … (copter)"
+    )
+    sim.add_argument("--speedup", type=float, default=1.0, metavar="X", help="times real time (1)")
+    sim.add_argument("--home", metavar="LAT,LON,ALT", help="degrees, metres above the sea (near Canberra)")
     parser.epilog = "Everything behind the program is the program's, options too."
     return parser
 
 
+class _Parser(argparse.ArgumentParser):
+    """Says what was perhaps meant when an option is not known."""
+
+    def error(self, message: str) -> NoReturn:
+        label, _, rest = message.partition("unrecognized arguments: ")
+        if rest and not label:
+            message += did_you_mean(rest.split()[0].partition("=")[0], self._option_string_actions)
+        super().error(message)
+
+
 def _split(arguments: Sequence[str]) -> tuple[Sequence[str], Sequence[str]]:
     """What is for us, the program included, and what is for the program."""
+    is_value = False
     for place, argument in enumerate(arguments, 1):
-        if not argument.startswith("-"):
+        if not is_value and not argument.startswith("-"):
             return arguments[:place], arguments[place:]
+        is_value = not is_value and argument in WITH_VALUE
     return arguments, []
+
+
+def _serve(options: argparse.Namespace, prog: str) -> ServedVehicle:
+    from aerokit.dronekit.sitl import parse_home, serve_for_program
+    from aerokit.sim.place import HOME
+
+    if not 0.1 <= options.speedup <= 100:
+        raise LocalProtocolError(f"speedup = {options.speedup:g} is not allowed: 0.1 to 100")
+    home = HOME if options.home is None else parse_home(options.home)
+    served = serve_for_program(options.vehicle, home, options.speedup)
+    tcp, udp = (place.replace("tcpin:", "tcp:").replace("udpout:", "udp:") for place in served.addresses)
+    errprinter(f"{prog}: a simulated {options.vehicle} is on {tcp} and {udp}")
+    return served
+
+
+def _unfindable(module: str) -> str | None:
+    """As Python says it of ``-m``; the folder of the program is the working directory."""
+    sys.path.insert(0, os.getcwd())
+    try:
+        spec = importlib.util.find_spec(module)
+        if spec is None:
+            return f"No module named {module}"
+        folders = spec.submodule_search_locations
+        if folders is None or not all(map(_is_without_main, folders)):
+            return None
+        return f"No module named {module}.__main__; {module!r} is a package and cannot be directly executed"
+    except ModuleNotFoundError as error:
+        return str(error)
+    finally:
+        del sys.path[0]
+
+
+def _without_main(path: str) -> str | None:
+    """As Python says it of a folder that is no program."""
+    return f"can't find '__main__' module in {path!r}" if _is_without_main(path) else None
+
+
+def _is_without_main(path: str) -> bool:
+    return os.path.isdir(path) and not any(
+        os.path.exists(os.path.join(path, name)) for name in ("__main__.py", "__main__.pyc")
+    )
 
 
 def _unreadable(path: str) -> str | None:

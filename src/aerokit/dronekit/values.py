@@ -249,19 +249,19 @@ class Capabilities:
 
     def __init__(self, capabilities: int | None) -> None:
         bits = capabilities or 0
-        self.mission_float = bool(bits & 1)
-        self.param_float = bool(bits & 1 << 1)
-        self.mission_int = bool(bits & 1 << 2)
-        self.command_int = bool(bits & 1 << 3)
-        self.param_union = bool(bits & 1 << 4)
-        self.ftp = bool(bits & 1 << 5)
-        self.set_attitude_target = bool(bits & 1 << 6)
-        self.set_attitude_target_local_ned = bool(bits & 1 << 7)
-        self.set_altitude_target_global_int = bool(bits & 1 << 8)
-        self.terrain = bool(bits & 1 << 9)
-        self.set_actuator_target = bool(bits & 1 << 10)
-        self.flight_termination = bool(bits & 1 << 11)
-        self.compass_calibration = bool(bits & 1 << 12)
+        self.mission_float: bool = bool(bits & 1)
+        self.param_float: bool = bool(bits & 1 << 1)
+        self.mission_int: bool = bool(bits & 1 << 2)
+        self.command_int: bool = bool(bits & 1 << 3)
+        self.param_union: bool = bool(bits & 1 << 4)
+        self.ftp: bool = bool(bits & 1 << 5)
+        self.set_attitude_target: bool = bool(bits & 1 << 6)
+        self.set_attitude_target_local_ned: bool = bool(bits & 1 << 7)
+        self.set_altitude_target_global_int: bool = bool(bits & 1 << 8)
+        self.terrain: bool = bool(bits & 1 << 9)
+        self.set_actuator_target: bool = bool(bits & 1 << 10)
+        self.flight_termination: bool = bool(bits & 1 << 11)
+        self.compass_calibration: bool = bool(bits & 1 << 12)
 
     def __repr__(self) -> str:
         known = [name for name, value in vars(self).items() if value]

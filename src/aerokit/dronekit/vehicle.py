@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 import threading
 import time
 from contextlib import asynccontextmanager, nullcontext
@@ -275,12 +274,13 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
     def _dk_wait_for_first_values(self) -> None:
         wanted, ready = set[str](FIRST_VALUES), self._dk.ready
         now = time.monotonic()
-        end, no_more_at = now + FIRST_VALUES_S, math.inf
-        while (missing := wanted - ready.names) and now < min(end, no_more_at):
+        end = no_more_at = now + FIRST_VALUES_S
+        missing = wanted
+        while (still := wanted - ready.names) and now < min(end, no_more_at):
+            if still < missing:  # also what came before anybody waited
+                missing, no_more_at = still, now + NO_MORE_S
             ready.wait_a_little(wanted, min(end, no_more_at) - now)
             now = time.monotonic()
-            if wanted - ready.names < missing:
-                no_more_at = now + NO_MORE_S
 
     def _dk_wait_until_booted(self, timeout: float) -> None:
         try:

@@ -5,11 +5,13 @@ Only this package touches sockets and ports.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from aerokit.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from .address import ACCEPTED_FORMS, LinkAddress, parse_address
     from .create import create_link
     from .fault_model import FaultModel
@@ -76,4 +78,6 @@ _HOMES = {
     "parse_address": "aerokit.links.address",
 }
 
+__getattr__: Callable[[str], Any]
+__dir__: Callable[[], list[str]]
 __getattr__, __dir__ = lazy_names(__name__, _HOMES, __all__)

@@ -26,6 +26,8 @@ class _State(enum.Enum):
 class BaseLink(Link):
     """The life of a link; a transport adds `_connect`, `_release` and `write`."""
 
+    dropped_writes: int
+
     def __init__(self, address: str) -> None:
         self.address = address
         self.dropped_writes = 0

@@ -63,7 +63,7 @@ class Air:
     """What is transmitted on: busy until its last frame has left. Two directions that share one are half duplex."""
 
     def __init__(self) -> None:
-        self.busy_until = -math.inf
+        self.busy_until: float = -math.inf
 
 
 class FaultyPath:
@@ -73,10 +73,18 @@ class FaultyPath:
     ``overflowed`` (no room in the queue), ``duplicated``, ``reordered`` and ``corrupted``.
     """
 
+    frames: int
+    lost: int
+    overflowed: int
+    duplicated: int
+    reordered: int
+    corrupted: int
+
     def __init__(self, model: FaultModel, seed: object = 0, air: Air | None = None) -> None:
         self.model = model
         """May be replaced at any time."""
-        self.frames = self.bytes = self.lost = self.overflowed = 0
+        self.frames = self.lost = self.overflowed = 0
+        self.bytes: int = 0
         self.duplicated = self.reordered = self.corrupted = 0
         self._chance = random.Random(repr(seed)).random
         self._bits = random.Random(repr((seed, "bits")))

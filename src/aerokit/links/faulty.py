@@ -53,9 +53,9 @@ class FaultyLink(Link):
         """The wrapped link."""
         model = FaultModel() if model is None else model
         air = Air() if half_duplex else None
-        self.outgoing = FaultyPath(outgoing or model, (seed, "outgoing"), air)
+        self.outgoing: FaultyPath = FaultyPath(outgoing or model, (seed, "outgoing"), air)
         """What happens to what is written, with its counters; its ``model`` may be replaced at any time."""
-        self.incoming = FaultyPath(incoming or model, (seed, "incoming"), air)
+        self.incoming: FaultyPath = FaultyPath(incoming or model, (seed, "incoming"), air)
         """What happens to what is received."""
         self._ears: _Ears | None = None
         self._on_the_way: _Timetable | None = None

@@ -39,7 +39,7 @@ class PtyLink(BaseLink):
             written = os.write(self._ends[0], data)
         except OSError:
             written = 0
-        self.dropped_writes += written < len(data)
+        self._drop(written < len(data))
 
     async def _connect(self) -> None:
         if sys.platform == "win32":
@@ -55,7 +55,7 @@ class PtyLink(BaseLink):
         name = os.ttyname(theirs)
         if self._path:
             self._link_to(name)
-        self.address = f"pty:{self._path or name}"
+        self.address: str = f"pty:{self._path or name}"
         self._released.clear()
         self._loop.add_reader(ours, self._read)
 

@@ -21,7 +21,7 @@ from .link import DrainListener, Link, Peer, Receiver, keeps_peers
 
 __all__ = ["Interruptible", "ReconnectingLink"]
 
-logger = logging.getLogger("aerokit")
+logger: logging.Logger = logging.getLogger("aerokit")
 
 STEADY_S = 1.0
 """A link that was opened again is back when bytes come, or when it has not been lost again for so long."""

@@ -30,6 +30,9 @@ class Replay(BaseLink):
     What is written goes nowhere and is counted in `ignored_writes`.
     """
 
+    ignored_writes: int
+    frames: int
+
     def __init__(self, path: str | os.PathLike[str], speed: float | None = 1.0) -> None:
         factor = math.inf if speed is None else float(speed)
         if not factor > 0:

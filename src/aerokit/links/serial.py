@@ -76,7 +76,7 @@ class SerialLink(BaseLink):
             self._port.reset_output_buffer()
         taken = before - self._waiting_to_be_sent(self._transport)
         self._outbox.taken_back(taken)
-        self.dropped_writes += taken > 0
+        self._drop(taken > 0)
 
     async def _connect(self) -> None:
         """Without an await in it: there is no half-way at which it could be cancelled."""

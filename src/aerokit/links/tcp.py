@@ -183,7 +183,7 @@ class TcpListen(_TcpLink):
         elif client_of_peer := self._clients.get(peer):
             client_of_peer.write(data)
         else:
-            self.dropped_writes += 1
+            self._drop(1)
 
     def keep_peer(self, peer: Peer) -> None:
         """See `Link.keep_peer`: it is not turned away for another one."""
@@ -208,7 +208,7 @@ class TcpListen(_TcpLink):
     async def _connect(self) -> None:
         self._socket = sock = await bound_socket(self._host, self._port, socket.SOCK_STREAM)
         self._local_address = sock.getsockname()[:2]
-        self.address = f"tcpin:{host_and_port(self._host, self._local_address[1])}"
+        self.address: str = f"tcpin:{host_and_port(self._host, self._local_address[1])}"
         loop = asyncio.get_running_loop()
         self._server = await loop.create_server(
             lambda: _Stream(self), sock=sock, backlog=16, start_serving=False

@@ -140,7 +140,7 @@ class _UdpLink(BaseLink):
         try:
             self._socket.sendto(data, address)
         except OSError:
-            self.dropped_writes += 1
+            self._drop(1)
 
 
 class UdpListen(_UdpLink):
@@ -169,7 +169,7 @@ class UdpListen(_UdpLink):
         elif peer in self._peers:
             self._send(data, peer)
         else:
-            self.dropped_writes += 1
+            self._drop(1)
 
     def keep_peer(self, peer: Peer) -> None:
         """See `Link.keep_peer`."""
@@ -185,7 +185,7 @@ class UdpListen(_UdpLink):
 
     async def _make_socket(self) -> socket.socket:
         sock = await bound_socket(self._host, self._port, socket.SOCK_DGRAM)
-        self.address = f"udpin:{host_and_port(self._host, sock.getsockname()[1])}"
+        self.address: str = f"udpin:{host_and_port(self._host, sock.getsockname()[1])}"
         return sock
 
     def _datagram_received(self, data: bytes, source: Any) -> None:
@@ -237,8 +237,8 @@ class UdpBroadcast(_UdpLink):
     and networks that are listened to (None: all).
     """
 
-    _heard_at: float
     # of _remote
+    _heard_at: float
 
     def __init__(self, host: str, port: int, *, peers: Peers | None = None) -> None:
         super().__init__("udpbcast", host, port)

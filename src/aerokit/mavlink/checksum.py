@@ -35,5 +35,5 @@ def _fastest() -> Callable[[bytes], int]:
     return mcrf4xx
 
 
-x25 = _fastest()
+x25: Callable[[bytes], int] = _fastest()
 """The checksum of some bytes, 0..65535."""

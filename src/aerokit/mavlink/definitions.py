@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 from aerokit.errors import LocalProtocolError
 from aerokit.mavlink.checksum import x25
-from aerokit.mavlink.message import SIZES
+from aerokit.mavlink.message import BYTES_IN_CHARS, SIZES
 from aerokit.whole_file import read_bounded
 
 if TYPE_CHECKING:
@@ -60,6 +60,7 @@ class FieldDefinition:
     description: str = ""
     extension: bool = False
     default: int | None = None  # only mavlink_version, which the standard fills in
+    carries_bytes: bool = False  # of a char array: see BYTES_IN_CHARS
 
     @property
     def attribute(self) -> str:
@@ -71,6 +72,16 @@ class FieldDefinition:
     def length(self) -> int:
         """Bytes on the wire."""
         return SIZES[self.type] * (self.array_length or 1)
+
+    @property
+    def is_text(self) -> bool:
+        """Whether its value is a ``str``."""
+        return self.type == "char" and not self.carries_bytes
+
+    @property
+    def is_bytes(self) -> bool:
+        """Whether its value is ``bytes``."""
+        return self.carries_bytes or (self.type == "uint8_t" and bool(self.array_length))
 
 
 @dataclass(frozen=True)
@@ -251,7 +262,7 @@ def _message(node: Element, origin: str) -> MessageDefinition:
         if child.tag == "extensions":
             extension = True
         elif child.tag == "field":
-            fields.append(_field(child, extension))
+            fields.append(_field(child, extension, node.attrib["name"]))
     message = MessageDefinition(
         id=int(node.attrib["id"], 0),
         name=_identifier(node.attrib["name"]),
@@ -271,7 +282,7 @@ def _message(node: Element, origin: str) -> MessageDefinition:
     return message
 
 
-def _field(node: Element, extension: bool) -> FieldDefinition:
+def _field(node: Element, extension: bool, message: str) -> FieldDefinition:
     found = _FIELD_TYPE.match(node.attrib["type"])
     if found is None or found[1] not in SIZES or found[2] == "0":
         raise ValueError(f"unknown field type {node.attrib['type']!r}")
@@ -285,7 +296,13 @@ def _field(node: Element, extension: bool) -> FieldDefinition:
         description=_text(node),
         extension=extension,
         default=3 if node.attrib["type"] == "uint8_t_mavlink_version" else None,
+        carries_bytes=carries_bytes(message, node.attrib["name"], found[1]),
     )
+
+
+def carries_bytes(message: str, field_name: str, kind: str) -> bool:
+    """Whether a field is one of BYTES_IN_CHARS, in whichever dialect."""
+    return kind == "char" and (message, field_name) in BYTES_IN_CHARS
 
 
 def _enum(node: Element, origin: str) -> EnumDefinition:

@@ -36,9 +36,9 @@ class FrameEncoder:
             )
         if not 0 <= component_id <= 255:
             raise LocalProtocolError(f"component_id = {component_id!r} must be in 0..255")
-        self.system_id = int(system_id)
-        self.component_id = int(component_id)
-        self.sequence = 0
+        self.system_id: int = int(system_id)
+        self.component_id: int = int(component_id)
+        self.sequence: int = 0
         """The sequence number of the next frame, 0..255."""
         self.signing: Signing | None = None
         """Signs the frames of MAVLink 2; None: they are not signed. MAVLink 1 has no signatures."""

@@ -62,7 +62,7 @@ class Framer:
         self.keep_unknown = False
         """Whether frames of messages that the dialect does not know are returned too, whatever is wanted: for a
         recording. Their checksums cannot be checked."""
-        self.statistics = FramerStatistics()
+        self.statistics: FramerStatistics = FramerStatistics()
         """Counters since the beginning."""
         self.late: list[Frame] = []
         """Those frames of the last `receive` that newer ones of their sender have overtaken, or that came before."""

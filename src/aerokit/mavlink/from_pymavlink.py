@@ -98,8 +98,10 @@ def _has(message: Any, name: str) -> bool:
 
 
 def _converted(message_class: type[Message], field: Field, value: Any) -> Any:
-    if field.type == "char":
+    if field.is_text:
         return _text(value)
+    if field.type == "char" and isinstance(value, str):
+        return value.encode()
     is_real = field.type in REAL_TYPES
     if not field.array_length:
         return _real(value) if is_real else _integer(value)

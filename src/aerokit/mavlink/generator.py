@@ -24,7 +24,7 @@ from aerokit.mavlink.union import read_additions, with_added_enums, with_added_m
 
 __all__ = ["definitions", "differences", "fingerprint", "generate", "generated_fingerprint", "xml_folder"]
 
-MODULES = {
+MODULES: dict[str, tuple[str, ...]] = {
     "minimal": ("minimal",),
     "standard": ("standard",),
     "common": ("common",),
@@ -65,7 +65,7 @@ _MESSAGES_HEAD = '''# The classes are immutable for whoever uses them; only the 
 from __future__ import annotations
 
 from struct import Struct
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from aerokit.mavlink.message import PACK_ERRORS, Message{helpers}
 

@@ -21,13 +21,18 @@ else:  # importing typing_extensions would cost more than everything else here
         return lambda cls: cls
 
 
-__all__ = ["Field", "Message", "offset_of"]
+__all__ = ["SECRET_FIELDS", "Field", "Message", "field_names", "offset_of"]
 
 PACK_ERRORS = (struct.error, OverflowError, TypeError, ValueError, AttributeError)
 """What packing a wrong value can raise; the generated classes turn it into LocalProtocolError."""
 
 _ANY_HEADER = bytes(HEADER_LENGTH)
-_SECRETS = frozenset(("secret_key", "passkey", "password"))
+BYTES_IN_CHARS = frozenset(
+    (name, "param_value") for name in ("PARAM_EXT_VALUE", "PARAM_EXT_SET", "PARAM_EXT_ACK")
+)
+"""Message and field of those ``char`` arrays that carry bytes: a number as C keeps it in memory, or a text, as another
+field says. As texts, which end at the first NUL, the numbers would be lost."""
+SECRET_FIELDS = frozenset(("secret_key", "passkey", "password"))
 """Fields that are shown to nobody."""
 SIZES = {
     "char": 1,
@@ -59,7 +64,9 @@ INTEGER_RANGES = {
 class Field:
     """One field of a message, as the standard describes it."""
 
-    __slots__ = ("array_length", "description", "enum", "extension", "invalid", "name", "type", "units")
+    __slots__ = (
+        *("array_length", "description", "enum", "extension", "invalid", "is_text", "name", "type", "units"),
+    )
 
     def __init__(
         self,
@@ -71,6 +78,7 @@ class Field:
         invalid: str,
         description: str,
         extension: bool,
+        carries_bytes: bool = False,
     ) -> None:
         self.name = name
         """The attribute's name, and the standard's, but for an underscore behind a Python keyword."""
@@ -88,6 +96,8 @@ class Field:
         """The standard's description."""
         self.extension = extension
         """Whether it is absent in MAVLink 1."""
+        self.is_text: bool = type == "char" and not carries_bytes
+        """Whether its value is a ``str``; a few ``char`` arrays are ``bytes``, because they carry numbers."""
 
     def __repr__(self) -> str:
         brackets = f"[{self.array_length}]" if self.array_length else ""
@@ -96,11 +106,11 @@ class Field:
 
     def complaint(self, value: Any) -> str | None:
         """What is wrong with ``value`` for this field, or None."""
-        if self.type == "char":
+        if self.is_text:
             return _text_complaint(value, self.array_length or 1)
         if not self.array_length:
             return _number_complaint(value, self.type)
-        if self.type == "uint8_t" and not isinstance(value, (bytes, bytearray)):
+        if self.type in ("uint8_t", "char") and not isinstance(value, (bytes, bytearray)):
             return f"must be bytes, at most {self.array_length}"
         try:
             size = len(value)
@@ -135,6 +145,11 @@ def offset_of(message_type: type[Message], field: str) -> int:
     raise LocalProtocolError(f"{message_type.NAME} has no field {field!r}")
 
 
+def field_names(message: Message) -> tuple[str, ...]:
+    """The names of its fields, in the order of the standard's definition."""
+    return message.__match_args__  # type: ignore[attr-defined,no-any-return]
+
+
 @dataclass_transform(frozen_default=True)
 class Message:
     """Base of all message classes; immutable by agreement, which the type checker enforces.
@@ -144,8 +159,8 @@ class Message:
 
     if not TYPE_CHECKING:  # a type checker would take the slot for a class attribute of the same name
         __slots__ = ("received_frame",)
-    __match_args__: ClassVar[tuple[str, ...]] = ()
-    __hash__ = None  # type: ignore[assignment]
+        __match_args__ = ()  # each class has its own: what a checker infers there is its names, for `match`
+    __hash__: ClassVar[None]  # type: ignore[assignment]
 
     ID: ClassVar[int]
     """The standard's number of the message."""
@@ -185,15 +200,15 @@ class Message:
 
     def to_dict(self) -> dict[str, Any]:
         """Field names and values, in the standard's order."""
-        return {name: getattr(self, name) for name in self.__match_args__}
+        return {name: getattr(self, name) for name in field_names(self)}
 
     def __eq__(self, other: object) -> bool:
         if type(self) is not type(other):
             return NotImplemented
-        return all(_same(getattr(self, name), getattr(other, name)) for name in self.__match_args__)
+        return all(_same(getattr(self, name), getattr(other, name)) for name in field_names(self))
 
     def __repr__(self) -> str:
-        fields = ", ".join(f"{name}={_shown(name, getattr(self, name))}" for name in self.__match_args__)
+        fields = ", ".join(f"{name}={_shown(name, getattr(self, name))}" for name in field_names(self))
         return f"{type(self).__name__}({fields})"
 
     def _encode_error(self) -> LocalProtocolError:
@@ -208,7 +223,7 @@ class Message:
 
 def _shown(name: str, value: object) -> str:
     """A value as text; logs and error messages are no place for keys."""
-    return "<not shown>" if name in _SECRETS else repr(value)
+    return "<not shown>" if name in SECRET_FIELDS else repr(value)
 
 
 # -------------------------------------------------------------------- used by the generated classes

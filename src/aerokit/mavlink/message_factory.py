@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import wraps
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega
@@ -13,10 +13,20 @@ from aerokit.errors import LocalProtocolError
 
 __all__ = ["MessageFactory"]
 
-_MAVLink: Any = ardupilotmega.MAVLink  # its own types are stricter than what is taken here
+if TYPE_CHECKING:  # its own types are stricter than what is taken here
+
+    class _MAVLink:
+        total_packets_sent: int
+        send_callback: Callable[..., object] | None
+        send_callback_args: tuple[Any, ...] | None
+        send_callback_kwargs: dict[str, Any] | None
+
+        def __init__(self, file: object, source_system: int, source_component: int) -> None: ...
+else:
+    _MAVLink = ardupilotmega.MAVLink
 
 
-class MessageFactory(_MAVLink):  # type: ignore[misc]
+class MessageFactory(_MAVLink):
     """Has ``<message>_encode(…)``, which returns a message of pymavlink, and ``<message>_send(…)`` for every message.
 
     The messages are those of pymavlink's ardupilotmega dialect for MAVLink 2; those that only the dialect of the
@@ -26,6 +36,7 @@ class MessageFactory(_MAVLink):  # type: ignore[misc]
     """
 
     seq: int
+    total_packets_sent: int
     """How many messages it has sent, 0..255, then from 0 again; the link counts by itself."""
 
     def __init__(

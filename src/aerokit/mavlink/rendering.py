@@ -45,11 +45,11 @@ def render_message(message: MessageDefinition, *, docs: bool = True) -> str:
     names = [f.attribute for f in message.fields]
     lines += ["", *_tuple("__slots__", names), *_tuple("__match_args__", names)]
     lines += [
-        f"    ID = {message.id}",
-        f"    NAME = {_quoted(message.name)}",
-        f"    CRC_EXTRA = {message.crc_extra}",
-        f"    LENGTH = {message.length}",
-        f"    BASE_LENGTH = {message.base_length}",
+        f"    ID: ClassVar[int] = {message.id}",
+        f"    NAME: ClassVar[str] = {_quoted(message.name)}",
+        f"    CRC_EXTRA: ClassVar[int] = {message.crc_extra}",
+        f"    LENGTH: ClassVar[int] = {message.length}",
+        f"    BASE_LENGTH: ClassVar[int] = {message.base_length}",
         "    _FIELDS = (",
         *(f"        {_field_row(f)}," for f in message.fields),
         "    )",
@@ -170,7 +170,8 @@ def _filled(head: str, items: list[str], tail: str, indent: str) -> list[str]:
 
 def _field_row(f: FieldDefinition) -> str:
     texts = ", ".join(_quoted(text) for text in (f.units, f.enum, f.invalid, f.description))
-    return f'({_quoted(f.attribute)}, "{f.type}", {f.array_length}, {texts}, {f.extension})'
+    more = ", True" if f.carries_bytes else ""
+    return f'({_quoted(f.attribute)}, "{f.type}", {f.array_length}, {texts}, {f.extension}{more})'
 
 
 def _code(f: FieldDefinition) -> str:
@@ -188,9 +189,9 @@ def _is_tuple(f: FieldDefinition) -> bool:
 
 
 def _annotation(f: FieldDefinition, *, argument: bool = False) -> str:
-    if f.type == "char":
+    if f.is_text:
         return "str"
-    if f.type == "uint8_t" and f.array_length:
+    if f.is_bytes:
         return "bytes"
     number = "float" if f.type in ("float", "double") else "int"
     if not f.array_length:
@@ -203,10 +204,10 @@ def _default(f: FieldDefinition) -> str:
         return f" = {f.default}"
     if not f.extension:
         return ""
-    if f.type == "char":
+    if f.is_text:
         return ' = ""'
     if f.array_length:
-        return f" = bytes({f.array_length})" if f.type == "uint8_t" else f" = (0,) * {f.array_length}"
+        return f" = bytes({f.array_length})" if f.is_bytes else f" = (0,) * {f.array_length}"
     return " = 0"
 
 
@@ -224,7 +225,7 @@ def _init(message: MessageDefinition) -> list[str]:
     for f in message.fields:
         value = f"tuple({f.attribute})" if _is_tuple(f) else f.attribute
         lines.append(f"        self.{f.attribute} = {value}")
-    return [*lines, "        self.received_frame = None"]
+    return [*lines, "        self.received_frame: Frame | None = None"]
 
 
 def _decode(message: MessageDefinition) -> list[str]:
@@ -248,7 +249,7 @@ def _decode(message: MessageDefinition) -> list[str]:
             targets += parts
             comma = "," if len(parts) == 1 else ""
             after.append(f"        self.{f.attribute} = ({', '.join(parts)}{comma})")
-        elif f.type == "char":
+        elif f.is_text:
             targets.append(f"v{number}")
             after.append(f"        self.{f.attribute} = {_text(f'v{number}')}")
         else:
@@ -265,7 +266,7 @@ def _decode_by_index(fields: Iterable[FieldDefinition], unpacked: str) -> list[s
             value, count = f"values[{index}:{index + f.array_length}]", f.array_length
         else:
             value, count = f"values[{index}]", 1
-        lines.append(f"        self.{f.attribute} = {_text(value) if f.type == 'char' else value}")
+        lines.append(f"        self.{f.attribute} = {_text(value) if f.is_text else value}")
         index += count
     return lines
 
@@ -278,9 +279,9 @@ def _encode(message: MessageDefinition) -> list[str]:
     arguments: list[str] = []
     for f in message.wire_fields:
         value = f"self.{f.attribute}"
-        if f.type == "char":
+        if f.is_text:
             value = f"pack_text({value}, {f.array_length or 1})"
-        elif f.type == "uint8_t" and f.array_length:
+        elif f.is_bytes:
             value = f"pack_bytes({value}, {f.array_length})"
         elif f.array_length:
             value = f"*pack_items({value}, {f.array_length})"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from struct import Struct
@@ -16,6 +17,7 @@ from aerokit.mavlink.definitions import (
     EnumDefinition,
     FieldDefinition,
     MessageDefinition,
+    carries_bytes,
     merged_enums,
     read_dialect,
 )
@@ -131,17 +133,20 @@ def _import(name: str) -> ModuleType:
 
 def _message(cls: Any) -> MessageDefinition:
     order = list(cls.ordered_fieldnames)
+    message_name = getattr(cls, "msgname", None) or cls.name
     fields = []
     for name, kind in zip(cls.fieldnames, cls.fieldtypes):  # noqa: B905 - of one length
         array_length = int(cls.array_lengths[order.index(name)])
         units = getattr(cls, "fieldunits_by_name", {}).get(name, "")
         enum = getattr(cls, "fieldenums_by_name", {}).get(name, "")
         default = 3 if name == "mavlink_version" else None
-        fields.append(FieldDefinition(name, kind, array_length, units, enum, default=default))
-    name = getattr(cls, "msgname", None) or cls.name
+        is_bytes = carries_bytes(message_name, name, kind)
+        fields.append(
+            FieldDefinition(name, kind, array_length, units, enum, default=default, carries_bytes=is_bytes)
+        )
     description = " ".join((cls.__doc__ or "").split())
     definition = MessageDefinition(
-        int(cls.id), name, tuple(fields), description, cls.__module__.rpartition(".")[2]
+        int(cls.id), message_name, tuple(fields), description, cls.__module__.rpartition(".")[2]
     )
     return _with_extensions(definition, order, int(cls.crc_extra))
 
@@ -153,12 +158,7 @@ def _with_extensions(definition: MessageDefinition, order: list[str], crc_extra:
         guess = MessageDefinition(
             definition.id,
             definition.name,
-            tuple(
-                FieldDefinition(
-                    f.name, f.type, f.array_length, f.units, f.enum, extension=i >= base, default=f.default
-                )
-                for i, f in enumerate(fields)
-            ),
+            tuple(replace(f, extension=i >= base) for i, f in enumerate(fields)),
             definition.description,
             definition.origin,
         )

@@ -164,8 +164,8 @@ class Signing:
         if not 0 <= timestamp <= LAST_TIMESTAMP:
             raise LocalProtocolError(f"timestamp = {timestamp!r} must be in 0..{LAST_TIMESTAMP}")
         self.key = key
-        self.link_id = int(link_id)
-        self.timestamp = int(timestamp)
+        self.link_id: int = int(link_id)
+        self.timestamp: int = int(timestamp)
         """The earliest time stamp that the next frame gets, in 10 µs since 2015: later than all that were sent, and not
         before any that was received. Keep it where it survives a restart if the clock does not."""
         self.allow_unsigned = allow_unsigned

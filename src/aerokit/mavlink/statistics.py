@@ -29,6 +29,8 @@ class SourceStatistics:
     goes on at its own. The one with more frames is taken for the sender, until it has been quiet for 1.5 s.
     """
 
+    expected: int
+
     __slots__ = (
         "_double_at",
         "_late_at",
@@ -60,9 +62,9 @@ class SourceStatistics:
     _returns: int  # frames at the other place, of the stream that was here before
 
     def __init__(self, system_id: int, component_id: int, sequence: int) -> None:
-        self.system_id = system_id
-        self.component_id = component_id
-        self.lost = 0
+        self.system_id: int = system_id
+        self.component_id: int = component_id
+        self.lost: int = 0
         """Frames missing in the sequence; one that comes late after all is taken off again."""
         self.expected = sequence
         """The sequence number of the next frame; its low byte is what is on the wire, it counts on beyond 255."""
@@ -203,6 +205,8 @@ class SourceLimit:
     When it is full, those that were quiet for the last 10 s at least make room.
     """
 
+    free: int
+
     __slots__ = ("_statistics", "_swept_at", "free")
 
     def __init__(self, most: int) -> None:
@@ -235,6 +239,8 @@ class SourceLimit:
 class FramerStatistics:
     """Counters of one framer since it was made; every byte is in a frame, in an unknown one, bad, or still waiting."""
 
+    unknown_ids: int
+
     __slots__ = (
         "_by_key",
         "_heard",
@@ -248,11 +254,11 @@ class FramerStatistics:
     )
 
     def __init__(self) -> None:
-        self.bytes = 0
+        self.bytes: int = 0
         """Bytes taken in."""
-        self.bad_bytes = 0
+        self.bad_bytes: int = 0
         """Bytes that belong to no frame: text, noise, damaged frames."""
-        self.bad_crcs = 0
+        self.bad_crcs: int = 0
         """Places that looked like a frame of a known message, but for the checksum."""
         self.unknown_ids = 0
         """Frames, as far as one can tell, of messages this dialect does not know; their checksum cannot be checked."""

@@ -26,7 +26,7 @@ class TimestampFile:
 
     def __init__(self, path: str | PathLike[str], most: int) -> None:
         self._path, self._most = Path(path), most
-        self.timestamp = self._read()
+        self.timestamp: int = self._read()
         """The number in the file; 0 when there was none."""
         self.error: OSError | None = None
         """Why it could not be written the last time."""

@@ -23,6 +23,7 @@ _LONGEST = 8 + 280
 # zeros of a frame's header look like one.
 _FIRST_TIME = 946_684_800_000_000  # the year 2000
 _LAST_TIME = 4_102_444_800_000_000  # the year 2100: what claims to be later is no time stamp
+_LAST = (_LAST_TIME - (1 << 48)).to_bytes(8, "big")[:2]  # the beginning of times that are surely before that
 
 
 def read_tlog(source: str | PathLike[str] | BinaryIO) -> Iterator[tuple[float, bytes]]:
@@ -40,13 +41,28 @@ def read_tlog(source: str | PathLike[str] | BinaryIO) -> Iterator[tuple[float, b
 
 def _records(file: BinaryIO) -> Iterator[tuple[float, bytes]]:
     data, begin, ended, earliest = b"", 0, False, 0
+    end: int | None
     while True:
         if not ended and len(data) - begin < 2 * _LONGEST:  # a record and the head of the next, to tell both
             block = file.read(_BLOCK)
             ended = not block
             data, begin = data[begin:] + block, 0
             continue
-        end = _record_end(data, begin, earliest)
+        # Almost every record is MAVLink 2 and unsigned, and so is the next: `_record_end` in half the time.
+        try:
+            end = begin + 20 + data[begin + 9]
+            if (
+                earliest
+                or data[begin + 8] != MAGIC_V2
+                or data[end + 8] != MAGIC_V2
+                or data[begin + 10]
+                or data[end + 10]
+                or data[begin : begin + 2] > _LAST
+                or data[end : end + 2] > _LAST
+            ):
+                end = _record_end(data, begin, earliest)
+        except IndexError:
+            end = _record_end(data, begin, earliest)
         if end is None:
             if len(data) - begin <= 8:
                 return

@@ -36,9 +36,9 @@ class JsonValue:
     __slots__ = ("name", "path", "value")
 
     def __init__(self, value: Any, name: str, path: str) -> None:
-        self.value = value
-        self.name = name
-        self.path = path
+        self.value: Any = value
+        self.name: str = name
+        self.path: str = path
 
     def error(self, expected: str) -> FileFormatError:
         """The complaint that this value is not what was expected."""

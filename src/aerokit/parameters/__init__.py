@@ -11,6 +11,14 @@ from aerokit.parameters.parameter import Parameter, ParameterType, check_name, c
 from aerokit.parameters.table import ParameterTable
 
 if TYPE_CHECKING:
+    from aerokit.parameters.definition import (
+        CameraDefinition,
+        SettingDefinition,
+        SettingOption,
+        SettingRange,
+        load_definition,
+        parse_definition,
+    )
     from aerokit.parameters.differences import ParameterDifference, ParameterValues, diff
     from aerokit.parameters.files import (
         FileFormat,
@@ -31,8 +39,10 @@ if TYPE_CHECKING:
         to_known,
         translate_values,
     )
+    from aerokit.parameters.setting import Setting, SettingValue
 
 __all__ = [
+    "CameraDefinition",
     "FileFormat",
     "Metadata",
     "Parameter",
@@ -45,13 +55,20 @@ __all__ = [
     "ParameterValues",
     "Rename",
     "Renamed",
+    "Setting",
+    "SettingDefinition",
+    "SettingOption",
+    "SettingRange",
+    "SettingValue",
     "check_name",
     "checked_value",
     "diff",
     "find_rename",
+    "load_definition",
     "load_metadata",
     "other_names",
     "pack_parameters",
+    "parse_definition",
     "parse_metadata",
     "parse_parameter_file",
     "read_parameter_file",
@@ -63,12 +80,14 @@ __all__ = [
 ]
 
 _HOMES = {
+    "definition": "CameraDefinition SettingDefinition SettingOption SettingRange load_definition parse_definition",
     "differences": "ParameterDifference ParameterValues diff",
     "files": "FileFormat ParameterFile parse_parameter_file read_parameter_file write_parameter_file",
     "metadata": "Metadata ParameterMetadata load_metadata parse_metadata",
     "pack": "pack_parameters unpack_parameters",
     "renames": "ParameterRenamedWarning Rename Renamed find_rename other_names replacement_of to_known"
     " translate_values",
+    "setting": "Setting SettingValue",
 }
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names.split()}
 

@@ -53,8 +53,8 @@ class ParameterFile(Mapping[str, "int | float"]):
     ) -> None:
         self._values = dict(values)
         self.format: FileFormat = format
-        self.types = dict(types or {})
-        self.comments = tuple(comments)
+        self.types: dict[str, ParameterType] = dict(types or {})
+        self.comments: tuple[str, ...] = tuple(comments)
         self.component_id = component_id
 
     def __getitem__(self, name: str) -> int | float:

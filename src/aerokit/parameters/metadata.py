@@ -21,12 +21,10 @@ from types import MappingProxyType
 
 from aerokit.errors import FileFormatError, LocalProtocolError
 from aerokit.snapshot import Snapshot
-from aerokit.whole_file import LARGEST_FILE, read_bounded, too_large
+from aerokit.whole_file import read_bounded, unpacked
 
 __all__ = ["Metadata", "ParameterMetadata", "load_metadata", "parse_metadata"]
 
-_XZ = b"\xfd7zXZ\x00"
-_MOST_MEMORY = 128 << 20  # xz -9 takes 65 MB
 _NOTHING: Mapping[float, str] = MappingProxyType({})
 _NO_BITS: Mapping[int, str] = MappingProxyType({})
 
@@ -134,7 +132,7 @@ def parse_metadata(data: bytes, source: str = "metadata") -> Metadata:
     from aerokit.parameters import metadata_formats
 
     try:
-        found = metadata_formats.parse(_unpacked(data, source))
+        found = metadata_formats.parse(unpacked(data, source))
     except FileFormatError:
         raise
     except (ValueError, SyntaxError, TypeError, AttributeError, LookupError, RecursionError) as error:
@@ -144,21 +142,3 @@ def parse_metadata(data: bytes, source: str = "metadata") -> Metadata:
     if not found:
         raise FileFormatError(f"{source} describes no parameters")
     return Metadata(found)
-
-
-def _unpacked(data: bytes, source: str) -> bytes:
-    """Never more than LARGEST_FILE, whatever a small file claims to hold."""
-    if not data.startswith(_XZ):
-        return data
-    import lzma  # some builds of Python are without it
-
-    unpacker = lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=_MOST_MEMORY)
-    try:
-        unpacked = unpacker.decompress(data, LARGEST_FILE + 1)
-    except lzma.LZMAError as error:
-        raise ValueError(error) from None
-    if len(unpacked) > LARGEST_FILE:
-        raise too_large(source)
-    if not unpacker.eof:
-        raise ValueError("it is cut off")
-    return unpacked

@@ -18,6 +18,7 @@ __all__ = [
     "ParameterType",
     "check_name",
     "checked_value",
+    "number_of",
     "same_value",
     "to_float32",
 ]
@@ -121,7 +122,7 @@ def checked_value(name: str, value: float, type: ParameterType) -> int | float: 
     Raises :class:`LocalProtocolError` for what the type cannot hold: NaN, infinity, 300 as an INT8, 1.5 as an
     integer. ``True`` is 1.
     """
-    number = _number(name, value)
+    number = number_of(name, value)
     if isinstance(number, float) and not math.isfinite(number):
         raise LocalProtocolError(f"{name} = {shown(value)}: a finite number is allowed only")
     if type.is_integer and number != int(number):
@@ -137,8 +138,8 @@ def checked_value(name: str, value: float, type: ParameterType) -> int | float: 
     return to_float32(number) if type is ParameterType.REAL32 else float(number)
 
 
-def _number(name: str, value: object) -> int | float:
-    """An int, a float, or what says that it is one of them, as numpy's numbers do."""
+def number_of(name: str, value: object) -> int | float:
+    """An int, a float, or what says that it is one of them, as numpy's numbers do; else LocalProtocolError."""
     if isinstance(value, (int, float)):
         return value
     if isinstance(value, SupportsIndex):

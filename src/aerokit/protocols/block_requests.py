@@ -81,7 +81,7 @@ class BlockRequests:
     def __init__(
         self, round_trip: RoundTrip, *, at_once: int = AT_ONCE, spacing_s: float = SPACING_S
     ) -> None:
-        self.window = AdaptiveWindow()
+        self.window: AdaptiveWindow = AdaptiveWindow()
         self._round_trip, self._at_once, self._spacing_s = round_trip, at_once, spacing_s
         self._waiting: dict[int, None] = {}
         self._under_way: dict[int, _Block] = {}  # in the order of sending

@@ -117,11 +117,11 @@ class CommandExchange(Exchange[CommandAck]):
         CommandTimeout: ``attempts`` times ``attempt_timeout`` seconds without an ack.
     """
 
-    expects = (CommandAck,)
+    expects: tuple[type[Message], ...] = (CommandAck,)
 
+    # from start() on
     _started: float
     _sent_at: float
-    # from start() on
 
     def __init__(
         self,
@@ -241,7 +241,7 @@ class CommandExchange(Exchange[CommandAck]):
 
     def _report_progress(self, ack: CommandAck, now: float) -> None:
         self._in_progress = True
-        self.deadline = now + self._progress_timeout
+        self.deadline: float | None = now + self._progress_timeout
         if self._on_progress is not None:
             self._on_progress(ack.progress if 0 < ack.progress <= 100 else None)
 

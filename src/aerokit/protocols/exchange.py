@@ -29,7 +29,7 @@ class Exchange(ABC, Generic[ResultT]):
         self._outbox: list[Message] = []
         self._result: ResultT | None = None
         self._error: Exception | None = None
-        self.done = False
+        self.done: bool = False
 
     @abstractmethod
     def start(self, now: float) -> None:
@@ -66,4 +66,6 @@ class Exchange(ABC, Generic[ResultT]):
 
     def _fail(self, error: Exception) -> None:
         if not self.done:
-            self._error, self.done, self.deadline = error, True, None
+            self._error = error
+            self.done = True
+            self.deadline = None

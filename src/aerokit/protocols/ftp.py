@@ -71,8 +71,10 @@ class FtpClient:
         source_component: int,
         first_sequence: int = 0,
     ) -> None:
-        self.target_system, self.target_component = target_system, target_component
-        self.source_system, self.source_component = source_system, source_component
+        self.target_system: int = target_system
+        self.target_component: int = target_component
+        self.source_system: int = source_system
+        self.source_component: int = source_component
         self._sequence = first_sequence
         self._session = first_sequence
 
@@ -102,7 +104,7 @@ class FtpClient:
 class FtpExchange(Transfer[ResultT]):
     """What one request, a download and an upload have in common."""
 
-    expects = (FileTransferProtocol,)
+    expects: tuple[type[Message], ...] = (FileTransferProtocol,)
 
     def __init__(
         self,
@@ -152,8 +154,10 @@ class FtpRequest(FtpExchange[FtpMessage]):
         is_sent: it was sent already, outside of this exchange.
     """
 
-    _sent_at: float
+    attempts: int
+
     # from start() on
+    _sent_at: float
 
     def __init__(
         self,
@@ -221,7 +225,7 @@ class FtpRequest(FtpExchange[FtpMessage]):
         timeout_s = self.round_trip.timeout_s(max(1, self.attempts - STEADY))
         if self._request.opcode == MavFtpOpcode.CALCFILECRC:
             timeout_s += SLOW_ANSWER_S * (self.attempts - 1)
-        self.deadline = min(now + timeout_s, self._moved_at + self._patience_s)
+        self.deadline: float | None = min(now + timeout_s, self._moved_at + self._patience_s)
 
     def _receive_reply(self, reply: FtpMessage, now: float) -> None:
         if reply.sequence != (self._request.sequence + 1) % SEQUENCES:

@@ -313,7 +313,7 @@ class FtpDownload(FtpExchange[int]):
             deadline = min(deadline, due_at)
         if self._is_bursting:
             deadline = min(deadline, self._burst_due_at)
-        self.deadline = deadline
+        self.deadline: float | None = deadline
 
     # ------------------------------------------------------------------------------------ ends
 
@@ -409,7 +409,7 @@ class FtpUpload(FtpExchange[None]):
             self._write(offset, now)
         patient = self._moved_at + self._patience_s
         due_at = self._requests.deadline
-        self.deadline = patient if due_at is None else min(patient, due_at)
+        self.deadline: float | None = patient if due_at is None else min(patient, due_at)
 
     def _write(self, offset: int, now: float) -> None:
         sequence = self._client.next_sequence()

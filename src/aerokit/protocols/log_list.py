@@ -26,7 +26,7 @@ class LogList(Transfer[tuple[LogEntry, ...]]):
         most_unanswered: give up after so many requests without any entry; None: after ``patience_s``.
     """
 
-    expects = (LogEntry,)
+    expects: tuple[type[Message], ...] = (LogEntry,)
 
     def __init__(
         self,
@@ -113,7 +113,7 @@ class LogList(Transfer[tuple[LogEntry, ...]]):
 
     def _set_deadline(self) -> None:
         if not self.done:
-            self.deadline = min(self._stream.due_at, self._moved_at + self._patience_s)
+            self.deadline: float | None = min(self._stream.due_at, self._moved_at + self._patience_s)
 
     def _timed_out(self) -> FileTimeout:
         if self._missing is None:

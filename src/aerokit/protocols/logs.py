@@ -47,7 +47,7 @@ class LogDownload(Transfer[int]):
         size: of the log, as its entry says it.
     """
 
-    expects = (LogData,)
+    expects: tuple[type[Message], ...] = (LogData,)
 
     def __init__(
         self,
@@ -213,7 +213,7 @@ class LogDownload(Transfer[int]):
     def _set_deadline(self) -> None:
         deadline = self._moved_at + self._patience_s
         due_at = self._stream.due_at if self._is_streaming else self._requests.deadline
-        self.deadline = deadline if due_at is None else min(deadline, due_at)
+        self.deadline: float | None = deadline if due_at is None else min(deadline, due_at)
 
 
 class LogEnd(Transfer[None]):
@@ -223,7 +223,7 @@ class LogEnd(Transfer[None]):
         is_sent: it was sent already, outside of this exchange.
     """
 
-    expects = (LogData, LogEntry)
+    expects: tuple[type[Message], ...] = (LogData, LogEntry)
 
     def __init__(
         self,
@@ -265,4 +265,4 @@ class LogEnd(Transfer[None]):
 
     def _wait(self, now: float) -> None:
         self._is_heard = False
-        self.deadline = now + 2.0 * self.round_trip.timeout_s()
+        self.deadline: float | None = now + 2.0 * self.round_trip.timeout_s()

@@ -18,7 +18,7 @@ class MessageStream:
         self._interval = RoundTrip(shortest_s=0.001)
         self._heard_at: float | None = None
         self._at = 0.0
-        self.fails = 0
+        self.fails: int = 0
         """How often in a row nothing came; counted by the owner."""
 
     @property

@@ -27,10 +27,10 @@ class MissionSetCurrent(Transfer[None]):
     With a ``standing``, it is sent again only after a HEARTBEAT that came since, and while that is not against it.
     """
 
-    expects = (MissionCurrent,)
+    expects: tuple[type[Message], ...] = (MissionCurrent,)
 
-    _sent_at: float
     # from start() on
+    _sent_at: float
 
     def __init__(
         self,
@@ -88,4 +88,6 @@ class MissionSetCurrent(Transfer[None]):
         self._sent_at = now
         self._outbox.append(SetCurrentMessage(self.target_system, self.target_component, self._seq))
         left = self._started_at + self._patience_s - now
-        self.deadline = now + min(max(self.round_trip.timeout_s(), TOLD_EVERY_S), max(left, 0.01))
+        self.deadline: float | None = now + min(
+            max(self.round_trip.timeout_s(), TOLD_EVERY_S), max(left, 0.01)
+        )

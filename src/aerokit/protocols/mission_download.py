@@ -54,11 +54,11 @@ class MissionDownload(MissionExchange[Downloaded]):
     again. With ``only``, no others than these are asked for.
     """
 
-    expects = (MissionCount, MissionItemInt, MissionItem, MissionAck)
+    expects: tuple[type[Message], ...] = (MissionCount, MissionItemInt, MissionItem, MissionAck)
 
+    # from start() on
     _list_at: float
     _heard_at: float
-    # from start() on
 
     def __init__(
         self,
@@ -218,7 +218,7 @@ class MissionDownload(MissionExchange[Downloaded]):
 
     def _wait_for_items(self, now: float) -> None:
         if self._asked_at:
-            self.deadline = max(now, min(self._due_at(seq) for seq in self._asked_at))
+            self.deadline: float | None = max(now, min(self._due_at(seq) for seq in self._asked_at))
 
     # ------------------------------------------------------------------------------------ end
 

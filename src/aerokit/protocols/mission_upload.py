@@ -60,12 +60,12 @@ class MissionUpload(MissionExchange[UploadEnd]):
     INVALID_SEQUENCE, and the following item is sent.
     """
 
-    expects = (MissionRequestInt, MissionRequest, MissionAck)
+    expects: tuple[type[Message], ...] = (MissionRequestInt, MissionRequest, MissionAck)
 
-    _heard_at: float
     # from start() on
-    _as_float: bool
+    _heard_at: float
     # from the first request on
+    _as_float: bool
 
     def __init__(
         self,
@@ -84,9 +84,9 @@ class MissionUpload(MissionExchange[UploadEnd]):
         self._first = first or 0
         self._end = self._first + len(items)
         self._window, self._takes_int = window, takes_int
-        self.was_vague = False
+        self.was_vague: bool = False
         """Whether a refusal may mean any of several items that were under way: then send one at a time to find out."""
-        self.was_begun = False
+        self.was_begun: bool = False
         """Whether the vehicle has asked for an item: then it may have overwritten some."""
         self._restarts = 0
         self._busy_until: float | None = None
@@ -161,7 +161,8 @@ class MissionUpload(MissionExchange[UploadEnd]):
         if seq > self._sent:
             return
         if not self._is_asked:
-            self._is_asked = self.was_begun = True
+            self._is_asked = True
+            self.was_begun = True
             self._busy_until = None
             self._move(now, 0, len(self._items))
         if seq > self._taken:

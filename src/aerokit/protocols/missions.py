@@ -34,12 +34,12 @@ BUSY_AGAIN_S = 1.0
 FEW_ATTEMPTS, SAME_ATTEMPTS = 5, 7
 FORGOTTEN_S = 4.5
 """After so long a silence a vehicle may have given the transfer up (PX4 after 5 s, ArduPilot after 8)."""
-NAMES = {
+NAMES: dict[int, str] = {
     MavMissionType.MISSION: "mission",
     MavMissionType.FENCE: "fence",
     MavMissionType.RALLY: "rally points",
 }
-RESULTS = {
+RESULTS: dict[int, str] = {
     MavMissionResult.ERROR: "an error it does not explain, or it is busy with another transfer",
     MavMissionResult.UNSUPPORTED_FRAME: "the coordinate frame is not supported",
     MavMissionResult.UNSUPPORTED: "the command is not supported",
@@ -112,7 +112,7 @@ class MissionExchange(Transfer[ResultT]):
 
     def _wait(self, now: float, seconds: float | None = None) -> None:
         """Set the deadline: an answer is due by then."""
-        self.deadline = now + (self._timeout_s(self._attempt) if seconds is None else seconds)
+        self.deadline: float | None = now + (self._timeout_s(self._attempt) if seconds is None else seconds)
 
     def _timeout_s(self, attempt: int) -> float:
         """Small messages do not choke a link: wait longer after each attempt only while few, or many, were in vain."""
@@ -133,7 +133,7 @@ class MissionClear(MissionExchange[None]):
     ArduPilot refuses (ERROR) while the mission is being flown. PX4 says nothing while it is busy with a transfer.
     """
 
-    expects = (MissionAck,)
+    expects: tuple[type[Message], ...] = (MissionAck,)
 
     def start(self, now: float) -> None:
         """Send it."""

@@ -57,7 +57,7 @@ class ParameterList(Transfer[ParameterTable]):
         ParameterTimeout: nothing new for ``patience_s`` seconds; ``missing`` are the indices that did not come.
     """
 
-    expects = (ParamValue, ParamError)
+    expects: tuple[type[Message], ...] = (ParamValue, ParamError)
 
     def __init__(
         self,
@@ -238,7 +238,7 @@ class ParameterList(Transfer[ParameterTable]):
         for index in self._window.take_due(now):
             self._outbox.append(ParamRequestRead(self.target_system, self.target_component, "", index))
         times = (self._window.deadline, self._quiet_at, self._moved_at + self._patience_s)
-        self.deadline = min(at for at in times if at is not None)
+        self.deadline: float | None = min(at for at in times if at is not None)
 
     # -------------------------------------------------------------------------------- the end
 

@@ -45,7 +45,7 @@ class ParameterRequests(Transfer[dict[str, Answer]]):
     Where nothing new comes for ``patience_s`` seconds, what is missing becomes a ParameterTimeout.
     """
 
-    expects = (ParamValue, ParamError)
+    expects: tuple[type[Message], ...] = (ParamValue, ParamError)
 
     def __init__(
         self,
@@ -153,7 +153,7 @@ class ParameterRequests(Transfer[dict[str, Answer]]):
             self._sent_at[name] = now
         self._after_sending(now)
         times = (self._window.deadline, self._moved_at + self._patience_s)
-        self.deadline = min(at for at in times if at is not None)
+        self.deadline: float | None = min(at for at in times if at is not None)
 
 
 def rejection(name: str, code: int) -> ParameterRejected:

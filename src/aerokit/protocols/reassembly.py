@@ -17,11 +17,14 @@ class Reassembly:
     multiple of ``block_size`` bytes into the file; only the last one is shorter.
     """
 
+    position: int
+
     def __init__(self, write: WriteBytes, *, block_size: int, start: int = 0) -> None:
-        self.start, self.block_size = start, block_size
+        self.start: int = start
+        self.block_size: int = block_size
         self.position = start
         """Everything before this was written."""
-        self.tail = start
+        self.tail: int = start
         """The end of the last block that has come."""
         self.end: int | None = None
         """Where the file ends; None while that is not known."""

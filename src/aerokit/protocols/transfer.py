@@ -65,9 +65,9 @@ class Transfer(Exchange[ResultT]):
     ``patience_s`` seconds; what did come sets that clock back, so that a long transfer over a bad radio ends well.
     """
 
+    # from start() on
     _started_at: float
     _moved_at: float
-    # from start() on
 
     def __init__(
         self,
@@ -81,8 +81,9 @@ class Transfer(Exchange[ResultT]):
         super().__init__()
         if not patience_s > 0:
             raise LocalProtocolError(f"patience_s = {patience_s!r} is not allowed: above 0")
-        self.target_system, self.target_component = target_system, target_component
-        self.round_trip = RoundTrip() if round_trip is None else round_trip
+        self.target_system: int = target_system
+        self.target_component: int = target_component
+        self.round_trip: RoundTrip = RoundTrip() if round_trip is None else round_trip
         self._patience_s = patience_s
         self._on_progress = on_progress
 

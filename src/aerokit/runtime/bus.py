@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Bus", "Detach", "Sink", "once"]
 
-logger = logging.getLogger("aerokit")
+logger: logging.Logger = logging.getLogger("aerokit")
 
 Detach = Callable[[], None]
 """Calling it ends an attachment; calling it again does nothing."""
@@ -46,7 +46,6 @@ class Bus:
         self._sinks: dict[tuple[int, int], tuple[_Entry, ...]] = {}
         self._plans: dict[int, _Plan] = {}  # system and message id → all sinks, when needed
         self._event_sinks: dict[type[Event], tuple[Sink, ...]] = {}
-        self._running: tuple[_Entry, ...] = ()  # who gets the frame that is being delivered, or was last
 
     def attach(self, message_type: type[Message], sink: Sink, *, system_id: int = EVERY_SYSTEM) -> Detach:
         """Have every ``message_type`` of ``system_id`` (0: of every system) delivered to ``sink``."""
@@ -71,18 +70,21 @@ class Bus:
     def attach_first(
         self, message_ids: Iterable[int], make: Callable[[], object], *, system_id: int = EVERY_SYSTEM
     ) -> Detach:
-        """Call ``make()``, once, when the first of these messages comes; what it attaches to that kind gets it."""
+        """Call ``make()``, once, when the first of these messages comes; what it attaches to that kind gets it.
+
+        Ahead of who attached before: none of them can have made it while the message is delivered.
+        """
 
         def first(frame: Frame) -> None:
-            had_it = self._running  # who else made it meanwhile is not in there
+            before = self._plan(frame)[1]
             make()
             detach_all()
             for entry in self._plan(frame)[1]:
-                if entry not in had_it:
+                if entry not in before:
                     kind, sink = entry
                     sink(self.dialect.decode(frame) if kind == MESSAGE else frame)
 
-        attached = [self._attach((system_id, each), (FRAME, first)) for each in message_ids]
+        attached = [self._attach((system_id, each), (FRAME, first), ahead=True) for each in message_ids]
 
         def detach_all() -> None:
             for detach in attached:
@@ -101,7 +103,6 @@ class Bus:
             is_read, entries = self._plans[frame.system_id << 24 | frame.message_id]
         except KeyError:
             is_read, entries = self._plan(frame)
-        self._running = entries
         if not is_read:  # nearly always: who takes frames, or both, takes the frame alone
             for _, sink in entries:
                 try:
@@ -130,8 +131,9 @@ class Bus:
                 except Exception:
                     _report(sink)
 
-    def _attach(self, key: tuple[int, int], entry: _Entry) -> Detach:
-        self._sinks[key] = (*self._sinks.get(key, ()), entry)
+    def _attach(self, key: tuple[int, int], entry: _Entry, *, ahead: bool = False) -> Detach:
+        sinks = self._sinks.get(key, ())
+        self._sinks[key] = (entry, *sinks) if ahead else (*sinks, entry)
         self._plans.clear()
         self.wanted[key[1]] = self.wanted.get(key[1], 0) + 1
         return once(lambda: self._detach(key, entry))

@@ -18,7 +18,7 @@ __all__ = ["Changes", "Feed", "Source", "StateCell"]
 
 T = TypeVar("T")
 
-logger = logging.getLogger("aerokit")
+logger: logging.Logger = logging.getLogger("aerokit")
 
 _SEEN = 3  # how many of the last distinct values a time-out names
 

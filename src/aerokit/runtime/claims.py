@@ -38,13 +38,16 @@ class Claim:
         self._follows: bool | None = None
         self._clock_is_right: bool | None = None
         self._frames, self._since = 0, 0.0  # since the other one was heard last
-        self.is_told = self.is_refusal_told = False
+        self.is_told: bool = False
+        self.is_refusal_told: bool = False
 
     def hear(self, frame: Frame, evidence: tuple[int, bool | None, bool | None]) -> None:
         """One more frame: how far the other one has come, and whether number and clock go on there (None: unknown)."""
         expected, follows, clock_is_right = evidence
         if expected != self._expected:
-            self._expected, self._frames, self.is_refusal_told = expected, 0, False
+            self._expected = expected
+            self._frames = 0
+            self.is_refusal_told = False
             self._follows, self._clock_is_right, self._since = follows, None, frame.received_at
         self._frames += 1
         if clock_is_right is not None and self._clock_is_right is not False:

@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import MavAutopilot, MavType
+from aerokit.runtime.events import ComponentFound, VehicleFound
 
 if TYPE_CHECKING:
     from aerokit.mavlink.messages import Heartbeat
 
-__all__ = ["is_autopilot"]
+__all__ = ["found_by", "is_autopilot"]
 
 NO_AUTOPILOTS = frozenset(
     (
@@ -42,3 +43,12 @@ def is_autopilot(heartbeat: Heartbeat) -> bool:
     Some of those call their autopilot GENERIC instead of INVALID, so their type counts too.
     """
     return heartbeat.autopilot != MavAutopilot.INVALID and heartbeat.type not in NO_AUTOPILOTS
+
+
+def found_by(
+    heartbeat: Heartbeat, at: float, system_id: int, component_id: int
+) -> VehicleFound | ComponentFound:
+    """What a first heartbeat tells."""
+    if is_autopilot(heartbeat):
+        return VehicleFound(at, system_id, component_id, heartbeat.type, heartbeat.autopilot)
+    return ComponentFound(at, system_id, component_id, heartbeat.type)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 import time
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -21,7 +22,7 @@ from aerokit.mavlink.messages import Heartbeat
 from aerokit.runtime.background import Background
 from aerokit.runtime.bus import Bus, once
 from aerokit.runtime.cells import StateCell
-from aerokit.runtime.components import is_autopilot
+from aerokit.runtime.components import found_by
 from aerokit.runtime.deadlines import Deadlines
 from aerokit.runtime.endings import raisable
 from aerokit.runtime.events import (
@@ -45,7 +46,7 @@ from aerokit.runtime.subscription import Overflow, Subscription
 
 if TYPE_CHECKING:
     import os
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import AsyncGenerator, Callable, Iterator, Sequence
 
     from aerokit.links.link import Peer
     from aerokit.mavlink.dialect import Dialect
@@ -58,7 +59,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Connection"]
 
-logger = logging.getLogger("aerokit")
+logger: logging.Logger = logging.getLogger("aerokit")
 
 ItemT = TypeVar("ItemT", bound="Message | Event")
 
@@ -94,8 +95,9 @@ class Connection:
                 f"dialect {dialect.name!r} has no HEARTBEAT: pass Dialect.extended_by of the standard one"
             )
         self.link = link
-        self.bus = Bus(dialect)
-        self.source_system, self.source_component = source_system, source_component
+        self.bus: Bus = Bus(dialect)
+        self.source_system: int = source_system
+        self.source_component: int = source_component
         self.heard: dict[tuple[int, int], Heartbeat] = {}
         """The last HEARTBEAT of every (system id, component id) on the link."""
         self.attached: set[int] = set()
@@ -104,7 +106,7 @@ class Connection:
         """Of some (system id, component id): its time since boot in milliseconds, by our time; None while unknown."""
         self.link_state: StateCell[LinkState] = StateCell("link_state", self.now, "frame")
         """Whether frames come at all, from whomever; ``vehicle.link_state`` is about one vehicle."""
-        self.deadlines = Deadlines()
+        self.deadlines: Deadlines = Deadlines()
         """What has to happen at a time, as long as the connection is open."""
         self._clock = asyncio.get_running_loop().time
         self._wall_at_0 = time.time() - self._clock()
@@ -227,6 +229,23 @@ class Connection:
         subscription: Subscription[ItemT] = Subscription(attach, capacity=capacity, overflow=overflow)
         return subscription
 
+    async def vehicles(self) -> AsyncGenerator[VehicleFound, None]:
+        """Each autopilot once: those that were heard already, then those that will be, until the connection ends.
+
+        ``async for found in connection.vehicles(): async with aerokit.connect(connection, system_id=found.system_id)…``
+
+        Raises:
+            ConnectionClosed, LinkLost: the connection ended.
+        """
+        self.raise_if_ended()
+        with self.subscribe(VehicleFound, capacity=MOST_ROUTES) as news:
+            known = [found_by(heartbeat, self.now(), *source) for source, heartbeat in self.heard.items()]
+            for found in known:
+                if isinstance(found, VehicleFound):
+                    yield found
+            async for each in news:
+                yield each
+
     def attach(self, types: Sequence[type[Any]], sink: Sink, *, system_id: int = 0) -> list[Detach]:
         """Have these messages and events, of one system or of all (0), delivered to ``sink``."""
         return [self._attach(item, sink, system_id) for item in types]
@@ -276,6 +295,12 @@ class Connection:
         """Raise what ended the connection (ConnectionClosed, LinkLost), if it has ended."""
         if self._error is not None:
             raise raisable(self._error)
+
+    def heard_at(self, system_id: int, component_id: int) -> float:
+        """When the last HEARTBEAT of a component came, on :meth:`now`'s clock; −inf: none has."""
+        heartbeat = self.heard.get((system_id, component_id))
+        frame = None if heartbeat is None else heartbeat.received_frame
+        return -math.inf if frame is None else frame.received_at
 
     def now(self) -> float:
         """Seconds on the event loop's clock, the one that all ages and deadlines are measured on."""
@@ -346,7 +371,7 @@ class Connection:
             framer = self._framers.get(peer)
             now = self._clock()
             if now > self._loop_watch.late_after:
-                now = self._loop_watch.arrival()
+                now = self._loop_watch.arrival(now)
             if framer is not None:
                 frames = framer.receive(data, now)
             else:
@@ -501,8 +526,8 @@ class Connection:
             source = frame.system_id, frame.component_id
             is_new = source not in self.heard
             self.heard[source] = heartbeat
-            if is_new and is_autopilot(heartbeat):
-                self.bus.publish(VehicleFound(self._clock(), *source))
+            if is_new:
+                self.bus.publish(found_by(heartbeat, self._clock(), *source))
             if len(self.heard) > MOST_ROUTES:
                 for source in [source for source in self.heard if not self._routes.is_known(source)]:
                     del self.heard[source]

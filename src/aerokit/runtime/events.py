@@ -11,13 +11,17 @@ from aerokit.snapshot import Snapshot
 
 if TYPE_CHECKING:
     from aerokit.errors import AerokitError
+    from aerokit.position import Position
     from aerokit.runtime.link_state import LinkState
 
 __all__ = [
     "ArmedChanged",
+    "ComponentFound",
     "Event",
     "FrameRefused",
+    "GimbalControlLost",
     "HeardTwice",
+    "ImageCaptured",
     "LandedStateChanged",
     "LinkClosed",
     "LinkDrained",
@@ -33,6 +37,7 @@ __all__ = [
     "ModeChanged",
     "MoveRefused",
     "ParameterChanged",
+    "SettingChanged",
     "StatusTextReceived",
     "StreamSlow",
     "StreamUnavailable",
@@ -52,9 +57,24 @@ class Event(Snapshot):
 
 
 class VehicleFound(Event):
-    """The first heartbeat of this autopilot was heard on the connection, whether a vehicle is connected to or not."""
+    """The first heartbeat of this autopilot was heard on the connection, whether a vehicle is connected to or not.
+
+    ``vehicle_type`` is its MAV_TYPE, ``autopilot`` its MAV_AUTOPILOT.
+    """
 
     component_id: int
+    vehicle_type: int
+    autopilot: int
+
+
+class ComponentFound(Event):
+    """The first heartbeat of another component than an autopilot was heard on the connection; ``type`` is its MAV_TYPE.
+
+    Cameras, gimbals, companion computers, other ground stations: of any system, connected to or not.
+    """
+
+    component_id: int
+    type: int
 
 
 class VehicleSilent(Event):
@@ -151,6 +171,18 @@ class MissionFinished(Event):
     """The vehicle has flown its mission to the end."""
 
 
+class GimbalControlLost(Event):
+    """A gimbal that a block ``gimbal.control()`` had in its hands is not ours any more (GIMBAL_MANAGER_STATUS).
+
+    ``to_system_id`` and ``to_component_id`` are who has it now, zeros: nobody; ``is_primary``: which control it was.
+    """
+
+    gimbal_device_id: int
+    is_primary: bool
+    to_system_id: int
+    to_component_id: int
+
+
 class StatusTextReceived(Event):
     """The vehicle said something (STATUSTEXT, chunks joined); ``severity`` is a MAV_SEVERITY, 0 the worst, 7 debug."""
 
@@ -159,26 +191,53 @@ class StatusTextReceived(Event):
 
 
 class StreamSlow(Event):
-    """A message comes at less than half the rate that was asked for."""
+    """A message comes at less than half the rate that this component was asked for."""
 
     message: str
     asked_hz: float
     achieved_hz: float
+    component_id: int = 1
 
 
 class StreamUnavailable(Event):
-    """The vehicle refuses to send this message at the rate that was asked for."""
+    """This component refuses to send this message at the rate that was asked for."""
 
     message: str
     reason: str
+    component_id: int = 1
 
 
 class ParameterChanged(Event):
-    """A parameter of the autopilot whose value was known has another one now, whoever changed it."""
+    """A parameter of this component whose value was known has another one now, whoever changed it."""
 
     name: str
     before: int | float
     after: int | float
+    component_id: int = 1
+
+
+class SettingChanged(Event):
+    """A setting of this component (PARAM_EXT) whose value was known has another one now, whoever changed it."""
+
+    name: str
+    before: bool | int | float | str | bytes
+    after: bool | int | float | str | bytes
+    component_id: int
+
+
+class ImageCaptured(Event):
+    """A camera has told of a picture, heard of for the first time; ``camera.captures()`` has more of it.
+
+    ``camera`` is 1 to 6 behind the autopilot, otherwise a component id; ``index`` counts from 0; ``success`` is None
+    where nobody said. Told once ``vehicle.camera`` or ``vehicle.cameras`` was used, or a message of this kind has come.
+    """
+
+    camera: int
+    index: int
+    success: bool | None
+    place: Position | None
+    file_url: str
+    component_id: int = 1
 
 
 class LinkReport(Event):

@@ -18,8 +18,8 @@ __all__ = ["LinkStateWatch"]
 class LinkStateWatch:
     """Is told what is heard, and looks from time to time for how long nothing was; times on the loop's clock."""
 
-    _heard_at: float
     # from heard() on
+    _heard_at: float
 
     def __init__(
         self, cell: StateCell[LinkState], bus: Bus, *, system_id: int, component_id: int = 0

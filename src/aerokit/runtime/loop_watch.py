@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 __all__ = ["PERIOD_S", "LoopWatch"]
 
 PERIOD_S = 0.1
-"""How often it is looked."""
+"""How often it is looked, by a timer or by what is read."""
 LATE_AFTER_S = 0.1
 BLOCKED_AFTER_S = 0.25
 QUIET_TURNS = 3
@@ -22,6 +22,7 @@ first in a turn, timers or sockets."""
 
 class LoopWatch:
     """A timer that is always under way. When it comes late, the program, or the system, kept the loop from running.
+    What is read in time puts it off: each time that it wakes a sleeping process costs as much as a few messages.
 
     What is read afterwards may have waited since the loop last ran: nobody knows better, so that is when it came, until
     all that had waited has been read. A pause of less than ``PERIOD_S + LATE_AFTER_S`` is not noticed; what is read is
@@ -32,7 +33,7 @@ class LoopWatch:
     def __init__(self, on_blocked: Callable[[float], None]) -> None:
         self._loop = asyncio.get_running_loop()
         self._on_blocked = on_blocked
-        self.late_after = math.inf
+        self.late_after: float = math.inf
         """What is read at a later time than this came at :meth:`arrival`, else when it was read."""
         self._ran_at = self._due = self._loop.time()
         self._timer: asyncio.TimerHandle | None = None
@@ -51,8 +52,13 @@ class LoopWatch:
             self._timer.cancel()
             self._timer = None
 
-    def arrival(self) -> float:
-        """The earliest time at which what is read now may have come."""
+    def arrival(self, now: float) -> float:
+        """When what is read came: now, or, if it may have waited, the earliest time at which it may have come."""
+        if self._oldest is None and now <= self._due + LATE_AFTER_S:
+            if self._timer is not None:
+                self._timer.cancel()
+            self._set_timer(now)
+            return now
         self._has_read = True
         return self._fall_behind()
 
@@ -68,7 +74,7 @@ class LoopWatch:
     def _set_timer(self, now: float) -> None:
         self._ran_at, self._due = now, now + PERIOD_S
         if self._oldest is None:
-            self.late_after = self._due + LATE_AFTER_S
+            self.late_after = now + PERIOD_S / 2
         self._timer = self._loop.call_at(self._due, self._tick)
 
     def _fall_behind(self) -> float:
@@ -87,4 +93,4 @@ class LoopWatch:
             self._loop.call_soon(self._look)
         else:
             self._oldest = None
-            self.late_after = self._due + LATE_AFTER_S
+            self.late_after = self._ran_at + PERIOD_S / 2

@@ -24,9 +24,12 @@ if TYPE_CHECKING:
     from aerokit.mavlink.dialect import Dialect
     from aerokit.mavlink.signing import Signing
 
-__all__ = ["open_connection"]
+__all__ = ["ONLOOKER", "open_connection"]
 
 CLOSE_TIMEOUT_S = 2.0
+ONLOOKER = 254
+"""Who comes and goes while a vehicle flies: ArduPilot (FS_GCS_ENABLE) misses the ground station 255, its MAV_GCS_SYSID,
+five seconds after it has gone."""
 
 
 @checked

@@ -12,7 +12,7 @@ from aerokit.mavlink.tlog import TlogWriter
 
 __all__ = ["Recording"]
 
-logger = logging.getLogger("aerokit")
+logger: logging.Logger = logging.getLogger("aerokit")
 
 SETUP_SIGNING = (256).to_bytes(3, "little")
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = ["MOST_CLAIMS", "MOST_ROUTES", "MOVES_AFTER_S", "Routes"]
 
-logger = logging.getLogger("aerokit")
+logger: logging.Logger = logging.getLogger("aerokit")
 
 MOVES_AFTER_S = 3.5
 """A component that was silent for so long may come from another peer: its port has changed, or the link."""

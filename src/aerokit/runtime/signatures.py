@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = ["SignatureGate", "check_signing"]
 
-logger = logging.getLogger("aerokit")
+logger: logging.Logger = logging.getLogger("aerokit")
 
 
 UNSIGNED_FRAMES = 3
@@ -45,7 +45,7 @@ class SignatureGate:
         self._handover: _Handover | None = None
         self._is_handing_over = False
         self._keep_error: OSError | None = None
-        self.is_open = True
+        self.is_open: bool = True
         """Whether everything is let in without looking at it."""
 
     def use(self, signing: Signing | None) -> None:

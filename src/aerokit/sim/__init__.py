@@ -19,12 +19,14 @@ from aerokit.sim.components import SimulatedCamera, SimulatedComponent, Simulate
 from aerokit.sim.faults import CommandFault, Faults
 from aerokit.sim.logs import SimulatedLog
 from aerokit.sim.motion import Wind
+from aerokit.sim.place import HOME
 from aerokit.sim.px4 import SimulatedPx4, SimulatedPx4Plane
 from aerokit.sim.recorded import RecordedVehicle
 from aerokit.sim.server import SimulatorServer, open_simulator, simulated_link
 from aerokit.sim.vehicle import Component, ExtraComponent, SimulatedVehicle
 
 __all__ = [
+    "HOME",
     "BootTimeline",
     "CommandFault",
     "Component",

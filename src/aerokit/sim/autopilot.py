@@ -52,7 +52,7 @@ class SimulatedAutopilot(SimulatedVehicle):
     ) -> None:
         super().__init__(system_id=system_id, component_id=1, seed=seed, components=components)
         self.version = version
-        self.unsupported_commands = frozenset(unsupported_commands)
+        self.unsupported_commands: frozenset[int] = frozenset(unsupported_commands)
         self._unix_time_at_start = unix_time_at_boot
         self.signing = self.make_signing(signing_key, timestamp_at(unix_time_at_boot))
 

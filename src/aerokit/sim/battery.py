@@ -17,6 +17,9 @@ _RESTING_CELL_SLOPES = tuple(
 class Battery:
     """One pack. ``drain`` is all that happens to it; everything else is read from it."""
 
+    consumed_mah: float
+    consumed_wh: float
+
     def __init__(
         self,
         capacity_mah: float = 3300.0,
@@ -31,7 +34,7 @@ class Battery:
         self.consumed_mah = 0.0
         """Since power on, as a current sensor counts it."""
         self.consumed_wh = 0.0
-        self.current_a = 0.0
+        self.current_a: float = 0.0
         self._charge_mah = capacity_mah * percent / 100.0
 
     @property

@@ -31,7 +31,7 @@ class Channel:
         self, system_id: int, component_id: int, wanted: Container[int], *, version: int = 2
     ) -> None:
         self.version = version
-        self.streams = Streams()
+        self.streams: Streams = Streams()
         self._wanted = wanted
         self._own = (system_id, component_id)
         self._framers: dict[Hashable, Framer] = {}

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import MavResult
+
+if TYPE_CHECKING:
+    from aerokit.mavlink.message import Message
 
 __all__ = ["CommandFault", "Faults"]
 
@@ -43,6 +47,7 @@ class Faults:
     - ``drop_outgoing``, ``drop_incoming``: this many of the next frames are lost (they count down)
     - ``loss``, ``loss_incoming``: share of the outgoing and of the incoming frames that is lost at random, 0 to 1, the
       same for the same seed
+    - ``lost_messages``: message id → how many of the next ones of this kind are lost on their way out; see ``lose``
     - ``motor_failed``: a motor stands still; the vehicle cannot hold its height and comes down
     - ``no_ftp``: FILE_TRANSFER_PROTOCOL is neither answered nor among the capabilities
     - ``parameter_limits``: name → lowest and highest value; what is set is clamped to them without a word
@@ -61,6 +66,7 @@ class Faults:
     drop_incoming: int = 0
     loss: float = 0.0
     loss_incoming: float = 0.0
+    lost_messages: dict[int, int] = field(default_factory=dict)
     motor_failed: bool = False
     no_ftp: bool = False
     parameter_limits: dict[str, tuple[float, float]] = field(default_factory=dict)
@@ -86,6 +92,17 @@ class Faults:
     def lose_ack(self, command: int, *, times: int | None = 1) -> None:
         """Do it, but lose the answer."""
         self.commands[command] = CommandFault(times, acks=0)
+
+    def lose(self, message_type: type[Message], *, times: int = 1) -> None:
+        """Have the next messages of a kind lost on their way out."""
+        self.lost_messages[message_type.ID] = times
+
+    def loses(self, message: Message) -> bool:
+        """Whether this one is lost; counts down."""
+        left = self.lost_messages.get(message.ID, 0)
+        if left:
+            self.lost_messages[message.ID] = left - 1
+        return left > 0
 
     def repeat_ack(self, command: int, count: int = 2, *, times: int | None = None) -> None:
         """Do it and answer several times."""

@@ -30,6 +30,8 @@ def fitted(message: MessageT) -> MessageT:
 
 def _fitting(field: Field, value: Any) -> Any:
     if field.type == "char":
+        if not field.is_text:
+            return value[: field.array_length] if isinstance(value, bytes) else value
         is_text = isinstance(value, str)
         return (
             value.encode(errors="replace")[: field.array_length or 1].decode(errors="ignore")

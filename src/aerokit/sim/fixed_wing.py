@@ -48,10 +48,17 @@ class FixedWing(Motion):
     names of `Motion` for position, velocity and attitude are kept.
     """
 
+    north: float
+    east: float
+    down: float
+
+    roll: float
+    pitch: float
+
     def __init__(self, rng: random.Random, wing: WingLimits | None = None, wind: Wind | None = None) -> None:
         super().__init__(rng, wind=wind)
-        self.wing = wing if wing is not None else WingLimits()
-        self.throttle = 0.0
+        self.wing: WingLimits = wing if wing is not None else WingLimits()
+        self.throttle: float = 0.0
         """0 to 1: what the engine gives."""
         self._speed = 0.0
         self._wanted_airspeed = 0.0
@@ -153,15 +160,17 @@ class FixedWing(Motion):
         level = math.sqrt(max(0.0, self._speed * self._speed - self.velocity_down * self.velocity_down))
         air_north, air_east = self._air_movement()
         north, east = self._along_nose(level)
-        self.velocity_north, self.velocity_east = north + air_north, east + air_east
+        self.velocity_north: float = north + air_north
+        self.velocity_east: float = east + air_east
         self._advance(dt)
         climb_share = -self.velocity_down / wing.climb_m_s
         self.throttle = max(0.0, min(1.0, 0.45 + 0.5 * climb_share)) if powered else 0.0
 
     def _touch_down(self) -> None:
-        self.impact_speed_m_s = self.velocity_down
+        self.impact_speed_m_s: float = self.velocity_down
         self._speed = self.ground_speed_m_s
-        self.down, self.velocity_down = self.ground_down, 0.0
+        self.down = self.ground_down
+        self.velocity_down: float = 0.0
         self.roll = self.pitch = 0.0
 
     def _approach_speed(self, wanted: float, dt: float) -> None:
@@ -171,15 +180,15 @@ class FixedWing(Motion):
     def _bank(self, wanted: float, dt: float) -> None:
         step = (wanted - self.roll) * min(1.0, dt / _BANK_TIME_CONSTANT_S)
         self.roll += step
-        self.roll_rate = step / dt
-        self.yaw_rate = GRAVITY_M_S2 * math.tan(self.roll) / max(self._speed, 1.0)
-        self.yaw = wrap_pi(self.yaw + self.yaw_rate * dt)
+        self.roll_rate: float = step / dt
+        self.yaw_rate: float = GRAVITY_M_S2 * math.tan(self.roll) / max(self._speed, 1.0)
+        self.yaw: float = wrap_pi(self.yaw + self.yaw_rate * dt)
 
     def _tilt(self, dt: float) -> None:
         slope = math.asin(max(-0.7, min(0.7, -self.velocity_down / max(self._speed, 1.0))))
         step = (slope + _ANGLE_OF_ATTACK_RAD - self.pitch) * min(1.0, dt / _PITCH_TIME_CONSTANT_S)
         self.pitch += step
-        self.pitch_rate = step / dt
+        self.pitch_rate: float = step / dt
 
     def _along_nose(self, speed: float) -> tuple[float, float]:
         return speed * math.cos(self.yaw), speed * math.sin(self.yaw)
@@ -193,6 +202,6 @@ class FixedWing(Motion):
         self.down += self.velocity_down * dt
 
     def _differentiate(self, before: tuple[float, float, float], dt: float) -> None:
-        self.acceleration_north = (self.velocity_north - before[0]) / dt
-        self.acceleration_east = (self.velocity_east - before[1]) / dt
-        self.acceleration_down = (self.velocity_down - before[2]) / dt
+        self.acceleration_north: float = (self.velocity_north - before[0]) / dt
+        self.acceleration_east: float = (self.velocity_east - before[1]) / dt
+        self.acceleration_down: float = (self.velocity_down - before[2]) / dt

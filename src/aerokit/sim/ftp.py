@@ -6,7 +6,7 @@ https://mavlink.io/en/services/ftp.html
 from __future__ import annotations
 
 import zlib
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Protocol
 
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
 from aerokit.mavlink.messages import FileTransferProtocol
@@ -15,11 +15,14 @@ from aerokit.sim.file_tree import EEXIST, ENOENT
 from aerokit.sim.vehicle import sender_of
 
 if TYPE_CHECKING:
-    from aerokit.sim.channel import Channel
-    from aerokit.sim.file_tree import FileTree
-    from aerokit.sim.vehicle import SimulatedVehicle
+    from collections.abc import Callable
 
-__all__ = ["FtpPacket", "FtpServer", "crc32", "path_in", "read_crc32"]
+    from aerokit.mavlink.message import Message
+    from aerokit.sim.channel import Channel
+    from aerokit.sim.faults import Faults
+    from aerokit.sim.file_tree import FileTree
+
+__all__ = ["FileHost", "FtpPacket", "FtpServer", "crc32", "path_in", "read_crc32"]
 
 
 class FtpPacket(FtpMessage):
@@ -63,13 +66,39 @@ class FtpPacket(FtpMessage):
         return self.refuse(MavFtpErr.FAILERRNO, errno) if own is None else self.refuse(own)
 
 
+class FileHost(Protocol):
+    """Who serves files: a vehicle, or a device beside its autopilot."""
+
+    faults: Faults
+
+    @property
+    def now(self) -> float:
+        """Simulated seconds."""
+        raise NotImplementedError
+
+    def on(self, message_class: type[Message], handler: Callable[[Any, Channel], None]) -> None:
+        """Hear such messages."""
+
+    def send(self, message: Message, channel: Channel | None = None) -> None:
+        """Send on one channel, or on all."""
+
+    def send_text(self, severity: int, text: str) -> None:
+        """Send a STATUSTEXT."""
+
+    def call_at(self, when: float, action: Callable[[], None]) -> None:
+        """Do something at this time."""
+
+    def call_later(self, delay: float, action: Callable[[], None]) -> None:
+        """Do something after ``delay`` seconds."""
+
+
 class FtpServer:
     """Hears requests and answers; an autopilot's own class says how.
 
     ``no_ftp`` of the vehicle's faults makes it deaf.
     """
 
-    def __init__(self, vehicle: SimulatedVehicle, files: FileTree) -> None:
+    def __init__(self, vehicle: FileHost, files: FileTree) -> None:
         self.files = files
         self._vehicle = vehicle
         vehicle.on(FileTransferProtocol, self._on_message)

@@ -35,11 +35,17 @@ class GroundLimits:
 class GroundMotion(Motion):
     """One of `drive`, `head`, `drive_to` and `stop` says what to do next; it keeps the rest of `Motion`'s names."""
 
+    north: float
+    east: float
+    down: float
+
+    speed_m_s: float
+
     def __init__(
         self, rng: random.Random, wheels: GroundLimits | None = None, wind: Wind | None = None
     ) -> None:
         super().__init__(rng, wind=wind)
-        self.wheels = wheels if wheels is not None else GroundLimits()
+        self.wheels: GroundLimits = wheels if wheels is not None else GroundLimits()
         self.speed_m_s = 0.0
         """Forwards; negative is backwards."""
         self._wanted_speed = 0.0
@@ -87,11 +93,13 @@ class GroundMotion(Motion):
         rate = self._turn_rate()
         self._accelerate(self._curve_speed(rate) if powered else 0.0, dt)
         middle = self.yaw + 0.5 * rate * dt
-        self.yaw, self.yaw_rate = wrap_pi(self.yaw + rate * dt), rate
+        self.yaw: float = wrap_pi(self.yaw + rate * dt)
+        self.yaw_rate: float = rate
         north, east = self.speed_m_s * math.cos(middle), self.speed_m_s * math.sin(middle)
-        self.acceleration_north = (north - self.velocity_north) / dt
-        self.acceleration_east = (east - self.velocity_east) / dt
-        self.velocity_north, self.velocity_east = north, east
+        self.acceleration_north: float = (north - self.velocity_north) / dt
+        self.acceleration_east: float = (east - self.velocity_east) / dt
+        self.velocity_north: float = north
+        self.velocity_east: float = east
         self.north += north * dt
         self.east += east * dt
 

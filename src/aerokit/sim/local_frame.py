@@ -28,7 +28,7 @@ class LocalFrame:
     __slots__ = ("_east_scale", "origin")
 
     def __init__(self, origin: GlobalPoint) -> None:
-        self.origin = origin
+        self.origin: GlobalPoint = origin
         self._east_scale = _METRES_PER_DEGREE_E7 * math.cos(math.radians(origin.latitude_e7 * 1e-7))
 
     def to_global(self, north: float, east: float, down: float) -> GlobalPoint:

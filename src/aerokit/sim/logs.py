@@ -71,7 +71,7 @@ class LogServer:
         erase_files: Callable[[], None] = lambda: None,
         append_to_file: Callable[[int, bytes], None] = lambda number, data: None,
     ) -> None:
-        self.logs = list(logs)
+        self.logs: list[SimulatedLog] = list(logs)
         self.rate_hz = rate_hz
         self._vehicle = vehicle
         self._erase_files, self._append_to_file = erase_files, append_to_file

@@ -68,19 +68,34 @@ class Motion:
     ``ground_down``.
     """
 
+    north: float
+    east: float
+    roll: float
+    pitch: float
+
     def __init__(
         self, rng: random.Random, limits: MotionLimits | None = None, wind: Wind | None = None
     ) -> None:
-        self.limits = limits if limits is not None else MotionLimits()
-        self.wind = wind if wind is not None else Wind()
+        self.limits: MotionLimits = limits if limits is not None else MotionLimits()
+        self.wind: Wind = wind if wind is not None else Wind()
         self._rng = rng
-        self.ground_down = 0.0
-        self.north = self.east = self.down = 0.0
-        self.velocity_north = self.velocity_east = self.velocity_down = 0.0
-        self.acceleration_north = self.acceleration_east = self.acceleration_down = 0.0
-        self.roll = self.pitch = self.yaw = 0.0
-        self.roll_rate = self.pitch_rate = self.yaw_rate = 0.0
-        self.impact_speed_m_s = 0.0
+        self.ground_down: float = 0.0
+        self.north = 0.0
+        self.east = 0.0
+        self.down: float = 0.0
+        self.velocity_north: float = 0.0
+        self.velocity_east: float = 0.0
+        self.velocity_down: float = 0.0
+        self.acceleration_north: float = 0.0
+        self.acceleration_east: float = 0.0
+        self.acceleration_down: float = 0.0
+        self.roll = 0.0
+        self.pitch = 0.0
+        self.yaw: float = 0.0
+        self.roll_rate: float = 0.0
+        self.pitch_rate: float = 0.0
+        self.yaw_rate: float = 0.0
+        self.impact_speed_m_s: float = 0.0
         """Vertical speed at the last touch of the ground."""
         self._gust_north = self._gust_east = 0.0
         self._wanted = (0.0, 0.0, 0.0)
@@ -212,7 +227,9 @@ class Motion:
         )
 
     def _integrate(self, north: float, east: float, down: float, dt: float) -> None:
-        self.acceleration_north, self.acceleration_east, self.acceleration_down = north, east, down
+        self.acceleration_north = north
+        self.acceleration_east = east
+        self.acceleration_down = down
         was_on_ground = self.is_on_ground
         self.north += (self.velocity_north + 0.5 * north * dt) * dt
         self.east += (self.velocity_east + 0.5 * east * dt) * dt
@@ -224,7 +241,9 @@ class Motion:
             if not was_on_ground:
                 self.impact_speed_m_s = self.velocity_down
             self.down = self.ground_down
-            self.velocity_north = self.velocity_east = self.velocity_down = 0.0
+            self.velocity_north = 0.0
+            self.velocity_east = 0.0
+            self.velocity_down = 0.0
 
     def _lean(self, north: float, east: float, dt: float, *, powered: bool) -> None:
         roll = pitch = 0.0
@@ -239,7 +258,8 @@ class Motion:
         roll_step, pitch_step = (roll - self.roll) * share, (pitch - self.pitch) * share
         self.roll += roll_step
         self.pitch += pitch_step
-        self.roll_rate, self.pitch_rate = roll_step / dt, pitch_step / dt
+        self.roll_rate = roll_step / dt
+        self.pitch_rate = pitch_step / dt
 
     def _turn(self, dt: float, *, powered: bool) -> None:
         rate = 0.0

@@ -11,11 +11,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from aerokit.errors import AerokitError, LocalProtocolError
+from aerokit.sim.track import metres_from
 
 if TYPE_CHECKING:
     from os import PathLike
 
-    from aerokit.sim.track import Track
+    from aerokit.position import Position
+    from aerokit.sim.track import Track, TrackPoint
 
 __all__ = ["check_picture", "draw_svg", "save_picture"]
 
@@ -25,6 +27,9 @@ _WIDTH, _MAP_HEIGHT, _PROFILE_HEIGHT, _MARGIN = 800, 520, 160, 60
 _HEIGHT = _MAP_HEIGHT + _PROFILE_HEIGHT
 _FONT_SIZE = 12
 _MOST_NAMES = 8
+_FAILED = "#e00000"
+_LABEL_HEIGHT, _LABEL_WIDTH, _MOST_LABELS = 13, 60, 40
+_CORNERS = 90  # of a circle
 
 
 def check_picture(path: str | PathLike[str]) -> None:
@@ -67,10 +72,12 @@ def draw_svg(tracks: Sequence[Track]) -> str:
 class _Line:
     places: Sequence[tuple[float, float]]
     colour: str
+    is_dashed: bool = False
 
     def svg(self) -> str:
         points = " ".join(f"{x:.1f},{y:.1f}" for x, y in self.places)
-        return f'<polyline points="{points}" fill="none" stroke="{self.colour}" stroke-width="1.5"/>'
+        dashes = ' stroke-dasharray="6 4"' if self.is_dashed else ""
+        return f'<polyline points="{points}" fill="none" stroke="{self.colour}" stroke-width="1.5"{dashes}/>'
 
     def draw(self, image: Any, scale: int, font: Any) -> None:
         image.line([(x * scale, y * scale) for x, y in self.places], self.colour, round(1.5 * scale), "curve")
@@ -124,7 +131,7 @@ _Shape = _Line | _GridLine | _Dot | _Text
 
 
 def _shapes(tracks: Sequence[Track]) -> list[_Shape]:
-    drawn = [track for track in tracks if track]
+    drawn = [track.as_it_is() for track in tracks if track]
     return _map(drawn) + _profile(drawn) + _legend(drawn) if drawn else []
 
 
@@ -162,22 +169,105 @@ class _Axes:
 
 def _map(tracks: Sequence[Track]) -> list[_Shape]:
     paths = [[(east, north) for north, east, _ in track.local(tracks[0].home)] for track in tracks]
-    easts, norths = zip(*(place for path in paths for place in path), strict=True)
+    outlines = [outline for track in tracks for outline in _outlines(track, tracks[0].home)]
+    easts, norths = zip(*(place for path in paths + outlines for place in path), strict=True)
     axes = _Axes(easts, norths, 30, _MAP_HEIGHT - 60, square=True)
     shapes = axes.grid("m", "m")
-    for path, colour in zip(paths, _colours(len(paths)), strict=True):
+    shapes += [_Line([axes.place(*corner) for corner in outline], _FAILED, True) for outline in outlines]
+    labels = _Labels()
+    for track, path, colour in zip(tracks, paths, _colours(len(paths)), strict=True):
         places = [axes.place(east, north) for east, north in path]
         shapes += [_Line(places, colour), _Dot(*places[0], colour)]
+        shapes += labels.modes(track, places, colour)
+        shapes += _failed_point(track, places)
     return shapes
+
+
+def _outlines(track: Track, origin: Position) -> list[list[tuple[float, float]]]:
+    """The circle or polygon of the assertion that failed: metres east and north."""
+    failure = track.failure
+    if failure is None:
+        return []
+    plane, found = metres_from(origin), []
+    if failure.circle is not None:
+        (north, east), radius = plane(failure.circle[0]), failure.circle[1]
+        angles = [2 * math.pi * number / _CORNERS for number in range(_CORNERS + 1)]
+        found.append(
+            [(east + radius * math.sin(angle), north + radius * math.cos(angle)) for angle in angles]
+        )
+    if failure.polygon:
+        corners = [plane(corner) for corner in failure.polygon]
+        found.append([(east, north) for north, east in (*corners, corners[0])])
+    return found
+
+
+def _failed_point(track: Track, places: Sequence[tuple[float, float]]) -> list[_Shape]:
+    """A cross where the assertion failed."""
+    if track.failure is None:
+        return []
+    x, y = places[_index_of(track, track.failure.point)]
+    strokes = [
+        _Line([(x - 7, y - 7), (x + 7, y + 7)], _FAILED),
+        _Line([(x - 7, y + 7), (x + 7, y - 7)], _FAILED),
+    ]
+    return [*strokes, _Text(x, y + 22, "failed here", "middle", _FAILED)]
+
+
+def _index_of(track: Track, point: TrackPoint) -> int:
+    distances = [abs(each.time_s - point.time_s) for each in track]
+    return distances.index(min(distances))
+
+
+class _Labels:
+    """Names of modes where they begin; one that would lie on another is left out."""
+
+    def __init__(self) -> None:
+        self._places: list[tuple[float, float]] = []
+
+    def modes(
+        self, track: Track, places: Sequence[tuple[float, float]], colour: str, *, above: float = 8
+    ) -> list[_Shape]:
+        """Dots and names at the places where another mode begins."""
+        shapes: list[_Shape] = []
+        before = None
+        for point, (x, y) in zip(track, places, strict=True):
+            if point.mode == before:
+                continue
+            before = point.mode
+            shapes.append(_Dot(x, y, colour, 2.5))
+            free = (y - above - step * _LABEL_HEIGHT for step in range(4))
+            height = next((each for each in free if self._is_free(x, each)), None)
+            if height is not None and len(self._places) < _MOST_LABELS:
+                self._places.append((x, height))
+                shapes.append(_Text(x + 4, height, point.mode, "start", colour))
+        return shapes
+
+    def _is_free(self, x: float, y: float) -> bool:
+        return all(abs(x - a) > _LABEL_WIDTH or abs(y - b) >= _LABEL_HEIGHT for a, b in self._places)
 
 
 def _profile(tracks: Sequence[Track]) -> list[_Shape]:
     paths = [[(point.time_s, point.altitude_m) for point in track] for track in tracks]
+    limits = [track.failure.altitude_m for track in tracks if track.failure is not None]
+    limit = next((each for each in limits if each is not None), None)
     times, heights = zip(*(place for path in paths for place in path), strict=True)
-    axes = _Axes(times, heights, _MAP_HEIGHT, _PROFILE_HEIGHT - 40, square=False)
+    axes = _Axes(
+        times,
+        (*heights, *(() if limit is None else (limit,))),
+        _MAP_HEIGHT,
+        _PROFILE_HEIGHT - 40,
+        square=False,
+    )
     shapes = axes.grid("s", "m up")
-    for path, colour in zip(paths, _colours(len(paths)), strict=True):
-        shapes.append(_Line([axes.place(time, height) for time, height in path], colour))
+    if limit is not None:
+        shapes.append(_Line([axes.place(min(times), limit), axes.place(max(times), limit)], _FAILED, True))
+    labels = _Labels()
+    for track, path, colour in zip(tracks, paths, _colours(len(paths)), strict=True):
+        places = [axes.place(time, height) for time, height in path]
+        shapes.append(_Line(places, colour))
+        shapes += labels.modes(track, places, colour) if len(tracks) == 1 else []
+        if track.failure is not None:
+            shapes.append(_Dot(*places[_index_of(track, track.failure.point)], _FAILED))
     return shapes
 
 

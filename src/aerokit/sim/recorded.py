@@ -56,7 +56,7 @@ class RecordedVehicle(SimulatedVehicle):
         seed: int = 0,
         components: Iterable[Component] = (),
     ) -> None:
-        self.recording = FlightRecording(recording, system_id)
+        self.recording: FlightRecording = FlightRecording(recording, system_id)
         super().__init__(
             system_id=self.recording.system_id,
             component_id=self.recording.component_id,
@@ -67,9 +67,9 @@ class RecordedVehicle(SimulatedVehicle):
         self._next = 0
         self._began_at = 0.0
         self._asked: dict[int, int] = {}
-        self.parameters = RecordedParameters(self)
+        self.parameters: RecordedParameters = RecordedParameters(self)
         """What it knows at present."""
-        self.missions = RecordedMissions(self)
+        self.missions: RecordedMissions = RecordedMissions(self)
         """Its plans."""
         commands = dict.fromkeys(self.recording.answers, self._on_command)
         commands[MavCmd.REQUEST_MESSAGE] = self._on_request_message

@@ -22,6 +22,8 @@ _LIST_INTERVAL_S, _BURST = 0.005, 5
 class RecordedParameters:
     """Answers PARAM_REQUEST_LIST, PARAM_REQUEST_READ and PARAM_SET."""
 
+    names: list[str]
+
     def __init__(self, vehicle: RecordedVehicle) -> None:
         self._vehicle = vehicle
         self._written: dict[str, float] = {}

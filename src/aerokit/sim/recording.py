@@ -68,6 +68,9 @@ class FlightRecording:
     OSError when the file cannot be read.
     """
 
+    system_id: int
+    component_id: int
+
     def __init__(self, source: str | PathLike[str] | BinaryIO, system_id: int | None = None) -> None:
         frames = _frames(source)
         self.system_id, self.component_id = _autopilot(frames, system_id)
@@ -77,7 +80,7 @@ class FlightRecording:
         """MAV_CMD → how it was answered, in order."""
         self.parameters: list[tuple[float, m.ParamValue]] = []
         """Every value that was told."""
-        self.has_parameter_errors = False
+        self.has_parameter_errors: bool = False
         """Whether it says PARAM_ERROR where others are silent."""
         self.settable: set[str] = set()
         """Parameters that it was seen to take a value for."""
@@ -86,9 +89,9 @@ class FlightRecording:
         """MAV_MISSION_TYPE → MAV_MISSION_RESULTs of uploads."""
         self.clears: dict[int, list[int]] = {}
         """The same of MISSION_CLEAR_ALL."""
-        self.asks_by_int = True
+        self.asks_by_int: bool = True
         """Whether it asks for items by MISSION_REQUEST_INT, or by MISSION_REQUEST."""
-        self.duration_s = 0.0
+        self.duration_s: float = 0.0
         self._sets: dict[str, float] = {}
         self._incoming: dict[int, dict[int, m.MissionItemInt | m.MissionItem]] = {}
         self._outgoing: dict[int, tuple[int, dict[int, m.MissionItemInt | m.MissionItem]]] = {}

@@ -57,9 +57,13 @@ class SimulatorServer:
     ) -> None:
         if not speedup > 0:
             raise LocalProtocolError(f"speedup = {speedup!r} must be above 0")
-        self.vehicles = (vehicles,) if isinstance(vehicles, SimulatedVehicle) else tuple(vehicles)
+        self.vehicles: tuple[SimulatedVehicle] | tuple[SimulatedVehicle, ...] = (
+            (vehicles,) if isinstance(vehicles, SimulatedVehicle) else tuple(vehicles)
+        )
         self._links = (links,) if isinstance(links, Link) else tuple(links)
-        self.vehicles_on = [self.vehicles] * len(self._links) if vehicles_on is None else list(vehicles_on)
+        self.vehicles_on: (
+            list[tuple[SimulatedVehicle] | tuple[SimulatedVehicle, ...]] | list[Sequence[SimulatedVehicle]]
+        ) = [self.vehicles] * len(self._links) if vehicles_on is None else list(vehicles_on)
         if len(self.vehicles_on) != len(self._links):
             raise LocalProtocolError(
                 f"vehicles_on is for {len(self.vehicles_on)} links of {len(self._links)}"
@@ -78,6 +82,8 @@ class SimulatorServer:
         self._exit = AsyncExitStack()
         self._owner: asyncio.Task[Any] | None = None  # runs the block; a fixture's may have ended before
         self._cancels_owner = False
+        self.on_datagram: Callable[[float, bytes, bool], object] | None = None
+        """Called with all that comes in and goes out: the simulated second, the bytes, whether a vehicle sent them."""
         self.failure: Exception | None = None
         """What a vehicle raised; nothing has happened since."""
 
@@ -231,6 +237,8 @@ class SimulatorServer:
             return
         self._leave_out_lateness()
         now = self.now
+        if self.on_datagram is not None:
+            self.on_datagram(now, data, False)
         try:
             for vehicle, channel in zip(port.vehicles, port.channels, strict=True):
                 vehicle.receive(data, max(now, vehicle.now), peer, channel)
@@ -249,6 +257,8 @@ class SimulatorServer:
                     has_sent = True
                     for datagram in channel.take_datagrams():
                         port.link.write(datagram)
+                        if self.on_datagram is not None:
+                            self.on_datagram(self.now, datagram, True)
         return has_sent
 
     def _schedule(self) -> None:
@@ -292,7 +302,8 @@ class _Port:
     ) -> None:
         self._server = server
         self.link = link
-        self.vehicles, self.channels = vehicles, channels
+        self.vehicles: Sequence[SimulatedVehicle] = vehicles
+        self.channels: Sequence[Channel] = channels
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
         """See `Receiver`."""

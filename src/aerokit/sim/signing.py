@@ -29,7 +29,7 @@ class VehicleSigning:
     def __init__(self, vehicle: SimulatedAutopilot, key: SigningKey | None, timestamp: int) -> None:
         self.key = key
         """The stored key; None: nothing is signed or checked. Call `load` after changing it by hand."""
-        self.timestamp = timestamp if key is not None else 0
+        self.timestamp: int = timestamp if key is not None else 0
         """The stored time stamp."""
         self.trusts_first_port = False
         """Whether the first port lets everything in, as ArduPilot's does by default. Call `load` after changing it."""

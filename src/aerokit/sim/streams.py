@@ -14,7 +14,7 @@ class Streams:
     __slots__ = ("_heap", "_intervals", "_token", "next_due")
 
     def __init__(self) -> None:
-        self.next_due = math.inf
+        self.next_due: float = math.inf
         """When something is due; infinity when nothing is streamed."""
         self._intervals: dict[int, tuple[float, int]] = {}
         self._heap: list[tuple[float, int, int]] = []

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
     from aerokit.sim.vehicle import SimulatedVehicle
 
-__all__ = ["Track", "TrackPoint", "least_distance_m", "record_track", "true_point"]
+__all__ = ["Failure", "Track", "TrackPoint", "least_distance_m", "metres_from", "record_track", "true_point"]
 
 _ON_GROUND_M = 0.3
 
@@ -67,6 +67,18 @@ class TrackPoint:
         return f"at {self.time_s:.1f} s: {place}, {self.altitude_m:.1f} m above home, {armed}, {self.mode}"
 
 
+@dataclass(frozen=True)
+class Failure:
+    """Where an assertion about a track failed, and the limit that it was about; the picture of the track shows it."""
+
+    point: TrackPoint
+    circle: tuple[Position, float] | None = None
+    """Centre, and radius in metres."""
+    polygon: Sequence[Position] | None = None
+    altitude_m: float | None = None
+    """Above home."""
+
+
 class Track(Sequence[TrackPoint]):
     """What was flown, oldest first; it grows while the vehicle lives.
 
@@ -78,6 +90,8 @@ class Track(Sequence[TrackPoint]):
         """Where it was switched on."""
         self.name = name
         """In the legend of a picture."""
+        self.failure: Failure | None = None
+        """Of the last assertion that failed."""
         self._points = list(points)
         self._catch_up: Callable[[], None] | None = None
 
@@ -162,6 +176,12 @@ class Track(Sequence[TrackPoint]):
         plane = _plane(self.home if origin is None else origin)
         return [(*plane(point), point.altitude_m) for point in self]
 
+    def as_it_is(self) -> Track:
+        """A copy that does not grow."""
+        track = Track(self.home, tuple(self), name=self.name)
+        track.failure = self.failure
+        return track
+
     def save(self, path: str | PathLike[str]) -> None:
         """Draw it: an .svg file, or a .png one; see `aerokit.sim.picture.save_picture`."""
         from aerokit.sim.picture import save_picture
@@ -179,18 +199,21 @@ class Track(Sequence[TrackPoint]):
         __tracebackhide__ = True
         highest = self._highest()
         reached = highest.altitude_m >= altitude_m - within_m
+        self._note(reached, Failure(highest, altitude_m=altitude_m))
         assert reached, f"it did not reach {altitude_m:g} m: the highest point was {highest}"
 
     def assert_stayed_below(self, altitude_m: float) -> None:
         """It never was more than ``altitude_m`` metres above home."""
         __tracebackhide__ = True
         highest = self._highest()
+        self._note(highest.altitude_m <= altitude_m, Failure(highest, altitude_m=altitude_m))
         assert highest.altitude_m <= altitude_m, f"it rose above {altitude_m:g} m: {highest}"
 
     def assert_passed(self, place: Position, *, within_m: float = 2.0) -> None:
         """It came this near to a place; in space if the place has an ``altitude_relative_m``."""
         __tracebackhide__ = True
         distance, point = self._nearest(place)
+        self._note(distance <= within_m, Failure(point, (place, within_m)))
         assert distance <= within_m, (
             f"it did not pass within {within_m:g} m of {_text(place)}: the nearest was {distance:.1f} m, {point}"
         )
@@ -201,6 +224,7 @@ class Track(Sequence[TrackPoint]):
         centre = self.home if of is None else of
         distance, point = self._farthest(centre)
         name = "home" if of is None else _text(of)
+        self._note(distance <= radius_m, Failure(point, (centre, radius_m)))
         assert distance <= radius_m, (
             f"it left the {radius_m:g} m around {name}: {distance:.1f} m away {point}"
         )
@@ -213,6 +237,7 @@ class Track(Sequence[TrackPoint]):
         plane = _plane(self.home)
         border = Polygon([plane(corner) for corner in polygon])
         outside = [point for point in self if border.outside_m(plane(point)) > 0]
+        self._note(not outside, Failure(outside[0] if outside else self.end, polygon=polygon))
         assert not outside, (
             f"it left the polygon, {len(outside)} of {len(self)} points are outside; first {outside[0]}"
         )
@@ -221,6 +246,7 @@ class Track(Sequence[TrackPoint]):
         """It never was faster than this over the ground."""
         __tracebackhide__ = True
         fastest = self._fastest()
+        self._note(fastest.speed_m_s <= speed_m_s, Failure(fastest))
         assert fastest.speed_m_s <= speed_m_s, (
             f"it was faster than {speed_m_s:g} m/s: {fastest.speed_m_s:.1f} m/s {fastest}"
         )
@@ -229,10 +255,13 @@ class Track(Sequence[TrackPoint]):
         """It flew, and at the end it stands on the ground near home, or near a place."""
         __tracebackhide__ = True
         end, target = self.end, self.home if place is None else place
+        self._note(self.max_altitude_m > _ON_GROUND_M, Failure(end))
         assert self.max_altitude_m > _ON_GROUND_M, f"it never took off: it ended {end}"
+        self._note(abs(end.altitude_m) <= _ON_GROUND_M, Failure(end, (target, within_m)))
         assert abs(end.altitude_m) <= _ON_GROUND_M, f"it is not on the ground: it ended {end}"
         distance = target.distance_to(end.position)
         name = "home" if place is None else _text(place)
+        self._note(distance <= within_m, Failure(end, (target, within_m)))
         assert distance <= within_m, (
             f"it landed {distance:.1f} m from {name}, not within {within_m:g} m: {end}"
         )
@@ -240,11 +269,13 @@ class Track(Sequence[TrackPoint]):
     def assert_armed_at_end(self) -> None:
         """Its motors were armed at the end."""
         __tracebackhide__ = True
+        self._note(self.end.armed, Failure(self.end))
         assert self.end.armed, f"it ended disarmed, {self.end}"
 
     def assert_disarmed_at_end(self) -> None:
         """Its motors were disarmed at the end."""
         __tracebackhide__ = True
+        self._note(not self.end.armed, Failure(self.end))
         assert not self.end.armed, f"it ended armed, {self.end}"
 
     def assert_modes(self, *names: str) -> None:
@@ -257,6 +288,11 @@ class Track(Sequence[TrackPoint]):
             )
 
     # -------------------------------------------------------------------------------------------------
+
+    def _note(self, holds: bool, failure: Failure) -> None:
+        """Keep what the assertion that comes next fails on, if it does."""
+        if not holds:
+            self.failure = failure
 
     def _highest(self) -> TrackPoint:
         _ = self.end
@@ -284,6 +320,11 @@ class Track(Sequence[TrackPoint]):
                 nearest, point = distance, candidate
             before = here
         return nearest, point
+
+
+def metres_from(origin: Position) -> Callable[[Position | TrackPoint], tuple[float, float]]:
+    """What gives metres north and east of a place."""
+    return _plane(origin)
 
 
 def true_point(vehicle: SimulatedVehicle) -> TrackPoint:

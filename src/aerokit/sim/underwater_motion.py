@@ -78,4 +78,5 @@ class UnderwaterMotion(Motion):
         if self.down < self.ground_down:
             self.down, self.velocity_down = self.ground_down, max(0.0, self.velocity_down)
         elif self.down > self.bottom_down:
-            self.down, self.velocity_down = self.bottom_down, min(0.0, self.velocity_down)
+            self.down: float = self.bottom_down
+            self.velocity_down: float = min(0.0, self.velocity_down)

@@ -22,6 +22,8 @@ from aerokit.sim.channel import Channel
 from aerokit.sim.faults import Faults
 
 if TYPE_CHECKING:
+    from random import Random
+
     from aerokit.sim.journal import Journal
 
 __all__ = ["Component", "ExtraComponent", "SimulatedVehicle", "sender_of"]
@@ -81,13 +83,13 @@ class SimulatedVehicle:
     ) -> None:
         self.system_id = system_id
         self.component_id = component_id
-        self.faults = Faults()
-        self.rng = random.Random(seed)
-        self.now = 0.0
+        self.faults: Faults = Faults()
+        self.rng: Random = random.Random(seed)
+        self.now: float = 0.0
         """Simulated seconds of the latest thing that happened."""
-        self.booted_at = math.nan
+        self.booted_at: float = math.nan
         """When it was switched on or last rebooted."""
-        self.components = tuple(components)
+        self.components: tuple[Component, ...] = tuple(components)
         self.journal: Journal | None = None
         """What it hears and says is written down here if somebody wants it."""
         self.handlers: dict[int, Handler] = {}
@@ -180,7 +182,8 @@ class SimulatedVehicle:
 
     def power_on(self) -> None:
         """Start booting now."""
-        self.booted_at, self._is_on = self.now, True
+        self.booted_at = self.now
+        self._is_on = True
         self.boot()
         for channel in self.channels:
             self.start_channel(channel)
@@ -346,6 +349,8 @@ class SimulatedVehicle:
     def _is_lost(self, message: Message) -> bool:
         faults = self.faults
         if faults.silent or (faults.heartbeats_stopped and message.ID == Heartbeat.ID):
+            return True
+        if faults.lost_messages and faults.loses(message):
             return True
         if faults.drop_outgoing > 0:
             faults.drop_outgoing -= 1

@@ -22,11 +22,13 @@ place. Exceptions come through as they are. Any thread may call; functions that 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from aerokit.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from aerokit.sync.twins import (
         Connection,
         Guided,
@@ -49,4 +51,6 @@ __all__ = [
     "open_connection",
 ]
 
+__getattr__: Callable[[str], Any]
+__dir__: Callable[[], list[str]]
 __getattr__, __dir__ = lazy_names(__name__, dict.fromkeys(__all__, "aerokit.sync.twins"), __all__)

@@ -12,7 +12,7 @@ from aerokit.sync.loop_thread import Held, LoopThread
 from aerokit.vehicle.connect import tell_how_it_is_left
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import AsyncIterator, Callable, Iterator
     from contextlib import AbstractAsyncContextManager, AbstractContextManager
     from types import TracebackType
 
@@ -20,16 +20,27 @@ if TYPE_CHECKING:
 
     from aerokit.runtime.cells import Changes, StateCell  # noqa: F401 - named in the base classes below
     from aerokit.runtime.connection import Connection
+    from aerokit.runtime.events import VehicleFound
     from aerokit.runtime.subscription import Subscription  # noqa: F401
-    from aerokit.vehicle.orders.guided import SetpointStream  # noqa: F401
+    from aerokit.sync.twins import Gimbal
+    from aerokit.vehicle.camera.capture import Capture
+    from aerokit.vehicle.camera.part import CameraBlock
+    from aerokit.vehicle.camera.shooting import PhotoInterval
+    from aerokit.vehicle.gimbal.control import GimbalControl
+    from aerokit.vehicle.gimbal.gimbals import Gimbals  # noqa: F401
+    from aerokit.vehicle.gimbal.rates import GimbalRates
+    from aerokit.vehicle.orders.guided import SetpointStream
     from aerokit.vehicle.parameters.results import ParameterWrite
     from aerokit.vehicle.parameters.transaction import Temporarily, Transaction
     from aerokit.vehicle.vehicle import Vehicle
 
 __all__ = [
+    "BlockTwin",
     "CellTwin",
     "ChangesTwin",
     "ConnectionTwin",
+    "GimbalsTwin",
+    "PhotoIntervalTwin",
     "StreamTwin",
     "SubscriptionTwin",
     "TemporarilyTwin",
@@ -42,6 +53,9 @@ __all__ = [
 A = TypeVar("A")
 T = TypeVar("T")
 EnteredT = TypeVar("EnteredT")
+LeftT = TypeVar(
+    "LeftT", bound="CameraBlock | GimbalControl | GimbalRates | PhotoInterval | SetpointStream[Any]"
+)
 BlockT = TypeVar("BlockT", bound="Temporarily | Transaction")
 TwinT = TypeVar("TwinT", bound="ConnectionTwin | VehicleTwin")
 
@@ -93,6 +107,21 @@ class ChangesTwin(TwinOf["Changes[T]"], Generic[T]):
         return self._loop.run(self.aio.__anext__)
 
 
+def _next_of(loop: LoopThread, items: AsyncIterator[T]) -> T:
+    """The next one; StopIteration at their end: StopAsyncIteration cannot leave a coroutine."""
+
+    async def read() -> tuple[T, ...]:
+        try:
+            return (await items.__anext__(),)
+        except StopAsyncIteration:
+            return ()
+
+    found = loop.run(read)
+    if not found:
+        raise StopIteration
+    return found[0]
+
+
 class SubscriptionTwin(TwinOf["Subscription[T]"], Generic[T]):
     """Registered on entry of its ``with``, gone at its exit; an iterator."""
 
@@ -113,21 +142,11 @@ class SubscriptionTwin(TwinOf["Subscription[T]"], Generic[T]):
         return self
 
     def __next__(self) -> T:
-        found = self._loop.run(self._next)
-        if not found:
-            raise StopIteration
-        return found[0]
-
-    async def _next(self) -> tuple[T, ...]:
-        """StopAsyncIteration cannot leave a coroutine."""
-        try:
-            return (await self.aio.__anext__(),)
-        except StopAsyncIteration:
-            return ()
+        return _next_of(self._loop, self.aio)
 
 
-class StreamTwin(TwinOf["SetpointStream[T]"], Generic[T]):
-    """Set-points are sent while its ``with`` lasts."""
+class BlockTwin(TwinOf[LeftT]):
+    """What holds while its ``with`` lasts."""
 
     def __enter__(self) -> Self:
         self._loop.enter(self.aio)
@@ -140,6 +159,44 @@ class StreamTwin(TwinOf["SetpointStream[T]"], Generic[T]):
         traceback: TracebackType | None,
     ) -> None:
         self._loop.run(self.aio.__aexit__, exc_type, exc, traceback)
+
+
+class StreamTwin(BlockTwin["SetpointStream[T]"], Generic[T]):
+    """Set-points are sent while its ``with`` lasts."""
+
+
+class GimbalsTwin(TwinOf["Gimbals"]):
+    """They are found by their ids; an iterable."""
+
+    if TYPE_CHECKING:  # generated
+
+        @property
+        def ids(self) -> tuple[int, ...]:
+            """Of those that were heard of."""
+            raise NotImplementedError
+
+        def get(self, device_id: int) -> Gimbal:
+            """The gimbal of this id."""
+            raise NotImplementedError
+
+    def __getitem__(self, device_id: int) -> Gimbal:
+        return self.get(device_id)
+
+    def __iter__(self) -> Iterator[Gimbal]:
+        return iter([self.get(each) for each in self.ids])
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+
+class PhotoIntervalTwin(BlockTwin["PhotoInterval"]):
+    """Pictures are taken while its ``with`` lasts; an iterator over them."""
+
+    def __iter__(self) -> Self:
+        return self
+
+    def __next__(self) -> Capture:
+        return _next_of(self._loop, self.aio)
 
 
 class ToItsEndTwin(TwinOf[BlockT]):
@@ -177,6 +234,20 @@ class ConnectionTwin(TwinOf["Connection"], BlockingBlock):
     def __init__(self, loop: LoopThread, aio: Connection, held: Held[Connection] | None = None) -> None:
         super().__init__(loop, aio)
         self._held = held
+
+    def vehicles(self) -> Iterator[VehicleFound]:
+        """Each autopilot once: those that were heard already, then those that will be, until the connection ends.
+
+        Raises:
+            ConnectionClosed, LinkLost: the connection ended.
+        """
+        found = self.aio.vehicles()
+        try:
+            while True:
+                yield self._loop.run(found.__anext__)
+        finally:
+            with contextlib.suppress(ConnectionClosed):
+                self._loop.run(found.aclose)
 
     def close(self) -> None:
         """End it, its link, its loop and its thread; idempotent. Calls that wait raise ConnectionClosed.

@@ -30,6 +30,8 @@ __all__ = ["FILE", "generate"]
 FILE = Path(__file__).with_name("twins.py")
 """What is written."""
 WIDTH = 100
+OF_ONE = ("TwinOf", "BlockTwin")
+"""Bases that are told whose twin it is."""
 FUNCTIONS = ("aerokit.runtime.opening.open_connection", "aerokit.vehicle.connect.connect")
 """Blocks that are opened by a function."""
 
@@ -207,7 +209,7 @@ def generate() -> str:
     page.at_run_time |= {("aerokit.sync.blocks", twin.base) for twin in TWINS}
     page.at_run_time |= {("aerokit.sync.blocks", "opened"), ("aerokit.arguments", "checked")}
     page.for_types |= {
-        (each.module, f"{each.name} as Async{each.name}") for each in TWINS if each.base == "TwinOf"
+        (each.module, f"{each.name} as Async{each.name}") for each in TWINS if each.base in OF_ONE
     }
     page.for_types |= {("aerokit.mavlink.message", "Message"), ("aerokit.runtime.events", "Event")}
     for path in FUNCTIONS:
@@ -226,7 +228,7 @@ def _class(page: Page, twin: Twin) -> str:
     original = getattr(importlib.import_module(twin.module), twin.name)
     parameter = f"[{twin.parameter}]" if twin.parameter else ""
     base = twin.base + parameter
-    if base == "TwinOf":
+    if base in OF_ONE:
         base += f'["Async{twin.name}"]'
     text = _docstring(inspect.getdoc(original), "    ")
     members = "\n".join(page.member(twin, each) for each in members_of(twin))

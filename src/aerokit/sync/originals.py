@@ -69,7 +69,10 @@ TWINS = (
     ),
     Twin("aerokit.vehicle.orders.guided.SetpointStream", "StreamTwin", parameter="SetpointT"),
     Twin("aerokit.vehicle.orders.guided.Guided"),
-    Twin("aerokit.vehicle.orders.gimbal.Gimbal"),
+    Twin("aerokit.vehicle.gimbal.control.GimbalControl", "BlockTwin"),
+    Twin("aerokit.vehicle.gimbal.rates.GimbalRates", "BlockTwin"),
+    Twin("aerokit.vehicle.gimbal.gimbal.Gimbal", called=_names("device_id")),
+    Twin("aerokit.vehicle.gimbal.gimbals.Gimbals", "GimbalsTwin", called=_names("ids")),
     Twin("aerokit.vehicle.orders.posting.PostedOrder"),
     Twin("aerokit.vehicle.files.files.Files"),
     Twin("aerokit.vehicle.files.logs.Logs"),
@@ -79,12 +82,19 @@ TWINS = (
     Twin("aerokit.vehicle.plans.mission.MissionControl"),
     Twin("aerokit.vehicle.plans.fence.FenceControl"),
     Twin("aerokit.vehicle.plans.rally.RallyControl"),
+    Twin("aerokit.vehicle.camera.part.CameraBlock", "BlockTwin"),
+    Twin("aerokit.vehicle.camera.shooting.PhotoInterval", "PhotoIntervalTwin"),
+    Twin("aerokit.vehicle.camera.camera.Camera"),
+    Twin("aerokit.vehicle.components.settings.Settings", direct=_names("known")),
+    Twin("aerokit.vehicle.components.component.Component", called=_names("files parameters settings")),
     Twin(
         "aerokit.vehicle.vehicle.Vehicle",
         "VehicleTwin",
         without=_names("telemetry"),
         direct=_names("distance_to describe_now"),
-        parts=_names("guided gimbal files logs parameters mission fence rally"),
+        parts=_names(
+            "camera cameras components guided gimbal gimbals files logs parameters mission fence rally"
+        ),
     ),
 )
 """The classes that programs without ``async`` use, each below those that it gives."""

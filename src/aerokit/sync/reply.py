@@ -26,7 +26,7 @@ class Reply(Generic[T]):
         self._gate.acquire()
         self._values: tuple[T, ...] = ()
         self._error: BaseException | None = None
-        self.is_done = False
+        self.is_done: bool = False
         """Whether it was given, or it is certain that it never will be."""
 
     @property

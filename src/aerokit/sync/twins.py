@@ -17,9 +17,12 @@ from aerokit.mavlink.enums import MavComponent
 from aerokit.protocols.transfer import PATIENCE_S
 from aerokit.runtime.opening import open_connection as open_connection_async
 from aerokit.sync.blocks import (
+    BlockTwin,
     CellTwin,
     ChangesTwin,
     ConnectionTwin,
+    GimbalsTwin,
+    PhotoIntervalTwin,
     StreamTwin,
     SubscriptionTwin,
     TemporarilyTwin,
@@ -28,6 +31,7 @@ from aerokit.sync.blocks import (
     VehicleTwin,
     opened,
 )
+from aerokit.vehicle.camera.storing import FORMATTING_S
 from aerokit.vehicle.connect import connect as connect_async
 from aerokit.vehicle.files.logs import ERASE_PATIENCE_S
 from aerokit.vehicle.orders.progress import LONGEST_SILENCE_S
@@ -41,6 +45,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
     from contextlib import AbstractContextManager
     import os
+    from typing import Any
     from aerokit.autopilots import Autopilot, Mode
     from aerokit.autopilots.modes import Mode
     from aerokit.autopilots.version import AutopilotVersion
@@ -52,17 +57,46 @@ if TYPE_CHECKING:
     from aerokit.mavlink.messages import CommandAck
     from aerokit.mavlink.signing import Signing
     from aerokit.missions import Fence, Mission, RallyPoints
-    from aerokit.parameters import Metadata, Parameter, ParameterDifference, ParameterTable
+    from aerokit.parameters import (
+        CameraDefinition,
+        Metadata,
+        Parameter,
+        ParameterDifference,
+        ParameterTable,
+        Setting,
+        SettingValue,
+    )
     from aerokit.position import Position
     from aerokit.protocols.transfer import OnProgress
     from aerokit.runtime.cells import Source
     from aerokit.runtime.events import Event, LinkReport
     from aerokit.runtime.link_state import LinkState
     from aerokit.runtime.subscription import Overflow
+    from aerokit.vehicle.camera.camera import Camera as AsyncCamera
+    from aerokit.vehicle.camera.capture import Capture
+    from aerokit.vehicle.camera.lens import AutoFocus
+    from aerokit.vehicle.camera.part import CameraBlock as AsyncCameraBlock
+    from aerokit.vehicle.camera.values import (
+        CameraInformation,
+        CameraStatus,
+        ModeName,
+        Storage,
+        ThermalRange,
+        TrackedPlace,
+        TrackingStatus,
+        VideoStream,
+    )
+    from aerokit.vehicle.camera.videos import SourceName
+    from aerokit.vehicle.components.component import Component as AsyncComponent, MetadataKind
+    from aerokit.vehicle.components.settings import Settings as AsyncSettings
+    from aerokit.vehicle.components.status import ComponentInformation, ComponentStatus
     from aerokit.vehicle.files.files import FileEntry, Files as AsyncFiles
     from aerokit.vehicle.files.log_entry import LogEntry
     from aerokit.vehicle.files.logs import LogMethod, Logs as AsyncLogs
-    from aerokit.vehicle.orders.gimbal import Gimbal as AsyncGimbal
+    from aerokit.vehicle.gimbal.control import GimbalControl as AsyncGimbalControl
+    from aerokit.vehicle.gimbal.gimbal import Gimbal as AsyncGimbal
+    from aerokit.vehicle.gimbal.rates import GimbalRates as AsyncGimbalRates
+    from aerokit.vehicle.gimbal.values import Frame, GimbalControllers, GimbalInformation
     from aerokit.vehicle.orders.guided import Guided as AsyncGuided
     from aerokit.vehicle.orders.order import Subject
     from aerokit.vehicle.orders.posting import PostedOrder as AsyncPostedOrder
@@ -101,18 +135,26 @@ if TYPE_CHECKING:
     from aerokit.vehicle.state.movement import Attitude, Home, LocalPosition, Velocity, Wind
 
 __all__ = [
+    "Camera",
+    "CameraBlock",
     "Changes",
+    "Component",
     "Connection",
     "FenceControl",
     "Files",
     "Gimbal",
+    "GimbalControl",
+    "GimbalRates",
+    "Gimbals",
     "Guided",
     "Logs",
     "MissionControl",
     "Parameters",
+    "PhotoInterval",
     "PostedOrder",
     "RallyControl",
     "SetpointStream",
+    "Settings",
     "StateCell",
     "Subscription",
     "Temporarily",
@@ -491,10 +533,115 @@ class Guided(TwinOf["AsyncGuided"]):
         ))
 
 
-class Gimbal(TwinOf["AsyncGimbal"]):
-    """The gimbal that the autopilot manages, or its mount; of several the first.
+class GimbalControl(BlockTwin["AsyncGimbalControl"]):
+    """We are in control of a gimbal while its ``async with`` lasts (MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE).
 
-    Places are looked at by :meth:`aerokit.Vehicle.look_at`.
+    Entering claims it, from whoever has it, and returns when the manager tells that we have it. Leaving gives it back,
+    in any way: without waiting when the block is left by an error or cancelled. When somebody else takes it, that is
+    the event ``GimbalControlLost``; orders to the gimbal, those under way too, raise :class:`GimbalTaken`, and so does
+    leaving the block if nothing in it was told. Nothing is given back then. A station with our own system and component
+    id is not told from us.
+
+    Entering raises:
+        NotSupported: the vehicle has no gimbal manager, or its manager knows no secondary control.
+        BusyError: a block of this program has that control already. Nothing was sent.
+        CommandRejected: the manager refused.
+        CommandTimeout: there was no answer.
+        OperationTimeout: it was accepted, and the manager does not tell that we have it.
+    """
+
+    @property
+    def is_primary(self) -> bool:
+        """Whether it is the primary control."""
+        return self.aio.is_primary
+
+    @property
+    def is_held(self) -> bool:
+        """Whether we are in control."""
+        return self.aio.is_held
+
+    @property
+    def is_taken(self) -> bool:
+        """Whether it was lost."""
+        return self.aio.is_taken
+
+    def until_lost(self) -> tuple[int, int]:
+        """Wait until somebody else has taken control; their system and component id, (0, 0): nobody has it.
+
+        Raises:
+            OperationRejected: the block was left meanwhile.
+            ConnectionClosed, LinkLost: the connection ended.
+        """
+        return self._loop.run(self.aio.until_lost)
+
+    def raise_if_taken(self) -> None:
+        """Raise what tells who has it now; nothing while we have it.
+
+        Raises:
+            GimbalTaken: somebody else has taken control, or nobody has it any more.
+        """
+        self._loop.call(self.aio.raise_if_taken)
+
+
+class GimbalRates(BlockTwin["AsyncGimbalRates"]):
+    """Turns a gimbal at the latest rates for as long as its ``async with`` block feeds them.
+
+    Entering orders the first rates by MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW; then they are sent at ``rate_hz``
+    (GIMBAL_MANAGER_SET_PITCHYAW, or GIMBAL_MANAGER_SET_ATTITUDE to PX4). Leaving, in any way, orders a rate of zero: it
+    stays where it points. The stream stops by itself, with a rate of zero, when nothing new was set for
+    ``valid_for_s``, the event loop was blocked for ``max_lag_s``, or the vehicle is silent; and is left to others when
+    another order was given to the gimbal, or control was lost. Then ``set`` and leaving the block raise.
+
+    Entering raises:
+        LocalProtocolError: a rate is out of range. Nothing was sent.
+        NotSupported: the vehicle has no gimbal manager: mounts of old turn to angles only.
+        CommandRejected: the manager refused.
+        CommandTimeout: there was no answer.
+        GimbalTaken: control was lost in the block that has it.
+    """
+
+    @property
+    def is_running(self) -> bool:
+        """Whether rates are being sent."""
+        return self.aio.is_running
+
+    def set(self, pitch_deg_s: float=0.0, yaw_deg_s: float=0.0) -> None:
+        """Take new rates; they are sent at the next tick, and resent until ``valid_for_s`` has passed.
+
+        Args:
+            pitch_deg_s: degrees per second, −720 to 720; positive is up.
+            yaw_deg_s: degrees per second, −720 to 720; positive is to the right.
+
+        Raises:
+            LocalProtocolError: a rate is out of range; those before stay in force until they are too old.
+            SetpointStreamStopped: the stream has ended by itself, or the block was left.
+            GimbalTaken: control was lost in the block that has it.
+        """
+        self._loop.call(self.aio.set, pitch_deg_s, yaw_deg_s)
+
+    def turn(self, pitch_deg_s: float, yaw_deg_s: float, duration_s: float) -> None:
+        """Feed one pair of rates for ``duration_s`` seconds.
+
+        Args:
+            pitch_deg_s: degrees per second, −720 to 720; positive is up.
+            yaw_deg_s: degrees per second, −720 to 720; positive is to the right.
+            duration_s: for so long.
+
+        Raises:
+            LocalProtocolError: a rate is out of range.
+            SetpointStreamStopped: the stream ended meanwhile.
+            GimbalTaken: control was lost in the block that has it.
+        """
+        self._loop.run(self.aio.turn, pitch_deg_s, yaw_deg_s, duration_s)
+
+
+class Gimbal(TwinOf["AsyncGimbal"]):
+    """One gimbal, by the gimbal protocol v2 (https://mavlink.io/en/services/gimbal_v2.html), or the mount of a vehicle
+    that knows no better.
+
+    ``vehicle.gimbal`` is the first one, ``vehicle.gimbals`` has all. An order returns when the gimbal tells that it is
+    there, ends when another one is given, and is stayed with however the vehicle moves. Where a manager obeys only who
+    is in control, an order outside a block of :meth:`control` claims it, until :meth:`release`.
     """
 
     @cached_property
@@ -504,34 +651,277 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         """
         return StateCell(self._loop, self.aio.attitude)
 
-    def point(self, pitch_deg: float, yaw_deg: float, *, roll_deg: float=0.0) -> None:
-        """Turn it and keep it there, however the vehicle moves; returns when that was accepted, not when it is there.
+    @cached_property
+    def controllers(self) -> StateCell[GimbalControllers]:
+        """Who is in control of it, as its manager tells by itself (GIMBAL_MANAGER_STATUS)."""
+        return StateCell(self._loop, self.aio.controllers)
+
+    @property
+    def device_id(self) -> int:
+        """Its gimbal device id: 1 to 6 behind its manager, or its component id; 0 while none is heard of."""
+        return self._loop.call(lambda: self.aio.device_id)
+
+    def look_at(
+        self,
+        target: Position,
+        *,
+        wait: bool = True,
+        tolerance_deg: float = 5.0,
+        timeout: float = 15.0,
+    ) -> None:
+        """Keep it pointed at a place, and return when it points there; without an altitude, at the vehicle's own.
+
+        Sends MAV_CMD_DO_SET_ROI_LOCATION. A copter whose gimbal does not pan turns its nose.
+
+        Args:
+            target: the place.
+            wait: False: return when it was accepted.
+            tolerance_deg: how near in each axis is there, above 0 to 45.
+            timeout: seconds until it has to be there.
+
+        Raises:
+            LocalProtocolError: the tolerance is out of range. Nothing was sent.
+            NotSupported: the manager can do that with its first gimbal only. Nothing was sent.
+            ValueUnknownError: home, or the vehicle's altitude, is not known and is needed here. Nothing was sent.
+            CommandRejected: the manager refused.
+            CommandTimeout: there was no answer.
+            GimbalTaken: control was lost in the block that has it.
+            OperationRejected: another order was given meanwhile, or the vehicle rebooted.
+            OperationTimeout: it was not there in time; the text says where it points.
+            HeartbeatTimeout: the vehicle fell silent.
+        """
+        self._loop.run(self.aio.look_at, target, wait=wait, tolerance_deg=tolerance_deg, timeout=timeout)
+
+    def look_at_system(
+        self,
+        system_id: int,
+        *,
+        wait: bool = True,
+        tolerance_deg: float = 5.0,
+        timeout: float = 15.0,
+    ) -> None:
+        """Keep it pointed at another vehicle (MAV_CMD_DO_SET_ROI_SYSID), and return when it points there.
+
+        Both have to hear where the other vehicle is (its GLOBAL_POSITION_INT): the gimbal's manager to point at it,
+        and this connection to notice.
+
+        Args:
+            system_id: its MAVLink system id, 1 to 255.
+            wait: False: return when it was accepted.
+            tolerance_deg: how near in each axis is there, above 0 to 45.
+            timeout: seconds until it has to be there.
+
+        Raises:
+            LocalProtocolError: there is no such system id, or the tolerance is out of range. Nothing was sent.
+            NotSupported: the manager cannot do that. Nothing was sent.
+            CommandRejected: the manager refused.
+            CommandTimeout: there was no answer.
+            GimbalTaken: control was lost in the block that has it.
+            OperationRejected: another order was given meanwhile, or the vehicle rebooted.
+            OperationTimeout: it was not there in time; the text says where it points.
+            HeartbeatTimeout: the vehicle fell silent.
+        """
+        self._loop.run(
+            self.aio.look_at_system,
+            system_id,
+            wait=wait,
+            tolerance_deg=tolerance_deg,
+            timeout=timeout,
+        )
+
+    def stop_looking(self) -> None:
+        """End :meth:`look_at` (MAV_CMD_DO_SET_ROI_NONE). Where it turns then is its manager's business.
+
+        Raises:
+            CommandRejected: the manager refused.
+            CommandTimeout: there was no answer.
+            GimbalTaken: control was lost in the block that has it.
+        """
+        self._loop.run(self.aio.stop_looking)
+
+    def point(
+        self,
+        pitch_deg: float,
+        yaw_deg: float,
+        *,
+        roll_deg: float = 0.0,
+        frame: Frame = 'earth',
+        wait: bool = True,
+        tolerance_deg: float = 3.0,
+        timeout: float = 10.0,
+    ) -> None:
+        """Turn it, and return when it tells that it points there.
 
         Args:
             pitch_deg: from the horizon, −360 to 360: 0 is level, −90 straight down.
-            yaw_deg: clockwise from north, −360 to 360.
+            yaw_deg: −360 to 360, clockwise from north (``frame="earth"``) or from the vehicle's nose (``"vehicle"``).
             roll_deg: from the horizon, −360 to 360. If it is not 0, only the mount's command can do it, which turns the
-                camera with the vehicle: ``yaw_deg`` is right at the moment of the order.
+                camera with the vehicle: a yaw from north is right at the moment of the order.
+            frame: what the yaw counts from, and keeps to.
+            wait: False: return when it was accepted.
+            tolerance_deg: how near in each axis is there, above 0 to 45.
+            timeout: seconds until it has to be there.
 
-        Sends MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW (https://mavlink.io/en/services/gimbal_v2.html); control is claimed
-        when that is denied, until :meth:`release`. MAV_CMD_DO_MOUNT_CONTROL to a vehicle without a gimbal manager, and
-        MOUNT_CONTROL, which has no answer, to one that does not know that either.
+        Sends MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW; control is claimed when that is denied, until :meth:`release`.
+        MAV_CMD_DO_MOUNT_CONTROL to a vehicle without a gimbal manager, and MOUNT_CONTROL, which has no answer, to one
+        that does not know that either.
 
         Raises:
-            LocalProtocolError: an angle is out of range. Nothing was sent.
-            CommandRejected: the vehicle refused.
+            LocalProtocolError: an angle is out of range, or beyond the limits of the gimbal if :meth:`information` was
+                asked for. Nothing was sent.
+            CommandRejected: the manager refused.
             CommandTimeout: there was no answer.
+            GimbalTaken: control was lost in the block that has it.
+            OperationRejected: another order was given meanwhile, or the vehicle rebooted.
+            OperationTimeout: it was not there in time; the text says where it points.
+            HeartbeatTimeout: the vehicle fell silent.
         """
-        self._loop.run(self.aio.point, pitch_deg, yaw_deg, roll_deg=roll_deg)
+        self._loop.run(
+            self.aio.point,
+            pitch_deg,
+            yaw_deg,
+            roll_deg=roll_deg,
+            frame=frame,
+            wait=wait,
+            tolerance_deg=tolerance_deg,
+            timeout=timeout,
+        )
+
+    def neutral(self, *, wait: bool=True, timeout: float=10.0) -> None:
+        """Turn it to its neutral position, mostly level and straight ahead, and return when it rests there.
+
+        Args:
+            wait: False: return when it was accepted.
+            timeout: seconds until it has to be there.
+
+        Raises:
+            CommandRejected: the manager refused.
+            CommandTimeout: there was no answer.
+            GimbalTaken: control was lost in the block that has it.
+            OperationRejected: another order was given meanwhile, or the vehicle rebooted.
+            OperationTimeout: it was not there in time; the text says where it points.
+            HeartbeatTimeout: the vehicle fell silent.
+        """
+        self._loop.run(self.aio.neutral, wait=wait, timeout=timeout)
+
+    def retract(self, *, wait: bool=True, timeout: float=10.0) -> None:
+        """Put it away, and return when it rests there.
+
+        Args:
+            wait: False: return when it was accepted.
+            timeout: seconds until it has to be there.
+
+        Raises:
+            NotSupported: its manager takes the order and does nothing (PX4). Nothing was sent.
+            CommandRejected: the manager refused.
+            CommandTimeout: there was no answer.
+            GimbalTaken: control was lost in the block that has it.
+            OperationRejected: another order was given meanwhile, or the vehicle rebooted.
+            OperationTimeout: it was not there in time; the text says where it points.
+            HeartbeatTimeout: the vehicle fell silent.
+        """
+        self._loop.run(self.aio.retract, wait=wait, timeout=timeout)
 
     def release(self) -> None:
-        """Give it back to the pilot's sticks, and the control that was claimed to whoever wants it.
+        """Give it back to the pilot's sticks, and the control that was claimed without a block to whoever wants it.
 
         Raises:
             CommandRejected: the vehicle refused.
             CommandTimeout: there was no answer.
         """
         self._loop.run(self.aio.release)
+
+    def information(self) -> GimbalInformation:
+        """Ask what it is, what it can do, and its limits (GIMBAL_MANAGER_INFORMATION, GIMBAL_DEVICE_INFORMATION).
+
+        From then on angles beyond its limits are refused before anything is sent.
+
+        Raises:
+            CommandRejected: there is no gimbal manager, or it does not tell.
+            CommandTimeout: there was no answer.
+        """
+        return self._loop.run(self.aio.information)
+
+    def control(self, *, secondary: bool=False) -> GimbalControl:
+        """Be in control of it for the time of an ``async with`` block; see :class:`GimbalControl`.
+
+        Args:
+            secondary: take the secondary control, beside whoever has the primary.
+        """
+        return GimbalControl(self._loop, self._loop.call(self.aio.control, secondary=secondary))
+
+    def rates(
+        self,
+        pitch_deg_s: float = 0.0,
+        yaw_deg_s: float = 0.0,
+        *,
+        frame: Frame = 'vehicle',
+        rate_hz: float = 10.0,
+        valid_for_s: float = 1.0,
+        max_lag_s: float = 0.5,
+    ) -> GimbalRates:
+        """Turn it at rates for the time of an ``async with`` block that feeds them; see :class:`GimbalRates`.
+
+        Args:
+            pitch_deg_s: the first rate in degrees per second, −720 to 720; positive is up.
+            yaw_deg_s: the first rate in degrees per second, −720 to 720; positive is to the right.
+            frame: whether its yaw keeps to north (``"earth"``) or turns with the vehicle (``"vehicle"``) meanwhile.
+            rate_hz: how often the latest rates are sent, 2 to 100.
+            valid_for_s: how long rates may be resent without new ones.
+            max_lag_s: how late the event loop may be.
+
+        Raises:
+            LocalProtocolError: a value is out of range. Nothing was sent.
+        """
+        return GimbalRates(self._loop, self._loop.call(
+            self.aio.rates,
+            pitch_deg_s,
+            yaw_deg_s,
+            frame=frame,
+            rate_hz=rate_hz,
+            valid_for_s=valid_for_s,
+            max_lag_s=max_lag_s,
+        ))
+
+
+class Gimbals(GimbalsTwin):
+    """The gimbals that were heard of: ``vehicle.gimbals[154]``; ``for gimbal in vehicle.gimbals``.
+
+    A gimbal is known by its gimbal device id: its component id (154, 171 to 175), or 1 to 6 behind the autopilot.
+    """
+
+    @cached_property
+    def first(self) -> Gimbal:
+        """The first one, whichever that is: one behind the autopilot goes before those with ids of their own."""
+        return Gimbal(self._loop, self.aio.first)
+
+    @property
+    def ids(self) -> tuple[int, ...]:
+        """The gimbal device ids of those that were heard of, the first one first."""
+        return self._loop.call(lambda: self.aio.ids)
+
+    def get(self, device_id: int) -> Gimbal:
+        """The gimbal of this id, whether it was heard of or not.
+
+        Args:
+            device_id: 1 to 6 behind the autopilot, or a component id up to 255.
+
+        Raises:
+            LocalProtocolError: there is no such id.
+            BusyError: too many gimbals were heard of already.
+        """
+        return Gimbal(self._loop, self._loop.call(self.aio.get, device_id))
+
+    def discover(self, *, timeout: float=2.0) -> tuple[int, ...]:
+        """Ask everybody on the vehicle which gimbals they manage (GIMBAL_MANAGER_INFORMATION); :attr:`ids` afterwards.
+
+        Args:
+            timeout: seconds in which they have to answer; this takes so long.
+
+        Raises:
+            ConnectionClosed, LinkLost: the connection ended.
+        """
+        return self._loop.run(self.aio.discover, timeout=timeout)
 
 
 class PostedOrder(TwinOf["AsyncPostedOrder"]):
@@ -1603,6 +1993,783 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
         self._loop.run(self.aio.clear, patience_s=patience_s, timeout=timeout)
 
 
+class CameraBlock(BlockTwin["AsyncCameraBlock"]):
+    """Something that a camera does for the time of an ``async with`` block: it ends with it, whatever comes.
+
+    The order to end leaves at once, also when the program is cancelled, and is sent again until it is answered. It
+    leaves with the vehicle's block, too, if that ends before. A newer order about the same is not undone by it.
+    """
+
+
+
+class PhotoInterval(PhotoIntervalTwin):
+    """Pictures one after the other, for the time of an ``async with`` block; an iterator over them, in order.
+
+    Made by :meth:`Camera.photo_interval`. What was missed is asked for again; ``missed`` counts pictures of which the
+    camera could not tell any more (ArduPilot's and PX4's own know no more than the last one).
+    """
+
+    @property
+    def missed(self) -> int:
+        """How many pictures were taken of which nothing more is known."""
+        return self.aio.missed
+
+
+class Camera(TwinOf["AsyncCamera"]):
+    """One camera: pictures, video, lens, tracking, storage, streams (https://mavlink.io/en/services/camera.html).
+
+    ``vehicle.camera`` is the first one that is heard, ``vehicle.camera_at(number)`` any: one with a component id of its
+    own (100 to 105), or behind the autopilot (1 to 6), which are ArduPilot's own drivers and PX4's trigger. What a
+    camera says that it cannot do is refused before anything is sent. Cells are asked for while somebody looks at them.
+    """
+
+    @cached_property
+    def mode(self) -> StateCell[str]:
+        """``"photo"``, ``"video"`` or ``"survey"`` (CAMERA_SETTINGS), which a camera tells when it changes; asked for
+        every 5 s while somebody looks at this cell, as the next two.
+        """
+        return StateCell(self._loop, self.aio.mode)
+
+    @cached_property
+    def zoom_percent(self) -> StateCell[float | None]:
+        """0 (widest) to 100; None while the camera does not know."""
+        return StateCell(self._loop, self.aio.zoom_percent)
+
+    @cached_property
+    def focus_percent(self) -> StateCell[float | None]:
+        """0 (nearest) to 100; None while the camera does not know."""
+        return StateCell(self._loop, self.aio.focus_percent)
+
+    @cached_property
+    def storage(self) -> StateCell[tuple[Storage, ...]]:
+        """Its storage media by their numbers; asked for every 5 s while somebody looks at this cell."""
+        return StateCell(self._loop, self.aio.storage)
+
+    def set_mode(self, mode: ModeName, *, timeout: float=5.0) -> None:
+        """Change the mode (MAV_CMD_SET_CAMERA_MODE); returns when the camera tells that it is in it.
+
+        A camera that tells no mode (CAMERA_SETTINGS) is believed when it accepts.
+
+        Args:
+            mode: ``"photo"``, ``"video"`` or ``"survey"``.
+            timeout: seconds until it must be told.
+
+        Raises:
+            NotSupported: the camera has no modes. Nothing was sent.
+            CommandRejected: the camera refused: it is busy, or does not know this one.
+            CommandTimeout: it did not answer.
+            OperationTimeout: it accepted, and tells another mode; or no camera was heard.
+        """
+        self._loop.run(self.aio.set_mode, mode, timeout=timeout)
+
+    def load_storage(self) -> tuple[Storage, ...]:
+        """Ask for the storage media (STORAGE_INFORMATION).
+
+        Raises:
+            OperationTimeout: none was told of, or no camera was heard.
+        """
+        return self._loop.run(self.aio.load_storage)
+
+    def format_storage(
+        self,
+        number: int = 1,
+        *,
+        timeout: float = FORMATTING_S,
+        on_progress: Callable[[int | None], None] | None = None,
+    ) -> None:
+        """Format a storage medium, and clear the log of pictures (MAV_CMD_STORAGE_FORMAT): what is on it is lost.
+
+        Args:
+            number: of the medium, 1 to 255.
+            timeout: seconds to wait after the order, and after each sign of progress.
+            on_progress: called with 0–100, or None.
+
+        Raises:
+            LocalProtocolError: ``number`` is out of range. Nothing was sent.
+            CommandRejected: the camera refused: it is busy, or there is no such medium.
+            CommandTimeout: it did not answer; it may be formatting.
+            OperationTimeout: no camera was heard.
+        """
+        self._loop.run(self.aio.format_storage, number, timeout=timeout, on_progress=on_progress)
+
+    def reset_settings(self) -> None:
+        """Set everything as it came from the factory (MAV_CMD_RESET_CAMERA_SETTINGS).
+
+        Raises:
+            CommandRejected: the camera refused.
+            CommandTimeout: it did not answer.
+            OperationTimeout: no camera was heard.
+        """
+        self._loop.run(self.aio.reset_settings)
+
+    @cached_property
+    def tracking(self) -> StateCell[TrackingStatus]:
+        """What it tracks in its picture; asked for at a rate from :meth:`track_point` or :meth:`track_rectangle` on."""
+        return StateCell(self._loop, self.aio.tracking)
+
+    @cached_property
+    def tracked_place(self) -> StateCell[TrackedPlace]:
+        """Where on earth that is, of a camera that can tell; asked for in the same way."""
+        return StateCell(self._loop, self.aio.tracked_place)
+
+    def track_point(self, x: float, y: float, *, radius: float=0.0, status_hz: float=5.0) -> None:
+        """Track what is at a point of the picture (MAV_CMD_CAMERA_TRACK_POINT), until :meth:`stop_tracking`.
+
+        Returns when the camera has accepted; ``camera.tracking`` tells whether it holds it.
+
+        Args:
+            x: 0 (left) to 1 (right).
+            y: 0 (top) to 1 (bottom).
+            radius: part of the picture's width, 0 (one pixel) to 1.
+            status_hz: how often it shall tell, above 0 to 50.
+
+        Raises:
+            LocalProtocolError: an argument is out of range. Nothing was sent.
+            NotSupported: the camera cannot track a point. Nothing was sent.
+            CommandRejected: the camera refused.
+            CommandTimeout: it did not answer.
+            OperationTimeout: no camera was heard.
+        """
+        self._loop.run(self.aio.track_point, x, y, radius=radius, status_hz=status_hz)
+
+    def track_rectangle(
+        self,
+        left: float,
+        top: float,
+        right: float,
+        bottom: float,
+        *,
+        status_hz: float = 5.0,
+    ) -> None:
+        """Track what is in a rectangle of the picture (MAV_CMD_CAMERA_TRACK_RECTANGLE), until :meth:`stop_tracking`.
+
+        Args:
+            left: 0 to 1.
+            top: 0 to 1.
+            right: 0 to 1, right of ``left``.
+            bottom: 0 to 1, below ``top``.
+            status_hz: how often it shall tell, above 0 to 50.
+
+        Raises:
+            LocalProtocolError: an argument is out of range, or the rectangle is none. Nothing was sent.
+            NotSupported: the camera cannot track a rectangle. Nothing was sent.
+            CommandRejected: the camera refused.
+            CommandTimeout: it did not answer.
+            OperationTimeout: no camera was heard.
+        """
+        self._loop.run(self.aio.track_rectangle, left, top, right, bottom, status_hz=status_hz)
+
+    def stop_tracking(self) -> None:
+        """Track nothing any more (MAV_CMD_CAMERA_STOP_TRACKING).
+
+        Raises:
+            NotSupported: the camera cannot track. Nothing was sent.
+            CommandRejected: the camera refused.
+            CommandTimeout: it did not answer.
+            OperationTimeout: no camera was heard.
+        """
+        self._loop.run(self.aio.stop_tracking)
+
+    def zoom_step(self, steps: int) -> None:
+        """Zoom in by so many steps of the camera's own, out if negative (MAV_CMD_SET_CAMERA_ZOOM).
+
+        Not sent again without an answer: a step would be made twice.
+
+        Args:
+            steps: −100 to 100.
+
+        Raises:
+            LocalProtocolError: ``steps`` is out of range. Nothing was sent.
+            NotSupported: the camera has no zoom. Nothing was sent.
+            CommandRejected: the camera refused.
+            CommandTimeout: it did not answer; it may have zoomed.
+            OperationTimeout: no camera was heard.
+        """
+        self._loop.run(self.aio.zoom_step, steps)
+
+    def zoom_to(self, percent: float) -> None:
+        """Zoom to a part of the range: 0 (widest) to 100 %; errors are those of :meth:`zoom_step`."""
+        self._loop.run(self.aio.zoom_to, percent)
+
+    def zoom_to_focal_length(self, millimetres: float) -> None:
+        """Zoom to a focal length, above 0 to 10,000 mm; errors are those of :meth:`zoom_step`."""
+        self._loop.run(self.aio.zoom_to_focal_length, millimetres)
+
+    def zooming(self, speed: float=1.0) -> CameraBlock:
+        """Zoom for as long as an ``async with`` block lasts; it stops with it, also under cancellation.
+
+        Entering raises what :meth:`zoom_step` does.
+
+        Args:
+            speed: −1 (out) to 1 (in); most cameras know these two.
+
+        Raises:
+            LocalProtocolError: ``speed`` is out of range. Nothing was sent.
+        """
+        return CameraBlock(self._loop, self._loop.call(self.aio.zooming, speed))
+
+    def focus_step(self, steps: int) -> None:
+        """Focus farther by so many steps of the camera's own, nearer if negative (MAV_CMD_SET_CAMERA_FOCUS).
+
+        Not sent again without an answer: a step would be made twice.
+
+        Args:
+            steps: −100 to 100.
+
+        Raises:
+            LocalProtocolError: ``steps`` is out of range. Nothing was sent.
+            NotSupported: the camera cannot be focused. Nothing was sent.
+            CommandRejected: the camera refused.
+            CommandTimeout: it did not answer; it may have moved.
+            OperationTimeout: no camera was heard.
+        """
+        self._loop.run(self.aio.focus_step, steps)
+
+    def focus_to(self, percent: float) -> None:
+        """Focus to a part of the range: 0 (nearest) to 100 %; errors are those of :meth:`focus_step`."""
+        self._loop.run(self.aio.focus_to, percent)
+
+    def focus_at(self, metres: float) -> None:
+        """Focus at a distance, above 0 to 100,000 m; errors are those of :meth:`focus_step`."""
+        self._loop.run(self.aio.focus_at, metres)
+
+    def auto_focus(self, kind: AutoFocus='auto') -> None:
+        """Have the camera focus by itself: ``"auto"`` as it likes, ``"single"`` once, ``"continuous"`` from now on.
+
+        Raises:
+            NotSupported: the camera cannot be focused. Nothing was sent.
+            CommandRejected: the camera refused.
+            CommandTimeout: it did not answer.
+            OperationTimeout: no camera was heard.
+        """
+        self._loop.run(self.aio.auto_focus, kind)
+
+    def focusing(self, speed: float=1.0) -> CameraBlock:
+        """Move the focus for as long as an ``async with`` block lasts; it stops with it, also under cancellation.
+
+        Entering raises what :meth:`focus_step` does.
+
+        Args:
+            speed: −1 (nearer) to 1 (farther); most cameras know these two.
+
+        Raises:
+            LocalProtocolError: ``speed`` is out of range. Nothing was sent.
+        """
+        return CameraBlock(self._loop, self._loop.call(self.aio.focusing, speed))
+
+    @cached_property
+    def status(self) -> StateCell[CameraStatus]:
+        """What it does: recording and for how long, pictures taken, storage left (CAMERA_CAPTURE_STATUS). It is asked
+        every 2 s while somebody looks at this cell, as far as it does not tell by itself.
+        """
+        return StateCell(self._loop, self.aio.status)
+
+    @cached_property
+    def streams(self) -> StateCell[tuple[VideoStream, ...]]:
+        """Its video streams by their numbers; asked for every 5 s while somebody looks at this cell."""
+        return StateCell(self._loop, self.aio.streams)
+
+    @cached_property
+    def thermal_range(self) -> StateCell[ThermalRange]:
+        """The coldest and hottest point of the last thermal picture; asked for once a second while somebody looks."""
+        return StateCell(self._loop, self.aio.thermal_range)
+
+    def start_video(self, *, status_hz: float=1.0, timeout: float=5.0) -> None:
+        """Begin to record (MAV_CMD_VIDEO_START_CAPTURE); returns when the camera says that it records.
+
+        A camera that does not tell what it does (such as those behind an autopilot) is believed when it accepts.
+
+        Args:
+            status_hz: how often it tells its status meanwhile, 0 to 10.
+            timeout: seconds until it must be recording.
+
+        Raises:
+            LocalProtocolError: ``status_hz`` is out of range. Nothing was sent.
+            NotSupported: the camera records no video. Nothing was sent.
+            CommandRejected: the camera refused: it is busy, or in the wrong mode.
+            CommandTimeout: it did not answer; it may be recording.
+            OperationTimeout: it accepted and does not record, or no camera was heard.
+        """
+        self._loop.run(self.aio.start_video, status_hz=status_hz, timeout=timeout)
+
+    def stop_video(self, *, timeout: float=5.0) -> None:
+        """End the recording (MAV_CMD_VIDEO_STOP_CAPTURE); returns when the camera says that it has.
+
+        Raises:
+            NotSupported: the camera records no video. Nothing was sent.
+            CommandRejected: the camera refused.
+            CommandTimeout: it did not answer.
+            OperationTimeout: it accepted and goes on recording, or no camera was heard.
+        """
+        self._loop.run(self.aio.stop_video, timeout=timeout)
+
+    def video(self, *, status_hz: float=1.0) -> CameraBlock:
+        """Record for the time of an ``async with`` block; it ends with it, also under cancellation.
+
+        Entering raises what :meth:`start_video` does.
+
+        Raises:
+            LocalProtocolError: ``status_hz`` is not 0 to 10. Nothing was sent.
+        """
+        return CameraBlock(self._loop, self._loop.call(self.aio.video, status_hz=status_hz))
+
+    def load_streams(self) -> tuple[VideoStream, ...]:
+        """Ask for the video streams (VIDEO_STREAM_INFORMATION), each by its number where they do not all come at once.
+
+        Raises:
+            NotSupported: the camera has none. Nothing was sent.
+            OperationTimeout: they did not come, or no camera was heard.
+        """
+        return self._loop.run(self.aio.load_streams)
+
+    def start_streaming(self, stream: int=0) -> None:
+        """Have a stream sent (MAV_CMD_VIDEO_START_STREAMING).
+
+        Args:
+            stream: its number, 0 (all of them) to 255.
+
+        Raises:
+            LocalProtocolError: there can be no such stream. Nothing was sent.
+            NotSupported: the camera has no streams. Nothing was sent.
+            CommandRejected: the camera refused; there is no such stream.
+            CommandTimeout: it did not answer.
+            OperationTimeout: no camera was heard.
+        """
+        self._loop.run(self.aio.start_streaming, stream)
+
+    def stop_streaming(self, stream: int=0) -> None:
+        """Have a stream end (MAV_CMD_VIDEO_STOP_STREAMING); errors are those of :meth:`start_streaming`."""
+        self._loop.run(self.aio.stop_streaming, stream)
+
+    def select_stream(self, stream: int) -> None:
+        """Have this stream sent, and the others that run ended; errors are those of :meth:`start_streaming`.
+
+        Args:
+            stream: its number, 1 to 255.
+        """
+        self._loop.run(self.aio.select_stream, stream)
+
+    def select_source(self, primary: SourceName, secondary: SourceName='default') -> None:
+        """Choose the sensor that is shown (MAV_CMD_SET_CAMERA_SOURCE), and one that is shown within its picture.
+
+        Args:
+            primary: ``"default"``, ``"rgb"``, ``"ir"`` or ``"ndvi"``.
+            secondary: the same; ``"default"``: no picture within the picture.
+
+        Raises:
+            CommandRejected: the camera refused; it has no such sensor.
+            CommandTimeout: it did not answer.
+            OperationTimeout: no camera was heard.
+        """
+        self._loop.run(self.aio.select_source, primary, secondary)
+
+    @cached_property
+    def capture(self) -> StateCell[Capture]:
+        """The latest picture that was heard of."""
+        return StateCell(self._loop, self.aio.capture)
+
+    def take_photo(self, *, timeout: float=10.0) -> Capture:
+        """Take one picture; returns when the camera has told of it.
+
+        Sends MAV_CMD_IMAGE_START_CAPTURE (https://mavlink.io/en/services/camera.html), MAV_CMD_DO_DIGICAM_CONTROL to
+        PX4's trigger and to whoever knows nothing better. The order is never sent again blindly: only when the camera,
+        asked after it, says that it takes no picture and has taken none. CAMERA_IMAGE_CAPTURED that was lost is asked
+        for. Cancelled, it may still be taken.
+
+        Args:
+            timeout: seconds until it must have been told.
+
+        Raises:
+            NotSupported: the camera takes no pictures. Nothing was sent.
+            CommandRejected: the camera refused: it is busy, or in the wrong mode.
+            CommandTimeout: it did not answer; it may have taken the picture.
+            OperationRejected: it could not take the picture.
+            OperationTimeout: it told of no picture, or no camera was heard.
+        """
+        return self._loop.run(self.aio.take_photo, timeout=timeout)
+
+    def photo_interval(self, seconds: float, count: int=0) -> PhotoInterval:
+        """A picture every so many seconds for the time of an ``async with`` block, which gives them in order.
+
+        ``async with camera.photo_interval(2, count=10) as captures: async for capture in captures: …``. Those of which
+        the message was lost are asked for again. MAV_CMD_IMAGE_STOP_CAPTURE at the end of the block, also when it is
+        cancelled; PX4's trigger is started and stopped by MAV_CMD_DO_TRIGGER_CONTROL.
+
+        Args:
+            seconds: from one picture to the next, above 0 to 3600.
+            count: 0 (until the block ends) to 32767; after so many the iterator ends.
+
+        Raises:
+            LocalProtocolError: an argument is out of range. Nothing was sent.
+        """
+        return PhotoInterval(self._loop, self._loop.call(self.aio.photo_interval, seconds, count))
+
+    def captures(self) -> list[Capture]:
+        """The pictures that were heard of, by their index; at most 20,000, the newest."""
+        return self._loop.call(self.aio.captures)
+
+    def load_captures(self, *, timeout: float=600.0) -> list[Capture]:
+        """All pictures in the camera's log, also those that were taken before: what is not known yet is asked for.
+
+        The newest 20,000 at most. A camera behind the autopilot tells of its newest one only. Where three on
+        end are not told, it ends.
+
+        Args:
+            timeout: seconds until all must have come; :meth:`captures` has those that came in time.
+
+        Raises:
+            OperationTimeout: the camera does not say how many there are, or what it is, or it took too long.
+        """
+        return self._loop.run(self.aio.load_captures, timeout=timeout)
+
+    def read_picture(self, capture: Capture) -> bytes:
+        """The file of a picture, by MAVFTP: for a ``file_url`` that begins with ``mftp:`` or ``/``, at most 16 MB.
+
+        Raises:
+            NotSupported: its URL is another one, or it has none. Nothing was sent.
+            FileError: the camera has no such file.
+            OperationTimeout: nothing came any more, or no camera was heard.
+        """
+        return self._loop.run(self.aio.read_picture, capture)
+
+    @cached_property
+    def information(self) -> StateCell[CameraInformation]:
+        """What it is (CAMERA_INFORMATION): asked for once, by the first call."""
+        return StateCell(self._loop, self.aio.information)
+
+    @property
+    def number(self) -> int | None:
+        """1 to 6 behind the autopilot, otherwise its component id; None before the first camera was heard."""
+        return self.aio.number
+
+    def wait_found(self, *, timeout: float=10.0) -> CameraInformation:
+        """Wait until the camera is heard and says what it is; other calls do so by themselves.
+
+        Raises:
+            CommandRejected: it does not say what it is.
+            OperationTimeout: none was heard, or it does not say what it is: PX4's trigger never does.
+        """
+        return self._loop.run(self.aio.wait_found, timeout=timeout)
+
+
+class Settings(TwinOf["AsyncSettings"]):
+    """The settings of one component. Coroutines talk to it; ``table`` is what is known, and never does.
+
+    Every PARAM_EXT_VALUE and PARAM_EXT_ACK of the component keeps the table up to date, also when somebody else has
+    changed something, and is told as :class:`aerokit.events.SettingChanged`. After a reboot of the vehicle nothing is
+    known until it is read anew.
+
+    A camera's settings are explained by its definition file: :meth:`fetch_definition` has it from the camera,
+    :meth:`load` takes one that is here. From then on options go by their names, and what is out of range or excluded
+    by other settings is refused before anything is sent. Without it each value is sent as it is.
+
+    All methods take ``patience_s`` (give up after so many seconds without anything new) and ``timeout`` (for all of
+    it; then OperationTimeout), if they talk to the component. Each can be cancelled at any moment.
+    """
+
+    @property
+    def table(self) -> Mapping[str, Setting]:
+        """What is known now, by name; empty before anything was read, and after a reboot."""
+        return self.aio.table
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether the whole list was downloaded since the vehicle started."""
+        return self.aio.is_complete
+
+    def known(self, name: str) -> Setting | None:
+        """What was told last of a setting; None when nothing was."""
+        return self.aio.known(name)
+
+    @property
+    def definition(self) -> CameraDefinition | None:
+        """What the camera's file says of its settings, once it is here."""
+        return self.aio.definition
+
+    def load(
+        self,
+        definition: CameraDefinition | str | os.PathLike[str],
+        *,
+        locale: str | None = None,
+    ) -> CameraDefinition:
+        """Take a definition, or read it from a file (``.xml`` or ``.xml.xz``).
+
+        Args:
+            definition: made by :func:`aerokit.parameters.parse_definition`, or the path of a file.
+            locale: language of descriptions and of the names of options, ``"de"`` or ``"de_DE"``, if the file has it.
+
+        Raises:
+            FileFormatError: the file is none, or has more than 16 MB. What was there before stays.
+        """
+        return self._loop.call(self.aio.load, definition, locale=locale)
+
+    def fetch_definition(
+        self,
+        uri: str | None = None,
+        *,
+        locale: str | None = None,
+        patience_s: float = PATIENCE_S,
+        timeout: float | None = None,
+    ) -> CameraDefinition:
+        """Fetch the camera's own definition file and take it, as :meth:`load` does.
+
+        Args:
+            uri: where it is: ``mftp://`` is MAVFTP, ``mftp://[;comp=1]/…`` that of another component; ``http://`` and
+                ``https://`` are fetched from the web, wherever that is. By default what CAMERA_INFORMATION says.
+            locale: as for :meth:`load`.
+            patience_s: give up after so many seconds without anything new.
+            timeout: seconds for all of it; from the web it takes a minute at most.
+
+        Raises:
+            NotSupported: the camera names no definition file.
+            CommandRejected, OperationTimeout: it did not tell what it is.
+            LocalProtocolError: an address of another kind.
+            FileFormatError: what came is none, or has more than 16 MB.
+            FileError, FileTimeout, RemoteProtocolError: as for :meth:`aerokit.vehicle.files.files.Files.read`.
+            OperationRejected: the web server does not give it.
+        """
+        return self._loop.run(
+            self.aio.fetch_definition,
+            uri,
+            locale=locale,
+            patience_s=patience_s,
+            timeout=timeout,
+        )
+
+    def options(self, name: str) -> Mapping[str, SettingValue]:
+        """The options that a setting has now, name → value, as the other settings allow it by what is known of them.
+
+        Empty where any value in its range may be set, and without a definition.
+        """
+        return self._loop.call(self.aio.options, name)
+
+    def excluded_by(self, name: str) -> tuple[str, ...]:
+        """What makes a setting mean nothing now, by what is known of the others: ``("CAM_EXPMODE = Auto",)``."""
+        return self._loop.call(self.aio.excluded_by, name)
+
+    def download(
+        self,
+        *,
+        refresh: bool = False,
+        patience_s: float = PATIENCE_S,
+        timeout: float | None = None,
+        on_progress: OnProgress | None = None,
+    ) -> Mapping[str, Setting]:
+        """Return all settings by name, in the component's order; at once when they were downloaded before.
+
+        Raises:
+            ParameterTimeout: the list did not come whole, or the component has none. What did come is in ``table``.
+        """
+        return self._loop.run(
+            self.aio.download,
+            refresh=refresh,
+            patience_s=patience_s,
+            timeout=timeout,
+            on_progress=on_progress,
+        )
+
+    def get(
+        self,
+        name: str,
+        *,
+        patience_s: float = PATIENCE_S,
+        timeout: float | None = None,
+    ) -> SettingValue:
+        """Ask the component for one value; the rest is as for :meth:`read`."""
+        return self._loop.run(self.aio.get, name, patience_s=patience_s, timeout=timeout)
+
+    def read(
+        self,
+        name: str,
+        *,
+        patience_s: float = PATIENCE_S,
+        timeout: float | None = None,
+    ) -> Setting:
+        """Ask the component for one setting; ``table[name]`` is what is known without asking.
+
+        Raises:
+            LocalProtocolError: the name is none, or longer than 16 characters.
+            ParameterRejected: the component answers for other settings, and not for this one.
+            ParameterTimeout: no answer.
+        """
+        return self._loop.run(self.aio.read, name, patience_s=patience_s, timeout=timeout)
+
+    def set(
+        self,
+        name: str,
+        value: float | str | bytes,
+        *,
+        patience_s: float = PATIENCE_S,
+        timeout: float | None = None,
+    ) -> Setting:
+        """Set one setting, and return what the component says it is then; it may have taken another value.
+
+        With a definition ``value`` may be the name of an option, and settings that may change with this one are read
+        again before it returns. What decides on this setting and is not known yet is read before.
+
+        Raises:
+            LocalProtocolError: a name or value that cannot be; with a definition: an option or a value that is not
+                allowed, a setting that can only be read or is excluded now. It was not set.
+            ParameterRejected: the component has no such setting, or refused; ``code`` is its PARAM_ACK.
+            ParameterTimeout: not confirmed. It may have been set all the same.
+        """
+        return self._loop.run(self.aio.set, name, value, patience_s=patience_s, timeout=timeout)
+
+
+class Component(TwinOf["AsyncComponent"]):
+    """One component of a vehicle: a camera, a gimbal, a companion computer, a receiver or another.
+
+    Made by :meth:`aerokit.Vehicle.component`. Commands, messages with rates, parameters and files are those of this
+    component, by the code that the autopilot's go through. https://mavlink.io/en/services/component_information.html
+    """
+
+    @property
+    def system_id(self) -> int:
+        """The vehicle's system id."""
+        return self.aio.system_id
+
+    @property
+    def component_id(self) -> int:
+        """Its MAV_COMPONENT id, 1 to 255."""
+        return self.aio.component_id
+
+    @property
+    def kind(self) -> str:
+        """What its HEARTBEAT says it is: ``"camera"``, ``"gimbal"``, ``"onboard_controller"`` … or ``"unknown"``."""
+        return self.aio.kind
+
+    @property
+    def age(self) -> float:
+        """Seconds since its last HEARTBEAT; inf before the first."""
+        return self.aio.age
+
+    @property
+    def is_silent(self) -> bool:
+        """Whether it has not been heard for more than 3.5 seconds, or never."""
+        return self.aio.is_silent
+
+    def information(self, *, timeout: float=3.0) -> ComponentInformation:
+        """Ask what it is and what it can do (COMPONENT_INFORMATION_BASIC).
+
+        Raises:
+            CommandRejected: it does not know the question.
+            OperationTimeout: it did not answer within ``timeout`` seconds.
+        """
+        return self._loop.run(self.aio.information, timeout=timeout)
+
+    def metadata(self, kind: MetadataKind='general', *, timeout: float=3.0) -> dict[str, Any]:
+        """What it tells of itself in a file (COMPONENT_METADATA, read by MAVFTP), as its JSON has it.
+
+        Args:
+            kind: ``"general"`` lists the others: ``"parameter"``, ``"commands"``, ``"peripherals"``, ``"events"``,
+                ``"actuators"``. PX4 has general, parameter, events and actuators.
+            timeout: seconds until it must have said where the files are.
+
+        Raises:
+            NotSupported: it has no such file, or not on the vehicle.
+            FileFormatError: the file is damaged.
+            FileError, FileTimeout: it cannot be read.
+        """
+        return self._loop.run(self.aio.metadata, kind, timeout=timeout)
+
+    def fetch(self, uri: str, *, patience_s: float=10.0) -> bytes:
+        """The content of a file that a component names by its address, at most 16 MB.
+
+        Args:
+            uri: ``mftp://path`` is on this component, ``mftp://[;comp=1]path`` on another one of the vehicle;
+                ``http://`` and ``https://`` are fetched from the web.
+            patience_s: give up when nothing has come for so many seconds.
+
+        Raises:
+            LocalProtocolError: the address is another one.
+            FileFormatError: the file has more than 16 MB.
+            FileError, FileTimeout, OperationRejected: it was not given.
+        """
+        return self._loop.run(self.aio.fetch, uri, patience_s=patience_s)
+
+    def command(
+        self,
+        command: int,
+        *params: float,
+        attempts: int = 4,
+        attempt_timeout: float = 1.0,
+        progress_timeout: float = 10.0,
+        on_progress: Callable[[int | None], None] | None = None,
+    ) -> CommandAck:
+        """Send it any MAV_CMD as COMMAND_LONG and return its ACCEPTED ack; as :meth:`aerokit.Vehicle.command`."""
+        return self._loop.run(
+            self.aio.command,
+            command,
+            *params,
+            attempts=attempts,
+            attempt_timeout=attempt_timeout,
+            progress_timeout=progress_timeout,
+            on_progress=on_progress,
+        )
+
+    def request(
+        self,
+        message_type: type[MessageT],
+        *params: float,
+        timeout: float = 3.0,
+        where: Callable[[MessageT], bool] | None = None,
+    ) -> MessageT:
+        """Ask for one message (MAV_CMD_REQUEST_MESSAGE with these params behind the id) and return it.
+
+        Args:
+            message_type: its class.
+            params: param2 to param6, where the message has several: which camera, stream, card …
+            timeout: seconds until it must have come; it is asked for up to three times.
+            where: which of several is meant; called with each that comes.
+
+        Raises:
+            CommandRejected: it refused.
+            OperationTimeout: no such message came.
+        """
+        return self._loop.run(self.aio.request, message_type, *params, timeout=timeout, where=where)
+
+    def subscribe(
+        self,
+        *types: type[ItemT],
+        capacity: int = 1,
+        overflow: Overflow = 'drop_oldest',
+        rate_hz: float | None = None,
+    ) -> Subscription[ItemT]:
+        """What this component says, and events that name it; it is asked for ``rate_hz``.
+
+        As :meth:`aerokit.Vehicle.subscribe`.
+        """
+        return Subscription(self._loop, self._loop.call(self.aio.subscribe, *types, capacity=capacity, overflow=overflow, rate_hz=rate_hz))
+
+    def message(
+        self,
+        message_type: type[MessageT],
+        *,
+        rate_hz: float | None = None,
+    ) -> StateCell[MessageT]:
+        """Its latest message of a kind, in a cell; as :meth:`aerokit.Vehicle.message`."""
+        return StateCell(self._loop, self._loop.call(self.aio.message, message_type, rate_hz=rate_hz))
+
+    def rate(self, message_type: type[Message], rate_hz: float) -> AbstractContextManager[None]:
+        """Have it send ``message_type`` at ``rate_hz`` or faster for the time of the ``with`` block."""
+        return self._block(self.aio.rate(message_type, rate_hz))
+
+    @cached_property
+    def files(self) -> Files:
+        """The files on it, by MAVFTP."""
+        return Files(self._loop, self._loop.call(lambda: self.aio.files))
+
+    @cached_property
+    def parameters(self) -> Parameters:
+        """Its parameters (PARAM_VALUE), as those of the autopilot."""
+        return Parameters(self._loop, self._loop.call(lambda: self.aio.parameters))
+
+    @cached_property
+    def settings(self) -> Settings:
+        """Its settings (PARAM_EXT), texts among them; those of a camera with what its definition file says of them."""
+        return Settings(self._loop, self._loop.call(lambda: self.aio.settings))
+
+
 class Vehicle(VehicleTwin):
     """One vehicle. Coroutines talk to it, properties never do; everything has a deadline and can be cancelled.
 
@@ -1931,9 +3098,10 @@ class Vehicle(VehicleTwin):
 
         ``capacity=1`` gives the latest only, ``missed`` counts the others.
 
-        Subscribing is the rate request: while the block lasts, the vehicle is asked to send these messages at
+        Subscribing is the rate request: while the block lasts, the autopilot is asked to send these messages at
         ``rate_hz`` (above 0, at most 1000), or faster if others want it. None means the default rate of a message that
-        comes in a stream; one that is sent when there is need (HEARTBEAT, STATUSTEXT, acks) is not asked for.
+        comes in a stream; one that is sent when there is need (HEARTBEAT, STATUSTEXT, acks) is not asked for. What a
+        camera or another component is to be asked for: ``vehicle.component(100).subscribe(...)``.
 
         Raises:
             LocalProtocolError: no type, a rate out of range, or a message that the dialect does not hold.
@@ -1967,7 +3135,8 @@ class Vehicle(VehicleTwin):
 
         The first call registers it, and has the vehicle send it at ``rate_hz`` (None: the default rate of a message
         that comes in a stream) for as long as the vehicle object lives; later calls give the same cell, and may change
-        the rate. Only messages of the autopilot count.
+        the rate. Only messages of the autopilot count; those of a camera or another component are in
+        ``vehicle.component(100).message(...)``.
 
         Raises:
             LocalProtocolError: the rate is out of range, or the dialect does not hold the message.
@@ -2367,14 +3536,62 @@ class Vehicle(VehicleTwin):
         self._loop.run(self.aio.return_to_launch, timeout=timeout, max_silence_s=max_silence_s)
 
     @property
+    def components(self) -> StateCell[tuple[ComponentStatus, ...]]:
+        """What is on board, as far as it was heard: autopilot, cameras, gimbals, companions, receivers, others.
+
+        Cameras and gimbals without a component id of their own are known once one of their messages has come.
+        """
+        return self._part("components", StateCell)
+
+    def component(self, component_id: int) -> Component:
+        """One of them, to talk to: ``vehicle.component(100).command(…)``. It need not have been heard yet.
+
+        Raises:
+            LocalProtocolError: the id is not from 1 to 255.
+        """
+        return Component(self._loop, self._loop.call(self.aio.component, component_id))
+
+    @property
+    def camera(self) -> Camera:
+        """The first camera that is heard: one with a component id of its own before those behind the autopilot.
+
+        Its calls wait for it a moment; ``camera_at`` gives any other one.
+        """
+        return self._part("camera", Camera)
+
+    @property
+    def cameras(self) -> StateCell[tuple[int, ...]]:
+        """The numbers of the cameras that have been heard, for ``camera_at``.
+
+        Component ids (100 to 105), and 1 to 6 for those behind the autopilot once they have told of a picture.
+        """
+        return self._part("cameras", StateCell)
+
+    def camera_at(self, number: int) -> Camera:
+        """One camera by its number; it need not have been heard yet.
+
+        Args:
+            number: its component id (100 to 105, at most 255), or 1 to 6 behind the autopilot.
+
+        Raises:
+            LocalProtocolError: there can be no such camera.
+        """
+        return Camera(self._loop, self._loop.call(self.aio.camera_at, number))
+
+    @property
     def guided(self) -> Guided:
         """Set-point streams: velocity, position, acceleration, attitude."""
         return self._part("guided", Guided)
 
     @property
     def gimbal(self) -> Gimbal:
-        """The gimbal: where it points, and orders to it."""
+        """The first gimbal: where it points, and orders to it."""
         return self._part("gimbal", Gimbal)
+
+    @property
+    def gimbals(self) -> Gimbals:
+        """All gimbals that it carries."""
+        return self._part("gimbals", Gimbals)
 
     @property
     def files(self) -> Files:

@@ -6,11 +6,13 @@ An event loop on virtual time (`run_virtual`), simulated vehicles with faults an
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from aerokit.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from aerokit.sim.journal import Journal
     from aerokit.sim.track import Track, TrackPoint
 
@@ -54,4 +56,6 @@ _HOMES = {
     "serve_flight": "aerokit.testing.served",
 }
 
+__getattr__: Callable[[str], Any]
+__dir__: Callable[[], list[str]]
 __getattr__, __dir__ = lazy_names(__name__, _HOMES, __all__)

@@ -27,6 +27,7 @@ from aerokit.sim.server import SimulatorServer
 from aerokit.sim.track import least_distance_m
 from aerokit.testing.clock import run_virtual
 from aerokit.testing.fault_verbs import FaultInjector
+from aerokit.testing.recording import FlightRecording
 from aerokit.testing.stage import Stagehand
 
 if TYPE_CHECKING:
@@ -54,7 +55,7 @@ class Flight:
         """Where it truly was."""
         self.journal: Journal = fleet._stagehand.journals[number]
         """What it said, and the orders that it heard."""
-        self.faults = FaultInjector(self.simulated, fleet._on_stage)
+        self.faults: FaultInjector = FaultInjector(self.simulated, fleet._on_stage)
         """What goes wrong with it."""
         self._vehicle: aerokit.Vehicle | None = None
 
@@ -65,6 +66,11 @@ class Flight:
             self._fleet._check_open()
             raise RuntimeError("nobody connected: this flight was opened with connect=False; use flight.link")
         return self._vehicle
+
+    @property
+    def recording(self) -> FlightRecording | None:
+        """All that goes over its link, with ``record=True`` only; of a fleet all of them together."""
+        return self._fleet.recording
 
     @property
     def link(self) -> Link:
@@ -93,12 +99,15 @@ class Fleet(Sequence[Flight]):
         connect: bool = True,
         latency_s: float = 0.0,
         spacing_m: float = 5.0,
+        record: bool = False,
         **options: Any,
     ) -> None:
         options.setdefault("boot_time_s", _BOOT_TIME_S)
         self._vehicles = _side_by_side(kinds, spacing_m, **options)
         self._stagehand = Stagehand(self._vehicles)
         self._connect, self._latency_s = connect, latency_s
+        self.recording: FlightRecording | None = FlightRecording() if record else None
+        """All that goes over their link, with ``record=True`` only."""
         self._server: SimulatorServer | None = None
         self._link: Link | None = None
         self._was_opened = False
@@ -178,6 +187,8 @@ class Fleet(Sequence[Flight]):
             self._server = await stack.enter_async_context(
                 SimulatorServer([self._stagehand, *self._vehicles], far)
             )
+            if self.recording is not None:
+                self.recording.follow(self._server)
             stack.callback(self._close)
             self._stagehand.follow(self._catch_up)
             if self._connect:
@@ -237,8 +248,9 @@ async def open_flight(kind: str = "copter", **options: Any) -> AsyncIterator[Fli
     """A vehicle of a kind ("copter", "plane", "rover", "sub", "px4", "px4_plane"), connected.
 
     ``connect=False`` leaves connecting to the program, by ``flight.link``; ``latency_s`` passes on the way in
-    both directions. Other options are those of the simulated vehicle: ``seed``, ``home``, ``parameters``,
-    ``battery_percent`` … Raises LocalProtocolError for a kind that does not exist.
+    both directions; ``record=True`` keeps all that goes over the link, for the report of a test that fails. Other
+    options are those of the simulated vehicle: ``seed``, ``home``, ``parameters``, ``battery_percent`` …
+    Raises LocalProtocolError for a kind that does not exist.
     """
     fleet = Fleet(kind, **options)
     async with fleet.open():

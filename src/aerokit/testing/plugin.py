@@ -1,4 +1,4 @@
-"""The pytest plugin of `aerokit[testing]`: simulated vehicles as fixtures; docs/testing.md shows each.
+"""The pytest plugin of `aerokit-mavlink[testing]`: simulated vehicles as fixtures; docs/testing.md shows each.
 
 - ``flight``, ``fleet``: on virtual time, for ``async def`` tests (with anyio's plugin or none) or ``flight.run(main)``
 - ``served_flight``: on a socket, for blocking programs; ``blocking_vehicle`` is an `aerokit.sync.Vehicle` on it
@@ -50,7 +50,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.getgroup("aerokit").addoption(
         _PICTURES,
         metavar="DIR",
-        help="draw what was flown in each test that fails, as an .svg in this directory",
+        help="draw what was flown in each test that fails, as an .svg in this directory, and put its recording"
+        " (.tlog) and report (.html) there",
     )
 
 
@@ -174,7 +175,9 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
 
 def _wanted(request: pytest.FixtureRequest) -> tuple[tuple[str, ...], dict[str, Any]]:
     marker = request.node.get_closest_marker(_MARKER)
-    return (marker.args or ("copter",), dict(marker.kwargs)) if marker else (("copter",), {})
+    kinds, options = (marker.args, dict(marker.kwargs)) if marker else ((), {})
+    options.setdefault("record", request.config.getoption(_PICTURES) is not None)
+    return kinds or ("copter",), options
 
 
 def _flown(item: pytest.Item) -> list[Any]:

@@ -11,10 +11,14 @@ from aerokit.sim.patience import wait_longer
 from aerokit.sim.server import SimulatorServer, open_simulator
 from aerokit.testing.fault_verbs import FaultInjector
 from aerokit.testing.interruption import Interruption
+from aerokit.testing.recording import FlightRecording
 from aerokit.testing.stage import Stagehand
 
 if TYPE_CHECKING:
     from anyio.from_thread import BlockingPortal
+
+    from aerokit.sim.journal import Journal
+    from aerokit.sim.track import Track
 
 __all__ = ["SPEEDUP", "ServedFlight", "hosted_flight", "serve_flight"]
 
@@ -32,17 +36,20 @@ class ServedFlight:
         hand: Stagehand,
         vehicle: Any,
         interruption: Interruption,
+        recording: FlightRecording | None = None,
     ) -> None:
-        self.address = server.addresses[0].replace("tcpin:", "tcp:")
+        self.address: str = server.addresses[0].replace("tcpin:", "tcp:")
         """Where programs connect to, such as "tcp:127.0.0.1:5760"."""
         self.simulated: Any = vehicle
         """The simulated vehicle; it lives on another thread: read it, change it by the verbs of ``faults``."""
-        self.track = hand.tracks[0]
+        self.track: Track = hand.tracks[0]
         """Where it truly was."""
-        self.journal = hand.journals[0]
+        self.journal: Journal = hand.journals[0]
         """What it said, and the orders that it heard."""
-        self.faults = FaultInjector(vehicle, lambda plan: portal.call(self._on_stage, plan))
+        self.faults: FaultInjector = FaultInjector(vehicle, lambda plan: portal.call(self._on_stage, plan))
         """What goes wrong with it."""
+        self.recording: FlightRecording | None = recording
+        """All that goes over its link, with ``record=True`` only."""
         self._portal, self._server, self._hand, self._interruption = portal, server, hand, interruption
         self._is_told = False
         hand.follow(lambda: portal.call(self._catch_up))
@@ -99,7 +106,12 @@ def serve_flight(kind: str = "copter", **options: Any) -> Iterator[ServedFlight]
 
 @contextmanager
 def hosted_flight(
-    kind: str = "copter", *, address: str = "tcpin:127.0.0.1:0", speedup: float = SPEEDUP, **options: Any
+    kind: str = "copter",
+    *,
+    address: str = "tcpin:127.0.0.1:0",
+    speedup: float = SPEEDUP,
+    record: bool = False,
+    **options: Any,
 ) -> Iterator[ServedFlight]:
     """Serve a vehicle of a kind on an address while the block runs; ``options`` are those of the vehicle.
 
@@ -114,16 +126,19 @@ def hosted_flight(
     vehicle: Any = simulated(kind, **options)
     wait_longer([vehicle], speedup, leave=options.get("parameters") or ())
     hand, interruption = Stagehand([vehicle]), Interruption()
+    recording = FlightRecording() if record else None
 
     @asynccontextmanager
     async def serve() -> AsyncIterator[SimulatorServer]:
         with interruption.at_an_error():
             async with open_simulator([hand, vehicle], address, speedup=speedup) as server:
+                if recording is not None:
+                    recording.follow(server)
                 yield server
 
     with start_blocking_portal() as portal:
         serving = portal.wrap_async_context_manager(serve())
-        flight = ServedFlight(portal, serving.__enter__(), hand, vehicle, interruption)
+        flight = ServedFlight(portal, serving.__enter__(), hand, vehicle, interruption, recording)
         try:
             yield flight
         finally:

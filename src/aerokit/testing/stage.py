@@ -11,6 +11,7 @@ from aerokit.sim.vehicle import SimulatedVehicle
 
 if TYPE_CHECKING:
     from aerokit.sim.channel import Channel
+    from aerokit.sim.track import Track
 
 __all__ = ["Stagehand"]
 
@@ -28,9 +29,9 @@ class Stagehand(SimulatedVehicle):
     def __init__(self, vehicles: Sequence[Any]) -> None:
         super().__init__(system_id=0, component_id=0, seed=0, components=())
         self._vehicles = vehicles
-        self.tracks = [record_track(vehicle) for vehicle in vehicles]
+        self.tracks: list[Track] = [record_track(vehicle) for vehicle in vehicles]
         """Of each vehicle, in their order."""
-        self.journals = [Journal() for _ in vehicles]
+        self.journals: list[Journal] = [Journal() for _ in vehicles]
         """The same."""
         for vehicle, journal in zip(vehicles, self.journals, strict=True):
             vehicle.journal = journal

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 __all__ = ["connect", "tell_how_it_is_left"]
 
-logger = logging.getLogger("aerokit")
+logger: logging.Logger = logging.getLogger("aerokit")
 
 FRESH_HEARTBEAT_S = 2.0
 """A heartbeat heard longer ago says nothing about now: the next one is waited for."""

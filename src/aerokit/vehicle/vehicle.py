@@ -18,10 +18,17 @@ from aerokit.vehicle.state.told import MESSAGE_IDS
 
 if TYPE_CHECKING:
     from aerokit.mavlink.signing import Signing
+    from aerokit.runtime.cells import StateCell
+    from aerokit.vehicle.camera.camera import Camera
+    from aerokit.vehicle.camera.cameras import Cameras
+    from aerokit.vehicle.components.component import Component
+    from aerokit.vehicle.components.components import Components
+    from aerokit.vehicle.components.status import ComponentStatus
     from aerokit.vehicle.files.files import Files
     from aerokit.vehicle.files.logs import Logs
+    from aerokit.vehicle.gimbal.gimbal import Gimbal
+    from aerokit.vehicle.gimbal.gimbals import Gimbals
     from aerokit.vehicle.orders.bridge import Bridge
-    from aerokit.vehicle.orders.gimbal import Gimbal
     from aerokit.vehicle.orders.guided import Guided
     from aerokit.vehicle.parameters.parameters import Parameters
     from aerokit.vehicle.plans.fence import FenceControl
@@ -30,7 +37,13 @@ if TYPE_CHECKING:
 
 __all__ = ["Vehicle"]
 
-TELL_OF_GIMBALS = ("GimbalDeviceAttitudeStatus", "MountStatus", "MountOrientation")
+TELL_OF_GIMBALS = tuple(
+    MESSAGE_IDS[name]
+    for name in ("GimbalDeviceAttitudeStatus", "GimbalManagerStatus", "MountStatus", "MountOrientation")
+)
+TELL_OF_PICTURES = tuple(
+    MESSAGE_IDS[name] for name in ("CameraImageCaptured", "CameraFeedback", "CameraTrigger")
+)
 """By their names: few vehicles send one of them, and no other program needs their classes."""
 
 
@@ -48,11 +61,67 @@ class Vehicle(FlightActions, TravelActions, LookActions, ArmingActions, ModeActi
         self._plans = PlanContext(bridge, lambda: self.files)
         first = partial(self.connection.bus.attach_first, system_id=self.system_id)
         bridge.talk.at_close(
-            first(map(MESSAGE_IDS.__getitem__, TELL_OF_GIMBALS), lambda: self.gimbal),
+            first(TELL_OF_GIMBALS, lambda: self.gimbal),
             first([ParamValue.ID], lambda: self.parameters),
+            first(TELL_OF_PICTURES, lambda: self._cameras),
         )
 
     # Parts are made, and imported, when they are first used, or when the vehicle first says what they listen to.
+
+    @property
+    def components(self) -> StateCell[tuple[ComponentStatus, ...]]:
+        """What is on board, as far as it was heard: autopilot, cameras, gimbals, companions, receivers, others.
+
+        Cameras and gimbals without a component id of their own are known once one of their messages has come.
+        """
+        return self._components.cell
+
+    def component(self, component_id: int) -> Component:
+        """One of them, to talk to: ``vehicle.component(100).command(…)``. It need not have been heard yet.
+
+        Raises:
+            LocalProtocolError: the id is not from 1 to 255.
+        """
+        return self._components.component(component_id)
+
+    @cached_property
+    def _components(self) -> Components:
+        from aerokit.vehicle.components.components import Components
+
+        return Components(self._bridge, lambda: self.files, lambda: self.parameters)
+
+    @property
+    def camera(self) -> Camera:
+        """The first camera that is heard: one with a component id of its own before those behind the autopilot.
+
+        Its calls wait for it a moment; ``camera_at`` gives any other one.
+        """
+        return self._cameras.first
+
+    @property
+    def cameras(self) -> StateCell[tuple[int, ...]]:
+        """The numbers of the cameras that have been heard, for ``camera_at``.
+
+        Component ids (100 to 105), and 1 to 6 for those behind the autopilot once they have told of a picture.
+        """
+        return self._cameras.cell
+
+    def camera_at(self, number: int) -> Camera:
+        """One camera by its number; it need not have been heard yet.
+
+        Args:
+            number: its component id (100 to 105, at most 255), or 1 to 6 behind the autopilot.
+
+        Raises:
+            LocalProtocolError: there can be no such camera.
+        """
+        return self._cameras.at(number)
+
+    @cached_property
+    def _cameras(self) -> Cameras:
+        from aerokit.vehicle.camera.cameras import Cameras
+
+        return Cameras(self._bridge, self._components)
 
     @cached_property
     def guided(self) -> Guided:
@@ -63,10 +132,15 @@ class Vehicle(FlightActions, TravelActions, LookActions, ArmingActions, ModeActi
 
     @cached_property
     def gimbal(self) -> Gimbal:
-        """The gimbal: where it points, and orders to it."""
-        from aerokit.vehicle.orders.gimbal import Gimbal
+        """The first gimbal: where it points, and orders to it."""
+        return self.gimbals.first
 
-        return Gimbal(self._bridge)
+    @cached_property
+    def gimbals(self) -> Gimbals:
+        """All gimbals that it carries."""
+        from aerokit.vehicle.gimbal.gimbals import Gimbals
+
+        return Gimbals(self._bridge)
 
     @cached_property
     def files(self) -> Files:

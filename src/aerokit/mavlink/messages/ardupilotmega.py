@@ -9,7 +9,7 @@
 from __future__ import annotations
 
 from struct import Struct
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from aerokit.mavlink.message import PACK_ERRORS, Message, pack_bytes, pack_items, pack_text
 
@@ -134,11 +134,11 @@ class SensorOffsets(Message):
         "mag_ofs_x", "mag_ofs_y", "mag_ofs_z", "mag_declination", "raw_press", "raw_temp", "gyro_cal_x",
         "gyro_cal_y", "gyro_cal_z", "accel_cal_x", "accel_cal_y", "accel_cal_z",
     )
-    ID = 150
-    NAME = "SENSOR_OFFSETS"
-    CRC_EXTRA = 134
-    LENGTH = 42
-    BASE_LENGTH = 42
+    ID: ClassVar[int] = 150
+    NAME: ClassVar[str] = "SENSOR_OFFSETS"
+    CRC_EXTRA: ClassVar[int] = 134
+    LENGTH: ClassVar[int] = 42
+    BASE_LENGTH: ClassVar[int] = 42
     _FIELDS = (
         ("mag_ofs_x", "int16_t", 0, "", "", "", "Magnetometer X offset.", False),
         ("mag_ofs_y", "int16_t", 0, "", "", "", "Magnetometer Y offset.", False),
@@ -207,7 +207,7 @@ class SensorOffsets(Message):
         self.accel_cal_x = accel_cal_x
         self.accel_cal_y = accel_cal_y
         self.accel_cal_z = accel_cal_z
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> SensorOffsets:
@@ -245,11 +245,11 @@ class SetMagOffsets(Message):
 
     __slots__ = ("target_system", "target_component", "mag_ofs_x", "mag_ofs_y", "mag_ofs_z")
     __match_args__ = ("target_system", "target_component", "mag_ofs_x", "mag_ofs_y", "mag_ofs_z")
-    ID = 151
-    NAME = "SET_MAG_OFFSETS"
-    CRC_EXTRA = 219
-    LENGTH = 8
-    BASE_LENGTH = 8
+    ID: ClassVar[int] = 151
+    NAME: ClassVar[str] = "SET_MAG_OFFSETS"
+    CRC_EXTRA: ClassVar[int] = 219
+    LENGTH: ClassVar[int] = 8
+    BASE_LENGTH: ClassVar[int] = 8
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID.", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID.", False),
@@ -281,7 +281,7 @@ class SetMagOffsets(Message):
         self.mag_ofs_x = mag_ofs_x
         self.mag_ofs_y = mag_ofs_y
         self.mag_ofs_z = mag_ofs_z
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> SetMagOffsets:
@@ -313,11 +313,11 @@ class Meminfo(Message):
 
     __slots__ = ("brkval", "freemem", "freemem32")
     __match_args__ = ("brkval", "freemem", "freemem32")
-    ID = 152
-    NAME = "MEMINFO"
-    CRC_EXTRA = 208
-    LENGTH = 8
-    BASE_LENGTH = 4
+    ID: ClassVar[int] = 152
+    NAME: ClassVar[str] = "MEMINFO"
+    CRC_EXTRA: ClassVar[int] = 208
+    LENGTH: ClassVar[int] = 8
+    BASE_LENGTH: ClassVar[int] = 4
     _FIELDS = (
         ("brkval", "uint16_t", 0, "", "", "", "Heap top.", False),
         ("freemem", "uint16_t", 0, "bytes", "", "", "Free memory.", False),
@@ -337,7 +337,7 @@ class Meminfo(Message):
         self.brkval = brkval
         self.freemem = freemem
         self.freemem32 = freemem32
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> Meminfo:
@@ -365,11 +365,11 @@ class ApAdc(Message):
 
     __slots__ = ("adc1", "adc2", "adc3", "adc4", "adc5", "adc6")
     __match_args__ = ("adc1", "adc2", "adc3", "adc4", "adc5", "adc6")
-    ID = 153
-    NAME = "AP_ADC"
-    CRC_EXTRA = 188
-    LENGTH = 12
-    BASE_LENGTH = 12
+    ID: ClassVar[int] = 153
+    NAME: ClassVar[str] = "AP_ADC"
+    CRC_EXTRA: ClassVar[int] = 188
+    LENGTH: ClassVar[int] = 12
+    BASE_LENGTH: ClassVar[int] = 12
     _FIELDS = (
         ("adc1", "uint16_t", 0, "", "", "", "ADC output 1.", False),
         ("adc2", "uint16_t", 0, "", "", "", "ADC output 2.", False),
@@ -404,7 +404,7 @@ class ApAdc(Message):
         self.adc4 = adc4
         self.adc5 = adc5
         self.adc6 = adc6
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> ApAdc:
@@ -438,11 +438,11 @@ class DigicamConfigure(Message):
         "target_system", "target_component", "mode", "shutter_speed", "aperture", "iso", "exposure_type",
         "command_id", "engine_cut_off", "extra_param", "extra_value",
     )
-    ID = 154
-    NAME = "DIGICAM_CONFIGURE"
-    CRC_EXTRA = 84
-    LENGTH = 15
-    BASE_LENGTH = 15
+    ID: ClassVar[int] = 154
+    NAME: ClassVar[str] = "DIGICAM_CONFIGURE"
+    CRC_EXTRA: ClassVar[int] = 84
+    LENGTH: ClassVar[int] = 15
+    BASE_LENGTH: ClassVar[int] = 15
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID.", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID.", False),
@@ -508,7 +508,7 @@ class DigicamConfigure(Message):
         self.engine_cut_off = engine_cut_off
         self.extra_param = extra_param
         self.extra_value = extra_value
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> DigicamConfigure:
@@ -550,11 +550,11 @@ class DigicamControl(Message):
         "target_system", "target_component", "session", "zoom_pos", "zoom_step", "focus_lock", "shot",
         "command_id", "extra_param", "extra_value",
     )
-    ID = 155
-    NAME = "DIGICAM_CONTROL"
-    CRC_EXTRA = 22
-    LENGTH = 13
-    BASE_LENGTH = 13
+    ID: ClassVar[int] = 155
+    NAME: ClassVar[str] = "DIGICAM_CONTROL"
+    CRC_EXTRA: ClassVar[int] = 22
+    LENGTH: ClassVar[int] = 13
+    BASE_LENGTH: ClassVar[int] = 13
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID.", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID.", False),
@@ -614,7 +614,7 @@ class DigicamControl(Message):
         self.command_id = command_id
         self.extra_param = extra_param
         self.extra_value = extra_value
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> DigicamControl:
@@ -650,11 +650,11 @@ class MountConfigure(Message):
     __match_args__ = (
         "target_system", "target_component", "mount_mode", "stab_roll", "stab_pitch", "stab_yaw",
     )
-    ID = 156
-    NAME = "MOUNT_CONFIGURE"
-    CRC_EXTRA = 19
-    LENGTH = 6
-    BASE_LENGTH = 6
+    ID: ClassVar[int] = 156
+    NAME: ClassVar[str] = "MOUNT_CONFIGURE"
+    CRC_EXTRA: ClassVar[int] = 19
+    LENGTH: ClassVar[int] = 6
+    BASE_LENGTH: ClassVar[int] = 6
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID.", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID.", False),
@@ -692,7 +692,7 @@ class MountConfigure(Message):
         self.stab_roll = stab_roll
         self.stab_pitch = stab_pitch
         self.stab_yaw = stab_yaw
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> MountConfigure:
@@ -726,11 +726,11 @@ class MountControl(Message):
 
     __slots__ = ("target_system", "target_component", "input_a", "input_b", "input_c", "save_position")
     __match_args__ = ("target_system", "target_component", "input_a", "input_b", "input_c", "save_position")
-    ID = 157
-    NAME = "MOUNT_CONTROL"
-    CRC_EXTRA = 21
-    LENGTH = 15
-    BASE_LENGTH = 15
+    ID: ClassVar[int] = 157
+    NAME: ClassVar[str] = "MOUNT_CONTROL"
+    CRC_EXTRA: ClassVar[int] = 21
+    LENGTH: ClassVar[int] = 15
+    BASE_LENGTH: ClassVar[int] = 15
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID.", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID.", False),
@@ -770,7 +770,7 @@ class MountControl(Message):
         self.input_b = input_b
         self.input_c = input_c
         self.save_position = save_position
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> MountControl:
@@ -806,11 +806,11 @@ class MountStatus(Message):
     __match_args__ = (
         "target_system", "target_component", "pointing_a", "pointing_b", "pointing_c", "mount_mode",
     )
-    ID = 158
-    NAME = "MOUNT_STATUS"
-    CRC_EXTRA = 134
-    LENGTH = 15
-    BASE_LENGTH = 14
+    ID: ClassVar[int] = 158
+    NAME: ClassVar[str] = "MOUNT_STATUS"
+    CRC_EXTRA: ClassVar[int] = 134
+    LENGTH: ClassVar[int] = 15
+    BASE_LENGTH: ClassVar[int] = 14
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID.", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID.", False),
@@ -848,7 +848,7 @@ class MountStatus(Message):
         self.pointing_b = pointing_b
         self.pointing_c = pointing_c
         self.mount_mode = mount_mode
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> MountStatus:
@@ -883,11 +883,11 @@ class FencePoint(Message):
 
     __slots__ = ("target_system", "target_component", "idx", "count", "lat", "lng")
     __match_args__ = ("target_system", "target_component", "idx", "count", "lat", "lng")
-    ID = 160
-    NAME = "FENCE_POINT"
-    CRC_EXTRA = 78
-    LENGTH = 12
-    BASE_LENGTH = 12
+    ID: ClassVar[int] = 160
+    NAME: ClassVar[str] = "FENCE_POINT"
+    CRC_EXTRA: ClassVar[int] = 78
+    LENGTH: ClassVar[int] = 12
+    BASE_LENGTH: ClassVar[int] = 12
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID.", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID.", False),
@@ -924,7 +924,7 @@ class FencePoint(Message):
         self.count = count
         self.lat = lat
         self.lng = lng
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> FencePoint:
@@ -956,11 +956,11 @@ class FenceFetchPoint(Message):
 
     __slots__ = ("target_system", "target_component", "idx")
     __match_args__ = ("target_system", "target_component", "idx")
-    ID = 161
-    NAME = "FENCE_FETCH_POINT"
-    CRC_EXTRA = 68
-    LENGTH = 3
-    BASE_LENGTH = 3
+    ID: ClassVar[int] = 161
+    NAME: ClassVar[str] = "FENCE_FETCH_POINT"
+    CRC_EXTRA: ClassVar[int] = 68
+    LENGTH: ClassVar[int] = 3
+    BASE_LENGTH: ClassVar[int] = 3
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID.", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID.", False),
@@ -980,7 +980,7 @@ class FenceFetchPoint(Message):
         self.target_system = target_system
         self.target_component = target_component
         self.idx = idx
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> FenceFetchPoint:
@@ -1008,11 +1008,11 @@ class Ahrs(Message):
 
     __slots__ = ("omegaIx", "omegaIy", "omegaIz", "accel_weight", "renorm_val", "error_rp", "error_yaw")
     __match_args__ = ("omegaIx", "omegaIy", "omegaIz", "accel_weight", "renorm_val", "error_rp", "error_yaw")
-    ID = 163
-    NAME = "AHRS"
-    CRC_EXTRA = 127
-    LENGTH = 28
-    BASE_LENGTH = 28
+    ID: ClassVar[int] = 163
+    NAME: ClassVar[str] = "AHRS"
+    CRC_EXTRA: ClassVar[int] = 127
+    LENGTH: ClassVar[int] = 28
+    BASE_LENGTH: ClassVar[int] = 28
     _FIELDS = (
         ("omegaIx", "float", 0, "rad/s", "", "", "X gyro drift estimate.", False),
         ("omegaIy", "float", 0, "rad/s", "", "", "Y gyro drift estimate.", False),
@@ -1055,7 +1055,7 @@ class Ahrs(Message):
         self.renorm_val = renorm_val
         self.error_rp = error_rp
         self.error_yaw = error_yaw
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> Ahrs:
@@ -1089,11 +1089,11 @@ class Simstate(Message):
 
     __slots__ = ("roll", "pitch", "yaw", "xacc", "yacc", "zacc", "xgyro", "ygyro", "zgyro", "lat", "lng")
     __match_args__ = ("roll", "pitch", "yaw", "xacc", "yacc", "zacc", "xgyro", "ygyro", "zgyro", "lat", "lng")
-    ID = 164
-    NAME = "SIMSTATE"
-    CRC_EXTRA = 154
-    LENGTH = 44
-    BASE_LENGTH = 44
+    ID: ClassVar[int] = 164
+    NAME: ClassVar[str] = "SIMSTATE"
+    CRC_EXTRA: ClassVar[int] = 154
+    LENGTH: ClassVar[int] = 44
+    BASE_LENGTH: ClassVar[int] = 44
     _FIELDS = (
         ("roll", "float", 0, "rad", "", "", "Roll angle.", False),
         ("pitch", "float", 0, "rad", "", "", "Pitch angle.", False),
@@ -1156,7 +1156,7 @@ class Simstate(Message):
         self.zgyro = zgyro
         self.lat = lat
         self.lng = lng
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> Simstate:
@@ -1193,11 +1193,11 @@ class Hwstatus(Message):
 
     __slots__ = ("Vcc", "I2Cerr")
     __match_args__ = ("Vcc", "I2Cerr")
-    ID = 165
-    NAME = "HWSTATUS"
-    CRC_EXTRA = 21
-    LENGTH = 3
-    BASE_LENGTH = 3
+    ID: ClassVar[int] = 165
+    NAME: ClassVar[str] = "HWSTATUS"
+    CRC_EXTRA: ClassVar[int] = 21
+    LENGTH: ClassVar[int] = 3
+    BASE_LENGTH: ClassVar[int] = 3
     _FIELDS = (
         ("Vcc", "uint16_t", 0, "mV", "", "", "Board voltage.", False),
         ("I2Cerr", "uint8_t", 0, "", "", "", "I2C error count.", False),
@@ -1212,7 +1212,7 @@ class Hwstatus(Message):
     def __init__(self, Vcc: int, I2Cerr: int) -> None:
         self.Vcc = Vcc
         self.I2Cerr = I2Cerr
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> Hwstatus:
@@ -1242,11 +1242,11 @@ class Radio(Message):
 
     __slots__ = ("rssi", "remrssi", "txbuf", "noise", "remnoise", "rxerrors", "fixed")
     __match_args__ = ("rssi", "remrssi", "txbuf", "noise", "remnoise", "rxerrors", "fixed")
-    ID = 166
-    NAME = "RADIO"
-    CRC_EXTRA = 21
-    LENGTH = 9
-    BASE_LENGTH = 9
+    ID: ClassVar[int] = 166
+    NAME: ClassVar[str] = "RADIO"
+    CRC_EXTRA: ClassVar[int] = 21
+    LENGTH: ClassVar[int] = 9
+    BASE_LENGTH: ClassVar[int] = 9
     _FIELDS = (
         ("rssi", "uint8_t", 0, "", "", "", "Local signal strength.", False),
         ("remrssi", "uint8_t", 0, "", "", "", "Remote signal strength.", False),
@@ -1288,7 +1288,7 @@ class Radio(Message):
         self.remnoise = remnoise
         self.rxerrors = rxerrors
         self.fixed = fixed
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> Radio:
@@ -1326,11 +1326,11 @@ class LimitsStatus(Message):
         "limits_state", "last_trigger", "last_action", "last_recovery", "last_clear", "breach_count",
         "mods_enabled", "mods_required", "mods_triggered",
     )
-    ID = 167
-    NAME = "LIMITS_STATUS"
-    CRC_EXTRA = 144
-    LENGTH = 22
-    BASE_LENGTH = 22
+    ID: ClassVar[int] = 167
+    NAME: ClassVar[str] = "LIMITS_STATUS"
+    CRC_EXTRA: ClassVar[int] = 144
+    LENGTH: ClassVar[int] = 22
+    BASE_LENGTH: ClassVar[int] = 22
     _FIELDS = (
         ("limits_state", "uint8_t", 0, "", "LIMITS_STATE", "", "State of AP_Limits.", False),
         ("last_trigger", "uint32_t", 0, "ms", "", "", "Time (since boot) of last breach.", False),
@@ -1383,7 +1383,7 @@ class LimitsStatus(Message):
         self.mods_enabled = mods_enabled
         self.mods_required = mods_required
         self.mods_triggered = mods_triggered
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> LimitsStatus:
@@ -1417,11 +1417,11 @@ class Wind(Message):
 
     __slots__ = ("direction", "speed", "speed_z")
     __match_args__ = ("direction", "speed", "speed_z")
-    ID = 168
-    NAME = "WIND"
-    CRC_EXTRA = 1
-    LENGTH = 12
-    BASE_LENGTH = 12
+    ID: ClassVar[int] = 168
+    NAME: ClassVar[str] = "WIND"
+    CRC_EXTRA: ClassVar[int] = 1
+    LENGTH: ClassVar[int] = 12
+    BASE_LENGTH: ClassVar[int] = 12
     _FIELDS = (
         ("direction", "float", 0, "deg", "", "", "Wind direction (that wind is coming from).", False),
         ("speed", "float", 0, "m/s", "", "", "Wind speed in ground plane.", False),
@@ -1441,7 +1441,7 @@ class Wind(Message):
         self.direction = direction
         self.speed = speed
         self.speed_z = speed_z
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> Wind:
@@ -1469,11 +1469,11 @@ class Data16(Message):
 
     __slots__ = ("type", "len", "data")
     __match_args__ = ("type", "len", "data")
-    ID = 169
-    NAME = "DATA16"
-    CRC_EXTRA = 234
-    LENGTH = 18
-    BASE_LENGTH = 18
+    ID: ClassVar[int] = 169
+    NAME: ClassVar[str] = "DATA16"
+    CRC_EXTRA: ClassVar[int] = 234
+    LENGTH: ClassVar[int] = 18
+    BASE_LENGTH: ClassVar[int] = 18
     _FIELDS = (
         ("type", "uint8_t", 0, "", "", "", "Data type.", False),
         ("len", "uint8_t", 0, "bytes", "", "", "Data length.", False),
@@ -1493,7 +1493,7 @@ class Data16(Message):
         self.type = type
         self.len = len
         self.data = data
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> Data16:
@@ -1521,11 +1521,11 @@ class Data32(Message):
 
     __slots__ = ("type", "len", "data")
     __match_args__ = ("type", "len", "data")
-    ID = 170
-    NAME = "DATA32"
-    CRC_EXTRA = 73
-    LENGTH = 34
-    BASE_LENGTH = 34
+    ID: ClassVar[int] = 170
+    NAME: ClassVar[str] = "DATA32"
+    CRC_EXTRA: ClassVar[int] = 73
+    LENGTH: ClassVar[int] = 34
+    BASE_LENGTH: ClassVar[int] = 34
     _FIELDS = (
         ("type", "uint8_t", 0, "", "", "", "Data type.", False),
         ("len", "uint8_t", 0, "bytes", "", "", "Data length.", False),
@@ -1545,7 +1545,7 @@ class Data32(Message):
         self.type = type
         self.len = len
         self.data = data
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> Data32:
@@ -1573,11 +1573,11 @@ class Data64(Message):
 
     __slots__ = ("type", "len", "data")
     __match_args__ = ("type", "len", "data")
-    ID = 171
-    NAME = "DATA64"
-    CRC_EXTRA = 181
-    LENGTH = 66
-    BASE_LENGTH = 66
+    ID: ClassVar[int] = 171
+    NAME: ClassVar[str] = "DATA64"
+    CRC_EXTRA: ClassVar[int] = 181
+    LENGTH: ClassVar[int] = 66
+    BASE_LENGTH: ClassVar[int] = 66
     _FIELDS = (
         ("type", "uint8_t", 0, "", "", "", "Data type.", False),
         ("len", "uint8_t", 0, "bytes", "", "", "Data length.", False),
@@ -1597,7 +1597,7 @@ class Data64(Message):
         self.type = type
         self.len = len
         self.data = data
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> Data64:
@@ -1625,11 +1625,11 @@ class Data96(Message):
 
     __slots__ = ("type", "len", "data")
     __match_args__ = ("type", "len", "data")
-    ID = 172
-    NAME = "DATA96"
-    CRC_EXTRA = 22
-    LENGTH = 98
-    BASE_LENGTH = 98
+    ID: ClassVar[int] = 172
+    NAME: ClassVar[str] = "DATA96"
+    CRC_EXTRA: ClassVar[int] = 22
+    LENGTH: ClassVar[int] = 98
+    BASE_LENGTH: ClassVar[int] = 98
     _FIELDS = (
         ("type", "uint8_t", 0, "", "", "", "Data type.", False),
         ("len", "uint8_t", 0, "bytes", "", "", "Data length.", False),
@@ -1649,7 +1649,7 @@ class Data96(Message):
         self.type = type
         self.len = len
         self.data = data
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> Data96:
@@ -1677,11 +1677,11 @@ class Rangefinder(Message):
 
     __slots__ = ("distance", "voltage")
     __match_args__ = ("distance", "voltage")
-    ID = 173
-    NAME = "RANGEFINDER"
-    CRC_EXTRA = 83
-    LENGTH = 8
-    BASE_LENGTH = 8
+    ID: ClassVar[int] = 173
+    NAME: ClassVar[str] = "RANGEFINDER"
+    CRC_EXTRA: ClassVar[int] = 83
+    LENGTH: ClassVar[int] = 8
+    BASE_LENGTH: ClassVar[int] = 8
     _FIELDS = (
         ("distance", "float", 0, "m", "", "", "Distance.", False),
         ("voltage", "float", 0, "V", "", "", "Raw voltage if available, zero otherwise.", False),
@@ -1696,7 +1696,7 @@ class Rangefinder(Message):
     def __init__(self, distance: float, voltage: float) -> None:
         self.distance = distance
         self.voltage = voltage
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> Rangefinder:
@@ -1730,11 +1730,11 @@ class AirspeedAutocal(Message):
         "vx", "vy", "vz", "diff_pressure", "EAS2TAS", "ratio", "state_x", "state_y", "state_z", "Pax", "Pby",
         "Pcz",
     )
-    ID = 174
-    NAME = "AIRSPEED_AUTOCAL"
-    CRC_EXTRA = 167
-    LENGTH = 48
-    BASE_LENGTH = 48
+    ID: ClassVar[int] = 174
+    NAME: ClassVar[str] = "AIRSPEED_AUTOCAL"
+    CRC_EXTRA: ClassVar[int] = 167
+    LENGTH: ClassVar[int] = 48
+    BASE_LENGTH: ClassVar[int] = 48
     _FIELDS = (
         ("vx", "float", 0, "m/s", "", "", "GPS velocity north.", False),
         ("vy", "float", 0, "m/s", "", "", "GPS velocity east.", False),
@@ -1802,7 +1802,7 @@ class AirspeedAutocal(Message):
         self.Pax = Pax
         self.Pby = Pby
         self.Pcz = Pcz
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> AirspeedAutocal:
@@ -1843,11 +1843,11 @@ class RallyPoint(Message):
         "target_system", "target_component", "idx", "count", "lat", "lng", "alt", "break_alt", "land_dir",
         "flags",
     )
-    ID = 175
-    NAME = "RALLY_POINT"
-    CRC_EXTRA = 138
-    LENGTH = 19
-    BASE_LENGTH = 19
+    ID: ClassVar[int] = 175
+    NAME: ClassVar[str] = "RALLY_POINT"
+    CRC_EXTRA: ClassVar[int] = 138
+    LENGTH: ClassVar[int] = 19
+    BASE_LENGTH: ClassVar[int] = 19
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID.", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID.", False),
@@ -1905,7 +1905,7 @@ class RallyPoint(Message):
         self.break_alt = break_alt
         self.land_dir = land_dir
         self.flags = flags
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> RallyPoint:
@@ -1940,11 +1940,11 @@ class RallyFetchPoint(Message):
 
     __slots__ = ("target_system", "target_component", "idx")
     __match_args__ = ("target_system", "target_component", "idx")
-    ID = 176
-    NAME = "RALLY_FETCH_POINT"
-    CRC_EXTRA = 234
-    LENGTH = 3
-    BASE_LENGTH = 3
+    ID: ClassVar[int] = 176
+    NAME: ClassVar[str] = "RALLY_FETCH_POINT"
+    CRC_EXTRA: ClassVar[int] = 234
+    LENGTH: ClassVar[int] = 3
+    BASE_LENGTH: ClassVar[int] = 3
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID.", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID.", False),
@@ -1964,7 +1964,7 @@ class RallyFetchPoint(Message):
         self.target_system = target_system
         self.target_component = target_component
         self.idx = idx
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> RallyFetchPoint:
@@ -1994,11 +1994,11 @@ class CompassmotStatus(Message):
     __match_args__ = (
         "throttle", "current", "interference", "CompensationX", "CompensationY", "CompensationZ",
     )
-    ID = 177
-    NAME = "COMPASSMOT_STATUS"
-    CRC_EXTRA = 240
-    LENGTH = 20
-    BASE_LENGTH = 20
+    ID: ClassVar[int] = 177
+    NAME: ClassVar[str] = "COMPASSMOT_STATUS"
+    CRC_EXTRA: ClassVar[int] = 240
+    LENGTH: ClassVar[int] = 20
+    BASE_LENGTH: ClassVar[int] = 20
     _FIELDS = (
         ("throttle", "uint16_t", 0, "d%", "", "", "Throttle.", False),
         ("current", "float", 0, "A", "", "", "Current.", False),
@@ -2036,7 +2036,7 @@ class CompassmotStatus(Message):
         self.CompensationX = CompensationX
         self.CompensationY = CompensationY
         self.CompensationZ = CompensationZ
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> CompassmotStatus:
@@ -2070,11 +2070,11 @@ class Ahrs2(Message):
 
     __slots__ = ("roll", "pitch", "yaw", "altitude", "lat", "lng")
     __match_args__ = ("roll", "pitch", "yaw", "altitude", "lat", "lng")
-    ID = 178
-    NAME = "AHRS2"
-    CRC_EXTRA = 47
-    LENGTH = 24
-    BASE_LENGTH = 24
+    ID: ClassVar[int] = 178
+    NAME: ClassVar[str] = "AHRS2"
+    CRC_EXTRA: ClassVar[int] = 47
+    LENGTH: ClassVar[int] = 24
+    BASE_LENGTH: ClassVar[int] = 24
     _FIELDS = (
         ("roll", "float", 0, "rad", "", "", "Roll angle.", False),
         ("pitch", "float", 0, "rad", "", "", "Pitch angle.", False),
@@ -2109,7 +2109,7 @@ class Ahrs2(Message):
         self.altitude = altitude
         self.lat = lat
         self.lng = lng
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> Ahrs2:
@@ -2137,11 +2137,11 @@ class CameraStatus(Message):
 
     __slots__ = ("time_usec", "target_system", "cam_idx", "img_idx", "event_id", "p1", "p2", "p3", "p4")
     __match_args__ = ("time_usec", "target_system", "cam_idx", "img_idx", "event_id", "p1", "p2", "p3", "p4")
-    ID = 179
-    NAME = "CAMERA_STATUS"
-    CRC_EXTRA = 189
-    LENGTH = 29
-    BASE_LENGTH = 29
+    ID: ClassVar[int] = 179
+    NAME: ClassVar[str] = "CAMERA_STATUS"
+    CRC_EXTRA: ClassVar[int] = 189
+    LENGTH: ClassVar[int] = 29
+    BASE_LENGTH: ClassVar[int] = 29
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Image timestamp (since UNIX epoch, according to camera clock).", False),
         ("target_system", "uint8_t", 0, "", "", "", "System ID.", False),
@@ -2194,7 +2194,7 @@ class CameraStatus(Message):
         self.p2 = p2
         self.p3 = p3
         self.p4 = p4
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> CameraStatus:
@@ -2234,11 +2234,11 @@ class CameraFeedback(Message):
         "time_usec", "target_system", "cam_idx", "img_idx", "lat", "lng", "alt_msl", "alt_rel", "roll",
         "pitch", "yaw", "foc_len", "flags", "completed_captures",
     )
-    ID = 180
-    NAME = "CAMERA_FEEDBACK"
-    CRC_EXTRA = 52
-    LENGTH = 47
-    BASE_LENGTH = 45
+    ID: ClassVar[int] = 180
+    NAME: ClassVar[str] = "CAMERA_FEEDBACK"
+    CRC_EXTRA: ClassVar[int] = 52
+    LENGTH: ClassVar[int] = 47
+    BASE_LENGTH: ClassVar[int] = 45
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Image timestamp (since UNIX epoch), as passed in by CAMERA_STATUS message (or autopilot if no CCB).", False),
         ("target_system", "uint8_t", 0, "", "", "", "System ID.", False),
@@ -2319,7 +2319,7 @@ class CameraFeedback(Message):
         self.foc_len = foc_len
         self.flags = flags
         self.completed_captures = completed_captures
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> CameraFeedback:
@@ -2356,11 +2356,11 @@ class Battery2(Message):
 
     __slots__ = ("voltage", "current_battery")
     __match_args__ = ("voltage", "current_battery")
-    ID = 181
-    NAME = "BATTERY2"
-    CRC_EXTRA = 174
-    LENGTH = 4
-    BASE_LENGTH = 4
+    ID: ClassVar[int] = 181
+    NAME: ClassVar[str] = "BATTERY2"
+    CRC_EXTRA: ClassVar[int] = 174
+    LENGTH: ClassVar[int] = 4
+    BASE_LENGTH: ClassVar[int] = 4
     _FIELDS = (
         ("voltage", "uint16_t", 0, "mV", "", "", "Voltage.", False),
         ("current_battery", "int16_t", 0, "cA", "", "", "Battery current, -1: autopilot does not measure the current.", False),
@@ -2375,7 +2375,7 @@ class Battery2(Message):
     def __init__(self, voltage: int, current_battery: int) -> None:
         self.voltage = voltage
         self.current_battery = current_battery
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> Battery2:
@@ -2404,11 +2404,11 @@ class Ahrs3(Message):
 
     __slots__ = ("roll", "pitch", "yaw", "altitude", "lat", "lng", "v1", "v2", "v3", "v4")
     __match_args__ = ("roll", "pitch", "yaw", "altitude", "lat", "lng", "v1", "v2", "v3", "v4")
-    ID = 182
-    NAME = "AHRS3"
-    CRC_EXTRA = 229
-    LENGTH = 40
-    BASE_LENGTH = 40
+    ID: ClassVar[int] = 182
+    NAME: ClassVar[str] = "AHRS3"
+    CRC_EXTRA: ClassVar[int] = 229
+    LENGTH: ClassVar[int] = 40
+    BASE_LENGTH: ClassVar[int] = 40
     _FIELDS = (
         ("roll", "float", 0, "rad", "", "", "Roll angle.", False),
         ("pitch", "float", 0, "rad", "", "", "Pitch angle.", False),
@@ -2466,7 +2466,7 @@ class Ahrs3(Message):
         self.v2 = v2
         self.v3 = v3
         self.v4 = v4
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> Ahrs3:
@@ -2500,11 +2500,11 @@ class AutopilotVersionRequest(Message):
 
     __slots__ = ("target_system", "target_component")
     __match_args__ = ("target_system", "target_component")
-    ID = 183
-    NAME = "AUTOPILOT_VERSION_REQUEST"
-    CRC_EXTRA = 85
-    LENGTH = 2
-    BASE_LENGTH = 2
+    ID: ClassVar[int] = 183
+    NAME: ClassVar[str] = "AUTOPILOT_VERSION_REQUEST"
+    CRC_EXTRA: ClassVar[int] = 85
+    LENGTH: ClassVar[int] = 2
+    BASE_LENGTH: ClassVar[int] = 2
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID.", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID.", False),
@@ -2519,7 +2519,7 @@ class AutopilotVersionRequest(Message):
     def __init__(self, target_system: int, target_component: int) -> None:
         self.target_system = target_system
         self.target_component = target_component
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> AutopilotVersionRequest:
@@ -2547,11 +2547,11 @@ class RemoteLogDataBlock(Message):
 
     __slots__ = ("target_system", "target_component", "seqno", "data")
     __match_args__ = ("target_system", "target_component", "seqno", "data")
-    ID = 184
-    NAME = "REMOTE_LOG_DATA_BLOCK"
-    CRC_EXTRA = 159
-    LENGTH = 206
-    BASE_LENGTH = 206
+    ID: ClassVar[int] = 184
+    NAME: ClassVar[str] = "REMOTE_LOG_DATA_BLOCK"
+    CRC_EXTRA: ClassVar[int] = 159
+    LENGTH: ClassVar[int] = 206
+    BASE_LENGTH: ClassVar[int] = 206
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID.", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID.", False),
@@ -2576,7 +2576,7 @@ class RemoteLogDataBlock(Message):
         self.target_component = target_component
         self.seqno = seqno
         self.data = data
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> RemoteLogDataBlock:
@@ -2606,11 +2606,11 @@ class RemoteLogBlockStatus(Message):
 
     __slots__ = ("target_system", "target_component", "seqno", "status")
     __match_args__ = ("target_system", "target_component", "seqno", "status")
-    ID = 185
-    NAME = "REMOTE_LOG_BLOCK_STATUS"
-    CRC_EXTRA = 186
-    LENGTH = 7
-    BASE_LENGTH = 7
+    ID: ClassVar[int] = 185
+    NAME: ClassVar[str] = "REMOTE_LOG_BLOCK_STATUS"
+    CRC_EXTRA: ClassVar[int] = 186
+    LENGTH: ClassVar[int] = 7
+    BASE_LENGTH: ClassVar[int] = 7
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID.", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID.", False),
@@ -2635,7 +2635,7 @@ class RemoteLogBlockStatus(Message):
         self.target_component = target_component
         self.seqno = seqno
         self.status = status
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> RemoteLogBlockStatus:
@@ -2665,11 +2665,11 @@ class LedControl(Message):
     __match_args__ = (
         "target_system", "target_component", "instance", "pattern", "custom_len", "custom_bytes",
     )
-    ID = 186
-    NAME = "LED_CONTROL"
-    CRC_EXTRA = 72
-    LENGTH = 29
-    BASE_LENGTH = 29
+    ID: ClassVar[int] = 186
+    NAME: ClassVar[str] = "LED_CONTROL"
+    CRC_EXTRA: ClassVar[int] = 72
+    LENGTH: ClassVar[int] = 29
+    BASE_LENGTH: ClassVar[int] = 29
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID.", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID.", False),
@@ -2707,7 +2707,7 @@ class LedControl(Message):
         self.pattern = pattern
         self.custom_len = custom_len
         self.custom_bytes = custom_bytes
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> LedControl:
@@ -2747,11 +2747,11 @@ class MagCalProgress(Message):
         "compass_id", "cal_mask", "cal_status", "attempt", "completion_pct", "completion_mask", "direction_x",
         "direction_y", "direction_z",
     )
-    ID = 191
-    NAME = "MAG_CAL_PROGRESS"
-    CRC_EXTRA = 92
-    LENGTH = 27
-    BASE_LENGTH = 27
+    ID: ClassVar[int] = 191
+    NAME: ClassVar[str] = "MAG_CAL_PROGRESS"
+    CRC_EXTRA: ClassVar[int] = 92
+    LENGTH: ClassVar[int] = 27
+    BASE_LENGTH: ClassVar[int] = 27
     _FIELDS = (
         ("compass_id", "uint8_t", 0, "", "", "", "Compass being calibrated.", False),
         ("cal_mask", "uint8_t", 0, "", "", "", "Bitmask of compasses being calibrated.", False),
@@ -2804,7 +2804,7 @@ class MagCalProgress(Message):
         self.direction_x = direction_x
         self.direction_y = direction_y
         self.direction_z = direction_z
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> MagCalProgress:
@@ -2844,11 +2844,11 @@ class EkfStatusReport(Message):
         "flags", "velocity_variance", "pos_horiz_variance", "pos_vert_variance", "compass_variance",
         "terrain_alt_variance", "airspeed_variance",
     )
-    ID = 193
-    NAME = "EKF_STATUS_REPORT"
-    CRC_EXTRA = 71
-    LENGTH = 26
-    BASE_LENGTH = 22
+    ID: ClassVar[int] = 193
+    NAME: ClassVar[str] = "EKF_STATUS_REPORT"
+    CRC_EXTRA: ClassVar[int] = 71
+    LENGTH: ClassVar[int] = 26
+    BASE_LENGTH: ClassVar[int] = 22
     _FIELDS = (
         ("flags", "uint16_t", 0, "", "EKF_STATUS_FLAGS", "", "Flags.", False),
         ("velocity_variance", "float", 0, "", "", "", "Velocity variance.", False),
@@ -2891,7 +2891,7 @@ class EkfStatusReport(Message):
         self.compass_variance = compass_variance
         self.terrain_alt_variance = terrain_alt_variance
         self.airspeed_variance = airspeed_variance
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> EkfStatusReport:
@@ -2925,11 +2925,11 @@ class PidTuning(Message):
 
     __slots__ = ("axis", "desired", "achieved", "FF", "P", "I", "D", "SRate", "PDmod")
     __match_args__ = ("axis", "desired", "achieved", "FF", "P", "I", "D", "SRate", "PDmod")
-    ID = 194
-    NAME = "PID_TUNING"
-    CRC_EXTRA = 98
-    LENGTH = 33
-    BASE_LENGTH = 25
+    ID: ClassVar[int] = 194
+    NAME: ClassVar[str] = "PID_TUNING"
+    CRC_EXTRA: ClassVar[int] = 98
+    LENGTH: ClassVar[int] = 33
+    BASE_LENGTH: ClassVar[int] = 25
     _FIELDS = (
         ("axis", "uint8_t", 0, "", "PID_TUNING_AXIS", "", "Axis.", False),
         ("desired", "float", 0, "", "", "", "Desired rate.", False),
@@ -2982,7 +2982,7 @@ class PidTuning(Message):
         self.D = D
         self.SRate = SRate
         self.PDmod = PDmod
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> PidTuning:
@@ -3021,11 +3021,11 @@ class Deepstall(Message):
         "landing_lat", "landing_lon", "path_lat", "path_lon", "arc_entry_lat", "arc_entry_lon", "altitude",
         "expected_travel_distance", "cross_track_error", "stage",
     )
-    ID = 195
-    NAME = "DEEPSTALL"
-    CRC_EXTRA = 120
-    LENGTH = 37
-    BASE_LENGTH = 37
+    ID: ClassVar[int] = 195
+    NAME: ClassVar[str] = "DEEPSTALL"
+    CRC_EXTRA: ClassVar[int] = 120
+    LENGTH: ClassVar[int] = 37
+    BASE_LENGTH: ClassVar[int] = 37
     _FIELDS = (
         ("landing_lat", "int32_t", 0, "degE7", "", "", "Landing latitude.", False),
         ("landing_lon", "int32_t", 0, "degE7", "", "", "Landing longitude.", False),
@@ -3084,7 +3084,7 @@ class Deepstall(Message):
         self.expected_travel_distance = expected_travel_distance
         self.cross_track_error = cross_track_error
         self.stage = stage
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> Deepstall:
@@ -3126,11 +3126,11 @@ class GimbalReport(Message):
         "target_system", "target_component", "delta_time", "delta_angle_x", "delta_angle_y", "delta_angle_z",
         "delta_velocity_x", "delta_velocity_y", "delta_velocity_z", "joint_roll", "joint_el", "joint_az",
     )
-    ID = 200
-    NAME = "GIMBAL_REPORT"
-    CRC_EXTRA = 134
-    LENGTH = 42
-    BASE_LENGTH = 42
+    ID: ClassVar[int] = 200
+    NAME: ClassVar[str] = "GIMBAL_REPORT"
+    CRC_EXTRA: ClassVar[int] = 134
+    LENGTH: ClassVar[int] = 42
+    BASE_LENGTH: ClassVar[int] = 42
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID.", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID.", False),
@@ -3199,7 +3199,7 @@ class GimbalReport(Message):
         self.joint_roll = joint_roll
         self.joint_el = joint_el
         self.joint_az = joint_az
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> GimbalReport:
@@ -3237,11 +3237,11 @@ class GimbalControl(Message):
     __match_args__ = (
         "target_system", "target_component", "demanded_rate_x", "demanded_rate_y", "demanded_rate_z",
     )
-    ID = 201
-    NAME = "GIMBAL_CONTROL"
-    CRC_EXTRA = 205
-    LENGTH = 14
-    BASE_LENGTH = 14
+    ID: ClassVar[int] = 201
+    NAME: ClassVar[str] = "GIMBAL_CONTROL"
+    CRC_EXTRA: ClassVar[int] = 205
+    LENGTH: ClassVar[int] = 14
+    BASE_LENGTH: ClassVar[int] = 14
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID.", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID.", False),
@@ -3274,7 +3274,7 @@ class GimbalControl(Message):
         self.demanded_rate_x = demanded_rate_x
         self.demanded_rate_y = demanded_rate_y
         self.demanded_rate_z = demanded_rate_z
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> GimbalControl:
@@ -3308,11 +3308,11 @@ class GimbalTorqueCmdReport(Message):
 
     __slots__ = ("target_system", "target_component", "rl_torque_cmd", "el_torque_cmd", "az_torque_cmd")
     __match_args__ = ("target_system", "target_component", "rl_torque_cmd", "el_torque_cmd", "az_torque_cmd")
-    ID = 214
-    NAME = "GIMBAL_TORQUE_CMD_REPORT"
-    CRC_EXTRA = 69
-    LENGTH = 8
-    BASE_LENGTH = 8
+    ID: ClassVar[int] = 214
+    NAME: ClassVar[str] = "GIMBAL_TORQUE_CMD_REPORT"
+    CRC_EXTRA: ClassVar[int] = 69
+    LENGTH: ClassVar[int] = 8
+    BASE_LENGTH: ClassVar[int] = 8
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID.", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID.", False),
@@ -3345,7 +3345,7 @@ class GimbalTorqueCmdReport(Message):
         self.rl_torque_cmd = rl_torque_cmd
         self.el_torque_cmd = el_torque_cmd
         self.az_torque_cmd = az_torque_cmd
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> GimbalTorqueCmdReport:
@@ -3379,11 +3379,11 @@ class GoproHeartbeat(Message):
 
     __slots__ = ("status", "capture_mode", "flags")
     __match_args__ = ("status", "capture_mode", "flags")
-    ID = 215
-    NAME = "GOPRO_HEARTBEAT"
-    CRC_EXTRA = 101
-    LENGTH = 3
-    BASE_LENGTH = 3
+    ID: ClassVar[int] = 215
+    NAME: ClassVar[str] = "GOPRO_HEARTBEAT"
+    CRC_EXTRA: ClassVar[int] = 101
+    LENGTH: ClassVar[int] = 3
+    BASE_LENGTH: ClassVar[int] = 3
     _FIELDS = (
         ("status", "uint8_t", 0, "", "GOPRO_HEARTBEAT_STATUS", "", "Status.", False),
         ("capture_mode", "uint8_t", 0, "", "GOPRO_CAPTURE_MODE", "", "Current capture mode.", False),
@@ -3403,7 +3403,7 @@ class GoproHeartbeat(Message):
         self.status = status
         self.capture_mode = capture_mode
         self.flags = flags
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> GoproHeartbeat:
@@ -3431,11 +3431,11 @@ class GoproGetRequest(Message):
 
     __slots__ = ("target_system", "target_component", "cmd_id")
     __match_args__ = ("target_system", "target_component", "cmd_id")
-    ID = 216
-    NAME = "GOPRO_GET_REQUEST"
-    CRC_EXTRA = 50
-    LENGTH = 3
-    BASE_LENGTH = 3
+    ID: ClassVar[int] = 216
+    NAME: ClassVar[str] = "GOPRO_GET_REQUEST"
+    CRC_EXTRA: ClassVar[int] = 50
+    LENGTH: ClassVar[int] = 3
+    BASE_LENGTH: ClassVar[int] = 3
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID.", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID.", False),
@@ -3455,7 +3455,7 @@ class GoproGetRequest(Message):
         self.target_system = target_system
         self.target_component = target_component
         self.cmd_id = cmd_id
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> GoproGetRequest:
@@ -3483,11 +3483,11 @@ class GoproGetResponse(Message):
 
     __slots__ = ("cmd_id", "status", "value")
     __match_args__ = ("cmd_id", "status", "value")
-    ID = 217
-    NAME = "GOPRO_GET_RESPONSE"
-    CRC_EXTRA = 202
-    LENGTH = 6
-    BASE_LENGTH = 6
+    ID: ClassVar[int] = 217
+    NAME: ClassVar[str] = "GOPRO_GET_RESPONSE"
+    CRC_EXTRA: ClassVar[int] = 202
+    LENGTH: ClassVar[int] = 6
+    BASE_LENGTH: ClassVar[int] = 6
     _FIELDS = (
         ("cmd_id", "uint8_t", 0, "", "GOPRO_COMMAND", "", "Command ID.", False),
         ("status", "uint8_t", 0, "", "GOPRO_REQUEST_STATUS", "", "Status.", False),
@@ -3507,7 +3507,7 @@ class GoproGetResponse(Message):
         self.cmd_id = cmd_id
         self.status = status
         self.value = value
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> GoproGetResponse:
@@ -3535,11 +3535,11 @@ class GoproSetRequest(Message):
 
     __slots__ = ("target_system", "target_component", "cmd_id", "value")
     __match_args__ = ("target_system", "target_component", "cmd_id", "value")
-    ID = 218
-    NAME = "GOPRO_SET_REQUEST"
-    CRC_EXTRA = 17
-    LENGTH = 7
-    BASE_LENGTH = 7
+    ID: ClassVar[int] = 218
+    NAME: ClassVar[str] = "GOPRO_SET_REQUEST"
+    CRC_EXTRA: ClassVar[int] = 17
+    LENGTH: ClassVar[int] = 7
+    BASE_LENGTH: ClassVar[int] = 7
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID.", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID.", False),
@@ -3564,7 +3564,7 @@ class GoproSetRequest(Message):
         self.target_component = target_component
         self.cmd_id = cmd_id
         self.value = value
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> GoproSetRequest:
@@ -3594,11 +3594,11 @@ class GoproSetResponse(Message):
 
     __slots__ = ("cmd_id", "status")
     __match_args__ = ("cmd_id", "status")
-    ID = 219
-    NAME = "GOPRO_SET_RESPONSE"
-    CRC_EXTRA = 162
-    LENGTH = 2
-    BASE_LENGTH = 2
+    ID: ClassVar[int] = 219
+    NAME: ClassVar[str] = "GOPRO_SET_RESPONSE"
+    CRC_EXTRA: ClassVar[int] = 162
+    LENGTH: ClassVar[int] = 2
+    BASE_LENGTH: ClassVar[int] = 2
     _FIELDS = (
         ("cmd_id", "uint8_t", 0, "", "GOPRO_COMMAND", "", "Command ID.", False),
         ("status", "uint8_t", 0, "", "GOPRO_REQUEST_STATUS", "", "Status.", False),
@@ -3613,7 +3613,7 @@ class GoproSetResponse(Message):
     def __init__(self, cmd_id: int, status: int) -> None:
         self.cmd_id = cmd_id
         self.status = status
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> GoproSetResponse:
@@ -3641,11 +3641,11 @@ class Rpm(Message):
 
     __slots__ = ("rpm1", "rpm2")
     __match_args__ = ("rpm1", "rpm2")
-    ID = 226
-    NAME = "RPM"
-    CRC_EXTRA = 207
-    LENGTH = 8
-    BASE_LENGTH = 8
+    ID: ClassVar[int] = 226
+    NAME: ClassVar[str] = "RPM"
+    CRC_EXTRA: ClassVar[int] = 207
+    LENGTH: ClassVar[int] = 8
+    BASE_LENGTH: ClassVar[int] = 8
     _FIELDS = (
         ("rpm1", "float", 0, "", "", "", "RPM Sensor1.", False),
         ("rpm2", "float", 0, "", "", "", "RPM Sensor2.", False),
@@ -3660,7 +3660,7 @@ class Rpm(Message):
     def __init__(self, rpm1: float, rpm2: float) -> None:
         self.rpm1 = rpm1
         self.rpm2 = rpm2
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> Rpm:
@@ -3694,11 +3694,11 @@ class DeviceOpRead(Message):
         "target_system", "target_component", "request_id", "bustype", "bus", "address", "busname", "regstart",
         "count", "bank",
     )
-    ID = 11000
-    NAME = "DEVICE_OP_READ"
-    CRC_EXTRA = 134
-    LENGTH = 52
-    BASE_LENGTH = 51
+    ID: ClassVar[int] = 11000
+    NAME: ClassVar[str] = "DEVICE_OP_READ"
+    CRC_EXTRA: ClassVar[int] = 134
+    LENGTH: ClassVar[int] = 52
+    BASE_LENGTH: ClassVar[int] = 51
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID.", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID.", False),
@@ -3756,7 +3756,7 @@ class DeviceOpRead(Message):
         self.regstart = regstart
         self.count = count
         self.bank = bank
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> DeviceOpRead:
@@ -3791,11 +3791,11 @@ class DeviceOpReadReply(Message):
 
     __slots__ = ("request_id", "result", "regstart", "count", "data", "bank")
     __match_args__ = ("request_id", "result", "regstart", "count", "data", "bank")
-    ID = 11001
-    NAME = "DEVICE_OP_READ_REPLY"
-    CRC_EXTRA = 15
-    LENGTH = 136
-    BASE_LENGTH = 135
+    ID: ClassVar[int] = 11001
+    NAME: ClassVar[str] = "DEVICE_OP_READ_REPLY"
+    CRC_EXTRA: ClassVar[int] = 15
+    LENGTH: ClassVar[int] = 136
+    BASE_LENGTH: ClassVar[int] = 135
     _FIELDS = (
         ("request_id", "uint32_t", 0, "", "", "", "Request ID - copied from request.", False),
         ("result", "uint8_t", 0, "", "", "", "0 for success, anything else is failure code.", False),
@@ -3832,7 +3832,7 @@ class DeviceOpReadReply(Message):
         self.count = count
         self.data = data
         self.bank = bank
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> DeviceOpReadReply:
@@ -3871,11 +3871,11 @@ class DeviceOpWrite(Message):
         "target_system", "target_component", "request_id", "bustype", "bus", "address", "busname", "regstart",
         "count", "data", "bank",
     )
-    ID = 11002
-    NAME = "DEVICE_OP_WRITE"
-    CRC_EXTRA = 234
-    LENGTH = 180
-    BASE_LENGTH = 179
+    ID: ClassVar[int] = 11002
+    NAME: ClassVar[str] = "DEVICE_OP_WRITE"
+    CRC_EXTRA: ClassVar[int] = 234
+    LENGTH: ClassVar[int] = 180
+    BASE_LENGTH: ClassVar[int] = 179
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID.", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID.", False),
@@ -3938,7 +3938,7 @@ class DeviceOpWrite(Message):
         self.count = count
         self.data = data
         self.bank = bank
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> DeviceOpWrite:
@@ -3974,11 +3974,11 @@ class DeviceOpWriteReply(Message):
 
     __slots__ = ("request_id", "result")
     __match_args__ = ("request_id", "result")
-    ID = 11003
-    NAME = "DEVICE_OP_WRITE_REPLY"
-    CRC_EXTRA = 64
-    LENGTH = 5
-    BASE_LENGTH = 5
+    ID: ClassVar[int] = 11003
+    NAME: ClassVar[str] = "DEVICE_OP_WRITE_REPLY"
+    CRC_EXTRA: ClassVar[int] = 64
+    LENGTH: ClassVar[int] = 5
+    BASE_LENGTH: ClassVar[int] = 5
     _FIELDS = (
         ("request_id", "uint32_t", 0, "", "", "", "Request ID - copied from request.", False),
         ("result", "uint8_t", 0, "", "", "", "0 for success, anything else is failure code.", False),
@@ -3993,7 +3993,7 @@ class DeviceOpWriteReply(Message):
     def __init__(self, request_id: int, result: int) -> None:
         self.request_id = request_id
         self.result = result
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> DeviceOpWriteReply:
@@ -4030,11 +4030,11 @@ class SecureCommand(Message):
     __match_args__ = (
         "target_system", "target_component", "sequence", "operation", "data_length", "sig_length", "data",
     )
-    ID = 11004
-    NAME = "SECURE_COMMAND"
-    CRC_EXTRA = 11
-    LENGTH = 232
-    BASE_LENGTH = 232
+    ID: ClassVar[int] = 11004
+    NAME: ClassVar[str] = "SECURE_COMMAND"
+    CRC_EXTRA: ClassVar[int] = 11
+    LENGTH: ClassVar[int] = 232
+    BASE_LENGTH: ClassVar[int] = 232
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID.", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID.", False),
@@ -4077,7 +4077,7 @@ class SecureCommand(Message):
         self.data_length = data_length
         self.sig_length = sig_length
         self.data = data
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> SecureCommand:
@@ -4111,11 +4111,11 @@ class SecureCommandReply(Message):
 
     __slots__ = ("sequence", "operation", "result", "data_length", "data")
     __match_args__ = ("sequence", "operation", "result", "data_length", "data")
-    ID = 11005
-    NAME = "SECURE_COMMAND_REPLY"
-    CRC_EXTRA = 93
-    LENGTH = 230
-    BASE_LENGTH = 230
+    ID: ClassVar[int] = 11005
+    NAME: ClassVar[str] = "SECURE_COMMAND_REPLY"
+    CRC_EXTRA: ClassVar[int] = 93
+    LENGTH: ClassVar[int] = 230
+    BASE_LENGTH: ClassVar[int] = 230
     _FIELDS = (
         ("sequence", "uint32_t", 0, "", "", "", "Sequence ID from request.", False),
         ("operation", "uint32_t", 0, "", "SECURE_COMMAND_OP", "", "Operation that was requested.", False),
@@ -4145,7 +4145,7 @@ class SecureCommandReply(Message):
         self.result = result
         self.data_length = data_length
         self.data = data
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> SecureCommandReply:
@@ -4183,11 +4183,11 @@ class AdapTuning(Message):
         "axis", "desired", "achieved", "error", "theta", "omega", "sigma", "theta_dot", "omega_dot",
         "sigma_dot", "f", "f_dot", "u",
     )
-    ID = 11010
-    NAME = "ADAP_TUNING"
-    CRC_EXTRA = 46
-    LENGTH = 49
-    BASE_LENGTH = 49
+    ID: ClassVar[int] = 11010
+    NAME: ClassVar[str] = "ADAP_TUNING"
+    CRC_EXTRA: ClassVar[int] = 46
+    LENGTH: ClassVar[int] = 49
+    BASE_LENGTH: ClassVar[int] = 49
     _FIELDS = (
         ("axis", "uint8_t", 0, "", "PID_TUNING_AXIS", "", "Axis.", False),
         ("desired", "float", 0, "deg/s", "", "", "Desired rate.", False),
@@ -4260,7 +4260,7 @@ class AdapTuning(Message):
         self.f = f
         self.f_dot = f_dot
         self.u = u
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> AdapTuning:
@@ -4294,11 +4294,11 @@ class VisionPositionDelta(Message):
 
     __slots__ = ("time_usec", "time_delta_usec", "angle_delta", "position_delta", "confidence")
     __match_args__ = ("time_usec", "time_delta_usec", "angle_delta", "position_delta", "confidence")
-    ID = 11011
-    NAME = "VISION_POSITION_DELTA"
-    CRC_EXTRA = 106
-    LENGTH = 44
-    BASE_LENGTH = 44
+    ID: ClassVar[int] = 11011
+    NAME: ClassVar[str] = "VISION_POSITION_DELTA"
+    CRC_EXTRA: ClassVar[int] = 106
+    LENGTH: ClassVar[int] = 44
+    BASE_LENGTH: ClassVar[int] = 44
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (synced to UNIX time or since system boot).", False),
         ("time_delta_usec", "uint64_t", 0, "us", "", "", "Time since the last reported camera frame.", False),
@@ -4335,7 +4335,7 @@ class VisionPositionDelta(Message):
         self.angle_delta = tuple(angle_delta)
         self.position_delta = tuple(position_delta)
         self.confidence = confidence
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> VisionPositionDelta:
@@ -4370,11 +4370,11 @@ class AoaSsa(Message):
 
     __slots__ = ("time_usec", "AOA", "SSA")
     __match_args__ = ("time_usec", "AOA", "SSA")
-    ID = 11020
-    NAME = "AOA_SSA"
-    CRC_EXTRA = 205
-    LENGTH = 16
-    BASE_LENGTH = 16
+    ID: ClassVar[int] = 11020
+    NAME: ClassVar[str] = "AOA_SSA"
+    CRC_EXTRA: ClassVar[int] = 205
+    LENGTH: ClassVar[int] = 16
+    BASE_LENGTH: ClassVar[int] = 16
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (since boot or Unix epoch).", False),
         ("AOA", "float", 0, "deg", "", "", "Angle of Attack.", False),
@@ -4394,7 +4394,7 @@ class AoaSsa(Message):
         self.time_usec = time_usec
         self.AOA = AOA
         self.SSA = SSA
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> AoaSsa:
@@ -4422,11 +4422,11 @@ class EscTelemetry1To4(Message):
 
     __slots__ = ("temperature", "voltage", "current", "totalcurrent", "rpm", "count")
     __match_args__ = ("temperature", "voltage", "current", "totalcurrent", "rpm", "count")
-    ID = 11030
-    NAME = "ESC_TELEMETRY_1_TO_4"
-    CRC_EXTRA = 144
-    LENGTH = 44
-    BASE_LENGTH = 44
+    ID: ClassVar[int] = 11030
+    NAME: ClassVar[str] = "ESC_TELEMETRY_1_TO_4"
+    CRC_EXTRA: ClassVar[int] = 144
+    LENGTH: ClassVar[int] = 44
+    BASE_LENGTH: ClassVar[int] = 44
     _FIELDS = (
         ("temperature", "uint8_t", 4, "degC", "", "", "Temperature.", False),
         ("voltage", "uint16_t", 4, "cV", "", "", "Voltage.", False),
@@ -4464,7 +4464,7 @@ class EscTelemetry1To4(Message):
         self.totalcurrent = tuple(totalcurrent)
         self.rpm = tuple(rpm)
         self.count = tuple(count)
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> EscTelemetry1To4:
@@ -4503,11 +4503,11 @@ class EscTelemetry5To8(Message):
 
     __slots__ = ("temperature", "voltage", "current", "totalcurrent", "rpm", "count")
     __match_args__ = ("temperature", "voltage", "current", "totalcurrent", "rpm", "count")
-    ID = 11031
-    NAME = "ESC_TELEMETRY_5_TO_8"
-    CRC_EXTRA = 133
-    LENGTH = 44
-    BASE_LENGTH = 44
+    ID: ClassVar[int] = 11031
+    NAME: ClassVar[str] = "ESC_TELEMETRY_5_TO_8"
+    CRC_EXTRA: ClassVar[int] = 133
+    LENGTH: ClassVar[int] = 44
+    BASE_LENGTH: ClassVar[int] = 44
     _FIELDS = (
         ("temperature", "uint8_t", 4, "degC", "", "", "Temperature.", False),
         ("voltage", "uint16_t", 4, "cV", "", "", "Voltage.", False),
@@ -4545,7 +4545,7 @@ class EscTelemetry5To8(Message):
         self.totalcurrent = tuple(totalcurrent)
         self.rpm = tuple(rpm)
         self.count = tuple(count)
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> EscTelemetry5To8:
@@ -4585,11 +4585,11 @@ class EscTelemetry9To12(Message):
 
     __slots__ = ("temperature", "voltage", "current", "totalcurrent", "rpm", "count")
     __match_args__ = ("temperature", "voltage", "current", "totalcurrent", "rpm", "count")
-    ID = 11032
-    NAME = "ESC_TELEMETRY_9_TO_12"
-    CRC_EXTRA = 85
-    LENGTH = 44
-    BASE_LENGTH = 44
+    ID: ClassVar[int] = 11032
+    NAME: ClassVar[str] = "ESC_TELEMETRY_9_TO_12"
+    CRC_EXTRA: ClassVar[int] = 85
+    LENGTH: ClassVar[int] = 44
+    BASE_LENGTH: ClassVar[int] = 44
     _FIELDS = (
         ("temperature", "uint8_t", 4, "degC", "", "", "Temperature.", False),
         ("voltage", "uint16_t", 4, "cV", "", "", "Voltage.", False),
@@ -4627,7 +4627,7 @@ class EscTelemetry9To12(Message):
         self.totalcurrent = tuple(totalcurrent)
         self.rpm = tuple(rpm)
         self.count = tuple(count)
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> EscTelemetry9To12:
@@ -4672,11 +4672,11 @@ class OsdParamConfig(Message):
         "target_system", "target_component", "request_id", "osd_screen", "osd_index", "param_id",
         "config_type", "min_value", "max_value", "increment",
     )
-    ID = 11033
-    NAME = "OSD_PARAM_CONFIG"
-    CRC_EXTRA = 195
-    LENGTH = 37
-    BASE_LENGTH = 37
+    ID: ClassVar[int] = 11033
+    NAME: ClassVar[str] = "OSD_PARAM_CONFIG"
+    CRC_EXTRA: ClassVar[int] = 195
+    LENGTH: ClassVar[int] = 37
+    BASE_LENGTH: ClassVar[int] = 37
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID.", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID.", False),
@@ -4737,7 +4737,7 @@ class OsdParamConfig(Message):
         self.min_value = min_value
         self.max_value = max_value
         self.increment = increment
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> OsdParamConfig:
@@ -4773,11 +4773,11 @@ class OsdParamConfigReply(Message):
 
     __slots__ = ("request_id", "result")
     __match_args__ = ("request_id", "result")
-    ID = 11034
-    NAME = "OSD_PARAM_CONFIG_REPLY"
-    CRC_EXTRA = 79
-    LENGTH = 5
-    BASE_LENGTH = 5
+    ID: ClassVar[int] = 11034
+    NAME: ClassVar[str] = "OSD_PARAM_CONFIG_REPLY"
+    CRC_EXTRA: ClassVar[int] = 79
+    LENGTH: ClassVar[int] = 5
+    BASE_LENGTH: ClassVar[int] = 5
     _FIELDS = (
         ("request_id", "uint32_t", 0, "", "", "", "Request ID - copied from request.", False),
         ("result", "uint8_t", 0, "", "OSD_PARAM_CONFIG_ERROR", "", "Config error type.", False),
@@ -4792,7 +4792,7 @@ class OsdParamConfigReply(Message):
     def __init__(self, request_id: int, result: int) -> None:
         self.request_id = request_id
         self.result = result
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> OsdParamConfigReply:
@@ -4820,11 +4820,11 @@ class OsdParamShowConfig(Message):
 
     __slots__ = ("target_system", "target_component", "request_id", "osd_screen", "osd_index")
     __match_args__ = ("target_system", "target_component", "request_id", "osd_screen", "osd_index")
-    ID = 11035
-    NAME = "OSD_PARAM_SHOW_CONFIG"
-    CRC_EXTRA = 128
-    LENGTH = 8
-    BASE_LENGTH = 8
+    ID: ClassVar[int] = 11035
+    NAME: ClassVar[str] = "OSD_PARAM_SHOW_CONFIG"
+    CRC_EXTRA: ClassVar[int] = 128
+    LENGTH: ClassVar[int] = 8
+    BASE_LENGTH: ClassVar[int] = 8
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID.", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID.", False),
@@ -4856,7 +4856,7 @@ class OsdParamShowConfig(Message):
         self.request_id = request_id
         self.osd_screen = osd_screen
         self.osd_index = osd_index
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> OsdParamShowConfig:
@@ -4890,11 +4890,11 @@ class OsdParamShowConfigReply(Message):
     __match_args__ = (
         "request_id", "result", "param_id", "config_type", "min_value", "max_value", "increment",
     )
-    ID = 11036
-    NAME = "OSD_PARAM_SHOW_CONFIG_REPLY"
-    CRC_EXTRA = 177
-    LENGTH = 34
-    BASE_LENGTH = 34
+    ID: ClassVar[int] = 11036
+    NAME: ClassVar[str] = "OSD_PARAM_SHOW_CONFIG_REPLY"
+    CRC_EXTRA: ClassVar[int] = 177
+    LENGTH: ClassVar[int] = 34
+    BASE_LENGTH: ClassVar[int] = 34
     _FIELDS = (
         ("request_id", "uint32_t", 0, "", "", "", "Request ID - copied from request.", False),
         ("result", "uint8_t", 0, "", "OSD_PARAM_CONFIG_ERROR", "", "Config error type.", False),
@@ -4940,7 +4940,7 @@ class OsdParamShowConfigReply(Message):
         self.min_value = min_value
         self.max_value = max_value
         self.increment = increment
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> OsdParamShowConfigReply:
@@ -4979,11 +4979,11 @@ class ObstacleDistance3d(Message):
     __match_args__ = (
         "time_boot_ms", "sensor_type", "frame", "obstacle_id", "x", "y", "z", "min_distance", "max_distance",
     )
-    ID = 11037
-    NAME = "OBSTACLE_DISTANCE_3D"
-    CRC_EXTRA = 130
-    LENGTH = 28
-    BASE_LENGTH = 28
+    ID: ClassVar[int] = 11037
+    NAME: ClassVar[str] = "OBSTACLE_DISTANCE_3D"
+    CRC_EXTRA: ClassVar[int] = 130
+    LENGTH: ClassVar[int] = 28
+    BASE_LENGTH: ClassVar[int] = 28
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot).", False),
         ("sensor_type", "uint8_t", 0, "", "MAV_DISTANCE_SENSOR", "", "Class id of the distance sensor type.", False),
@@ -5038,7 +5038,7 @@ class ObstacleDistance3d(Message):
         self.z = z
         self.min_distance = min_distance
         self.max_distance = max_distance
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> ObstacleDistance3d:
@@ -5078,11 +5078,11 @@ class WaterDepth(Message):
         "time_boot_ms", "id", "healthy", "lat", "lng", "alt", "roll", "pitch", "yaw", "distance",
         "temperature",
     )
-    ID = 11038
-    NAME = "WATER_DEPTH"
-    CRC_EXTRA = 47
-    LENGTH = 38
-    BASE_LENGTH = 38
+    ID: ClassVar[int] = 11038
+    NAME: ClassVar[str] = "WATER_DEPTH"
+    CRC_EXTRA: ClassVar[int] = 47
+    LENGTH: ClassVar[int] = 38
+    BASE_LENGTH: ClassVar[int] = 38
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot)", False),
         ("id", "uint8_t", 0, "", "", "", "Onboard ID of the sensor", False),
@@ -5145,7 +5145,7 @@ class WaterDepth(Message):
         self.yaw = yaw
         self.distance = distance
         self.temperature = temperature
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> WaterDepth:
@@ -5180,11 +5180,11 @@ class McuStatus(Message):
 
     __slots__ = ("id", "MCU_temperature", "MCU_voltage", "MCU_voltage_min", "MCU_voltage_max")
     __match_args__ = ("id", "MCU_temperature", "MCU_voltage", "MCU_voltage_min", "MCU_voltage_max")
-    ID = 11039
-    NAME = "MCU_STATUS"
-    CRC_EXTRA = 142
-    LENGTH = 9
-    BASE_LENGTH = 9
+    ID: ClassVar[int] = 11039
+    NAME: ClassVar[str] = "MCU_STATUS"
+    CRC_EXTRA: ClassVar[int] = 142
+    LENGTH: ClassVar[int] = 9
+    BASE_LENGTH: ClassVar[int] = 9
     _FIELDS = (
         ("id", "uint8_t", 0, "", "", "", "MCU instance", False),
         ("MCU_temperature", "int16_t", 0, "cdegC", "", "", "MCU Internal temperature", False),
@@ -5216,7 +5216,7 @@ class McuStatus(Message):
         self.MCU_voltage = MCU_voltage
         self.MCU_voltage_min = MCU_voltage_min
         self.MCU_voltage_max = MCU_voltage_max
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> McuStatus:
@@ -5249,11 +5249,11 @@ class EscTelemetry13To16(Message):
 
     __slots__ = ("temperature", "voltage", "current", "totalcurrent", "rpm", "count")
     __match_args__ = ("temperature", "voltage", "current", "totalcurrent", "rpm", "count")
-    ID = 11040
-    NAME = "ESC_TELEMETRY_13_TO_16"
-    CRC_EXTRA = 132
-    LENGTH = 44
-    BASE_LENGTH = 44
+    ID: ClassVar[int] = 11040
+    NAME: ClassVar[str] = "ESC_TELEMETRY_13_TO_16"
+    CRC_EXTRA: ClassVar[int] = 132
+    LENGTH: ClassVar[int] = 44
+    BASE_LENGTH: ClassVar[int] = 44
     _FIELDS = (
         ("temperature", "uint8_t", 4, "degC", "", "", "Temperature.", False),
         ("voltage", "uint16_t", 4, "cV", "", "", "Voltage.", False),
@@ -5291,7 +5291,7 @@ class EscTelemetry13To16(Message):
         self.totalcurrent = tuple(totalcurrent)
         self.rpm = tuple(rpm)
         self.count = tuple(count)
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> EscTelemetry13To16:
@@ -5331,11 +5331,11 @@ class EscTelemetry17To20(Message):
 
     __slots__ = ("temperature", "voltage", "current", "totalcurrent", "rpm", "count")
     __match_args__ = ("temperature", "voltage", "current", "totalcurrent", "rpm", "count")
-    ID = 11041
-    NAME = "ESC_TELEMETRY_17_TO_20"
-    CRC_EXTRA = 208
-    LENGTH = 44
-    BASE_LENGTH = 44
+    ID: ClassVar[int] = 11041
+    NAME: ClassVar[str] = "ESC_TELEMETRY_17_TO_20"
+    CRC_EXTRA: ClassVar[int] = 208
+    LENGTH: ClassVar[int] = 44
+    BASE_LENGTH: ClassVar[int] = 44
     _FIELDS = (
         ("temperature", "uint8_t", 4, "degC", "", "", "Temperature.", False),
         ("voltage", "uint16_t", 4, "cV", "", "", "Voltage.", False),
@@ -5373,7 +5373,7 @@ class EscTelemetry17To20(Message):
         self.totalcurrent = tuple(totalcurrent)
         self.rpm = tuple(rpm)
         self.count = tuple(count)
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> EscTelemetry17To20:
@@ -5413,11 +5413,11 @@ class EscTelemetry21To24(Message):
 
     __slots__ = ("temperature", "voltage", "current", "totalcurrent", "rpm", "count")
     __match_args__ = ("temperature", "voltage", "current", "totalcurrent", "rpm", "count")
-    ID = 11042
-    NAME = "ESC_TELEMETRY_21_TO_24"
-    CRC_EXTRA = 201
-    LENGTH = 44
-    BASE_LENGTH = 44
+    ID: ClassVar[int] = 11042
+    NAME: ClassVar[str] = "ESC_TELEMETRY_21_TO_24"
+    CRC_EXTRA: ClassVar[int] = 201
+    LENGTH: ClassVar[int] = 44
+    BASE_LENGTH: ClassVar[int] = 44
     _FIELDS = (
         ("temperature", "uint8_t", 4, "degC", "", "", "Temperature.", False),
         ("voltage", "uint16_t", 4, "cV", "", "", "Voltage.", False),
@@ -5455,7 +5455,7 @@ class EscTelemetry21To24(Message):
         self.totalcurrent = tuple(totalcurrent)
         self.rpm = tuple(rpm)
         self.count = tuple(count)
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> EscTelemetry21To24:
@@ -5495,11 +5495,11 @@ class EscTelemetry25To28(Message):
 
     __slots__ = ("temperature", "voltage", "current", "totalcurrent", "rpm", "count")
     __match_args__ = ("temperature", "voltage", "current", "totalcurrent", "rpm", "count")
-    ID = 11043
-    NAME = "ESC_TELEMETRY_25_TO_28"
-    CRC_EXTRA = 193
-    LENGTH = 44
-    BASE_LENGTH = 44
+    ID: ClassVar[int] = 11043
+    NAME: ClassVar[str] = "ESC_TELEMETRY_25_TO_28"
+    CRC_EXTRA: ClassVar[int] = 193
+    LENGTH: ClassVar[int] = 44
+    BASE_LENGTH: ClassVar[int] = 44
     _FIELDS = (
         ("temperature", "uint8_t", 4, "degC", "", "", "Temperature.", False),
         ("voltage", "uint16_t", 4, "cV", "", "", "Voltage.", False),
@@ -5537,7 +5537,7 @@ class EscTelemetry25To28(Message):
         self.totalcurrent = tuple(totalcurrent)
         self.rpm = tuple(rpm)
         self.count = tuple(count)
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> EscTelemetry25To28:
@@ -5577,11 +5577,11 @@ class EscTelemetry29To32(Message):
 
     __slots__ = ("temperature", "voltage", "current", "totalcurrent", "rpm", "count")
     __match_args__ = ("temperature", "voltage", "current", "totalcurrent", "rpm", "count")
-    ID = 11044
-    NAME = "ESC_TELEMETRY_29_TO_32"
-    CRC_EXTRA = 189
-    LENGTH = 44
-    BASE_LENGTH = 44
+    ID: ClassVar[int] = 11044
+    NAME: ClassVar[str] = "ESC_TELEMETRY_29_TO_32"
+    CRC_EXTRA: ClassVar[int] = 189
+    LENGTH: ClassVar[int] = 44
+    BASE_LENGTH: ClassVar[int] = 44
     _FIELDS = (
         ("temperature", "uint8_t", 4, "degC", "", "", "Temperature.", False),
         ("voltage", "uint16_t", 4, "cV", "", "", "Voltage.", False),
@@ -5619,7 +5619,7 @@ class EscTelemetry29To32(Message):
         self.totalcurrent = tuple(totalcurrent)
         self.rpm = tuple(rpm)
         self.count = tuple(count)
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> EscTelemetry29To32:
@@ -5660,11 +5660,11 @@ class NamedValueString(Message):
 
     __slots__ = ("time_boot_ms", "name", "value")
     __match_args__ = ("time_boot_ms", "name", "value")
-    ID = 11060
-    NAME = "NAMED_VALUE_STRING"
-    CRC_EXTRA = 162
-    LENGTH = 78
-    BASE_LENGTH = 78
+    ID: ClassVar[int] = 11060
+    NAME: ClassVar[str] = "NAMED_VALUE_STRING"
+    CRC_EXTRA: ClassVar[int] = 162
+    LENGTH: ClassVar[int] = 78
+    BASE_LENGTH: ClassVar[int] = 78
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot).", False),
         ("name", "char", 10, "", "", "", "Name of the debug variable", False),
@@ -5684,7 +5684,7 @@ class NamedValueString(Message):
         self.time_boot_ms = time_boot_ms
         self.name = name
         self.value = value
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> NamedValueString:
@@ -5721,11 +5721,11 @@ class UavionixAdsbOutCfg(Message):
         "ICAO", "callsign", "emitterType", "aircraftSize", "gpsOffsetLat", "gpsOffsetLon", "stallSpeed",
         "rfSelect",
     )
-    ID = 10001
-    NAME = "UAVIONIX_ADSB_OUT_CFG"
-    CRC_EXTRA = 209
-    LENGTH = 20
-    BASE_LENGTH = 20
+    ID: ClassVar[int] = 10001
+    NAME: ClassVar[str] = "UAVIONIX_ADSB_OUT_CFG"
+    CRC_EXTRA: ClassVar[int] = 209
+    LENGTH: ClassVar[int] = 20
+    BASE_LENGTH: ClassVar[int] = 20
     _FIELDS = (
         ("ICAO", "uint32_t", 0, "", "", "", "Vehicle address (24 bit)", False),
         ("callsign", "char", 9, "", "", "", "Vehicle identifier (8 characters, null terminated, valid characters are A-Z, 0-9, \" \" only)", False),
@@ -5783,7 +5783,7 @@ class UavionixAdsbOutCfg(Message):
         self.gpsOffsetLon = gpsOffsetLon
         self.stallSpeed = stallSpeed
         self.rfSelect = rfSelect
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> UavionixAdsbOutCfg:
@@ -5825,11 +5825,11 @@ class UavionixAdsbOutDynamic(Message):
         "utcTime", "gpsLat", "gpsLon", "gpsAlt", "gpsFix", "numSats", "baroAltMSL", "accuracyHor",
         "accuracyVert", "accuracyVel", "velVert", "velNS", "VelEW", "emergencyStatus", "state", "squawk",
     )
-    ID = 10002
-    NAME = "UAVIONIX_ADSB_OUT_DYNAMIC"
-    CRC_EXTRA = 186
-    LENGTH = 41
-    BASE_LENGTH = 41
+    ID: ClassVar[int] = 10002
+    NAME: ClassVar[str] = "UAVIONIX_ADSB_OUT_DYNAMIC"
+    CRC_EXTRA: ClassVar[int] = 186
+    LENGTH: ClassVar[int] = 41
+    BASE_LENGTH: ClassVar[int] = 41
     _FIELDS = (
         ("utcTime", "uint32_t", 0, "s", "", "", "UTC time in seconds since GPS epoch (Jan 6, 1980). If unknown set to UINT32_MAX", False),
         ("gpsLat", "int32_t", 0, "degE7", "", "", "Latitude WGS84 (deg * 1E7). If unknown set to INT32_MAX", False),
@@ -5930,7 +5930,7 @@ class UavionixAdsbOutDynamic(Message):
         self.emergencyStatus = emergencyStatus
         self.state = state
         self.squawk = squawk
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> UavionixAdsbOutDynamic:
@@ -5967,11 +5967,11 @@ class UavionixAdsbTransceiverHealthReport(Message):
 
     __slots__ = ("rfHealth",)
     __match_args__ = ("rfHealth",)
-    ID = 10003
-    NAME = "UAVIONIX_ADSB_TRANSCEIVER_HEALTH_REPORT"
-    CRC_EXTRA = 4
-    LENGTH = 1
-    BASE_LENGTH = 1
+    ID: ClassVar[int] = 10003
+    NAME: ClassVar[str] = "UAVIONIX_ADSB_TRANSCEIVER_HEALTH_REPORT"
+    CRC_EXTRA: ClassVar[int] = 4
+    LENGTH: ClassVar[int] = 1
+    BASE_LENGTH: ClassVar[int] = 1
     _FIELDS = (
         ("rfHealth", "uint8_t", 0, "", "UAVIONIX_ADSB_RF_HEALTH", "", "ADS-B transponder messages", False),
     )
@@ -5981,7 +5981,7 @@ class UavionixAdsbTransceiverHealthReport(Message):
 
     def __init__(self, rfHealth: int) -> None:
         self.rfHealth = rfHealth
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> UavionixAdsbTransceiverHealthReport:
@@ -6009,11 +6009,11 @@ class UavionixAdsbOutCfgRegistration(Message):
 
     __slots__ = ("registration",)
     __match_args__ = ("registration",)
-    ID = 10004
-    NAME = "UAVIONIX_ADSB_OUT_CFG_REGISTRATION"
-    CRC_EXTRA = 133
-    LENGTH = 9
-    BASE_LENGTH = 9
+    ID: ClassVar[int] = 10004
+    NAME: ClassVar[str] = "UAVIONIX_ADSB_OUT_CFG_REGISTRATION"
+    CRC_EXTRA: ClassVar[int] = 133
+    LENGTH: ClassVar[int] = 9
+    BASE_LENGTH: ClassVar[int] = 9
     _FIELDS = (
         ("registration", "char", 9, "", "", "", "Aircraft Registration (ASCII string A-Z, 0-9 only), e.g. \"N8644B \". Trailing spaces (0x20) only. This is null-terminated.", False),
     )
@@ -6025,7 +6025,7 @@ class UavionixAdsbOutCfgRegistration(Message):
 
     def __init__(self, registration: str) -> None:
         self.registration = registration
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> UavionixAdsbOutCfgRegistration:
@@ -6054,11 +6054,11 @@ class UavionixAdsbOutCfgFlightid(Message):
 
     __slots__ = ("flight_id",)
     __match_args__ = ("flight_id",)
-    ID = 10005
-    NAME = "UAVIONIX_ADSB_OUT_CFG_FLIGHTID"
-    CRC_EXTRA = 103
-    LENGTH = 9
-    BASE_LENGTH = 9
+    ID: ClassVar[int] = 10005
+    NAME: ClassVar[str] = "UAVIONIX_ADSB_OUT_CFG_FLIGHTID"
+    CRC_EXTRA: ClassVar[int] = 103
+    LENGTH: ClassVar[int] = 9
+    BASE_LENGTH: ClassVar[int] = 9
     _FIELDS = (
         ("flight_id", "char", 9, "", "", "", "Flight Identification: 8 ASCII characters, '0' through '9', 'A' through 'Z' or space. Spaces (0x20) used as a trailing pad character, or when call sign is unavailable. Reflects Control message setting. This is null-terminated.", False),
     )
@@ -6071,7 +6071,7 @@ class UavionixAdsbOutCfgFlightid(Message):
 
     def __init__(self, flight_id: str) -> None:
         self.flight_id = flight_id
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> UavionixAdsbOutCfgFlightid:
@@ -6100,11 +6100,11 @@ class UavionixAdsbGet(Message):
 
     __slots__ = ("ReqMessageId",)
     __match_args__ = ("ReqMessageId",)
-    ID = 10006
-    NAME = "UAVIONIX_ADSB_GET"
-    CRC_EXTRA = 193
-    LENGTH = 4
-    BASE_LENGTH = 4
+    ID: ClassVar[int] = 10006
+    NAME: ClassVar[str] = "UAVIONIX_ADSB_GET"
+    CRC_EXTRA: ClassVar[int] = 193
+    LENGTH: ClassVar[int] = 4
+    BASE_LENGTH: ClassVar[int] = 4
     _FIELDS = (
         ("ReqMessageId", "uint32_t", 0, "", "", "", "Message ID to request. Supports any message in this 10000-10099 range", False),
     )
@@ -6114,7 +6114,7 @@ class UavionixAdsbGet(Message):
 
     def __init__(self, ReqMessageId: int) -> None:
         self.ReqMessageId = ReqMessageId
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> UavionixAdsbGet:
@@ -6142,11 +6142,11 @@ class UavionixAdsbOutControl(Message):
 
     __slots__ = ("state", "baroAltMSL", "squawk", "emergencyStatus", "flight_id", "x_bit")
     __match_args__ = ("state", "baroAltMSL", "squawk", "emergencyStatus", "flight_id", "x_bit")
-    ID = 10007
-    NAME = "UAVIONIX_ADSB_OUT_CONTROL"
-    CRC_EXTRA = 71
-    LENGTH = 17
-    BASE_LENGTH = 17
+    ID: ClassVar[int] = 10007
+    NAME: ClassVar[str] = "UAVIONIX_ADSB_OUT_CONTROL"
+    CRC_EXTRA: ClassVar[int] = 71
+    LENGTH: ClassVar[int] = 17
+    BASE_LENGTH: ClassVar[int] = 17
     _FIELDS = (
         ("state", "uint8_t", 0, "", "UAVIONIX_ADSB_OUT_CONTROL_STATE", "", "ADS-B transponder control state flags", False),
         ("baroAltMSL", "int32_t", 0, "mbar", "", "", "Barometric pressure altitude (MSL) relative to a standard atmosphere of 1013.2 mBar and NOT bar corrected altitude (m * 1E-3). (up +ve). If unknown set to INT32_MAX", False),
@@ -6187,7 +6187,7 @@ class UavionixAdsbOutControl(Message):
         self.emergencyStatus = emergencyStatus
         self.flight_id = flight_id
         self.x_bit = x_bit
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> UavionixAdsbOutControl:
@@ -6222,11 +6222,11 @@ class UavionixAdsbOutStatus(Message):
 
     __slots__ = ("state", "squawk", "NIC_NACp", "boardTemp", "fault", "flight_id")
     __match_args__ = ("state", "squawk", "NIC_NACp", "boardTemp", "fault", "flight_id")
-    ID = 10008
-    NAME = "UAVIONIX_ADSB_OUT_STATUS"
-    CRC_EXTRA = 240
-    LENGTH = 14
-    BASE_LENGTH = 14
+    ID: ClassVar[int] = 10008
+    NAME: ClassVar[str] = "UAVIONIX_ADSB_OUT_STATUS"
+    CRC_EXTRA: ClassVar[int] = 240
+    LENGTH: ClassVar[int] = 14
+    BASE_LENGTH: ClassVar[int] = 14
     _FIELDS = (
         ("state", "uint8_t", 0, "", "UAVIONIX_ADSB_OUT_STATUS_STATE", "", "ADS-B transponder status state flags", False),
         ("squawk", "uint16_t", 0, "", "", "", "Mode A code (typically 1200 [0x04B0] for VFR)", False),
@@ -6268,7 +6268,7 @@ class UavionixAdsbOutStatus(Message):
         self.boardTemp = boardTemp
         self.fault = fault
         self.flight_id = flight_id
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> UavionixAdsbOutStatus:
@@ -6302,11 +6302,11 @@ class IcarousHeartbeat(Message):
 
     __slots__ = ("status",)
     __match_args__ = ("status",)
-    ID = 42000
-    NAME = "ICAROUS_HEARTBEAT"
-    CRC_EXTRA = 227
-    LENGTH = 1
-    BASE_LENGTH = 1
+    ID: ClassVar[int] = 42000
+    NAME: ClassVar[str] = "ICAROUS_HEARTBEAT"
+    CRC_EXTRA: ClassVar[int] = 227
+    LENGTH: ClassVar[int] = 1
+    BASE_LENGTH: ClassVar[int] = 1
     _FIELDS = (
         ("status", "uint8_t", 0, "", "ICAROUS_FMS_STATE", "", "See the FMS_STATE enum.", False),
     )
@@ -6316,7 +6316,7 @@ class IcarousHeartbeat(Message):
 
     def __init__(self, status: int) -> None:
         self.status = status
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> IcarousHeartbeat:
@@ -6350,11 +6350,11 @@ class IcarousKinematicBands(Message):
         "numBands", "type1", "min1", "max1", "type2", "min2", "max2", "type3", "min3", "max3", "type4",
         "min4", "max4", "type5", "min5", "max5",
     )
-    ID = 42001
-    NAME = "ICAROUS_KINEMATIC_BANDS"
-    CRC_EXTRA = 239
-    LENGTH = 46
-    BASE_LENGTH = 46
+    ID: ClassVar[int] = 42001
+    NAME: ClassVar[str] = "ICAROUS_KINEMATIC_BANDS"
+    CRC_EXTRA: ClassVar[int] = 239
+    LENGTH: ClassVar[int] = 46
+    BASE_LENGTH: ClassVar[int] = 46
     _FIELDS = (
         ("numBands", "int8_t", 0, "", "", "", "Number of track bands", False),
         ("type1", "uint8_t", 0, "", "ICAROUS_TRACK_BAND_TYPES", "", "See the TRACK_BAND_TYPES enum.", False),
@@ -6443,7 +6443,7 @@ class IcarousKinematicBands(Message):
         self.type5 = type5
         self.min5 = min5
         self.max5 = max5
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> IcarousKinematicBands:
@@ -6490,11 +6490,11 @@ class LoweheiserGovEfi(Message):
         "efi_fuel_flow", "efi_fuel_consumed", "efi_baro", "efi_mat", "efi_clt", "efi_tps",
         "efi_exhaust_gas_temperature", "efi_index", "generator_status", "efi_status",
     )
-    ID = 10151
-    NAME = "LOWEHEISER_GOV_EFI"
-    CRC_EXTRA = 195
-    LENGTH = 85
-    BASE_LENGTH = 85
+    ID: ClassVar[int] = 10151
+    NAME: ClassVar[str] = "LOWEHEISER_GOV_EFI"
+    CRC_EXTRA: ClassVar[int] = 195
+    LENGTH: ClassVar[int] = 85
+    BASE_LENGTH: ClassVar[int] = 85
     _FIELDS = (
         ("volt_batt", "float", 0, "V", "", "", "Generator Battery voltage.", False),
         ("curr_batt", "float", 0, "A", "", "", "Generator Battery current.", False),
@@ -6622,7 +6622,7 @@ class LoweheiserGovEfi(Message):
         self.efi_index = efi_index
         self.generator_status = generator_status
         self.efi_status = efi_status
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> LoweheiserGovEfi:
@@ -6662,11 +6662,11 @@ class CubepilotRawRc(Message):
 
     __slots__ = ("rc_raw",)
     __match_args__ = ("rc_raw",)
-    ID = 50001
-    NAME = "CUBEPILOT_RAW_RC"
-    CRC_EXTRA = 246
-    LENGTH = 32
-    BASE_LENGTH = 32
+    ID: ClassVar[int] = 50001
+    NAME: ClassVar[str] = "CUBEPILOT_RAW_RC"
+    CRC_EXTRA: ClassVar[int] = 246
+    LENGTH: ClassVar[int] = 32
+    BASE_LENGTH: ClassVar[int] = 32
     _FIELDS = (
         ("rc_raw", "uint8_t", 32, "", "", "", "", False),
     )
@@ -6676,7 +6676,7 @@ class CubepilotRawRc(Message):
 
     def __init__(self, rc_raw: bytes) -> None:
         self.rc_raw = rc_raw
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> CubepilotRawRc:
@@ -6708,11 +6708,11 @@ class HerelinkVideoStreamInformation(Message):
     __match_args__ = (
         "camera_id", "status", "framerate", "resolution_h", "resolution_v", "bitrate", "rotation", "uri",
     )
-    ID = 50002
-    NAME = "HERELINK_VIDEO_STREAM_INFORMATION"
-    CRC_EXTRA = 181
-    LENGTH = 246
-    BASE_LENGTH = 246
+    ID: ClassVar[int] = 50002
+    NAME: ClassVar[str] = "HERELINK_VIDEO_STREAM_INFORMATION"
+    CRC_EXTRA: ClassVar[int] = 181
+    LENGTH: ClassVar[int] = 246
+    BASE_LENGTH: ClassVar[int] = 246
     _FIELDS = (
         ("camera_id", "uint8_t", 0, "", "", "", "Video Stream ID (1 for first, 2 for second, etc.)", False),
         ("status", "uint8_t", 0, "", "", "", "Number of streams available.", False),
@@ -6762,7 +6762,7 @@ class HerelinkVideoStreamInformation(Message):
         self.bitrate = bitrate
         self.rotation = rotation
         self.uri = uri
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> HerelinkVideoStreamInformation:
@@ -6797,11 +6797,11 @@ class HerelinkTelem(Message):
 
     __slots__ = ("rssi", "snr", "rf_freq", "link_bw", "link_rate", "cpu_temp", "board_temp")
     __match_args__ = ("rssi", "snr", "rf_freq", "link_bw", "link_rate", "cpu_temp", "board_temp")
-    ID = 50003
-    NAME = "HERELINK_TELEM"
-    CRC_EXTRA = 62
-    LENGTH = 19
-    BASE_LENGTH = 19
+    ID: ClassVar[int] = 50003
+    NAME: ClassVar[str] = "HERELINK_TELEM"
+    CRC_EXTRA: ClassVar[int] = 62
+    LENGTH: ClassVar[int] = 19
+    BASE_LENGTH: ClassVar[int] = 19
     _FIELDS = (
         ("rssi", "uint8_t", 0, "", "", "", "", False),
         ("snr", "int16_t", 0, "", "", "", "", False),
@@ -6843,7 +6843,7 @@ class HerelinkTelem(Message):
         self.link_rate = link_rate
         self.cpu_temp = cpu_temp
         self.board_temp = board_temp
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> HerelinkTelem:
@@ -6876,11 +6876,11 @@ class CubepilotFirmwareUpdateStart(Message):
 
     __slots__ = ("target_system", "target_component", "size", "crc")
     __match_args__ = ("target_system", "target_component", "size", "crc")
-    ID = 50004
-    NAME = "CUBEPILOT_FIRMWARE_UPDATE_START"
-    CRC_EXTRA = 240
-    LENGTH = 10
-    BASE_LENGTH = 10
+    ID: ClassVar[int] = 50004
+    NAME: ClassVar[str] = "CUBEPILOT_FIRMWARE_UPDATE_START"
+    CRC_EXTRA: ClassVar[int] = 240
+    LENGTH: ClassVar[int] = 10
+    BASE_LENGTH: ClassVar[int] = 10
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID.", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID.", False),
@@ -6905,7 +6905,7 @@ class CubepilotFirmwareUpdateStart(Message):
         self.target_component = target_component
         self.size = size
         self.crc = crc
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> CubepilotFirmwareUpdateStart:
@@ -6933,11 +6933,11 @@ class CubepilotFirmwareUpdateResp(Message):
 
     __slots__ = ("target_system", "target_component", "offset")
     __match_args__ = ("target_system", "target_component", "offset")
-    ID = 50005
-    NAME = "CUBEPILOT_FIRMWARE_UPDATE_RESP"
-    CRC_EXTRA = 152
-    LENGTH = 6
-    BASE_LENGTH = 6
+    ID: ClassVar[int] = 50005
+    NAME: ClassVar[str] = "CUBEPILOT_FIRMWARE_UPDATE_RESP"
+    CRC_EXTRA: ClassVar[int] = 152
+    LENGTH: ClassVar[int] = 6
+    BASE_LENGTH: ClassVar[int] = 6
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID.", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID.", False),
@@ -6957,7 +6957,7 @@ class CubepilotFirmwareUpdateResp(Message):
         self.target_system = target_system
         self.target_component = target_component
         self.offset = offset
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> CubepilotFirmwareUpdateResp:
@@ -6985,11 +6985,11 @@ class AirlinkAuth(Message):
 
     __slots__ = ("login", "password")
     __match_args__ = ("login", "password")
-    ID = 52000
-    NAME = "AIRLINK_AUTH"
-    CRC_EXTRA = 13
-    LENGTH = 100
-    BASE_LENGTH = 100
+    ID: ClassVar[int] = 52000
+    NAME: ClassVar[str] = "AIRLINK_AUTH"
+    CRC_EXTRA: ClassVar[int] = 13
+    LENGTH: ClassVar[int] = 100
+    BASE_LENGTH: ClassVar[int] = 100
     _FIELDS = (
         ("login", "char", 50, "", "", "", "Login", False),
         ("password", "char", 50, "", "", "", "Password", False),
@@ -7004,7 +7004,7 @@ class AirlinkAuth(Message):
     def __init__(self, login: str, password: str) -> None:
         self.login = login
         self.password = password
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> AirlinkAuth:
@@ -7034,11 +7034,11 @@ class AirlinkAuthResponse(Message):
 
     __slots__ = ("resp_type",)
     __match_args__ = ("resp_type",)
-    ID = 52001
-    NAME = "AIRLINK_AUTH_RESPONSE"
-    CRC_EXTRA = 239
-    LENGTH = 1
-    BASE_LENGTH = 1
+    ID: ClassVar[int] = 52001
+    NAME: ClassVar[str] = "AIRLINK_AUTH_RESPONSE"
+    CRC_EXTRA: ClassVar[int] = 239
+    LENGTH: ClassVar[int] = 1
+    BASE_LENGTH: ClassVar[int] = 1
     _FIELDS = (
         ("resp_type", "uint8_t", 0, "", "AIRLINK_AUTH_RESPONSE_TYPE", "", "Response type", False),
     )
@@ -7048,7 +7048,7 @@ class AirlinkAuthResponse(Message):
 
     def __init__(self, resp_type: int) -> None:
         self.resp_type = resp_type
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> AirlinkAuthResponse:

@@ -9,7 +9,7 @@
 from __future__ import annotations
 
 from struct import Struct
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from aerokit.mavlink.message import PACK_ERRORS, Message, pack_bytes, pack_items, pack_text
 
@@ -98,11 +98,11 @@ class SysStatus(Message):
         "onboard_control_sensors_present_extended", "onboard_control_sensors_enabled_extended",
         "onboard_control_sensors_health_extended",
     )
-    ID = 1
-    NAME = "SYS_STATUS"
-    CRC_EXTRA = 124
-    LENGTH = 43
-    BASE_LENGTH = 31
+    ID: ClassVar[int] = 1
+    NAME: ClassVar[str] = "SYS_STATUS"
+    CRC_EXTRA: ClassVar[int] = 124
+    LENGTH: ClassVar[int] = 43
+    BASE_LENGTH: ClassVar[int] = 31
     _FIELDS = (
         ("onboard_control_sensors_present", "uint32_t", 0, "", "MAV_SYS_STATUS_SENSOR", "", "Bitmap showing which onboard controllers and sensors are present. Value of 0: not present. Value of 1: present.", False),
         ("onboard_control_sensors_enabled", "uint32_t", 0, "", "MAV_SYS_STATUS_SENSOR", "", "Bitmap showing which onboard controllers and sensors are enabled: Value of 0: not enabled. Value of 1: enabled.", False),
@@ -220,7 +220,7 @@ class SysStatus(Message):
         self.onboard_control_sensors_present_extended = onboard_control_sensors_present_extended
         self.onboard_control_sensors_enabled_extended = onboard_control_sensors_enabled_extended
         self.onboard_control_sensors_health_extended = onboard_control_sensors_health_extended
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> SysStatus:
@@ -266,11 +266,11 @@ class SystemTime(Message):
 
     __slots__ = ("time_unix_usec", "time_boot_ms")
     __match_args__ = ("time_unix_usec", "time_boot_ms")
-    ID = 2
-    NAME = "SYSTEM_TIME"
-    CRC_EXTRA = 137
-    LENGTH = 12
-    BASE_LENGTH = 12
+    ID: ClassVar[int] = 2
+    NAME: ClassVar[str] = "SYSTEM_TIME"
+    CRC_EXTRA: ClassVar[int] = 137
+    LENGTH: ClassVar[int] = 12
+    BASE_LENGTH: ClassVar[int] = 12
     _FIELDS = (
         ("time_unix_usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX epoch time).", False),
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot).", False),
@@ -285,7 +285,7 @@ class SystemTime(Message):
     def __init__(self, time_unix_usec: int, time_boot_ms: int) -> None:
         self.time_unix_usec = time_unix_usec
         self.time_boot_ms = time_boot_ms
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> SystemTime:
@@ -317,11 +317,11 @@ class SetMode(Message):
 
     __slots__ = ("target_system", "base_mode", "custom_mode")
     __match_args__ = ("target_system", "base_mode", "custom_mode")
-    ID = 11
-    NAME = "SET_MODE"
-    CRC_EXTRA = 89
-    LENGTH = 6
-    BASE_LENGTH = 6
+    ID: ClassVar[int] = 11
+    NAME: ClassVar[str] = "SET_MODE"
+    CRC_EXTRA: ClassVar[int] = 89
+    LENGTH: ClassVar[int] = 6
+    BASE_LENGTH: ClassVar[int] = 6
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "The system setting the mode", False),
         ("base_mode", "uint8_t", 0, "", "MAV_MODE_FLAG", "", "The new base mode.", False),
@@ -341,7 +341,7 @@ class SetMode(Message):
         self.target_system = target_system
         self.base_mode = base_mode
         self.custom_mode = custom_mode
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> SetMode:
@@ -374,11 +374,11 @@ class ParamRequestRead(Message):
 
     __slots__ = ("target_system", "target_component", "param_id", "param_index")
     __match_args__ = ("target_system", "target_component", "param_id", "param_index")
-    ID = 20
-    NAME = "PARAM_REQUEST_READ"
-    CRC_EXTRA = 214
-    LENGTH = 20
-    BASE_LENGTH = 20
+    ID: ClassVar[int] = 20
+    NAME: ClassVar[str] = "PARAM_REQUEST_READ"
+    CRC_EXTRA: ClassVar[int] = 214
+    LENGTH: ClassVar[int] = 20
+    BASE_LENGTH: ClassVar[int] = 20
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID", False),
@@ -408,7 +408,7 @@ class ParamRequestRead(Message):
         self.target_component = target_component
         self.param_id = param_id
         self.param_index = param_index
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> ParamRequestRead:
@@ -441,11 +441,11 @@ class ParamRequestList(Message):
 
     __slots__ = ("target_system", "target_component")
     __match_args__ = ("target_system", "target_component")
-    ID = 21
-    NAME = "PARAM_REQUEST_LIST"
-    CRC_EXTRA = 159
-    LENGTH = 2
-    BASE_LENGTH = 2
+    ID: ClassVar[int] = 21
+    NAME: ClassVar[str] = "PARAM_REQUEST_LIST"
+    CRC_EXTRA: ClassVar[int] = 159
+    LENGTH: ClassVar[int] = 2
+    BASE_LENGTH: ClassVar[int] = 2
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID", False),
@@ -460,7 +460,7 @@ class ParamRequestList(Message):
     def __init__(self, target_system: int, target_component: int) -> None:
         self.target_system = target_system
         self.target_component = target_component
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> ParamRequestList:
@@ -491,11 +491,11 @@ class ParamValue(Message):
 
     __slots__ = ("param_id", "param_value", "param_type", "param_count", "param_index")
     __match_args__ = ("param_id", "param_value", "param_type", "param_count", "param_index")
-    ID = 22
-    NAME = "PARAM_VALUE"
-    CRC_EXTRA = 220
-    LENGTH = 25
-    BASE_LENGTH = 25
+    ID: ClassVar[int] = 22
+    NAME: ClassVar[str] = "PARAM_VALUE"
+    CRC_EXTRA: ClassVar[int] = 220
+    LENGTH: ClassVar[int] = 25
+    BASE_LENGTH: ClassVar[int] = 25
     _FIELDS = (
         ("param_id", "char", 16, "", "", "", "Onboard parameter id, terminated by NULL if the length is less than 16 human-readable chars and WITHOUT null termination (NULL) byte if the length is exactly 16 chars - applications have to provide 16+1 bytes storage if the ID is stored as string", False),
         ("param_value", "float", 0, "", "", "", "Onboard parameter value", False),
@@ -530,7 +530,7 @@ class ParamValue(Message):
         self.param_type = param_type
         self.param_count = param_count
         self.param_index = param_index
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> ParamValue:
@@ -568,11 +568,11 @@ class ParamSet(Message):
 
     __slots__ = ("target_system", "target_component", "param_id", "param_value", "param_type")
     __match_args__ = ("target_system", "target_component", "param_id", "param_value", "param_type")
-    ID = 23
-    NAME = "PARAM_SET"
-    CRC_EXTRA = 168
-    LENGTH = 23
-    BASE_LENGTH = 23
+    ID: ClassVar[int] = 23
+    NAME: ClassVar[str] = "PARAM_SET"
+    CRC_EXTRA: ClassVar[int] = 168
+    LENGTH: ClassVar[int] = 23
+    BASE_LENGTH: ClassVar[int] = 23
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID", False),
@@ -607,7 +607,7 @@ class ParamSet(Message):
         self.param_id = param_id
         self.param_value = param_value
         self.param_type = param_type
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> ParamSet:
@@ -649,11 +649,11 @@ class GpsRawInt(Message):
         "time_usec", "fix_type", "lat", "lon", "alt", "eph", "epv", "vel", "cog", "satellites_visible",
         "alt_ellipsoid", "h_acc", "v_acc", "vel_acc", "hdg_acc", "yaw",
     )
-    ID = 24
-    NAME = "GPS_RAW_INT"
-    CRC_EXTRA = 24
-    LENGTH = 52
-    BASE_LENGTH = 30
+    ID: ClassVar[int] = 24
+    NAME: ClassVar[str] = "GPS_RAW_INT"
+    CRC_EXTRA: ClassVar[int] = 24
+    LENGTH: ClassVar[int] = 52
+    BASE_LENGTH: ClassVar[int] = 30
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX Epoch time or time since system boot). The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
         ("fix_type", "uint8_t", 0, "", "GPS_FIX_TYPE", "", "GPS fix type.", False),
@@ -758,7 +758,7 @@ class GpsRawInt(Message):
         self.vel_acc = vel_acc
         self.hdg_acc = hdg_acc
         self.yaw = yaw
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> GpsRawInt:
@@ -795,11 +795,11 @@ class Attitude(Message):
 
     __slots__ = ("time_boot_ms", "roll", "pitch", "yaw", "rollspeed", "pitchspeed", "yawspeed")
     __match_args__ = ("time_boot_ms", "roll", "pitch", "yaw", "rollspeed", "pitchspeed", "yawspeed")
-    ID = 30
-    NAME = "ATTITUDE"
-    CRC_EXTRA = 39
-    LENGTH = 28
-    BASE_LENGTH = 28
+    ID: ClassVar[int] = 30
+    NAME: ClassVar[str] = "ATTITUDE"
+    CRC_EXTRA: ClassVar[int] = 39
+    LENGTH: ClassVar[int] = 28
+    BASE_LENGTH: ClassVar[int] = 28
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot).", False),
         ("roll", "float", 0, "rad", "", "", "Roll angle (-pi..+pi)", False),
@@ -842,7 +842,7 @@ class Attitude(Message):
         self.rollspeed = rollspeed
         self.pitchspeed = pitchspeed
         self.yawspeed = yawspeed
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> Attitude:
@@ -882,11 +882,11 @@ class AttitudeQuaternion(Message):
     __match_args__ = (
         "time_boot_ms", "q1", "q2", "q3", "q4", "rollspeed", "pitchspeed", "yawspeed", "repr_offset_q",
     )
-    ID = 31
-    NAME = "ATTITUDE_QUATERNION"
-    CRC_EXTRA = 246
-    LENGTH = 48
-    BASE_LENGTH = 32
+    ID: ClassVar[int] = 31
+    NAME: ClassVar[str] = "ATTITUDE_QUATERNION"
+    CRC_EXTRA: ClassVar[int] = 246
+    LENGTH: ClassVar[int] = 48
+    BASE_LENGTH: ClassVar[int] = 32
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot).", False),
         ("q1", "float", 0, "", "", "", "Quaternion component 1, w (1 in null-rotation)", False),
@@ -946,7 +946,7 @@ class AttitudeQuaternion(Message):
         self.pitchspeed = pitchspeed
         self.yawspeed = yawspeed
         self.repr_offset_q = tuple(repr_offset_q)
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> AttitudeQuaternion:
@@ -983,11 +983,11 @@ class LocalPositionNed(Message):
 
     __slots__ = ("time_boot_ms", "x", "y", "z", "vx", "vy", "vz")
     __match_args__ = ("time_boot_ms", "x", "y", "z", "vx", "vy", "vz")
-    ID = 32
-    NAME = "LOCAL_POSITION_NED"
-    CRC_EXTRA = 185
-    LENGTH = 28
-    BASE_LENGTH = 28
+    ID: ClassVar[int] = 32
+    NAME: ClassVar[str] = "LOCAL_POSITION_NED"
+    CRC_EXTRA: ClassVar[int] = 185
+    LENGTH: ClassVar[int] = 28
+    BASE_LENGTH: ClassVar[int] = 28
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot).", False),
         ("x", "float", 0, "m", "", "", "X Position", False),
@@ -1029,7 +1029,7 @@ class LocalPositionNed(Message):
         self.vx = vx
         self.vy = vy
         self.vz = vz
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> LocalPositionNed:
@@ -1065,11 +1065,11 @@ class RcChannelsRaw(Message):
         "time_boot_ms", "port", "chan1_raw", "chan2_raw", "chan3_raw", "chan4_raw", "chan5_raw", "chan6_raw",
         "chan7_raw", "chan8_raw", "rssi",
     )
-    ID = 35
-    NAME = "RC_CHANNELS_RAW"
-    CRC_EXTRA = 244
-    LENGTH = 22
-    BASE_LENGTH = 22
+    ID: ClassVar[int] = 35
+    NAME: ClassVar[str] = "RC_CHANNELS_RAW"
+    CRC_EXTRA: ClassVar[int] = 244
+    LENGTH: ClassVar[int] = 22
+    BASE_LENGTH: ClassVar[int] = 22
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot).", False),
         ("port", "uint8_t", 0, "", "", "", "Servo output port (set of 8 outputs = 1 port). Flight stacks running on Pixhawk should use: 0 = MAIN, 1 = AUX.", False),
@@ -1136,7 +1136,7 @@ class RcChannelsRaw(Message):
         self.chan7_raw = chan7_raw
         self.chan8_raw = chan8_raw
         self.rssi = rssi
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> RcChannelsRaw:
@@ -1180,11 +1180,11 @@ class ServoOutputRaw(Message):
         "servo6_raw", "servo7_raw", "servo8_raw", "servo9_raw", "servo10_raw", "servo11_raw", "servo12_raw",
         "servo13_raw", "servo14_raw", "servo15_raw", "servo16_raw",
     )
-    ID = 36
-    NAME = "SERVO_OUTPUT_RAW"
-    CRC_EXTRA = 222
-    LENGTH = 37
-    BASE_LENGTH = 21
+    ID: ClassVar[int] = 36
+    NAME: ClassVar[str] = "SERVO_OUTPUT_RAW"
+    CRC_EXTRA: ClassVar[int] = 222
+    LENGTH: ClassVar[int] = 37
+    BASE_LENGTH: ClassVar[int] = 21
     _FIELDS = (
         ("time_usec", "uint32_t", 0, "us", "", "", "Timestamp (UNIX Epoch time or time since system boot). The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
         ("port", "uint8_t", 0, "", "", "", "Servo output port (set of 8 outputs = 1 port). Flight stacks running on Pixhawk should use: 0 = MAIN, 1 = AUX.", False),
@@ -1289,7 +1289,7 @@ class ServoOutputRaw(Message):
         self.servo14_raw = servo14_raw
         self.servo15_raw = servo15_raw
         self.servo16_raw = servo16_raw
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> ServoOutputRaw:
@@ -1329,11 +1329,11 @@ class MissionWritePartialList(Message):
 
     __slots__ = ("target_system", "target_component", "start_index", "end_index", "mission_type")
     __match_args__ = ("target_system", "target_component", "start_index", "end_index", "mission_type")
-    ID = 38
-    NAME = "MISSION_WRITE_PARTIAL_LIST"
-    CRC_EXTRA = 9
-    LENGTH = 7
-    BASE_LENGTH = 6
+    ID: ClassVar[int] = 38
+    NAME: ClassVar[str] = "MISSION_WRITE_PARTIAL_LIST"
+    CRC_EXTRA: ClassVar[int] = 9
+    LENGTH: ClassVar[int] = 7
+    BASE_LENGTH: ClassVar[int] = 6
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID", False),
@@ -1368,7 +1368,7 @@ class MissionWritePartialList(Message):
         self.start_index = start_index
         self.end_index = end_index
         self.mission_type = mission_type
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> MissionWritePartialList:
@@ -1406,11 +1406,11 @@ class MissionRequest(Message):
 
     __slots__ = ("target_system", "target_component", "seq", "mission_type")
     __match_args__ = ("target_system", "target_component", "seq", "mission_type")
-    ID = 40
-    NAME = "MISSION_REQUEST"
-    CRC_EXTRA = 230
-    LENGTH = 5
-    BASE_LENGTH = 4
+    ID: ClassVar[int] = 40
+    NAME: ClassVar[str] = "MISSION_REQUEST"
+    CRC_EXTRA: ClassVar[int] = 230
+    LENGTH: ClassVar[int] = 5
+    BASE_LENGTH: ClassVar[int] = 4
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID", False),
@@ -1435,7 +1435,7 @@ class MissionRequest(Message):
         self.target_component = target_component
         self.seq = seq
         self.mission_type = mission_type
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> MissionRequest:
@@ -1473,11 +1473,11 @@ class MissionSetCurrent(Message):
 
     __slots__ = ("target_system", "target_component", "seq")
     __match_args__ = ("target_system", "target_component", "seq")
-    ID = 41
-    NAME = "MISSION_SET_CURRENT"
-    CRC_EXTRA = 28
-    LENGTH = 4
-    BASE_LENGTH = 4
+    ID: ClassVar[int] = 41
+    NAME: ClassVar[str] = "MISSION_SET_CURRENT"
+    CRC_EXTRA: ClassVar[int] = 28
+    LENGTH: ClassVar[int] = 4
+    BASE_LENGTH: ClassVar[int] = 4
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID", False),
@@ -1497,7 +1497,7 @@ class MissionSetCurrent(Message):
         self.target_system = target_system
         self.target_component = target_component
         self.seq = seq
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> MissionSetCurrent:
@@ -1530,11 +1530,11 @@ class MissionCurrent(Message):
     __match_args__ = (
         "seq", "total", "mission_state", "mission_mode", "mission_id", "fence_id", "rally_points_id",
     )
-    ID = 42
-    NAME = "MISSION_CURRENT"
-    CRC_EXTRA = 28
-    LENGTH = 18
-    BASE_LENGTH = 2
+    ID: ClassVar[int] = 42
+    NAME: ClassVar[str] = "MISSION_CURRENT"
+    CRC_EXTRA: ClassVar[int] = 28
+    LENGTH: ClassVar[int] = 18
+    BASE_LENGTH: ClassVar[int] = 2
     _FIELDS = (
         ("seq", "uint16_t", 0, "", "", "", "Sequence", False),
         ("total", "uint16_t", 0, "", "", "UINT16_MAX", "Total number of mission items on vehicle (on last item, sequence == total). If the autopilot stores its home location as part of the mission this will be excluded from the total. 0: Not supported, UINT16_MAX if no mission is present on the vehicle.", True),
@@ -1587,7 +1587,7 @@ class MissionCurrent(Message):
         self.mission_id = mission_id
         self.fence_id = fence_id
         self.rally_points_id = rally_points_id
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> MissionCurrent:
@@ -1621,11 +1621,11 @@ class MissionRequestList(Message):
 
     __slots__ = ("target_system", "target_component", "mission_type")
     __match_args__ = ("target_system", "target_component", "mission_type")
-    ID = 43
-    NAME = "MISSION_REQUEST_LIST"
-    CRC_EXTRA = 132
-    LENGTH = 3
-    BASE_LENGTH = 2
+    ID: ClassVar[int] = 43
+    NAME: ClassVar[str] = "MISSION_REQUEST_LIST"
+    CRC_EXTRA: ClassVar[int] = 132
+    LENGTH: ClassVar[int] = 3
+    BASE_LENGTH: ClassVar[int] = 2
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID", False),
@@ -1645,7 +1645,7 @@ class MissionRequestList(Message):
         self.target_system = target_system
         self.target_component = target_component
         self.mission_type = mission_type
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> MissionRequestList:
@@ -1675,11 +1675,11 @@ class MissionCount(Message):
 
     __slots__ = ("target_system", "target_component", "count", "mission_type", "opaque_id")
     __match_args__ = ("target_system", "target_component", "count", "mission_type", "opaque_id")
-    ID = 44
-    NAME = "MISSION_COUNT"
-    CRC_EXTRA = 221
-    LENGTH = 9
-    BASE_LENGTH = 4
+    ID: ClassVar[int] = 44
+    NAME: ClassVar[str] = "MISSION_COUNT"
+    CRC_EXTRA: ClassVar[int] = 221
+    LENGTH: ClassVar[int] = 9
+    BASE_LENGTH: ClassVar[int] = 4
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID", False),
@@ -1714,7 +1714,7 @@ class MissionCount(Message):
         self.count = count
         self.mission_type = mission_type
         self.opaque_id = opaque_id
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> MissionCount:
@@ -1746,11 +1746,11 @@ class MissionClearAll(Message):
 
     __slots__ = ("target_system", "target_component", "mission_type")
     __match_args__ = ("target_system", "target_component", "mission_type")
-    ID = 45
-    NAME = "MISSION_CLEAR_ALL"
-    CRC_EXTRA = 232
-    LENGTH = 3
-    BASE_LENGTH = 2
+    ID: ClassVar[int] = 45
+    NAME: ClassVar[str] = "MISSION_CLEAR_ALL"
+    CRC_EXTRA: ClassVar[int] = 232
+    LENGTH: ClassVar[int] = 3
+    BASE_LENGTH: ClassVar[int] = 2
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID", False),
@@ -1770,7 +1770,7 @@ class MissionClearAll(Message):
         self.target_system = target_system
         self.target_component = target_component
         self.mission_type = mission_type
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> MissionClearAll:
@@ -1800,11 +1800,11 @@ class MissionItemReached(Message):
 
     __slots__ = ("seq",)
     __match_args__ = ("seq",)
-    ID = 46
-    NAME = "MISSION_ITEM_REACHED"
-    CRC_EXTRA = 11
-    LENGTH = 2
-    BASE_LENGTH = 2
+    ID: ClassVar[int] = 46
+    NAME: ClassVar[str] = "MISSION_ITEM_REACHED"
+    CRC_EXTRA: ClassVar[int] = 11
+    LENGTH: ClassVar[int] = 2
+    BASE_LENGTH: ClassVar[int] = 2
     _FIELDS = (
         ("seq", "uint16_t", 0, "", "", "", "Sequence", False),
     )
@@ -1814,7 +1814,7 @@ class MissionItemReached(Message):
 
     def __init__(self, seq: int) -> None:
         self.seq = seq
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> MissionItemReached:
@@ -1843,11 +1843,11 @@ class MissionAck(Message):
 
     __slots__ = ("target_system", "target_component", "type", "mission_type", "opaque_id")
     __match_args__ = ("target_system", "target_component", "type", "mission_type", "opaque_id")
-    ID = 47
-    NAME = "MISSION_ACK"
-    CRC_EXTRA = 153
-    LENGTH = 8
-    BASE_LENGTH = 3
+    ID: ClassVar[int] = 47
+    NAME: ClassVar[str] = "MISSION_ACK"
+    CRC_EXTRA: ClassVar[int] = 153
+    LENGTH: ClassVar[int] = 8
+    BASE_LENGTH: ClassVar[int] = 3
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID", False),
@@ -1882,7 +1882,7 @@ class MissionAck(Message):
         self.type = type
         self.mission_type = mission_type
         self.opaque_id = opaque_id
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> MissionAck:
@@ -1916,11 +1916,11 @@ class GpsGlobalOrigin(Message):
 
     __slots__ = ("latitude", "longitude", "altitude", "time_usec")
     __match_args__ = ("latitude", "longitude", "altitude", "time_usec")
-    ID = 49
-    NAME = "GPS_GLOBAL_ORIGIN"
-    CRC_EXTRA = 39
-    LENGTH = 20
-    BASE_LENGTH = 12
+    ID: ClassVar[int] = 49
+    NAME: ClassVar[str] = "GPS_GLOBAL_ORIGIN"
+    CRC_EXTRA: ClassVar[int] = 39
+    LENGTH: ClassVar[int] = 20
+    BASE_LENGTH: ClassVar[int] = 12
     _FIELDS = (
         ("latitude", "int32_t", 0, "degE7", "", "", "Latitude (WGS84)", False),
         ("longitude", "int32_t", 0, "degE7", "", "", "Longitude (WGS84)", False),
@@ -1948,7 +1948,7 @@ class GpsGlobalOrigin(Message):
         self.longitude = longitude
         self.altitude = altitude
         self.time_usec = time_usec
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> GpsGlobalOrigin:
@@ -1978,11 +1978,11 @@ class MissionRequestInt(Message):
 
     __slots__ = ("target_system", "target_component", "seq", "mission_type")
     __match_args__ = ("target_system", "target_component", "seq", "mission_type")
-    ID = 51
-    NAME = "MISSION_REQUEST_INT"
-    CRC_EXTRA = 196
-    LENGTH = 5
-    BASE_LENGTH = 4
+    ID: ClassVar[int] = 51
+    NAME: ClassVar[str] = "MISSION_REQUEST_INT"
+    CRC_EXTRA: ClassVar[int] = 196
+    LENGTH: ClassVar[int] = 5
+    BASE_LENGTH: ClassVar[int] = 4
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID", False),
@@ -2007,7 +2007,7 @@ class MissionRequestInt(Message):
         self.target_component = target_component
         self.seq = seq
         self.mission_type = mission_type
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> MissionRequestInt:
@@ -2045,11 +2045,11 @@ class RcChannels(Message):
         "chan6_raw", "chan7_raw", "chan8_raw", "chan9_raw", "chan10_raw", "chan11_raw", "chan12_raw",
         "chan13_raw", "chan14_raw", "chan15_raw", "chan16_raw", "chan17_raw", "chan18_raw", "rssi",
     )
-    ID = 65
-    NAME = "RC_CHANNELS"
-    CRC_EXTRA = 118
-    LENGTH = 42
-    BASE_LENGTH = 42
+    ID: ClassVar[int] = 65
+    NAME: ClassVar[str] = "RC_CHANNELS"
+    CRC_EXTRA: ClassVar[int] = 118
+    LENGTH: ClassVar[int] = 42
+    BASE_LENGTH: ClassVar[int] = 42
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot).", False),
         ("chancount", "uint8_t", 0, "", "", "", "Total number of RC channels being received. This can be larger than 18, indicating that more channels are available but not given in this message. This value should be 0 when no RC channels are available.", False),
@@ -2169,7 +2169,7 @@ class RcChannels(Message):
         self.chan17_raw = chan17_raw
         self.chan18_raw = chan18_raw
         self.rssi = rssi
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> RcChannels:
@@ -2209,11 +2209,11 @@ class RequestDataStream(Message):
 
     __slots__ = ("target_system", "target_component", "req_stream_id", "req_message_rate", "start_stop")
     __match_args__ = ("target_system", "target_component", "req_stream_id", "req_message_rate", "start_stop")
-    ID = 66
-    NAME = "REQUEST_DATA_STREAM"
-    CRC_EXTRA = 148
-    LENGTH = 6
-    BASE_LENGTH = 6
+    ID: ClassVar[int] = 66
+    NAME: ClassVar[str] = "REQUEST_DATA_STREAM"
+    CRC_EXTRA: ClassVar[int] = 148
+    LENGTH: ClassVar[int] = 6
+    BASE_LENGTH: ClassVar[int] = 6
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "The target requested to send the message stream.", False),
         ("target_component", "uint8_t", 0, "", "", "", "The target requested to send the message stream.", False),
@@ -2246,7 +2246,7 @@ class RequestDataStream(Message):
         self.req_stream_id = req_stream_id
         self.req_message_rate = req_message_rate
         self.start_stop = start_stop
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> RequestDataStream:
@@ -2291,11 +2291,11 @@ class RcChannelsOverride(Message):
         "chan6_raw", "chan7_raw", "chan8_raw", "chan9_raw", "chan10_raw", "chan11_raw", "chan12_raw",
         "chan13_raw", "chan14_raw", "chan15_raw", "chan16_raw", "chan17_raw", "chan18_raw",
     )
-    ID = 70
-    NAME = "RC_CHANNELS_OVERRIDE"
-    CRC_EXTRA = 124
-    LENGTH = 38
-    BASE_LENGTH = 18
+    ID: ClassVar[int] = 70
+    NAME: ClassVar[str] = "RC_CHANNELS_OVERRIDE"
+    CRC_EXTRA: ClassVar[int] = 124
+    LENGTH: ClassVar[int] = 38
+    BASE_LENGTH: ClassVar[int] = 18
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID", False),
@@ -2452,7 +2452,7 @@ class RcChannelsOverride(Message):
         self.chan16_raw = chan16_raw
         self.chan17_raw = chan17_raw
         self.chan18_raw = chan18_raw
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> RcChannelsOverride:
@@ -2501,11 +2501,11 @@ class MissionItemInt(Message):
         "target_system", "target_component", "seq", "frame", "command", "current", "autocontinue", "param1",
         "param2", "param3", "param4", "x", "y", "z", "mission_type",
     )
-    ID = 73
-    NAME = "MISSION_ITEM_INT"
-    CRC_EXTRA = 38
-    LENGTH = 38
-    BASE_LENGTH = 37
+    ID: ClassVar[int] = 73
+    NAME: ClassVar[str] = "MISSION_ITEM_INT"
+    CRC_EXTRA: ClassVar[int] = 38
+    LENGTH: ClassVar[int] = 38
+    BASE_LENGTH: ClassVar[int] = 37
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID", False),
@@ -2597,7 +2597,7 @@ class MissionItemInt(Message):
         self.y = y
         self.z = z
         self.mission_type = mission_type
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> MissionItemInt:
@@ -2633,11 +2633,11 @@ class VfrHud(Message):
 
     __slots__ = ("airspeed", "groundspeed", "heading", "throttle", "alt", "climb")
     __match_args__ = ("airspeed", "groundspeed", "heading", "throttle", "alt", "climb")
-    ID = 74
-    NAME = "VFR_HUD"
-    CRC_EXTRA = 20
-    LENGTH = 20
-    BASE_LENGTH = 20
+    ID: ClassVar[int] = 74
+    NAME: ClassVar[str] = "VFR_HUD"
+    CRC_EXTRA: ClassVar[int] = 20
+    LENGTH: ClassVar[int] = 20
+    BASE_LENGTH: ClassVar[int] = 20
     _FIELDS = (
         ("airspeed", "float", 0, "m/s", "", "", "Vehicle speed in form appropriate for vehicle type. For standard aircraft this is typically calibrated airspeed (CAS) or indicated airspeed (IAS) - either of which can be used by a pilot to estimate stall speed.", False),
         ("groundspeed", "float", 0, "m/s", "", "", "Current ground speed.", False),
@@ -2677,7 +2677,7 @@ class VfrHud(Message):
         self.throttle = throttle
         self.alt = alt
         self.climb = climb
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> VfrHud:
@@ -2717,11 +2717,11 @@ class CommandInt(Message):
         "target_system", "target_component", "frame", "command", "current", "autocontinue", "param1",
         "param2", "param3", "param4", "x", "y", "z",
     )
-    ID = 75
-    NAME = "COMMAND_INT"
-    CRC_EXTRA = 158
-    LENGTH = 35
-    BASE_LENGTH = 35
+    ID: ClassVar[int] = 75
+    NAME: ClassVar[str] = "COMMAND_INT"
+    CRC_EXTRA: ClassVar[int] = 158
+    LENGTH: ClassVar[int] = 35
+    BASE_LENGTH: ClassVar[int] = 35
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID", False),
@@ -2801,7 +2801,7 @@ class CommandInt(Message):
         self.x = x
         self.y = y
         self.z = z
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> CommandInt:
@@ -2844,11 +2844,11 @@ class CommandLong(Message):
         "target_system", "target_component", "command", "confirmation", "param1", "param2", "param3",
         "param4", "param5", "param6", "param7",
     )
-    ID = 76
-    NAME = "COMMAND_LONG"
-    CRC_EXTRA = 152
-    LENGTH = 33
-    BASE_LENGTH = 33
+    ID: ClassVar[int] = 76
+    NAME: ClassVar[str] = "COMMAND_LONG"
+    CRC_EXTRA: ClassVar[int] = 152
+    LENGTH: ClassVar[int] = 33
+    BASE_LENGTH: ClassVar[int] = 33
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System which should execute the command", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component which should execute the command, 0 for all components", False),
@@ -2913,7 +2913,7 @@ class CommandLong(Message):
         self.param5 = param5
         self.param6 = param6
         self.param7 = param7
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> CommandLong:
@@ -2948,11 +2948,11 @@ class CommandAck(Message):
 
     __slots__ = ("command", "result", "progress", "result_param2", "target_system", "target_component")
     __match_args__ = ("command", "result", "progress", "result_param2", "target_system", "target_component")
-    ID = 77
-    NAME = "COMMAND_ACK"
-    CRC_EXTRA = 143
-    LENGTH = 10
-    BASE_LENGTH = 3
+    ID: ClassVar[int] = 77
+    NAME: ClassVar[str] = "COMMAND_ACK"
+    CRC_EXTRA: ClassVar[int] = 143
+    LENGTH: ClassVar[int] = 10
+    BASE_LENGTH: ClassVar[int] = 3
     _FIELDS = (
         ("command", "uint16_t", 0, "", "MAV_CMD", "", "Command ID (of acknowledged command).", False),
         ("result", "uint8_t", 0, "", "MAV_RESULT", "", "Result of command.", False),
@@ -2995,7 +2995,7 @@ class CommandAck(Message):
         self.result_param2 = result_param2
         self.target_system = target_system
         self.target_component = target_component
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> CommandAck:
@@ -3036,11 +3036,11 @@ class SetAttitudeTarget(Message):
         "time_boot_ms", "target_system", "target_component", "type_mask", "q", "body_roll_rate",
         "body_pitch_rate", "body_yaw_rate", "thrust", "thrust_body",
     )
-    ID = 82
-    NAME = "SET_ATTITUDE_TARGET"
-    CRC_EXTRA = 49
-    LENGTH = 51
-    BASE_LENGTH = 39
+    ID: ClassVar[int] = 82
+    NAME: ClassVar[str] = "SET_ATTITUDE_TARGET"
+    CRC_EXTRA: ClassVar[int] = 49
+    LENGTH: ClassVar[int] = 51
+    BASE_LENGTH: ClassVar[int] = 39
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot).", False),
         ("target_system", "uint8_t", 0, "", "", "", "System ID", False),
@@ -3105,7 +3105,7 @@ class SetAttitudeTarget(Message):
         self.body_yaw_rate = body_yaw_rate
         self.thrust = thrust
         self.thrust_body = tuple(thrust_body)
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> SetAttitudeTarget:
@@ -3151,11 +3151,11 @@ class SetPositionTargetLocalNed(Message):
         "time_boot_ms", "target_system", "target_component", "coordinate_frame", "type_mask", "x", "y", "z",
         "vx", "vy", "vz", "afx", "afy", "afz", "yaw", "yaw_rate",
     )
-    ID = 84
-    NAME = "SET_POSITION_TARGET_LOCAL_NED"
-    CRC_EXTRA = 143
-    LENGTH = 53
-    BASE_LENGTH = 53
+    ID: ClassVar[int] = 84
+    NAME: ClassVar[str] = "SET_POSITION_TARGET_LOCAL_NED"
+    CRC_EXTRA: ClassVar[int] = 143
+    LENGTH: ClassVar[int] = 53
+    BASE_LENGTH: ClassVar[int] = 53
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot).", False),
         ("target_system", "uint8_t", 0, "", "", "", "System ID", False),
@@ -3254,7 +3254,7 @@ class SetPositionTargetLocalNed(Message):
         self.afz = afz
         self.yaw = yaw
         self.yaw_rate = yaw_rate
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> SetPositionTargetLocalNed:
@@ -3298,11 +3298,11 @@ class SetPositionTargetGlobalInt(Message):
         "time_boot_ms", "target_system", "target_component", "coordinate_frame", "type_mask", "lat_int",
         "lon_int", "alt", "vx", "vy", "vz", "afx", "afy", "afz", "yaw", "yaw_rate",
     )
-    ID = 86
-    NAME = "SET_POSITION_TARGET_GLOBAL_INT"
-    CRC_EXTRA = 5
-    LENGTH = 53
-    BASE_LENGTH = 53
+    ID: ClassVar[int] = 86
+    NAME: ClassVar[str] = "SET_POSITION_TARGET_GLOBAL_INT"
+    CRC_EXTRA: ClassVar[int] = 5
+    LENGTH: ClassVar[int] = 53
+    BASE_LENGTH: ClassVar[int] = 53
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot). The rationale for the timestamp in the setpoint is to allow the system to compensate for the transport delay of the setpoint. This allows the system to compensate processing latency.", False),
         ("target_system", "uint8_t", 0, "", "", "", "System ID", False),
@@ -3406,7 +3406,7 @@ class SetPositionTargetGlobalInt(Message):
         self.afz = afz
         self.yaw = yaw
         self.yaw_rate = yaw_rate
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> SetPositionTargetGlobalInt:
@@ -3443,11 +3443,11 @@ class FileTransferProtocol(Message):
 
     __slots__ = ("target_network", "target_system", "target_component", "payload")
     __match_args__ = ("target_network", "target_system", "target_component", "payload")
-    ID = 110
-    NAME = "FILE_TRANSFER_PROTOCOL"
-    CRC_EXTRA = 84
-    LENGTH = 254
-    BASE_LENGTH = 254
+    ID: ClassVar[int] = 110
+    NAME: ClassVar[str] = "FILE_TRANSFER_PROTOCOL"
+    CRC_EXTRA: ClassVar[int] = 84
+    LENGTH: ClassVar[int] = 254
+    BASE_LENGTH: ClassVar[int] = 254
     _FIELDS = (
         ("target_network", "uint8_t", 0, "", "", "", "Network ID (0 for broadcast)", False),
         ("target_system", "uint8_t", 0, "", "", "", "System ID (0 for broadcast)", False),
@@ -3477,7 +3477,7 @@ class FileTransferProtocol(Message):
         self.target_system = target_system
         self.target_component = target_component
         self.payload = payload
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> FileTransferProtocol:
@@ -3520,11 +3520,11 @@ class Timesync(Message):
 
     __slots__ = ("tc1", "ts1", "target_system", "target_component")
     __match_args__ = ("tc1", "ts1", "target_system", "target_component")
-    ID = 111
-    NAME = "TIMESYNC"
-    CRC_EXTRA = 34
-    LENGTH = 18
-    BASE_LENGTH = 16
+    ID: ClassVar[int] = 111
+    NAME: ClassVar[str] = "TIMESYNC"
+    CRC_EXTRA: ClassVar[int] = 34
+    LENGTH: ClassVar[int] = 18
+    BASE_LENGTH: ClassVar[int] = 16
     _FIELDS = (
         ("tc1", "int64_t", 0, "ns", "", "", "Time sync timestamp 1. Syncing: 0. Responding: Timestamp of responding component.", False),
         ("ts1", "int64_t", 0, "ns", "", "", "Time sync timestamp 2. Timestamp of syncing component (mirrored in response).", False),
@@ -3557,7 +3557,7 @@ class Timesync(Message):
         self.ts1 = ts1
         self.target_system = target_system
         self.target_component = target_component
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> Timesync:
@@ -3591,11 +3591,11 @@ class Gps2Raw(Message):
         "time_usec", "fix_type", "lat", "lon", "alt", "eph", "epv", "vel", "cog", "satellites_visible",
         "dgps_numch", "dgps_age", "yaw", "alt_ellipsoid", "h_acc", "v_acc", "vel_acc", "hdg_acc",
     )
-    ID = 124
-    NAME = "GPS2_RAW"
-    CRC_EXTRA = 87
-    LENGTH = 57
-    BASE_LENGTH = 35
+    ID: ClassVar[int] = 124
+    NAME: ClassVar[str] = "GPS2_RAW"
+    CRC_EXTRA: ClassVar[int] = 87
+    LENGTH: ClassVar[int] = 57
+    BASE_LENGTH: ClassVar[int] = 35
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX Epoch time or time since system boot). The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
         ("fix_type", "uint8_t", 0, "", "GPS_FIX_TYPE", "", "GPS fix type.", False),
@@ -3708,7 +3708,7 @@ class Gps2Raw(Message):
         self.v_acc = v_acc
         self.vel_acc = vel_acc
         self.hdg_acc = hdg_acc
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> Gps2Raw:
@@ -3744,11 +3744,11 @@ class PowerStatus(Message):
 
     __slots__ = ("Vcc", "Vservo", "flags")
     __match_args__ = ("Vcc", "Vservo", "flags")
-    ID = 125
-    NAME = "POWER_STATUS"
-    CRC_EXTRA = 203
-    LENGTH = 6
-    BASE_LENGTH = 6
+    ID: ClassVar[int] = 125
+    NAME: ClassVar[str] = "POWER_STATUS"
+    CRC_EXTRA: ClassVar[int] = 203
+    LENGTH: ClassVar[int] = 6
+    BASE_LENGTH: ClassVar[int] = 6
     _FIELDS = (
         ("Vcc", "uint16_t", 0, "mV", "", "", "5V rail voltage.", False),
         ("Vservo", "uint16_t", 0, "mV", "", "", "Servo rail voltage.", False),
@@ -3768,7 +3768,7 @@ class PowerStatus(Message):
         self.Vcc = Vcc
         self.Vservo = Vservo
         self.flags = flags
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> PowerStatus:
@@ -3802,11 +3802,11 @@ class DistanceSensor(Message):
         "time_boot_ms", "min_distance", "max_distance", "current_distance", "type", "id", "orientation",
         "covariance", "horizontal_fov", "vertical_fov", "quaternion", "signal_quality",
     )
-    ID = 132
-    NAME = "DISTANCE_SENSOR"
-    CRC_EXTRA = 85
-    LENGTH = 39
-    BASE_LENGTH = 14
+    ID: ClassVar[int] = 132
+    NAME: ClassVar[str] = "DISTANCE_SENSOR"
+    CRC_EXTRA: ClassVar[int] = 85
+    LENGTH: ClassVar[int] = 39
+    BASE_LENGTH: ClassVar[int] = 14
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot).", False),
         ("min_distance", "uint16_t", 0, "cm", "", "", "Minimum distance the sensor can measure", False),
@@ -3894,7 +3894,7 @@ class DistanceSensor(Message):
         self.vertical_fov = vertical_fov
         self.quaternion = tuple(quaternion)
         self.signal_quality = signal_quality
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> DistanceSensor:
@@ -3939,11 +3939,11 @@ class BatteryStatus(Message):
         "energy_consumed", "battery_remaining", "time_remaining", "charge_state", "voltages_ext", "mode",
         "fault_bitmask",
     )
-    ID = 147
-    NAME = "BATTERY_STATUS"
-    CRC_EXTRA = 154
-    LENGTH = 54
-    BASE_LENGTH = 36
+    ID: ClassVar[int] = 147
+    NAME: ClassVar[str] = "BATTERY_STATUS"
+    CRC_EXTRA: ClassVar[int] = 154
+    LENGTH: ClassVar[int] = 54
+    BASE_LENGTH: ClassVar[int] = 36
     _FIELDS = (
         ("id", "uint8_t", 0, "", "", "", "Battery ID", False),
         ("battery_function", "uint8_t", 0, "", "MAV_BATTERY_FUNCTION", "", "Function of the battery", False),
@@ -4053,7 +4053,7 @@ class BatteryStatus(Message):
         self.voltages_ext = tuple(voltages_ext)
         self.mode = mode
         self.fault_bitmask = fault_bitmask
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> BatteryStatus:
@@ -4114,11 +4114,11 @@ class EstimatorStatus(Message):
         "time_usec", "flags", "vel_ratio", "pos_horiz_ratio", "pos_vert_ratio", "mag_ratio", "hagl_ratio",
         "tas_ratio", "pos_horiz_accuracy", "pos_vert_accuracy",
     )
-    ID = 230
-    NAME = "ESTIMATOR_STATUS"
-    CRC_EXTRA = 163
-    LENGTH = 42
-    BASE_LENGTH = 42
+    ID: ClassVar[int] = 230
+    NAME: ClassVar[str] = "ESTIMATOR_STATUS"
+    CRC_EXTRA: ClassVar[int] = 163
+    LENGTH: ClassVar[int] = 42
+    BASE_LENGTH: ClassVar[int] = 42
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX Epoch time or time since system boot). The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
         ("flags", "uint16_t", 0, "", "ESTIMATOR_STATUS_FLAGS", "", "Bitmap indicating which EKF outputs are valid.", False),
@@ -4180,7 +4180,7 @@ class EstimatorStatus(Message):
         self.tas_ratio = tas_ratio
         self.pos_horiz_accuracy = pos_horiz_accuracy
         self.pos_vert_accuracy = pos_vert_accuracy
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> EstimatorStatus:
@@ -4222,11 +4222,11 @@ class WindCov(Message):
         "time_usec", "wind_x", "wind_y", "wind_z", "var_horiz", "var_vert", "wind_alt", "horiz_accuracy",
         "vert_accuracy",
     )
-    ID = 231
-    NAME = "WIND_COV"
-    CRC_EXTRA = 105
-    LENGTH = 40
-    BASE_LENGTH = 40
+    ID: ClassVar[int] = 231
+    NAME: ClassVar[str] = "WIND_COV"
+    CRC_EXTRA: ClassVar[int] = 105
+    LENGTH: ClassVar[int] = 40
+    BASE_LENGTH: ClassVar[int] = 40
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX Epoch time or time since system boot). The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
         ("wind_x", "float", 0, "m/s", "", "NaN", "Wind in North (NED) direction (NAN if unknown)", False),
@@ -4288,7 +4288,7 @@ class WindCov(Message):
         self.wind_alt = wind_alt
         self.horiz_accuracy = horiz_accuracy
         self.vert_accuracy = vert_accuracy
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> WindCov:
@@ -4326,11 +4326,11 @@ class Vibration(Message):
     __match_args__ = (
         "time_usec", "vibration_x", "vibration_y", "vibration_z", "clipping_0", "clipping_1", "clipping_2",
     )
-    ID = 241
-    NAME = "VIBRATION"
-    CRC_EXTRA = 90
-    LENGTH = 32
-    BASE_LENGTH = 32
+    ID: ClassVar[int] = 241
+    NAME: ClassVar[str] = "VIBRATION"
+    CRC_EXTRA: ClassVar[int] = 90
+    LENGTH: ClassVar[int] = 32
+    BASE_LENGTH: ClassVar[int] = 32
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX Epoch time or time since system boot). The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
         ("vibration_x", "float", 0, "", "", "", "Vibration levels on X-axis", False),
@@ -4376,7 +4376,7 @@ class Vibration(Message):
         self.clipping_0 = clipping_0
         self.clipping_1 = clipping_1
         self.clipping_2 = clipping_2
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> Vibration:
@@ -4423,11 +4423,11 @@ class HomePosition(Message):
         "latitude", "longitude", "altitude", "x", "y", "z", "q", "approach_x", "approach_y", "approach_z",
         "time_usec",
     )
-    ID = 242
-    NAME = "HOME_POSITION"
-    CRC_EXTRA = 104
-    LENGTH = 60
-    BASE_LENGTH = 52
+    ID: ClassVar[int] = 242
+    NAME: ClassVar[str] = "HOME_POSITION"
+    CRC_EXTRA: ClassVar[int] = 104
+    LENGTH: ClassVar[int] = 60
+    BASE_LENGTH: ClassVar[int] = 52
     _FIELDS = (
         ("latitude", "int32_t", 0, "degE7", "", "", "Latitude (WGS84)", False),
         ("longitude", "int32_t", 0, "degE7", "", "", "Longitude (WGS84)", False),
@@ -4507,7 +4507,7 @@ class HomePosition(Message):
         self.approach_y = approach_y
         self.approach_z = approach_z
         self.time_usec = time_usec
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> HomePosition:
@@ -4542,11 +4542,11 @@ class ExtendedSysState(Message):
 
     __slots__ = ("vtol_state", "landed_state")
     __match_args__ = ("vtol_state", "landed_state")
-    ID = 245
-    NAME = "EXTENDED_SYS_STATE"
-    CRC_EXTRA = 130
-    LENGTH = 2
-    BASE_LENGTH = 2
+    ID: ClassVar[int] = 245
+    NAME: ClassVar[str] = "EXTENDED_SYS_STATE"
+    CRC_EXTRA: ClassVar[int] = 130
+    LENGTH: ClassVar[int] = 2
+    BASE_LENGTH: ClassVar[int] = 2
     _FIELDS = (
         ("vtol_state", "uint8_t", 0, "", "MAV_VTOL_STATE", "", "The VTOL state if applicable. Is set to MAV_VTOL_STATE_UNDEFINED if UAV is not in VTOL configuration.", False),
         ("landed_state", "uint8_t", 0, "", "MAV_LANDED_STATE", "", "The landed state. Is set to MAV_LANDED_STATE_UNDEFINED if landed state is unknown.", False),
@@ -4565,7 +4565,7 @@ class ExtendedSysState(Message):
     def __init__(self, vtol_state: int, landed_state: int) -> None:
         self.vtol_state = vtol_state
         self.landed_state = landed_state
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> ExtendedSysState:
@@ -4596,11 +4596,11 @@ class Statustext(Message):
 
     __slots__ = ("severity", "text", "id", "chunk_seq")
     __match_args__ = ("severity", "text", "id", "chunk_seq")
-    ID = 253
-    NAME = "STATUSTEXT"
-    CRC_EXTRA = 83
-    LENGTH = 54
-    BASE_LENGTH = 51
+    ID: ClassVar[int] = 253
+    NAME: ClassVar[str] = "STATUSTEXT"
+    CRC_EXTRA: ClassVar[int] = 83
+    LENGTH: ClassVar[int] = 54
+    BASE_LENGTH: ClassVar[int] = 51
     _FIELDS = (
         ("severity", "uint8_t", 0, "", "MAV_SEVERITY", "", "Severity of status. Relies on the definitions within RFC-5424.", False),
         ("text", "char", 50, "", "", "", "Status text message, without null termination character. UTF-8 encoded.", False),
@@ -4631,7 +4631,7 @@ class Statustext(Message):
         self.text = text
         self.id = id
         self.chunk_seq = chunk_seq
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> Statustext:
@@ -4662,11 +4662,11 @@ class PlayTune(Message):
 
     __slots__ = ("target_system", "target_component", "tune", "tune2")
     __match_args__ = ("target_system", "target_component", "tune", "tune2")
-    ID = 258
-    NAME = "PLAY_TUNE"
-    CRC_EXTRA = 187
-    LENGTH = 232
-    BASE_LENGTH = 32
+    ID: ClassVar[int] = 258
+    NAME: ClassVar[str] = "PLAY_TUNE"
+    CRC_EXTRA: ClassVar[int] = 187
+    LENGTH: ClassVar[int] = 232
+    BASE_LENGTH: ClassVar[int] = 32
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID", False),
@@ -4691,7 +4691,7 @@ class PlayTune(Message):
         self.target_component = target_component
         self.tune = tune
         self.tune2 = tune2
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> PlayTune:
@@ -4727,11 +4727,11 @@ class ParamError(Message):
 
     __slots__ = ("target_system", "target_component", "param_id", "param_index", "error")
     __match_args__ = ("target_system", "target_component", "param_id", "param_index", "error")
-    ID = 345
-    NAME = "PARAM_ERROR"
-    CRC_EXTRA = 209
-    LENGTH = 21
-    BASE_LENGTH = 21
+    ID: ClassVar[int] = 345
+    NAME: ClassVar[str] = "PARAM_ERROR"
+    CRC_EXTRA: ClassVar[int] = 209
+    LENGTH: ClassVar[int] = 21
+    BASE_LENGTH: ClassVar[int] = 21
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID", False),
@@ -4768,7 +4768,7 @@ class ParamError(Message):
         self.param_id = param_id
         self.param_index = param_index
         self.error = error
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> ParamError:
@@ -4806,11 +4806,11 @@ class AvailableModes(Message):
 
     __slots__ = ("number_modes", "mode_index", "standard_mode", "custom_mode", "properties", "mode_name")
     __match_args__ = ("number_modes", "mode_index", "standard_mode", "custom_mode", "properties", "mode_name")
-    ID = 435
-    NAME = "AVAILABLE_MODES"
-    CRC_EXTRA = 134
-    LENGTH = 46
-    BASE_LENGTH = 46
+    ID: ClassVar[int] = 435
+    NAME: ClassVar[str] = "AVAILABLE_MODES"
+    CRC_EXTRA: ClassVar[int] = 134
+    LENGTH: ClassVar[int] = 46
+    BASE_LENGTH: ClassVar[int] = 46
     _FIELDS = (
         ("number_modes", "uint8_t", 0, "", "", "", "The total number of available modes for the current vehicle type.", False),
         ("mode_index", "uint8_t", 0, "", "", "", "The current mode index within number_modes, indexed from 1.", False),
@@ -4850,7 +4850,7 @@ class AvailableModes(Message):
         self.custom_mode = custom_mode
         self.properties = properties
         self.mode_name = mode_name
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> AvailableModes:
@@ -4885,11 +4885,11 @@ class CurrentMode(Message):
 
     __slots__ = ("standard_mode", "custom_mode", "intended_custom_mode")
     __match_args__ = ("standard_mode", "custom_mode", "intended_custom_mode")
-    ID = 436
-    NAME = "CURRENT_MODE"
-    CRC_EXTRA = 193
-    LENGTH = 9
-    BASE_LENGTH = 9
+    ID: ClassVar[int] = 436
+    NAME: ClassVar[str] = "CURRENT_MODE"
+    CRC_EXTRA: ClassVar[int] = 193
+    LENGTH: ClassVar[int] = 9
+    BASE_LENGTH: ClassVar[int] = 9
     _FIELDS = (
         ("standard_mode", "uint8_t", 0, "", "MAV_STANDARD_MODE", "", "Standard mode.", False),
         ("custom_mode", "uint32_t", 0, "", "", "", "A bitfield for use for autopilot-specific flags", False),
@@ -4914,7 +4914,7 @@ class CurrentMode(Message):
         self.standard_mode = standard_mode
         self.custom_mode = custom_mode
         self.intended_custom_mode = intended_custom_mode
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> CurrentMode:

@@ -9,7 +9,7 @@
 from __future__ import annotations
 
 from struct import Struct
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from aerokit.mavlink.message import PACK_ERRORS, Message, pack_bytes, pack_items, pack_text
 
@@ -218,11 +218,11 @@ class Ping(Message):
 
     __slots__ = ("time_usec", "seq", "target_system", "target_component")
     __match_args__ = ("time_usec", "seq", "target_system", "target_component")
-    ID = 4
-    NAME = "PING"
-    CRC_EXTRA = 237
-    LENGTH = 14
-    BASE_LENGTH = 14
+    ID: ClassVar[int] = 4
+    NAME: ClassVar[str] = "PING"
+    CRC_EXTRA: ClassVar[int] = 237
+    LENGTH: ClassVar[int] = 14
+    BASE_LENGTH: ClassVar[int] = 14
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX Epoch time or time since system boot). The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
         ("seq", "uint32_t", 0, "", "", "", "PING sequence", False),
@@ -254,7 +254,7 @@ class Ping(Message):
         self.seq = seq
         self.target_system = target_system
         self.target_component = target_component
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> Ping:
@@ -282,11 +282,11 @@ class ChangeOperatorControl(Message):
 
     __slots__ = ("target_system", "control_request", "version", "passkey")
     __match_args__ = ("target_system", "control_request", "version", "passkey")
-    ID = 5
-    NAME = "CHANGE_OPERATOR_CONTROL"
-    CRC_EXTRA = 217
-    LENGTH = 28
-    BASE_LENGTH = 28
+    ID: ClassVar[int] = 5
+    NAME: ClassVar[str] = "CHANGE_OPERATOR_CONTROL"
+    CRC_EXTRA: ClassVar[int] = 217
+    LENGTH: ClassVar[int] = 28
+    BASE_LENGTH: ClassVar[int] = 28
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System the GCS requests control for", False),
         ("control_request", "uint8_t", 0, "", "", "", "0: request control of this MAV, 1: Release control of this MAV", False),
@@ -316,7 +316,7 @@ class ChangeOperatorControl(Message):
         self.control_request = control_request
         self.version = version
         self.passkey = passkey
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> ChangeOperatorControl:
@@ -347,11 +347,11 @@ class ChangeOperatorControlAck(Message):
 
     __slots__ = ("gcs_system_id", "control_request", "ack")
     __match_args__ = ("gcs_system_id", "control_request", "ack")
-    ID = 6
-    NAME = "CHANGE_OPERATOR_CONTROL_ACK"
-    CRC_EXTRA = 104
-    LENGTH = 3
-    BASE_LENGTH = 3
+    ID: ClassVar[int] = 6
+    NAME: ClassVar[str] = "CHANGE_OPERATOR_CONTROL_ACK"
+    CRC_EXTRA: ClassVar[int] = 104
+    LENGTH: ClassVar[int] = 3
+    BASE_LENGTH: ClassVar[int] = 3
     _FIELDS = (
         ("gcs_system_id", "uint8_t", 0, "", "", "", "ID of the GCS this message", False),
         ("control_request", "uint8_t", 0, "", "", "", "0: request control of this MAV, 1: Release control of this MAV", False),
@@ -373,7 +373,7 @@ class ChangeOperatorControlAck(Message):
         self.gcs_system_id = gcs_system_id
         self.control_request = control_request
         self.ack = ack
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> ChangeOperatorControlAck:
@@ -402,11 +402,11 @@ class AuthKey(Message):
 
     __slots__ = ("key",)
     __match_args__ = ("key",)
-    ID = 7
-    NAME = "AUTH_KEY"
-    CRC_EXTRA = 119
-    LENGTH = 32
-    BASE_LENGTH = 32
+    ID: ClassVar[int] = 7
+    NAME: ClassVar[str] = "AUTH_KEY"
+    CRC_EXTRA: ClassVar[int] = 119
+    LENGTH: ClassVar[int] = 32
+    BASE_LENGTH: ClassVar[int] = 32
     _FIELDS = (
         ("key", "char", 32, "", "", "", "key", False),
     )
@@ -416,7 +416,7 @@ class AuthKey(Message):
 
     def __init__(self, key: str) -> None:
         self.key = key
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> AuthKey:
@@ -453,11 +453,11 @@ class GpsStatus(Message):
         "satellites_visible", "satellite_prn", "satellite_used", "satellite_elevation", "satellite_azimuth",
         "satellite_snr",
     )
-    ID = 25
-    NAME = "GPS_STATUS"
-    CRC_EXTRA = 23
-    LENGTH = 101
-    BASE_LENGTH = 101
+    ID: ClassVar[int] = 25
+    NAME: ClassVar[str] = "GPS_STATUS"
+    CRC_EXTRA: ClassVar[int] = 23
+    LENGTH: ClassVar[int] = 101
+    BASE_LENGTH: ClassVar[int] = 101
     _FIELDS = (
         ("satellites_visible", "uint8_t", 0, "", "", "", "Number of satellites visible", False),
         ("satellite_prn", "uint8_t", 20, "", "", "", "Global satellite ID", False),
@@ -497,7 +497,7 @@ class GpsStatus(Message):
         self.satellite_elevation = satellite_elevation
         self.satellite_azimuth = satellite_azimuth
         self.satellite_snr = satellite_snr
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> GpsStatus:
@@ -539,11 +539,11 @@ class ScaledImu(Message):
         "time_boot_ms", "xacc", "yacc", "zacc", "xgyro", "ygyro", "zgyro", "xmag", "ymag", "zmag",
         "temperature",
     )
-    ID = 26
-    NAME = "SCALED_IMU"
-    CRC_EXTRA = 170
-    LENGTH = 24
-    BASE_LENGTH = 22
+    ID: ClassVar[int] = 26
+    NAME: ClassVar[str] = "SCALED_IMU"
+    CRC_EXTRA: ClassVar[int] = 170
+    LENGTH: ClassVar[int] = 24
+    BASE_LENGTH: ClassVar[int] = 22
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot).", False),
         ("xacc", "int16_t", 0, "mG", "", "", "X acceleration", False),
@@ -608,7 +608,7 @@ class ScaledImu(Message):
         self.ymag = ymag
         self.zmag = zmag
         self.temperature = temperature
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> ScaledImu:
@@ -651,11 +651,11 @@ class RawImu(Message):
         "time_usec", "xacc", "yacc", "zacc", "xgyro", "ygyro", "zgyro", "xmag", "ymag", "zmag", "id",
         "temperature",
     )
-    ID = 27
-    NAME = "RAW_IMU"
-    CRC_EXTRA = 144
-    LENGTH = 29
-    BASE_LENGTH = 26
+    ID: ClassVar[int] = 27
+    NAME: ClassVar[str] = "RAW_IMU"
+    CRC_EXTRA: ClassVar[int] = 144
+    LENGTH: ClassVar[int] = 29
+    BASE_LENGTH: ClassVar[int] = 26
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX Epoch time or time since system boot). The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
         ("xacc", "int16_t", 0, "", "", "", "X acceleration (raw)", False),
@@ -730,7 +730,7 @@ class RawImu(Message):
         self.zmag = zmag
         self.id = id
         self.temperature = temperature
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> RawImu:
@@ -765,11 +765,11 @@ class RawPressure(Message):
 
     __slots__ = ("time_usec", "press_abs", "press_diff1", "press_diff2", "temperature")
     __match_args__ = ("time_usec", "press_abs", "press_diff1", "press_diff2", "temperature")
-    ID = 28
-    NAME = "RAW_PRESSURE"
-    CRC_EXTRA = 67
-    LENGTH = 16
-    BASE_LENGTH = 16
+    ID: ClassVar[int] = 28
+    NAME: ClassVar[str] = "RAW_PRESSURE"
+    CRC_EXTRA: ClassVar[int] = 67
+    LENGTH: ClassVar[int] = 16
+    BASE_LENGTH: ClassVar[int] = 16
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX Epoch time or time since system boot). The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
         ("press_abs", "int16_t", 0, "", "", "", "Absolute pressure (raw)", False),
@@ -804,7 +804,7 @@ class RawPressure(Message):
         self.press_diff1 = press_diff1
         self.press_diff2 = press_diff2
         self.temperature = temperature
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> RawPressure:
@@ -837,11 +837,11 @@ class ScaledPressure(Message):
 
     __slots__ = ("time_boot_ms", "press_abs", "press_diff", "temperature", "temperature_press_diff")
     __match_args__ = ("time_boot_ms", "press_abs", "press_diff", "temperature", "temperature_press_diff")
-    ID = 29
-    NAME = "SCALED_PRESSURE"
-    CRC_EXTRA = 115
-    LENGTH = 16
-    BASE_LENGTH = 14
+    ID: ClassVar[int] = 29
+    NAME: ClassVar[str] = "SCALED_PRESSURE"
+    CRC_EXTRA: ClassVar[int] = 115
+    LENGTH: ClassVar[int] = 16
+    BASE_LENGTH: ClassVar[int] = 14
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot).", False),
         ("press_abs", "float", 0, "hPa", "", "", "Absolute pressure", False),
@@ -876,7 +876,7 @@ class ScaledPressure(Message):
         self.press_diff = press_diff
         self.temperature = temperature
         self.temperature_press_diff = temperature_press_diff
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> ScaledPressure:
@@ -916,11 +916,11 @@ class RcChannelsScaled(Message):
         "time_boot_ms", "port", "chan1_scaled", "chan2_scaled", "chan3_scaled", "chan4_scaled",
         "chan5_scaled", "chan6_scaled", "chan7_scaled", "chan8_scaled", "rssi",
     )
-    ID = 34
-    NAME = "RC_CHANNELS_SCALED"
-    CRC_EXTRA = 237
-    LENGTH = 22
-    BASE_LENGTH = 22
+    ID: ClassVar[int] = 34
+    NAME: ClassVar[str] = "RC_CHANNELS_SCALED"
+    CRC_EXTRA: ClassVar[int] = 237
+    LENGTH: ClassVar[int] = 22
+    BASE_LENGTH: ClassVar[int] = 22
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot).", False),
         ("port", "uint8_t", 0, "", "", "", "Servo output port (set of 8 outputs = 1 port). Flight stacks running on Pixhawk should use: 0 = MAIN, 1 = AUX.", False),
@@ -988,7 +988,7 @@ class RcChannelsScaled(Message):
         self.chan7_scaled = chan7_scaled
         self.chan8_scaled = chan8_scaled
         self.rssi = rssi
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> RcChannelsScaled:
@@ -1025,11 +1025,11 @@ class MissionRequestPartialList(Message):
 
     __slots__ = ("target_system", "target_component", "start_index", "end_index", "mission_type")
     __match_args__ = ("target_system", "target_component", "start_index", "end_index", "mission_type")
-    ID = 37
-    NAME = "MISSION_REQUEST_PARTIAL_LIST"
-    CRC_EXTRA = 212
-    LENGTH = 7
-    BASE_LENGTH = 6
+    ID: ClassVar[int] = 37
+    NAME: ClassVar[str] = "MISSION_REQUEST_PARTIAL_LIST"
+    CRC_EXTRA: ClassVar[int] = 212
+    LENGTH: ClassVar[int] = 7
+    BASE_LENGTH: ClassVar[int] = 6
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID", False),
@@ -1062,7 +1062,7 @@ class MissionRequestPartialList(Message):
         self.start_index = start_index
         self.end_index = end_index
         self.mission_type = mission_type
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> MissionRequestPartialList:
@@ -1108,11 +1108,11 @@ class MissionItem(Message):
         "target_system", "target_component", "seq", "frame", "command", "current", "autocontinue", "param1",
         "param2", "param3", "param4", "x", "y", "z", "mission_type",
     )
-    ID = 39
-    NAME = "MISSION_ITEM"
-    CRC_EXTRA = 254
-    LENGTH = 38
-    BASE_LENGTH = 37
+    ID: ClassVar[int] = 39
+    NAME: ClassVar[str] = "MISSION_ITEM"
+    CRC_EXTRA: ClassVar[int] = 254
+    LENGTH: ClassVar[int] = 38
+    BASE_LENGTH: ClassVar[int] = 37
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID", False),
@@ -1200,7 +1200,7 @@ class MissionItem(Message):
         self.y = y
         self.z = z
         self.mission_type = mission_type
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> MissionItem:
@@ -1242,11 +1242,11 @@ class SetGpsGlobalOrigin(Message):
 
     __slots__ = ("target_system", "latitude", "longitude", "altitude", "time_usec")
     __match_args__ = ("target_system", "latitude", "longitude", "altitude", "time_usec")
-    ID = 48
-    NAME = "SET_GPS_GLOBAL_ORIGIN"
-    CRC_EXTRA = 41
-    LENGTH = 21
-    BASE_LENGTH = 13
+    ID: ClassVar[int] = 48
+    NAME: ClassVar[str] = "SET_GPS_GLOBAL_ORIGIN"
+    CRC_EXTRA: ClassVar[int] = 41
+    LENGTH: ClassVar[int] = 21
+    BASE_LENGTH: ClassVar[int] = 13
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID", False),
         ("latitude", "int32_t", 0, "degE7", "", "", "Latitude (WGS84)", False),
@@ -1281,7 +1281,7 @@ class SetGpsGlobalOrigin(Message):
         self.longitude = longitude
         self.altitude = altitude
         self.time_usec = time_usec
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> SetGpsGlobalOrigin:
@@ -1318,11 +1318,11 @@ class ParamMapRc(Message):
         "target_system", "target_component", "param_id", "param_index", "parameter_rc_channel_index",
         "param_value0", "scale", "param_value_min", "param_value_max",
     )
-    ID = 50
-    NAME = "PARAM_MAP_RC"
-    CRC_EXTRA = 78
-    LENGTH = 37
-    BASE_LENGTH = 37
+    ID: ClassVar[int] = 50
+    NAME: ClassVar[str] = "PARAM_MAP_RC"
+    CRC_EXTRA: ClassVar[int] = 78
+    LENGTH: ClassVar[int] = 37
+    BASE_LENGTH: ClassVar[int] = 37
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID", False),
@@ -1387,7 +1387,7 @@ class ParamMapRc(Message):
         self.scale = scale
         self.param_value_min = param_value_min
         self.param_value_max = param_value_max
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> ParamMapRc:
@@ -1425,11 +1425,11 @@ class SafetySetAllowedArea(Message):
 
     __slots__ = ("target_system", "target_component", "frame", "p1x", "p1y", "p1z", "p2x", "p2y", "p2z")
     __match_args__ = ("target_system", "target_component", "frame", "p1x", "p1y", "p1z", "p2x", "p2y", "p2z")
-    ID = 54
-    NAME = "SAFETY_SET_ALLOWED_AREA"
-    CRC_EXTRA = 15
-    LENGTH = 27
-    BASE_LENGTH = 27
+    ID: ClassVar[int] = 54
+    NAME: ClassVar[str] = "SAFETY_SET_ALLOWED_AREA"
+    CRC_EXTRA: ClassVar[int] = 15
+    LENGTH: ClassVar[int] = 27
+    BASE_LENGTH: ClassVar[int] = 27
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID", False),
@@ -1484,7 +1484,7 @@ class SafetySetAllowedArea(Message):
         self.p2x = p2x
         self.p2y = p2y
         self.p2z = p2z
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> SafetySetAllowedArea:
@@ -1518,11 +1518,11 @@ class SafetyAllowedArea(Message):
 
     __slots__ = ("frame", "p1x", "p1y", "p1z", "p2x", "p2y", "p2z")
     __match_args__ = ("frame", "p1x", "p1y", "p1z", "p2x", "p2y", "p2z")
-    ID = 55
-    NAME = "SAFETY_ALLOWED_AREA"
-    CRC_EXTRA = 3
-    LENGTH = 25
-    BASE_LENGTH = 25
+    ID: ClassVar[int] = 55
+    NAME: ClassVar[str] = "SAFETY_ALLOWED_AREA"
+    CRC_EXTRA: ClassVar[int] = 3
+    LENGTH: ClassVar[int] = 25
+    BASE_LENGTH: ClassVar[int] = 25
     _FIELDS = (
         ("frame", "uint8_t", 0, "", "MAV_FRAME", "", "Coordinate frame. Can be either global, GPS, right-handed with Z axis up or local, right handed, Z axis down.", False),
         ("p1x", "float", 0, "m", "", "", "x position 1 / Latitude 1", False),
@@ -1566,7 +1566,7 @@ class SafetyAllowedArea(Message):
         self.p2x = p2x
         self.p2y = p2y
         self.p2z = p2z
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> SafetyAllowedArea:
@@ -1596,11 +1596,11 @@ class AttitudeQuaternionCov(Message):
 
     __slots__ = ("time_usec", "q", "rollspeed", "pitchspeed", "yawspeed", "covariance")
     __match_args__ = ("time_usec", "q", "rollspeed", "pitchspeed", "yawspeed", "covariance")
-    ID = 61
-    NAME = "ATTITUDE_QUATERNION_COV"
-    CRC_EXTRA = 167
-    LENGTH = 72
-    BASE_LENGTH = 72
+    ID: ClassVar[int] = 61
+    NAME: ClassVar[str] = "ATTITUDE_QUATERNION_COV"
+    CRC_EXTRA: ClassVar[int] = 167
+    LENGTH: ClassVar[int] = 72
+    BASE_LENGTH: ClassVar[int] = 72
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX Epoch time or time since system boot). The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
         ("q", "float", 4, "", "", "", "Quaternion components, w, x, y, z (1 0 0 0 is the null-rotation)", False),
@@ -1644,7 +1644,7 @@ class AttitudeQuaternionCov(Message):
         self.pitchspeed = pitchspeed
         self.yawspeed = yawspeed
         self.covariance = tuple(covariance)
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> AttitudeQuaternionCov:
@@ -1687,11 +1687,11 @@ class NavControllerOutput(Message):
         "nav_roll", "nav_pitch", "nav_bearing", "target_bearing", "wp_dist", "alt_error", "aspd_error",
         "xtrack_error",
     )
-    ID = 62
-    NAME = "NAV_CONTROLLER_OUTPUT"
-    CRC_EXTRA = 183
-    LENGTH = 26
-    BASE_LENGTH = 26
+    ID: ClassVar[int] = 62
+    NAME: ClassVar[str] = "NAV_CONTROLLER_OUTPUT"
+    CRC_EXTRA: ClassVar[int] = 183
+    LENGTH: ClassVar[int] = 26
+    BASE_LENGTH: ClassVar[int] = 26
     _FIELDS = (
         ("nav_roll", "float", 0, "deg", "", "", "Current desired roll", False),
         ("nav_pitch", "float", 0, "deg", "", "", "Current desired pitch", False),
@@ -1739,7 +1739,7 @@ class NavControllerOutput(Message):
         self.alt_error = alt_error
         self.aspd_error = aspd_error
         self.xtrack_error = xtrack_error
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> NavControllerOutput:
@@ -1781,11 +1781,11 @@ class GlobalPositionIntCov(Message):
     __match_args__ = (
         "time_usec", "estimator_type", "lat", "lon", "alt", "relative_alt", "vx", "vy", "vz", "covariance",
     )
-    ID = 63
-    NAME = "GLOBAL_POSITION_INT_COV"
-    CRC_EXTRA = 119
-    LENGTH = 181
-    BASE_LENGTH = 181
+    ID: ClassVar[int] = 63
+    NAME: ClassVar[str] = "GLOBAL_POSITION_INT_COV"
+    CRC_EXTRA: ClassVar[int] = 119
+    LENGTH: ClassVar[int] = 181
+    BASE_LENGTH: ClassVar[int] = 181
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX Epoch time or time since system boot). The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
         ("estimator_type", "uint8_t", 0, "", "MAV_ESTIMATOR_TYPE", "", "Class id of the estimator this estimate originated from.", False),
@@ -1849,7 +1849,7 @@ class GlobalPositionIntCov(Message):
         self.vy = vy
         self.vz = vz
         self.covariance = tuple(covariance)
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> GlobalPositionIntCov:
@@ -1896,11 +1896,11 @@ class LocalPositionNedCov(Message):
     __match_args__ = (
         "time_usec", "estimator_type", "x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az", "covariance",
     )
-    ID = 64
-    NAME = "LOCAL_POSITION_NED_COV"
-    CRC_EXTRA = 191
-    LENGTH = 225
-    BASE_LENGTH = 225
+    ID: ClassVar[int] = 64
+    NAME: ClassVar[str] = "LOCAL_POSITION_NED_COV"
+    CRC_EXTRA: ClassVar[int] = 191
+    LENGTH: ClassVar[int] = 225
+    BASE_LENGTH: ClassVar[int] = 225
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX Epoch time or time since system boot). The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
         ("estimator_type", "uint8_t", 0, "", "MAV_ESTIMATOR_TYPE", "", "Class id of the estimator this estimate originated from.", False),
@@ -1975,7 +1975,7 @@ class LocalPositionNedCov(Message):
         self.ay = ay
         self.az = az
         self.covariance = tuple(covariance)
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> LocalPositionNedCov:
@@ -2020,11 +2020,11 @@ class DataStream(Message):
 
     __slots__ = ("stream_id", "message_rate", "on_off")
     __match_args__ = ("stream_id", "message_rate", "on_off")
-    ID = 67
-    NAME = "DATA_STREAM"
-    CRC_EXTRA = 21
-    LENGTH = 4
-    BASE_LENGTH = 4
+    ID: ClassVar[int] = 67
+    NAME: ClassVar[str] = "DATA_STREAM"
+    CRC_EXTRA: ClassVar[int] = 21
+    LENGTH: ClassVar[int] = 4
+    BASE_LENGTH: ClassVar[int] = 4
     _FIELDS = (
         ("stream_id", "uint8_t", 0, "", "MAV_DATA_STREAM", "", "The ID of the requested data stream.", False),
         ("message_rate", "uint16_t", 0, "Hz", "", "", "The message rate", False),
@@ -2044,7 +2044,7 @@ class DataStream(Message):
         self.stream_id = stream_id
         self.message_rate = message_rate
         self.on_off = on_off
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> DataStream:
@@ -2080,11 +2080,11 @@ class ManualControl(Message):
         "target", "x", "y", "z", "r", "buttons", "buttons2", "enabled_extensions", "s", "t", "aux1", "aux2",
         "aux3", "aux4", "aux5", "aux6",
     )
-    ID = 69
-    NAME = "MANUAL_CONTROL"
-    CRC_EXTRA = 243
-    LENGTH = 30
-    BASE_LENGTH = 11
+    ID: ClassVar[int] = 69
+    NAME: ClassVar[str] = "MANUAL_CONTROL"
+    CRC_EXTRA: ClassVar[int] = 243
+    LENGTH: ClassVar[int] = 30
+    BASE_LENGTH: ClassVar[int] = 11
     _FIELDS = (
         ("target", "uint8_t", 0, "", "", "", "The system to be controlled.", False),
         ("x", "int16_t", 0, "", "", "INT16_MAX", "X-axis, normalized to the range [-1000,1000]. A value of INT16_MAX indicates that this axis is invalid. Generally corresponds to forward(1000)-backward(-1000) movement on a joystick and the pitch of a vehicle.", False),
@@ -2217,7 +2217,7 @@ class ManualControl(Message):
         self.aux4 = aux4
         self.aux5 = aux5
         self.aux6 = aux6
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> ManualControl:
@@ -2254,11 +2254,11 @@ class ManualSetpoint(Message):
     __match_args__ = (
         "time_boot_ms", "roll", "pitch", "yaw", "thrust", "mode_switch", "manual_override_switch",
     )
-    ID = 81
-    NAME = "MANUAL_SETPOINT"
-    CRC_EXTRA = 106
-    LENGTH = 22
-    BASE_LENGTH = 22
+    ID: ClassVar[int] = 81
+    NAME: ClassVar[str] = "MANUAL_SETPOINT"
+    CRC_EXTRA: ClassVar[int] = 106
+    LENGTH: ClassVar[int] = 22
+    BASE_LENGTH: ClassVar[int] = 22
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot).", False),
         ("roll", "float", 0, "rad/s", "", "", "Desired roll rate", False),
@@ -2301,7 +2301,7 @@ class ManualSetpoint(Message):
         self.thrust = thrust
         self.mode_switch = mode_switch
         self.manual_override_switch = manual_override_switch
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> ManualSetpoint:
@@ -2341,11 +2341,11 @@ class AttitudeTarget(Message):
     __match_args__ = (
         "time_boot_ms", "type_mask", "q", "body_roll_rate", "body_pitch_rate", "body_yaw_rate", "thrust",
     )
-    ID = 83
-    NAME = "ATTITUDE_TARGET"
-    CRC_EXTRA = 22
-    LENGTH = 37
-    BASE_LENGTH = 37
+    ID: ClassVar[int] = 83
+    NAME: ClassVar[str] = "ATTITUDE_TARGET"
+    CRC_EXTRA: ClassVar[int] = 22
+    LENGTH: ClassVar[int] = 37
+    BASE_LENGTH: ClassVar[int] = 37
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot).", False),
         ("type_mask", "uint8_t", 0, "", "ATTITUDE_TARGET_TYPEMASK", "", "Bitmap to indicate which dimensions should be ignored by the vehicle.", False),
@@ -2392,7 +2392,7 @@ class AttitudeTarget(Message):
         self.body_pitch_rate = body_pitch_rate
         self.body_yaw_rate = body_yaw_rate
         self.thrust = thrust
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> AttitudeTarget:
@@ -2435,11 +2435,11 @@ class PositionTargetLocalNed(Message):
         "time_boot_ms", "coordinate_frame", "type_mask", "x", "y", "z", "vx", "vy", "vz", "afx", "afy", "afz",
         "yaw", "yaw_rate",
     )
-    ID = 85
-    NAME = "POSITION_TARGET_LOCAL_NED"
-    CRC_EXTRA = 140
-    LENGTH = 51
-    BASE_LENGTH = 51
+    ID: ClassVar[int] = 85
+    NAME: ClassVar[str] = "POSITION_TARGET_LOCAL_NED"
+    CRC_EXTRA: ClassVar[int] = 140
+    LENGTH: ClassVar[int] = 51
+    BASE_LENGTH: ClassVar[int] = 51
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot).", False),
         ("coordinate_frame", "uint8_t", 0, "", "MAV_FRAME", "", "Valid options are: MAV_FRAME_LOCAL_NED = 1, MAV_FRAME_LOCAL_OFFSET_NED = 7, MAV_FRAME_BODY_NED = 8, MAV_FRAME_BODY_OFFSET_NED = 9", False),
@@ -2527,7 +2527,7 @@ class PositionTargetLocalNed(Message):
         self.afz = afz
         self.yaw = yaw
         self.yaw_rate = yaw_rate
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> PositionTargetLocalNed:
@@ -2569,11 +2569,11 @@ class PositionTargetGlobalInt(Message):
         "time_boot_ms", "coordinate_frame", "type_mask", "lat_int", "lon_int", "alt", "vx", "vy", "vz", "afx",
         "afy", "afz", "yaw", "yaw_rate",
     )
-    ID = 87
-    NAME = "POSITION_TARGET_GLOBAL_INT"
-    CRC_EXTRA = 150
-    LENGTH = 51
-    BASE_LENGTH = 51
+    ID: ClassVar[int] = 87
+    NAME: ClassVar[str] = "POSITION_TARGET_GLOBAL_INT"
+    CRC_EXTRA: ClassVar[int] = 150
+    LENGTH: ClassVar[int] = 51
+    BASE_LENGTH: ClassVar[int] = 51
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot). The rationale for the timestamp in the setpoint is to allow the system to compensate for the transport delay of the setpoint. This allows the system to compensate processing latency.", False),
         ("coordinate_frame", "uint8_t", 0, "", "MAV_FRAME", "", "Valid options are: MAV_FRAME_GLOBAL = 0, MAV_FRAME_GLOBAL_RELATIVE_ALT = 3, MAV_FRAME_GLOBAL_TERRAIN_ALT = 10 (MAV_FRAME_GLOBAL_INT, MAV_FRAME_GLOBAL_RELATIVE_ALT_INT, MAV_FRAME_GLOBAL_TERRAIN_ALT_INT are allowed synonyms, but have been deprecated)", False),
@@ -2667,7 +2667,7 @@ class PositionTargetGlobalInt(Message):
         self.afz = afz
         self.yaw = yaw
         self.yaw_rate = yaw_rate
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> PositionTargetGlobalInt:
@@ -2703,11 +2703,11 @@ class LocalPositionNedSystemGlobalOffset(Message):
 
     __slots__ = ("time_boot_ms", "x", "y", "z", "roll", "pitch", "yaw")
     __match_args__ = ("time_boot_ms", "x", "y", "z", "roll", "pitch", "yaw")
-    ID = 89
-    NAME = "LOCAL_POSITION_NED_SYSTEM_GLOBAL_OFFSET"
-    CRC_EXTRA = 231
-    LENGTH = 28
-    BASE_LENGTH = 28
+    ID: ClassVar[int] = 89
+    NAME: ClassVar[str] = "LOCAL_POSITION_NED_SYSTEM_GLOBAL_OFFSET"
+    CRC_EXTRA: ClassVar[int] = 231
+    LENGTH: ClassVar[int] = 28
+    BASE_LENGTH: ClassVar[int] = 28
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot).", False),
         ("x", "float", 0, "m", "", "", "X Position", False),
@@ -2749,7 +2749,7 @@ class LocalPositionNedSystemGlobalOffset(Message):
         self.roll = roll
         self.pitch = pitch
         self.yaw = yaw
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> LocalPositionNedSystemGlobalOffset:
@@ -2789,11 +2789,11 @@ class HilState(Message):
         "time_usec", "roll", "pitch", "yaw", "rollspeed", "pitchspeed", "yawspeed", "lat", "lon", "alt", "vx",
         "vy", "vz", "xacc", "yacc", "zacc",
     )
-    ID = 90
-    NAME = "HIL_STATE"
-    CRC_EXTRA = 183
-    LENGTH = 56
-    BASE_LENGTH = 56
+    ID: ClassVar[int] = 90
+    NAME: ClassVar[str] = "HIL_STATE"
+    CRC_EXTRA: ClassVar[int] = 183
+    LENGTH: ClassVar[int] = 56
+    BASE_LENGTH: ClassVar[int] = 56
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX Epoch time or time since system boot). The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
         ("roll", "float", 0, "rad", "", "", "Roll angle", False),
@@ -2885,7 +2885,7 @@ class HilState(Message):
         self.xacc = xacc
         self.yacc = yacc
         self.zacc = zacc
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> HilState:
@@ -2927,11 +2927,11 @@ class HilControls(Message):
         "time_usec", "roll_ailerons", "pitch_elevator", "yaw_rudder", "throttle", "aux1", "aux2", "aux3",
         "aux4", "mode", "nav_mode",
     )
-    ID = 91
-    NAME = "HIL_CONTROLS"
-    CRC_EXTRA = 63
-    LENGTH = 42
-    BASE_LENGTH = 42
+    ID: ClassVar[int] = 91
+    NAME: ClassVar[str] = "HIL_CONTROLS"
+    CRC_EXTRA: ClassVar[int] = 63
+    LENGTH: ClassVar[int] = 42
+    BASE_LENGTH: ClassVar[int] = 42
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX Epoch time or time since system boot). The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
         ("roll_ailerons", "float", 0, "", "", "", "Control output -1 .. 1", False),
@@ -2997,7 +2997,7 @@ class HilControls(Message):
         self.aux4 = aux4
         self.mode = mode
         self.nav_mode = nav_mode
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> HilControls:
@@ -3039,11 +3039,11 @@ class HilRcInputsRaw(Message):
         "time_usec", "chan1_raw", "chan2_raw", "chan3_raw", "chan4_raw", "chan5_raw", "chan6_raw",
         "chan7_raw", "chan8_raw", "chan9_raw", "chan10_raw", "chan11_raw", "chan12_raw", "rssi",
     )
-    ID = 92
-    NAME = "HIL_RC_INPUTS_RAW"
-    CRC_EXTRA = 54
-    LENGTH = 33
-    BASE_LENGTH = 33
+    ID: ClassVar[int] = 92
+    NAME: ClassVar[str] = "HIL_RC_INPUTS_RAW"
+    CRC_EXTRA: ClassVar[int] = 54
+    LENGTH: ClassVar[int] = 33
+    BASE_LENGTH: ClassVar[int] = 33
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX Epoch time or time since system boot). The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
         ("chan1_raw", "uint16_t", 0, "us", "", "", "RC channel 1 value", False),
@@ -3127,7 +3127,7 @@ class HilRcInputsRaw(Message):
         self.chan11_raw = chan11_raw
         self.chan12_raw = chan12_raw
         self.rssi = rssi
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> HilRcInputsRaw:
@@ -3164,11 +3164,11 @@ class HilActuatorControls(Message):
 
     __slots__ = ("time_usec", "controls", "mode", "flags")
     __match_args__ = ("time_usec", "controls", "mode", "flags")
-    ID = 93
-    NAME = "HIL_ACTUATOR_CONTROLS"
-    CRC_EXTRA = 47
-    LENGTH = 81
-    BASE_LENGTH = 81
+    ID: ClassVar[int] = 93
+    NAME: ClassVar[str] = "HIL_ACTUATOR_CONTROLS"
+    CRC_EXTRA: ClassVar[int] = 47
+    LENGTH: ClassVar[int] = 81
+    BASE_LENGTH: ClassVar[int] = 81
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX Epoch time or time since system boot). The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
         ("controls", "float", 16, "", "", "", "Control outputs -1 .. 1. Channel assignment depends on the simulated hardware.", False),
@@ -3196,7 +3196,7 @@ class HilActuatorControls(Message):
         self.controls = tuple(controls)
         self.mode = mode
         self.flags = flags
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> HilActuatorControls:
@@ -3234,11 +3234,11 @@ class OpticalFlow(Message):
         "time_usec", "sensor_id", "flow_x", "flow_y", "flow_comp_m_x", "flow_comp_m_y", "quality",
         "ground_distance", "flow_rate_x", "flow_rate_y",
     )
-    ID = 100
-    NAME = "OPTICAL_FLOW"
-    CRC_EXTRA = 175
-    LENGTH = 34
-    BASE_LENGTH = 26
+    ID: ClassVar[int] = 100
+    NAME: ClassVar[str] = "OPTICAL_FLOW"
+    CRC_EXTRA: ClassVar[int] = 175
+    LENGTH: ClassVar[int] = 34
+    BASE_LENGTH: ClassVar[int] = 26
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX Epoch time or time since system boot). The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
         ("sensor_id", "uint8_t", 0, "", "", "", "Sensor ID", False),
@@ -3302,7 +3302,7 @@ class OpticalFlow(Message):
         self.ground_distance = ground_distance
         self.flow_rate_x = flow_rate_x
         self.flow_rate_y = flow_rate_y
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> OpticalFlow:
@@ -3336,11 +3336,11 @@ class GlobalVisionPositionEstimate(Message):
 
     __slots__ = ("usec", "x", "y", "z", "roll", "pitch", "yaw", "covariance", "reset_counter")
     __match_args__ = ("usec", "x", "y", "z", "roll", "pitch", "yaw", "covariance", "reset_counter")
-    ID = 101
-    NAME = "GLOBAL_VISION_POSITION_ESTIMATE"
-    CRC_EXTRA = 102
-    LENGTH = 117
-    BASE_LENGTH = 32
+    ID: ClassVar[int] = 101
+    NAME: ClassVar[str] = "GLOBAL_VISION_POSITION_ESTIMATE"
+    CRC_EXTRA: ClassVar[int] = 102
+    LENGTH: ClassVar[int] = 117
+    BASE_LENGTH: ClassVar[int] = 32
     _FIELDS = (
         ("usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX time or since system boot)", False),
         ("x", "float", 0, "m", "", "", "Global X position", False),
@@ -3400,7 +3400,7 @@ class GlobalVisionPositionEstimate(Message):
         self.yaw = yaw
         self.covariance = tuple(covariance)
         self.reset_counter = reset_counter
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> GlobalVisionPositionEstimate:
@@ -3440,11 +3440,11 @@ class VisionPositionEstimate(Message):
 
     __slots__ = ("usec", "x", "y", "z", "roll", "pitch", "yaw", "covariance", "reset_counter")
     __match_args__ = ("usec", "x", "y", "z", "roll", "pitch", "yaw", "covariance", "reset_counter")
-    ID = 102
-    NAME = "VISION_POSITION_ESTIMATE"
-    CRC_EXTRA = 158
-    LENGTH = 117
-    BASE_LENGTH = 32
+    ID: ClassVar[int] = 102
+    NAME: ClassVar[str] = "VISION_POSITION_ESTIMATE"
+    CRC_EXTRA: ClassVar[int] = 158
+    LENGTH: ClassVar[int] = 117
+    BASE_LENGTH: ClassVar[int] = 32
     _FIELDS = (
         ("usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX time or time since system boot)", False),
         ("x", "float", 0, "m", "", "", "Local X position", False),
@@ -3504,7 +3504,7 @@ class VisionPositionEstimate(Message):
         self.yaw = yaw
         self.covariance = tuple(covariance)
         self.reset_counter = reset_counter
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> VisionPositionEstimate:
@@ -3544,11 +3544,11 @@ class VisionSpeedEstimate(Message):
 
     __slots__ = ("usec", "x", "y", "z", "covariance", "reset_counter")
     __match_args__ = ("usec", "x", "y", "z", "covariance", "reset_counter")
-    ID = 103
-    NAME = "VISION_SPEED_ESTIMATE"
-    CRC_EXTRA = 208
-    LENGTH = 57
-    BASE_LENGTH = 20
+    ID: ClassVar[int] = 103
+    NAME: ClassVar[str] = "VISION_SPEED_ESTIMATE"
+    CRC_EXTRA: ClassVar[int] = 208
+    LENGTH: ClassVar[int] = 57
+    BASE_LENGTH: ClassVar[int] = 20
     _FIELDS = (
         ("usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX time or time since system boot)", False),
         ("x", "float", 0, "m/s", "", "", "Global X speed", False),
@@ -3592,7 +3592,7 @@ class VisionSpeedEstimate(Message):
         self.z = z
         self.covariance = tuple(covariance)
         self.reset_counter = reset_counter
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> VisionSpeedEstimate:
@@ -3628,11 +3628,11 @@ class ViconPositionEstimate(Message):
 
     __slots__ = ("usec", "x", "y", "z", "roll", "pitch", "yaw", "covariance")
     __match_args__ = ("usec", "x", "y", "z", "roll", "pitch", "yaw", "covariance")
-    ID = 104
-    NAME = "VICON_POSITION_ESTIMATE"
-    CRC_EXTRA = 56
-    LENGTH = 116
-    BASE_LENGTH = 32
+    ID: ClassVar[int] = 104
+    NAME: ClassVar[str] = "VICON_POSITION_ESTIMATE"
+    CRC_EXTRA: ClassVar[int] = 56
+    LENGTH: ClassVar[int] = 116
+    BASE_LENGTH: ClassVar[int] = 32
     _FIELDS = (
         ("usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX time or time since system boot)", False),
         ("x", "float", 0, "m", "", "", "Global X position", False),
@@ -3684,7 +3684,7 @@ class ViconPositionEstimate(Message):
         self.pitch = pitch
         self.yaw = yaw
         self.covariance = tuple(covariance)
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> ViconPositionEstimate:
@@ -3729,11 +3729,11 @@ class HighresImu(Message):
         "time_usec", "xacc", "yacc", "zacc", "xgyro", "ygyro", "zgyro", "xmag", "ymag", "zmag",
         "abs_pressure", "diff_pressure", "pressure_alt", "temperature", "fields_updated", "id",
     )
-    ID = 105
-    NAME = "HIGHRES_IMU"
-    CRC_EXTRA = 93
-    LENGTH = 63
-    BASE_LENGTH = 62
+    ID: ClassVar[int] = 105
+    NAME: ClassVar[str] = "HIGHRES_IMU"
+    CRC_EXTRA: ClassVar[int] = 93
+    LENGTH: ClassVar[int] = 63
+    BASE_LENGTH: ClassVar[int] = 62
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX Epoch time or time since system boot). The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
         ("xacc", "float", 0, "m/s/s", "", "", "X acceleration", False),
@@ -3829,7 +3829,7 @@ class HighresImu(Message):
         self.temperature = temperature
         self.fields_updated = fields_updated
         self.id = id
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> HighresImu:
@@ -3873,11 +3873,11 @@ class OpticalFlowRad(Message):
         "integrated_ygyro", "integrated_zgyro", "temperature", "quality", "time_delta_distance_us",
         "distance",
     )
-    ID = 106
-    NAME = "OPTICAL_FLOW_RAD"
-    CRC_EXTRA = 138
-    LENGTH = 44
-    BASE_LENGTH = 44
+    ID: ClassVar[int] = 106
+    NAME: ClassVar[str] = "OPTICAL_FLOW_RAD"
+    CRC_EXTRA: ClassVar[int] = 138
+    LENGTH: ClassVar[int] = 44
+    BASE_LENGTH: ClassVar[int] = 44
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX Epoch time or time since system boot). The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
         ("sensor_id", "uint8_t", 0, "", "", "", "Sensor ID", False),
@@ -3957,7 +3957,7 @@ class OpticalFlowRad(Message):
         self.quality = quality
         self.time_delta_distance_us = time_delta_distance_us
         self.distance = distance
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> OpticalFlowRad:
@@ -3999,11 +3999,11 @@ class HilSensor(Message):
         "time_usec", "xacc", "yacc", "zacc", "xgyro", "ygyro", "zgyro", "xmag", "ymag", "zmag",
         "abs_pressure", "diff_pressure", "pressure_alt", "temperature", "fields_updated", "id",
     )
-    ID = 107
-    NAME = "HIL_SENSOR"
-    CRC_EXTRA = 108
-    LENGTH = 65
-    BASE_LENGTH = 64
+    ID: ClassVar[int] = 107
+    NAME: ClassVar[str] = "HIL_SENSOR"
+    CRC_EXTRA: ClassVar[int] = 108
+    LENGTH: ClassVar[int] = 65
+    BASE_LENGTH: ClassVar[int] = 64
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX Epoch time or time since system boot). The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
         ("xacc", "float", 0, "m/s/s", "", "", "X acceleration", False),
@@ -4099,7 +4099,7 @@ class HilSensor(Message):
         self.temperature = temperature
         self.fields_updated = fields_updated
         self.id = id
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> HilSensor:
@@ -4141,11 +4141,11 @@ class SimState(Message):
         "q1", "q2", "q3", "q4", "roll", "pitch", "yaw", "xacc", "yacc", "zacc", "xgyro", "ygyro", "zgyro",
         "lat", "lon", "alt", "std_dev_horz", "std_dev_vert", "vn", "ve", "vd", "lat_int", "lon_int",
     )
-    ID = 108
-    NAME = "SIM_STATE"
-    CRC_EXTRA = 32
-    LENGTH = 92
-    BASE_LENGTH = 84
+    ID: ClassVar[int] = 108
+    NAME: ClassVar[str] = "SIM_STATE"
+    CRC_EXTRA: ClassVar[int] = 32
+    LENGTH: ClassVar[int] = 92
+    BASE_LENGTH: ClassVar[int] = 84
     _FIELDS = (
         ("q1", "float", 0, "", "", "", "True attitude quaternion component 1, w (1 in null-rotation)", False),
         ("q2", "float", 0, "", "", "", "True attitude quaternion component 2, x (0 in null-rotation)", False),
@@ -4280,7 +4280,7 @@ class SimState(Message):
         self.vd = vd
         self.lat_int = lat_int
         self.lon_int = lon_int
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> SimState:
@@ -4316,11 +4316,11 @@ class RadioStatus(Message):
 
     __slots__ = ("rssi", "remrssi", "txbuf", "noise", "remnoise", "rxerrors", "fixed")
     __match_args__ = ("rssi", "remrssi", "txbuf", "noise", "remnoise", "rxerrors", "fixed")
-    ID = 109
-    NAME = "RADIO_STATUS"
-    CRC_EXTRA = 185
-    LENGTH = 9
-    BASE_LENGTH = 9
+    ID: ClassVar[int] = 109
+    NAME: ClassVar[str] = "RADIO_STATUS"
+    CRC_EXTRA: ClassVar[int] = 185
+    LENGTH: ClassVar[int] = 9
+    BASE_LENGTH: ClassVar[int] = 9
     _FIELDS = (
         ("rssi", "uint8_t", 0, "", "", "UINT8_MAX", "Local (message sender) received signal strength indication in device-dependent units/scale. Values: [0-254], UINT8_MAX: invalid/unknown.", False),
         ("remrssi", "uint8_t", 0, "", "", "UINT8_MAX", "Remote (message receiver) signal strength indication in device-dependent units/scale. Values: [0-254], UINT8_MAX: invalid/unknown.", False),
@@ -4370,7 +4370,7 @@ class RadioStatus(Message):
         self.remnoise = remnoise
         self.rxerrors = rxerrors
         self.fixed = fixed
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> RadioStatus:
@@ -4402,11 +4402,11 @@ class CameraTrigger(Message):
 
     __slots__ = ("time_usec", "seq")
     __match_args__ = ("time_usec", "seq")
-    ID = 112
-    NAME = "CAMERA_TRIGGER"
-    CRC_EXTRA = 174
-    LENGTH = 12
-    BASE_LENGTH = 12
+    ID: ClassVar[int] = 112
+    NAME: ClassVar[str] = "CAMERA_TRIGGER"
+    CRC_EXTRA: ClassVar[int] = 174
+    LENGTH: ClassVar[int] = 12
+    BASE_LENGTH: ClassVar[int] = 12
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp for image frame (UNIX Epoch time or time since system boot). The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
         ("seq", "uint32_t", 0, "", "", "", "Image frame sequence", False),
@@ -4424,7 +4424,7 @@ class CameraTrigger(Message):
     def __init__(self, time_usec: int, seq: int) -> None:
         self.time_usec = time_usec
         self.seq = seq
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> CameraTrigger:
@@ -4460,11 +4460,11 @@ class HilGps(Message):
         "time_usec", "fix_type", "lat", "lon", "alt", "eph", "epv", "vel", "vn", "ve", "vd", "cog",
         "satellites_visible", "id", "yaw",
     )
-    ID = 113
-    NAME = "HIL_GPS"
-    CRC_EXTRA = 124
-    LENGTH = 39
-    BASE_LENGTH = 36
+    ID: ClassVar[int] = 113
+    NAME: ClassVar[str] = "HIL_GPS"
+    CRC_EXTRA: ClassVar[int] = 124
+    LENGTH: ClassVar[int] = 39
+    BASE_LENGTH: ClassVar[int] = 36
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX Epoch time or time since system boot). The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
         ("fix_type", "uint8_t", 0, "", "", "", "0-1: no fix, 2: 2D fix, 3: 3D fix. Some applications will not use the value of this field unless it is at least two, so always correctly fill in the fix.", False),
@@ -4560,7 +4560,7 @@ class HilGps(Message):
         self.satellites_visible = satellites_visible
         self.id = id
         self.yaw = yaw
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> HilGps:
@@ -4603,11 +4603,11 @@ class HilOpticalFlow(Message):
         "integrated_ygyro", "integrated_zgyro", "temperature", "quality", "time_delta_distance_us",
         "distance",
     )
-    ID = 114
-    NAME = "HIL_OPTICAL_FLOW"
-    CRC_EXTRA = 237
-    LENGTH = 44
-    BASE_LENGTH = 44
+    ID: ClassVar[int] = 114
+    NAME: ClassVar[str] = "HIL_OPTICAL_FLOW"
+    CRC_EXTRA: ClassVar[int] = 237
+    LENGTH: ClassVar[int] = 44
+    BASE_LENGTH: ClassVar[int] = 44
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX Epoch time or time since system boot). The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
         ("sensor_id", "uint8_t", 0, "", "", "", "Sensor ID", False),
@@ -4687,7 +4687,7 @@ class HilOpticalFlow(Message):
         self.quality = quality
         self.time_delta_distance_us = time_delta_distance_us
         self.distance = distance
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> HilOpticalFlow:
@@ -4731,11 +4731,11 @@ class HilStateQuaternion(Message):
         "time_usec", "attitude_quaternion", "rollspeed", "pitchspeed", "yawspeed", "lat", "lon", "alt", "vx",
         "vy", "vz", "ind_airspeed", "true_airspeed", "xacc", "yacc", "zacc",
     )
-    ID = 115
-    NAME = "HIL_STATE_QUATERNION"
-    CRC_EXTRA = 4
-    LENGTH = 64
-    BASE_LENGTH = 64
+    ID: ClassVar[int] = 115
+    NAME: ClassVar[str] = "HIL_STATE_QUATERNION"
+    CRC_EXTRA: ClassVar[int] = 4
+    LENGTH: ClassVar[int] = 64
+    BASE_LENGTH: ClassVar[int] = 64
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX Epoch time or time since system boot). The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
         ("attitude_quaternion", "float", 4, "", "", "", "Vehicle attitude expressed as normalized quaternion in w, x, y, z order (with 1 0 0 0 being the null-rotation)", False),
@@ -4829,7 +4829,7 @@ class HilStateQuaternion(Message):
         self.xacc = xacc
         self.yacc = yacc
         self.zacc = zacc
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> HilStateQuaternion:
@@ -4873,11 +4873,11 @@ class ScaledImu2(Message):
         "time_boot_ms", "xacc", "yacc", "zacc", "xgyro", "ygyro", "zgyro", "xmag", "ymag", "zmag",
         "temperature",
     )
-    ID = 116
-    NAME = "SCALED_IMU2"
-    CRC_EXTRA = 76
-    LENGTH = 24
-    BASE_LENGTH = 22
+    ID: ClassVar[int] = 116
+    NAME: ClassVar[str] = "SCALED_IMU2"
+    CRC_EXTRA: ClassVar[int] = 76
+    LENGTH: ClassVar[int] = 24
+    BASE_LENGTH: ClassVar[int] = 22
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot).", False),
         ("xacc", "int16_t", 0, "mG", "", "", "X acceleration", False),
@@ -4942,7 +4942,7 @@ class ScaledImu2(Message):
         self.ymag = ymag
         self.zmag = zmag
         self.temperature = temperature
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> ScaledImu2:
@@ -4979,11 +4979,11 @@ class LogRequestList(Message):
 
     __slots__ = ("target_system", "target_component", "start", "end")
     __match_args__ = ("target_system", "target_component", "start", "end")
-    ID = 117
-    NAME = "LOG_REQUEST_LIST"
-    CRC_EXTRA = 128
-    LENGTH = 6
-    BASE_LENGTH = 6
+    ID: ClassVar[int] = 117
+    NAME: ClassVar[str] = "LOG_REQUEST_LIST"
+    CRC_EXTRA: ClassVar[int] = 128
+    LENGTH: ClassVar[int] = 6
+    BASE_LENGTH: ClassVar[int] = 6
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID", False),
@@ -5008,7 +5008,7 @@ class LogRequestList(Message):
         self.target_component = target_component
         self.start = start
         self.end = end
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> LogRequestList:
@@ -5036,11 +5036,11 @@ class LogEntry(Message):
 
     __slots__ = ("id", "num_logs", "last_log_num", "time_utc", "size")
     __match_args__ = ("id", "num_logs", "last_log_num", "time_utc", "size")
-    ID = 118
-    NAME = "LOG_ENTRY"
-    CRC_EXTRA = 56
-    LENGTH = 14
-    BASE_LENGTH = 14
+    ID: ClassVar[int] = 118
+    NAME: ClassVar[str] = "LOG_ENTRY"
+    CRC_EXTRA: ClassVar[int] = 56
+    LENGTH: ClassVar[int] = 14
+    BASE_LENGTH: ClassVar[int] = 14
     _FIELDS = (
         ("id", "uint16_t", 0, "", "", "", "Log id", False),
         ("num_logs", "uint16_t", 0, "", "", "", "Total number of logs", False),
@@ -5070,7 +5070,7 @@ class LogEntry(Message):
         self.last_log_num = last_log_num
         self.time_utc = time_utc
         self.size = size
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> LogEntry:
@@ -5098,11 +5098,11 @@ class LogRequestData(Message):
 
     __slots__ = ("target_system", "target_component", "id", "ofs", "count")
     __match_args__ = ("target_system", "target_component", "id", "ofs", "count")
-    ID = 119
-    NAME = "LOG_REQUEST_DATA"
-    CRC_EXTRA = 116
-    LENGTH = 12
-    BASE_LENGTH = 12
+    ID: ClassVar[int] = 119
+    NAME: ClassVar[str] = "LOG_REQUEST_DATA"
+    CRC_EXTRA: ClassVar[int] = 116
+    LENGTH: ClassVar[int] = 12
+    BASE_LENGTH: ClassVar[int] = 12
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID", False),
@@ -5132,7 +5132,7 @@ class LogRequestData(Message):
         self.id = id
         self.ofs = ofs
         self.count = count
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> LogRequestData:
@@ -5162,11 +5162,11 @@ class LogData(Message):
 
     __slots__ = ("id", "ofs", "count", "data")
     __match_args__ = ("id", "ofs", "count", "data")
-    ID = 120
-    NAME = "LOG_DATA"
-    CRC_EXTRA = 134
-    LENGTH = 97
-    BASE_LENGTH = 97
+    ID: ClassVar[int] = 120
+    NAME: ClassVar[str] = "LOG_DATA"
+    CRC_EXTRA: ClassVar[int] = 134
+    LENGTH: ClassVar[int] = 97
+    BASE_LENGTH: ClassVar[int] = 97
     _FIELDS = (
         ("id", "uint16_t", 0, "", "", "", "Log id (from LOG_ENTRY reply)", False),
         ("ofs", "uint32_t", 0, "", "", "", "Offset into the log", False),
@@ -5191,7 +5191,7 @@ class LogData(Message):
         self.ofs = ofs
         self.count = count
         self.data = data
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> LogData:
@@ -5219,11 +5219,11 @@ class LogErase(Message):
 
     __slots__ = ("target_system", "target_component")
     __match_args__ = ("target_system", "target_component")
-    ID = 121
-    NAME = "LOG_ERASE"
-    CRC_EXTRA = 237
-    LENGTH = 2
-    BASE_LENGTH = 2
+    ID: ClassVar[int] = 121
+    NAME: ClassVar[str] = "LOG_ERASE"
+    CRC_EXTRA: ClassVar[int] = 237
+    LENGTH: ClassVar[int] = 2
+    BASE_LENGTH: ClassVar[int] = 2
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID", False),
@@ -5238,7 +5238,7 @@ class LogErase(Message):
     def __init__(self, target_system: int, target_component: int) -> None:
         self.target_system = target_system
         self.target_component = target_component
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> LogErase:
@@ -5266,11 +5266,11 @@ class LogRequestEnd(Message):
 
     __slots__ = ("target_system", "target_component")
     __match_args__ = ("target_system", "target_component")
-    ID = 122
-    NAME = "LOG_REQUEST_END"
-    CRC_EXTRA = 203
-    LENGTH = 2
-    BASE_LENGTH = 2
+    ID: ClassVar[int] = 122
+    NAME: ClassVar[str] = "LOG_REQUEST_END"
+    CRC_EXTRA: ClassVar[int] = 203
+    LENGTH: ClassVar[int] = 2
+    BASE_LENGTH: ClassVar[int] = 2
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID", False),
@@ -5285,7 +5285,7 @@ class LogRequestEnd(Message):
     def __init__(self, target_system: int, target_component: int) -> None:
         self.target_system = target_system
         self.target_component = target_component
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> LogRequestEnd:
@@ -5315,11 +5315,11 @@ class GpsInjectData(Message):
 
     __slots__ = ("target_system", "target_component", "len", "data")
     __match_args__ = ("target_system", "target_component", "len", "data")
-    ID = 123
-    NAME = "GPS_INJECT_DATA"
-    CRC_EXTRA = 250
-    LENGTH = 113
-    BASE_LENGTH = 113
+    ID: ClassVar[int] = 123
+    NAME: ClassVar[str] = "GPS_INJECT_DATA"
+    CRC_EXTRA: ClassVar[int] = 250
+    LENGTH: ClassVar[int] = 113
+    BASE_LENGTH: ClassVar[int] = 113
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID", False),
@@ -5344,7 +5344,7 @@ class GpsInjectData(Message):
         self.target_component = target_component
         self.len = len
         self.data = data
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> GpsInjectData:
@@ -5379,11 +5379,11 @@ class SerialControl(Message):
     __match_args__ = (
         "device", "flags", "timeout", "baudrate", "count", "data", "target_system", "target_component",
     )
-    ID = 126
-    NAME = "SERIAL_CONTROL"
-    CRC_EXTRA = 220
-    LENGTH = 81
-    BASE_LENGTH = 79
+    ID: ClassVar[int] = 126
+    NAME: ClassVar[str] = "SERIAL_CONTROL"
+    CRC_EXTRA: ClassVar[int] = 220
+    LENGTH: ClassVar[int] = 81
+    BASE_LENGTH: ClassVar[int] = 79
     _FIELDS = (
         ("device", "uint8_t", 0, "", "SERIAL_CONTROL_DEV", "", "Serial control device type.", False),
         ("flags", "uint8_t", 0, "", "SERIAL_CONTROL_FLAG", "", "Bitmap of serial control flags.", False),
@@ -5431,7 +5431,7 @@ class SerialControl(Message):
         self.data = data
         self.target_system = target_system
         self.target_component = target_component
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> SerialControl:
@@ -5474,11 +5474,11 @@ class GpsRtk(Message):
         "baseline_coords_type", "baseline_a_mm", "baseline_b_mm", "baseline_c_mm", "accuracy",
         "iar_num_hypotheses",
     )
-    ID = 127
-    NAME = "GPS_RTK"
-    CRC_EXTRA = 25
-    LENGTH = 35
-    BASE_LENGTH = 35
+    ID: ClassVar[int] = 127
+    NAME: ClassVar[str] = "GPS_RTK"
+    CRC_EXTRA: ClassVar[int] = 25
+    LENGTH: ClassVar[int] = 35
+    BASE_LENGTH: ClassVar[int] = 35
     _FIELDS = (
         ("time_last_baseline_ms", "uint32_t", 0, "ms", "", "", "Time since boot of last baseline message received.", False),
         ("rtk_receiver_id", "uint8_t", 0, "", "", "", "Identification of connected RTK receiver.", False),
@@ -5552,7 +5552,7 @@ class GpsRtk(Message):
         self.baseline_c_mm = baseline_c_mm
         self.accuracy = accuracy
         self.iar_num_hypotheses = iar_num_hypotheses
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> GpsRtk:
@@ -5597,11 +5597,11 @@ class Gps2Rtk(Message):
         "baseline_coords_type", "baseline_a_mm", "baseline_b_mm", "baseline_c_mm", "accuracy",
         "iar_num_hypotheses",
     )
-    ID = 128
-    NAME = "GPS2_RTK"
-    CRC_EXTRA = 226
-    LENGTH = 35
-    BASE_LENGTH = 35
+    ID: ClassVar[int] = 128
+    NAME: ClassVar[str] = "GPS2_RTK"
+    CRC_EXTRA: ClassVar[int] = 226
+    LENGTH: ClassVar[int] = 35
+    BASE_LENGTH: ClassVar[int] = 35
     _FIELDS = (
         ("time_last_baseline_ms", "uint32_t", 0, "ms", "", "", "Time since boot of last baseline message received.", False),
         ("rtk_receiver_id", "uint8_t", 0, "", "", "", "Identification of connected RTK receiver.", False),
@@ -5675,7 +5675,7 @@ class Gps2Rtk(Message):
         self.baseline_c_mm = baseline_c_mm
         self.accuracy = accuracy
         self.iar_num_hypotheses = iar_num_hypotheses
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> Gps2Rtk:
@@ -5718,11 +5718,11 @@ class ScaledImu3(Message):
         "time_boot_ms", "xacc", "yacc", "zacc", "xgyro", "ygyro", "zgyro", "xmag", "ymag", "zmag",
         "temperature",
     )
-    ID = 129
-    NAME = "SCALED_IMU3"
-    CRC_EXTRA = 46
-    LENGTH = 24
-    BASE_LENGTH = 22
+    ID: ClassVar[int] = 129
+    NAME: ClassVar[str] = "SCALED_IMU3"
+    CRC_EXTRA: ClassVar[int] = 46
+    LENGTH: ClassVar[int] = 24
+    BASE_LENGTH: ClassVar[int] = 22
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot).", False),
         ("xacc", "int16_t", 0, "mG", "", "", "X acceleration", False),
@@ -5787,7 +5787,7 @@ class ScaledImu3(Message):
         self.ymag = ymag
         self.zmag = zmag
         self.temperature = temperature
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> ScaledImu3:
@@ -5822,11 +5822,11 @@ class DataTransmissionHandshake(Message):
 
     __slots__ = ("type", "size", "width", "height", "packets", "payload", "jpg_quality")
     __match_args__ = ("type", "size", "width", "height", "packets", "payload", "jpg_quality")
-    ID = 130
-    NAME = "DATA_TRANSMISSION_HANDSHAKE"
-    CRC_EXTRA = 29
-    LENGTH = 13
-    BASE_LENGTH = 13
+    ID: ClassVar[int] = 130
+    NAME: ClassVar[str] = "DATA_TRANSMISSION_HANDSHAKE"
+    CRC_EXTRA: ClassVar[int] = 29
+    LENGTH: ClassVar[int] = 13
+    BASE_LENGTH: ClassVar[int] = 13
     _FIELDS = (
         ("type", "uint8_t", 0, "", "MAVLINK_DATA_STREAM_TYPE", "", "Type of requested/acknowledged data.", False),
         ("size", "uint32_t", 0, "bytes", "", "", "total data size (set on ACK only).", False),
@@ -5870,7 +5870,7 @@ class DataTransmissionHandshake(Message):
         self.packets = packets
         self.payload = payload
         self.jpg_quality = jpg_quality
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> DataTransmissionHandshake:
@@ -5903,11 +5903,11 @@ class EncapsulatedData(Message):
 
     __slots__ = ("seqnr", "data")
     __match_args__ = ("seqnr", "data")
-    ID = 131
-    NAME = "ENCAPSULATED_DATA"
-    CRC_EXTRA = 223
-    LENGTH = 255
-    BASE_LENGTH = 255
+    ID: ClassVar[int] = 131
+    NAME: ClassVar[str] = "ENCAPSULATED_DATA"
+    CRC_EXTRA: ClassVar[int] = 223
+    LENGTH: ClassVar[int] = 255
+    BASE_LENGTH: ClassVar[int] = 255
     _FIELDS = (
         ("seqnr", "uint16_t", 0, "", "", "", "sequence number (starting with 0 on every transmission)", False),
         ("data", "uint8_t", 253, "", "", "", "image data bytes", False),
@@ -5922,7 +5922,7 @@ class EncapsulatedData(Message):
     def __init__(self, seqnr: int, data: bytes) -> None:
         self.seqnr = seqnr
         self.data = data
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> EncapsulatedData:
@@ -5951,11 +5951,11 @@ class TerrainRequest(Message):
 
     __slots__ = ("lat", "lon", "grid_spacing", "mask")
     __match_args__ = ("lat", "lon", "grid_spacing", "mask")
-    ID = 133
-    NAME = "TERRAIN_REQUEST"
-    CRC_EXTRA = 6
-    LENGTH = 18
-    BASE_LENGTH = 18
+    ID: ClassVar[int] = 133
+    NAME: ClassVar[str] = "TERRAIN_REQUEST"
+    CRC_EXTRA: ClassVar[int] = 6
+    LENGTH: ClassVar[int] = 18
+    BASE_LENGTH: ClassVar[int] = 18
     _FIELDS = (
         ("lat", "int32_t", 0, "degE7", "", "", "Latitude of SW corner of first grid", False),
         ("lon", "int32_t", 0, "degE7", "", "", "Longitude of SW corner of first grid", False),
@@ -5980,7 +5980,7 @@ class TerrainRequest(Message):
         self.lon = lon
         self.grid_spacing = grid_spacing
         self.mask = mask
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> TerrainRequest:
@@ -6010,11 +6010,11 @@ class TerrainData(Message):
 
     __slots__ = ("lat", "lon", "grid_spacing", "gridbit", "data")
     __match_args__ = ("lat", "lon", "grid_spacing", "gridbit", "data")
-    ID = 134
-    NAME = "TERRAIN_DATA"
-    CRC_EXTRA = 229
-    LENGTH = 43
-    BASE_LENGTH = 43
+    ID: ClassVar[int] = 134
+    NAME: ClassVar[str] = "TERRAIN_DATA"
+    CRC_EXTRA: ClassVar[int] = 229
+    LENGTH: ClassVar[int] = 43
+    BASE_LENGTH: ClassVar[int] = 43
     _FIELDS = (
         ("lat", "int32_t", 0, "degE7", "", "", "Latitude of SW corner of first grid", False),
         ("lon", "int32_t", 0, "degE7", "", "", "Longitude of SW corner of first grid", False),
@@ -6044,7 +6044,7 @@ class TerrainData(Message):
         self.grid_spacing = grid_spacing
         self.gridbit = gridbit
         self.data = tuple(data)
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> TerrainData:
@@ -6079,11 +6079,11 @@ class TerrainCheck(Message):
 
     __slots__ = ("lat", "lon")
     __match_args__ = ("lat", "lon")
-    ID = 135
-    NAME = "TERRAIN_CHECK"
-    CRC_EXTRA = 203
-    LENGTH = 8
-    BASE_LENGTH = 8
+    ID: ClassVar[int] = 135
+    NAME: ClassVar[str] = "TERRAIN_CHECK"
+    CRC_EXTRA: ClassVar[int] = 203
+    LENGTH: ClassVar[int] = 8
+    BASE_LENGTH: ClassVar[int] = 8
     _FIELDS = (
         ("lat", "int32_t", 0, "degE7", "", "", "Latitude", False),
         ("lon", "int32_t", 0, "degE7", "", "", "Longitude", False),
@@ -6098,7 +6098,7 @@ class TerrainCheck(Message):
     def __init__(self, lat: int, lon: int) -> None:
         self.lat = lat
         self.lon = lon
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> TerrainCheck:
@@ -6128,11 +6128,11 @@ class TerrainReport(Message):
 
     __slots__ = ("lat", "lon", "spacing", "terrain_height", "current_height", "pending", "loaded")
     __match_args__ = ("lat", "lon", "spacing", "terrain_height", "current_height", "pending", "loaded")
-    ID = 136
-    NAME = "TERRAIN_REPORT"
-    CRC_EXTRA = 1
-    LENGTH = 22
-    BASE_LENGTH = 22
+    ID: ClassVar[int] = 136
+    NAME: ClassVar[str] = "TERRAIN_REPORT"
+    CRC_EXTRA: ClassVar[int] = 1
+    LENGTH: ClassVar[int] = 22
+    BASE_LENGTH: ClassVar[int] = 22
     _FIELDS = (
         ("lat", "int32_t", 0, "degE7", "", "", "Latitude", False),
         ("lon", "int32_t", 0, "degE7", "", "", "Longitude", False),
@@ -6175,7 +6175,7 @@ class TerrainReport(Message):
         self.current_height = current_height
         self.pending = pending
         self.loaded = loaded
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> TerrainReport:
@@ -6209,11 +6209,11 @@ class ScaledPressure2(Message):
 
     __slots__ = ("time_boot_ms", "press_abs", "press_diff", "temperature", "temperature_press_diff")
     __match_args__ = ("time_boot_ms", "press_abs", "press_diff", "temperature", "temperature_press_diff")
-    ID = 137
-    NAME = "SCALED_PRESSURE2"
-    CRC_EXTRA = 195
-    LENGTH = 16
-    BASE_LENGTH = 14
+    ID: ClassVar[int] = 137
+    NAME: ClassVar[str] = "SCALED_PRESSURE2"
+    CRC_EXTRA: ClassVar[int] = 195
+    LENGTH: ClassVar[int] = 16
+    BASE_LENGTH: ClassVar[int] = 14
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot).", False),
         ("press_abs", "float", 0, "hPa", "", "", "Absolute pressure", False),
@@ -6248,7 +6248,7 @@ class ScaledPressure2(Message):
         self.press_diff = press_diff
         self.temperature = temperature
         self.temperature_press_diff = temperature_press_diff
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> ScaledPressure2:
@@ -6281,11 +6281,11 @@ class AttPosMocap(Message):
 
     __slots__ = ("time_usec", "q", "x", "y", "z", "covariance")
     __match_args__ = ("time_usec", "q", "x", "y", "z", "covariance")
-    ID = 138
-    NAME = "ATT_POS_MOCAP"
-    CRC_EXTRA = 109
-    LENGTH = 120
-    BASE_LENGTH = 36
+    ID: ClassVar[int] = 138
+    NAME: ClassVar[str] = "ATT_POS_MOCAP"
+    CRC_EXTRA: ClassVar[int] = 109
+    LENGTH: ClassVar[int] = 120
+    BASE_LENGTH: ClassVar[int] = 36
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX Epoch time or time since system boot). The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
         ("q", "float", 4, "", "", "", "Attitude quaternion (w, x, y, z order, zero-rotation is 1, 0, 0, 0)", False),
@@ -6330,7 +6330,7 @@ class AttPosMocap(Message):
         self.y = y
         self.z = z
         self.covariance = tuple(covariance)
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> AttPosMocap:
@@ -6367,11 +6367,11 @@ class SetActuatorControlTarget(Message):
 
     __slots__ = ("time_usec", "group_mlx", "target_system", "target_component", "controls")
     __match_args__ = ("time_usec", "group_mlx", "target_system", "target_component", "controls")
-    ID = 139
-    NAME = "SET_ACTUATOR_CONTROL_TARGET"
-    CRC_EXTRA = 168
-    LENGTH = 43
-    BASE_LENGTH = 43
+    ID: ClassVar[int] = 139
+    NAME: ClassVar[str] = "SET_ACTUATOR_CONTROL_TARGET"
+    CRC_EXTRA: ClassVar[int] = 168
+    LENGTH: ClassVar[int] = 43
+    BASE_LENGTH: ClassVar[int] = 43
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX Epoch time or time since system boot). The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
         ("group_mlx", "uint8_t", 0, "", "", "", "Actuator group. The \"_mlx\" indicates this is a multi-instance message and a MAVLink parser should use this field to difference between instances.", False),
@@ -6413,7 +6413,7 @@ class SetActuatorControlTarget(Message):
         self.target_system = target_system
         self.target_component = target_component
         self.controls = tuple(controls)
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> SetActuatorControlTarget:
@@ -6449,11 +6449,11 @@ class ActuatorControlTarget(Message):
 
     __slots__ = ("time_usec", "group_mlx", "controls")
     __match_args__ = ("time_usec", "group_mlx", "controls")
-    ID = 140
-    NAME = "ACTUATOR_CONTROL_TARGET"
-    CRC_EXTRA = 181
-    LENGTH = 41
-    BASE_LENGTH = 41
+    ID: ClassVar[int] = 140
+    NAME: ClassVar[str] = "ACTUATOR_CONTROL_TARGET"
+    CRC_EXTRA: ClassVar[int] = 181
+    LENGTH: ClassVar[int] = 41
+    BASE_LENGTH: ClassVar[int] = 41
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX Epoch time or time since system boot). The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
         ("group_mlx", "uint8_t", 0, "", "", "", "Actuator group. The \"_mlx\" indicates this is a multi-instance message and a MAVLink parser should use this field to difference between instances.", False),
@@ -6482,7 +6482,7 @@ class ActuatorControlTarget(Message):
         self.time_usec = time_usec
         self.group_mlx = group_mlx
         self.controls = tuple(controls)
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> ActuatorControlTarget:
@@ -6519,11 +6519,11 @@ class Altitude(Message):
         "time_usec", "altitude_monotonic", "altitude_amsl", "altitude_local", "altitude_relative",
         "altitude_terrain", "bottom_clearance",
     )
-    ID = 141
-    NAME = "ALTITUDE"
-    CRC_EXTRA = 47
-    LENGTH = 32
-    BASE_LENGTH = 32
+    ID: ClassVar[int] = 141
+    NAME: ClassVar[str] = "ALTITUDE"
+    CRC_EXTRA: ClassVar[int] = 47
+    LENGTH: ClassVar[int] = 32
+    BASE_LENGTH: ClassVar[int] = 32
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX Epoch time or time since system boot). The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
         ("altitude_monotonic", "float", 0, "m", "", "", "This altitude measure is initialized on system boot and monotonic (it is never reset, but represents the local altitude change). The only guarantee on this field is that it will never be reset and is consistent within a flight. The recommended value for this field is the uncorrected barometric altitude at boot time. This altitude will also drift and vary between flights.", False),
@@ -6587,7 +6587,7 @@ class Altitude(Message):
         self.altitude_relative = altitude_relative
         self.altitude_terrain = altitude_terrain
         self.bottom_clearance = bottom_clearance
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> Altitude:
@@ -6621,11 +6621,11 @@ class ResourceRequest(Message):
 
     __slots__ = ("request_id", "uri_type", "uri", "transfer_type", "storage")
     __match_args__ = ("request_id", "uri_type", "uri", "transfer_type", "storage")
-    ID = 142
-    NAME = "RESOURCE_REQUEST"
-    CRC_EXTRA = 72
-    LENGTH = 243
-    BASE_LENGTH = 243
+    ID: ClassVar[int] = 142
+    NAME: ClassVar[str] = "RESOURCE_REQUEST"
+    CRC_EXTRA: ClassVar[int] = 72
+    LENGTH: ClassVar[int] = 243
+    BASE_LENGTH: ClassVar[int] = 243
     _FIELDS = (
         ("request_id", "uint8_t", 0, "", "", "", "Request ID. This ID should be reused when sending back URI contents", False),
         ("uri_type", "uint8_t", 0, "", "", "", "The type of requested URI. 0 = a file via URL. 1 = a UAVCAN binary", False),
@@ -6661,7 +6661,7 @@ class ResourceRequest(Message):
         self.uri = uri
         self.transfer_type = transfer_type
         self.storage = storage
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> ResourceRequest:
@@ -6694,11 +6694,11 @@ class ScaledPressure3(Message):
 
     __slots__ = ("time_boot_ms", "press_abs", "press_diff", "temperature", "temperature_press_diff")
     __match_args__ = ("time_boot_ms", "press_abs", "press_diff", "temperature", "temperature_press_diff")
-    ID = 143
-    NAME = "SCALED_PRESSURE3"
-    CRC_EXTRA = 131
-    LENGTH = 16
-    BASE_LENGTH = 14
+    ID: ClassVar[int] = 143
+    NAME: ClassVar[str] = "SCALED_PRESSURE3"
+    CRC_EXTRA: ClassVar[int] = 131
+    LENGTH: ClassVar[int] = 16
+    BASE_LENGTH: ClassVar[int] = 14
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot).", False),
         ("press_abs", "float", 0, "hPa", "", "", "Absolute pressure", False),
@@ -6733,7 +6733,7 @@ class ScaledPressure3(Message):
         self.press_diff = press_diff
         self.temperature = temperature
         self.temperature_press_diff = temperature_press_diff
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> ScaledPressure3:
@@ -6772,11 +6772,11 @@ class FollowTarget(Message):
         "timestamp", "est_capabilities", "lat", "lon", "alt", "vel", "acc", "attitude_q", "rates",
         "position_cov", "custom_state",
     )
-    ID = 144
-    NAME = "FOLLOW_TARGET"
-    CRC_EXTRA = 127
-    LENGTH = 93
-    BASE_LENGTH = 93
+    ID: ClassVar[int] = 144
+    NAME: ClassVar[str] = "FOLLOW_TARGET"
+    CRC_EXTRA: ClassVar[int] = 127
+    LENGTH: ClassVar[int] = 93
+    BASE_LENGTH: ClassVar[int] = 93
     _FIELDS = (
         ("timestamp", "uint64_t", 0, "ms", "", "", "Timestamp (time since system boot).", False),
         ("est_capabilities", "uint8_t", 0, "", "", "", "bit positions for tracker reporting capabilities (POS = 0, VEL = 1, ACCEL = 2, ATT + RATES = 3)", False),
@@ -6842,7 +6842,7 @@ class FollowTarget(Message):
         self.rates = tuple(rates)
         self.position_cov = tuple(position_cov)
         self.custom_state = custom_state
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> FollowTarget:
@@ -6889,11 +6889,11 @@ class ControlSystemState(Message):
         "time_usec", "x_acc", "y_acc", "z_acc", "x_vel", "y_vel", "z_vel", "x_pos", "y_pos", "z_pos",
         "airspeed", "vel_variance", "pos_variance", "q", "roll_rate", "pitch_rate", "yaw_rate",
     )
-    ID = 146
-    NAME = "CONTROL_SYSTEM_STATE"
-    CRC_EXTRA = 103
-    LENGTH = 100
-    BASE_LENGTH = 100
+    ID: ClassVar[int] = 146
+    NAME: ClassVar[str] = "CONTROL_SYSTEM_STATE"
+    CRC_EXTRA: ClassVar[int] = 103
+    LENGTH: ClassVar[int] = 100
+    BASE_LENGTH: ClassVar[int] = 100
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX Epoch time or time since system boot). The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
         ("x_acc", "float", 0, "m/s/s", "", "", "X acceleration in body frame", False),
@@ -6991,7 +6991,7 @@ class ControlSystemState(Message):
         self.roll_rate = roll_rate
         self.pitch_rate = pitch_rate
         self.yaw_rate = yaw_rate
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> ControlSystemState:
@@ -7038,11 +7038,11 @@ class LandingTarget(Message):
         "time_usec", "target_num", "frame", "angle_x", "angle_y", "distance", "size_x", "size_y", "x", "y",
         "z", "q", "type", "position_valid",
     )
-    ID = 149
-    NAME = "LANDING_TARGET"
-    CRC_EXTRA = 200
-    LENGTH = 60
-    BASE_LENGTH = 30
+    ID: ClassVar[int] = 149
+    NAME: ClassVar[str] = "LANDING_TARGET"
+    CRC_EXTRA: ClassVar[int] = 200
+    LENGTH: ClassVar[int] = 60
+    BASE_LENGTH: ClassVar[int] = 30
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX Epoch time or time since system boot). The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
         ("target_num", "uint8_t", 0, "", "", "", "The ID of the target if multiple targets are present", False),
@@ -7129,7 +7129,7 @@ class LandingTarget(Message):
         self.q = tuple(q)
         self.type = type
         self.position_valid = position_valid
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> LandingTarget:
@@ -7166,11 +7166,11 @@ class FenceStatus(Message):
 
     __slots__ = ("breach_status", "breach_count", "breach_type", "breach_time", "breach_mitigation")
     __match_args__ = ("breach_status", "breach_count", "breach_type", "breach_time", "breach_mitigation")
-    ID = 162
-    NAME = "FENCE_STATUS"
-    CRC_EXTRA = 189
-    LENGTH = 9
-    BASE_LENGTH = 8
+    ID: ClassVar[int] = 162
+    NAME: ClassVar[str] = "FENCE_STATUS"
+    CRC_EXTRA: ClassVar[int] = 189
+    LENGTH: ClassVar[int] = 9
+    BASE_LENGTH: ClassVar[int] = 8
     _FIELDS = (
         ("breach_status", "uint8_t", 0, "", "", "", "Breach status (0 if currently inside fence, 1 if outside).", False),
         ("breach_count", "uint16_t", 0, "", "", "", "Number of fence breaches.", False),
@@ -7205,7 +7205,7 @@ class FenceStatus(Message):
         self.breach_type = breach_type
         self.breach_time = breach_time
         self.breach_mitigation = breach_mitigation
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> FenceStatus:
@@ -7247,11 +7247,11 @@ class MagCalReport(Message):
         "diag_y", "diag_z", "offdiag_x", "offdiag_y", "offdiag_z", "orientation_confidence",
         "old_orientation", "new_orientation", "scale_factor",
     )
-    ID = 192
-    NAME = "MAG_CAL_REPORT"
-    CRC_EXTRA = 36
-    LENGTH = 54
-    BASE_LENGTH = 44
+    ID: ClassVar[int] = 192
+    NAME: ClassVar[str] = "MAG_CAL_REPORT"
+    CRC_EXTRA: ClassVar[int] = 36
+    LENGTH: ClassVar[int] = 54
+    BASE_LENGTH: ClassVar[int] = 44
     _FIELDS = (
         ("compass_id", "uint8_t", 0, "", "", "", "Compass being calibrated.", False),
         ("cal_mask", "uint8_t", 0, "", "", "", "Bitmask of compasses being calibrated.", False),
@@ -7355,7 +7355,7 @@ class MagCalReport(Message):
         self.old_orientation = old_orientation
         self.new_orientation = new_orientation
         self.scale_factor = scale_factor
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> MagCalReport:
@@ -7403,11 +7403,11 @@ class EfiStatus(Message):
         "cylinder_head_temperature", "ignition_timing", "injection_time", "exhaust_gas_temperature",
         "throttle_out", "pt_compensation", "ignition_voltage", "fuel_pressure",
     )
-    ID = 225
-    NAME = "EFI_STATUS"
-    CRC_EXTRA = 208
-    LENGTH = 73
-    BASE_LENGTH = 65
+    ID: ClassVar[int] = 225
+    NAME: ClassVar[str] = "EFI_STATUS"
+    CRC_EXTRA: ClassVar[int] = 208
+    LENGTH: ClassVar[int] = 73
+    BASE_LENGTH: ClassVar[int] = 65
     _FIELDS = (
         ("health", "uint8_t", 0, "", "", "", "EFI health status", False),
         ("ecu_index", "float", 0, "", "", "", "ECU index", False),
@@ -7517,7 +7517,7 @@ class EfiStatus(Message):
         self.pt_compensation = pt_compensation
         self.ignition_voltage = ignition_voltage
         self.fuel_pressure = fuel_pressure
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> EfiStatus:
@@ -7567,11 +7567,11 @@ class GpsInput(Message):
         "hdop", "vdop", "vn", "ve", "vd", "speed_accuracy", "horiz_accuracy", "vert_accuracy",
         "satellites_visible", "yaw",
     )
-    ID = 232
-    NAME = "GPS_INPUT"
-    CRC_EXTRA = 151
-    LENGTH = 65
-    BASE_LENGTH = 63
+    ID: ClassVar[int] = 232
+    NAME: ClassVar[str] = "GPS_INPUT"
+    CRC_EXTRA: ClassVar[int] = 151
+    LENGTH: ClassVar[int] = 65
+    BASE_LENGTH: ClassVar[int] = 63
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX Epoch time or time since system boot). The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
         ("gps_id", "uint8_t", 0, "", "", "", "ID of the GPS for multiple GPS inputs", False),
@@ -7689,7 +7689,7 @@ class GpsInput(Message):
         self.vert_accuracy = vert_accuracy
         self.satellites_visible = satellites_visible
         self.yaw = yaw
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> GpsInput:
@@ -7726,11 +7726,11 @@ class GpsRtcmData(Message):
 
     __slots__ = ("flags", "len", "data")
     __match_args__ = ("flags", "len", "data")
-    ID = 233
-    NAME = "GPS_RTCM_DATA"
-    CRC_EXTRA = 35
-    LENGTH = 182
-    BASE_LENGTH = 182
+    ID: ClassVar[int] = 233
+    NAME: ClassVar[str] = "GPS_RTCM_DATA"
+    CRC_EXTRA: ClassVar[int] = 35
+    LENGTH: ClassVar[int] = 182
+    BASE_LENGTH: ClassVar[int] = 182
     _FIELDS = (
         ("flags", "uint8_t", 0, "", "", "", "LSB: 1 means message is fragmented, next 2 bits are the fragment ID, the remaining 5 bits are used for the sequence ID. Messages are only to be flushed to the GPS when the entire message has been reconstructed on the autopilot. The fragment ID specifies which order the fragments should be assembled into a buffer, while the sequence ID is used to detect a mismatch between different buffers. The buffer is considered fully reconstructed when either all 4 fragments are present, or all the fragments before the first fragment with a non full payload is received. This management is used to ensure that normal GPS operation doesn't corrupt RTCM data, and to recover from a unreliable transport delivery order.", False),
         ("len", "uint8_t", 0, "bytes", "", "", "data length", False),
@@ -7758,7 +7758,7 @@ class GpsRtcmData(Message):
         self.flags = flags
         self.len = len
         self.data = data
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> GpsRtcmData:
@@ -7798,11 +7798,11 @@ class HighLatency(Message):
         "climb_rate", "gps_nsat", "gps_fix_type", "battery_remaining", "temperature", "temperature_air",
         "failsafe", "wp_num", "wp_distance",
     )
-    ID = 234
-    NAME = "HIGH_LATENCY"
-    CRC_EXTRA = 150
-    LENGTH = 40
-    BASE_LENGTH = 40
+    ID: ClassVar[int] = 234
+    NAME: ClassVar[str] = "HIGH_LATENCY"
+    CRC_EXTRA: ClassVar[int] = 150
+    LENGTH: ClassVar[int] = 40
+    BASE_LENGTH: ClassVar[int] = 40
     _FIELDS = (
         ("base_mode", "uint8_t", 0, "", "MAV_MODE_FLAG", "", "Bitmap of enabled system modes.", False),
         ("custom_mode", "uint32_t", 0, "", "", "", "A bitfield for use for autopilot-specific flags.", False),
@@ -7937,7 +7937,7 @@ class HighLatency(Message):
         self.failsafe = failsafe
         self.wp_num = wp_num
         self.wp_distance = wp_distance
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> HighLatency:
@@ -7987,11 +7987,11 @@ class HighLatency2(Message):
         "airspeed_sp", "groundspeed", "windspeed", "wind_heading", "eph", "epv", "temperature_air",
         "climb_rate", "battery", "wp_num", "failure_flags", "custom0", "custom1", "custom2",
     )
-    ID = 235
-    NAME = "HIGH_LATENCY2"
-    CRC_EXTRA = 179
-    LENGTH = 42
-    BASE_LENGTH = 42
+    ID: ClassVar[int] = 235
+    NAME: ClassVar[str] = "HIGH_LATENCY2"
+    CRC_EXTRA: ClassVar[int] = 179
+    LENGTH: ClassVar[int] = 42
+    BASE_LENGTH: ClassVar[int] = 42
     _FIELDS = (
         ("timestamp", "uint32_t", 0, "ms", "", "", "Timestamp (milliseconds since boot or Unix epoch)", False),
         ("type", "uint8_t", 0, "", "MAV_TYPE", "", "Type of the MAV (quadrotor, helicopter, etc.)", False),
@@ -8139,7 +8139,7 @@ class HighLatency2(Message):
         self.custom0 = custom0
         self.custom1 = custom1
         self.custom2 = custom2
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> HighLatency2:
@@ -8196,11 +8196,11 @@ class SetHomePosition(Message):
         "target_system", "latitude", "longitude", "altitude", "x", "y", "z", "q", "approach_x", "approach_y",
         "approach_z", "time_usec",
     )
-    ID = 243
-    NAME = "SET_HOME_POSITION"
-    CRC_EXTRA = 85
-    LENGTH = 61
-    BASE_LENGTH = 53
+    ID: ClassVar[int] = 243
+    NAME: ClassVar[str] = "SET_HOME_POSITION"
+    CRC_EXTRA: ClassVar[int] = 85
+    LENGTH: ClassVar[int] = 61
+    BASE_LENGTH: ClassVar[int] = 53
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID.", False),
         ("latitude", "int32_t", 0, "degE7", "", "", "Latitude (WGS84)", False),
@@ -8287,7 +8287,7 @@ class SetHomePosition(Message):
         self.approach_y = approach_y
         self.approach_z = approach_z
         self.time_usec = time_usec
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> SetHomePosition:
@@ -8325,11 +8325,11 @@ class MessageInterval(Message):
 
     __slots__ = ("message_id", "interval_us")
     __match_args__ = ("message_id", "interval_us")
-    ID = 244
-    NAME = "MESSAGE_INTERVAL"
-    CRC_EXTRA = 95
-    LENGTH = 6
-    BASE_LENGTH = 6
+    ID: ClassVar[int] = 244
+    NAME: ClassVar[str] = "MESSAGE_INTERVAL"
+    CRC_EXTRA: ClassVar[int] = 95
+    LENGTH: ClassVar[int] = 6
+    BASE_LENGTH: ClassVar[int] = 6
     _FIELDS = (
         ("message_id", "uint16_t", 0, "", "", "", "The ID of the requested MAVLink message. v1.0 is limited to 254 messages.", False),
         ("interval_us", "int32_t", 0, "us", "", "", "The interval between two messages. A value of -1 indicates this stream is disabled, 0 indicates it is not available, > 0 indicates the interval at which it is sent.", False),
@@ -8346,7 +8346,7 @@ class MessageInterval(Message):
     def __init__(self, message_id: int, interval_us: int) -> None:
         self.message_id = message_id
         self.interval_us = interval_us
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> MessageInterval:
@@ -8380,11 +8380,11 @@ class AdsbVehicle(Message):
         "ICAO_address", "lat", "lon", "altitude_type", "altitude", "heading", "hor_velocity", "ver_velocity",
         "callsign", "emitter_type", "tslc", "flags", "squawk",
     )
-    ID = 246
-    NAME = "ADSB_VEHICLE"
-    CRC_EXTRA = 184
-    LENGTH = 38
-    BASE_LENGTH = 38
+    ID: ClassVar[int] = 246
+    NAME: ClassVar[str] = "ADSB_VEHICLE"
+    CRC_EXTRA: ClassVar[int] = 184
+    LENGTH: ClassVar[int] = 38
+    BASE_LENGTH: ClassVar[int] = 38
     _FIELDS = (
         ("ICAO_address", "uint32_t", 0, "", "", "", "ICAO address", False),
         ("lat", "int32_t", 0, "degE7", "", "INT32_MAX", "Latitude", False),
@@ -8460,7 +8460,7 @@ class AdsbVehicle(Message):
         self.tslc = tslc
         self.flags = flags
         self.squawk = squawk
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> AdsbVehicle:
@@ -8502,11 +8502,11 @@ class Collision(Message):
         "src", "id", "action", "threat_level", "time_to_minimum_delta", "altitude_minimum_delta",
         "horizontal_minimum_delta",
     )
-    ID = 247
-    NAME = "COLLISION"
-    CRC_EXTRA = 81
-    LENGTH = 19
-    BASE_LENGTH = 19
+    ID: ClassVar[int] = 247
+    NAME: ClassVar[str] = "COLLISION"
+    CRC_EXTRA: ClassVar[int] = 81
+    LENGTH: ClassVar[int] = 19
+    BASE_LENGTH: ClassVar[int] = 19
     _FIELDS = (
         ("src", "uint8_t", 0, "", "MAV_COLLISION_SRC", "", "Collision data source", False),
         ("id", "uint32_t", 0, "", "", "", "Unique identifier, domain based on src field", False),
@@ -8551,7 +8551,7 @@ class Collision(Message):
         self.time_to_minimum_delta = time_to_minimum_delta
         self.altitude_minimum_delta = altitude_minimum_delta
         self.horizontal_minimum_delta = horizontal_minimum_delta
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> Collision:
@@ -8586,11 +8586,11 @@ class V2Extension(Message):
 
     __slots__ = ("target_network", "target_system", "target_component", "message_type", "payload")
     __match_args__ = ("target_network", "target_system", "target_component", "message_type", "payload")
-    ID = 248
-    NAME = "V2_EXTENSION"
-    CRC_EXTRA = 8
-    LENGTH = 254
-    BASE_LENGTH = 254
+    ID: ClassVar[int] = 248
+    NAME: ClassVar[str] = "V2_EXTENSION"
+    CRC_EXTRA: ClassVar[int] = 8
+    LENGTH: ClassVar[int] = 254
+    BASE_LENGTH: ClassVar[int] = 254
     _FIELDS = (
         ("target_network", "uint8_t", 0, "", "", "", "Network ID (0 for broadcast)", False),
         ("target_system", "uint8_t", 0, "", "", "", "System ID (0 for broadcast)", False),
@@ -8637,7 +8637,7 @@ class V2Extension(Message):
         self.target_component = target_component
         self.message_type = message_type
         self.payload = payload
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> V2Extension:
@@ -8671,11 +8671,11 @@ class MemoryVect(Message):
 
     __slots__ = ("address", "ver", "type", "value")
     __match_args__ = ("address", "ver", "type", "value")
-    ID = 249
-    NAME = "MEMORY_VECT"
-    CRC_EXTRA = 204
-    LENGTH = 36
-    BASE_LENGTH = 36
+    ID: ClassVar[int] = 249
+    NAME: ClassVar[str] = "MEMORY_VECT"
+    CRC_EXTRA: ClassVar[int] = 204
+    LENGTH: ClassVar[int] = 36
+    BASE_LENGTH: ClassVar[int] = 36
     _FIELDS = (
         ("address", "uint16_t", 0, "", "", "", "Starting address of the debug variables", False),
         ("ver", "uint8_t", 0, "", "", "0", "Version code of the type variable. 0=unknown, type ignored and assumed int16_t. 1=as below", False),
@@ -8704,7 +8704,7 @@ class MemoryVect(Message):
         self.ver = ver
         self.type = type
         self.value = tuple(value)
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> MemoryVect:
@@ -8736,11 +8736,11 @@ class DebugVect(Message):
 
     __slots__ = ("name", "time_usec", "x", "y", "z")
     __match_args__ = ("name", "time_usec", "x", "y", "z")
-    ID = 250
-    NAME = "DEBUG_VECT"
-    CRC_EXTRA = 49
-    LENGTH = 30
-    BASE_LENGTH = 30
+    ID: ClassVar[int] = 250
+    NAME: ClassVar[str] = "DEBUG_VECT"
+    CRC_EXTRA: ClassVar[int] = 49
+    LENGTH: ClassVar[int] = 30
+    BASE_LENGTH: ClassVar[int] = 30
     _FIELDS = (
         ("name", "char", 10, "", "", "", "Name", False),
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX Epoch time or time since system boot). The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
@@ -8773,7 +8773,7 @@ class DebugVect(Message):
         self.x = x
         self.y = y
         self.z = z
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> DebugVect:
@@ -8804,11 +8804,11 @@ class NamedValueFloat(Message):
 
     __slots__ = ("time_boot_ms", "name", "value")
     __match_args__ = ("time_boot_ms", "name", "value")
-    ID = 251
-    NAME = "NAMED_VALUE_FLOAT"
-    CRC_EXTRA = 170
-    LENGTH = 18
-    BASE_LENGTH = 18
+    ID: ClassVar[int] = 251
+    NAME: ClassVar[str] = "NAMED_VALUE_FLOAT"
+    CRC_EXTRA: ClassVar[int] = 170
+    LENGTH: ClassVar[int] = 18
+    BASE_LENGTH: ClassVar[int] = 18
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot).", False),
         ("name", "char", 10, "", "", "", "Name of the debug variable", False),
@@ -8828,7 +8828,7 @@ class NamedValueFloat(Message):
         self.time_boot_ms = time_boot_ms
         self.name = name
         self.value = value
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> NamedValueFloat:
@@ -8859,11 +8859,11 @@ class NamedValueInt(Message):
 
     __slots__ = ("time_boot_ms", "name", "value")
     __match_args__ = ("time_boot_ms", "name", "value")
-    ID = 252
-    NAME = "NAMED_VALUE_INT"
-    CRC_EXTRA = 44
-    LENGTH = 18
-    BASE_LENGTH = 18
+    ID: ClassVar[int] = 252
+    NAME: ClassVar[str] = "NAMED_VALUE_INT"
+    CRC_EXTRA: ClassVar[int] = 44
+    LENGTH: ClassVar[int] = 18
+    BASE_LENGTH: ClassVar[int] = 18
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot).", False),
         ("name", "char", 10, "", "", "", "Name of the debug variable", False),
@@ -8883,7 +8883,7 @@ class NamedValueInt(Message):
         self.time_boot_ms = time_boot_ms
         self.name = name
         self.value = value
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> NamedValueInt:
@@ -8913,11 +8913,11 @@ class Debug(Message):
 
     __slots__ = ("time_boot_ms", "ind", "value")
     __match_args__ = ("time_boot_ms", "ind", "value")
-    ID = 254
-    NAME = "DEBUG"
-    CRC_EXTRA = 46
-    LENGTH = 9
-    BASE_LENGTH = 9
+    ID: ClassVar[int] = 254
+    NAME: ClassVar[str] = "DEBUG"
+    CRC_EXTRA: ClassVar[int] = 46
+    LENGTH: ClassVar[int] = 9
+    BASE_LENGTH: ClassVar[int] = 9
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot).", False),
         ("ind", "uint8_t", 0, "", "", "", "index of debug variable", False),
@@ -8937,7 +8937,7 @@ class Debug(Message):
         self.time_boot_ms = time_boot_ms
         self.ind = ind
         self.value = value
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> Debug:
@@ -8966,11 +8966,11 @@ class SetupSigning(Message):
 
     __slots__ = ("target_system", "target_component", "secret_key", "initial_timestamp")
     __match_args__ = ("target_system", "target_component", "secret_key", "initial_timestamp")
-    ID = 256
-    NAME = "SETUP_SIGNING"
-    CRC_EXTRA = 71
-    LENGTH = 42
-    BASE_LENGTH = 42
+    ID: ClassVar[int] = 256
+    NAME: ClassVar[str] = "SETUP_SIGNING"
+    CRC_EXTRA: ClassVar[int] = 71
+    LENGTH: ClassVar[int] = 42
+    BASE_LENGTH: ClassVar[int] = 42
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "system id of the target", False),
         ("target_component", "uint8_t", 0, "", "", "", "component ID of the target", False),
@@ -8997,7 +8997,7 @@ class SetupSigning(Message):
         self.target_component = target_component
         self.secret_key = secret_key
         self.initial_timestamp = initial_timestamp
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> SetupSigning:
@@ -9030,11 +9030,11 @@ class ButtonChange(Message):
 
     __slots__ = ("time_boot_ms", "last_change_ms", "state")
     __match_args__ = ("time_boot_ms", "last_change_ms", "state")
-    ID = 257
-    NAME = "BUTTON_CHANGE"
-    CRC_EXTRA = 131
-    LENGTH = 9
-    BASE_LENGTH = 9
+    ID: ClassVar[int] = 257
+    NAME: ClassVar[str] = "BUTTON_CHANGE"
+    CRC_EXTRA: ClassVar[int] = 131
+    LENGTH: ClassVar[int] = 9
+    BASE_LENGTH: ClassVar[int] = 9
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot).", False),
         ("last_change_ms", "uint32_t", 0, "ms", "", "", "Time of last change of button state.", False),
@@ -9054,7 +9054,7 @@ class ButtonChange(Message):
         self.time_boot_ms = time_boot_ms
         self.last_change_ms = last_change_ms
         self.state = state
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> ButtonChange:
@@ -9091,11 +9091,11 @@ class CameraInformation(Message):
         "sensor_size_v", "resolution_h", "resolution_v", "lens_id", "flags", "cam_definition_version",
         "cam_definition_uri", "gimbal_device_id", "camera_device_id",
     )
-    ID = 259
-    NAME = "CAMERA_INFORMATION"
-    CRC_EXTRA = 92
-    LENGTH = 237
-    BASE_LENGTH = 235
+    ID: ClassVar[int] = 259
+    NAME: ClassVar[str] = "CAMERA_INFORMATION"
+    CRC_EXTRA: ClassVar[int] = 92
+    LENGTH: ClassVar[int] = 237
+    BASE_LENGTH: ClassVar[int] = 235
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot).", False),
         ("vendor_name", "uint8_t", 32, "", "", "", "Name of the camera vendor", False),
@@ -9193,7 +9193,7 @@ class CameraInformation(Message):
         self.cam_definition_uri = cam_definition_uri
         self.gimbal_device_id = gimbal_device_id
         self.camera_device_id = camera_device_id
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> CameraInformation:
@@ -9234,11 +9234,11 @@ class CameraSettings(Message):
 
     __slots__ = ("time_boot_ms", "mode_id", "zoomLevel", "focusLevel", "camera_device_id")
     __match_args__ = ("time_boot_ms", "mode_id", "zoomLevel", "focusLevel", "camera_device_id")
-    ID = 260
-    NAME = "CAMERA_SETTINGS"
-    CRC_EXTRA = 146
-    LENGTH = 14
-    BASE_LENGTH = 5
+    ID: ClassVar[int] = 260
+    NAME: ClassVar[str] = "CAMERA_SETTINGS"
+    CRC_EXTRA: ClassVar[int] = 146
+    LENGTH: ClassVar[int] = 14
+    BASE_LENGTH: ClassVar[int] = 5
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot).", False),
         ("mode_id", "uint8_t", 0, "", "CAMERA_MODE", "", "Camera mode", False),
@@ -9277,7 +9277,7 @@ class CameraSettings(Message):
         self.zoomLevel = zoomLevel
         self.focusLevel = focusLevel
         self.camera_device_id = camera_device_id
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> CameraSettings:
@@ -9318,11 +9318,11 @@ class StorageInformation(Message):
         "time_boot_ms", "storage_id", "storage_count", "status", "total_capacity", "used_capacity",
         "available_capacity", "read_speed", "write_speed", "type", "name", "storage_usage",
     )
-    ID = 261
-    NAME = "STORAGE_INFORMATION"
-    CRC_EXTRA = 179
-    LENGTH = 61
-    BASE_LENGTH = 27
+    ID: ClassVar[int] = 261
+    NAME: ClassVar[str] = "STORAGE_INFORMATION"
+    CRC_EXTRA: ClassVar[int] = 179
+    LENGTH: ClassVar[int] = 61
+    BASE_LENGTH: ClassVar[int] = 27
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot).", False),
         ("storage_id", "uint8_t", 0, "", "", "", "Storage ID (1 for first, 2 for second, etc.)", False),
@@ -9405,7 +9405,7 @@ class StorageInformation(Message):
         self.type = type
         self.name = name
         self.storage_usage = storage_usage
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> StorageInformation:
@@ -9449,11 +9449,11 @@ class CameraCaptureStatus(Message):
         "time_boot_ms", "image_status", "video_status", "image_interval", "recording_time_ms",
         "available_capacity", "image_count", "camera_device_id",
     )
-    ID = 262
-    NAME = "CAMERA_CAPTURE_STATUS"
-    CRC_EXTRA = 12
-    LENGTH = 23
-    BASE_LENGTH = 18
+    ID: ClassVar[int] = 262
+    NAME: ClassVar[str] = "CAMERA_CAPTURE_STATUS"
+    CRC_EXTRA: ClassVar[int] = 12
+    LENGTH: ClassVar[int] = 23
+    BASE_LENGTH: ClassVar[int] = 18
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot).", False),
         ("image_status", "uint8_t", 0, "", "", "", "Current status of image capturing (0: idle, 1: capture in progress, 2: interval set but idle, 3: interval set and capture in progress)", False),
@@ -9509,7 +9509,7 @@ class CameraCaptureStatus(Message):
         self.available_capacity = available_capacity
         self.image_count = image_count
         self.camera_device_id = camera_device_id
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> CameraCaptureStatus:
@@ -9556,11 +9556,11 @@ class CameraImageCaptured(Message):
         "time_boot_ms", "time_utc", "camera_id", "lat", "lon", "alt", "relative_alt", "q", "image_index",
         "capture_result", "file_url",
     )
-    ID = 263
-    NAME = "CAMERA_IMAGE_CAPTURED"
-    CRC_EXTRA = 133
-    LENGTH = 255
-    BASE_LENGTH = 255
+    ID: ClassVar[int] = 263
+    NAME: ClassVar[str] = "CAMERA_IMAGE_CAPTURED"
+    CRC_EXTRA: ClassVar[int] = 133
+    LENGTH: ClassVar[int] = 255
+    BASE_LENGTH: ClassVar[int] = 255
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot).", False),
         ("time_utc", "uint64_t", 0, "us", "", "0", "Timestamp (time since UNIX epoch) in UTC. 0 for unknown.", False),
@@ -9631,7 +9631,7 @@ class CameraImageCaptured(Message):
         self.image_index = image_index
         self.capture_result = capture_result
         self.file_url = file_url
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> CameraImageCaptured:
@@ -9671,11 +9671,11 @@ class FlightInformation(Message):
 
     __slots__ = ("time_boot_ms", "arming_time_utc", "takeoff_time_utc", "flight_uuid", "landing_time")
     __match_args__ = ("time_boot_ms", "arming_time_utc", "takeoff_time_utc", "flight_uuid", "landing_time")
-    ID = 264
-    NAME = "FLIGHT_INFORMATION"
-    CRC_EXTRA = 49
-    LENGTH = 32
-    BASE_LENGTH = 28
+    ID: ClassVar[int] = 264
+    NAME: ClassVar[str] = "FLIGHT_INFORMATION"
+    CRC_EXTRA: ClassVar[int] = 49
+    LENGTH: ClassVar[int] = 32
+    BASE_LENGTH: ClassVar[int] = 28
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot).", False),
         ("arming_time_utc", "uint64_t", 0, "us", "", "0", "Timestamp at arming (since system boot). Set to 0 on boot. Set value on arming. Note, field is misnamed UTC.", False),
@@ -9714,7 +9714,7 @@ class FlightInformation(Message):
         self.takeoff_time_utc = takeoff_time_utc
         self.flight_uuid = flight_uuid
         self.landing_time = landing_time
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> FlightInformation:
@@ -9752,11 +9752,11 @@ class MountOrientation(Message):
 
     __slots__ = ("time_boot_ms", "roll", "pitch", "yaw", "yaw_absolute")
     __match_args__ = ("time_boot_ms", "roll", "pitch", "yaw", "yaw_absolute")
-    ID = 265
-    NAME = "MOUNT_ORIENTATION"
-    CRC_EXTRA = 26
-    LENGTH = 20
-    BASE_LENGTH = 16
+    ID: ClassVar[int] = 265
+    NAME: ClassVar[str] = "MOUNT_ORIENTATION"
+    CRC_EXTRA: ClassVar[int] = 26
+    LENGTH: ClassVar[int] = 20
+    BASE_LENGTH: ClassVar[int] = 16
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot).", False),
         ("roll", "float", 0, "deg", "", "NaN", "Roll in global frame (set to NaN for invalid).", False),
@@ -9790,7 +9790,7 @@ class MountOrientation(Message):
         self.pitch = pitch
         self.yaw = yaw
         self.yaw_absolute = yaw_absolute
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> MountOrientation:
@@ -9820,11 +9820,11 @@ class LoggingData(Message):
     __match_args__ = (
         "target_system", "target_component", "sequence", "length", "first_message_offset", "data",
     )
-    ID = 266
-    NAME = "LOGGING_DATA"
-    CRC_EXTRA = 193
-    LENGTH = 255
-    BASE_LENGTH = 255
+    ID: ClassVar[int] = 266
+    NAME: ClassVar[str] = "LOGGING_DATA"
+    CRC_EXTRA: ClassVar[int] = 193
+    LENGTH: ClassVar[int] = 255
+    BASE_LENGTH: ClassVar[int] = 255
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "system ID of the target", False),
         ("target_component", "uint8_t", 0, "", "", "", "component ID of the target", False),
@@ -9864,7 +9864,7 @@ class LoggingData(Message):
         self.length = length
         self.first_message_offset = first_message_offset
         self.data = data
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> LoggingData:
@@ -9901,11 +9901,11 @@ class LoggingDataAcked(Message):
     __match_args__ = (
         "target_system", "target_component", "sequence", "length", "first_message_offset", "data",
     )
-    ID = 267
-    NAME = "LOGGING_DATA_ACKED"
-    CRC_EXTRA = 35
-    LENGTH = 255
-    BASE_LENGTH = 255
+    ID: ClassVar[int] = 267
+    NAME: ClassVar[str] = "LOGGING_DATA_ACKED"
+    CRC_EXTRA: ClassVar[int] = 35
+    LENGTH: ClassVar[int] = 255
+    BASE_LENGTH: ClassVar[int] = 255
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "system ID of the target", False),
         ("target_component", "uint8_t", 0, "", "", "", "component ID of the target", False),
@@ -9945,7 +9945,7 @@ class LoggingDataAcked(Message):
         self.length = length
         self.first_message_offset = first_message_offset
         self.data = data
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> LoggingDataAcked:
@@ -9979,11 +9979,11 @@ class LoggingAck(Message):
 
     __slots__ = ("target_system", "target_component", "sequence")
     __match_args__ = ("target_system", "target_component", "sequence")
-    ID = 268
-    NAME = "LOGGING_ACK"
-    CRC_EXTRA = 14
-    LENGTH = 4
-    BASE_LENGTH = 4
+    ID: ClassVar[int] = 268
+    NAME: ClassVar[str] = "LOGGING_ACK"
+    CRC_EXTRA: ClassVar[int] = 14
+    LENGTH: ClassVar[int] = 4
+    BASE_LENGTH: ClassVar[int] = 4
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "system ID of the target", False),
         ("target_component", "uint8_t", 0, "", "", "", "component ID of the target", False),
@@ -10003,7 +10003,7 @@ class LoggingAck(Message):
         self.target_system = target_system
         self.target_component = target_component
         self.sequence = sequence
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> LoggingAck:
@@ -10039,11 +10039,11 @@ class VideoStreamInformation(Message):
         "stream_id", "count", "type", "flags", "framerate", "resolution_h", "resolution_v", "bitrate",
         "rotation", "hfov", "name", "uri", "encoding", "camera_device_id",
     )
-    ID = 269
-    NAME = "VIDEO_STREAM_INFORMATION"
-    CRC_EXTRA = 109
-    LENGTH = 215
-    BASE_LENGTH = 213
+    ID: ClassVar[int] = 269
+    NAME: ClassVar[str] = "VIDEO_STREAM_INFORMATION"
+    CRC_EXTRA: ClassVar[int] = 109
+    LENGTH: ClassVar[int] = 215
+    BASE_LENGTH: ClassVar[int] = 213
     _FIELDS = (
         ("stream_id", "uint8_t", 0, "", "", "", "Video Stream ID (1 for first, 2 for second, etc.)", False),
         ("count", "uint8_t", 0, "", "", "", "Number of streams available.", False),
@@ -10126,7 +10126,7 @@ class VideoStreamInformation(Message):
         self.uri = uri
         self.encoding = encoding
         self.camera_device_id = camera_device_id
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> VideoStreamInformation:
@@ -10170,11 +10170,11 @@ class VideoStreamStatus(Message):
         "stream_id", "flags", "framerate", "resolution_h", "resolution_v", "bitrate", "rotation", "hfov",
         "camera_device_id",
     )
-    ID = 270
-    NAME = "VIDEO_STREAM_STATUS"
-    CRC_EXTRA = 59
-    LENGTH = 20
-    BASE_LENGTH = 19
+    ID: ClassVar[int] = 270
+    NAME: ClassVar[str] = "VIDEO_STREAM_STATUS"
+    CRC_EXTRA: ClassVar[int] = 59
+    LENGTH: ClassVar[int] = 20
+    BASE_LENGTH: ClassVar[int] = 19
     _FIELDS = (
         ("stream_id", "uint8_t", 0, "", "", "", "Video Stream ID (1 for first, 2 for second, etc.)", False),
         ("flags", "uint16_t", 0, "", "VIDEO_STREAM_STATUS_FLAGS", "", "Bitmap of stream status flags", False),
@@ -10229,7 +10229,7 @@ class VideoStreamStatus(Message):
         self.rotation = rotation
         self.hfov = hfov
         self.camera_device_id = camera_device_id
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> VideoStreamStatus:
@@ -10270,11 +10270,11 @@ class CameraFovStatus(Message):
         "time_boot_ms", "lat_camera", "lon_camera", "alt_camera", "lat_image", "lon_image", "alt_image", "q",
         "hfov", "vfov", "camera_device_id",
     )
-    ID = 271
-    NAME = "CAMERA_FOV_STATUS"
-    CRC_EXTRA = 22
-    LENGTH = 53
-    BASE_LENGTH = 52
+    ID: ClassVar[int] = 271
+    NAME: ClassVar[str] = "CAMERA_FOV_STATUS"
+    CRC_EXTRA: ClassVar[int] = 22
+    LENGTH: ClassVar[int] = 53
+    BASE_LENGTH: ClassVar[int] = 52
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot).", False),
         ("lat_camera", "int32_t", 0, "degE7", "", "INT32_MAX", "Latitude of camera (INT32_MAX if unknown).", False),
@@ -10346,7 +10346,7 @@ class CameraFovStatus(Message):
         self.hfov = hfov
         self.vfov = vfov
         self.camera_device_id = camera_device_id
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> CameraFovStatus:
@@ -10390,11 +10390,11 @@ class CameraTrackingImageStatus(Message):
         "tracking_status", "tracking_mode", "target_data", "point_x", "point_y", "radius", "rec_top_x",
         "rec_top_y", "rec_bottom_x", "rec_bottom_y", "camera_device_id",
     )
-    ID = 275
-    NAME = "CAMERA_TRACKING_IMAGE_STATUS"
-    CRC_EXTRA = 126
-    LENGTH = 32
-    BASE_LENGTH = 31
+    ID: ClassVar[int] = 275
+    NAME: ClassVar[str] = "CAMERA_TRACKING_IMAGE_STATUS"
+    CRC_EXTRA: ClassVar[int] = 126
+    LENGTH: ClassVar[int] = 32
+    BASE_LENGTH: ClassVar[int] = 31
     _FIELDS = (
         ("tracking_status", "uint8_t", 0, "", "CAMERA_TRACKING_STATUS_FLAGS", "", "Current tracking status", False),
         ("tracking_mode", "uint8_t", 0, "", "CAMERA_TRACKING_MODE", "", "Current tracking mode", False),
@@ -10474,7 +10474,7 @@ class CameraTrackingImageStatus(Message):
         self.rec_bottom_x = rec_bottom_x
         self.rec_bottom_y = rec_bottom_y
         self.camera_device_id = camera_device_id
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> CameraTrackingImageStatus:
@@ -10517,11 +10517,11 @@ class CameraTrackingGeoStatus(Message):
         "tracking_status", "lat", "lon", "alt", "h_acc", "v_acc", "vel_n", "vel_e", "vel_d", "vel_acc",
         "dist", "hdg", "hdg_acc", "camera_device_id",
     )
-    ID = 276
-    NAME = "CAMERA_TRACKING_GEO_STATUS"
-    CRC_EXTRA = 18
-    LENGTH = 50
-    BASE_LENGTH = 49
+    ID: ClassVar[int] = 276
+    NAME: ClassVar[str] = "CAMERA_TRACKING_GEO_STATUS"
+    CRC_EXTRA: ClassVar[int] = 18
+    LENGTH: ClassVar[int] = 50
+    BASE_LENGTH: ClassVar[int] = 49
     _FIELDS = (
         ("tracking_status", "uint8_t", 0, "", "CAMERA_TRACKING_STATUS_FLAGS", "", "Current tracking status", False),
         ("lat", "int32_t", 0, "degE7", "", "", "Latitude of tracked object", False),
@@ -10602,7 +10602,7 @@ class CameraTrackingGeoStatus(Message):
         self.hdg = hdg
         self.hdg_acc = hdg_acc
         self.camera_device_id = camera_device_id
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> CameraTrackingGeoStatus:
@@ -10647,11 +10647,11 @@ class CameraThermalRange(Message):
         "time_boot_ms", "stream_id", "camera_device_id", "max", "max_point_x", "max_point_y", "min",
         "min_point_x", "min_point_y",
     )
-    ID = 277
-    NAME = "CAMERA_THERMAL_RANGE"
-    CRC_EXTRA = 62
-    LENGTH = 30
-    BASE_LENGTH = 30
+    ID: ClassVar[int] = 277
+    NAME: ClassVar[str] = "CAMERA_THERMAL_RANGE"
+    CRC_EXTRA: ClassVar[int] = 62
+    LENGTH: ClassVar[int] = 30
+    BASE_LENGTH: ClassVar[int] = 30
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot).", False),
         ("stream_id", "uint8_t", 0, "", "", "", "Video Stream ID (1 for first, 2 for second, etc.)", False),
@@ -10714,7 +10714,7 @@ class CameraThermalRange(Message):
         self.min = min
         self.min_point_x = min_point_x
         self.min_point_y = min_point_y
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> CameraThermalRange:
@@ -10755,11 +10755,11 @@ class GimbalManagerInformation(Message):
         "time_boot_ms", "cap_flags", "gimbal_device_id", "roll_min", "roll_max", "pitch_min", "pitch_max",
         "yaw_min", "yaw_max",
     )
-    ID = 280
-    NAME = "GIMBAL_MANAGER_INFORMATION"
-    CRC_EXTRA = 70
-    LENGTH = 33
-    BASE_LENGTH = 33
+    ID: ClassVar[int] = 280
+    NAME: ClassVar[str] = "GIMBAL_MANAGER_INFORMATION"
+    CRC_EXTRA: ClassVar[int] = 70
+    LENGTH: ClassVar[int] = 33
+    BASE_LENGTH: ClassVar[int] = 33
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot).", False),
         ("cap_flags", "uint32_t", 0, "", "GIMBAL_MANAGER_CAP_FLAGS", "", "Bitmap of gimbal capability flags.", False),
@@ -10818,7 +10818,7 @@ class GimbalManagerInformation(Message):
         self.pitch_max = pitch_max
         self.yaw_min = yaw_min
         self.yaw_max = yaw_max
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> GimbalManagerInformation:
@@ -10859,11 +10859,11 @@ class GimbalManagerStatus(Message):
         "time_boot_ms", "flags", "gimbal_device_id", "primary_control_sysid", "primary_control_compid",
         "secondary_control_sysid", "secondary_control_compid",
     )
-    ID = 281
-    NAME = "GIMBAL_MANAGER_STATUS"
-    CRC_EXTRA = 48
-    LENGTH = 13
-    BASE_LENGTH = 13
+    ID: ClassVar[int] = 281
+    NAME: ClassVar[str] = "GIMBAL_MANAGER_STATUS"
+    CRC_EXTRA: ClassVar[int] = 48
+    LENGTH: ClassVar[int] = 13
+    BASE_LENGTH: ClassVar[int] = 13
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot).", False),
         ("flags", "uint32_t", 0, "", "GIMBAL_MANAGER_FLAGS", "", "High level gimbal manager flags currently applied.", False),
@@ -10908,7 +10908,7 @@ class GimbalManagerStatus(Message):
         self.primary_control_compid = primary_control_compid
         self.secondary_control_sysid = secondary_control_sysid
         self.secondary_control_compid = secondary_control_compid
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> GimbalManagerStatus:
@@ -10950,11 +10950,11 @@ class GimbalManagerSetAttitude(Message):
         "target_system", "target_component", "flags", "gimbal_device_id", "q", "angular_velocity_x",
         "angular_velocity_y", "angular_velocity_z",
     )
-    ID = 282
-    NAME = "GIMBAL_MANAGER_SET_ATTITUDE"
-    CRC_EXTRA = 123
-    LENGTH = 35
-    BASE_LENGTH = 35
+    ID: ClassVar[int] = 282
+    NAME: ClassVar[str] = "GIMBAL_MANAGER_SET_ATTITUDE"
+    CRC_EXTRA: ClassVar[int] = 123
+    LENGTH: ClassVar[int] = 35
+    BASE_LENGTH: ClassVar[int] = 35
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID", False),
@@ -11013,7 +11013,7 @@ class GimbalManagerSetAttitude(Message):
         self.angular_velocity_x = angular_velocity_x
         self.angular_velocity_y = angular_velocity_y
         self.angular_velocity_z = angular_velocity_z
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> GimbalManagerSetAttitude:
@@ -11059,11 +11059,11 @@ class GimbalDeviceInformation(Message):
         "uid", "cap_flags", "custom_cap_flags", "roll_min", "roll_max", "pitch_min", "pitch_max", "yaw_min",
         "yaw_max", "gimbal_device_id", "cap_flags2",
     )
-    ID = 283
-    NAME = "GIMBAL_DEVICE_INFORMATION"
-    CRC_EXTRA = 74
-    LENGTH = 149
-    BASE_LENGTH = 144
+    ID: ClassVar[int] = 283
+    NAME: ClassVar[str] = "GIMBAL_DEVICE_INFORMATION"
+    CRC_EXTRA: ClassVar[int] = 74
+    LENGTH: ClassVar[int] = 149
+    BASE_LENGTH: ClassVar[int] = 144
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot).", False),
         ("vendor_name", "char", 32, "", "", "", "Name of the gimbal vendor.", False),
@@ -11181,7 +11181,7 @@ class GimbalDeviceInformation(Message):
         self.yaw_max = yaw_max
         self.gimbal_device_id = gimbal_device_id
         self.cap_flags2 = cap_flags2
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> GimbalDeviceInformation:
@@ -11238,11 +11238,11 @@ class GimbalDeviceSetAttitude(Message):
         "target_system", "target_component", "flags", "q", "angular_velocity_x", "angular_velocity_y",
         "angular_velocity_z",
     )
-    ID = 284
-    NAME = "GIMBAL_DEVICE_SET_ATTITUDE"
-    CRC_EXTRA = 99
-    LENGTH = 32
-    BASE_LENGTH = 32
+    ID: ClassVar[int] = 284
+    NAME: ClassVar[str] = "GIMBAL_DEVICE_SET_ATTITUDE"
+    CRC_EXTRA: ClassVar[int] = 99
+    LENGTH: ClassVar[int] = 32
+    BASE_LENGTH: ClassVar[int] = 32
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID", False),
@@ -11293,7 +11293,7 @@ class GimbalDeviceSetAttitude(Message):
         self.angular_velocity_x = angular_velocity_x
         self.angular_velocity_y = angular_velocity_y
         self.angular_velocity_z = angular_velocity_z
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> GimbalDeviceSetAttitude:
@@ -11351,11 +11351,11 @@ class GimbalDeviceAttitudeStatus(Message):
         "angular_velocity_y", "angular_velocity_z", "failure_flags", "delta_yaw", "delta_yaw_velocity",
         "gimbal_device_id",
     )
-    ID = 285
-    NAME = "GIMBAL_DEVICE_ATTITUDE_STATUS"
-    CRC_EXTRA = 137
-    LENGTH = 49
-    BASE_LENGTH = 40
+    ID: ClassVar[int] = 285
+    NAME: ClassVar[str] = "GIMBAL_DEVICE_ATTITUDE_STATUS"
+    CRC_EXTRA: ClassVar[int] = 137
+    LENGTH: ClassVar[int] = 49
+    BASE_LENGTH: ClassVar[int] = 40
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID", False),
@@ -11441,7 +11441,7 @@ class GimbalDeviceAttitudeStatus(Message):
         self.delta_yaw = delta_yaw
         self.delta_yaw_velocity = delta_yaw_velocity
         self.gimbal_device_id = gimbal_device_id
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> GimbalDeviceAttitudeStatus:
@@ -11490,11 +11490,11 @@ class AutopilotStateForGimbalDevice(Message):
         "v_estimated_delay_us", "feed_forward_angular_velocity_z", "estimator_status", "landed_state",
         "angular_velocity_z",
     )
-    ID = 286
-    NAME = "AUTOPILOT_STATE_FOR_GIMBAL_DEVICE"
-    CRC_EXTRA = 210
-    LENGTH = 57
-    BASE_LENGTH = 53
+    ID: ClassVar[int] = 286
+    NAME: ClassVar[str] = "AUTOPILOT_STATE_FOR_GIMBAL_DEVICE"
+    CRC_EXTRA: ClassVar[int] = 210
+    LENGTH: ClassVar[int] = 57
+    BASE_LENGTH: ClassVar[int] = 53
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID", False),
@@ -11577,7 +11577,7 @@ class AutopilotStateForGimbalDevice(Message):
         self.estimator_status = estimator_status
         self.landed_state = landed_state
         self.angular_velocity_z = angular_velocity_z
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> AutopilotStateForGimbalDevice:
@@ -11624,11 +11624,11 @@ class GimbalManagerSetPitchyaw(Message):
         "target_system", "target_component", "flags", "gimbal_device_id", "pitch", "yaw", "pitch_rate",
         "yaw_rate",
     )
-    ID = 287
-    NAME = "GIMBAL_MANAGER_SET_PITCHYAW"
-    CRC_EXTRA = 1
-    LENGTH = 23
-    BASE_LENGTH = 23
+    ID: ClassVar[int] = 287
+    NAME: ClassVar[str] = "GIMBAL_MANAGER_SET_PITCHYAW"
+    CRC_EXTRA: ClassVar[int] = 1
+    LENGTH: ClassVar[int] = 23
+    BASE_LENGTH: ClassVar[int] = 23
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID", False),
@@ -11685,7 +11685,7 @@ class GimbalManagerSetPitchyaw(Message):
         self.yaw = yaw
         self.pitch_rate = pitch_rate
         self.yaw_rate = yaw_rate
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> GimbalManagerSetPitchyaw:
@@ -11728,11 +11728,11 @@ class GimbalManagerSetManualControl(Message):
         "target_system", "target_component", "flags", "gimbal_device_id", "pitch", "yaw", "pitch_rate",
         "yaw_rate",
     )
-    ID = 288
-    NAME = "GIMBAL_MANAGER_SET_MANUAL_CONTROL"
-    CRC_EXTRA = 20
-    LENGTH = 23
-    BASE_LENGTH = 23
+    ID: ClassVar[int] = 288
+    NAME: ClassVar[str] = "GIMBAL_MANAGER_SET_MANUAL_CONTROL"
+    CRC_EXTRA: ClassVar[int] = 20
+    LENGTH: ClassVar[int] = 23
+    BASE_LENGTH: ClassVar[int] = 23
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID", False),
@@ -11791,7 +11791,7 @@ class GimbalManagerSetManualControl(Message):
         self.yaw = yaw
         self.pitch_rate = pitch_rate
         self.yaw_rate = yaw_rate
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> GimbalManagerSetManualControl:
@@ -11825,11 +11825,11 @@ class Airspeed(Message):
 
     __slots__ = ("id", "airspeed", "temperature", "raw_press", "flags")
     __match_args__ = ("id", "airspeed", "temperature", "raw_press", "flags")
-    ID = 295
-    NAME = "AIRSPEED"
-    CRC_EXTRA = 234
-    LENGTH = 12
-    BASE_LENGTH = 12
+    ID: ClassVar[int] = 295
+    NAME: ClassVar[str] = "AIRSPEED"
+    CRC_EXTRA: ClassVar[int] = 234
+    LENGTH: ClassVar[int] = 12
+    BASE_LENGTH: ClassVar[int] = 12
     _FIELDS = (
         ("id", "uint8_t", 0, "", "", "", "Sensor ID.", False),
         ("airspeed", "float", 0, "m/s", "", "", "Calibrated airspeed (CAS).", False),
@@ -11859,7 +11859,7 @@ class Airspeed(Message):
         self.temperature = temperature
         self.raw_press = raw_press
         self.flags = flags
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> Airspeed:
@@ -11894,11 +11894,11 @@ class GlobalPositionSensor(Message):
         "target_system", "target_component", "id", "time_usec", "processing_time", "source", "flags", "lat",
         "lon", "alt_ellipsoid", "alt", "eph", "epv",
     )
-    ID = 296
-    NAME = "GLOBAL_POSITION_SENSOR"
-    CRC_EXTRA = 158
-    LENGTH = 41
-    BASE_LENGTH = 41
+    ID: ClassVar[int] = 296
+    NAME: ClassVar[str] = "GLOBAL_POSITION_SENSOR"
+    CRC_EXTRA: ClassVar[int] = 158
+    LENGTH: ClassVar[int] = 41
+    BASE_LENGTH: ClassVar[int] = 41
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID (ID of target system, normally autopilot and ground station).", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID (normally 0 for broadcast).", False),
@@ -11981,7 +11981,7 @@ class GlobalPositionSensor(Message):
         self.alt = alt
         self.eph = eph
         self.epv = epv
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> GlobalPositionSensor:
@@ -12018,11 +12018,11 @@ class WifiConfigAp(Message):
 
     __slots__ = ("ssid", "password", "mode", "response")
     __match_args__ = ("ssid", "password", "mode", "response")
-    ID = 299
-    NAME = "WIFI_CONFIG_AP"
-    CRC_EXTRA = 19
-    LENGTH = 98
-    BASE_LENGTH = 96
+    ID: ClassVar[int] = 299
+    NAME: ClassVar[str] = "WIFI_CONFIG_AP"
+    CRC_EXTRA: ClassVar[int] = 19
+    LENGTH: ClassVar[int] = 98
+    BASE_LENGTH: ClassVar[int] = 96
     _FIELDS = (
         ("ssid", "char", 32, "", "", "", "Name of Wi-Fi network (SSID). Blank to leave it unchanged when setting. Current SSID when sent back as a response.", False),
         ("password", "char", 64, "", "", "", "Password. Blank for an open AP. MD5 hash when message is sent back as a response.", False),
@@ -12051,7 +12051,7 @@ class WifiConfigAp(Message):
         self.password = password
         self.mode = mode
         self.response = response
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> WifiConfigAp:
@@ -12091,11 +12091,11 @@ class AisVessel(Message):
         "dimension_bow", "dimension_stern", "dimension_port", "dimension_starboard", "callsign", "name",
         "tslc", "flags",
     )
-    ID = 301
-    NAME = "AIS_VESSEL"
-    CRC_EXTRA = 243
-    LENGTH = 58
-    BASE_LENGTH = 58
+    ID: ClassVar[int] = 301
+    NAME: ClassVar[str] = "AIS_VESSEL"
+    CRC_EXTRA: ClassVar[int] = 243
+    LENGTH: ClassVar[int] = 58
+    BASE_LENGTH: ClassVar[int] = 58
     _FIELDS = (
         ("MMSI", "uint32_t", 0, "", "", "", "Mobile Marine Service Identifier, 9 decimal digits", False),
         ("lat", "int32_t", 0, "degE7", "", "INT32_MAX", "Latitude", False),
@@ -12189,7 +12189,7 @@ class AisVessel(Message):
         self.name = name
         self.tslc = tslc
         self.flags = flags
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> AisVessel:
@@ -12230,11 +12230,11 @@ class UavcanNodeStatus(Message):
 
     __slots__ = ("time_usec", "uptime_sec", "health", "mode", "sub_mode", "vendor_specific_status_code")
     __match_args__ = ("time_usec", "uptime_sec", "health", "mode", "sub_mode", "vendor_specific_status_code")
-    ID = 310
-    NAME = "UAVCAN_NODE_STATUS"
-    CRC_EXTRA = 28
-    LENGTH = 17
-    BASE_LENGTH = 17
+    ID: ClassVar[int] = 310
+    NAME: ClassVar[str] = "UAVCAN_NODE_STATUS"
+    CRC_EXTRA: ClassVar[int] = 28
+    LENGTH: ClassVar[int] = 17
+    BASE_LENGTH: ClassVar[int] = 17
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX Epoch time or time since system boot). The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
         ("uptime_sec", "uint32_t", 0, "s", "", "", "Time since the start-up of the node.", False),
@@ -12275,7 +12275,7 @@ class UavcanNodeStatus(Message):
         self.mode = mode
         self.sub_mode = sub_mode
         self.vendor_specific_status_code = vendor_specific_status_code
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> UavcanNodeStatus:
@@ -12320,11 +12320,11 @@ class UavcanNodeInfo(Message):
         "time_usec", "uptime_sec", "name", "hw_version_major", "hw_version_minor", "hw_unique_id",
         "sw_version_major", "sw_version_minor", "sw_vcs_commit",
     )
-    ID = 311
-    NAME = "UAVCAN_NODE_INFO"
-    CRC_EXTRA = 95
-    LENGTH = 116
-    BASE_LENGTH = 116
+    ID: ClassVar[int] = 311
+    NAME: ClassVar[str] = "UAVCAN_NODE_INFO"
+    CRC_EXTRA: ClassVar[int] = 95
+    LENGTH: ClassVar[int] = 116
+    BASE_LENGTH: ClassVar[int] = 116
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX Epoch time or time since system boot). The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
         ("uptime_sec", "uint32_t", 0, "s", "", "", "Time since the start-up of the node.", False),
@@ -12382,7 +12382,7 @@ class UavcanNodeInfo(Message):
         self.sw_version_major = sw_version_major
         self.sw_version_minor = sw_version_minor
         self.sw_vcs_commit = sw_vcs_commit
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> UavcanNodeInfo:
@@ -12419,11 +12419,11 @@ class ParamExtRequestRead(Message):
 
     __slots__ = ("target_system", "target_component", "param_id", "param_index")
     __match_args__ = ("target_system", "target_component", "param_id", "param_index")
-    ID = 320
-    NAME = "PARAM_EXT_REQUEST_READ"
-    CRC_EXTRA = 243
-    LENGTH = 20
-    BASE_LENGTH = 20
+    ID: ClassVar[int] = 320
+    NAME: ClassVar[str] = "PARAM_EXT_REQUEST_READ"
+    CRC_EXTRA: ClassVar[int] = 243
+    LENGTH: ClassVar[int] = 20
+    BASE_LENGTH: ClassVar[int] = 20
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID", False),
@@ -12453,7 +12453,7 @@ class ParamExtRequestRead(Message):
         self.target_component = target_component
         self.param_id = param_id
         self.param_index = param_index
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> ParamExtRequestRead:
@@ -12485,11 +12485,11 @@ class ParamExtRequestList(Message):
 
     __slots__ = ("target_system", "target_component")
     __match_args__ = ("target_system", "target_component")
-    ID = 321
-    NAME = "PARAM_EXT_REQUEST_LIST"
-    CRC_EXTRA = 88
-    LENGTH = 2
-    BASE_LENGTH = 2
+    ID: ClassVar[int] = 321
+    NAME: ClassVar[str] = "PARAM_EXT_REQUEST_LIST"
+    CRC_EXTRA: ClassVar[int] = 88
+    LENGTH: ClassVar[int] = 2
+    BASE_LENGTH: ClassVar[int] = 2
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID", False),
@@ -12504,7 +12504,7 @@ class ParamExtRequestList(Message):
     def __init__(self, target_system: int, target_component: int) -> None:
         self.target_system = target_system
         self.target_component = target_component
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> ParamExtRequestList:
@@ -12534,14 +12534,14 @@ class ParamExtValue(Message):
 
     __slots__ = ("param_id", "param_value", "param_type", "param_count", "param_index")
     __match_args__ = ("param_id", "param_value", "param_type", "param_count", "param_index")
-    ID = 322
-    NAME = "PARAM_EXT_VALUE"
-    CRC_EXTRA = 243
-    LENGTH = 149
-    BASE_LENGTH = 149
+    ID: ClassVar[int] = 322
+    NAME: ClassVar[str] = "PARAM_EXT_VALUE"
+    CRC_EXTRA: ClassVar[int] = 243
+    LENGTH: ClassVar[int] = 149
+    BASE_LENGTH: ClassVar[int] = 149
     _FIELDS = (
         ("param_id", "char", 16, "", "", "", "Parameter id, terminated by NULL if the length is less than 16 human-readable chars and WITHOUT null termination (NULL) byte if the length is exactly 16 chars - applications have to provide 16+1 bytes storage if the ID is stored as string", False),
-        ("param_value", "char", 128, "", "", "", "Parameter value", False),
+        ("param_value", "char", 128, "", "", "", "Parameter value", False, True),
         ("param_type", "uint8_t", 0, "", "MAV_PARAM_EXT_TYPE", "", "Parameter type.", False),
         ("param_count", "uint16_t", 0, "", "", "", "Total number of parameters", False),
         ("param_index", "uint16_t", 0, "", "", "", "Index of this parameter", False),
@@ -12553,7 +12553,7 @@ class ParamExtValue(Message):
     storage if the ID is stored as string. Type: char[16].
     """
 
-    param_value: str
+    param_value: bytes
     """Parameter value. Type: char[128]."""
 
     param_type: int
@@ -12566,30 +12566,31 @@ class ParamExtValue(Message):
     """Index of this parameter. Type: uint16_t."""
 
     def __init__(
-        self, param_id: str, param_value: str, param_type: int, param_count: int, param_index: int,
+        self, param_id: str, param_value: bytes, param_type: int, param_count: int, param_index: int,
     ) -> None:
         self.param_id = param_id
         self.param_value = param_value
         self.param_type = param_type
         self.param_count = param_count
         self.param_index = param_index
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> ParamExtValue:
         body = body.ljust(158, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.param_count, self.param_index, v2, v3, self.param_type) = _S322.unpack_from(body, 9)
+        (
+            self.param_count, self.param_index, v2, self.param_value, self.param_type,
+        ) = _S322.unpack_from(body, 9)
         self.param_id = v2.partition(b"\0")[0].decode("utf-8", "replace")
-        self.param_value = v3.partition(b"\0")[0].decode("utf-8", "replace")
         return self
 
     def encode(self) -> bytes:
         try:
             return _S322.pack(
                 self.param_count, self.param_index, pack_text(self.param_id, 16),
-                pack_text(self.param_value, 128), self.param_type,
+                pack_bytes(self.param_value, 128), self.param_type,
             )
         except PACK_ERRORS:
             raise self._encode_error() from None
@@ -12609,16 +12610,16 @@ class ParamExtSet(Message):
 
     __slots__ = ("target_system", "target_component", "param_id", "param_value", "param_type")
     __match_args__ = ("target_system", "target_component", "param_id", "param_value", "param_type")
-    ID = 323
-    NAME = "PARAM_EXT_SET"
-    CRC_EXTRA = 78
-    LENGTH = 147
-    BASE_LENGTH = 147
+    ID: ClassVar[int] = 323
+    NAME: ClassVar[str] = "PARAM_EXT_SET"
+    CRC_EXTRA: ClassVar[int] = 78
+    LENGTH: ClassVar[int] = 147
+    BASE_LENGTH: ClassVar[int] = 147
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID", False),
         ("param_id", "char", 16, "", "", "", "Parameter id, terminated by NULL if the length is less than 16 human-readable chars and WITHOUT null termination (NULL) byte if the length is exactly 16 chars - applications have to provide 16+1 bytes storage if the ID is stored as string", False),
-        ("param_value", "char", 128, "", "", "", "Parameter value", False),
+        ("param_value", "char", 128, "", "", "", "Parameter value", False, True),
         ("param_type", "uint8_t", 0, "", "MAV_PARAM_EXT_TYPE", "", "Parameter type.", False),
     )
 
@@ -12634,37 +12635,38 @@ class ParamExtSet(Message):
     storage if the ID is stored as string. Type: char[16].
     """
 
-    param_value: str
+    param_value: bytes
     """Parameter value. Type: char[128]."""
 
     param_type: int
     """Parameter type. Type: uint8_t. Values: MAV_PARAM_EXT_TYPE."""
 
     def __init__(
-        self, target_system: int, target_component: int, param_id: str, param_value: str, param_type: int,
+        self, target_system: int, target_component: int, param_id: str, param_value: bytes, param_type: int,
     ) -> None:
         self.target_system = target_system
         self.target_component = target_component
         self.param_id = param_id
         self.param_value = param_value
         self.param_type = param_type
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> ParamExtSet:
         body = body.ljust(156, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (self.target_system, self.target_component, v2, v3, self.param_type) = _S323.unpack_from(body, 9)
+        (
+            self.target_system, self.target_component, v2, self.param_value, self.param_type,
+        ) = _S323.unpack_from(body, 9)
         self.param_id = v2.partition(b"\0")[0].decode("utf-8", "replace")
-        self.param_value = v3.partition(b"\0")[0].decode("utf-8", "replace")
         return self
 
     def encode(self) -> bytes:
         try:
             return _S323.pack(
                 self.target_system, self.target_component, pack_text(self.param_id, 16),
-                pack_text(self.param_value, 128), self.param_type,
+                pack_bytes(self.param_value, 128), self.param_type,
             )
         except PACK_ERRORS:
             raise self._encode_error() from None
@@ -12681,14 +12683,14 @@ class ParamExtAck(Message):
 
     __slots__ = ("param_id", "param_value", "param_type", "param_result")
     __match_args__ = ("param_id", "param_value", "param_type", "param_result")
-    ID = 324
-    NAME = "PARAM_EXT_ACK"
-    CRC_EXTRA = 132
-    LENGTH = 146
-    BASE_LENGTH = 146
+    ID: ClassVar[int] = 324
+    NAME: ClassVar[str] = "PARAM_EXT_ACK"
+    CRC_EXTRA: ClassVar[int] = 132
+    LENGTH: ClassVar[int] = 146
+    BASE_LENGTH: ClassVar[int] = 146
     _FIELDS = (
         ("param_id", "char", 16, "", "", "", "Parameter id, terminated by NULL if the length is less than 16 human-readable chars and WITHOUT null termination (NULL) byte if the length is exactly 16 chars - applications have to provide 16+1 bytes storage if the ID is stored as string", False),
-        ("param_value", "char", 128, "", "", "", "Parameter value (new value if PARAM_ACK_ACCEPTED, current value otherwise)", False),
+        ("param_value", "char", 128, "", "", "", "Parameter value (new value if PARAM_ACK_ACCEPTED, current value otherwise)", False, True),
         ("param_type", "uint8_t", 0, "", "MAV_PARAM_EXT_TYPE", "", "Parameter type.", False),
         ("param_result", "uint8_t", 0, "", "PARAM_ACK", "", "Result code.", False),
     )
@@ -12699,7 +12701,7 @@ class ParamExtAck(Message):
     storage if the ID is stored as string. Type: char[16].
     """
 
-    param_value: str
+    param_value: bytes
     """Parameter value (new value if PARAM_ACK_ACCEPTED, current value otherwise) Type: char[128]."""
 
     param_type: int
@@ -12708,27 +12710,26 @@ class ParamExtAck(Message):
     param_result: int
     """Result code. Type: uint8_t. Values: PARAM_ACK."""
 
-    def __init__(self, param_id: str, param_value: str, param_type: int, param_result: int) -> None:
+    def __init__(self, param_id: str, param_value: bytes, param_type: int, param_result: int) -> None:
         self.param_id = param_id
         self.param_value = param_value
         self.param_type = param_type
         self.param_result = param_result
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> ParamExtAck:
         body = body.ljust(155, b"\0")
         self = _new(cls)
         self.received_frame = frame
-        (v0, v1, self.param_type, self.param_result) = _S324.unpack_from(body, 9)
+        (v0, self.param_value, self.param_type, self.param_result) = _S324.unpack_from(body, 9)
         self.param_id = v0.partition(b"\0")[0].decode("utf-8", "replace")
-        self.param_value = v1.partition(b"\0")[0].decode("utf-8", "replace")
         return self
 
     def encode(self) -> bytes:
         try:
             return _S324.pack(
-                pack_text(self.param_id, 16), pack_text(self.param_value, 128), self.param_type,
+                pack_text(self.param_id, 16), pack_bytes(self.param_value, 128), self.param_type,
                 self.param_result,
             )
         except PACK_ERRORS:
@@ -12753,11 +12754,11 @@ class ObstacleDistance(Message):
         "time_usec", "sensor_type", "distances", "increment", "min_distance", "max_distance", "increment_f",
         "angle_offset", "frame",
     )
-    ID = 330
-    NAME = "OBSTACLE_DISTANCE"
-    CRC_EXTRA = 23
-    LENGTH = 167
-    BASE_LENGTH = 158
+    ID: ClassVar[int] = 330
+    NAME: ClassVar[str] = "OBSTACLE_DISTANCE"
+    CRC_EXTRA: ClassVar[int] = 23
+    LENGTH: ClassVar[int] = 167
+    BASE_LENGTH: ClassVar[int] = 158
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX Epoch time or time since system boot). The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
         ("sensor_type", "uint8_t", 0, "", "MAV_DISTANCE_SENSOR", "", "Class id of the distance sensor type.", False),
@@ -12829,7 +12830,7 @@ class ObstacleDistance(Message):
         self.increment_f = increment_f
         self.angle_offset = angle_offset
         self.frame = frame
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> ObstacleDistance:
@@ -12878,11 +12879,11 @@ class Odometry(Message):
         "pitchspeed", "yawspeed", "pose_covariance", "velocity_covariance", "reset_counter", "estimator_type",
         "quality",
     )
-    ID = 331
-    NAME = "ODOMETRY"
-    CRC_EXTRA = 91
-    LENGTH = 233
-    BASE_LENGTH = 230
+    ID: ClassVar[int] = 331
+    NAME: ClassVar[str] = "ODOMETRY"
+    CRC_EXTRA: ClassVar[int] = 91
+    LENGTH: ClassVar[int] = 233
+    BASE_LENGTH: ClassVar[int] = 230
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX Epoch time or time since system boot). The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
         ("frame_id", "uint8_t", 0, "", "MAV_FRAME", "", "Coordinate frame of reference for the pose data.", False),
@@ -13002,7 +13003,7 @@ class Odometry(Message):
         self.reset_counter = reset_counter
         self.estimator_type = estimator_type
         self.quality = quality
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> Odometry:
@@ -13063,11 +13064,11 @@ class TrajectoryRepresentationWaypoints(Message):
         "time_usec", "valid_points", "pos_x", "pos_y", "pos_z", "vel_x", "vel_y", "vel_z", "acc_x", "acc_y",
         "acc_z", "pos_yaw", "vel_yaw", "command",
     )
-    ID = 332
-    NAME = "TRAJECTORY_REPRESENTATION_WAYPOINTS"
-    CRC_EXTRA = 236
-    LENGTH = 239
-    BASE_LENGTH = 239
+    ID: ClassVar[int] = 332
+    NAME: ClassVar[str] = "TRAJECTORY_REPRESENTATION_WAYPOINTS"
+    CRC_EXTRA: ClassVar[int] = 236
+    LENGTH: ClassVar[int] = 239
+    BASE_LENGTH: ClassVar[int] = 239
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX Epoch time or time since system boot). The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
         ("valid_points", "uint8_t", 0, "", "", "", "Number of valid points (up-to 5 waypoints are possible)", False),
@@ -13158,7 +13159,7 @@ class TrajectoryRepresentationWaypoints(Message):
         self.pos_yaw = tuple(pos_yaw)
         self.vel_yaw = tuple(vel_yaw)
         self.command = tuple(command)
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> TrajectoryRepresentationWaypoints:
@@ -13210,11 +13211,11 @@ class TrajectoryRepresentationBezier(Message):
 
     __slots__ = ("time_usec", "valid_points", "pos_x", "pos_y", "pos_z", "delta", "pos_yaw")
     __match_args__ = ("time_usec", "valid_points", "pos_x", "pos_y", "pos_z", "delta", "pos_yaw")
-    ID = 333
-    NAME = "TRAJECTORY_REPRESENTATION_BEZIER"
-    CRC_EXTRA = 231
-    LENGTH = 109
-    BASE_LENGTH = 109
+    ID: ClassVar[int] = 333
+    NAME: ClassVar[str] = "TRAJECTORY_REPRESENTATION_BEZIER"
+    CRC_EXTRA: ClassVar[int] = 231
+    LENGTH: ClassVar[int] = 109
+    BASE_LENGTH: ClassVar[int] = 109
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX Epoch time or time since system boot). The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
         ("valid_points", "uint8_t", 0, "", "", "", "Number of valid control points (up-to 5 points are possible)", False),
@@ -13268,7 +13269,7 @@ class TrajectoryRepresentationBezier(Message):
         self.pos_z = tuple(pos_z)
         self.delta = tuple(delta)
         self.pos_yaw = tuple(pos_yaw)
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> TrajectoryRepresentationBezier:
@@ -13313,11 +13314,11 @@ class IsbdLinkStatus(Message):
         "timestamp", "last_heartbeat", "failed_sessions", "successful_sessions", "signal_quality",
         "ring_pending", "tx_session_pending", "rx_session_pending",
     )
-    ID = 335
-    NAME = "ISBD_LINK_STATUS"
-    CRC_EXTRA = 225
-    LENGTH = 24
-    BASE_LENGTH = 24
+    ID: ClassVar[int] = 335
+    NAME: ClassVar[str] = "ISBD_LINK_STATUS"
+    CRC_EXTRA: ClassVar[int] = 225
+    LENGTH: ClassVar[int] = 24
+    BASE_LENGTH: ClassVar[int] = 24
     _FIELDS = (
         ("timestamp", "uint64_t", 0, "us", "", "", "Timestamp (UNIX Epoch time or time since system boot). The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
         ("last_heartbeat", "uint64_t", 0, "us", "", "", "Timestamp of the last successful sbd session. The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
@@ -13373,7 +13374,7 @@ class IsbdLinkStatus(Message):
         self.ring_pending = ring_pending
         self.tx_session_pending = tx_session_pending
         self.rx_session_pending = rx_session_pending
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> IsbdLinkStatus:
@@ -13407,11 +13408,11 @@ class RawRpm(Message):
 
     __slots__ = ("index", "frequency")
     __match_args__ = ("index", "frequency")
-    ID = 339
-    NAME = "RAW_RPM"
-    CRC_EXTRA = 199
-    LENGTH = 5
-    BASE_LENGTH = 5
+    ID: ClassVar[int] = 339
+    NAME: ClassVar[str] = "RAW_RPM"
+    CRC_EXTRA: ClassVar[int] = 199
+    LENGTH: ClassVar[int] = 5
+    BASE_LENGTH: ClassVar[int] = 5
     _FIELDS = (
         ("index", "uint8_t", 0, "", "", "", "Index of this RPM sensor (0-indexed)", False),
         ("frequency", "float", 0, "rpm", "", "", "Indicated rate", False),
@@ -13426,7 +13427,7 @@ class RawRpm(Message):
     def __init__(self, index: int, frequency: float) -> None:
         self.index = index
         self.frequency = frequency
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> RawRpm:
@@ -13460,11 +13461,11 @@ class UtmGlobalPosition(Message):
         "time", "uas_id", "lat", "lon", "alt", "relative_alt", "vx", "vy", "vz", "h_acc", "v_acc", "vel_acc",
         "next_lat", "next_lon", "next_alt", "update_rate", "flight_state", "flags",
     )
-    ID = 340
-    NAME = "UTM_GLOBAL_POSITION"
-    CRC_EXTRA = 99
-    LENGTH = 70
-    BASE_LENGTH = 70
+    ID: ClassVar[int] = 340
+    NAME: ClassVar[str] = "UTM_GLOBAL_POSITION"
+    CRC_EXTRA: ClassVar[int] = 99
+    LENGTH: ClassVar[int] = 70
+    BASE_LENGTH: ClassVar[int] = 70
     _FIELDS = (
         ("time", "uint64_t", 0, "us", "", "", "Time of applicability of position (microseconds since UNIX epoch).", False),
         ("uas_id", "uint8_t", 18, "", "", "", "Unique UAS ID.", False),
@@ -13565,7 +13566,7 @@ class UtmGlobalPosition(Message):
         self.update_rate = update_rate
         self.flight_state = flight_state
         self.flags = flags
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> UtmGlobalPosition:
@@ -13603,11 +13604,11 @@ class DebugFloatArray(Message):
 
     __slots__ = ("time_usec", "name", "array_id", "data")
     __match_args__ = ("time_usec", "name", "array_id", "data")
-    ID = 350
-    NAME = "DEBUG_FLOAT_ARRAY"
-    CRC_EXTRA = 232
-    LENGTH = 252
-    BASE_LENGTH = 20
+    ID: ClassVar[int] = 350
+    NAME: ClassVar[str] = "DEBUG_FLOAT_ARRAY"
+    CRC_EXTRA: ClassVar[int] = 232
+    LENGTH: ClassVar[int] = 252
+    BASE_LENGTH: ClassVar[int] = 20
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX Epoch time or time since system boot). The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
         ("name", "char", 10, "", "", "", "Name, for human-friendly display in a Ground Control Station", False),
@@ -13635,7 +13636,7 @@ class DebugFloatArray(Message):
         self.name = name
         self.array_id = array_id
         self.data = tuple(data)
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> DebugFloatArray:
@@ -13670,11 +13671,11 @@ class OrbitExecutionStatus(Message):
 
     __slots__ = ("time_usec", "radius", "frame", "x", "y", "z")
     __match_args__ = ("time_usec", "radius", "frame", "x", "y", "z")
-    ID = 360
-    NAME = "ORBIT_EXECUTION_STATUS"
-    CRC_EXTRA = 11
-    LENGTH = 25
-    BASE_LENGTH = 25
+    ID: ClassVar[int] = 360
+    NAME: ClassVar[str] = "ORBIT_EXECUTION_STATUS"
+    CRC_EXTRA: ClassVar[int] = 11
+    LENGTH: ClassVar[int] = 25
+    BASE_LENGTH: ClassVar[int] = 25
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX Epoch time or time since system boot). The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
         ("radius", "float", 0, "m", "", "", "Radius of the orbit circle. Positive values orbit clockwise, negative values orbit counter-clockwise.", False),
@@ -13718,7 +13719,7 @@ class OrbitExecutionStatus(Message):
         self.x = x
         self.y = y
         self.z = z
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> OrbitExecutionStatus:
@@ -13760,11 +13761,11 @@ class SmartBatteryInfo(Message):
         "resting_minimum_voltage", "charging_maximum_voltage", "cells_in_series", "discharge_maximum_current",
         "discharge_maximum_burst_current", "manufacture_date",
     )
-    ID = 370
-    NAME = "SMART_BATTERY_INFO"
-    CRC_EXTRA = 75
-    LENGTH = 109
-    BASE_LENGTH = 87
+    ID: ClassVar[int] = 370
+    NAME: ClassVar[str] = "SMART_BATTERY_INFO"
+    CRC_EXTRA: ClassVar[int] = 75
+    LENGTH: ClassVar[int] = 109
+    BASE_LENGTH: ClassVar[int] = 87
     _FIELDS = (
         ("id", "uint8_t", 0, "", "", "", "Battery ID", False),
         ("battery_function", "uint8_t", 0, "", "MAV_BATTERY_FUNCTION", "", "Function of the battery", False),
@@ -13884,7 +13885,7 @@ class SmartBatteryInfo(Message):
         self.discharge_maximum_current = discharge_maximum_current
         self.discharge_maximum_burst_current = discharge_maximum_burst_current
         self.manufacture_date = manufacture_date
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> SmartBatteryInfo:
@@ -13935,11 +13936,11 @@ class GeneratorStatus(Message):
         "rectifier_temperature", "bat_current_setpoint", "generator_temperature", "runtime",
         "time_until_maintenance",
     )
-    ID = 373
-    NAME = "GENERATOR_STATUS"
-    CRC_EXTRA = 117
-    LENGTH = 42
-    BASE_LENGTH = 42
+    ID: ClassVar[int] = 373
+    NAME: ClassVar[str] = "GENERATOR_STATUS"
+    CRC_EXTRA: ClassVar[int] = 117
+    LENGTH: ClassVar[int] = 42
+    BASE_LENGTH: ClassVar[int] = 42
     _FIELDS = (
         ("status", "uint64_t", 0, "", "MAV_GENERATOR_STATUS_FLAG", "", "Status flags.", False),
         ("generator_speed", "uint16_t", 0, "rpm", "", "UINT16_MAX", "Speed of electrical generator or alternator. UINT16_MAX: field not provided.", False),
@@ -14022,7 +14023,7 @@ class GeneratorStatus(Message):
         self.generator_temperature = generator_temperature
         self.runtime = runtime
         self.time_until_maintenance = time_until_maintenance
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> GeneratorStatus:
@@ -14059,11 +14060,11 @@ class ActuatorOutputStatus(Message):
 
     __slots__ = ("time_usec", "active", "actuator")
     __match_args__ = ("time_usec", "active", "actuator")
-    ID = 375
-    NAME = "ACTUATOR_OUTPUT_STATUS"
-    CRC_EXTRA = 251
-    LENGTH = 140
-    BASE_LENGTH = 140
+    ID: ClassVar[int] = 375
+    NAME: ClassVar[str] = "ACTUATOR_OUTPUT_STATUS"
+    CRC_EXTRA: ClassVar[int] = 251
+    LENGTH: ClassVar[int] = 140
+    BASE_LENGTH: ClassVar[int] = 140
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (since system boot).", False),
         ("active", "uint32_t", 0, "", "", "", "Active outputs", False),
@@ -14083,7 +14084,7 @@ class ActuatorOutputStatus(Message):
         self.time_usec = time_usec
         self.active = active
         self.actuator = tuple(actuator)
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> ActuatorOutputStatus:
@@ -14116,11 +14117,11 @@ class RelayStatus(Message):
 
     __slots__ = ("time_boot_ms", "on", "present")
     __match_args__ = ("time_boot_ms", "on", "present")
-    ID = 376
-    NAME = "RELAY_STATUS"
-    CRC_EXTRA = 199
-    LENGTH = 8
-    BASE_LENGTH = 8
+    ID: ClassVar[int] = 376
+    NAME: ClassVar[str] = "RELAY_STATUS"
+    CRC_EXTRA: ClassVar[int] = 199
+    LENGTH: ClassVar[int] = 8
+    BASE_LENGTH: ClassVar[int] = 8
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot).", False),
         ("on", "uint16_t", 0, "", "", "", "Relay states. Relay instance numbers are represented as individual bits in this mask by offset.", False),
@@ -14144,7 +14145,7 @@ class RelayStatus(Message):
         self.time_boot_ms = time_boot_ms
         self.on = on
         self.present = present
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> RelayStatus:
@@ -14175,11 +14176,11 @@ class Tunnel(Message):
 
     __slots__ = ("target_system", "target_component", "payload_type", "payload_length", "payload")
     __match_args__ = ("target_system", "target_component", "payload_type", "payload_length", "payload")
-    ID = 385
-    NAME = "TUNNEL"
-    CRC_EXTRA = 147
-    LENGTH = 133
-    BASE_LENGTH = 133
+    ID: ClassVar[int] = 385
+    NAME: ClassVar[str] = "TUNNEL"
+    CRC_EXTRA: ClassVar[int] = 147
+    LENGTH: ClassVar[int] = 133
+    BASE_LENGTH: ClassVar[int] = 133
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID (can be 0 for broadcast, but this is discouraged)", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID (can be 0 for broadcast, but this is discouraged)", False),
@@ -14219,7 +14220,7 @@ class Tunnel(Message):
         self.payload_type = payload_type
         self.payload_length = payload_length
         self.payload = payload
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> Tunnel:
@@ -14252,11 +14253,11 @@ class CanFrame(Message):
 
     __slots__ = ("target_system", "target_component", "bus", "len", "id", "data")
     __match_args__ = ("target_system", "target_component", "bus", "len", "id", "data")
-    ID = 386
-    NAME = "CAN_FRAME"
-    CRC_EXTRA = 132
-    LENGTH = 16
-    BASE_LENGTH = 16
+    ID: ClassVar[int] = 386
+    NAME: ClassVar[str] = "CAN_FRAME"
+    CRC_EXTRA: ClassVar[int] = 132
+    LENGTH: ClassVar[int] = 16
+    BASE_LENGTH: ClassVar[int] = 16
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID.", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID.", False),
@@ -14293,7 +14294,7 @@ class CanFrame(Message):
         self.len = len
         self.id = id
         self.data = data
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> CanFrame:
@@ -14327,11 +14328,11 @@ class CanfdFrame(Message):
 
     __slots__ = ("target_system", "target_component", "bus", "len", "id", "data")
     __match_args__ = ("target_system", "target_component", "bus", "len", "id", "data")
-    ID = 387
-    NAME = "CANFD_FRAME"
-    CRC_EXTRA = 4
-    LENGTH = 72
-    BASE_LENGTH = 72
+    ID: ClassVar[int] = 387
+    NAME: ClassVar[str] = "CANFD_FRAME"
+    CRC_EXTRA: ClassVar[int] = 4
+    LENGTH: ClassVar[int] = 72
+    BASE_LENGTH: ClassVar[int] = 72
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID.", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID.", False),
@@ -14368,7 +14369,7 @@ class CanfdFrame(Message):
         self.len = len
         self.id = id
         self.data = data
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> CanfdFrame:
@@ -14405,11 +14406,11 @@ class CanFilterModify(Message):
 
     __slots__ = ("target_system", "target_component", "bus", "operation", "num_ids", "ids")
     __match_args__ = ("target_system", "target_component", "bus", "operation", "num_ids", "ids")
-    ID = 388
-    NAME = "CAN_FILTER_MODIFY"
-    CRC_EXTRA = 8
-    LENGTH = 37
-    BASE_LENGTH = 37
+    ID: ClassVar[int] = 388
+    NAME: ClassVar[str] = "CAN_FILTER_MODIFY"
+    CRC_EXTRA: ClassVar[int] = 8
+    LENGTH: ClassVar[int] = 37
+    BASE_LENGTH: ClassVar[int] = 37
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID.", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID.", False),
@@ -14449,7 +14450,7 @@ class CanFilterModify(Message):
         self.operation = operation
         self.num_ids = num_ids
         self.ids = tuple(ids)
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> CanFilterModify:
@@ -14496,11 +14497,11 @@ class OnboardComputerStatus(Message):
         "storage_usage", "storage_total", "link_type", "link_tx_rate", "link_rx_rate", "link_tx_max",
         "link_rx_max", "status_flags",
     )
-    ID = 390
-    NAME = "ONBOARD_COMPUTER_STATUS"
-    CRC_EXTRA = 156
-    LENGTH = 240
-    BASE_LENGTH = 238
+    ID: ClassVar[int] = 390
+    NAME: ClassVar[str] = "ONBOARD_COMPUTER_STATUS"
+    CRC_EXTRA: ClassVar[int] = 156
+    LENGTH: ClassVar[int] = 240
+    BASE_LENGTH: ClassVar[int] = 238
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX Epoch time or time since system boot). The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
         ("uptime", "uint32_t", 0, "ms", "", "", "Time since system boot.", False),
@@ -14660,7 +14661,7 @@ class OnboardComputerStatus(Message):
         self.link_tx_max = tuple(link_tx_max)
         self.link_rx_max = tuple(link_rx_max)
         self.status_flags = status_flags
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> OnboardComputerStatus:
@@ -14719,11 +14720,11 @@ class WheelDistance(Message):
 
     __slots__ = ("time_usec", "count", "distance")
     __match_args__ = ("time_usec", "count", "distance")
-    ID = 9000
-    NAME = "WHEEL_DISTANCE"
-    CRC_EXTRA = 113
-    LENGTH = 137
-    BASE_LENGTH = 137
+    ID: ClassVar[int] = 9000
+    NAME: ClassVar[str] = "WHEEL_DISTANCE"
+    CRC_EXTRA: ClassVar[int] = 113
+    LENGTH: ClassVar[int] = 137
+    BASE_LENGTH: ClassVar[int] = 137
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (synced to UNIX time or since system boot).", False),
         ("count", "uint8_t", 0, "", "", "", "Number of wheels reported.", False),
@@ -14746,7 +14747,7 @@ class WheelDistance(Message):
         self.time_usec = time_usec
         self.count = count
         self.distance = tuple(distance)
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> WheelDistance:
@@ -14781,11 +14782,11 @@ class WinchStatus(Message):
     __match_args__ = (
         "time_usec", "line_length", "speed", "tension", "voltage", "current", "temperature", "status",
     )
-    ID = 9005
-    NAME = "WINCH_STATUS"
-    CRC_EXTRA = 117
-    LENGTH = 34
-    BASE_LENGTH = 34
+    ID: ClassVar[int] = 9005
+    NAME: ClassVar[str] = "WINCH_STATUS"
+    CRC_EXTRA: ClassVar[int] = 117
+    LENGTH: ClassVar[int] = 34
+    BASE_LENGTH: ClassVar[int] = 34
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (synced to UNIX time or since system boot).", False),
         ("line_length", "float", 0, "m", "", "NaN", "Length of line released. NaN if unknown", False),
@@ -14835,7 +14836,7 @@ class WinchStatus(Message):
         self.current = current
         self.temperature = temperature
         self.status = status
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> WinchStatus:
@@ -14873,11 +14874,11 @@ class OpenDroneIdBasicId(Message):
 
     __slots__ = ("target_system", "target_component", "id_or_mac", "id_type", "ua_type", "uas_id")
     __match_args__ = ("target_system", "target_component", "id_or_mac", "id_type", "ua_type", "uas_id")
-    ID = 12900
-    NAME = "OPEN_DRONE_ID_BASIC_ID"
-    CRC_EXTRA = 114
-    LENGTH = 44
-    BASE_LENGTH = 44
+    ID: ClassVar[int] = 12900
+    NAME: ClassVar[str] = "OPEN_DRONE_ID_BASIC_ID"
+    CRC_EXTRA: ClassVar[int] = 114
+    LENGTH: ClassVar[int] = 44
+    BASE_LENGTH: ClassVar[int] = 44
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID (0 for broadcast).", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID (0 for broadcast).", False),
@@ -14919,7 +14920,7 @@ class OpenDroneIdBasicId(Message):
         self.id_type = id_type
         self.ua_type = ua_type
         self.uas_id = uas_id
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> OpenDroneIdBasicId:
@@ -14965,11 +14966,11 @@ class OpenDroneIdLocation(Message):
         "height_reference", "height", "horizontal_accuracy", "vertical_accuracy", "barometer_accuracy",
         "speed_accuracy", "timestamp", "timestamp_accuracy",
     )
-    ID = 12901
-    NAME = "OPEN_DRONE_ID_LOCATION"
-    CRC_EXTRA = 254
-    LENGTH = 59
-    BASE_LENGTH = 59
+    ID: ClassVar[int] = 12901
+    NAME: ClassVar[str] = "OPEN_DRONE_ID_LOCATION"
+    CRC_EXTRA: ClassVar[int] = 254
+    LENGTH: ClassVar[int] = 59
+    BASE_LENGTH: ClassVar[int] = 59
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID (0 for broadcast).", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID (0 for broadcast).", False),
@@ -15098,7 +15099,7 @@ class OpenDroneIdLocation(Message):
         self.speed_accuracy = speed_accuracy
         self.timestamp = timestamp
         self.timestamp_accuracy = timestamp_accuracy
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> OpenDroneIdLocation:
@@ -15149,11 +15150,11 @@ class OpenDroneIdAuthentication(Message):
         "target_system", "target_component", "id_or_mac", "authentication_type", "data_page",
         "last_page_index", "length", "timestamp", "authentication_data",
     )
-    ID = 12902
-    NAME = "OPEN_DRONE_ID_AUTHENTICATION"
-    CRC_EXTRA = 140
-    LENGTH = 53
-    BASE_LENGTH = 53
+    ID: ClassVar[int] = 12902
+    NAME: ClassVar[str] = "OPEN_DRONE_ID_AUTHENTICATION"
+    CRC_EXTRA: ClassVar[int] = 140
+    LENGTH: ClassVar[int] = 53
+    BASE_LENGTH: ClassVar[int] = 53
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID (0 for broadcast).", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID (0 for broadcast).", False),
@@ -15220,7 +15221,7 @@ class OpenDroneIdAuthentication(Message):
         self.length = length
         self.timestamp = timestamp
         self.authentication_data = authentication_data
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> OpenDroneIdAuthentication:
@@ -15260,11 +15261,11 @@ class OpenDroneIdSelfId(Message):
 
     __slots__ = ("target_system", "target_component", "id_or_mac", "description_type", "description")
     __match_args__ = ("target_system", "target_component", "id_or_mac", "description_type", "description")
-    ID = 12903
-    NAME = "OPEN_DRONE_ID_SELF_ID"
-    CRC_EXTRA = 249
-    LENGTH = 46
-    BASE_LENGTH = 46
+    ID: ClassVar[int] = 12903
+    NAME: ClassVar[str] = "OPEN_DRONE_ID_SELF_ID"
+    CRC_EXTRA: ClassVar[int] = 249
+    LENGTH: ClassVar[int] = 46
+    BASE_LENGTH: ClassVar[int] = 46
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID (0 for broadcast).", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID (0 for broadcast).", False),
@@ -15301,7 +15302,7 @@ class OpenDroneIdSelfId(Message):
         self.id_or_mac = id_or_mac
         self.description_type = description_type
         self.description = description
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> OpenDroneIdSelfId:
@@ -15345,11 +15346,11 @@ class OpenDroneIdSystem(Message):
         "operator_latitude", "operator_longitude", "area_count", "area_radius", "area_ceiling", "area_floor",
         "category_eu", "class_eu", "operator_altitude_geo", "timestamp",
     )
-    ID = 12904
-    NAME = "OPEN_DRONE_ID_SYSTEM"
-    CRC_EXTRA = 77
-    LENGTH = 54
-    BASE_LENGTH = 54
+    ID: ClassVar[int] = 12904
+    NAME: ClassVar[str] = "OPEN_DRONE_ID_SYSTEM"
+    CRC_EXTRA: ClassVar[int] = 77
+    LENGTH: ClassVar[int] = 54
+    BASE_LENGTH: ClassVar[int] = 54
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID (0 for broadcast).", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID (0 for broadcast).", False),
@@ -15450,7 +15451,7 @@ class OpenDroneIdSystem(Message):
         self.class_eu = class_eu
         self.operator_altitude_geo = operator_altitude_geo
         self.timestamp = timestamp
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> OpenDroneIdSystem:
@@ -15489,11 +15490,11 @@ class OpenDroneIdOperatorId(Message):
 
     __slots__ = ("target_system", "target_component", "id_or_mac", "operator_id_type", "operator_id")
     __match_args__ = ("target_system", "target_component", "id_or_mac", "operator_id_type", "operator_id")
-    ID = 12905
-    NAME = "OPEN_DRONE_ID_OPERATOR_ID"
-    CRC_EXTRA = 49
-    LENGTH = 43
-    BASE_LENGTH = 43
+    ID: ClassVar[int] = 12905
+    NAME: ClassVar[str] = "OPEN_DRONE_ID_OPERATOR_ID"
+    CRC_EXTRA: ClassVar[int] = 49
+    LENGTH: ClassVar[int] = 43
+    BASE_LENGTH: ClassVar[int] = 43
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID (0 for broadcast).", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID (0 for broadcast).", False),
@@ -15530,7 +15531,7 @@ class OpenDroneIdOperatorId(Message):
         self.id_or_mac = id_or_mac
         self.operator_id_type = operator_id_type
         self.operator_id = operator_id
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> OpenDroneIdOperatorId:
@@ -15571,11 +15572,11 @@ class OpenDroneIdMessagePack(Message):
     __match_args__ = (
         "target_system", "target_component", "id_or_mac", "single_message_size", "msg_pack_size", "messages",
     )
-    ID = 12915
-    NAME = "OPEN_DRONE_ID_MESSAGE_PACK"
-    CRC_EXTRA = 94
-    LENGTH = 249
-    BASE_LENGTH = 249
+    ID: ClassVar[int] = 12915
+    NAME: ClassVar[str] = "OPEN_DRONE_ID_MESSAGE_PACK"
+    CRC_EXTRA: ClassVar[int] = 94
+    LENGTH: ClassVar[int] = 249
+    BASE_LENGTH: ClassVar[int] = 249
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID (0 for broadcast).", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID (0 for broadcast).", False),
@@ -15621,7 +15622,7 @@ class OpenDroneIdMessagePack(Message):
         self.single_message_size = single_message_size
         self.msg_pack_size = msg_pack_size
         self.messages = messages
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> OpenDroneIdMessagePack:
@@ -15657,11 +15658,11 @@ class OpenDroneIdArmStatus(Message):
 
     __slots__ = ("status", "error")
     __match_args__ = ("status", "error")
-    ID = 12918
-    NAME = "OPEN_DRONE_ID_ARM_STATUS"
-    CRC_EXTRA = 139
-    LENGTH = 51
-    BASE_LENGTH = 51
+    ID: ClassVar[int] = 12918
+    NAME: ClassVar[str] = "OPEN_DRONE_ID_ARM_STATUS"
+    CRC_EXTRA: ClassVar[int] = 139
+    LENGTH: ClassVar[int] = 51
+    BASE_LENGTH: ClassVar[int] = 51
     _FIELDS = (
         ("status", "uint8_t", 0, "", "MAV_ODID_ARM_STATUS", "", "Status level indicating if arming is allowed.", False),
         ("error", "char", 50, "", "", "", "Text error message, should be empty if status is good to arm. Fill with nulls in unused portion.", False),
@@ -15678,7 +15679,7 @@ class OpenDroneIdArmStatus(Message):
     def __init__(self, status: int, error: str) -> None:
         self.status = status
         self.error = error
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> OpenDroneIdArmStatus:
@@ -15717,11 +15718,11 @@ class OpenDroneIdSystemUpdate(Message):
         "target_system", "target_component", "operator_latitude", "operator_longitude",
         "operator_altitude_geo", "timestamp",
     )
-    ID = 12919
-    NAME = "OPEN_DRONE_ID_SYSTEM_UPDATE"
-    CRC_EXTRA = 7
-    LENGTH = 18
-    BASE_LENGTH = 18
+    ID: ClassVar[int] = 12919
+    NAME: ClassVar[str] = "OPEN_DRONE_ID_SYSTEM_UPDATE"
+    CRC_EXTRA: ClassVar[int] = 7
+    LENGTH: ClassVar[int] = 18
+    BASE_LENGTH: ClassVar[int] = 18
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID (0 for broadcast).", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID (0 for broadcast).", False),
@@ -15761,7 +15762,7 @@ class OpenDroneIdSystemUpdate(Message):
         self.operator_longitude = operator_longitude
         self.operator_altitude_geo = operator_altitude_geo
         self.timestamp = timestamp
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> OpenDroneIdSystemUpdate:
@@ -15795,11 +15796,11 @@ class HygrometerSensor(Message):
 
     __slots__ = ("id", "temperature", "humidity")
     __match_args__ = ("id", "temperature", "humidity")
-    ID = 12920
-    NAME = "HYGROMETER_SENSOR"
-    CRC_EXTRA = 20
-    LENGTH = 5
-    BASE_LENGTH = 5
+    ID: ClassVar[int] = 12920
+    NAME: ClassVar[str] = "HYGROMETER_SENSOR"
+    CRC_EXTRA: ClassVar[int] = 20
+    LENGTH: ClassVar[int] = 5
+    BASE_LENGTH: ClassVar[int] = 5
     _FIELDS = (
         ("id", "uint8_t", 0, "", "", "", "Hygrometer ID", False),
         ("temperature", "int16_t", 0, "cdegC", "", "", "Temperature", False),
@@ -15819,7 +15820,7 @@ class HygrometerSensor(Message):
         self.id = id
         self.temperature = temperature
         self.humidity = humidity
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> HygrometerSensor:
@@ -15850,11 +15851,11 @@ class AvailableModesMonitor(Message):
 
     __slots__ = ("seq",)
     __match_args__ = ("seq",)
-    ID = 437
-    NAME = "AVAILABLE_MODES_MONITOR"
-    CRC_EXTRA = 30
-    LENGTH = 1
-    BASE_LENGTH = 1
+    ID: ClassVar[int] = 437
+    NAME: ClassVar[str] = "AVAILABLE_MODES_MONITOR"
+    CRC_EXTRA: ClassVar[int] = 30
+    LENGTH: ClassVar[int] = 1
+    BASE_LENGTH: ClassVar[int] = 1
     _FIELDS = (
         ("seq", "uint8_t", 0, "", "", "", "Sequence number. The value iterates sequentially whenever AVAILABLE_MODES changes (e.g. support for a new mode is added/removed dynamically).", False),
     )
@@ -15866,7 +15867,7 @@ class AvailableModesMonitor(Message):
 
     def __init__(self, seq: int) -> None:
         self.seq = seq
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> AvailableModesMonitor:
@@ -15902,11 +15903,11 @@ class LinkNodeStatus(Message):
         "timestamp", "tx_buf", "rx_buf", "tx_rate", "rx_rate", "rx_parse_err", "tx_overflows", "rx_overflows",
         "messages_sent", "messages_received", "messages_lost",
     )
-    ID = 8
-    NAME = "LINK_NODE_STATUS"
-    CRC_EXTRA = 117
-    LENGTH = 36
-    BASE_LENGTH = 36
+    ID: ClassVar[int] = 8
+    NAME: ClassVar[str] = "LINK_NODE_STATUS"
+    CRC_EXTRA: ClassVar[int] = 117
+    LENGTH: ClassVar[int] = 36
+    BASE_LENGTH: ClassVar[int] = 36
     _FIELDS = (
         ("timestamp", "uint64_t", 0, "ms", "", "", "Time since the boot.", False),
         ("tx_buf", "uint8_t", 0, "%", "", "", "Free part of the send buffer.", False),
@@ -15969,7 +15970,7 @@ class LinkNodeStatus(Message):
         self.messages_sent = messages_sent
         self.messages_received = messages_received
         self.messages_lost = messages_lost
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> LinkNodeStatus:
@@ -16008,11 +16009,11 @@ class CommandCancel(Message):
 
     __slots__ = ("target_system", "target_component", "command")
     __match_args__ = ("target_system", "target_component", "command")
-    ID = 80
-    NAME = "COMMAND_CANCEL"
-    CRC_EXTRA = 14
-    LENGTH = 4
-    BASE_LENGTH = 4
+    ID: ClassVar[int] = 80
+    NAME: ClassVar[str] = "COMMAND_CANCEL"
+    CRC_EXTRA: ClassVar[int] = 14
+    LENGTH: ClassVar[int] = 4
+    BASE_LENGTH: ClassVar[int] = 4
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System that runs the command; not 0.", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component that runs the command.", False),
@@ -16032,7 +16033,7 @@ class CommandCancel(Message):
         self.target_system = target_system
         self.target_component = target_component
         self.command = command
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> CommandCancel:
@@ -16069,11 +16070,11 @@ class EscInfo(Message):
         "index", "time_usec", "counter", "count", "connection_type", "info", "failure_flags", "error_count",
         "temperature",
     )
-    ID = 290
-    NAME = "ESC_INFO"
-    CRC_EXTRA = 251
-    LENGTH = 46
-    BASE_LENGTH = 46
+    ID: ClassVar[int] = 290
+    NAME: ClassVar[str] = "ESC_INFO"
+    CRC_EXTRA: ClassVar[int] = 251
+    LENGTH: ClassVar[int] = 46
+    BASE_LENGTH: ClassVar[int] = 46
     _FIELDS = (
         ("index", "uint8_t", 0, "", "", "", "Number of the first ESC in this message, in the order of the motors: 0, 4, 8 … 60.", False),
         ("time_usec", "uint64_t", 0, "us", "", "", "Time since 1970, or since the boot when it is too small for that.", False),
@@ -16126,7 +16127,7 @@ class EscInfo(Message):
         self.failure_flags = tuple(failure_flags)
         self.error_count = tuple(error_count)
         self.temperature = tuple(temperature)
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> EscInfo:
@@ -16167,11 +16168,11 @@ class EscStatus(Message):
 
     __slots__ = ("index", "time_usec", "rpm", "voltage", "current")
     __match_args__ = ("index", "time_usec", "rpm", "voltage", "current")
-    ID = 291
-    NAME = "ESC_STATUS"
-    CRC_EXTRA = 10
-    LENGTH = 57
-    BASE_LENGTH = 57
+    ID: ClassVar[int] = 291
+    NAME: ClassVar[str] = "ESC_STATUS"
+    CRC_EXTRA: ClassVar[int] = 10
+    LENGTH: ClassVar[int] = 57
+    BASE_LENGTH: ClassVar[int] = 57
     _FIELDS = (
         ("index", "uint8_t", 0, "", "", "", "Number of the first ESC in this message, in the order of the motors: 0, 4, 8 … 60.", False),
         ("time_usec", "uint64_t", 0, "us", "", "", "Time since 1970, or since the boot when it is too small for that.", False),
@@ -16204,7 +16205,7 @@ class EscStatus(Message):
         self.rpm = tuple(rpm)
         self.voltage = tuple(voltage)
         self.current = tuple(current)
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> EscStatus:
@@ -16243,11 +16244,11 @@ class ProtocolVersion(Message):
 
     __slots__ = ("version", "min_version", "max_version", "spec_version_hash", "library_version_hash")
     __match_args__ = ("version", "min_version", "max_version", "spec_version_hash", "library_version_hash")
-    ID = 300
-    NAME = "PROTOCOL_VERSION"
-    CRC_EXTRA = 217
-    LENGTH = 22
-    BASE_LENGTH = 22
+    ID: ClassVar[int] = 300
+    NAME: ClassVar[str] = "PROTOCOL_VERSION"
+    CRC_EXTRA: ClassVar[int] = 217
+    LENGTH: ClassVar[int] = 22
+    BASE_LENGTH: ClassVar[int] = 22
     _FIELDS = (
         ("version", "uint16_t", 0, "", "", "", "Version in use, times 100: 100 or 200.", False),
         ("min_version", "uint16_t", 0, "", "", "", "Lowest version it speaks, times 100.", False),
@@ -16280,7 +16281,7 @@ class ProtocolVersion(Message):
         self.max_version = max_version
         self.spec_version_hash = spec_version_hash
         self.library_version_hash = library_version_hash
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> ProtocolVersion:
@@ -16322,11 +16323,11 @@ class CellularStatus(Message):
         "link_rx_rate", "cell_tower_id", "band_number", "band_frequency", "channel_number", "rx_level",
         "tx_level", "rx_quality", "sinr",
     )
-    ID = 334
-    NAME = "CELLULAR_STATUS"
-    CRC_EXTRA = 72
-    LENGTH = 53
-    BASE_LENGTH = 10
+    ID: ClassVar[int] = 334
+    NAME: ClassVar[str] = "CELLULAR_STATUS"
+    CRC_EXTRA: ClassVar[int] = 72
+    LENGTH: ClassVar[int] = 53
+    BASE_LENGTH: ClassVar[int] = 10
     _FIELDS = (
         ("status", "uint8_t", 0, "", "CELLULAR_STATUS_FLAG", "", "State of the modem.", False),
         ("failure_reason", "uint8_t", 0, "", "CELLULAR_NETWORK_FAILED_REASON", "", "Why it failed, when the state says so.", False),
@@ -16440,7 +16441,7 @@ class CellularStatus(Message):
         self.tx_level = tx_level
         self.rx_quality = rx_quality
         self.sinr = sinr
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> CellularStatus:
@@ -16479,11 +16480,11 @@ class CellularConfig(Message):
 
     __slots__ = ("enable_lte", "enable_pin", "pin", "new_pin", "apn", "puk", "roaming", "response")
     __match_args__ = ("enable_lte", "enable_pin", "pin", "new_pin", "apn", "puk", "roaming", "response")
-    ID = 336
-    NAME = "CELLULAR_CONFIG"
-    CRC_EXTRA = 245
-    LENGTH = 84
-    BASE_LENGTH = 84
+    ID: ClassVar[int] = 336
+    NAME: ClassVar[str] = "CELLULAR_CONFIG"
+    CRC_EXTRA: ClassVar[int] = 245
+    LENGTH: ClassVar[int] = 84
+    BASE_LENGTH: ClassVar[int] = 84
     _FIELDS = (
         ("enable_lte", "uint8_t", 0, "", "", "", "LTE: 0, 1 or 2.", False),
         ("enable_pin", "uint8_t", 0, "", "", "", "PIN of the SIM card: 0, 1 or 2.", False),
@@ -16531,7 +16532,7 @@ class CellularConfig(Message):
         self.puk = puk
         self.roaming = roaming
         self.response = response
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> CellularConfig:
@@ -16569,11 +16570,11 @@ class FigureEightExecutionStatus(Message):
 
     __slots__ = ("time_usec", "major_radius", "minor_radius", "orientation", "frame", "x", "y", "z")
     __match_args__ = ("time_usec", "major_radius", "minor_radius", "orientation", "frame", "x", "y", "z")
-    ID = 361
-    NAME = "FIGURE_EIGHT_EXECUTION_STATUS"
-    CRC_EXTRA = 93
-    LENGTH = 33
-    BASE_LENGTH = 33
+    ID: ClassVar[int] = 361
+    NAME: ClassVar[str] = "FIGURE_EIGHT_EXECUTION_STATUS"
+    CRC_EXTRA: ClassVar[int] = 93
+    LENGTH: ClassVar[int] = 33
+    BASE_LENGTH: ClassVar[int] = 33
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Time since 1970, or since the boot when it is too small for that.", False),
         ("major_radius", "float", 0, "m", "", "", "Half of the long axis; positive when the northern circle is flown clockwise.", False),
@@ -16621,7 +16622,7 @@ class FigureEightExecutionStatus(Message):
         self.x = x
         self.y = y
         self.z = z
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> FigureEightExecutionStatus:
@@ -16662,11 +16663,11 @@ class FuelStatus(Message):
         "id", "maximum_fuel", "consumed_fuel", "remaining_fuel", "percent_remaining", "flow_rate",
         "temperature", "fuel_type",
     )
-    ID = 371
-    NAME = "FUEL_STATUS"
-    CRC_EXTRA = 10
-    LENGTH = 26
-    BASE_LENGTH = 26
+    ID: ClassVar[int] = 371
+    NAME: ClassVar[str] = "FUEL_STATUS"
+    CRC_EXTRA: ClassVar[int] = 10
+    LENGTH: ClassVar[int] = 26
+    BASE_LENGTH: ClassVar[int] = 26
     _FIELDS = (
         ("id", "uint8_t", 0, "", "", "", "Number of the tank; other messages of the same one have the same id.", False),
         ("maximum_fuel", "float", 0, "", "", "", "What goes into it.", False),
@@ -16714,7 +16715,7 @@ class FuelStatus(Message):
         self.flow_rate = flow_rate
         self.temperature = temperature
         self.fuel_type = fuel_type
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> FuelStatus:
@@ -16763,11 +16764,11 @@ class BatteryInfo(Message):
         "discharge_maximum_current", "discharge_maximum_burst_current", "design_capacity",
         "full_charge_capacity", "manufacture_date", "serial_number", "name",
     )
-    ID = 372
-    NAME = "BATTERY_INFO"
-    CRC_EXTRA = 26
-    LENGTH = 140
-    BASE_LENGTH = 140
+    ID: ClassVar[int] = 372
+    NAME: ClassVar[str] = "BATTERY_INFO"
+    CRC_EXTRA: ClassVar[int] = 26
+    LENGTH: ClassVar[int] = 140
+    BASE_LENGTH: ClassVar[int] = 140
     _FIELDS = (
         ("id", "uint8_t", 0, "", "", "", "Number of the battery.", False),
         ("battery_function", "uint8_t", 0, "", "MAV_BATTERY_FUNCTION", "", "What it is for.", False),
@@ -16879,7 +16880,7 @@ class BatteryInfo(Message):
         self.manufacture_date = manufacture_date
         self.serial_number = serial_number
         self.name = name
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> BatteryInfo:
@@ -16925,11 +16926,11 @@ class TimeEstimateToTarget(Message):
 
     __slots__ = ("safe_return", "land", "mission_next_item", "mission_end", "commanded_action")
     __match_args__ = ("safe_return", "land", "mission_next_item", "mission_end", "commanded_action")
-    ID = 380
-    NAME = "TIME_ESTIMATE_TO_TARGET"
-    CRC_EXTRA = 232
-    LENGTH = 20
-    BASE_LENGTH = 20
+    ID: ClassVar[int] = 380
+    NAME: ClassVar[str] = "TIME_ESTIMATE_TO_TARGET"
+    CRC_EXTRA: ClassVar[int] = 232
+    LENGTH: ClassVar[int] = 20
+    BASE_LENGTH: ClassVar[int] = 20
     _FIELDS = (
         ("safe_return", "int32_t", 0, "s", "", "", "To where it would return to; -1 when landed, or not known.", False),
         ("land", "int32_t", 0, "s", "", "", "To the ground; -1 when landed, or not known.", False),
@@ -16961,7 +16962,7 @@ class TimeEstimateToTarget(Message):
         self.mission_next_item = mission_next_item
         self.mission_end = mission_end
         self.commanded_action = commanded_action
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> TimeEstimateToTarget:
@@ -17001,11 +17002,11 @@ class ComponentInformation(Message):
         "time_boot_ms", "general_metadata_file_crc", "general_metadata_uri", "peripherals_metadata_file_crc",
         "peripherals_metadata_uri",
     )
-    ID = 395
-    NAME = "COMPONENT_INFORMATION"
-    CRC_EXTRA = 0
-    LENGTH = 212
-    BASE_LENGTH = 212
+    ID: ClassVar[int] = 395
+    NAME: ClassVar[str] = "COMPONENT_INFORMATION"
+    CRC_EXTRA: ClassVar[int] = 0
+    LENGTH: ClassVar[int] = 212
+    BASE_LENGTH: ClassVar[int] = 212
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Time since the boot.", False),
         ("general_metadata_file_crc", "uint32_t", 0, "", "", "", "CRC32 of the general file.", False),
@@ -17042,7 +17043,7 @@ class ComponentInformation(Message):
         self.general_metadata_uri = general_metadata_uri
         self.peripherals_metadata_file_crc = peripherals_metadata_file_crc
         self.peripherals_metadata_uri = peripherals_metadata_uri
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> ComponentInformation:
@@ -17083,11 +17084,11 @@ class ComponentInformationBasic(Message):
         "time_boot_ms", "capabilities", "time_manufacture_s", "vendor_name", "model_name", "software_version",
         "hardware_version", "serial_number",
     )
-    ID = 396
-    NAME = "COMPONENT_INFORMATION_BASIC"
-    CRC_EXTRA = 50
-    LENGTH = 160
-    BASE_LENGTH = 160
+    ID: ClassVar[int] = 396
+    NAME: ClassVar[str] = "COMPONENT_INFORMATION_BASIC"
+    CRC_EXTRA: ClassVar[int] = 50
+    LENGTH: ClassVar[int] = 160
+    BASE_LENGTH: ClassVar[int] = 160
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Time since the boot.", False),
         ("capabilities", "uint64_t", 0, "", "MAV_PROTOCOL_CAPABILITY", "", "What it can do.", False),
@@ -17135,7 +17136,7 @@ class ComponentInformationBasic(Message):
         self.software_version = software_version
         self.hardware_version = hardware_version
         self.serial_number = serial_number
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> ComponentInformationBasic:
@@ -17176,11 +17177,11 @@ class ComponentMetadata(Message):
 
     __slots__ = ("time_boot_ms", "file_crc", "uri")
     __match_args__ = ("time_boot_ms", "file_crc", "uri")
-    ID = 397
-    NAME = "COMPONENT_METADATA"
-    CRC_EXTRA = 182
-    LENGTH = 108
-    BASE_LENGTH = 108
+    ID: ClassVar[int] = 397
+    NAME: ClassVar[str] = "COMPONENT_METADATA"
+    CRC_EXTRA: ClassVar[int] = 182
+    LENGTH: ClassVar[int] = 108
+    BASE_LENGTH: ClassVar[int] = 108
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Time since the boot.", False),
         ("file_crc", "uint32_t", 0, "", "", "", "CRC32 of the general file, for those who keep it.", False),
@@ -17202,7 +17203,7 @@ class ComponentMetadata(Message):
         self.time_boot_ms = time_boot_ms
         self.file_crc = file_crc
         self.uri = uri
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> ComponentMetadata:
@@ -17231,11 +17232,11 @@ class PlayTuneV2(Message):
 
     __slots__ = ("target_system", "target_component", "format", "tune")
     __match_args__ = ("target_system", "target_component", "format", "tune")
-    ID = 400
-    NAME = "PLAY_TUNE_V2"
-    CRC_EXTRA = 110
-    LENGTH = 254
-    BASE_LENGTH = 254
+    ID: ClassVar[int] = 400
+    NAME: ClassVar[str] = "PLAY_TUNE_V2"
+    CRC_EXTRA: ClassVar[int] = 110
+    LENGTH: ClassVar[int] = 254
+    BASE_LENGTH: ClassVar[int] = 254
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System it is for.", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component it is for.", False),
@@ -17260,7 +17261,7 @@ class PlayTuneV2(Message):
         self.target_component = target_component
         self.format = format
         self.tune = tune
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> PlayTuneV2:
@@ -17291,11 +17292,11 @@ class SupportedTunes(Message):
 
     __slots__ = ("target_system", "target_component", "format")
     __match_args__ = ("target_system", "target_component", "format")
-    ID = 401
-    NAME = "SUPPORTED_TUNES"
-    CRC_EXTRA = 183
-    LENGTH = 6
-    BASE_LENGTH = 6
+    ID: ClassVar[int] = 401
+    NAME: ClassVar[str] = "SUPPORTED_TUNES"
+    CRC_EXTRA: ClassVar[int] = 183
+    LENGTH: ClassVar[int] = 6
+    BASE_LENGTH: ClassVar[int] = 6
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System it is for.", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component it is for.", False),
@@ -17315,7 +17316,7 @@ class SupportedTunes(Message):
         self.target_system = target_system
         self.target_component = target_component
         self.format = format
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> SupportedTunes:
@@ -17353,11 +17354,11 @@ class Event(Message):
         "destination_component", "destination_system", "id", "event_time_boot_ms", "sequence", "log_levels",
         "arguments",
     )
-    ID = 410
-    NAME = "EVENT"
-    CRC_EXTRA = 160
-    LENGTH = 53
-    BASE_LENGTH = 53
+    ID: ClassVar[int] = 410
+    NAME: ClassVar[str] = "EVENT"
+    CRC_EXTRA: ClassVar[int] = 160
+    LENGTH: ClassVar[int] = 53
+    BASE_LENGTH: ClassVar[int] = 53
     _FIELDS = (
         ("destination_component", "uint8_t", 0, "", "", "", "Component it is meant for, 0 for all.", False),
         ("destination_system", "uint8_t", 0, "", "", "", "System it is meant for, 0 for all.", False),
@@ -17403,7 +17404,7 @@ class Event(Message):
         self.sequence = sequence
         self.log_levels = log_levels
         self.arguments = arguments
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> Event:
@@ -17439,11 +17440,11 @@ class CurrentEventSequence(Message):
 
     __slots__ = ("sequence", "flags")
     __match_args__ = ("sequence", "flags")
-    ID = 411
-    NAME = "CURRENT_EVENT_SEQUENCE"
-    CRC_EXTRA = 106
-    LENGTH = 3
-    BASE_LENGTH = 3
+    ID: ClassVar[int] = 411
+    NAME: ClassVar[str] = "CURRENT_EVENT_SEQUENCE"
+    CRC_EXTRA: ClassVar[int] = 106
+    LENGTH: ClassVar[int] = 3
+    BASE_LENGTH: ClassVar[int] = 3
     _FIELDS = (
         ("sequence", "uint16_t", 0, "", "", "", "Number of the latest event.", False),
         ("flags", "uint8_t", 0, "", "MAV_EVENT_CURRENT_SEQUENCE_FLAGS", "", "Whether the numbers began anew.", False),
@@ -17458,7 +17459,7 @@ class CurrentEventSequence(Message):
     def __init__(self, sequence: int, flags: int) -> None:
         self.sequence = sequence
         self.flags = flags
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> CurrentEventSequence:
@@ -17488,11 +17489,11 @@ class RequestEvent(Message):
 
     __slots__ = ("target_system", "target_component", "first_sequence", "last_sequence")
     __match_args__ = ("target_system", "target_component", "first_sequence", "last_sequence")
-    ID = 412
-    NAME = "REQUEST_EVENT"
-    CRC_EXTRA = 33
-    LENGTH = 6
-    BASE_LENGTH = 6
+    ID: ClassVar[int] = 412
+    NAME: ClassVar[str] = "REQUEST_EVENT"
+    CRC_EXTRA: ClassVar[int] = 33
+    LENGTH: ClassVar[int] = 6
+    BASE_LENGTH: ClassVar[int] = 6
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System it is for.", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component it is for.", False),
@@ -17519,7 +17520,7 @@ class RequestEvent(Message):
         self.target_component = target_component
         self.first_sequence = first_sequence
         self.last_sequence = last_sequence
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> RequestEvent:
@@ -17553,11 +17554,11 @@ class ResponseEventError(Message):
 
     __slots__ = ("target_system", "target_component", "sequence", "sequence_oldest_available", "reason")
     __match_args__ = ("target_system", "target_component", "sequence", "sequence_oldest_available", "reason")
-    ID = 413
-    NAME = "RESPONSE_EVENT_ERROR"
-    CRC_EXTRA = 77
-    LENGTH = 7
-    BASE_LENGTH = 7
+    ID: ClassVar[int] = 413
+    NAME: ClassVar[str] = "RESPONSE_EVENT_ERROR"
+    CRC_EXTRA: ClassVar[int] = 77
+    LENGTH: ClassVar[int] = 7
+    BASE_LENGTH: ClassVar[int] = 7
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System it is for.", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component it is for.", False),
@@ -17590,7 +17591,7 @@ class ResponseEventError(Message):
         self.sequence = sequence
         self.sequence_oldest_available = sequence_oldest_available
         self.reason = reason
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> ResponseEventError:
@@ -17630,11 +17631,11 @@ class IlluminatorStatus(Message):
         "uptime_ms", "enable", "mode_bitmask", "error_status", "mode", "brightness", "strobe_period",
         "strobe_duty_cycle", "temp_c", "min_strobe_period", "max_strobe_period",
     )
-    ID = 440
-    NAME = "ILLUMINATOR_STATUS"
-    CRC_EXTRA = 66
-    LENGTH = 35
-    BASE_LENGTH = 35
+    ID: ClassVar[int] = 440
+    NAME: ClassVar[str] = "ILLUMINATOR_STATUS"
+    CRC_EXTRA: ClassVar[int] = 66
+    LENGTH: ClassVar[int] = 35
+    BASE_LENGTH: ClassVar[int] = 35
     _FIELDS = (
         ("uptime_ms", "uint32_t", 0, "ms", "", "", "Time since it was started.", False),
         ("enable", "uint8_t", 0, "", "", "", "1: on, 0: off.", False),
@@ -17698,7 +17699,7 @@ class IlluminatorStatus(Message):
         self.temp_c = temp_c
         self.min_strobe_period = min_strobe_period
         self.max_strobe_period = max_strobe_period
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> IlluminatorStatus:

@@ -9,7 +9,7 @@
 from __future__ import annotations
 
 from struct import Struct
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from aerokit.mavlink.message import PACK_ERRORS, Message, pack_bytes, pack_items
 
@@ -61,11 +61,11 @@ class MissionChecksum(Message):
 
     __slots__ = ("mission_type", "checksum")
     __match_args__ = ("mission_type", "checksum")
-    ID = 53
-    NAME = "MISSION_CHECKSUM"
-    CRC_EXTRA = 3
-    LENGTH = 5
-    BASE_LENGTH = 5
+    ID: ClassVar[int] = 53
+    NAME: ClassVar[str] = "MISSION_CHECKSUM"
+    CRC_EXTRA: ClassVar[int] = 3
+    LENGTH: ClassVar[int] = 5
+    BASE_LENGTH: ClassVar[int] = 5
     _FIELDS = (
         ("mission_type", "uint8_t", 0, "", "MAV_MISSION_TYPE", "", "Mission type.", False),
         ("checksum", "uint32_t", 0, "", "", "", "CRC32 checksum of current plan for specified type.", False),
@@ -80,7 +80,7 @@ class MissionChecksum(Message):
     def __init__(self, mission_type: int, checksum: int) -> None:
         self.mission_type = mission_type
         self.checksum = checksum
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> MissionChecksum:
@@ -129,11 +129,11 @@ class RadioRcChannels(Message):
     __match_args__ = (
         "target_system", "target_component", "time_last_update_ms", "flags", "count", "channels",
     )
-    ID = 420
-    NAME = "RADIO_RC_CHANNELS"
-    CRC_EXTRA = 20
-    LENGTH = 73
-    BASE_LENGTH = 9
+    ID: ClassVar[int] = 420
+    NAME: ClassVar[str] = "RADIO_RC_CHANNELS"
+    CRC_EXTRA: ClassVar[int] = 20
+    LENGTH: ClassVar[int] = 73
+    BASE_LENGTH: ClassVar[int] = 9
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System ID (ID of target system, normally flight controller).", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component ID (normally 0 for broadcast).", False),
@@ -178,7 +178,7 @@ class RadioRcChannels(Message):
         self.flags = flags
         self.count = count
         self.channels = tuple(channels)
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> RadioRcChannels:
@@ -224,11 +224,11 @@ class GnssIntegrity(Message):
         "raim_hfom", "raim_vfom", "corrections_quality", "system_status_summary", "gnss_signal_quality",
         "post_processing_quality",
     )
-    ID = 441
-    NAME = "GNSS_INTEGRITY"
-    CRC_EXTRA = 169
-    LENGTH = 17
-    BASE_LENGTH = 17
+    ID: ClassVar[int] = 441
+    NAME: ClassVar[str] = "GNSS_INTEGRITY"
+    CRC_EXTRA: ClassVar[int] = 169
+    LENGTH: ClassVar[int] = 17
+    BASE_LENGTH: ClassVar[int] = 17
     _FIELDS = (
         ("id", "uint8_t", 0, "", "", "", "GNSS receiver id. Must match instance ids of other messages from same receiver.", False),
         ("system_errors", "uint32_t", 0, "", "GPS_SYSTEM_ERROR_FLAGS", "", "Errors in the GPS system.", False),
@@ -309,7 +309,7 @@ class GnssIntegrity(Message):
         self.system_status_summary = system_status_summary
         self.gnss_signal_quality = gnss_signal_quality
         self.post_processing_quality = post_processing_quality
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> GnssIntegrity:
@@ -355,11 +355,11 @@ class RangingBeacon(Message):
         "time_usec", "target_system", "target_component", "beacon_id", "range", "lat", "lon", "alt",
         "alt_type", "hacc_est", "vacc_est", "carrier_freq", "range_accuracy", "sequence", "status",
     )
-    ID = 513
-    NAME = "RANGING_BEACON"
-    CRC_EXTRA = 99
-    LENGTH = 45
-    BASE_LENGTH = 45
+    ID: ClassVar[int] = 513
+    NAME: ClassVar[str] = "RANGING_BEACON"
+    CRC_EXTRA: ClassVar[int] = 99
+    LENGTH: ClassVar[int] = 45
+    BASE_LENGTH: ClassVar[int] = 45
     _FIELDS = (
         ("time_usec", "uint64_t", 0, "us", "", "", "Timestamp (UNIX Epoch time or time since system boot). The receiving end can infer timestamp format (since 1.1.1970 or since system boot) by checking for the magnitude of the number.", False),
         ("target_system", "uint8_t", 0, "", "", "", "System ID.", False),
@@ -448,7 +448,7 @@ class RangingBeacon(Message):
         self.range_accuracy = range_accuracy
         self.sequence = sequence
         self.status = status
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> RangingBeacon:
@@ -493,11 +493,11 @@ class SetVelocityLimits(Message):
         "target_system", "target_component", "horizontal_speed_limit", "vertical_speed_limit",
         "yaw_rate_limit",
     )
-    ID = 354
-    NAME = "SET_VELOCITY_LIMITS"
-    CRC_EXTRA = 210
-    LENGTH = 14
-    BASE_LENGTH = 14
+    ID: ClassVar[int] = 354
+    NAME: ClassVar[str] = "SET_VELOCITY_LIMITS"
+    CRC_EXTRA: ClassVar[int] = 210
+    LENGTH: ClassVar[int] = 14
+    BASE_LENGTH: ClassVar[int] = 14
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System it is for, 0 for all.", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component it is for, 0 for all.", False),
@@ -530,7 +530,7 @@ class SetVelocityLimits(Message):
         self.horizontal_speed_limit = horizontal_speed_limit
         self.vertical_speed_limit = vertical_speed_limit
         self.yaw_rate_limit = yaw_rate_limit
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> SetVelocityLimits:
@@ -566,11 +566,11 @@ class VelocityLimits(Message):
 
     __slots__ = ("horizontal_speed_limit", "vertical_speed_limit", "yaw_rate_limit")
     __match_args__ = ("horizontal_speed_limit", "vertical_speed_limit", "yaw_rate_limit")
-    ID = 355
-    NAME = "VELOCITY_LIMITS"
-    CRC_EXTRA = 6
-    LENGTH = 12
-    BASE_LENGTH = 12
+    ID: ClassVar[int] = 355
+    NAME: ClassVar[str] = "VELOCITY_LIMITS"
+    CRC_EXTRA: ClassVar[int] = 6
+    LENGTH: ClassVar[int] = 12
+    BASE_LENGTH: ClassVar[int] = 12
     _FIELDS = (
         ("horizontal_speed_limit", "float", 0, "m/s", "", "", "Limit of the speed over ground; NaN: none.", False),
         ("vertical_speed_limit", "float", 0, "m/s", "", "", "Limit of climbing and sinking; NaN: none.", False),
@@ -592,7 +592,7 @@ class VelocityLimits(Message):
         self.horizontal_speed_limit = horizontal_speed_limit
         self.vertical_speed_limit = vertical_speed_limit
         self.yaw_rate_limit = yaw_rate_limit
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> VelocityLimits:
@@ -629,11 +629,11 @@ class BatteryStatusV2(Message):
         "id", "temperature", "voltage", "current", "capacity_consumed", "capacity_remaining",
         "state_of_charge", "status_flags",
     )
-    ID = 369
-    NAME = "BATTERY_STATUS_V2"
-    CRC_EXTRA = 145
-    LENGTH = 27
-    BASE_LENGTH = 27
+    ID: ClassVar[int] = 369
+    NAME: ClassVar[str] = "BATTERY_STATUS_V2"
+    CRC_EXTRA: ClassVar[int] = 145
+    LENGTH: ClassVar[int] = 27
+    BASE_LENGTH: ClassVar[int] = 27
     _FIELDS = (
         ("id", "uint8_t", 0, "", "", "", "Number of the battery.", False),
         ("temperature", "int16_t", 0, "cdegC", "", "INT16_MAX", "Temperature of the pack.", False),
@@ -685,7 +685,7 @@ class BatteryStatusV2(Message):
         self.capacity_remaining = capacity_remaining
         self.state_of_charge = state_of_charge
         self.status_flags = status_flags
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> BatteryStatusV2:
@@ -719,11 +719,11 @@ class GroupStart(Message):
 
     __slots__ = ("group_id", "mission_checksum", "time_usec")
     __match_args__ = ("group_id", "mission_checksum", "time_usec")
-    ID = 414
-    NAME = "GROUP_START"
-    CRC_EXTRA = 109
-    LENGTH = 16
-    BASE_LENGTH = 16
+    ID: ClassVar[int] = 414
+    NAME: ClassVar[str] = "GROUP_START"
+    CRC_EXTRA: ClassVar[int] = 109
+    LENGTH: ClassVar[int] = 16
+    BASE_LENGTH: ClassVar[int] = 16
     _FIELDS = (
         ("group_id", "uint32_t", 0, "", "", "", "Id of the group in this mission.", False),
         ("mission_checksum", "uint32_t", 0, "", "", "", "CRC32 of all plans, as in MISSION_CHECKSUM.", False),
@@ -743,7 +743,7 @@ class GroupStart(Message):
         self.group_id = group_id
         self.mission_checksum = mission_checksum
         self.time_usec = time_usec
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> GroupStart:
@@ -771,11 +771,11 @@ class GroupEnd(Message):
 
     __slots__ = ("group_id", "mission_checksum", "time_usec")
     __match_args__ = ("group_id", "mission_checksum", "time_usec")
-    ID = 415
-    NAME = "GROUP_END"
-    CRC_EXTRA = 161
-    LENGTH = 16
-    BASE_LENGTH = 16
+    ID: ClassVar[int] = 415
+    NAME: ClassVar[str] = "GROUP_END"
+    CRC_EXTRA: ClassVar[int] = 161
+    LENGTH: ClassVar[int] = 16
+    BASE_LENGTH: ClassVar[int] = 16
     _FIELDS = (
         ("group_id", "uint32_t", 0, "", "", "", "Id of the group in this mission.", False),
         ("mission_checksum", "uint32_t", 0, "", "", "", "CRC32 of all plans, as in MISSION_CHECKSUM.", False),
@@ -795,7 +795,7 @@ class GroupEnd(Message):
         self.group_id = group_id
         self.mission_checksum = mission_checksum
         self.time_usec = time_usec
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> GroupEnd:
@@ -826,11 +826,11 @@ class RcChannelsOverrideV2(Message):
 
     __slots__ = ("target_system", "target_component", "active_mask", "channels")
     __match_args__ = ("target_system", "target_component", "active_mask", "channels")
-    ID = 421
-    NAME = "RC_CHANNELS_OVERRIDE_V2"
-    CRC_EXTRA = 149
-    LENGTH = 70
-    BASE_LENGTH = 6
+    ID: ClassVar[int] = 421
+    NAME: ClassVar[str] = "RC_CHANNELS_OVERRIDE_V2"
+    CRC_EXTRA: ClassVar[int] = 149
+    LENGTH: ClassVar[int] = 70
+    BASE_LENGTH: ClassVar[int] = 6
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System it is for.", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component it is for.", False),
@@ -860,7 +860,7 @@ class RcChannelsOverrideV2(Message):
         self.target_component = target_component
         self.active_mask = active_mask
         self.channels = tuple(channels)
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> RcChannelsOverrideV2:
@@ -900,11 +900,11 @@ class TargetAbsolute(Message):
         "timestamp", "id", "sensor_capabilities", "lat", "lon", "alt", "vel", "acc", "q_target", "rates",
         "position_std", "vel_std", "acc_std",
     )
-    ID = 510
-    NAME = "TARGET_ABSOLUTE"
-    CRC_EXTRA = 245
-    LENGTH = 106
-    BASE_LENGTH = 106
+    ID: ClassVar[int] = 510
+    NAME: ClassVar[str] = "TARGET_ABSOLUTE"
+    CRC_EXTRA: ClassVar[int] = 245
+    LENGTH: ClassVar[int] = 106
+    BASE_LENGTH: ClassVar[int] = 106
     _FIELDS = (
         ("timestamp", "uint64_t", 0, "us", "", "", "Time since 1970.", False),
         ("id", "uint8_t", 0, "", "", "", "Which target.", False),
@@ -978,7 +978,7 @@ class TargetAbsolute(Message):
         self.position_std = tuple(position_std)
         self.vel_std = tuple(vel_std)
         self.acc_std = tuple(acc_std)
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> TargetAbsolute:
@@ -1026,11 +1026,11 @@ class TargetRelative(Message):
     __match_args__ = (
         "timestamp", "id", "frame", "x", "y", "z", "pos_std", "yaw_std", "q_target", "q_sensor", "type",
     )
-    ID = 511
-    NAME = "TARGET_RELATIVE"
-    CRC_EXTRA = 28
-    LENGTH = 71
-    BASE_LENGTH = 71
+    ID: ClassVar[int] = 511
+    NAME: ClassVar[str] = "TARGET_RELATIVE"
+    CRC_EXTRA: ClassVar[int] = 28
+    LENGTH: ClassVar[int] = 71
+    BASE_LENGTH: ClassVar[int] = 71
     _FIELDS = (
         ("timestamp", "uint64_t", 0, "us", "", "", "Time since 1970.", False),
         ("id", "uint8_t", 0, "", "", "", "Which target.", False),
@@ -1095,7 +1095,7 @@ class TargetRelative(Message):
         self.q_target = tuple(q_target)
         self.q_sensor = tuple(q_sensor)
         self.type = type
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> TargetRelative:
@@ -1133,11 +1133,11 @@ class ControlStatus(Message):
 
     __slots__ = ("flags", "gcs_main", "gcs_secondary")
     __match_args__ = ("flags", "gcs_main", "gcs_secondary")
-    ID = 512
-    NAME = "CONTROL_STATUS"
-    CRC_EXTRA = 21
-    LENGTH = 12
-    BASE_LENGTH = 12
+    ID: ClassVar[int] = 512
+    NAME: ClassVar[str] = "CONTROL_STATUS"
+    CRC_EXTRA: ClassVar[int] = 21
+    LENGTH: ClassVar[int] = 12
+    BASE_LENGTH: ClassVar[int] = 12
     _FIELDS = (
         ("flags", "uint8_t", 0, "", "GCS_CONTROL_STATUS_FLAGS", "", "Whether it speaks of the whole system, and whether control may be taken over.", False),
         ("gcs_main", "uint8_t", 0, "", "", "0", "System id of the one that may do everything.", False),
@@ -1159,7 +1159,7 @@ class ControlStatus(Message):
         self.flags = flags
         self.gcs_main = gcs_main
         self.gcs_secondary = gcs_secondary
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> ControlStatus:
@@ -1195,11 +1195,11 @@ class EscEeprom(Message):
         "target_system", "target_component", "firmware", "msg_index", "msg_count", "esc_index", "write_mask",
         "length", "data",
     )
-    ID = 292
-    NAME = "ESC_EEPROM"
-    CRC_EXTRA = 227
-    LENGTH = 223
-    BASE_LENGTH = 223
+    ID: ClassVar[int] = 292
+    NAME: ClassVar[str] = "ESC_EEPROM"
+    CRC_EXTRA: ClassVar[int] = 227
+    LENGTH: ClassVar[int] = 223
+    BASE_LENGTH: ClassVar[int] = 223
     _FIELDS = (
         ("target_system", "uint8_t", 0, "", "", "", "System it is for.", False),
         ("target_component", "uint8_t", 0, "", "", "", "Component it is for, normally 0.", False),
@@ -1254,7 +1254,7 @@ class EscEeprom(Message):
         self.write_mask = tuple(write_mask)
         self.length = length
         self.data = data
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> EscEeprom:
@@ -1295,11 +1295,11 @@ class EstimatorSensorFusionStatus(Message):
 
     __slots__ = ("intended", "active", "test_ratio")
     __match_args__ = ("intended", "active", "test_ratio")
-    ID = 514
-    NAME = "ESTIMATOR_SENSOR_FUSION_STATUS"
-    CRC_EXTRA = 197
-    LENGTH = 54
-    BASE_LENGTH = 54
+    ID: ClassVar[int] = 514
+    NAME: ClassVar[str] = "ESTIMATOR_SENSOR_FUSION_STATUS"
+    CRC_EXTRA: ClassVar[int] = 197
+    LENGTH: ClassVar[int] = 54
+    BASE_LENGTH: ClassVar[int] = 54
     _FIELDS = (
         ("intended", "uint8_t", 9, "", "", "", "Those it is to use, by parameters and MAV_CMD_ESTIMATOR_SENSOR_ENABLE.", False),
         ("active", "uint8_t", 9, "", "", "", "Those it uses.", False),
@@ -1319,7 +1319,7 @@ class EstimatorSensorFusionStatus(Message):
         self.intended = intended
         self.active = active
         self.test_ratio = tuple(test_ratio)
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> EstimatorSensorFusionStatus:

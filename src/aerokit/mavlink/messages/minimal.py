@@ -9,7 +9,7 @@
 from __future__ import annotations
 
 from struct import Struct
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from aerokit.mavlink.message import PACK_ERRORS, Message
 
@@ -36,11 +36,11 @@ class Heartbeat(Message):
 
     __slots__ = ("type", "autopilot", "base_mode", "custom_mode", "system_status", "mavlink_version")
     __match_args__ = ("type", "autopilot", "base_mode", "custom_mode", "system_status", "mavlink_version")
-    ID = 0
-    NAME = "HEARTBEAT"
-    CRC_EXTRA = 50
-    LENGTH = 9
-    BASE_LENGTH = 9
+    ID: ClassVar[int] = 0
+    NAME: ClassVar[str] = "HEARTBEAT"
+    CRC_EXTRA: ClassVar[int] = 50
+    LENGTH: ClassVar[int] = 9
+    BASE_LENGTH: ClassVar[int] = 9
     _FIELDS = (
         ("type", "uint8_t", 0, "", "MAV_TYPE", "", "Vehicle or component type. For a flight controller component the vehicle type (quadrotor, helicopter, etc.). For other components the component type (e.g. camera, gimbal, etc.). This should be used in preference to component id for identifying the component type.", False),
         ("autopilot", "uint8_t", 0, "", "MAV_AUTOPILOT", "", "Autopilot type / class. Use MAV_AUTOPILOT_INVALID for components that are not flight controllers.", False),
@@ -86,7 +86,7 @@ class Heartbeat(Message):
         self.custom_mode = custom_mode
         self.system_status = system_status
         self.mavlink_version = mavlink_version
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> Heartbeat:

@@ -9,7 +9,7 @@
 from __future__ import annotations
 
 from struct import Struct
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from aerokit.mavlink.message import PACK_ERRORS, Message, pack_bytes
 
@@ -36,11 +36,11 @@ class GlobalPositionInt(Message):
 
     __slots__ = ("time_boot_ms", "lat", "lon", "alt", "relative_alt", "vx", "vy", "vz", "hdg")
     __match_args__ = ("time_boot_ms", "lat", "lon", "alt", "relative_alt", "vx", "vy", "vz", "hdg")
-    ID = 33
-    NAME = "GLOBAL_POSITION_INT"
-    CRC_EXTRA = 104
-    LENGTH = 28
-    BASE_LENGTH = 28
+    ID: ClassVar[int] = 33
+    NAME: ClassVar[str] = "GLOBAL_POSITION_INT"
+    CRC_EXTRA: ClassVar[int] = 104
+    LENGTH: ClassVar[int] = 28
+    BASE_LENGTH: ClassVar[int] = 28
     _FIELDS = (
         ("time_boot_ms", "uint32_t", 0, "ms", "", "", "Timestamp (time since system boot).", False),
         ("lat", "int32_t", 0, "degE7", "", "", "Latitude, expressed", False),
@@ -97,7 +97,7 @@ class GlobalPositionInt(Message):
         self.vy = vy
         self.vz = vz
         self.hdg = hdg
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> GlobalPositionInt:
@@ -140,11 +140,11 @@ class AutopilotVersion(Message):
         "flight_custom_version", "middleware_custom_version", "os_custom_version", "vendor_id", "product_id",
         "uid", "uid2",
     )
-    ID = 148
-    NAME = "AUTOPILOT_VERSION"
-    CRC_EXTRA = 178
-    LENGTH = 78
-    BASE_LENGTH = 60
+    ID: ClassVar[int] = 148
+    NAME: ClassVar[str] = "AUTOPILOT_VERSION"
+    CRC_EXTRA: ClassVar[int] = 178
+    LENGTH: ClassVar[int] = 78
+    BASE_LENGTH: ClassVar[int] = 60
     _FIELDS = (
         ("capabilities", "uint64_t", 0, "", "MAV_PROTOCOL_CAPABILITY", "", "Bitmap of capabilities", False),
         ("flight_sw_version", "uint32_t", 0, "", "", "", "Firmware version number. The field must be encoded as 4 bytes, where each byte (shown from MSB to LSB) is part of a semantic version: (major) (minor) (patch) (FIRMWARE_VERSION_TYPE).", False),
@@ -231,7 +231,7 @@ class AutopilotVersion(Message):
         self.product_id = product_id
         self.uid = uid
         self.uid2 = uid2
-        self.received_frame = None
+        self.received_frame: Frame | None = None
 
     @classmethod
     def decode_body(cls, body: bytes, frame: Frame | None = None) -> AutopilotVersion:

@@ -36,7 +36,7 @@ class Accessories:
         self._vehicle = vehicle
         self.servos: dict[int, int] = {}
         """Output, from 1 on → its pulse in microseconds."""
-        self.relays = 0
+        self.relays: int = 0
         """A bit for each that is on."""
         self.functions: dict[int, int] = {}
         """RC option → position of its switch: 0 low, 1 middle, 2 high."""

@@ -50,7 +50,7 @@ class Arming:
 
     def __init__(self, vehicle: ArduPilotVehicle) -> None:
         self._vehicle = vehicle
-        self.passes = False
+        self.passes: bool = False
         """What SYS_STATUS says of the pre-arm checks."""
         self._reported_at = -math.inf
         self._passed_common = self._is_news = False

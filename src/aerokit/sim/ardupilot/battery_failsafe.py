@@ -32,9 +32,9 @@ class BatteryFailsafe:
         self._priorities = tuple(priorities)
         self._act = act
         self._below_since = {_LOW: math.nan, _CRITICAL: math.nan}
-        self.level = _OK
+        self.level: int = _OK
         """0 as it should be, 1 low, 2 critical; it never goes back."""
-        self.priority = len(self._priorities)
+        self.priority: int = len(self._priorities)
         """Place of the gravest action so far among the priorities; their number before the first."""
 
     def update(self) -> None:

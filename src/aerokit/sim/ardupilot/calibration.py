@@ -33,8 +33,8 @@ class Calibrations:
 
     def __init__(self, vehicle: ArduPilotVehicle) -> None:
         self._vehicle = vehicle
-        self.compasses = CompassCalibration(vehicle)
-        self.accelerometers = AccelerometerCalibration(vehicle)
+        self.compasses: CompassCalibration = CompassCalibration(vehicle)
+        self.accelerometers: AccelerometerCalibration = AccelerometerCalibration(vehicle)
         self._accelerometers_at = -math.inf
 
     def reset(self) -> None:

@@ -32,20 +32,23 @@ class Camera:
     heartbeat of its own. It is there while the parameter CAM1_TYPE is not 0.
     """
 
+    image_count: int
+    remaining: int
+
     def __init__(self, vehicle: ArduPilotVehicle) -> None:
         self._vehicle = vehicle
         self.image_count = 0
         """Pictures since power on."""
-        self.interval_s = 0.0
+        self.interval_s: float = 0.0
         """Between the pictures of a series."""
         self.remaining = 0
         """Pictures of a series that are still to be taken; -1 is without end."""
-        self.trigger_distance_m = 0.0
+        self.trigger_distance_m: float = 0.0
         """A picture whenever the vehicle has moved so far; 0 is off."""
         self._taken_at = -math.inf
         self._taken_where: tuple[float, float] | None = None
         self._ticks = False
-        self.feedback = m.CameraFeedback(0, 0, 0, 0, 0, 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0)
+        self.feedback: m.CameraFeedback = m.CameraFeedback(0, 0, 0, 0, 0, 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0)
         """Of the latest picture; zeros before the first."""
 
     @property
@@ -78,11 +81,13 @@ class Camera:
 
     def stop(self) -> None:
         """End a series."""
-        self.interval_s, self.remaining = 0.0, 0
+        self.interval_s = 0.0
+        self.remaining = 0
 
     def trigger_by_distance(self, metres: float) -> None:
         """A picture every so many metres; 0 ends it."""
-        self.trigger_distance_m, self._taken_where = metres, None
+        self.trigger_distance_m = metres
+        self._taken_where = None
         self._watch()
 
     def _watch(self) -> None:

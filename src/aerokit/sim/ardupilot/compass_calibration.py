@@ -29,7 +29,7 @@ class CompassCalibration:
 
     def __init__(self, vehicle: ArduPilotVehicle) -> None:
         self._vehicle = vehicle
-        self.turns_s = 30.0
+        self.turns_s: float = 30.0
         self._mask = 0
         self._started_at = math.inf
         self._saves = False

@@ -27,14 +27,14 @@ class Failsafes:
 
     def __init__(self, vehicle: ArduPilotVehicle) -> None:
         self._vehicle = vehicle
-        self.battery = BatteryFailsafe(vehicle, self.BATTERY_PRIORITIES, self.act_on_battery)
+        self.battery: BatteryFailsafe = BatteryFailsafe(vehicle, self.BATTERY_PRIORITIES, self.act_on_battery)
         self.ground_station = False
         self.estimator = False
         self.radio = False
         """Whether the pilot's radio counts as lost; it is not armed then."""
-        self.ground_station_seen_at = math.nan
+        self.ground_station_seen_at: float = math.nan
         """When the last heartbeat of the ground station MAV_GCS_SYSID came."""
-        self.radio_heard_at = math.nan
+        self.radio_heard_at: float = math.nan
         """When the last pulses of the radio came, or what RC_CHANNELS_OVERRIDE put in their place."""
 
     def start(self) -> None:

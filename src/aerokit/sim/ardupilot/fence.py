@@ -50,6 +50,9 @@ class Fence:
     and looks only while it is armed. Not simulated: slowing down before the fence (AVOID_ENABLE).
     """
 
+    breached: int
+    breach_count: int
+
     PERIOD_S: ClassVar[float] = 1.0 / 3.0
     """How often it looks, at most."""
     CIRCLE_BACKUP_M: ClassVar[float] = 20.0
@@ -60,14 +63,14 @@ class Fence:
 
     def __init__(self, vehicle: ArduPilotVehicle) -> None:
         self._vehicle = vehicle
-        self.enabled = 0
+        self.enabled: int = 0
         """Kinds in force, whether or not they are configured."""
         self.breached = 0
         """Kinds that are passed now."""
         self.breach_count = 0
-        self.breach_time_ms = 0
+        self.breach_time_ms: int = 0
         """When the present or latest breach began, in milliseconds since boot."""
-        self.caused_mode = False
+        self.caused_mode: bool = False
         """Whether the present mode is what FENCE_ACTION changed to."""
         self._switch = (0, 0)
         self._backup: dict[int, float] = {}

@@ -10,12 +10,15 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from aerokit.mavlink.enums import GimbalManagerFlags, MavMountMode, MavResult, MavSeverity
+from aerokit.mavlink.enums import GimbalManagerFlags, MavFrame, MavMountMode, MavResult, MavSeverity
+from aerokit.mavlink.messages import GlobalPositionInt
 from aerokit.sim.ardupilot.gimbal_status import gimbal_manager_status
+from aerokit.sim.vehicle import sender_of
 
 if TYPE_CHECKING:
     from aerokit.sim.ardupilot.navigation import Ned
     from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
+    from aerokit.sim.channel import Channel
 
 __all__ = ["Gimbal", "Target"]
 
@@ -51,12 +54,15 @@ class Gimbal:
         self._vehicle = vehicle
         self.mode: int = int(self.setting("MNT1_DEFLT_MODE"))
         """MAV_MOUNT_MODE."""
-        self.is_yaw_locked = False
+        self.is_yaw_locked: bool = False
         """Whether the pilot's stick turns it from north."""
-        self.in_control = (0, 0)
+        self.in_control: tuple[int, int] = (0, 0)
         """System and component id of who has said that he is."""
         self._target = Target()
         self._region: Ned | None = None
+        self._followed = 0
+        self._follows: Ned | None = None
+        vehicle.overhear(GlobalPositionInt, self._hear_place)
 
     @property
     def is_fitted(self) -> bool:
@@ -90,6 +96,8 @@ class Gimbal:
             return Target(self._middle("ROLL"), self._middle("PITCH"), 0.0, self.is_yaw_locked)
         if self.mode == MavMountMode.GPS_POINT:
             return self._towards(self._region)
+        if self.mode == MavMountMode.SYSID_TARGET:
+            return self._towards(self._follows)
         if self.mode == MavMountMode.HOME_LOCATION:
             return self._towards(self._vehicle.navigation.home)
         return self._moved(self._target)
@@ -155,6 +163,16 @@ class Gimbal:
             self.set_mode(MavMountMode.GPS_POINT)
         elif self.mode == MavMountMode.GPS_POINT:
             self.set_mode(int(self.setting("MNT1_DEFLT_MODE")))
+
+    def follow(self, system_id: int) -> None:
+        """Keep pointing at another vehicle, from when it tells where it is."""
+        self._followed, self._follows = system_id, None
+        self.set_mode(MavMountMode.SYSID_TARGET)
+
+    def _hear_place(self, told: GlobalPositionInt, _: Channel) -> None:
+        if sender_of(told)[0] == self._followed:
+            place = self._vehicle.point(told.lat, told.lon, told.alt * 1e-3, MavFrame.GLOBAL)
+            self._follows = self._follows if place is None else place
 
     def set_control(self, sender: tuple[int, int], system: int, component: int) -> bool:
         """As MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE says it; False for numbers that mean nothing."""

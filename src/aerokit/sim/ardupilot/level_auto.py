@@ -40,7 +40,7 @@ class LevelAuto(VehicleMode):
 
     def __init__(self, vehicle: LevelVehicle) -> None:
         self.vehicle = vehicle
-        self.speed = 0.0
+        self.speed: float = 0.0
         """In m/s."""
         self.may_lift_off = False
         self.is_paused = False

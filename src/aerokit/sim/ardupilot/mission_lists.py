@@ -71,6 +71,8 @@ class ItemList:
 class CommandList(ItemList):
     """The mission. Item 0 is home, which is never stored: it is where home is when somebody asks."""
 
+    version: int
+
     name = "Mission"
 
     def __init__(

@@ -86,7 +86,7 @@ class MissionRun:
         self._vehicle, self._flyer = vehicle, flyer
         self._list = vehicle.missions.commands
         self._state = MissionState.NOT_STARTED
-        self.nav_index = 0
+        self.nav_index: int = 0
         """The navigation command that runs, or is to be resumed."""
         self._nav: MissionItem | None = None
         self._do: tuple[int, MissionItem] | None = None

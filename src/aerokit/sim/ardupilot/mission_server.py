@@ -55,12 +55,12 @@ class MissionServer:
 
     def __init__(self, vehicle: ArduPilotVehicle) -> None:
         self._vehicle = vehicle
-        self.commands = CommandList(
+        self.commands: CommandList = CommandList(
             _COMMANDS_IN_MEMORY, self._home, lambda: vehicle.mission.is_being_flown, vehicle.KIND
         )
         """The mission, for its execution."""
-        self.fence = FenceList()
-        self.rally = RallyList(_RALLY_POINTS_IN_MEMORY)
+        self.fence: FenceList = FenceList()
+        self.rally: RallyList = RallyList(_RALLY_POINTS_IN_MEMORY)
         self._lists: dict[int, ItemList] = {
             MavMissionType.MISSION: self.commands,
             MavMissionType.FENCE: self.fence,

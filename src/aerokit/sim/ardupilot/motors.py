@@ -20,14 +20,14 @@ class Motors:
     """``spool`` is 0 while the motors idle or stand, 1 when they can lift; ``wanted`` asks for that."""
 
     def __init__(self) -> None:
-        self.is_armed = False
-        self.armed_at = -math.inf
-        self.disarmed_at = -math.inf
-        self.may_turn = False
+        self.is_armed: bool = False
+        self.armed_at: float = -math.inf
+        self.disarmed_at: float = -math.inf
+        self.may_turn: bool = False
         """Whether the arming delay is over."""
-        self.wanted = False
-        self.spool = 0.0
-        self.throttle = 0.0
+        self.wanted: bool = False
+        self.spool: float = 0.0
+        self.throttle: float = 0.0
         """0 to 1, as VFR_HUD says it in percent."""
 
     @property
@@ -56,7 +56,9 @@ class Motors:
         """Arm or stop them."""
         if self.is_armed and not armed:
             self.disarmed_at = now
-        self.is_armed, self.armed_at, self.may_turn = armed, now, False
+        self.is_armed = armed
+        self.armed_at = now
+        self.may_turn = False
         self.spool = self.throttle = 0.0
         self.wanted = False
 

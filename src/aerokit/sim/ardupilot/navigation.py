@@ -49,11 +49,11 @@ class Navigation:
         self.flags: int | None = None
         """EKF_STATUS_FLAGS; None while there is no estimator to ask."""
         self.fix_type: int = GpsFixType.NO_GPS
-        self.is_gps_detected = False
-        self.is_healthy = False
+        self.is_gps_detected: bool = False
+        self.is_healthy: bool = False
         self.origin: Ned | None = None
         self.home: Ned | None = None
-        self.home_is_locked = False
+        self.home_is_locked: bool = False
         self._lost_at = math.nan
 
     def start(self) -> None:
@@ -116,7 +116,8 @@ class Navigation:
 
     def set_home(self, point: Ned, *, lock: bool) -> None:
         """Make a point home and tell everybody."""
-        self.home, self.home_is_locked = point, self.home_is_locked or lock
+        self.home = point
+        self.home_is_locked = self.home_is_locked or lock
         self._vehicle.missions.commands.add_home()
         self._vehicle.call_later(0.0, self._vehicle.send_home)
 
@@ -154,7 +155,8 @@ class Navigation:
         self._say_cores("MAG0 initial yaw alignment complete")
 
     def _detect_gps(self) -> None:
-        self.is_gps_detected, self.fix_type = True, GpsFixType.NO_FIX
+        self.is_gps_detected = True
+        self.fix_type = GpsFixType.NO_FIX
         self._vehicle.info("GPS 1: probing for u-blox at 230400 baud")
         self._vehicle.info("GPS 1: detected u-blox")
 

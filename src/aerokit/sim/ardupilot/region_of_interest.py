@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import MavCmd, MavResult
+from aerokit.sim.commands import whole
 
 if TYPE_CHECKING:
     from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
@@ -14,7 +15,7 @@ __all__ = ["RegionOfInterest"]
 
 
 class RegionOfInterest:
-    """Accepted with or without a gimbal. Another vehicle as the target (…_SYSID) is accepted, and not followed."""
+    """Accepted with or without a gimbal, which alone follows another vehicle (…_SYSID), as far as it is heard."""
 
     def __init__(self, vehicle: ArduPilotVehicle) -> None:
         self._vehicle = vehicle
@@ -26,7 +27,7 @@ class RegionOfInterest:
             MavCmd.DO_SET_ROI: self._look_at,
             MavCmd.DO_SET_ROI_LOCATION: self._look_at,
             MavCmd.DO_SET_ROI_NONE: self._look_ahead,
-            MavCmd.DO_SET_ROI_SYSID: lambda _: MavResult.ACCEPTED,
+            MavCmd.DO_SET_ROI_SYSID: self._follow,
         }
 
     def _look_at(self, command: Command) -> int:
@@ -36,6 +37,10 @@ class RegionOfInterest:
             return MavResult.DENIED
         nowhere = command.place() == (0, 0) and command.z == 0
         self._vehicle.look_at(None if nowhere else point)
+        return MavResult.ACCEPTED
+
+    def _follow(self, command: Command) -> int:
+        self._vehicle.gimbal.follow(whole(command.param1))
         return MavResult.ACCEPTED
 
     def _look_ahead(self, _: Command) -> int:

@@ -66,7 +66,7 @@ class ArduPilotSigning(VehicleSigning):
     def _save(self) -> None:
         if self.key is not None:
             used = [each.signing.timestamp for each in self._ardupilot.channels if each.signing is not None]
-            self.timestamp = max([self.timestamp, *used])
+            self.timestamp: int = max([self.timestamp, *used])
 
 
 def _everything(_: Frame) -> bool:

@@ -36,7 +36,7 @@ class SmartPath:
         self._good_at = self._saved_at = -math.inf
         self._warned_at = -math.inf
         self._has_begun = False
-        self.is_active = False
+        self.is_active: bool = False
         """Whether there is a way back."""
 
     def __len__(self) -> int:

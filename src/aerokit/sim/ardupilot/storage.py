@@ -48,17 +48,17 @@ class Storage:
         link_bytes_per_s: float | None,
     ) -> None:
         self._vehicle = vehicle
-        self.files = FileTree()
+        self.files: FileTree = FileTree()
         self._put_logs(logs)
         self.files.mounts["@SYS"] = TextMount(_SYSTEM_TEXTS)
         self.files.mounts["@PARAM"] = ParameterPackMount(vehicle.parameters, self._apply)
         self.files.mounts["@MISSION"] = MissionMount(vehicle.missions)
         banner = vehicle.send_banner
-        self.parameters = ArduPilotParameterServer(
+        self.parameters: ArduPilotParameterServer = ArduPilotParameterServer(
             vehicle, vehicle.parameters, errors=parameter_errors, send_banner=banner
         )
-        self.ftp = ArduPilotFtp(vehicle, self.files, send_banner=banner)
-        self.logs = ArduPilotLogServer(
+        self.ftp: ArduPilotFtp = ArduPilotFtp(vehicle, self.files, send_banner=banner)
+        self.logs: ArduPilotLogServer = ArduPilotLogServer(
             vehicle,
             logs,
             is_armed=lambda: vehicle.is_armed,

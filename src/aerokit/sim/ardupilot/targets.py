@@ -48,10 +48,8 @@ class Target:
 class TargetMode(Protocol):
     """The mode that follows targets."""
 
-    @property
-    def number(self) -> int:
-        """The vehicle's number for it."""
-        ...
+    number: ClassVar[int]
+    """The vehicle's number for it."""
 
     def take(self, target: Target) -> None:
         """Follow it from now on."""
@@ -69,7 +67,8 @@ class Targets:
     """Whether yaw and turn of a global target are taken."""
 
     def __init__(self, vehicle: ArduPilotVehicle, mode: TargetMode) -> None:
-        self.vehicle, self.mode = vehicle, mode
+        self.vehicle: ArduPilotVehicle = vehicle
+        self.mode: TargetMode = mode
         vehicle.on(SetPositionTargetLocalNed, self._on_local)
         vehicle.on(SetPositionTargetGlobalInt, self._on_global)
         vehicle.on(SetAttitudeTarget, self._on_attitude)
@@ -165,9 +164,9 @@ class RoverTargets(Targets):
 class SubTargets(Targets):
     """Thrust is a climb: 0.5 holds the depth; lean angles move nothing here. A yaw is relative in one frame only."""
 
-    BODY_FRAMES = _BODY | {MavFrame.BODY_FRD}
+    BODY_FRAMES: ClassVar[frozenset[int]] = _BODY | {MavFrame.BODY_FRD}
     RELATIVE_YAW_FRAMES = frozenset({MavFrame.BODY_OFFSET_NED})
-    GLOBAL_YAW = False
+    GLOBAL_YAW: ClassVar[bool] = False
 
     def steer(self, message: SetAttitudeTarget) -> None:
         """Only with both attitude and thrust; it holds for one second."""

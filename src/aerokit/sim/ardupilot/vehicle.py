@@ -35,17 +35,21 @@ from aerokit.sim.autopilot import SimulatedAutopilot
 from aerokit.sim.battery import Battery
 from aerokit.sim.local_frame import GlobalPoint, LocalFrame
 from aerokit.sim.motion import Motion, Wind
+from aerokit.sim.place import HOME
 from aerokit.sim.vehicle import Component, sender_of
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.mavlink.signing import SigningKey
+    from aerokit.sim.ardupilot.boot import BootTimeline
     from aerokit.sim.ardupilot.ftp import ArduPilotFtp
     from aerokit.sim.ardupilot.mode import AutoMode, VehicleMode
     from aerokit.sim.ardupilot.navigation import Ned
     from aerokit.sim.channel import Channel
     from aerokit.sim.commands import CommandHandler
+    from aerokit.sim.file_tree import FileTree
     from aerokit.sim.logs import SimulatedLog
+    from aerokit.sim.parameters import Parameters
 
 __all__ = ["ArduPilotVehicle"]
 
@@ -103,7 +107,7 @@ class ArduPilotVehicle(SimulatedAutopilot):
         self,
         *,
         system_id: int = 1,
-        home: tuple[float, float, float] = (-35.3632610, 149.1652299, 584.09),
+        home: tuple[float, float, float] = HOME,
         heading_deg: float = 353.0,
         seed: int = 0,
         boot_time_s: float = 5.0,
@@ -124,7 +128,7 @@ class ArduPilotVehicle(SimulatedAutopilot):
         unix_time_at_boot: float = 1_790_000_000.0,
         signing_key: SigningKey | None = None,
     ) -> None:
-        self.parameters = parameters_of(self.KIND, parameter_count)
+        self.parameters: Parameters = parameters_of(self.KIND, parameter_count)
         """By name; change them as a test needs it. They survive a reboot."""
         self.parameters["MAV_SYSID"] = system_id
         self.parameters.change(parameters or {})
@@ -137,42 +141,43 @@ class ArduPilotVehicle(SimulatedAutopilot):
             unix_time_at_boot=unix_time_at_boot,
             signing_key=signing_key,
         )
-        self.timeline = BOOT_TIMELINES[self.KIND].scaled(boot_time_s)
-        self.uid = bytes([0xA0, system_id]) + bytes(16)
-        self.battery = Battery(battery_capacity_mah, percent=battery_percent)
-        self.motion = self.make_motion(wind)
+        self.timeline: BootTimeline = BOOT_TIMELINES[self.KIND].scaled(boot_time_s)
+        self.uid: bytes = bytes([0xA0, system_id]) + bytes(16)
+        self.battery: Battery = Battery(battery_capacity_mah, percent=battery_percent)
+        self.motion: Motion = self.make_motion(wind)
         self.motion.yaw = math.remainder(math.radians(heading_deg), 2 * math.pi)
         self.rangefinder_reach_m = rangefinder_reach_m
-        self.rc = Radio(self)
+        self.rc: Radio = Radio(self)
         """What it hears of sticks and switches; the throttle (index 2) rests at 1000."""
-        self.tunes = hear_tunes(self)
+        self.tunes: list[str] = hear_tunes(self)
         """What PLAY_TUNE had it play."""
         self.calibrations: Calibrations = Calibrations(self)
         self._boot_text = boot_text
         self._stream_groups = stream_groups
         self._frame = LocalFrame(GlobalPoint(round(home[0] * 1e7), round(home[1] * 1e7), home[2]))
-        self.missions = MissionServer(self)
+        self.missions: MissionServer = MissionServer(self)
         """Mission, fence and rally points; they survive a reboot."""
         self._reset()
         self._listen()
-        self.storage = Storage(
+        self.storage: Storage = Storage(
             self, logs, parameter_errors=parameter_errors, link_bytes_per_s=link_bytes_per_s
         )
         """Files, logs, and the servers of them and of the parameters."""
-        self.files = self.storage.files
+        self.files: FileTree = self.storage.files
 
     def _reset(self) -> None:
         """What a power cycle makes new."""
-        self.is_initialised = self.has_left_boot = False
-        self.is_landed = self.motion.is_on_ground
-        self.motors = self.make_motors()
-        self.navigation = Navigation(self, self._frame)
-        self.arming = self.ARMING(self)
-        self.accessories = Accessories(self)
-        self.failsafes = self.FAILSAFES(self)
-        self.fence = self.FENCE(self)
-        self.gimbal = Gimbal(self)
-        self.camera = Camera(self)
+        self.is_initialised: bool = False
+        self.has_left_boot: bool = False
+        self.is_landed: bool = self.motion.is_on_ground
+        self.motors: Motors = self.make_motors()
+        self.navigation: Navigation = Navigation(self, self._frame)
+        self.arming: Arming = self.ARMING(self)
+        self.accessories: Accessories = Accessories(self)
+        self.failsafes: Failsafes = self.FAILSAFES(self)
+        self.fence: Fence = self.FENCE(self)
+        self.gimbal: Gimbal = Gimbal(self)
+        self.camera: Camera = Camera(self)
         self.calibrations.reset()
         self.rc.reset()
         self._modes: dict[int, VehicleMode] = {}
@@ -180,7 +185,7 @@ class ArduPilotVehicle(SimulatedAutopilot):
             mode = make(self)
             self._modes[mode.number] = mode
         self.reset_controllers()
-        self.mission = MissionRun(self, self.auto)
+        self.mission: MissionRun = MissionRun(self, self.auto)
         self.missions.reset()
         self.mode: VehicleMode = self._modes[self.first_mode]
 
@@ -189,7 +194,7 @@ class ArduPilotVehicle(SimulatedAutopilot):
         return ArduPilotSigning(self, key, timestamp)
 
     def _listen(self) -> None:
-        self.requests = Requests(self, stream_groups=self._stream_groups)
+        self.requests: Requests = Requests(self, stream_groups=self._stream_groups)
         self.serve_commands(self.make_commands())
         self.hear_setpoints()
         self.on(m.Heartbeat, self._on_heartbeat)

@@ -7,17 +7,25 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
-from aerokit.mavlink.enums import CameraCapFlags, CameraMode, MavType
+from aerokit.mavlink.enums import CameraCapFlags, CameraMode, CameraSource, MavType
+from aerokit.parameters import parse_definition
 from aerokit.sim.components.camera_commands import camera_commands
 from aerokit.sim.components.camera_messages import camera_builders
+from aerokit.sim.components.camera_parameters import DEFINITION_PATH, CameraParameters, own_definition
 from aerokit.sim.components.captures import Captures
 from aerokit.sim.components.component import Builder, SimulatedComponent
+from aerokit.sim.components.files import serve_files
+from aerokit.sim.components.lens import Lens
 from aerokit.sim.components.pose import pose_of
-from aerokit.sim.components.storage import MemoryCard
+from aerokit.sim.components.storage import GREY_JPEG, MemoryCard
+from aerokit.sim.components.tracking import Tracking
+from aerokit.sim.file_tree import FileTree
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
+    from aerokit.mavlink.messages import CameraImageCaptured
+    from aerokit.parameters.definition import CameraDefinition
     from aerokit.sim.commands import CommandHandler
     from aerokit.sim.components.gimbal import SimulatedGimbal
 
@@ -30,6 +38,12 @@ _CAPABILITIES = (
     | CameraCapFlags.HAS_BASIC_ZOOM
     | CameraCapFlags.HAS_BASIC_FOCUS
 )
+_MORE_CAPABILITIES = (
+    CameraCapFlags.HAS_IMAGE_SURVEY_MODE
+    | CameraCapFlags.HAS_TRACKING_POINT
+    | CameraCapFlags.HAS_TRACKING_RECTANGLE
+    | CameraCapFlags.HAS_TRACKING_GEO_STATUS
+)
 
 
 class SimulatedCamera(SimulatedComponent):
@@ -39,15 +53,29 @@ class SimulatedCamera(SimulatedComponent):
     - ``vendor``, ``model``, ``definition_uri``, ``capabilities`` (CAMERA_CAP_FLAGS), ``resolution`` in pixels: go into
       CAMERA_INFORMATION. Without HAS_MODES it takes both pictures and videos at any time.
     - ``streams``: addresses of its video streams, such as ``rtsp://192.168.0.10:8554/main``; nothing is streamed
+    - ``thermal_celsius``: the coldest and the hottest that it sees, at the edges of its picture; None: it sees light.
+      Its last stream is the thermal one.
+    - ``picture``: what each picture's file holds, as JPEG, or what makes it of the capture; ``files`` has them
+      below ``/DCIM`` and they are given away by MAVFTP
     - ``gimbal``: what it hangs on; its pictures look where that points
     - ``capacity_mib``, ``image_mib``, ``video_mib_s``: size of the card, of a picture, of a second of video
     - ``shutter_s``: seconds until a picture is there
 
-    Pictures stay over a reboot, modes and series do not. Not simulated: tracking, thermal ranges, the parameters of a
-    camera definition (PARAM_EXT).
+    Its settings (PARAM_EXT) are those of ``camera_definition.xml`` beside this file, which it serves by MAVFTP, or of
+    another ``definition``; a ``definition_uri`` names the place that is told instead, an empty one none.
+
+    Pictures, settings and files stay over a reboot, modes and series do not. What it tracks it keeps until
+    ``tracking.lose()``.
     """
 
+    capabilities: int
+
     TYPE: ClassVar[int] = MavType.CAMERA
+    ALL_CAPABILITIES: ClassVar[int] = _CAPABILITIES | _MORE_CAPABILITIES
+    """For ``capabilities``: survey mode and tracking, too."""
+
+    parameters: CameraParameters
+    """Its settings, once it is on a vehicle."""
 
     def __init__(
         self,
@@ -56,32 +84,57 @@ class SimulatedCamera(SimulatedComponent):
         system_id: int | None = None,
         vendor: str = "aerokit",
         model: str = "Simulated camera",
-        definition_uri: str = "",
+        definition: bytes | None = None,
+        definition_uri: str | None = None,
         capabilities: int = _CAPABILITIES,
         resolution: tuple[int, int] = (4000, 3000),
         streams: Sequence[str] = (),
+        thermal_celsius: tuple[float, float] | None = None,
         gimbal: SimulatedGimbal | None = None,
         capacity_mib: float = 8192.0,
         image_mib: float = 5.0,
         video_mib_s: float = 10.0,
         shutter_s: float = 0.2,
+        picture: bytes | Callable[[CameraImageCaptured], bytes] = GREY_JPEG,
     ) -> None:
         super().__init__(component_id, system_id=system_id)
-        self.vendor, self.model = vendor, model
-        self.definition_uri = definition_uri
+        self.vendor: str = vendor
+        self.model: str = model
+        content = own_definition() if definition is None else definition
+        self.definition: CameraDefinition = parse_definition(content)
+        self.definition_uri = f"mftp://{DEFINITION_PATH}" if definition_uri is None else definition_uri
+        self.files: FileTree = FileTree().put(DEFINITION_PATH, content)
+        """What it serves by MAVFTP: the definition, and the pictures on its card in ``/DCIM``."""
         self.resolution = resolution
-        self.streams = tuple(streams)
+        self.streams: tuple[str, ...] = tuple(streams)
         self.gimbal = gimbal
-        self.image_mib, self.video_mib_s, self.shutter_s = image_mib, video_mib_s, shutter_s
+        self.image_mib: float = image_mib
+        self.video_mib_s: float = video_mib_s
+        self.shutter_s: float = shutter_s
+        self.thermal_celsius: tuple[float, float] | None = thermal_celsius
+        self.picture = picture
         self.capabilities = capabilities | (CameraCapFlags.HAS_VIDEO_STREAM if streams else 0)
-        self.card = MemoryCard(capacity_mib)
-        self.captures = Captures(self)
+        self.capabilities |= CameraCapFlags.HAS_THERMAL_RANGE if thermal_celsius else 0
+        self.card: MemoryCard = MemoryCard(capacity_mib)
+        self.captures: Captures = Captures(self)
         self.running_streams: set[int] = set()
         """Numbers, from 1, of the streams that run."""
         self.mode: int = CameraMode.IMAGE
         """CAMERA_MODE."""
-        self.zoom = self.focus = 0.0
+        self.source: int = CameraSource.DEFAULT
+        """CAMERA_SOURCE of the sensor that is shown."""
+        self.lens: Lens = Lens(lambda: self.now)
+        self.tracking: Tracking = Tracking(self)
+
+    @property
+    def zoom(self) -> float:
         """In percent."""
+        return self.lens.zoom.percent
+
+    @property
+    def focus(self) -> float:
+        """In percent."""
+        return self.lens.focus.percent
 
     @property
     def image_count(self) -> int:
@@ -102,13 +155,34 @@ class SimulatedCamera(SimulatedComponent):
 
     def reset_settings(self) -> None:
         """Mode, zoom and focus as they were from the factory."""
-        self.mode, self.zoom, self.focus = CameraMode.IMAGE, 0.0, 0.0
+        self.mode, self.source = CameraMode.IMAGE, CameraSource.DEFAULT
+        self.lens.zoom.set(0.0)
+        self.lens.focus.set(0.0)
+
+    def listen(self) -> None:
+        """Files by MAVFTP, settings by PARAM_EXT."""
+        serve_files(self, self.files)
+        self.parameters = CameraParameters(self)
 
     def start(self) -> None:
         """The power comes on; streams run at once."""
         self.captures.switch_off()
         self.reset_settings()
+        self.parameters.restart()
+        self.tracking.reset()
         self.running_streams = set(range(1, len(self.streams) + 1))
+
+    def clear_files(self) -> None:
+        """Have no pictures any more."""
+        for name, _ in self.files.entries("/DCIM") if "/DCIM" in self.files else ():
+            self.files.remove_file(f"/DCIM/{name}")
+
+    def keep(self, image: CameraImageCaptured) -> str:
+        """Write the file of a picture; its URL."""
+        path = f"/DCIM/IMG_{len(self.captures.images) + 1:04d}.JPG"
+        picture = self.picture
+        self.files.put(path, picture if isinstance(picture, bytes) else picture(image))
+        return f"mftp://{path}"
 
     def commands(self) -> dict[int, CommandHandler]:
         """See `camera_commands`."""

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import CameraCapFlags, CameraMode, CameraZoomType, MavCmd, MavResult, SetFocusType
+from aerokit.mavlink.enums import CameraCapFlags, CameraMode, CameraSource, MavCmd, MavResult
 from aerokit.sim.commands import Progress, whole
 from aerokit.sim.components.camera_messages import camera_settings
 
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 __all__ = ["camera_commands"]
 
 _FORMAT_S, _FORMAT_PERCENTS = 0.5, (0, 25, 50, 75)
-_STEP_PERCENT = 10.0
 _CAN_ALWAYS_CAPTURE = CameraCapFlags.CAN_CAPTURE_IMAGE_IN_VIDEO_MODE
 _CAN_ALWAYS_RECORD = CameraCapFlags.CAN_CAPTURE_VIDEO_IN_IMAGE_MODE
 
@@ -38,7 +37,11 @@ def camera_commands(camera: SimulatedCamera) -> dict[int, CommandHandler]:
         MavCmd.SET_CAMERA_MODE: settings.set_mode,
         MavCmd.SET_CAMERA_ZOOM: settings.set_zoom,
         MavCmd.SET_CAMERA_FOCUS: settings.set_focus,
+        MavCmd.SET_CAMERA_SOURCE: settings.set_source,
         MavCmd.RESET_CAMERA_SETTINGS: settings.reset,
+        MavCmd.CAMERA_TRACK_POINT: lambda command: camera.tracking.track_point(command),
+        MavCmd.CAMERA_TRACK_RECTANGLE: lambda command: camera.tracking.track_rectangle(command),
+        MavCmd.CAMERA_STOP_TRACKING: lambda command: camera.tracking.stop(command),
         **_requests_of_old(camera),
     }
 
@@ -110,6 +113,7 @@ class _Pictures:
         def finish() -> None:
             if command.param2 == 1.0:
                 camera.card.format()
+                camera.clear_files()
             if command.param3 == 1.0:
                 captures.clear()
 
@@ -177,36 +181,36 @@ class _Settings:
         return self._told()
 
     def set_zoom(self, command: Command) -> int:
-        """By a step, or to a percentage; continuous zoom goes to its end at once."""
-        camera, value = self._camera, command.param2
+        """See `Lens.set_zoom`."""
+        camera = self._camera
         if not camera.can(CameraCapFlags.HAS_BASIC_ZOOM):
             return MavResult.UNSUPPORTED
-        zoom = {
-            CameraZoomType.STEP: camera.zoom + value * _STEP_PERCENT,
-            CameraZoomType.CONTINUOUS: camera.zoom + value * 100.0,
-            CameraZoomType.RANGE: value,
-        }.get(whole(command.param1))  # type: ignore[call-overload]
-        if zoom is None or (command.param1 == CameraZoomType.RANGE and not 0.0 <= value <= 100.0):
+        if not camera.lens.set_zoom(whole(command.param1), command.param2):
             return MavResult.DENIED
-        camera.zoom = max(0.0, min(100.0, zoom))
         return self._told()
 
     def set_focus(self, command: Command) -> int:
-        """To a percentage, or by itself: then it is in the middle."""
-        camera, kind = self._camera, whole(command.param1)
+        """See `Lens.set_focus`."""
+        camera = self._camera
         if not camera.can(CameraCapFlags.HAS_BASIC_FOCUS):
             return MavResult.UNSUPPORTED
-        if kind == SetFocusType.RANGE and 0.0 <= command.param2 <= 100.0:
-            camera.focus = command.param2
-        elif kind in (SetFocusType.AUTO, SetFocusType.AUTO_SINGLE, SetFocusType.AUTO_CONTINUOUS):
-            camera.focus = 50.0
-        else:
+        if not camera.lens.set_focus(whole(command.param1), command.param2):
             return MavResult.DENIED
         return self._told()
+
+    def set_source(self, command: Command) -> int:
+        """Light, and warmth of a thermal one."""
+        source = whole(command.param2)
+        here = {CameraSource.DEFAULT, CameraSource.IR if self._camera.thermal_celsius else CameraSource.RGB}
+        if source not in here | {CameraSource.RGB}:
+            return MavResult.DENIED
+        self._camera.source = source
+        return MavResult.ACCEPTED
 
     def reset(self, command: Command) -> int:
         if command.param1 == 1.0:
             self._camera.reset_settings()
+            self._camera.parameters.reset()
         return self._told()
 
     def _told(self) -> int:

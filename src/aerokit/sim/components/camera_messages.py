@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import CameraCapFlags, VideoStreamEncoding, VideoStreamStatusFlags, VideoStreamType
 from aerokit.sim.commands import whole
+from aerokit.sim.components.lens import FOCAL_LENGTH_MM
 
 if TYPE_CHECKING:
     from aerokit.sim.commands import Command
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 __all__ = ["camera_builders", "camera_settings"]
 
 _FIRMWARE = 1 << 24
-_FOCAL_LENGTH_MM, _SENSOR_MM = 4.5, (6.17, 4.63)
+_SENSOR_MM = (6.17, 4.63)
 _STREAM_HZ, _STREAM_SIZE, _STREAM_BITS_S = 30.0, (1920, 1080), 4_000_000
 _TO_THE_END = -1
 
@@ -32,6 +33,9 @@ def camera_builders(camera: SimulatedCamera) -> dict[int, Builder]:
         m.CameraImageCaptured.ID: lambda command: _images(camera, command),
         m.VideoStreamInformation.ID: lambda command: _streams(camera, _number(command)),
         m.VideoStreamStatus.ID: lambda command: _stream_status(camera, _number(command)),
+        m.CameraTrackingImageStatus.ID: lambda _: [camera.tracking.image_status()],
+        m.CameraTrackingGeoStatus.ID: lambda _: camera.tracking.geo_status(),
+        m.CameraThermalRange.ID: lambda _: _thermal_range(camera),
     }
 
 
@@ -56,14 +60,14 @@ def _information(camera: SimulatedCamera) -> m.CameraInformation:
         vendor_name=camera.vendor.encode()[:32].ljust(32, b"\0"),
         model_name=camera.model.encode()[:32].ljust(32, b"\0"),
         firmware_version=_FIRMWARE,
-        focal_length=_FOCAL_LENGTH_MM,
+        focal_length=FOCAL_LENGTH_MM,
         sensor_size_h=_SENSOR_MM[0],
         sensor_size_v=_SENSOR_MM[1],
         resolution_h=camera.resolution[0],
         resolution_v=camera.resolution[1],
         lens_id=0,
         flags=camera.capabilities,
-        cam_definition_version=1 if camera.definition_uri else 0,
+        cam_definition_version=camera.definition.version if camera.definition_uri else 0,
         cam_definition_uri=camera.definition_uri,
         gimbal_device_id=0 if camera.gimbal is None else camera.gimbal.component_id,
     )
@@ -122,9 +126,21 @@ def _stream_status(camera: SimulatedCamera, number: int) -> list[m.VideoStreamSt
 
 
 def _flags(camera: SimulatedCamera, stream: int) -> int:
-    return VideoStreamStatusFlags.RUNNING if stream in camera.running_streams else 0
+    flags: int = VideoStreamStatusFlags.RUNNING if stream in camera.running_streams else 0
+    if camera.thermal_celsius and stream == len(camera.streams):
+        flags |= VideoStreamStatusFlags.THERMAL | VideoStreamStatusFlags.THERMAL_RANGE_ENABLED
+    return flags
+
+
+def _thermal_range(camera: SimulatedCamera) -> list[m.CameraThermalRange]:
+    """Cold at the upper left, hot at the lower right."""
+    if camera.thermal_celsius is None:
+        return []
+    coldest, hottest = camera.thermal_celsius
+    stream = len(camera.streams)
+    return [m.CameraThermalRange(camera.time_boot_ms, stream, 0, hottest, 1.0, 1.0, coldest, 0.0, 0.0)]
 
 
 def _field_of_view() -> int:
     """Horizontally, in degrees."""
-    return round(math.degrees(2 * math.atan(_SENSOR_MM[0] / 2 / _FOCAL_LENGTH_MM)))
+    return round(math.degrees(2 * math.atan(_SENSOR_MM[0] / 2 / FOCAL_LENGTH_MM)))

@@ -27,7 +27,7 @@ class Captures:
         self._camera = camera
         self.images: list[CameraImageCaptured] = []
         """One for each picture since the log of pictures was last cleared; their indices count from 0."""
-        self.interval_s = 0.0
+        self.interval_s: float = 0.0
         """Between the pictures of a series."""
         self._remaining = 0
         self._is_open = False
@@ -90,6 +90,7 @@ class Captures:
         is_stored = camera.card.store(camera.image_mib)
         image = shot(image_index=len(self.images), capture_result=int(is_stored))
         if is_stored:
+            image = shot(image_index=len(self.images), capture_result=1, file_url=camera.keep(image))
             self.images.append(image)
         else:
             self.stop()

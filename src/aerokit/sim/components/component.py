@@ -41,7 +41,7 @@ class SimulatedComponent:
 
     def __init__(self, component_id: int, *, system_id: int | None = None) -> None:
         self.component_id = component_id
-        self.faults = Faults()
+        self.faults: Faults = Faults()
         """What goes wrong with it: commands, ``silent``, ``heartbeats_stopped``, losses."""
         self._system_id = system_id
         self._vehicle: SimulatedVehicle | None = None
@@ -137,6 +137,10 @@ class SimulatedComponent:
         """Do something after ``delay`` seconds; a reboot forgets it."""
         self.vehicle.call_later(delay, action)
 
+    def call_at(self, when: float, action: Callable[[], None]) -> None:
+        """Do something at this time; a reboot forgets it."""
+        self.vehicle.call_at(when, action)
+
     def stream(self, message_id: int, interval_s: float, channel: Channel | None = None) -> None:
         """Send messages of an id again and again from now on, on one channel or on all; 0 ends it."""
         key = (channel, message_id)
@@ -177,6 +181,8 @@ class SimulatedComponent:
         faults = self.faults
         stopped = faults.heartbeats_stopped and message.ID == Heartbeat.ID
         if faults.silent or faults.frozen or stopped:
+            return True
+        if faults.lost_messages and faults.loses(message):
             return True
         if faults.drop_outgoing > 0:
             faults.drop_outgoing -= 1

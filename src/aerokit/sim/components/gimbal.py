@@ -9,6 +9,7 @@ import math
 from typing import TYPE_CHECKING, ClassVar
 
 from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import GimbalManagerFlags as Flags
 from aerokit.mavlink.enums import MavType
 from aerokit.sim.components.component import Builder, SimulatedComponent
 from aerokit.sim.components.gimbal_commands import gimbal_commands, hear_gimbal_orders
@@ -54,21 +55,24 @@ class SimulatedGimbal(SimulatedComponent):
         attitude_rate_hz: float = 5.0,
     ) -> None:
         super().__init__(component_id, system_id=system_id)
-        self.limits = tuple(
+        self.limits: tuple[tuple[float, float], ...] = tuple(
             (math.radians(low), math.radians(high)) for low, high in (roll_deg, pitch_deg, yaw_deg)
         )
         """Lowest and highest roll, pitch, yaw in radians."""
-        self.slew_rad_s = math.radians(slew_deg_s)
+        self.slew_rad_s: float = math.radians(slew_deg_s)
         self._attitude_rate_hz = attitude_rate_hz
         self._forget()
 
     def _forget(self) -> None:
-        self.primary = self.secondary = (0, 0)
+        self.primary: tuple[int, int] = (0, 0)
+        self.secondary: tuple[int, int] = (0, 0)
         """System and component ids of who is in control; zeros are nobody."""
-        self.flags = 0
+        self.flags: int = 0
         """GIMBAL_MANAGER_FLAGS of the latest order."""
         self.region: GlobalPoint | None = None
         """The place that it looks at."""
+        self.followed: int = 0
+        """The system id of the vehicle that it looks at, wherever that is; 0: none."""
         self._from: Angles = _STILL
         self._since = 0.0
         self._target: Angles = _STILL
@@ -164,15 +168,32 @@ class SimulatedGimbal(SimulatedComponent):
         self._begin(0)
         self.region = place
 
+    def follow(self, system_id: int) -> None:
+        """Keep pointing at another vehicle, from when it tells where it is; until then it stays as it is."""
+        here = self.angles_from_north()
+        self.point(here, Flags.YAW_LOCK, locked=True)
+        self.followed = system_id
+
+    def note_place(self, system_id: int, place: GlobalPoint) -> None:
+        """Another vehicle tells where it is."""
+        if system_id == self.followed:
+            self._from, self._since = self.angles(), self.now
+            self.region = place
+
     def _begin(self, flags: int) -> None:
         self._from, self._since = self.angles(), self.now
-        self._target, self._rates, self.region = _STILL, _STILL, None
-        self.flags, self._is_locked = flags, False
+        self._target = _STILL
+        self._rates = _STILL
+        self.region = None
+        self.followed = 0
+        self.flags = flags
+        self._is_locked = False
 
     def set_control(self, primary: tuple[int, int], secondary: tuple[int, int]) -> None:
         """Give it to somebody; a change is told at once."""
         if (primary, secondary) != (self.primary, self.secondary):
-            self.primary, self.secondary = primary, secondary
+            self.primary = primary
+            self.secondary = secondary
             self.send(gimbal_manager_status(self))
 
     def obeys(self, sender: tuple[int, int]) -> bool:

@@ -36,6 +36,7 @@ def gimbal_commands(gimbal: SimulatedGimbal) -> dict[int, CommandHandler]:
         MavCmd.DO_GIMBAL_MANAGER_CONFIGURE: orders.configure,
         MavCmd.DO_GIMBAL_MANAGER_PITCHYAW: orders.pitch_and_yaw,
         MavCmd.DO_SET_ROI_LOCATION: orders.look_at,
+        MavCmd.DO_SET_ROI_SYSID: orders.follow,
         MavCmd.DO_SET_ROI_NONE: orders.look_ahead,
     }
 
@@ -47,6 +48,7 @@ def hear_gimbal_orders(gimbal: SimulatedGimbal) -> None:
     gimbal.on(m.GimbalManagerSetPitchyaw, orders.on_pitch_and_yaw)
     gimbal.on(m.GimbalManagerSetManualControl, orders.on_manual_control)
     gimbal.on(m.GimbalDeviceSetAttitude, orders.on_device_attitude)
+    gimbal.on(m.GlobalPositionInt, orders.on_place)
 
 
 class _Orders:
@@ -93,6 +95,18 @@ class _Orders:
             altitude += 0.0 if pose is None else pose.place.altitude_m - pose.height_m
         gimbal.look_at(GlobalPoint(*command.place(), altitude))
         return MavResult.ACCEPTED
+
+    def follow(self, command: Command) -> int:
+        """Param 1 is whom."""
+        gimbal = self._gimbal
+        if not self._is_mine(command.param2) or not gimbal.obeys(command.sender):
+            return MavResult.DENIED
+        gimbal.follow(whole(command.param1))
+        return MavResult.ACCEPTED
+
+    def on_place(self, told: m.GlobalPositionInt, _: Channel) -> None:
+        """Of the vehicle that it looks at."""
+        self._gimbal.note_place(sender_of(told)[0], GlobalPoint(told.lat, told.lon, told.alt * 1e-3))
 
     def look_ahead(self, command: Command) -> int:
         gimbal = self._gimbal

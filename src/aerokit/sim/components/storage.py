@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import StorageStatus, StorageType, StorageUsageFlag
@@ -10,7 +11,13 @@ from aerokit.mavlink.messages import StorageInformation
 if TYPE_CHECKING:
     from aerokit.sim.components.component import SimulatedComponent
 
-__all__ = ["MemoryCard"]
+__all__ = ["GREY_JPEG", "MemoryCard"]
+
+GREY_JPEG = base64.b85decode(
+    "|JeWF01!$>Nk#wx0RR9200961|JwjV02B@n5)Ta&5)cv>6%-gAG9exu93DL^E+jHZKuk+VKt@GST61DhRc%&9Mr4R(ZFhTtf`Lw8jhBpl"
+    "mUDiAeE+}z3kU!Z01yEI5di<h02KfM0RR910000000000000000{_GS6c7Ob00000000000000000030+5iXv0RR9$0DvF=*#"
+)
+"""A picture of 16 × 16 pixels."""
 
 _READ_MIB_S, _WRITE_MIB_S = 90.0, 45.0
 _NUMBER = 1
@@ -21,7 +28,7 @@ class MemoryCard:
 
     def __init__(self, capacity_mib: float) -> None:
         self.capacity_mib = capacity_mib
-        self.used_mib = 0.0
+        self.used_mib: float = 0.0
         self.is_inserted = True
 
     @property

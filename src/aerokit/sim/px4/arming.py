@@ -35,9 +35,9 @@ class Arming:
 
     def __init__(self, px4: SimulatedPx4) -> None:
         self._px4 = px4
-        self.since = -math.inf
+        self.since: float = -math.inf
         """When it was armed the last time."""
-        self.is_terminated = False
+        self.is_terminated: bool = False
         """Whether DO_FLIGHTTERMINATION has stopped the motors; only a restart ends that."""
         self._is_logging = False
 
@@ -121,7 +121,8 @@ class Arming:
 
     def terminate(self) -> None:
         """Stop the motors for good, wherever it is, and call for the parachute."""
-        px4, self.is_terminated = self._px4, True
+        px4 = self._px4
+        self.is_terminated = True
         px4.is_in_failsafe = True
         px4.send_text(MavSeverity.CRITICAL, "Failsafe activated")
         px4.send_text(MavSeverity.CRITICAL, "Preflight Fail: Flight termination active")

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import MavCmd, MavModeFlag, MavResult, MavSeverity
 from aerokit.sim.commands import Command, CommandHandler, Progress, whole
+from aerokit.sim.px4.gimbal import gimbal_commands
 from aerokit.sim.px4.message_requests import message_requests
 from aerokit.sim.px4.modes import (
     AUTO,
@@ -41,6 +42,8 @@ def px4_commands(px4: SimulatedPx4) -> dict[int, CommandHandler]:
     return {
         **message_requests(px4),
         **other_commands(px4),
+        **px4.camera_trigger.commands(),
+        **gimbal_commands(px4),
         MavCmd.COMPONENT_ARM_DISARM: flight.arm_or_disarm,
         MavCmd.DO_SET_MODE: flight.set_mode,
         MavCmd.NAV_TAKEOFF: flight.take_off,

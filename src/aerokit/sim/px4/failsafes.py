@@ -53,14 +53,16 @@ _BATTERY_TEXTS = {
 class Failsafes:
     """What watches over the flight. `check` runs five times a second while the vehicle is on."""
 
+    battery_state: MavBatteryChargeState
+
     def __init__(self, px4: SimulatedPx4) -> None:
         self._px4 = px4
-        self.fence = Fence(px4)
-        self.action = _A.NONE
+        self.fence: Fence = Fence(px4)
+        self.action: FailsafeAction = _A.NONE
         """What is being done now."""
         self.battery_state = MavBatteryChargeState.OK
         """MAV_BATTERY_CHARGE_STATE; while armed it only gets worse."""
-        self.has_station = False
+        self.has_station: bool = False
         """Whether a ground station is heard; False before the first."""
         self._station_at = -math.inf
         self._had_sticks = False
@@ -261,4 +263,5 @@ class Failsafes:
         self._active = {cause: action for cause, action in self._active.items() if cause in self._failing}
         if self.action > _A.WARN:
             self._is_taken_over = bool(self._active)
-            self.action, self._holds_until = _A.WARN, -math.inf
+            self.action = _A.WARN
+            self._holds_until = -math.inf

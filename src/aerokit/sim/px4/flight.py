@@ -45,11 +45,11 @@ class Flight:
         self.destination: Ned = (0.0, 0.0, 0.0)
         """Where RTL lands: home, or a rally point."""
         self.heading: float | None = None
-        self.speed_m_s = 0.0
-        self.lifts_off = False
+        self.speed_m_s: float = 0.0
+        self.lifts_off: bool = False
         """Whether the mode wants to leave the ground."""
-        self.by_hand = ManualFlight(vehicle)
-        self.orbit = Orbit(vehicle)
+        self.by_hand: ManualFlight = ManualFlight(vehicle)
+        self.orbit: Orbit = Orbit(vehicle)
         self._phase = ""
         self._ramp_from = 0.0
         self._is_default_height = False

@@ -15,7 +15,7 @@ from aerokit.sim.ftp import FtpPacket, FtpServer, path_in, read_crc32
 if TYPE_CHECKING:
     from aerokit.sim.channel import Channel
     from aerokit.sim.file_tree import FileTree, OpenFile
-    from aerokit.sim.vehicle import SimulatedVehicle
+    from aerokit.sim.ftp import FileHost
 
 __all__ = ["Px4Ftp"]
 
@@ -55,9 +55,7 @@ class Px4Ftp(FtpServer):
 
     burst = 24
 
-    def __init__(
-        self, vehicle: SimulatedVehicle, files: FileTree, *, burst_interval_s: float = 0.005
-    ) -> None:
+    def __init__(self, vehicle: FileHost, files: FileTree, *, burst_interval_s: float = 0.005) -> None:
         super().__init__(vehicle, files)
         self.burst_interval_s = burst_interval_s
         self._ports: dict[Channel, _Port] = {}

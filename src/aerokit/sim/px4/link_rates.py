@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import pkgutil
-from collections.abc import Collection, Sequence
+from collections.abc import Container, Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -42,7 +42,7 @@ class LinkRates:
     "normal" is as the simulator's link for ground stations is started: some messages come at ``fast_hz``.
     """
 
-    def __init__(self, modes: Sequence[str], built: Collection[int], fast_hz: float) -> None:
+    def __init__(self, modes: Sequence[str], built: Container[int], fast_hz: float) -> None:
         unknown = sorted(set(modes) - set(LINK_MODES))
         if unknown or not modes:
             raise ValueError(

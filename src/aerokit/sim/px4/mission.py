@@ -43,13 +43,13 @@ class Mission:
 
     def __init__(self, px4: SimulatedPx4) -> None:
         self._px4 = px4
-        self.current = 0
+        self.current: int = 0
         """The item that is flown, or will be."""
-        self.reached = -1
+        self.reached: int = -1
         """The item that was reached last; -1 before the first."""
-        self.is_finished = False
+        self.is_finished: bool = False
         """Whether the last item was done."""
-        self.is_valid = False
+        self.is_valid: bool = False
         """Whether there is a mission, and one that can be flown."""
         self._phase = ""
         self._arrived_at = math.nan
@@ -309,7 +309,8 @@ class Mission:
         """Told at once; of several at the same time only the last."""
         if self.reached == self.current:
             return
-        self.reached, self._repeats = self.current, _REPEATS
+        self.reached = self.current
+        self._repeats = _REPEATS
         if not self._has_news:
             self._has_news = True
             self._px4.call_later(0.0, self._tell_reached)

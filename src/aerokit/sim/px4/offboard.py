@@ -36,7 +36,7 @@ class Offboard:
 
     def __init__(self, vehicle: SimulatedPx4) -> None:
         self._vehicle = vehicle
-        self.updated_at = -math.inf
+        self.updated_at: float = -math.inf
         self._position, self._velocity, self._acceleration = _NAN3, _NAN3, _NAN3
         self._yaw = self._yaw_rate = math.nan
         self._attitude: tuple[float, float, float] | None = None

@@ -21,17 +21,19 @@ class Orbit:
 
     def __init__(self, px4: SimulatedPx4) -> None:
         self._px4 = px4
-        self.middle = (0.0, 0.0)
-        self.down = 0.0
-        self.radius_m = 20.0
-        self.speed_m_s = 1.0
+        self.middle: tuple[float, float] = (0.0, 0.0)
+        self.down: float = 0.0
+        self.radius_m: float = 20.0
+        self.speed_m_s: float = 1.0
 
     def plan(self, radius_m: float, speed_m_s: float, place: tuple[float, float], down: float) -> bool:
         """Take a new circle; False, and the old one stays, when its radius is out of limits."""
         if not _RADII_M[0] <= abs(radius_m) <= _RADII_M[1]:
             return False
-        self.radius_m, self.speed_m_s = radius_m, speed_m_s
-        self.middle, self.down = place, down
+        self.radius_m = radius_m
+        self.speed_m_s = speed_m_s
+        self.middle = place
+        self.down = down
         return True
 
     def update(self) -> None:

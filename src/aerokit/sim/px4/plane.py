@@ -37,8 +37,8 @@ class SimulatedPx4Plane(SimulatedPx4):
     VEHICLE_TYPE: ClassVar[int] = MavType.FIXED_WING
     PARAMETER_TABLE: ClassVar[str] = "airplane"
 
-    flight: PlaneFlight
-    motion: FixedWing
+    flight: PlaneFlight  # pyright: ignore[reportIncompatibleVariableOverride]
+    motion: FixedWing  # pyright: ignore[reportIncompatibleVariableOverride]
 
     @property
     def airspeed_m_s(self) -> float:
@@ -72,5 +72,5 @@ class SimulatedPx4Plane(SimulatedPx4):
         return self.motion.is_at_rest
 
     def _run_motors(self, dt: float) -> None:
-        self.throttle = self.motion.throttle if self.is_armed else 0.0
+        self.throttle: float = self.motion.throttle if self.is_armed else 0.0
         self.battery.drain(self.throttle * _AMPERES_AT_FULL, dt)

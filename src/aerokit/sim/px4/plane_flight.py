@@ -11,6 +11,7 @@ from aerokit.sim.px4.flight import Flight
 from aerokit.sim.px4.modes import LAND, MISSION, OFFBOARD, RTL, STICK_MODES, TAKEOFF, Px4Mode
 
 if TYPE_CHECKING:
+    from aerokit.sim.px4.offboard import Ned
     from aerokit.sim.px4.plane import SimulatedPx4Plane
 
 __all__ = ["PlaneFlight"]
@@ -27,9 +28,9 @@ class PlaneFlight(Flight):
     def __init__(self, plane: SimulatedPx4Plane, motion: FixedWing) -> None:
         super().__init__(plane)
         self._motion = motion
-        self.radius_m = 0.0
+        self.radius_m: float = 0.0
         """Of the circle; negative is anticlockwise."""
-        self.course = 0.0
+        self.course: float = 0.0
         """The climb-out's direction, in radians."""
         self._plane = plane
 
@@ -61,7 +62,7 @@ class PlaneFlight(Flight):
         """Tell the motion what to do until the next tick."""
         plane = self._plane
         mode, mission = plane.mode, plane.mission
-        self.lifts_off = mode == TAKEOFF or (mode == MISSION and mission.wants_up)
+        self.lifts_off: bool = mode == TAKEOFF or (mode == MISSION and mission.wants_up)
         if plane.is_landed and not self.is_rolling:
             return
         if plane.is_landed and not self._motion.is_on_ground:
@@ -161,10 +162,8 @@ class PlaneFlight(Flight):
         elif self._phase == "return":
             descend = plane.parameters["RTL_DESCEND_ALT"]
             self.radius_m = plane.parameters["RTL_LOITER_RAD"]
-            self._phase, self.target = (
-                "loiter",
-                (*self.destination[:2], max(self.target[2], self.destination[2] - descend)),
-            )
+            self._phase = "loiter"
+            self.target: Ned = (*self.destination[:2], max(self.target[2], self.destination[2] - descend))
         elif self._phase == "loiter":
             self._phase = "done" if plane.parameters["RTL_LAND_DELAY"] < 0 else "land"
             done = self._phase == "done"

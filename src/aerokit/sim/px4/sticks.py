@@ -28,8 +28,10 @@ class Sticks:
 
     def __init__(self, px4: SimulatedPx4) -> None:
         self._px4 = px4
-        self.roll = self.pitch = self.yaw = 0.0
-        self.throttle = -1.0
+        self.roll: float = 0.0
+        self.pitch: float = 0.0
+        self.yaw: float = 0.0
+        self.throttle: float = -1.0
         self.channels: tuple[int, ...] = ()
         """What RC_CHANNELS_OVERRIDE said last, in µs."""
         self._at = self._channels_at = -math.inf
@@ -69,7 +71,10 @@ class Sticks:
 
     def _move(self, roll: float, pitch: float, yaw: float, throttle: float) -> None:
         before, were_fresh = (self.roll, self.pitch, self.yaw, self.throttle), self.are_fresh
-        self.roll, self.pitch, self.yaw, self.throttle = roll, pitch, yaw, throttle
+        self.roll = roll
+        self.pitch = pitch
+        self.yaw = yaw
+        self.throttle = throttle
         self._at = self._px4.now
         if were_fresh:
             moved = max(abs(new - old) for new, old in zip((roll, pitch, yaw, throttle), before, strict=True))

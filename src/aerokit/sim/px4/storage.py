@@ -39,14 +39,14 @@ class Storage:
         link_bytes_per_s: float | None,
     ) -> None:
         self._px4 = px4
-        self.files = FileTree()
+        self.files: FileTree = FileTree()
         self._put_logs(logs)
         if parameter_file:
             self.files.mounts["@PARAM"] = Px4ParameterMount(px4.parameters, self._apply)
         errors = not px4.version.startswith("1.16")
-        self.parameters = Px4ParameterServer(px4, px4.parameters, errors=errors)
-        self.ftp = Px4Ftp(px4, self.files)
-        self.logs = Px4LogServer(
+        self.parameters: Px4ParameterServer = Px4ParameterServer(px4, px4.parameters, errors=errors)
+        self.ftp: Px4Ftp = Px4Ftp(px4, self.files)
+        self.logs: Px4LogServer = Px4LogServer(
             px4,
             logs,
             erase_files=self._erase_logs,

@@ -14,12 +14,15 @@ from aerokit.sim.battery import Battery
 from aerokit.sim.commands import Command
 from aerokit.sim.local_frame import GlobalPoint, LocalFrame
 from aerokit.sim.motion import GRAVITY_M_S2, Motion, MotionLimits, Wind
+from aerokit.sim.place import HOME
 from aerokit.sim.px4.arming import Arming
 from aerokit.sim.px4.calibration import Calibration
+from aerokit.sim.px4.camera_trigger import CameraTrigger
 from aerokit.sim.px4.commands import px4_commands, set_mode
 from aerokit.sim.px4.events import Events
 from aerokit.sim.px4.failsafes import Failsafes
 from aerokit.sim.px4.flight import Flight
+from aerokit.sim.px4.gimbal import GIMBAL_BUILDERS, BuiltWithGimbal, Gimbal
 from aerokit.sim.px4.link_rates import LinkRates
 from aerokit.sim.px4.mission import Mission
 from aerokit.sim.px4.mission_server import MissionServer
@@ -50,7 +53,10 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.mavlink.signing import SigningKey
     from aerokit.sim.channel import Channel
+    from aerokit.sim.commands import CommandServer
+    from aerokit.sim.file_tree import FileTree
     from aerokit.sim.logs import SimulatedLog
+    from aerokit.sim.parameters import Parameters
     from aerokit.sim.px4.ftp import Px4Ftp
 
 __all__ = ["SimulatedPx4"]
@@ -73,7 +79,8 @@ class SimulatedPx4(SimulatedAutopilot):
     events of those texts, bytewise parameters with _HASH_CHECK, commands of its own to component 0, pings to
     everybody, the failsafes of battery, ground station, manual control and geofence.
     Not simulated: REQUEST_EVENT, returning by way of a mission (RTL_TYPE 2), estimator failures other than a lost GPS,
-    follow-me, modes of a companion; gimbal and camera are components of their own, and without them nobody answers.
+    follow-me, modes of a companion; the camera is a component of its own, and without it nobody answers. MNT_MODE_IN 4
+    fits a gimbal.
 
     - ``home``: latitude, longitude (degrees), altitude AMSL (m); ``heading_deg``: where its nose points
     - ``boot_time_s``: seconds until it can be armed
@@ -96,7 +103,7 @@ class SimulatedPx4(SimulatedAutopilot):
         self,
         *,
         system_id: int = 1,
-        home: tuple[float, float, float] = (47.3977432, 8.5455939, 489.4),
+        home: tuple[float, float, float] = HOME,
         heading_deg: float = 0.0,
         seed: int = 0,
         boot_time_s: float = 3.5,
@@ -115,7 +122,7 @@ class SimulatedPx4(SimulatedAutopilot):
         unix_time_at_boot: float = 1_790_000_000.0,
         signing_key: SigningKey | None = None,
     ) -> None:
-        self.parameters = px4_parameters(parameter_count, self.PARAMETER_TABLE)
+        self.parameters: Parameters = px4_parameters(parameter_count, self.PARAMETER_TABLE)
         """By name; they survive a reboot."""
         self.parameters["MAV_SYS_ID"] = system_id
         self.parameters.change(parameters or {})
@@ -128,23 +135,27 @@ class SimulatedPx4(SimulatedAutopilot):
             unix_time_at_boot=unix_time_at_boot,
             signing_key=signing_key,
         )
-        self.frame = LocalFrame(GlobalPoint(round(home[0] * 1e7), round(home[1] * 1e7), home[2]))
-        self.battery = Battery(5000.0, cells=4, percent=battery_percent)
-        self.motion = self._make_motion(wind)
+        self.frame: LocalFrame = LocalFrame(GlobalPoint(round(home[0] * 1e7), round(home[1] * 1e7), home[2]))
+        self.battery: Battery = Battery(5000.0, cells=4, percent=battery_percent)
+        self.motion: Motion = self._make_motion(wind)
         self.motion.yaw = math.remainder(math.radians(heading_deg), 2 * math.pi)
         self._boot_time_s = boot_time_s
-        self.rates = LinkRates(link_modes, BUILDERS, fast_rate_hz)
+        self.rates: LinkRates = LinkRates(link_modes, BuiltWithGimbal(self, BUILDERS), fast_rate_hz)
         self.events = Events(self)
         self._next_text_id = 0
         self._pings = 0
-        self.home = (0.0, 0.0, 0.0)
-        self.missions = MissionServer(self)
+        self.home: tuple[float, float, float] = (0.0, 0.0, 0.0)
+        self.missions: MissionServer = MissionServer(self)
         """Mission, fence and rally points; they survive a reboot."""
+        self.camera_trigger: CameraTrigger = CameraTrigger(self)
+        """There while the parameter TRIG_MODE is not 0."""
         self._reset()
         self._listen()
-        self.storage = Storage(self, logs, parameter_file=parameter_file, link_bytes_per_s=link_bytes_per_s)
+        self.storage: Storage = Storage(
+            self, logs, parameter_file=parameter_file, link_bytes_per_s=link_bytes_per_s
+        )
         """Files, logs, and the servers of them and of the parameters."""
-        self.files = self.storage.files
+        self.files: FileTree = self.storage.files
 
     def _make_motion(self, wind: Wind | None) -> Motion:
         limits = MotionLimits(
@@ -159,21 +170,23 @@ class SimulatedPx4(SimulatedAutopilot):
         return Mission(self)
 
     def _reset(self) -> None:
-        self.is_ready = self.is_armed = False
-        self.is_landed = True
+        self.is_ready: bool = False
+        self.is_armed: bool = False
+        self.is_landed: bool = True
         self.mode: Px4Mode = HOLD
         self.intended_mode: Px4Mode = HOLD
-        self.is_in_failsafe = False
-        self.arming, self.calibration = Arming(self), Calibration(self)
-        self.throttle = 0.0
+        self.is_in_failsafe: bool = False
+        self.arming: Arming = Arming(self)
+        self.calibration: Calibration = Calibration(self)
+        self.throttle: float = 0.0
         self.home_is_set_by_hand = False
         self.mode_after_landing: Px4Mode = HOLD
         self._touched_at = math.nan
         self._landed_at = math.nan
         self._has_flown = False
-        self.flight = self._make_flight()
-        self.mission = self._make_mission()
-        self.failsafes = Failsafes(self)
+        self.flight: Flight = self._make_flight()
+        self.mission: Mission = self._make_mission()
+        self.failsafes: Failsafes = Failsafes(self)
         self.missions.reset()
 
     def make_signing(self, key: SigningKey | None, timestamp: int) -> Px4Signing:
@@ -181,8 +194,11 @@ class SimulatedPx4(SimulatedAutopilot):
         return Px4Signing(self, key, timestamp)
 
     def _listen(self) -> None:
-        self.offboard, self.sticks = Offboard(self), Sticks(self)
-        self.commands = self.serve_commands(px4_commands(self))
+        self.offboard: Offboard = Offboard(self)
+        self.sticks: Sticks = Sticks(self)
+        self.gimbal: Gimbal = Gimbal(self)
+        """On its AUX outputs, if MNT_MODE_IN fits one."""
+        self.commands: CommandServer = self.serve_commands(px4_commands(self))
         self.on(m.SetMode, self._on_set_mode)
         self.listen_to_clocks()
         self.missions.listen()
@@ -225,6 +241,8 @@ class SimulatedPx4(SimulatedAutopilot):
     def boot(self) -> None:
         """Start up."""
         self.storage.restart()
+        self.camera_trigger.restart()
+        self.gimbal.start()
         self.call_later(0.3 * self._boot_time_s, self._warn_while_booting)
         self.mission.start()
         self.failsafes.listen()
@@ -256,7 +274,7 @@ class SimulatedPx4(SimulatedAutopilot):
 
     def build(self, message_id: int) -> Message | None:
         """What is to be streamed now."""
-        builder = BUILDERS.get(message_id)
+        builder = BUILDERS.get(message_id) or GIMBAL_BUILDERS.get(message_id)
         return None if builder is None else builder(self)
 
     def send_text(self, severity: int, text: str) -> None:
@@ -282,7 +300,9 @@ class SimulatedPx4(SimulatedAutopilot):
 
     def disarmed(self) -> None:
         """It was disarmed just now."""
-        self.is_armed, self.throttle, self.is_in_failsafe = False, 0.0, False
+        self.is_armed = False
+        self.throttle = 0.0
+        self.is_in_failsafe = False
 
     def terminate(self) -> None:
         """Stop the motors for good."""
@@ -379,7 +399,8 @@ class SimulatedPx4(SimulatedAutopilot):
         elif math.isnan(self._touched_at):
             self._touched_at = self.now
         elif self.now - self._touched_at >= _LAND_DETECTOR_S or not self.is_armed:
-            self.is_landed, self._landed_at = True, self.now
+            self.is_landed = True
+            self._landed_at = self.now
             self.motion.settle()
             self.info("Landing detected")
             self.mission.landed()

@@ -44,7 +44,7 @@ class FileChannel:
     def __init__(self, transfers: Transfers) -> None:
         connection = transfers.connection
         self.transfers = transfers
-        self.client = FtpClient(
+        self.client: FtpClient = FtpClient(
             transfers.system_id,
             transfers.component_id,
             source_system=connection.source_system,

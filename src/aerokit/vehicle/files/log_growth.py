@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 __all__ = ["GrowthWatch"]
 
-logger = logging.getLogger("aerokit")
+logger: logging.Logger = logging.getLogger("aerokit")
 
 
 class GrowthWatch:

@@ -21,7 +21,7 @@ class PartFile:
 
     def __init__(self, to: str | os.PathLike[str], mark: str = "") -> None:
         self._to = os.fspath(to)
-        self.path = Path(f"{self._to}{mark}.part")
+        self.path: Path = Path(f"{self._to}{mark}.part")
         """Where it is meanwhile."""
 
     @property

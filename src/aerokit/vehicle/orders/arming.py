@@ -39,7 +39,7 @@ REBOOT_ANSWER_S = 3.0
 READY_IN_MODE_S = 3.0
 """How long a vehicle that was put into another mode may take to be ready in it."""
 
-logger = logging.getLogger("aerokit")
+logger: logging.Logger = logging.getLogger("aerokit")
 
 
 @checks_arguments

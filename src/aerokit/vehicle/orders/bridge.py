@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from typing import TYPE_CHECKING
 
 from aerokit.vehicle.orders.health import Health
 from aerokit.vehicle.orders.helm import Helm
 from aerokit.vehicle.orders.holding import Holding
 from aerokit.vehicle.orders.late_arming import LateArming
+from aerokit.vehicle.orders.newest import Newest
 from aerokit.vehicle.orders.orders import Orders
+from aerokit.vehicle.orders.subjects import Subject
 from aerokit.vehicle.orders.whereabouts import Whereabouts
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from aerokit.vehicle.talk.talk import Talk
 
 __all__ = ["Bridge"]
@@ -22,16 +27,24 @@ class Bridge:
 
     def __init__(self, talk: Talk) -> None:
         self.talk = talk
-        self.helm = Helm(talk.connection.now, talk.telemetry)
-        self.orders = Orders(talk, self.helm)
-        self.holding = Holding(talk, self.helm, self.orders)
-        self.late_arming = LateArming(talk, self.helm, self.orders)
-        self.health = Health(talk)
-        self.where = Whereabouts(talk)
+        self.helm: Helm = Helm(talk.connection.now, talk.telemetry)
+        self.orders: Orders = Orders(talk, self.helm)
+        self.holding: Holding = Holding(talk, self.helm, self.orders)
+        self.late_arming: LateArming = LateArming(talk, self.helm, self.orders)
+        self.health: Health = Health(talk)
+        self.where: Whereabouts = Whereabouts(talk)
+        self.looking: Newest = Newest(self.helm)
+        """What the autopilot's gimbal, or its nose, looks at."""
+        self.subjects: defaultdict[tuple[int, int, str], Subject] = defaultdict(Subject)
+        """What orders to cameras are about: component id, device there, and the name of it."""
+        self.on_finish: list[Callable[[], None]] = []
+        """What is to be sent when the vehicle's block ends, without waiting."""
         talk.on_reboot.append(self.helm.note_reboot)
 
     async def finish(self) -> bool:
         """At the end of everything: what was given up is told to hold, as far as that can be; whether there was any."""
+        for each in tuple(self.on_finish):
+            each()
         self.holding.end_flights()
         is_given_up = self.holding.is_told_to_hold
         await self.holding.finish()

@@ -75,9 +75,11 @@ class FlightActions(Part):
         if not self.telemetry.is_armed:
             raise OperationRejected("take_off: the vehicle is not armed: arm() comes first; nothing was sent")
         landed = self.telemetry.landed_state
-        if landed.latest == MavLandedState.IN_AIR and landed.age <= OLD_POSITION_S:
+        flies = landed.latest in (MavLandedState.IN_AIR, MavLandedState.LANDING)
+        if flies and landed.age <= OLD_POSITION_S:  # its mode alone would end a landing
             raise OperationRejected(
-                "take_off: the vehicle flies already: go_to() climbs too; nothing was sent"
+                f"take_off: the vehicle flies already ({IN_THE_AIR[landed.latest]}): go_to() climbs too;"
+                " nothing was sent"
             )
         modes = (
             plan.mode,

@@ -35,15 +35,17 @@ class Helm:
     disarms: that is for good, also if the mode comes back.
     """
 
+    arming_orders: int
+
     def __init__(self, now: Callable[[], float], telemetry: Telemetry) -> None:
         self._now, self._telemetry = now, telemetry
         self.newest: Order | None = None
         """The last order that steers."""
         self.arming_orders = 0
         """How many orders to arm or disarm were sent."""
-        self.mode_is_in_doubt = False
+        self.mode_is_in_doubt: bool = False
         """An order that changes the mode is out and its end is not known: the mode told may be about to change."""
-        self.mode_settles_at = -math.inf
+        self.mode_settles_at: float = -math.inf
         """Until then HEARTBEAT may tell the mode of an order that was given up."""
         self._any_mode_until = -math.inf
         self._orders: list[Order] = []

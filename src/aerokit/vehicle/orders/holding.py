@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Holding"]
 
-logger = logging.getLogger("aerokit")
+logger: logging.Logger = logging.getLogger("aerokit")
 
 HOLD_AT_END_S = 1.5
 """How long the end of a block waits for the answer to an order to hold."""

@@ -26,7 +26,7 @@ ARMING_AT_END_S = 1.5
 """How long the end of a block waits for it."""
 FORCE = 21196
 
-logger = logging.getLogger("aerokit")
+logger: logging.Logger = logging.getLogger("aerokit")
 
 
 async def give_arm(talk: Talk, orders: Orders, order: Order, armed: bool, *, force: bool = False) -> None:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Leftover"]
 
-logger = logging.getLogger("aerokit")
+logger: logging.Logger = logging.getLogger("aerokit")
 
 
 class Leftover:

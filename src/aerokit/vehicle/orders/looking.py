@@ -25,8 +25,6 @@ LOCATION = MavCmd.DO_SET_ROI_LOCATION
 class LookActions(Part):
     """Nose or gimbal at a place: of two orders the newer one counts."""
 
-    _looking: Order | None = None
-
     async def look_at(self, target: Position) -> None:
         """Make nose or gimbal point at a place, until :meth:`stop_looking`; without an altitude, at its own.
 
@@ -72,10 +70,8 @@ class LookActions(Part):
 
     @contextmanager
     def _newest(self) -> Iterator[Order]:
-        if self._looking is not None:
-            self._looking.note_newer()
-        with self._helm.aside() as self._looking:
-            yield self._looking
+        with self._bridge.looking.begin().order() as order:
+            yield order
 
     @staticmethod
     def _raise_if_overruled(order: Order) -> None:

@@ -110,8 +110,8 @@ class Order:
         any_until: float = -math.inf,
     ) -> None:
         self.given_at = given_at
-        self.modes = tuple(modes)
-        self.taken_by = ""
+        self.modes: tuple[Mode, ...] = tuple(modes)
+        self.taken_by: str = ""
         """What somebody else has done, as a clause; empty: nothing that was told."""
         self.is_given = False
         """Whether the vehicle may move by it, or moves by what the program had ordered before: given up, it is held."""
@@ -178,7 +178,7 @@ class Sending:
         is_done: Callable[[], bool] = lambda: False,
     ) -> None:
         self.order = order
-        self.told_at = -math.inf
+        self.told_at: float = -math.inf
         """When HEARTBEAT came last."""
         self._was_told = False
         is_there = None if mode_now is None else mode_now.custom_mode

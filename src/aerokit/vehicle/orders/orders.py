@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from aerokit.errors import CommandRejected, CommandTimeout, NotSupported, OperationRejected
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.vehicle.orders.helm import KNOWN_S, MODE_GRACE_S
-from aerokit.vehicle.orders.order import CHANGED_BY_COMMAND
+from aerokit.vehicle.orders.order import CHANGED_BY_COMMAND, QUESTIONS
 from aerokit.vehicle.orders.progress import await_progress
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
+    from collections.abc import Awaitable, Callable, Iterator
 
     from aerokit.autopilots import Mode, Purpose
     from aerokit.mavlink.messages import CommandAck
@@ -173,3 +174,34 @@ class Orders:
         """A command that changes something and does not steer."""
         with self._helm.aside() as order:
             await self.give(order, self._talk.commands.send_long, command, *params)
+
+    # ------------------------------------------------------------------------ the program's own
+
+    async def answered(
+        self,
+        send: Callable[..., Awaitable[CommandAck]],
+        command: int,
+        *params: float,
+        **options: Any,
+    ) -> CommandAck:
+        """Any command that the program itself sends; ``send`` is one of the command sender's."""
+        started = self._talk.connection.now()
+        try:
+            if command in QUESTIONS:
+                return await send(command, *params, **options)
+            with self._own_order(command) as order:
+                armed = params[0] == 1 if command == MavCmd.COMPONENT_ARM_DISARM and params else None
+                with self._helm.sending(order, armed=armed) as sending:
+                    return await send(command, *params, standing=sending, **options)
+        except CommandRejected as error:
+            await self._talk.settle()
+            raise self._talk.explained(error, started) from None
+
+    @contextmanager
+    def _own_order(self, command: int) -> Iterator[Order]:
+        """A program that steers past the actions gives a new order, which ends theirs."""
+        if command in CHANGED_BY_COMMAND:
+            yield self._helm.order_of_the_programs_own(CHANGED_BY_COMMAND[command])
+        else:
+            with self._helm.aside() as order:
+                yield order

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from aerokit.runtime.connection import Connection
     from aerokit.runtime.events import LinkReport
     from aerokit.vehicle.orders.bridge import Bridge
+    from aerokit.vehicle.state.telemetry import Telemetry
 
 __all__ = ["Part"]
 
@@ -31,7 +32,7 @@ class Part(States):
         """MAV_TYPE of the first heartbeat (https://mavlink.io/en/messages/minimal.html#MAV_TYPE)."""
         self.autopilot: Autopilot = talk.autopilot
         """What differs between ArduPilot, PX4 and others."""
-        self.telemetry = talk.telemetry
+        self.telemetry: Telemetry = talk.telemetry
         """The state cells; most are properties of the vehicle too."""
         self.link_quality: StateCell[LinkReport] = talk.link_quality
         """Loss, delay and rates of the last second."""

@@ -35,12 +35,12 @@ class Posted:
         armed_now: bool | None,
         moves: bool = False,
     ) -> None:
-        self.has_worked = False
+        self.has_worked: bool = False
         """Whether HEARTBEAT has told its effect."""
-        self.told_at = -math.inf
+        self.told_at: float = -math.inf
         """When HEARTBEAT came last."""
         self._is_newest, self._taken_by = is_newest, ""
-        self.modes = tuple(modes)
+        self.modes: tuple[Mode, ...] = tuple(modes)
         """Those that it brings about."""
         self.armed = armed
         """Whether it arms or disarms."""

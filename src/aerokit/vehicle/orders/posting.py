@@ -10,9 +10,7 @@ import anyio
 from aerokit.arguments import checks_arguments
 from aerokit.errors import CommandRejected, CommandTimeout, LocalProtocolError, OperationTimeout
 from aerokit.mavlink.enums import MavCmd, MavResult
-from aerokit.mavlink.messages import SetMode
 from aerokit.protocols.command import command_name, rejection
-from aerokit.vehicle.orders.helm import KNOWN_S
 from aerokit.vehicle.orders.progress import Arrivals
 
 if TYPE_CHECKING:
@@ -22,6 +20,7 @@ if TYPE_CHECKING:
 
     from aerokit.autopilots import Mode
     from aerokit.mavlink.messages import CommandAck
+    from aerokit.vehicle.orders.helm import Helm
     from aerokit.vehicle.orders.posted import Posted
     from aerokit.vehicle.talk.talk import Talk
 
@@ -35,8 +34,8 @@ MODE_ATTEMPTS, ASK_AGAIN_S = 4, 0.5
 class PostedOrder:
     """An order that others may follow before it is answered; made by :meth:`aerokit.Vehicle.posted`."""
 
-    def __init__(self, talk: Talk, posted: Posted) -> None:
-        self._talk, self._posted = talk, posted
+    def __init__(self, talk: Talk, helm: Helm, posted: Posted) -> None:
+        self._talk, self._helm, self._posted = talk, helm, posted
         self._ends = ExitStack()
         self._started = talk.connection.now()
         self._refusals: list[CommandAck] = []
@@ -130,27 +129,24 @@ class PostedOrder:
             Arrivals(self._talk, self._talk.telemetry.armed, every_arrival=True) as news,
             anyio.move_on_after(timeout),
         ):
-            while self._posted.told_at <= answered_at or not self._is_heard:
+            while self._posted.told_at <= answered_at or not self._helm.is_known:
                 await news.next(LOOK_S)
             return not (self.end or self._is_over)
         return False
 
-    @property
-    def _is_heard(self) -> bool:
-        return self._talk.telemetry.armed.age <= KNOWN_S
-
     async def _request_mode(self, mode: Mode, component_id: int | None) -> None:
         talk = self._talk
-        params = (mode.base_mode, *talk.autopilot.mode_order(mode).params[1:])
+        order = talk.autopilot.mode_order(mode).replace(base_mode=mode.base_mode)
+        params = (order.base_mode, *order.params[1:])
         try:
             await self.command(MavCmd.DO_SET_MODE, *params, component_id=component_id)
         except CommandRejected as error:
             if error.result != MavResult.UNSUPPORTED or (self.end and not talk.telemetry.is_in(mode)):
                 raise
             if not self.end:
-                if self._is_over or not self._is_heard:
+                if self._is_over or not self._helm.is_known:
                     raise
-                talk.send(SetMode(talk.system_id, mode.base_mode, mode.custom_mode))
+                talk.send(order.legacy(talk.system_id))
 
     async def until_told(self, timeout: float) -> None:
         """Wait until HEARTBEAT tells the order's effect, or that it was there before.

@@ -107,8 +107,8 @@ class Stillness:
     Nothing is said while its position is not heard, nor before ``STILL_S`` seconds: it turns first, or spools up.
     """
 
-    _since: float
     # together with _from
+    _since: float
 
     def __init__(self, talk: Talk) -> None:
         self._talk = talk

@@ -2,32 +2,27 @@
 
 from __future__ import annotations
 
-import math
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from aerokit.arguments import checks_arguments
-from aerokit.errors import CommandRejected, LocalProtocolError
-from aerokit.mavlink.enums import MavCmd, MavFrame
+from aerokit.errors import LocalProtocolError
+from aerokit.mavlink.enums import MavFrame
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import CommandAck, CommandInt, CommandLong, SetMode
-from aerokit.runtime.cells import Source, StateCell
+from aerokit.runtime.cells import StateCell
 from aerokit.runtime.subscription import Overflow, Subscription
-from aerokit.vehicle.orders.order import CHANGED_BY_COMMAND, QUESTIONS, Subject, subjects_of
+from aerokit.vehicle.orders.order import Subject, subjects_of
 from aerokit.vehicle.orders.part import Part
 from aerokit.vehicle.orders.posting import PostedOrder
 from aerokit.vehicle.talk.every_stream import every_stream
-from aerokit.vehicle.talk.rates import check_rate, subscription_rate_hz
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterator
+    from collections.abc import Callable, Iterator
 
     from aerokit.autopilots import Mode
-    from aerokit.runtime.bus import Detach, Sink
     from aerokit.runtime.events import Event
     from aerokit.runtime.link_state import LinkState
-    from aerokit.vehicle.orders.bridge import Bridge
-    from aerokit.vehicle.orders.order import Order
 
 __all__ = ["TalkActions"]
 
@@ -40,11 +35,6 @@ MessageT = TypeVar("MessageT", bound=Message)
 @checks_arguments
 class TalkActions(Part):
     """Commands, messages, subscriptions; what is known of the vehicle beside its cells."""
-
-    def __init__(self, bridge: Bridge) -> None:
-        super().__init__(bridge)
-        self._messages: dict[type[Message], StateCell[Any]] = {}
-        self._message_rates: dict[type[Message], Detach] = {}
 
     # ---------------------------------------------------------------------------- commands
 
@@ -78,7 +68,7 @@ class TalkActions(Part):
             CommandRejected: any other result; ``reasons`` has the status texts seen meanwhile.
             CommandTimeout: no ack; the text names attempts, seconds, the last heartbeat and the loss.
         """
-        return await self._answered(
+        return await self._orders.answered(
             self._talk.commands.send_long,
             command,
             *params,
@@ -113,7 +103,7 @@ class TalkActions(Part):
         if or_long and frame != MavFrame.GLOBAL:
             raise LocalProtocolError(f"frame = {frame} is not allowed with or_long: MAV_FRAME_GLOBAL (0)")
         kind = {} if or_long else {"frame": frame}
-        return await self._answered(
+        return await self._orders.answered(
             self._talk.commands.send_place if or_long else self._talk.commands.send_int,
             command,
             *params,
@@ -177,7 +167,7 @@ class TalkActions(Part):
             raise LocalProtocolError("posted: an order about arm needs armed=True or armed=False")
         with (
             self._helm.posting(subjects, modes=modes, armed=armed) as posted,
-            PostedOrder(self._talk, posted) as order,
+            PostedOrder(self._talk, self._helm, posted) as order,
         ):
             yield order
 
@@ -194,30 +184,15 @@ class TalkActions(Part):
 
         ``capacity=1`` gives the latest only, ``missed`` counts the others.
 
-        Subscribing is the rate request: while the block lasts, the vehicle is asked to send these messages at
+        Subscribing is the rate request: while the block lasts, the autopilot is asked to send these messages at
         ``rate_hz`` (above 0, at most 1000), or faster if others want it. None means the default rate of a message that
-        comes in a stream; one that is sent when there is need (HEARTBEAT, STATUSTEXT, acks) is not asked for.
+        comes in a stream; one that is sent when there is need (HEARTBEAT, STATUSTEXT, acks) is not asked for. What a
+        camera or another component is to be asked for: ``vehicle.component(100).subscribe(...)``.
 
         Raises:
             LocalProtocolError: no type, a rate out of range, or a message that the dialect does not hold.
         """
-        self.connection.check_types(types)
-        messages: list[type[Message]] = [each for each in types if issubclass(each, Message)]
-        if rate_hz is not None:
-            for message in messages:
-                check_rate(message, rate_hz)
-
-        def attach(sink: Sink) -> list[Detach]:
-            detach = self.connection.attach(types, sink, system_id=self.system_id)
-            detach.append(self.connection.on_end(subscription.close))
-            for each in messages:
-                hz = subscription_rate_hz(each) if rate_hz is None else rate_hz
-                if hz is not None:
-                    detach.append(self._talk.rates.want(each, hz))
-            return detach
-
-        subscription: Subscription[ItemT] = Subscription(attach, capacity=capacity, overflow=overflow)
-        return subscription
+        return self._talk.hearing.subscribe(types, capacity, overflow, rate_hz, whole_system=True)
 
     @contextmanager
     def rate(self, message_type: type[Message], rate_hz: float) -> Iterator[None]:
@@ -250,40 +225,13 @@ class TalkActions(Part):
 
         The first call registers it, and has the vehicle send it at ``rate_hz`` (None: the default rate of a message
         that comes in a stream) for as long as the vehicle object lives; later calls give the same cell, and may change
-        the rate. Only messages of the autopilot count.
+        the rate. Only messages of the autopilot count; those of a camera or another component are in
+        ``vehicle.component(100).message(...)``.
 
         Raises:
             LocalProtocolError: the rate is out of range, or the dialect does not hold the message.
         """
-        cell = self._messages.get(message_type)
-        if cell is None:
-            self.connection.check_types((message_type,))
-            cell = self._messages[message_type] = self._message_cell(message_type)
-            self._talk.keep(cell)
-            rate_hz = subscription_rate_hz(message_type) if rate_hz is None else rate_hz
-        if rate_hz is not None:
-            release = self._message_rates.pop(message_type, None)
-            self._message_rates[message_type] = self._talk.rates.want(message_type, rate_hz)
-            if release is not None:
-                release()
-        return cell
-
-    def _message_cell(self, message_type: type[Message]) -> StateCell[Any]:
-        arrived_at = math.nan
-        cell: StateCell[Any] = StateCell(
-            message_type.NAME, self.connection.now, message_type.NAME, stamp=lambda: arrived_at
-        )
-        source = Source(self.system_id, self.component_id, message_type.NAME)
-
-        def take(message: Message) -> None:
-            nonlocal arrived_at
-            frame = message.received_frame
-            if frame is not None and self.telemetry.accepts(frame):
-                arrived_at = frame.received_at
-                cell.set(message, source)
-
-        self._talk.at_close(self.connection.bus.attach(message_type, take, system_id=self.system_id))
-        return cell
+        return self._talk.hearing.cell(message_type, rate_hz)
 
     @property
     def mode_name(self) -> str:
@@ -331,34 +279,3 @@ class TalkActions(Part):
     def texts_since(self, at: float) -> tuple[str, ...]:
         """What the vehicle said (STATUSTEXT) since this time on the loop's clock, oldest first."""
         return self._talk.texts_since(at)
-
-    # ------------------------------------------------------------------------------ inside
-
-    async def _answered(
-        self,
-        send: Callable[..., Awaitable[CommandAck]],
-        command: int,
-        *params: float,
-        **options: Any,
-    ) -> CommandAck:
-        """What the commands of the program itself have in common; ``send`` is one of the command sender's."""
-        started = self.connection.now()
-        try:
-            if command in QUESTIONS:
-                return await send(command, *params, **options)
-            with self._own_order(command) as order:
-                armed = params[0] == 1 if command == MavCmd.COMPONENT_ARM_DISARM and params else None
-                with self._helm.sending(order, armed=armed) as sending:
-                    return await send(command, *params, standing=sending, **options)
-        except CommandRejected as error:
-            await self._talk.settle()
-            raise self._talk.explained(error, started) from None
-
-    @contextmanager
-    def _own_order(self, command: int) -> Iterator[Order]:
-        """A program that steers past the actions gives a new order, which ends theirs."""
-        if command in CHANGED_BY_COMMAND:
-            yield self._helm.order_of_the_programs_own(CHANGED_BY_COMMAND[command])
-        else:
-            with self._helm.aside() as order:
-                yield order

@@ -58,7 +58,7 @@ class ParameterAccess:
 
     def __init__(self, transfers: Transfers, files: Files) -> None:
         self._transfers, self._files = transfers, files
-        self.store = ParameterStore(transfers)
+        self.store: ParameterStore = ParameterStore(transfers)
         self._downloading = asyncio.Lock()
         self._writing = asyncio.Lock()
         self._has_pack: bool | None = None

@@ -40,7 +40,7 @@ class ParameterCache:
     """The lists of vehicles in one directory. A file that cannot be read or written is as none."""
 
     def __init__(self, directory: str | os.PathLike[str] | None = None) -> None:
-        self.directory = default_directory() if directory is None else Path(directory)
+        self.directory: Path = default_directory() if directory is None else Path(directory)
 
     def load(self, vehicle: str, hash_: int) -> ParameterTable | None:
         """The list of this vehicle, if the one on disk has this hash."""

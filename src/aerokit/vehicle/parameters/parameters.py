@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from aerokit.protocols.parameter_requests import Answer
     from aerokit.protocols.transfer import OnProgress
     from aerokit.vehicle.files.files import Files
-    from aerokit.vehicle.talk.talk import Talk
+    from aerokit.vehicle.talk.transfers import Talking
 
 __all__ = ["Outcome", "ParameterWrite", "Parameters", "Transaction"]
 
@@ -47,7 +47,7 @@ class Parameters:
     then OperationTimeout). Each can be cancelled at any moment.
     """
 
-    def __init__(self, talk: Talk, files: Files) -> None:
+    def __init__(self, talk: Talking, files: Files) -> None:
         self._transfers = transfers = talk.transfers
         self._access = ParameterAccess(transfers, files)
         talk.at_close(self._access.store.attach())

@@ -25,11 +25,13 @@ UNDER_WAY_S = 1.0
 class ParameterStore:
     """Name → parameter. Publishes :class:`ParameterChanged` when a value that was known becomes another one."""
 
+    updates: int
+
     def __init__(self, transfers: Transfers) -> None:
         self._transfers = transfers
         self._known: dict[str, Parameter] = {}
         self._table: ParameterTable | None = ParameterTable()
-        self.is_complete = False
+        self.is_complete: bool = False
         """Whether the whole list has come since the vehicle started."""
         self.updates = 0
         """Counts the values that have come in messages."""
@@ -97,7 +99,8 @@ class ParameterStore:
             self._known[name] = parameter
         for name in newer - self._known.keys():
             self._known[name] = before[name]
-        self._table, self.is_complete = None, True
+        self._table = None
+        self.is_complete = True
         for name, parameter in self._known.items():
             self._publish(before.get(name), parameter)
 
@@ -126,6 +129,11 @@ class ParameterStore:
         transfers = self._transfers
         transfers.connection.bus.publish(
             ParameterChanged(
-                transfers.connection.now(), transfers.system_id, after.name, before.value, after.value
+                transfers.connection.now(),
+                transfers.system_id,
+                after.name,
+                before.value,
+                after.value,
+                transfers.component_id,
             )
         )

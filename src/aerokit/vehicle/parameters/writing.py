@@ -42,7 +42,9 @@ class ParameterWriting:
     """Sets what programs ask for, and says what came of it."""
 
     def __init__(self, access: ParameterAccess, names: ParameterNames, note_of: NoteOf) -> None:
-        self._access, self.names, self._note_of = access, names, note_of
+        self._access = access
+        self.names: ParameterNames = names
+        self._note_of = note_of
 
     async def write(
         self,

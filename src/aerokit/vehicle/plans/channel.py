@@ -43,7 +43,7 @@ class PlanChannel:
         self._path = PACKED_NAMES[mission_type]
         self._has_changed = False
         """Whether something of ours may be among what the vehicle holds."""
-        self.is_single_precision = False
+        self.is_single_precision: bool = False
         """Whether places go through 32-bit floats: the vehicle knows no MISSION_ITEM_INT."""
 
     # ------------------------------------------------------------------------------- one by one

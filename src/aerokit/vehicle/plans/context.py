@@ -14,11 +14,14 @@ from aerokit.vehicle.plans.mission_watch import MissionWatch
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from aerokit.autopilots.base import Autopilot
     from aerokit.mavlink.frame import Frame
     from aerokit.missions.item import MissionItem
     from aerokit.position import Position
     from aerokit.protocols.transfer import OnProgress
     from aerokit.vehicle.orders.bridge import Bridge
+    from aerokit.vehicle.talk.talk import Talk
+    from aerokit.vehicle.talk.transfers import Transfers
 
 __all__ = ["PlanContext", "PlanFiles", "PlanMemory"]
 
@@ -44,7 +47,7 @@ class PlanMemory:
 
     def __init__(self) -> None:
         self.items: tuple[MissionItem, ...] | None = None
-        self.learned_at = -math.inf
+        self.learned_at: float = -math.inf
         self.has_file: bool | None = None
         """Whether the vehicle has a file of it; None: not tried yet."""
 
@@ -54,7 +57,8 @@ class PlanMemory:
 
     def forget(self, now: float) -> None:
         """The vehicle may hold anything from now on."""
-        self.items, self.learned_at = None, now
+        self.items = None
+        self.learned_at = now
 
 
 class PlanContext:
@@ -65,18 +69,20 @@ class PlanContext:
     """
 
     def __init__(self, bridge: Bridge, files: Callable[[], PlanFiles]) -> None:
-        self.bridge, self.talk, self.files = bridge, bridge.talk, files
-        self.transfers = bridge.talk.transfers
-        self.autopilot = bridge.talk.autopilot
-        self.lock = asyncio.Lock()
-        self.memories = (PlanMemory(), PlanMemory(), PlanMemory())
+        self.bridge: Bridge = bridge
+        self.talk: Talk = bridge.talk
+        self.files: Callable[[], PlanFiles] = files
+        self.transfers: Transfers = bridge.talk.transfers
+        self.autopilot: Autopilot = bridge.talk.autopilot
+        self.lock: asyncio.Lock = asyncio.Lock()
+        self.memories: tuple[PlanMemory, PlanMemory, PlanMemory] = (PlanMemory(), PlanMemory(), PlanMemory())
         """By MAV_MISSION_TYPE."""
         self._current: Frame | None = None
         talk = bridge.talk
         talk.at_close(
             talk.connection.bus.attach_frames(MissionCurrent, self._note_current, system_id=talk.system_id)
         )
-        self.watch = MissionWatch(talk)
+        self.watch: MissionWatch = MissionWatch(talk)
 
     def now(self) -> float:
         """Seconds on the loop's clock."""

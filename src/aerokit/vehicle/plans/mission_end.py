@@ -45,7 +45,7 @@ class MissionEnd:
         last = items[-1].command if items else None
         self._ends_by_landing = last in LANDINGS
         self._stays_up = last == MavCmd.NAV_RETURN_TO_LAUNCH and not talk.autopilot.lands_after_return
-        self._complete_since: float | None = None
+        self._returns_since: float | None = None
         self._landing_modes = tuple(
             talk.autopilot.mode_for(purpose, is_vtol=talk.telemetry.is_vtol) for purpose in ("return", "land")
         )
@@ -56,8 +56,11 @@ class MissionEnd:
     def is_reached(self) -> bool:
         """Whether it is over."""
         if self._watch.is_complete:
-            return not self._ends_by_landing or self._is_down or (self._stays_up and self._is_back)
-        self._complete_since = None
+            at_home = self._stays_up and (self._talk.autopilot.completes_at_home or self._is_back)
+            return not self._ends_by_landing or self._is_down or at_home
+        if self._stays_up and self._is_landing:  # ArduPlane returns in another mode, and its mission stops
+            return self._is_down or self._is_back
+        self._returns_since = None
         if self._talk.telemetry.is_surely_disarmed and self._is_landing:
             return True
         progress = self._watch.progress.latest
@@ -105,16 +108,14 @@ class MissionEnd:
     def _is_back(self) -> bool:
         """At home, or wherever else it has gone to in ``BACK_AT_LAST_S`` seconds."""
         talk, now = self._talk, self._talk.connection.now()
-        if talk.autopilot.completes_at_home:
-            return True
-        if self._complete_since is None:
-            self._complete_since = now
+        if self._returns_since is None:
+            self._returns_since = now
         home = talk.telemetry.home.latest
         place = None if home is None else Position(home.latitude_deg, home.longitude_deg)
         is_near = (
             place is not None and self._bridge.where.distance_to(place) <= talk.autopilot.arrival_radius_m
         )
-        return is_near or now - self._complete_since > BACK_AT_LAST_S
+        return is_near or now - self._returns_since > BACK_AT_LAST_S
 
     @property
     def _is_down(self) -> bool:

@@ -43,7 +43,7 @@ class MissionWatch:
         self.progress: StateCell[MissionProgress] = StateCell("mission.progress", now, "MISSION_CURRENT")
         self.reached: int | None = None
         """The item that was reached last."""
-        self.is_complete = False
+        self.is_complete: bool = False
         """Whether the mission that was flown last came to its end."""
         self._reached_at = self._at_last_at = -math.inf
         self._may_repeat = False

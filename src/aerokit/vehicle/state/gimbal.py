@@ -22,7 +22,8 @@ STRAIGHT = 0.99999
 
 class GimbalAttitude(Snapshot):
     """Where it points, in degrees, None for what is not told: ``pitch_deg`` (0 level, −90 straight down) and
-    ``roll_deg`` from the horizon, ``yaw_deg`` 0 to 360 clockwise from north.
+    ``roll_deg`` from the horizon, ``yaw_deg`` 0 to 360 clockwise from north, ``yaw_from_nose_deg`` −180 to 180
+    clockwise from the vehicle's nose.
 
     While the vehicle's heading is not known, the yaw of a gimbal that tells it so is from the nose; of MOUNT_STATUS
     (ArduPilot before 4.3) it is that number, whatever it counts from.
@@ -31,6 +32,7 @@ class GimbalAttitude(Snapshot):
     pitch_deg: float | None
     roll_deg: float | None
     yaw_deg: float | None
+    yaw_from_nose_deg: float | None = None
 
 
 def from_status(message: MountStatus) -> GimbalAttitude:
@@ -49,7 +51,7 @@ def from_orientation(message: MountOrientation, heading: float | None) -> Gimbal
         yaw = _compass(message.yaw + heading)
     else:
         yaw = _known(message.yaw)
-    return GimbalAttitude(_known(message.pitch), _known(message.roll), yaw)
+    return GimbalAttitude(_known(message.pitch), _known(message.roll), yaw, _turned(message.yaw))
 
 
 def from_device(message: GimbalDeviceAttitudeStatus, heading: float | None) -> GimbalAttitude:
@@ -59,15 +61,18 @@ def from_device(message: GimbalDeviceAttitudeStatus, heading: float | None) -> G
     tell what is in between; while neither is known, yaw is from the nose.
     """
     pitch, roll, yaw = _euler(message.q)
-    if _is_from_nose(message.flags):
-        delta = message.delta_yaw if message.flags & YAW_IN_VEHICLE_FRAME else 0.0
-        if delta and math.isfinite(delta):  # 0 is also what PX4 says when it does not know
-            yaw += math.degrees(delta)
-        elif heading is not None:
-            yaw += heading
-        else:
-            return GimbalAttitude(_known(pitch), _known(roll), _known(yaw))
-    return GimbalAttitude(_known(pitch), _known(roll), _compass(yaw))
+    tells_delta = message.flags & (YAW_IN_VEHICLE_FRAME | YAW_IN_EARTH_FRAME) and math.isfinite(
+        message.delta_yaw
+    )
+    if tells_delta and message.delta_yaw:  # 0 is also what PX4 says when it does not know
+        nose: float | None = math.degrees(message.delta_yaw)
+    else:
+        nose = heading
+    angles = (_known(pitch), _known(roll))
+    if not _is_from_nose(message.flags):
+        return GimbalAttitude(*angles, _compass(yaw), None if nose is None else _turned(yaw - nose))
+    from_north = _known(yaw) if nose is None else _compass(yaw + nose)
+    return GimbalAttitude(*angles, from_north, _turned(yaw))
 
 
 def _is_from_nose(flags: int) -> bool:
@@ -97,6 +102,10 @@ def _euler(q: tuple[float, ...]) -> tuple[float, float, float]:
 def _known(degrees: float) -> float | None:
     """To hundredths, as MOUNT_STATUS has them: the noise of 32 bits is not worth showing."""
     return round(degrees, 2) + 0.0 if math.isfinite(degrees) else None
+
+
+def _turned(degrees: float) -> float | None:
+    return round(math.remainder(degrees, 360.0), 2) + 0.0 if math.isfinite(degrees) else None
 
 
 def _compass(degrees: float) -> float | None:

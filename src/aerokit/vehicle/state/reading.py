@@ -29,8 +29,10 @@ class Context:
     def __init__(
         self, autopilot: Autopilot, mode_names: Mapping[int, str], home_is_known: Callable[[], bool]
     ) -> None:
-        self.autopilot, self.mode_names, self.home_is_known = autopilot, mode_names, home_is_known
-        self.base_mode = 0
+        self.autopilot: Autopilot = autopilot
+        self.mode_names: Mapping[int, str] = mode_names
+        self.home_is_known: Callable[[], bool] = home_is_known
+        self.base_mode: int = 0
         self.before: Any = None
 
 

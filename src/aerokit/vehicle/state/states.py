@@ -209,8 +209,8 @@ LAZY = tuple(name for name, rows in SOURCES.items() if not any(told.at_once for 
 """Messages that are worked out when somebody looks at one of their states."""
 
 DEFAULT_RATES_HZ: Mapping[str, float] = {
-    name: max(rates)
+    name: max(source.hz for _, source in rows if source.hz is not None)
     for name, rows in SOURCES.items()
-    if (rates := [source.hz for _, source in rows if source.hz is not None])
+    if any(source.hz is not None for _, source in rows)
 }
 """Name of a message class → how fast it should come when nobody asks for another rate."""

@@ -43,6 +43,8 @@ class Telemetry(States):
     says which it is.
     """
 
+    autopilot: Autopilot
+
     def __init__(
         self,
         clock: Callable[[], float],
@@ -51,7 +53,8 @@ class Telemetry(States):
         component_id: int = 1,
         autopilot: Autopilot | None = None,
     ) -> None:
-        self.system_id, self.component_id = system_id, component_id
+        self.system_id: int = system_id
+        self.component_id: int = component_id
         self.autopilot = autopilot or Autopilot(0)
         self._knows_autopilot = autopilot is not None
         self._clock = clock

@@ -53,8 +53,13 @@ class By(Generic[T]):
     ) -> None:
         if message not in MESSAGE_IDS:
             raise ValueError(f"{message} is no message class")
-        self.message, self.decode, self.knowing, self.hz = message, decode, knowing, hz
-        self.second_best, self.instead, self.one_of = second_best, instead, one_of
+        self.message: str = message
+        self.decode = decode
+        self.knowing: bool = knowing
+        self.hz: float | None = hz
+        self.second_best: bool = second_best
+        self.instead: bool = instead
+        self.one_of: str | None = one_of
 
 
 class _HasCells(Protocol):
@@ -77,7 +82,8 @@ class Told(Generic[T]):
     def __init__(self, *sources: By[T], waits_for: str = "", at_once: bool = False) -> None:
         if not sources:
             raise ValueError("a state needs a message that tells it")
-        self.sources, self.at_once = sources, at_once
+        self.sources = sources
+        self.at_once: bool = at_once
         self._waits_for = waits_for
 
     def __set_name__(self, owner: type, name: str) -> None:

@@ -135,10 +135,11 @@ class CommandSender:
         fill = (0.0,) * (4 - len(params))
         return await self.send_long(command, *params, *fill, *place, standing=standing, **options)
 
-    def send_unconfirmed(self, command: int, *params: float) -> None:
+    def send_unconfirmed(self, command: int, *params: float, component_id: int | None = None) -> None:
         """Send a COMMAND_LONG once and do not wait: for ends of blocks, which must not await."""
-        self._connection.send(command_long(self._system_id, self._component_id, command, params))
-        self._expect_answers((self._component_id, command), 1)
+        target = self._component_id if component_id is None else component_id
+        self._connection.send(command_long(self._system_id, target, command, params))
+        self._expect_answers((target, command), 1)
 
     def is_for_us(self, ack: CommandAck) -> bool:
         """Whether it answers us, and not another ground station; targets are 0 in MAVLink 1 and old firmwares."""
@@ -147,17 +148,17 @@ class CommandSender:
             self._connection.source_component,
         )
 
-    def last_result(self, command: int) -> int | None:
-        """What the autopilot answered last to a command of ours (MAV_RESULT), also if nobody waited any more."""
-        return self._results.get((self._component_id, command))
+    def last_result(self, command: int, component_id: int | None = None) -> int | None:
+        """What it answered last to a command of ours (MAV_RESULT), also if nobody waited any more."""
+        return self._results.get((self._component_id if component_id is None else component_id, command))
 
-    def is_unknown(self, command: int) -> bool:
-        """Whether the autopilot has said that it does not know a command, or not in the form that it had."""
-        return self.last_result(command) in UNKNOWN
+    def is_unknown(self, command: int, component_id: int | None = None) -> bool:
+        """Whether it has said that it does not know a command, or not in the form that it had."""
+        return self.last_result(command, component_id) in UNKNOWN
 
-    def forget_result(self, command: int) -> None:
+    def forget_result(self, command: int, component_id: int | None = None) -> None:
         """What was answered does not count any more."""
-        self._results.pop((self._component_id, command), None)
+        self._results.pop((self._component_id if component_id is None else component_id, command), None)
 
     def forget_results(self) -> None:
         """The vehicle has rebooted: what it knows may be other commands."""

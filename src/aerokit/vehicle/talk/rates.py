@@ -21,6 +21,7 @@ from aerokit.vehicle.state.states import DEFAULT_RATES_HZ
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.message import Message
     from aerokit.runtime.bus import Detach
     from aerokit.runtime.connection import Connection
@@ -54,8 +55,8 @@ def check_rate(message_type: type[Message], hz: float) -> None:
 class _Stream:
     """What is wanted of one message, what was asked and what came."""
 
-    def __init__(self, message_type: type[Message]) -> None:
-        self.message_type = message_type
+    def __init__(self, message_type: type[Message], component_id: int) -> None:
+        self.message_type, self._component_id = message_type, component_id
         self.wishes: dict[object, float] = {}
         self.is_optional = True
         self.asked_hz: float | None = None
@@ -86,12 +87,13 @@ class _Stream:
         self.counts = deque([self.count], maxlen=WATCH_WINDOW + 1)
         self.ask_again_at = now + self.patience_s if hz > 0 else math.inf
 
-    def on_message(self, message: Message) -> None:
-        self.count += 1
+    def on_frame(self, frame: Frame) -> None:
+        if frame.component_id == self._component_id:
+            self.count += 1
 
 
 class MessageRates:
-    """Keeps the vehicle sending what somebody wants, at the fastest rate that anybody wants it.
+    """Keeps one component sending what somebody wants, at the fastest rate that anybody wants it.
 
     Asks by MAV_CMD_SET_MESSAGE_INTERVAL, and by REQUEST_DATA_STREAM once the vehicle has said that it does not know
     that command (https://mavlink.io/en/mavgen_python/howto_requestmessages.html). A stream that does not come, also
@@ -170,9 +172,9 @@ class MessageRates:
     # ------------------------------------------------------------------------------- asking
 
     def _new_stream(self, message_type: type[Message]) -> _Stream:
-        stream = _Stream(message_type)
-        stream.detach = self._connection.bus.attach(
-            message_type, stream.on_message, system_id=self._system_id
+        stream = _Stream(message_type, self._component_id)
+        stream.detach = self._connection.bus.attach_frames(
+            message_type, stream.on_frame, system_id=self._system_id
         )
         return stream
 
@@ -194,7 +196,11 @@ class MessageRates:
         times_forgotten = self._times_forgotten
         try:
             await self._commands.send_long(
-                MavCmd.SET_MESSAGE_INTERVAL, stream.message_type.ID, interval_us, attempts=1
+                MavCmd.SET_MESSAGE_INTERVAL,
+                stream.message_type.ID,
+                interval_us,
+                component_id=self._component_id,
+                attempts=1,
             )
         except CommandRejected as error:
             if error.result == MavResult.UNSUPPORTED:
@@ -243,8 +249,8 @@ class MessageRates:
     def _publish_unavailable(self, stream: _Stream, reason: str) -> None:
         if stream.is_optional:
             return
-        name = stream.message_type.NAME
-        self._connection.bus.publish(StreamUnavailable(self._connection.now(), self._system_id, name, reason))
+        told = (self._connection.now(), self._system_id, stream.message_type.NAME, reason, self._component_id)
+        self._connection.bus.publish(StreamUnavailable(*told))
 
     # ------------------------------------------------------------------------------ watching
 
@@ -269,6 +275,9 @@ class MessageRates:
             return
         achieved = stream.achieved_hz()
         expected = SLOW_FACTOR * stream.asked_hz * WATCH_WINDOW * WATCH_PERIOD_S
+        has_just_begun = achieved > 0 and stream.counts[0] == stream.counts[1]
+        if has_just_begun and not stream.is_slow:
+            return  # nothing came at the beginning of the window: that says nothing of its speed since
         was_slow, stream.is_slow = stream.is_slow, achieved * WATCH_WINDOW * WATCH_PERIOD_S < expected - 1
         if achieved == 0 and stream.is_optional:
             return
@@ -280,5 +289,6 @@ class MessageRates:
                     stream.message_type.NAME,
                     stream.asked_hz,
                     achieved,
+                    self._component_id,
                 )
             )

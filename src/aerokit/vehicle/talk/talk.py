@@ -24,6 +24,7 @@ from aerokit.runtime.events import (
 from aerokit.vehicle.state.telemetry import Telemetry
 from aerokit.vehicle.talk.commands import CommandSender
 from aerokit.vehicle.talk.constants import learn_constants
+from aerokit.vehicle.talk.hearing import Hearing
 from aerokit.vehicle.talk.rates import MessageRates
 from aerokit.vehicle.talk.transfers import Transfers
 from aerokit.vehicle.talk.watch import LinkWatch, VehicleWatch
@@ -56,27 +57,32 @@ class Talk:
     def __init__(
         self, connection: Connection, system_id: int, component_id: int, heartbeat: Heartbeat
     ) -> None:
-        self.connection, self.system_id, self.component_id = connection, system_id, component_id
+        self.connection: Connection = connection
+        self.system_id: int = system_id
+        self.component_id: int = component_id
         self.vehicle_type: int = heartbeat.type
         self.autopilot: Autopilot = autopilot_for(heartbeat)
-        self.telemetry = Telemetry(
+        self.telemetry: Telemetry = Telemetry(
             connection.now, system_id=system_id, component_id=component_id, autopilot=self.autopilot
         )
         self.link_quality: StateCell[LinkReport] = StateCell(
             "link_quality", connection.now, "second of traffic"
         )
-        self.commands = CommandSender(
+        self.commands: CommandSender = CommandSender(
             connection, system_id, component_id, self.describe_link, lambda: self.link_watch.round_trip_s
         )
-        self.rates = MessageRates(
+        self.rates: MessageRates = MessageRates(
             connection, self.commands, system_id, component_id, self.autopilot.stream_groups
         )
-        self.watch = VehicleWatch(connection, system_id, component_id, self._note_reboot)
-        self.link_watch = LinkWatch(
+        self.hearing: Hearing = Hearing(
+            connection, system_id, component_id, self.rates, keep=self.keep, at_close=self.at_close
+        )
+        self.watch: VehicleWatch = VehicleWatch(connection, system_id, component_id, self._note_reboot)
+        self.link_watch: LinkWatch = LinkWatch(
             connection, system_id, component_id, self._on_link_report, self.watch.note_answer
         )
-        self.background = Background(connection.fail)
-        self.transfers = Transfers(
+        self.background: Background = Background(connection.fail)
+        self.transfers: Transfers = Transfers(
             connection,
             system_id,
             component_id,
@@ -87,7 +93,7 @@ class Talk:
             round_trip_s=lambda: self.link_watch.round_trip_s,
             send_command=self.commands.send_long,
         )
-        self.is_closed = False
+        self.is_closed: bool = False
         self._cells: list[StateCell[Any]] = [self.link_quality]
         self._detach: list[Detach] = []
         self._ended_by: Exception | None = None
@@ -109,7 +115,8 @@ class Talk:
 
     def close(self) -> None:
         """Say and hear nothing more; who waits gets ConnectionClosed."""
-        self.is_closed = self.transfers.is_closed = True
+        self.is_closed = True
+        self.transfers.is_closed = True
         self._on_end(ConnectionClosed("the block of this vehicle was left"))
         for detach in self._detach:
             detach()

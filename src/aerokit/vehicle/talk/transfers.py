@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import anyio
 
@@ -18,15 +18,30 @@ if TYPE_CHECKING:
     from aerokit.autopilots.version import AutopilotVersion
     from aerokit.protocols.exchange import Exchange
     from aerokit.runtime.background import Background
+    from aerokit.runtime.bus import Detach
     from aerokit.runtime.cells import StateCell
     from aerokit.runtime.connection import Connection
 
-__all__ = ["Transfers"]
+__all__ = ["Talking", "Transfers"]
 
 ResultT = TypeVar("ResultT")
 
 VERSION_TIMEOUT_S = 3.0
 IN_BACKGROUND_S = 5.0
+
+
+class Talking(Protocol):
+    """What a part needs of the talk with the autopilot, or with another component."""
+
+    on_reboot: list[Callable[[], None]]
+
+    @property
+    def transfers(self) -> Transfers:
+        """What its exchanges go through."""
+        ...
+
+    def at_close(self, *functions: Detach) -> None:
+        """Have these called when the vehicle is let go."""
 
 
 class Transfers:
@@ -46,14 +61,15 @@ class Transfers:
         send_command: Callable[..., Awaitable[object]] | None = None,
     ) -> None:
         self.connection = connection
-        self.began_at = connection.now()
+        self.began_at: float = connection.now()
         """When the talk with the vehicle began: numbers that must not be those of a program before count from here."""
-        self.system_id, self.component_id = system_id, component_id
+        self.system_id: int = system_id
+        self.component_id: int = component_id
         self.autopilot = autopilot
         self.background = background
-        self.round_trip = RoundTrip()
+        self.round_trip: RoundTrip = RoundTrip()
         """Measured by whatever was transferred before, at first by what keeps the clocks together."""
-        self.is_closed = False
+        self.is_closed: bool = False
         self._send_command = send_command
         self._version, self._describe, self._round_trip_s = version, describe, round_trip_s
 

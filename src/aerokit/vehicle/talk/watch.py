@@ -43,6 +43,8 @@ QUESTIONS = 64
 class VehicleWatch:
     """Tells when the heartbeats of one vehicle stop and come back, and when it has rebooted."""
 
+    reboots: int
+
     def __init__(
         self,
         connection: Connection,
@@ -52,7 +54,8 @@ class VehicleWatch:
     ) -> None:
         self._connection, self._system_id, self._component_id = connection, system_id, component_id
         self._on_reboot = on_reboot
-        self.last_heartbeat_at = self._heartbeat_read_at = connection.now()
+        self.last_heartbeat_at: float = connection.now()
+        self._heartbeat_read_at = connection.now()
         self.link_state: StateCell[LinkState] = StateCell("link_state", connection.now, "HEARTBEAT")
         self._state_watch = LinkStateWatch(
             self.link_state, connection.bus, system_id=system_id, component_id=component_id

@@ -19,6 +19,8 @@ from aerokit.sim.ardupilot.copter.modes import Mode
 from aerokit.sim.motion import wrap_pi
 
 if TYPE_CHECKING:
+    from typing import ClassVar
+
     from aerokit.sim.ardupilot.copter.vehicle import SimulatedCopter
     from aerokit.sim.ardupilot.navigation import Ned
 
@@ -48,7 +50,7 @@ _NOTHING_TO_DO = frozenset(
 class Auto(Mode):
     """What it does now is a leg; the mission run says which command comes when."""
 
-    number = CopterMode.AUTO
+    number: ClassVar[int] = CopterMode.AUTO
     name = "AUTO"
     needs_mission = True
     arms_with_raised_throttle = True
@@ -56,13 +58,15 @@ class Auto(Mode):
 
     def __init__(self, copter: SimulatedCopter) -> None:
         super().__init__(copter)
-        self.speed = self.climb = self.descent = 0.0
+        self.speed: float = 0.0
+        self.climb: float = 0.0
+        self.descent: float = 0.0
         """Limits in m/s."""
-        self.may_lift_off = False
+        self.may_lift_off: bool = False
         """On the ground a take-off waits for MISSION_START or a raised throttle."""
         self._leg: Leg = Stay(copter)
         self._is_waiting = False
-        self.is_paused = False
+        self.is_paused: bool = False
         self._last_reached = 0
         self._reached_at = self._condition_from = self._delay_until = 0.0
         self._version = -1
@@ -303,7 +307,8 @@ class Auto(Mode):
         return (north, east, here[2] if item.z == 0 else point[2])
 
     def _go(self, place: Ned, *, stops: bool = True) -> None:
-        self._reached_at, self.is_paused = 0.0, False
+        self._reached_at = 0.0
+        self.is_paused = False
         if not self.copter.yaw.has_region_of_interest:
             self.copter.yaw.default()
         self._leg = Way(self.copter, self, place, stops=stops)

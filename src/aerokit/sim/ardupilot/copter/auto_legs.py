@@ -64,7 +64,7 @@ class Way:
         self._copter, self._limits = copter, limits
         self.destination = destination
         self._radius = _STOPPED_M if stops else copter.parameters["WPNAV_RADIUS"] / 100.0
-        self.is_complete = False
+        self.is_complete: bool = False
 
     def update(self, dt: float) -> None:
         """Fly on, and stay when it is reached."""

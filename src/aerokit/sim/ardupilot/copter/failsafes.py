@@ -79,7 +79,7 @@ class CopterFailsafes(Failsafes):
         copter, parameters = self._copter, self._copter.parameters
         hears = copter.rc.is_heard
         if hears:
-            self.radio_heard_at = copter.now
+            self.radio_heard_at: float = copter.now
         if not parameters["FS_THR_ENABLE"]:
             self._set_radio(False)
             return
@@ -180,7 +180,7 @@ class CopterFailsafes(Failsafes):
             self._bad_since = copter.now
             self.say("EKF variance", MavSeverity.CRITICAL)
         if not self.estimator and copter.now - self._bad_since >= _ESTIMATOR_PATIENCE_S:
-            self.estimator = True
+            self.estimator: bool = True
             copter.set_mode(CopterMode.LAND)
             self.say(f"EKF Failsafe: changed to {copter.mode.name} Mode", MavSeverity.CRITICAL)
 

@@ -39,7 +39,7 @@ class CopterFence(Fence):
         if action == REPORT_ONLY:
             return
         modes = (CopterMode.LAND,) if self.beyond_m(new) > _GIVE_UP_M else _ACTIONS.get(action, _ACTIONS[1])
-        self.caused_mode = any(vehicle.set_mode(mode) for mode in modes)
+        self.caused_mode: bool = any(vehicle.set_mode(mode) for mode in modes)
 
     def cleared(self) -> None:
         """It says so in the air."""

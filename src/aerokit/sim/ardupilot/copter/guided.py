@@ -10,6 +10,8 @@ from aerokit.mavlink.enums import CopterMode
 from aerokit.sim.ardupilot.copter.modes import Mode, TakeOff
 
 if TYPE_CHECKING:
+    from typing import ClassVar
+
     from aerokit.sim.ardupilot.copter.vehicle import SimulatedCopter
     from aerokit.sim.ardupilot.navigation import Ned
 
@@ -36,15 +38,17 @@ class Guided(Mode):
     ArduCopter does: DO_CHANGE_SPEED is for the flight to the present kind of target.
     """
 
-    number = CopterMode.GUIDED
+    number: ClassVar[int] = CopterMode.GUIDED
     name = "GUIDED"
     arms_with_raised_throttle = True
     can_change_speed = True
 
     def __init__(self, copter: SimulatedCopter) -> None:
         super().__init__(copter)
-        self.submode = Submode.VELOCITY
-        self.speed = self.climb = self.descent = 0.0
+        self.submode: Submode = Submode.VELOCITY
+        self.speed: float = 0.0
+        self.climb: float = 0.0
+        self.descent: float = 0.0
         """Limits in m/s."""
         self.position: Ned = _STILL
         self.velocity: Ned = _STILL
@@ -155,7 +159,7 @@ class Guided(Mode):
     def _run_take_off(self) -> None:
         assert self._take_off is not None
         self._take_off.update(self.copter.parameters["WPNAV_SPEED_UP"] / 100.0)
-        self.is_taking_off = not self._take_off.is_complete
+        self.is_taking_off: bool = not self._take_off.is_complete
         self.copter.yaw.update()
 
     def _run_attitude(self) -> None:

@@ -14,6 +14,8 @@ from aerokit.mavlink.enums import CopterMode
 from aerokit.sim.ardupilot.mode import VehicleMode
 
 if TYPE_CHECKING:
+    from typing import ClassVar
+
     from aerokit.sim.ardupilot.copter.vehicle import SimulatedCopter
     from aerokit.sim.ardupilot.navigation import Ned
 
@@ -46,7 +48,7 @@ class TakeOff:
         home = copter.navigation.home
         ground = copter.motion.ground_down if home is None else home[2]
         self.target: Ned = (copter.motion.north, copter.motion.east, ground - altitude_m)
-        self.is_complete = False
+        self.is_complete: bool = False
 
     def update(self, climb_m_s: float) -> None:
         """Climb on."""
@@ -115,14 +117,15 @@ class PilotedMode(Mode):
 
     def start_take_off(self, altitude_m: float) -> bool:
         """Begin the climb."""
-        self._take_off, self.is_taking_off = TakeOff(self.copter, altitude_m), True
+        self._take_off = TakeOff(self.copter, altitude_m)
+        self.is_taking_off: bool = True
         return True
 
 
 class Stabilize(PilotedMode):
     """Attitude and throttle by stick; with the throttle stick low it comes down fast."""
 
-    number = CopterMode.STABILIZE
+    number: ClassVar[int] = CopterMode.STABILIZE
     name = "STABILIZE"
     needs_position = False
     has_manual_throttle = True
@@ -138,7 +141,7 @@ class Stabilize(PilotedMode):
 class AltHold(PilotedMode):
     """Attitude by stick, height held."""
 
-    number = CopterMode.ALT_HOLD
+    number: ClassVar[int] = CopterMode.ALT_HOLD
     name = "ALT_HOLD"
     needs_position = False
 
@@ -150,7 +153,7 @@ class AltHold(PilotedMode):
 class Loiter(PilotedMode):
     """Position and height held, sticks move them. A low throttle stick descends, and lands."""
 
-    number = CopterMode.LOITER
+    number: ClassVar[int] = CopterMode.LOITER
     name = "LOITER"
 
     def take_off(self, altitude_m: float, *, must_navigate: bool) -> bool:
@@ -169,14 +172,14 @@ class Loiter(PilotedMode):
 class PosHold(Loiter):
     """As LOITER here."""
 
-    number = CopterMode.POSHOLD
+    number: ClassVar[int] = CopterMode.POSHOLD
     name = "POSHOLD"
 
 
 class Circle(Loiter):
     """Holds like LOITER here instead of circling."""
 
-    number = CopterMode.CIRCLE
+    number: ClassVar[int] = CopterMode.CIRCLE
     name = "CIRCLE"
     can_arm = False
 
@@ -188,7 +191,7 @@ class Circle(Loiter):
 class Brake(Mode):
     """Stops and stays, whatever the sticks do."""
 
-    number = CopterMode.BRAKE
+    number: ClassVar[int] = CopterMode.BRAKE
     name = "BRAKE"
     can_arm = False
 

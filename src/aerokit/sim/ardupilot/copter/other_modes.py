@@ -28,14 +28,14 @@ __all__ = [
 class Acro(Stabilize):
     """Turn rates by stick; here as STABILIZE."""
 
-    number = CopterMode.ACRO
+    number: ClassVar[int] = CopterMode.ACRO
     name = "ACRO"
 
 
 class Drift(AltHold):
     """Turns like an aeroplane; here as ALT_HOLD, but it needs a position."""
 
-    number = CopterMode.DRIFT
+    number: ClassVar[int] = CopterMode.DRIFT
     name = "DRIFT"
     needs_position = True
 
@@ -47,7 +47,7 @@ class Drift(AltHold):
 class ZigZag(Loiter):
     """Flies by stick, as LOITER, until two points are stored; here always."""
 
-    number = CopterMode.ZIGZAG
+    number: ClassVar[int] = CopterMode.ZIGZAG
     name = "ZIGZAG"
 
 
@@ -62,14 +62,14 @@ class _Holding(Mode):
 class Throw(_Holding):
     """Waits to be thrown, with motors that stand still; thrown it would hold, as it does here in the air."""
 
-    number = CopterMode.THROW
+    number: ClassVar[int] = CopterMode.THROW
     name = "THROW"
 
 
 class AvoidAdsb(_Holding):
     """Holds: there is no traffic to avoid."""
 
-    number = CopterMode.AVOID_ADSB
+    number: ClassVar[int] = CopterMode.AVOID_ADSB
     name = "AVOID_ADSB"
     can_arm = False
 
@@ -77,7 +77,7 @@ class AvoidAdsb(_Holding):
 class Follow(_Holding):
     """FOLL_ENABLE lets it in; it holds, as the real one does without somebody to follow."""
 
-    number = CopterMode.FOLLOW
+    number: ClassVar[int] = CopterMode.FOLLOW
     name = "FOLLOW"
     can_arm = False
 
@@ -92,7 +92,7 @@ class Follow(_Holding):
 class GuidedNoGps(Guided):
     """GUIDED for attitudes only."""
 
-    number = CopterMode.GUIDED_NOGPS
+    number: ClassVar[int] = CopterMode.GUIDED_NOGPS
     name = "GUIDED_NOGPS"
     needs_position = False
 
@@ -114,43 +114,43 @@ class _Refusing(Mode):
 class Flip(_Refusing):
     """Needs a flight by stick; flips are not simulated."""
 
-    number = CopterMode.FLIP
+    number: ClassVar[int] = CopterMode.FLIP
     name = "FLIP"
 
 
 class Autotune(_Refusing):
     """Needs a flight in ALT_HOLD, LOITER or POSHOLD; tuning is not simulated."""
 
-    number = CopterMode.AUTOTUNE
+    number: ClassVar[int] = CopterMode.AUTOTUNE
     name = "AUTOTUNE"
 
 
 class FlowHold(_Refusing):
     """Needs a sensor of optical flow."""
 
-    number = CopterMode.FLOWHOLD
+    number: ClassVar[int] = CopterMode.FLOWHOLD
     name = "FLOWHOLD"
 
 
 class SystemId(_Refusing):
     """Needs SID_AXIS; exciting the controllers is not simulated."""
 
-    number = CopterMode.SYSTEMID
+    number: ClassVar[int] = CopterMode.SYSTEMID
     name = "SYSTEMID"
-    TEXT = "No axis selected, SID_AXIS = 0"
+    TEXT: ClassVar[str] = "No axis selected, SID_AXIS = 0"
 
 
 class Turtle(_Refusing):
     """Needs motors that turn backwards."""
 
-    number = CopterMode.TURTLE
+    number: ClassVar[int] = CopterMode.TURTLE
     name = "TURTLE"
 
 
 class AutoRtl(_Refusing):
     """AUTO from a DO_LAND_START or DO_RETURN_PATH_START of the mission on; jumping there is not simulated."""
 
-    number = CopterMode.AUTO_RTL
+    number: ClassVar[int] = CopterMode.AUTO_RTL
     name = "AUTO RTL"
-    TEXT = "Unable to start landing sequence"
+    TEXT: ClassVar[str] = "Unable to start landing sequence"
     refused_because = "No return path or landing sequence found"

@@ -10,6 +10,8 @@ from aerokit.sim.ardupilot.copter.modes import Mode
 from aerokit.sim.ardupilot.rally import best_return_place
 
 if TYPE_CHECKING:
+    from typing import ClassVar
+
     from aerokit.sim.ardupilot.copter.vehicle import SimulatedCopter
     from aerokit.sim.ardupilot.navigation import Ned
 
@@ -23,7 +25,7 @@ _SMART_RTL_HIGHER_M = 2.0
 class Land(Mode):
     """Comes straight down: WPNAV_SPEED_DN to LAND_ALT_LOW, then LAND_SPEED; disarms when it is down."""
 
-    number = CopterMode.LAND
+    number: ClassVar[int] = CopterMode.LAND
     name = "LAND"
     needs_position = False
     can_arm = False
@@ -62,7 +64,7 @@ def sink(copter: SimulatedCopter) -> None:
 class Rtl(Mode):
     """Climbs to RTL_ALT (less when it is close), flies home or to a rally point, waits RTL_LOIT_TIME and lands."""
 
-    number = CopterMode.RTL
+    number: ClassVar[int] = CopterMode.RTL
     name = "RTL"
     can_arm = False
     can_change_speed = True
@@ -73,7 +75,7 @@ class Rtl(Mode):
         self._altitude_down = 0.0
         self._waiting_since = 0.0
         self._place: Ned = (0.0, 0.0, 0.0)
-        self.speed = 0.0
+        self.speed: float = 0.0
 
     def enter(self, *, force: bool) -> bool:
         """Plan the way home."""
@@ -132,7 +134,8 @@ class Rtl(Mode):
         elif self._phase == "wait":
             waited = self.copter.now - self._waiting_since
             if waited >= self.copter.parameters["RTL_LOIT_TIME"] / 1000.0:
-                self._phase, self.is_landing = "land", True
+                self._phase = "land"
+                self.is_landing: bool = True
 
     def _home(self) -> Ned:
         home = self.copter.navigation.home
@@ -142,7 +145,7 @@ class Rtl(Mode):
 class SmartRtl(Mode):
     """Back on the path it has come on, without its loops; above the beginning it lands. See `SmartPath`."""
 
-    number = CopterMode.SMART_RTL
+    number: ClassVar[int] = CopterMode.SMART_RTL
     name = "SMARTRTL"
     can_arm = False
     returns_on_path = True
@@ -177,7 +180,7 @@ class SmartRtl(Mode):
         """Fly to the next point, or land."""
         copter = self.copter
         if copter.is_landed or not self._way:
-            self.is_landing = True
+            self.is_landing: bool = True
             descend(copter)
             return
         copter.motors.wanted = True

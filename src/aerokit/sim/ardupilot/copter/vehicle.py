@@ -35,6 +35,13 @@ from aerokit.sim.ardupilot.smart_path import SmartPath
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+    from typing import Any
+
+    from aerokit.sim.ardupilot.arming import Arming
+    from aerokit.sim.ardupilot.failsafes import Failsafes
+    from aerokit.sim.ardupilot.fence import Fence
+    from aerokit.sim.ardupilot.mode import VehicleMode
     from aerokit.sim.ardupilot.navigation import Ned
     from aerokit.sim.ardupilot.parameter_tables import Kind
     from aerokit.sim.commands import CommandHandler
@@ -66,13 +73,13 @@ class SimulatedCopter(ArduPilotVehicle):
     FRAME: ClassVar[str | None] = "Frame: QUAD/PLUS"
     MAV_TYPE: ClassVar[int] = MavType.QUADROTOR
     CAPABILITIES: ClassVar[int] = 0xFBEF
-    MODES = (
+    MODES: ClassVar[tuple[Callable[[Any], VehicleMode], ...]] = (
         AutoRtl, Auto, Acro, Stabilize, AltHold, Circle, Loiter, Guided, Land, Rtl, Drift, Flip, Autotune, PosHold,
         Brake, Throw, AvoidAdsb, GuidedNoGps, SmartRtl, FlowHold, Follow, ZigZag, SystemId, Turtle,
     )  # fmt: skip
-    ARMING = CopterArming
-    FAILSAFES = CopterFailsafes
-    FENCE = CopterFence
+    ARMING: ClassVar[type[Arming]] = CopterArming
+    FAILSAFES: ClassVar[type[Failsafes]] = CopterFailsafes
+    FENCE: ClassVar[type[Fence]] = CopterFence
 
     def make_commands(self) -> dict[int, CommandHandler]:
         """See `copter_commands`."""
@@ -84,9 +91,9 @@ class SimulatedCopter(ArduPilotVehicle):
 
     def reset_controllers(self) -> None:
         """Where it points its nose, the land detector, and the way back of SMART_RTL."""
-        self.yaw = AutoYaw(self)
+        self.yaw: AutoYaw = AutoYaw(self)
         self._still_since = math.nan
-        self.path = SmartPath(self, only_armed=True)
+        self.path: SmartPath = SmartPath(self, only_armed=True)
 
     def _become_ready(self) -> None:
         super()._become_ready()
@@ -129,5 +136,6 @@ class SimulatedCopter(ArduPilotVehicle):
         elif math.isnan(self._still_since):
             self._still_since = self.now
         elif self.now - self._still_since >= _LAND_DETECTOR_S or not self.motors.is_armed:
-            self.is_landed, self._still_since = True, math.nan
+            self.is_landed: bool = True
+            self._still_since = math.nan
             motion.settle()

@@ -17,6 +17,8 @@ from aerokit.sim.ardupilot.plane.modes import NavigatingMode, climb_out
 from aerokit.sim.motion import wrap_pi
 
 if TYPE_CHECKING:
+    from typing import ClassVar
+
     from aerokit.missions import MissionItem
     from aerokit.sim.ardupilot.navigation import Ned
     from aerokit.sim.ardupilot.plane.vehicle import SimulatedPlane
@@ -32,7 +34,7 @@ _ON_CIRCLE = 1.3
 class Auto(NavigatingMode):
     """The mission run says which command comes when; past the end it returns to launch."""
 
-    number = PlaneMode.AUTO
+    number: ClassVar[int] = PlaneMode.AUTO
     name = "AUTO"
     needs_mission = True
     can_change_speed = True
@@ -226,7 +228,7 @@ class Auto(NavigatingMode):
 
     def _loiter(self, item: MissionItem) -> None:
         self._go(item, _LOITER)
-        self.radius = item.param2 if item.command == _C.NAV_LOITER_TO_ALT else item.param3
+        self.radius: float = item.param2 if item.command == _C.NAV_LOITER_TO_ALT else item.param3
 
     def _land(self, item: MissionItem) -> None:
         self._go(item, _LAND)
@@ -237,10 +239,8 @@ class Auto(NavigatingMode):
         plane.info(f"Landing approach start at {plane.altitude_m:.1f}m")
 
     def _return(self, _: MissionItem) -> None:
-        plane = self.plane
-        home = plane.navigation.home or (0.0, 0.0, plane.wing.ground_down)
-        self._place = (home[0], home[1], home[2] - plane.parameters["RTL_ALTITUDE"])
-        self._does, self.radius = _LOITER, plane.parameters["RTL_RADIUS"]
+        """In the other mode (``start_command`` of ArduPlane's commands_logic.cpp); the mission stops at this item."""
+        self.plane.set_mode(PlaneMode.RTL)
 
     def _wait(self, _: MissionItem) -> None:
         self._condition_from = self.plane.now
@@ -250,7 +250,7 @@ class Auto(NavigatingMode):
 
     def _change_speed(self, item: MissionItem) -> None:
         if self.plane.can_fly_at(item.param2):
-            self.speed = item.param2
+            self.speed: float = item.param2
             self.plane.info(f"Set airspeed {item.param2:.0f} m/s")
 
     def _set_home(self, item: MissionItem) -> None:

@@ -42,7 +42,7 @@ class PlaneFailsafes(Failsafes):
     def __init__(self, plane: SimulatedPlane) -> None:
         super().__init__(plane)
         self._plane = plane
-        self.state = _NONE
+        self.state: int = _NONE
         """0 nothing, 1 short and 2 long failsafe of the radio, 3 ground station."""
         self._short_since = math.nan
         self._bad_since = math.nan
@@ -77,7 +77,7 @@ class PlaneFailsafes(Failsafes):
     def _watch_radio(self) -> None:
         plane = self._plane
         if plane.rc.is_heard:
-            self.radio_heard_at = plane.now
+            self.radio_heard_at: float = plane.now
         if not self._is_radio_bad():
             self._bad_since = math.nan
             self._set_radio(False)
@@ -151,7 +151,7 @@ class PlaneFailsafes(Failsafes):
         parameters = self._plane.parameters
         name = "FS_LONG_TIMEOUT" if parameters["FS_SHORT_ACTN"] == _SHORT_DISABLED else "FS_SHORT_TIMEOUT"
         if self.state == _GCS and self.ground_station_silence < parameters[name]:
-            self.ground_station = False
+            self.ground_station: bool = False
             self._end_long("GCS Failsafe Off")
         elif self.state == _LONG and not self.radio:
             self._end_long("RC Long Failsafe Cleared")
@@ -163,7 +163,8 @@ class PlaneFailsafes(Failsafes):
     def _begin_long(self, state: int) -> None:
         plane = self._plane
         plane.rc.release_overrides()
-        self.state, mode = state, plane.mode.number
+        self.state = state
+        mode = plane.mode.number
         action = int(plane.parameters["FS_LONG_ACTN"])
         if mode in _LONG_AS_PILOTED:
             glides = action in (_LONG_GLIDE, _LONG_PARACHUTE)

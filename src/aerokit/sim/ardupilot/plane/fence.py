@@ -93,7 +93,7 @@ class PlaneFence(Fence):
         return int(self._plane.parameters["FENCE_ACTION"])
 
     def _turn_back(self, before: int, *modes: int) -> None:
-        self.caused_mode = any(self._plane.set_mode(mode) for mode in modes)
+        self.caused_mode: bool = any(self._plane.set_mode(mode) for mode in modes)
         self._mode_before = before
 
     def _return_point(self) -> tuple[float, float] | None:

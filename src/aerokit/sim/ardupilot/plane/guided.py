@@ -15,6 +15,8 @@ from aerokit.sim.commands import whole
 from aerokit.sim.rotations import euler_from_quaternion
 
 if TYPE_CHECKING:
+    from typing import ClassVar
+
     from aerokit.sim.ardupilot.navigation import Ned
     from aerokit.sim.ardupilot.plane.vehicle import SimulatedPlane
     from aerokit.sim.channel import Channel
@@ -43,7 +45,7 @@ class Guided(NavigatingMode):
     for three seconds each.
     """
 
-    number = PlaneMode.GUIDED
+    number: ClassVar[int] = PlaneMode.GUIDED
     name = "GUIDED"
     can_change_speed = True
 

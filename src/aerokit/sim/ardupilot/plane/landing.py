@@ -22,7 +22,8 @@ class Landing:
     """Comes down on ``point``; with ``start`` it flies there first, to come in from there."""
 
     def __init__(self, plane: SimulatedPlane, point: Ned, start: Ned | None = None) -> None:
-        self._plane, self.point = plane, point
+        self._plane = plane
+        self.point: Ned = point
         self._start = start
         wing = plane.wing
         self._from: Ned = (wing.north, wing.east, wing.down)

@@ -14,6 +14,8 @@ from aerokit.sim.ardupilot.plane.landing import Landing
 from aerokit.sim.ardupilot.rally import best_return_place
 
 if TYPE_CHECKING:
+    from typing import ClassVar
+
     from aerokit.sim.ardupilot.navigation import Ned
     from aerokit.sim.ardupilot.plane.vehicle import SimulatedPlane
 
@@ -82,29 +84,29 @@ class Piloted(PlaneModeBase):
 class Manual(Piloted):
     """Sticks straight to the rudders; here as `FlyByWireA`."""
 
-    number = PlaneMode.MANUAL
+    number: ClassVar[int] = PlaneMode.MANUAL
     name = "MANUAL"
-    flags = MavModeFlag.MANUAL_INPUT_ENABLED | MavModeFlag.STABILIZE_ENABLED
+    flags: int = MavModeFlag.MANUAL_INPUT_ENABLED | MavModeFlag.STABILIZE_ENABLED
 
 
 class Stabilize(Piloted):
     """Level when the sticks are let go."""
 
-    number = PlaneMode.STABILIZE
+    number: ClassVar[int] = PlaneMode.STABILIZE
     name = "STABILIZE"
 
 
 class FlyByWireA(Piloted):
     """Bank and pitch by stick."""
 
-    number = PlaneMode.FLY_BY_WIRE_A
+    number: ClassVar[int] = PlaneMode.FLY_BY_WIRE_A
     name = "FLY_BY_WIRE_A"
 
 
 class FlyByWireB(PlaneModeBase):
     """Bank by stick, height and speed held."""
 
-    number = PlaneMode.FLY_BY_WIRE_B
+    number: ClassVar[int] = PlaneMode.FLY_BY_WIRE_B
     name = "FLY_BY_WIRE_B"
 
     def __init__(self, plane: SimulatedPlane) -> None:
@@ -134,7 +136,7 @@ class FlyByWireB(PlaneModeBase):
 class Cruise(FlyByWireB):
     """As FBWB, and without the stick on the same course over the ground."""
 
-    number = PlaneMode.CRUISE
+    number: ClassVar[int] = PlaneMode.CRUISE
     name = "CRUISE"
 
     def __init__(self, plane: SimulatedPlane) -> None:
@@ -156,9 +158,9 @@ class Cruise(FlyByWireB):
 class Circle(PlaneModeBase):
     """Keeps turning gently without GPS, and keeps its height."""
 
-    number = PlaneMode.CIRCLE
+    number: ClassVar[int] = PlaneMode.CIRCLE
     name = "CIRCLE"
-    flags = _NAVIGATES
+    flags: int = _NAVIGATES
 
     def enter(self, *, force: bool) -> bool:
         """Keep this height."""
@@ -178,20 +180,21 @@ class Circle(PlaneModeBase):
 class NavigatingMode(PlaneModeBase):
     """Flies somewhere by itself, and circles there."""
 
-    flags = _NAVIGATES
+    flags: int = _NAVIGATES
 
     def __init__(self, plane: SimulatedPlane) -> None:
         super().__init__(plane)
-        self.speed = 0.0
+        self.speed: float = 0.0
         """Airspeed in m/s that was asked for; 0 is AIRSPEED_CRUISE."""
-        self.radius = 0.0
+        self.radius: float = 0.0
         """Of the circle in metres; 0 is WP_LOITER_RAD."""
         self._place: Ned | None = None
 
     def enter(self, *, force: bool) -> bool:
         """Circle here."""
         wing = self.plane.wing
-        self.speed = self.radius = 0.0
+        self.speed = 0.0
+        self.radius = 0.0
         self._place = (wing.north, wing.east, wing.down)
         return True
 
@@ -218,14 +221,14 @@ class NavigatingMode(PlaneModeBase):
 class Loiter(NavigatingMode):
     """Circles where it was switched on."""
 
-    number = PlaneMode.LOITER
+    number: ClassVar[int] = PlaneMode.LOITER
     name = "LOITER"
 
 
 class Rtl(NavigatingMode):
     """Home at RTL_ALTITUDE, or to a rally point, to circle there with RTL_RADIUS."""
 
-    number = PlaneMode.RTL
+    number: ClassVar[int] = PlaneMode.RTL
     name = "RTL"
     can_arm = False
 
@@ -235,7 +238,7 @@ class Rtl(NavigatingMode):
         plane = self.plane
         home = plane.navigation.home or (0.0, 0.0, plane.wing.ground_down)
         height = plane.parameters["RTL_ALTITUDE"]
-        self.radius = plane.parameters["RTL_RADIUS"]
+        self.radius: float = plane.parameters["RTL_RADIUS"]
         down = plane.wing.down if height < 0 else home[2] - height
         self._place = best_return_place(plane, (home[0], home[1], down))
         return True
@@ -244,7 +247,7 @@ class Rtl(NavigatingMode):
 class TakeOff(NavigatingMode):
     """Takes off when it is armed, climbs to TKOFF_ALT and circles TKOFF_DIST ahead."""
 
-    number = PlaneMode.TAKEOFF
+    number: ClassVar[int] = PlaneMode.TAKEOFF
     name = "TAKEOFF"
 
     def enter(self, *, force: bool) -> bool:
@@ -291,7 +294,7 @@ class TakeOff(NavigatingMode):
 class Autoland(NavigatingMode):
     """Lands where it has taken off and in that direction; only in flight. Armed after that, it disarms at once."""
 
-    number = PlaneMode.AUTOLAND
+    number: ClassVar[int] = PlaneMode.AUTOLAND
     name = "AUTOLAND"
     is_landing = True
 

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from aerokit.mavlink.enums import PlaneMode
 from aerokit.sim.ardupilot.plane.modes import FlyByWireA, Loiter, PlaneModeBase, Stabilize
+
+if TYPE_CHECKING:
+    from typing import ClassVar
 
 __all__ = ["Acro", "Autotune", "AvoidAdsb", "Initialising", "Thermal", "Training"]
 
@@ -11,21 +16,21 @@ __all__ = ["Acro", "Autotune", "AvoidAdsb", "Initialising", "Thermal", "Training
 class Training(Stabilize):
     """Limits bank and pitch only; here as STABILIZE."""
 
-    number = PlaneMode.TRAINING
+    number: ClassVar[int] = PlaneMode.TRAINING
     name = "TRAINING"
 
 
 class Acro(Stabilize):
     """Turn rates by stick; here as STABILIZE."""
 
-    number = PlaneMode.ACRO
+    number: ClassVar[int] = PlaneMode.ACRO
     name = "ACRO"
 
 
 class Autotune(FlyByWireA):
     """As FBWA; nothing is tuned."""
 
-    number = PlaneMode.AUTOTUNE
+    number: ClassVar[int] = PlaneMode.AUTOTUNE
     name = "AUTOTUNE"
 
     def enter(self, *, force: bool) -> bool:
@@ -38,7 +43,7 @@ class Autotune(FlyByWireA):
 class AvoidAdsb(Loiter):
     """Circles: there is no traffic to avoid."""
 
-    number = PlaneMode.AVOID_ADSB
+    number: ClassVar[int] = PlaneMode.AVOID_ADSB
     name = "AVOID_ADSB"
 
 
@@ -53,12 +58,12 @@ class _Refusing(PlaneModeBase):
 class Initialising(_Refusing):
     """What it is in while it boots; nobody can ask for it."""
 
-    number = PlaneMode.INITIALIZING
+    number: ClassVar[int] = PlaneMode.INITIALIZING
     name = "INITIALISING"
 
 
 class Thermal(_Refusing):
     """Needs SOAR_ENABLE; soaring is not simulated."""
 
-    number = PlaneMode.THERMAL
+    number: ClassVar[int] = PlaneMode.THERMAL
     name = "THERMAL"

@@ -38,6 +38,11 @@ from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 from aerokit.sim.fixed_wing import FixedWing
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from aerokit.sim.ardupilot.arming import Arming
+    from aerokit.sim.ardupilot.failsafes import Failsafes
+    from aerokit.sim.ardupilot.fence import Fence
     from aerokit.sim.ardupilot.mode import VehicleMode
     from aerokit.sim.ardupilot.parameter_tables import Kind
     from aerokit.sim.commands import CommandHandler
@@ -62,20 +67,20 @@ class SimulatedPlane(ArduPilotVehicle):
     MAV_TYPE: ClassVar[int] = MavType.FIXED_WING
     HOME_NEEDS_ORIGIN: ClassVar[bool] = False
     CAPABILITIES: ClassVar[int] = 0xF36F
-    MODES = (
+    MODES: ClassVar[tuple[Callable[[Any], VehicleMode], ...]] = (
         Manual, Circle, Stabilize, Training, Acro, FlyByWireA, FlyByWireB, Cruise, Autotune, Auto, Rtl, Loiter,
         AvoidAdsb, Guided, Initialising, TakeOff, Thermal, Autoland,
     )  # fmt: skip
-    ARMING = PlaneArming
-    FAILSAFES = PlaneFailsafes
-    FENCE = PlaneFence
+    ARMING: ClassVar[type[Arming]] = PlaneArming
+    FAILSAFES: ClassVar[type[Failsafes]] = PlaneFailsafes
+    FENCE: ClassVar[type[Fence]] = PlaneFence
 
-    fence: PlaneFence
-    failsafes: PlaneFailsafes
+    fence: PlaneFence  # pyright: ignore[reportIncompatibleVariableOverride]
+    failsafes: PlaneFailsafes  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def make_motion(self, wind: Wind | None) -> Motion:
         """An aeroplane within the limits of the parameters."""
-        self.wing = FixedWing(self.rng, wind=wind)
+        self.wing: FixedWing = FixedWing(self.rng, wind=wind)
         """What flies; the same as ``motion``."""
         self._read_limits()
         return self.wing
@@ -163,7 +168,7 @@ class SimulatedPlane(ArduPilotVehicle):
         elif math.isnan(self._rests_since):
             self._rests_since = self.now
         elif self.now - self._rests_since >= _STANDS_S:
-            self.is_landed = True
+            self.is_landed: bool = True
             wing.settle()
 
 

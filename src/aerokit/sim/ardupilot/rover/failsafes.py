@@ -76,19 +76,19 @@ class RoverFailsafes(Failsafes):
     def _watch_radio(self) -> None:
         rover, parameters = self._rover, self._rover.parameters
         if rover.rc.is_heard:
-            self.radio_heard_at = rover.now
+            self.radio_heard_at: float = rover.now
         if not parameters["FS_THR_ENABLE"]:
             self.radio = False
             return
         low = rover.rc[2] < parameters["FS_THR_VALUE"]
-        self.radio = low or rover.now - self.radio_heard_at > _SILENT_S
+        self.radio: bool = low or rover.now - self.radio_heard_at > _SILENT_S
         self._trigger(_RADIO, self.radio)
 
     def _watch_ground_station(self) -> None:
         parameters = self._rover.parameters
         if not parameters["FS_GCS_ENABLE"] or math.isnan(self.ground_station_seen_at):
             return
-        self.ground_station = self.ground_station_silence >= parameters["FS_GCS_TIMEOUT"]
+        self.ground_station: bool = self.ground_station_silence >= parameters["FS_GCS_TIMEOUT"]
         self._trigger(_GCS, self.ground_station)
 
     def _trigger(self, name: str, lost: bool) -> None:
@@ -141,7 +141,7 @@ class RoverFailsafes(Failsafes):
             self._bad_since = rover.now
         if self.estimator or rover.now - self._bad_since < _ESTIMATOR_PATIENCE_S:
             return
-        self.estimator = True
+        self.estimator: bool = True
         self.say("EKF variance", MavSeverity.CRITICAL)
         action = int(rover.parameters["FS_EKF_ACTION"])
         if action and rover.mode.needs_position:

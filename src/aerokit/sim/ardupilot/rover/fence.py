@@ -32,7 +32,7 @@ class RoverFence(Fence):
         elif action == _TERMINATE:
             vehicle.arming.disarm()
         else:
-            self.caused_mode = any(vehicle.set_mode(mode) for mode in modes_of_action(action))
+            self.caused_mode: bool = any(vehicle.set_mode(mode) for mode in modes_of_action(action))
 
     def mode_changed(self) -> None:
         """Ten seconds for the pilot."""

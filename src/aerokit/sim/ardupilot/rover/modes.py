@@ -13,6 +13,8 @@ from aerokit.sim.ardupilot.rally import best_return_place
 from aerokit.sim.ardupilot.targets import Target
 
 if TYPE_CHECKING:
+    from typing import ClassVar
+
     from aerokit.sim.ardupilot.navigation import Ned
     from aerokit.sim.ardupilot.rover.vehicle import SimulatedRover
 
@@ -181,7 +183,7 @@ class _SmartRtl(_Rtl):
 class RoverAuto(LevelAuto):
     """AUTO: see `LevelAuto`."""
 
-    number = RoverMode.AUTO
+    number: ClassVar[int] = RoverMode.AUTO
     name = "AUTO"
 
     vehicle: SimulatedRover
@@ -226,12 +228,12 @@ class RoverAuto(LevelAuto):
 class RoverGuided(_Mode):
     """GUIDED: a place to drive to, or a velocity, with or without a turn rate, for three seconds."""
 
-    number = RoverMode.GUIDED
+    number: ClassVar[int] = RoverMode.GUIDED
     name = "GUID"
 
     def __init__(self, rover: SimulatedRover) -> None:
         super().__init__(rover)
-        self.speed = 0.0
+        self.speed: float = 0.0
         self._place: Ned | None = None
         self._is_there = False
         self._target: Target | None = None

@@ -20,6 +20,9 @@ from aerokit.sim.ground_motion import GroundLimits, GroundMotion
 from aerokit.sim.motion import wrap_pi
 
 if TYPE_CHECKING:
+    from aerokit.sim.ardupilot.arming import Arming
+    from aerokit.sim.ardupilot.failsafes import Failsafes
+    from aerokit.sim.ardupilot.fence import Fence
     from aerokit.sim.ardupilot.mode import VehicleMode
     from aerokit.sim.ardupilot.parameter_tables import Kind
     from aerokit.sim.commands import CommandHandler
@@ -65,11 +68,11 @@ class SimulatedRover(LevelVehicle):
     TELLS_HOME: ClassVar[bool] = True
     CAPABILITIES: ClassVar[int] = 0xF1EF
     MODES: ClassVar[tuple[Callable[[Any], VehicleMode], ...]] = ROVER_MODES
-    ARMING = RoverArming
-    FAILSAFES = RoverFailsafes
-    FENCE = RoverFence
+    ARMING: ClassVar[type[Arming]] = RoverArming
+    FAILSAFES: ClassVar[type[Failsafes]] = RoverFailsafes
+    FENCE: ClassVar[type[Fence]] = RoverFence
 
-    motion: GroundMotion
+    motion: GroundMotion  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def make_motion(self, wind: Wind | None) -> GroundMotion:
         """Limits as the parameters have them now; wind is only told, it moves nothing."""
@@ -90,7 +93,7 @@ class SimulatedRover(LevelVehicle):
     def reset_controllers(self) -> None:
         """The throttle stick rests in the middle, and the way back of SMART_RTL is forgotten."""
         super().reset_controllers()
-        self.path = SmartPath(self, only_armed=False)
+        self.path: SmartPath = SmartPath(self, only_armed=False)
 
     def _become_ready(self) -> None:
         super()._become_ready()
@@ -116,7 +119,7 @@ class SimulatedRover(LevelVehicle):
         return self.mode.number == RoverMode.HOLD
 
     @is_landed.setter
-    def is_landed(self, _: bool) -> None:
+    def is_landed(self, _: bool) -> None:  # pyright: ignore[reportIncompatibleVariableOverride]
         """It is always on the ground."""
 
     @property

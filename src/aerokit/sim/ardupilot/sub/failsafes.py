@@ -31,11 +31,11 @@ class SubFailsafes(Failsafes):
     def __init__(self, sub: SimulatedSub) -> None:
         super().__init__(sub)
         self._sub = sub
-        self.pilot = False
+        self.pilot: bool = False
         """Whether nobody steers: neither pulses nor MANUAL_CONTROL for FS_PILOT_TIMEOUT."""
-        self.leak = False
-        self.pressure = _HullLimit("pressure", "FS_PRESS")
-        self.temperature = _HullLimit("temperature", "FS_TEMP")
+        self.leak: bool = False
+        self.pressure: _HullLimit = _HullLimit("pressure", "FS_PRESS")
+        self.temperature: _HullLimit = _HullLimit("temperature", "FS_TEMP")
         self._gcs_warned_at = self._leak_warned_at = -math.inf
         self._radio_heard_before = True
 
@@ -63,7 +63,7 @@ class SubFailsafes(Failsafes):
         sub, enabled = self._sub, int(self._sub.parameters["FS_THR_ENABLE"])
         hears = sub.rc.is_heard
         if hears:
-            self.radio_heard_at = sub.now
+            self.radio_heard_at: float = sub.now
         low = hears and sub.rc[2] < sub.parameters["FS_THR_VALUE"]
         lost = low or sub.now - self.radio_heard_at >= _SILENT_S
         if not enabled:
@@ -106,7 +106,7 @@ class SubFailsafes(Failsafes):
             self.say(f"MYGCS: {int(sub.parameters['MAV_GCS_SYSID'])}, heartbeat lost")
         if self.ground_station or not sub.is_armed:
             return
-        self.ground_station = True
+        self.ground_station: bool = True
         modes = {_HOLD: SubMode.ALT_HOLD, _SURFACE: SubMode.SURFACE}
         if action == _DISARM or (action in modes and not sub.set_mode(modes[action])):
             sub.arming.disarm()
@@ -138,7 +138,7 @@ class _HullLimit:
     """Two seconds above FS_PRESS_MAX (Pa) or FS_TEMP_MAX (°C) are too much; it is told every 30 s."""
 
     def __init__(self, what: str, prefix: str) -> None:
-        self.is_exceeded = False
+        self.is_exceeded: bool = False
         self._what, self._prefix = what, prefix
         self._good_at = self._warned_at = 0.0
 

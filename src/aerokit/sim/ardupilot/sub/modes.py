@@ -12,6 +12,8 @@ from aerokit.sim.ardupilot.targets import Target
 from aerokit.sim.motion import wrap_pi
 
 if TYPE_CHECKING:
+    from typing import ClassVar
+
     from aerokit.sim.ardupilot.navigation import Ned
     from aerokit.sim.ardupilot.sub.vehicle import SimulatedSub
 
@@ -128,7 +130,7 @@ class _Surface(_AltHold):
 class SubAuto(LevelAuto):
     """AUTO: see `LevelAuto`. After the last command it stays."""
 
-    number = SubMode.AUTO
+    number: ClassVar[int] = SubMode.AUTO
     name = "AUTO"
 
     vehicle: SimulatedSub
@@ -157,13 +159,13 @@ class SubAuto(LevelAuto):
 class SubGuided(_Mode):
     """GUIDED: a place that stays, or a velocity for three seconds; first it keeps still."""
 
-    number = SubMode.GUIDED
+    number: ClassVar[int] = SubMode.GUIDED
     name = "GUIDED"
     can_change_speed = True
 
     def __init__(self, sub: SimulatedSub) -> None:
         super().__init__(sub)
-        self.speed = 0.0
+        self.speed: float = 0.0
         self._place: Ned | None = None
         self._target: Target | None = None
         self._target_at = 0.0

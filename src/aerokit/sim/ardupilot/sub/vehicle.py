@@ -19,6 +19,8 @@ from aerokit.sim.ardupilot.telemetry_extra import DISPLAY_VALUES
 from aerokit.sim.underwater_motion import UnderwaterMotion
 
 if TYPE_CHECKING:
+    from aerokit.sim.ardupilot.arming import Arming
+    from aerokit.sim.ardupilot.failsafes import Failsafes
     from aerokit.sim.ardupilot.mode import VehicleMode
     from aerokit.sim.ardupilot.navigation import Ned
     from aerokit.sim.ardupilot.parameter_tables import Kind
@@ -74,10 +76,10 @@ class SimulatedSub(LevelVehicle):
     MAV_TYPE: ClassVar[int] = MavType.SUBMARINE
     CAPABILITIES: ClassVar[int] = 0xF9E7
     MODES: ClassVar[tuple[Callable[[Any], VehicleMode], ...]] = SUB_MODES
-    ARMING = SubArming
-    FAILSAFES = SubFailsafes
+    ARMING: ClassVar[type[Arming]] = SubArming
+    FAILSAFES: ClassVar[type[Failsafes]] = SubFailsafes
 
-    motion: UnderwaterMotion
+    motion: UnderwaterMotion  # pyright: ignore[reportIncompatibleVariableOverride]
     hull_pressure_pa: float = 101_325.0
     """What the sensors inside measure."""
     hull_temperature_c: float = 28.0
@@ -100,7 +102,7 @@ class SimulatedSub(LevelVehicle):
 
     def reset_controllers(self) -> None:
         """All sticks rest in the middle."""
-        self.display_names = cycle(DISPLAY_VALUES)
+        self.display_names: cycle[str] = cycle(DISPLAY_VALUES)
         """Which of `DISPLAY_VALUES` is told next."""
         for index in range(_STICKS):
             self.rc[index] = 1500
@@ -116,7 +118,7 @@ class SimulatedSub(LevelVehicle):
         return not self.motors.is_armed
 
     @is_landed.setter
-    def is_landed(self, _: bool) -> None:
+    def is_landed(self, _: bool) -> None:  # pyright: ignore[reportIncompatibleVariableOverride]
         """It never is."""
 
     @property

@@ -1,0 +1,162 @@
+"""What each further vehicle costs a client: processor time and memory with 1 to 500 of them.
+
+    python benchmarks/client_scale.py
+
+Every vehicle sends what a client watches at 4 Hz, from a recorded flight, in real time; the frames are made beforehand
+and handed to the connections in this process, so that only clients and loop are measured. System ids end at 255: more
+vehicles are on several connections.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import json
+import statistics
+import sys
+import time
+import tracemalloc
+from collections.abc import Sequence
+from contextlib import AsyncExitStack
+
+import decode
+from deliver import FedLink
+from table import Row, row
+
+import aerokit
+from aerokit import messages
+from aerokit.mavlink import STANDARD, Frame, Message
+from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.runtime.connection import Connection
+from aerokit.vehicle.state.states import DEFAULT_RATES_HZ
+from aerokit.vehicle.vehicle import Vehicle
+
+__all__ = ["COUNTS", "rows"]
+
+COUNTS = (1, 10, 50, 100, 200, 500)
+ON_A_LINK = 250
+LINEAR = 0.8
+"""One of many takes at most 1/0.8 of what one of ten takes."""
+MOST_MIB = 0.15
+TURN_S = 0.25
+"""All vehicles are heard in each."""
+HEARTBEAT = messages.Heartbeat(2, 3, 81, 4, 4, 3)
+
+Turn = list[list[bytes]]
+"""For each link what comes on it."""
+
+
+def rows(counts: Sequence[int] = COUNTS, turns: int = 16, rounds: int = 3) -> list[Row]:
+    """For each count the share of a core that one vehicle takes, beside one of ten; and the memory of one."""
+    found = {
+        count: statistics.median(asyncio.run(_share_of_each(count, turns)) for _ in range(rounds))
+        for count in sorted({10, *counts})
+    }
+    table: list[Row] = []
+    for count in counts:
+        each, of_ten = 100 * found[count], 100 * found[10]
+        shown = row(
+            f"clients_{count}", each, of_ten, "one of ten",
+            unit="% of a core each", ratio=of_ten / each, aim=LINEAR if count >= 10 else 0.0,
+        )  # fmt: skip
+        table.append({**shown, "note": f"{each:.3f} % of a core each, {each * count:.1f} % together"})
+    mib = asyncio.run(_mebibytes_of_each(max(counts)))
+    shown = row("client_memory", mib, MOST_MIB, "the most allowed", unit="MiB", ratio=MOST_MIB / mib, aim=1.0)
+    return [
+        *table,
+        {**shown, "note": f"{mib:.3f} MiB for each of {max(counts)} clients, heard of for a turn"},
+    ]
+
+
+async def _share_of_each(count: int, turns: int) -> float:
+    """Share of a core that each vehicle takes."""
+    async with AsyncExitStack() as stack:
+        fleet = await _connected(stack, count, turns)
+        fleet.feed_turn()
+        await asyncio.sleep(TURN_S)
+        wall, used = time.perf_counter(), time.process_time()
+        for _ in range(turns):
+            fleet.feed_turn()
+            await asyncio.sleep(max(0.0, TURN_S - (time.perf_counter() - wall) % TURN_S))
+        wall, used = time.perf_counter() - wall, time.process_time() - used
+        fleet.check()
+        return used / wall / count
+
+
+async def _mebibytes_of_each(count: int) -> float:
+    async with AsyncExitStack() as stack:
+        tracemalloc.start()
+        stack.callback(tracemalloc.stop)
+        fleet = await _connected(stack, count, 0)
+        fleet.feed_turn()
+        fleet.check()
+        fleet.forget()
+        gc.collect()
+        return tracemalloc.get_traced_memory()[0] / count / (1 << 20)
+
+
+class _Fleet:
+    """Clients that are connected, and what their vehicles will send."""
+
+    def __init__(self, vehicles: list[Vehicle], connections: list[Connection], turns: list[Turn]) -> None:
+        self._vehicles, self._connections, self._turns = vehicles, connections, turns
+
+    def feed_turn(self) -> None:
+        for connection, datagrams in zip(self._connections, self._turns.pop(0), strict=True):
+            for datagram in datagrams:
+                connection.bytes_received(datagram, None)
+
+    def forget(self) -> None:
+        """What was not fed counts as nobody's memory."""
+        self._turns.clear()
+
+    def check(self) -> None:
+        if not all(vehicle.attitude.is_known for vehicle in self._vehicles):
+            raise AssertionError("not every client was told of its vehicle")
+
+
+async def _connected(stack: AsyncExitStack, count: int, turns: int) -> _Fleet:
+    encoders = [FrameEncoder(1 + number % ON_A_LINK, 1) for number in range(count)]
+    connections = [
+        await stack.enter_async_context(aerokit.open_connection(FedLink(f"network {number}")))
+        for number in range(-(-count // ON_A_LINK))
+    ]
+    vehicles = []
+    for number, encoder in enumerate(encoders):
+        connection = connections[number // ON_A_LINK]
+        for _ in range(5):  # what is read in turn after turn counts as having waited
+            await asyncio.sleep(0)
+        connection.bytes_received(encoder.encode(HEARTBEAT), None)
+        system_id = 1 + number % ON_A_LINK
+        vehicles.append(
+            await stack.enter_async_context(aerokit.connect(connection, system_id=system_id, rates={}))
+        )
+    return _Fleet(vehicles, connections, _made(encoders, turns + 1))
+
+
+def _made(encoders: Sequence[FrameEncoder], turns: int) -> list[Turn]:
+    """Turn by turn a message of each kind from every vehicle, one in a datagram, and heartbeats with every fourth."""
+    kinds = _kinds()
+    made: list[Turn] = []
+    for number in range(turns):
+        turn: Turn = [[] for _ in range(-(-len(encoders) // ON_A_LINK))]
+        for which, encoder in enumerate(encoders):
+            sent = [HEARTBEAT, *kinds] if number % 4 == 0 else kinds
+            turn[which // ON_A_LINK] += [encoder.encode(each) for each in sent]
+        made.append(turn)
+    return made
+
+
+def _kinds() -> list[Message]:
+    """The last of each kind that a client watches, out of the recorded flight."""
+    wanted = {getattr(messages, name) for name in DEFAULT_RATES_HZ}
+    found: dict[type[Message], Message] = {}
+    for raw in decode.frames_of(next(iter(decode.RECORDINGS.values()))):
+        frame = Frame.parse(raw)
+        if STANDARD[frame.message_id] in wanted:
+            found[STANDARD[frame.message_id]] = STANDARD.decode(frame)
+    return list(found.values())
+
+
+if __name__ == "__main__":
+    sys.stdout.write(json.dumps(rows(), indent=2) + "\n")

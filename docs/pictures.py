@@ -1,0 +1,120 @@
+"""Draws docs/images: the flights of the demonstration and of the examples, and what the demonstration says.
+
+python docs/pictures.py [NAME …]        or: nox -s pictures
+
+Flights are on virtual time, or on a socket for programs that block; the pictures are of where the vehicle truly was.
+"""
+
+from __future__ import annotations
+
+import runpy
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from terminal_picture import draw_terminal
+
+from aerokit.sim import HOME, SimulatedCamera, SimulatedCopter, simulated_link
+from aerokit.sim.picture import save_picture
+from aerokit.sim.track import Track, record_track
+from aerokit.testing import run_virtual, serve_flight
+
+ROOT = Path(__file__).parent.parent
+IMAGES = ROOT / "docs" / "images"
+MOST_POINTS = 400
+"""Of a track in a picture: more cannot be seen."""
+SPEEDUP = 20.0
+
+ON_VIRTUAL_TIME: dict[str, list[Any]] = {
+    "fly_square": [],
+    "guided_velocity": [],
+    "land_on_low_battery": [95.0],
+    "mission": [],
+    "survey_photos": [],
+    "two_vehicles": [],
+}
+"""Example: what its ``main`` takes behind the address."""
+ON_A_SOCKET: dict[str, list[str]] = {
+    "blocking_hello": ["{address}"],
+    "blocking_messages": ["{address}"],
+    "dronekit/simple_goto": ["--connect", "{address}"],
+    "dronekit/basic_mission": ["--connect", "{address}"],
+    "dronekit/guided_velocity_and_yaw": ["--seconds", "0.2", "--altitude", "5", "--connect", "{address}"],
+}
+"""Example: its arguments."""
+
+
+def main(names: list[str]) -> None:
+    """Draw the pictures of these names, or all."""
+    makers: dict[str, Callable[[], None]] = {"demo": draw_demo}
+    makers |= {name: partial(fly_on_virtual_time, name) for name in ON_VIRTUAL_TIME}
+    makers |= {name: partial(fly_on_a_socket, name) for name in ON_A_SOCKET}
+    for name in names or makers:
+        makers[name]()
+
+
+def draw_demo() -> None:
+    """``aerokit demo`` as a picture of its flight, and of the terminal."""
+    with tempfile.TemporaryDirectory() as folder, serve_flight(speedup=5.0) as flight:
+        told = run([sys.executable, "-m", "aerokit", "demo", "--connect", flight.address], folder)
+        draw([flight.track], "demo")
+    lines = [line for line in told.splitlines() if not line.startswith("connecting")]
+    (IMAGES / "terminal.svg").write_text(draw_terminal("aerokit demo", lines), encoding="utf-8")
+
+
+def fly_on_virtual_time(name: str) -> None:
+    """An example with a coroutine ``main``."""
+    example = runpy.run_path(str(ROOT / "examples" / f"{name}.py"))
+    has_camera = name == "survey_photos"
+    latitude_deg, longitude_deg, altitude_m = HOME
+    flown = [
+        SimulatedCopter(
+            system_id=number,
+            boot_time_s=0.0,
+            home=(latitude_deg, longitude_deg + 0.0001 * number, altitude_m),  # nine metres apart
+            components=[SimulatedCamera()] if has_camera else [],
+        )
+        for number in ((1, 2) if name == "two_vehicles" else (1,))
+    ]
+    tracks = [record_track(copter) for copter in flown]
+
+    async def fly() -> None:
+        async with simulated_link(flown) as link:
+            with tempfile.TemporaryDirectory() as folder:
+                await example["main"](link, *([folder] if has_camera else ON_VIRTUAL_TIME[name]))
+
+    run_virtual(fly())
+    draw(tracks, name)
+
+
+def fly_on_a_socket(name: str) -> None:
+    """An example that is a program."""
+    is_classic = name.startswith("dronekit/")
+    runner = ["-m", "aerokit.dronekit"] if is_classic else []
+    with tempfile.TemporaryDirectory() as folder, serve_flight(speedup=SPEEDUP) as flight:
+        arguments = [argument.format(address=flight.address) for argument in ON_A_SOCKET[name]]
+        run([sys.executable, *runner, str(ROOT / "examples" / f"{name}.py"), *arguments], folder)
+        draw([flight.track], name.replace("/", "-"))
+
+
+def run(command: list[str], folder: str) -> str:
+    """What a program prints."""
+    return subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True).stdout
+
+
+def draw(tracks: list[Track], name: str) -> None:
+    """From above and in height; of as many points as can be seen."""
+    thin = []
+    for track in tracks:
+        points = list(track)
+        step = max(1, len(points) // MOST_POINTS)
+        thin.append(Track(track.home, points[::step] + points[-1:], name=track.name))
+    save_picture(thin, IMAGES / f"{name}.svg")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

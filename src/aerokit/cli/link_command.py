@@ -1,0 +1,118 @@
+"""What the commands that listen to a whole link share: its address, how long to listen, and the connection."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import AsyncExitStack, asynccontextmanager
+from typing import TYPE_CHECKING
+
+import anyio
+
+from aerokit.cli.arguments import address, number
+from aerokit.cli.completers import addresses, offer
+from aerokit.cli.interrupt import on_interrupt
+from aerokit.cli.output import add_json
+from aerokit.cli.signing import ENVIRONMENT, add_signing_key, signing_of
+from aerokit.cli.vehicle_command import ADDRESS_VARIABLE, USUAL_ADDRESS, default_address
+from aerokit.cli.waiting import waiting
+from aerokit.errors import ConnectFailed
+
+if TYPE_CHECKING:
+    import argparse
+    from collections.abc import AsyncIterator
+
+    from aerokit.links.link import Link
+    from aerokit.runtime.connection import Connection
+
+__all__ = ["add_link", "add_seconds", "await_end", "await_vehicle", "opened"]
+
+
+def add_link(command: argparse.ArgumentParser, *, default: str | None = None) -> None:
+    """Add the address, what belongs to it, and ``--json``; ``default`` says what happens without an address."""
+    place = command.add_argument(
+        "address",
+        nargs="?",
+        type=address,
+        default=default_address() if default is None else None,
+        metavar="ADDRESS",
+        help="udpin:0.0.0.0:14550, tcp:127.0.0.1:5760, /dev/ttyACM0,57600 … "
+        + (f"(${ADDRESS_VARIABLE}, else {USUAL_ADDRESS})" if default is None else f"({default})"),
+    )
+    offer(place, addresses)
+    command.add_argument(
+        "--baud", type=int, default=57600, help="of a serial port whose address says none (57600)"
+    )
+    add_signing_key(command, f"of vehicles that want signed messages (${ENVIRONMENT})")
+    add_json(command)
+
+
+def add_seconds(command: argparse.ArgumentParser, text: str, default: float | None = None) -> None:
+    """Add ``--seconds``."""
+    command.add_argument("--seconds", type=number(0.1, 1e6), default=default, metavar="S", help=text)
+
+
+@asynccontextmanager
+async def opened(options: argparse.Namespace, *, reconnect: bool = False) -> AsyncIterator[Connection]:
+    """A connection to the address, or to the link, that the options name; nothing but heartbeats is sent.
+
+    ``reconnect``: one that is lost is opened again, if it has an address.
+    """
+    from aerokit.runtime.opening import ONLOOKER, open_connection
+
+    place: str | Link = options.address
+    async with open_connection(
+        place,
+        baud=options.baud,
+        signing=signing_of(options),
+        source_system=ONLOOKER,
+        reconnect=reconnect and isinstance(place, str),
+    ) as connection:
+        yield connection
+
+
+async def await_vehicle(connection: Connection, options: argparse.Namespace, patience_s: float) -> None:
+    """Wait for the first heartbeat of an autopilot.
+
+    Raises:
+        ConnectFailed: none came; the text says what was heard instead.
+        ConnectionClosed, LinkLost: the connection ended.
+    """
+    from aerokit.runtime.diagnosis import no_vehicle_reason
+
+    async with AsyncExitStack() as stack:
+        await stack.enter_async_context(waiting(options, connection.link.address, patience_s))
+        with anyio.move_on_after(patience_s):
+            async for _ in connection.vehicles():
+                return
+    raise ConnectFailed(
+        f"no heartbeat of an autopilot within {patience_s:g} s on {connection.link.address}:"
+        f" {no_vehicle_reason(connection, None)}"
+    )
+
+
+async def await_end(
+    connection: Connection, seconds: float | None, work: asyncio.Task[None] | None = None
+) -> bool:
+    """Wait for Ctrl-C or for so many seconds; whether it was Ctrl-C. Raises what ended the connection, if it did.
+
+    ``work``: what is done meanwhile; its end, by an error of its own, ends the waiting, too.
+    """
+    ended = asyncio.Event()
+    interrupted = False
+
+    def interrupt() -> None:
+        nonlocal interrupted
+        interrupted = True
+        ended.set()
+
+    detach = connection.on_end(lambda _: ended.set())
+    if work is not None:
+        work.add_done_callback(lambda _: ended.set())
+    try:
+        with on_interrupt(interrupt), anyio.move_on_after(seconds):
+            await ended.wait()
+    finally:
+        detach()
+    if not interrupted:
+        connection.raise_if_ended()
+    return interrupted

@@ -1,0 +1,142 @@
+"""What ``aerokit status`` says of a vehicle, as lines for people and as a record."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from aerokit.mavlink.enums import MavAutopilot, MavType
+from aerokit.mavlink.signing import is_signed_with_a_key
+from aerokit.vehicle.components.status import kind_of
+from aerokit.vehicle.overview import overview
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from aerokit.mavlink.messages import Heartbeat
+    from aerokit.vehicle.state.equipment import Battery, GpsReceiver
+    from aerokit.vehicle.vehicle import Vehicle
+
+__all__ = ["about_vehicle", "component_line", "link_line", "vehicle_lines"]
+
+UNKNOWN = "not told"
+FIXES = ("no receiver", "no fix", "2D", "3D", "DGPS", "RTK float", "RTK fixed", "static", "PPP")
+
+
+def about_vehicle(vehicle: Vehicle, missing: Sequence[str]) -> dict[str, Any]:
+    """The record of one vehicle."""
+    version = vehicle.version.latest
+    return {
+        **overview(vehicle),
+        "component_id": vehicle.component_id,
+        "version": None if version is None else str(version),
+        "mode": vehicle.mode_name,
+        "armed": vehicle.armed.latest,
+        "missing": list(missing),
+        **_frame_of(vehicle.connection.heard.get((vehicle.system_id, vehicle.component_id))),
+    }
+
+
+def vehicle_lines(vehicle: Vehicle, missing: Sequence[str]) -> list[str]:
+    """The same for people."""
+    version = vehicle.version.latest
+    heartbeat = vehicle.connection.heard.get((vehicle.system_id, vehicle.component_id))
+    frame = _frame_of(heartbeat)
+    armed = {None: "armed or not: unknown", True: "ARMED", False: "disarmed"}[vehicle.armed.latest]
+    landed = vehicle.landed_state.latest
+    place = "" if landed is None else f", {_words(getattr(landed, 'name', str(landed)))}"
+    kind = "" if heartbeat is None else f", {_words(_name(MavType, heartbeat.type))}"
+    return [
+        f"system {vehicle.system_id}: {vehicle.autopilot.firmware} {version or 'of unknown version'}{kind}",
+        f"  mode     {vehicle.mode_name}, {armed}{place}",
+        f"  GPS      {'; '.join(map(_gps, vehicle.gps.latest or ())) or UNKNOWN}",
+        f"  battery  {'; '.join(map(_battery, vehicle.batteries.latest or ())) or UNKNOWN}",
+        f"  link     {_link(vehicle, frame)}",
+        *_aligned("missing", missing or ["nothing that is known"]),
+    ]
+
+
+def component_line(heartbeat: Heartbeat, system_id: int, component_id: int) -> tuple[dict[str, Any], str]:
+    """Record and line of another component."""
+    kind = kind_of(heartbeat, component_id)
+    record = {
+        "system_id": system_id,
+        "component_id": component_id,
+        "kind": kind,
+        "autopilot": _name(MavAutopilot, heartbeat.autopilot),
+        "vehicle_type": heartbeat.type,
+        **_frame_of(heartbeat),
+    }
+    name = "ground station" if kind == "gcs" else kind.replace("_", " ")
+    return record, f"system {system_id}, component {component_id}: {name}"
+
+
+def link_line(record: Mapping[str, Any]) -> str:
+    """The link as a whole."""
+    total = record["frames"] + record["frames_lost"]
+    parts = [
+        f"{record['address']}: {record['frames']} frames in {record['seconds']:.1f} s",
+        f"{_percent(record['frames_lost'], total)} lost",
+    ]
+    if record["bad_bytes"]:
+        parts.append(f"{record['bad_bytes']} of {record['bytes']} bytes are no frame")
+    if record["unknown_messages"]:
+        parts.append(f"{record['unknown_messages']} frames of unknown messages")
+    return ", ".join(parts)
+
+
+def _link(vehicle: Vehicle, frame: Mapping[str, Any]) -> str:
+    received, lost = vehicle.connection.counts(vehicle.system_id)
+    report = vehicle.link_quality.latest
+    trip = None if report is None else report.round_trip_s
+    parts = [
+        f"MAVLink {frame['mavlink_version'] or '?'}{', signed' if frame['signed'] else ''}",
+        f"last heartbeat {vehicle.heartbeat_age:.1f} s ago",
+        f"{_percent(lost, received + lost)} of {received + lost} frames lost",
+    ]
+    return ", ".join(parts if trip is None else [*parts, f"{trip * 1000:.0f} ms there and back"])
+
+
+def _frame_of(heartbeat: Heartbeat | None) -> dict[str, Any]:
+    frame = None if heartbeat is None else heartbeat.received_frame
+    return {
+        "mavlink_version": None if frame is None else frame.version,
+        "signed": None if frame is None else is_signed_with_a_key(frame),
+    }
+
+
+def _gps(receiver: GpsReceiver) -> str:
+    known = 0 <= receiver.fix_type < len(FIXES)
+    parts = [FIXES[receiver.fix_type] if known else f"fix {receiver.fix_type}"]
+    if receiver.satellites is not None:
+        parts.append(f"{receiver.satellites} satellites")
+    if receiver.hdop is not None:
+        parts.append(f"HDOP {receiver.hdop:.1f}")
+    return ", ".join(parts)
+
+
+def _battery(battery: Battery) -> str:
+    values = (
+        (battery.remaining_percent, ".0f", "%"),
+        (battery.voltage_v, ".1f", "V"),
+        (battery.current_a, ".1f", "A"),
+    )
+    return ", ".join(f"{value:{form}} {unit}" for value, form, unit in values if value is not None) or UNKNOWN
+
+
+def _aligned(label: str, texts: Sequence[str]) -> list[str]:
+    return [f"  {label if place == 0 else '':8} {text}" for place, text in enumerate(texts)]
+
+
+def _percent(part: int, whole: int) -> str:
+    return f"{100 * part / whole if whole else 0:.1f} %"
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ").lower()
+
+
+def _name(enum: type[MavType | MavAutopilot], number: int) -> str:
+    try:
+        return enum(number).name
+    except ValueError:
+        return str(number)

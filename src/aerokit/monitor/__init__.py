@@ -1,0 +1,1 @@
+"""``aerokit monitor``: the vehicles on a link, in a terminal. Needs the extra ``monitor`` (Textual)."""

@@ -1,0 +1,153 @@
+"""Who may ask: host and origin of a request, the token, and what browsers are told to forbid themselves."""
+
+from __future__ import annotations
+
+import hmac
+import ipaddress
+from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
+
+from starlette.datastructures import Headers, MutableHeaders
+
+from aerokit.errors import LocalProtocolError
+from aerokit.serve.problems import Problem, problem_response
+
+if TYPE_CHECKING:
+    from collections.abc import Collection
+
+    from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+__all__ = ["PROTOCOL", "Guard", "Keys", "check_token", "content_policy"]
+
+PROTOCOL = "aerokit.v1"
+"""The WebSocket subprotocol that is spoken."""
+_TOKEN_PREFIX = "bearer."
+SHORTEST_TOKEN = 16
+_TOKEN_CHARACTERS = frozenset("ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789-._~")
+
+
+def check_token(token: str) -> str:
+    """Raise LocalProtocolError unless it can stand in headers and is not short; its value is in no text."""
+    if not (SHORTEST_TOKEN <= len(token) <= 256 and set(token) <= _TOKEN_CHARACTERS):
+        raise LocalProtocolError(
+            f"a token has {SHORTEST_TOKEN} to 256 characters of A-Z, a-z, 0-9 and - . _ ~; this one has {len(token)},"
+            " or others"
+        )
+    return token
+
+
+class Keys:
+    """Checks the token of a request: ``Authorization: Bearer …``, or for WebSockets a subprotocol ``bearer.…``."""
+
+    def __init__(self, token: str, *, open_reading: bool, read_only: bool) -> None:
+        self._token = check_token(token).encode()
+        self._open_reading = open_reading
+        self.read_only: bool = read_only
+
+    def check(self, headers: Headers, *, is_order: bool = False, needs_token: bool = False) -> None:
+        """Raise Problem, 401 or 403, unless this may be asked."""
+        if is_order and self.read_only:
+            raise Problem(403, "ReadOnly", "this server takes no orders; nothing was sent")
+        given = _token_of(headers)
+        if given is None and self._open_reading and not (is_order or needs_token):
+            return
+        if given is None or not hmac.compare_digest(given.encode("utf-8", "surrogateescape"), self._token):
+            what = "the token is missing" if given is None else "the token is wrong"
+            headers_back = {"WWW-Authenticate": 'Bearer realm="aerokit"'}
+            raise Problem(401, "Unauthorized", f"{what}; nothing was sent", headers_back)
+
+
+def _token_of(headers: Headers) -> str | None:
+    scheme, _, token = headers.get("authorization", "").partition(" ")
+    if scheme.lower() == "bearer":
+        return token.strip()
+    for each in headers.get("sec-websocket-protocol", "").split(","):
+        if each.strip().startswith(_TOKEN_PREFIX):
+            return each.strip()[len(_TOKEN_PREFIX) :]
+    return None
+
+
+def content_policy(tiles: str | None) -> str:
+    """The Content-Security-Policy of all answers; pictures of a tile server are let in by its origin."""
+    pictures = "'self'"
+    if tiles is not None:
+        place = urlsplit(tiles)
+        is_place = place.scheme in ("http", "https") and place.hostname and "@" not in place.netloc
+        if (
+            not is_place
+            or any(f"{{{each}}}" not in tiles for each in "xyz")
+            or set(tiles) & set(" \t\n\"';,<>\\")
+        ):
+            raise LocalProtocolError(
+                f"tiles = {tiles!r} is no URL of tiles: https://tiles.example/{{z}}/{{x}}/{{y}}.png"
+            )
+        pictures += f" {place.scheme}://{place.netloc}"
+    return (
+        f"default-src 'none'; script-src 'self'; style-src 'self'; img-src {pictures}; connect-src 'self';"
+        " base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    )
+
+
+class Guard:
+    """ASGI middleware: refuses other hosts and origins, and adds the headers that every answer has.
+
+    A Host that is an IP address or ``localhost`` cannot be a name that somebody else points here (DNS rebinding);
+    other names have to be in ``hosts``. A request that a browser makes for another site says so by its Origin.
+    """
+
+    def __init__(self, app: ASGIApp, hosts: Collection[str], tiles: str | None) -> None:
+        self._app = app
+        self._hosts = {"localhost", *(host.lower() for host in hosts)}
+        self._headers = {
+            "Content-Security-Policy": content_policy(tiles),
+            "X-Content-Type-Options": "nosniff",
+            "X-Frame-Options": "DENY",
+            "Referrer-Policy": "no-referrer" if tiles is None else "strict-origin-when-cross-origin",
+            "Cross-Origin-Opener-Policy": "same-origin",
+            "Cross-Origin-Resource-Policy": "same-origin",
+        }
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer one request, or hand it on."""
+        if scope["type"] not in ("http", "websocket"):
+            await self._app(scope, receive, send)
+            return
+
+        async def sending(message: Message) -> None:
+            if message["type"] in ("http.response.start", "websocket.http.response.start"):
+                MutableHeaders(scope=message).update(self._headers)
+            await send(message)
+
+        try:
+            self._check(Headers(scope=scope))
+        except Problem as problem:
+            if scope["type"] == "websocket":
+                await receive()
+                await send({"type": "websocket.close", "code": 1008})
+            else:
+                await problem_response(problem)(scope, receive, sending)
+            return
+        await self._app(scope, receive, sending)
+
+    def _check(self, headers: Headers) -> None:
+        host = headers.get("host", "")
+        if not self._is_own(host):
+            raise Problem(421, "WrongHost", "this server is not known by that name (--allow-host)")
+        origins = headers.getlist("origin")
+        if any(urlsplit(origin).netloc.lower() != host.lower() for origin in origins):
+            raise Problem(403, "WrongOrigin", "pages of other sites may not ask here")
+        if (
+            headers.get("sec-fetch-site", "none") == "cross-site"
+            and headers.get("sec-fetch-mode") != "navigate"
+        ):
+            raise Problem(403, "WrongOrigin", "pages of other sites may not ask here")
+
+    def _is_own(self, host: str) -> bool:
+        try:
+            name = (urlsplit(f"//{host}").hostname or "").lower()
+            if name in self._hosts:
+                return True
+            ipaddress.ip_address(name)
+        except ValueError:
+            return False
+        return True

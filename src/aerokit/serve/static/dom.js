@@ -1,0 +1,58 @@
+// Elements and numbers. Texts of vehicles become text nodes, never HTML: nothing here or elsewhere sets innerHTML.
+
+export function element(tag, properties = {}, ...children) {
+  const made = document.createElement(tag);
+  for (const [name, value] of Object.entries(properties)) {
+    if (name.startsWith("on")) made.addEventListener(name.slice(2), value);
+    else if (name === "class") made.className = value;
+    else if (name in made && name !== "list") made[name] = value;
+    else made.setAttribute(name, value);
+  }
+  made.append(...children.filter((child) => child !== null && child !== undefined));
+  return made;
+}
+
+export const byId = (id) => document.getElementById(id);
+export const UNKNOWN = "—";
+
+export function number(value, digits = 1, unit = "") {
+  if (typeof value !== "number" || !Number.isFinite(value)) return UNKNOWN;
+  const text = value.toFixed(digits).replace(/^-(0(\.0+)?)$/, "$1");
+  return unit ? `${text} ${unit}` : text;
+}
+
+// the unit that a name ends with, the longer endings first, and how many digits such a value is shown with
+const UNITS = [
+  ["_rate_deg_s", "°/s", 1, " rate"], ["_m_s2", "m/s²", 2], ["_m_s", "m/s", 2], ["_per_s", "/s"], ["_deg", "°", 1], ["_percent", "%"], ["_mah", "mAh"],
+  ["_wh", "Wh", 1], ["_hz", "Hz", 1], ["_us", "µs"], ["_m", "m", 2], ["_v", "V", 2], ["_a", "A", 2], ["_c", "°C", 1], ["_s", "s", 1],
+];
+
+// "north_m_s" is the label "north", and how to show a value in its unit: "-0.12 m/s"
+export function unitOf(name) {
+  const [ending, unit, digits, rest = ""] = UNITS.find(([each]) => name.endsWith(each)) ?? ["", "", undefined];
+  const label = (name.slice(0, name.length - ending.length) + rest).replaceAll("_", " ");
+  return { label, unit, digits: /itude_deg$/.test(name) ? 6 : digits };
+}
+
+export function age(seconds) {
+  if (typeof seconds !== "number") return UNKNOWN;
+  if (seconds < 1) return "now";
+  if (seconds < 60) return `${seconds.toFixed(0)} s`;
+  if (seconds < 3600) return `${(seconds / 60).toFixed(0)} min`;
+  return `${(seconds / 3600).toFixed(1)} h`;
+}
+
+// how old a value may be that comes several times a second, or once, before it is shown as old
+export function staleness(seconds) {
+  if (seconds === undefined || seconds === null) return "unknown";
+  return seconds > 10 ? "very-old" : seconds > 3 ? "old" : "";
+}
+
+export function clock(unixSeconds) {
+  return new Date(unixSeconds * 1000).toLocaleTimeString([], { hour12: false });
+}
+
+export function show(node, text, className) {
+  if (node.textContent !== text) node.textContent = text;
+  if (className !== undefined && node.className !== className) node.className = className;
+}

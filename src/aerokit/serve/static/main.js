@@ -1,0 +1,215 @@
+// The page: keeps what the stream tells and shows it.
+
+import { drawAttitude } from "./attitude.js";
+import { age, byId, element, number, show } from "./dom.js";
+import { colourOf, MapView } from "./map.js";
+import { Orders } from "./orders.js";
+import { currentItem, MissionPanel, OrderPanel, orderText, ParameterPanel, TextPanel } from "./panels.js";
+import { ask, hasToken, openStream, useToken } from "./server.js";
+import { ageOf, BigValues, StateTable } from "./state.js";
+
+const page = { vehicles: new Map(), selected: undefined, receivedAt: 0, atSeconds: null, isOpen: false, isReadOnly: false, modesOf: undefined };
+const selected = () => page.vehicles.get(page.selected);
+
+const map = new MapView(byId("map"), (place) => { pick(false); orders.goTo(place, heightNow()); });
+const big = new BigValues(byId("tiles-of-state"));
+const table = new StateTable();
+const missions = new MissionPanel(draw);
+const texts = new TextPanel();
+const given = new OrderPanel();
+const orders = new Orders(byId("orders"), {
+  vehicle: selected, seenAt: () => page.atSeconds, pick: () => pick(!map.isPicking), toast, given: note,
+});
+const parameters = new ParameterPanel((id, parameter) => { if (!page.isReadOnly) orders.setParameter(id, parameter); });
+
+// ------------------------------------------------------------------------------------------- panels
+
+const TABS = [["State", table], ["Mission", missions], ["Parameters", parameters], ["Messages", texts], ["Orders", given]];
+let tab = table;
+const tabButtons = TABS.map(([name, panel]) => element("button", { type: "button", role: "tab", onclick: () => open(panel) }, name));
+byId("tabs").append(...tabButtons);
+
+function open(panel) {
+  tab = panel;
+  TABS.forEach(([, each], index) => tabButtons[index].setAttribute("aria-selected", String(each === panel)));
+  byId("panel").replaceChildren(panel.node);
+  draw();
+}
+
+// ------------------------------------------------------------------------------------------- vehicles
+
+function choose(id) {
+  page.selected = id;
+  pick(false);
+  if (map.follows !== null) map.follows = id;
+  missions.load(id);
+  loadModes(id);
+  draw();
+}
+
+async function loadModes(id) {
+  page.modesOf = id;
+  try {
+    const found = await ask("GET", `api/vehicles/${id}`);
+    if (page.selected === id) orders.showModes(found.modes);
+  } catch { page.modesOf = undefined; }
+}
+
+function showVehicles() {
+  const box = byId("vehicles");
+  const ids = [...page.vehicles.keys()].sort((a, b) => a - b);
+  if (box.dataset.ids !== ids.join()) {
+    box.dataset.ids = ids.join();
+    box.replaceChildren(...ids.map((id) => {
+      const button = element("button", { type: "button", class: "vehicle", onclick: () => choose(id) }, element("span", { class: "dot" }), element("span", {}));
+      button.dataset.id = id;
+      return button;
+    }));
+  }
+  for (const button of box.children) {
+    const vehicle = page.vehicles.get(Number(button.dataset.id));
+    const state = page.isOpen ? vehicle.link.state : "lost";
+    show(button.children[1], `${vehicle.system_id} ${vehicle.firmware}`);
+    if (button.children[0].className !== `dot ${state}`) button.children[0].className = `dot ${state}`;
+    button.title = `link ${state}`;
+    button.setAttribute("aria-pressed", String(vehicle.system_id === page.selected));
+  }
+}
+
+// ------------------------------------------------------------------------------------------- the map
+
+function heightNow() {
+  const told = selected() && selected().states.position;
+  const height = told && told.value.altitude_relative_m;
+  return typeof height === "number" ? Math.max(1, Math.round(height)) : 10;
+}
+
+function pick(isOn) {
+  map.isPicking = isOn && Boolean(selected());
+  byId("map").classList.toggle("picking", map.isPicking);
+  byId("hint").hidden = !map.isPicking;
+  if (map.isPicking) show(byId("hint"), `click where vehicle ${page.selected} is to go`);
+}
+
+function onMap(vehicle) {
+  const { position, heading_deg, home, mode } = vehicle.states;
+  const height = position && number(position.value.altitude_relative_m, 1, "m");
+  const old = ageOf(position, page.receivedAt);
+  const label = [vehicle.system_id, mode && mode.value && mode.value.name, height, old > 3 ? `${age(old)} old` : null];
+  return {
+    id: vehicle.system_id, position: position && position.value, heading: heading_deg && heading_deg.value,
+    age: old, home: home && home.value, label: label.filter(Boolean).join(" · "),
+  };
+}
+
+byId("zoom-in").onclick = () => map.zoom(1.5);
+byId("zoom-out").onclick = () => map.zoom(1 / 1.5);
+byId("fit").onclick = () => { map.isMoved = false; map.follows = null; };
+byId("follow").onclick = () => { map.follows = map.follows === null ? page.selected : null; map.isMoved = true; };
+window.addEventListener("keydown", (event) => { if (event.key === "Escape") pick(false); });
+
+// ------------------------------------------------------------------------------------------- showing
+
+let isDrawn = false;
+
+function draw() {
+  if (isDrawn) return;
+  isDrawn = true;
+  requestAnimationFrame(() => { isDrawn = false; drawNow(); });
+}
+
+function drawNow() {
+  const vehicle = selected();
+  showVehicles();
+  big.show(vehicle, page.receivedAt);
+  tab.show(vehicle, page.receivedAt);
+  const attitude = vehicle && vehicle.states.attitude;
+  drawAttitude(byId("attitude"), attitude && attitude.value, ageOf(attitude, page.receivedAt) > 3);
+  const going = given.running(page.selected, "go_to");
+  const plan = { items: missions.items(page.selected), current: vehicle ? currentItem(vehicle) : null };
+  map.draw([...page.vehicles.values()].map(onMap), page.selected, plan, going && going.arguments);
+  byId("follow").setAttribute("aria-pressed", String(map.follows !== null));
+  orders.enable(page.isOpen && !page.isReadOnly && Boolean(vehicle));
+}
+
+function toast(text, kind) {
+  const made = element("button", { type: "button", class: `toast ${kind}`, title: "close", onclick: () => made.remove() }, text);
+  byId("toasts").append(made);
+  setTimeout(() => made.remove(), kind === "failed" ? 15000 : 5000);
+}
+
+const toldOf = new Set();
+
+function note(record, isNew = true) {
+  const before = given.records.get(record.key);
+  if (before && before.state !== "running") return;
+  given.note(record);
+  if (record.state !== "running" && record.order === "set_parameter" && record.result) {
+    parameters.changed(record.system_id, record.arguments.name, record.result.value);
+  }
+  if (isNew && !toldOf.has(record.key + record.state)) {
+    toldOf.add(record.key + record.state);
+    const why = record.problem ? `: ${record.problem.detail}` : "";
+    toast(`Vehicle ${record.system_id}: ${orderText(record)}: ${record.state === "running" ? "ordered" : record.state}${why}`, record.state);
+  }
+  draw();
+}
+
+// ------------------------------------------------------------------------------------------- the stream
+
+function heard(message) {
+  if (message.type === "state") {
+    page.receivedAt = performance.now();
+    page.atSeconds = message.at_s;
+    page.vehicles = new Map(message.vehicles.map((each) => [each.system_id, each]));
+    for (const each of message.vehicles) if (each.states.position) map.note(each.system_id, each.states.position.value);
+    if (page.selected === undefined && page.vehicles.size) choose(Math.min(...page.vehicles.keys()));
+    else if (selected() && page.modesOf !== page.selected) loadModes(page.selected);
+  } else if (message.type === "event") {
+    texts.add(message);
+    if (message.event === "ParameterChanged") parameters.changed(message.system_id, message.name, message.after);
+  } else if (message.type === "order") note(message);
+  else if (message.type === "hello") {
+    page.isReadOnly = message.read_only;
+    message.events.forEach((each) => texts.add(each));
+    message.orders.forEach((each) => note(each, false));
+  }
+  draw();
+}
+
+function opened() {
+  page.isOpen = true;
+  byId("banner").hidden = true;
+}
+
+function closed(reason) {
+  page.isOpen = false;
+  const banner = byId("banner");
+  banner.hidden = false;
+  if (reason !== "unauthorized") show(banner, "No connection to the server: what is shown is old, and gets older.");
+  else if (!banner.querySelector("form")) askToken(banner);
+  draw();
+}
+
+function askToken(banner) {
+  const input = element("input", { type: "password", required: true, autocomplete: "off" });
+  const form = element("form", { onsubmit: (event) => { event.preventDefault(); useToken(input.value); show(banner, "trying …"); } },
+    hasToken() ? "The token is wrong (a new one is made at each start): " : "This server wants its token: ", input, " ", element("button", { type: "submit" }, "Use"));
+  banner.replaceChildren(form);
+}
+
+function showServer() {
+  const isFresh = page.isOpen && performance.now() - page.receivedAt < 3000;
+  const text = !page.isOpen ? "no connection" : !isFresh ? "no news" : page.isReadOnly ? "reading only" : "live";
+  show(byId("server"), text, `pill ${isFresh ? "good" : "bad"}`);
+}
+
+ask("GET", "api").then((about) => {
+  map.tiles = about.tiles;
+  show(byId("attribution"), about.tiles ? about.attribution : "");
+  byId("server").title = `aerokit ${about.aerokit}`;
+}).catch(() => {});
+open(table);
+openStream({ message: heard, opened, closed });
+setInterval(() => { showServer(); draw(); }, 500);
+window.addEventListener("resize", draw);

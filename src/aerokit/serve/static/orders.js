@@ -1,0 +1,119 @@
+// Orders: buttons, and the dialog that names vehicle and order. Nothing is sent without it, and nothing twice.
+
+import { byId, element } from "./dom.js";
+import { ask, hasToken, newKey, Refusal, useToken } from "./server.js";
+
+// name, text of the button, what the dialog says, fields [name, label, value, step], kind of button
+export const BUTTONS = [
+  ["arm", "Arm", "arm the motors: propellers may start to turn", [], "main"],
+  ["take_off", "Take off", "take off and climb", [["altitude_m", "Metres above home", 10, "any"]], "main"],
+  ["pick", "Go to …", "", [], "main"],
+  ["hold", "Hold", "stop, and stay where it is", [], "rest"],
+  ["land", "Land", "land where it is now", [], "rest"],
+  ["return_to_launch", "Return", "return to the launch place", [], "rest"],
+  ["disarm", "Disarm", "stop the motors", [], ""],
+  null,
+  ["mission/start", "Start mission", "fly its mission from an item on: it takes off if the mission says so", [["item", "From item", 0, "1"]], ""],
+  ["mission/pause", "Pause", "pause its mission, and hold", [], ""],
+  ["mission/resume", "Resume", "go on with its mission", [], ""],
+];
+
+export class Orders {
+  // page: {vehicle(), seenAt(), pick(), toast(text, kind), given(record)}
+  constructor(box, page) {
+    this.page = page;
+    this.buttons = [];
+    for (const each of BUTTONS) {
+      if (!each) { box.append(element("span", { class: "gap" })); continue; }
+      const [name, title, text, fields, kind] = each;
+      const clicked = () => (name === "pick" ? page.pick() : this.confirm({ order: name, title, text, fields }));
+      const button = element("button", { type: "button", class: kind, onclick: clicked }, title);
+      button.dataset.order = name;
+      this.buttons.push(button);
+      box.append(button);
+    }
+    this.modes = element("select", { onchange: () => this.modeChosen() });
+    this.modes.setAttribute("aria-label", "Flight mode");
+    this.buttons.push(this.modes);
+    this.showModes([]);
+    box.append(this.modes);
+  }
+
+  enable(isPossible) {
+    for (const each of this.buttons) if (each.disabled === isPossible) each.disabled = !isPossible;
+  }
+
+  showModes(names) {
+    this.modes.replaceChildren(element("option", { value: "" }, "Mode …"), ...names.map((name) => element("option", { value: name }, name)));
+  }
+
+  modeChosen() {
+    const mode = this.modes.value;
+    this.modes.value = "";
+    if (mode) this.confirm({ order: "mode", title: `Mode ${mode}`, text: `change its flight mode to ${mode}`, fields: [], fixed: { mode } });
+  }
+
+  goTo(place, altitude) {
+    this.confirm({
+      order: "go_to", title: "Go to", fixed: place,
+      text: `go to ${place.latitude_deg.toFixed(6)}, ${place.longitude_deg.toFixed(6)}`,
+      fields: [["altitude_relative_m", "Metres above home", altitude, "any"], ["speed_m_s", "Speed in m/s (optional)", "", "any"]],
+    });
+  }
+
+  setParameter(id, parameter) {
+    this.confirm({
+      vehicle: id, title: `Set ${parameter.name}`, text: `set ${parameter.name}, which is ${parameter.value} now`,
+      fields: [["value", "New value", parameter.value, "any"]], order: "parameter", parameter: parameter.name,
+    });
+  }
+
+  confirm(wanted) {
+    const vehicle = this.page.vehicle();
+    if (!vehicle) return;
+    const id = wanted.vehicle ?? vehicle.system_id; // what the dialog names is what is ordered, whatever is selected later
+    const dialog = byId("dialog"), key = newKey();
+    const inputs = wanted.fields.map(([name, label, value, step]) => {
+      const input = element("input", { type: "number", step, name, required: value !== "" });
+      input.value = typeof value === "number" ? String(+value.toFixed(7)) : value;
+      return [name, input, element("label", {}, label, input)];
+    });
+    const token = hasToken() ? null : element("input", { type: "password", required: true, autocomplete: "off" });
+    const give = (event) => {
+      event.preventDefault();
+      if (token) useToken(token.value);
+      const body = { ...wanted.fixed };
+      for (const [name, input] of inputs) if (input.value !== "") body[name] = Number(input.value);
+      dialog.close();
+      this.give(id, wanted, body, key);
+    };
+    const cancel = element("button", { type: "button", onclick: () => dialog.close() }, "Cancel");
+    dialog.replaceChildren(element("form", { onsubmit: give },
+      element("h2", {}, `${wanted.title}?`),
+      element("p", {}, element("span", { class: "whom" }, `Vehicle ${id}`), ` (${vehicle.firmware}) is ordered to ${wanted.text}.`),
+      ...inputs.map(([, , label]) => label),
+      token ? element("label", {}, "Token", token) : null,
+      element("div", { class: "buttons" }, cancel, element("button", { type: "submit", class: "yes" }, `Yes, ${wanted.title.toLowerCase()} · vehicle ${id}`))));
+    if (dialog.open) dialog.close();
+    dialog.showModal();
+    (inputs.length ? inputs[0][1] : token ?? cancel).focus();
+  }
+
+  async give(id, wanted, body, key) {
+    const isParameter = wanted.order === "parameter";
+    const path = isParameter ? `parameters/${encodeURIComponent(wanted.parameter)}` : wanted.order;
+    const headers = { "Idempotency-Key": key };
+    if (this.page.seenAt() !== null) headers["Aerokit-Seen-At"] = String(this.page.seenAt());
+    const what = `Vehicle ${id}: ${wanted.title}`;
+    try {
+      const record = await ask(isParameter ? "PUT" : "POST", `api/vehicles/${id}/${path}?wait=false`, body, headers);
+      this.page.given(record);
+    } catch (error) {
+      if (error instanceof Refusal) {
+        if (error.problem.status === 401) useToken("");
+        if (error.problem.order) this.page.given(error.problem.order);
+        else this.page.toast(`${what}: ${error.message}`, "failed");
+      } else this.page.toast(`${what}: the server did not answer. It is not known whether the order was given: look at the orders.`, "failed");
+    }
+  }
+}

@@ -1,0 +1,112 @@
+// What a vehicle has told, with ages: the few big values, and the table of all of it.
+
+import { age, element, number, show, staleness, UNKNOWN, unitOf } from "./dom.js";
+
+const TOLD_ONCE = new Set(["home", "origin", "version", "capabilities", "status_text", "mission_reached", "mission_current"]);
+
+// seconds since it was told, by now: it goes on while nothing comes
+export const ageOf = (entry, receivedAt) =>
+  entry && typeof entry.age_s === "number" ? entry.age_s + (performance.now() - receivedAt) / 1000 : undefined;
+
+const first = (value) => (Array.isArray(value) ? value[0] : undefined);
+const heading = (value) => number(value, 0, "°");
+
+const BIG = [
+  ["Mode", "mode", (value) => value.name],
+  ["Motors", "armed", (value) => (value === true ? "ARMED" : value === false ? "disarmed" : UNKNOWN)],
+  ["Above home", "position", (value) => number(value.altitude_relative_m, 1, "m")],
+  ["Ground speed", "ground_speed_m_s", (value) => number(value, 1, "m/s")],
+  ["Heading", "heading_deg", heading],
+  ["Climb", "climb_m_s", (value) => number(value, 1, "m/s")],
+  ["Battery", "batteries", (value) => battery(first(value))],
+  ["Satellites", "gps", (value) => satellites(first(value))],
+];
+
+function battery(value) {
+  if (!value) return UNKNOWN;
+  return `${number(value.remaining_percent, 0, "%")} · ${number(value.voltage_v, 1, "V")}`;
+}
+
+function satellites(value) {
+  if (!value) return UNKNOWN;
+  const fix = String(value.fix_type ?? UNKNOWN).replace(/^TYPE_/, "").replaceAll("_", " ").replace("FIXED", "fixed").replace("FLOAT", "float");
+  return `${number(value.satellites, 0)} · ${fix}`;
+}
+
+export class BigValues {
+  constructor(list) {
+    this.cells = BIG.map(([title]) => {
+      const cell = element("dd", { class: "unknown" }, UNKNOWN);
+      list.append(element("div", {}, element("dt", {}, title), cell));
+      return cell;
+    });
+  }
+
+  show(vehicle, receivedAt) {
+    BIG.forEach(([, name, text], index) => {
+      const entry = vehicle && vehicle.states[name];
+      const known = entry && entry.value !== null && entry.value !== undefined;
+      const shown = known ? text(entry.value) : UNKNOWN;
+      const old = ageOf(entry, receivedAt);
+      const kind = shown === UNKNOWN ? "unknown" : staleness(old) || (shown === "ARMED" ? "armed" : "");
+      show(this.cells[index], kind.includes("old") ? `${shown} (${age(old)})` : shown, kind);
+      this.cells[index].title = known ? `told ${age(old)} ago` : "not told";
+    });
+  }
+}
+
+export class StateTable {
+  constructor() {
+    this.node = element("div", {});
+    this.body = element("tbody", {});
+    this.link = element("p", { class: "note" });
+    const head = element("tr", {}, ...["State", "Value", "Age"].map((text, index) => element("th", index === 2 ? { class: "age" } : {}, text)));
+    this.node.append(this.link, element("table", {}, element("thead", {}, head), this.body));
+    this.rows = new Map();
+  }
+
+  show(vehicle, receivedAt) {
+    if (vehicle !== undefined && this.vehicle !== vehicle.system_id) {
+      this.vehicle = vehicle.system_id;
+      this.rows.clear();
+      this.body.replaceChildren();
+    }
+    if (!vehicle) return;
+    const { link } = vehicle, total = link.frames_received + link.frames_lost;
+    const lost = total ? `${(100 * link.frames_lost / total).toFixed(1)} % lost` : UNKNOWN;
+    show(this.link, `${vehicle.autopilot} ${vehicle.firmware} · link ${link.state ?? UNKNOWN} · ${link.frames_received} frames, ${lost}`);
+    for (const [name, entry] of Object.entries(vehicle.states)) this.row(name, entry, receivedAt);
+  }
+
+  row(name, entry, receivedAt) {
+    let cells = this.rows.get(name);
+    if (!cells) {
+      cells = [element("td", { class: "name" }, unitOf(name).label), element("td", { class: "value" }), element("td", { class: "age" })];
+      this.rows.set(name, cells);
+      this.body.append(element("tr", {}, ...cells));
+    }
+    const old = ageOf(entry, receivedAt), kind = TOLD_ONCE.has(name) ? "" : staleness(old);
+    show(cells[1], plain(entry.value, unitOf(name)), `value ${kind}`);
+    show(cells[2], age(old), `age ${kind === "very-old" ? "old" : kind}`);
+  }
+}
+
+const RAW = new Set(["custom_mode", "base_mode"]); // numbers that the name beside them tells
+
+function plain(value, { unit, digits } = { unit: "" }) {
+  if (value === null || value === undefined) return UNKNOWN;
+  if (typeof value === "number") return measured(value, unit, digits);
+  if (Array.isArray(value)) return value.length ? value.map((each) => plain(each, { unit, digits })).join(", ") : UNKNOWN;
+  if (typeof value === "object") {
+    const shown = Object.entries(value).filter(([name]) => !RAW.has(name));
+    if (shown.length === 1 && shown[0][0] === "name") return String(shown[0][1]);
+    return shown.map(([name, each]) => `${unitOf(name).label} ${plain(each, unitOf(name))}`).join(" · ");
+  }
+  return typeof value === "boolean" ? (value ? "yes" : "no") : String(value);
+}
+
+function measured(value, unit, digits) {
+  if (digits !== undefined) return number(value, digits, unit);
+  if (!Number.isInteger(value)) return number(value, Math.abs(value) < 1 ? 4 : 2, unit).replace(/(\.\d*?)0+(?!\d)/, "$1").replace(/\.(?!\d)/, "");
+  return unit ? `${value} ${unit}` : String(value);
+}

@@ -1,0 +1,252 @@
+"""The gimbal of a simulated PX4 on its AUX outputs (MNT_MODE_OUT 0), with its manager; MNT_MODE_IN 0 or 4 fits it.
+
+Servos tell nothing: what the vehicle tells is the set-point, at once. It obeys only who is in control, but a region of
+interest whoever orders it; it knows no secondary control, no retracted position, and no GIMBAL_MANAGER_SET_PITCHYAW. On
+the way home it takes control itself for a moment and turns to neutral.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Container
+from typing import TYPE_CHECKING
+
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import GimbalDeviceFlags, GimbalManagerCapFlags, MavCmd, MavMountMode, MavResult
+from aerokit.mavlink.enums import GimbalManagerFlags as Flags
+from aerokit.sim.commands import whole
+from aerokit.sim.px4.modes import RTL
+from aerokit.sim.rotations import euler_from_quaternion, quaternion_from_euler
+from aerokit.sim.vehicle import sender_of
+
+if TYPE_CHECKING:
+    from aerokit.mavlink.message import Message
+    from aerokit.sim.channel import Channel
+    from aerokit.sim.commands import Command, CommandHandler
+    from aerokit.sim.px4.vehicle import SimulatedPx4
+
+__all__ = ["GIMBAL_BUILDERS", "BuiltWithGimbal", "Gimbal", "gimbal_commands"]
+
+_FITTED_BY = frozenset({0, 4})
+"""MNT_MODE_IN: the radio and MAVLink, MAVLink alone."""
+_DEVICE_ID = 1
+_UNCHANGED, _ITSELF, _RELEASE = -1, -2, -3
+_LIMITS = ((-45.0, 45.0), (-45.0, 45.0), (-180.0, 180.0))
+_TAU_S, _STEP_S = 0.3, 0.0187
+_SLOWED = _STEP_S / (_TAU_S + _STEP_S)
+"""It filters the angle that it integrates, and so turns slower than it is told."""
+_RATES_END_S = 2.0
+_LOOKS_S = 0.25
+_Can = GimbalManagerCapFlags
+_CAPABILITIES = (
+    _Can.HAS_NEUTRAL | _Can.HAS_ROLL_LOCK | _Can.HAS_PITCH_AXIS | _Can.HAS_PITCH_LOCK
+    | _Can.HAS_YAW_AXIS | _Can.HAS_YAW_LOCK | _Can.CAN_POINT_LOCATION_GLOBAL
+)  # fmt: skip
+Angles = tuple[float, float, float]
+_AHEAD: Angles = (0.0, 0.0, 0.0)
+
+
+class Gimbal:
+    """Set-point, and who is in control."""
+
+    def __init__(self, px4: SimulatedPx4) -> None:
+        self._px4 = px4
+        self.in_control: tuple[int, int] = (0, 0)
+        """System and component id; zeros are nobody."""
+        self._target, self._rates, self._since = _AHEAD, _AHEAD, 0.0
+        self._flags = 0
+        self._place: tuple[int, int, float] | None = None
+        self._was_going_home = False
+        self.is_fitted: bool = False
+        """Whether there is one, as MNT_MODE_IN said when it was switched on."""
+        px4.on(m.GimbalManagerSetAttitude, self._on_attitude)
+
+    def start(self) -> None:
+        """The power comes on: it looks ahead, and nobody is in control."""
+        parameters = self._px4.parameters
+        self.is_fitted = "MNT_MODE_IN" in parameters and parameters["MNT_MODE_IN"] in _FITTED_BY
+        self.rest()
+        self.in_control = (0, 0)
+        if self.is_fitted:
+            self._px4.every(_LOOKS_S, self._look_home)
+
+    @property
+    def is_from_north(self) -> bool:
+        """Whether its yaw is."""
+        return self._place is not None or bool(self._flags & Flags.YAW_LOCK)
+
+    @property
+    def flags(self) -> int:
+        """GIMBAL_DEVICE_FLAGS."""
+        locks = self._flags & (Flags.ROLL_LOCK | Flags.PITCH_LOCK)
+        return locks | (
+            GimbalDeviceFlags.YAW_LOCK if self.is_from_north else GimbalDeviceFlags.YAW_IN_VEHICLE_FRAME
+        )
+
+    def angles(self) -> Angles:
+        """Roll, pitch and yaw of the set-point in radians."""
+        if self._place is not None:
+            return self._towards(self._place)
+        seconds = min(self._px4.now - self._since, _RATES_END_S) * _SLOWED
+        moved = [angle + rate * seconds for angle, rate in zip(self._target, self._rates, strict=True)]
+        limited = [
+            max(math.radians(low), min(math.radians(high), angle))
+            for angle, (low, high) in zip(moved, _LIMITS, strict=True)
+        ]
+        return (limited[0], limited[1], limited[2])
+
+    def _towards(self, place: tuple[int, int, float]) -> Angles:
+        north, east = self._px4.frame.to_local(place[0], place[1])
+        motion = self._px4.motion
+        north, east = north - motion.north, east - motion.east
+        here = self._px4.frame.to_global(motion.north, motion.east, motion.down)
+        pitch = math.atan2(place[2] - here.altitude_m, math.hypot(north, east))
+        return (0.0, max(math.radians(_LIMITS[1][0]), pitch), math.atan2(east, north))
+
+    # ----------------------------------------------------------------------------------------- orders
+
+    def obey(self, flags: int, angles: Angles, rates: Angles) -> None:
+        """Angles if there are any, and rates besides; an order to retract is taken, and nothing done."""
+        if flags & Flags.RETRACT:
+            return
+        here = self.angles()
+        if flags & Flags.NEUTRAL:
+            self.rest()
+            return
+        self._place, self._flags, self._since = None, flags, self._px4.now
+        self._target = here if any(map(math.isnan, angles)) else angles
+        roll, pitch, yaw = (0.0 if math.isnan(rate) else rate for rate in rates)
+        self._rates = (roll, pitch, yaw)
+
+    def rest(self) -> None:
+        """Straight ahead."""
+        self._place, self._flags, self._target, self._rates = None, 0, _AHEAD, _AHEAD
+
+    def look_at(self, latitude_e7: int, longitude_e7: int, altitude_m: float) -> None:
+        """Keep pointing at a place, above the sea."""
+        self._place = (latitude_e7, longitude_e7, altitude_m)
+
+    def _look_home(self) -> None:
+        is_going_home = self._px4.mode == RTL
+        if is_going_home and not self._was_going_home:
+            self.rest()
+            self.in_control = (0, 0)  # it was PX4's own for a moment
+        self._was_going_home = is_going_home
+
+    def _on_attitude(self, order: m.GimbalManagerSetAttitude, _: Channel) -> None:
+        if not self.is_fitted or sender_of(order) != self.in_control:
+            return
+        has_angles = not any(map(math.isnan, order.q))
+        angles = euler_from_quaternion(*order.q) if has_angles else (math.nan,) * 3
+        rates = (order.angular_velocity_x, order.angular_velocity_y, order.angular_velocity_z)
+        self.obey(order.flags, (angles[0], angles[1], angles[2]), rates)
+
+
+def gimbal_commands(px4: SimulatedPx4) -> dict[int, CommandHandler]:
+    """MAV_CMD → handler; without a gimbal nobody answers those for it."""
+
+    def if_fitted(handler: Callable[[Gimbal, Command], int]) -> CommandHandler:
+        return lambda command: handler(px4.gimbal, command) if px4.gimbal.is_fitted else None
+
+    return {
+        MavCmd.DO_GIMBAL_MANAGER_CONFIGURE: if_fitted(_configure),
+        MavCmd.DO_GIMBAL_MANAGER_PITCHYAW: if_fitted(_pitch_and_yaw),
+        MavCmd.DO_MOUNT_CONTROL: if_fitted(_control_mount),
+        MavCmd.DO_MOUNT_CONFIGURE: if_fitted(lambda *_: MavResult.ACCEPTED),
+        MavCmd.DO_SET_ROI_LOCATION: lambda command: _look(px4.gimbal, command),
+        MavCmd.DO_SET_ROI_NONE: lambda _: _look(px4.gimbal, None),
+    }
+
+
+def _configure(gimbal: Gimbal, command: Command) -> int:
+    """Ids; −2 is PX4 itself, not who asks. Secondary control is not known."""
+    own = (gimbal._px4.system_id, gimbal._px4.component_id)
+    now = []
+    for number, before, mine, sender in zip(
+        (command.param1, command.param2), gimbal.in_control, own, command.sender, strict=True
+    ):
+        wanted = whole(number)
+        if wanted == _ITSELF:
+            now.append(mine)
+        elif wanted == _RELEASE:
+            now.append(0 if before == sender else before)
+        else:
+            now.append(wanted if 0 <= wanted <= 255 else before)
+    gimbal.in_control = (now[0], now[1])
+    return MavResult.ACCEPTED
+
+
+def _pitch_and_yaw(gimbal: Gimbal, command: Command) -> int:
+    if command.sender != gimbal.in_control:
+        return MavResult.DENIED
+    angles = (0.0, math.radians(command.param1), math.radians(command.param2))
+    rates = (math.nan, math.radians(command.param3), math.radians(command.param4))
+    gimbal.obey(whole(command.x), angles, rates)
+    return MavResult.ACCEPTED
+
+
+def _control_mount(gimbal: Gimbal, command: Command) -> int:
+    """Modes that it does not know are accepted as well."""
+    mode = whole(command.z)
+    if mode in (MavMountMode.RETRACT, MavMountMode.NEUTRAL):
+        gimbal.rest()
+    elif mode == MavMountMode.MAVLINK_TARGETING:
+        pitch, roll, yaw = (math.radians(each) for each in (command.param1, command.param2, command.param3))
+        angles = (roll, pitch, math.remainder(yaw, math.tau))
+        gimbal.obey(Flags.ROLL_LOCK | Flags.PITCH_LOCK, angles, _AHEAD)
+    return MavResult.ACCEPTED
+
+
+def _look(gimbal: Gimbal, command: Command | None) -> int:
+    """The altitude is taken for one above the sea, whatever the frame."""
+    if command is None:
+        gimbal.rest()
+    elif math.isfinite(command.z):
+        gimbal.look_at(*command.place(), command.z)
+    return MavResult.ACCEPTED
+
+
+# -------------------------------------------------------------------------------------------- telemetry
+
+
+def _attitude_status(px4: SimulatedPx4) -> m.GimbalDeviceAttitudeStatus | None:
+    gimbal = px4.gimbal
+    if not gimbal.is_fitted:
+        return None
+    q = quaternion_from_euler(*gimbal.angles())
+    return m.GimbalDeviceAttitudeStatus(
+        0, 0, px4.time_boot_ms, gimbal.flags, q, 0.0, 0.0, 0.0, 0, 0.0, 0.0, _DEVICE_ID
+    )
+
+
+def _manager_information(px4: SimulatedPx4) -> m.GimbalManagerInformation | None:
+    if not px4.gimbal.is_fitted:
+        return None
+    limits = [math.radians(end) for axis in _LIMITS for end in axis]
+    return m.GimbalManagerInformation(px4.time_boot_ms, _CAPABILITIES, _DEVICE_ID, *limits)
+
+
+def _manager_status(px4: SimulatedPx4) -> m.GimbalManagerStatus | None:
+    gimbal = px4.gimbal
+    if not gimbal.is_fitted:
+        return None
+    return m.GimbalManagerStatus(px4.time_boot_ms, gimbal.flags, _DEVICE_ID, *gimbal.in_control, 0, 0)
+
+
+GIMBAL_BUILDERS: dict[int, Callable[[SimulatedPx4], Message | None]] = {
+    m.GimbalDeviceAttitudeStatus.ID: _attitude_status,
+    m.GimbalManagerInformation.ID: _manager_information,
+    m.GimbalManagerStatus.ID: _manager_status,
+}
+"""Message id → what to send now, or None."""
+
+
+class BuiltWithGimbal(Container[int]):
+    """The ids of the messages that a PX4 has, those of a gimbal only with one."""
+
+    def __init__(self, px4: SimulatedPx4, others: Container[int]) -> None:
+        self._px4, self._others = px4, others
+
+    def __contains__(self, message_id: object) -> bool:
+        is_of_gimbal = message_id in GIMBAL_BUILDERS and self._px4.gimbal.is_fitted
+        return is_of_gimbal or (isinstance(message_id, int) and message_id in self._others)

@@ -1,0 +1,117 @@
+"""Looking at places and at other vehicles: the region of interest of one gimbal."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from aerokit.arguments import checks_arguments
+from aerokit.errors import LocalProtocolError
+from aerokit.mavlink.enums import MavCmd, MavFrame
+from aerokit.vehicle.checks import check_range
+from aerokit.vehicle.gimbal.arrival import Aim, arrive, told_often
+from aerokit.vehicle.gimbal.directions import direction_to
+from aerokit.vehicle.gimbal.looking import Looking
+from aerokit.vehicle.gimbal.part import GimbalPart
+
+if TYPE_CHECKING:
+    from aerokit.position import Position
+
+__all__ = ["PlaceActions"]
+
+
+@checks_arguments
+class PlaceActions(GimbalPart):
+    """Orders to look at something: of two the newer one counts."""
+
+    async def look_at(
+        self, target: Position, *, wait: bool = True, tolerance_deg: float = 5.0, timeout: float = 15.0
+    ) -> None:
+        """Keep it pointed at a place, and return when it points there; without an altitude, at the vehicle's own.
+
+        Sends MAV_CMD_DO_SET_ROI_LOCATION. A copter whose gimbal does not pan turns its nose.
+
+        Args:
+            target: the place.
+            wait: False: return when it was accepted.
+            tolerance_deg: how near in each axis is there, above 0 to 45.
+            timeout: seconds until it has to be there.
+
+        Raises:
+            LocalProtocolError: the tolerance is out of range. Nothing was sent.
+            NotSupported: the manager can do that with its first gimbal only. Nothing was sent.
+            ValueUnknownError: home, or the vehicle's altitude, is not known and is needed here. Nothing was sent.
+            CommandRejected: the manager refused.
+            CommandTimeout: there was no answer.
+            GimbalTaken: control was lost in the block that has it.
+            OperationRejected: another order was given meanwhile, or the vehicle rebooted.
+            OperationTimeout: it was not there in time; the text says where it points.
+            HeartbeatTimeout: the vehicle fell silent.
+        """
+        check_range("tolerance_deg", tolerance_deg, 0, 45, above=True)
+        orders = self._orders
+        orders.check_looks()
+        x, y, z, is_relative = self._bridge.where.global_target(target)
+        frame = MavFrame.GLOBAL_RELATIVE_ALT_INT if is_relative else MavFrame.GLOBAL_INT
+        turn = orders.begin()
+        aim = Aim(
+            lambda: direction_to(self._bridge, target), tolerance_deg, "the vehicle does not tell where it is"
+        )
+        with told_often(orders), self._talk.streaming("position"):
+            since = self._now()
+            place = {"frame": frame, "x": x, "y": y, "z": z}
+            await orders.look(turn, MavCmd.DO_SET_ROI_LOCATION, orders.roi_parameter, **place)
+            if wait:
+                await arrive(orders, turn, f"{orders.name}: look_at", aim, since=since, timeout=timeout)
+
+    async def look_at_system(
+        self, system_id: int, *, wait: bool = True, tolerance_deg: float = 5.0, timeout: float = 15.0
+    ) -> None:
+        """Keep it pointed at another vehicle (MAV_CMD_DO_SET_ROI_SYSID), and return when it points there.
+
+        Both have to hear where the other vehicle is (its GLOBAL_POSITION_INT): the gimbal's manager to point at it,
+        and this connection to notice.
+
+        Args:
+            system_id: its MAVLink system id, 1 to 255.
+            wait: False: return when it was accepted.
+            tolerance_deg: how near in each axis is there, above 0 to 45.
+            timeout: seconds until it has to be there.
+
+        Raises:
+            LocalProtocolError: there is no such system id, or the tolerance is out of range. Nothing was sent.
+            NotSupported: the manager cannot do that. Nothing was sent.
+            CommandRejected: the manager refused.
+            CommandTimeout: there was no answer.
+            GimbalTaken: control was lost in the block that has it.
+            OperationRejected: another order was given meanwhile, or the vehicle rebooted.
+            OperationTimeout: it was not there in time; the text says where it points.
+            HeartbeatTimeout: the vehicle fell silent.
+        """
+        if isinstance(system_id, bool):
+            raise LocalProtocolError(f"system_id = {system_id} is not allowed: 1 to 255")
+        check_range("system_id", system_id, 1, 255)
+        check_range("tolerance_deg", tolerance_deg, 0, 45, above=True)
+        orders = self._orders
+        orders.check_looks()
+        if not orders.rules.looks_at_systems:
+            orders.not_supported("points at places, and at no systems")
+        turn = orders.begin()
+        with Looking(self._bridge, system_id) as other, told_often(orders), self._talk.streaming("position"):
+            since = self._now()
+            await orders.look(turn, MavCmd.DO_SET_ROI_SYSID, system_id, orders.roi_parameter)
+            if wait:
+                aim = Aim(other.direction, tolerance_deg, f"where system {system_id} is was not heard here")
+                what = f"{orders.name}: look_at_system({system_id})"
+                await arrive(orders, turn, what, aim, since=since, timeout=timeout)
+
+    async def stop_looking(self) -> None:
+        """End :meth:`look_at` (MAV_CMD_DO_SET_ROI_NONE). Where it turns then is its manager's business.
+
+        Raises:
+            CommandRejected: the manager refused.
+            CommandTimeout: there was no answer.
+            GimbalTaken: control was lost in the block that has it.
+        """
+        orders = self._orders
+        orders.raise_if_taken()
+        await orders.look(orders.begin(), MavCmd.DO_SET_ROI_NONE, orders.roi_parameter)

@@ -1,0 +1,259 @@
+"""``GimbalRates``: turning a gimbal at rates, for as long as the code lives that feeds them."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from contextlib import ExitStack
+from typing import TYPE_CHECKING
+
+import anyio
+
+from aerokit.arguments import checks_arguments
+from aerokit.errors import AerokitError, BusyError, CommandRejected, NotSupported, SetpointStreamStopped
+from aerokit.mavlink.messages import GimbalManagerSetAttitude, GimbalManagerSetPitchyaw
+from aerokit.runtime.link_state import SILENT_AFTER_S
+from aerokit.vehicle.checks import check_range
+from aerokit.vehicle.gimbal.ending import LastWord
+from aerokit.vehicle.gimbal.orders import LEVEL, LOCKED, NAN, PITCHYAW, GimbalOrders
+from aerokit.vehicle.orders.newest import OVERRULED
+
+if TYPE_CHECKING:
+    from types import TracebackType
+
+    from typing_extensions import Self
+
+    from aerokit.mavlink.message import Message
+    from aerokit.vehicle.orders.newest import Turn
+
+__all__ = ["FASTEST_DEG_S", "GimbalRates"]
+
+FASTEST_DEG_S = 720.0
+"""What is taken as a rate; a gimbal turns as fast as it can."""
+
+
+@checks_arguments
+class GimbalRates:
+    """Turns a gimbal at the latest rates for as long as its ``async with`` block feeds them.
+
+    Entering orders the first rates by MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW; then they are sent at ``rate_hz``
+    (GIMBAL_MANAGER_SET_PITCHYAW, or GIMBAL_MANAGER_SET_ATTITUDE to PX4). Leaving, in any way, orders a rate of zero: it
+    stays where it points. The stream stops by itself, with a rate of zero, when nothing new was set for
+    ``valid_for_s``, the event loop was blocked for ``max_lag_s``, or the vehicle is silent; and is left to others when
+    another order was given to the gimbal, or control was lost. Then ``set`` and leaving the block raise.
+
+    Entering raises:
+        LocalProtocolError: a rate is out of range. Nothing was sent.
+        NotSupported: the vehicle has no gimbal manager: mounts of old turn to angles only.
+        CommandRejected: the manager refused.
+        CommandTimeout: there was no answer.
+        GimbalTaken: control was lost in the block that has it.
+    """
+
+    def __init__(
+        self,
+        orders: GimbalOrders,
+        first: tuple[float, float],
+        is_from_north: bool,
+        rate_hz: float,
+        valid_for_s: float,
+        max_lag_s: float,
+    ) -> None:
+        check_range("rate_hz", rate_hz, 2, 100)
+        check_range("valid_for_s", valid_for_s, 0, 60, above=True)
+        check_range("max_lag_s", max_lag_s, 0, 60, above=True)
+        _check(*first)
+        self._orders, self._talk = orders, orders.talk
+        self._rates, self._flags = first, int(LOCKED if is_from_north else LEVEL)
+        self._period_s, self._valid_for_s, self._max_lag_s = 1 / rate_hz, valid_for_s, max_lag_s
+        self._set_at = self._began_at = -math.inf
+        self._turn: Turn | None = None
+        self._release = ExitStack()
+        """What keeps the first gimbal the first one meanwhile."""
+        self._timer: asyncio.TimerHandle | None = None
+        self._stopped: AerokitError | None = None
+        self._was_told = self._was_entered = False
+
+    @property
+    def is_running(self) -> bool:
+        """Whether rates are being sent."""
+        return self._timer is not None
+
+    def set(self, pitch_deg_s: float = 0.0, yaw_deg_s: float = 0.0) -> None:
+        """Take new rates; they are sent at the next tick, and resent until ``valid_for_s`` has passed.
+
+        Args:
+            pitch_deg_s: degrees per second, −720 to 720; positive is up.
+            yaw_deg_s: degrees per second, −720 to 720; positive is to the right.
+
+        Raises:
+            LocalProtocolError: a rate is out of range; those before stay in force until they are too old.
+            SetpointStreamStopped: the stream has ended by itself, or the block was left.
+            GimbalTaken: control was lost in the block that has it.
+        """
+        _check(pitch_deg_s, yaw_deg_s)
+        self._raise_if_stopped()
+        if self._timer is None:
+            raise SetpointStreamStopped("these rates are not being sent: use them inside their `async with`")
+        self._rates, self._set_at = (pitch_deg_s, yaw_deg_s), self._now()
+
+    async def turn(self, pitch_deg_s: float, yaw_deg_s: float, duration_s: float) -> None:
+        """Feed one pair of rates for ``duration_s`` seconds.
+
+        Args:
+            pitch_deg_s: degrees per second, −720 to 720; positive is up.
+            yaw_deg_s: degrees per second, −720 to 720; positive is to the right.
+            duration_s: for so long.
+
+        Raises:
+            LocalProtocolError: a rate is out of range.
+            SetpointStreamStopped: the stream ended meanwhile.
+            GimbalTaken: control was lost in the block that has it.
+        """
+        until = self._now() + duration_s
+        while (left := until - self._now()) > 0:
+            self.set(pitch_deg_s, yaw_deg_s)
+            await anyio.sleep(min(left, self._valid_for_s / 3))
+        self._raise_if_stopped()
+
+    async def __aenter__(self) -> Self:
+        if self._was_entered:
+            raise BusyError("rates of a gimbal are entered once: call rates() again")
+        self._was_entered = True
+        orders = self._orders
+        self._turn = orders.begin()
+        self._release.enter_context(orders.device.in_use())
+        try:
+            if not await orders.manage(self._turn, NAN, NAN, *self._rates, flags=self._flags):
+                orders.not_supported("has no gimbal manager, which knows rates")
+            self._set_at = self._began_at = self._now()
+            orders.bridge.on_finish.append(self._finish)
+            self._tick(self._now())
+        except (CommandRejected, NotSupported):  # nothing was obeyed
+            self._end()
+            raise
+        except BaseException:  # no answer, too: it may be turning
+            self._leave()
+            raise
+        return self
+
+    async def __aexit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        if self._stopped is None and (error := self._why_leave_alone()):
+            self._stop(error, zero=False)
+        if self._stopped is None:
+            zero = self._zero()
+            self._end()
+            self._stopped = SetpointStreamStopped("the block of these rates was left")
+            if exc is None:
+                await zero.say(f"{self._orders.name}: rates of zero")
+            else:
+                zero.leave()
+        elif exc is None and not self._was_told:
+            raise self._stopped
+
+    # ---------------------------------------------------------------------------- the stream
+
+    def _tick(self, due: float) -> None:
+        """Send once more, unless something says that nobody feeds it any more."""
+        self._timer = None
+        if error := self._why_leave_alone():
+            self._stop(error, zero=False)
+            return
+        if reason := self._why_stop(self._now() - due):
+            self._stop(_stopped(reason))
+            return
+        try:
+            self._talk.connection.send(self._message())
+        except AerokitError as error:
+            self._stop(_stopped(str(error)))
+            return
+        due = max(due + self._period_s, self._now())
+        self._timer = asyncio.get_running_loop().call_at(due, self._tick, due)
+
+    def _message(self) -> Message:
+        orders = self._orders
+        pitch, yaw = (math.radians(each) for each in self._rates)
+        address = (self._talk.system_id, orders.manager_id, self._flags, orders.parameter)
+        if orders.rules.knows_pitchyaw:
+            return GimbalManagerSetPitchyaw(*address, NAN, NAN, pitch, yaw)
+        return GimbalManagerSetAttitude(*address, (NAN, NAN, NAN, NAN), 0.0, pitch, yaw)
+
+    def _why_stop(self, lag: float) -> str | None:
+        age = self._now() - self._set_at
+        if lag > self._max_lag_s:
+            return f"the event loop was blocked for {lag:.1f} s"
+        if age > self._valid_for_s:
+            return f"no new rates came for {age:.1f} s (valid_for_s = {self._valid_for_s:g})"
+        if self._talk.watch.is_silent and self._talk.connection.is_open:
+            return f"the vehicle has been silent for {self._talk.heartbeat_age:.1f} s"
+        manager_id = self._orders.manager_id
+        silent_for_s = min(self._orders.silent_for_s(manager_id), self._now() - self._began_at)
+        if manager_id != self._talk.component_id and silent_for_s > SILENT_AFTER_S:
+            return f"the gimbal's manager has been silent for {silent_for_s:.1f} s"
+        return None
+
+    def _why_leave_alone(self) -> AerokitError | None:
+        """Somebody else has it, or another order of ours holds."""
+        try:
+            self._orders.raise_if_taken()
+        except AerokitError as error:
+            return error
+        if self._turn is not None and not self._turn.is_newest:
+            return _stopped(OVERRULED)
+        return None
+
+    def _stop(self, error: AerokitError, *, zero: bool = True) -> None:
+        self._stopped = error
+        if zero:
+            self._leave()
+        else:
+            self._end()
+
+    def _zero(self) -> LastWord:
+        orders, turn = self._orders, self._turn
+        params = (NAN, NAN, 0.0, 0.0, self._flags, 0, orders.parameter)
+        return LastWord(
+            orders,
+            PITCHYAW,
+            params,
+            lambda: turn is not None and turn.is_newest and not orders.is_taken,
+        )
+
+    def _leave(self) -> None:
+        zero = self._zero()
+        self._end()
+        zero.leave()
+
+    def _finish(self) -> None:
+        """The block of the vehicle is left."""
+        self._stop(_stopped("the block of its vehicle was left"))
+
+    def _end(self) -> None:
+        self._release.close()
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        if self._finish in self._orders.bridge.on_finish:
+            self._orders.bridge.on_finish.remove(self._finish)
+
+    def _raise_if_stopped(self) -> None:
+        if self._stopped is not None:
+            self._was_told = True
+            raise self._stopped
+
+    def _now(self) -> float:
+        return self._talk.connection.now()
+
+
+def _stopped(reason: str) -> SetpointStreamStopped:
+    return SetpointStreamStopped(f"the rates of the gimbal have stopped: {reason}")
+
+
+def _check(pitch_deg_s: float, yaw_deg_s: float) -> None:
+    check_range("pitch_deg_s", pitch_deg_s, -FASTEST_DEG_S, FASTEST_DEG_S)
+    check_range("yaw_deg_s", yaw_deg_s, -FASTEST_DEG_S, FASTEST_DEG_S)

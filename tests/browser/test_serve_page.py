@@ -1,0 +1,259 @@
+"""The page of ``aerokit serve`` in headless Chromium (`nox -s browser`); skipped where one is missing.
+
+With AEROKIT_SCREENSHOTS=DIRECTORY it leaves pictures of the page there.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from anyio.from_thread import start_blocking_portal
+from served_copter import served
+
+import aerokit
+from aerokit.missions import Mission, return_to_launch, take_off, waypoint
+from aerokit.sim import SimulatedCopter
+from aerokit.sim.local_frame import GlobalPoint, LocalFrame
+from aerokit.sim.track import true_point
+
+playwright = pytest.importorskip("playwright.sync_api", reason="playwright is installed by `nox -s browser`")
+CHROMIUM = os.environ.get("AEROKIT_CHROMIUM") or shutil.which("chromium")
+pytestmark = [
+    pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium"),
+    pytest.mark.timeout(300),
+]
+
+HOME = (-35.363261, 149.165230, 584.0)
+HOSTILE = "<img src=x onerror=alert(1)>"
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    quiet = [
+        "--no-first-run",
+        "--disable-background-networking",
+        "--disable-component-update",
+        "--disable-sync",
+    ]
+    with playwright.sync_playwright() as driver:
+        chromium = driver.chromium.launch(
+            executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu", "--disable-quic", *quiet]
+        )
+        yield chromium
+        chromium.close()
+
+
+@contextlib.contextmanager
+def serving(*arguments: str) -> Iterator[dict[str, Any]]:
+    command = [sys.executable, "-m", "aerokit", "serve", *arguments, "--port", "0", "--json"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            yield json.loads(process.stdout.readline())
+        finally:
+            process.terminate()
+            assert process.wait(10) == 0
+
+
+@pytest.fixture(scope="module")
+def copters() -> Iterator[tuple[list[SimulatedCopter], str]]:
+    frame = LocalFrame(GlobalPoint(round(HOME[0] * 1e7), round(HOME[1] * 1e7), HOME[2]))
+    made = []
+    for number in (1, 2):
+        place = frame.to_global(0.0, 25.0 * (number - 1), 0.0)
+        made.append(
+            SimulatedCopter(
+                system_id=number,
+                home=(place.latitude_e7 / 1e7, place.longitude_e7 / 1e7, HOME[2]),
+                boot_time_s=0.0,
+            )
+        )
+    with served(made, speedup=4.0) as address:
+        with start_blocking_portal() as portal:  # this thread has playwright's loop
+            portal.call(upload, address)
+        yield made, address
+
+
+async def upload(address: str) -> None:
+    async with aerokit.connect(address, system_id=1) as vehicle:
+        await vehicle.wait_ready()
+        here = vehicle.position.value
+        corners = [here.offset(north_m=n, east_m=e) for n, e in ((70, -20), (80, 60), (30, 95), (-15, 50))]
+        items = [waypoint(at.latitude_deg, at.longitude_deg, altitude_relative_m=20) for at in corners]
+        await vehicle.mission.upload(Mission([take_off(altitude_relative_m=20), *items, return_to_launch()]))
+
+
+@contextlib.contextmanager
+def opened(browser: Any, url: str, wide: int = 1360, high: int = 820) -> Iterator[Any]:
+    """A page, which at the end must have had no mistake, no foreign request and nothing refused by its policy."""
+    mistakes: list[str] = []
+    context = browser.new_context(viewport={"width": wide, "height": high})
+    page = context.new_page()
+    page.set_default_timeout(10_000)
+    page.on("pageerror", lambda error: mistakes.append(str(error)))
+    page.on("console", lambda each: mistakes.append(each.text) if each.type == "error" else None)
+    page.on("dialog", lambda each: mistakes.append(each.message))
+    page.on("request", lambda each: mistakes.append(each.url) if "//127.0.0.1:" not in each.url else None)
+    page.goto(url)
+    page.wait_for_selector(".vehicle[aria-pressed=true]")
+    yield page
+    assert [each for each in mistakes if "Failed to load resource" not in each] == []  # refused orders
+    context.close()
+
+
+def picture(page: Any, name: str) -> None:
+    if directory := os.environ.get("AEROKIT_SCREENSHOTS"):
+        page.screenshot(path=str(Path(directory) / f"{name}.png"))
+
+
+def order(page: Any, name: str, fields: dict[str, str] | None = None) -> None:
+    page.click(f"button[data-order='{name}']")
+    for field, value in (fields or {}).items():
+        page.fill(f"dialog input[name={field}]", value)
+    page.click("dialog .yes")
+
+
+def wait_done(page: Any, text: str) -> None:
+    page.locator(".toast.done", has_text=text).first.wait_for(timeout=60_000)
+
+
+def test_a_flight_by_the_page(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:
+    (first, second), address = copters
+    with serving(address) as told, opened(browser, told["page"]) as page:
+        assert told["token"] not in page.url  # it was taken out of the address
+        page.get_by_role("tab", name="Mission").click()
+        page.locator("#panel tr").nth(5).wait_for()
+        assert page.locator("#tiles-of-state dd").first.inner_text() == "STABILIZE"
+
+        page.click("button[data-order='arm']")
+        assert "Vehicle 1" in page.locator("dialog .whom").inner_text()
+        picture(page, "dialog")
+        page.click("dialog button >> text=Cancel")
+        assert not first.is_armed
+
+        order(page, "arm")
+        wait_done(page, "arm")
+        assert (first.is_armed, second.is_armed) == (True, False)
+        order(page, "take_off", {"altitude_m": "20"})
+        wait_done(page, "Vehicle 1: take off to 20 m: done")
+        values_have_units(page)
+        order(page, "mission/start")
+        wait_done(page, "mission start")
+        page.locator("tr.current", has_text=re.compile("^[34]")).wait_for(timeout=90_000)
+        picture(page, "mission")
+        fly_to_a_click(page, first)
+        order(page, "land")
+        wait_done(page, "land")
+        page.get_by_role("tab", name="Orders").click()
+        page.locator(
+            "#panel .text", has_text="go to: latitude -35."
+        ).wait_for()  # it is drawn with the next frame
+        picture(page, "orders")
+
+
+def values_have_units(page: Any) -> None:
+    page.get_by_role("tab", name="State").click()
+    rows = dict(
+        page.locator("#panel tbody tr").evaluate_all(
+            "rows => rows.map(r => [...r.cells].map(c => c.innerText).slice(0, 2))"
+        )
+    )
+    metres, speed = r"-?\d+\.\d\d m", r"-?\d+\.\d\d m/s"
+    local = rf"north {metres} · east {metres} · down {metres} · north {speed} · east {speed} · down {speed}"
+    assert re.fullmatch(local, rows["local position"]), rows["local position"]
+    assert re.search(r"voltage \d+\.\d\d V", rows["batteries"])
+    assert re.match(r"latitude -35\.\d{6} °", rows["position"])
+    assert re.fullmatch(r"\d+\.\d °", rows["heading"])
+    assert rows["mode"] == "GUIDED"
+    picture(page, "state")
+    page.set_viewport_size({"width": 1300, "height": 820})
+    page.evaluate("document.querySelectorAll('#tiles-of-state dd')[7].textContent = '10 · RTK fixed (12 s)'")
+    assert page.locator("#tiles-of-state dd").evaluate_all(
+        "all => all.every(e => e.scrollWidth <= e.clientWidth)"
+    )
+    picture(page, "narrow")
+    page.set_viewport_size({"width": 1360, "height": 820})
+    page.get_by_role("tab", name="Mission").click()
+
+
+def fly_to_a_click(page: Any, copter: SimulatedCopter) -> None:
+    page.click("button[data-order='pick']")
+    box = page.locator("#map").bounding_box()
+    page.mouse.click(box["x"] + box["width"] * 0.55, box["y"] + box["height"] * 0.55)
+    asked = re.search(r"(-?\d+\.\d+), (-?\d+\.\d+)", page.locator("dialog p").inner_text())
+    assert asked is not None
+    page.click("dialog .yes")
+    wait_done(page, "go to")
+    place = true_point(copter)
+    assert place.latitude_deg == pytest.approx(float(asked[1]), abs=3e-5)
+    assert place.longitude_deg == pytest.approx(float(asked[2]), abs=3e-5)
+
+
+def test_parameters_are_set_behind_a_confirmation(
+    browser: Any, copters: tuple[list[SimulatedCopter], str]
+) -> None:
+    _, address = copters
+    with serving(address) as told, opened(browser, told["page"]) as page:
+        page.locator(".vehicle", has_text="2 ArduCopter").click()
+        page.get_by_role("tab", name="Parameters").click()
+        page.fill("input[type=search]", "wpnav_speed")
+        page.locator("tr", has_text="WPNAV_SPEED_UP").click()
+        page.fill("dialog input[name=value]", "321")
+        assert "Vehicle 2" in page.locator("dialog").inner_text()
+        page.click("dialog .yes")
+        wait_done(page, "WPNAV_SPEED_UP")
+        page.locator("tr", has_text="321").wait_for()
+        picture(page, "parameters")
+
+
+def test_what_vehicles_say_is_no_html_and_old_values_look_old(
+    browser: Any, copters: tuple[list[SimulatedCopter], str]
+) -> None:
+    (_, second), address = copters
+    with serving(address) as told, opened(browser, told["page"]) as page:
+        page.get_by_role("tab", name="Messages").click()
+        second.send_text(4, HOSTILE)
+        page.locator(".vehicle", has_text="2 ArduCopter").click()
+        page.get_by_text(HOSTILE).wait_for()
+        assert page.locator("#panel img").count() == 0
+        page.get_by_role("tab", name="State").click()
+        second.faults.silent = True
+        page.locator("#tiles-of-state dd.old").first.wait_for()
+        page.locator(".vehicle .dot.silent").wait_for()
+        order(page, "arm")
+        page.locator(".toast.failed", has_text="not heard").wait_for()
+        assert not second.is_armed
+        picture(page, "silent")
+        second.faults.silent = False
+
+
+def test_on_a_phone_without_a_token_and_read_only(
+    browser: Any, copters: tuple[list[SimulatedCopter], str]
+) -> None:
+    _, address = copters
+    with serving(address, "--read-only") as told, opened(browser, told["url"], 390, 844) as page:
+        page.locator("#server", has_text="reading only").wait_for()
+        assert page.locator("#orders button:enabled").count() == 0
+        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+        picture(page, "phone")
+
+
+def test_a_server_that_ends(browser: Any) -> None:
+    with serving("--sim") as told:
+        started = opened(browser, told["url"])
+        page = started.__enter__()
+    page.locator("#banner", has_text="No connection").wait_for()
+    page.locator("#tiles-of-state dd.old").first.wait_for()
+    assert page.locator("#orders button:enabled").count() == 0
+    picture(page, "ended")
+    page.context.close()

@@ -1,0 +1,36 @@
+"""A simulated camera that is put beside a vehicle which flies already, when a call about cameras needs it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from call_stage import Stage
+
+from aerokit.sim import SimulatedCamera
+from aerokit.sim.components.camera_parameters import DEFINITION_PATH, own_definition
+from aerokit.sim.faults import Faults
+from aerokit.vehicle.components.settings import Settings
+
+__all__ = ["camera_of", "settings_of"]
+
+
+def camera_of(stage: Stage) -> SimulatedCamera:
+    """As new, but for the time it has been there."""
+    simulated: Any = stage.simulated
+    camera = next((each for each in simulated.components if isinstance(each, SimulatedCamera)), None)
+    if camera is None:
+        camera = SimulatedCamera()
+        camera.join(simulated)
+        camera._power_on()
+        simulated.components = (*simulated.components, camera)
+    camera.faults = Faults()
+    camera.files.put(DEFINITION_PATH, own_definition())
+    camera.definition_uri = f"mftp://{DEFINITION_PATH}"
+    camera.parameters.reset()
+    camera.parameters.slow.clear()
+    return camera
+
+
+def settings_of(stage: Stage) -> Settings:
+    """Those of the camera, as the program has them."""
+    return stage.vehicle.component(100).settings

@@ -1,0 +1,150 @@
+"""``--json``: every record has the fields that docs/command-line.md lists, whatever command prints it."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from pathlib import Path
+
+import pytest
+from cli_harness import DOCUMENT, HOME, MISSION, documented, records, run_with
+
+from aerokit.cli import main
+from aerokit.cli.commands import COMMANDS
+from aerokit.cli.exits import describe
+from aerokit.cli.main import make_parser
+from aerokit.sim import SimulatedCamera, SimulatedCopter, SimulatedGimbal
+
+SEEN: set[str] = set()
+TOLD_ELSEWHERE = {"conversion", "serving", "bridging", "bridged_vehicle"}
+"""By commands that need an extra, a browser or a viewer; and what is rare."""
+RARE = {"missed", "gimbal_silent", "interrupted"}
+
+
+@pytest.fixture(autouse=True)
+def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def copter() -> SimulatedCopter:
+    return SimulatedCopter(
+        boot_time_s=0.0,
+        home=HOME,
+        components=[SimulatedCamera(streams=["rtsp://127.0.0.1:8554/main"]), SimulatedGimbal()],
+    )
+
+
+GROUPS = {
+    "params": (
+        ["params", "list", "RTL_*"],
+        ["params", "get", "RTL_ALT"],
+        ["params", "get", "NO_SUCH"],
+        ["params", "set", "RTL_ALT=2000"],
+        ["params", "save", "mine.param"],
+        ["params", "set", "RTL_ALT=2100"],
+        ["params", "diff", "mine.param"],
+        ["params", "load", "mine.param"],
+    ),
+    "mission": (
+        ["mission", "check", "m.waypoints"],
+        ["mission", "upload", "m.waypoints"],
+        ["mission", "show"],
+        ["mission", "download", "again.plan"],
+        ["mission", "clear"],
+        ["mission", "start"],
+    ),
+    "files and logs": (
+        ["files", "mkdir", "/box"],
+        ["files", "put", "m.waypoints", "/box/a"],
+        ["files", "ls", "/box"],
+        ["files", "crc", "/box/a"],
+        ["files", "get", "/box/a", "b"],
+        ["files", "rm", "/box/a"],
+        ["logs", "list"],
+        ["logs", "get"],
+        ["logs", "erase"],
+    ),
+    "camera and gimbal": (
+        ["camera", "info"],
+        ["camera", "photo", "--to", "."],
+        ["camera", "streams"],
+        ["camera", "zoom", "30"],
+        ["camera", "format"],
+        ["gimbal", "info"],
+        ["gimbal", "neutral"],
+    ),
+    "link": (
+        ["status"],
+        ["events", "--seconds", "2", "--all"],
+        ["record", "flight.tlog", "--seconds", "2"],
+        ["doctor", "x.tlog", "--seconds", "3"],
+    ),
+}
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_records_are_as_documented(group: str, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("m.waypoints").write_text(MISSION)
+    run_with(copter(), *([*arguments, "--json"] for arguments in GROUPS[group]))
+    told = records(capsys.readouterr().out)
+    assert len(told) >= len(GROUPS[group])
+    SEEN.update(record["type"] for record in told)
+
+
+def test_a_flight(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("m.waypoints").write_text(MISSION)
+    assert main(["fly", "m.waypoints", "--sim", "--speedup", "50", "--json"]) == 0
+    told = records(capsys.readouterr().out)
+    assert told[-1]["type"] == "flight_summary"
+    SEEN.update(record["type"] for record in told)
+
+
+def test_the_demonstration(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["demo", "--altitude", "3", "--side", "3", "--speedup", "50", "--json"]) == 0
+    told = records(capsys.readouterr().out)
+    assert [each["type"] for each in told[:2]] == ["simulated", "connecting"]
+    assert told[-1]["recorded_in"] == "demo.tlog"
+    SEEN.update(record["type"] for record in told)
+
+
+def test_the_simulator(capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["sim", "tcpin:127.0.0.1:0", "--duration", "1", "--speedup", "20", "--picture", "track.svg"]
+    assert main([*arguments, "--json"]) == 0
+    told = records(capsys.readouterr().out)
+    assert [each["type"] for each in told] == ["simulated", "stopped", "saved"]
+    SEEN.update(record["type"] for record in told)
+
+
+def test_every_documented_record_was_seen() -> None:
+    """Runs behind the others of this file, which stay together."""
+    assert set(documented()) - SEEN == TOLD_ELSEWHERE | RARE
+
+
+def test_all_commands_have_it_but_those_that_say_so() -> None:
+    without = set()
+    for command in COMMANDS:
+        own = below(make_parser(command.name))[command.name]
+        for parser in below(own).values() or [own]:
+            if "--json" not in parser._option_string_actions:
+                without.add(command.name)
+    assert without == {"monitor", "completion"}
+
+
+def below(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
+    """The parsers of its commands or actions; none if it has none."""
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            return dict(action.choices)
+    return {}
+
+
+def test_exit_codes_are_as_documented() -> None:
+    table = DOCUMENT.read_text(encoding="utf-8").partition("## Exit codes")[2].partition("## JSON")[0]
+    rows = re.findall(r"^\| (\d+) \| (.*) \|$", table, re.MULTILINE)
+    assert "Exit codes: " + ", ".join(f"{code} {text}" for code, text in rows) + "." == describe()
+
+
+def test_every_command_is_documented() -> None:
+    text = DOCUMENT.read_text(encoding="utf-8")
+    for command in COMMANDS:
+        assert f"aerokit {command.name}" in text, command.name

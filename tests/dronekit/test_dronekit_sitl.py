@@ -1,0 +1,132 @@
+"""``import dronekit_sitl`` in a program, and ``aerokit run --sim``."""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from aerokit.dronekit import runner
+from aerokit.dronekit.sitl import SITL, start_default
+from aerokit.errors import LinkOpenError, LocalProtocolError
+
+OWN = """\
+import dronekit_sitl
+from dronekit import connect
+sitl = dronekit_sitl.SITL(instance={instance})
+sitl.download("copter", "stable")
+sitl.launch(["--model", "quad", "--home=-35.5,149.5,600,353"], await_ready=True, restart=True, speedup=20)
+vehicle = connect(sitl.connection_string(), wait_ready=False)
+vehicle.wait_ready("gps_0", "armed")
+print(vehicle.version is not None, vehicle.armed)
+vehicle.close()
+sitl.stop()
+print(sitl.poll())
+"""
+GIVEN = """\
+import sys
+from dronekit import connect
+vehicle = connect(sys.argv[1], wait_ready=False)
+vehicle.wait_ready("mode")
+print(vehicle.mode.name)
+vehicle.close()
+"""
+
+
+def free_instance() -> int:
+    """Its port is free: 5760 and ten more for each."""
+    for instance in range(1574, 1624):
+        with socket.socket() as probe:
+            try:
+                probe.bind(("127.0.0.1", 5760 + 10 * instance))
+            except OSError:
+                continue
+            return instance
+    raise AssertionError
+
+
+def run(*arguments: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "aerokit", "run", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+
+
+def test_a_program_that_starts_its_own_vehicle_gets_one(tmp_path: Path) -> None:
+    program = tmp_path / "program.py"
+    program.write_text(OWN.format(instance=free_instance()))
+    ended = run(program)
+    assert (ended.returncode, ended.stdout.splitlines()) == (0, ["True False", "0"]), ended.stderr
+
+
+def test_a_taken_port_is_an_error_and_a_second_launch_needs_restart() -> None:
+    instance = free_instance()
+    sitl, other = SITL(instance=instance), SITL(instance=instance)
+    sitl.launch([])
+    try:
+        assert sitl.connection_string() == f"tcp:127.0.0.1:{5760 + 10 * instance}"
+        with pytest.raises(LinkOpenError):
+            other.launch([])
+        with pytest.raises(ChildProcessError):
+            sitl.launch([])
+        sitl.launch([], restart=True)
+        assert sitl.block_until_ready() is None
+    finally:
+        sitl.stop()
+    sitl.complete()
+    assert sitl.poll() == 0
+
+
+def test_half_a_place_and_unknown_systems_are_refused() -> None:
+    with pytest.raises(LocalProtocolError, match="both lat and lon"):
+        start_default(lat=1.0)
+    with pytest.raises(LocalProtocolError, match="not one of"):
+        SITL().download("boat", "stable")
+
+
+def test_with_sim_there_is_a_vehicle(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    program = tmp_path / "program.py"
+    program.write_text(GIVEN)
+    instance = free_instance()
+    port = 5760 + 10 * instance
+    monkeypatch.setattr(
+        "aerokit.dronekit.sitl.USUAL_ADDRESSES", (f"tcpin:127.0.0.1:{port}", f"udpout:127.0.0.1:{port}")
+    )
+    monkeypatch.setattr(sys, "path", ["", *sys.path])
+    monkeypatch.setattr(sys, "argv", [""])
+    monkeypatch.setattr(sys, "excepthook", sys.excepthook)
+    monkeypatch.setitem(sys.modules, "__main__", sys.modules["__main__"])
+    from aerokit.dronekit.alias import uninstall
+
+    try:
+        code = runner.main(["--sim", "--speedup", "10", str(program), f"tcp:127.0.0.1:{port}"], "aerokit run")
+    finally:
+        uninstall()
+    told = capsys.readouterr()
+    assert (code, told.out) == (0, "STABILIZE\n")
+    assert f"a simulated copter is on tcp:127.0.0.1:{port}" in told.err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["--sim", "--vehicle", "coptr"], "did you mean 'copter'"),
+        (["--sim", "--home", "x"], "is not LAT,LON,ALT"),
+        (["-m", "no_such_module"], "No module named no_such_module"),
+    ],
+)
+def test_own_errors_have_no_traceback(arguments: list[str], text: str, tmp_path: Path) -> None:
+    program = [] if "-m" in arguments else [tmp_path / "p.py"]
+    (tmp_path / "p.py").write_text("")
+    ended = run(*arguments, *program)
+    assert ended.returncode == 1
+    assert text in ended.stderr
+    assert "Traceback" not in ended.stderr

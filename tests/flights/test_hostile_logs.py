@@ -1,0 +1,201 @@
+"""Logs with times, texts and values that cannot be, of other vehicles, and of two batteries."""
+
+from __future__ import annotations
+
+import csv
+import math
+import random
+import struct
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import log_files
+import pytest
+
+from aerokit.convert import convert
+from aerokit.errors import FileFormatError
+from aerokit.flights import failsafes, read_flight
+from aerokit.flights.columns import Columns
+from aerokit.flights.flight_controllers import BinFile
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.message import Message
+from aerokit.mavlink.tlog import TlogWriter
+
+BEGIN = 1_700_000_000
+HEARTBEAT = m.Heartbeat(2, 3, 81, 0, 3, 3)
+
+
+def write_tlog(path: Path, told: Iterable[tuple[int, Message]]) -> Path:
+    """Heartbeats of vehicle 1, then messages of these systems, one a second."""
+    encoders: dict[int, FrameEncoder] = {}
+    with TlogWriter(path) as writer:
+        for second, (system, message) in enumerate([(1, HEARTBEAT), *told]):
+            encoder = encoders.setdefault(system, FrameEncoder(system, 190 if system == 255 else 1))
+            writer.write(encoder.encode(message), BEGIN + second)
+    return path
+
+
+def place(latitude_e7: int = 470_000_000, longitude_e7: int = 80_000_000) -> Message:
+    return m.GlobalPositionInt(1000, latitude_e7, longitude_e7, 500_000, 10_000, 0, 0, 0, 0)
+
+
+def item(number: int, target: int, x: float = 47.0, z: float = 10.0) -> Message:
+    return m.MissionItem(target, 1, number, 3, 16, 0, 1, 0.0, 0.0, 0.0, 0.0, x, 8.0, z)
+
+
+def item_int(number: int, target: int, command: int = 16) -> Message:
+    return m.MissionItemInt(
+        target, 1, number, 6, command, 0, 1, 0.0, 0.0, 0.0, 0.0, 470_000_000, 80_000_000, 10.0
+    )
+
+
+@pytest.mark.parametrize(
+    ("suffix", "write"), [(".bin", log_files.write_bin), (".ulg", log_files.write_ulog)], ids=["bin", "ulg"]
+)
+@pytest.mark.parametrize("target", ["out.mcap", "out"])
+def test_a_row_of_a_damaged_time_is_left_out(
+    suffix: str, write: Callable[[Path], None], target: str, tmp_path: Path
+) -> None:
+    for package in ("pyulog", "mcap", "pymavlink"):
+        pytest.importorskip(package)
+    path = tmp_path / f"log{suffix}"
+    write(path)
+    at = struct.pack("<Q", 20_000_000)
+    whole = path.read_bytes()
+    assert at in whole
+    path.write_bytes(whole.replace(at, struct.pack("<Q", 1 << 62), 1))
+    done = convert(path, tmp_path / target)
+    assert done.entries > 100
+    assert any("1 damaged rows" in note for note in done.notes)
+
+
+def test_damaged_formats_are_refused_and_nothing_is_printed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("pymavlink")
+    path, seeded = tmp_path / "log.bin", random.Random(1)
+    log_files.write_bin(path)
+    data = bytearray(path.read_bytes())
+    for _ in range(60):
+        data[seeded.randrange(3, 1500)] ^= 0x55
+    path.write_bytes(data)
+    with pytest.raises(FileFormatError, match="cannot be read"):
+        convert(path, tmp_path / "out.csv")
+    assert capsys.readouterr().out == ""
+
+
+def test_a_second_battery_is_not_told_for_the_first(tmp_path: Path) -> None:
+    pytest.importorskip("pymavlink")
+    path = tmp_path / "log.bin"
+    log_files.write_bin(path)
+    number, form, _ = log_files.TABLES["BAT"]
+    size = struct.calcsize("<QBfffB")
+    data = bytearray(path.read_bytes())
+    head = b"\xa3\x95" + bytes((number,))
+    first = data.index(head, 4000)
+    data[first:first] = head + struct.pack("<QBfffB", 1_000_000, 1, 3.3, 0.1, 0.0, 9)
+    path.write_bytes(data)
+    assert (form, size) == ("QBfffB", 22)
+    told = [
+        value[0]
+        for each in BinFile(path).entries(lambda _: None)
+        for name, value in each.states
+        if name == "batteries"
+    ]
+    assert len(told) > 50
+    assert all(battery.voltage_v > 14 for battery in told)
+
+
+def test_a_text_begins_no_row(tmp_path: Path) -> None:
+    log = write_tlog(
+        tmp_path / "log.tlog",
+        [(1, m.Statustext(severity=4, text="well\rnot a row")), (1, m.Statustext(4, "fine"))],
+    )
+    convert(log, tmp_path / "out")
+    with (tmp_path / "out" / "STATUSTEXT.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.reader(file))
+    assert [row[4] for row in rows] == ["text", "well\rnot a row", "fine"]
+    assert b"\r\n" not in (tmp_path / "out" / "STATUSTEXT.csv").read_bytes()
+
+
+@pytest.mark.parametrize("text", ["well\rnot", "=1\r"])
+def test_a_carriage_return_is_put_into_quotes(text: str, tmp_path: Path) -> None:
+    log = write_tlog(tmp_path / "log.tlog", [(1, m.Statustext(severity=4, text=text))])
+    convert(log, tmp_path / "out")
+    assert f'"{text}"' in (tmp_path / "out" / "STATUSTEXT.csv").read_bytes().decode()
+
+
+@pytest.mark.parametrize("suffix", [".gpx", ".kml"])
+def test_items_that_are_nowhere_are_left_out(suffix: str, tmp_path: Path) -> None:
+    pytest.importorskip({".gpx": "gpxpy", ".kml": "simplekml"}[suffix])
+    told = [(1, place()), *((1, item(i, 255, x)) for i, x in enumerate((math.nan, 95.0, 47.5)))]
+    log = write_tlog(tmp_path / "log.tlog", [*told, (1, item(3, 255, z=math.inf))])
+    convert(log, tmp_path / f"out{suffix}")
+    text = (tmp_path / f"out{suffix}").read_text()
+    assert "47.5" in text
+    assert not any(each in text for each in ("nan", "inf", "95.0"))
+
+
+def test_an_attitude_that_is_none_ends_no_conversion(tmp_path: Path) -> None:
+    pytest.importorskip("mcap")
+    told = [(1, place()), (1, m.Attitude(1000, math.inf, math.nan, 0.0, 0.0, 0.0, 0.0)), (1, place())]
+    assert convert(write_tlog(tmp_path / "log.tlog", told), tmp_path / "out.mcap").entries == 4
+
+
+def test_positions_that_are_not_on_earth_are_none(tmp_path: Path) -> None:
+    told = [(1, place()), (1, place(2**31 - 1, -(2**31))), (1, place())]
+    assert len(read_flight(write_tlog(tmp_path / "log.tlog", told)).track) == 2
+
+
+def test_the_mission_is_this_vehicles_and_the_last_one(tmp_path: Path) -> None:
+    before = [(255, m.MissionCount(1, 1, 3)), *((255, item_int(i, 1)) for i in range(3))]
+    now = [(255, m.MissionCount(1, 1, 2)), *((255, item_int(i, 1, 17)) for i in range(2))]
+    other = [
+        (255, m.MissionCount(7, 1, 5)),
+        *((255, item_int(i, 7, 21)) for i in range(5)),
+        (7, item_int(6, 255)),
+    ]
+    flight = read_flight(write_tlog(tmp_path / "log.tlog", [*before, *now, *other]))
+    assert [(each.number, each.command) for each in flight.mission] == [(0, 17), (1, 17)]
+
+
+def test_a_mode_that_another_vehicle_was_ordered_is_not_this_ones(tmp_path: Path) -> None:
+    def by_autopilot(target: int) -> bool | None:
+        told = [(255, m.SetMode(target, 1, 6)), (1, m.Heartbeat(2, 3, 81, 6, 3, 3))]
+        return read_flight(write_tlog(tmp_path / f"{target}.tlog", told)).modes[-1].by_autopilot
+
+    assert (by_autopilot(1), by_autopilot(7)) == (False, None)
+
+
+def test_what_was_before_a_span_is_not_of_it() -> None:
+    columns = Columns("a")
+    for time_s, value in ((0.0, 9.0), (60.0, 1.0), (61.0, 2.0)):
+        columns.add(time_s, value)
+    assert list(columns.between("a", 51.0, 61.0)) == [1.0, 2.0]
+    assert list(columns.between("a", 60.0, 60.5)) == [1.0]
+
+
+@pytest.mark.parametrize(("seconds", "acted"), [(1, True), (7, False)])
+def test_a_pilot_who_returns_for_a_low_battery_is_no_failsafe(
+    seconds: int, acted: bool, tmp_path: Path
+) -> None:
+    """A log of a station does not tell who moved the switch of the mode; at once it is the autopilot."""
+    flying, returning = m.Heartbeat(2, 3, 209, 5, 4, 3), m.Heartbeat(2, 3, 209, 6, 4, 3)
+    low = m.Statustext(severity=4, text="Battery 1 is low 14.20V used 900 mAh")
+    told: list[tuple[int, Message]] = [*[(1, flying)] * 5, (1, low), *[(1, flying)] * (seconds - 1)]
+    flight = read_flight(write_tlog(tmp_path / "log.tlog", [*told, *[(1, returning)] * 20]))
+    (found,) = failsafes(flight)
+    assert found.acted is acted
+    assert found.reaction.startswith("mode LOITER → RTL")
+    assert found.reaction.endswith("the log does not tell by whom") is not acted
+
+
+def test_who_lands_with_a_low_battery_and_disarms_is_no_failsafe(tmp_path: Path) -> None:
+    flying, landed = m.Heartbeat(2, 3, 209, 5, 4, 3), m.Heartbeat(2, 3, 81, 5, 3, 3)
+    low = m.Statustext(severity=4, text="Battery 1 is low 14.20V used 900 mAh")
+    flight = read_flight(
+        write_tlog(tmp_path / "log.tlog", [*[(1, flying)] * 5, (1, low), *[(1, landed)] * 5])
+    )
+    (found,) = failsafes(flight)
+    assert (found.acted, found.reaction) == (False, "disarmed 1.0 s later; the log does not tell by whom")

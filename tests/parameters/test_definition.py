@@ -1,0 +1,327 @@
+"""Camera definition files: what is read of them, what excludes what, and what a setting takes."""
+
+from __future__ import annotations
+
+import lzma
+import tracemalloc
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from aerokit.errors import FileFormatError, LocalProtocolError
+from aerokit.mavlink.enums import MavParamExtType
+from aerokit.parameters import CameraDefinition, SettingValue, load_definition, parse_definition
+from aerokit.parameters.setting import checked_setting, setting_bytes, setting_value, settings_equal
+from aerokit.sim import components
+from aerokit.whole_file import LARGEST_FILE
+
+OWN = Path(components.__file__).with_name("camera_definition.xml")
+CAMERA = load_definition(OWN)
+VIDEO_BY_HAND = {"CAM_MODE": 1, "CAM_EXPMODE": 1, "CAM_VIDRES": 0}
+
+
+def xml(parameters: str, more: str = "") -> bytes:
+    text = f'<?xml version="1.0"?><mavlinkcamera><parameters>{parameters}</parameters>{more}</mavlinkcamera>'
+    return text.encode()
+
+
+def of(parameters: str, more: str = "") -> CameraDefinition:
+    return parse_definition(xml(parameters, more))
+
+
+def refusal(camera: CameraDefinition, name: str, value: object, **values: SettingValue) -> str:
+    with pytest.raises(LocalProtocolError) as caught:
+        camera.checked(name, value, values)
+    return str(caught.value)
+
+
+# ------------------------------------------------------------------------------------ what is read
+
+
+def test_what_the_file_says_of_a_camera_and_its_settings() -> None:
+    assert (CAMERA.vendor, CAMERA.model, CAMERA.version) == ("aerokit", "Simulated camera", 1)
+    assert repr(CAMERA) == "<CameraDefinition of aerokit Simulated camera: 12 settings>"
+    ev = CAMERA.settings["CAM_EV"]
+    assert (ev.type, ev.wire_type, ev.description) == ("float", MavParamExtType.REAL32, "Brighter or darker")
+    assert (ev.default, ev.minimum, ev.maximum, ev.step) == (0.0, -3, 3, 0.5)
+    mode = CAMERA.settings["CAM_MODE"]
+    assert (mode.updates, mode.is_control) == (("CAM_ISO", "CAM_SHUTTER"), False)
+    assert [(each.name, each.value, each.excludes) for each in mode.options] == [
+        ("Photo", 0, ("CAM_VIDRES",)),
+        ("Video", 1, ("CAM_QUALITY",)),
+    ]
+    assert CAMERA.settings["CAM_STAMP"].default is False
+    assert CAMERA.settings["CAM_LENS"].read_only
+    pin = of('<parameter name="PIN" type="uint32" writeonly="1" control="0"/>').settings["PIN"]
+    assert (pin.write_only, pin.read_only, pin.is_control) == (True, False, False)
+
+
+def test_compressed_or_not(tmp_path: Path) -> None:
+    path = tmp_path / "camera.xml.xz"
+    path.write_bytes(lzma.compress(OWN.read_bytes()))
+    assert load_definition(path) == CAMERA
+
+
+def test_texts_in_other_languages() -> None:
+    for locale in ("de_DE", "de", "de_CH"):
+        german = CAMERA.localized(locale).settings["CAM_WBMODE"]
+        assert german.description == "Weißabgleich"
+        assert [each.name for each in german.options] == ["Auto", "Sonnig", "Bewölkt"]
+    assert CAMERA.localized("fr_FR") is CAMERA
+    assert CAMERA.localized("de").checked("CAM_WBMODE", "Sonnig", {}) == 4
+
+
+def test_what_makes_no_sense_is_left_out() -> None:
+    camera = of(
+        """<parameter name="A" type="uint8" default="300" min="low" max="nan" step="">
+             <options><option name="big" value="999"/><option name="none"/><option name="x" value="x"/>
+               <option name="one" value="1"><parameterranges>
+                 <parameterrange parameter="NOWHERE"><roption name="1" value="1"/></parameterrange>
+                 <parameterrange parameter="B" condition="A"><roption name="1" value="1"/></parameterrange>
+                 <parameterrange parameter="B" condition="A=1 AND"><roption name="1" value="1"/></parameterrange>
+               </parameterranges></option></options></parameter>
+           <parameter type="uint8"/><parameter name="C" type="struct"/>
+           <parameter name="B" type="int8"/><parameter name="B" type="float"/>"""
+    )
+    assert list(camera.settings) == ["A", "B"]
+    first = camera.settings["A"]
+    assert (first.default, first.minimum, first.maximum, first.step) == (None, None, None, None)
+    assert [(each.name, each.ranges) for each in first.options] == [("one", ())]
+    assert camera.settings["B"].type == "int8"
+
+
+# ---------------------------------------------------------------------------- what excludes what
+
+
+def test_what_an_option_excludes_cannot_be_set() -> None:
+    text = refusal(CAMERA, "CAM_ISO", 400, CAM_EXPMODE=0)
+    assert text == "CAM_ISO = 400 is not allowed now: excluded by CAM_EXPMODE = Auto"
+    assert CAMERA.checked("CAM_ISO", 400, {"CAM_EXPMODE": 1}) == 400
+    assert CAMERA.excluded_by("CAM_EV", {"CAM_EXPMODE": 1}) == ("CAM_EXPMODE = Manual",)
+    assert CAMERA.excluded_by("CAM_EV", {}) == ()
+
+
+def test_ranges_hold_under_their_condition() -> None:
+    assert len(CAMERA.options("CAM_ISO", {"CAM_MODE": 1})) == 5
+    assert [each.name for each in CAMERA.options("CAM_ISO", VIDEO_BY_HAND)] == ["100", "200", "400"]
+    text = refusal(CAMERA, "CAM_ISO", 800, CAM_MODE=1, CAM_EXPMODE=1)
+    assert (
+        text == "CAM_ISO = 800 is not allowed while CAM_MODE = Video: '100' (100), '200' (200), '400' (400)"
+    )
+    assert "1/30" in refusal(CAMERA, "CAM_SHUTTER", "1/30", **VIDEO_BY_HAND)
+    assert len(CAMERA.options("CAM_SHUTTER", {**VIDEO_BY_HAND, "CAM_MODE": 0})) == 4
+
+
+@pytest.mark.parametrize(
+    ("condition", "values", "holds"),
+    [
+        ("A=1", {"A": 1}, True),
+        ("A=1", {"A": 2}, False),
+        ("A=1", {}, False),
+        ("A != 1", {"A": 2}, True),
+        ("A>=2 AND B<0.5", {"A": 2, "B": 0.4}, True),
+        ("A>2 AND B<0.5", {"A": 2, "B": 0.4}, False),
+        ("A<=2 OR B=7", {"A": 3, "B": 7}, True),
+        ("A=1 AND B=1 OR C=1", {"A": 0, "B": 0, "C": 1}, True),
+        ("A=text", {"A": "text"}, True),
+        ("A!=text", {"A": "text"}, False),
+        ("A>text", {"A": "text"}, False),
+        ("A=text", {"A": 1}, False),
+        ("A=0.016666", {"A": 0.016666000708937645}, True),
+    ],
+)
+def test_conditions(condition: str, values: dict[str, SettingValue], holds: bool) -> None:
+    condition = condition.replace("<", "&lt;").replace(">", "&gt;")
+    camera = of(
+        f"""<parameter name="R" type="uint8"><options><option name="on" value="1"><parameterranges>
+              <parameterrange parameter="S" condition="{condition}"><roption name="five" value="5"/></parameterrange>
+              </parameterranges></option></options></parameter><parameter name="S" type="uint8"/>
+            <parameter name="A" type="float"/><parameter name="B" type="float"/>"""
+    )
+    assert bool(camera.options("S", {"R": 1, **values})) == holds
+    assert set(camera.rulers("S")) >= {"R"}
+
+
+def test_of_several_ranges_each_has_its_say() -> None:
+    def ruler(name: str, *allowed: int) -> str:
+        options = "".join(f'<roption name="{each}" value="{each}"/>' for each in allowed)
+        return f"""<parameter name="{name}" type="uint8"><options><option name="on" value="1"><parameterranges>
+            <parameterrange parameter="S">{options}</parameterrange></parameterranges></option></options></parameter>"""
+
+    camera = of(f'{ruler("A", 1, 2)}{ruler("B", 2, 3)}<parameter name="S" type="uint8"/>')
+    assert camera.rulers("S") == ("A", "B")
+    assert [each.value for each in camera.options("S", {"A": 1, "B": 1})] == [2]
+    assert "while A = on, B = on: '2' (2)" in refusal(camera, "S", 3, A=1, B=1)
+
+
+def test_an_option_cannot_exclude_its_own_setting() -> None:
+    camera = of(
+        """<parameter name="A" type="uint8"><options><option name="off" value="0"><exclusions>
+             <exclude>A</exclude></exclusions></option><option name="on" value="1"/></options></parameter>"""
+    )
+    assert camera.checked("A", "on", {"A": 0}) == 1
+
+
+def test_who_decides_on_a_setting() -> None:
+    assert CAMERA.rulers("CAM_SHUTTER") == ("CAM_EXPMODE", "CAM_VIDRES", "CAM_MODE")
+    assert CAMERA.rulers("CAM_WBMODE") == ()
+
+
+# ------------------------------------------------------------------------------- what it takes
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "sent"),
+    [
+        ("CAM_WBMODE", "Sunny", 4),
+        ("CAM_WBMODE", 5, 5),
+        ("CAM_EV", -2.5, -2.5),
+        ("CAM_EV", 0.3, pytest.approx(0.3)),
+        ("CAM_QUALITY", 95, 95),
+        ("CAM_STAMP", True, True),
+        ("CAM_STAMP", 0, False),
+        ("CAM_OWNER", "Zoë", "Zoë"),
+        ("CAM_OFFSET", -100, -100),
+    ],
+)
+def test_what_is_taken(name: str, value: object, sent: object) -> None:
+    taken = CAMERA.checked(name, value, {})
+    assert taken == sent
+    assert type(taken) is type(sent) or not isinstance(sent, bool)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "complaint"),
+    [
+        ("CAM_WBMODE", 3, r"CAM_WBMODE = 3 is not allowed: 'Auto' \(0\), 'Sunny' \(4\), 'Cloudy' \(5\)"),
+        ("CAM_WBMODE", "sunny", r"did you mean 'Sunny'\?"),
+        ("CAM_OFFSET", 70000, r"-32768\.\.32767"),
+        ("CAM_EV", 3.1, r"CAM_EV = 3\.1 is not allowed: -3\.\.3"),
+        ("CAM_EV", "bright", "a number"),
+        ("CAM_EV", float("nan"), "a finite number"),
+        ("CAM_QUALITY", 91, r"10, 15, 20 …"),
+        ("CAM_QUALITY", 5, r"10\.\.100"),
+        ("CAM_QUALITY", 50.5, "whole numbers"),
+        ("CAM_STAMP", 2, "True or False"),
+        ("CAM_OWNER", 5, "a text or bytes"),
+        ("CAM_OWNER", "x" * 129, "at most 128"),
+        ("CAM_OWNER", b"\0", "zeros at its end"),
+        ("CAM_LENS", "new", "can only be read"),
+    ],
+)
+def test_what_is_refused(name: str, value: object, complaint: str) -> None:
+    with pytest.raises(LocalProtocolError, match=complaint) as caught:
+        CAMERA.checked(name, value, {})
+    assert str(caught.value).startswith(f"{name} = ")
+
+
+# ------------------------------------------------------------------------------- values as bytes
+
+NUMBERS = st.one_of(
+    *(
+        st.tuples(st.integers(int(lowest), int(highest)), st.just(kind))
+        for kind, (lowest, highest) in {
+            MavParamExtType.UINT8: (0, 255),
+            MavParamExtType.INT8: (-128, 127),
+            MavParamExtType.UINT16: (0, 0xFFFF),
+            MavParamExtType.INT32: (-(1 << 31), (1 << 31) - 1),
+            MavParamExtType.UINT64: (0, (1 << 64) - 1),
+            MavParamExtType.INT64: (-(1 << 63), (1 << 63) - 1),
+        }.items()
+    ),
+    st.tuples(st.floats(allow_nan=False, allow_infinity=False), st.just(MavParamExtType.REAL64)),
+    st.tuples(st.floats(width=32, allow_nan=False, allow_infinity=False), st.just(MavParamExtType.REAL32)),
+    st.tuples(
+        st.text(max_size=30).filter(lambda text: not text.endswith("\0")), st.just(MavParamExtType.CUSTOM)
+    ),
+    st.tuples(
+        st.binary(max_size=128).filter(lambda data: data[-1:] != b"\0"), st.just(MavParamExtType.CUSTOM)
+    ),
+)
+
+
+@given(NUMBERS)
+def test_values_there_and_back(given_value: tuple[SettingValue, MavParamExtType]) -> None:
+    value, kind = given_value
+    try:
+        wanted = checked_setting("A", value, kind)
+    except LocalProtocolError:
+        assert isinstance(value, str)  # half of a surrogate pair
+        return
+    told = setting_value(setting_bytes(wanted, kind).ljust(128, b"\0"), kind)
+    assert told == wanted
+    assert settings_equal(told, value)
+
+
+@given(st.binary(max_size=128), st.integers(0, 255))
+def test_any_bytes_of_any_type_are_some_value(data: bytes, kind: int) -> None:
+    value = setting_value(data, kind)
+    assert settings_equal(value, value)
+
+
+def test_the_bytes_of_numbers_are_those_of_c() -> None:
+    assert setting_bytes(-2, MavParamExtType.INT16) == b"\xfe\xff"
+    assert setting_bytes(0.5, MavParamExtType.REAL32) == b"\0\0\0\x3f"
+    assert setting_value(b"\xff", 77) == b"\xff"
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "same"),
+    [(1, True, True), (0.1, 0.10000000149, True), (1, 2, False), ("a", b"a", True), ("1", 1, False)],
+)
+def test_what_a_component_cannot_tell_apart(one: SettingValue, other: SettingValue, same: bool) -> None:
+    assert settings_equal(one, other) == settings_equal(other, one) == same
+
+
+# ------------------------------------------------------------------------------- hostile files
+
+BOMB = b"""<?xml version="1.0"?><!DOCTYPE mavlinkcamera [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;">]>
+<mavlinkcamera><parameters><parameter name="&b;" type="uint8"/></parameters></mavlinkcamera>"""
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"<",
+        b"<mavlinkcamera/>",
+        b"<mavlink/>",
+        xml(""),
+        b'<?xml version="1.0" encoding="nonsense"?><mavlinkcamera/>',
+        BOMB,
+        b"\xfd7zXZ\x00",
+        lzma.compress(OWN.read_bytes())[:-5],
+        b"<a>" * 100_000,
+    ],
+    ids=lambda data: repr(data[-30:]),
+)
+def test_a_file_that_is_none(data: bytes) -> None:
+    with pytest.raises(FileFormatError, match=r"^camera definition (is|describes) "):
+        parse_definition(data)
+
+
+def test_a_small_file_that_unpacks_to_a_large_one() -> None:
+    bomb = lzma.compress(bytes(LARGEST_FILE + (1 << 20)), preset=0)
+    tracemalloc.start()
+    try:
+        with pytest.raises(FileFormatError, match=r"^camera definition has more than 16 MB"):
+            parse_definition(bomb)
+        assert tracemalloc.get_traced_memory()[1] < 3 * LARGEST_FILE
+    finally:
+        tracemalloc.stop()
+    with pytest.raises(FileFormatError, match="more than 16 MB"):
+        parse_definition(bytes(LARGEST_FILE + 1))
+
+
+def test_a_long_condition_and_many_options_take_no_time() -> None:
+    options = "".join(f'<option name="{n}" value="{n}"/>' for n in range(10_000))
+    condition = " " * 200_000 + "A=1" + " AND A=1" * 20_000
+    camera = of(
+        f"""<parameter name="A" type="uint32"><options>{options}<option name="on" value="70000"><parameterranges>
+            <parameterrange parameter="B" condition="{condition}"><roption name="1" value="1"/></parameterrange>
+            </parameterranges></option></options></parameter><parameter name="B" type="uint8"/>"""
+    )
+    assert len(refusal(camera, "A", 30_000)) < 1000
+    assert camera.checked("B", 7, {"A": 70000}) == 7

@@ -1,0 +1,247 @@
+"""What is read: vehicles, missions, parameters, the OpenAPI document, the page, the stream."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import anyio
+import httpx
+import pytest
+from serve_stage import HOST, TOKEN, Socket, open_stage
+from starlette.applications import Starlette
+from starlette.routing import Mount, Route, WebSocketRoute
+
+import aerokit
+from aerokit.errors import LocalProtocolError
+from aerokit.missions import Mission, return_to_launch, take_off
+from aerokit.serve import make_app
+from aerokit.serve.app import STATIC
+from aerokit.serve.stream import MOST_SOCKETS, MOST_WAITING
+from aerokit.sim import SimulatedCopter, simulated_link
+
+pytestmark = pytest.mark.anyio
+BEARER = {"Authorization": f"Bearer {TOKEN}"}
+
+
+async def test_what_is_known() -> None:
+    async with open_stage() as stage:
+        await stage.flight.vehicle.mission.upload(Mission([take_off(altitude_relative_m=20)]))
+        stage.flight.copter.send_text(4, "<b>hello</b>")
+        await anyio.sleep(1)
+
+        async def read(path: str) -> dict[str, object]:
+            answer = await stage.client.get(path, headers=BEARER)
+            assert (answer.status_code, answer.headers["cache-control"]) == (200, "no-store")
+            return dict(answer.json())
+
+        listed = await read("/api/vehicles")
+        assert [each["system_id"] for each in listed["vehicles"]] == [1]  # type: ignore[attr-defined]
+        vehicle = await read("/api/vehicles/1")
+        assert vehicle["states"]["armed"]["value"] is False  # type: ignore[index]
+        assert "range_finders" not in vehicle["states"]  # type: ignore[operator]
+        assert "GUIDED" in vehicle["modes"]  # type: ignore[operator]
+        assert [each["name"] for each in (await read("/api/vehicles/1/mission"))["items"]] == ["NAV_TAKEOFF"]  # type: ignore[attr-defined]
+        await anyio.sleep(5)
+        assert (await read("/api/vehicles/1/mission"))["age_s"] == pytest.approx(5, abs=0.5)
+        assert len((await read("/api/vehicles/1/parameters"))["parameters"]) > 1000  # type: ignore[arg-type]
+        texts = (await read("/api/vehicles/1/texts"))["texts"]
+        assert "<b>hello</b>" in [each["text"] for each in texts]  # type: ignore[attr-defined]
+        told = (await read("/api/events"))["events"]
+        assert any(each["event"] == "StatusTextReceived" for each in told)  # type: ignore[attr-defined]
+
+
+async def test_a_mission_of_another_length_is_read_again() -> None:
+    async with open_stage() as stage:
+        mission = stage.flight.vehicle.mission
+
+        async def names() -> list[str]:
+            answer = await stage.client.get("/api/vehicles/1/mission", headers=BEARER)
+            return [each["name"] for each in answer.json()["items"]]
+
+        await mission.upload(Mission([take_off(altitude_relative_m=10)]))
+        assert await names() == ["NAV_TAKEOFF"]
+        await mission.upload(Mission([take_off(altitude_relative_m=10), return_to_launch()]))
+        await anyio.sleep(3)
+        assert await names() == ["NAV_TAKEOFF", "NAV_RETURN_TO_LAUNCH"]
+
+
+@pytest.mark.parametrize("is_open", [True, False])
+async def test_reading_wants_the_token_unless_it_is_open(is_open: bool) -> None:
+    async with open_stage(open_reading=is_open) as stage:
+        paths = [
+            route.path
+            for route in stage.app.routes
+            if isinstance(route, Route) and "GET" in (route.methods or ())
+        ]
+        vehicles = [path for path in paths if path.startswith("/api/") and not path.endswith("openapi.json")]
+        assert len(vehicles) == 9
+        for path in vehicles:
+            asked = path.format(system_id=1, name="RTL_ALT", key="12345678")
+            answer = await stage.client.get(asked)
+            assert (answer.status_code == 401) is not is_open
+        wrong = await stage.client.get("/api/vehicles", headers={"Authorization": "Bearer wrong"})
+        refresh = await stage.client.get("/api/vehicles/1/mission?refresh=true")
+        assert (wrong.status_code, refresh.status_code) == (401, 401)
+
+
+async def test_the_document_has_every_route_and_no_other() -> None:
+    async with open_stage() as stage:
+        document = (await stage.client.get("/api/openapi.json")).json()
+        assert document["openapi"] == "3.1.0"
+        documented = {(method.upper(), path) for path, item in document["paths"].items() for method in item}
+        routes = {
+            (method, route.path)
+            for route in stage.app.routes
+            if isinstance(route, Route) and route.path.startswith("/api")
+            for method in (route.methods or set()) - {"HEAD"}
+        }
+        streams = {("GET", route.path) for route in stage.app.routes if isinstance(route, WebSocketRoute)}
+        assert documented == routes | streams
+        check_shape(document)
+
+
+def check_shape(document: dict[str, object]) -> None:
+    """As OpenAPI 3.1 has it: what is required is there, references lead somewhere, path parameters are declared."""
+    names = []
+    for path, item in document["paths"].items():  # type: ignore[attr-defined]
+        for operation in item.values():
+            names.append(operation["operationId"])
+            declared = {each["name"] for each in operation["parameters"] if each["in"] == "path"}
+            assert declared == set(re.findall(r"{(\w+)}", path))
+            assert all(
+                each["schema"] and each["in"] in ("path", "query", "header")
+                for each in operation["parameters"]
+            )
+            assert operation["responses"]
+            assert all(each["description"] for each in operation["responses"].values())
+            if "requestBody" in operation:
+                schema = operation["requestBody"]["content"]["application/json"]["schema"]
+                assert set(schema["required"]) <= set(schema["properties"])
+    assert len(names) == len(set(names))
+    schemas = document["components"]["schemas"]  # type: ignore[index]
+    assert set(re.findall(r"#/components/schemas/(\w+)", str(document))) == set(schemas)
+    assert set(document) == {"openapi", "info", "servers", "paths", "components"}
+
+
+async def test_the_page_needs_nothing_from_elsewhere() -> None:
+    async with open_stage() as stage:
+        page = await stage.client.get("/")
+        assert page.headers["content-type"].startswith("text/html")
+        assert "img-src 'self';" in page.headers["content-security-policy"]
+        for name in re.findall(r"static/[\w.]+", page.text):
+            assert (await stage.client.get(f"/{name}")).status_code == 200
+        for path in ("/static/../app.py", "/static/%2e%2e/app.py", "/static/", "/app.py"):
+            assert (await stage.client.get(path)).status_code == 404
+
+
+def test_no_script_makes_html_of_text() -> None:
+    scripts = [path.read_text() for path in sorted(Path(STATIC).glob("*.js"))]
+    assert len(scripts) >= 8
+    for script in scripts:
+        assert not re.search(
+            r"\.(innerHTML|outerHTML|insertAdjacentHTML)|document\.write|eval\(|https?://", script
+        )
+
+
+async def test_tiles_are_let_in_by_their_origin_alone() -> None:
+    async with open_stage(tiles="https://tiles.example:8443/a/{z}/{x}/{y}.png") as stage:
+        policy = (await stage.client.get("/")).headers["content-security-policy"]
+        assert "img-src 'self' https://tiles.example:8443;" in policy
+        for wrong in (
+            "tiles.example/{z}",
+            "https://t/{z}/{x}.png",
+            "https://t/{z}/{x}/{y};x",
+            "javascript:{z}{x}{y}",
+        ):
+            with pytest.raises(LocalProtocolError, match="tiles"):
+                make_app(stage.flight.vehicle, token=TOKEN, tiles=wrong)
+
+
+async def test_all_vehicles_of_a_connection_and_mounted_elsewhere() -> None:
+    copters = [SimulatedCopter(system_id=number, boot_time_s=0.0) for number in (3, 7)]
+    async with simulated_link(copters) as link, aerokit.open_connection(link) as connection:
+        async with make_app(connection, token=TOKEN) as app:
+            await anyio.sleep(2)
+            host = Starlette(routes=[Mount("/drones", app)])
+            transport = httpx.ASGITransport(host)
+            async with httpx.AsyncClient(transport=transport, base_url=f"http://{HOST}") as client:
+                answer = await client.get("/drones/api/vehicles", headers=BEARER)
+                assert [each["system_id"] for each in answer.json()["vehicles"]] == [3, 7]
+                assert (await client.get("/drones/")).status_code == 200
+                document = (await client.get("/drones/api/openapi.json")).json()
+                assert document["servers"] == [{"url": "/drones"}]
+        assert connection.is_open
+
+
+# ------------------------------------------------------------------------------------------- stream
+
+
+async def test_the_stream_tells_state_events_and_orders() -> None:
+    async with open_stage() as stage, Socket(stage.app, query="rate_hz=2", origin=f"http://{HOST}") as socket:
+        assert (await socket.next("websocket.accept"))["subprotocol"] == "aerokit.v1"
+        assert (await socket.next("hello"))["read_only"] is False
+        first, second = await socket.next("state"), await socket.next("state")
+        assert second["at_s"] - first["at_s"] == pytest.approx(0.5, abs=0.05)
+        await stage.give("arm")
+        assert (await socket.next("order"))["state"] == "running"
+        assert (await socket.next("order"))["state"] == "done"
+        stage.flight.copter.send_text(4, "hello")
+        told = await socket.next("event")
+        while told["event"] != "StatusTextReceived" or told["text"] != "hello":
+            told = await socket.next("event")
+
+
+@pytest.mark.parametrize(
+    ("change", "status"),
+    [
+        ({"token": "wrong-token-wrong-token"}, 401),
+        ({"token": None}, 401),
+        ({"query": "rate_hz=1000"}, 400),
+        ({"query": "rate_hz=nan"}, 400),
+        ({"origin": "http://evil.example"}, None),
+        ({"host": "evil.example"}, None),
+    ],
+)
+async def test_sockets_that_are_not_let_in(change: dict[str, str], status: int | None) -> None:
+    async with open_stage() as stage, Socket(stage.app, **change) as socket:  # type: ignore[arg-type]
+        if status is None:
+            assert (await socket.next("websocket.close"))["code"] == 1008
+        else:
+            assert (await socket.next("websocket.http.response.start"))["status"] == status
+
+
+async def test_there_are_only_so_many_sockets() -> None:
+    async with open_stage() as stage:
+        sockets = [Socket(stage.app) for _ in range(MOST_SOCKETS)]
+        for each in sockets:
+            await each.__aenter__()
+            await each.next("websocket.accept")
+        async with Socket(stage.app) as one_more:
+            assert (await one_more.next("websocket.http.response.start"))["status"] == 503
+        for each in sockets:
+            await each.__aexit__()
+        async with Socket(stage.app) as later:
+            await later.next("websocket.accept")
+
+
+async def test_a_slow_client_gets_the_newest_state_and_one_that_stops_is_let_go() -> None:
+    async with open_stage() as stage, Socket(stage.app) as socket:
+        before = (await socket.next("state"))["at_s"]
+        socket.flows.clear()
+        for number in range(MOST_WAITING + 50):
+            stage.app._watch.publish({"type": "event", "event": "Test", "index": number})
+        await anyio.sleep(8)
+        socket.flows.set()
+        states = [await socket.next("state") for _ in range(3)]
+        assert states[1]["at_s"] - before >= 8  # what was waiting, then the newest, not 40 in between
+        socket.flows.clear()
+        await anyio.sleep(30)
+        assert socket.task.done()
+
+
+async def test_a_client_that_speaks_is_let_go() -> None:
+    async with open_stage() as stage, Socket(stage.app) as socket:
+        await socket.next("state")
+        socket.incoming.put_nowait({"type": "websocket.receive", "text": '{"order": "arm"}'})
+        assert (await socket.next("websocket.close"))["code"] == 1008

@@ -1,0 +1,46 @@
+"""Every block of Python in README.md and docs/ runs, with the imports that it shows; `pages` has the rules."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pages
+import pytest
+
+LANGUAGES = {"python", "sh", "text", "json", "yaml", "toml", "ini", "xml", "powershell", "mermaid"}
+CHAINS = [
+    pytest.param(chain, id=f"{chain[0].page.relative_to(pages.ROOT)}:{chain[0].line}".replace("/", "-"))
+    for page in pages.pages()
+    for chain in pages.chains(page)
+]
+WITH_CODE = [page for page in pages.pages() if pages.blocks(page)]
+
+
+@pytest.mark.parametrize("chain", CHAINS)
+def test_block_runs(chain: pages.Chain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    pages.run(chain, tmp_path)
+
+
+@pytest.mark.parametrize("page", WITH_CODE, ids=lambda page: str(page.relative_to(pages.ROOT)))
+def test_page_keeps_the_rules(page: Path) -> None:
+    given = {"vehicle"} if pages.tells_the_rule(page) else set()
+    before = None
+    for block in pages.blocks(page):
+        where = f"{page.name}, line {block.line}"
+        assert block.language in LANGUAGES, (
+            f"{where}: ```{block.language} (allowed: {', '.join(sorted(LANGUAGES))})"
+        )
+        if block.language == "python":
+            assert block.title in ("", "continued") or block.title.endswith(".py"), (
+                f"{where}: title {block.title}"
+            )
+            if block.title == "continued":
+                assert before is not None, f"{where}: nothing to continue"
+                assert not before.is_for_pytest, f"{where}: a file for pytest is not continued"
+            before = block
+    for chain in pages.chains(page):
+        missing = pages.free_names(chain) - given
+        assert not missing, (
+            f"{page.name}, line {chain[0].line}: no import shown of {', '.join(sorted(missing))}"
+        )

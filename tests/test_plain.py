@@ -1,0 +1,58 @@
+"""Every value as JSON."""
+
+from __future__ import annotations
+
+import enum
+import json
+import math
+from datetime import datetime, timedelta, timezone
+from pathlib import PurePosixPath
+
+from aerokit import Position
+from aerokit.errors import AerokitError
+from aerokit.mavlink.enums import MavModeFlag, MavState
+from aerokit.mavlink.messages import Heartbeat
+from aerokit.plain import plain
+
+
+class Kind(enum.Enum):
+    ONE = "one"
+
+
+def test_values_are_what_json_knows() -> None:
+    value = {
+        "texts": ("a", None, True),
+        Kind.ONE: 1.5,
+        3: [math.nan, math.inf, -1],
+        "bytes": b"\x01\xff",
+        "time": datetime(2026, 11, 23, tzinfo=timezone.utc),
+        "span": timedelta(seconds=1.5),
+        "state": MavState.ACTIVE,
+        "flags": MavModeFlag.SAFETY_ARMED | MavModeFlag.GUIDED_ENABLED,
+        "path": PurePosixPath("/a"),
+        "error": AerokitError("no"),
+        "set": {1},
+    }
+    made = plain(value)
+    assert made == {
+        "texts": ["a", None, True],
+        "ONE": 1.5,
+        "3": [None, None, -1],
+        "bytes": "01ff",
+        "time": "2026-11-23T00:00:00+00:00",
+        "span": 1.5,
+        "state": "ACTIVE",
+        "flags": made["flags"],
+        "path": "/a",
+        "error": "no",
+        "set": [1],
+    }
+    assert set(made["flags"]) == {"SAFETY_ARMED", "GUIDED_ENABLED"}
+    json.dumps(made, allow_nan=False)
+
+
+def test_objects_are_their_fields_and_messages_say_which_they_are() -> None:
+    assert plain(Position(47.0, 8.0, altitude_relative_m=3))["altitude_relative_m"] == 3
+    heartbeat = plain(Heartbeat(2, 3, 81, 4, 3))
+    assert (heartbeat["message"], heartbeat["custom_mode"]) == ("HEARTBEAT", 4)
+    assert plain(Heartbeat) == str(Heartbeat)

@@ -1,0 +1,81 @@
+"""The reference of the documentation has every public name; `nox -s docs` fills the pages."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import runpy
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.fixture(scope="module")
+def site() -> dict[str, Any]:
+    return runpy.run_path(str(ROOT / "docs" / "site_reference.py"))
+
+
+@pytest.fixture(scope="module")
+def pages(site: dict[str, Any]) -> dict[str, str]:
+    return dict(site["reference_pages"]())
+
+
+def test_every_object_stands_once(pages: dict[str, str]) -> None:
+    told = [line for text in pages.values() for line in text.splitlines() if line.startswith("::: ")]
+    assert len(told) > 400
+    assert sorted(told) == sorted(set(told))
+
+
+@pytest.mark.parametrize(
+    ("page", "names"),
+    [
+        (
+            "aerokit",
+            ["vehicle.connect.connect", "runtime.opening.open_connection", "mavlink.signing.Signing"],
+        ),
+        ("vehicle", ["vehicle.vehicle.Vehicle"]),
+        ("missions", ["vehicle.plans.mission.MissionControl", "missions.mission.Mission"]),
+        ("parameters", ["vehicle.parameters.parameters.Parameters", "parameters.table.ParameterTable"]),
+        ("dronekit", ["dronekit.connect.connect", "dronekit.vehicle.Vehicle"]),
+        ("sync", ["sync.twins.Vehicle"]),
+    ],
+)
+def test_what_was_missing_once_is_there(pages: dict[str, str], page: str, names: list[str]) -> None:
+    for name in names:
+        assert f"\n::: aerokit.{name}\n" in pages[f"reference/{page}.md"]
+
+
+@pytest.mark.parametrize(
+    "name", ["", "missions", "parameters", "errors", "events", "sim", "testing", "links", "geo"]
+)
+def test_whatever_is_exported_is_told(pages: dict[str, str], name: str) -> None:
+    module = importlib.import_module(f"aerokit.{name}" if name else "aerokit")
+    told = pages[f"reference/{name or 'aerokit'}.md"]
+    for exported in module.__all__:
+        if not inspect.ismodule(getattr(module, exported)):
+            assert f".{exported}\n" in told or f"[`{exported}`][" in told, exported
+
+
+def test_messages_and_enums_are_all_there(pages: dict[str, str]) -> None:
+    for page, least in (("messages", 300), ("enums", 200)):
+        assert pages[f"reference/{page}.md"].count('<a id="') > least
+    assert "**Attitude** · ATTITUDE (30): " in pages["reference/messages.md"]
+
+
+def test_every_command_is_told(pages: dict[str, str]) -> None:
+    for command in (
+        "demo",
+        "sim",
+        "run",
+        "params",
+        "mission",
+        "files",
+        "logs",
+        "camera",
+        "gimbal",
+        "monitor",
+    ):
+        assert f"aerokit {command}\n" in pages["reference/cli.md"]

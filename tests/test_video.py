@@ -1,0 +1,179 @@
+"""Frames of a video stream that is made here, beside what the vehicle tells."""
+
+from __future__ import annotations
+
+import math
+import socket
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from fractions import Fraction
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import anyio
+import numpy as np
+import pytest
+
+import aerokit
+from aerokit.errors import BusyError, LinkLost, LinkOpenError, LocalProtocolError, NotSupported
+from aerokit.sim import SimulatedCopter, simulated_link
+from aerokit.video import open_video
+
+av: Any = pytest.importorskip("av")
+pytestmark = pytest.mark.anyio
+RATE = 25
+
+
+@pytest.fixture
+def anyio_backend() -> str:
+    return "asyncio"
+
+
+def encode(target: str, kind: str, count: int, *, pace: Callable[[], object] = lambda: None) -> None:
+    """Write a video whose frames grow brighter."""
+    with av.open(target, "w", format=kind) as container:
+        stream = container.add_stream("mpeg2video" if kind == "mpegts" else "mpeg4", rate=RATE)
+        stream.width, stream.height, stream.pix_fmt, stream.gop_size = 64, 48, "yuv420p", 5
+        for number in range(count):
+            picture = av.VideoFrame.from_ndarray(np.full((48, 64, 3), 5 * number % 250, np.uint8), "rgb24")
+            picture.pts, picture.time_base = number, Fraction(1, RATE)
+            for packet in stream.encode(picture):
+                container.mux(packet)
+            pace()
+        for packet in stream.encode():
+            container.mux(packet)
+
+
+@contextmanager
+def streamed(port: int) -> Iterator[threading.Event]:
+    """A camera that sends MPEG-TS by UDP until the block ends, or the event is set."""
+    is_over = threading.Event()
+
+    def pace() -> None:
+        if is_over.wait(1 / RATE):
+            raise InterruptedError
+
+    def send() -> None:
+        with suppress(InterruptedError):
+            encode(f"udp://127.0.0.1:{port}?pkt_size=1316", "mpegts", 10_000, pace=pace)
+
+    thread = threading.Thread(target=send)
+    thread.start()
+    try:
+        yield is_over
+    finally:
+        is_over.set()
+        thread.join()
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+async def test_a_live_stream_beside_the_vehicles_state() -> None:
+    port = free_port()
+    async with (
+        simulated_link(SimulatedCopter(boot_time_s=0.0)) as link,
+        aerokit.connect(link) as vehicle,
+    ):
+        await vehicle.wait_ready(timeout=30)
+        with streamed(port):
+            async with open_video(f"udp://127.0.0.1:{port}", vehicle) as video:
+                frames = []
+                async for frame in video:
+                    frames.append(frame)
+                    if len(frames) == 5:
+                        break
+        times = [each.received_at for each in frames]
+        assert times == sorted(times)
+        assert all(each.position is not None and each.attitude is not None for each in frames)
+        assert frames[0].picture.to_ndarray(format="rgb24").shape == (48, 64, 3)
+        stamps = [each.stream_s or 0.0 for each in frames]
+        assert all(later > earlier for earlier, later in pairwise(stamps))
+    assert not [each for each in threading.enumerate() if "video" in each.name]
+
+
+async def test_a_file_is_read_to_its_end(tmp_path: Path) -> None:
+    path = tmp_path / "flight.mp4"
+    encode(str(path), "mp4", 10)
+    async with open_video(str(path)) as video:
+        frames = [frame async for frame in video]
+    assert 1 <= len(frames) == 10 - video.missed
+    assert frames[-1].position is None
+    assert math.isclose(frames[-1].stream_s or 0, 9 / RATE)
+
+
+async def test_a_slow_reader_gets_the_latest(tmp_path: Path) -> None:
+    path = tmp_path / "flight.mp4"
+    encode(str(path), "mp4", 40)
+    async with open_video(str(path)) as video:
+        with anyio.fail_after(20):
+            while video.missed < 39:
+                await anyio.lowlevel.checkpoint()
+        frame = await video.__anext__()
+        assert frame.stream_s == pytest.approx(39 / RATE)
+        with pytest.raises(StopAsyncIteration):
+            await video.__anext__()
+
+
+async def test_a_stream_that_falls_silent_is_lost() -> None:
+    port = free_port()
+    with streamed(port) as is_over:
+        async with open_video(f"udp://127.0.0.1:{port}", silence_s=0.5) as video:
+            await video.__anext__()
+            is_over.set()
+            with pytest.raises(LinkLost, match="broke off"), anyio.fail_after(20):
+                async for _ in video:
+                    pass
+
+
+async def test_a_stream_that_is_not_there() -> None:
+    with pytest.raises(LinkOpenError, match=r"no-such-file\.mp4 cannot be opened"):
+        async with open_video("/no-such-file.mp4"):
+            pass
+    with pytest.raises(LinkOpenError, match="cannot be opened"):
+        async with open_video(f"udp://127.0.0.1:{free_port()}", timeout=0.3):
+            pass
+
+
+async def test_cancelled_while_opening_it_ends_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("aerokit.video.ENDS_WITHIN_S", 0.1)
+    with anyio.move_on_after(0.2) as scope:
+        async with open_video(f"udp://127.0.0.1:{free_port()}", timeout=3.0):
+            pass
+    assert scope.cancelled_caught
+    left = [each for each in threading.enumerate() if "video" in each.name]
+    assert len(left) == 1  # until the time-out
+    left[0].join(20)
+    assert not left[0].is_alive()
+
+
+async def test_one_reader(tmp_path: Path) -> None:
+    port = free_port()
+    with streamed(port):
+        async with open_video(f"udp://127.0.0.1:{port}") as video, anyio.create_task_group() as tasks:
+            tasks.start_soon(video.__anext__)
+            await anyio.lowlevel.checkpoint()
+            with pytest.raises(BusyError):
+                await video.__anext__()
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"uri": ""}, {"uri": "x", "timeout": 0.0}, {"uri": "x", "silence_s": -1.0}]
+)
+async def test_wrong_arguments(wrong: dict[str, Any]) -> None:
+    with pytest.raises(LocalProtocolError):
+        async with open_video(**wrong):
+            pass
+
+
+async def test_without_pyav_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(NotSupported, match=r"aerokit-mavlink\[video\]"):
+        async with open_video("x"):
+            pass

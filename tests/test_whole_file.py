@@ -1,0 +1,21 @@
+"""`write_whole`: whole or not at all, and never through a link that somebody has laid."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from aerokit.whole_file import write_whole
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="links need rights there")
+def test_no_other_file_is_written_through_a_link(tmp_path: Path) -> None:
+    victim = tmp_path / "victim"
+    victim.write_text("precious")
+    (tmp_path / "report.html.part").symlink_to(victim)
+    write_whole(tmp_path / "report.html", "text")
+    assert victim.read_text() == "precious"
+    assert not (tmp_path / "report.html").is_symlink()
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["report.html", "victim"]

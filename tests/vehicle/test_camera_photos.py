@@ -1,0 +1,437 @@
+"""Pictures: one order takes one, none is missed, and a series ends with its block."""
+
+from __future__ import annotations
+
+import asyncio
+
+import anyio
+import pytest
+from camera_stage import commands_to, on_board, px4
+
+from aerokit import messages as m
+from aerokit.errors import (
+    CommandRejected,
+    CommandTimeout,
+    LocalProtocolError,
+    NotSupported,
+    OperationRejected,
+    OperationTimeout,
+)
+from aerokit.events import ImageCaptured
+from aerokit.mavlink.enums import CameraCapFlags, MavCmd, MavResult
+from aerokit.sim import SimulatedCamera, SimulatedCopter, SimulatedPx4
+
+pytestmark = pytest.mark.anyio
+
+START, STOP = int(MavCmd.IMAGE_START_CAPTURE), int(MavCmd.IMAGE_STOP_CAPTURE)
+STATUS = int(m.CameraCaptureStatus.ID)
+
+
+async def test_a_picture_is_told_with_time_place_and_attitude() -> None:
+    camera = SimulatedCamera()
+    async with on_board(camera) as vehicle:
+        with vehicle.subscribe(ImageCaptured, capacity=10) as events:
+            capture = await vehicle.camera.take_photo()
+            event = await events.get()
+        assert (capture.camera, capture.index, capture.success) == (100, 0, True)
+        assert capture.taken_at is not None
+        assert capture.taken_at > 1.7e9
+        copter = camera.vehicle
+        assert isinstance(copter, SimulatedCopter)
+        assert capture.place is not None
+        assert capture.place.latitude_deg == pytest.approx(copter.frame.origin.latitude_e7 / 1e7, abs=1e-6)
+        assert capture.roll_deg == pytest.approx(0, abs=1)
+        assert capture.quaternion is not None
+        assert (event.camera, event.index, event.success, event.component_id) == (100, 0, True, 100)
+        assert event.place == capture.place
+        assert vehicle.camera.capture.value == capture
+        assert vehicle.camera.captures() == [capture]
+        assert (await vehicle.camera.take_photo()).index == 1
+        assert camera.image_count == 2
+
+
+async def test_cameras_are_found_by_what_they_say() -> None:
+    async with on_board(SimulatedCamera(101), SimulatedCamera(model="Second")) as vehicle:
+        assert vehicle.cameras.value == (100, 101)
+        assert vehicle.camera.number in (100, 101)
+        assert vehicle.camera is vehicle.camera_at(vehicle.camera.number)
+        information = await vehicle.camera_at(100).wait_found()
+        assert (information.number, information.model, information.vendor) == (100, "Second", "aerokit")
+        assert information.firmware == "0.0.0.1"
+        assert (information.width_px, information.height_px) == (4000, 3000)
+        assert information.focal_length_mm == pytest.approx(4.5)
+        assert information.capabilities == {
+            "capture_image", "capture_video", "has_modes", "has_basic_zoom", "has_basic_focus",
+        }  # fmt: skip
+        assert vehicle.camera_at(100).information.value == information
+        assert "100 (aerokit Second)" in repr(vehicle.camera_at(100))
+        for wrong in (0, 256):
+            with pytest.raises(LocalProtocolError, match=f"number = {wrong} is not allowed"):
+                vehicle.camera_at(wrong)
+
+
+async def test_a_call_waits_for_the_camera_to_be_heard() -> None:
+    camera = SimulatedCamera()
+    camera.faults.silent = True
+    async with on_board(camera, settle_s=0.2) as vehicle:
+        assert vehicle.camera.number is None
+        assert vehicle.cameras.latest is None
+        camera.call_later(1.0, lambda: setattr(camera.faults, "silent", False))
+        assert (await vehicle.camera.take_photo()).camera == 100
+
+
+async def test_what_it_cannot_do_is_refused_before_anything_is_sent() -> None:
+    camera = SimulatedCamera(capabilities=CameraCapFlags.CAPTURE_VIDEO)
+    async with on_board(camera) as vehicle:
+        await vehicle.camera.wait_found()
+        heard = commands_to(camera)
+        with pytest.raises(NotSupported, match="has no CAPTURE_IMAGE; nothing was sent"):
+            await vehicle.camera.take_photo()
+        with pytest.raises(NotSupported, match="photo_interval: camera 100"):
+            async with vehicle.camera.photo_interval(1.0):
+                pass
+        assert heard == []
+        for seconds, count in ((0.0, 1), (3601.0, 1), (1.0, -1), (1.0, 32768)):
+            with pytest.raises(LocalProtocolError):
+                vehicle.camera.photo_interval(seconds, count)
+
+
+@pytest.mark.parametrize("lost", [1, 2])
+async def test_an_order_that_was_lost_is_given_again_on_evidence(lost: int) -> None:
+    camera = SimulatedCamera()
+    async with on_board(camera) as vehicle:
+        await vehicle.camera.wait_found()
+        heard = commands_to(camera, START)
+        camera.faults.ignore(START, times=lost)
+        capture = await vehicle.camera.take_photo()
+        assert (capture.index, camera.image_count) == (0, 1)
+        assert len(heard) == lost + 1
+        assert len({each[4] for each in heard}) == 1, "the number of the order stays"
+
+
+async def test_nothing_is_given_again_when_only_the_answer_was_lost() -> None:
+    camera = SimulatedCamera(shutter_s=3.0)
+    async with on_board(camera) as vehicle:
+        await vehicle.camera.wait_found()
+        heard = commands_to(camera, START)
+        camera.faults.lose_ack(START)
+        assert (await vehicle.camera.take_photo()).index == 0
+        assert len(heard) == camera.image_count == 1
+
+
+async def test_without_evidence_nothing_is_given_again() -> None:
+    camera = SimulatedCamera()
+    async with on_board(camera) as vehicle:
+        await vehicle.camera.wait_found()
+        heard = commands_to(camera, START)
+        camera.faults.ignore(START, times=10)
+        camera.faults.ignore(int(MavCmd.REQUEST_MESSAGE), times=1000)
+        with pytest.raises(CommandTimeout, match="IMAGE_START_CAPTURE"):
+            await vehicle.camera.take_photo(timeout=8.0)
+        assert len(heard) == 1
+
+
+async def test_a_picture_of_which_the_message_was_lost_is_asked_for() -> None:
+    camera = SimulatedCamera()
+    async with on_board(camera) as vehicle:
+        await vehicle.camera.take_photo()
+        camera.faults.lose(m.CameraImageCaptured, times=1)
+        capture = await vehicle.camera.take_photo()
+        assert (capture.index, capture.success) == (1, True)
+        assert camera.image_count == 2
+
+
+async def test_a_picture_that_cannot_be_taken_is_an_error() -> None:
+    camera = SimulatedCamera(capacity_mib=12.0)
+    async with on_board(camera) as vehicle:
+        for _ in range(2):
+            await vehicle.camera.take_photo()
+        with pytest.raises(CommandRejected) as refused:
+            await vehicle.camera.take_photo()
+        assert refused.value.result == MavResult.FAILED
+        camera.card.used_mib = 6.0
+
+        def fill() -> None:
+            camera.card.used_mib = 12.0
+
+        camera.call_later(0.1, fill)
+        with pytest.raises(OperationRejected, match=r"camera 100 .* could not take the picture"):
+            await vehicle.camera.take_photo()
+
+
+async def test_two_calls_at_once_take_two_pictures() -> None:
+    camera = SimulatedCamera()
+    async with on_board(camera) as vehicle:
+        found = []
+
+        async def take() -> None:
+            found.append((await vehicle.camera.take_photo()).index)
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(take)
+            tasks.start_soon(take)
+        assert sorted(found) == [0, 1]
+        assert camera.image_count == 2
+
+
+# ------------------------------------------------------------------------------------------ one after the other
+
+
+async def test_a_series_gives_pictures_in_order_and_ends() -> None:
+    camera = SimulatedCamera()
+    async with on_board(camera) as vehicle:
+        await vehicle.camera.wait_found()
+        heard = commands_to(camera, START, STOP)
+        async with vehicle.camera.photo_interval(1.0, count=4) as captures:
+            found = [each.index async for each in captures]
+        assert found == [0, 1, 2, 3]
+        assert captures.missed == 0
+        assert heard == [(START, 0.0, 1.0, 4.0, 0.0)]
+        assert [each.index for each in vehicle.camera.captures()] == found
+
+
+async def test_holes_are_filled() -> None:
+    camera = SimulatedCamera()
+    async with on_board(camera) as vehicle:
+        await vehicle.camera.wait_found()
+        async with vehicle.camera.photo_interval(1.0, count=8) as captures:
+            found = []
+            async for each in captures:
+                found.append(each.index)
+                if each.index in (1, 5):
+                    camera.faults.lose(m.CameraImageCaptured, times=2)
+        assert found == list(range(8))
+        assert captures.missed == 0
+
+
+async def test_the_end_of_the_block_ends_the_series() -> None:
+    camera = SimulatedCamera()
+    async with on_board(camera) as vehicle:
+        async with vehicle.camera.photo_interval(0.5) as captures:
+            async for each in captures:
+                if each.index == 2:
+                    break
+        taken = camera.image_count
+        await anyio.sleep(3.0)
+        assert camera.image_count <= taken + 1 <= 5
+        assert not camera.captures.is_busy
+
+
+async def test_it_ends_under_cancellation_also_when_the_first_order_to_end_is_lost() -> None:
+    camera = SimulatedCamera()
+    async with on_board(camera) as vehicle:
+        await vehicle.camera.wait_found()
+
+        async def survey() -> None:
+            async with vehicle.camera.photo_interval(0.5) as captures:
+                async for _ in captures:
+                    pass
+
+        task = asyncio.create_task(survey())
+        await anyio.sleep(2.0)
+        heard = commands_to(camera, STOP)
+        camera.faults.ignore(STOP, times=1)
+        task.cancel()
+        began = vehicle.connection.now()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+        assert vehicle.connection.now() - began < 0.1
+        await anyio.sleep(4.0)
+        assert len(heard) == 2
+        assert not camera.captures.is_busy
+
+
+async def test_a_series_that_the_camera_ends_is_an_error() -> None:
+    camera = SimulatedCamera(capacity_mib=12.0)
+    async with on_board(camera) as vehicle:
+        found = []
+        with pytest.raises(OperationRejected, match="has ended the series after 3 pictures"):
+            async with vehicle.camera.photo_interval(0.5, count=6) as captures:
+                async for each in captures:
+                    found.append(each.success)
+        assert found == [True, True, False]
+
+
+async def test_a_camera_that_falls_silent_ends_the_wait() -> None:
+    camera = SimulatedCamera()
+    async with on_board(camera) as vehicle:
+        with pytest.raises(OperationTimeout, match="takes pictures, and tells of none any more"):
+            async with vehicle.camera.photo_interval(0.5) as captures:
+                async for each in captures:
+                    camera.faults.silent = each.index == 2
+
+
+async def test_an_order_of_a_series_that_was_lost_is_given_again() -> None:
+    camera = SimulatedCamera()
+    async with on_board(camera) as vehicle:
+        await vehicle.camera.wait_found()
+        camera.faults.ignore(START, times=1)
+        async with vehicle.camera.photo_interval(1.0, count=2) as captures:
+            assert [each.index async for each in captures] == [0, 1]
+        camera.faults.lose_ack(START)
+        heard = commands_to(camera, START)
+        async with vehicle.camera.photo_interval(2.0, count=2) as captures:
+            assert [each.index async for each in captures] == [2, 3]
+        assert len(heard) == 1
+
+
+async def test_pictures_of_before_are_loaded() -> None:
+    camera = SimulatedCamera()
+    async with on_board(camera, settle_s=0.5) as vehicle:
+        for _ in range(3):
+            camera.captures.take()
+            camera.faults.lose(m.CameraImageCaptured, times=1)
+            await anyio.sleep(1.0)
+        assert vehicle.camera.captures() == []
+        assert [each.index for each in await vehicle.camera.load_captures()] == [0, 1, 2]
+
+
+# --------------------------------------------------------------------------------------- behind the autopilot
+
+
+async def test_ardupilots_own_camera_tells_by_camera_feedback() -> None:
+    copter = SimulatedCopter(boot_time_s=0.0)
+    copter.parameters["CAM1_TYPE"] = 1.0
+    async with on_board(vehicle=copter) as vehicle:
+        capture = await vehicle.camera.take_photo()
+        assert (capture.camera, capture.index, capture.success) == (1, 0, True)
+        assert vehicle.camera.number == 1
+        assert capture.place is not None
+        assert capture.place.altitude_relative_m == pytest.approx(0, abs=1)
+        assert vehicle.cameras.value == (1,)
+        await anyio.sleep(0.5)  # the shutter is busy
+        copter.faults.lose(m.CameraFeedback, times=1)
+        assert (await vehicle.camera.take_photo()).index == 1
+        async with vehicle.camera.photo_interval(1.0, count=3) as captures:
+            assert [each.index async for each in captures] == [2, 3, 4]
+        async with vehicle.camera.photo_interval(0.5):
+            await anyio.sleep(2.0)
+        taken = copter.camera.image_count
+        await anyio.sleep(2.0)
+        assert copter.camera.image_count == taken
+
+
+async def test_what_ardupilot_does_not_remember_is_counted() -> None:
+    copter = SimulatedCopter(boot_time_s=0.0)
+    copter.parameters["CAM1_TYPE"] = 1.0
+    async with on_board(vehicle=copter) as vehicle:
+        async with vehicle.camera.photo_interval(1.0, count=6) as captures:
+            found = []
+            async for each in captures:
+                found.append(each.index)
+                if each.index == 1:
+                    copter.faults.lose(m.CameraFeedback, times=2)
+        assert captures.missed == 6 - len(found) > 0
+        assert found == sorted(found)
+
+
+async def test_px4s_trigger_takes_pictures_too() -> None:
+    simulated = px4()
+    assert isinstance(simulated, SimulatedPx4)
+    simulated.parameters["TRIG_MODE"] = 1.0
+    async with on_board(vehicle=simulated) as vehicle:
+        heard = commands_to(simulated, START, int(MavCmd.DO_DIGICAM_CONTROL))
+        capture = await vehicle.camera.take_photo()
+        assert (capture.camera, capture.index, capture.success) == (1, 0, True)
+        assert capture.place is not None
+        assert [each[0] for each in heard] == [MavCmd.DO_DIGICAM_CONTROL]
+        async with vehicle.camera.photo_interval(1.0, count=3) as captures:
+            found = [each.index async for each in captures]
+        assert found == [capture.index + 1, capture.index + 2, capture.index + 3]
+        with pytest.raises(NotSupported, match="is a trigger, which takes pictures; nothing was sent"):
+            await vehicle.camera.zoom_to(10)
+        with pytest.raises(OperationTimeout, match="says nothing of itself"):
+            await vehicle.camera.wait_found(timeout=4.0)
+        assert not simulated.camera_trigger.is_running
+
+
+async def test_a_trigger_alone_tells_the_vehicles_own_place() -> None:
+    simulated = px4()
+    simulated.parameters["TRIG_MODE"] = 1.0
+    simulated.camera_trigger.tells_places = False
+    async with on_board(vehicle=simulated, settle_s=6.0) as vehicle:
+        capture = await vehicle.camera.take_photo()
+        assert (capture.index, capture.success, capture.taken_at) == (0, None, None)
+        assert capture.place is not None
+        assert capture.place.distance_to(vehicle.position.value) < 1
+        assert capture.yaw_deg == pytest.approx(vehicle.attitude.value.yaw_deg % 360, abs=1)
+
+
+async def test_a_vehicle_without_a_camera_refuses() -> None:
+    async with on_board() as vehicle:
+        with pytest.raises(CommandRejected):
+            await vehicle.camera.take_photo()
+    async with on_board(vehicle=px4()) as vehicle:
+        with pytest.raises(CommandTimeout, match="DO_DIGICAM_CONTROL"):
+            await vehicle.camera.take_photo(timeout=3.0)
+
+
+# ------------------------------------------------------------------------------------------ events without asking
+
+
+async def test_pictures_are_told_of_though_nobody_has_asked_for_a_camera() -> None:
+    camera, other = SimulatedCamera(), SimulatedCamera(101)
+    async with on_board(camera, other) as vehicle:
+        with vehicle.subscribe(ImageCaptured, capacity=20) as events:
+            for each in (camera, other, camera):
+                each.captures.take()
+                await anyio.sleep(1.0)
+            told = []
+            while (event := events.get_nowait()) is not None:
+                told.append((event.camera, event.index, event.component_id))
+        assert told == [(100, 0, 100), (101, 0, 101), (100, 1, 100)]
+        assert [each.index for each in vehicle.camera_at(101).captures()] == [0]
+
+
+async def test_pictures_of_the_autopilots_camera_too_and_none_is_told_twice() -> None:
+    copter = SimulatedCopter(boot_time_s=0.0)
+    copter.parameters["CAM1_TYPE"] = 1.0
+    async with on_board(vehicle=copter) as vehicle:
+        with vehicle.subscribe(ImageCaptured, capacity=20) as events:
+            for _ in range(3):
+                copter.camera.take()
+                await anyio.sleep(1.0)
+            await anyio.sleep(2.0)
+            assert vehicle.camera.number == 1
+            copter.camera.take()
+            await anyio.sleep(1.0)
+            told = []
+            while (event := events.get_nowait()) is not None:
+                told.append((event.camera, event.index))
+        assert told == [(1, 0), (1, 1), (1, 2), (1, 3)]
+
+
+async def test_a_camera_that_was_named_before_it_was_heard_tells_once() -> None:
+    camera = SimulatedCamera()
+    camera.faults.silent = True
+    async with on_board(camera, settle_s=0.2) as vehicle:
+        named, first = vehicle.camera_at(100), vehicle.camera
+        camera.faults.silent = False
+        await named.wait_found()
+        await first.wait_found()
+        with vehicle.subscribe(ImageCaptured, capacity=20) as events:
+            await first.take_photo()
+            assert (await events.get()).index == 0
+            await anyio.sleep(1.0)
+            assert events.get_nowait() is None
+        assert named.captures() == first.captures()
+
+
+# ------------------------------------------------------------------------------------------------ a bad radio
+
+
+@pytest.mark.parametrize("seed", range(8))
+async def test_on_a_bad_radio_no_picture_is_taken_twice_and_none_is_missed(seed: int) -> None:
+    camera = SimulatedCamera()
+    copter = SimulatedCopter(boot_time_s=0.0, components=[camera], seed=seed)
+    async with on_board(vehicle=copter) as vehicle:
+        await vehicle.camera.take_photo()
+        camera.faults.loss = camera.faults.loss_incoming = 0.3
+        for number in range(1, 8):
+            capture = await vehicle.camera.take_photo(timeout=60.0)
+            assert (capture.index, camera.image_count) == (number, number + 1)
+            await anyio.sleep(0.5)
+        async with vehicle.camera.photo_interval(1.0, count=12) as captures:
+            assert [each.index async for each in captures] == list(range(8, 20))
+            assert captures.missed == 0
+        assert camera.image_count == 20

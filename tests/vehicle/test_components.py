@@ -1,0 +1,253 @@
+"""What is on board beside the autopilot: heard of, and spoken to as the autopilot is."""
+
+from __future__ import annotations
+
+import json
+import lzma
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+import anyio
+import pytest
+
+import aerokit
+from aerokit import messages as m
+from aerokit.errors import (
+    CommandRejected,
+    FileFormatError,
+    LocalProtocolError,
+    NotSupported,
+    OperationTimeout,
+)
+from aerokit.events import ComponentFound, StreamSlow, VehicleFound
+from aerokit.mavlink.enums import MavCmd, MavResult
+from aerokit.runtime.connection import Connection
+from aerokit.runtime.opening import open_connection
+from aerokit.sim import SimulatedCamera, SimulatedCopter, SimulatedGimbal, SimulatedPx4, simulated_link
+from aerokit.vehicle.components.component import Component
+
+pytestmark = pytest.mark.anyio
+
+
+@asynccontextmanager
+async def on_board(*components: SimulatedCamera | SimulatedGimbal) -> AsyncIterator[aerokit.Vehicle]:
+    copter = SimulatedCopter(boot_time_s=0.0, components=components)
+    async with simulated_link(copter) as link, aerokit.connect(link) as vehicle:
+        await anyio.sleep(1.5)
+        yield vehicle
+
+
+async def test_what_has_been_heard_is_told_with_kind_and_age() -> None:
+    async with on_board(SimulatedCamera(), SimulatedCamera(101), SimulatedGimbal()) as vehicle:
+        told = vehicle.components.value
+        assert [(each.component_id, each.device_id, each.kind) for each in told] == [
+            (1, 0, "autopilot"),
+            (100, 0, "camera"),
+            (101, 0, "camera"),
+            (154, 0, "gimbal"),
+        ]
+        assert all(0 <= vehicle.connection.now() - each.heard_at <= 1.5 for each in told)
+
+
+async def test_the_list_grows_when_somebody_new_is_heard() -> None:
+    camera = SimulatedCamera()
+    camera.faults.silent = True
+    async with on_board(camera) as vehicle:
+        assert [each.kind for each in vehicle.components.value] == ["autopilot"]
+        assert vehicle.component(100).is_silent
+        assert vehicle.component(100).kind == "unknown"
+        camera.faults.silent = False
+        told = await vehicle.components.wait_until(lambda told: len(told) == 2, timeout=3)
+        assert told[1].kind == vehicle.component(100).kind == "camera"
+        assert not vehicle.component(100).is_silent
+
+
+async def test_devices_behind_the_autopilot_are_on_the_list() -> None:
+    async with on_board() as vehicle:
+        assert [each.device_id for each in vehicle.components.value] == [0]
+        source = m.GimbalDeviceAttitudeStatus(0, 0, 0, 0, (1.0, 0.0, 0.0, 0.0), 0, 0, 0, 0)
+        assert source.gimbal_device_id == 0
+    device = m.GimbalDeviceAttitudeStatus(0, 0, 0, 0, (1.0, 0.0, 0.0, 0.0), 0, 0, 0, 0, gimbal_device_id=2)
+    copter = SimulatedCopter(boot_time_s=0.0)
+    async with simulated_link(copter) as link, aerokit.connect(link) as vehicle:
+        assert len(vehicle.components.value) == 1
+        copter.send(device)
+        told = await vehicle.components.wait_until(lambda told: len(told) == 2, timeout=3)
+        assert (told[1].component_id, told[1].device_id, told[1].kind) == (1, 2, "gimbal")
+
+
+async def test_messages_come_from_the_component_at_the_rate_asked_of_it() -> None:
+    async with on_board(SimulatedCamera(), SimulatedCamera(101)) as vehicle:
+        with (
+            vehicle.subscribe(StreamSlow, capacity=10) as slow,
+            vehicle.component(101).subscribe(m.CameraCaptureStatus, capacity=100, rate_hz=5) as statuses,
+        ):
+            await anyio.sleep(8.0)
+            came = []
+            while (status := statuses.get_nowait()) is not None:
+                came.append(status)
+            assert slow.get_nowait() is None
+        assert 35 <= len(came) <= 41
+        assert {each.received_frame.component_id for each in came if each.received_frame} == {101}
+
+
+async def test_a_cell_has_the_messages_of_one_component_only() -> None:
+    async with on_board(SimulatedCamera(), SimulatedCamera(101)) as vehicle:
+        of_second = vehicle.component(101).message(m.CameraSettings, rate_hz=2)
+        assert vehicle.component(101).message(m.CameraSettings) is of_second
+        await vehicle.component(100).command(MavCmd.SET_CAMERA_ZOOM, 2, 30)
+        await of_second.wait_until(lambda _: True, timeout=3)
+        await anyio.sleep(2.0)
+        assert of_second.value.zoomLevel == 0
+
+
+async def test_a_stream_that_is_slow_names_its_component() -> None:
+    camera = SimulatedCamera()
+    async with on_board(camera) as vehicle:
+        with vehicle.subscribe(StreamSlow, capacity=10) as slow:
+            vehicle.component(100).message(m.CameraSettings, rate_hz=5)
+            await anyio.sleep(1.0)
+            camera.faults.silent = True
+            with anyio.fail_after(20.0):
+                event = await slow.get()
+            assert isinstance(event, StreamSlow)
+            assert event.component_id == 100
+
+
+async def test_commands_and_questions_go_to_the_component() -> None:
+    camera = SimulatedCamera()
+    async with on_board(camera, SimulatedCamera(101)) as vehicle:
+        component = vehicle.component(100)
+        assert (await component.command(MavCmd.IMAGE_START_CAPTURE, 0, 0, 1)).result == MavResult.ACCEPTED
+        information = await component.request(m.CameraInformation)
+        assert information.received_frame is not None
+        assert information.received_frame.component_id == 100
+        with pytest.raises(CommandRejected) as caught:
+            await component.request(m.ComponentInformationBasic)
+        assert caught.value.result == MavResult.DENIED
+        camera.faults.silent = True
+        with pytest.raises(OperationTimeout, match="component 100 sent no CAMERA_INFORMATION"):
+            await component.request(m.CameraInformation, timeout=2.0)
+
+
+async def test_an_answer_is_asked_for_again() -> None:
+    camera = SimulatedCamera()
+    async with on_board(camera) as vehicle:
+        camera.faults.drop_incoming = 1
+        assert (await vehicle.component(100).request(m.CameraInformation)).model_name.startswith(b"Simulated")
+
+
+async def test_only_what_is_meant_is_returned() -> None:
+    async with on_board(SimulatedCamera(streams=["rtsp://127.0.0.1/a", "rtsp://127.0.0.1/b"])) as vehicle:
+        stream = await vehicle.component(100).request(
+            m.VideoStreamInformation, where=lambda each: each.stream_id == 2
+        )
+        assert stream.uri == "rtsp://127.0.0.1/b"
+
+
+async def test_an_id_that_cannot_be_is_refused() -> None:
+    async with on_board() as vehicle:
+        for wrong in (0, 256, -1):
+            with pytest.raises(LocalProtocolError, match=f"component_id = {wrong} is not allowed: 1 to 255"):
+                vehicle.component(wrong)
+        assert vehicle.component(100) is vehicle.component(100)
+
+
+async def test_everybody_who_is_heard_is_told_of() -> None:
+    one = SimulatedCopter(system_id=1, boot_time_s=0.0, components=[SimulatedCamera()])
+    two = SimulatedPx4(system_id=2, boot_time_s=1.0)
+    async with simulated_link([one, two]) as link, open_connection(link) as connection:
+        with connection.subscribe(VehicleFound, ComponentFound, capacity=10) as found:
+            await anyio.sleep(2.5)
+            told = []
+            while (event := found.get_nowait()) is not None:
+                assert isinstance(event, VehicleFound | ComponentFound)
+                told.append((type(event), event.system_id, event.component_id))
+        assert sorted(told, key=lambda each: each[1:]) == [
+            (VehicleFound, 1, 1),
+            (ComponentFound, 1, 100),
+            (VehicleFound, 2, 1),
+        ]
+        assert await first_vehicles(connection, 2) == [(1, 2, 3), (2, 2, 12)]
+
+
+async def first_vehicles(connection: Connection, count: int) -> list[tuple[int, int, int]]:
+    found = []
+    with anyio.fail_after(5.0):
+        async for each in connection.vehicles():
+            found.append((each.system_id, each.vehicle_type, each.autopilot))
+            if len(found) == count:
+                return sorted(found)
+    raise AssertionError("the connection goes on, and so does the search")
+
+
+async def test_the_search_goes_on_while_nobody_new_is_heard() -> None:
+    late = SimulatedPx4(system_id=2, boot_time_s=1.0)
+    late.faults.silent = True
+    copter = SimulatedCopter(boot_time_s=0.0)
+    async with (
+        simulated_link([copter, late]) as link,
+        open_connection(link) as connection,
+        anyio.create_task_group() as tasks,
+    ):
+
+        async def wake() -> None:
+            await anyio.sleep(3.0)
+            late.faults.silent = False
+
+        tasks.start_soon(wake)
+        assert [each[0] for each in await first_vehicles(connection, 2)] == [1, 2]
+
+
+async def test_the_autopilot_is_a_component_too() -> None:
+    async with on_board() as vehicle:
+        autopilot = vehicle.component(vehicle.component_id)
+        assert autopilot.kind == "autopilot"
+        assert autopilot.files is vehicle.files
+        assert autopilot.parameters is vehicle.parameters
+        assert autopilot.message(m.Attitude) is vehicle.message(m.Attitude)
+
+
+GENERAL = "/etc/extras/component_general.json.xz"
+"""Where a PX4 says that its files begin."""
+
+
+@asynccontextmanager
+async def px4_with(files: dict[str, bytes]) -> AsyncIterator[Component]:
+    px4 = SimulatedPx4(boot_time_s=1.0)
+    for path, content in files.items():
+        px4.files.put(path, content)
+    async with simulated_link(px4) as link, aerokit.connect(link) as vehicle:
+        yield vehicle.component(1)
+
+
+def packed(content: object) -> bytes:
+    return lzma.compress(json.dumps(content).encode())
+
+
+async def test_metadata_are_read_off_the_vehicle() -> None:
+    general = {"version": 1, "metadataTypes": [{"type": 1, "uri": "mftp://etc/extras/parameters.json"}, "?"]}
+    parameters = {"version": 1, "parameters": []}
+    files = {GENERAL: packed(general), "/etc/extras/parameters.json": json.dumps(parameters).encode()}
+    async with px4_with(files) as component:
+        assert await component.metadata() == general
+        assert await component.metadata("parameter") == parameters
+        with pytest.raises(NotSupported, match="no metadata of its events"):
+            await component.metadata("events")
+
+
+@pytest.mark.parametrize("content", [b"no JSON", b"[]", lzma.compress(b"{}")[:-5], b"[" * 100_000])
+async def test_damaged_metadata_are_told(content: bytes) -> None:
+    async with px4_with({GENERAL: content}) as component:
+        with pytest.raises(FileFormatError, match="component_general"):
+            await component.metadata()
+
+
+async def test_who_tells_no_metadata_has_none() -> None:
+    camera = SimulatedCamera()
+    async with on_board(camera) as vehicle:
+        with pytest.raises(NotSupported, match=r"component 100 tells of no metadata: .*DENIED"):
+            await vehicle.component(100).metadata()
+        camera.faults.silent = True
+        with pytest.raises(NotSupported, match="component 100 tells of no metadata: component 100 sent no"):
+            await vehicle.component(100).metadata()

@@ -1,0 +1,611 @@
+"""`gimbal.control()` and `gimbal.rates()`: taken, told, lost, given back; rates that end with their code."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import Any
+
+import anyio
+import anyio.lowlevel
+import pytest
+from flight_harness import Px4Flight, block_loop, now, open_flight, open_px4
+from gimbal_stage import (
+    CONFIGURE,
+    OTHER,
+    PITCHYAW,
+    beside,
+    configured,
+    mounted,
+    takes_control,
+    us,
+)
+
+from aerokit import errors, events
+from aerokit import messages as m
+from aerokit.errors import (
+    BusyError,
+    CommandRejected,
+    CommandTimeout,
+    GimbalTaken,
+    LocalProtocolError,
+    NotSupported,
+    OperationRejected,
+    OperationTimeout,
+    SetpointStreamStopped,
+)
+from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.enums import MavResult
+from aerokit.sim import SimulatedGimbal, SimulatedPx4
+
+pytestmark = pytest.mark.anyio
+
+KEEP = (-1, -1)
+
+
+class Boom(Exception):
+    pass
+
+
+# ------------------------------------------------------------------------------------------- control
+
+
+async def test_it_is_taken_told_and_given_back() -> None:
+    gimbal = SimulatedGimbal()
+    async with beside(gimbal) as flight:
+        async with flight.vehicle.gimbal.control() as control:
+            assert gimbal.primary == us(flight)
+            assert (control.is_held, control.is_primary) == (True, True)
+            assert flight.vehicle.gimbal.controllers.value.primary == us(flight)
+            await flight.vehicle.gimbal.point(-20.0, 0.0, frame="vehicle")
+        assert gimbal.primary == (0, 0)
+        assert not control.is_held
+        assert configured(flight)[0] == (*us(flight), *KEEP, 154)
+        assert configured(flight)[-1] == (-3, -3, *KEEP, 154)
+
+
+async def test_the_autopilots_is_asked_for_what_it_does_not_tell_by_itself() -> None:
+    async with mounted() as flight:
+        for _ in range(2):
+            async with flight.vehicle.gimbal.control():
+                assert flight.copter.gimbal.in_control == us(flight)
+            assert flight.copter.gimbal.in_control == (0, 0)
+        assert configured(flight)[0] == (*us(flight), *KEEP, 0)
+
+
+async def test_secondary_control_is_beside_the_primary() -> None:
+    gimbal = SimulatedGimbal()
+    async with beside(gimbal) as flight:
+        takes_control(flight)
+        async with flight.vehicle.gimbal.control(secondary=True) as control:
+            assert (gimbal.primary, gimbal.secondary) == (OTHER, us(flight))
+            assert not control.is_primary
+            await flight.vehicle.gimbal.point(-20.0, 0.0, frame="vehicle")
+            takes_control(flight, secondary=True)
+            assert await control.until_lost() == OTHER
+        assert (gimbal.primary, gimbal.secondary) == (OTHER, OTHER)
+
+
+@pytest.mark.parametrize("how", ["raises", "is cancelled"])
+async def test_it_is_given_back_without_waiting(how: str) -> None:
+    gimbal = SimulatedGimbal()
+    async with beside(gimbal) as flight:
+        left_at = math.nan
+        with anyio.CancelScope() as scope:
+            try:
+                async with flight.vehicle.gimbal.control():
+                    left_at = now()
+                    if how == "raises":
+                        raise Boom
+                    scope.cancel()
+                    await anyio.sleep(9)
+            except Boom:
+                pass
+        assert now() == left_at
+        await anyio.sleep(1.0)
+        assert gimbal.primary == (0, 0)
+
+
+async def test_what_was_given_back_in_passing_is_said_again_until_it_is_answered() -> None:
+    gimbal = SimulatedGimbal()
+    async with beside(gimbal) as flight:
+        with pytest.raises(Boom):
+            async with flight.vehicle.gimbal.control():
+                gimbal.faults.drop_incoming = 1
+                raise Boom
+        assert gimbal.primary == us(flight)
+        await anyio.sleep(3.0)
+        assert gimbal.primary == (0, 0)
+
+
+async def test_the_end_of_the_vehicles_block_gives_it_back() -> None:
+    gimbal = SimulatedGimbal()
+    async with anyio.create_task_group() as tasks:
+        async with beside(gimbal) as flight:
+
+            async def hold() -> None:
+                async with flight.vehicle.gimbal.control():
+                    await anyio.sleep(99)
+
+            tasks.start_soon(hold)
+            await anyio.sleep(1.0)
+            assert gimbal.primary == us(flight)
+            await anyio.lowlevel.checkpoint()
+        assert configured(flight)[-1] == (-3, -3, *KEEP, 154)
+        tasks.cancel_scope.cancel()
+
+
+async def test_losing_it_is_an_event_and_ends_what_waits() -> None:
+    gimbal = SimulatedGimbal(slew_deg_s=5.0)
+    async with beside(gimbal) as flight:
+        with flight.vehicle.subscribe(events.GimbalControlLost) as lost:
+            async with flight.vehicle.gimbal.control() as control:
+                asyncio.get_running_loop().call_later(1.0, takes_control, flight)
+                began = now()
+                with pytest.raises(GimbalTaken, match="254/190 has it now") as caught:
+                    await flight.vehicle.gimbal.point(-80.0, 0.0, timeout=30)
+                assert now() - began < 3.0
+                assert (caught.value.system_id, caught.value.component_id) == OTHER
+                assert not control.is_held
+                sent = len(flight.wire.commands(PITCHYAW))
+                with pytest.raises(GimbalTaken):
+                    await flight.vehicle.gimbal.point(0.0, 0.0)
+                assert len(flight.wire.commands(PITCHYAW)) == sent
+            event = lost.get_nowait()
+            assert event is not None
+            assert (event.gimbal_device_id, event.is_primary) == (154, True)
+            assert (event.to_system_id, event.to_component_id) == OTHER
+        await anyio.sleep(1.0)
+        assert gimbal.primary == OTHER, "nothing is given back that somebody else has"
+
+
+async def test_who_was_told_nothing_is_told_when_the_block_is_left() -> None:
+    gimbal = SimulatedGimbal()
+    async with beside(gimbal) as flight:
+        with pytest.raises(GimbalTaken):
+            async with flight.vehicle.gimbal.control():
+                takes_control(flight)
+                await anyio.sleep(2.0)
+        with pytest.raises(Boom):
+            async with flight.vehicle.gimbal.control():
+                takes_control(flight)
+                await anyio.sleep(2.0)
+                raise Boom
+
+
+async def test_who_has_it_twice_and_loses_one_still_has_it() -> None:
+    gimbal = SimulatedGimbal()
+    async with beside(gimbal) as flight:
+        async with flight.vehicle.gimbal.control() as primary:
+            with pytest.raises(GimbalTaken):
+                async with flight.vehicle.gimbal.control(secondary=True) as secondary:
+                    takes_control(flight, secondary=True)
+                    await anyio.sleep(2.0)
+                    assert (primary.is_held, secondary.is_held) == (True, False)
+                    await flight.vehicle.gimbal.point(-20.0, 0.0, frame="vehicle")
+        assert (gimbal.primary, gimbal.secondary) == ((0, 0), OTHER)
+
+
+async def test_a_status_that_was_overtaken_takes_nothing_away() -> None:
+    gimbal = SimulatedGimbal()
+    async with beside(gimbal) as flight, flight.vehicle.gimbal.control() as control:
+        status = m.GimbalManagerStatus(gimbal.time_boot_ms - 700, 0, 154, *OTHER, 0, 0)
+        flight.wire.deliver(FrameEncoder(1, 154).encode(status))
+        assert control.is_held
+        await anyio.sleep(2.0)
+        assert control.is_held
+
+
+async def test_one_block_at_a_time_has_it() -> None:
+    async with beside(SimulatedGimbal()) as flight:
+        gimbal = flight.vehicle.gimbal
+        async with gimbal.control() as control:
+            for again in (gimbal.control(), flight.vehicle.gimbals[154].control()):
+                with pytest.raises(BusyError, match="already"):
+                    async with again:
+                        pass
+            async with gimbal.control(secondary=True):
+                pass
+            with pytest.raises(BusyError, match="once"):
+                await control.__aenter__()
+            assert control.is_held
+            with anyio.move_on_after(1.0):
+                await control.until_lost()
+            control.raise_if_taken()
+
+
+async def test_a_second_try_keeps_what_the_first_one_gave_back_without_an_answer() -> None:
+    gimbal = SimulatedGimbal()
+    async with beside(gimbal) as flight:
+        control = flight.vehicle.gimbal.control
+        gimbal.faults.lose_ack(CONFIGURE, times=5)
+        with pytest.raises(CommandTimeout):
+            async with control():
+                pass
+        async with control() as held:
+            await anyio.sleep(8.0)
+            assert gimbal.primary == us(flight)
+            assert held.is_held
+        await anyio.sleep(1.0)
+        assert gimbal.primary == (0, 0)
+
+
+async def test_an_attempt_that_was_given_up_takes_nothing_from_another_task() -> None:
+    gimbal = SimulatedGimbal()
+    async with beside(gimbal) as flight:
+        gimbal.faults.delay_ack(CONFIGURE, 0.6, times=1)
+
+        async def give_up() -> None:
+            with anyio.move_on_after(0.3):
+                async with flight.vehicle.gimbal.control():
+                    raise Boom
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(give_up)
+            await anyio.sleep(0.1)
+            gimbal.faults.clear()
+            async with flight.vehicle.gimbals[154].control() as control:
+                await anyio.sleep(3.0)
+                assert gimbal.primary == us(flight)
+                assert control.is_held
+
+
+@pytest.mark.parametrize("end", ["left", "refused"])
+async def test_what_was_left_to_a_later_block_is_given_back_by_it(end: str) -> None:
+    gimbal = SimulatedGimbal()
+    async with beside(gimbal) as flight:
+        control = flight.vehicle.gimbal.control
+        with pytest.raises(Boom):
+            async with control():
+                gimbal.faults.drop_incoming = 1
+                raise Boom
+        if end == "refused":
+            gimbal.faults.refuse(
+                CONFIGURE, MavResult.TEMPORARILY_REJECTED, times=2
+            )  # one is taken for the other's
+            with pytest.raises(CommandRejected):
+                async with control():
+                    pass
+        else:
+            async with control():
+                pass
+        await anyio.sleep(3.0)
+        assert gimbal.primary == (0, 0)
+
+
+async def test_secondary_control_that_nobody_was_told_of_is_given_back_beside_the_primary() -> None:
+    gimbal = SimulatedGimbal()
+    async with beside(gimbal) as flight, flight.vehicle.gimbal.control():
+        gimbal.faults.lose_ack(CONFIGURE, times=4)
+        with pytest.raises(CommandTimeout):
+            async with flight.vehicle.gimbal.control(secondary=True):
+                pass
+        await anyio.sleep(1.0)
+        assert (gimbal.primary, gimbal.secondary) == (us(flight), (0, 0))
+
+
+async def test_who_waits_for_its_loss_is_told_that_the_block_was_left() -> None:
+    async with beside(SimulatedGimbal()) as flight:
+        async with flight.vehicle.gimbal.control() as control:
+            waits = asyncio.ensure_future(control.until_lost())
+            await anyio.sleep(0.5)
+        with pytest.raises(OperationRejected, match="was left"):
+            await waits
+
+
+async def test_a_refusal_and_a_lie_are_told() -> None:
+    gimbal = SimulatedGimbal()
+    async with beside(gimbal) as flight:
+        gimbal.faults.refuse(CONFIGURE, MavResult.TEMPORARILY_REJECTED, times=1)
+        with pytest.raises(CommandRejected):
+            async with flight.vehicle.gimbal.control():
+                pass
+        gimbal.faults.refuse(CONFIGURE, MavResult.ACCEPTED, times=1)
+        with pytest.raises(OperationTimeout, match="being told that we are in control"):
+            async with flight.vehicle.gimbal.control():
+                pass
+        await anyio.sleep(1.0)  # it is given back, though the manager does not say that we have it
+        assert configured(flight)[-1][:2] == (-3, -3)
+        gimbal.faults.refuse(CONFIGURE, MavResult.UNSUPPORTED, times=1)
+        with pytest.raises(NotSupported, match="has no gimbal manager"):
+            async with flight.vehicle.gimbal.control():
+                pass
+
+
+async def test_autopilots_know_no_secondary_control() -> None:
+    async with mounted() as flight:
+        with pytest.raises(NotSupported, match="ArduCopter knows no secondary control; nothing was sent"):
+            async with flight.vehicle.gimbal.control(secondary=True):
+                pass
+        assert not configured(flight)
+
+
+async def test_px4_retracts_nothing_and_looks_at_no_system() -> None:
+    async with open_px4() as flight:
+        gimbal = flight.vehicle.gimbal
+        for order in (gimbal.retract(), gimbal.look_at_system(2)):
+            with pytest.raises(NotSupported, match=r"PX4 .*; nothing was sent"):
+                await order
+        assert not flight.wire.commands(PITCHYAW)
+
+
+async def test_after_a_silence_it_is_given_back_when_the_vehicle_is_heard() -> None:
+    gimbal = SimulatedGimbal()
+    async with beside(gimbal) as flight:
+        with pytest.raises(OperationTimeout, match="not sent yet, because the vehicle is silent"):
+            async with flight.vehicle.gimbal.control():
+                flight.copter.faults.silent = True
+                await anyio.sleep(4.0)
+        assert gimbal.primary == us(flight)
+        flight.copter.faults.silent = False
+        await anyio.sleep(3.0)
+        assert gimbal.primary == (0, 0)
+
+
+# --------------------------------------------------------------------------------------------- rates
+
+
+def pitchyaws(flight: Any) -> list[tuple[float, float]]:
+    """The rates that were streamed, degrees per second."""
+    return [
+        (round(math.degrees(each.pitch_rate), 2), round(math.degrees(each.yaw_rate), 2))
+        for each in flight.wire.all(m.GimbalManagerSetPitchyaw)
+    ]
+
+
+@pytest.mark.parametrize("frame", ["vehicle", "earth"])
+async def test_rates_are_sent_while_they_are_fed_and_end_in_zero(frame: Any) -> None:
+    gimbal = SimulatedGimbal()
+    async with beside(gimbal) as flight, flight.vehicle.gimbal.control():
+        async with flight.vehicle.gimbal.rates(0.0, 0.0, frame=frame, rate_hz=10.0) as stream:
+            was_running = stream.is_running
+            await stream.turn(-10.0, 20.0, 2.0)
+        assert (was_running, stream.is_running) == (True, False)
+        assert len(flight.wire.all(m.GimbalManagerSetPitchyaw)) == pytest.approx(20, abs=2)
+        assert pitchyaws(flight)[5] == (-10.0, 20.0)
+        here = gimbal.angles()
+        assert math.degrees(here[1]) == pytest.approx(-20, abs=2)
+        await anyio.sleep(2.0)
+        assert gimbal.angles() == pytest.approx(here, abs=0.02)
+        commands: list[Any] = flight.wire.commands(PITCHYAW)
+        first, last = commands[0], commands[-1]
+        assert (last.param3, last.param4, last.param5) == (0, 0, 28 if frame == "earth" else 12)
+        assert math.isnan(first.param1)
+
+
+@pytest.mark.parametrize("how", ["raises", "is cancelled"])
+async def test_rates_end_in_zero_without_waiting(how: str) -> None:
+    gimbal = SimulatedGimbal()
+    async with beside(gimbal) as flight, flight.vehicle.gimbal.control():
+        stream = flight.vehicle.gimbal.rates(-5.0, 0.0)
+        with anyio.CancelScope() as scope:
+            try:
+                async with stream:
+                    await anyio.sleep(0.5)
+                    gimbal.faults.drop_incoming = 1
+                    if how == "raises":
+                        raise Boom
+                    scope.cancel()
+                    await anyio.sleep(9)
+            except Boom:
+                pass
+        await anyio.sleep(3.0)
+        here = gimbal.angles()
+        await anyio.sleep(2.0)
+        assert gimbal.angles() == here
+        with pytest.raises(SetpointStreamStopped):
+            stream.set(1.0, 1.0)
+
+
+async def test_first_rates_without_an_answer_end_in_zero() -> None:
+    gimbal = SimulatedGimbal()
+    async with beside(gimbal) as flight, flight.vehicle.gimbal.control():
+        gimbal.faults.lose_ack(PITCHYAW, times=None)
+        with pytest.raises(CommandTimeout):
+            async with flight.vehicle.gimbal.rates(0.0, 5.0):
+                pass
+        await anyio.sleep(0.5)
+        here = gimbal.angles()
+        await anyio.sleep(2.0)
+        assert gimbal.angles() == here
+        assert math.degrees(here[2]) > 5, "it had obeyed"
+        commands: list[Any] = flight.wire.commands(PITCHYAW)
+        assert (commands[-1].param3, commands[-1].param4) == (0, 0)
+
+
+async def test_first_rates_that_were_refused_need_no_zero() -> None:
+    gimbal = SimulatedGimbal()
+    async with beside(gimbal) as flight, flight.vehicle.gimbal.control():
+        gimbal.faults.refuse(PITCHYAW, MavResult.TEMPORARILY_REJECTED, times=1)
+        with pytest.raises(CommandRejected):
+            async with flight.vehicle.gimbal.rates(0.0, 5.0):
+                pass
+        await anyio.sleep(2.0)
+        assert len(flight.wire.commands(PITCHYAW)) == 1
+
+
+async def test_rates_stay_with_the_gimbal_that_was_the_first() -> None:
+    one, two = SimulatedGimbal(154), SimulatedGimbal(171)
+    async with beside(one, two) as flight:
+        flight.wire.deliver(FrameEncoder(1, 1).encode(m.GimbalManagerStatus(0, 0, 154, 0, 0, 0, 0)))
+        flight.copter.faults.refuse(PITCHYAW, MavResult.ACCEPTED)
+        async with flight.vehicle.gimbal.rates(0.0, 5.0) as stream:
+            one.faults.silent = True
+            await stream.turn(0.0, 5.0, 15.0)
+        commands: list[Any] = flight.wire.commands(PITCHYAW)
+        assert {each.target_component for each in commands} == {1}
+        assert {each.target_component for each in flight.wire.all(m.GimbalManagerSetPitchyaw)} == {1}
+        assert flight.vehicle.gimbals.ids == (171, 154)
+
+
+async def test_rates_that_nobody_feeds_stop() -> None:
+    gimbal = SimulatedGimbal()
+    async with beside(gimbal) as flight, flight.vehicle.gimbal.control():
+        with pytest.raises(SetpointStreamStopped, match="no new rates came for"):
+            async with flight.vehicle.gimbal.rates(-5.0, 0.0, valid_for_s=1.0):
+                await anyio.sleep(3.0)
+        assert math.degrees(gimbal.angles()[1]) == pytest.approx(-5.5, abs=1.0)
+        with pytest.raises(SetpointStreamStopped, match="the event loop was blocked"):
+            async with flight.vehicle.gimbal.rates(-5.0, 0.0, valid_for_s=9.0):
+                await anyio.sleep(0.3)
+                block_loop(2.0)
+                await anyio.sleep(1.0)
+        with pytest.raises(SetpointStreamStopped, match="the vehicle has been silent"):
+            async with flight.vehicle.gimbal.rates(-5.0, 0.0, valid_for_s=30.0):
+                flight.copter.faults.silent = True
+                await anyio.sleep(8.0)
+        flight.copter.faults.silent = False
+        await anyio.sleep(3.0)
+
+
+@pytest.mark.parametrize("silence_s", [0.0, 30.0])
+async def test_rates_to_a_manager_that_is_silent_stop(silence_s: float) -> None:
+    gimbal = SimulatedGimbal(yaw_deg=(-9999.0, 9999.0))
+    async with beside(gimbal) as flight, flight.vehicle.gimbal.control():
+        began = now()
+        with pytest.raises(SetpointStreamStopped, match="manager has been silent for 3"):
+            async with flight.vehicle.gimbal.rates(0.0, 5.0) as stream:
+                await stream.turn(0.0, 5.0, 6.0)
+                assert stream.is_running
+                gimbal.faults.silent = True
+                await stream.turn(0.0, 5.0, 9.0)
+        assert now() - began == pytest.approx(9.5, abs=1.0)
+        await anyio.sleep(silence_s)
+        gimbal.faults.silent = False
+        await anyio.sleep(3.0)
+        here = gimbal.angles()
+        await anyio.sleep(2.0)
+        assert gimbal.angles() == here
+
+
+async def test_another_order_ends_them_and_holds() -> None:
+    gimbal = SimulatedGimbal()
+    async with beside(gimbal) as flight, flight.vehicle.gimbal.control():
+        with pytest.raises(SetpointStreamStopped, match="another order was given"):
+            async with flight.vehicle.gimbal.rates(-5.0, 0.0) as stream:
+                await anyio.sleep(0.3)
+                await flight.vehicle.gimbal.point(-30.0, 0.0, frame="vehicle")
+                stream.set(1.0, 1.0)
+        await anyio.sleep(2.0)
+        assert math.degrees(gimbal.angles()[1]) == pytest.approx(-30, abs=0.5)
+
+
+async def test_who_takes_control_ends_them() -> None:
+    gimbal = SimulatedGimbal()
+    async with beside(gimbal) as flight, flight.vehicle.gimbal.control():
+        with pytest.raises(GimbalTaken):
+            async with flight.vehicle.gimbal.rates(-5.0, 0.0) as stream:
+                await anyio.sleep(0.3)
+                takes_control(flight)
+                await anyio.sleep(0.3)
+                flight.wire.forget()
+                await stream.turn(-5.0, 0.0, 1.0)
+        assert not flight.wire.all(m.GimbalManagerSetPitchyaw)
+        assert not flight.wire.commands(PITCHYAW)
+
+
+async def test_rates_without_control_claim_it_where_that_is_denied() -> None:
+    gimbal = SimulatedGimbal()
+    async with beside(gimbal) as flight:
+        async with flight.vehicle.gimbal.rates(-5.0, 0.0) as stream:
+            await stream.turn(-5.0, 0.0, 1.0)
+        assert gimbal.primary == us(flight)
+        assert math.degrees(gimbal.angles()[1]) == pytest.approx(-5, abs=1)
+
+
+async def test_mounts_of_old_know_no_rates() -> None:
+    async with open_flight() as flight:
+        flight.copter.faults.refuse(PITCHYAW, MavResult.UNSUPPORTED)
+        with pytest.raises(NotSupported, match="which knows rates"):
+            async with flight.vehicle.gimbal.rates():
+                pass
+        assert not flight.wire.all(m.GimbalManagerSetPitchyaw)
+
+
+async def test_px4_is_told_rates_by_another_message() -> None:
+    async with open_px4() as flight:
+        flight.px4.faults.refuse(PITCHYAW, MavResult.ACCEPTED)
+        async with flight.vehicle.gimbal.rates(-5.0, 0.0) as stream:
+            await stream.turn(-5.0, 10.0, 1.0)
+        assert not flight.wire.all(m.GimbalManagerSetPitchyaw)
+        sent = flight.wire.last(m.GimbalManagerSetAttitude)
+        assert all(map(math.isnan, sent.q))
+        assert math.degrees(sent.angular_velocity_y) == pytest.approx(-5.0)
+        assert math.degrees(sent.angular_velocity_z) == pytest.approx(10.0)
+
+
+async def test_rates_are_checked_and_entered_once() -> None:
+    async with beside(SimulatedGimbal()) as flight:
+        gimbal = flight.vehicle.gimbal
+        for wrong in (
+            {"pitch_deg_s": 800.0},
+            {"yaw_deg_s": math.nan},
+            {"rate_hz": 1.0},
+            {"valid_for_s": 99.0},
+        ):
+            with pytest.raises(LocalProtocolError):
+                gimbal.rates(**wrong)  # type: ignore[arg-type]
+        assert not flight.wire.commands(PITCHYAW)
+        stream = gimbal.rates()
+        with pytest.raises(SetpointStreamStopped, match="inside their `async with`"):
+            stream.set(1.0, 1.0)
+        async with stream:
+            with pytest.raises(LocalProtocolError):
+                stream.set(999.0, 0.0)
+            with pytest.raises(BusyError, match="once"):
+                await stream.__aenter__()
+        assert isinstance(errors.GimbalTaken("x", system_id=1, component_id=2), errors.OperationRejected)
+
+
+# ----------------------------------------------------------------------------------------------- PX4
+
+
+@asynccontextmanager
+async def px4_with_gimbal() -> AsyncIterator[Px4Flight]:
+    async with open_px4(SimulatedPx4(boot_time_s=1.0, parameters={"MNT_MODE_IN": 4.0})) as flight:
+        await flight.vehicle.wait_ready()
+        flight.wire.forget()
+        yield flight
+
+
+async def test_px4s_gimbal_is_controlled_by_ids_in_figures() -> None:
+    async with px4_with_gimbal() as flight:
+        gimbal = flight.vehicle.gimbal
+        assert await flight.vehicle.gimbals.discover() == (1,)
+        assert (await gimbal.information()).pitch_deg == (-45.0, 45.0)
+        async with gimbal.control():
+            assert flight.px4.gimbal.in_control == (255, 190)
+            await gimbal.point(-30.0, 90.0)
+            await gimbal.point(-20.0, 10.0, frame="vehicle")
+            await gimbal.neutral()
+            async with gimbal.rates() as stream:
+                await stream.turn(-100.0, 100.0, 1.0)
+            turned = flight.px4.gimbal.angles()
+            await anyio.sleep(3.0)
+            assert flight.px4.gimbal.angles() == turned
+            assert math.degrees(turned[1]) == pytest.approx(-6, abs=2), "as slow as the real one"
+        assert flight.px4.gimbal.in_control == (0, 0)
+        assert not flight.wire.all(m.GimbalManagerSetPitchyaw)
+
+
+async def test_px4_takes_control_on_its_way_home() -> None:
+    async with px4_with_gimbal() as flight:
+        await flight.take_off(20.0)
+        with pytest.raises(GimbalTaken, match="nobody has it now"):
+            async with flight.vehicle.gimbal.control() as control:
+                await flight.vehicle.set_mode("RTL")
+                assert await control.until_lost() == (0, 0)
+                control.raise_if_taken()
+        assert flight.px4.gimbal.in_control == (0, 0)
+
+
+async def test_px4_looks_at_a_place() -> None:
+    async with px4_with_gimbal() as flight:
+        await flight.take_off(20.0)
+        there = flight.vehicle.position.value.offset(east_m=60.0, up_m=-20.0)
+        await flight.vehicle.gimbal.look_at(there)
+        assert flight.vehicle.gimbal.attitude.value.yaw_deg == pytest.approx(90, abs=6)
+        assert not configured(flight)
+        await flight.vehicle.gimbal.stop_looking()

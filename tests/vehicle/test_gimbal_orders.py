@@ -1,0 +1,564 @@
+"""`vehicle.gimbal` and `vehicle.gimbals`: orders return when it points there, and go to whoever manages it."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+
+import anyio
+import pytest
+from flight_harness import Flight, in_the_air, now, open_flight
+from gimbal_stage import CONFIGURE, MOUNT, PITCHYAW, REQUEST, beside, copter_with_mount, mounted
+
+from aerokit import Position
+from aerokit import messages as m
+from aerokit.errors import (
+    BusyError,
+    CommandRejected,
+    CommandTimeout,
+    HeartbeatTimeout,
+    LocalProtocolError,
+    NotSupported,
+    OperationRejected,
+    OperationTimeout,
+)
+from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.enums import GimbalManagerFlags as Flags
+from aerokit.mavlink.enums import MavCmd, MavMountMode, MavResult
+from aerokit.runtime.cells import Source
+from aerokit.sim import SimulatedCopter, SimulatedGimbal
+from aerokit.vehicle.gimbal.hearing import MOST
+
+pytestmark = pytest.mark.anyio
+
+LEVEL, LOCKED = 12, 28
+
+
+def degrees(gimbal: SimulatedGimbal) -> list[float]:
+    return [math.degrees(each) for each in gimbal.angles()]
+
+
+# ------------------------------------------------------------------------------------------- pointing
+
+
+async def test_it_returns_when_it_points_there() -> None:
+    gimbal = SimulatedGimbal(slew_deg_s=30.0)
+    async with beside(gimbal) as flight:
+        began = now()
+        await flight.vehicle.gimbal.point(-60.0, 90.0, tolerance_deg=1.0)
+        assert now() - began == pytest.approx(3.0, abs=1.2)
+        told = flight.vehicle.gimbal.attitude.value
+        assert told.pitch_deg == pytest.approx(-60, abs=1)
+        assert told.yaw_deg == pytest.approx(90, abs=1)
+
+
+async def test_without_waiting_it_returns_when_it_was_accepted() -> None:
+    async with beside(SimulatedGimbal(slew_deg_s=10.0)) as flight:
+        began = now()
+        await flight.vehicle.gimbal.point(-60.0, 90.0, wait=False)
+        assert now() - began < 0.5
+
+
+async def test_angles_from_the_nose_turn_with_the_vehicle() -> None:
+    gimbal = SimulatedGimbal()
+    async with in_the_air(copter=SimulatedCopter(boot_time_s=0.0, components=[gimbal])) as flight:
+        await flight.vehicle.gimbal.point(-20.0, -30.0, frame="vehicle")
+        await flight.vehicle.set_heading(90.0, tolerance_deg=1.0)
+        assert degrees(gimbal)[1:] == pytest.approx([-20, -30], abs=0.5)
+        await flight.vehicle.gimbal.point(-20.0, 60.0)
+        assert flight.vehicle.gimbal.attitude.value.yaw_from_nose_deg == pytest.approx(-30, abs=4)
+        flags = [int(each.param5) for each in flight.wire.commands(PITCHYAW)]  # type: ignore[union-attr]
+        assert flags[0] == LEVEL
+        assert flags[-1] == LOCKED
+
+
+async def test_straight_down_any_yaw_will_do() -> None:
+    async with beside(SimulatedGimbal()) as flight:
+        await flight.vehicle.gimbal.point(-90.0, 123.0)
+
+
+async def test_the_autopilots_gimbal_is_asked_where_it_points_meanwhile() -> None:
+    async with mounted() as flight:
+        await flight.vehicle.gimbal.point(-45.0, 90.0)
+        (command,) = flight.wire.commands(PITCHYAW)
+        assert (command.target_component, command.param7) == (1, 0)  # type: ignore[union-attr]
+        await anyio.sleep(1.0)
+        asked = flight.wire.commands(MavCmd.SET_MESSAGE_INTERVAL)
+        of_it = [each.param2 for each in asked if each.param1 == m.GimbalDeviceAttitudeStatus.ID]
+        assert of_it == [250_000, 0]
+
+
+async def test_what_it_cannot_reach_is_an_error_that_says_where_it_points() -> None:
+    async with beside(SimulatedGimbal(pitch_deg=(-45.0, 10.0))) as flight:
+        with pytest.raises(OperationTimeout) as caught:
+            await flight.vehicle.gimbal.point(-80.0, 0.0, timeout=4.0)
+        assert "not there within 4 s: it points to pitch -45.0" in str(caught.value)
+        assert "wanted was pitch -80.0, yaw from north 0.0" in str(caught.value)
+
+
+async def test_what_fails_stands_in_the_error() -> None:
+    async with beside(SimulatedGimbal(attitude_rate_hz=0.0)) as flight:
+        status = m.GimbalDeviceAttitudeStatus(0, 0, 0, 32, (1, 0, 0, 0), 0, 0, 0, 16)
+        copter = flight.copter
+        copter.every(0.2, lambda: copter.send(status, None, (1, 154)))
+        with pytest.raises(OperationTimeout, match="it says: POWER_ERROR"):
+            await flight.vehicle.gimbal.point(-30.0, 0.0, timeout=3.0)
+
+
+async def test_a_gimbal_that_tells_nothing_is_not_there() -> None:
+    async with open_flight() as flight:
+        for command in (PITCHYAW, MOUNT):
+            flight.copter.faults.refuse(command, MavResult.ACCEPTED)
+        with pytest.raises(OperationTimeout, match="it does not tell where it points"):
+            await flight.vehicle.gimbal.point(-45.0, 0.0, timeout=2.0)
+
+
+async def test_an_old_attitude_is_no_arrival() -> None:
+    gimbal = SimulatedGimbal()
+    async with beside(gimbal) as flight:
+        await flight.vehicle.gimbal.point(-10.0, 0.0)
+        gimbal.faults.silent = True
+        flight.copter.faults.refuse(PITCHYAW, MavResult.ACCEPTED)
+        with pytest.raises(OperationTimeout, match="no COMMAND_ACK"):
+            await flight.vehicle.gimbal.point(-10.0, 0.0, timeout=2.0)
+
+
+async def test_a_newer_order_ends_the_wait_for_the_one_before() -> None:
+    gimbal = SimulatedGimbal(slew_deg_s=10.0)
+    async with beside(gimbal) as flight:
+        ends: list[str] = []
+
+        async def point() -> None:
+            with pytest.raises(OperationRejected, match="another order was given"):
+                await flight.vehicle.gimbal.point(-80.0, 0.0)
+            ends.append("first")
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(point)
+            await anyio.sleep(1.0)
+            await flight.vehicle.gimbals[154].point(-20.0, 0.0, frame="vehicle")
+            ends.append("second")
+        assert ends == ["first", "second"]
+        assert degrees(gimbal)[1] == pytest.approx(-20, abs=3)
+
+
+async def test_looking_somewhere_by_the_vehicle_ends_it_too() -> None:
+    async with in_the_air(copter=copter_with_mount()) as flight:
+        flight.copter.faults.ignore(PITCHYAW, times=1)
+
+        async def point() -> None:
+            with pytest.raises((OperationRejected, OperationTimeout)):
+                await flight.vehicle.gimbal.point(-80.0, 0.0)
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(point)
+            await anyio.sleep(0.2)
+            await flight.vehicle.look_at(flight.vehicle.position.value.offset(north_m=50.0))
+        assert len(flight.wire.commands(PITCHYAW)) == 1
+
+
+async def test_a_reboot_ends_the_wait() -> None:
+    async with beside(SimulatedGimbal(slew_deg_s=1.0)) as flight:
+
+        async def reboot() -> None:
+            await anyio.sleep(1.0)
+            flight.copter.reboot(0.5)
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(reboot)
+            with pytest.raises(OperationRejected, match="the vehicle rebooted"):
+                await flight.vehicle.gimbal.point(-80.0, 0.0, timeout=30.0)
+
+
+async def test_a_silent_vehicle_ends_the_wait() -> None:
+    async with beside(SimulatedGimbal(slew_deg_s=1.0)) as flight:
+
+        async def fall_silent() -> None:
+            await anyio.sleep(1.0)
+            flight.copter.faults.silent = True
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(fall_silent)
+            with pytest.raises(HeartbeatTimeout):
+                await flight.vehicle.gimbal.point(-80.0, 0.0, timeout=40.0)
+
+
+async def test_a_mode_of_the_vehicle_does_not_end_the_wait() -> None:
+    async with in_the_air(copter=copter_with_mount()) as flight:
+        flight.copter.parameters["MNT1_PITCH_MIN"] = -90.0
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(flight.vehicle.set_mode, "LOITER")
+            await flight.vehicle.gimbal.point(-45.0, 0.0)
+
+
+# --------------------------------------------------------------------------------- neutral, retracted
+
+
+@pytest.mark.parametrize(("name", "flag"), [("neutral", Flags.NEUTRAL), ("retract", Flags.RETRACT)])
+async def test_it_rests_when_it_says_so_and_stands(name: str, flag: int) -> None:
+    gimbal = SimulatedGimbal(slew_deg_s=30.0)
+    async with beside(gimbal) as flight:
+        await flight.vehicle.gimbal.point(-60.0, 0.0, frame="vehicle")
+        began = now()
+        await getattr(flight.vehicle.gimbal, name)()
+        assert 1.8 <= now() - began <= 4.0
+        assert gimbal.flags == flag
+        assert degrees(gimbal) == pytest.approx([0, 0, 0], abs=0.5)
+        (command,) = flight.wire.commands(PITCHYAW)[-1:]
+        assert math.isnan(command.param1)
+        assert command.param5 == flag  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(
+    ("name", "mode"), [("neutral", MavMountMode.NEUTRAL), ("retract", MavMountMode.RETRACT)]
+)
+async def test_mounts_of_old_have_modes_for_it(name: str, mode: int) -> None:
+    async with mounted() as flight:
+        flight.copter.faults.refuse(PITCHYAW, MavResult.UNSUPPORTED)
+        await getattr(flight.vehicle.gimbal, name)()
+        assert [each.param7 for each in flight.wire.commands(MOUNT)] == [mode]  # type: ignore[union-attr]
+        await getattr(flight.vehicle.gimbal, name)(wait=False)
+        assert len(flight.wire.commands(PITCHYAW)) == 1
+
+
+# --------------------------------------------------------------------------------------------- places
+
+
+def place(flight: Flight, **metres: float) -> Position:
+    return flight.vehicle.position.value.offset(**metres)
+
+
+@pytest.mark.parametrize("kind", ["autopilot", "beside"])
+async def test_it_looks_at_a_place_until_it_is_told_to_stop(kind: str) -> None:
+    is_beside = kind == "beside"
+    fitted = SimulatedCopter(boot_time_s=0.0, components=[SimulatedGimbal()])
+    async with in_the_air(20.0, copter=fitted if is_beside else copter_with_mount()) as flight:
+        vehicle = flight.vehicle
+        await vehicle.gimbals.discover()
+        async with vehicle.gimbal.control():
+            target = place(flight, east_m=30.0, up_m=-20.0)
+            await vehicle.gimbal.look_at(target)
+            told = vehicle.gimbal.attitude.value
+            assert told.yaw_deg == pytest.approx(90, abs=6)
+            assert told.pitch_deg == pytest.approx(-33.7, abs=6)
+            await vehicle.gimbal.stop_looking()
+        target_component = 154 if is_beside else 1
+        for command in (MavCmd.DO_SET_ROI_LOCATION, MavCmd.DO_SET_ROI_NONE):
+            (sent,) = flight.wire.commands(command)
+            assert sent.target_component == target_component
+
+
+async def test_it_looks_at_another_vehicle_where_that_tells_it_is() -> None:
+    async with in_the_air(20.0, copter=copter_with_mount()) as flight:
+        there = place(flight, east_m=-40.0)
+        x, y = round(there.latitude_deg * 1e7), round(there.longitude_deg * 1e7)
+        assert there.altitude_amsl_m is not None
+        told = FrameEncoder(7, 1).encode(
+            m.GlobalPositionInt(0, x, y, round(there.altitude_amsl_m * 1e3), 20000, 0, 0, 0, 0)
+        )
+
+        def tell() -> None:
+            flight.copter.receive(told, flight.copter.now)
+            flight.wire.deliver(told)
+
+        flight.copter.every(0.5, tell)
+        await flight.vehicle.gimbal.look_at_system(7)
+        attitude = flight.vehicle.gimbal.attitude.value
+        assert attitude.yaw_deg == pytest.approx(270, abs=6)
+        assert attitude.pitch_deg == pytest.approx(0, abs=6)
+
+
+async def test_a_vehicle_that_is_not_heard_is_not_looked_at() -> None:
+    async with in_the_air(copter=copter_with_mount()) as flight:
+        with pytest.raises(OperationTimeout, match="where system 9 is was not heard here"):
+            await flight.vehicle.gimbal.look_at_system(9, timeout=3.0)
+
+
+async def test_only_the_autopilots_first_gimbal_looks_at_places() -> None:
+    async with in_the_air(copter=copter_with_mount()) as flight:
+        second = flight.vehicle.gimbals[2]
+        for order in (second.look_at(place(flight, east_m=9.0)), second.look_at_system(7)):
+            with pytest.raises(NotSupported, match="first gimbal only"):
+                await order
+        assert not flight.wire.commands(MavCmd.DO_SET_ROI_LOCATION)
+
+
+async def test_a_place_claims_control_where_it_is_denied() -> None:
+    gimbal = SimulatedGimbal()
+    async with in_the_air(copter=SimulatedCopter(boot_time_s=0.0, components=[gimbal])) as flight:
+        await flight.vehicle.gimbal.controllers.wait_until(lambda _: True, timeout=3)
+        await flight.vehicle.gimbal.look_at(place(flight, east_m=30.0))
+        assert gimbal.primary == (255, 190)
+        assert len(flight.wire.commands(MavCmd.DO_SET_ROI_LOCATION)) == 2
+        await flight.vehicle.gimbal.stop_looking()
+
+
+async def test_an_autopilot_that_denies_a_place_is_not_claimed() -> None:
+    async with in_the_air(copter=copter_with_mount()) as flight:
+        flight.copter.faults.refuse(MavCmd.DO_SET_ROI_LOCATION, MavResult.DENIED)
+        with pytest.raises(CommandRejected):
+            await flight.vehicle.gimbal.look_at(place(flight, east_m=30.0))
+        assert not flight.wire.commands(CONFIGURE)
+
+
+# -------------------------------------------------------------------------------------------- limits
+
+
+async def test_limits_that_somebody_else_asked_for_refuse_nothing() -> None:
+    async with mounted() as flight:
+        flight.vehicle.gimbal  # noqa: B018 - it begins to listen
+        told = m.GimbalManagerInformation(0, 0, 1, 0, 0, -0.1, 0.1, 0, 0)
+        flight.wire.deliver(FrameEncoder(1, 1).encode(told))
+        await flight.vehicle.gimbal.point(-45.0, 0.0)
+
+
+async def test_information_of_a_gimbal_beside_the_autopilot() -> None:
+    async with beside(SimulatedGimbal(pitch_deg=(-80.0, 10.0))) as flight:
+        told = await flight.vehicle.gimbal.information()
+        assert (told.gimbal_device_id, told.manager_component_id) == (154, 154)
+        assert told.pitch_deg == (-80.0, 10.0)
+        assert (told.vendor, told.model, told.firmware_version) == ("aerokit", "Simulated gimbal", "0.0.0")
+        assert told.axes == ("roll", "pitch", "yaw")
+        assert (told.retracts, told.has_neutral, told.looks_at_places) == (True, True, True)
+        for pitch, roll in ((-85.0, 0.0), (20.0, 0.0), (0.0, 40.0)):
+            with pytest.raises(LocalProtocolError, match="is not allowed: gimbal 154 turns from"):
+                await flight.vehicle.gimbal.point(pitch, 0.0, roll_deg=roll)
+        assert not flight.wire.commands(PITCHYAW)
+        await flight.vehicle.gimbal.point(-10, 0)
+        with pytest.raises(OperationTimeout, match="its limits are pitch -80 to 10, yaw -180 to 180"):
+            await flight.vehicle.gimbal.point(-10, 0, tolerance_deg=0.01, timeout=0.05)
+
+
+async def test_information_of_the_autopilots_gimbal() -> None:
+    async with mounted() as flight:
+        told = await flight.vehicle.gimbal.information()
+        assert (told.gimbal_device_id, told.manager_component_id, told.vendor) == (1, 1, "")
+        assert (told.pitch_deg, told.yaw_deg) == ((-90.0, 20.0), (-180.0, 180.0))
+        assert flight.vehicle.gimbals.ids == (1,)
+
+
+async def test_without_a_gimbal_there_is_no_information() -> None:
+    async with open_flight() as flight:
+        flight.copter.faults.refuse(REQUEST, MavResult.FAILED)
+        with pytest.raises(CommandRejected):
+            await flight.vehicle.gimbal.information()
+
+
+@pytest.mark.parametrize("tolerance", [0.0, 46.0, math.nan])
+async def test_tolerances_have_limits(tolerance: float, grounded: Flight) -> None:
+    with pytest.raises(LocalProtocolError, match="tolerance_deg"):
+        await grounded.vehicle.gimbal.point(0, 0, tolerance_deg=tolerance)
+    with pytest.raises(LocalProtocolError, match="frame"):
+        await grounded.vehicle.gimbal.point(0, 0, frame="sideways")  # type: ignore[arg-type]
+    assert not grounded.wire.commands(PITCHYAW)
+
+
+# ------------------------------------------------------------------------------------------- several
+
+
+async def test_several_gimbals_are_found_and_told_apart() -> None:
+    one, two = SimulatedGimbal(154), SimulatedGimbal(171)
+    copter = copter_with_mount(components=[one, two])
+    async with open_flight(copter) as flight:
+        gimbals = flight.vehicle.gimbals
+        assert await gimbals.discover() == (1, 154, 171)
+        assert len(gimbals) == 3
+        assert [each.device_id for each in gimbals] == [1, 154, 171]
+        await gimbals[171].point(-30.0, 0.0, frame="vehicle")
+        assert (degrees(one)[1], degrees(two)[1]) == pytest.approx((0, -30), abs=3)
+        await gimbals[1].point(-10.0, 0.0, frame="vehicle")
+        assert gimbals[1].attitude.value.pitch_deg == pytest.approx(-10, abs=3)
+        assert flight.vehicle.gimbal.device_id == 1
+        to = [(each.target_component, each.param7) for each in flight.wire.commands(PITCHYAW)]  # type: ignore[union-attr]
+        assert to == [(171, 171), (171, 171), (1, 1)]
+        claimed = [each.target_component for each in flight.wire.commands(CONFIGURE)]
+        assert claimed == [171]
+
+
+async def test_the_first_is_the_autopilots_though_another_one_tells_where_it_points() -> None:
+    async with open_flight(copter_with_mount(components=[SimulatedGimbal()])) as flight:
+        await flight.vehicle.gimbals.discover()
+        assert flight.vehicle.gimbal.attitude.source == Source(1, 154, "GIMBAL_DEVICE_ATTITUDE_STATUS")
+        await flight.vehicle.gimbal.point(0.0, 0.0, frame="vehicle")
+        assert flight.vehicle.gimbals[1].attitude.value.pitch_deg == pytest.approx(0, abs=3)
+        assert [each.target_component for each in flight.wire.commands(PITCHYAW)] == [1]
+
+
+async def test_one_that_is_named_and_was_not_heard_is_asked_who_manages_it() -> None:
+    gimbal = SimulatedGimbal(172, attitude_rate_hz=0.0)
+    async with open_flight(SimulatedCopter(boot_time_s=0.0, components=[gimbal])) as flight:
+        told = await flight.vehicle.gimbals.get(172).information()
+        assert told.manager_component_id == 172
+
+
+async def test_an_autopilot_manages_a_gimbal_with_an_id_of_its_own() -> None:
+    """As PX4 does that speaks MAVLink to its gimbal: the autopilot's word goes before the gimbal's."""
+    async with beside(SimulatedGimbal()) as flight:
+        flight.wire.deliver(FrameEncoder(1, 1).encode(m.GimbalManagerStatus(0, 0, 154, 0, 0, 0, 0)))
+        flight.copter.faults.refuse(PITCHYAW, MavResult.ACCEPTED)
+        await flight.vehicle.gimbals[154].point(0.0, 0.0, frame="vehicle", wait=False)
+        (command,) = flight.wire.commands(PITCHYAW)
+        assert (command.target_component, command.param7) == (1, 154)  # type: ignore[union-attr]
+
+
+async def test_gimbals_from_the_air_fill_no_table() -> None:
+    async with open_flight() as flight:
+        flight.vehicle.gimbal  # noqa: B018 - it begins to listen
+        for number in range(2, 200):
+            message = m.GimbalDeviceAttitudeStatus(0, 0, 0, 32, (1, 0, 0, 0), 0, 0, 0, 0)
+            flight.wire.deliver(FrameEncoder(1, number).encode(message))
+        gimbals = flight.vehicle.gimbals
+        assert len(gimbals) == MOST
+        with pytest.raises(BusyError):
+            gimbals.get(250)
+        assert len({id(each) for each in gimbals}) == MOST
+        assert gimbals.get(1) is gimbals.get(1)
+    with pytest.raises(LocalProtocolError):
+        gimbals.get(0)
+
+
+async def test_a_device_id_of_an_old_autopilot_is_its_first() -> None:
+    async with open_flight() as flight:
+        message = m.GimbalDeviceAttitudeStatus(0, 0, 0, 32, (1, 0, 0, 0), 0, 0, 0, 0)
+        flight.wire.deliver(FrameEncoder(1, 1).encode(message))
+        assert flight.vehicle.gimbals.ids == (1,)
+
+
+def tells(flight: Flight, component: int, message: object) -> None:
+    flight.wire.deliver(FrameEncoder(1, component).encode(message))  # type: ignore[arg-type]
+
+
+def attitude_of(number: int, q: tuple[float, ...] = (1, 0, 0, 0)) -> m.GimbalDeviceAttitudeStatus:
+    return m.GimbalDeviceAttitudeStatus(0, 0, 0, 32, q, 0, 0, 0, 0, gimbal_device_id=number)
+
+
+async def test_what_is_told_with_the_id_of_another_is_nobodys() -> None:
+    async with beside(SimulatedGimbal()) as flight:
+        tells(flight, 154, attitude_of(9))
+        tells(flight, 30, attitude_of(154, (0, 1, 0, 0)))
+        assert flight.vehicle.gimbals.ids == (154,)
+        assert flight.vehicle.gimbal.attitude.value.roll_deg == pytest.approx(0, abs=1)
+        await flight.vehicle.gimbal.point(-20.0, 0.0, frame="vehicle")
+        tells(flight, 154, m.GimbalManagerInformation(0, 0, 9, 0, 0, 0, 0, 0, 0))
+        tells(flight, 191, m.GimbalManagerStatus(0, 0, 171, 0, 0, 0, 0))
+        assert flight.vehicle.gimbals.ids == (154,)
+
+
+async def test_ids_are_the_senders_own_or_numbers_behind_it() -> None:
+    async with open_flight() as flight:
+        flight.vehicle.gimbal  # noqa: B018 - it begins to listen
+        for sender, number in ((1, 2), (30, 0), (40, 40), (50, 6), (171, 0)):
+            tells(flight, sender, attitude_of(number))
+        assert flight.vehicle.gimbals.ids == (2, 30, 40, 6, 171)
+
+
+async def test_one_that_is_gone_is_the_first_no_more() -> None:
+    one, two = SimulatedGimbal(154), SimulatedGimbal(171)
+    async with beside(one, two) as flight:
+        vehicle = flight.vehicle
+        await anyio.sleep(3.0)
+        one.faults.silent = True
+        await anyio.sleep(9.0)
+        assert vehicle.gimbals.ids == (154, 171)
+        await anyio.sleep(3.0)
+        assert vehicle.gimbals.ids == (171, 154)
+        assert [each.device_id for each in vehicle.gimbals] == [171, 154]
+        await vehicle.gimbal.point(-20.0, 0.0, frame="vehicle")
+        assert degrees(two)[1] == pytest.approx(-20, abs=3)
+        source = vehicle.gimbal.attitude.source
+        assert source is not None
+        assert source.component_id == 171
+        one.faults.silent = False
+        await anyio.sleep(2.0)
+        assert vehicle.gimbals.ids == (154, 171)
+
+
+async def test_after_an_outage_of_the_link_the_first_is_the_same() -> None:
+    one, two = SimulatedGimbal(154), SimulatedGimbal(171)
+    async with beside(one, two) as flight:
+        await anyio.sleep(12.0)
+        for each in (flight.copter, one, two):
+            each.faults.silent = True
+        await anyio.sleep(15.0)
+        tells(flight, 171, attitude_of(0))
+        assert flight.vehicle.gimbals.ids == (154, 171)
+        two.faults.silent = flight.copter.faults.silent = False
+        await anyio.sleep(3.0)
+        assert flight.vehicle.gimbals.ids == (154, 171)
+
+
+async def test_one_that_is_in_use_stays_the_first() -> None:
+    one, two = SimulatedGimbal(154), SimulatedGimbal(171)
+    async with beside(one, two) as flight:
+        await flight.vehicle.gimbals[171].point(-30.0, 0.0, frame="vehicle")
+        one.faults.refuse(PITCHYAW, MavResult.ACCEPTED)
+        asyncio.get_running_loop().call_later(1.0, setattr, one.faults, "silent", True)
+        with pytest.raises(OperationTimeout):
+            await flight.vehicle.gimbal.point(-30.0, 0.0, frame="vehicle", timeout=20.0)
+
+
+async def test_a_status_from_somebody_else_moves_no_orders() -> None:
+    async with beside(SimulatedGimbal()) as flight:
+        tells(flight, 191, m.GimbalManagerStatus(0, 0, 154, 9, 9, 0, 0))
+        assert flight.vehicle.gimbal.controllers.value.primary != (9, 9)
+        tells(flight, 191, m.GimbalManagerInformation(0, 0, 154, 0, 0, 0, 0, 0, 0))
+        await flight.vehicle.gimbal.point(-20.0, 0.0, frame="vehicle")
+        assert {each.target_component for each in flight.wire.commands(PITCHYAW)} == {154}
+
+
+@pytest.mark.parametrize("number", [0, 30])
+async def test_a_gimbal_of_any_id_is_its_own_manager(number: int) -> None:
+    async with open_flight() as flight:
+        gimbals = flight.vehicle.gimbals
+        tells(flight, 30, attitude_of(number))
+        tells(flight, 30, m.GimbalManagerStatus(0, 0, number, 0, 0, 0, 0))
+        tells(flight, 191, m.GimbalManagerInformation(0, 0, 30, 0, 0, 0, 0, 0, 0))
+        with pytest.raises(CommandTimeout):
+            await gimbals[30].point(0.0, 0.0, wait=False)
+        assert {each.target_component for each in flight.wire.commands(PITCHYAW)} == {30}
+
+
+async def test_another_manager_counts_when_the_one_in_use_is_gone() -> None:
+    gimbal = SimulatedGimbal()
+    async with beside(gimbal) as flight:
+        gimbal.faults.silent = True
+        status = m.GimbalManagerStatus(0, 0, 154, 9, 9, 0, 0)
+        await anyio.sleep(9.0)
+        tells(flight, 191, status)
+        assert flight.vehicle.gimbal.controllers.value.primary == (0, 0)
+        await anyio.sleep(3.0)
+        tells(flight, 191, status)
+        assert flight.vehicle.gimbal.controllers.value.primary == (9, 9)
+
+
+async def test_a_manager_that_told_what_it_is_goes_before_one_that_did_not() -> None:
+    async with open_flight() as flight:
+        vehicle = flight.vehicle
+        vehicle.gimbal  # noqa: B018 - it begins to listen
+        tells(flight, 154, attitude_of(0))
+        tells(flight, 191, m.GimbalManagerStatus(0, 0, 154, 1, 1, 0, 0))
+        assert vehicle.gimbal.controllers.value.primary == (1, 1)
+        tells(flight, 192, m.GimbalManagerInformation(0, 0, 154, 0, 0, 0, 0, 0, 0))
+        tells(flight, 192, m.GimbalManagerStatus(0, 0, 154, 2, 2, 0, 0))
+        tells(flight, 191, m.GimbalManagerStatus(0, 0, 154, 1, 1, 0, 0))
+        assert vehicle.gimbal.controllers.value.primary == (2, 2)
+        tells(flight, 1, m.GimbalManagerStatus(0, 0, 154, 3, 3, 0, 0))
+        tells(flight, 192, m.GimbalManagerStatus(0, 0, 154, 2, 2, 0, 0))
+        assert vehicle.gimbal.controllers.value.primary == (3, 3)
+
+
+@pytest.mark.parametrize("wrong", [math.inf, -math.inf, math.nan])
+async def test_angles_that_are_no_numbers_are_not_known(wrong: float) -> None:
+    async with open_flight() as flight:
+        attitude = flight.vehicle.gimbal.attitude
+        for place in range(4):
+            tells(flight, 154, attitude_of(0, tuple(wrong if place == each else 0.5 for each in range(4))))
+            told = attitude.value
+            assert (told.pitch_deg, told.roll_deg, told.yaw_deg, told.yaw_from_nose_deg) == (None,) * 4
+
+
+async def test_true_is_no_system_id() -> None:
+    async with mounted() as flight:
+        with pytest.raises(LocalProtocolError, match="system_id = True is not allowed: 1 to 255"):
+            await flight.vehicle.gimbal.look_at_system(True)
+        assert not flight.wire.commands(MavCmd.DO_SET_ROI_SYSID)

@@ -1,0 +1,70 @@
+"""All vehicles of a connection, and what is known of each as plain values."""
+
+from __future__ import annotations
+
+import json
+
+import anyio
+import pytest
+
+import aerokit
+from aerokit.errors import BusyError, ConnectionClosed
+from aerokit.runtime.opening import open_connection
+from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
+from aerokit.vehicle.overview import overview
+from aerokit.vehicle.vehicles import vehicles_on
+
+pytestmark = pytest.mark.anyio
+
+
+async def test_each_is_connected_to_when_it_is_heard_and_let_go_at_the_end() -> None:
+    simulated = [SimulatedCopter(system_id=1, boot_time_s=0.0), SimulatedPx4(system_id=7, boot_time_s=0.0)]
+    found: list[int] = []
+    both = anyio.Event()
+
+    def on_found(vehicle: aerokit.Vehicle) -> None:
+        found.append(vehicle.system_id)
+        if len(found) == 2:
+            both.set()
+
+    async with simulated_link(simulated) as link, open_connection(link) as connection:
+        async with vehicles_on(connection, on_found=on_found) as vehicles:
+            with anyio.fail_after(10):
+                await both.wait()
+            assert sorted(found) == [1, 7]
+            await vehicles[7].position.wait_until(lambda place: True, timeout=10)
+            told = overview(vehicles[7])
+            assert (told["system_id"], told["autopilot"], told["link"]["state"]) == (7, "PX4", "connected")
+            assert told["states"]["position"]["value"]["latitude_deg"] == pytest.approx(
+                vehicles[7].position.value.latitude_deg
+            )
+            assert 0 <= told["states"]["position"]["age_s"] < 5
+            assert told["states"]["armed"]["value"] is False
+            json.dumps(told, allow_nan=False)
+            with pytest.raises(BusyError):
+                async with aerokit.connect(connection, system_id=1):
+                    raise AssertionError
+        async with aerokit.connect(connection, system_id=1) as again:
+            assert again.system_id == 1
+
+
+async def test_one_that_the_program_has_already_is_left_out() -> None:
+    simulated = [SimulatedCopter(system_id=number, boot_time_s=0.0) for number in (1, 2)]
+    async with (
+        simulated_link(simulated) as link,
+        open_connection(link) as connection,
+        aerokit.connect(connection, system_id=1) as own,
+        vehicles_on(connection) as vehicles,
+    ):
+        await anyio.sleep(5)
+        assert list(vehicles) == [2]
+        await own.mode.wait_until(lambda mode: True, timeout=5)
+
+
+async def test_of_a_closed_connection_there_are_none() -> None:
+    async with simulated_link(SimulatedCopter()) as link:
+        async with open_connection(link) as connection:
+            pass
+        with pytest.raises(ConnectionClosed):
+            async with vehicles_on(connection):
+                raise AssertionError
