@@ -34,12 +34,18 @@ def copter() -> SimulatedCopter:
     return SimulatedCopter(boot_time_s=0.0, home=HOME)
 
 
+FLIGHTS = pytest.mark.parametrize(
+    "command", [("fly", "m.waypoints", "--yes"), ("demo",)], ids=lambda each: each[0]
+)
+
+
+@FLIGHTS
 def test_an_order_to_arm_that_arrives_late_is_undone(
-    copter: SimulatedCopter, capsys: pytest.CaptureFixture[str]
+    command: tuple[str, ...], copter: SimulatedCopter, capsys: pytest.CaptureFixture[str]
 ) -> None:
     async def scenario() -> int:
         async with simulated_link(copter, latency_s=0.8) as link:
-            flight = asyncio.create_task(run_on(link, "fly", "m.waypoints", "--yes"))
+            flight = asyncio.create_task(run_on(link, *command))
             out = ""
             while "arming" not in out:
                 out += capsys.readouterr().out

@@ -193,10 +193,11 @@ async def test_nothing_is_listening_behind_the_block_and_the_port_can_be_used_ag
     with pytest.raises(OSError, match=r"111|refused|Connect"):
         await asyncio.open_connection("127.0.0.1", port)
     files, tasks = _files(), asyncio.all_tasks()
-    async with bridged() as (bridge, _):
-        assert bridge.port
-    assert _threads() <= threads, "another bridge needs no more threads"
-    assert _files() <= files
+    for _ in range(5):  # the SDK's own threads may close a socket a moment late: only what adds up is kept
+        async with bridged() as (bridge, _):
+            assert bridge.port
+    assert _threads() <= threads, "other bridges need no more threads"
+    assert _files() <= files + 2
     assert asyncio.all_tasks() == tasks
 
 

@@ -12,16 +12,17 @@ from aerokit.cli.exits import DONE, FAILED, INTERRUPTED
 from aerokit.cli.interrupt import Interruptible, on_interrupt
 from aerokit.cli.new_file import add_force, check_new
 from aerokit.cli.output import add_json, tell
+from aerokit.cli.own_flight import OwnFlight
 from aerokit.cli.signing import ENVIRONMENT, add_signing_key, signing_of
 from aerokit.cli.vehicle_command import reached
 from aerokit.cli.vehicles import simulated_vehicle
 from aerokit.errors import AerokitError, NotSupported, OperationRejected
-from aerokit.mavlink.enums import MavLandedState
 
 if TYPE_CHECKING:
     import argparse
     from collections.abc import AsyncIterator
 
+    from aerokit.cli.own_flight import Purpose
     from aerokit.vehicle.vehicle import Vehicle
 
 __all__ = ["add_arguments", "run_demo"]
@@ -92,7 +93,9 @@ async def _connect_and_fly(options: argparse.Namespace, interruptible: Interrupt
         )
         report = FlightReport(vehicle, options)
         async with report.running():
-            code = await _Flight(vehicle, report, interruptible).fly(options.altitude, options.side)
+            code = await _SquareFlight(vehicle, report, interruptible).fly_square(
+                options.altitude, options.side
+            )
         report.print_summary(options.record)
     return code
 
@@ -116,36 +119,34 @@ async def _address(options: argparse.Namespace) -> AsyncIterator[str]:
         yield address
 
 
-class _Flight:
-    """The square, and what is done when it is interrupted or fails."""
+class _SquareFlight(OwnFlight):
+    """The square; it ends in landing, also when it is interrupted or fails."""
 
     def __init__(self, vehicle: Vehicle, report: FlightReport, interruptible: Interruptible) -> None:
-        self._vehicle, self._say, self._interruptible = vehicle, report.say, interruptible
-        self._is_ours = False  # armed by us; what somebody else flies is not ours to land
+        super().__init__(vehicle, report, interruptible, "land")
+        self._was_left_by_mode = False  # an order of ours ended because of the mode
 
-    async def fly(self, altitude_m: float, side_m: float) -> int:
+    async def fly_square(self, altitude_m: float, side_m: float) -> int:
         """Fly it, come down whatever happens, and return the exit code."""
+        self._altitude_m, self._side_m = altitude_m, side_m
         try:
-            code = await self._interruptible.run(lambda: self._fly_square(altitude_m, side_m))
-        except AerokitError as error:
-            self._say(f"failed: {error}")
-            if self._is_ours:
-                await self._come_down_after_failure(error)
+            return await self.fly()
+        except AerokitError:  # it has been told
             return FAILED
-        if code is None:
-            self._say(f"interrupted, {self._vehicle.describe_now()}")
-            if self._is_ours:
-                await self._come_down()
-            return INTERRUPTED
-        return code
 
-    async def _fly_square(self, altitude_m: float, side_m: float) -> int:
-        await self._take_off(altitude_m)
-        start = self._vehicle.position.value.replace(altitude_relative_m=altitude_m, altitude_amsl_m=None)
+    async def _fly(self) -> int:
+        await self._take_off(self._altitude_m)
+        start = self._vehicle.position.value.replace(
+            altitude_relative_m=self._altitude_m, altitude_amsl_m=None
+        )
         for name, north, east in CORNERS:
-            await self._vehicle.go_to(start.offset(north_m=north * side_m, east_m=east * side_m))
+            await self._vehicle.go_to(start.offset(north_m=north * self._side_m, east_m=east * self._side_m))
             self._say(f"at the {name} corner")
-        await self._land()
+        self._say("landing")
+        await self._vehicle.land()
+        self._say("on the ground; waiting for the motors to stop")
+        await self._vehicle.armed.wait_until(lambda armed: not armed, timeout=30)
+        self._say("disarmed")
         return DONE
 
     async def _take_off(self, altitude_m: float) -> None:
@@ -158,55 +159,18 @@ class _Flight:
         await vehicle.wait_ready(timeout=READY_TIMEOUT_S)
         home = vehicle.home.value
         self._say(f"ready, home is {home.latitude_deg:.6f}, {home.longitude_deg:.6f}; arming")
-        if not vehicle.is_surely_disarmed:
-            now = vehicle.describe_now()
-            raise OperationRejected(f"it is left to whoever armed it ({now}); nothing was sent")
-        self._is_ours = True
-        await vehicle.arm()
+        await self._arm()
         self._say(f"armed; taking off to {altitude_m:g} m")
+        self._has_started = True  # whoever changes the mode from now on, a pilot for example, keeps it
         await vehicle.take_off(altitude_m)
         self._say("at altitude; flying the square")
 
-    async def _land(self) -> int:
-        self._say("landing")
-        await self._vehicle.land()
-        self._say("on the ground; waiting for the motors to stop")
-        await self._vehicle.armed.wait_until(lambda armed: not armed, timeout=30)
-        self._say("disarmed")
-        return DONE
+    def _our_purposes(self) -> tuple[Purpose, ...]:
+        """Holding and landing are our own after an answer that did not come; not when the mode ended an order."""
+        return (
+            ("take_off", "setpoint") if self._was_left_by_mode else ("take_off", "setpoint", "hold", "land")
+        )
 
-    # ---------------------------------------------------------------------- when it went wrong
-
-    async def _come_down_after_failure(self, error: AerokitError) -> None:
-        """Whoever changed the mode, a pilot or a failsafe, keeps the vehicle.
-
-        Holding and landing are our own after an answer that did not come; not when an order ended because of the mode.
-        """
-        vehicle, autopilot = self._vehicle, self._vehicle.autopilot
-        ours = [autopilot.mode_for("take_off"), autopilot.mode_for("setpoint")]
-        if type(error) is not OperationRejected:
-            ours += [autopilot.mode_for("hold"), autopilot.mode_for("land")]
-        if vehicle.is_armed and vehicle.mode_name not in [mode.name for mode in ours if mode is not None]:
-            self._say(f"left to whoever put it into {vehicle.mode_name}: {vehicle.describe_now()}")
-            return
-        await self._come_down()
-
-    async def _come_down(self) -> None:
-        """Land, or switch off what stands on the ground; a second Ctrl-C leaves it to itself."""
-        try:
-            if await self._interruptible.run(self._end_flight) is None:
-                self._say(f"interrupted again: left {self._vehicle.describe_now()}")
-        except AerokitError as error:
-            self._say(f"it could not be landed: {error}")
-            self._say(f"left {self._vehicle.describe_now()}")
-
-    async def _end_flight(self) -> int:
-        vehicle = self._vehicle
-        if not vehicle.is_armed:
-            return DONE
-        if vehicle.landed_state.latest == MavLandedState.ON_GROUND:
-            self._say("on the ground and armed; disarming")
-            await vehicle.disarm()
-            return DONE
-        self._say("landing here; Ctrl-C again to leave it to itself")
-        return await self._land()
+    async def _after_failure(self, error: Exception) -> int:
+        self._was_left_by_mode = type(error) is OperationRejected
+        return await self._after_interrupt()

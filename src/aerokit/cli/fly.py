@@ -10,9 +10,10 @@ from aerokit.cli.asking import is_somebody_there
 from aerokit.cli.completers import kinds, offer
 from aerokit.cli.demo_lines import FlightReport
 from aerokit.cli.exits import INTERRUPTED
-from aerokit.cli.flown_plan import ON_INTERRUPT, PlanFlight
+from aerokit.cli.flown_plan import PlanFlight
 from aerokit.cli.interrupt import Interruptible, on_interrupt
 from aerokit.cli.output import add_json, tell
+from aerokit.cli.own_flight import ON_INTERRUPT
 from aerokit.cli.plans import PARTS, read_plan, tell_items
 from aerokit.cli.signing import signing_of
 from aerokit.cli.vehicle_command import add_vehicle, default_address, reached
