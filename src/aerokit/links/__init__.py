@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from .reconnecting import Interruptible, ReconnectingLink
     from .replay import Replay
     from .serial import SerialLink
+    from .several import LinkPeer, OneOfSeveralListener, SeveralLinks
     from .tcp import TcpConnect, TcpListen
     from .udp import UdpBroadcast, UdpConnect, UdpListen
 
@@ -33,7 +34,9 @@ __all__ = [
     "Interruptible",
     "Link",
     "LinkAddress",
+    "LinkPeer",
     "MemoryLink",
+    "OneOfSeveralListener",
     "Peer",
     "PeerKeeper",
     "PtyLink",
@@ -41,6 +44,7 @@ __all__ = [
     "ReconnectingLink",
     "Replay",
     "SerialLink",
+    "SeveralLinks",
     "TcpConnect",
     "TcpListen",
     "UdpBroadcast",
@@ -60,7 +64,9 @@ _HOMES = {
     "Interruptible": "aerokit.links.reconnecting",
     "Link": "aerokit.links.link",
     "LinkAddress": "aerokit.links.address",
+    "LinkPeer": "aerokit.links.several",
     "MemoryLink": "aerokit.links.memory",
+    "OneOfSeveralListener": "aerokit.links.several",
     "Peer": "aerokit.links.link",
     "PeerKeeper": "aerokit.links.link",
     "PtyLink": "aerokit.links.pty",
@@ -68,6 +74,7 @@ _HOMES = {
     "ReconnectingLink": "aerokit.links.reconnecting",
     "Replay": "aerokit.links.replay",
     "SerialLink": "aerokit.links.serial",
+    "SeveralLinks": "aerokit.links.several",
     "TcpConnect": "aerokit.links.tcp",
     "TcpListen": "aerokit.links.tcp",
     "UdpBroadcast": "aerokit.links.udp",

@@ -45,7 +45,8 @@ class LinkAddress(Snapshot):
     options: tuple[tuple[str, str], ...] = ()
     """The rest, sorted.
 
-    ``rtscts`` is "1"; ``speed`` a factor, "inf" as fast as it goes; ``timeout`` is in seconds.
+    ``rtscts`` is "1"; ``speed`` a factor, "inf" as fast as it goes; ``timeout`` is in seconds. ``costly`` is "1" for
+    one of several links that is used only when the others fail.
     """
 
     def __str__(self) -> str:
@@ -100,6 +101,7 @@ _OPTIONS: dict[LinkKind, tuple[str, ...]] = {
     "replay": ("speed",),
 }
 _LISTENING = ("udpin", "tcpin")
+_NEVER_COSTLY = ("replay", "pty")
 _NOT_HERE = ("uds", "unix", "mcast", "ws", "wss", "wsserver", "csv")  # pymavlink knows these
 _SCHEME = re.compile(r"([a-z][a-z0-9_+.-]+):(.*)", re.IGNORECASE | re.DOTALL)  # one letter is a drive
 _URL = re.compile(r"([a-z][a-z0-9_+.-]*)://(.*)", re.IGNORECASE | re.DOTALL)
@@ -237,23 +239,24 @@ class _Parser:
         for item in filter(None, query.split("&")):
             key, _, value = item.partition("=")
             key = key.strip().lower()
-            if key not in _OPTIONS.get(kind, ()):
-                known = ", ".join(_OPTIONS.get(kind, ())) or "none"
-                meant = did_you_mean(key, _OPTIONS.get(kind, ()))
+            allowed = (*_OPTIONS.get(kind, ()), *(() if kind in _NEVER_COSTLY else ("costly",)))
+            if key not in allowed:
+                known = ", ".join(allowed) or "none"
+                meant = did_you_mean(key, allowed)
                 self.fail(f"{key!r} is not an option of {kind} links (they have: {known}){meant}")
             found[key] = self.option_value(key, value.strip().lower())
         return {
             key: value
             for key, value in found.items()
-            if (key, value) not in (("rtscts", "0"), ("speed", "1"))
+            if (key, value) not in (("rtscts", "0"), ("costly", "0"), ("speed", "1"))
         }
 
     def option_value(self, key: str, value: str) -> str:
         if key == "baud":
             return value
-        if key == "rtscts":
+        if key in ("rtscts", "costly"):
             if value not in _YES_AND_NO:
-                self.fail(f"rtscts={value} is neither yes (1) nor no (0)")
+                self.fail(f"{key}={value} is neither yes (1) nor no (0)")
             return str(int(_YES_AND_NO[value]))
         try:
             number = float("inf" if value == "max" else value)

@@ -68,6 +68,9 @@ class Link(ABC):
     dropped_writes: int = 0
     """Writes (datagrams, whole calls of `write`) that were thrown away: no room in time, no route, nobody there."""
 
+    is_several: bool = False
+    """Whether it is several links to the same vehicles (`SeveralLinks`), with a way for each peer over each of them."""
+
     @abstractmethod
     async def open(self, receiver: Receiver) -> None:
         """Opens the link; from now on the receiver is called.

@@ -54,6 +54,8 @@ if TYPE_CHECKING:
     from aerokit.mavlink.signing import Signing
     from aerokit.mavlink.statistics import FramerStatistics, SourceStatistics
     from aerokit.runtime.bus import Detach, Sink
+    from aerokit.runtime.link_state import LinkStatus
+    from aerokit.runtime.several_routes import SeveralRoutes
 
     Tap = Callable[[Frame, Peer], object]
 
@@ -113,7 +115,16 @@ class Connection:
         self._encoder = FrameEncoder(source_system, source_component, version=mavlink_version)
         self._gate = SignatureGate(self._encoder, self.unix_time, self.bus.publish)
         self.signing = signing
-        self._routes = Routes(link, self.bus.publish, self.attached, self.boot_clocks, may_move=may_move)
+        self._several: SeveralRoutes | None = None
+        self._routes: Routes | SeveralRoutes
+        if link.is_several:
+            from aerokit.links.several import SeveralLinks  # few programs have several
+            from aerokit.runtime.several_routes import SeveralRoutes
+
+            assert isinstance(link, SeveralLinks)
+            self._routes = self._several = SeveralRoutes(link, self, may_move=may_move)
+        else:
+            self._routes = Routes(link, self.bus.publish, self.attached, self.boot_clocks, may_move=may_move)
         self._peers = Peers(link, dialect, self._routes, self._let_through)
         self._framers = self._peers.framers
         self.keeps_peers = True
@@ -164,6 +175,19 @@ class Connection:
         frame = Frame.parse(bytes(data))
         known = self.bus.dialect.get(frame.message_id)
         self._write(frame.raw, None if known is None else self.bus.dialect.decode(frame), None)
+
+    def send_to_peer(self, message: Message, peer: Peer) -> None:
+        """Number, frame and write a message to one peer, whoever is behind it; for what is asked over each link."""
+        now = 0.0 if self._encoder.signing is None else self.unix_time()
+        data = self._encoder.encode(message, now)
+        self.link.write(data, peer)
+        if self._recording is not None:
+            self._recording.write(data, self._clock())
+
+    @property
+    def links(self) -> StateCell[tuple[LinkStatus, ...]] | None:
+        """How each of several links does; None where there is one link only. Told once a second, and at each change."""
+        return None if self._several is None else self._several.status
 
     @property
     def unsent_bytes(self) -> int:
@@ -368,7 +392,7 @@ class Connection:
     def bytes_received(self, data: bytes, peer: Peer) -> None:
         """Take bytes off the link (called by the link); never raises."""
         try:
-            framer = self._framers.get(peer)
+            framer, several = self._framers.get(peer), self._several
             now = self._clock()
             if now > self._loop_watch.late_after:
                 now = self._loop_watch.arrival(now)
@@ -379,15 +403,22 @@ class Connection:
             for frame in frames:
                 if self._error is not None:  # a sink has closed it
                     return
+                if several is not None and several.is_copy(frame, peer):
+                    continue
                 is_elsewhere = len(self._framers) > 1 and self._routes.is_elsewhere(frame, peer)
                 if not self._gate.is_open and not self._gate.admits(frame, may_hand_over=not is_elsewhere):
                     continue
-                if self._recording is not None:
+                if self._recording is not None and several is None:
                     self._recording.write(frame.raw, self._clock())
                 if is_elsewhere and not self._takes_place(framer, frame, peer):
                     continue
                 if (framer.late or framer.foreign) and self._is_stale(framer, frame):
                     continue
+                if several is not None:
+                    if not several.takes(frame, peer, _counters(framer, frame)):
+                        continue
+                    if self._recording is not None:
+                        self._recording.write(frame.raw, self._clock())
                 if frame.message_id == Heartbeat.ID:
                     self._note_heartbeat(framer, frame, peer)
                 self.bus.deliver(frame)
@@ -415,6 +446,16 @@ class Connection:
         """It does again (called by the link)."""
         self.bus.publish(LinkDrained(self._clock(), 0, stalled_s))
 
+    def one_link_changed(self, link: int, is_there: bool) -> None:
+        """One of several links has gone or is there again (called by the link)."""
+        if self._several is not None:
+            self._several.link_changed(link, is_there)
+
+    def one_link_stalled(self, link: int, is_stalled: bool) -> None:
+        """What is written to one of several links does not leave, or does again (called by the link)."""
+        if self._several is not None:
+            self._several.link_stalled(link, is_stalled)
+
     def link_lost(self, error: LinkLost) -> None:
         """The link has gone (called by the link): whatever waits ends with this error."""
         self._end(error)
@@ -437,6 +478,8 @@ class Connection:
         self._state_watch.heard(self._clock())
         self._loop_watch.start()
         self._background.start(self._send_heartbeats, "aerokit heartbeat")
+        if self._several is not None:
+            self._background.start(self._several.watch, "aerokit links")
 
     def _on_blocked(self, seconds: float) -> None:
         self.bus.publish(LoopBlocked(self._clock(), 0, seconds))
@@ -457,6 +500,8 @@ class Connection:
         self._error = error
         self._state_watch.lost(self._clock(), is_told=isinstance(error, LinkLost))
         self.link_state.close(error)
+        if self._several is not None:
+            self._several.status.close(error)
         if isinstance(error, LinkLost):
             self.bus.publish(LinkClosed(self._clock(), 0, error))
         enders, self._enders = self._enders, []
@@ -471,7 +516,7 @@ class Connection:
 
     def _write(self, data: bytes, message: Message | None, to: int | None) -> None:
         system_id = getattr(message, "target_system", 0) if to is None else to
-        for peer in self._routes.peers_of(system_id, getattr(message, "target_component", 0)):
+        for peer in self._routes.peers_of(system_id, getattr(message, "target_component", 0), message):
             self.link.write(data, peer)
         if self._recording is not None:
             self._recording.write(data, self._clock())

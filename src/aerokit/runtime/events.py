@@ -23,6 +23,7 @@ __all__ = [
     "HeardTwice",
     "ImageCaptured",
     "LandedStateChanged",
+    "LinkChosen",
     "LinkClosed",
     "LinkDrained",
     "LinkInterrupted",
@@ -36,6 +37,7 @@ __all__ = [
     "MissionItemReached",
     "ModeChanged",
     "MoveRefused",
+    "OneLinkChanged",
     "ParameterChanged",
     "SettingChanged",
     "StatusTextReceived",
@@ -285,6 +287,27 @@ class LinkDrained(Event):
     """What is written leaves again, after ``stalled_s`` seconds."""
 
     stalled_s: float
+
+
+class LinkChosen(Event):
+    """Of several links, ``link`` (its address) is used for this system from now on: orders go over it.
+
+    ``before`` is the one used until now (None: this is the first), ``reason`` says why: "first heard", "silent",
+    "stalled", "lost" (the former one), "better", or "cheaper" (the former one is a costly one). Message rates are asked
+    for again, for an autopilot keeps them for each link.
+    """
+
+    link: str
+    before: str | None
+    reason: str
+
+
+class OneLinkChanged(Event):
+    """One of several links (its address) has gone, fallen silent, or is there again."""
+
+    link: str
+    before: LinkState
+    after: LinkState
 
 
 class LinkStateChanged(Event):

@@ -10,17 +10,16 @@ import anyio
 from aerokit.arguments import checked
 from aerokit.async_block import async_block
 from aerokit.errors import LocalProtocolError
-from aerokit.links import ReconnectingLink, create_link
+from aerokit.links import Link, ReconnectingLink, create_link
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.enums import MavComponent
 from aerokit.runtime.connection import Connection
 
 if TYPE_CHECKING:
     import os
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Callable, Sequence
 
     from aerokit.links.allowed import Peers
-    from aerokit.links.link import Link
     from aerokit.mavlink.dialect import Dialect
     from aerokit.mavlink.signing import Signing
 
@@ -35,7 +34,7 @@ five seconds after it has gone."""
 @checked
 @async_block
 async def open_connection(
-    address: str | Link,
+    address: str | Link | Sequence[str | Link],
     *,
     source_system: int = 255,
     source_component: int = MavComponent.MISSIONPLANNER.value,
@@ -54,7 +53,10 @@ async def open_connection(
     of it as it is. Our HEARTBEAT goes out at 1 Hz from the start (https://mavlink.io/en/services/heartbeat.html).
 
     Args:
-        address: a connection string (``"udpin:0.0.0.0:14550"``, ``"/dev/ttyACM0,57600"``, …) or a link not yet open.
+        address: a connection string (``"udpin:0.0.0.0:14550"``, ``"/dev/ttyACM0,57600"``, …) or a link not yet open; or
+            several of them, that lead to the same vehicles (docs/several-links.md): each frame is taken once, orders go
+            over the best link, and over the next one when it falls silent. ``?costly=1`` behind an address marks one
+            that is used when the others fail. A link that is lost is opened again, as long as another one is there.
         source_system: our own system id, 1–255; ground stations take 255.
         source_component: our own component id, 1–255. 0, which is nobody's, is allowed for programs that always were
             that (DroneKit).
@@ -67,7 +69,7 @@ async def open_connection(
             is replaced. A disk that is full ends the recording, not the connection.
         reconnect: whether a link that is lost, a device unplugged for example, is opened again until it is back,
             instead of ending the connection: ``LinkInterrupted``, ``LinkRestored``. Not for the first opening, and not
-            at the end of a recording.
+            at the end of a recording. Of several links: whether the connection outlives that all are away.
         peers: the IP addresses and networks that are listened to: ``"10.0.0.7"``, ``["10.0.0.0/24", "fd00::/8"]``, or
             those of :mod:`ipaddress`. For links to which anybody can send: udpin, udpbcast, tcpin. None: all.
         may_move: whether a vehicle that was silent may come back from another IP address without going on where it
@@ -106,10 +108,14 @@ async def open_connection(
                 await connection._wait_until_link_is_closed()
 
 
-def _link(address: str | Link, baud: int, reconnect: bool, peers: Peers | None) -> Link:
+def _link(
+    address: str | Link | Sequence[str | Link], baud: int, reconnect: bool, peers: Peers | None
+) -> Link:
     if isinstance(address, str):
         make_link = partial(create_link, address, baud=baud, peers=peers)
         return ReconnectingLink(make_link) if reconnect else make_link()
+    if not isinstance(address, Link):
+        return _several(address, baud, reconnect, peers)
     if reconnect:
         raise LocalProtocolError(
             "reconnect = True is not allowed with a link, which can be opened once only: pass an address,"
@@ -120,3 +126,32 @@ def _link(address: str | Link, baud: int, reconnect: bool, peers: Peers | None) 
             "peers = … is not allowed with a link: pass an address, or give them to the link (UdpListen, TcpListen)"
         )
     return address
+
+
+def _several(addresses: Sequence[str | Link], baud: int, reconnect: bool, peers: Peers | None) -> Link:
+    if len(addresses) < 2:
+        if not addresses:
+            raise LocalProtocolError("address = [] is not allowed: at least one")
+        return _link(addresses[0], baud, reconnect, peers)
+    from aerokit.links import SeveralLinks, parse_address  # few programs have several
+
+    makers: list[Callable[[], Link]] = []
+    costly: set[int] = set()
+    for index, address in enumerate(addresses):
+        if isinstance(address, Link):
+            makers.append(partial(_itself, address))
+            continue
+        where = parse_address(address)
+        if where.option("costly") == "1":
+            costly.add(index)
+        if where.kind == "replay":
+            raise LocalProtocolError(
+                f"{address} is not allowed among several links: a recording is no link to a vehicle"
+            )
+        listened_to = peers if where.kind in ("udpin", "udpbcast", "tcpin") else None
+        makers.append(partial(ReconnectingLink, partial(create_link, where, baud=baud, peers=listened_to)))
+    return SeveralLinks(makers, costly=costly, stays=reconnect)
+
+
+def _itself(link: Link) -> Link:
+    return link

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from aerokit.mavlink.dialect import Dialect
     from aerokit.mavlink.frame import Frame
     from aerokit.runtime.routes import Routes
+    from aerokit.runtime.several_routes import SeveralRoutes
 
 __all__ = ["MOST_PEERS", "MOST_SENDERS", "MOST_STRANGERS", "Peers"]
 
@@ -33,7 +34,11 @@ class Peers:
     """
 
     def __init__(
-        self, link: Link, dialect: Dialect, routes: Routes, prepare: Callable[[Framer], object]
+        self,
+        link: Link,
+        dialect: Dialect,
+        routes: Routes | SeveralRoutes,
+        prepare: Callable[[Framer], object],
     ) -> None:
         self._link, self._dialect, self._routes, self._prepare = link, dialect, routes, prepare
         self.framers: dict[Peer, Framer] = {}

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
     from aerokit.links.link import Link, Peer
     from aerokit.mavlink.frame import Frame
+    from aerokit.mavlink.message import Message
     from aerokit.mavlink.statistics import SourceStatistics
     from aerokit.runtime.events import Event
 
@@ -111,7 +112,7 @@ class Routes:
             return False
         return 0 < (route.sequence - frame.sequence) & 0xFF < 128
 
-    def peers_of(self, system_id: int, component_id: int) -> Collection[Peer]:
+    def peers_of(self, system_id: int, component_id: int, message: Message | None = None) -> Collection[Peer]:
         """Where to send what is for this component, or for this system if the component is 0 or was never heard.
 
         Who speaks in another one's name is not part of the system: it would obey what is for all components.

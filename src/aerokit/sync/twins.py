@@ -42,7 +42,7 @@ from aerokit.vehicle.orders.setpoints import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping, Sequence
     from contextlib import AbstractContextManager
     import os
     from typing import Any
@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from aerokit.autopilots.modes import Mode
     from aerokit.autopilots.version import AutopilotVersion
     from aerokit.errors import ParameterRejected, ParameterTimeout
+    from aerokit.links import Link
     from aerokit.links.allowed import Peers
     from aerokit.links.link import Link
     from aerokit.mavlink.dialect import Dialect
@@ -3646,7 +3647,7 @@ class Vehicle(VehicleTwin):
 
 @checked
 def open_connection(
-    address: str | Link,
+    address: str | Link | Sequence[str | Link],
     *,
     source_system: int = 255,
     source_component: int = MavComponent.MISSIONPLANNER.value,
@@ -3665,7 +3666,10 @@ def open_connection(
     of it as it is. Our HEARTBEAT goes out at 1 Hz from the start (https://mavlink.io/en/services/heartbeat.html).
 
     Args:
-        address: a connection string (``"udpin:0.0.0.0:14550"``, ``"/dev/ttyACM0,57600"``, …) or a link not yet open.
+        address: a connection string (``"udpin:0.0.0.0:14550"``, ``"/dev/ttyACM0,57600"``, …) or a link not yet open; or
+            several of them, that lead to the same vehicles (docs/several-links.md): each frame is taken once, orders go
+            over the best link, and over the next one when it falls silent. ``?costly=1`` behind an address marks one
+            that is used when the others fail. A link that is lost is opened again, as long as another one is there.
         source_system: our own system id, 1–255; ground stations take 255.
         source_component: our own component id, 1–255. 0, which is nobody's, is allowed for programs that always were
             that (DroneKit).
@@ -3678,7 +3682,7 @@ def open_connection(
             is replaced. A disk that is full ends the recording, not the connection.
         reconnect: whether a link that is lost, a device unplugged for example, is opened again until it is back,
             instead of ending the connection: ``LinkInterrupted``, ``LinkRestored``. Not for the first opening, and not
-            at the end of a recording.
+            at the end of a recording. Of several links: whether the connection outlives that all are away.
         peers: the IP addresses and networks that are listened to: ``"10.0.0.7"``, ``["10.0.0.0/24", "fd00::/8"]``, or
             those of :mod:`ipaddress`. For links to which anybody can send: udpin, udpbcast, tcpin. None: all.
         may_move: whether a vehicle that was silent may come back from another IP address without going on where it
@@ -3709,7 +3713,7 @@ def open_connection(
 
 @checked
 def connect(
-    address: str | Link | Connection,
+    address: str | Link | Sequence[str | Link] | Connection,
     *,
     system_id: int | None = None,
     timeout: float = 30.0,
@@ -3732,8 +3736,8 @@ def connect(
 
     Args:
         address: ``"udpin:0.0.0.0:14550"``, ``"tcp:127.0.0.1:5760"``, ``"/dev/ttyACM0,57600"``, a ``.tlog`` file …;
-            a link; or a connection that is open already, for several vehicles on one link: what follows ``rates`` here
-            is then said where it is opened.
+            a link; several of these that lead to the vehicle (docs/several-links.md); or a connection that is open
+            already, for several vehicles on one link: what follows ``rates`` here is then said where it is opened.
         system_id: the vehicle's MAVLink system id, 1–255; None takes the first autopilot that is heard.
         timeout: seconds to wait for its first heartbeat, above 0.
         rates: message class → Hz (above 0, at most 1000), asked for instead of the default rates; ``{}`` asks for

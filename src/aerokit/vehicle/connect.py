@@ -29,7 +29,7 @@ from aerokit.vehicle.vehicle import Vehicle
 
 if TYPE_CHECKING:
     import os
-    from collections.abc import AsyncIterator, Mapping
+    from collections.abc import AsyncIterator, Mapping, Sequence
 
     from aerokit.links.allowed import Peers
     from aerokit.mavlink.dialect import Dialect
@@ -50,7 +50,7 @@ HEARTBEATS_ALONE = 3
 @checked
 @async_block
 async def connect(
-    address: str | Link | Connection,
+    address: str | Link | Sequence[str | Link] | Connection,
     *,
     system_id: int | None = None,
     timeout: float = 30.0,
@@ -73,8 +73,8 @@ async def connect(
 
     Args:
         address: ``"udpin:0.0.0.0:14550"``, ``"tcp:127.0.0.1:5760"``, ``"/dev/ttyACM0,57600"``, a ``.tlog`` file …;
-            a link; or a connection that is open already, for several vehicles on one link: what follows ``rates`` here
-            is then said where it is opened.
+            a link; several of these that lead to the vehicle (docs/several-links.md); or a connection that is open
+            already, for several vehicles on one link: what follows ``rates`` here is then said where it is opened.
         system_id: the vehicle's MAVLink system id, 1–255; None takes the first autopilot that is heard.
         timeout: seconds to wait for its first heartbeat, above 0.
         rates: message class → Hz (above 0, at most 1000), asked for instead of the default rates; ``{}`` asks for

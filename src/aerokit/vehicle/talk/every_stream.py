@@ -10,7 +10,7 @@ import anyio
 
 from aerokit.mavlink import messages as m
 from aerokit.runtime.background import Background
-from aerokit.runtime.events import Event, LinkRestored, VehicleBack, VehicleRebooted
+from aerokit.runtime.events import Event, LinkChosen, LinkRestored, VehicleBack, VehicleRebooted
 from aerokit.vehicle.checks import check_range
 
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ class _Heard:
         bus = talk.connection.bus
         for message_type in STREAMED:
             ends.callback(bus.attach(message_type, self._on_message, system_id=talk.system_id))
-        for event_type in (LinkRestored, VehicleBack, VehicleRebooted):
+        for event_type in (LinkChosen, LinkRestored, VehicleBack, VehicleRebooted):
             ends.callback(bus.attach_event(event_type, self._on_event))
 
     def forget(self) -> None:

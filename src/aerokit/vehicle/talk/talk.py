@@ -16,6 +16,7 @@ from aerokit.runtime.cells import Source, StateCell
 from aerokit.runtime.events import (
     ArmedChanged,
     LandedStateChanged,
+    LinkChosen,
     LinkReport,
     LinkRestored,
     ModeChanged,
@@ -244,8 +245,14 @@ class Talk:
                 lambda _, new: publish(StatusTextReceived, new.severity, new.text), every_arrival=True
             ),
             bus.attach_event(LinkRestored, lambda _: self.rates.ask_again()),
+            bus.attach_event(LinkChosen, self._on_link_chosen),
             self.connection.on_end(self._on_end),
         ]
+
+    def _on_link_chosen(self, event: LinkChosen) -> None:
+        """An autopilot keeps rates for each of its ports."""
+        if event.system_id == self.system_id and event.before is not None:
+            self.rates.ask_again()
 
     def _on_link_report(self, report: LinkReport) -> None:
         self.link_quality.set(report, Source(self.system_id, self.component_id, "link"))

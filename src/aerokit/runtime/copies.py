@@ -1,0 +1,71 @@
+"""``Copies``: a frame that came over another link already is not taken again."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from aerokit.mavlink.frame import Frame
+
+__all__ = ["Copies"]
+
+MOST = 4096
+"""So many frames are remembered: 10 s of 400 frames a second."""
+WINDOW_S = 3.0
+"""A copy comes no later than this."""
+SAME_NUMBER_AFTER = 128
+"""Numbers come again after 256 frames: after half of them a frame with the same bytes is another one."""
+
+
+class _Seen:
+    __slots__ = ("at", "count", "is_taken", "links")
+
+    def __init__(self, at: float, links: int, count: int) -> None:
+        self.at, self.links, self.count = (
+            at,
+            links,
+            count,
+        )  # a bit for each link; how many frames of the sender then
+        self.is_taken = False
+
+
+class Copies:
+    """Remembers what came over which link.
+
+    What came twice over the same link is no copy: the sender sent it twice, or its numbers have come round.
+    """
+
+    def __init__(self) -> None:
+        self._seen: dict[tuple[bytes, int, bytes], _Seen] = {}
+        self._counts: dict[int, int] = {}  # of each sender: its frames that were no copies
+        self._present: _Seen | None = None
+
+    def is_copy(self, frame: Frame, link: int) -> bool:
+        """Whether exactly this frame came over another link within the last seconds, and not over this one."""
+        sender = frame.component_id << 8 | frame.system_id
+        key = frame.body, frame.checksum, frame.signature
+        count = self._counts.get(sender, 0)
+        before, bit = self._seen.get(key), 1 << link
+        if before is not None:
+            is_near = frame.received_at - before.at <= WINDOW_S and count - before.count < SAME_NUMBER_AFTER
+            if is_near and not before.links & bit:
+                before.links |= bit
+                self._present = before
+                return True
+            del self._seen[key]
+        self._counts[sender] = count + 1
+        self._present = self._seen[key] = _Seen(frame.received_at, bit, count + 1)
+        if len(self._seen) > MOST:
+            for old in list(self._seen)[: MOST // 4]:
+                del self._seen[old]
+        return False
+
+    @property
+    def was_taken(self) -> bool:
+        """Whether the frame last asked about was taken when it came the first time."""
+        return self._present is not None and self._present.is_taken
+
+    def take(self) -> None:
+        """The frame last asked about is taken."""
+        if self._present is not None:
+            self._present.is_taken = True

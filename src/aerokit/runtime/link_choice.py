@@ -1,0 +1,194 @@
+"""``LinkChoice``: over which of several links a system is spoken to, and whom it is believed to be behind the others.
+
+Sans-IO: what is heard, measured and asked comes in with its time.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from aerokit.runtime.vehicle_clock import VehicleClock
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+__all__ = ["PROOFS", "PROVEN_BY_COPIES", "SILENT_S", "Candidate", "LinkChoice"]
+
+SILENT_S = 1.0
+"""Of a link over which questions are answered twice a second."""
+QUIET_S = 2.5
+"""Of a link over which little may come: two heartbeats are missing."""
+PROOFS = 3
+"""So many times in a row must the clock be the same before a second link is believed to lead to the same vehicle."""
+PROVEN_BY_COPIES = 3
+SHARED_S = 5.0
+"""Links have carried the same frames within this time: what comes over either is of one stream."""
+ALIKE = 0.5
+"""Another link must be better than by this factor before a good one is left for it."""
+JITTER_S = 0.05
+STEADY_S = 3.0
+"""And for so long."""
+
+
+class Candidate:
+    """One link to one system."""
+
+    def __init__(self, link: int, *, is_costly: bool, now: float) -> None:
+        self.link = link
+        self.is_costly = is_costly
+        self.heard_at: float = now
+        self.answered_at: float = -math.inf
+        self.shared_at: float = -math.inf
+        self.is_there: bool = True
+        self.is_stalled: bool = False
+        self.loss: float | None = None
+        """Share of frames lost, 0 to 1, over the last seconds; None: not known yet."""
+        self.round_trip_s: float | None = None
+        """None: nothing was answered yet."""
+        self.is_proven: bool = False
+        self.is_doubted: bool = False
+        """Whether somebody else speaks in this system's name there."""
+        self._agreed = self._disagreed = self._copies = 0
+        self._counted = (0, 0)
+
+    def note_counts(self, received: int, lost: int, now: float) -> None:
+        """So many frames came over it in all, and so many did not."""
+        before, self._counted = self._counted, (received, lost)
+        if received > before[0]:
+            self.heard_at = now
+        came, missing = received - before[0], max(0, lost - before[1])
+        if came > 0 or missing:
+            share = missing / (max(came, 0) + missing)
+            weight = 1 - 0.85 ** (max(came, 0) + missing)  # the last dozen of frames counts most
+            self.loss = share if self.loss is None else self.loss + weight * (share - self.loss)
+
+    def note_round_trip(self, seconds: float, now: float) -> None:
+        """A question was answered over it."""
+        self.answered_at = self.heard_at = now
+        before = self.round_trip_s
+        self.round_trip_s = seconds if before is None else 0.7 * before + 0.3 * seconds
+
+    def note_clock(self, is_the_same: bool) -> None:
+        """The time that is told over it is the vehicle's, or another one's."""
+        if is_the_same:
+            self._agreed, self._disagreed = self._agreed + 1, 0
+        else:
+            self._agreed, self._disagreed = 0, self._disagreed + 1
+        if self._agreed >= PROOFS:
+            self.is_proven, self.is_doubted = True, False
+        elif self._disagreed >= PROOFS:
+            self.is_proven, self.is_doubted = False, True
+
+    def note_copy(self, now: float) -> None:
+        """The same frame came over it and over the link in use."""
+        self.shared_at = now
+        self._copies += 1
+        if self._copies >= PROVEN_BY_COPIES:
+            self.is_proven, self.is_doubted = True, False
+
+    def forget_proof(self) -> None:
+        """The vehicle has rebooted: what was shown of its clock does not count any more."""
+        self.is_proven = False
+        self._agreed = self._disagreed = self._copies = 0
+
+    def is_alive(self, now: float) -> bool:
+        """Whether something comes over it, and what is written leaves."""
+        answers = now - self.answered_at <= 2 * QUIET_S
+        silent_after_s = SILENT_S if answers and not self.is_costly else QUIET_S
+        return self.is_there and not self.is_stalled and now - self.heard_at <= silent_after_s
+
+    def why_not(self) -> str:
+        """Why it is not used any more."""
+        return "lost" if not self.is_there else "stalled" if self.is_stalled else "silent"
+
+    @property
+    def cost_s(self) -> float:
+        """How long an order and its answer take, with what is lost on the way."""
+        loss = min(0.9, self.loss or 0.0)
+        return ((0.1 if self.round_trip_s is None else self.round_trip_s) + 0.05) / (1 - loss) ** 2
+
+
+class LinkChoice:
+    """The links to one system, and the one in use.
+
+    ``needs_proof`` is of systems with an autopilot: what comes over a second link is believed, and orders go there,
+    only when it has shown to be the same vehicle, by its clock or by carrying the same frames.
+    """
+
+    def __init__(self, *, needs_proof: bool) -> None:
+        self.needs_proof = needs_proof
+        self.candidates: dict[int, Candidate] = {}
+        self.clock = VehicleClock()
+        self.used: Candidate | None = None
+        self.former: Candidate | None = None
+        """The one before, until its answers have come."""
+        self.changed_at: float = -math.inf
+        self.fresh_after: float = -math.inf
+        """What comes over the link in use before this time was sent before the last that came over the former one."""
+        self._better: Candidate | None = None
+        self._better_since = 0.0
+
+    def heard(self, link: int, now: float, *, is_costly: bool) -> Candidate:
+        """A heartbeat came over a link."""
+        candidate = self.candidates.get(link)
+        if candidate is None:
+            candidate = self.candidates[link] = Candidate(link, is_costly=is_costly, now=now)
+        candidate.heard_at = now
+        return candidate
+
+    def note_answer(self, link: int, at: float, told_s: float, round_trip_s: float, now: float) -> None:
+        """The system has told its time over a link; ``at`` is when, by our clock."""
+        candidate = self.candidates[link]
+        candidate.note_round_trip(round_trip_s, now)
+        if candidate is self.used:
+            if not self.clock.note(at, told_s, round_trip_s):
+                for other in self.candidates.values():
+                    other.forget_proof()
+        else:
+            agrees = self.clock.agrees(at, told_s, round_trip_s)
+            if agrees is not None:
+                candidate.note_clock(agrees)
+
+    def may_be_used(self, candidate: Candidate) -> bool:
+        """Whether what is behind it is the same system."""
+        return self.used in (None, candidate) or candidate.is_proven or not self.needs_proof
+
+    def is_shared(self, candidate: Candidate, now: float) -> bool:
+        """Whether it carries the frames that the link in use carries."""
+        return now - candidate.shared_at <= SHARED_S
+
+    def choose(self, now: float) -> str | None:
+        """Look whether another link is to be used from now on; why, if so."""
+        alive = sorted(
+            (each for each in self.candidates.values() if self.may_be_used(each) and each.is_alive(now)),
+            key=lambda each: (each.is_costly, each.cost_s),
+        )
+        if not alive:
+            return None
+        best, used = alive[0], self.used
+        if used is None:
+            return self._change(best, "first heard", now)
+        if used not in alive:
+            return self._change(best, used.why_not(), now)
+        is_better = best.is_costly < used.is_costly or best.cost_s < ALIKE * used.cost_s
+        if best is used or not is_better:
+            self._better = None
+        elif best is not self._better:
+            self._better, self._better_since = best, now
+        elif now - self._better_since >= STEADY_S:
+            return self._change(best, "cheaper" if best.is_costly < used.is_costly else "better", now)
+        return None
+
+    def _change(self, to: Candidate, reason: str, now: float) -> str:
+        former = self.used
+        if former is not None:
+            longer_s = ((to.round_trip_s or 0.0) - (former.round_trip_s or 0.0)) / 2
+            self.fresh_after = former.heard_at + longer_s + JITTER_S
+        self.former, self.used, self.changed_at, self._better = former, to, now, None
+        return reason
+
+    def forget(self, links: Iterable[int]) -> None:
+        """Nothing is behind these any more."""
+        for link in links:
+            self.candidates.pop(link, None)

@@ -1,0 +1,409 @@
+"""``SeveralRoutes``: several links to the same vehicles: what is taken from which, and over which of them orders go."""
+
+from __future__ import annotations
+
+import logging
+import math
+from typing import TYPE_CHECKING
+
+import anyio
+
+from aerokit.links.several import LinkPeer
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import MavAutopilot
+from aerokit.runtime.cells import Source, StateCell
+from aerokit.runtime.claims import boot_time_ms
+from aerokit.runtime.copies import Copies
+from aerokit.runtime.events import HeardTwice, LinkChosen, OneLinkChanged
+from aerokit.runtime.link_choice import LinkChoice
+from aerokit.runtime.link_state import LinkState, LinkStatus
+from aerokit.runtime.routes import EVERY_PEER, Routes
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable
+
+    from aerokit.links.link import Peer
+    from aerokit.links.several import SeveralLinks
+    from aerokit.mavlink.frame import Frame
+    from aerokit.mavlink.message import Message
+    from aerokit.mavlink.statistics import SourceStatistics
+    from aerokit.runtime.connection import Connection
+    from aerokit.runtime.link_choice import Candidate
+
+__all__ = ["SeveralRoutes"]
+
+logger: logging.Logger = logging.getLogger("aerokit")
+
+LOOK_S = 0.1
+ASK_S = 0.5
+ASK_COSTLY_S = 5.0
+STATUS_S = 1.0
+MOST_QUESTIONS = 256
+ANSWERS_WITHIN_S = 3.0
+"""After a change what was asked over the former link is still answered over it."""
+LIVES_S = 10.0
+"""A component is taken for one behind a link for so long after something of it came there."""
+MOST_SOURCES = 1024
+
+ANSWERS = frozenset(
+    each.ID
+    for each in (
+        m.CommandAck, m.ParamValue, m.ParamExtValue, m.ParamExtAck, m.MissionCount, m.MissionItem, m.MissionItemInt,
+        m.MissionRequest, m.MissionRequestInt, m.MissionAck, m.FileTransferProtocol, m.LogEntry, m.LogData,
+    )
+)  # fmt: skip
+"""What is no state of the vehicle: it does not grow old on its way."""
+FOR_ALL = frozenset(each.ID for each in (m.Heartbeat, m.Timesync, m.Ping))
+"""What everybody on every link is told: it orders nothing."""
+
+
+class _Stream:
+    """The frames of one component."""
+
+    __slots__ = ("heard_at", "newest")
+
+    def __init__(self, links: int) -> None:
+        self.heard_at = [-math.inf] * links
+        self.newest = -1  # number of the newest frame that was taken; -1: none
+
+
+class SeveralRoutes:
+    """One :class:`Routes` for each link, and over them the choice of a link for each system.
+
+    Exactly the same frame is taken once, whichever copy comes first. Where two links carry streams of their own (two
+    ports of an autopilot number their frames apart), only what comes over the link in use is taken: what came over the
+    other one may be older.
+    """
+
+    def __init__(self, link: SeveralLinks, connection: Connection, *, may_move: bool) -> None:
+        self._link, self._connection = link, connection
+        self._count = len(link.names)
+        self._routes = [
+            Routes(
+                link, connection.bus.publish, connection.attached, connection.boot_clocks, may_move=may_move
+            )
+            for _ in range(self._count)
+        ]
+        self._choices: dict[int, LinkChoice] = {}
+        self._streams: dict[int, _Stream] = {}
+        self._counters: dict[
+            tuple[int, int], dict[int, SourceStatistics]
+        ] = {}  # of (system, link), by component
+        self._copies = Copies()
+        self._questions: dict[int, tuple[int, int, float]] = {}  # ts1 → system, link, asked at
+        self._asked_at: dict[tuple[int, int], float] = {}
+        self._doubts_told: set[tuple[int, int]] = set()
+        self._told_at = -math.inf
+        self._states = [LinkState.LOST] * self._count
+        self.status: StateCell[tuple[LinkStatus, ...]] = StateCell("links", connection.now, "frame")
+        connection.bus.attach(m.Timesync, _ignore)
+
+    # ------------------------------------------------------- as Routes, for the connection
+
+    def note(self, frame: Frame, peer: Peer, counters: SourceStatistics | None) -> bool:
+        """A heartbeat came from this peer; False when there is no room to remember it."""
+        if not self._routes[_link(peer)].note(frame, peer, counters):
+            return False
+        heartbeat = self._connection.bus.dialect.decode(frame)
+        is_autopilot = getattr(heartbeat, "autopilot", MavAutopilot.INVALID) != MavAutopilot.INVALID
+        choice = self._choices.get(frame.system_id)
+        if choice is None:
+            choice = self._choices[frame.system_id] = LinkChoice(needs_proof=is_autopilot)
+        choice.needs_proof |= is_autopilot
+        is_costly = _link(peer) in self._link.costly
+        choice.heard(_link(peer), frame.received_at, is_costly=is_costly)
+        if counters is not None:
+            self._counters.setdefault((frame.system_id, _link(peer)), {})[frame.component_id] = counters
+        if choice.used is None:
+            self._choose(frame.system_id, choice, frame.received_at)
+        return True
+
+    def is_known(self, source: tuple[int, int]) -> bool:
+        """Whether a heartbeat of this component is remembered."""
+        return any(routes.is_known(source) for routes in self._routes)
+
+    def is_overtaken(self, frame: Frame) -> bool:
+        """Whether a heartbeat that is late by its number is older than the last one that was noted."""
+        return any(routes.is_overtaken(frame) for routes in self._routes)
+
+    def is_elsewhere(self, frame: Frame, peer: Peer) -> bool:
+        """Whether the component of this frame is known to be behind another peer of this link."""
+        return self._routes[_link(peer)].is_elsewhere(frame, peer)
+
+    def takes_place(
+        self, frame: Frame, peer: Peer, counters: SourceStatistics | None, is_signed: bool
+    ) -> bool:
+        """See :meth:`Routes.takes_place`, of the same link."""
+        return self._routes[_link(peer)].takes_place(frame, peer, counters, is_signed)
+
+    def hear_double(self, frame: Frame) -> None:
+        """Somebody behind the same peer speaks in this one's name."""
+        self._routes[0].hear_double(frame)
+
+    def least_wanted(self, peers: Iterable[Peer], now: float) -> list[Peer]:
+        """The first behind which nobody lives, if there is one."""
+        for index, routes in enumerate(self._routes):
+            found = routes.least_wanted((peer for peer in peers if _link(peer) == index), now)
+            if found:
+                return found
+        return []
+
+    def peers_of(self, system_id: int, component_id: int, message: Message | None = None) -> Collection[Peer]:
+        """Where to send what is for this component: over one link, the best one.
+
+        What is for everybody goes once to each system that is known, and to all links behind which none is;
+        heartbeats and the like go everywhere.
+        """
+        if system_id != 0:
+            choice = self._choices.get(system_id)
+            if choice is None or choice.used is None:
+                return EVERY_PEER
+            self._choose(system_id, choice, self._connection.now())
+            return self._routes[choice.used.link].peers_of(system_id, component_id)
+        if message is not None and message.ID in FOR_ALL:
+            return EVERY_PEER
+        return self._one_for_each_system()
+
+    # ---------------------------------------------------------------- what comes, and what of it is taken
+
+    def is_copy(self, frame: Frame, peer: Peer) -> bool:
+        """Whether this frame has come over another link already, and was taken."""
+        if not self._copies.is_copy(frame, _link(peer)):
+            return False
+        choice = self._choices.get(frame.system_id)
+        if choice is not None and boot_time_ms(
+            frame
+        ):  # a heartbeat is like another one, also of another vehicle
+            for link in {_link(peer), -1 if choice.used is None else choice.used.link}:
+                if (candidate := choice.candidates.get(link)) is not None:
+                    candidate.note_copy(frame.received_at)
+        if not self._copies.was_taken:
+            return False
+        self._stream(frame).heard_at[_link(peer)] = frame.received_at
+        if frame.message_id == m.Heartbeat.ID and not self.is_elsewhere(frame, peer):
+            counters = self._counters.get((frame.system_id, _link(peer)), {}).get(frame.component_id)
+            self.note(frame, peer, counters)
+        return True
+
+    def takes(self, frame: Frame, peer: Peer, counters: SourceStatistics | None) -> bool:
+        """Whether it is to be delivered; heartbeats of a link that is not in use are noted here."""
+        if frame.message_id == m.Timesync.ID and self._is_answer(frame, peer):
+            return False
+        choice = self._choices.get(frame.system_id)
+        if frame.message_id == m.Heartbeat.ID:
+            self.note(frame, peer, counters)
+            choice = self._choices.get(frame.system_id)
+        stream = self._stream(frame)
+        stream.heard_at[_link(peer)] = frame.received_at
+        candidate = None if choice is None else choice.candidates.get(_link(peer))
+        if choice is None or choice.used is None:
+            self._copies.take()
+            return True  # of somebody who sends no heartbeats: a radio
+        used = choice.used
+        if frame.received_at <= choice.fresh_after and frame.message_id not in ANSWERS:
+            return False
+        if _link(peer) != used.link:
+            if candidate is None or not choice.may_be_used(candidate):
+                return False
+            lives_there = frame.received_at - stream.heard_at[used.link] <= LIVES_S
+            is_shared = choice.is_shared(candidate, frame.received_at)
+            is_late = stream.newest >= 0 and (frame.sequence - stream.newest) & 0xFF >= 128
+            is_late_answer = (
+                frame.message_id in ANSWERS
+                and candidate is choice.former
+                and frame.received_at - choice.changed_at <= ANSWERS_WITHIN_S
+            )
+            if lives_there and not is_late_answer and not is_shared:
+                return False
+            if is_shared and is_late and frame.message_id not in ANSWERS:
+                return False
+        stream.newest = frame.sequence
+        self._copies.take()
+        return True
+
+    # ---------------------------------------------------------------------------- the links themselves
+
+    def link_changed(self, link: int, is_there: bool) -> None:
+        """A link has gone, or is there again."""
+        now = self._connection.now()
+        for system_id, choice in self._choices.items():
+            if (candidate := choice.candidates.get(link)) is not None:
+                candidate.is_there = is_there
+                if not is_there:
+                    candidate.is_stalled = False
+                self._choose(system_id, choice, now)
+        self._set_state(link, LinkState.CONNECTED if is_there else LinkState.LOST, now)
+
+    def link_stalled(self, link: int, is_stalled: bool) -> None:
+        """What is written to a link does not leave, or leaves again."""
+        now = self._connection.now()
+        for system_id, choice in self._choices.items():
+            if (candidate := choice.candidates.get(link)) is not None:
+                candidate.is_stalled = is_stalled
+                self._choose(system_id, choice, now)
+
+    async def watch(self) -> None:
+        """Count, ask and choose, as long as the connection is open."""
+        while self._connection.is_open:
+            self.look(self._connection.now())
+            await anyio.sleep(LOOK_S)
+
+    def look(self, now: float) -> None:
+        """Take stock: what has come over which link, who is to be asked, which link is to be used."""
+        for system_id, choice in self._choices.items():
+            for link, candidate in choice.candidates.items():
+                counters = self._counters.get((system_id, link), {}).values()
+                received, lost = sum(each.received for each in counters), sum(each.lost for each in counters)
+                candidate.note_counts(received, lost, now)
+                self._ask(system_id, choice, candidate, now)
+            self._choose(system_id, choice, now)
+        self._tell_states(now)
+
+    # ------------------------------------------------------------------------------------- inside
+
+    def _stream(self, frame: Frame) -> _Stream:
+        key = frame.component_id << 8 | frame.system_id
+        stream = self._streams.get(key)
+        if stream is None:
+            if len(self._streams) >= MOST_SOURCES:
+                del self._streams[next(iter(self._streams))]
+            stream = self._streams[key] = _Stream(self._count)
+        return stream
+
+    def _one_for_each_system(self) -> Collection[Peer]:
+        peers: set[Peer] = set()
+        reached: set[int] = set()
+        for system_id, choice in self._choices.items():
+            reached.update(choice.candidates)
+            if choice.used is not None:
+                peers.update(self._routes[choice.used.link].peers_of(system_id, 0))
+        peers.update(LinkPeer(link, None) for link in range(self._count) if link not in reached)
+        return peers
+
+    def _choose(self, system_id: int, choice: LinkChoice, now: float) -> None:
+        before = choice.used
+        reason = choice.choose(now)
+        used = choice.used
+        if reason is None or used is None:
+            return
+        if before is not None:
+            self._link.discard_unsent_of(
+                before.link
+            )  # it may not arrive after what is ordered over the other one
+            self._streams = {key: each for key, each in self._streams.items() if key & 0xFF != system_id}
+            name, former = self._link.names[used.link], self._link.names[before.link]
+            log = logger.info if reason in ("better", "cheaper") else logger.warning
+            log(
+                "system %d: %s is used now, %s is %s", system_id, name, former, _OF_FORMER.get(reason, reason)
+            )
+        self._connection.bus.publish(
+            LinkChosen(
+                now,
+                system_id,
+                link=self._link.names[used.link],
+                before=None if before is None else self._link.names[before.link],
+                reason=reason,
+            )
+        )
+        self._told_at = -math.inf
+
+    def _ask(self, system_id: int, choice: LinkChoice, candidate: Candidate, now: float) -> None:
+        """The vehicle's time, over each link to it."""
+        if not choice.needs_proof or not candidate.is_there or candidate.is_stalled:
+            return
+        is_idle = candidate.is_costly and candidate is not choice.used
+        is_new = not candidate.is_proven and not candidate.is_doubted
+        period = ASK_COSTLY_S if is_idle and not is_new else ASK_S
+        key = system_id, candidate.link
+        if now - self._asked_at.get(key, -math.inf) < period - LOOK_S / 2:
+            return
+        self._asked_at[key] = now
+        # Our time in nanoseconds, and in its last digits what nobody else asks.
+        number = int(now * 1e9) // 1000 * 1000 + (system_id * self._count + candidate.link) % 1000
+        if number <= 0 or number in self._questions:
+            return
+        if len(self._questions) >= MOST_QUESTIONS:
+            del self._questions[next(iter(self._questions))]
+        self._questions[number] = system_id, candidate.link, now
+        for peer in self._routes[candidate.link].peers_of(system_id, 1):
+            self._connection.send_to_peer(
+                m.Timesync(0, number, target_system=system_id, target_component=1), peer
+            )
+
+    def _is_answer(self, frame: Frame, peer: Peer) -> bool:
+        message = self._connection.bus.dialect.decode(frame)
+        if not isinstance(message, m.Timesync) or message.tc1 == 0:
+            return False
+        question = self._questions.get(message.ts1)
+        if question is None or question[:2] != (frame.system_id, _link(peer)):
+            return question is not None  # a copy of an answer over another link
+        del self._questions[message.ts1]
+        choice, now = self._choices[frame.system_id], frame.received_at
+        if _link(peer) not in choice.candidates:
+            return True
+        round_trip = max(0.0, now - question[2])
+        candidate = choice.candidates[_link(peer)]
+        choice.note_answer(_link(peer), now - round_trip / 2, message.tc1 / 1e9, round_trip, now)
+        self._tell_doubt(frame, candidate)
+        return True
+
+    def _tell_doubt(self, frame: Frame, candidate: Candidate) -> None:
+        key = frame.system_id, candidate.link
+        if not candidate.is_doubted:
+            self._doubts_told.discard(key)
+        elif key not in self._doubts_told:
+            self._doubts_told.add(key)
+            logger.warning(
+                "another vehicle speaks as system %d over %s: its clock is another one; it is not listened to",
+                frame.system_id,
+                self._link.names[candidate.link],
+            )
+            self._connection.bus.publish(HeardTwice(frame.received_at, frame.system_id, frame.component_id))
+
+    def _tell_states(self, now: float) -> None:
+        for link in range(self._count):
+            candidates = [each.candidates[link] for each in self._choices.values() if link in each.candidates]
+            if candidates and self._link.is_there(link):
+                is_alive = any(each.is_alive(now) for each in candidates)
+                self._set_state(link, LinkState.CONNECTED if is_alive else LinkState.SILENT, now)
+        if now - self._told_at >= STATUS_S - LOOK_S / 2:
+            self._told_at = now
+            self.status.set(tuple(self._status(link) for link in range(self._count)), Source(0, 0, "link"))
+
+    def _set_state(self, link: int, state: LinkState, now: float) -> None:
+        before, self._states[link] = self._states[link], state
+        if before is not state:
+            self._told_at = -math.inf
+            self._connection.bus.publish(OneLinkChanged(now, 0, self._link.names[link], before, state))
+
+    def _status(self, link: int) -> LinkStatus:
+        candidates = {
+            system_id: choice.candidates[link]
+            for system_id, choice in self._choices.items()
+            if link in choice.candidates
+        }
+        losses = [each.loss for each in candidates.values() if each.loss is not None]
+        trips = [each.round_trip_s for each in candidates.values() if each.round_trip_s is not None]
+        return LinkStatus(
+            self._link.names[link],
+            self._states[link],
+            is_costly=link in self._link.costly,
+            systems=tuple(sorted(candidates)),
+            used_for=tuple(
+                sorted(each for each in candidates if self._choices[each].used is candidates[each])
+            ),
+            loss_percent=100 * max(losses) if losses else None,
+            round_trip_s=max(trips) if trips else None,
+        )
+
+
+_OF_FORMER = {"better": "worse", "cheaper": "costly"}
+
+
+def _link(peer: Peer) -> int:
+    assert isinstance(peer, LinkPeer)
+    return peer.link
+
+
+def _ignore(message: object) -> None:
+    pass

@@ -1,0 +1,141 @@
+"""A vehicle with two radios, on virtual time: links that can be cut, delayed and stalled, and copies of one stream."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Iterable, Sequence
+from contextlib import AsyncExitStack, asynccontextmanager
+from functools import partial
+from typing import Any
+
+from aerokit import events
+from aerokit.errors import LinkLost
+from aerokit.links import FaultModel, FaultyLink, Link, MemoryLink, Peer, SeveralLinks, memory_link_pair
+from aerokit.mavlink.framer import Framer
+from aerokit.mavlink.message import Message
+from aerokit.runtime.connection import Connection
+from aerokit.runtime.opening import open_connection
+from aerokit.sim import SimulatedVehicle, SimulatorServer
+
+DEAD = FaultModel(loss=1.0)
+GOOD = FaultModel()
+
+
+class Radios:
+    """Several faulty links to the same vehicles, each with a port of the autopilot of its own."""
+
+    def __init__(self, count: int, *, models: Sequence[FaultModel] = (), seed: int = 0) -> None:
+        pairs = [memory_link_pair() for _ in range(count)]
+        self.far: list[MemoryLink] = [far for _, far in pairs]
+        self.links: list[FaultyLink] = [
+            FaultyLink(near, models[index] if models else GOOD, seed=seed + index)
+            for index, (near, _) in enumerate(pairs)
+        ]
+
+    def together(self, **options: Any) -> SeveralLinks:
+        """As one link."""
+        return SeveralLinks([partial(_itself, link) for link in self.links], **options)
+
+    def cut(self, index: int) -> None:
+        """Nothing comes through any more, in either direction, and nobody is told."""
+        self.links[index].incoming.model = self.links[index].outgoing.model = DEAD
+
+    def mend(self, index: int) -> None:
+        """It is as new."""
+        self.links[index].incoming.model = self.links[index].outgoing.model = GOOD
+
+
+def _itself(link: Link) -> Link:
+    return link
+
+
+class Told:
+    """What the vehicle's side was sent, over which radio, in the order in which it was written."""
+
+    def __init__(self, radios: Radios) -> None:
+        self.messages: list[tuple[int, float, Message]] = []
+        self._framers = [Framer() for _ in radios.links]
+        for index, link in enumerate(radios.links):
+            link.link.write = partial(self._write, index, link.link.write)  # type: ignore[method-assign]
+
+    def _write(self, index: int, write: Any, data: bytes, peer: Peer = None) -> None:
+        framer = self._framers[index]
+        for frame in framer.receive(data):
+            self.messages.append((index, 0.0, framer.dialect.decode(frame)))
+        write(data, peer)
+
+    def of(self, *types: type[Message]) -> list[tuple[int, Message]]:
+        """Those of these types, with the radio that each arrived by."""
+        return [(index, message) for index, _, message in self.messages if isinstance(message, types)]
+
+
+class Splitter:
+    """One stream of the autopilot copied onto several radios, as a router on board does it."""
+
+    def __init__(self, far: Sequence[MemoryLink]) -> None:
+        self.port, self._inside = memory_link_pair()
+        self._far = far
+        self.keeps_peers = False
+
+    async def open(self, stack: AsyncExitStack) -> None:
+        """Begin to copy; everything is closed with the stack."""
+        splitter = self
+
+        class FromRadio:
+            def bytes_received(self, data: bytes, peer: Peer) -> None:
+                splitter._inside.write(data)
+
+            def link_lost(self, error: LinkLost) -> None:
+                pass
+
+        for link in (*self._far, self._inside):
+            stack.callback(link.close)
+        for link in self._far:
+            await link.open(FromRadio())
+        await self._inside.open(self)
+
+    def bytes_received(self, data: bytes, peer: Peer) -> None:
+        for link in self._far:
+            link.write(data)
+
+    def link_lost(self, error: LinkLost) -> None:
+        pass
+
+
+@asynccontextmanager
+async def over(
+    radios: Radios,
+    vehicles: SimulatedVehicle | Iterable[SimulatedVehicle],
+    *,
+    copied: bool = False,
+    server: dict[str, Any] | None = None,
+    links: dict[str, Any] | None = None,
+    **options: Any,
+) -> AsyncIterator[Connection]:
+    """A connection over these radios to simulated vehicles."""
+    async with AsyncExitStack() as stack:
+        ports: list[Link] = list(radios.far)
+        if copied:
+            splitter = Splitter(radios.far)
+            await splitter.open(stack)
+            ports = [splitter.port]
+        await stack.enter_async_context(SimulatorServer(vehicles, ports, **(server or {})))
+        together = radios.together(**(links or {}))
+        yield await stack.enter_async_context(open_connection(together, **options))
+
+
+class News:
+    """The events of a connection, as they come."""
+
+    def __init__(self, connection: Connection, *types: type[events.Event]) -> None:
+        self.all: list[events.Event] = []
+        for each in types or (events.LinkChosen,):
+            connection.bus.attach_event(each, self.all.append)
+
+    @property
+    def chosen(self) -> list[tuple[str, str]]:
+        """(link, reason) of each change, without the first choice."""
+        return [
+            (each.link, each.reason)
+            for each in self.all
+            if isinstance(each, events.LinkChosen) and each.before is not None
+        ]

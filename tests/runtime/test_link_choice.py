@@ -1,0 +1,149 @@
+"""The choice among several links, and copies of frames, by any history."""
+
+from __future__ import annotations
+
+import math
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from aerokit import messages as m
+from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.frame import Frame
+from aerokit.runtime.copies import Copies
+from aerokit.runtime.link_choice import PROOFS, SILENT_S, LinkChoice
+from aerokit.runtime.vehicle_clock import VehicleClock
+
+STEPS = st.lists(
+    st.tuples(
+        st.sampled_from(["heard", "counts", "answer", "there", "gone", "stalled", "drained", "look"]),
+        st.integers(0, 2),
+        st.floats(0.01, 1.5),
+        st.floats(0.0, 0.5),
+    ),
+    max_size=80,
+)
+
+
+@given(STEPS)
+def test_nothing_goes_over_a_link_that_was_not_shown_to_lead_there(
+    steps: list[tuple[str, int, float, float]],
+) -> None:
+    """Link 2 leads to another vehicle: its clock is 300 s ahead."""
+    choice, now = LinkChoice(needs_proof=True), 1.0
+    choice.heard(0, now, is_costly=False)
+    assert choice.choose(now) == "first heard"
+    received = 0
+    for what, link, later, round_trip in steps:
+        now += later
+        candidate = (
+            choice.heard(link, now, is_costly=link == 1) if what == "heard" else choice.candidates.get(link)
+        )
+        if candidate is None:
+            continue
+        if what == "counts":
+            received += 5
+            candidate.note_counts(received, 1, now)
+        elif what == "answer":
+            choice.note_answer(link, now - round_trip / 2, now + 50 + 300 * (link == 2), round_trip, now)
+        elif what in ("there", "gone"):
+            candidate.is_there = what == "there"
+        elif what in ("stalled", "drained"):
+            candidate.is_stalled = what == "stalled"
+        before = choice.used
+        reason = choice.choose(now)
+        assert choice.used is not None
+        assert choice.used.link != 2
+        if reason is not None:
+            assert choice.used is not before
+            assert choice.used.is_alive(now)
+            if before is not None and before.is_alive(now):
+                assert reason in ("better", "cheaper")
+        elif choice.used is before and before is not None and not before.is_alive(now):
+            others = [each for each in choice.candidates.values() if each is not before and each.is_proven]
+            assert not any(each.is_alive(now) for each in others), "a living link was not taken"
+
+
+@given(st.floats(0.2, 20.0), st.floats(-1e5, 1e5), st.lists(st.floats(0.0, 0.4), min_size=3, max_size=30))
+def test_a_clock_goes_on_at_whatever_speed(speed: float, begin: float, round_trips: list[float]) -> None:
+    """Answers come with delays that are not the same both ways."""
+    clock, now = VehicleClock(), 100.0
+    for index, round_trip in enumerate(round_trips):
+        now += 0.5
+        told = begin + speed * (now - round_trip / 2 + (round_trip / 2) * 0.2 * (-1) ** index)
+        at = now - round_trip / 2
+        assert clock.agrees(at, told, round_trip) is not False
+        assert not clock.agrees(at, told + 60.0 * max(1.0, speed), round_trip)
+        assert clock.note(at, told, round_trip)
+
+
+def test_a_reboot_takes_the_proof_away_and_the_same_clock_gives_it_back() -> None:
+    choice = LinkChoice(needs_proof=True)
+    for link in (0, 1):
+        choice.heard(link, 0.0, is_costly=False)
+    choice.choose(0.0)
+    for step in range(PROOFS + 1):
+        for link in (0, 1):
+            choice.note_answer(link, step, step + 70.0, 0.01, step)
+    assert choice.candidates[1].is_proven
+    choice.note_answer(0, 5.0, 1.0, 0.01, 5.0)
+    assert not choice.candidates[1].is_proven
+    choice.note_answer(0, 6.0, 2.0, 0.01, 6.0)
+    for step in range(PROOFS):
+        choice.note_answer(1, 6.0 + step, 2.0 + step, 0.01, 6.0 + step)
+    assert choice.candidates[1].is_proven
+
+
+def test_silence_counts_from_the_last_frame() -> None:
+    choice = LinkChoice(needs_proof=False)
+    first = choice.heard(0, 0.0, is_costly=False)
+    second = choice.heard(1, 0.0, is_costly=False)
+    choice.choose(0.0)
+    first.note_round_trip(0.05, 1.0)
+    second.heard_at = 1.0 + SILENT_S
+    assert choice.choose(1.0 + SILENT_S) is None
+    assert choice.choose(1.01 + SILENT_S) == "silent"
+    assert choice.used is second
+    assert math.isclose(choice.fresh_after, 1.0 - 0.025 + 0.05)
+
+
+def frame_of(sequence: int, at: float, value: int = 0) -> Frame:
+    encoder = FrameEncoder(1, 1)
+    encoder.sequence = sequence  # type: ignore[attr-defined]
+    raw = bytearray(encoder.encode(m.SystemTime(0, value)))
+    raw[4] = sequence
+    return Frame.parse(bytes(raw), at)
+
+
+@given(st.lists(st.tuples(st.integers(0, 2), st.floats(0.0, 2.0)), max_size=6), st.integers(0, 255))
+def test_of_copies_exactly_one_is_taken(rest: list[tuple[int, float]], sequence: int) -> None:
+    copies, seen = Copies(), set[int]()
+    taken = 0
+    for link, delay in sorted(rest, key=lambda each: each[1]):
+        if link in seen:
+            continue  # the same link again: another frame
+        seen.add(link)
+        if not copies.is_copy(frame_of(sequence, 10.0 + delay), link):
+            taken += 1
+            copies.take()
+        else:
+            assert copies.was_taken
+    assert taken == (1 if seen else 0)
+
+
+def test_the_same_bytes_over_the_same_link_or_much_later_are_no_copy() -> None:
+    copies = Copies()
+    assert not copies.is_copy(frame_of(7, 0.0), 0)
+    assert not copies.is_copy(frame_of(7, 0.1), 0)
+    assert copies.is_copy(frame_of(7, 0.2), 1)
+    assert not copies.is_copy(frame_of(7, 4.0), 1)
+    for number in range(130):
+        assert not copies.is_copy(frame_of((8 + number) % 256, 4.1, number + 1), 0)
+    assert not copies.is_copy(frame_of(7, 4.2), 0), "its numbers have come round"
+
+
+def test_copies_are_bounded() -> None:
+    copies = Copies()
+    for number in range(20_000):
+        copies.is_copy(frame_of(number % 256, 0.0, number), 0)
+    assert len(copies._seen) <= 4096
