@@ -6,7 +6,7 @@ import os
 import socket
 import subprocess
 import tempfile
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,12 +15,12 @@ import pytest
 from vehicle_kinds import KINDS, Kind
 
 from aerokit import Vehicle, connect
-from aerokit.links import Link
-from aerokit.sim import SimulatedVehicle, open_simulator, simulated_link
+from aerokit.links import Link, create_link, memory_link_pair
+from aerokit.sim import SimulatedVehicle, SimulatorServer, open_simulator, simulated_link
 from aerokit.sim.kinds import simulated
 from aerokit.sim.patience import wait_longer
 
-__all__ = ["Choice", "connected", "ready", "served"]
+__all__ = ["Choice", "connected", "ready", "served", "served_on_two"]
 
 SPEEDUP_BINARY = 5.0
 LATENCY_S = 0.005
@@ -54,6 +54,11 @@ class Choice:
             )
         return [cls(vehicle, KINDS[name or "copter"], speedup or 1.0, False)]
 
+    @property
+    def is_binary(self) -> bool:
+        """Whether a firmware is started for each test."""
+        return Path(self.vehicle).is_file()
+
     def seconds(self, simulated_s: float) -> float:
         """As a deadline by our clock, with room for a busy machine."""
         return simulated_s / self.speedup + (0.0 if self.is_virtual else 20.0)
@@ -78,7 +83,23 @@ def served(choice: Choice) -> AbstractAsyncContextManager[str | Link]:
     """The vehicle runs; gives what to connect to."""
     if choice.vehicle == "sim":
         return _simulated(choice)
-    return _binary(choice) if Path(choice.vehicle).is_file() else _given(choice.vehicle)
+    return _binary(choice) if choice.is_binary else _given(choice.vehicle)
+
+
+@asynccontextmanager
+async def served_on_two(choice: Choice) -> AsyncIterator[list[Link]]:
+    """The vehicle runs, with two ports of its own; a vehicle at an address is skipped."""
+    if choice.vehicle == "sim":
+        ours, theirs = zip(*(memory_link_pair() for _ in range(2)), strict=True)
+        async with SimulatorServer(_patient(choice), theirs, speedup=choice.speedup):
+            yield list(ours)
+        return
+    if not choice.is_binary:
+        pytest.skip("one address is one link")
+    second = 14550 if not choice.kind.is_ardupilot else _free_port()
+    more = ["--serial1", f"udpclient:127.0.0.1:{second}"] if choice.kind.is_ardupilot else []
+    async with _binary(choice, more) as first:
+        yield [create_link(first), create_link(f"udpin:127.0.0.1:{second}")]
 
 
 @asynccontextmanager
@@ -105,14 +126,14 @@ def _patient(choice: Choice) -> SimulatedVehicle:
 
 
 @asynccontextmanager
-async def _binary(choice: Choice) -> AsyncIterator[str]:
+async def _binary(choice: Choice, more: Sequence[str] = ()) -> AsyncIterator[str]:
     """It is started in an empty directory, and ended afterwards."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         is_px4 = not choice.kind.is_ardupilot
         port = 14540 + min(INSTANCE, 9) if is_px4 else _free_port()
         command, environment = _px4(choice) if is_px4 else _ardupilot(choice, port, Path(folder))
         with subprocess.Popen(  # noqa: ASYNC220 - it takes milliseconds
-            command, cwd=folder, env=environment, stdin=subprocess.DEVNULL,
+            [*command, *more], cwd=folder, env=environment, stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
         ) as process:  # fmt: skip
             try:

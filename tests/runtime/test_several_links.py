@@ -13,6 +13,7 @@ from aerokit import events
 from aerokit import messages as m
 from aerokit.errors import AerokitError, LinkLost, LinkOpenError, LocalProtocolError
 from aerokit.links import FaultModel
+from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.missions import Mission, waypoint
 from aerokit.runtime.link_state import LinkState
 from aerokit.runtime.opening import open_connection
@@ -204,12 +205,42 @@ async def test_another_vehicle_with_the_same_id_is_never_believed() -> None:
             assert to_it == []
 
 
-async def test_transfers_go_on_over_the_next_link() -> None:
-    slow = FaultModel(delay_s=0.05, bandwidth=5760)
+async def test_a_component_behind_the_other_link_is_heard_and_reached_there() -> None:
+    """A camera on the second radio; the vehicle is spoken to over the first one."""
+    radios = Radios(2)
+    told, camera = Told(radios), FrameEncoder(1, 100)
+    async with over(radios, a_copter()) as connection, aerokit.connect(connection):
+        heard: list[m.Heartbeat] = []
+        connection.bus.attach(m.Heartbeat, heard.append)
+        await proven(connection, 1)
+        for _ in range(3):
+            radios.far[1].write(camera.encode(m.Heartbeat(30, 8, 0, 0, 4)))
+            await anyio.sleep(1)
+        assert len([each for each in heard if each.autopilot == 8]) == 3
+        told.messages.clear()
+        connection.send(m.CommandLong(1, 100, 512, 0, 259.0, 0, 0, 0, 0, 0, 0))
+        connection.send(m.CommandLong(1, 1, 512, 0, 148.0, 0, 0, 0, 0, 0, 0))
+        assert [index for index, _ in told.of(m.CommandLong)] == [1, 0]
+
+
+async def test_our_own_frames_that_are_passed_on_from_one_port_to_the_other_are_nobodys() -> None:
+    """As PX4 does with heartbeats of ground stations."""
+    radios = Radios(2)
+    async with over(radios, a_copter()) as connection, aerokit.connect(connection):
+        ours = FrameEncoder(connection.source_system, connection.source_component)
+        for _ in range(5):
+            radios.far[1].write(ours.encode(m.Heartbeat(6, 8, 0, 0, 4)))
+            await anyio.sleep(1)
+        assert connection.links is not None
+        assert all(each.systems == (1,) for each in connection.links.value)
+        assert (connection.source_system, connection.source_component) not in connection.heard
+
+
+async def test_transfers_go_on_over_the_next_link(vehicle: SimulatedVehicle) -> None:
+    slow = FaultModel(delay_s=0.1, bandwidth=30_000)
     radios = Radios(2, models=[slow, slow])
-    copter = a_copter()
     items = [waypoint(-35.36 + index * 1e-4, 149.16, altitude_relative_m=20.0) for index in range(150)]
-    async with over(radios, copter) as connection, aerokit.connect(connection) as flying:
+    async with over(radios, vehicle) as connection, aerokit.connect(connection) as flying:
         await flying.wait_ready()
         await proven(connection, 1)
         used = 0 if flying.connection.links.value[0].used_for else 1  # type: ignore[union-attr]
@@ -217,8 +248,20 @@ async def test_transfers_go_on_over_the_next_link() -> None:
             tasks.start_soon(flying.mission.upload, Mission(items))
             await anyio.sleep(1.0)
             radios.cut(used)
-        back = await flying.mission.download()
-        assert len(back.items) == 150
+        assert connection.links.value[1 - used].used_for, "the other one is used"  # type: ignore[union-attr]
+        radios.mend(used)
+        await anyio.sleep(5)
+        used = 1 - used
+        back: list[Mission] = []
+
+        async def download() -> None:
+            back.append(await flying.mission.download())
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(download)
+            await anyio.sleep(1.0)
+            radios.cut(used)
+        assert len(back[0].items) == 150
 
 
 async def test_what_waits_in_a_stalled_link_is_taken_back() -> None:

@@ -43,6 +43,13 @@ class Exchange(ABC, Generic[ResultT]):
     def expire(self, now: float) -> None:
         """The deadline has come: send again or give up. Not called once it is ``done``."""
 
+    def link_changed(self, now: float) -> None:
+        """The vehicle is spoken to over another link from now on, by another port of it.
+
+        Most exchanges send again what got no answer. One whose state the vehicle keeps for the port begins anew.
+        """
+        return
+
     def abort(self, error: Exception) -> None:
         """End at once with this error, unless the end was there before."""
         self._fail(error)

@@ -116,6 +116,11 @@ class MissionDownload(MissionExchange[Downloaded]):
                 self._ask(seq, now)
             self._wait_for_items(now)
 
+    def link_changed(self, now: float) -> None:
+        """PX4 gives items over the port that was asked for their number; what is there already is kept."""
+        if self._count is not None and not self.done:
+            self._ask_anew(now)
+
     # --------------------------------------------------------------------------------- answers
 
     def _take_count(self, message: MissionCount, now: float) -> None:
@@ -180,6 +185,9 @@ class MissionDownload(MissionExchange[Downloaded]):
             self._reject(MavMissionResult.ERROR)
             return
         self._restarts += 1
+        self._ask_anew(now)
+
+    def _ask_anew(self, now: float) -> None:
         self._forget_requests()
         self._count, self._attempt, self._heard_at = None, 1, now
         self._ask_list(now)

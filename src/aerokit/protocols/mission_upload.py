@@ -154,6 +154,12 @@ class MissionUpload(MissionExchange[UploadEnd]):
             self._send_window(now)
         self._wait(now)
 
+    def link_changed(self, now: float) -> None:
+        """PX4 takes items over the port that was told their number, and over no other one."""
+        if self._is_asked and not self._is_partial and not self.done:
+            self._reset()
+            self._announce(now)
+
     # ------------------------------------------------------------------------------- requests
 
     def _take_request(self, seq: int, now: float) -> None:

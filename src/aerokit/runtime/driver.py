@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+from functools import partial
 from typing import TYPE_CHECKING, Generic, TypeVar
 
 from aerokit.runtime.endings import raisable
+from aerokit.runtime.events import LinkChosen
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
@@ -29,6 +31,8 @@ async def run_exchange(connection: Connection, system_id: int, exchange: Exchang
         for message_type in exchange.expects
     ]
     detachments.append(connection.on_end(run.abort))
+    if connection.links is not None:
+        detachments.append(connection.bus.attach_event(LinkChosen, partial(run.link_chosen, system_id)))
     try:
         return await run.result()
     finally:
@@ -65,6 +69,12 @@ class ExchangeRun(Generic[ResultT]):
         try:
             self._exchange.receive(message, self._connection.now())
         finally:  # what a callback of the program raised is for the bus to report; the exchange goes on
+            self._after_step()
+
+    def link_chosen(self, system_id: int, event: LinkChosen) -> None:
+        """Of several links another one is used."""
+        if event.system_id == system_id and event.before is not None:
+            self._exchange.link_changed(self._connection.now())
             self._after_step()
 
     def abort(self, error: Exception) -> None:

@@ -10,13 +10,14 @@ import anyio
 
 from aerokit.links.several import LinkPeer
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavAutopilot
-from aerokit.runtime.cells import Source, StateCell
+from aerokit.mavlink.enums import MavAutopilot, MavComponent
 from aerokit.runtime.claims import boot_time_ms
 from aerokit.runtime.copies import Copies
-from aerokit.runtime.events import HeardTwice, LinkChosen, OneLinkChanged
+from aerokit.runtime.events import HeardTwice, LinkChosen
 from aerokit.runtime.link_choice import LinkChoice
-from aerokit.runtime.link_state import LinkState, LinkStatus
+from aerokit.runtime.link_questions import LinkQuestions
+from aerokit.runtime.link_state import LinkState
+from aerokit.runtime.link_states import LinkStates
 from aerokit.runtime.routes import EVERY_PEER, Routes
 
 if TYPE_CHECKING:
@@ -27,18 +28,16 @@ if TYPE_CHECKING:
     from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.message import Message
     from aerokit.mavlink.statistics import SourceStatistics
+    from aerokit.runtime.cells import StateCell
     from aerokit.runtime.connection import Connection
     from aerokit.runtime.link_choice import Candidate
+    from aerokit.runtime.link_state import LinkStatus
 
 __all__ = ["SeveralRoutes"]
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
 LOOK_S = 0.1
-ASK_S = 0.5
-ASK_COSTLY_S = 5.0
-STATUS_S = 1.0
-MOST_QUESTIONS = 256
 ANSWERS_WITHIN_S = 3.0
 """After a change what was asked over the former link is still answered over it."""
 LIVES_S = 10.0
@@ -78,6 +77,7 @@ class SeveralRoutes:
     def __init__(self, link: SeveralLinks, connection: Connection, *, may_move: bool) -> None:
         self._link, self._connection = link, connection
         self._count = len(link.names)
+        self._we = connection.source_system, connection.source_component
         self._routes = [
             Routes(
                 link, connection.bus.publish, connection.attached, connection.boot_clocks, may_move=may_move
@@ -90,12 +90,10 @@ class SeveralRoutes:
             tuple[int, int], dict[int, SourceStatistics]
         ] = {}  # of (system, link), by component
         self._copies = Copies()
-        self._questions: dict[int, tuple[int, int, float]] = {}  # ts1 → system, link, asked at
-        self._asked_at: dict[tuple[int, int], float] = {}
+        self._questions = LinkQuestions(self._count, connection.send_to_peer)
         self._doubts_told: set[tuple[int, int]] = set()
-        self._told_at = -math.inf
-        self._states = [LinkState.LOST] * self._count
-        self.status: StateCell[tuple[LinkStatus, ...]] = StateCell("links", connection.now, "frame")
+        self._states = LinkStates(link, self._choices, connection.now, connection.bus.publish)
+        self.status: StateCell[tuple[LinkStatus, ...]] = self._states.cell
         connection.bus.attach(m.Timesync, _ignore)
 
     # ------------------------------------------------------- as Routes, for the connection
@@ -159,7 +157,9 @@ class SeveralRoutes:
             if choice is None or choice.used is None:
                 return EVERY_PEER
             self._choose(system_id, choice, self._connection.now())
-            return self._routes[choice.used.link].peers_of(system_id, component_id)
+            return self._routes[self._link_to(choice, (system_id, component_id))].peers_of(
+                system_id, component_id
+            )
         if message is not None and message.ID in FOR_ALL:
             return EVERY_PEER
         return self._one_for_each_system()
@@ -167,13 +167,17 @@ class SeveralRoutes:
     # ---------------------------------------------------------------- what comes, and what of it is taken
 
     def is_copy(self, frame: Frame, peer: Peer) -> bool:
-        """Whether this frame has come over another link already, and was taken."""
+        """Whether this frame has come over another link already, and was taken; or is our own.
+
+        PX4 passes our heartbeats on from one of its ports to the others.
+        """
+        if frame.system_id == self._we[0] and frame.component_id == self._we[1]:
+            return True
         if not self._copies.is_copy(frame, _link(peer)):
             return False
         choice = self._choices.get(frame.system_id)
-        if choice is not None and boot_time_ms(
-            frame
-        ):  # a heartbeat is like another one, also of another vehicle
+        # A heartbeat is like another one, also of another vehicle.
+        if choice is not None and boot_time_ms(frame):
             for link in {_link(peer), -1 if choice.used is None else choice.used.link}:
                 if (candidate := choice.candidates.get(link)) is not None:
                     candidate.note_copy(frame.received_at)
@@ -232,7 +236,7 @@ class SeveralRoutes:
                 if not is_there:
                     candidate.is_stalled = False
                 self._choose(system_id, choice, now)
-        self._set_state(link, LinkState.CONNECTED if is_there else LinkState.LOST, now)
+        self._states.become(link, LinkState.CONNECTED if is_there else LinkState.LOST, now)
 
     def link_stalled(self, link: int, is_stalled: bool) -> None:
         """What is written to a link does not leave, or leaves again."""
@@ -257,7 +261,7 @@ class SeveralRoutes:
                 candidate.note_counts(received, lost, now)
                 self._ask(system_id, choice, candidate, now)
             self._choose(system_id, choice, now)
-        self._tell_states(now)
+        self._states.look(now)
 
     # ------------------------------------------------------------------------------------- inside
 
@@ -269,6 +273,15 @@ class SeveralRoutes:
                 del self._streams[next(iter(self._streams))]
             stream = self._streams[key] = _Stream(self._count)
         return stream
+
+    def _link_to(self, choice: LinkChoice, source: tuple[int, int]) -> int:
+        """The link in use, or, to a component that is not behind it, another one that leads to the same system."""
+        assert choice.used is not None
+        if not self._routes[choice.used.link].is_known(source):
+            for link, candidate in choice.candidates.items():
+                if choice.may_be_used(candidate) and self._routes[link].is_known(source):
+                    return link
+        return choice.used.link
 
     def _one_for_each_system(self) -> Collection[Peer]:
         peers: set[Peer] = set()
@@ -287,9 +300,7 @@ class SeveralRoutes:
         if reason is None or used is None:
             return
         if before is not None:
-            self._link.discard_unsent_of(
-                before.link
-            )  # it may not arrive after what is ordered over the other one
+            self._link.discard_unsent_of(before.link)  # it may not arrive after what is ordered now
             self._streams = {key: each for key, each in self._streams.items() if key & 0xFF != system_id}
             name, former = self._link.names[used.link], self._link.names[before.link]
             log = logger.info if reason in ("better", "cheaper") else logger.warning
@@ -305,46 +316,23 @@ class SeveralRoutes:
                 reason=reason,
             )
         )
-        self._told_at = -math.inf
+        self._states.tell(now)
 
     def _ask(self, system_id: int, choice: LinkChoice, candidate: Candidate, now: float) -> None:
-        """The vehicle's time, over each link to it."""
-        if not choice.needs_proof or not candidate.is_there or candidate.is_stalled:
-            return
-        is_idle = candidate.is_costly and candidate is not choice.used
-        is_new = not candidate.is_proven and not candidate.is_doubted
-        period = ASK_COSTLY_S if is_idle and not is_new else ASK_S
-        key = system_id, candidate.link
-        if now - self._asked_at.get(key, -math.inf) < period - LOOK_S / 2:
-            return
-        self._asked_at[key] = now
-        # Our time in nanoseconds, and in its last digits what nobody else asks.
-        number = int(now * 1e9) // 1000 * 1000 + (system_id * self._count + candidate.link) % 1000
-        if number <= 0 or number in self._questions:
-            return
-        if len(self._questions) >= MOST_QUESTIONS:
-            del self._questions[next(iter(self._questions))]
-        self._questions[number] = system_id, candidate.link, now
-        for peer in self._routes[candidate.link].peers_of(system_id, 1):
-            self._connection.send_to_peer(
-                m.Timesync(0, number, target_system=system_id, target_component=1), peer
-            )
+        if choice.needs_proof and candidate.is_there and not candidate.is_stalled:
+            for peer in self._routes[candidate.link].peers_of(system_id, MavComponent.AUTOPILOT1):
+                self._questions.ask(system_id, choice, candidate, peer, now)
 
     def _is_answer(self, frame: Frame, peer: Peer) -> bool:
         message = self._connection.bus.dialect.decode(frame)
-        if not isinstance(message, m.Timesync) or message.tc1 == 0:
+        if not isinstance(message, m.Timesync) or not self._questions.is_ours(message):
             return False
-        question = self._questions.get(message.ts1)
-        if question is None or question[:2] != (frame.system_id, _link(peer)):
-            return question is not None  # a copy of an answer over another link
-        del self._questions[message.ts1]
-        choice, now = self._choices[frame.system_id], frame.received_at
-        if _link(peer) not in choice.candidates:
-            return True
-        round_trip = max(0.0, now - question[2])
-        candidate = choice.candidates[_link(peer)]
-        choice.note_answer(_link(peer), now - round_trip / 2, message.tc1 / 1e9, round_trip, now)
-        self._tell_doubt(frame, candidate)
+        link, now = _link(peer), frame.received_at
+        round_trip_s = self._questions.round_trip_of(message, frame.system_id, link, now)
+        choice = self._choices.get(frame.system_id)
+        if round_trip_s is not None and choice is not None and link in choice.candidates:
+            choice.note_answer(link, now - round_trip_s / 2, message.tc1 / 1e9, round_trip_s, now)
+            self._tell_doubt(frame, choice.candidates[link])
         return True
 
     def _tell_doubt(self, frame: Frame, candidate: Candidate) -> None:
@@ -359,42 +347,6 @@ class SeveralRoutes:
                 self._link.names[candidate.link],
             )
             self._connection.bus.publish(HeardTwice(frame.received_at, frame.system_id, frame.component_id))
-
-    def _tell_states(self, now: float) -> None:
-        for link in range(self._count):
-            candidates = [each.candidates[link] for each in self._choices.values() if link in each.candidates]
-            if candidates and self._link.is_there(link):
-                is_alive = any(each.is_alive(now) for each in candidates)
-                self._set_state(link, LinkState.CONNECTED if is_alive else LinkState.SILENT, now)
-        if now - self._told_at >= STATUS_S - LOOK_S / 2:
-            self._told_at = now
-            self.status.set(tuple(self._status(link) for link in range(self._count)), Source(0, 0, "link"))
-
-    def _set_state(self, link: int, state: LinkState, now: float) -> None:
-        before, self._states[link] = self._states[link], state
-        if before is not state:
-            self._told_at = -math.inf
-            self._connection.bus.publish(OneLinkChanged(now, 0, self._link.names[link], before, state))
-
-    def _status(self, link: int) -> LinkStatus:
-        candidates = {
-            system_id: choice.candidates[link]
-            for system_id, choice in self._choices.items()
-            if link in choice.candidates
-        }
-        losses = [each.loss for each in candidates.values() if each.loss is not None]
-        trips = [each.round_trip_s for each in candidates.values() if each.round_trip_s is not None]
-        return LinkStatus(
-            self._link.names[link],
-            self._states[link],
-            is_costly=link in self._link.costly,
-            systems=tuple(sorted(candidates)),
-            used_for=tuple(
-                sorted(each for each in candidates if self._choices[each].used is candidates[each])
-            ),
-            loss_percent=100 * max(losses) if losses else None,
-            round_trip_s=max(trips) if trips else None,
-        )
 
 
 _OF_FORMER = {"better": "worse", "cheaper": "costly"}

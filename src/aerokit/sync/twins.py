@@ -3667,9 +3667,10 @@ def open_connection(
 
     Args:
         address: a connection string (``"udpin:0.0.0.0:14550"``, ``"/dev/ttyACM0,57600"``, …) or a link not yet open; or
-            several of them, that lead to the same vehicles (docs/several-links.md): each frame is taken once, orders go
-            over the best link, and over the next one when it falls silent. ``?costly=1`` behind an address marks one
-            that is used when the others fail. A link that is lost is opened again, as long as another one is there.
+            several of them, that lead to the same vehicles (docs/how-to/several-links.md): each frame is taken once,
+            orders go over the best link, and over the next one when it falls silent. ``?costly=1`` behind an address
+            marks one that is used when the others fail. A link that is lost is opened again, as long as another one is
+            there.
         source_system: our own system id, 1–255; ground stations take 255.
         source_component: our own component id, 1–255. 0, which is nobody's, is allowed for programs that always were
             that (DroneKit).
@@ -3736,8 +3737,8 @@ def connect(
 
     Args:
         address: ``"udpin:0.0.0.0:14550"``, ``"tcp:127.0.0.1:5760"``, ``"/dev/ttyACM0,57600"``, a ``.tlog`` file …;
-            a link; several of these that lead to the vehicle (docs/several-links.md); or a connection that is open
-            already, for several vehicles on one link: what follows ``rates`` here is then said where it is opened.
+            a link; several of these that lead to the vehicle (docs/how-to/several-links.md); or a connection that is
+            open already, for several vehicles on one link: what follows ``rates`` here is then said where it is opened.
         system_id: the vehicle's MAVLink system id, 1–255; None takes the first autopilot that is heard.
         timeout: seconds to wait for its first heartbeat, above 0.
         rates: message class → Hz (above 0, at most 1000), asked for instead of the default rates; ``{}`` asks for

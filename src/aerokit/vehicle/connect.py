@@ -73,8 +73,8 @@ async def connect(
 
     Args:
         address: ``"udpin:0.0.0.0:14550"``, ``"tcp:127.0.0.1:5760"``, ``"/dev/ttyACM0,57600"``, a ``.tlog`` file …;
-            a link; several of these that lead to the vehicle (docs/several-links.md); or a connection that is open
-            already, for several vehicles on one link: what follows ``rates`` here is then said where it is opened.
+            a link; several of these that lead to the vehicle (docs/how-to/several-links.md); or a connection that is
+            open already, for several vehicles on one link: what follows ``rates`` here is then said where it is opened.
         system_id: the vehicle's MAVLink system id, 1–255; None takes the first autopilot that is heard.
         timeout: seconds to wait for its first heartbeat, above 0.
         rates: message class → Hz (above 0, at most 1000), asked for instead of the default rates; ``{}`` asks for
