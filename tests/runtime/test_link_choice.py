@@ -85,9 +85,9 @@ def test_a_reboot_takes_the_proof_away_and_the_same_clock_gives_it_back() -> Non
     for step in range(PROOFS + 1):
         for link in (0, 1):
             choice.note_answer(link, step, step + 70.0, 0.01, step)
-    assert choice.candidates[1].is_proven
-    choice.note_answer(0, 5.0, 1.0, 0.01, 5.0)
-    assert not choice.candidates[1].is_proven
+    second = choice.candidates[1]
+    before, _ = second.is_proven, choice.note_answer(0, 5.0, 1.0, 0.01, 5.0)
+    assert (before, second.is_proven) == (True, False)
     choice.note_answer(0, 6.0, 2.0, 0.01, 6.0)
     for step in range(PROOFS):
         choice.note_answer(1, 6.0 + step, 2.0 + step, 0.01, 6.0 + step)
@@ -109,7 +109,6 @@ def test_silence_counts_from_the_last_frame() -> None:
 
 def frame_of(sequence: int, at: float, value: int = 0) -> Frame:
     encoder = FrameEncoder(1, 1)
-    encoder.sequence = sequence  # type: ignore[attr-defined]
     raw = bytearray(encoder.encode(m.SystemTime(0, value)))
     raw[4] = sequence
     return Frame.parse(bytes(raw), at)

@@ -17,7 +17,7 @@ from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import Attitude, CommandLong, Heartbeat, SystemTime
 from aerokit.runtime.connection import Connection
 from aerokit.runtime.peers import MOST_PEERS, MOST_SENDERS, MOST_STRANGERS
-from aerokit.runtime.routes import MOST_CLAIMS, MOST_ROUTES
+from aerokit.runtime.routes import MOST_CLAIMS, MOST_ROUTES, Routes
 
 pytestmark = pytest.mark.anyio
 
@@ -213,7 +213,9 @@ async def test_claims_are_bounded(link: KeptPeers) -> None:
         for port in range(MOST_CLAIMS + 100):
             for component_id in (1, 2, 3):
                 link.hear(f"{port % 200}@stranger", (1, component_id), COPTER)
-        assert len(vehicle.connection._routes._claims) <= MOST_CLAIMS
+        routes = vehicle.connection._routes
+        assert isinstance(routes, Routes)
+        assert len(routes._claims) <= MOST_CLAIMS
 
 
 # ------------------------------------------------------------------------- taking a place

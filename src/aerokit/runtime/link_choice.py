@@ -22,6 +22,7 @@ QUIET_S = 2.5
 PROOFS = 3
 """So many times in a row must the clock be the same before a second link is believed to lead to the same vehicle."""
 PROVEN_BY_COPIES = 3
+"""So many frames must have come over it and over the link in use."""
 SHARED_S = 5.0
 """Links have carried the same frames within this time: what comes over either is of one stream."""
 ALIKE = 0.5
