@@ -86,8 +86,9 @@ def test_a_reboot_takes_the_proof_away_and_the_same_clock_gives_it_back() -> Non
         for link in (0, 1):
             choice.note_answer(link, step, step + 70.0, 0.01, step)
     second = choice.candidates[1]
-    before, _ = second.is_proven, choice.note_answer(0, 5.0, 1.0, 0.01, 5.0)
-    assert (before, second.is_proven) == (True, False)
+    proofs = [second.is_proven]
+    choice.note_answer(0, 5.0, 1.0, 0.01, 5.0)
+    assert [*proofs, second.is_proven] == [True, False]
     choice.note_answer(0, 6.0, 2.0, 0.01, 6.0)
     for step in range(PROOFS):
         choice.note_answer(1, 6.0 + step, 2.0 + step, 0.01, 6.0 + step)
