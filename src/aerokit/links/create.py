@@ -39,6 +39,8 @@ def create_link(address: str | LinkAddress, *, baud: int = 57600, peers: Peers |
         from .pty import PtyLink
 
         return PtyLink(where.path)
+    if where.kind in ("zenoh", "zenohin"):
+        return _zenoh(where)
     if where.kind in ("tcp", "tcpin"):
         return _tcp(where, peers)
     return _udp(where, peers)
@@ -51,6 +53,30 @@ def _tcp(where: LinkAddress, peers: Peers | None) -> Link:
         return TcpListen(where.host, where.port, peers=peers)
     timeout = float(where.option("timeout") or CONNECT_TIMEOUT_S)
     return TcpConnect(where.host, where.port, connect_timeout_s=timeout)
+
+
+def _zenoh(where: LinkAddress) -> Link:
+    from .zenoh_session import NetworkOptions
+
+    fleet, _, name = where.path.partition("/")
+    connect, listen = (
+        tuple(filter(None, (where.option(each) or "").split(","))) for each in ("connect", "listen")
+    )
+    options = NetworkOptions(connect, listen, where.option("mode") or "", where.option("config") or "")
+    if where.kind == "zenohin":
+        from .zenoh_listen import ZenohListen
+
+        return ZenohListen(fleet, name, options=options)
+    from .zenoh_connect import OPEN_TIMEOUT_S, ZenohConnect
+
+    return ZenohConnect(
+        fleet,
+        name,
+        options=options,
+        client=where.option("client") or "",
+        wish=where.option("helm") or "free",
+        open_timeout_s=float(where.option("timeout") or OPEN_TIMEOUT_S),
+    )
 
 
 def _udp(where: LinkAddress, peers: Peers | None) -> Link:

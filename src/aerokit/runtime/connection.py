@@ -33,6 +33,7 @@ from aerokit.runtime.events import (
     LinkRestored,
     LinkStalled,
     LoopBlocked,
+    OrderRefused,
     VehicleFound,
 )
 from aerokit.runtime.link_state import LinkState
@@ -414,6 +415,12 @@ class Connection:
     def link_drained(self, stalled_s: float) -> None:
         """It does again (called by the link)."""
         self.bus.publish(LinkDrained(self._clock(), 0, stalled_s))
+
+    def order_refused(self, message: str, reason: str, helm: str | None, answer: bytes) -> None:
+        """The other side of a network let no order of ours through (called by the link)."""
+        self.bus.publish(OrderRefused(self._clock(), 0, message, reason, helm))
+        if is_whole_frame(answer):  # past the framers: it is nobody's of those that they count
+            self.bus.deliver(Frame.parse(answer, self._clock()))
 
     def link_lost(self, error: LinkLost) -> None:
         """The link has gone (called by the link): whatever waits ends with this error."""

@@ -36,6 +36,7 @@ __all__ = [
     "MissionItemReached",
     "ModeChanged",
     "MoveRefused",
+    "OrderRefused",
     "ParameterChanged",
     "SettingChanged",
     "StatusTextReceived",
@@ -129,6 +130,18 @@ class FrameRefused(Event):
 
     component_id: int
     reason: str
+
+
+class OrderRefused(Event):
+    """What we sent did not go to the vehicle: the program that has it on the network refused it (docs/network.md).
+
+    ``message`` is the MAVLink message's name, ``reason`` a clause, ``helm`` who orders the vehicle, if that is why.
+    Told twice a second at most of messages of one name.
+    """
+
+    message: str
+    reason: str
+    helm: str | None
 
 
 class ModeChanged(Event):
