@@ -12,7 +12,9 @@ from aerokit.wording import did_you_mean
 
 __all__ = ["ACCEPTED_FORMS", "LinkAddress", "LinkKind", "host_and_port", "parse_address"]
 
-LinkKind = Literal["udpin", "udpout", "udpbcast", "tcp", "tcpin", "serial", "replay", "pty", "zenoh", "zenohin"]
+LinkKind = Literal[
+    "udpin", "udpout", "udpbcast", "tcp", "tcpin", "serial", "replay", "pty", "zenoh", "zenohin"
+]
 
 ACCEPTED_FORMS = """\
   127.0.0.1:14550  udp:0.0.0.0:14550  udpin:0.0.0.0:14550  udp://:14550   listen for UDP

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.message import Message
 
-__all__ = ["HELM_KEPT_S", "Gate", "Helm", "is_read"]
+__all__ = ["HELM_KEPT_S", "Gate", "Helm", "is_read", "is_refusal"]
 
 HELM_KEPT_S = 5.0
 """Who has not been heard for so long has the helm no more."""
@@ -73,6 +73,15 @@ def is_read(message: Message | None) -> bool:
         payload: bytes = getattr(fields, "payload", b"")
         return len(payload) > 3 and payload[3] in READ_FILES
     return message.NAME in READ_MESSAGES
+
+
+def is_refusal(answer: bytes) -> bool:
+    """Whether these bytes are one frame by which an order is refused, and nothing else."""
+    frames = Framer().receive(answer)
+    message = _decoded(frames[0]) if len(frames) == 1 else None
+    if isinstance(message, CommandAck):
+        return message.result == MavResult.TEMPORARILY_REJECTED
+    return isinstance(message, MissionAck) and message.type == MavMissionResult.DENIED
 
 
 class Helm:

@@ -18,6 +18,7 @@ from aerokit.errors import LinkOpenError, LocalProtocolError
 from .base import BaseLink
 from .freshness import Ears
 from .handover import Handover
+from .helm import is_refusal
 from .link import HelmListener, Peer
 from .zenoh_keys import WISHES, Beacon, Place, Told, Wish, check_name, read_sent_at
 from .zenoh_session import NetworkOptions, attachment_of, close_session, open_session, payload_of
@@ -101,7 +102,9 @@ class ZenohConnect(BaseLink):
         self._first_beacon.clear()
         self._handover = Handover(_call)
         with anyio.move_on_after(self._open_timeout_s):
-            self._session = await open_session(self.address, self._options, partial(self._declare, self._handover))
+            self._session = await open_session(
+                self.address, self._options, partial(self._declare, self._handover)
+            )
             self._released.clear()
             await self._first_beacon.wait()
             self._look_later()
@@ -178,7 +181,8 @@ class ZenohConnect(BaseLink):
             return
         self._drop(told.count)
         if isinstance(self._receiver, HelmListener):
-            self._receiver.order_refused(told.message, told.reason, told.helm, told.answer)
+            answer = told.answer if is_refusal(told.answer) else b""
+            self._receiver.order_refused(told.message, told.reason, told.helm, answer)
 
     def _hear_alive(self, key: str, is_alive: bool) -> None:
         (self._alive.add if is_alive else self._alive.discard)(key)
@@ -221,7 +225,9 @@ class ZenohConnect(BaseLink):
         names = sorted({key.split("/")[2] for key in self._alive})
         place = self._place
         if place.name in names:
-            return f"{place.name} is on the network, but nothing was heard of it for {self._open_timeout_s:g} s"
+            return (
+                f"{place.name} is on the network, but nothing was heard of it for {self._open_timeout_s:g} s"
+            )
         others = f" (there are: {', '.join(names)})" if names else " (nobody else either)"
         return f"nobody is called {place.name} in the fleet {place.fleet}{others}"
 
@@ -233,5 +239,3 @@ def _own_name() -> str:
 
 def _call(what: Callable[[], object]) -> object:
     return what()
-
-

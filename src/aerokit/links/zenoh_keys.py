@@ -185,7 +185,11 @@ class Told(Snapshot):
             return None
         count = fields.get("count")
         return cls(
-            str(message), str(reason), helm if isinstance(helm, str) else None, answer, count if _is_u32(count) else 1  # type: ignore[arg-type]
+            str(message),
+            str(reason),
+            helm if isinstance(helm, str) else None,
+            answer,
+            count if _is_u32(count) else 1,  # type: ignore[arg-type]
         )
 
 

@@ -106,7 +106,9 @@ class ZenohListen(BaseLink):
 
     async def _connect(self) -> None:
         self._handover = Handover(_call)
-        self._session = await open_session(self.address, self._options, partial(self._look_around, self._handover))
+        self._session = await open_session(
+            self.address, self._options, partial(self._look_around, self._handover)
+        )
         self._released.clear()
         if self._has_others:
             with anyio.move_on_after(_RIVAL_WAIT_S):
@@ -208,7 +210,9 @@ class ZenohListen(BaseLink):
             return
         self._rival.set()
         if self._is_serving:
-            logger.warning("%s: another program serves this name, too; clients stay with theirs", self.address)
+            logger.warning(
+                "%s: another program serves this name, too; clients stay with theirs", self.address
+            )
 
     # ---------------------------------------------------------------------------------- what goes out
 
