@@ -128,8 +128,7 @@ class Gate:
         self.refused = 0
         """Frames that did not pass."""
         self._client, self._helm = client, helm
-        self._framer = Framer()
-        self._framer.keep_unknown = True  # whoever has the helm may send what we do not know
+        self._framer = _framer()
         self._told: dict[str, tuple[float, int]] = {}  # message → when it was told, and how many came since
 
     def receive(self, data: bytes, wish: Wish, now: float) -> tuple[bytes, list[Told]]:
@@ -137,7 +136,10 @@ class Gate:
         self._helm.hear(self._client, now)
         passed: list[bytes] = []
         tell: list[Told] = []
-        for frame in self._framer.receive(data, now):
+        frames = self._framer.receive(data, now)
+        if self._framer.waiting:  # a datagram has whole frames: what is begun in one does not end in the next
+            self._framer = _framer()
+        for frame in frames:
             message = _decoded(frame)
             if is_read(message) or (wish != "never" and self._helm.may_order(self._client, now)):
                 passed.append(frame.raw)
@@ -152,10 +154,8 @@ class Gate:
 
         Without an answer: whoever waited for one may have given the same order again.
         """
-        framer = Framer()
-        framer.keep_unknown = True
         tell: list[Told] = []
-        for frame in framer.receive(data, now):
+        for frame in _framer().receive(data, now):
             message = _decoded(frame)
             if is_read(message):
                 self.refused += 1
@@ -184,6 +184,12 @@ class Gate:
             self._told.clear()
         self._told[name] = (now, 0)
         return [Told(name, reason, helm, answer, waiting + 1)]
+
+
+def _framer() -> Framer:
+    framer = Framer()
+    framer.keep_unknown = True  # whoever has the helm may send what we do not know
+    return framer
 
 
 def _decoded(frame: Frame) -> Message | None:

@@ -27,7 +27,7 @@ __all__ = ["MAX_CLIENTS", "ZenohListen"]
 MAX_CLIENTS = 64
 """Further clients are not listened to."""
 
-_SOONEST_S = 0.05
+_SOONEST_S = 0.02  # after the last beacon, whoever comes
 _RIVAL_WAIT_S = 2.5 * BEACON_EVERY_S
 
 logger: logging.Logger = logging.getLogger("aerokit")
@@ -195,8 +195,10 @@ class ZenohListen(BaseLink):
 
     def _greet(self, client: str) -> None:
         """It need not wait for the next beacon: it knows at once that we are there."""
-        if self._come(client) is not None and self._now() - self._beaten_at > _SOONEST_S:
-            self._beacon()
+        if self._come(client) is not None and self._timer is not None:
+            self._timer.cancel()
+            soon = max(0.0, self._beaten_at + _SOONEST_S - self._now())
+            self._timer = asyncio.get_running_loop().call_later(soon, self._beat)
 
     def _go(self, client: str) -> None:
         gate = self._clients.pop(client, None)
@@ -218,12 +220,9 @@ class ZenohListen(BaseLink):
 
     def _beat(self) -> None:
         """The beacon is what proves to clients that we are there, and to us that what they send is from now."""
-        self._beacon()
-        self._timer = asyncio.get_running_loop().call_later(BEACON_EVERY_S, self._beat)
-
-    def _beacon(self) -> None:
         self._beaten_at = now = self._now()
         self._put(self._place.beacon, self._judge.beacon(now, self._helm.holder(now)).encode(), b"")
+        self._timer = asyncio.get_running_loop().call_later(BEACON_EVERY_S, self._beat)
 
     def _tell(self, client: str, told: list[Told]) -> None:
         for each in told:

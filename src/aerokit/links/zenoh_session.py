@@ -139,6 +139,7 @@ def _settings(options: NetworkOptions) -> Iterable[tuple[str, object]]:
         yield "listen/endpoints", list(options.listen)
     if not options.config and not options.scouts:
         yield "scouting/multicast/enabled", False
+        yield "scouting/delay", 0  # nobody is waited for who would be found so
         if not options.listen:
             yield "listen/endpoints", []
 
