@@ -18,7 +18,7 @@ def test_keys() -> None:
     assert place.everybody == "aerokit/north/alpha/from/all"
     assert place.to_vehicle("ground") == "aerokit/north/alpha/to/ground"
     assert place.alive(255) == "aerokit/north/alpha/alive/000000ff"
-    assert place.state("position") == "aerokit/north/alpha/state/position"
+    assert place.state("1/position") == "aerokit/north/alpha/state/1/position"
 
 
 @pytest.mark.parametrize(

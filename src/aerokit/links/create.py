@@ -11,8 +11,9 @@ from .address import LinkAddress, parse_address
 if TYPE_CHECKING:
     from .allowed import Peers
     from .link import Link
+    from .zenoh_session import NetworkOptions
 
-__all__ = ["create_link"]
+__all__ = ["create_link", "network_options"]
 
 
 def create_link(address: str | LinkAddress, *, baud: int = 57600, peers: Peers | None = None) -> Link:
@@ -55,14 +56,19 @@ def _tcp(where: LinkAddress, peers: Peers | None) -> Link:
     return TcpConnect(where.host, where.port, connect_timeout_s=timeout)
 
 
-def _zenoh(where: LinkAddress) -> Link:
+def network_options(where: LinkAddress) -> NetworkOptions:
+    """How an address of a network says that a program is connected to it."""
     from .zenoh_session import NetworkOptions
 
-    fleet, _, name = where.path.partition("/")
     connect, listen = (
         tuple(filter(None, (where.option(each) or "").split(","))) for each in ("connect", "listen")
     )
-    options = NetworkOptions(connect, listen, where.option("mode") or "", where.option("config") or "")
+    return NetworkOptions(connect, listen, where.option("mode") or "", where.option("config") or "")
+
+
+def _zenoh(where: LinkAddress) -> Link:
+    fleet, _, name = where.path.partition("/")
+    options = network_options(where)
     if where.kind == "zenohin":
         from .zenoh_listen import ZenohListen
 

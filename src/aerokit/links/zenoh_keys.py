@@ -8,7 +8,7 @@ aerokit/FLEET/NAME/told/CLIENT   JSON: an order of this client was refused
 aerokit/FLEET/NAME/to/CLIENT     frames of one client to the vehicle side    who may order
 aerokit/FLEET/NAME/alive/EPOCH   liveliness token of a vehicle side
 aerokit/FLEET/NAME/client/CLIENT liveliness token of a client
-aerokit/FLEET/NAME/state/STATE   JSON: typed state, for programs in other languages
+aerokit/FLEET/NAME/state/1/STATE JSON: typed state of the vehicle with this system id, for programs in other languages
 ```
 
 Payloads of ``from`` and ``to`` are whole MAVLink frames; what is said of them stands in the attachment.
@@ -92,8 +92,8 @@ class Place(Snapshot):
         """The liveliness token of a client, or of any."""
         return f"{self.root}/client/{client}"
 
-    def state(self, name: str = "*") -> str:
-        """The JSON of one state, or of any."""
+    def state(self, name: str) -> str:
+        """The JSON of a state: "1/position"; "**" is any of any vehicle."""
         return f"{self.root}/state/{name}"
 
 
