@@ -9,18 +9,8 @@ from typing import Any
 
 import pytest
 from link_harness import Recorder, each_loop
-from zenoh_harness import (
-    VEHICLE_SIDE,
-    HoldingProxy,
-    Told,
-    client,
-    eventually,
-    free_port,
-    process,
-    reconnecting,
-    router,
-    serving,
-)
+from zenoh_harness import Told, client, reconnecting, serving
+from zenoh_network import VEHICLE_SIDE, HoldingProxy, eventually, free_port, process, router
 
 from aerokit.errors import BusyError, ConnectionClosed, LinkOpenError, LocalProtocolError
 from aerokit.links import create_link, zenoh_session
@@ -159,7 +149,7 @@ async def test_without_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
 
 async def test_orders_that_a_broken_connection_kept_back_are_refused() -> None:
     port = free_port()
-    async with serving(port) as (vehicle, heard), HoldingProxy(port) as line:
+    async with serving(port) as (vehicle, heard), HoldingProxy(port) as line:  # noqa: SIM117 - the line's port
         async with client(line.port, "&client=ground") as (link, told):
             link.write(before := frame())
             await heard.until_data(before)
@@ -273,26 +263,54 @@ async def test_two_programs_order_the_same_vehicle() -> None:
                 await eventually(lambda: told.refused[-1] == ("COMMAND_LONG", "three has the helm", "three"))
 
 
-async def test_who_may_see_and_who_may_order_is_the_routers_to_say() -> None:
-    """The example of docs/network.md."""
+async def test_who_may_see_and_who_may_order_is_the_routers_to_say(tmp_path: Path) -> None:
+    """The configuration of docs/network.md."""
     port = free_port()
     page = (Path(__file__).parents[2] / "docs" / "network.md").read_text(encoding="utf-8")
-    rules = page.split("```json5\n")[1].split("```")[0]
-    assert "access_control" in rules
-    body = rules[rules.index("access_control:") + len("access_control:") : rules.rindex("}")]
-    with router(port, body.strip().rstrip(",")):
-        async with serving(port, how="connect") as (vehicle, heard):
-            vehicle.write(b"x")
-            async with (
-                client(port, "&client=ground-1") as (pilot, _),
-                client(port, "&client=onlooker") as (eyes, seen),
-            ):
-                vehicle.write(b"telemetry")
-                await seen.until_data(b"telemetry")
-                eyes.write(frame())
-                pilot.write(order := frame())
-                await heard.until_data(order)
-                assert vehicle.helm == "ground-1"
+    users, files = tmp_path / "users.txt", {}
+    users.write_text("router:r\nalpha:a\nground-1:g\nonlooker:o\n")
+    config = page.split("```json5\n")[1].split("```")[0]
+    assert config.count("tcp/0.0.0.0:7447") == config.count("/etc/zenoh/users.txt") == 1
+    files["router"] = tmp_path / "router.json5"
+    files["router"].write_text(
+        config.replace("tcp/0.0.0.0:7447", f"tcp/127.0.0.1:{port}").replace(
+            "/etc/zenoh/users.txt", str(users)
+        )
+    )
+    for user, password in (("alpha", "a"), ("ground-1", "g"), ("onlooker", "o")):
+        files[user] = tmp_path / f"{user}.json5"
+        files[user].write_text(
+            f"""{{ mode: "client", connect: {{ endpoints: ["tcp/127.0.0.1:{port}"] }},
+            scouting: {{ multicast: {{ enabled: false }} }},
+            transport: {{ auth: {{ usrpwd: {{ user: "{user}", password: "{password}" }} }} }} }}"""
+        )
+    with router(port, str(files["router"])):
+        vehicle, heard = create_link(f"zenohin://north/alpha?config={files['alpha']}"), Recorder()
+        pilot, onlooker = (
+            create_link(f"zenoh://north/alpha?client={name}&config={files[name]}")
+            for name in ("ground-1", "onlooker")
+        )
+        liar = create_link(f"zenohin://north/beta?config={files['ground-1']}")
+        seen, told = Told(), Told()
+        opened = ((vehicle, heard), (pilot, told), (onlooker, seen), (liar, Recorder()))
+        for link, receiver in opened:
+            await link.open(receiver)
+        vehicle.write(b"telemetry")
+        for each in (seen, told):
+            await each.until_data(b"telemetry")
+        onlooker.write(frame())
+        liar.write(b"a vehicle that is none")
+        pilot.write(order := frame())
+        await heard.until_data(order)
+        assert heard.peers == ["ground-1"]
+        with pytest.raises(
+            LinkOpenError, match=r"nobody is called beta in the fleet north \(there are: alpha\)"
+        ):
+            await create_link(f"zenoh://north/beta?timeout=0.3&config={files['onlooker']}").open(Told())
+        for link, _ in opened:
+            link.close()
+        for link, _ in opened:
+            await link.wait_closed()
 
 
 # ------------------------------------------------------------------------------------ nothing is left
@@ -352,7 +370,12 @@ async def test_given_up_while_it_is_being_opened(after_s: float) -> None:
 async def test_a_slow_loop_costs_no_memory() -> None:
     taken: list[int] = []
     handover: Handover[int] = Handover(taken.append, most=100)
-    thread = threading.Thread(target=lambda: [handover.post(n) for n in range(10_000)])
+
+    def post() -> None:
+        for number in range(10_000):
+            handover.post(number)
+
+    thread = threading.Thread(target=post)
     thread.start()
     thread.join()  # the loop does not come round
     assert handover.dropped == 9_900

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import inspect
 import json
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +16,10 @@ import aerokit
 from aerokit.errors import ConnectionClosed, LocalProtocolError
 from aerokit.network import Publisher, publishing
 from aerokit.network.publishing import REPEAT_S
-from aerokit.network.schema import document, rendered
-from aerokit.sim import SimulatedCopter, SimulatedPlane, SimulatedVehicle, simulated_link
+from aerokit.network.schema import ENUMS, document, rendered
+from aerokit.sim import SimulatedCopter, SimulatedPlane, SimulatedPx4, SimulatedVehicle, simulated_link
 from aerokit.testing import run_virtual
+from aerokit.vehicle.state import states
 
 SCHEMA = document()
 KINDS: dict[str, Any] = {
@@ -88,8 +91,18 @@ def test_the_file_is_what_the_types_say() -> None:
     assert json.loads(rendered()) == SCHEMA
 
 
-@pytest.mark.parametrize("kind", [SimulatedCopter, SimulatedPlane])
-def test_what_a_flight_publishes_is_what_the_schema_says(kind: type[SimulatedVehicle]) -> None:
+def test_every_integer_with_names_is_known() -> None:
+    folder = Path(inspect.getfile(states)).parent
+    used = {
+        name
+        for path in folder.glob("*.py")
+        for name in re.findall(r"\bmember\((\w+)", path.read_text("utf-8"))
+    }
+    assert used - {"enum"} <= {each.__name__ for each in ENUMS.values()}
+
+
+@pytest.mark.parametrize("kind", [SimulatedCopter, SimulatedPlane, SimulatedPx4])
+def test_what_a_flight_publishes_is_what_the_schema_says(kind: Callable[[], SimulatedVehicle]) -> None:
     kept = Kept()
 
     async def main() -> None:
@@ -101,6 +114,7 @@ def test_what_a_flight_publishes_is_what_the_schema_says(kind: type[SimulatedVeh
             await vehicle.wait_ready()
             if kind is SimulatedCopter:
                 await vehicle.set_mode("GUIDED")
+            if kind is not SimulatedPlane:
                 await vehicle.arm()
                 await vehicle.take_off(5)
 
@@ -148,7 +162,7 @@ def test_arguments() -> None:
         async with simulated_link(SimulatedCopter()) as link, aerokit.connect(link) as vehicle:
             for wrong in ({"rate_hz": 0.0}, {"rate_hz": 51.0}, {"states": ["nonsense"]}):
                 with pytest.raises(LocalProtocolError, match=r"not allowed|is no state"):
-                    async with publishing(vehicle, Kept(), **wrong):  # type: ignore[arg-type]
+                    async with publishing(vehicle, Kept(), **wrong):
                         pass
             with pytest.raises(LocalProtocolError, match="it is not on a network"):
                 async with publishing(vehicle, "udpin:0.0.0.0:14550"):

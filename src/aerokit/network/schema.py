@@ -11,6 +11,7 @@ from datetime import date, datetime
 from enum import Enum, Flag
 from typing import Any
 
+from aerokit.mavlink import enums
 from aerokit.network.publishing import VERSION
 from aerokit.runtime.link_state import LinkState
 from aerokit.snapshot import Snapshot
@@ -33,6 +34,17 @@ _PLAIN: dict[Any, dict[str, Any]] = {
     date: {"type": "string", "format": "date"},
     type(None): {"type": "null"},
 }
+ENUMS: dict[str, type[Enum]] = {
+    "system_status": enums.MavState,
+    "vtol_state": enums.MavVtolState,
+    "landed_state": enums.MavLandedState,
+    "capabilities": enums.MavProtocolCapability,
+    "GpsReceiver.fix_type": enums.GpsFixType,
+    "Battery.charge_state": enums.MavBatteryChargeState,
+    "MissionProgress.state": enums.MissionState,
+    "Power.flags": enums.MavPowerStatus,
+}
+"""Integers that are published by their names in the standard (`aerokit.plain`), where the number has one."""
 
 
 def document() -> dict[str, Any]:
@@ -41,7 +53,9 @@ def document() -> dict[str, Any]:
     texts = documentation()
     hints = typing.get_type_hints(States)
     states = {
-        name: _message(name, texts[name][1], _schema_of(typing.get_args(hints[name])[0], values))
+        name: _message(
+            name, texts[name][1], _named(name) or _schema_of(typing.get_args(hints[name])[0], values)
+        )
         for name in texts
     }
     states["link"] = _message("link", "Whether frames of it come at all, and how many.", _LINK)
@@ -105,11 +119,17 @@ def _schema_of(kind: Any, values: dict[str, dict[str, Any]]) -> dict[str, Any]:
             values[kind.__name__] = {}  # of one that has itself inside
             values[kind.__name__] = _object(kind, values)
         return {"$ref": f"#/$defs/{kind.__name__}"}
-    if isinstance(kind, type) and issubclass(kind, Flag):
-        return {"anyOf": [{"type": "string"}, {"type": "array", "items": {"type": "string"}}]}
-    if isinstance(kind, type) and issubclass(kind, Enum):
-        return {"type": "string", "enum": [each.name for each in kind]}
     return dict(_PLAIN[kind])
+
+
+def _named(name: str) -> dict[str, Any] | None:
+    """Of an integer that has names: its name, or a list of those of its bits; the number where it has none."""
+    enum = ENUMS.get(name)
+    if enum is None:
+        return None
+    names = {"enum": [each.name for each in enum]}
+    several = [{"type": "array", "items": names}] if issubclass(enum, Flag) else []
+    return {"description": f"of {enum.__name__}", "anyOf": [names, *several, {"type": "integer"}]}
 
 
 def _object(kind: type[Snapshot], values: dict[str, dict[str, Any]]) -> dict[str, Any]:
@@ -121,7 +141,9 @@ def _object(kind: type[Snapshot], values: dict[str, dict[str, Any]]) -> dict[str
     return {
         "type": "object",
         "description": " ".join((inspect.getdoc(kind) or "").replace("`", "").split()),
-        "properties": {name: _schema_of(annotations[name], values) for name in names},
+        "properties": {
+            name: _named(f"{kind.__name__}.{name}") or _schema_of(annotations[name], values) for name in names
+        },
         "required": names,
     }
 
