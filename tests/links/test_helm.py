@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aerokit.links.helm import HELM_KEPT_S, READ_COMMANDS, Gate, Helm, is_read, is_refusal
+from aerokit.links.helm import HELM_KEPT_S, READ_COMMANDS, Gate, Helm, is_read, refusals_in
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavCmd
@@ -27,6 +27,7 @@ from aerokit.mavlink.messages import (
     ParamSet,
     SetMode,
     SetPositionTargetLocalNed,
+    Statustext,
 )
 from aerokit.vehicle.orders.order import CHANGED_BY_COMMAND, CHANGED_BY_MESSAGE, QUESTIONS
 
@@ -60,8 +61,12 @@ def send(message: Message, *, system: int = 255) -> bytes:
 
 
 def answer_of(data: bytes) -> Message:
-    (frame,) = Framer().receive(data)
-    assert (frame.system_id, frame.component_id) == (1, 1)
+    text, frame = Framer().receive(data)
+    assert (frame.system_id, frame.component_id) == (text.system_id, text.component_id) == (1, 1)
+    assert refusals_in(data) == (text.raw, frame.raw)
+    said = STANDARD.decode(text)
+    assert isinstance(said, Statustext)
+    assert said.text == "network: one has the helm"
     return STANDARD.decode(frame)
 
 
@@ -97,7 +102,6 @@ def test_who_orders_first_has_the_helm_and_the_other_is_told() -> None:
     answer = answer_of(told.answer)
     assert isinstance(answer, CommandAck)
     assert (answer.command, answer.result, answer.target_system) == (400, 1, 255)
-    assert is_refusal(told.answer)
     assert second.refused == 1
 
 
@@ -108,7 +112,6 @@ def test_a_plan_is_refused_by_an_answer_too() -> None:
     answer = answer_of(told.answer)
     assert isinstance(answer, MissionAck)
     assert (answer.type, answer.mission_type, answer.target_system) == (14, 1, 255)
-    assert is_refusal(told.answer)
 
 
 def test_the_helm_is_free_again_when_its_holder_is_silent_or_has_gone() -> None:
@@ -183,6 +186,8 @@ def test_a_client_without_the_helm_gets_only_reads_through(messages: list[Messag
         assert is_read(STANDARD.decode(frame))
 
 
-@pytest.mark.parametrize("answer", [b"", b"noise", send(HEARTBEAT), send(CommandAck(400, 0)), send(ARM)])
+@pytest.mark.parametrize(
+    "answer", [b"", b"noise", send(HEARTBEAT), send(CommandAck(400, 0)), send(Statustext(6, "hello"))]
+)
 def test_what_is_no_refusal_is_no_answer(answer: bytes) -> None:
-    assert not is_refusal(answer)
+    assert refusals_in(answer) == ()

@@ -168,7 +168,7 @@ async def test_orders_that_a_broken_connection_kept_back_are_refused() -> None:
             await eventually(lambda: vehicle.late_datagrams >= written - 1)
             assert heard.data == before  # not one of them
             await eventually(lambda: ("COMMAND_LONG", "it came too late", None) in told.refused)
-            assert set(told.answers) == {b""}
+            assert set(told.answers) == {()}
 
             def goes_through() -> bool:
                 link.write(frame())
@@ -242,7 +242,7 @@ async def test_two_programs_order_the_same_vehicle() -> None:
             two.write(read := frame(ParamRequestList(1, 1)))
             await eventually(lambda: len(told.refused) == 2)
             assert told.refused[0] == ("COMMAND_LONG", "one has the helm", "one")
-            assert len(told.answers[0]) > 10
+            assert len(told.answers[0]) == 2
             assert heard.data == read
             assert vehicle.refused_frames == 2 == two.dropped_writes
             one.close()

@@ -18,13 +18,13 @@ class Told(Recorder):
     def __init__(self) -> None:
         super().__init__()
         self.refused: list[tuple[str, str, str | None]] = []
-        self.answers: list[bytes] = []
+        self.answers: list[tuple[bytes, ...]] = []
         self.interruptions = 0
         self.restored = 0
 
-    def order_refused(self, message: str, reason: str, helm: str | None, answer: bytes) -> None:
+    def order_refused(self, message: str, reason: str, helm: str | None, answers: tuple[bytes, ...]) -> None:
         self.refused.append((message, reason, helm))
-        self.answers.append(answer)
+        self.answers.append(answers)
 
     def link_interrupted(self, error: Exception) -> None:
         self.interruptions += 1

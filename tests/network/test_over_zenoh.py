@@ -83,9 +83,10 @@ async def test_the_one_without_the_helm_is_told() -> None:
         await one.set_mode("GUIDED")
         with two.subscribe(events.OrderRefused, capacity=8) as refusals:
             began = asyncio.get_running_loop().time()
-            with pytest.raises(CommandRejected):
+            with pytest.raises(CommandRejected) as refused:
                 await two.arm(timeout=5)
-            assert asyncio.get_running_loop().time() - began < 1  # not a time-out
+            assert asyncio.get_running_loop().time() - began < 3  # reasons are waited for; not a time-out
+            assert "network: one has the helm" in refused.value.reasons
             refusal = await refusals.get(timeout=1)
             assert (refusal.message, refusal.reason, refusal.helm) == (
                 "COMMAND_LONG",

@@ -235,10 +235,10 @@ class _Ears:
         if not self._is_closed and isinstance(self._receiver, DrainListener):
             self._receiver.link_drained(stalled_s)
 
-    def order_refused(self, message: str, reason: str, helm: str | None, answer: bytes) -> None:
+    def order_refused(self, message: str, reason: str, helm: str | None, answers: tuple[bytes, ...]) -> None:
         """See `HelmListener`."""
         if not self._is_closed and isinstance(self._receiver, HelmListener):
-            self._receiver.order_refused(message, reason, helm, answer)
+            self._receiver.order_refused(message, reason, helm, answers)
 
     def close(self) -> None:
         self._is_closed = True

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
-from aerokit.mavlink.enums import MavCmd, MavFtpOpcode, MavMissionResult, MavResult
+from aerokit.mavlink.enums import MavCmd, MavFtpOpcode, MavMissionResult, MavResult, MavSeverity
 from aerokit.mavlink.framer import Framer
-from aerokit.mavlink.messages import CommandAck, MissionAck
+from aerokit.mavlink.messages import CommandAck, MissionAck, Statustext
 
 from .zenoh_keys import Told, Wish
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.message import Message
 
-__all__ = ["HELM_KEPT_S", "Gate", "Helm", "is_read", "is_refusal"]
+__all__ = ["HELM_KEPT_S", "Gate", "Helm", "is_read", "refusals_in"]
 
 HELM_KEPT_S = 5.0
 """Who has not been heard for so long has the helm no more."""
@@ -57,6 +57,8 @@ READ_FILES = frozenset(
 )  # fmt: skip
 """And these operations of MAVFTP."""
 
+_SAYS = "network: "
+_LONGEST_TEXT = 50
 _MOST_KINDS = 64
 COMMANDS = ("COMMAND_LONG", "COMMAND_INT")
 _PLANS = ("MISSION_COUNT", "MISSION_CLEAR_ALL", "MISSION_WRITE_PARTIAL_LIST")
@@ -75,12 +77,16 @@ def is_read(message: Message | None) -> bool:
     return message.NAME in READ_MESSAGES
 
 
-def is_refusal(answer: bytes) -> bool:
-    """Whether these bytes are one frame by which an order is refused, and nothing else."""
-    frames = Framer().receive(answer)
-    message = _decoded(frames[0]) if len(frames) == 1 else None
+def refusals_in(answer: bytes) -> tuple[bytes, ...]:
+    """The frames of an answer by which an order is refused; others have no business there."""
+    return tuple(frame.raw for frame in Framer().receive(answer) if _is_refusal(_decoded(frame)))
+
+
+def _is_refusal(message: Message | None) -> bool:
     if isinstance(message, CommandAck):
         return message.result == MavResult.TEMPORARILY_REJECTED
+    if isinstance(message, Statustext):
+        return message.text.startswith(_SAYS)
     return isinstance(message, MissionAck) and message.type == MavMissionResult.DENIED
 
 
@@ -175,7 +181,7 @@ class Gate:
     ) -> list[Told]:
         self.refused += 1
         name = f"message {frame.message_id}" if message is None else message.NAME
-        answer = b"" if message is None or is_late else _answer(frame, message)
+        answer = b"" if message is None or is_late else _answer(frame, message, reason)
         told_at, waiting = self._told.get(name, (-TELL_EVERY_S, 0))
         if not answer and now - told_at < TELL_EVERY_S:
             self._told[name] = (told_at, waiting + 1)
@@ -196,14 +202,12 @@ def _decoded(frame: Frame) -> Message | None:
     return None if STANDARD.get(frame.message_id) is None else STANDARD.decode(frame)
 
 
-def _answer(frame: Frame, message: Message) -> bytes:
-    """The frame by which a vehicle would refuse; empty where it has none, or the order is for all."""
+def _answer(frame: Frame, message: Message, reason: str) -> bytes:
+    """The frames by which a vehicle would refuse, with the reason; empty where it has none, or the order is for all."""
     fields: object = message
     system: int = getattr(fields, "target_system", 0)
     component: int = getattr(fields, "target_component", 0) or 1
-    if system == 0:
-        return b""
-    answer: Message
+    answer: Message | None = None
     if message.NAME in COMMANDS:
         command: int = getattr(fields, "command", 0)
         result = MavResult.TEMPORARILY_REJECTED
@@ -211,6 +215,8 @@ def _answer(frame: Frame, message: Message) -> bytes:
     elif message.NAME in _PLANS:
         kind: int = getattr(fields, "mission_type", 0)
         answer = MissionAck(frame.system_id, frame.component_id, MavMissionResult.DENIED, kind)
-    else:
+    if answer is None or system == 0:
         return b""
-    return FrameEncoder(system, component).encode(answer)
+    text = Statustext(MavSeverity.WARNING, f"{_SAYS}{reason}"[:_LONGEST_TEXT])
+    encoder = FrameEncoder(system, component)
+    return encoder.encode(text) + encoder.encode(answer)

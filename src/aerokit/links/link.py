@@ -43,10 +43,10 @@ class DrainListener(Receiver, Protocol):
 class HelmListener(Receiver, Protocol):
     """A receiver that wants to be told when the other side of a network refuses an order (docs/network.md)."""
 
-    def order_refused(self, message: str, reason: str, helm: str | None, answer: bytes) -> None:
+    def order_refused(self, message: str, reason: str, helm: str | None, answers: tuple[bytes, ...]) -> None:
         """A message of this name did not go to the vehicle; ``helm`` is who orders it, if that is why.
 
-        ``answer`` is a frame such as the vehicle would refuse it by, for whoever waits for one; empty: there is none.
+        ``answers`` are frames such as the vehicle would refuse it by, for whoever waits for them; not of every message.
         """
 
 

@@ -258,10 +258,10 @@ class _Ears:
         if listener := self._owner._listener_of(self):
             listener.link_drained(stalled_s)
 
-    def order_refused(self, message: str, reason: str, helm: str | None, answer: bytes) -> None:
+    def order_refused(self, message: str, reason: str, helm: str | None, answers: tuple[bytes, ...]) -> None:
         receiver = self._owner._receiver
         if self is self._owner._ears and isinstance(receiver, HelmListener):
-            receiver.order_refused(message, reason, helm, answer)
+            receiver.order_refused(message, reason, helm, answers)
 
     def link_lost(self, error: LinkLost) -> None:
         self.is_lost = True

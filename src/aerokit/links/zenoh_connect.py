@@ -18,7 +18,7 @@ from aerokit.errors import LinkOpenError, LocalProtocolError
 from .base import BaseLink
 from .freshness import Ears
 from .handover import Handover
-from .helm import is_refusal
+from .helm import refusals_in
 from .link import HelmListener, Peer
 from .zenoh_keys import WISHES, Beacon, Place, Told, Wish, check_name, read_sent_at
 from .zenoh_session import NetworkOptions, attachment_of, close_session, open_session, payload_of
@@ -181,8 +181,7 @@ class ZenohConnect(BaseLink):
             return
         self._drop(told.count)
         if isinstance(self._receiver, HelmListener):
-            answer = told.answer if is_refusal(told.answer) else b""
-            self._receiver.order_refused(told.message, told.reason, told.helm, answer)
+            self._receiver.order_refused(told.message, told.reason, told.helm, refusals_in(told.answer))
 
     def _hear_alive(self, key: str, is_alive: bool) -> None:
         (self._alive.add if is_alive else self._alive.discard)(key)

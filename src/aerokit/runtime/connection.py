@@ -416,10 +416,10 @@ class Connection:
         """It does again (called by the link)."""
         self.bus.publish(LinkDrained(self._clock(), 0, stalled_s))
 
-    def order_refused(self, message: str, reason: str, helm: str | None, answer: bytes) -> None:
+    def order_refused(self, message: str, reason: str, helm: str | None, answers: tuple[bytes, ...]) -> None:
         """The other side of a network let no order of ours through (called by the link)."""
         self.bus.publish(OrderRefused(self._clock(), 0, message, reason, helm))
-        if is_whole_frame(answer):  # past the framers: it is nobody's of those that they count
+        for answer in answers:  # past the framers: they are nobody's of those that they count
             self.bus.deliver(Frame.parse(answer, self._clock()))
 
     def link_lost(self, error: LinkLost) -> None:
