@@ -19,7 +19,7 @@ from aerokit.network import found, publishing
 from aerokit.sim import SimulatedCopter, open_simulator
 from aerokit.sim.patience import wait_longer
 
-pytest.importorskip("zenoh")
+zenoh: Any = pytest.importorskip("zenoh")
 pytestmark = pytest.mark.anyio
 
 SPEEDUP = 20.0
@@ -117,8 +117,6 @@ async def test_a_reconnecting_program_lives_through_a_partition() -> None:
 
 
 async def test_state_for_other_programs() -> None:
-    import zenoh
-
     port = free_port()
     endpoint = f"tcp/127.0.0.1:{port}"
     heard: dict[str, dict[str, Any]] = {}

@@ -37,16 +37,22 @@ _JSON = json.JSONEncoder(separators=(",", ":"), ensure_ascii=False, allow_nan=Fa
 
 
 class Publishing:
-    """States of one vehicle under way, while the block of :func:`publishing` lasts."""
+    """States of one vehicle on their way to a publisher: by the block of :func:`publishing`, or whenever asked.
 
-    def __init__(self, vehicle: Vehicle, publisher: Publisher, states: frozenset[str]) -> None:
+    Args:
+        vehicle: a vehicle that is connected.
+        publisher: where they go.
+        states: names; none: all.
+    """
+
+    def __init__(self, vehicle: Vehicle, publisher: Publisher, states: frozenset[str] = frozenset()) -> None:
         self.published = 0
         """Messages so far."""
         self._vehicle, self._publisher, self._states = vehicle, publisher, states
         self._told: dict[str, tuple[float, object]] = {}  # state → when it was put, and what
 
     def publish(self, now: float) -> None:
-        """Put what has changed since it was put last, and what was not put for `REPEAT_S`."""
+        """Put what has changed since it was put last, and what was not put for `REPEAT_S`; ``now`` in seconds."""
         for name, cell in self._vehicle.telemetry.cells.items():
             if cell.is_known and (not self._states or name in self._states):
                 self._publish(name, plain(cell.latest), cell.age, now)
