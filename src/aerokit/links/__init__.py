@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from .udp import UdpBroadcast, UdpConnect, UdpListen
     from .zenoh_connect import ZenohConnect
     from .zenoh_listen import ZenohListen
+    from .zenoh_session import NetworkOptions
 
 __all__ = [
     "ACCEPTED_FORMS",
@@ -37,6 +38,7 @@ __all__ = [
     "Link",
     "LinkAddress",
     "MemoryLink",
+    "NetworkOptions",
     "Peer",
     "PeerKeeper",
     "PtyLink",
@@ -67,6 +69,7 @@ _HOMES = {
     "Link": "aerokit.links.link",
     "LinkAddress": "aerokit.links.address",
     "MemoryLink": "aerokit.links.memory",
+    "NetworkOptions": "aerokit.links.zenoh_session",
     "Peer": "aerokit.links.link",
     "PeerKeeper": "aerokit.links.link",
     "PtyLink": "aerokit.links.pty",
