@@ -18,7 +18,6 @@ _TX = "transport/link/tx/queue"
 _SETTINGS = (
     # A message that is thrown away costs nobody a wait; without this, a put may keep the loop for a millisecond.
     (f"{_TX}/congestion_control/drop/wait_before_drop", 0),
-    (f"{_TX}/congestion_control/wait_before_drop", 0),  # its name in zenoh 1.0
     # Batches, of 64 KB at most: a burst of 1000 frames fits, a broken connection holds back no more than these.
     (f"{_TX}/size/data", 4),
     (f"{_TX}/size/real_time", 4),
