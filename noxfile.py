@@ -34,7 +34,9 @@ MEETS_OTHERS = (
 OF_EXTRAS = (
     "tests/convert",
     "tests/flights",
+    "tests/links/test_zenoh.py",
     "tests/monitor",
+    "tests/network",
     "tests/report",
     "tests/serve",
     "tests/viewers",

@@ -69,6 +69,7 @@ ROOMS = (
     Room("flights", "aerokit.flights", "Flight logs as what was flown", ("aerokit.flights",)),
     Room("report", "aerokit.report", "A flight as one HTML file", ("aerokit.report",)),
     Room("foxglove", "aerokit.foxglove", "Vehicles live in Foxglove", ("aerokit.foxglove",)),
+    Room("network", "aerokit.network", "State for other machines and languages", ("aerokit.network",)),
     Room("serve", "aerokit.serve", "A page and an API for vehicles", ("aerokit.serve",)),
     Room("monitor", "aerokit.monitor", "Vehicles in the terminal", ("aerokit.monitor.app",)),
 )  # fmt: skip

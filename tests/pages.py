@@ -46,6 +46,8 @@ ROOT = Path(__file__).parent.parent
 THE_RULE = "docs/how-to/index.md#how-to-read-the-code"
 """Where it is said that ``vehicle`` is connected."""
 ADDRESS = "udpin:0.0.0.0:14550"
+NETWORK = "zenoh://"
+"""What begins so leads there, too."""
 NOT_HERE = frozenset({
     "dronekit", "fastapi", "mavros_msgs", "mavsdk", "geographic_msgs", "geometry_msgs", "rclpy", "rospy",
     "sensor_msgs", "std_msgs", "std_srvs",
@@ -227,7 +229,8 @@ async def _run_in_a_loop(code: Sequence[Any], chain: Chain) -> None:
 async def _on_stage(main: Coroutine[Any, Any, Any], chain: Chain) -> Any:
     """Await what `ADDRESS` leads to simulated vehicles for; each time it is opened to a link of its own."""
     text = "\n".join(block.body for block in chain)
-    ends = [memory_link_pair() for _ in range(max(text.count(ADDRESS), 1) + wants_given_vehicle(chain))]
+    named = text.count(ADDRESS) + text.count(f'"{NETWORK}')
+    ends = [memory_link_pair() for _ in range(max(named, 1) + wants_given_vehicle(chain))]
     nears = iter([near for near, _ in ends])
     async with SimulatorServer(_vehicles_for(text), [far for _, far in ends]):
         with _address_is(lambda: next(nears)), _served_to_nobody():
@@ -258,7 +261,7 @@ def _address_is(make: Any) -> Iterator[None]:
         link: Link = make() if is_ours else opened(where, peers)
         return link
 
-    with patch.object(create, "_udp", udp):
+    with patch.object(create, "_udp", udp), patch.object(create, "_zenoh", lambda _: make()):
         yield
 
 

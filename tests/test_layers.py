@@ -21,7 +21,7 @@ FLOORS = [
     {"vehicle"},
     {"sync", "video", "flights"},
     {"dronekit"},
-    {"convert", "report", "serve", "foxglove", "monitor"},
+    {"convert", "report", "serve", "foxglove", "monitor", "network"},
     {"testing", "cli"},
 ]
 ROOMS = {

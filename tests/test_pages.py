@@ -7,7 +7,7 @@ from pathlib import Path
 import pages
 import pytest
 
-LANGUAGES = {"python", "sh", "text", "json", "yaml", "toml", "ini", "xml", "powershell", "mermaid"}
+LANGUAGES = {"python", "sh", "text", "json", "json5", "yaml", "toml", "ini", "xml", "powershell", "mermaid"}
 CHAINS = [
     pytest.param(chain, id=f"{chain[0].page.relative_to(pages.ROOT)}:{chain[0].line}".replace("/", "-"))
     for page in pages.pages()

@@ -1,4 +1,4 @@
-"""``aerokit bridge foxglove``: every vehicle on a link, live in the Foxglove viewer."""
+"""``aerokit bridge``: every vehicle on a link, live in the Foxglove viewer, or as JSON on a zenoh network."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from aerokit.cli.vehicle_command import ADDRESS_VARIABLE, default_address
 
 if TYPE_CHECKING:
     from aerokit.foxglove import FoxgloveBridge
+    from aerokit.runtime.connection import Connection
     from aerokit.vehicle.vehicle import Vehicle
 
 __all__ = ["add_arguments"]
@@ -26,13 +27,46 @@ __all__ = ["add_arguments"]
 def add_arguments(command: argparse.ArgumentParser) -> None:
     """The actions of the command, and their arguments."""
     actions = command.add_subparsers(required=True, metavar="ACTION", title="actions")
-    action = actions.add_parser(
+    foxglove = actions.add_parser(
         "foxglove",
         help="serve Foxglove's WebSocket protocol",
         description="Show every vehicle on a link to the Foxglove viewer, until Ctrl-C: position on the map, 3D frames,"
         " texts, and each state as a topic. What a viewer does reaches no vehicle.",
     )
-    action.set_defaults(run=_foxglove)
+    foxglove.set_defaults(run=_foxglove)
+    _add_place(foxglove)
+    foxglove.add_argument(
+        "--host", default="127.0.0.1", metavar="IP", help="listen here; 0.0.0.0: everywhere (127.0.0.1)"
+    )
+    foxglove.add_argument(
+        "--port", type=_port, default=8765, help="listen on this port; 0: a free one (8765)"
+    )
+    foxglove.add_argument(
+        "--messages",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="show these MAVLink messages as they come, too: 'GPS_*' (repeatable)",
+    )
+    _add_common(foxglove, 10.0)
+    zenoh = actions.add_parser(
+        "zenoh",
+        help="put states on a zenoh network, as JSON",
+        description="Put each state of every vehicle on a link on a zenoh network, as JSON for programs in any"
+        " language, until Ctrl-C (docs/network.md). What anybody does there reaches no vehicle.",
+    )
+    zenoh.set_defaults(run=_zenoh)
+    _add_place(zenoh)
+    zenoh.add_argument(
+        "network",
+        type=address,
+        metavar="NETWORK",
+        help="where the states go: zenoh://FLEET/NAME, zenoh://FLEET/NAME?connect=tcp/10.0.0.5:7447 …",
+    )
+    _add_common(zenoh, 5.0)
+
+
+def _add_place(action: argparse.ArgumentParser) -> None:
     place = action.add_argument(
         "address",
         nargs="?",
@@ -45,19 +79,15 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     action.add_argument(
         "--baud", type=int, default=57600, help="of a serial port whose address says none (57600)"
     )
+
+
+def _add_common(action: argparse.ArgumentParser, rate_hz: float) -> None:
     action.add_argument(
-        "--host", default="127.0.0.1", metavar="IP", help="listen here; 0.0.0.0: everywhere (127.0.0.1)"
-    )
-    action.add_argument("--port", type=_port, default=8765, help="listen on this port; 0: a free one (8765)")
-    action.add_argument(
-        "--rate", type=number(0.1, 100), default=10.0, metavar="HZ", help="of each topic at most (10)"
-    )
-    action.add_argument(
-        "--messages",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="show these MAVLink messages as they come, too: 'GPS_*' (repeatable)",
+        "--rate",
+        type=number(0.1, 50 if rate_hz < 10 else 100),
+        default=rate_hz,
+        metavar="HZ",
+        help=f"of each topic or state at most ({rate_hz:g})",
     )
     action.add_argument(
         "--listen-only",
@@ -100,19 +130,59 @@ async def _foxglove(options: argparse.Namespace) -> int:
             ) as bridge,
         ):
             _tell_serving(options, bridge)
-            ended: asyncio.Future[Exception] = asyncio.get_running_loop().create_future()
-            connection.on_end(ended.set_result)
-            stopped = asyncio.ensure_future(stop.wait())
-            waits: set[asyncio.Future[Any]] = {ended, stopped}
-            try:
-                await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
-            finally:
-                stopped.cancel()
-                with suppress(asyncio.CancelledError):
-                    await stopped
-            if ended.done():
-                connection.raise_if_ended()
+            await _until_end(connection, stop)
     return DONE
+
+
+async def _zenoh(options: argparse.Namespace) -> int:
+    need("zenoh", "zenoh")
+    from aerokit.network import Publishing, zenoh_publisher
+    from aerokit.runtime.opening import ONLOOKER, open_connection
+    from aerokit.vehicle.vehicles import vehicles_on
+
+    stop = asyncio.Event()
+    signing = signing_of(options)
+    with on_interrupt(stop.set):
+        async with (
+            open_connection(
+                options.address, source_system=ONLOOKER, baud=options.baud, signing=signing
+            ) as connection,
+            zenoh_publisher(options.network) as publisher,
+            vehicles_on(
+                connection,
+                rates={} if options.listen_only else None,
+                on_found=lambda vehicle: _tell_vehicle(options, vehicle),
+            ) as vehicles,
+        ):
+            where = {"network": options.network, "address": options.address}
+            text = f"listening to {options.address}\nputting states on {options.network}\nuntil Ctrl-C"
+            tell(options, "publishing", where, text)
+            published: dict[int, Publishing] = {}
+            while not stop.is_set():
+                connection.raise_if_ended()
+                for system_id, vehicle in vehicles.items():
+                    if system_id not in published:
+                        published[system_id] = Publishing(vehicle, publisher)
+                    published[system_id].publish(connection.now())
+                with suppress(asyncio.TimeoutError):
+                    await asyncio.wait_for(stop.wait(), 1 / options.rate)
+    return DONE
+
+
+async def _until_end(connection: Connection, stop: asyncio.Event) -> None:
+    """Until the connection ends, which is raised, or somebody stops it."""
+    ended: asyncio.Future[Exception] = asyncio.get_running_loop().create_future()
+    connection.on_end(ended.set_result)
+    stopped = asyncio.ensure_future(stop.wait())
+    waits: set[asyncio.Future[Any]] = {ended, stopped}
+    try:
+        await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        stopped.cancel()
+        with suppress(asyncio.CancelledError):
+            await stopped
+    if ended.done():
+        connection.raise_if_ended()
 
 
 def _tell_serving(options: argparse.Namespace, bridge: FoxgloveBridge) -> None:

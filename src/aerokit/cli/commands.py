@@ -92,7 +92,11 @@ COMMANDS = (
         " API, until interrupted. Orders need the token that is printed.",
     ),
     Command("gimbal", "gimbals of a vehicle", "Say where a vehicle's gimbal points, and point it."),
-    Command("bridge", "vehicles in viewers of others", "Show the vehicles on a link in a viewer: Foxglove."),
+    Command(
+        "bridge",
+        "vehicles for programs of others",
+        "Show the vehicles on a link in a viewer (Foxglove), or put their states on a network (zenoh).",
+    ),
     Command(
         "report",
         "what a flight log tells",

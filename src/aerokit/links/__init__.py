@@ -1,4 +1,4 @@
-"""Bytes in, bytes out: UDP, TCP, serial, memory, recordings, and a bad radio around any of them.
+"""Bytes in, bytes out: UDP, TCP, serial, zenoh, memory, recordings, and a bad radio around any of them.
 
 Only this package touches sockets and ports.
 """
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from .create import create_link
     from .fault_model import FaultModel
     from .faulty import FaultyLink
-    from .link import DrainListener, Link, Peer, PeerKeeper, Receiver
+    from .link import DrainListener, HelmListener, Link, Peer, PeerKeeper, Receiver
     from .memory import MemoryLink, memory_link_pair
     from .pty import PtyLink
     from .reconnecting import Interruptible, ReconnectingLink
@@ -25,17 +25,22 @@ if TYPE_CHECKING:
     from .several import LinkPeer, OneOfSeveralListener, SeveralLinks
     from .tcp import TcpConnect, TcpListen
     from .udp import UdpBroadcast, UdpConnect, UdpListen
+    from .zenoh_connect import ZenohConnect
+    from .zenoh_listen import ZenohListen
+    from .zenoh_session import NetworkOptions
 
 __all__ = [
     "ACCEPTED_FORMS",
     "DrainListener",
     "FaultModel",
     "FaultyLink",
+    "HelmListener",
     "Interruptible",
     "Link",
     "LinkAddress",
     "LinkPeer",
     "MemoryLink",
+    "NetworkOptions",
     "OneOfSeveralListener",
     "Peer",
     "PeerKeeper",
@@ -50,6 +55,8 @@ __all__ = [
     "UdpBroadcast",
     "UdpConnect",
     "UdpListen",
+    "ZenohConnect",
+    "ZenohListen",
     "create_link",
     "memory_link_pair",
     "parse_address",
@@ -61,12 +68,14 @@ _HOMES = {
     "DrainListener": "aerokit.links.link",
     "FaultModel": "aerokit.links.fault_model",
     "FaultyLink": "aerokit.links.faulty",
+    "HelmListener": "aerokit.links.link",
     "Interruptible": "aerokit.links.reconnecting",
     "Link": "aerokit.links.link",
     "LinkAddress": "aerokit.links.address",
     "LinkPeer": "aerokit.links.several",
     "MemoryLink": "aerokit.links.memory",
     "OneOfSeveralListener": "aerokit.links.several",
+    "NetworkOptions": "aerokit.links.zenoh_session",
     "Peer": "aerokit.links.link",
     "PeerKeeper": "aerokit.links.link",
     "PtyLink": "aerokit.links.pty",
@@ -80,6 +89,8 @@ _HOMES = {
     "UdpBroadcast": "aerokit.links.udp",
     "UdpConnect": "aerokit.links.udp",
     "UdpListen": "aerokit.links.udp",
+    "ZenohConnect": "aerokit.links.zenoh_connect",
+    "ZenohListen": "aerokit.links.zenoh_listen",
     "create_link": "aerokit.links.create",
     "memory_link_pair": "aerokit.links.memory",
     "parse_address": "aerokit.links.address",

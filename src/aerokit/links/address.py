@@ -12,7 +12,9 @@ from aerokit.wording import did_you_mean
 
 __all__ = ["ACCEPTED_FORMS", "LinkAddress", "LinkKind", "host_and_port", "parse_address"]
 
-LinkKind = Literal["udpin", "udpout", "udpbcast", "tcp", "tcpin", "serial", "replay", "pty"]
+LinkKind = Literal[
+    "udpin", "udpout", "udpbcast", "tcp", "tcpin", "serial", "replay", "pty", "zenoh", "zenohin"
+]
 
 ACCEPTED_FORMS = """\
   127.0.0.1:14550  udp:0.0.0.0:14550  udpin:0.0.0.0:14550  udp://:14550   listen for UDP
@@ -24,6 +26,8 @@ ACCEPTED_FORMS = """\
   serial:///dev/ttyUSB0:57600  serial://COM3:57600?rtscts=1               the same, with flow control
   flight.tlog  replay:flight.tlog?speed=2  file:///logs/flight.tlog       replay a recording
   pty  pty:/tmp/ttyV0                                                     a pseudo-terminal, and a name for it
+  zenoh://fleet/alpha  zenoh://fleet/alpha?connect=tcp/10.0.0.5:7447      what a zenoh network has of this name
+  zenohin://fleet/alpha?listen=tcp/0.0.0.0:7447                           put it there, for clients of zenoh:
   an IPv6 address stands in brackets: udpin:[::1]:14550"""
 """What an address may look like, for error messages and help texts."""
 
@@ -41,7 +45,10 @@ class LinkAddress(Snapshot):
     baud: int | None = None
     """Bits per second; None when the string does not say."""
     path: str = ""
-    """File of a recording; of a pseudo-terminal the symbolic link to its other end, "" for none."""
+    """File of a recording; of a pseudo-terminal the symbolic link to its other end, "" for none.
+
+    On a zenoh network fleet and name: "fleet/alpha".
+    """
     options: tuple[tuple[str, str], ...] = ()
     """The rest, sorted.
 
@@ -50,7 +57,8 @@ class LinkAddress(Snapshot):
     """
 
     def __str__(self) -> str:
-        query = "&".join(f"{key}={value}" for key, value in self.options)
+        as_written = _quote_option if self.kind in _ON_NETWORKS else str
+        query = "&".join(f"{key}={as_written(value)}" for key, value in self.options)
         return self._without_options() + (f"?{query}" if query else "")
 
     def option(self, name: str) -> str | None:
@@ -65,6 +73,8 @@ class LinkAddress(Snapshot):
             return f"replay:{'//' if self.path.startswith('//') else ''}{_quote(self.path)}"
         if self.kind == "pty":
             return f"pty:{self.path}" if self.path else "pty"
+        if self.kind in _ON_NETWORKS:
+            return f"{self.kind}://{self.path}"
         return f"{self.kind}:{host_and_port(self.host, self.port)}"
 
 
@@ -94,14 +104,21 @@ _SCHEMES: dict[str, LinkKind] = {
     "serial": "serial",
     "replay": "replay",
     "file": "replay",
+    "zenoh": "zenoh",
+    "zenohin": "zenohin",
 }
 _OPTIONS: dict[LinkKind, tuple[str, ...]] = {
     "tcp": ("timeout",),
     "serial": ("baud", "rtscts"),
     "replay": ("speed",),
+    "zenoh": ("connect", "listen", "mode", "config", "client", "helm", "timeout"),
+    "zenohin": ("connect", "listen", "mode", "config"),
 }
 _LISTENING = ("udpin", "tcpin")
 _NEVER_COSTLY = ("replay", "pty")
+_ON_NETWORKS = ("zenoh", "zenohin")
+_CHOICES = {"mode": ("peer", "client"), "helm": ("free", "take", "never")}
+_AS_IT_IS = ("connect", "listen", "config", "client")  # names and paths: in upper and lower case
 _NOT_HERE = ("uds", "unix", "mcast", "ws", "wss", "wsserver", "csv")  # pymavlink knows these
 _SCHEME = re.compile(r"([a-z][a-z0-9_+.-]+):(.*)", re.IGNORECASE | re.DOTALL)  # one letter is a drive
 _URL = re.compile(r"([a-z][a-z0-9_+.-]*)://(.*)", re.IGNORECASE | re.DOTALL)
@@ -162,6 +179,8 @@ class _Parser:
         if kind == "replay":
             drive = scheme == "file" and re.match(r"/[a-z]:[/\\]", rest, re.IGNORECASE)
             return self.replay(_unquote(rest[1:] if drive else rest), options)
+        if kind in _ON_NETWORKS:
+            return self.named(kind, rest.removesuffix("/"), options)
         return self.network(kind, rest.removesuffix("/"), options)
 
     def bare(self, text: str) -> LinkAddress:
@@ -204,6 +223,20 @@ class _Parser:
             kind, host=host, port=self.port(kind, tail), options=tuple(sorted(options.items()))
         )
 
+    def named(self, kind: LinkKind, text: str, options: dict[str, str]) -> LinkAddress:
+        from .zenoh_keys import check_name  # few addresses need it
+
+        fleet, slash, name = text.partition("/")
+        if not slash:
+            self.fail(f"the name of the vehicle is missing, as in {kind}://fleet/alpha")
+        try:
+            check_name("the fleet", fleet)
+            check_name("the name", name)
+            check_name("client", options.get("client", "c"))
+        except LocalProtocolError as error:
+            self.fail(str(error))
+        return LinkAddress(kind, path=f"{fleet}/{name}", options=tuple(sorted(options.items())))
+
     def port(self, kind: LinkKind, tail: str) -> int:
         if not tail.startswith(":") or tail == ":":
             self.fail("the port is missing" if tail in ("", ":") else f"{tail!r} follows the host, not :port")
@@ -244,7 +277,10 @@ class _Parser:
                 known = ", ".join(allowed) or "none"
                 meant = did_you_mean(key, allowed)
                 self.fail(f"{key!r} is not an option of {kind} links (they have: {known}){meant}")
-            found[key] = self.option_value(key, value.strip().lower())
+            if key in _AS_IT_IS:
+                found[key] = _unquote(value.strip()) or self.fail(f"{key}= is empty")
+            else:
+                found[key] = self.option_value(key, value.strip().lower())
         return {
             key: value
             for key, value in found.items()
@@ -253,6 +289,10 @@ class _Parser:
 
     def option_value(self, key: str, value: str) -> str:
         if key == "baud":
+            return value
+        if key in _CHOICES:
+            if value not in _CHOICES[key]:
+                self.fail(f"{key}={value} is none of {', '.join(_CHOICES[key])}")
             return value
         if key in ("rtscts", "costly"):
             if value not in _YES_AND_NO:
@@ -300,6 +340,10 @@ def _quote(text: str) -> str:
     from urllib.parse import quote
 
     return re.sub(r"[%?\s]", lambda match: quote(match[0], safe=""), text)
+
+
+def _quote_option(text: str) -> str:
+    return _quote(text).replace("&", "%26")
 
 
 def _unquote(text: str) -> str:

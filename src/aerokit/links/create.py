@@ -11,8 +11,9 @@ from .address import LinkAddress, parse_address
 if TYPE_CHECKING:
     from .allowed import Peers
     from .link import Link
+    from .zenoh_session import NetworkOptions
 
-__all__ = ["create_link"]
+__all__ = ["create_link", "network_options"]
 
 
 def create_link(address: str | LinkAddress, *, baud: int = 57600, peers: Peers | None = None) -> Link:
@@ -39,6 +40,8 @@ def create_link(address: str | LinkAddress, *, baud: int = 57600, peers: Peers |
         from .pty import PtyLink
 
         return PtyLink(where.path)
+    if where.kind in ("zenoh", "zenohin"):
+        return _zenoh(where)
     if where.kind in ("tcp", "tcpin"):
         return _tcp(where, peers)
     return _udp(where, peers)
@@ -51,6 +54,35 @@ def _tcp(where: LinkAddress, peers: Peers | None) -> Link:
         return TcpListen(where.host, where.port, peers=peers)
     timeout = float(where.option("timeout") or CONNECT_TIMEOUT_S)
     return TcpConnect(where.host, where.port, connect_timeout_s=timeout)
+
+
+def network_options(where: LinkAddress) -> NetworkOptions:
+    """How an address of a network says that a program is connected to it."""
+    from .zenoh_session import NetworkOptions
+
+    connect, listen = (
+        tuple(filter(None, (where.option(each) or "").split(","))) for each in ("connect", "listen")
+    )
+    return NetworkOptions(connect, listen, where.option("mode") or "", where.option("config") or "")
+
+
+def _zenoh(where: LinkAddress) -> Link:
+    fleet, _, name = where.path.partition("/")
+    options = network_options(where)
+    if where.kind == "zenohin":
+        from .zenoh_listen import ZenohListen
+
+        return ZenohListen(fleet, name, options=options)
+    from .zenoh_connect import OPEN_TIMEOUT_S, ZenohConnect
+
+    return ZenohConnect(
+        fleet,
+        name,
+        options=options,
+        client=where.option("client") or "",
+        wish=where.option("helm") or "free",
+        open_timeout_s=float(where.option("timeout") or OPEN_TIMEOUT_S),
+    )
 
 
 def _udp(where: LinkAddress, peers: Peers | None) -> Link:

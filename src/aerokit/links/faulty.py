@@ -22,7 +22,7 @@ from heapq import heappop, heappush
 from aerokit.errors import BusyError, ConnectionClosed, LinkLost
 
 from .fault_model import Air, FaultModel, FaultyPath
-from .link import LINGER_S, DrainListener, Link, Peer, Receiver, keeps_peers
+from .link import LINGER_S, DrainListener, HelmListener, Link, Peer, Receiver, keeps_peers
 from .stalled_line import StalledLine
 
 __all__ = ["FaultyLink"]
@@ -234,6 +234,11 @@ class _Ears:
         """See `DrainListener`."""
         if not self._is_closed and isinstance(self._receiver, DrainListener):
             self._receiver.link_drained(stalled_s)
+
+    def order_refused(self, message: str, reason: str, helm: str | None, answers: tuple[bytes, ...]) -> None:
+        """See `HelmListener`."""
+        if not self._is_closed and isinstance(self._receiver, HelmListener):
+            self._receiver.order_refused(message, reason, helm, answers)
 
     def close(self) -> None:
         self._is_closed = True

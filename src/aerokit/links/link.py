@@ -8,7 +8,7 @@ from typing import Protocol, runtime_checkable
 
 from aerokit.errors import LinkLost
 
-__all__ = ["DrainListener", "Link", "Peer", "PeerKeeper", "Receiver", "keeps_peers"]
+__all__ = ["DrainListener", "HelmListener", "Link", "Peer", "PeerKeeper", "Receiver", "keeps_peers"]
 
 Peer = Hashable
 """Who sent the bytes, to be handed back to `Link.write`; None where there is only one. Opaque."""
@@ -37,6 +37,17 @@ class DrainListener(Receiver, Protocol):
 
     def link_drained(self, stalled_s: float) -> None:
         """It goes on, after so many seconds."""
+
+
+@runtime_checkable
+class HelmListener(Receiver, Protocol):
+    """A receiver that wants to be told when the other side of a network refuses an order (docs/network.md)."""
+
+    def order_refused(self, message: str, reason: str, helm: str | None, answers: tuple[bytes, ...]) -> None:
+        """A message of this name did not go to the vehicle; ``helm`` is who orders it, if that is why.
+
+        ``answers`` are frames such as the vehicle would refuse it by, for whoever waits for them; not of every message.
+        """
 
 
 @runtime_checkable

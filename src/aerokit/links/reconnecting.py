@@ -17,7 +17,7 @@ from typing import Protocol, runtime_checkable
 
 from aerokit.errors import BusyError, ConnectionClosed, LinkLost, RecordingEnded
 
-from .link import DrainListener, Link, Peer, Receiver, keeps_peers
+from .link import DrainListener, HelmListener, Link, Peer, Receiver, keeps_peers
 
 __all__ = ["Interruptible", "ReconnectingLink"]
 
@@ -257,6 +257,11 @@ class _Ears:
     def link_drained(self, stalled_s: float) -> None:
         if listener := self._owner._listener_of(self):
             listener.link_drained(stalled_s)
+
+    def order_refused(self, message: str, reason: str, helm: str | None, answers: tuple[bytes, ...]) -> None:
+        receiver = self._owner._receiver
+        if self is self._owner._ears and isinstance(receiver, HelmListener):
+            receiver.order_refused(message, reason, helm, answers)
 
     def link_lost(self, error: LinkLost) -> None:
         self.is_lost = True

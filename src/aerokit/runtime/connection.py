@@ -33,6 +33,7 @@ from aerokit.runtime.events import (
     LinkRestored,
     LinkStalled,
     LoopBlocked,
+    OrderRefused,
     VehicleFound,
 )
 from aerokit.runtime.link_state import LinkState
@@ -455,6 +456,12 @@ class Connection:
         """What is written to one of several links does not leave, or does again (called by the link)."""
         if self._several is not None:
             self._several.link_stalled(link, is_stalled)
+
+    def order_refused(self, message: str, reason: str, helm: str | None, answers: tuple[bytes, ...]) -> None:
+        """The other side of a network let no order of ours through (called by the link)."""
+        self.bus.publish(OrderRefused(self._clock(), 0, message, reason, helm))
+        for answer in answers:  # past the framers: they are nobody's of those that they count
+            self.bus.deliver(Frame.parse(answer, self._clock()))
 
     def link_lost(self, error: LinkLost) -> None:
         """The link has gone (called by the link): whatever waits ends with this error."""

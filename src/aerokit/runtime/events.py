@@ -38,6 +38,7 @@ __all__ = [
     "ModeChanged",
     "MoveRefused",
     "OneLinkChanged",
+    "OrderRefused",
     "ParameterChanged",
     "SettingChanged",
     "StatusTextReceived",
@@ -131,6 +132,18 @@ class FrameRefused(Event):
 
     component_id: int
     reason: str
+
+
+class OrderRefused(Event):
+    """What we sent did not go to the vehicle: the program that has it on the network refused it (docs/network.md).
+
+    ``message`` is the MAVLink message's name, ``reason`` a clause, ``helm`` who orders the vehicle, if that is why.
+    Told twice a second at most of messages of one name.
+    """
+
+    message: str
+    reason: str
+    helm: str | None
 
 
 class ModeChanged(Event):

@@ -1,0 +1,222 @@
+"""Who may order the vehicle when several programs can reach it: one has the helm, the others are told.
+
+Sans-IO; time is an argument.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from aerokit.mavlink.dialect import STANDARD
+from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.enums import MavCmd, MavFtpOpcode, MavMissionResult, MavResult, MavSeverity
+from aerokit.mavlink.framer import Framer
+from aerokit.mavlink.messages import CommandAck, MissionAck, Statustext
+
+from .zenoh_keys import Told, Wish
+
+if TYPE_CHECKING:
+    from aerokit.mavlink.frame import Frame
+    from aerokit.mavlink.message import Message
+
+__all__ = ["HELM_KEPT_S", "Gate", "Helm", "is_read", "refusals_in"]
+
+HELM_KEPT_S = 5.0
+"""Who has not been heard for so long has the helm no more."""
+
+TELL_EVERY_S = 0.5
+"""A client is told so often of messages of one kind that were refused (set-points come 20 times a second)."""
+
+READ_MESSAGES = frozenset(
+    (
+        "HEARTBEAT", "SYSTEM_TIME", "TIMESYNC", "PING", "STATUSTEXT", "COMMAND_ACK", "MESSAGE_INTERVAL", "LOGGING_ACK",
+        "PARAM_REQUEST_READ", "PARAM_REQUEST_LIST", "PARAM_EXT_REQUEST_READ", "PARAM_EXT_REQUEST_LIST",
+        "MISSION_REQUEST", "MISSION_REQUEST_INT", "MISSION_REQUEST_LIST", "MISSION_REQUEST_PARTIAL_LIST", "MISSION_ACK",
+        "FENCE_FETCH_POINT", "RALLY_FETCH_POINT", "REQUEST_DATA_STREAM", "REQUEST_EVENT",
+        "LOG_REQUEST_LIST", "LOG_REQUEST_DATA", "LOG_REQUEST_END", "DEVICE_OP_READ",
+    )
+)  # fmt: skip
+"""What anybody may send: it asks, or says something of its sender, and changes nothing but streams."""
+
+READ_COMMANDS = frozenset(
+    (
+        MavCmd.REQUEST_MESSAGE, MavCmd.SET_MESSAGE_INTERVAL, MavCmd.GET_MESSAGE_INTERVAL, MavCmd.GET_HOME_POSITION,
+        MavCmd.REQUEST_PROTOCOL_VERSION, MavCmd.REQUEST_AUTOPILOT_CAPABILITIES, MavCmd.RUN_PREARM_CHECKS,
+        MavCmd.REQUEST_CAMERA_INFORMATION, MavCmd.REQUEST_CAMERA_SETTINGS, MavCmd.REQUEST_STORAGE_INFORMATION,
+        MavCmd.REQUEST_CAMERA_CAPTURE_STATUS, MavCmd.REQUEST_CAMERA_IMAGE_CAPTURE, MavCmd.REQUEST_FLIGHT_INFORMATION,
+        MavCmd.REQUEST_VIDEO_STREAM_INFORMATION, MavCmd.REQUEST_VIDEO_STREAM_STATUS,
+    )
+)  # fmt: skip
+"""So do these commands."""
+
+READ_FILES = frozenset(
+    (
+        MavFtpOpcode.NONE, MavFtpOpcode.TERMINATESESSION, MavFtpOpcode.RESETSESSION, MavFtpOpcode.LISTDIRECTORY,
+        MavFtpOpcode.OPENFILERO, MavFtpOpcode.READFILE, MavFtpOpcode.CALCFILECRC, MavFtpOpcode.BURSTREADFILE,
+    )
+)  # fmt: skip
+"""And these operations of MAVFTP."""
+
+_SAYS = "network: "
+_LONGEST_TEXT = 50
+_MOST_KINDS = 64
+COMMANDS = ("COMMAND_LONG", "COMMAND_INT")
+_PLANS = ("MISSION_COUNT", "MISSION_CLEAR_ALL", "MISSION_WRITE_PARTIAL_LIST")
+
+
+def is_read(message: Message | None) -> bool:
+    """Whether anybody may send it; what is not known (None: not of our dialect) is an order."""
+    if message is None:
+        return False
+    fields: object = message
+    if message.NAME in COMMANDS:
+        return getattr(fields, "command", 0) in READ_COMMANDS
+    if message.NAME == "FILE_TRANSFER_PROTOCOL":
+        payload: bytes = getattr(fields, "payload", b"")
+        return len(payload) > 3 and payload[3] in READ_FILES
+    return message.NAME in READ_MESSAGES
+
+
+def refusals_in(answer: bytes) -> tuple[bytes, ...]:
+    """The frames of an answer by which an order is refused; others have no business there."""
+    return tuple(frame.raw for frame in Framer().receive(answer) if _is_refusal(_decoded(frame)))
+
+
+def _is_refusal(message: Message | None) -> bool:
+    if isinstance(message, CommandAck):
+        return message.result == MavResult.TEMPORARILY_REJECTED
+    if isinstance(message, Statustext):
+        return message.text.startswith(_SAYS)
+    return isinstance(message, MissionAck) and message.type == MavMissionResult.DENIED
+
+
+class Helm:
+    """Which client may order. Whoever orders first has it while it is free, and keeps it while it is heard.
+
+    It is free again when its holder has gone, or was not heard for `HELM_KEPT_S`; who takes it has it at once.
+    """
+
+    def __init__(self) -> None:
+        self._holder: str | None = None
+        self._heard_at = 0.0
+
+    def holder(self, now: float) -> str | None:
+        """The client that has it; None: it is free."""
+        if self._holder is not None and now - self._heard_at > HELM_KEPT_S:
+            self._holder = None
+        return self._holder
+
+    def hear(self, client: str, now: float) -> None:
+        """A client is there: something from now came of it."""
+        if self.holder(now) == client:
+            self._heard_at = now
+
+    def may_order(self, client: str, now: float) -> bool:
+        """Whether this client has it; it has when it was free."""
+        if self.holder(now) is None:
+            self.take(client, now)
+        return self._holder == client
+
+    def take(self, client: str, now: float) -> None:
+        """Give it to this client, whoever has it."""
+        self._holder, self._heard_at = client, now
+
+    def leave(self, client: str) -> None:
+        """A client has gone, or wants it no more."""
+        if self._holder == client:
+            self._holder = None
+
+
+class Gate:
+    """What one client sends: whole frames that it may send pass, of the others it is told."""
+
+    def __init__(self, client: str, helm: Helm) -> None:
+        self.refused = 0
+        """Frames that did not pass."""
+        self._client, self._helm = client, helm
+        self._framer = _framer()
+        self._told: dict[str, tuple[float, int]] = {}  # message → when it was told, and how many came since
+
+    def receive(self, data: bytes, wish: Wish, now: float) -> tuple[bytes, list[Told]]:
+        """Take a datagram that is from now; return what passes, and what the client is to be told."""
+        self._helm.hear(self._client, now)
+        passed: list[bytes] = []
+        tell: list[Told] = []
+        frames = self._framer.receive(data, now)
+        if self._framer.waiting:  # a datagram has whole frames: what is begun in one does not end in the next
+            self._framer = _framer()
+        for frame in frames:
+            message = _decoded(frame)
+            if is_read(message) or (wish != "never" and self._helm.may_order(self._client, now)):
+                passed.append(frame.raw)
+                continue
+            holder = None if wish == "never" else self._helm.holder(now)
+            reason = "this link never orders (helm=never)" if holder is None else f"{holder} has the helm"
+            tell += self._refuse(frame, message, reason, holder, now)
+        return b"".join(passed), tell
+
+    def refuse_late(self, data: bytes, now: float) -> list[Told]:
+        """Take a datagram that is not from now: nothing of it passes; its orders are told.
+
+        Without an answer: whoever waited for one may have given the same order again.
+        """
+        tell: list[Told] = []
+        for frame in _framer().receive(data, now):
+            message = _decoded(frame)
+            if is_read(message):
+                self.refused += 1
+            else:
+                tell += self._refuse(frame, message, "it came too late", None, now, is_late=True)
+        return tell
+
+    def _refuse(
+        self,
+        frame: Frame,
+        message: Message | None,
+        reason: str,
+        helm: str | None,
+        now: float,
+        *,
+        is_late: bool = False,
+    ) -> list[Told]:
+        self.refused += 1
+        name = f"message {frame.message_id}" if message is None else message.NAME
+        answer = b"" if message is None or is_late else _answer(frame, message, reason)
+        told_at, waiting = self._told.get(name, (-TELL_EVERY_S, 0))
+        if not answer and now - told_at < TELL_EVERY_S:
+            self._told[name] = (told_at, waiting + 1)
+            return []
+        if len(self._told) >= _MOST_KINDS:
+            self._told.clear()
+        self._told[name] = (now, 0)
+        return [Told(name, reason, helm, answer, waiting + 1)]
+
+
+def _framer() -> Framer:
+    framer = Framer()
+    framer.keep_unknown = True  # whoever has the helm may send what we do not know
+    return framer
+
+
+def _decoded(frame: Frame) -> Message | None:
+    return None if STANDARD.get(frame.message_id) is None else STANDARD.decode(frame)
+
+
+def _answer(frame: Frame, message: Message, reason: str) -> bytes:
+    """The frames by which a vehicle would refuse, with the reason; empty where it has none, or the order is for all."""
+    fields: object = message
+    system: int = getattr(fields, "target_system", 0)
+    component: int = getattr(fields, "target_component", 0) or 1
+    answer: Message | None = None
+    if message.NAME in COMMANDS:
+        command: int = getattr(fields, "command", 0)
+        result = MavResult.TEMPORARILY_REJECTED
+        answer = CommandAck(command, result, 0, 0, frame.system_id, frame.component_id)
+    elif message.NAME in _PLANS:
+        kind: int = getattr(fields, "mission_type", 0)
+        answer = MissionAck(frame.system_id, frame.component_id, MavMissionResult.DENIED, kind)
+    if answer is None or system == 0:
+        return b""
+    text = Statustext(MavSeverity.WARNING, f"{_SAYS}{reason}"[:_LONGEST_TEXT])
+    encoder = FrameEncoder(system, component)
+    return encoder.encode(text) + encoder.encode(answer)

@@ -1,0 +1,152 @@
+"""Sessions of zenoh: made from an address's options, opened and closed without keeping the loop waiting."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+from collections.abc import Callable, Iterable
+from importlib import import_module
+from typing import Any
+
+from aerokit.errors import LinkOpenError, LocalProtocolError
+from aerokit.snapshot import Snapshot
+
+__all__ = ["NetworkOptions", "attachment_of", "close_session", "open_session", "payload_of", "zenoh_module"]
+
+_TX = "transport/link/tx/queue"
+_SETTINGS = (
+    # A message that is thrown away costs nobody a wait; without this, a put may keep the loop for a millisecond.
+    (f"{_TX}/congestion_control/drop/wait_before_drop", 0),
+    # Batches, of 64 KB at most: a burst of 1000 frames fits, a broken connection holds back no more than these.
+    (f"{_TX}/size/data", 4),
+    (f"{_TX}/size/real_time", 4),
+    ("transport/shared_memory/enabled", False),  # frames are small; a pool for large messages is 16 MB
+)
+
+
+class NetworkOptions(Snapshot):
+    """How a program is connected to a zenoh network; what is "" or None is as zenoh, or its file, has it."""
+
+    connect: tuple[str, ...] = ()
+    """Endpoints of routers and peers: "tcp/192.168.1.5:7447", "tls/…", "quic/…"."""
+    listen: tuple[str, ...] = ()
+    """Endpoints to listen on."""
+    mode: str = ""
+    """"peer" or "client"; "": a client where there is somebody to connect to and nothing to listen on, else a peer."""
+    config: str = ""
+    """A configuration file of zenoh's own (JSON5): TLS, access control, queues."""
+
+    @property
+    def scouts(self) -> bool:
+        """Whether it looks for others by multicast, unless the file says otherwise: when nobody is named."""
+        return not (self.connect or self.listen)
+
+
+def zenoh_module(address: str) -> Any:
+    """The module ``zenoh``; LinkOpenError with what to install when it is not there."""
+    try:
+        return import_module("zenoh")
+    except ModuleNotFoundError as error:
+        raise LinkOpenError(
+            f"cannot open {address}: this needs eclipse-zenoh, which is not installed:"
+            " pip install 'aerokit-mavlink[zenoh]'"
+        ) from error
+
+
+async def open_session(address: str, options: NetworkOptions, prepare: Callable[[Any, Any], object]) -> Any:
+    """Open a session; then ``prepare(zenoh, session)`` in the same thread, where declaring may take its time.
+
+    Raises:
+        LinkOpenError: zenoh is not installed, or could not open it.
+        LocalProtocolError: the configuration is wrong.
+    """
+    zenoh = zenoh_module(address)
+    config = _config(zenoh, address, options)
+
+    def work() -> Any:
+        session = zenoh.open(config)
+        try:
+            prepare(zenoh, session)
+        except BaseException:
+            session.close()
+            raise
+        return session
+
+    opening = asyncio.get_running_loop().run_in_executor(None, work)
+    try:
+        return await asyncio.shield(opening)
+    except asyncio.CancelledError:
+        opening.add_done_callback(_close_later)  # a thread cannot be stopped; what it opens is closed
+        raise
+    except zenoh.ZError as error:
+        raise LinkOpenError(f"cannot open {address}: {_reason(error)}") from error
+
+
+def close_session(session: Any, closed: Callable[[], object]) -> None:
+    """Close it in a thread of the loop's; ``closed()`` is called on the loop then."""
+
+    def work() -> None:
+        with contextlib.suppress(Exception):  # whatever it says, it is closed
+            session.close()
+
+    try:
+        future = asyncio.get_running_loop().run_in_executor(None, work)
+    except RuntimeError:  # the loop is closed, or on its way
+        work()
+        closed()
+    else:
+        future.add_done_callback(lambda _: closed())
+
+
+def payload_of(sample: Any) -> bytes:
+    """The bytes of a sample."""
+    return bytes(sample.payload.to_bytes())
+
+
+def attachment_of(sample: Any) -> bytes:
+    """The bytes of its attachment; empty when it has none."""
+    attachment = sample.attachment
+    return b"" if attachment is None else bytes(attachment.to_bytes())
+
+
+def _close_later(opening: asyncio.Future[Any]) -> None:
+    if not opening.cancelled() and opening.exception() is None:
+        close_session(opening.result(), _nothing)
+
+
+def _config(zenoh: Any, address: str, options: NetworkOptions) -> Any:
+    try:
+        config = zenoh.Config.from_file(options.config) if options.config else zenoh.Config()
+        for key, value in _settings(options):
+            config.insert_json5(key, json.dumps(value))
+    except zenoh.ZError as error:
+        raise LocalProtocolError(f"{address}: {_reason(error)}") from error
+    for key, value in _SETTINGS if not options.config else ():
+        with contextlib.suppress(zenoh.ZError):  # another version's
+            config.insert_json5(key, json.dumps(value))
+    return config
+
+
+def _settings(options: NetworkOptions) -> Iterable[tuple[str, object]]:
+    if options.mode or not options.config:
+        is_client = bool(options.connect) and not options.listen
+        yield "mode", options.mode or ("client" if is_client else "peer")
+    if options.connect:
+        yield "connect/endpoints", list(options.connect)
+    if options.listen:
+        yield "listen/endpoints", list(options.listen)
+    if not options.config and not options.scouts:
+        yield "scouting/multicast/enabled", False
+        yield "scouting/delay", 0  # nobody is waited for who would be found so
+        if not options.listen:
+            yield "listen/endpoints", []
+
+
+def _reason(error: Exception) -> str:
+    """Without the place in zenoh's source."""
+    return str(error).split(" at /", 1)[0].strip().rstrip("!.") or type(error).__name__
+
+
+def _nothing() -> None:
+    pass

@@ -1,0 +1,13 @@
+"""Vehicles for programs on other machines, in whatever language: typed state as JSON, and who is on a network.
+
+Frames, and with them the whole API, go over the addresses ``zenoh:`` and ``zenohin:``; see docs/network.md.
+"""
+
+from __future__ import annotations
+
+from aerokit.network.found import found
+from aerokit.network.publisher import Publisher
+from aerokit.network.publishing import Publishing, publishing
+from aerokit.network.zenoh_publisher import zenoh_publisher
+
+__all__ = ["Publisher", "Publishing", "found", "publishing", "zenoh_publisher"]

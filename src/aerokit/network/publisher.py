@@ -1,0 +1,15 @@
+"""``Publisher``: where typed state goes; zenoh, or whatever else takes a name and bytes."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+__all__ = ["Publisher"]
+
+
+class Publisher(ABC):
+    """Puts bytes under a name on some network: zenoh here, NATS or MQTT where a program brings a client of these."""
+
+    @abstractmethod
+    def put(self, name: str, data: bytes) -> None:
+        """Put ``data`` under ``name`` ("1/position"), at once or not at all: it must not block and not raise."""

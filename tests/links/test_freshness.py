@@ -1,0 +1,172 @@
+"""Nothing older than two seconds is ever accepted, whatever the network did with it and whatever clocks show."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterator
+from itertools import count
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from aerokit.links.freshness import BEACON_EVERY_S, FRESH_S, Ears, Judge, Lateness
+from aerokit.links.zenoh_keys import Beacon, Stamp
+
+Event = tuple[float, int, str, Any]
+
+clocks = st.tuples(
+    st.floats(-1e6, 1e6), st.sampled_from([1.0, 0.9999, 1.0001])
+)  # what it shows at 0, and its rate
+delays = st.one_of(st.floats(0, 0.5), st.floats(0, 20))
+
+
+class World:
+    """A vehicle side that sends beacons, a client that sends all the time, a network that does what it likes."""
+
+    def __init__(
+        self, vehicle: tuple[float, float], client: tuple[float, float], delays: Iterator[float]
+    ) -> None:
+        self.judge, self.ears = Judge(7), Ears(1)
+        self.vehicle_clock, self.client_clock = vehicle, client
+        self.delays = delays
+        self.events: list[Event] = []
+        self.order = count()
+        self.accepted: list[tuple[float, float]] = []  # sent, accepted: in true time
+        self.refused: list[tuple[float, float]] = []
+        self.unsent: list[float] = []
+
+    def at(self, when: float, kind: str, what: Any = None) -> None:
+        heapq.heappush(self.events, (when, next(self.order), kind, what))
+
+    def run(self, until: float) -> None:
+        for number in range(int(until / BEACON_EVERY_S)):
+            self.at(number * BEACON_EVERY_S, "beacon")
+        for number in range(int(until / 0.3)):
+            self.at(number * 0.3, "send", number)
+        while self.events:
+            now, _, kind, what = heapq.heappop(self.events)
+            (begun, rate), (begun_too, rate_too) = self.vehicle_clock, self.client_clock
+            vehicle, client = begun + rate * now, begun_too + rate_too * now
+            if kind == "beacon":
+                self.at(now + next(self.delays), "heard", self.judge.beacon(vehicle))
+            elif kind == "heard":
+                self.ears.hear_beacon(what, client)
+            elif kind == "send":
+                stamp = self.ears.stamp(client)
+                if stamp is None:
+                    self.unsent.append(now)
+                else:
+                    self.at(now + next(self.delays), "came", (now, stamp))
+            else:
+                sent, stamp = what
+                accepted = self.judge.accepts("ground", stamp, vehicle)
+                (self.accepted if accepted else self.refused).append((sent, now))
+
+
+@given(clocks, clocks, st.lists(delays, min_size=120, max_size=120))
+def test_what_is_accepted_was_sent_within_two_seconds(
+    vehicle: tuple[float, float], client: tuple[float, float], delays: list[float]
+) -> None:
+    world = World(vehicle, client, iter(delays))
+    world.run(15)
+    for sent, accepted in world.accepted:
+        assert accepted - sent <= FRESH_S * 1.001
+    times = [sent for sent, _ in world.accepted]
+    assert times == sorted(set(times))  # none twice, none behind a later one
+
+
+@given(clocks, clocks, st.lists(st.floats(0, 0.7), min_size=1, max_size=120))
+def test_on_a_network_that_works_everything_is_accepted(
+    vehicle: tuple[float, float], client: tuple[float, float], delays: list[float]
+) -> None:
+    steady = max(delays)  # in order
+    world = World(vehicle, client, iter([steady] * 200))
+    world.run(15)
+    assert world.refused == []
+    assert all(sent <= steady for sent in world.unsent)  # before the first beacon
+    assert len(world.accepted) + len(world.unsent) == 50
+
+
+def test_nothing_is_sent_into_silence_and_what_was_held_back_is_refused() -> None:
+    judge, ears = Judge(7), Ears(1)
+    assert ears.stamp(0.0) is None  # nobody was heard
+    assert ears.hear_beacon(judge.beacon(100.0), 0.0)
+    held = ears.stamp(1.9)
+    assert held is not None
+    assert ears.stamp(2.1) is None  # the beacon is too old by our own clock
+    assert not judge.accepts("ground", held, 102.1)
+    assert judge.late == 1
+    for _ in range(20):
+        beacon = judge.beacon(110.0)
+    assert not ears.hear_beacon(beacon, 20.0)  # ten seconds late: it was held back, too
+    assert ears.late == 1
+    assert ears.stamp(20.0) is None
+    assert ears.hear_beacon(judge.beacon(120.0), 20.0)
+    fresh = ears.stamp(20.1)
+    assert judge.accepts("ground", fresh, 120.1)
+    assert not judge.accepts("ground", fresh, 120.1)  # the same once more
+    assert judge.doubled == 1
+
+
+def test_another_vehicle_side_of_the_same_name() -> None:
+    first, second, ears = Judge(1), Judge(2), Ears(1)
+    assert ears.hear_beacon(first.beacon(0.0), 0.0)
+    assert not ears.hear_beacon(second.beacon(50.0), 0.1)  # the first one is there
+    assert not ears.hears(2, 50.0, 0.1)
+    assert ears.foreign == 2
+    stamp = ears.stamp(0.2)
+    assert first.accepts("ground", stamp, 0.2)
+    assert not second.accepts("ground", stamp, 50.2)
+    assert ears.hear_beacon(second.beacon(53.0), 3.0)  # the first one is silent: this is its successor
+    assert second.accepts("ground", ears.stamp(3.1), 53.1)
+    ears.forget()
+    assert ears.stamp(3.2) is None
+    assert ears.hear_beacon(first.beacon(3.3), 3.3)
+
+
+@pytest.mark.parametrize("stamp", [None, Stamp(8, 1, 1, 1), Stamp(7, 0, 1, 1), Stamp(7, 2, 1, 1)])
+def test_what_bears_no_stamp_of_ours_is_refused(stamp: Stamp | None) -> None:
+    judge = Judge(7)
+    judge.beacon(0.0)
+    assert not judge.accepts("ground", stamp, 0.1)
+    assert judge.late == 1
+    assert judge.accepts("ground", Stamp(7, 1, 1, 1), 0.1)
+
+
+def test_a_judge_remembers_so_many_clients() -> None:
+    judge = Judge(7)
+    judge.beacon(0.0)
+    for nonce in range(1000):
+        assert judge.accepts("ground", Stamp(7, 1, nonce, 1), 0.1)
+    assert len(judge._sequences) == 256
+
+
+@given(
+    clocks,
+    clocks,
+    st.lists(st.tuples(st.floats(0, 30), st.floats(0, 60)), min_size=1, max_size=40),
+)
+def test_lateness_is_never_more_than_the_delay(
+    theirs: tuple[float, float], ours: tuple[float, float], sent: list[tuple[float, float]]
+) -> None:
+    lateness = Lateness()
+    for delay, at in sorted(sent, key=lambda each: sum(each)):
+        now = at + delay
+        late = lateness.of(theirs[0] + theirs[1] * at, ours[0] + ours[1] * now)
+        assert 0 <= late <= delay + 0.02
+
+
+def test_lateness_after_a_quick_one() -> None:
+    lateness = Lateness()
+    assert lateness.of(1000.0, 5.0) == 0.0
+    assert lateness.of(1001.0, 9.0) == pytest.approx(3.0, abs=0.01)
+    assert lateness.of(1005.0, 9.9) == 0.0  # quicker still
+
+
+def test_a_beacon_that_was_overtaken_is_none() -> None:
+    ears = Ears(1)
+    assert ears.hear_beacon(Beacon(7, 2, 1.0), 1.0)
+    assert not ears.hear_beacon(Beacon(7, 1, 0.5), 1.1)
+    assert not ears.hear_beacon(Beacon(7, 2, 1.0), 1.2)

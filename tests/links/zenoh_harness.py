@@ -1,0 +1,78 @@
+"""Both sides of a name on a zenoh network, with receivers that keep all."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import AsyncIterator
+
+from link_harness import Recorder
+
+from aerokit.links import ReconnectingLink, ZenohConnect, ZenohListen, create_link
+
+__all__ = ["Told", "client", "reconnecting", "serving"]
+
+
+class Told(Recorder):
+    """A receiver that is told of refused orders, and of interruptions."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.refused: list[tuple[str, str, str | None]] = []
+        self.answers: list[tuple[bytes, ...]] = []
+        self.interruptions = 0
+        self.restored = 0
+
+    def order_refused(self, message: str, reason: str, helm: str | None, answers: tuple[bytes, ...]) -> None:
+        self.refused.append((message, reason, helm))
+        self.answers.append(answers)
+
+    def link_interrupted(self, error: Exception) -> None:
+        self.interruptions += 1
+
+    def link_restored(self, away_s: float) -> None:
+        self.restored += 1
+
+
+@contextlib.asynccontextmanager
+async def serving(
+    port: int, name: str = "alpha", how: str = "listen"
+) -> AsyncIterator[tuple[ZenohListen, Recorder]]:
+    """A vehicle side that listens on a port, or connects to it."""
+    link = create_link(f"zenohin://north/{name}?{how}=tcp/127.0.0.1:{port}")
+    assert isinstance(link, ZenohListen)
+    heard = Recorder()
+    await link.open(heard)
+    try:
+        yield link, heard
+    finally:
+        link.close()
+        await link.wait_closed()
+
+
+@contextlib.asynccontextmanager
+async def client(
+    port: int, more: str = "", *, name: str = "alpha"
+) -> AsyncIterator[tuple[ZenohConnect, Told]]:
+    """A client that connects to a port."""
+    link = create_link(f"zenoh://north/{name}?connect=tcp/127.0.0.1:{port}{more}")
+    assert isinstance(link, ZenohConnect)
+    answered = Told()
+    await link.open(answered)
+    try:
+        yield link, answered
+    finally:
+        link.close()
+        await link.wait_closed()
+
+
+@contextlib.asynccontextmanager
+async def reconnecting(port: int) -> AsyncIterator[tuple[ReconnectingLink, Told]]:
+    """The same, opened again when it is lost."""
+    address = f"zenoh://north/alpha?connect=tcp/127.0.0.1:{port}&timeout=1"
+    link, answered = ReconnectingLink(lambda: create_link(address), longest_delay_s=0.4), Told()
+    await link.open(answered)
+    try:
+        yield link, answered
+    finally:
+        link.close()
+        await link.wait_closed()

@@ -1,0 +1,62 @@
+"""``aerokit bridge zenoh``: states of every vehicle on a link, for whoever listens."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+from typing import Any
+
+import pytest
+from zenoh_network import eventually, free_port, router
+
+from aerokit.cli.main import make_parser
+from aerokit.sim import SimulatedCopter, SimulatedPlane, simulated_link
+
+zenoh: Any = pytest.importorskip("zenoh")
+pytestmark = pytest.mark.anyio
+
+
+@pytest.fixture
+def anyio_backend() -> str:
+    return "asyncio"
+
+
+async def test_states_of_all_vehicles_on_a_link(capsys: pytest.CaptureFixture[str]) -> None:
+    endpoint = f"tcp/127.0.0.1:{(port := free_port())}"
+    config = zenoh.Config()
+    for key, value in (
+        ("mode", "client"),
+        ("connect/endpoints", [endpoint]),
+        ("scouting/multicast/enabled", False),
+    ):
+        config.insert_json5(key, json.dumps(value))
+    heard: dict[str, Any] = {}
+
+    def hear(sample: Any) -> None:
+        heard[str(sample.key_expr)] = json.loads(sample.payload.to_bytes())["value"]
+
+    network = f"zenoh://north/box?connect={endpoint}"
+    arguments = ["bridge", "zenoh", "udpin:127.0.0.1:0", network, "--json", "--rate", "20"]
+    options = make_parser("bridge").parse_args(arguments)
+    vehicles = [SimulatedCopter(system_id=1), SimulatedPlane(system_id=2)]
+    with router(port):
+        listener = zenoh.open(config)
+        subscriber = listener.declare_subscriber("aerokit/north/box/state/**", hear)
+        async with simulated_link(vehicles) as options.address:
+            command = asyncio.get_running_loop().create_task(options.run(options))
+            keys = {f"aerokit/north/box/state/{n}/{name}" for n in (1, 2) for name in ("mode", "link")}
+            await eventually(lambda: keys <= heard.keys())
+            os.kill(os.getpid(), signal.SIGINT)
+            assert await command == 0
+        del subscriber
+        listener.close()
+    told = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [each["type"] for each in told] == ["publishing", "bridged_vehicle", "bridged_vehicle"]
+    assert told[0]["network"] == network
+
+
+def test_the_vehicles_address_may_be_left_out() -> None:
+    options = make_parser("bridge").parse_args(["bridge", "zenoh", "zenoh://north/box"])
+    assert (options.network, options.rate) == ("zenoh://north/box", 5.0)
