@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from .create import create_link
     from .fault_model import FaultModel
     from .faulty import FaultyLink
-    from .link import DrainListener, Link, Peer, PeerKeeper, Receiver
+    from .link import DrainListener, Link, Peer, PeerKeeper, PeerListener, Receiver
     from .memory import MemoryLink, memory_link_pair
     from .pty import PtyLink
     from .reconnecting import Interruptible, ReconnectingLink
@@ -36,6 +36,7 @@ __all__ = [
     "MemoryLink",
     "Peer",
     "PeerKeeper",
+    "PeerListener",
     "PtyLink",
     "Receiver",
     "ReconnectingLink",
@@ -63,6 +64,7 @@ _HOMES = {
     "MemoryLink": "aerokit.links.memory",
     "Peer": "aerokit.links.link",
     "PeerKeeper": "aerokit.links.link",
+    "PeerListener": "aerokit.links.link",
     "PtyLink": "aerokit.links.pty",
     "Receiver": "aerokit.links.link",
     "ReconnectingLink": "aerokit.links.reconnecting",
