@@ -236,16 +236,22 @@ class Attachment:
         if why not in self._told_refusals:
             self._told_refusals.add(why)
             source = f"{frame.system_id}/{frame.component_id}"
-            self._tell(self, "refused", f"a frame of {source} was refused: {why}; more such frames are only counted")
+            self._tell(
+                self, "refused", f"a frame of {source} was refused: {why}; more such frames are only counted"
+            )
 
     def _dropped(self, reason: str, held: Held) -> None:
         known = self._dialect.get(held.message_id)
         if known is None or kind_of(known.NAME, is_for_one=held.target[0] != 0) is not Kind.ORDER:
             return
         waited = self._now() - held.since
-        why = {"late": "it had waited too long", "queue_full": "too much was waiting"}.get(reason, "the link went")
+        why = {"late": "it had waited too long", "queue_full": "too much was waiting"}.get(
+            reason, "the link went"
+        )
         target = f"{held.target[0]}/{held.target[1]}"
-        self._tell(self, "order_dropped", f"{known.NAME} for {target} was dropped after {waited:.1f} s: {why}")
+        self._tell(
+            self, "order_dropped", f"{known.NAME} for {target} was dropped after {waited:.1f} s: {why}"
+        )
 
 
 def _counted(framer: Framer) -> tuple[int, int, int, int]:

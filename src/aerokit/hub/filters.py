@@ -42,7 +42,9 @@ class Filters:
                 self._check(field, pattern)
         for pattern, hz in self._rates.items():
             if not 0 < hz <= MOST_HZ:
-                raise LocalProtocolError(f"rates: {pattern} = {hz:g} Hz is not allowed: above 0, at most {MOST_HZ:g}")
+                raise LocalProtocolError(
+                    f"rates: {pattern} = {hz:g} Hz is not allowed: above 0, at most {MOST_HZ:g}"
+                )
 
     def period(self, message_id: int) -> float | None:
         """None: the message does not go out; 0: it does; else once in so many seconds at most."""

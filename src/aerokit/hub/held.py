@@ -33,7 +33,9 @@ class HeldFrames:
     """
 
     def __init__(self) -> None:
-        self._frames: dict[int, Held] = {}  # telemetry by sender and message, others by numbers below 0; in order
+        self._frames: dict[
+            int, Held
+        ] = {}  # telemetry by sender and message, others by numbers below 0; in order
         self._bytes = 0
         self._count = 0
         self._orders = 0
@@ -54,7 +56,9 @@ class HeldFrames:
             self._count -= 1
             key = self._count
         while self._is_full(len(held.raw)):
-            oldest = next((each for each, frame in self._frames.items() if frame.kind is Kind.TELEMETRY), None)
+            oldest = next(
+                (each for each, frame in self._frames.items() if frame.kind is Kind.TELEMETRY), None
+            )
             if oldest is None:
                 return [*dropped, ("queue_full", held)]
             dropped.append(("queue_full", self._take(oldest)))

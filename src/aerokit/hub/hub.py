@@ -51,14 +51,16 @@ class Hub:
         await asyncio.sleep(3600)
     ```
 
-    Each client of a listening endpoint is a place of its own to the routing. Links that are lost are opened again. An
-    endpoint that fails, stalls or is flooded harms no other one: what waits for it is bounded, newer telemetry takes the
-    place of older, and an order that has waited for a second is dropped instead of arriving late.
+    Each client of a listening endpoint is a place of its own to the routing. Links that are lost are opened again.
+    An endpoint that fails, stalls or is flooded harms no other one: what waits for it is bounded, newer telemetry
+    takes the place of older, and an order that has waited for a second is dropped instead of arriving late.
 
     A hub runs in the asyncio loop it was entered in, and is entered once.
     """
 
-    def __init__(self, endpoints: Iterable[str | Endpoint | Link] = (), *, dialect: Dialect = STANDARD) -> None:
+    def __init__(
+        self, endpoints: Iterable[str | Endpoint | Link] = (), *, dialect: Dialect = STANDARD
+    ) -> None:
         """Nothing is opened yet.
 
         Args:
@@ -132,7 +134,9 @@ class Hub:
         self._raise_unless_open()
         attachment = self._attachments.pop(name, None)
         if attachment is None:
-            raise LocalProtocolError(f"name = {name!r} is not allowed: {', '.join(self._attachments) or 'none'}")
+            raise LocalProtocolError(
+                f"name = {name!r} is not allowed: {', '.join(self._attachments) or 'none'}"
+            )
         attachment.close()
         self._tell(attachment, "removed", f"{name} was removed")
         await _closed([attachment])
@@ -184,7 +188,8 @@ class Hub:
     # ------------------------------------------------------------------------------------ inside
 
     async def _add(self, endpoint: Endpoint) -> Attachment:
-        assert self._switch is not None and self._background is not None
+        assert self._switch is not None
+        assert self._background is not None
         clock = asyncio.get_running_loop().time
         attachment = Attachment(endpoint, self._switch, self._dialect, clock, self._tell)
         if attachment.name in self._attachments:
@@ -240,11 +245,15 @@ class Hub:
 
     def _raise_unless_open(self) -> Switch:
         if self._switch is None or self._is_closed:
-            raise ConnectionClosed("the hub is closed" if self._is_closed else "enter the hub first: async with hub:")
+            raise ConnectionClosed(
+                "the hub is closed" if self._is_closed else "enter the hub first: async with hub:"
+            )
         return self._switch
 
     def _tell(self, attachment: Attachment, kind: HubEventKind, text: str) -> None:
-        logger.log(logging.INFO if kind in _QUIET_KINDS else logging.WARNING, "hub: %s: %s", attachment.name, text)
+        logger.log(
+            logging.INFO if kind in _QUIET_KINDS else logging.WARNING, "hub: %s: %s", attachment.name, text
+        )
         event = HubEvent(asyncio.get_running_loop().time(), attachment.name, kind, text)
         for listener in tuple(self._listeners):
             try:

@@ -1,7 +1,7 @@
 """``Router``: where a frame goes, by MAVLink's rules (https://mavlink.io/en/guide/routing.html).
 
-No link and no clock here: frames and ``now`` come in, plans go out. What is worked out for a message, its sender and its
-target is kept, so that a frame costs two look-ups; it is forgotten whenever somebody comes, goes or moves.
+No link and no clock here: frames and ``now`` come in, plans go out. What is worked out for a message, its sender and
+its target is kept, so that a frame costs a few look-ups; it is forgotten whenever somebody comes, goes or moves.
 """
 
 from __future__ import annotations
@@ -73,16 +73,16 @@ class Router(Generic[PortT]):
     """Learns behind which ports everybody is, and says where frames go.
 
     - what is for everybody goes to all other ports;
-    - what is for one component, or for all of one system, goes to the ports behind which it was heard, and nowhere while
-      it was not; what is for a component of a system that is known otherwise goes where the system is;
-    - to a vehicle that is heard at several ports it goes by one of them, so that no order is given twice: the first one,
-      until nothing has come from there for 3.5 s. Ground stations that share their ids all get it;
-    - nothing goes back to where it came from, and nothing is passed on twice: copies that come by another way, within two
-      seconds, end here, and teach nothing;
+    - what is for one component, or for all of one system, goes to the ports behind which it was heard, and nowhere
+      while it was not; what is for an unknown component of a known system goes where the system is;
+    - to a vehicle that is heard at several ports it goes by one of them, so that no order is given twice: the first
+      one, until nothing has come from there for 3.5 s. Ground stations that share their ids all get it;
+    - nothing goes back to where it came from, and nothing is passed on twice: copies that come by another way, within
+      two seconds, end here, and teach nothing;
     - SETUP_SIGNING, which holds a key, goes nowhere; a telemetry radio's word on its own link does not go to vehicles.
 
-    ``gate(port, message_id)`` says whether a port wants a message: None: no; 0: all of them; else one in so many seconds
-    of each sender, unless it has a target.
+    ``gate(port, message_id)`` says whether a port wants a message: None: no; 0: all of them; else one in so many
+    seconds of each sender, unless it has a target.
     """
 
     def __init__(self, targets: Targets, gate: Callable[[PortT, int], float | None]) -> None:

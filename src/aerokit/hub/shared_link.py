@@ -50,7 +50,7 @@ class SharedLink(Link):
         ]
 
     def write(self, data: bytes, peer: Peer = None) -> None:
-        """See `Link.write`: to the vehicles, signed if the connection signs; what is for this program does not go there."""
+        """See `Link.write`: to the vehicles, signed if the connection signs; not what is for this program."""
         if self._receiver is None:
             return
         for raw in _frames(data):

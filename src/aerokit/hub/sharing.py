@@ -20,9 +20,7 @@ __all__ = ["shared"]
 
 @checked
 @async_block
-async def shared(
-    connection: Connection, endpoints: Iterable[str | Endpoint | Link]
-) -> AsyncIterator[Hub]:
+async def shared(connection: Connection, endpoints: Iterable[str | Endpoint | Link]) -> AsyncIterator[Hub]:
     """Share an open connection with other programs for the time of the ``async with`` block; gives the hub that does.
 
     ``aerokit.connect(…, share=[…])`` does the same. See `Hub.share`.

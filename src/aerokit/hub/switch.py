@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from aerokit.hub.routing import Router
 from aerokit.hub.targets import Targets
+from aerokit.mavlink.frame import MAGIC_V2
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -89,17 +90,20 @@ class Switch:
         if node is None or port.is_mute:
             port.totals.dropped["read_only"] += len(frames)
             return
-        late, route, recording = framer.late, self.router.route, self.recording
+        late, route, recording, border = framer.late, self.router.route, self.recording, port.border
         is_written_soon = bool(self._dirty)
+        size = len(data) - 3
         for frame in frames:
-            if port.border is not None and (admitted := port.border.admitted(frame, self.unix_time())) is not frame:
+            is_late = bool(late) and frame in late
+            if border is not None:
+                admitted = border.admitted(frame, self.unix_time())
                 if admitted is None:
                     continue
-                plan, frame, raw = route(node, admitted, now, frame in late), admitted, admitted.raw  # noqa: PLW2901
-            else:
-                plan = route(node, frame, now, bool(late) and frame in late)
-                # Most datagrams are one frame: there is no need to put it together again.
-                raw = data if data[1:-2] == frame.body and data[0] == 0xFD else frame.raw
+                frame = admitted
+            plan = route(node, frame, now, is_late)
+            # Most datagrams are one frame: there is no need to put it together again.
+            body = frame.body
+            raw = data if len(body) == size and data[1:-2] == body and data[0] == MAGIC_V2 else frame.raw
             for out in plan.outs:
                 if batch := out.batch:
                     batch.append(raw)

@@ -55,7 +55,9 @@ class Endpoint(Snapshot):
         elif self.peers is not None:
             raise LocalProtocolError("peers = … is not allowed with a link: give them to the link")
         elif self.patient:
-            raise LocalProtocolError("patient = True is not allowed with a link, which can be opened once only")
+            raise LocalProtocolError(
+                "patient = True is not allowed with a link, which can be opened once only"
+            )
         for field in ("only", "block"):
             patterns = getattr(self, field)
             if isinstance(patterns, str) or not _are_texts(patterns):
@@ -110,7 +112,9 @@ class EndpointStatistics(Snapshot):
     """(system id, component id) of everybody who was heard here."""
 
 
-HubEventKind = Literal["opened", "lost", "restored", "removed", "stalled", "drained", "order_dropped", "refused", "mistake"]
+HubEventKind = Literal[
+    "opened", "lost", "restored", "removed", "stalled", "drained", "order_dropped", "refused", "mistake"
+]
 
 
 class HubEvent(Snapshot):
