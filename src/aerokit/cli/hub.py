@@ -18,7 +18,7 @@ from aerokit.cli.signing import ENVIRONMENT, add_signing_key, signing_of
 from aerokit.errors import LocalProtocolError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from aerokit.hub import Endpoint, EndpointStatistics, Hub, HubEvent
 
@@ -40,19 +40,13 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         " or by the address as it is written",
     )
     offer(place, addresses)
-    command.add_argument(
-        "--read-only", **_names("what comes from there is not passed on, not even heartbeats")
-    )
-    command.add_argument("--patient", **_names("begin without it when it cannot be opened, and go on trying"))
-    command.add_argument(
-        "--only",
-        **_filters(_messages, "only these messages go out, at one endpoint or, without @NAME, at all"),
-    )
-    command.add_argument("--block", **_filters(_messages, "these messages do not go out"))
-    command.add_argument(
-        "--rate", **_filters(_rate, "at most so many a second, of each sender: 'ATTITUDE=5@NAME'", "NAME=HZ")
-    )
-    command.add_argument("--signed", **_names("sign what goes out there, and let in only what is signed"))
+    _add_names(command, "--read-only", "what comes from there is not passed on, not even heartbeats")
+    _add_names(command, "--patient", "begin without it when it cannot be opened, and go on trying")
+    only = f"only these messages go out, at one endpoint or, without @NAME, at all: {_FILTER}"
+    _add_filter(command, "--only", _messages, only)
+    _add_filter(command, "--block", _messages, "these messages do not go out")
+    _add_filter(command, "--rate", _rate, "at most so many a second, of each sender: 'ATTITUDE=5@NAME'")
+    _add_names(command, "--signed", "sign what goes out there, and let in only what is signed")
     add_signing_key(command, f"for --signed (${ENVIRONMENT})")
     command.add_argument(
         "--baud", type=int, default=57600, help="of serial ports whose address says none (57600)"
@@ -70,18 +64,16 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     add_json(command)
 
 
-def _names(text: str) -> dict[str, object]:
-    return {"action": "append", "default": [], "metavar": "NAME", "help": f"{text} (repeatable)"}
+def _add_names(command: argparse.ArgumentParser, option: str, text: str) -> None:
+    command.add_argument(option, action="append", default=[], metavar="NAME", help=f"{text} (repeatable)")
 
 
-def _filters(read: object, text: str, metavar: str = _FILTER) -> dict[str, object]:
-    return {
-        "action": "append",
-        "default": [],
-        "type": read,
-        "metavar": metavar,
-        "help": f"{text} (repeatable)",
-    }
+def _add_filter(
+    command: argparse.ArgumentParser, option: str, read: Callable[[str], object], text: str
+) -> None:
+    command.add_argument(
+        option, action="append", default=[], type=read, metavar="FILTER", help=f"{text} (repeatable)"
+    )
 
 
 def _place(text: str) -> tuple[str, str]:
@@ -115,6 +107,12 @@ def _log_file(text: str) -> str:
     return writable_file(text)
 
 
+def _make_anew(path: str) -> None:
+    """Make the file now, so that nobody else's is replaced."""
+    with open(path, "xb"):
+        pass
+
+
 async def _hub(options: argparse.Namespace) -> int:
     from aerokit.hub import Hub
 
@@ -125,8 +123,7 @@ async def _hub(options: argparse.Namespace) -> int:
     with on_interrupt(stop.set):
         async with hub:
             if options.record is not None:
-                with open(options.record, "xb"):  # nobody else's is replaced
-                    pass
+                _make_anew(options.record)
                 hub.record(options.record)
             record = {"endpoints": [each.address for each in hub.endpoints], "file": options.record}
             tell(options, "hub", record, f"{len(endpoints)} endpoints, until Ctrl-C")
