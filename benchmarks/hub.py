@@ -25,7 +25,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import table
@@ -45,6 +45,8 @@ NAMES = (*(f"out_{count}" for count in OUTS), "latency_median", "latency_p99")
 PYTHON = os.environ.get("AEROKIT_MAVPROXY_PYTHON", sys.executable)
 MAVPROXY = Path(PYTHON).parent / "mavproxy.py"
 PIECE = 10
+SENT_HZ = 600
+WARM_UP = 600
 TICKS_S = 1 / os.sysconf("SC_CLK_TCK")
 HEARTBEAT = FrameEncoder(1, 1).encode(Heartbeat(2, 3, 81, 0, 3))
 
@@ -85,9 +87,7 @@ def _throughput(count: int, quick: bool) -> Row:
     for _ in range(1 if quick else 5):
         for name in figures:
             with _hub(name, count) as (process, sender, receivers):
-                figures[name].append(
-                    _frames_per_second(process, sender, receivers, frames, 600 if quick else 1500)
-                )
+                figures[name].append(_frames_per_second(process, sender, receivers, frames))
             print(
                 f"out_{count} {name}: {figures[name][-1]:.0f} frames per CPU-second",
                 file=sys.stderr,
@@ -98,31 +98,36 @@ def _throughput(count: int, quick: bool) -> Row:
 
 
 def _frames_per_second(
-    process: subprocess.Popen[bytes],
-    sender: socket.socket,
-    receivers: list[socket.socket],
-    frames: int,
-    hz: float,
+    process: subprocess.Popen[bytes], sender: socket.socket, receivers: list[socket.socket], frames: int
 ) -> float:
     """Frames for which there was a second of processor time; RuntimeError when some were lost."""
-    recorded = _recorded(frames)
+    recorded = _recorded(WARM_UP + frames)
     counts = [0] * len(receivers)
-    before, began = _cpu_s(process.pid), time.perf_counter()
-    for sent in range(0, frames, PIECE):
-        for number in range(sent, sent + PIECE):
-            sender.send(recorded[number])
-        while time.perf_counter() - began < (sent + PIECE) / hz:
-            _count(receivers, counts)
-            time.sleep(0.001)
-    for _ in range(100):  # what is under way
-        time.sleep(0.01)
-        _count(receivers, counts)
-        if min(counts) >= frames:
-            break
+    _send(recorded[:WARM_UP], sender, receivers, counts)
+    before, counts = _cpu_s(process.pid), [0] * len(receivers)
+    _send(recorded[WARM_UP:], sender, receivers, counts)
     used = _cpu_s(process.pid) - before
     if min(counts) < frames * 0.995:
         raise RuntimeError(f"{frames - min(counts)} of {frames} frames were lost: {process.args!r}")
     return frames / used
+
+
+def _send(
+    frames: Sequence[bytes], sender: socket.socket, receivers: list[socket.socket], counts: list[int]
+) -> None:
+    """Send frames in pieces, and count what comes, until all have come or nothing comes any more."""
+    began = time.perf_counter()
+    for sent in range(0, len(frames), PIECE):
+        for raw in frames[sent : sent + PIECE]:
+            sender.send(raw)
+        while time.perf_counter() - began < (sent + PIECE) / SENT_HZ:
+            _count(receivers, counts)
+            time.sleep(0.001)
+    for _ in range(100):
+        if min(counts) >= len(frames):
+            return
+        time.sleep(0.01)
+        _count(receivers, counts)
 
 
 def _recorded(count: int) -> list[bytes]:
@@ -235,10 +240,8 @@ def _wait_until_it_works(
     while silent:
         if time.monotonic() > until or process.poll() is not None:
             raise RuntimeError(f"nothing comes through {process.args!r}")
-        try:
+        with suppress(ConnectionRefusedError):
             sender.send(HEARTBEAT)
-        except ConnectionRefusedError:
-            pass
         time.sleep(0.1)
         for each in tuple(silent):
             try:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from aerokit.hub.target_table import STANDARD_OFFSETS
+from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.frame import HEADER_LENGTH
 from aerokit.mavlink.message import offset_of
 
@@ -24,12 +26,17 @@ _SYSTEM_FIELDS = {"MANUAL_CONTROL": "target"}  # the one message that calls it o
 
 
 class Targets:
-    """Where each message of a dialect says for whom it is; worked out when the first of its kind comes."""
+    """Where each message of a dialect says for whom it is; of other dialects than ours worked out when it is asked."""
 
     def __init__(self, dialect: Dialect) -> None:
         self._dialect = dialect
         self.places: dict[int, Places | None] = {}
-        """Message id → places; None: a message for everybody. What has not come yet is not in here."""
+        """Message id → places; None: a message for everybody. What was not asked for yet may not be in here."""
+        if dialect is STANDARD:
+            self.places.update(dict.fromkeys(dialect.rows))
+            for (system, component), message_ids in STANDARD_OFFSETS.items():
+                component = NOWHERE if component is None else HEADER_LENGTH + component
+                self.places.update(dict.fromkeys(message_ids, (HEADER_LENGTH + system, component)))
 
     def look_up(self, message_id: int) -> Places | None:
         """The places of a message; None for one that is for everybody, or that the dialect does not know."""
