@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from contextlib import AbstractAsyncContextManager
 from types import TracebackType
@@ -57,7 +58,7 @@ class Program(AbstractAsyncContextManager["Program"]):
     def say(self, *messages: Message) -> None:
         """Send them, each by itself."""
         for message in messages:
-            self.link.write(self.encoder.encode(message, 1.7e9))
+            self.link.write(self.encoder.encode(message, time.time()))
 
     @property
     def heard(self) -> list[str]:
