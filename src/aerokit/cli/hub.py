@@ -126,7 +126,12 @@ async def _hub(options: argparse.Namespace) -> int:
                 _make_anew(options.record)
                 hub.record(options.record)
             record = {"endpoints": [each.address for each in hub.endpoints], "file": options.record}
-            tell(options, "hub", record, f"{len(endpoints)} endpoints, until Ctrl-C")
+            tell(
+                options,
+                "hub",
+                record,
+                f"{len(endpoints)} endpoint{'s' if len(endpoints) > 1 else ''}, until Ctrl-C",
+            )
             with anyio.move_on_after(options.seconds):
                 while not stop.is_set():
                     with anyio.move_on_after(options.every):
