@@ -12,6 +12,7 @@ from typing import Any
 import anyio
 import pytest
 from hub_stage import COPTER, STATION, Program, SlowLink, settle
+from wrong_types import misuses
 
 import aerokit
 from aerokit import Signing, SigningKey
@@ -575,3 +576,22 @@ async def test_a_recording_that_cannot_be_written(tmp_path: Path) -> None:
 def test_the_names_of_the_package() -> None:
     assert aerokit.Hub is Hub
     assert aerokit.Endpoint is Endpoint
+
+
+@virtual
+async def test_arguments_of_wrong_types_are_refused() -> None:
+    async with Hub() as hub:
+        for wrong in (None, "pty", 5):
+            with pytest.raises(LocalProtocolError, match="connection = "):
+                await hub.share(wrong)  # type: ignore[arg-type]
+        for misuse in misuses(hub, leave_out=frozenset({"share"})):
+            error: BaseException | None = None
+            try:
+                result = misuse.call()
+                if asyncio.iscoroutine(result):
+                    await result
+            except LocalProtocolError as refusal:
+                error = refusal
+            assert error is not None, misuse
+            assert misuse.parameter in str(error) or "address" in str(error)
+        assert hub.endpoints == ()

@@ -33,9 +33,9 @@ def to(statistics: EndpointStatistics, scheme: str) -> Any:
 
 async def test_each_client_of_a_server_is_a_place_of_its_own() -> None:
     async with Hub([Endpoint("tcpin:127.0.0.1:0", name="tcp")]) as hub:
-        link = lambda: to(of(hub, "tcp"), "tcp")  # noqa: E731
-        async with Program(1, 1, link()) as copter, Program(255, 190, link()) as station:
-            async with Program(9, 9, link()) as silent:
+        links = [to(of(hub, "tcp"), "tcp") for _ in range(3)]
+        async with Program(1, 1, links[0]) as copter, Program(255, 190, links[1]) as station:
+            async with Program(9, 9, links[2]) as silent:
                 await until(lambda: of(hub, "tcp").peers == 3)
                 copter.say(COPTER)
                 await until(lambda: silent.heard and station.heard)
@@ -55,11 +55,11 @@ async def test_each_client_of_a_server_is_a_place_of_its_own() -> None:
 
 async def test_senders_of_datagrams_are_told_apart_and_noise_is_nobody() -> None:
     async with Hub([Endpoint("udpin:127.0.0.1:0", name="udp")]) as hub:
-        link = lambda: to(of(hub, "udp"), "udpout")  # noqa: E731
+        links = [to(of(hub, "udp"), "udpout") for _ in range(3)]
         async with (
-            Program(1, 1, link()) as copter,
-            Program(255, 190, link()) as station,
-            Program(9, 9, link()) as noisy,
+            Program(1, 1, links[0]) as copter,
+            Program(255, 190, links[1]) as station,
+            Program(9, 9, links[2]) as noisy,
         ):
             station.say(STATION)
             noisy.link.write(b"GET / HTTP/1.0\r\n\r\n")

@@ -125,7 +125,9 @@ def test_a_station_flies_and_the_program_sees_it() -> None:
             await station.wait_ready()
             await station.arm()
             await station.take_off(5)
-            await program.position.wait_until(lambda position: position.altitude_relative_m > 4, timeout=5)
+            await program.position.wait_until(
+                lambda position: (position.altitude_relative_m or 0) > 4, timeout=5
+            )
             await program.land()
             await station.armed.wait_until(lambda armed: not armed, timeout=60)
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     Tell = Callable[["Attachment", HubEventKind, str], object]
 
-__all__ = ["Attachment"]
+__all__ = ["Attachment", "check_filters"]
 
 MOST_PEERS = 256
 """So many of one endpoint are remembered; of datagrams the one not heard for longest is forgotten first."""
@@ -51,7 +51,7 @@ class Attachment:
         self, endpoint: Endpoint, switch: Switch, dialect: Dialect, now: Callable[[], float], tell: Tell
     ) -> None:
         self.endpoint = endpoint
-        self.filters = Filters(dialect, endpoint.only, endpoint.block, endpoint.rates)
+        self.filters = check_filters(endpoint, dialect)
         self._switch, self._dialect, self._now, self._tell = switch, dialect, now, tell
         address = endpoint.address
         if isinstance(address, str):
@@ -252,6 +252,11 @@ class Attachment:
         self._tell(
             self, "order_dropped", f"{known.NAME} for {target} was dropped after {waited:.1f} s: {why}"
         )
+
+
+def check_filters(endpoint: Endpoint, dialect: Dialect) -> Filters:
+    """What may go out there; LocalProtocolError when a name fits no message of the dialect."""
+    return Filters(dialect, endpoint.only, endpoint.block, endpoint.rates)
 
 
 def _counted(framer: Framer) -> tuple[int, int, int, int]:

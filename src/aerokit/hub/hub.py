@@ -10,7 +10,7 @@ import anyio
 
 from aerokit.arguments import checks_arguments
 from aerokit.errors import BusyError, ConnectionClosed, LinkError, LocalProtocolError
-from aerokit.hub.attachment import Attachment
+from aerokit.hub.attachment import Attachment, check_filters
 from aerokit.hub.shared_link import SharedLink
 from aerokit.hub.switch import Switch
 from aerokit.hub.values import Endpoint, HubEvent
@@ -73,6 +73,12 @@ class Hub:
         if isinstance(endpoints, str):
             raise LocalProtocolError(f"endpoints = {endpoints!r} is not allowed: a list of addresses")
         self._given = [_endpoint(each) for each in endpoints]
+        for each in self._given:
+            check_filters(each, dialect)
+        names = [each.name for each in self._given if each.name]
+        for name in names:
+            if names.count(name) > 1:
+                raise LocalProtocolError(f"two endpoints are called {name!r}")
         self._dialect = dialect
         self._attachments: dict[str, Attachment] = {}
         self._listeners: list[Callable[[HubEvent], object]] = []
@@ -85,7 +91,7 @@ class Hub:
 
         Raises:
             LinkOpenError: one of them, which is not ``patient``, could not be opened; none is open then.
-            LocalProtocolError: a name of a message is wrong, or two endpoints have one name.
+            LocalProtocolError: two endpoints have one address and no names.
             BusyError: the hub was entered before.
         """
         if self._switch is not None:

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     import os
     from collections.abc import AsyncIterator, Iterable, Mapping
 
+    from aerokit.hub.hub import Hub
     from aerokit.hub.values import Endpoint
     from aerokit.links.allowed import Peers
     from aerokit.mavlink.dialect import Dialect
@@ -130,6 +131,7 @@ async def connect(
         async with _attached(address, system_id, timeout, rates) as vehicle:
             yield vehicle
         return
+    hub = _hub(share, dialect)
     async with (
         open_connection(
             address,
@@ -144,21 +146,30 @@ async def connect(
             peers=peers,
             may_move=may_move,
         ) as connection,
-        _shared(connection, share),
+        _shared(connection, hub),
         _attached(connection, system_id, timeout, rates) as vehicle,
     ):
         yield vehicle
 
 
+def _hub(share: Iterable[str | Endpoint | Link], dialect: Dialect) -> Hub | None:
+    """The hub that others use the link by, checked before anything is opened; None: there are no others."""
+    endpoints = tuple(share)
+    if not endpoints:
+        return None
+    from aerokit.hub.hub import Hub  # few programs share
+
+    return Hub(endpoints, dialect=dialect)
+
+
 @asynccontextmanager
-async def _shared(connection: Connection, share: Iterable[str | Endpoint | Link]) -> AsyncIterator[None]:
-    """Let others use the link, too, if anybody is to."""
-    if not share:
+async def _shared(connection: Connection, hub: Hub | None) -> AsyncIterator[None]:
+    """Let others use the link, too, for the time of the block."""
+    if hub is None:
         yield
         return
-    from aerokit.hub.sharing import shared  # few programs do
-
-    async with shared(connection, share):
+    async with hub:
+        await hub.share(connection)
         yield
 
 
