@@ -10,7 +10,7 @@ and went to all of them, in a second of its processor time, while a recorded Ard
 (in pieces of ten frames, as autopilots send); both take turns, and neither may lose any. ``latency_…``: time from
 sending to receiving at the first of four, of frames that come one by one, 100 a second: median and 99th percentile.
 
-MAVProxy is that of ``$AEROKIT_MAVPROXY_PYTHON``'s environment, else of this one; without it, its rows are left out.
+MAVProxy is that of ``$AEROKIT_MAVPROXY_PYTHON``'s environment, else of this one; without it there are no rows.
 """
 
 from __future__ import annotations
@@ -61,14 +61,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     wanted = options.names or NAMES
     if not set(wanted) <= set(NAMES):
         parser.error(f"the names are {', '.join(NAMES)}")
-    if not MAVPROXY.exists():
-        print(f"{', '.join(wanted)}: left out, MAVProxy is not installed")
-        table.write([], options.output)
-        return 0
     rows: list[Row] = []
     for count in OUTS:
         if f"out_{count}" in wanted:
-            rows.append(_throughput(count, options.quick))
+            rows += _throughput(count, options.quick)
     if any(name.startswith("latency") for name in wanted):
         rows += [each for each in _latencies(options.quick) if each["name"] in wanted]
     print(table.printed(rows))
@@ -81,9 +77,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 # ------------------------------------------------------------------------------- frames per CPU-second
 
 
-def _throughput(count: int, quick: bool) -> Row:
+def _throughput(count: int, quick: bool) -> list[Row]:
     frames = 2_000 if quick else 20_000
-    figures: dict[str, list[float]] = {"aerokit": [], "mavproxy": []}
+    figures: dict[str, list[float]] = {name: [] for name in _present()}
     for _ in range(1 if quick else 5):
         for name in figures:
             with _hub(name, count) as (process, sender, receivers):
@@ -93,8 +89,15 @@ def _throughput(count: int, quick: bool) -> Row:
                 file=sys.stderr,
                 flush=True,
             )
+    if len(figures) < 2:
+        return []
     own, peer = (statistics.median(each) for each in figures.values())
-    return row(f"out_{count}", own, peer, "MAVProxy --out", unit="frames/CPU-s", ratio=own / peer, aim=10.0)
+    unit = "frames/CPU-s"
+    return [row(f"out_{count}", own, peer, "MAVProxy --out", unit=unit, ratio=own / peer, aim=10.0)]
+
+
+def _present() -> tuple[str, ...]:
+    return ("aerokit", "mavproxy") if MAVPROXY.exists() else ("aerokit",)
 
 
 def _frames_per_second(
@@ -163,12 +166,14 @@ def _count(receivers: list[socket.socket], counts: list[int]) -> None:
 
 
 def _latencies(quick: bool) -> list[Row]:
-    series: dict[str, list[float]] = {"aerokit": [], "mavproxy": []}
+    series: dict[str, list[float]] = {name: [] for name in _present()}
     for _ in range(1 if quick else 5):
         for name, found in series.items():
             with _hub(name, 4) as (_, sender, receivers):
                 found += _delays(sender, receivers[0], 100 if quick else 500)
-    rows = []
+    rows: list[Row] = []
+    if len(series) < 2:
+        return rows
     for what, share in (("median", 0.5), ("p99", 0.99)):
         own, peer = (1e6 * sorted(each)[int(share * len(each))] for each in series.values())
         rows.append(row(f"latency_{what}", own, peer, "MAVProxy --out", unit="µs", ratio=peer / own, aim=1.0))

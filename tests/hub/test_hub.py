@@ -19,6 +19,7 @@ from aerokit import Signing, SigningKey
 from aerokit.errors import BusyError, ConnectionClosed, LinkLost, LinkOpenError, LocalProtocolError
 from aerokit.hub import Endpoint, EndpointStatistics, Hub, HubEvent
 from aerokit.links import Link, MemoryLink, Peer, memory_link_pair
+from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.messages import (
     Attitude,
     CommandLong,
@@ -467,6 +468,60 @@ async def test_a_patient_endpoint_may_come_later(monkeypatch: pytest.MonkeyPatch
             copter.say(COPTER)
             await settle()
             assert station.heard == ["HEARTBEAT"]
+
+
+class Broadcast(SlowLink):
+    """One other side, which has an address all the same, as `UdpBroadcast` has."""
+
+    kept: list[Peer]
+
+    def keep_peer(self, peer: Peer) -> None:
+        self.kept = [*getattr(self, "kept", []), peer]
+
+
+@virtual
+async def test_a_link_with_one_other_side_that_has_a_name() -> None:
+    link, station = Broadcast(), Program(255, 190)
+    async with station, Hub([Endpoint(link, name="a"), station.endpoint("b")]) as hub:
+        link.receiver.bytes_received(b"noise", ("10.0.0.9", 1))
+        assert not hasattr(link, "kept")
+        link.receiver.bytes_received(Program(1, 1).encoder.encode(COPTER), ("10.0.0.7", 14550))
+        assert link.kept == [("10.0.0.7", 14550)]
+        station.say(ORDER)
+        await settle()
+        assert link.names() == ["COMMAND_LONG"], "once, not to everybody and to it"
+        assert of(hub, "a").peers == 1
+
+
+class Crowded(SlowLink):
+    """A link with any number of peers."""
+
+    forgotten: int = 0
+
+    def has_peer(self, peer: Peer) -> bool:
+        return peer is not None
+
+    def forget_peer(self, peer: Peer) -> None:
+        self.forgotten += 1
+
+
+@virtual
+async def test_a_crowd_is_bounded_and_pushes_out_who_is_silent() -> None:
+    link, station = Crowded(), Program(255, 190)
+    async with station, Hub([Endpoint(link, name="a"), station.endpoint("b")]) as hub:
+        hear, copter = link.receiver.bytes_received, Program(1, 1)
+        for number in range(600):
+            await anyio.sleep(0.01)
+            hear(copter.encoder.encode(COPTER), "copter")
+            hear(b"noise", ("noise", number))
+            hear(FrameEncoder(2 + number % 200, 1).encode(ATTITUDE), ("peer", number))
+        await settle()
+        statistics = of(hub, "a")
+        assert statistics.peers == 256
+        assert link.forgotten == 601 - 256
+        assert statistics.frames_in == 1200
+        assert (1, 1) in statistics.systems
+        assert station.heard.count("HEARTBEAT") == 600
 
 
 @virtual

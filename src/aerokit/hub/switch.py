@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 __all__ = ["LOOK_EVERY_S", "Switch"]
 
 LOOK_EVERY_S = 0.01
-"""So often a link that took no more is asked whether it does again."""
+"""So often a link that took no more is asked whether it does again; while none does, ever more rarely."""
+LOOK_AT_LEAST_EVERY_S = 0.08
 MOST_GATHERED = 256
 """What came in one piece and is more than that is written at once."""
 
@@ -51,6 +52,7 @@ class Switch:
         self._dirty: list[Port] = []
         self._holding: dict[Port, None] = {}
         self._timer: asyncio.TimerHandle | None = None
+        self._pause_s = LOOK_EVERY_S
 
     def unix_time(self) -> float:
         """Seconds since 1970, as the system had them at the beginning, gone on by the loop's clock."""
@@ -141,6 +143,7 @@ class Switch:
             if out not in self._holding:
                 self._holding[out] = None
                 if self._timer is None:
+                    self._pause_s = LOOK_EVERY_S
                     self._timer = self._loop.call_later(LOOK_EVERY_S, self._look)
         else:
             out.batch.append(raw)
@@ -158,15 +161,19 @@ class Switch:
         """Now and then while something waits for a link."""
         now, unix_time = self._clock(), self.unix_time()
         self._timer = None
+        self._pause_s = min(2 * self._pause_s, LOOK_AT_LEAST_EVERY_S)
         for port in tuple(self._holding):
+            before = port.totals.frames_out
             try:
                 port.drain(now, unix_time)
             except Exception as error:
                 self._on_mistake(port, error)
+            if port.totals.frames_out > before:
+                self._pause_s = LOOK_EVERY_S
             if not port.is_holding:
                 del self._holding[port]
         if self._holding:
-            self._timer = self._loop.call_later(LOOK_EVERY_S, self._look)
+            self._timer = self._loop.call_later(self._pause_s, self._look)
 
 
 def _write_one_by_one(port: Port) -> None:
