@@ -136,6 +136,13 @@ def bench_scale(session: nox.Session) -> None:
 
 
 @nox.session
+def bench_hub(session: nox.Session) -> None:
+    """Measure what a frame costs on its way through a hub, beside MAVProxy, ten minutes. Writes bench-hub.json."""
+    session.install("-e", ".", "MAVProxy", "setuptools", "future")
+    session.run("python", "benchmarks/hub.py", *session.posargs)
+
+
+@nox.session
 def fuzz(session: nox.Session) -> None:
     """Fuzz what takes bytes from outside, a quarter of an hour; `-- --runs 100000 address plan` for some of it, longer.
 

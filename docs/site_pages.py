@@ -32,7 +32,7 @@ NAVIGATION: dict[str, list[str]] = {
         "coming-from/pymavlink.md", "coming-from/mavros.md",
     ],
     "Concepts": ["concepts.md"],
-    "Tools": ["command-line.md", "monitor.md", "report.md", "serve.md", "network.md", "convert.md"],
+    "Tools": ["command-line.md", "hub.md", "monitor.md", "report.md", "serve.md", "network.md", "convert.md"],
     "Reference": ["reference/index.md", *(f"reference/{page}.md" for page in (*(room.page for room in ROOMS), *MADE))],
     "Troubleshooting": ["troubleshooting.md"],
     "Gallery": ["gallery.md", "examples/*.md"],

@@ -56,6 +56,7 @@ ROOMS = (
     Room("sim", "aerokit.sim", "Simulated vehicles", ("aerokit.sim", "aerokit.sim.kinds", "aerokit.sim.picture")),
     Room("testing", "aerokit.testing", "For tests of your program", ("aerokit.testing",)),
     Room("links", "aerokit.links", "Bytes in, bytes out", ("aerokit.links",)),
+    Room("hub", "aerokit.hub", "Links joined into one network", ("aerokit.hub",)),
     Room("mavlink", "aerokit.mavlink", "The wire", ("aerokit.mavlink", "aerokit.mavlink.from_pymavlink",
          "aerokit.mavlink.to_pymavlink", "aerokit.mavlink.message_factory")),
     Room("protocols", "aerokit.protocols", "MAVLink's microservices without IO",

@@ -18,6 +18,7 @@ FLOORS = [
     {"parameters", "missions", "links", "autopilots"},
     {"protocols"},
     {"runtime", "sim"},
+    {"hub"},
     {"vehicle"},
     {"sync", "video", "flights"},
     {"dronekit"},

@@ -79,6 +79,9 @@ WRONG: dict[str, tuple[object, ...]] = {
         ("PlanT", "Mission", "Fence", "RallyPoints"), (*NOTHING, *STRANGE, *TEXT, *NUMBER, PLACE)
     ),
     "SetpointT": (*NOTHING, *STRANGE, *TEXT, *NUMBER, PLACE),
+    "Iterable[str | Endpoint | Link]": (*NOTHING, _Anything(), [PLACE], (47.0, 8.0), 1j, *TEXT, *NUMBER),
+    "str | Endpoint | Link": (*NOTHING, *STRANGE, *TEXT, *NUMBER),
+    "Callable[[HubEvent], object]": (*NOTHING, *TEXT, *NUMBER, [print]),
     "str | Link": (*NOTHING, *STRANGE, *NUMBER, b"udpin:0.0.0.0:14550"),
     "str | Link | Connection": (*NOTHING, *STRANGE, *NUMBER, b"udpin:0.0.0.0:14550"),
 }

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from aerokit import errors, events
+    from aerokit.hub.hub import Hub
+    from aerokit.hub.values import Endpoint
     from aerokit.mavlink import enums, messages
     from aerokit.mavlink.dialect import Dialect
     from aerokit.mavlink.signing import Signing, SigningKey
@@ -51,6 +53,8 @@ __all__ = [
     "BodyVelocitySetpoint",
     "Connection",
     "Dialect",
+    "Endpoint",
+    "Hub",
     "LinkState",
     "LocalPositionSetpoint",
     "Position",
@@ -74,6 +78,8 @@ _HOMES = {
     "BodyVelocitySetpoint": "aerokit.vehicle.orders.setpoints",
     "Connection": "aerokit.runtime.connection",
     "Dialect": "aerokit.mavlink.dialect",
+    "Endpoint": "aerokit.hub.values",
+    "Hub": "aerokit.hub.hub",
     "LinkState": "aerokit.runtime.link_state",
     "LocalPositionSetpoint": "aerokit.vehicle.orders.setpoints",
     "Position": "aerokit.position",

@@ -16,7 +16,16 @@ from aerokit.cli.main import make_parser
 from aerokit.sim import SimulatedCamera, SimulatedCopter, SimulatedGimbal
 
 SEEN: set[str] = set()
-TOLD_ELSEWHERE = {"conversion", "serving", "bridging", "publishing", "bridged_vehicle"}
+TOLD_ELSEWHERE = {
+    "conversion",
+    "serving",
+    "bridging",
+    "publishing",
+    "bridged_vehicle",
+    "hub",
+    "hub_event",
+    "endpoint",
+}
 """By commands that need an extra, a browser or a viewer; and what is rare."""
 RARE = {"missed", "gimbal_silent", "interrupted"}
 

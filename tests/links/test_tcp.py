@@ -5,14 +5,15 @@ import contextlib
 import errno
 import socket
 import struct
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
+from typing import Any
 
 import anyio
 import pytest
 from link_harness import Recorder, each_loop, each_traffic, eventually
 
 from aerokit.errors import BusyError, ConnectionClosed, LinkOpenError
-from aerokit.links import TcpConnect, TcpListen, tcp
+from aerokit.links import FaultyLink, Peer, ReconnectingLink, TcpConnect, TcpListen, tcp
 from aerokit.links.sockets import Endpoint
 
 HOSTS = pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
@@ -340,3 +341,59 @@ def test_close_works_without_a_running_loop() -> None:
     loop.close()
     listener.close()
     TcpListen("127.0.0.1", 0).close()
+
+
+class Listener(Recorder):
+    """Is told of clients that come and go."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.told: list[tuple[str, Peer]] = []
+
+    def peer_joined(self, peer: Peer) -> None:
+        self.told.append(("joined", peer))
+
+    def peer_left(self, peer: Peer) -> None:
+        self.told.append(("left", peer))
+
+
+@pytest.mark.parametrize("wrap", [lambda link: link, lambda link: ReconnectingLink(lambda: link), FaultyLink])
+@pytest.mark.anyio
+async def test_clients_are_told_of_before_they_say_anything(wrap: Callable[[Any], Any]) -> None:
+    inner = TcpListen("127.0.0.1", 0)
+    listener, server = Listener(), wrap(inner)
+    await server.open(listener)
+    _, first = await asyncio.open_connection(*inner.local_address)
+    await eventually(lambda: len(listener.told) == 1)
+    _, second = await asyncio.open_connection(*inner.local_address)
+    await eventually(lambda: len(listener.told) == 2)
+    one, other = (peer for _, peer in listener.told)
+    assert one == first.get_extra_info("sockname")
+    first.close()
+    await eventually(lambda: len(listener.told) == 3)
+    assert listener.told == [("joined", one), ("joined", other), ("left", one)]
+    second.close()
+    server.close()
+    await server.wait_closed()
+
+
+@pytest.mark.anyio
+async def test_what_one_client_does_not_take_is_not_the_others() -> None:
+    listener, server = Listener(), TcpListen("127.0.0.1", 0)
+    await server.open(listener)
+    with socket.socket() as stalled:
+        stalled.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        stalled.connect(server.local_address)
+        await eventually(lambda: len(listener.told) == 1)
+        reader, writer = await asyncio.open_connection(*server.local_address)
+        await eventually(lambda: len(listener.told) == 2)
+        slow, quick = (peer for _, peer in listener.told)
+        server.write(bytes(100_000), slow)
+        server.write(b"x" * 100, quick)
+        assert await reader.readexactly(100) == b"x" * 100
+        await eventually(lambda: server.unsent_bytes_to(quick) == 0)
+        assert 0 < server.unsent_bytes_to(slow) == server.unsent_bytes
+        assert server.unsent_bytes_to("nobody") == 0
+        writer.close()
+        server.close()
+        await server.wait_closed()

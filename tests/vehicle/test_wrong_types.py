@@ -49,7 +49,7 @@ USED_BY_THE_LIBRARY = {
         "fail",
         "heard_at",
     }
-    | {"on_end", "record", "tap"},
+    | {"on_end", "record", "tap", "tap_sent"},
 }
 """Nobody else calls them."""
 

@@ -61,6 +61,12 @@ COMMANDS = (
         "Record everything that comes over a link to a telemetry log (.tlog), until Ctrl-C.",
     ),
     Command(
+        "hub",
+        "join links into one network",
+        "Pass MAVLink on between links (serial, UDP, TCP, several of each), by MAVLink's routing rules, until Ctrl-C."
+        " Says nothing of its own.",
+    ),
+    Command(
         "monitor",
         "watch vehicles in the terminal",
         "Show the vehicles on a link in the terminal: state with ages, texts, message rates, link quality, a map."

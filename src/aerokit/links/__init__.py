@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from .create import create_link
     from .fault_model import FaultModel
     from .faulty import FaultyLink
-    from .link import DrainListener, HelmListener, Link, Peer, PeerKeeper, Receiver
+    from .link import DrainListener, HelmListener, Link, Peer, PeerKeeper, PeerListener, Receiver
     from .memory import MemoryLink, memory_link_pair
     from .pty import PtyLink
     from .reconnecting import Interruptible, ReconnectingLink
@@ -44,6 +44,7 @@ __all__ = [
     "OneOfSeveralListener",
     "Peer",
     "PeerKeeper",
+    "PeerListener",
     "PtyLink",
     "Receiver",
     "ReconnectingLink",
@@ -78,6 +79,7 @@ _HOMES = {
     "NetworkOptions": "aerokit.links.zenoh_session",
     "Peer": "aerokit.links.link",
     "PeerKeeper": "aerokit.links.link",
+    "PeerListener": "aerokit.links.link",
     "PtyLink": "aerokit.links.pty",
     "Receiver": "aerokit.links.link",
     "ReconnectingLink": "aerokit.links.reconnecting",

@@ -22,7 +22,7 @@ from heapq import heappop, heappush
 from aerokit.errors import BusyError, ConnectionClosed, LinkLost
 
 from .fault_model import Air, FaultModel, FaultyPath
-from .link import LINGER_S, DrainListener, HelmListener, Link, Peer, Receiver, keeps_peers
+from .link import LINGER_S, DrainListener, HelmListener, Link, Peer, PeerListener, Receiver, keeps_peers
 from .stalled_line import StalledLine
 
 __all__ = ["FaultyLink"]
@@ -239,6 +239,16 @@ class _Ears:
         """See `HelmListener`."""
         if not self._is_closed and isinstance(self._receiver, HelmListener):
             self._receiver.order_refused(message, reason, helm, answers)
+
+    def peer_joined(self, peer: Peer) -> None:
+        """See `PeerListener`."""
+        if not self._is_closed and isinstance(self._receiver, PeerListener):
+            self._receiver.peer_joined(peer)
+
+    def peer_left(self, peer: Peer) -> None:
+        """See `PeerListener`."""
+        if not self._is_closed and isinstance(self._receiver, PeerListener):
+            self._receiver.peer_left(peer)
 
     def close(self) -> None:
         self._is_closed = True

@@ -8,7 +8,16 @@ from typing import Protocol, runtime_checkable
 
 from aerokit.errors import LinkLost
 
-__all__ = ["DrainListener", "HelmListener", "Link", "Peer", "PeerKeeper", "Receiver", "keeps_peers"]
+__all__ = [
+    "DrainListener",
+    "HelmListener",
+    "Link",
+    "Peer",
+    "PeerKeeper",
+    "PeerListener",
+    "Receiver",
+    "keeps_peers",
+]
 
 Peer = Hashable
 """Who sent the bytes, to be handed back to `Link.write`; None where there is only one. Opaque."""
@@ -61,6 +70,20 @@ class PeerKeeper(Receiver, Protocol):
     """Whether it does: the link then writes to nobody else, and forgets nobody by itself."""
 
 
+@runtime_checkable
+class PeerListener(Receiver, Protocol):
+    """A receiver that wants to be told of peers that come and go by themselves: the clients of a TCP server.
+
+    They are there before they have said anything, and some never do.
+    """
+
+    def peer_joined(self, peer: Peer) -> None:
+        """A peer can be written to."""
+
+    def peer_left(self, peer: Peer) -> None:
+        """It cannot any more."""
+
+
 def keeps_peers(receiver: Receiver) -> bool:
     """Whether a receiver says whom to remember."""
     return isinstance(receiver, PeerKeeper) and receiver.keeps_peers
@@ -107,6 +130,10 @@ class Link(ABC):
         that the other side has read them.
         """
         return 0
+
+    def unsent_bytes_to(self, peer: Peer) -> int:
+        """The same of one peer; all of them together where the link does not tell them apart."""
+        return self.unsent_bytes
 
     def discard_unsent(self) -> None:
         """Take back what has not left, as far as that is possible, and count it in `dropped_writes`.

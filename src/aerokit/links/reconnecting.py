@@ -17,7 +17,7 @@ from typing import Protocol, runtime_checkable
 
 from aerokit.errors import BusyError, ConnectionClosed, LinkLost, RecordingEnded
 
-from .link import DrainListener, HelmListener, Link, Peer, Receiver, keeps_peers
+from .link import DrainListener, HelmListener, Link, Peer, PeerListener, Receiver, keeps_peers
 
 __all__ = ["Interruptible", "ReconnectingLink"]
 
@@ -78,6 +78,10 @@ class ReconnectingLink(Link):
     def unsent_bytes(self) -> int:
         """See `Link.unsent_bytes`; nothing of a link that was lost waits any more."""
         return self._link.unsent_bytes if self._is_up else 0
+
+    def unsent_bytes_to(self, peer: Peer) -> int:
+        """See `Link.unsent_bytes_to`."""
+        return self._link.unsent_bytes_to(peer) if self._is_up else 0
 
     def discard_unsent(self) -> None:
         """See `Link.discard_unsent`."""
@@ -262,6 +266,18 @@ class _Ears:
         receiver = self._owner._receiver
         if self is self._owner._ears and isinstance(receiver, HelmListener):
             receiver.order_refused(message, reason, helm, answers)
+
+    def peer_joined(self, peer: Peer) -> None:
+        if listener := self._peer_listener():
+            listener.peer_joined(peer)
+
+    def peer_left(self, peer: Peer) -> None:
+        if listener := self._peer_listener():
+            listener.peer_left(peer)
+
+    def _peer_listener(self) -> PeerListener | None:
+        receiver = self._owner._receiver if self is self._owner._ears else None
+        return receiver if isinstance(receiver, PeerListener) else None
 
     def link_lost(self, error: LinkLost) -> None:
         self.is_lost = True

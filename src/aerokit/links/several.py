@@ -14,7 +14,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 from aerokit.errors import BusyError, ConnectionClosed, LinkLost, LinkOpenError, LocalProtocolError
 
-from .link import Link, Peer, Receiver, keeps_peers
+from .link import HelmListener, Link, Peer, Receiver, keeps_peers
 from .reconnecting import Interruptible
 
 __all__ = ["LinkPeer", "OneOfSeveralListener", "SeveralLinks"]
@@ -288,6 +288,10 @@ class _Ears:
 
     def link_drained(self, stalled_s: float) -> None:
         self._owner._stalled(self._index, False)
+
+    def order_refused(self, message: str, reason: str, helm: str | None, answers: tuple[bytes, ...]) -> None:
+        if isinstance(self._owner._receiver, HelmListener):
+            self._owner._receiver.order_refused(message, reason, helm, answers)
 
     def link_interrupted(self, error: LinkLost) -> None:
         self._owner._gone(self._index, error)

@@ -15,7 +15,7 @@ import anyio
 from .address import host_and_port
 from .allowed import AllowedPeers, Peers
 from .base import BaseLink
-from .link import LINGER_S, Peer
+from .link import LINGER_S, Peer, PeerListener
 from .outbox import Outbox, unsent_in_kernel
 from .sockets import Endpoint, bound_socket, resolve
 
@@ -185,6 +185,11 @@ class TcpListen(_TcpLink):
         else:
             self._drop(1)
 
+    def unsent_bytes_to(self, peer: Peer) -> int:
+        """See `Link.unsent_bytes_to`."""
+        stream = self._clients.get(peer)
+        return 0 if stream is None else stream.unsent_bytes
+
     def keep_peer(self, peer: Peer) -> None:
         """See `Link.keep_peer`: it is not turned away for another one."""
         if peer in self._clients:
@@ -222,6 +227,8 @@ class TcpListen(_TcpLink):
             stream.close()
         else:
             self._clients[stream.peer] = stream
+            if isinstance(self._receiver, PeerListener):
+                self._receiver.peer_joined(stream.peer)
 
     def _has_room(self) -> bool:
         if len(self._clients) < MAX_CLIENTS:
@@ -230,12 +237,16 @@ class TcpListen(_TcpLink):
         if not self._keeps_peers or silent is None:
             return False
         self._clients.pop(silent).close()
+        if isinstance(self._receiver, PeerListener):
+            self._receiver.peer_left(silent)
         return True
 
     def _stream_lost(self, stream: _Stream, error: Exception | None) -> None:
         if self._clients.get(stream.peer) is stream:
             del self._clients[stream.peer]
             self._kept.discard(stream.peer)
+            if isinstance(self._receiver, PeerListener):
+                self._receiver.peer_left(stream.peer)
 
     def _release(self) -> None:
         self._clients.clear()

@@ -57,10 +57,8 @@ class Frame:
     @property
     def raw(self) -> bytes:
         """The whole frame, from the magic byte to the end of checksum or signature."""
-        try:
-            return self._raw
-        except AttributeError:
-            return b"\xfd" + self.body + self.checksum.to_bytes(2, "little")
+        raw: bytes | None = getattr(self, "_raw", None)  # half the time of an AttributeError that is caught
+        return b"\xfd" + self.body + self.checksum.to_bytes(2, "little") if raw is None else raw
 
     @property
     def payload(self) -> bytes:

@@ -131,6 +131,7 @@ class Connection:
         self.keeps_peers = True
         self._recording: Recording | None = None
         self._taps: tuple[Tap, ...] = ()
+        self._sent_taps: tuple[Callable[[bytes], object], ...] = ()
         self._enders: list[Callable[[Exception], None]] = []
         self._background = Background(self.fail)
         self._loop_watch = LoopWatch(self._on_blocked)
@@ -155,7 +156,10 @@ class Connection:
         """
         self.raise_if_ended()
         now = 0.0 if self._encoder.signing is None else self.unix_time()
-        self._write(self._encoder.encode(message, now), message, to)
+        data = self._encoder.encode(message, now)
+        self._write(data, message, to)
+        for tap in self._sent_taps:
+            tap(data)
 
     @checked
     def write_raw(self, data: bytes) -> None:
@@ -285,6 +289,20 @@ class Connection:
         self._taps = (*self._taps, sink)
         self._let_all_through()
         return once(lambda: self._untap(sink))
+
+    def tap_sent(self, sink: Callable[[bytes], object]) -> Detach:
+        """Have every frame of our own that is sent given to ``sink(raw)``, signed if we sign; not those of `write_raw`.
+
+        ``sink`` must be quick and must neither await nor raise.
+        """
+        self._sent_taps = (*self._sent_taps, sink)
+
+        def detach() -> None:
+            left = list(self._sent_taps)
+            left.remove(sink)
+            self._sent_taps = tuple(left)
+
+        return once(detach)
 
     def check_types(self, types: tuple[type[Any], ...]) -> None:
         """Raise LocalProtocolError unless each of these can be subscribed to."""

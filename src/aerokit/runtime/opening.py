@@ -10,7 +10,8 @@ import anyio
 from aerokit.arguments import checked
 from aerokit.async_block import async_block
 from aerokit.errors import LocalProtocolError
-from aerokit.links import Link, ReconnectingLink, create_link
+from aerokit.links import ReconnectingLink, create_link
+from aerokit.links.link import Link
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.enums import MavComponent
 from aerokit.runtime.connection import Connection

@@ -42,7 +42,7 @@ from aerokit.vehicle.orders.setpoints import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
     from contextlib import AbstractContextManager
     import os
     from typing import Any
@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from aerokit.autopilots.modes import Mode
     from aerokit.autopilots.version import AutopilotVersion
     from aerokit.errors import ParameterRejected, ParameterTimeout
-    from aerokit.links import Link
+    from aerokit.hub.values import Endpoint
     from aerokit.links.allowed import Peers
     from aerokit.links.link import Link
     from aerokit.mavlink.dialect import Dialect
@@ -3729,6 +3729,7 @@ def connect(
     reconnect: bool = False,
     peers: Peers | None = None,
     may_move: bool = False,
+    share: Iterable[str | Endpoint | Link] = (),
 ) -> Vehicle:
     """Connect to a vehicle ; use it in a ``with`` block, or close it.
 
@@ -3756,11 +3757,14 @@ def connect(
         may_move: whether the vehicle, once silent, may come back from another IP address without going on where it
             stopped, by sequence numbers and time since boot (rebooted, with a new address). Else it is not listened to
             there (``MoveRefused``), for it might be anybody.
+        share: where ground stations and other programs are, or come, that use the same link:
+            ``["tcpin:127.0.0.1:5760"]`` (docs/hub.md). They should have other ids than this program. For an open
+            connection: ``async with aerokit.hub.shared(connection, […])``.
 
     Raises:
         LocalProtocolError: an argument is wrong. Nothing was opened.
         BusyError: this system has a vehicle object on this connection already.
-        LinkOpenError: the link, or the file to record to, could not be opened.
+        LinkOpenError: the link, one to share it on, or the file to record to, could not be opened.
         LinkLost, ConnectionClosed: the link went down while waiting, or the connection was closed.
         ConnectFailed: no heartbeat of such a vehicle came in time; the text says what was heard instead.
     """
@@ -3781,4 +3785,5 @@ def connect(
         reconnect=reconnect,
         peers=peers,
         may_move=may_move,
+        share=share,
     )

@@ -29,8 +29,10 @@ from aerokit.vehicle.vehicle import Vehicle
 
 if TYPE_CHECKING:
     import os
-    from collections.abc import AsyncIterator, Mapping, Sequence
+    from collections.abc import AsyncIterator, Iterable, Mapping, Sequence
 
+    from aerokit.hub.hub import Hub
+    from aerokit.hub.values import Endpoint
     from aerokit.links.allowed import Peers
     from aerokit.mavlink.dialect import Dialect
     from aerokit.mavlink.frame import Frame
@@ -65,6 +67,7 @@ async def connect(
     reconnect: bool = False,
     peers: Peers | None = None,
     may_move: bool = False,
+    share: Iterable[str | Endpoint | Link] = (),
 ) -> AsyncIterator[Vehicle]:
     """Connect to a vehicle for the time of the ``async with`` block.
 
@@ -92,11 +95,14 @@ async def connect(
         may_move: whether the vehicle, once silent, may come back from another IP address without going on where it
             stopped, by sequence numbers and time since boot (rebooted, with a new address). Else it is not listened to
             there (``MoveRefused``), for it might be anybody.
+        share: where ground stations and other programs are, or come, that use the same link:
+            ``["tcpin:127.0.0.1:5760"]`` (docs/hub.md). They should have other ids than this program. For an open
+            connection: ``async with aerokit.hub.shared(connection, […])``.
 
     Raises:
         LocalProtocolError: an argument is wrong. Nothing was opened.
         BusyError: this system has a vehicle object on this connection already.
-        LinkOpenError: the link, or the file to record to, could not be opened.
+        LinkOpenError: the link, one to share it on, or the file to record to, could not be opened.
         LinkLost, ConnectionClosed: the link went down while waiting, or the connection was closed.
         ConnectFailed: no heartbeat of such a vehicle came in time; the text says what was heard instead.
     """
@@ -118,9 +124,14 @@ async def connect(
             raise LocalProtocolError(
                 "peers and may_move are not allowed here: the connection is open; say it to open_connection"
             )
+        if share:
+            raise LocalProtocolError(
+                "share = … is not allowed here: the connection is open; use aerokit.hub.shared(connection, …)"
+            )
         async with _attached(address, system_id, timeout, rates) as vehicle:
             yield vehicle
         return
+    hub = _hub(share, dialect)
     async with (
         open_connection(
             address,
@@ -135,9 +146,31 @@ async def connect(
             peers=peers,
             may_move=may_move,
         ) as connection,
+        _shared(connection, hub),
         _attached(connection, system_id, timeout, rates) as vehicle,
     ):
         yield vehicle
+
+
+def _hub(share: Iterable[str | Endpoint | Link], dialect: Dialect) -> Hub | None:
+    """The hub that others use the link by, checked before anything is opened; None: there are no others."""
+    endpoints = tuple(share)
+    if not endpoints:
+        return None
+    from aerokit.hub.hub import Hub  # few programs share
+
+    return Hub(endpoints, dialect=dialect)
+
+
+@asynccontextmanager
+async def _shared(connection: Connection, hub: Hub | None) -> AsyncIterator[None]:
+    """Let others use the link, too, for the time of the block."""
+    if hub is None:
+        yield
+        return
+    async with hub:
+        await hub.share(connection)
+        yield
 
 
 def _check(

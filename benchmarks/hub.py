@@ -1,0 +1,281 @@
+"""What a frame costs on its way through a hub, beside MAVProxy's ``--out``; writes it to ``bench-hub.json``.
+
+    python benchmarks/hub.py                          # everything, some minutes
+    python benchmarks/hub.py out_4                    # these only
+    python benchmarks/hub.py --quick                  # few frames: does it run? The figures mean little
+
+A vehicle sends over UDP on 127.0.0.1 to a process of its own, ``aerokit hub udpin:… udpout:… …`` or ``mavproxy.py
+--master udpin:… --out udpout:… …``, which passes every frame on to 1, 4 or 16 others. ``out_N``: frames that came in,
+and went to all of them, in a second of its processor time, while a recorded ArduCopter flies by faster than it did
+(in pieces of ten frames, as autopilots send); both take turns, and neither may lose any. ``latency_…``: time from
+sending to receiving at the first of four, of frames that come one by one, 100 a second: median and 99th percentile.
+
+MAVProxy is that of ``$AEROKIT_MAVPROXY_PYTHON``'s environment, else of this one; without it there are no rows.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import socket
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import table
+from table import Row, row
+
+from aerokit.hub.targets import Targets
+from aerokit.mavlink.checksum import x25
+from aerokit.mavlink.dialect import STANDARD
+from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.frame import MAGIC_V2, Frame
+from aerokit.mavlink.messages import Heartbeat, SystemTime
+from aerokit.mavlink.tlog import read_tlog
+
+ROOT = Path(__file__).parent.parent
+OUTS = (1, 4, 16)
+NAMES = (*(f"out_{count}" for count in OUTS), "latency_median", "latency_p99")
+PYTHON = os.environ.get("AEROKIT_MAVPROXY_PYTHON", sys.executable)
+MAVPROXY = Path(PYTHON).parent / "mavproxy.py"
+PIECE = 10
+SENT_HZ = 600
+WARM_UP = 600
+TICKS_S = 1 / os.sysconf("SC_CLK_TCK")
+HEARTBEAT = FrameEncoder(1, 1).encode(Heartbeat(2, 3, 81, 0, 3))
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure what was asked for, print it, write it."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(NAMES))
+    parser.add_argument("--quick", action="store_true", help="few frames: does it run?")
+    parser.add_argument("--output", type=Path, default=Path("bench-hub.json"), help="default: bench-hub.json")
+    options = parser.parse_args(arguments)
+    wanted = options.names or NAMES
+    if not set(wanted) <= set(NAMES):
+        parser.error(f"the names are {', '.join(NAMES)}")
+    rows: list[Row] = []
+    for count in OUTS:
+        if f"out_{count}" in wanted:
+            rows += _throughput(count, options.quick)
+    if any(name.startswith("latency") for name in wanted):
+        rows += [each for each in _latencies(options.quick) if each["name"] in wanted]
+    print(table.printed(rows))
+    missed = [each["name"] for each in rows if table.is_missed(each)]
+    print(f"MISSED: {', '.join(missed)}" if missed else "every aim is met")
+    table.write(rows, options.output)
+    return 0
+
+
+# ------------------------------------------------------------------------------- frames per CPU-second
+
+
+def _throughput(count: int, quick: bool) -> list[Row]:
+    frames = 2_000 if quick else 20_000
+    figures: dict[str, list[float]] = {name: [] for name in _present()}
+    for _ in range(1 if quick else 5):
+        for name in figures:
+            with _hub(name, count) as (process, sender, receivers):
+                figures[name].append(_frames_per_second(process, sender, receivers, frames))
+            print(
+                f"out_{count} {name}: {figures[name][-1]:.0f} frames per CPU-second",
+                file=sys.stderr,
+                flush=True,
+            )
+    if len(figures) < 2:
+        return []
+    own, peer = (statistics.median(each) for each in figures.values())
+    unit = "frames/CPU-s"
+    return [row(f"out_{count}", own, peer, "MAVProxy --out", unit=unit, ratio=own / peer, aim=10.0)]
+
+
+def _present() -> tuple[str, ...]:
+    return ("aerokit", "mavproxy") if MAVPROXY.exists() else ("aerokit",)
+
+
+def _frames_per_second(
+    process: subprocess.Popen[bytes], sender: socket.socket, receivers: list[socket.socket], frames: int
+) -> float:
+    """Frames for which there was a second of processor time; RuntimeError when some were lost."""
+    recorded = _recorded(WARM_UP + frames)
+    counts = [0] * len(receivers)
+    _send(recorded[:WARM_UP], sender, receivers, counts)
+    before, counts = _cpu_s(process.pid), [0] * len(receivers)
+    _send(recorded[WARM_UP:], sender, receivers, counts)
+    used = _cpu_s(process.pid) - before
+    if min(counts) < frames * 0.995:
+        raise RuntimeError(f"{frames - min(counts)} of {frames} frames were lost: {process.args!r}")
+    return frames / used
+
+
+def _send(
+    frames: Sequence[bytes], sender: socket.socket, receivers: list[socket.socket], counts: list[int]
+) -> None:
+    """Send frames in pieces, and count what comes, until all have come or nothing comes any more."""
+    began = time.perf_counter()
+    for sent in range(0, len(frames), PIECE):
+        for raw in frames[sent : sent + PIECE]:
+            sender.send(raw)
+        while time.perf_counter() - began < (sent + PIECE) / SENT_HZ:
+            _count(receivers, counts)
+            time.sleep(0.001)
+    for _ in range(100):
+        if min(counts) >= len(frames):
+            return
+        time.sleep(0.01)
+        _count(receivers, counts)
+
+
+def _recorded(count: int) -> list[bytes]:
+    """Frames of a recorded copter that are for everybody, numbered anew as often as they are flown through."""
+    path = ROOT / "tests" / "recordings" / "ardupilot-copter.tlog"
+    targets = Targets(STANDARD)
+    frames = [Frame.parse(raw) for _, raw in read_tlog(path) if raw[0] == MAGIC_V2 and raw[5:7] == b"\1\1"]
+    bodies = [each.body for each in frames if targets.of(each) == (0, 0) and not each.body[1]]
+    numbered = []
+    for number in range(count):
+        body = bodies[number % len(bodies)]
+        body = body[:3] + bytes((number & 0xFF,)) + body[4:]
+        checksum = x25(body + STANDARD.extras[int.from_bytes(body[6:9], "little")])
+        numbered.append(bytes((MAGIC_V2,)) + body + checksum.to_bytes(2, "little"))
+    return numbered
+
+
+def _count(receivers: list[socket.socket], counts: list[int]) -> None:
+    """Count whole frames: several may come in a datagram."""
+    for place, receiver in enumerate(receivers):
+        while True:
+            try:
+                data = receiver.recv(65535)
+            except BlockingIOError:
+                break
+            begin = 0
+            while begin < len(data):
+                counts[place] += data[begin] == 0xFD and data[begin + 5] == 1
+                begin += (data[begin + 1] + 12) if data[begin] == 0xFD else (data[begin + 1] + 8)
+
+
+# --------------------------------------------------------------------------------------------- latency
+
+
+def _latencies(quick: bool) -> list[Row]:
+    series: dict[str, list[float]] = {name: [] for name in _present()}
+    for _ in range(1 if quick else 5):
+        for name, found in series.items():
+            with _hub(name, 4) as (_, sender, receivers):
+                found += _delays(sender, receivers[0], 100 if quick else 500)
+    rows: list[Row] = []
+    if len(series) < 2:
+        return rows
+    for what, share in (("median", 0.5), ("p99", 0.99)):
+        own, peer = (1e6 * sorted(each)[int(share * len(each))] for each in series.values())
+        rows.append(row(f"latency_{what}", own, peer, "MAVProxy --out", unit="µs", ratio=peer / own, aim=1.0))
+    return rows
+
+
+def _delays(sender: socket.socket, receiver: socket.socket, count: int) -> list[float]:
+    encoder, delays = FrameEncoder(1, 1), []
+    receiver.setblocking(True)
+    receiver.settimeout(1.0)
+    for number in range(1, count + 1):
+        frame = encoder.encode(SystemTime(number, 7))
+        sent_at = time.perf_counter()
+        sender.send(frame)
+        while frame not in receiver.recv(65535):
+            pass
+        delays.append(time.perf_counter() - sent_at)
+        time.sleep(0.01)
+    return delays
+
+
+# --------------------------------------------------------------------------------------------- processes
+
+
+@contextmanager
+def _hub(
+    name: str, count: int
+) -> Iterator[tuple[subprocess.Popen[bytes], socket.socket, list[socket.socket]]]:
+    """A process that passes frames on, a socket to send to it, and those it sends to."""
+    receivers = [_bound() for _ in range(count)]
+    with _bound() as probe:
+        port = probe.getsockname()[1]
+    outs = [f"127.0.0.1:{each.getsockname()[1]}" for each in receivers]
+    master = f"udpin:127.0.0.1:{port}"
+    with tempfile.TemporaryDirectory() as folder:
+        if name == "aerokit":
+            command = [sys.executable, "-m", "aerokit", "hub", master, *(f"udpout:{out}" for out in outs)]
+        else:
+            command = [PYTHON, str(MAVPROXY), "--daemon", "--non-interactive", "--master", master]
+            command += ["--state-basedir", folder, "--default-modules", "", "--streamrate", "-1"]
+            command += [part for out in outs for part in ("--out", f"udpout:{out}")]
+        process = subprocess.Popen(
+            command,
+            cwd=folder,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        try:
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+                sender.connect(("127.0.0.1", port))
+                _wait_until_it_works(process, sender, receivers)
+                yield process, sender, receivers
+        finally:
+            process.send_signal(signal.SIGINT)
+            try:
+                process.wait(5)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+            for each in receivers:
+                each.close()
+
+
+def _wait_until_it_works(
+    process: subprocess.Popen[bytes], sender: socket.socket, receivers: list[socket.socket]
+) -> None:
+    until, silent = time.monotonic() + 30.0, set(receivers)
+    while silent:
+        if time.monotonic() > until or process.poll() is not None:
+            raise RuntimeError(f"nothing comes through {process.args!r}")
+        with suppress(ConnectionRefusedError):
+            sender.send(HEARTBEAT)
+        time.sleep(0.1)
+        for each in tuple(silent):
+            try:
+                each.recv(65535)
+                silent.discard(each)
+            except BlockingIOError:
+                pass
+    time.sleep(1.0)
+    for each in receivers:
+        try:
+            while True:
+                each.recv(65535)
+        except BlockingIOError:
+            pass
+
+
+def _bound() -> socket.socket:
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 * 1024 * 1024)
+    sock.bind(("127.0.0.1", 0))
+    sock.setblocking(False)
+    return sock
+
+
+def _cpu_s(pid: int) -> float:
+    """Processor time of a process, in user and system mode."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) * TICKS_S
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,201 @@
+"""``aerokit hub``: several links joined into one MAVLink network, until Ctrl-C."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import re
+from typing import TYPE_CHECKING
+
+import anyio
+
+from aerokit.cli.arguments import address, number, writable_file
+from aerokit.cli.completers import addresses, offer
+from aerokit.cli.exits import DONE, INTERRUPTED
+from aerokit.cli.interrupt import on_interrupt
+from aerokit.cli.output import add_json, tell
+from aerokit.cli.signing import ENVIRONMENT, add_signing_key, signing_of
+from aerokit.errors import LocalProtocolError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from aerokit.hub import Endpoint, EndpointStatistics, Hub, HubEvent
+
+__all__ = ["add_arguments"]
+
+_NAMED = re.compile(r"([A-Za-z][\w-]*)=(.+)", re.DOTALL)
+_FILTER = "'GPS_*,HEARTBEAT@NAME'"
+
+
+def add_arguments(command: argparse.ArgumentParser) -> None:
+    """The arguments of the command."""
+    command.set_defaults(run=_hub)
+    place = command.add_argument(
+        "places",
+        nargs="+",
+        type=_place,
+        metavar="[NAME=]ADDRESS",
+        help="tcpin:0.0.0.0:5760, udpout:10.0.0.7:14550, radio=/dev/ttyUSB0,57600 …; options find it by its NAME,"
+        " or by the address as it is written",
+    )
+    offer(place, addresses)
+    _add_names(command, "--read-only", "what comes from there is not passed on, not even heartbeats")
+    _add_names(command, "--patient", "begin without it when it cannot be opened, and go on trying")
+    only = f"only these messages go out, at one endpoint or, without @NAME, at all: {_FILTER}"
+    _add_filter(command, "--only", _messages, only)
+    _add_filter(command, "--block", _messages, "these messages do not go out")
+    _add_filter(command, "--rate", _rate, "at most so many a second, of each sender: 'ATTITUDE=5@NAME'")
+    _add_names(command, "--signed", "sign what goes out there, and let in only what is signed")
+    add_signing_key(command, f"for --signed (${ENVIRONMENT})")
+    command.add_argument(
+        "--baud", type=int, default=57600, help="of serial ports whose address says none (57600)"
+    )
+    command.add_argument(
+        "--record",
+        type=_log_file,
+        metavar="FILE",
+        help="write every frame once: flight.tlog; none that is there",
+    )
+    command.add_argument(
+        "--every", type=number(0.1, 1e6), default=10.0, metavar="S", help="seconds between statistics (10)"
+    )
+    command.add_argument("--seconds", type=number(0.1, 1e6), metavar="S", help="end after so many seconds")
+    add_json(command)
+
+
+def _add_names(command: argparse.ArgumentParser, option: str, text: str) -> None:
+    command.add_argument(option, action="append", default=[], metavar="NAME", help=f"{text} (repeatable)")
+
+
+def _add_filter(
+    command: argparse.ArgumentParser, option: str, read: Callable[[str], object], text: str
+) -> None:
+    command.add_argument(
+        option, action="append", default=[], type=read, metavar="FILTER", help=f"{text} (repeatable)"
+    )
+
+
+def _place(text: str) -> tuple[str, str]:
+    """Name and address."""
+    named = _NAMED.fullmatch(text)
+    return (named[1], address(named[2])) if named else (text, address(text))
+
+
+def _messages(text: str) -> tuple[str, tuple[str, ...]]:
+    """For which endpoint ("": all), and names of messages."""
+    names, _, endpoint = text.partition("@")
+    return endpoint, tuple(each.strip() for each in names.split(",") if each.strip())
+
+
+def _rate(text: str) -> tuple[str, dict[str, float]]:
+    """For which endpoint ("": all), and the rate of each message."""
+    endpoint, parts = _messages(text)
+    rates = {}
+    for part in parts:
+        name, _, hz = part.partition("=")
+        try:
+            rates[name] = float(hz)
+        except ValueError:
+            raise argparse.ArgumentTypeError(f"{part!r} is no rate: ATTITUDE=5") from None
+    return endpoint, rates
+
+
+def _log_file(text: str) -> str:
+    if not text.lower().endswith(".tlog"):
+        raise argparse.ArgumentTypeError(f"{text!r} does not end in .tlog")
+    return writable_file(text)
+
+
+def _make_anew(path: str) -> None:
+    """Make the file now, so that nobody else's is replaced."""
+    with open(path, "xb"):
+        pass
+
+
+async def _hub(options: argparse.Namespace) -> int:
+    from aerokit.hub import Hub
+
+    endpoints = _endpoints(options)
+    stop = asyncio.Event()
+    hub = Hub(endpoints)
+    hub.on_event(lambda event: _tell_event(options, event))
+    with on_interrupt(stop.set):
+        async with hub:
+            if options.record is not None:
+                _make_anew(options.record)
+                hub.record(options.record)
+            record = {"endpoints": [each.address for each in hub.endpoints], "file": options.record}
+            tell(
+                options,
+                "hub",
+                record,
+                f"{len(endpoints)} endpoint{'s' if len(endpoints) > 1 else ''}, until Ctrl-C",
+            )
+            with anyio.move_on_after(options.seconds):
+                while not stop.is_set():
+                    with anyio.move_on_after(options.every):
+                        await stop.wait()
+                    if not stop.is_set():
+                        _tell_statistics(options, hub)
+            _tell_statistics(options, hub)
+    return INTERRUPTED if stop.is_set() and options.seconds is not None else DONE
+
+
+def _endpoints(options: argparse.Namespace) -> list[Endpoint]:
+    from aerokit.hub import Endpoint
+
+    names = [name for name, _ in options.places]
+    for option in ("read_only", "patient", "signed"):
+        for name in getattr(options, option):
+            _check_known(name, names)
+    for name in (name for option in ("only", "block", "rate") for name, _ in getattr(options, option)):
+        if name:
+            _check_known(name, names)
+    if options.signed and signing_of(options) is None:
+        raise LocalProtocolError(f"--signed needs a key: --signing-key FILE or ${ENVIRONMENT}")
+    return [
+        Endpoint(
+            place,
+            name=name,
+            only=_for(name, options.only),
+            block=_for(name, options.block),
+            rates={
+                key: hz for where, rates in options.rate if where in ("", name) for key, hz in rates.items()
+            },
+            read_only=name in options.read_only,
+            signing=signing_of(options) if name in options.signed else None,
+            baud=options.baud,
+            patient=name in options.patient,
+        )
+        for name, place in options.places
+    ]
+
+
+def _for(name: str, filters: Sequence[tuple[str, tuple[str, ...]]]) -> tuple[str, ...]:
+    return tuple(pattern for where, patterns in filters if where in ("", name) for pattern in patterns)
+
+
+def _check_known(name: str, names: list[str]) -> None:
+    if name not in names:
+        raise LocalProtocolError(f"there is no endpoint {name!r}: {', '.join(names)}")
+
+
+def _tell_event(options: argparse.Namespace, event: HubEvent) -> None:
+    record = {"endpoint": event.endpoint, "kind": event.kind, "text": event.text}
+    tell(options, "hub_event", record, f"{event.endpoint}: {event.text}")
+
+
+def _tell_statistics(options: argparse.Namespace, hub: Hub) -> None:
+    for each in hub.endpoints:
+        tell(options, "endpoint", each.to_dict(), _line(each))
+
+
+def _line(each: EndpointStatistics) -> str:
+    systems = ", ".join(f"{system}/{component}" for system, component in each.systems) or "nobody"
+    text = (
+        f"{each.name}: {each.frames_in} frames in, {each.frames_out} out, {each.lost} lost; heard {systems}"
+    )
+    if not each.is_open:
+        text += "; away"
+    return text + "".join(f"; {reason.replace('_', ' ')} {count}" for reason, count in each.dropped.items())

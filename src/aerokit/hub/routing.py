@@ -1,0 +1,226 @@
+"""``Router``: where a frame goes, by MAVLink's rules (https://mavlink.io/en/guide/routing.html).
+
+No link and no clock here: frames and ``now`` come in, plans go out. What is worked out for a message, its sender and
+its target is kept, so that a frame costs a few look-ups; it is forgotten whenever somebody comes, goes or moves.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Generic, TypeVar
+
+from aerokit.hub.senders import MOST_RECENT, Recent, Sender
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from aerokit.hub.targets import Targets
+    from aerokit.mavlink.frame import Frame
+
+__all__ = ["MOST_PLANS", "MOST_SENDERS", "Node", "Plan", "Router"]
+
+PortT = TypeVar("PortT")
+
+MOST_SENDERS = 1024
+"""So many (system id, component id) are remembered; one more takes the place of the one not heard for longest."""
+MOST_PLANS = 4096
+"""So many plans are kept for each port."""
+
+_SETUP_SIGNING = 256
+_RADIOS = (109, 166)
+
+
+class Plan(Generic[PortT]):
+    """Where frames of one message, from one sender at one port to one target, go."""
+
+    __slots__ = ("key", "message_id", "outs", "reason", "target", "thinned")
+
+    def __init__(
+        self,
+        key: int,
+        message_id: int,
+        target: tuple[int, int],
+        outs: tuple[PortT, ...] = (),
+        thinned: tuple[tuple[PortT, float], ...] = (),
+        reason: str = "",
+    ) -> None:
+        self.key = key
+        """The same for all frames of this message from this sender, whatever the target."""
+        self.message_id = message_id
+        self.target = target
+        """System id and component id; 0 is everybody."""
+        self.outs: tuple[PortT, ...] = outs
+        """Where each of them goes."""
+        self.thinned: tuple[tuple[PortT, float], ...] = thinned
+        """Where one goes in so many seconds at most."""
+        self.reason = reason
+        """Why it goes nowhere: ``"duplicate"``, ``"no_route"``, ``"secret"``; "" where nobody else is there, or wants
+        it."""
+
+
+class Node(Generic[PortT]):
+    """A port as the router knows it."""
+
+    __slots__ = ("number", "plans", "port")
+
+    def __init__(self, port: PortT, number: int) -> None:
+        self.port: PortT = port
+        self.number = number
+        """Above 0, and never given twice."""
+        self.plans: dict[int, Plan[PortT]] = {}
+
+
+class Router(Generic[PortT]):
+    """Learns behind which ports everybody is, and says where frames go.
+
+    - what is for everybody goes to all other ports;
+    - what is for one component, or for all of one system, goes to the ports behind which it was heard, and nowhere
+      while it was not; what is for an unknown component of a known system goes where the system is;
+    - to a vehicle that is heard at several ports it goes by one of them, so that no order is given twice: the first
+      one, until nothing has come from there for 3.5 s. Ground stations that share their ids all get it;
+    - nothing goes back to where it came from, and nothing is passed on twice: copies that come by another way, within
+      two seconds, end here, and teach nothing;
+    - SETUP_SIGNING, which holds a key, goes nowhere; a telemetry radio's word on its own link does not go to vehicles.
+
+    ``gate(port, message_id)`` says whether a port wants a message: None: no; 0: all of them; else one in so many
+    seconds of each sender, unless it has a target.
+    """
+
+    def __init__(self, targets: Targets, gate: Callable[[PortT, int], float | None]) -> None:
+        self._targets, self._gate = targets, gate
+        self._places = targets.places
+        self._nodes: dict[int, Node[PortT]] = {}
+        self._senders: dict[int, Sender] = {}
+        self._recent = Recent()
+        self._count = 0
+        self._duplicate: Plan[PortT] = Plan(0, -1, (0, 0), reason="duplicate")
+        self._stranger: Plan[PortT] = Plan(0, -1, (0, 0), reason="unknown")
+        self.on_vehicle: Callable[[PortT], object] | None = None
+        """Called when an autopilot was heard at a port for the first time."""
+
+    def add(self, port: PortT) -> Node[PortT]:
+        """A port has come."""
+        self._count += 1
+        node = self._nodes[self._count] = Node(port, self._count)
+        self.forget_plans()
+        return node
+
+    def remove(self, node: Node[PortT]) -> None:
+        """A port has gone, and whoever was heard there only."""
+        if self._nodes.pop(node.number, None) is not None:
+            for key in [key for key, sender in self._senders.items() if sender.leave(node.number)]:
+                del self._senders[key]
+            self.forget_plans()
+
+    def forget_plans(self) -> None:
+        """Something has changed: who is there, or what ports want."""
+        for node in self._nodes.values():
+            node.plans.clear()
+
+    def heard_at(self, node: Node[PortT]) -> list[tuple[int, int]]:
+        """Who was heard at a port: (system id, component id), sorted."""
+        return sorted(
+            (sender.system_id, sender.component_id)
+            for sender in self._senders.values()
+            if node.number in sender.heard
+        )
+
+    def route(self, node: Node[PortT], frame: Frame, now: float, is_late: bool = False) -> Plan[PortT]:
+        """Where a frame goes that came from ``node``.
+
+        ``is_late``: by its number it was overtaken, or came before from there.
+        """
+        # This runs for every frame. Sender and target are numbers: system id + 256 · component id.
+        body, message_id = frame.body, frame.message_id
+        source = body[4] | body[5] << 8
+        sender = self._senders.get(source)
+        if sender is None:
+            if message_id not in self._places and self._targets.is_unknown(message_id):
+                return self._stranger  # its checksum could not be checked: it may be noise
+            sender = self._add_sender(source, node, now)
+        number, recent = node.number, self._recent
+        if now >= recent.ends_at or len(recent.newer) >= MOST_RECENT:
+            recent.begin_next(now)
+        which = source << 24 | body[3] << 16 | frame.checksum
+        before = recent.newer.get(which) or recent.older.get(which)
+        if before is not None and (is_late or before != number):
+            return self._duplicate
+        recent.newer[which] = number
+        if sender.number == number:
+            sender.heard_at = now
+        elif sender.hear_elsewhere(number, now):
+            self.forget_plans()
+        if not message_id:
+            self._note_heartbeat(sender, node, body)
+        try:
+            places = self._places[message_id]
+        except KeyError:
+            places = self._targets.look_up(message_id)
+        target = 0
+        if places is not None:
+            size, (system, component) = len(body), places
+            if system < size:
+                target = body[system] | (body[component] << 8 if component < size else 0)
+        key = message_id << 32 | target << 16 | source
+        try:
+            return node.plans[key]
+        except KeyError:
+            return self._plan(node, key)
+
+    # ------------------------------------------------------------------------------------ senders
+
+    def _add_sender(self, source: int, node: Node[PortT], now: float) -> Sender:
+        if len(self._senders) >= MOST_SENDERS:
+            del self._senders[min(self._senders, key=lambda key: self._senders[key].heard_at)]
+        sender = self._senders[source] = Sender(source, node.number, now)
+        self.forget_plans()
+        return sender
+
+    def _note_heartbeat(self, sender: Sender, node: Node[PortT], body: bytes) -> None:
+        if sender.note_heartbeat(body):
+            self.forget_plans()
+        if sender.is_autopilot and node.number not in sender.told:
+            sender.told.add(node.number)
+            self.forget_plans()
+            if self.on_vehicle is not None:
+                self.on_vehicle(node.port)
+
+    # -------------------------------------------------------------------------------------- plans
+
+    def _plan(self, node: Node[PortT], key: int) -> Plan[PortT]:
+        message_id, target, source = key >> 32, key >> 16 & 0xFFFF, key & 0xFFFF
+        where = target & 0xFF, target >> 8
+        name = message_id << 16 | source
+        if message_id == _SETUP_SIGNING:
+            return Plan(name, message_id, where, reason="secret")
+        if where[0]:
+            found = self._ways_to(*where)
+            if not found:
+                return Plan(name, message_id, where, reason="no_route")  # not kept: there are many nobodies
+        else:
+            found = dict.fromkeys(self._nodes)
+        found.pop(node.number, None)
+        if message_id in _RADIOS:
+            found = {number: None for number in found if not self._has_autopilot(number)}
+        outs, thinned = [], []
+        for port in (self._nodes[number].port for number in found):
+            period = self._gate(port, message_id)
+            if period == 0 or (period is not None and where[0]):
+                outs.append(port)
+            elif period is not None:
+                thinned.append((port, period))
+        if len(node.plans) >= MOST_PLANS:
+            node.plans.clear()
+        plan = node.plans[key] = Plan(name, message_id, where, tuple(outs), tuple(thinned))
+        return plan
+
+    def _ways_to(self, system_id: int, component_id: int) -> dict[int, None]:
+        """Numbers of the ports by which a component, or all of a system, is reached."""
+        exact = self._senders.get(system_id | component_id << 8) if component_id else None
+        known = [each for each in self._senders.values() if each.system_id == system_id]
+        found: dict[int, None] = {}
+        for sender in known if exact is None else [exact]:
+            found.update(dict.fromkeys(sender.ways))
+        return found
+
+    def _has_autopilot(self, number: int) -> bool:
+        return any(each.is_autopilot and number in each.heard for each in self._senders.values())

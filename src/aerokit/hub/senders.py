@@ -1,0 +1,100 @@
+"""``Sender``: one component that was heard: at which ports, and what it is. ``Recent``: which frames came."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from aerokit.mavlink.enums import MavAutopilot, MavType
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+__all__ = ["DUPLICATE_WINDOW_S", "MOST_RECENT", "MOVES_AFTER_S", "Recent", "Sender"]
+
+DUPLICATE_WINDOW_S = 2.0
+"""A frame with the sender, number and checksum of one that came from elsewhere so short a time ago is the same one."""
+MOST_RECENT = 1 << 15
+"""Of more frames than that the window is shorter."""
+
+MOVES_AFTER_S = 3.5
+"""A vehicle that is heard at several ports is reached by another one when so long nothing came from the present one."""
+
+_TYPE = 9 + 4  # of a HEARTBEAT, in `Frame.body`
+_AUTOPILOT = 9 + 5
+_STATION = int(MavType.GCS)
+_NO_AUTOPILOT = int(MavAutopilot.INVALID)
+
+
+class Sender:
+    """One component, (system id, component id)."""
+
+    __slots__ = (
+        *("component_id", "heard", "heard_at", "is_autopilot", "is_vehicles", "number", "system_id", "told"),
+    )
+
+    def __init__(self, source: int, number: int, now: float) -> None:
+        self.system_id: int = source & 0xFF
+        self.component_id: int = source >> 8
+        self.number = number
+        """Of the port by which it is reached, where one is enough."""
+        self.heard_at = now
+        """When something came from there."""
+        self.heard: dict[int, float] = {number: now}
+        """All ports where it was heard; when, of those beside `number`."""
+        self.is_vehicles = False
+        """Whether it has said to be no ground station: what is for it goes one way only."""
+        self.is_autopilot = False
+        self.told: set[int] = set()
+        """Ports of which it is known that an autopilot is behind them."""
+
+    @property
+    def ways(self) -> Iterable[int]:
+        """Numbers of the ports that what is for it goes to."""
+        return (self.number,) if self.is_vehicles else self.heard
+
+    def hear_elsewhere(self, number: int, now: float) -> bool:
+        """Something came by another port than `number`; whether that changes where to send."""
+        is_new = number not in self.heard
+        self.heard[number] = now
+        if now - self.heard_at > MOVES_AFTER_S:
+            self.heard[self.number] = self.heard_at
+            self.number, self.heard_at = number, now
+            return True
+        return is_new
+
+    def note_heartbeat(self, body: bytes) -> bool:
+        """What it says it is; whether that is news."""
+        if len(body) <= _AUTOPILOT:
+            return False
+        before = self.is_vehicles, self.is_autopilot
+        self.is_vehicles = body[_TYPE] != _STATION
+        self.is_autopilot = self.is_vehicles and body[_AUTOPILOT] != _NO_AUTOPILOT
+        return before != (self.is_vehicles, self.is_autopilot)
+
+    def leave(self, number: int) -> bool:
+        """A port has gone; whether it was the last one."""
+        self.told.discard(number)
+        self.heard.pop(number, None)
+        if self.number == number and self.heard:
+            self.number = max(self.heard, key=self.heard.__getitem__)
+            self.heard_at = self.heard[self.number]
+        return not self.heard
+
+
+class Recent:
+    """The frames of the last `DUPLICATE_WINDOW_S` to twice that, in two generations: nothing has to be searched."""
+
+    __slots__ = ("ends_at", "newer", "older")
+
+    def __init__(self) -> None:
+        self.newer: dict[int, int] = {}
+        """Sender, sequence number and checksum as one number → the number of the port it came from."""
+        self.older: dict[int, int] = {}
+        self.ends_at = float("-inf")
+        """When the next generation begins."""
+
+    def begin_next(self, now: float) -> None:
+        """Forget the older ones."""
+        is_over = now - self.ends_at >= DUPLICATE_WINDOW_S
+        self.older, self.newer = {} if is_over else self.newer, {}
+        self.ends_at = now + DUPLICATE_WINDOW_S

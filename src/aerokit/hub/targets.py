@@ -1,0 +1,72 @@
+"""``Targets``: for whom a frame is, read from its bytes without decoding the message."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from aerokit.hub.target_table import STANDARD_OFFSETS
+from aerokit.mavlink.dialect import STANDARD
+from aerokit.mavlink.frame import HEADER_LENGTH
+from aerokit.mavlink.message import offset_of
+
+if TYPE_CHECKING:
+    from aerokit.mavlink.dialect import Dialect
+    from aerokit.mavlink.frame import Frame
+    from aerokit.mavlink.message import Message
+
+__all__ = ["NOWHERE", "Targets"]
+
+NOWHERE = 1 << 16
+"""A place behind the end of every frame: there is no such field."""
+
+Places = tuple[int, int]
+"""Where in `Frame.body` the target's system id and component id are; `NOWHERE`: the message has none."""
+
+_SYSTEM_FIELDS = {"MANUAL_CONTROL": "target"}  # the one message that calls it otherwise
+
+
+class Targets:
+    """Where each message of a dialect says for whom it is; of other dialects than ours worked out when it is asked."""
+
+    def __init__(self, dialect: Dialect) -> None:
+        self._dialect = dialect
+        self.places: dict[int, Places | None] = {}
+        """Message id → places; None: a message for everybody. What was not asked for yet may not be in here."""
+        if dialect is STANDARD:
+            self.places.update(dict.fromkeys(dialect.rows))
+            for (system, component), message_ids in STANDARD_OFFSETS.items():
+                component = NOWHERE if component is None else HEADER_LENGTH + component
+                self.places.update(dict.fromkeys(message_ids, (HEADER_LENGTH + system, component)))
+
+    def look_up(self, message_id: int) -> Places | None:
+        """The places of a message; None for one that is for everybody, or that the dialect does not know."""
+        if message_id not in self._dialect.rows:
+            return None  # not kept: noise could name any number
+        places = self.places[message_id] = _places(self._dialect[message_id])
+        return places
+
+    def is_unknown(self, message_id: int) -> bool:
+        """Whether the dialect does not know a message, so that its checksum cannot have been checked."""
+        return message_id not in self._dialect.rows
+
+    def of(self, frame: Frame) -> tuple[int, int]:
+        """System id and component id that a frame is for; 0 is everybody."""
+        message_id = frame.message_id
+        places = self.places[message_id] if message_id in self.places else self.look_up(message_id)
+        if places is None:
+            return 0, 0
+        # MAVLink 2 cuts zeros off the end, MAVLink 1 has no extensions: what is not there is 0.
+        body, (system, component) = frame.body, places
+        size = len(body)
+        return body[system] if system < size else 0, body[component] if component < size else 0
+
+
+def _places(message_type: type[Message]) -> Places | None:
+    names = {field.name for field in message_type.FIELDS}
+    system = _SYSTEM_FIELDS.get(message_type.NAME, "target_system")
+    if system not in names:
+        return None
+    component = NOWHERE
+    if "target_component" in names:
+        component = HEADER_LENGTH + offset_of(message_type, "target_component")
+    return HEADER_LENGTH + offset_of(message_type, system), component

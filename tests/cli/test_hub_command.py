@@ -1,0 +1,119 @@
+"""``aerokit hub``: its arguments, what it tells, and how it ends."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import Any
+
+import pytest
+from cli_harness import ctrl_c, records
+
+from aerokit.cli import main
+from aerokit.cli.hub import _endpoints
+from aerokit.cli.main import make_parser
+from aerokit.errors import LocalProtocolError
+from aerokit.hub import Endpoint
+from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.messages import Heartbeat
+from aerokit.mavlink.tlog import read_tlog
+
+COPTER = Heartbeat(2, 3, 81, 0, 3)
+
+
+def endpoints(*arguments: str) -> dict[str, Endpoint]:
+    found = _endpoints(make_parser("hub").parse_args(["hub", *arguments]))
+    return {each.name: each for each in found}
+
+
+def test_endpoints_and_what_may_pass() -> None:
+    found = endpoints(
+        "radio=/dev/ttyUSB0,57600", "udpout:10.0.0.7:14550", "tablet=tcpin:0.0.0.0:5760",
+        "--read-only", "tablet", "--patient", "radio", "--only", "HEARTBEAT,GPS_*@tablet", "--block", "DEBUG*",
+        "--rate", "ATTITUDE=5,*=10@udpout:10.0.0.7:14550", "--rate", "VFR_HUD=1",
+    )  # fmt: skip
+    assert list(found) == ["radio", "udpout:10.0.0.7:14550", "tablet"]
+    radio, out, tablet = found.values()
+    assert (radio.address, radio.patient, radio.read_only) == ("/dev/ttyUSB0,57600", True, False)
+    assert (tablet.read_only, tablet.only, tablet.block) == (True, ("HEARTBEAT", "GPS_*"), ("DEBUG*",))
+    assert (radio.only, radio.rates) == ((), {"VFR_HUD": 1.0})
+    assert out.rates == {"ATTITUDE": 5.0, "*": 10.0, "VFR_HUD": 1.0}
+
+
+def test_signing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("AEROKIT_SIGNING_KEY", raising=False)
+    with pytest.raises(LocalProtocolError, match="--signed needs a key"):
+        endpoints("a=pty", "--signed", "a")
+    (tmp_path / "key").write_text("a passphrase")
+    found = endpoints("a=pty", "b=pty", "--signed", "a", "--signing-key", str(tmp_path / "key"))
+    assert found["a"].signing is not None
+    assert found["b"].signing is None
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["a=nonsense:1:2"], "nonsense"),
+        (["a=pty", "--rate", "ATTITUDE"], "is no rate"),
+        (["a=pty", "--record", "x.bin"], "does not end in .tlog"),
+        (["a=pty", "--read-only", "b"], "there is no endpoint 'b': a"),
+        (["a=pty", "--block", "DEBUG*@b"], "there is no endpoint 'b'"),
+        (["a=tcpin:127.0.0.1:0", "--only", "NO_SUCH"], "fits no message"),
+        (["a=tcpin:127.0.0.1:0", "a=tcpin:127.0.0.1:0"], "two endpoints are called 'a'"),
+        ([], "required"),
+    ],
+)
+def test_what_is_wrong_is_said(arguments: list[str], text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    try:
+        code = main(["hub", *arguments])
+    except SystemExit as ended:
+        code = ended.code  # type: ignore[assignment]
+    assert code == 2
+    assert text in capsys.readouterr().err
+
+
+def test_it_passes_frames_on_tells_and_records(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "hub.tlog"
+    arguments = [
+        "a=tcpin:127.0.0.1:0",
+        "b=udpin:127.0.0.1:0",
+        "--record",
+        str(path),
+        "--every",
+        "0.2",
+        "--json",
+    ]
+
+    async def run() -> int:
+        options = make_parser("hub").parse_args(["hub", *arguments])
+        running = asyncio.ensure_future(options.run(options))
+        told: list[dict[str, Any]] = []
+        while not any(each["type"] == "hub" for each in told):
+            await asyncio.sleep(0.01)
+            told += records(capsys.readouterr().out)
+        (hub,) = (each for each in told if each["type"] == "hub")
+        assert [each["kind"] for each in told if each["type"] == "hub_event"] == ["opened", "opened"]
+        host, _, port = hub["endpoints"][0].partition(":")[2].rpartition(":")
+        _, writer = await asyncio.open_connection(host, int(port))
+        writer.write(FrameEncoder(1, 1).encode(COPTER))
+        told.clear()
+        while not any(each["type"] == "endpoint" and each["frames_in"] for each in told):
+            await asyncio.sleep(0.01)
+            told += records(capsys.readouterr().out)
+        assert [1, 1] in next(each for each in told if each["name"] == "a" and each["frames_in"])["systems"]
+        writer.close()
+        ctrl_c()
+        return int(await running)
+
+    assert asyncio.run(run()) == 0
+    assert [raw[5] for _, raw in read_tlog(path)] == [1]
+    assert main(["hub", "a=tcpin:127.0.0.1:0", "--record", str(path)]) != 0
+    assert "exists" in capsys.readouterr().err
+
+
+def test_lines_for_people(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["hub", "a=tcpin:127.0.0.1:0", "--seconds", "0.1"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("a: tcpin:127.0.0.1:")
+    assert lines[1] == "1 endpoint, until Ctrl-C"
+    assert lines[-1] == "a: 0 frames in, 0 out, 0 lost; heard nobody"

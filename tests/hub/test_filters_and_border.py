@@ -1,0 +1,116 @@
+"""Which messages go out; and an endpoint that signs."""
+
+from __future__ import annotations
+
+import pytest
+
+from aerokit import Signing, SigningKey
+from aerokit.errors import LocalProtocolError
+from aerokit.hub.border import Border
+from aerokit.hub.filters import Filters
+from aerokit.mavlink.dialect import STANDARD
+from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.frame import Frame
+from aerokit.mavlink.framer import Framer
+from aerokit.mavlink.messages import Attitude, CommandAck, GpsRawInt, Heartbeat, ParamRequestList
+from aerokit.mavlink.signing import Refusal
+
+KEY = SigningKey.from_passphrase("border")
+NOW = 1_700_000_000.0
+
+
+def test_without_filters_everything_goes() -> None:
+    assert Filters(STANDARD).period(Attitude.ID) == 0.0
+    assert Filters(STANDARD).period(51234) == 0.0
+
+
+def test_only_and_block_and_rates() -> None:
+    filters = Filters(
+        STANDARD, only=["HEARTBEAT", "GPS_*"], block=["GPS_STATUS"], rates={"GPS_R*": 4, "*": 10}
+    )
+    assert filters.period(Heartbeat.ID) == pytest.approx(0.1)
+    assert filters.period(GpsRawInt.ID) == pytest.approx(0.25)
+    assert filters.period(25) is None
+    assert filters.period(Attitude.ID) is None
+    assert filters.period(51234) is None
+    assert Filters(STANDARD, block=["GPS_*"]).period(51234) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("fields", "text"),
+    [
+        ({"only": ["ATITUDE"]}, r"only = 'ATITUDE' fits no message .*did you mean 'ATTITUDE'"),
+        ({"block": ["X_*"]}, r"block = 'X_\*' fits no message"),
+        ({"rates": {"ATTITUDE": 0}}, "rates: ATTITUDE = 0 Hz is not allowed: above 0"),
+        ({"rates": {"ATTITUDE": 1001}}, "at most 1000"),
+        ({"rates": {"ATTITUDE": float("nan")}}, "above 0"),
+    ],
+)
+def test_what_fits_nothing_is_refused(fields: dict[str, object], text: str) -> None:
+    with pytest.raises(LocalProtocolError, match=text):
+        Filters(STANDARD, **fields)  # type: ignore[arg-type]
+
+
+def border() -> tuple[Border, list[str]]:
+    refused: list[str] = []
+    return Border(Signing(KEY), STANDARD.extras, lambda frame, why: refused.append(why)), refused
+
+
+MESSAGES = [Heartbeat(2, 3, 81, 0, 3), ParamRequestList(1, 0), CommandAck(400, 0, 0, 0, 255, 190)]
+
+
+@pytest.mark.parametrize("message", MESSAGES, ids=lambda message: message.NAME)
+@pytest.mark.parametrize("version", [1, 2])
+def test_what_goes_out_is_signed_and_stays_who_and_what_it_was(message: Heartbeat, version: int) -> None:
+    own, _ = border()
+    encoder = FrameEncoder(7, 9, version=version)
+    encoder.sequence = 77
+    signed = own.signed(encoder.encode(message), NOW)
+    assert signed is not None
+    (frame,) = Framer().receive(signed)
+    assert (frame.system_id, frame.component_id, frame.sequence, frame.version) == (7, 9, 77, 2)
+    expected = message if version == 2 else type(message).decode(Frame.parse(encoder.encode(message)).payload)
+    assert STANDARD.decode(frame) == expected
+    assert Signing(KEY).check(frame, NOW) is None
+    other, _ = border()
+    inside = other.admitted(frame, NOW)
+    assert inside is not None
+    assert inside.incompat_flags == 0
+    assert Framer().receive(inside.raw)[0].body == inside.body
+    if version == 2:
+        encoder.sequence = 77
+        assert inside.raw == encoder.encode(message)
+
+
+def test_what_is_not_signed_is_not_let_in() -> None:
+    own, refused = border()
+    raw = FrameEncoder(7, 9).encode(MESSAGES[0])
+    assert own.admitted(Frame.parse(raw), NOW) is None
+    assert refused == [Refusal.UNSIGNED.value]
+    signed = own.signed(raw, NOW)
+    assert signed is not None
+    again, refused = border()
+    assert again.admitted(Frame.parse(signed), NOW) is not None
+    assert again.admitted(Frame.parse(signed), NOW) is None
+    assert refused == [Refusal.REPLAYED.value]
+
+
+def test_a_radio_may_come_in_and_what_may_is_asked_for() -> None:
+    signing = Signing(KEY, allow_unsigned=lambda frame: frame.system_id == 7)
+    own = Border(signing, STANDARD.extras, lambda frame, why: None)
+    frame = Frame.parse(FrameEncoder(7, 9).encode(MESSAGES[0]))
+    assert own.admitted(frame, NOW) is frame
+    assert own.admitted(Frame.parse(FrameEncoder(8, 9).encode(MESSAGES[0])), NOW) is None
+
+
+def test_a_mistake_in_what_is_allowed_refuses() -> None:
+    refused: list[str] = []
+    signing = Signing(KEY, allow_unsigned=lambda frame: 1 / 0 > 1)
+    own = Border(signing, STANDARD.extras, lambda frame, why: refused.append(why))
+    assert own.admitted(Frame.parse(FrameEncoder(7, 9).encode(MESSAGES[0])), NOW) is None
+    assert "ZeroDivisionError" in refused[0]
+
+
+def test_unknown_messages_cannot_be_signed() -> None:
+    unknown = bytes.fromhex("fd 04 00 00 07 01 01 22 c8 00") + b"mine" + b"\x12\x34"
+    assert border()[0].signed(unknown, NOW) is None

@@ -1,0 +1,652 @@
+"""A hub with links in memory, on virtual time: who hears what, what waits, and who is told."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable, Coroutine
+from contextlib import AsyncExitStack, asynccontextmanager
+from functools import wraps
+from pathlib import Path
+from typing import Any
+
+import anyio
+import pytest
+from hub_stage import COPTER, STATION, Program, SlowLink, settle
+from wrong_types import misuses
+
+import aerokit
+from aerokit import Signing, SigningKey
+from aerokit.errors import BusyError, ConnectionClosed, LinkLost, LinkOpenError, LocalProtocolError
+from aerokit.hub import Endpoint, EndpointStatistics, Hub, HubEvent
+from aerokit.links import Link, MemoryLink, Peer, memory_link_pair
+from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.messages import (
+    Attitude,
+    CommandLong,
+    GlobalPositionInt,
+    ParamRequestList,
+    ParamValue,
+    SetupSigning,
+    Statustext,
+)
+from aerokit.mavlink.tlog import read_tlog
+from aerokit.testing import run_virtual
+
+KEY = SigningKey.from_passphrase("border")
+ATTITUDE = Attitude(0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+ORDER = CommandLong(1, 1, 400, 0, 1, 0, 0, 0, 0, 0, 0)
+UNKNOWN = bytes.fromhex("fd 04 00 00 07 01 01 22 c8 00") + b"mine" + b"\x12\x34"
+
+
+def virtual(test: Callable[..., Coroutine[Any, Any, None]]) -> Callable[..., None]:
+    @wraps(test)
+    def run(*args: Any, **kwargs: Any) -> None:
+        run_virtual(test(*args, **kwargs))
+
+    return run
+
+
+@asynccontextmanager
+async def joined(*programs: Program, **fields: dict[str, Any]) -> AsyncIterator[Hub]:
+    """A hub whose endpoints a, b, c … have these programs behind them; ``b={…}`` are fields of an endpoint."""
+    async with AsyncExitStack() as stack:
+        for program in programs:
+            await stack.enter_async_context(program)
+        names = "abcdefgh"[: len(programs)]
+        endpoints = [
+            each.endpoint(name, **fields.get(name, {})) for name, each in zip(names, programs, strict=True)
+        ]
+        yield await stack.enter_async_context(Hub(endpoints))
+
+
+def of(hub: Hub, name: str) -> EndpointStatistics:
+    return next(each for each in hub.endpoints if each.name == name)
+
+
+@virtual
+async def test_frames_are_passed_on_as_they_are() -> None:
+    copter, station, tablet = Program(1, 1), Program(255, 190), Program(254, 190, version=1)
+    async with joined(copter, station, tablet) as hub:
+        copter.say(COPTER, ATTITUDE)
+        await settle()
+        assert station.heard == tablet.heard == ["HEARTBEAT", "ATTITUDE"]
+        assert copter.frames == []
+        assert [(each.system_id, each.component_id, each.sequence) for each in station.frames] == [
+            (1, 1, 0),
+            (1, 1, 1),
+        ]
+        tablet.say(STATION)
+        station.say(STATION, ORDER, ParamRequestList(7, 1))
+        await settle()
+        assert copter.heard == ["HEARTBEAT", "HEARTBEAT", "COMMAND_LONG"]
+        assert copter.frames[0].version == 1
+        assert tablet.heard == ["HEARTBEAT", "ATTITUDE", "HEARTBEAT"]
+        assert of(hub, "b").dropped == {"no_route": 1}
+        assert of(hub, "a").systems == ((1, 1),)
+
+
+@virtual
+async def test_a_hub_says_nothing_of_its_own() -> None:
+    programs = Program(), Program()
+    async with joined(*programs):
+        await anyio.sleep(60)
+        assert not any(program.pieces for program in programs)
+
+
+@virtual
+async def test_frames_that_come_together_leave_together_but_not_to_autopilots() -> None:
+    copter, station = Program(1, 1), Program(255, 190)
+    async with joined(copter, station):
+        copter.say(COPTER)
+        await settle()
+        copter.link.write(b"".join(copter.encoder.encode(ATTITUDE) for _ in range(60)))
+        station.say(STATION)
+        station.link.write(b"".join(station.encoder.encode(ORDER) for _ in range(3)))
+        await settle()
+        assert len(copter.pieces) == len(copter.frames) == 4
+        assert len(station.frames) == 61
+        assert len(station.pieces) < 6
+        assert max(map(len, station.pieces)) <= 1200
+
+
+@virtual
+async def test_noise_and_unknown_messages() -> None:
+    copter, station = Program(1, 1), Program(255, 190)
+    async with joined(copter, station) as hub:
+        copter.link.write(UNKNOWN)
+        copter.link.write(b"booting ...\r\n")
+        copter.say(COPTER)
+        copter.link.write(UNKNOWN)
+        copter.say(COPTER)
+        await settle()
+        assert b"".join(station.pieces).count(b"mine") == 1
+        assert b"booting" not in b"".join(station.pieces)
+        assert [each.message_id for each in station.frames] == [0, 51234, 0]
+        assert of(hub, "a").bad_bytes == 13
+        assert of(hub, "a").dropped == {"unknown": 1}
+
+
+@virtual
+async def test_a_read_only_endpoint_hears_everything_and_is_heard_by_nobody() -> None:
+    copter, station, onlooker = Program(1, 1), Program(255, 190), Program(254, 190)
+    async with joined(copter, station, onlooker, c={"read_only": True}) as hub:
+        copter.say(COPTER)
+        onlooker.say(STATION, ORDER)
+        await settle()
+        assert onlooker.heard == ["HEARTBEAT"]
+        assert copter.frames == []
+        assert station.heard == ["HEARTBEAT"]
+        assert of(hub, "c").dropped == {"read_only": 2}
+        assert of(hub, "c").systems == ()
+        copter.say(CommandLong(254, 190, 400, 0, 0, 0, 0, 0, 0, 0, 0))  # nor does it draw what is for others
+        await settle()
+        assert onlooker.heard == ["HEARTBEAT"]
+
+
+@virtual
+async def test_filters_and_rates() -> None:
+    copter, narrow, slow = Program(1, 1), Program(255, 190), Program(254, 190)
+    filters = {"only": ("HEARTBEAT", "STATUSTEXT"), "block": ("STATUSTEXT",)}
+    async with joined(copter, narrow, slow, b=filters, c={"rates": {"ATTITUDE": 4, "GLOBAL_*": 1}}) as hub:
+        for _ in range(101):  # ten seconds
+            copter.say(ATTITUDE, GlobalPositionInt(0, 0, 0, 0, 0, 0, 0, 0, 0))
+            await anyio.sleep(0.1)
+        copter.say(COPTER, Statustext(6, "hello"))
+        await settle()
+        assert narrow.heard == ["HEARTBEAT"]
+        assert slow.heard.count("ATTITUDE") in (40, 41)
+        assert slow.heard.count("GLOBAL_POSITION_INT") in (10, 11)
+        assert slow.heard[-2:] == ["HEARTBEAT", "STATUSTEXT"]
+        assert of(hub, "c").dropped["thinned"] == 202 - len(slow.heard) + 2
+
+
+@virtual
+async def test_rates_are_for_each_sender() -> None:
+    copter, station = Program(1, 1), Program(255, 190)
+    other = Program(2, 1)
+    async with joined(copter, other, station, c={"rates": {"ATTITUDE": 1}}):
+        for program in (copter, other, copter, other):
+            program.say(ATTITUDE)
+        await settle()
+        assert [each.system_id for each in station.frames] == [1, 2]
+
+
+@virtual
+async def test_keys_are_not_passed_on() -> None:
+    copter, station = Program(1, 1), Program(255, 190)
+    async with joined(copter, station) as hub:
+        copter.say(COPTER)
+        station.say(SetupSigning(1, 1, bytes(range(32)), 7))
+        await settle()
+        assert copter.frames == []
+        assert of(hub, "b").dropped == {"secret": 1}
+
+
+# --------------------------------------------------------------------------- a link that does not take more
+
+
+@asynccontextmanager
+async def beside_a_slow_one() -> AsyncIterator[tuple[Hub, SlowLink, Program, Program, list[HubEvent]]]:
+    """A hub with a slow link, a vehicle and a station."""
+    slow, copter, station = SlowLink(), Program(2, 1), Program(255, 190)
+    async with (
+        copter,
+        station,
+        Hub([Endpoint(slow, name="slow"), copter.endpoint("b"), station.endpoint("c")]) as hub,
+    ):
+        events: list[HubEvent] = []
+        hub.on_event(events.append)
+        speaker = Program(1, 1)
+        slow.receiver.bytes_received(speaker.encoder.encode(COPTER), None)
+        await settle()
+        slow.unsent = 1 << 20
+        yield hub, slow, copter, station, events
+
+
+@virtual
+async def test_a_slow_link_gets_the_newest_telemetry_and_all_of_a_transfer() -> None:
+    async with beside_a_slow_one() as (hub, slow, copter, station, _):
+        for number in range(50):
+            copter.say(ATTITUDE, COPTER, ParamValue(f"P{number}", 1.0, 9, 50, number))
+            await anyio.sleep(0.02)
+        await settle()
+        assert slow.written == []
+        assert station.heard.count("ATTITUDE") == 50, "the others do not wait"
+        assert of(hub, "slow").waiting == 52
+        slow.unsent = 0
+        await anyio.sleep(0.05)
+        names = slow.names()
+        assert (names.count("ATTITUDE"), names.count("HEARTBEAT"), names.count("PARAM_VALUE")) == (1, 1, 50)
+        assert of(hub, "slow").dropped == {"superseded": 98}
+        copter.say(ATTITUDE)
+        await settle()
+        assert slow.names()[-1] == "ATTITUDE"
+        assert of(hub, "slow").waiting == 0
+
+
+@virtual
+async def test_an_order_never_arrives_late_and_that_is_told() -> None:
+    async with beside_a_slow_one() as (hub, slow, _, station, events):
+        station.say(ORDER, ParamRequestList(1, 1))
+        await anyio.sleep(0.9)
+        station.say(ORDER)
+        await anyio.sleep(0.2)
+        slow.unsent = 0
+        await anyio.sleep(0.05)
+        assert slow.names() == ["PARAM_REQUEST_LIST", "COMMAND_LONG"]
+        assert of(hub, "slow").dropped == {"late": 1}
+        (event,) = events
+        assert (event.endpoint, event.kind) == ("slow", "order_dropped")
+        assert event.text.startswith("COMMAND_LONG for 1/1 was dropped after 1.0 s: it had waited too long")
+
+
+@virtual
+async def test_a_link_that_takes_nothing_does_not_fill_the_memory() -> None:
+    async with beside_a_slow_one() as (hub, slow, copter, station, _):
+        for number in range(5000):
+            copter.say(Statustext(6, f"{number:050}"))
+            if number % 100 == 0:
+                await settle()
+        await settle()
+        assert station.heard.count("STATUSTEXT") == 5000
+        assert of(hub, "slow").waiting <= 1024
+        assert of(hub, "slow").dropped["queue_full"] >= 3900
+        slow.receiver.link_lost(LinkLost("gone"))
+        assert of(hub, "slow").waiting == 0
+
+
+@virtual
+async def test_what_a_link_says_of_itself_is_told() -> None:
+    async with beside_a_slow_one() as (hub, slow, copter, station, events):
+        slow.receiver.link_stalled(77)
+        slow.receiver.link_drained(2.5)
+        station.say(ORDER)
+        await settle()
+        slow.receiver.link_lost(LinkLost("slow:1: unplugged"))
+        assert [each.kind for each in events] == ["stalled", "drained", "order_dropped", "lost"]
+        assert "unplugged" in events[-1].text
+        assert not of(hub, "slow").is_open
+        station.say(ORDER)
+        copter.say(COPTER)
+        await settle()
+        assert of(hub, "c").dropped == {"no_route": 1}
+        assert station.heard[-1] == "HEARTBEAT"
+
+
+# ------------------------------------------------------------------------------------------ the border
+
+
+@virtual
+async def test_signed_outside_and_unsigned_inside() -> None:
+    copter, station = Program(1, 1, signing=Signing(KEY)), Program(255, 190)
+    async with joined(copter, station, a={"signing": Signing(KEY)}) as hub:
+        copter.say(COPTER)
+        station.say(STATION, ORDER)
+        await settle()
+        assert [each.incompat_flags for each in station.frames] == [0]
+        assert copter.heard == ["HEARTBEAT", "COMMAND_LONG"]
+        assert all(Signing(KEY).has_signed(each) for each in copter.frames)
+        assert [(each.system_id, each.sequence) for each in copter.frames] == [(255, 0), (255, 1)]
+        assert of(hub, "a").dropped == {}
+
+
+@virtual
+async def test_what_is_not_signed_stays_outside_and_is_told_once() -> None:
+    copter, station = Program(1, 1), Program(255, 190)
+    async with joined(copter, station, a={"signing": Signing(KEY)}) as hub:
+        events: list[HubEvent] = []
+        hub.on_event(events.append)
+        copter.say(COPTER, COPTER, ATTITUDE)
+        await settle()
+        assert station.frames == []
+        assert of(hub, "a").dropped == {"refused": 3}
+        assert of(hub, "a").systems == ()
+        assert [each.kind for each in events] == ["refused"]
+        assert "1/1" in events[0].text
+
+
+@virtual
+async def test_signatures_pass_where_the_hub_has_no_key() -> None:
+    copter, station = Program(1, 1, signing=Signing(KEY)), Program(255, 190)
+    async with joined(copter, station):
+        copter.say(COPTER)
+        await settle()
+        assert Signing(KEY).has_signed(station.frames[0])
+
+
+@virtual
+async def test_a_key_that_is_used_up_stops_one_endpoint_only() -> None:
+    copter, station, tablet = Program(1, 1), Program(255, 190), Program(254, 190)
+    async with joined(copter, station, tablet, b={"signing": Signing(KEY, timestamp=(1 << 48) - 1)}) as hub:
+        events: list[HubEvent] = []
+        hub.on_event(events.append)
+        copter.say(COPTER)
+        await settle()
+        copter.say(COPTER)
+        await settle()
+        assert tablet.heard == ["HEARTBEAT"] * 2
+        assert station.heard == ["HEARTBEAT"]
+        assert [each.kind for each in events] == ["mistake"]
+        assert "used up" in events[0].text
+
+
+# ------------------------------------------------------------------------------- coming and going
+
+
+@virtual
+async def test_endpoints_come_and_go() -> None:
+    copter, station, late = Program(1, 1), Program(255, 190), Program(254, 190)
+    async with joined(copter, station) as hub, late:
+        events: list[HubEvent] = []
+        detach = hub.on_event(events.append)
+        told = await hub.add(late.endpoint("late"))
+        assert (told.name, told.is_open, told.peers) == ("late", True, 1)
+        copter.say(COPTER)
+        await settle()
+        assert late.heard == ["HEARTBEAT"]
+        await hub.remove("late")
+        assert [each.name for each in hub.endpoints] == ["a", "b"]
+        copter.say(COPTER)
+        await settle()
+        assert late.is_lost
+        assert late.heard == ["HEARTBEAT"]
+        assert station.heard == ["HEARTBEAT"] * 2
+        assert [(each.endpoint, each.kind) for each in events] == [("late", "opened"), ("late", "removed")]
+        detach()
+        detach()
+        with pytest.raises(LocalProtocolError, match=r"name = 'late' is not allowed: a, b"):
+            await hub.remove("late")
+        other = Program(3, 1)
+        with pytest.raises(LocalProtocolError, match="two endpoints are called 'a'"):
+            await hub.add(other.endpoint("a"))
+        assert len(events) == 2
+
+
+@virtual
+async def test_a_listener_that_raises_harms_nobody(caplog: pytest.LogCaptureFixture) -> None:
+    copter, station, late = Program(1, 1), Program(255, 190), Program(254, 190)
+    async with joined(copter, station) as hub, late:
+        events: list[HubEvent] = []
+        hub.on_event(lambda event: 1 / 0)
+        hub.on_event(events.append)
+        await hub.add(late.endpoint("late"))
+        assert len(events) == 1
+        assert "ZeroDivisionError" in caplog.text
+
+
+@virtual
+async def test_a_mistake_at_one_endpoint_stays_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    copter, station = Program(1, 1), Program(255, 190)
+    async with joined(copter, station) as hub:
+        events: list[HubEvent] = []
+        hub.on_event(events.append)
+        monkeypatch.setattr(hub._switch.router, "route", lambda *_: 1 / 0)  # type: ignore[union-attr]
+        copter.say(COPTER)
+        await settle()
+        monkeypatch.undo()
+        copter.say(COPTER)
+        await settle()
+        assert [each.kind for each in events] == ["mistake"]
+        assert station.heard == ["HEARTBEAT"]
+
+
+class Phoenix:
+    """Links of one address: the far end of the present one, and whether another can be opened."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.far: list[MemoryLink] = []
+        self.can_be_opened = True
+        monkeypatch.setattr("aerokit.hub.attachment.create_link", self.make)
+
+    def make(self, *_: object, **__: object) -> Link:
+        near, far = memory_link_pair()
+        return Later(near, far, self)
+
+
+class Later(SlowLink):
+    """Stands for ``near`` where that can be opened."""
+
+    def __init__(self, near: MemoryLink, far: MemoryLink, phoenix: Phoenix) -> None:
+        super().__init__()
+        self._near, self._far, self._phoenix = near, far, phoenix
+
+    async def open(self, receiver: Any) -> None:
+        if not self._phoenix.can_be_opened:
+            raise LinkOpenError("cannot open it: it is not there")
+        self._phoenix.far.append(self._far)
+        await self._near.open(receiver)
+
+    def write(self, data: bytes, peer: Peer = None) -> None:
+        self._near.write(data, peer)
+
+    def close(self) -> None:
+        self._near.close()
+
+
+@virtual
+async def test_a_lost_link_is_opened_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    links, copter = Phoenix(monkeypatch), Program(1, 1)
+    async with copter, Hub([copter.endpoint("a"), Endpoint("tcp:127.0.0.1:5760", name="b")]) as hub:
+        events: list[HubEvent] = []
+        hub.on_event(events.append)
+        async with Program(255, 190, links.far[0]) as station:
+            station.say(STATION)
+            await settle()
+            assert of(hub, "b").systems == ((255, 190),)
+        links.can_be_opened = False
+        await anyio.sleep(3)
+        assert [each.kind for each in events] == ["lost"]
+        assert (of(hub, "b").is_open, of(hub, "b").peers, of(hub, "b").systems) == (False, 0, ())
+        links.can_be_opened = True
+        copter.say(COPTER)
+        await anyio.sleep(10)
+        async with Program(255, 190, links.far[-1]) as station:
+            copter.say(COPTER)
+            await settle()
+            assert station.heard == ["HEARTBEAT"]
+            assert [each.kind for each in events] == ["lost", "restored"]
+            assert of(hub, "b").is_open
+            assert of(hub, "b").frames_in == 1, "it is still counted"
+
+
+@virtual
+async def test_a_patient_endpoint_may_come_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    links, copter = Phoenix(monkeypatch), Program(1, 1)
+    links.can_be_opened = False
+    with pytest.raises(LinkOpenError, match="not there"):
+        await Hub(["tcp:127.0.0.1:5760"]).__aenter__()
+    async with (
+        copter,
+        Hub([copter.endpoint("a"), Endpoint("tcp:127.0.0.1:5760", name="b", patient=True)]) as hub,
+    ):
+        await anyio.sleep(20)
+        assert not of(hub, "b").is_open
+        links.can_be_opened = True
+        await anyio.sleep(6)
+        assert of(hub, "b").is_open
+        async with Program(255, 190, links.far[0]) as station:
+            copter.say(COPTER)
+            await settle()
+            assert station.heard == ["HEARTBEAT"]
+
+
+class Broadcast(SlowLink):
+    """One other side, which has an address all the same, as `UdpBroadcast` has."""
+
+    kept: list[Peer]
+
+    def keep_peer(self, peer: Peer) -> None:
+        self.kept = [*getattr(self, "kept", []), peer]
+
+
+@virtual
+async def test_a_link_with_one_other_side_that_has_a_name() -> None:
+    link, station = Broadcast(), Program(255, 190)
+    async with station, Hub([Endpoint(link, name="a"), station.endpoint("b")]) as hub:
+        link.receiver.bytes_received(b"noise", ("10.0.0.9", 1))
+        assert not hasattr(link, "kept")
+        link.receiver.bytes_received(Program(1, 1).encoder.encode(COPTER), ("10.0.0.7", 14550))
+        assert link.kept == [("10.0.0.7", 14550)]
+        station.say(ORDER)
+        await settle()
+        assert link.names() == ["COMMAND_LONG"], "once, not to everybody and to it"
+        assert of(hub, "a").peers == 1
+
+
+class Crowded(SlowLink):
+    """A link with any number of peers."""
+
+    forgotten: int = 0
+
+    def has_peer(self, peer: Peer) -> bool:
+        return peer is not None
+
+    def forget_peer(self, peer: Peer) -> None:
+        self.forgotten += 1
+
+
+@virtual
+async def test_a_crowd_is_bounded_and_pushes_out_who_is_silent() -> None:
+    link, station = Crowded(), Program(255, 190)
+    async with station, Hub([Endpoint(link, name="a"), station.endpoint("b")]) as hub:
+        hear, copter = link.receiver.bytes_received, Program(1, 1)
+        for number in range(600):
+            await anyio.sleep(0.01)
+            hear(copter.encoder.encode(COPTER), "copter")
+            hear(b"noise", ("noise", number))
+            hear(FrameEncoder(2 + number % 200, 1).encode(ATTITUDE), ("peer", number))
+        await settle()
+        statistics = of(hub, "a")
+        assert statistics.peers == 256
+        assert link.forgotten == 601 - 256
+        assert statistics.frames_in == 1200
+        assert (1, 1) in statistics.systems
+        assert station.heard.count("HEARTBEAT") == 600
+
+
+@virtual
+async def test_when_one_cannot_be_opened_none_is_open(monkeypatch: pytest.MonkeyPatch) -> None:
+    links, copter = Phoenix(monkeypatch), Program(1, 1)
+    links.can_be_opened = False
+    async with copter:
+        hub = Hub([copter.endpoint("a"), "tcp:127.0.0.1:5760"])
+        with pytest.raises(LinkOpenError):
+            async with hub:
+                pass
+        await settle()
+        assert copter.is_lost
+        assert hub.endpoints == ()
+
+
+@virtual
+async def test_a_hub_is_entered_once() -> None:
+    hub = Hub()
+    with pytest.raises(ConnectionClosed, match="enter the hub first"):
+        await hub.add(SlowLink())
+    async with hub:
+        with pytest.raises(BusyError):
+            await hub.__aenter__()
+        assert hub.endpoints == ()
+    with pytest.raises(ConnectionClosed, match="the hub is closed"):
+        await hub.add(SlowLink())
+    with pytest.raises(ConnectionClosed):
+        hub.record("x.tlog")
+    with pytest.raises(BusyError):
+        await hub.__aenter__()
+
+
+@virtual
+async def test_what_the_block_raises_comes_out_of_it() -> None:
+    copter, station = Program(1, 1), Program(255, 190)
+    with pytest.raises(KeyError):
+        async with joined(copter, station):
+            raise KeyError
+    before = asyncio.all_tasks()
+    with anyio.move_on_after(1.0):
+        async with Hub([Program().endpoint("a")]):
+            await anyio.sleep(10)
+    assert asyncio.all_tasks() == before
+
+
+@pytest.mark.parametrize(
+    ("fields", "text"),
+    [
+        ({"address": "nonsense:1:2"}, "nonsense"),
+        ({"address": 5}, "address = 5 is not allowed"),
+        ({"address": "pty", "only": "HEARTBEAT"}, "only = 'HEARTBEAT' is not allowed: several names"),
+        ({"address": "pty", "block": [5]}, "block = "),
+        ({"address": "pty", "rates": ["ATTITUDE"]}, "rates = "),
+        ({"address": "pty", "rates": {"ATTITUDE": "5"}}, "rates = "),
+        ({"address": "pty", "baud": 0}, "baud = 0 is not allowed"),
+        ({"address": "pty", "name": 7}, "name = 7 is not allowed"),
+        ({"address": SlowLink(), "patient": True}, "patient"),
+        ({"address": SlowLink(), "peers": ["10.0.0.1"]}, "peers"),
+    ],
+)
+def test_wrong_endpoints_are_refused(fields: dict[str, Any], text: str) -> None:
+    with pytest.raises(LocalProtocolError, match=text):
+        Endpoint(**fields)
+
+
+def test_wrong_arguments_of_a_hub_are_refused() -> None:
+    with pytest.raises(LocalProtocolError, match="a list of addresses"):
+        Hub("udpin:0.0.0.0:14550")
+    with pytest.raises(LocalProtocolError):
+        Hub(["no address"])
+    with pytest.raises(LocalProtocolError):
+        Hub([5])  # type: ignore[list-item]
+
+
+# ------------------------------------------------------------------------------------- recording
+
+
+@virtual
+async def test_a_recording_has_every_frame_once(tmp_path: Path) -> None:
+    path = tmp_path / "hub.tlog"
+    copter, station, onlooker = Program(1, 1), Program(255, 190), Program(254, 1)
+    async with joined(copter, station, onlooker, c={"read_only": True}) as hub:
+        hub.record(path)
+        with pytest.raises(BusyError):
+            hub.record(path)
+        copter.say(COPTER, ATTITUDE)
+        station.say(STATION, ORDER, SetupSigning(1, 1, bytes(range(32)), 7))
+        onlooker.say(STATION)
+        station.link.write(copter.encoder.encode(COPTER))
+        await anyio.sleep(1.5)
+        copter.encoder.sequence -= 1
+        copter.say(COPTER)  # the same frame by another way
+        await settle()
+        assert of(hub, "a").dropped == {"duplicate": 1}
+        assert path.stat().st_size > 0, "it is flushed now and then"
+    assert [raw[7] for _, raw in read_tlog(path)] == [0, 30, 0, 76, 0]
+
+
+@virtual
+async def test_a_recording_that_cannot_be_written(tmp_path: Path) -> None:
+    async with Hub() as hub:
+        with pytest.raises(LinkOpenError):
+            hub.record(tmp_path / "no" / "hub.tlog")
+
+
+def test_the_names_of_the_package() -> None:
+    assert aerokit.Hub is Hub
+    assert aerokit.Endpoint is Endpoint
+
+
+@virtual
+async def test_arguments_of_wrong_types_are_refused() -> None:
+    async with Hub() as hub:
+        for wrong in (None, "pty", 5):
+            with pytest.raises(LocalProtocolError, match="connection = "):
+                await hub.share(wrong)  # type: ignore[arg-type]
+        for misuse in misuses(hub, leave_out=frozenset({"share"})):
+            error: BaseException | None = None
+            try:
+                result = misuse.call()
+                if asyncio.iscoroutine(result):
+                    await result
+            except LocalProtocolError as refusal:
+                error = refusal
+            assert error is not None, misuse
+            assert misuse.parameter in str(error) or "address" in str(error)
+        assert hub.endpoints == ()

@@ -1,0 +1,319 @@
+"""The rules of routing, one by one, and on random networks with circles."""
+
+from __future__ import annotations
+
+import heapq
+import random
+from collections import Counter, defaultdict
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from aerokit.hub.routing import MOST_PLANS, MOST_SENDERS, Node, Router
+from aerokit.hub.senders import DUPLICATE_WINDOW_S, MOST_RECENT, MOVES_AFTER_S
+from aerokit.hub.targets import Targets
+from aerokit.mavlink.dialect import STANDARD
+from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.frame import Frame
+from aerokit.mavlink.message import Message
+from aerokit.mavlink.messages import (
+    Attitude,
+    CommandLong,
+    Heartbeat,
+    ParamRequestList,
+    RadioStatus,
+    SetupSigning,
+    Statustext,
+)
+
+TARGETS = Targets(STANDARD)
+COPTER = Heartbeat(2, 3, 81, 0, 3)
+CAMERA = Heartbeat(30, 8, 0, 0, 3)
+STATION = Heartbeat(6, 8, 0, 0, 4)
+UNKNOWN = bytes.fromhex("fd 04 00 00 07 01 01 22 c8 00") + b"mine" + b"\x12\x34"
+
+
+def order(system: int, component: int = 1) -> CommandLong:
+    return CommandLong(system, component, 400, 0, 1, 0, 0, 0, 0, 0, 0)
+
+
+class Stage:
+    """A router with ports a, b, c, d that want everything, and senders with counters of their own."""
+
+    def __init__(self) -> None:
+        self.wishes: dict[tuple[str, int], float | None] = {}
+        self.router: Router[str] = Router(TARGETS, lambda port, number: self.wishes.get((port, number), 0.0))
+        self.nodes: dict[str, Node[str]] = {name: self.router.add(name) for name in "abcd"}
+        self.encoders: dict[tuple[str, int, int], FrameEncoder] = {}
+        self.now = 100.0
+
+    def hear(self, port: str, message: Message, system: int = 1, component: int = 1) -> set[str]:
+        """Where it goes."""
+        key = port, system, component
+        encoder = self.encoders.setdefault(key, FrameEncoder(system, component))
+        return self.pass_on(port, encoder.encode(message))
+
+    def pass_on(self, port: str, raw: bytes, *, is_late: bool = False) -> set[str]:
+        plan = self.router.route(self.nodes[port], Frame.parse(raw), self.now, is_late)
+        self.reason, self.thinned = plan.reason, plan.thinned
+        assert len(set(plan.outs)) == len(plan.outs)
+        return set(plan.outs)
+
+
+@pytest.fixture
+def stage() -> Stage:
+    return Stage()
+
+
+def test_what_is_for_everybody_goes_to_all_others(stage: Stage) -> None:
+    assert stage.hear("a", COPTER) == set("bcd")
+    assert stage.hear("a", ParamRequestList(0, 0)) == set("bcd")
+    assert stage.hear("a", ParamRequestList(0, 1)) == set("bcd")
+
+
+def test_what_is_for_one_goes_where_it_was_heard(stage: Stage) -> None:
+    stage.hear("a", COPTER)
+    stage.hear("b", STATION, 255, 190)
+    assert stage.hear("b", order(1), 255, 190) == {"a"}
+    assert stage.hear("b", order(1, 0), 255, 190) == {"a"}
+    assert stage.hear("a", order(255, 190)) == {"b"}
+
+
+def test_what_is_for_somebody_unknown_goes_nowhere(stage: Stage) -> None:
+    assert stage.hear("a", order(7)) == set()
+    assert stage.reason == "no_route"
+
+
+def test_what_is_for_an_unknown_component_goes_where_its_system_is(stage: Stage) -> None:
+    stage.hear("a", COPTER)
+    stage.hear("b", CAMERA, 1, 100)
+    assert stage.hear("c", order(1, 154), 255, 190) == {"a", "b"}
+    assert stage.hear("c", order(1, 0), 255, 190) == {"a", "b"}
+    assert stage.hear("c", order(1, 100), 255, 190) == {"b"}
+    assert stage.hear("c", order(1, 1), 255, 190) == {"a"}
+    assert stage.hear("b", order(1, 1), 1, 100) == {"a"}
+
+
+def test_nothing_goes_back_to_where_it_came_from(stage: Stage) -> None:
+    stage.hear("a", COPTER)
+    assert stage.hear("a", order(1), 255, 190) == set()
+    assert stage.reason == ""
+
+
+def test_ground_stations_that_share_their_ids_all_get_it(stage: Stage) -> None:
+    stage.hear("b", STATION, 255, 190)
+    stage.hear("c", STATION.__class__(6, 8, 0, 1, 4), 255, 190)
+    assert stage.hear("a", order(255, 190)) == {"b", "c"}
+
+
+def test_a_vehicle_on_two_links_is_given_an_order_once(stage: Stage) -> None:
+    stage.hear("a", COPTER)
+    stage.hear("b", Heartbeat(2, 3, 81, 5, 3))
+    assert stage.hear("c", order(1), 255, 190) == {"a"}
+    assert stage.hear("c", order(1, 0), 255, 190) == {"a"}
+    stage.now += MOVES_AFTER_S + 0.1
+    stage.hear("b", Heartbeat(2, 3, 81, 6, 3))
+    assert stage.hear("c", order(1), 255, 190) == {"b"}
+    stage.hear("a", Heartbeat(2, 3, 81, 7, 3))  # it is back; there is no need to change again
+    assert stage.hear("c", order(1), 255, 190) == {"b"}
+    stage.router.remove(stage.nodes["b"])
+    assert stage.hear("c", order(1), 255, 190) == {"a"}
+
+
+def test_a_copy_by_another_way_ends_here_and_teaches_nothing(stage: Stage) -> None:
+    raw = FrameEncoder(1, 1).encode(COPTER)
+    assert stage.pass_on("a", raw) == set("bcd")
+    for port in "bcd":
+        assert stage.pass_on(port, raw) == set()
+        assert stage.reason == "duplicate"
+    assert stage.hear("c", order(1), 255, 190) == {"a"}
+    assert stage.router.heard_at(stage.nodes["b"]) == []
+
+
+def test_a_frame_that_comes_again_is_passed_on_once(stage: Stage) -> None:
+    raw = FrameEncoder(1, 1).encode(COPTER)
+    assert stage.pass_on("a", raw) == set("bcd")
+    assert stage.pass_on("a", raw, is_late=True) == set()
+    # The counter has come round, and the message is the same: that is another frame.
+    assert stage.pass_on("a", raw) == set("bcd")
+
+
+def test_what_looks_the_same_later_is_another_frame(stage: Stage) -> None:
+    raw = FrameEncoder(1, 1).encode(COPTER)
+    stage.pass_on("a", raw)
+    stage.now += 2 * DUPLICATE_WINDOW_S + 0.1
+    assert stage.pass_on("b", raw) == set("acd")
+
+
+def test_the_window_is_at_least_as_long_as_it_says(stage: Stage) -> None:
+    encoder = FrameEncoder(1, 1)
+    for _ in range(50):
+        raw = encoder.encode(COPTER)
+        stage.pass_on("a", raw)
+        stage.now += DUPLICATE_WINDOW_S - 0.01
+        assert stage.pass_on("b", raw) == set()
+
+
+def test_a_port_that_has_gone_is_forgotten(stage: Stage) -> None:
+    stage.hear("a", COPTER)
+    stage.hear("b", STATION, 255, 190)
+    assert stage.hear("b", order(1), 255, 190) == {"a"}
+    stage.router.remove(stage.nodes["a"])
+    assert stage.hear("b", order(1), 255, 190) == set()
+    assert stage.reason == "no_route"
+    assert stage.hear("b", STATION, 255, 190) == {"c", "d"}
+
+
+def test_a_port_that_comes_gets_what_is_for_everybody(stage: Stage) -> None:
+    stage.hear("a", COPTER)
+    stage.router.add("e")
+    assert stage.hear("a", COPTER) == set("bcde")
+
+
+def test_keys_go_nowhere(stage: Stage) -> None:
+    stage.hear("a", COPTER)
+    assert stage.hear("b", SetupSigning(1, 1, bytes(32), 0), 255, 190) == set()
+    assert stage.reason == "secret"
+
+
+def test_the_word_of_a_radio_does_not_go_to_vehicles(stage: Stage) -> None:
+    stage.hear("a", COPTER)
+    stage.hear("b", STATION, 255, 190)
+    stage.hear("d", Heartbeat(2, 12, 0, 0, 3), 2, 1)
+    assert stage.hear("a", RadioStatus(0, 0, 0, 0, 0, 0, 0), 51, 68) == {"b", "c"}
+
+
+def test_unknown_messages_are_passed_on_for_those_who_are_known(stage: Stage) -> None:
+    assert stage.pass_on("a", UNKNOWN) == set()
+    assert stage.reason == "unknown"
+    stage.hear("a", COPTER)
+    assert stage.pass_on("a", UNKNOWN) == set("bcd")
+    assert stage.pass_on("b", UNKNOWN) == set()
+
+
+def test_ports_say_what_they_want(stage: Stage) -> None:
+    stage.wishes = {("b", Attitude.ID): None, ("c", Attitude.ID): 0.5, ("c", CommandLong.ID): 0.5}
+    assert stage.hear("a", Attitude(0, 0, 0, 0, 0, 0, 0)) == {"d"}
+    assert stage.thinned == (("c", 0.5),)
+    stage.hear("c", COPTER, 3)
+    assert stage.hear("a", order(3)) == {"c"}  # what is for one is not thinned
+    stage.wishes[("c", CommandLong.ID)] = None
+    stage.router.forget_plans()
+    assert stage.hear("a", order(3)) == set()
+
+
+def test_a_vehicle_is_told_once_for_each_port(stage: Stage) -> None:
+    told: list[str] = []
+    stage.router.on_vehicle = told.append
+    for _ in range(3):
+        stage.hear("a", COPTER)
+        stage.hear("b", STATION, 255, 190)
+        stage.hear("c", CAMERA, 1, 100)
+    assert told == ["a"]
+
+
+def test_who_floods_the_tables_harms_nobody(stage: Stage) -> None:
+    stage.hear("a", COPTER)
+    for number in range(3 * MOST_SENDERS):
+        stage.now += 0.001
+        stage.hear("b", Statustext(6, "x"), 2 + number % 250, number // 250)
+        if number % 100 == 0:
+            stage.hear("a", COPTER)
+    assert len(stage.router._senders) <= MOST_SENDERS
+    assert stage.hear("c", order(1), 255, 190) == {"a"}
+    for target in range(1, 256):
+        for component in range(40):
+            stage.hear("b", order(target, component), 255, 190)
+    assert len(stage.nodes["b"].plans) <= MOST_PLANS
+
+
+def test_what_was_heard_is_not_remembered_without_bounds(stage: Stage) -> None:
+    encoder = FrameEncoder(1, 1)
+    for number in range(2 * MOST_RECENT + 100):
+        stage.pass_on("a", encoder.encode(Statustext(6, str(number))))
+    recent = stage.router._recent
+    assert len(recent.newer) + len(recent.older) <= 2 * MOST_RECENT
+
+
+# ------------------------------------------------------------------------------- random networks
+
+
+class Network:
+    """Hubs joined by edges, several between two of them, too, and one program at each hub; frames take their time."""
+
+    def __init__(self, hubs: int, edges: list[tuple[int, int]], seed: int) -> None:
+        self.random = random.Random(seed)
+        self.now = 10.0
+        self.heap: list[tuple[float, int, int, tuple[int, int], bytes]] = []
+        self.count = self.hops = 0
+        self.got: dict[int, Counter[bytes]] = defaultdict(Counter)
+        self.routers: list[Router[tuple[int, int]]] = [
+            Router(TARGETS, lambda port, number: 0.0) for _ in range(hubs)
+        ]
+        self.nodes: list[dict[tuple[int, int], Node[tuple[int, int]]]] = [{} for _ in range(hubs)]
+        self.far: dict[tuple[int, tuple[int, int]], tuple[int, tuple[int, int]]] = {}
+        for hub in range(hubs):
+            self._port(hub, (-1, 0))
+        for number, (one, other) in enumerate(edges):
+            self._port(one, (number, 0))
+            self._port(other, (number, 1))
+            self.far[one, (number, 0)] = other, (number, 1)
+            self.far[other, (number, 1)] = one, (number, 0)
+        self.encoders = [FrameEncoder(1 + hub, 1) for hub in range(hubs)]
+
+    def _port(self, hub: int, name: tuple[int, int]) -> None:
+        self.nodes[hub][name] = self.routers[hub].add(name)
+
+    def say(self, hub: int, message: Message) -> bytes:
+        raw = self.encoders[hub].encode(message)
+        self._post(hub, (-1, 0), raw)
+        return raw
+
+    def _post(self, hub: int, port: tuple[int, int], raw: bytes) -> None:
+        self.count += 1
+        heapq.heappush(self.heap, (self.now + self.random.uniform(0.001, 0.2), self.count, hub, port, raw))
+
+    def run(self) -> None:
+        while self.heap:
+            self.now, _, hub, port, raw = heapq.heappop(self.heap)
+            self.hops += 1
+            assert self.hops < 20_000, "frames go round and round"
+            for out in self.routers[hub].route(self.nodes[hub][port], Frame.parse(raw), self.now).outs:
+                if out == (-1, 0):
+                    self.got[hub][raw] += 1
+                else:
+                    self._post(*self.far[hub, out], raw)
+
+
+@st.composite
+def networks(draw: st.DrawFn) -> Network:
+    hubs = draw(st.integers(2, 6))
+    tree = [(draw(st.integers(0, hub - 1)), hub) for hub in range(1, hubs)]
+    pairs = st.tuples(st.integers(0, hubs - 1), st.integers(0, hubs - 1)).filter(
+        lambda pair: pair[0] != pair[1]
+    )
+    return Network(hubs, tree + draw(st.lists(pairs, max_size=6)), draw(st.integers(0, 2**32)))
+
+
+@settings(max_examples=150, deadline=None)
+@given(networks(), st.booleans(), st.data())
+def test_on_any_network_everybody_gets_what_is_for_him_once(
+    network: Network, vehicles: bool, data: st.DataObject
+) -> None:
+    hubs = range(len(network.routers))
+    hello = COPTER if vehicles else STATION
+    for _ in range(2):
+        said = {hub: network.say(hub, hello) for hub in hubs}
+        network.run()
+        for hub in hubs:
+            assert network.got[hub] == {raw: 1 for other, raw in said.items() if other != hub}
+        network.got.clear()
+    sender = data.draw(st.sampled_from(hubs))
+    target = data.draw(st.sampled_from([hub for hub in hubs if hub != sender]))
+    raws = [network.say(sender, order(1 + target, component)) for component in (1, 0, 1)]
+    nobody = network.say(sender, order(200))
+    network.run()
+    assert network.got[target] == dict.fromkeys(raws, 1)
+    assert not any(network.got[hub] for hub in hubs if hub != target)
+    assert nobody not in network.got[target]

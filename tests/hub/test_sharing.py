@@ -1,0 +1,268 @@
+"""A program that shares its link; and transfers through a hub, in both directions at once, on virtual time."""
+
+from __future__ import annotations
+
+import asyncio
+import random
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import Any
+
+import pytest
+from hub_stage import COPTER, STATION, Program, settle
+
+import aerokit
+from aerokit import Signing, SigningKey, Vehicle
+from aerokit.errors import ConnectionClosed, LinkOpenError, LocalProtocolError
+from aerokit.hub import Endpoint, Hub, HubEvent, shared
+from aerokit.links import FaultModel, FaultyLink, Link, memory_link_pair
+from aerokit.mavlink.messages import Attitude, CommandLong, ParamRequestList, ParamSet, SetupSigning
+from aerokit.missions import Mission, waypoint
+from aerokit.sim import SimulatedCopter, SimulatedPx4, SimulatedVehicle, simulated_link
+from aerokit.testing import run_virtual
+
+KEY = SigningKey.from_passphrase("border")
+DATA = random.Random(7).randbytes(6_000)
+MISSION = Mission([waypoint(47.3977, 8.5455 + number * 1e-4, altitude_relative_m=20) for number in range(40)])
+ORDER = CommandLong(1, 1, 400, 0, 0, 0, 0, 0, 0, 0, 0)
+
+
+def make(kind: str) -> tuple[SimulatedVehicle, str]:
+    """A vehicle with a file on it, and the file's path."""
+    vehicle = SimulatedCopter(boot_time_s=0.0) if kind == "ardupilot" else SimulatedPx4(boot_time_s=0.0)
+    path = "/APM/data.bin" if kind == "ardupilot" else "/fs/microsd/data.bin"
+    file = vehicle.ftp.files.open(path, writing=True, create=True)
+    file.write(0, DATA)
+    file.close()
+    return vehicle, path
+
+
+async def transfer_at_once(one: Vehicle, other: Vehicle, path: str, new: str) -> None:
+    """Each does all three kinds of transfers while the other does another one."""
+    for this, that in ((one, other), (other, one)):
+        parameters, _, data = await asyncio.gather(
+            this.parameters.download(method="list", refresh=True),
+            that.mission.upload(MISSION),
+            this.files.read(path),
+        )
+        assert len(parameters) > 500
+        assert data == DATA
+        downloaded, _, parameters = await asyncio.gather(
+            this.mission.download(),
+            that.files.write(new, DATA),
+            this.parameters.download(method="list", refresh=True),
+        )
+        assert len(downloaded) == len(MISSION)
+        assert len(parameters) > 500
+        assert await this.files.read(new) == DATA
+
+
+@asynccontextmanager
+async def through_a_hub(
+    vehicle: SimulatedVehicle, change: Any = None
+) -> AsyncIterator[tuple[Vehicle, Vehicle]]:
+    (one, far), (other, far_other) = memory_link_pair(latency_s=0.005), memory_link_pair(latency_s=0.005)
+    async with (
+        simulated_link(vehicle, latency_s=0.01) as link,
+        Hub(
+            [
+                Endpoint(change(link) if change else link, name="a"),
+                Endpoint(one, name="b"),
+                Endpoint(other, name="c"),
+            ]
+        ),
+        aerokit.connect(far, rates={}) as first,
+        aerokit.connect(far_other, rates={}, source_system=250) as second,
+    ):
+        yield first, second
+
+
+@asynccontextmanager
+async def through_a_program(
+    vehicle: SimulatedVehicle, change: Any = None
+) -> AsyncIterator[tuple[Vehicle, Vehicle]]:
+    near, far = memory_link_pair(latency_s=0.005)
+    async with (
+        simulated_link(vehicle, latency_s=0.01) as link,
+        aerokit.connect(change(link) if change else link, rates={}, share=[near]) as program,
+        aerokit.connect(far, rates={}, source_system=250) as station,
+    ):
+        yield program, station
+
+
+def lossy(link: Link) -> FaultyLink:
+    return FaultyLink(link, FaultModel(loss=0.03), seed=11)
+
+
+@pytest.mark.parametrize("way", [through_a_hub, through_a_program], ids=["hub", "share"])
+@pytest.mark.parametrize("kind", ["ardupilot", "px4"])
+def test_transfers_pass_in_both_directions_at_once(way: Any, kind: str) -> None:
+    vehicle, path = make(kind)
+
+    async def run() -> None:
+        async with way(vehicle) as (one, other):
+            await transfer_at_once(one, other, path, path.replace("data", "new"))
+
+    run_virtual(run())
+
+
+@pytest.mark.parametrize("way", [through_a_hub, through_a_program], ids=["hub", "share"])
+def test_transfers_pass_over_a_link_that_loses_frames(way: Any) -> None:
+    vehicle, path = make("px4")
+
+    async def run() -> None:
+        async with way(vehicle, lossy) as (one, other):
+            _, data = await asyncio.gather(other.mission.upload(MISSION), one.files.read(path))
+            assert data == DATA
+            assert len(await one.mission.download()) == len(MISSION)
+
+    run_virtual(run())
+
+
+def test_a_station_flies_and_the_program_sees_it() -> None:
+    async def run() -> None:
+        async with through_a_program(SimulatedCopter(boot_time_s=0.0)) as (program, station):
+            await station.wait_ready()
+            await station.arm()
+            await station.take_off(5)
+            await program.position.wait_until(
+                lambda position: (position.altitude_relative_m or 0) > 4, timeout=5
+            )
+            await program.land()
+            await station.armed.wait_until(lambda armed: not armed, timeout=60)
+
+    run_virtual(run())
+
+
+# ------------------------------------------------------------------------- what goes where
+
+
+class Stage:
+    """A program with a vehicle made of frames, and a station on its link."""
+
+    def __init__(self, vehicle: Program, station: Program, connection: aerokit.Connection, hub: Hub) -> None:
+        self.vehicle, self.station, self.connection, self.hub = vehicle, station, connection, hub
+
+
+@asynccontextmanager
+async def stage(signing: Signing | None = None, vehicle: Program | None = None) -> AsyncIterator[Stage]:
+    vehicle, station = vehicle or Program(1, 1), Program(250, 190)
+    assert vehicle.near is not None
+    async with (
+        vehicle,
+        station,
+        aerokit.open_connection(vehicle.near, signing=signing) as connection,
+        shared(connection, [station.endpoint("station")]) as hub,
+    ):
+        vehicle.say(COPTER)
+        await settle()
+        yield Stage(vehicle, station, connection, hub)
+
+
+def on_stage(play: Any, **options: Any) -> None:
+    async def run() -> None:
+        async with stage(**options) as on:
+            await play(on)
+
+    run_virtual(run())
+
+
+def test_a_station_hears_the_vehicle_and_the_program() -> None:
+    async def play(on: Stage) -> None:
+        on.connection.send(ORDER)
+        on.connection.send(ParamRequestList(0, 0))
+        await settle()
+        assert [(each.system_id, each.message_id) for each in on.station.frames if each.system_id == 1] == [
+            (1, 0)
+        ]
+        assert [each.message_id for each in on.station.frames if each.system_id == 255] == [0, 21]
+        assert on.vehicle.heard == ["HEARTBEAT", "COMMAND_LONG", "PARAM_REQUEST_LIST"]
+
+    on_stage(play)
+
+
+def test_the_vehicle_hears_the_station_once_and_not_what_is_for_others() -> None:
+    async def play(on: Stage) -> None:
+        on.vehicle.frames.clear()
+        on.station.frames.clear()
+        on.station.say(STATION, ORDER, ParamRequestList(77, 1), ParamRequestList(255, 190))
+        on.station.say(SetupSigning(1, 1, bytes(range(32)), 5))
+        await settle()
+        assert on.vehicle.heard == ["HEARTBEAT", "COMMAND_LONG"]
+        assert {(each.system_id, each.component_id) for each in on.vehicle.frames} == {(250, 190)}
+        assert on.station.frames == []
+
+    on_stage(play)
+
+
+def test_answers_go_to_whom_they_are_for() -> None:
+    async def play(on: Stage) -> None:
+        on.station.say(STATION)
+        await settle()
+        on.station.frames.clear()
+        on.vehicle.say(ParamSet(250, 190, "A", 1.0, 9), ParamSet(255, 190, "B", 1.0, 9))
+        await settle()
+        assert on.station.heard == ["PARAM_SET"]
+
+    on_stage(play)
+
+
+def test_a_program_that_signs_signs_for_its_stations() -> None:
+    async def play(on: Stage) -> None:
+        on.station.say(STATION, ORDER)
+        on.vehicle.say(Attitude(0, 0, 0, 0, 0, 0, 0))
+        await settle()
+        assert all(Signing(KEY).has_signed(each) for each in on.vehicle.frames)
+        assert [(each.system_id, each.message_id) for each in on.vehicle.frames] == [
+            (255, 0),
+            (250, 0),
+            (250, 76),
+        ]
+        assert {each.incompat_flags for each in on.station.frames} == {0}
+        assert {each.system_id for each in on.station.frames} == {1, 255}
+
+    on_stage(play, signing=Signing(KEY), vehicle=Program(1, 1, signing=Signing(KEY)))
+
+
+def test_it_ends_with_the_connection_and_the_connection_not_with_it() -> None:
+    async def run() -> None:
+        vehicle, station = Program(1, 1), Program(250, 190)
+        assert vehicle.near is not None
+        async with vehicle, station, aerokit.open_connection(vehicle.near) as connection:
+            async with shared(connection, [station.endpoint("station")]) as hub:
+                events: list[HubEvent] = []
+                hub.on_event(events.append)
+                with pytest.raises(LocalProtocolError, match="two endpoints"):
+                    await hub.share(connection)
+            assert connection.is_open
+            assert station.is_lost
+            again = Program(250, 190)
+            async with again, shared(connection, [again.endpoint("station")]) as hub:
+                hub.on_event(events.append)
+                connection.close()
+                await settle()
+                assert [(each.endpoint, each.kind) for each in events] == [("program", "lost")]
+                again.say(STATION)
+                await settle()
+                with pytest.raises(ConnectionClosed):
+                    await hub.share(connection, name="again")
+
+    run_virtual(run())
+
+
+def test_what_cannot_be_shared_is_said_at_once() -> None:
+    async def run() -> None:
+        async with simulated_link(SimulatedCopter()) as link:
+            with pytest.raises(LocalProtocolError):
+                async with aerokit.connect(link, share=["nonsense"]):
+                    pass
+        async with simulated_link(SimulatedCopter()) as link:
+            with pytest.raises(LinkOpenError):
+                async with aerokit.connect(link, share=["tcpin:203.0.113.9:5760"]):
+                    pass
+        async with simulated_link(SimulatedCopter()) as link, aerokit.open_connection(link) as connection:
+            with pytest.raises(LocalProtocolError, match=r"aerokit\.hub\.shared"):
+                async with aerokit.connect(connection, share=["tcpin:127.0.0.1:0"]):
+                    pass
+
+    asyncio.run(run())
