@@ -19,6 +19,7 @@ FLOORS = [
     {"protocols"},
     {"runtime", "sim"},
     {"vehicle"},
+    {"fleets"},
     {"sync", "video", "flights"},
     {"dronekit"},
     {"convert", "report", "serve", "foxglove", "monitor"},
