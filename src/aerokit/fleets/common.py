@@ -154,6 +154,7 @@ class CommonAction:
         others = [each for each in self._members if each.name not in self._failed]
         able = [each for each in others if self._may_be_ordered(each)]
         failure = Failure(failed.name, failed.group, self.what, error, tuple(each.name for each in able))
+        orders: dict[str, PolicyOrder]
         try:
             orders = self._crew.rules.decide(failure)
         except Exception as mistake:  # of the program's function: in doubt nobody flies on

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from aerokit.fleets.events import FleetEvent
     from aerokit.fleets.members import Member
     from aerokit.fleets.policy import Rules
+    from aerokit.missions.mission import Mission
     from aerokit.runtime.connection import Connection
 
 __all__ = ["Crew"]
@@ -32,14 +33,18 @@ class Crew:
         rules: Rules,
         now: Callable[[], float],
         on_mistake: Callable[[Exception], None],
+        min_distance_m: float | None = None,
     ) -> None:
         self.members: dict[str, Member] = {each.name: each for each in members}
         self.networks: dict[str, Connection] = dict(networks)
         self.rules: Rules = rules
         self.now: Callable[[], float] = now
+        self.min_distance_m: float | None = min_distance_m
         self.bus: Bus = Bus()
         self.background: Background = Background(on_mistake)
         self.under_way: list[CommonAction] = []
+        self.missions: dict[str, Mission] = {}
+        """Those that all who were given one have taken."""
         self.is_over: bool = False
 
     def start(self) -> None:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from aerokit.runtime.events import Event
+
+if TYPE_CHECKING:
+    from aerokit.fleets.apart import Deconfliction
 
 __all__ = [
     "FleetEvent",
@@ -13,6 +16,7 @@ __all__ = [
     "MemberLost",
     "MemberTakenBack",
     "MemberTakenOver",
+    "PathsDecided",
     "PolicyCarriedOut",
     "PolicyOrdered",
     "StateTold",
@@ -89,6 +93,12 @@ class PolicyCarriedOut(FleetEvent):
     action: str
     orders: dict[str, str]
     errors: dict[str, str]
+
+
+class PathsDecided(FleetEvent):
+    """Ways were compared before they are flown, of several members: ``member`` is empty; ``decided`` says how."""
+
+    decided: Deconfliction
 
 
 class TooClose(FleetEvent):

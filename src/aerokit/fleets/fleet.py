@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from aerokit.arguments import checks_arguments
 from aerokit.errors import LocalProtocolError
+from aerokit.fleets.corrections import fragments, rtcm_messages
 from aerokit.fleets.events import FleetEvent, StateTold, Told
 from aerokit.fleets.selection import Selection
 from aerokit.runtime.events import Event
@@ -29,6 +30,7 @@ class Fleet(Selection):
 
     def __init__(self, crew: Crew) -> None:
         super().__init__(crew, None)
+        self._rtcm_sequence = 0
 
     def __contains__(self, name: object) -> bool:
         return name in self._crew.members
@@ -52,6 +54,31 @@ class Fleet(Selection):
         """
         for each in self._crew.matching(name):
             self._crew.members[each].leave(why)
+
+    def send_corrections(self, rtcm: bytes) -> int:
+        """Send RTCM corrections (RTK, DGPS) to all of them: once for each link, whoever is on it (GPS_RTCM_DATA).
+
+        Args:
+            rtcm: one or more RTCM 3 messages, each of 720 bytes at most.
+
+        Returns:
+            How many messages were sent on each link.
+
+        Raises:
+            LocalProtocolError: one is longer, or there is none. Nothing was sent.
+            ConnectionClosed, LinkLost: a link has ended; the others before it have got them.
+        """
+        pieces = [
+            piece
+            for number, message in enumerate(rtcm_messages(rtcm) if rtcm else [b""], self._rtcm_sequence)
+            for piece in fragments(message, number)
+        ]
+        self._rtcm_sequence += len({piece.flags >> 3 for piece in pieces})
+        links = {id(each): each for each in self._crew.networks.values()}
+        for connection in links.values():
+            for piece in pieces:
+                connection.send(piece)
+        return len(pieces)
 
     # -------------------------------------------------------------------------------------- streams
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import AsyncExitStack
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from aerokit.arguments import checked
 from aerokit.async_block import async_block
 from aerokit.errors import LocalProtocolError
 from aerokit.fleets.crew import Crew
+from aerokit.fleets.distances import DistanceWatch
 from aerokit.fleets.finding import find_systems
 from aerokit.fleets.fleet import Fleet
 from aerokit.fleets.keeping import Keepers
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
 
 __all__ = ["fleet"]
 
+WhenTooClose = Literal["hold", "tell"]
+"""What is done about two members that are too near to each other in flight."""
 Source = str | Link | Connection | Vehicle
 
 
@@ -43,6 +46,7 @@ async def fleet(
     on_error_of: Mapping[str, PolicyName | Callable[[Failure], PolicyName | Mapping[str, PolicyOrder] | None]]
     | None = None,
     min_distance_m: float | None = None,
+    too_close: WhenTooClose = "hold",
     timeout: float = 30.0,
     rates: Mapping[type[Message], float] | None = None,
 ) -> AsyncIterator[Fleet]:
@@ -62,7 +66,9 @@ async def fleet(
         roles: role → names or patterns, likewise.
         on_error: what the others do when one fails in a common action (docs/fleets.md).
         on_error_of: group → the same when one of this group fails.
-        min_distance_m: tell when two come nearer to each other, and have both hold; None: do not look.
+        min_distance_m: metres between any two: ways are compared before they are flown, and in flight the event
+            ``TooClose`` tells who is nearer to whom; None: nobody looks.
+        too_close: what is done then: both ``"hold"``, as far as they take orders, or it is only told (``"tell"``).
         timeout: seconds to wait for all of them.
         rates: message class → Hz, asked of each instead of the default rates; ``{}`` asks for nothing.
 
@@ -74,6 +80,12 @@ async def fleet(
         ConnectFailed: not all of them were heard in time; the text says which were.
     """
     rules = Rules(on_error, on_error_of or {})
+    if min_distance_m is not None and not 0 < min_distance_m < 10_000:
+        raise LocalProtocolError(
+            f"min_distance_m = {min_distance_m!r} is not allowed: above 0 to 10,000 metres"
+        )
+    if too_close not in ("hold", "tell"):
+        raise LocalProtocolError(f"too_close = {too_close!r} is not allowed: 'hold' or 'tell'")
     if count is not None and count < 1:
         raise LocalProtocolError(f"count = {count} is not allowed: 1 or more, or None")
     named = _named(sources)
@@ -94,11 +106,14 @@ async def fleet(
         kept = await keepers.keep([(name, networks[name], each) for name in found for each in ids[name]])
         members += [Member(f"{name}/{vehicle.system_id}", name, vehicle) for name, vehicle in kept]
         _check_names(members)
-        crew = Crew(members, networks, rules, next(iter(networks.values())).now, _raise)
+        crew = Crew(members, networks, rules, next(iter(networks.values())).now, _raise, min_distance_m)
         _sort(crew, groups or {}, "group")
         _sort(crew, roles or {}, "role")
         stack.push_async_callback(crew.aclose)
         crew.start()
+        if min_distance_m is not None:
+            watch = DistanceWatch(crew, min_distance_m, holds=too_close == "hold")
+            crew.background.start(watch.run, "aerokit distances")
         yield Fleet(crew)
 
 
@@ -137,9 +152,11 @@ def _given(named: Mapping[str, Source], networks: dict[str, Connection]) -> list
 def _ids(
     system_ids: Iterable[int] | Mapping[str, Iterable[int]] | None, networks: list[str]
 ) -> dict[str, list[int] | None]:
-    by_network: Mapping[str, Iterable[int]] = system_ids if isinstance(system_ids, Mapping) else {}
     ids: dict[str, list[int] | None] = {name: None for name in networks}  # noqa: C420 - of a wider type
-    if system_ids is not None and not isinstance(system_ids, Mapping):
+    by_network: dict[str, Iterable[int]] = {}
+    if isinstance(system_ids, Mapping):
+        by_network = {str(name): those for name, those in system_ids.items()}
+    elif system_ids is not None:
         ids = {name: list(system_ids) for name in networks}
     for name, those in by_network.items():
         if name not in ids:
