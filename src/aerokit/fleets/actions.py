@@ -28,7 +28,7 @@ class Actions(FleetPart):
         action: str | Callable[[Member], Awaitable[Any]],
         *arguments: object,
         timeout: float | None = None,
-        stagger_s: float = 0.0,
+        stagger_s: float | None = None,
         **options: object,
     ) -> FleetResult:
         """Do something with each of them at once.
@@ -38,7 +38,7 @@ class Actions(FleetPart):
                 coroutine function that is called with each :class:`Member`.
             *arguments: of the method.
             timeout: seconds that each of them has; None: what the action itself allows.
-            stagger_s: each begins so many seconds after the one before.
+            stagger_s: each begins so many seconds after the one before; None: all at once.
             **options: of the method.
 
         Raises:
@@ -69,12 +69,12 @@ class Actions(FleetPart):
         """
         return await self._run("wait_ready", lambda member: member.vehicle.wait_ready(timeout=timeout))
 
-    async def arm(self, *, timeout: float = 10.0, stagger_s: float = 0.0) -> FleetResult:
+    async def arm(self, *, timeout: float = 10.0, stagger_s: float | None = None) -> FleetResult:
         """Arm them: **propellers may start to turn**; as :meth:`aerokit.Vehicle.arm`.
 
         Args:
             timeout: seconds that each of them has.
-            stagger_s: each begins so many seconds after the one before.
+            stagger_s: each begins so many seconds after the one before; None: all at once.
         """
         return await self._run("arm", lambda member: member.vehicle.arm(timeout=timeout), stagger_s=stagger_s)
 
@@ -87,14 +87,14 @@ class Actions(FleetPart):
         return await self._run("disarm", lambda member: member.vehicle.disarm(timeout=timeout))
 
     async def take_off(
-        self, altitude_m: float, *, timeout: float = 60.0, stagger_s: float = 0.0
+        self, altitude_m: float, *, timeout: float = 60.0, stagger_s: float | None = None
     ) -> FleetResult:
         """Take off and climb to ``altitude_m`` above home; as :meth:`aerokit.Vehicle.take_off`.
 
         Args:
             altitude_m: metres above the home of each.
             timeout: seconds that each of them has.
-            stagger_s: each begins so many seconds after the one before.
+            stagger_s: each begins so many seconds after the one before; None: all at once.
         """
         return await self._run(
             "take_off",
@@ -102,23 +102,25 @@ class Actions(FleetPart):
             stagger_s=stagger_s,
         )
 
-    async def land(self, *, timeout: float | None = 300.0, stagger_s: float = 0.0) -> FleetResult:
+    async def land(self, *, timeout: float | None = 300.0, stagger_s: float | None = None) -> FleetResult:
         """Land where they are; as :meth:`aerokit.Vehicle.land`. Nobody is stopped because another one has failed.
 
         Args:
             timeout: seconds that each of them has; None: as long as it takes.
-            stagger_s: each begins so many seconds after the one before.
+            stagger_s: each begins so many seconds after the one before; None: all at once.
         """
         return await self._run(
             "land", lambda member: member.vehicle.land(timeout=timeout), stagger_s=stagger_s
         )
 
-    async def return_to_launch(self, *, timeout: float | None = 600.0, stagger_s: float = 0.0) -> FleetResult:
+    async def return_to_launch(
+        self, *, timeout: float | None = 600.0, stagger_s: float | None = None
+    ) -> FleetResult:
         """Return to where each has started; as :meth:`aerokit.Vehicle.return_to_launch`, and as :meth:`land` here.
 
         Args:
             timeout: seconds that each of them has; None: as long as it takes.
-            stagger_s: each begins so many seconds after the one before.
+            stagger_s: each begins so many seconds after the one before; None: all at once.
         """
         return await self._run(
             "return_to_launch",

@@ -11,7 +11,6 @@ import anyio
 from aerokit.errors import (
     AerokitError,
     HeartbeatTimeout,
-    LocalProtocolError,
     OperationRejected,
     OperationTimeout,
 )
@@ -47,14 +46,12 @@ class CommonAction:
         act: Callable[[Member], Awaitable[Any]],
         *,
         timeout: float | None = None,
-        stagger_s: float = 0.0,
+        stagger_s: float | None = None,
         is_safe: bool = False,
         holds_if_cancelled: bool = True,
     ) -> None:
-        if not stagger_s >= 0:
-            raise LocalProtocolError(f"stagger_s = {stagger_s!r} is not allowed: 0 or more seconds")
         self._crew, self.what, self._act = crew, what, act
-        self._timeout, self._stagger_s = timeout, stagger_s
+        self._timeout, self._stagger_s = timeout, stagger_s or 0.0
         self._is_safe, self._holds_if_cancelled = is_safe, holds_if_cancelled
         everybody = list(members)
         for each in everybody:

@@ -66,12 +66,12 @@ class Missions(FleetPart):
         self._crew.missions.update(missions)
         return result
 
-    async def start_missions(self, *, timeout: float = 10.0, stagger_s: float = 0.0) -> FleetResult:
+    async def start_missions(self, *, timeout: float = 10.0, stagger_s: float | None = None) -> FleetResult:
         """Start the missions that were uploaded together, all at once or nobody; as ``vehicle.mission.start``.
 
         Args:
             timeout: seconds until each tells its mission mode.
-            stagger_s: each begins so many seconds after the one before.
+            stagger_s: each begins so many seconds after the one before; None: all at once.
 
         Raises:
             OperationRejected: there was no upload that all of them took, or one of them does not take part any more or

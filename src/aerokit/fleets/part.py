@@ -51,7 +51,7 @@ class FleetPart:
         act: Callable[[Member], Awaitable[Any]],
         *,
         timeout: float | None = None,
-        stagger_s: float = 0.0,
+        stagger_s: float | None = None,
         names: tuple[str, ...] | None = None,
     ) -> FleetResult:
         members = [each for each in self if names is None or each.name in names]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from itertools import combinations
+from itertools import combinations, pairwise
 from typing import TYPE_CHECKING
 
 from aerokit.fleets.clocks import ClockOffset
@@ -96,7 +96,7 @@ def error_between(
 
 
 def _between(samples: Sequence[tuple[float, Place]], at_s: float) -> Place | None:
-    for (then, one), (after, other) in zip(samples, samples[1:]):  # noqa: B905 - each with the next
+    for (then, one), (after, other) in pairwise(samples):
         if then <= at_s <= after:
             share = 0.0 if after == then else (at_s - then) / (after - then)
             return (

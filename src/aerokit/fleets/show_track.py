@@ -59,6 +59,11 @@ class FlownTrack:
         if self._detach is not None:
             self._detach()
 
+    @property
+    def is_known(self) -> bool:
+        """Whether it has told where it is since the block began."""
+        return self._latest is not None
+
     def where_now(self) -> Place:
         """Where it is by now: what it told last, and how far it has flown since.
 

@@ -63,6 +63,7 @@ class Shows(Travel):
         *,
         rate_hz: float = 5.0,
         start_in_s: float = 5.0,
+        lead_s: float | None = 0.3,
         speed_m_s: float | None = None,
     ) -> ShowReport:
         """Fly a show: all to their first points, all off at one instant, each along its track; they hold at its end.
@@ -76,6 +77,8 @@ class Shows(Travel):
             origin: where its metres count from; without an altitude above the sea it is at the home of the first.
             rate_hz: set-points a second for each, 2 to 50.
             start_in_s: seconds from when all are at their first points to the start.
+            lead_s: how much earlier each is told its velocity than the track has it: vehicles take a moment to obey,
+                and ``lag_s`` in the report says how long. None: not at all.
             speed_m_s: ground speed on the way to the first points; None leaves it.
 
         Raises:
@@ -108,7 +111,9 @@ class Shows(Travel):
             }
 
             async def fly(member: Member) -> None:
-                await _fly_track(member, show.tracks[member.name], flown[member.name], begin, rate_hz)
+                await _fly_track(
+                    member, show.tracks[member.name], flown[member.name], begin, rate_hz, lead_s or 0.0
+                )
 
             result = await self._run("show", fly, names=names)
         return _report(show, result, dict(clocks), {name: each.samples for name, each in flown.items()})
@@ -143,22 +148,31 @@ class Shows(Travel):
             )
 
 
-async def _fly_track(member: Member, path: Path, flown: FlownTrack, begin: float, rate_hz: float) -> None:
+async def _fly_track(
+    member: Member, path: Path, flown: FlownTrack, begin: float, rate_hz: float, lead_s: float
+) -> None:
     """By velocities: that of the track, and what brings it to where it should be."""
-    connection, period_s = member.vehicle.connection, 1 / rate_hz
-    async with member.vehicle.guided.velocity(rate_hz=rate_hz) as stream:
-        while (at_s := connection.now() - begin) < path.ends_at_s:
-            planned, velocity = state_at(path, at_s)
-            here = flown.where_now()
-            limit = max(FASTER[0] * _length(velocity), FASTER[1]) + FASTER[1]
-            north, east, up = follow_velocity(
-                (planned[0] - here[0], planned[1] - here[1], planned[2] - here[2]),
-                velocity,
-                gain=GAIN,
-                max_speed_m_s=limit,
-            )
-            stream.set(VelocitySetpoint(north, east, -up))
-            await anyio.sleep(period_s)
+    vehicle, period_s = member.vehicle, 1 / rate_hz
+    with vehicle._talk.streaming("position"):
+        async with vehicle.guided.velocity(rate_hz=rate_hz) as stream:
+            while (at_s := vehicle.connection.now() - begin) < path.ends_at_s:
+                if at_s >= 0 or flown.is_known:
+                    stream.set(_wanted(path, at_s, lead_s, flown.where_now()))
+                else:
+                    stream.set(VelocitySetpoint())
+                await anyio.sleep(period_s)
+
+
+def _wanted(path: Path, at_s: float, lead_s: float, here: Place) -> VelocitySetpoint:
+    planned, velocity = state_at(path, at_s)[0], state_at(path, at_s + lead_s)[1]
+    limit = max(FASTER[0] * _length(velocity), FASTER[1]) + FASTER[1]
+    north, east, up = follow_velocity(
+        (planned[0] - here[0], planned[1] - here[1], planned[2] - here[2]),
+        velocity,
+        gain=GAIN,
+        max_speed_m_s=limit,
+    )
+    return VelocitySetpoint(north, east, -up)
 
 
 def _report(

@@ -34,7 +34,7 @@ class Travel(FleetPart):
         *,
         speed_m_s: float | None = None,
         timeout: float | None = None,
-        stagger_s: float = 0.0,
+        stagger_s: float | None = None,
         apart: Deconfliction | None = None,
     ) -> FleetResult:
         """Fly each to a place of its own; as :meth:`aerokit.Vehicle.go_to`.
@@ -45,7 +45,7 @@ class Travel(FleetPart):
             targets: name → place; who is not named stays where it is. Or a function that gives the place of a member.
             speed_m_s: ground speed; None leaves it.
             timeout: seconds that each of them has for a leg; None: as long as it takes.
-            stagger_s: each begins so many seconds after the one before.
+            stagger_s: each begins so many seconds after the one before; None: all at once.
             apart: what :meth:`plan_apart` has decided about these targets.
 
         Raises:
@@ -152,7 +152,7 @@ class Travel(FleetPart):
         places: Mapping[str, Position],
         speed_m_s: float | None,
         timeout: float | None,
-        stagger_s: float = 0.0,
+        stagger_s: float | None = None,
         delays_s: Mapping[str, float] | None = None,
         names: tuple[str, ...] = (),
     ) -> FleetResult:
