@@ -55,7 +55,7 @@ class ModeActions(Part):
         """What somebody else has made of the program's last action, as a clause; empty: nothing that was told.
 
         "the mode changed to LOITER": by a pilot, a failsafe or another program, which HEARTBEAT does not tell apart.
-        A vehicle that only disarmed, as after a landing, was not taken over. The next action of the program begins anew.
+        A vehicle that only disarmed, as after a landing, was not taken over. The program's next action begins anew.
         """
         order = self._helm.newest
         return order.taken_by if order is not None and order.has_lost_mode else ""
