@@ -26,7 +26,7 @@ HOW_TO = (
 )  # fmt: skip
 NAVIGATION: dict[str, list[str]] = {
     "Tutorial": ["tutorial.md"],
-    "How-to": ["how-to/index.md", *(f"how-to/{name}.md" for name in HOW_TO)],
+    "How-to": ["how-to/index.md", *(f"how-to/{name}.md" for name in HOW_TO), "fleets.md"],
     "Coming from": [
         "coming-from/index.md", "coming-from/dronekit.md", "from-dronekit.md", "coming-from/mavsdk.md",
         "coming-from/pymavlink.md", "coming-from/mavros.md",

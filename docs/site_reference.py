@@ -27,6 +27,10 @@ ROOMS = (
     Room("aerokit", "aerokit", "Connecting, and what a program says", ("aerokit",)),
     Room("vehicle", "aerokit.vehicle: Vehicle", "State, actions, and the way to its parts",
          (f"{VEHICLE}.vehicle", f"{VEHICLE}.vehicles", f"{VEHICLE}.overview")),
+    Room("fleets", "aerokit.fleets: Fleet", "Many vehicles as one",
+         tuple(f"aerokit.fleets.{name}" for name in (
+             "fleet", "selection", "members", "results", "policy", "events", "formation", "following", "apart", "paths",
+             "show", "show_report", "clocks"))),
     Room("cells", "Cells and subscriptions", "Values with their age; messages and events as they come",
          ("aerokit.runtime.cells", "aerokit.runtime.subscription")),
     Room("state", "Values of the state", "What cells hold",

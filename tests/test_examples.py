@@ -32,9 +32,12 @@ IN_VIRTUAL_TIME: dict[str, tuple[list[Any], list[str]]] = {
         [],
         ["1349 parameters", " instead of ", "LAND_SPEED is 40 for now", "LAND_SPEED is 50 again"],
     ),
+    "fleet_formation": ([], ["field/1, field/2, field/3", "in formation", "m from its place", "3 of 3 done"]),
     "two_vehicles": ([], ["system 1 is at", "system 2 is at", "both landed"]),
 }
 """Example: what its ``main`` takes behind the address, and what it must print."""
+MANY = {"two_vehicles": 2, "fleet_formation": 3}
+"""Example: how many vehicles it flies."""
 AS_PROGRAMS: dict[str, list[str]] = {
     "hello": ["ArduCopter 4.7.0", "disarmed", "could be armed"],
     "blocking_hello": ["ArduCopter 4.7.0", "landed"],
@@ -54,8 +57,12 @@ def run_in_virtual_time(name: str, *arguments: Any) -> None:
     example = runpy.run_path(str(EXAMPLES / f"{name}.py"))
 
     async def main() -> None:
-        copters = [SimulatedCopter(system_id=number, boot_time_s=0.0) for number in (1, 2)]
-        async with simulated_link(copters if name == "two_vehicles" else copters[0]) as link:
+        homes = [(-35.363261, 149.165230 + 1e-4 * number, 584.0) for number in range(MANY.get(name, 1))]
+        copters = [
+            SimulatedCopter(system_id=number, boot_time_s=0.0, home=home)
+            for number, home in enumerate(homes, 1)
+        ]
+        async with simulated_link(copters if name in MANY else copters[0]) as link:
             await example["main"](link, *arguments)
 
     run_virtual(main())

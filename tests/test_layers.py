@@ -20,6 +20,7 @@ FLOORS = [
     {"runtime", "sim"},
     {"hub"},
     {"vehicle"},
+    {"fleets"},
     {"sync", "video", "flights"},
     {"dronekit"},
     {"convert", "report", "serve", "foxglove", "monitor", "network"},

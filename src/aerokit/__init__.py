@@ -25,6 +25,13 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from aerokit import errors, events
+    from aerokit.fleets.apart import Deconfliction
+    from aerokit.fleets.fleet import Fleet
+    from aerokit.fleets.formation import Formation, Offset
+    from aerokit.fleets.members import Member, MemberState
+    from aerokit.fleets.opening import fleet
+    from aerokit.fleets.results import FleetResult
+    from aerokit.fleets.show import Show
     from aerokit.hub.hub import Hub
     from aerokit.hub.values import Endpoint
     from aerokit.mavlink import enums, messages
@@ -52,13 +59,21 @@ __all__ = [
     "AttitudeSetpoint",
     "BodyVelocitySetpoint",
     "Connection",
+    "Deconfliction",
     "Dialect",
     "Endpoint",
+    "Fleet",
+    "FleetResult",
+    "Formation",
     "Hub",
     "LinkState",
     "LocalPositionSetpoint",
+    "Member",
+    "MemberState",
+    "Offset",
     "Position",
     "PositionSetpoint",
+    "Show",
     "Signing",
     "SigningKey",
     "Vehicle",
@@ -67,6 +82,7 @@ __all__ = [
     "enums",
     "errors",
     "events",
+    "fleet",
     "messages",
     "open_connection",
 ]
@@ -77,13 +93,21 @@ _HOMES = {
     "AttitudeSetpoint": "aerokit.vehicle.orders.setpoints",
     "BodyVelocitySetpoint": "aerokit.vehicle.orders.setpoints",
     "Connection": "aerokit.runtime.connection",
+    "Deconfliction": "aerokit.fleets.apart",
     "Dialect": "aerokit.mavlink.dialect",
     "Endpoint": "aerokit.hub.values",
     "Hub": "aerokit.hub.hub",
+    "Fleet": "aerokit.fleets.fleet",
+    "FleetResult": "aerokit.fleets.results",
+    "Formation": "aerokit.fleets.formation",
     "LinkState": "aerokit.runtime.link_state",
     "LocalPositionSetpoint": "aerokit.vehicle.orders.setpoints",
+    "Member": "aerokit.fleets.members",
+    "MemberState": "aerokit.fleets.members",
+    "Offset": "aerokit.fleets.formation",
     "Position": "aerokit.position",
     "PositionSetpoint": "aerokit.vehicle.orders.setpoints",
+    "Show": "aerokit.fleets.show",
     "Signing": "aerokit.mavlink.signing",
     "SigningKey": "aerokit.mavlink.signing",
     "Vehicle": "aerokit.vehicle.vehicle",
@@ -92,6 +116,7 @@ _HOMES = {
     "enums": "aerokit.mavlink.enums",
     "errors": "aerokit.errors",
     "events": "aerokit.events",
+    "fleet": "aerokit.fleets.opening",
     "messages": "aerokit.mavlink.messages",
     "open_connection": "aerokit.runtime.opening",
 }

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
 __all__ = [
     "AerokitError",
     "BusyError",
@@ -12,6 +17,7 @@ __all__ = [
     "FileError",
     "FileFormatError",
     "FileTimeout",
+    "FleetError",
     "GimbalTaken",
     "HeartbeatTimeout",
     "LinkError",
@@ -200,6 +206,14 @@ class GimbalTaken(OperationRejected):
         super().__init__(message)
         self.system_id = system_id
         self.component_id = component_id
+
+
+class FleetError(OperationRejected):
+    """Some of a fleet did not do what all of them were to do; ``errors`` has the error of each by the member's name."""
+
+    def __init__(self, message: str, *, errors: Mapping[str, Exception]) -> None:
+        super().__init__(message, reasons=tuple(f"{name}: {error}" for name, error in errors.items()))
+        self.errors: dict[str, Exception] = dict(errors)
 
 
 class SetpointStreamStopped(OperationRejected):

@@ -29,6 +29,7 @@ from aerokit.lazy import lazy_names
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from aerokit.sync.fleet_twins import Fleet, Selection, fleet
     from aerokit.sync.twins import (
         Connection,
         Guided,
@@ -42,15 +43,21 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Connection",
+    "Fleet",
     "Guided",
+    "Selection",
     "SetpointStream",
     "StateCell",
     "Subscription",
     "Vehicle",
     "connect",
+    "fleet",
     "open_connection",
 ]
 
+_OF_FLEETS = ("Fleet", "Selection", "fleet")
+_HOMES = {name: f"aerokit.sync.{'fleet_twins' if name in _OF_FLEETS else 'twins'}" for name in __all__}
+
 __getattr__: Callable[[str], Any]
 __dir__: Callable[[], list[str]]
-__getattr__, __dir__ = lazy_names(__name__, dict.fromkeys(__all__, "aerokit.sync.twins"), __all__)
+__getattr__, __dir__ = lazy_names(__name__, _HOMES, __all__)

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from typing_extensions import Self
 
+    from aerokit.fleets.following import Following
     from aerokit.runtime.cells import Changes, StateCell  # noqa: F401 - named in the base classes below
     from aerokit.runtime.connection import Connection
     from aerokit.runtime.events import VehicleFound
@@ -54,7 +55,8 @@ A = TypeVar("A")
 T = TypeVar("T")
 EnteredT = TypeVar("EnteredT")
 LeftT = TypeVar(
-    "LeftT", bound="CameraBlock | GimbalControl | GimbalRates | PhotoInterval | SetpointStream[Any]"
+    "LeftT",
+    bound="CameraBlock | Following | GimbalControl | GimbalRates | PhotoInterval | SetpointStream[Any]",
 )
 BlockT = TypeVar("BlockT", bound="Temporarily | Transaction")
 TwinT = TypeVar("TwinT", bound="ConnectionTwin | VehicleTwin")

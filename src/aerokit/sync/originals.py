@@ -23,7 +23,7 @@ class Twin:
 
     ``only``: these members alone; ``without``: all but these. ``direct``: methods that only read, and are called on
     the thread of the program; ``called``: properties that are read on the loop; ``parts``: those that are made
-    there when they are first read.
+    there when they are first read. ``page``: the file that it is written to.
     """
 
     path: str
@@ -34,6 +34,7 @@ class Twin:
     called: frozenset[str] = frozenset()
     parts: frozenset[str] = frozenset()
     parameter: str = ""
+    page: str = "twins"
 
     @property
     def name(self) -> str:
@@ -96,6 +97,11 @@ TWINS = (
             "camera cameras components guided gimbal gimbals files logs parameters mission fence rally"
         ),
     ),
+    Twin("aerokit.fleets.following.Following", "BlockTwin", direct=_names("error_m"), page="fleet_twins"),
+    Twin(
+        "aerokit.fleets.selection.Selection", "SelectionTwin", without=_names("vehicles"), page="fleet_twins"
+    ),
+    Twin("aerokit.fleets.fleet.Fleet", "FleetTwin", without=_names("vehicles"), page="fleet_twins"),
 )
 """The classes that programs without ``async`` use, each below those that it gives."""
 

@@ -3228,6 +3228,15 @@ class Vehicle(VehicleTwin):
         """Whether a flight was given up, and the order to hold that followed is not confirmed yet."""
         return self.aio.is_told_to_hold
 
+    @property
+    def taken_over(self) -> str:
+        """What somebody else has made of the program's last action, as a clause; empty: nothing that was told.
+
+        "the mode changed to LOITER": by a pilot, a failsafe or another program, which HEARTBEAT does not tell apart.
+        A vehicle that only disarmed, as after a landing, was not taken over. The program's next action begins anew.
+        """
+        return self.aio.taken_over
+
     def missing_for_flight(self) -> list[str]:
         """What is still missing before the vehicle can fly, as far as it is known already; talks to nobody."""
         return self._loop.call(self.aio.missing_for_flight)

@@ -49,3 +49,13 @@ class ModeActions(Part):
     def is_told_to_hold(self) -> bool:
         """Whether a flight was given up, and the order to hold that followed is not confirmed yet."""
         return self._holding.is_told_to_hold
+
+    @property
+    def taken_over(self) -> str:
+        """What somebody else has made of the program's last action, as a clause; empty: nothing that was told.
+
+        "the mode changed to LOITER": by a pilot, a failsafe or another program, which HEARTBEAT does not tell apart.
+        A vehicle that only disarmed, as after a landing, was not taken over. The program's next action begins anew.
+        """
+        order = self._helm.newest
+        return order.taken_by if order is not None and order.has_lost_mode else ""

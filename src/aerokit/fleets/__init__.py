@@ -1,0 +1,1 @@
+"""Many vehicles as one: actions on all of them, policies for failures, formations, shows."""

@@ -1,0 +1,174 @@
+"""``Following``: members that fly in their places beside a leader, by set-points, for the time of a block."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from typing import TYPE_CHECKING
+
+import anyio
+
+from aerokit.arguments import checks_arguments
+from aerokit.errors import BusyError, OperationRejected, SetpointStreamStopped, ValueUnknownError
+from aerokit.fleets.common import CommonAction
+from aerokit.fleets.formation import follow_velocity
+from aerokit.fleets.nearness import local_places
+from aerokit.fleets.whereabouts import altitude_amsl
+from aerokit.runtime.background import Background
+from aerokit.vehicle.orders.setpoints import VelocitySetpoint
+
+if TYPE_CHECKING:
+    from types import TracebackType
+
+    from typing_extensions import Self
+
+    from aerokit.fleets.crew import Crew
+    from aerokit.fleets.formation import Formation
+    from aerokit.fleets.members import Member
+    from aerokit.fleets.results import FleetResult
+
+__all__ = ["Following"]
+
+OLD_LEADER_S = 1.5
+"""Where the leader was longer ago is no place to follow."""
+GAIN = 0.6
+
+
+@checks_arguments
+class Following:
+    """In its block the followers keep their places; leaving it, in any way, tells them to hold.
+
+    It stops by itself when the leader is lost or taken over, and as the fleet's policy says when a follower is; then
+    leaving the block raises :class:`SetpointStreamStopped`.
+    """
+
+    def __init__(
+        self,
+        crew: Crew,
+        leader: Member,
+        followers: list[Member],
+        formation: Formation,
+        rate_hz: float,
+        max_speed_m_s: float,
+    ) -> None:
+        self._crew, self._leader, self._followers, self._formation = crew, leader, followers, formation
+        self._period_s, self._rate_hz, self._max_speed_m_s = 1 / rate_hz, rate_hz, max_speed_m_s
+        self._tasks = Background(self._on_mistake)
+        self._ended = asyncio.Event()
+        self._was_entered = False
+        self._why = ""
+        self._result: FleetResult | None = None
+
+    @property
+    def is_running(self) -> bool:
+        """Whether the followers follow."""
+        return self._was_entered and not self._ended.is_set()
+
+    @property
+    def why(self) -> str:
+        """Why it has stopped by itself, in words; empty while it has not."""
+        return self._why
+
+    def error_m(self, name: str) -> float:
+        """Metres between where a follower is and where its place is now; infinite while that is not known."""
+        member = next((each for each in self._followers if each.name == name), None)
+        try:
+            return math.inf if member is None else math.hypot(*self._to_go(member))
+        except (ValueUnknownError, OperationRejected):
+            return math.inf
+
+    async def wait_stopped(self) -> str:
+        """Wait until it stops by itself, and return why."""
+        await self._ended.wait()
+        return self._why
+
+    async def __aenter__(self) -> Self:
+        if self._was_entered:
+            raise BusyError("following is entered once; make a new one")
+        self._was_entered = True
+        self._look_at_leader()
+        self._tasks.start(self._follow, "aerokit following")
+        return self
+
+    async def __aexit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        has_stopped = self._ended.is_set()
+        self._ended.set()
+        await self._tasks.aclose()
+        if has_stopped and exc is None:
+            raise SetpointStreamStopped(f"following has stopped: {self._why}")
+
+    # --------------------------------------------------------------------------------------- inside
+
+    async def _follow(self) -> None:
+        action = CommonAction(self._crew, "following", self._followers, self._fly)
+        result = await action.run()
+        failed = [f"{name}: {error}" for name, error in result.failed.items()]
+        self._why = "; ".join(failed or ["nobody follows"])
+        self._ended.set()
+
+    async def _fly(self, member: Member) -> None:
+        async with member.vehicle.guided.velocity(rate_hz=self._rate_hz) as stream:
+            while not self._leader_is_gone():
+                stream.set(self._wanted(member))
+                await anyio.sleep(self._period_s)
+            await asyncio.Event().wait()  # it is being cancelled with all the others, and holds by that
+
+    def _leader_is_gone(self) -> bool:
+        """Stop all of it if there is nobody to follow any more."""
+        if not self._ended.is_set():
+            try:
+                self._look_at_leader()
+                self._leader.vehicle.position.fresh(OLD_LEADER_S)
+            except (OperationRejected, ValueUnknownError) as error:
+                self._why = str(error)
+                self._ended.set()
+                self._tasks.cancel()
+        return self._ended.is_set()
+
+    def _wanted(self, member: Member) -> VelocitySetpoint:
+        moving = self._leader.vehicle.velocity.latest
+        target = (0.0, 0.0, 0.0) if moving is None else (moving.north_m_s, moving.east_m_s, -moving.down_m_s)
+        north, east, up = follow_velocity(
+            self._to_go(member), target, gain=GAIN, max_speed_m_s=self._max_speed_m_s
+        )
+        return VelocitySetpoint(north, east, -up)
+
+    def _to_go(self, member: Member) -> tuple[float, float, float]:
+        """Metres north, east and up to its place, as of now: what was told a moment ago has moved on since."""
+        leader, vehicle = self._leader.vehicle, member.vehicle
+        there, here = leader.position.fresh(OLD_LEADER_S), vehicle.position.fresh(OLD_LEADER_S)
+        places = local_places(
+            {
+                "there": (there.latitude_deg, there.longitude_deg, altitude_amsl(self._leader, there)),
+                "here": (here.latitude_deg, here.longitude_deg, altitude_amsl(member, here)),
+            }
+        )
+        offset = self._formation.offset_of(member.name, leader.heading_deg.latest)
+        to_go = [
+            places["there"][i] - places["here"][i] + each
+            for i, each in enumerate((offset.north_m, offset.east_m, offset.up_m))
+        ]
+        for one, sign in ((leader, 1.0), (vehicle, -1.0)):
+            moving = one.velocity.latest
+            if moving is not None:
+                age = sign * one.position.age
+                to_go[0] += age * moving.north_m_s
+                to_go[1] += age * moving.east_m_s
+                to_go[2] -= age * moving.down_m_s
+        return to_go[0], to_go[1], to_go[2]
+
+    def _look_at_leader(self) -> None:
+        self._leader.look()
+        if not self._leader.takes_orders:
+            raise OperationRejected(
+                f"the leader {self._leader.name} is {self._leader.state.value}: {self._leader.why}"
+            )
+
+    def _on_mistake(self, error: Exception) -> None:
+        self._why = str(error)
+        self._ended.set()

@@ -1,0 +1,185 @@
+"""``Member``: one vehicle of a fleet, and how it stands with it."""
+
+from __future__ import annotations
+
+import asyncio
+import enum
+from functools import partial
+from typing import TYPE_CHECKING
+
+from aerokit.fleets.events import MemberBack, MemberFailed, MemberLost, MemberTakenBack, MemberTakenOver
+from aerokit.mavlink.enums import MavState
+from aerokit.runtime.events import VehicleBack, VehicleSilent
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from typing import Any
+
+    from aerokit.fleets.events import FleetEvent
+    from aerokit.runtime.bus import Detach
+    from aerokit.vehicle.vehicle import Vehicle
+
+__all__ = ["Member", "MemberState"]
+
+UNDER_FAILSAFE = (MavState.CRITICAL, MavState.EMERGENCY)
+
+
+class MemberState(enum.Enum):
+    """How it stands with a member."""
+
+    IN = "in"
+    """It takes part."""
+    LOST = "lost"
+    """It is not heard: nothing is ordered of it until it is heard again."""
+    TAKEN_OVER = "taken over"
+    """A pilot, a failsafe or another program has it: nothing is ordered of it until ``take_back``."""
+    FAILED = "failed"
+    """It has not done what was ordered last; it takes part in what is ordered next."""
+    LEFT = "left"
+    """The program has let it go: nothing is ordered of it until ``take_back``."""
+
+
+class Member:
+    """One vehicle of a fleet. ``why`` says in words how it came to its ``state``."""
+
+    def __init__(self, name: str, network: str, vehicle: Vehicle, *, group: str = "", role: str = "") -> None:
+        self.name: str = name
+        """Unique in the fleet: ``"north/7"``, or as the program has called it."""
+        self.network: str = network
+        """The name of the connection that it is on."""
+        self.vehicle: Vehicle = vehicle
+        """For all that is not done in common."""
+        self.group: str = group
+        """The group that it is in; empty: none."""
+        self.role: str = role
+        """What it does in it, in the program's words; empty: none."""
+        self.state: MemberState = MemberState.IN
+        """How it stands with it."""
+        self.why: str = ""
+        """How it came to that, in words; empty while it is IN."""
+        self._lost_at = 0.0
+        self._taken_back: tuple[object, object] | None = None
+        self._minds_failsafe = True
+        self._detach: list[Detach] = []
+        self._tell: Callable[[FleetEvent], None] = lambda _: None
+        self._on_fallen_out: Callable[[Member], None] = lambda _: None
+
+    @property
+    def takes_orders(self) -> bool:
+        """Whether it may be ordered something: it is heard, and nobody else flies it."""
+        return self.state in (MemberState.IN, MemberState.FAILED)
+
+    def __repr__(self) -> str:
+        return f"<Member {self.name} {self.state.value}{f': {self.why}' if self.why else ''}>"
+
+    # ------------------------------------------------------------------------------- by the fleet
+
+    def watch(self, tell: Callable[[FleetEvent], None], on_fallen_out: Callable[[Member], None]) -> None:
+        """Begin to listen; ``on_fallen_out`` is called when it is lost or taken over."""
+        self._tell, self._on_fallen_out = tell, on_fallen_out
+        vehicle, bus = self.vehicle, self.vehicle.connection.bus
+        later = partial(self._soon, self.look)
+        self._detach = [
+            bus.attach_event(VehicleSilent, self._on_silent),
+            bus.attach_event(VehicleBack, self._on_back),
+            vehicle.mode.observe(later),
+            vehicle.system_status.observe(later),
+            vehicle.connection.on_end(self._on_end),
+        ]
+        if vehicle.is_silent:
+            self._lose(vehicle.describe_link())
+
+    def stop_watching(self) -> None:
+        """Listen no more."""
+        for detach in self._detach:
+            detach()
+        self._detach = []
+
+    def look(self) -> None:
+        """Find out whether somebody else has it by now."""
+        if self.takes_orders and self._detach and (why := self._who_has_it()):
+            self._change(MemberState.TAKEN_OVER, why)
+            self._tell(MemberTakenOver(*self._when(), why))
+            self._on_fallen_out(self)
+
+    def note_failed(self, action: str, error: Exception) -> None:
+        """It has not done its part."""
+        self.look()
+        if self.takes_orders:
+            self._change(MemberState.FAILED, str(error))
+        self._tell(MemberFailed(*self._when(), action, str(error)))
+
+    def note_done(self) -> None:
+        """It has done its part."""
+        if self.state is MemberState.FAILED:
+            self._change(MemberState.IN, "")
+
+    def take_back(self) -> None:
+        """The program orders it again: what somebody else has done until now does not count."""
+        self._taken_back = self._who_steers()
+        self._minds_failsafe = self.vehicle.system_status.latest not in UNDER_FAILSAFE
+        if self.vehicle.is_silent:
+            self._lost_at = self.vehicle.connection.now()
+            self._change(MemberState.LOST, self.vehicle.describe_link())
+        elif self.state is not MemberState.IN:
+            self._change(MemberState.IN, "")
+            self._tell(MemberTakenBack(*self._when()))
+
+    def leave(self, why: str) -> None:
+        """The program orders it no more."""
+        self._change(MemberState.LEFT, why)
+
+    # --------------------------------------------------------------------------------- inside
+
+    def _who_has_it(self) -> str:
+        vehicle = self.vehicle
+        if vehicle.is_surely_disarmed:  # on the ground there is nothing to take over
+            return ""
+        status = vehicle.system_status.latest
+        if status not in UNDER_FAILSAFE:
+            self._minds_failsafe = True
+        elif self._minds_failsafe:
+            return f"it is under a failsafe (MAV_STATE {MavState(status).name})"
+        return "" if self._who_steers() == self._taken_back else vehicle.taken_over
+
+    def _who_steers(self) -> tuple[object, object]:
+        return self.vehicle._helm.newest, self.vehicle.mode.latest
+
+    def _soon(self, function: Callable[[], None], *_: Any) -> None:
+        """After all of the HEARTBEAT has been read: who landed disarms and changes its mode in the same one."""
+        asyncio.get_running_loop().call_soon(function)
+
+    def _on_silent(self, event: VehicleSilent) -> None:
+        if event.system_id == self.vehicle.system_id:
+            self._lose(f"no heartbeat for {event.silent_for_s:.1f} s")
+
+    def _on_end(self, error: Exception) -> None:
+        self._lose(str(error))
+
+    def _lose(self, why: str) -> None:
+        if not self.takes_orders:
+            return
+        self._lost_at = self.vehicle.connection.now()
+        self._change(MemberState.LOST, why)
+        self._tell(MemberLost(*self._when(), why))
+        self._on_fallen_out(self)
+
+    def _on_back(self, event: VehicleBack) -> None:
+        if event.system_id == self.vehicle.system_id:  # its HEARTBEAT is being read just now
+            self._soon(self._come_back)
+
+    def _come_back(self) -> None:
+        if self.state is not MemberState.LOST or not self._detach:
+            return
+        if why := self._who_has_it():
+            self._change(MemberState.TAKEN_OVER, why)
+            self._tell(MemberTakenOver(*self._when(), why))
+        else:
+            self._change(MemberState.IN, "")
+            self._tell(MemberBack(*self._when(), self.vehicle.connection.now() - self._lost_at))
+
+    def _change(self, state: MemberState, why: str) -> None:
+        self.state, self.why = state, why
+
+    def _when(self) -> tuple[float, int, str]:
+        return self.vehicle.connection.now(), self.vehicle.system_id, self.name

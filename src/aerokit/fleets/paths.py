@@ -1,0 +1,236 @@
+"""Ways through the air with times, and how near two of them come: geometry, without IO.
+
+Places are metres north, east and up of a common origin, times are seconds from a common start.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+from aerokit.errors import LocalProtocolError
+from aerokit.snapshot import Snapshot
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+__all__ = ["Approach", "Path", "PathPoint", "Place", "horizontal_distance", "least_distance"]
+
+Place = tuple[float, float, float]
+"""Metres north, east and up."""
+NEARLY = 1e-9
+
+
+class PathPoint(Snapshot):
+    """Where a vehicle is to be at ``t_s`` seconds: metres north, east and up of the origin."""
+
+    t_s: float
+    north_m: float
+    east_m: float
+    up_m: float
+
+    @property
+    def place(self) -> Place:
+        """Without the time."""
+        return self.north_m, self.east_m, self.up_m
+
+    def _check(self) -> None:
+        if not all(math.isfinite(each) for each in (self.t_s, *self.place)):
+            raise LocalProtocolError(f"{self!r} is not allowed: finite numbers")
+
+
+class Path(Snapshot):
+    """The way of one vehicle: straight from point to point, each at its time; before and after it rests."""
+
+    name: str
+    points: Sequence[PathPoint]
+
+    @classmethod
+    def straight(cls, name: str, start: Place, end: Place, speed_m_s: float, at_s: float = 0.0) -> Self:
+        """A straight leg at one speed that begins at ``at_s``.
+
+        Raises:
+            LocalProtocolError: the speed is not above 0.
+        """
+        if not speed_m_s > 0:
+            raise LocalProtocolError(f"speed_m_s = {speed_m_s!r} is not allowed: above 0")
+        duration_s = math.dist(start, end) / speed_m_s
+        return cls(name, (PathPoint(at_s, *start), PathPoint(at_s + duration_s, *end)))
+
+    @property
+    def begins_at_s(self) -> float:
+        """When it sets off."""
+        return self.points[0].t_s
+
+    @property
+    def ends_at_s(self) -> float:
+        """When it is there."""
+        return self.points[-1].t_s
+
+    def legs(self, begin_s: float, end_s: float) -> list[tuple[PathPoint, PathPoint]]:
+        """From point to point, and the rests before and after."""
+        first, last = self.points[0], self.points[-1]
+        points = [
+            first.replace(t_s=min(begin_s, first.t_s)),
+            *self.points,
+            last.replace(t_s=max(end_s, last.t_s)),
+        ]
+        return list(pairwise(points))
+
+    def _check(self) -> None:
+        object.__setattr__(self, "points", tuple(self.points))
+        if not self.points:
+            raise LocalProtocolError(f"points: the path of {self.name} has none")
+        for one, other in pairwise(self.points):
+            if other.t_s < one.t_s:
+                raise LocalProtocolError(
+                    f"points: the path of {self.name} goes back in time at {other.t_s:g} s"
+                )
+
+
+class Approach(Snapshot):
+    """How near two paths come: ``distance_m``, the one at ``at_s`` of its own time, the other at ``other_at_s``."""
+
+    distance_m: float
+    at_s: float
+    other_at_s: float
+
+
+def least_distance(
+    one: Path, other: Path, *, slack_s: float = math.inf, below_m: float = math.inf
+) -> Approach:
+    """How near two vehicles may come to each other.
+
+    Args:
+        one: the path of the first.
+        other: of the second.
+        slack_s: how much earlier or later than planned one of them may be compared with the other, in seconds; 0: both
+            are exactly on time, infinite: the times count for nothing.
+        below_m: what is farther apart than this is not looked at closely: the result is then at least as much.
+
+    Returns:
+        The nearest that two points of them come whose times differ by no more than the slack.
+    """
+    begin = min(one.begins_at_s, other.begins_at_s)
+    end = max(one.ends_at_s, other.ends_at_s)
+    best = Approach(math.inf, begin, begin)
+    others = other.legs(begin, end)
+    for leg in one.legs(begin, end):
+        for other_leg in others:
+            if other_leg[0].t_s - slack_s > leg[1].t_s or other_leg[1].t_s + slack_s < leg[0].t_s:
+                continue
+            if _at_least(leg, other_leg) >= min(best.distance_m, below_m):
+                best = best if best.distance_m < math.inf else Approach(below_m, leg[0].t_s, other_leg[0].t_s)
+                continue
+            found = _nearest(leg, other_leg, slack_s)
+            if found is not None and found.distance_m < best.distance_m:
+                best = found
+    return best
+
+
+def horizontal_distance(one: tuple[Place, Place], other: tuple[Place, Place]) -> float:
+    """Metres between two straight ways as seen from above, whenever they are flown."""
+    (a, b), (c, d) = [
+        tuple(PathPoint(0.0, place[0], place[1], 0.0) for place in each) for each in (one, other)
+    ]
+    found = _nearest((a, b), (c, d), math.inf)
+    assert found is not None
+    return found.distance_m
+
+
+def _at_least(one: tuple[PathPoint, PathPoint], other: tuple[PathPoint, PathPoint]) -> float:
+    """They are no nearer than this: the distance of the middles without half of both lengths."""
+    middles = [
+        tuple((a + b) / 2 for a, b in zip(leg[0].place, leg[1].place, strict=True)) for leg in (one, other)
+    ]
+    lengths = math.dist(one[0].place, one[1].place) + math.dist(other[0].place, other[1].place)
+    return math.dist(*middles) - lengths / 2
+
+
+def _nearest(
+    one: tuple[PathPoint, PathPoint], other: tuple[PathPoint, PathPoint], slack_s: float
+) -> Approach | None:
+    """The least distance of two legs; None when no two of their times are near enough.
+
+    With s and t from 0 to 1 along the legs the square of the distance is a convex function of both, and the times
+    cut a strip out of the square: the least is inside, or on the border of what is left.
+    """
+    a, b = one[0].place, other[0].place
+    along = [one[1].place[i] - a[i] for i in range(3)]
+    others = [other[1].place[i] - b[i] for i in range(3)]
+    between = [a[i] - b[i] for i in range(3)]
+    one_lasts, other_lasts = one[1].t_s - one[0].t_s, other[1].t_s - other[0].t_s
+
+    def ahead(s: float, t: float) -> float:
+        return (one[0].t_s + s * one_lasts) - (other[0].t_s + t * other_lasts)
+
+    def apart(s: float, t: float) -> list[float]:
+        return [between[i] + s * along[i] - t * others[i] for i in range(3)]
+
+    inside = _inside(between, along, others)
+    if inside is not None and abs(ahead(*inside)) <= slack_s:
+        corners = [inside]
+    else:
+        corners = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)]
+        if slack_s < math.inf:
+            corners = _cut(corners, lambda s, t: ahead(s, t) - slack_s)
+            corners = _cut(corners, lambda s, t: -ahead(s, t) - slack_s)
+    best: tuple[float, float, float] | None = None
+    for number, corner in enumerate(corners):
+        s, t = _best_between(corner, corners[number - 1], apart(*corner), apart(*corners[number - 1]))
+        distance = math.hypot(*apart(s, t))
+        if best is None or distance < best[0]:
+            best = distance, s, t
+    if best is None:
+        return None
+    distance, s, t = best
+    return Approach(distance, one[0].t_s + s * one_lasts, other[0].t_s + t * other_lasts)
+
+
+def _inside(
+    between: Sequence[float], along: Sequence[float], others: Sequence[float]
+) -> tuple[float, float] | None:
+    """Where two lines are nearest, if that is within both legs; None for parallel ones."""
+    aa, bb, ab = _dot(along, along), _dot(others, others), _dot(along, others)
+    determinant = aa * bb - ab * ab
+    if determinant <= NEARLY * max(aa * bb, NEARLY):
+        return None
+    c, d = _dot(between, along), _dot(between, others)
+    s, t = (ab * d - bb * c) / determinant, (aa * d - ab * c) / determinant
+    return (s, t) if 0 <= s <= 1 and 0 <= t <= 1 else None
+
+
+def _cut(corners: list[tuple[float, float]], beyond: _Beyond) -> list[tuple[float, float]]:
+    """What of a convex figure is not beyond a line."""
+    kept: list[tuple[float, float]] = []
+    for number, corner in enumerate(corners):
+        before = corners[number - 1]
+        here, there = beyond(*corner), beyond(*before)
+        if (here > NEARLY) != (there > NEARLY):
+            share = there / (there - here)
+            kept.append(tuple(p + share * (q - p) for p, q in zip(before, corner, strict=True)))  # type: ignore[arg-type]
+        if here <= NEARLY:
+            kept.append(corner)
+    return kept
+
+
+def _best_between(
+    one: tuple[float, float], other: tuple[float, float], here: Sequence[float], there: Sequence[float]
+) -> tuple[float, float]:
+    """The place on an edge at which the two are nearest."""
+    step = [q - p for p, q in zip(here, there, strict=True)]
+    length = _dot(step, step)
+    share = 0.0 if length == 0 else min(1.0, max(0.0, -_dot(here, step) / length))
+    return one[0] + share * (other[0] - one[0]), one[1] + share * (other[1] - one[1])
+
+
+def _dot(one: Sequence[float], other: Sequence[float]) -> float:
+    return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
+
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    _Beyond = Callable[[float, float], float]

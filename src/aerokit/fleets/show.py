@@ -1,0 +1,195 @@
+"""``Show``: timed trajectories of many vehicles, on one clock. Values and their files, without anything that flies.
+
+Two formats are read, both with seconds, and metres north, east and up of the show's origin:
+
+- CSV: a line ``name,t_s,north_m,east_m,up_m``, and below it one line for each point, in any order of names;
+- JSON: ``{"format": "aerokit show", "version": 1, "tracks": {"name": [[t_s, north_m, east_m, up_m], …], …}}``.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from bisect import bisect_right
+from collections.abc import Mapping
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+from aerokit.errors import FileFormatError, LocalProtocolError
+from aerokit.fleets.apart import Conflict, conflicts_of
+from aerokit.fleets.paths import Path, PathPoint, Place
+from aerokit.snapshot import Snapshot
+from aerokit.whole_file import read_bounded, write_whole
+
+if TYPE_CHECKING:
+    import os
+
+    from typing_extensions import Self
+
+__all__ = ["Show", "state_at"]
+
+COLUMNS = ["name", "t_s", "north_m", "east_m", "up_m"]
+FORMAT, VERSION = "aerokit show", 1
+
+
+class Show(Snapshot):
+    """Member's name → its path. All times count from the common start of the show."""
+
+    tracks: Mapping[str, Path]
+
+    @property
+    def duration_s(self) -> float:
+        """Seconds until the last of them is at its last point."""
+        return max(each.ends_at_s for each in self.tracks.values())
+
+    def top_speed_m_s(self, name: str) -> float:
+        """The fastest of the legs of one track, in m/s."""
+        legs = pairwise(self.tracks[name].points)
+        return max((_speed(one, other) for one, other in legs), default=0.0)
+
+    def conflicts(self, min_distance_m: float, *, slack_s: float = 0.5) -> tuple[Conflict, ...]:
+        """All pairs that come nearer to each other than ``min_distance_m`` metres.
+
+        Args:
+            min_distance_m: metres.
+            slack_s: by how many seconds one may be early or late compared with another.
+        """
+        return conflicts_of(list(self.tracks.values()), min_distance_m, slack_s=slack_s)
+
+    def renamed(self, names: Mapping[str, str]) -> Self:
+        """The same show by other members: name in the show → member's name.
+
+        Raises:
+            LocalProtocolError: a name is missing, or two become one.
+        """
+        missing = [name for name in self.tracks if name not in names]
+        if missing or len(set(names.values())) < len(self.tracks):
+            raise LocalProtocolError(
+                f"names: {missing or 'two names for one member'}: each track needs its own"
+            )
+        return type(self)(
+            {names[name]: track.replace(name=names[name]) for name, track in self.tracks.items()}
+        )
+
+    @classmethod
+    def from_points(cls, tracks: Mapping[str, Any]) -> Self:
+        """Of ``(t_s, north_m, east_m, up_m)`` for each name.
+
+        Raises:
+            LocalProtocolError: a point is no four numbers, or times go back.
+        """
+        made: dict[str, Path] = {}
+        for name, points in tracks.items():
+            try:
+                made[name] = Path(name, [PathPoint(*map(float, each)) for each in points])
+            except (TypeError, ValueError) as error:
+                raise LocalProtocolError(f"track {name!r}: {error}") from None
+        return cls(made)
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str]) -> Self:
+        """A file, CSV or JSON by what is in it.
+
+        Raises:
+            FileFormatError: it is neither, or damaged; the text names the line or the track.
+            OSError: it cannot be read.
+        """
+        text = read_bounded(path).decode("utf-8-sig", errors="replace")
+        try:
+            return cls.from_json(text) if text.lstrip().startswith("{") else cls.from_csv(text)
+        except LocalProtocolError as error:
+            raise FileFormatError(f"{path}: {error}") from None
+
+    @classmethod
+    def from_csv(cls, text: str) -> Self:
+        """See the module.
+
+        Raises:
+            LocalProtocolError: it is not like that; the text names the line.
+        """
+        rows = csv.reader(io.StringIO(text))
+        if [each.strip() for each in next(rows, [])] != COLUMNS:
+            raise LocalProtocolError(f"line 1 is not {','.join(COLUMNS)}")
+        points: dict[str, list[PathPoint]] = {}
+        for row in rows:
+            if not row:
+                continue
+            try:
+                name, *numbers = row
+                t_s, north_m, east_m, up_m = map(float, numbers)
+                points.setdefault(name, []).append(PathPoint(t_s, north_m, east_m, up_m))
+            except ValueError as error:
+                raise LocalProtocolError(f"line {rows.line_num}: {error}") from None
+        return cls({name: Path(name, each) for name, each in points.items()})
+
+    @classmethod
+    def from_json(cls, text: str) -> Self:
+        """See the module.
+
+        Raises:
+            LocalProtocolError: it is not like that; the text names the track.
+        """
+        try:
+            found = json.loads(text)
+        except (ValueError, RecursionError) as error:
+            raise LocalProtocolError(f"no JSON: {error}") from None
+        tracks = found.get("tracks") if isinstance(found, dict) else None
+        if not isinstance(tracks, dict) or (found.get("format"), found.get("version")) != (FORMAT, VERSION):
+            raise LocalProtocolError(f"no {FORMAT!r} of version {VERSION}")
+        return cls.from_points(tracks)
+
+    def to_csv(self) -> str:
+        """The text of a CSV file."""
+        out = io.StringIO()
+        writer = csv.writer(out, lineterminator="\n")
+        writer.writerow(COLUMNS)
+        for name, track in self.tracks.items():
+            writer.writerows([name, each.t_s, *each.place] for each in track.points)
+        return out.getvalue()
+
+    def to_json(self) -> str:
+        """The text of a JSON file."""
+        tracks = {
+            name: [[each.t_s, *each.place] for each in track.points] for name, track in self.tracks.items()
+        }
+        return json.dumps({"format": FORMAT, "version": VERSION, "tracks": tracks})
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write a file, JSON if its name ends so, else CSV (OSError)."""
+        write_whole(path, self.to_json() if str(path).lower().endswith(".json") else self.to_csv())
+
+    def _check(self) -> None:
+        object.__setattr__(self, "tracks", dict(self.tracks))
+        if not self.tracks:
+            raise LocalProtocolError("tracks: a show needs one")
+        for name, track in self.tracks.items():
+            if not isinstance(track, Path) or track.begins_at_s < 0:
+                raise LocalProtocolError(f"tracks: {name!r} needs a Path that begins at 0 s or later")
+            for one, other in pairwise(track.points):
+                if not _speed(one, other) < math.inf:
+                    raise LocalProtocolError(f"tracks: {name!r} is at two places at {other.t_s:g} s")
+
+
+def state_at(path: Path, at_s: float) -> tuple[Place, Place]:
+    """Where somebody is at a time, and how fast: metres and m/s north, east and up."""
+    points = path.points
+    after = bisect_right(points, at_s, key=_time_of)
+    if after == 0 or after == len(points):
+        return points[min(after, len(points) - 1)].place, (0.0, 0.0, 0.0)
+    one, other = points[after - 1], points[after]
+    lasts = other.t_s - one.t_s
+    share = (at_s - one.t_s) / lasts
+    way = [b - a for a, b in zip(one.place, other.place, strict=True)]
+    place = tuple(a + share * d for a, d in zip(one.place, way, strict=True))
+    return place, (way[0] / lasts, way[1] / lasts, way[2] / lasts)  # type: ignore[return-value]
+
+
+def _time_of(point: PathPoint) -> float:
+    return point.t_s
+
+
+def _speed(one: PathPoint, other: PathPoint) -> float:
+    way, lasts = math.dist(one.place, other.place), other.t_s - one.t_s
+    return way / lasts if lasts > 0 else (math.inf if way > 0 else 0.0)

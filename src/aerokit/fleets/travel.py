@@ -1,0 +1,188 @@
+"""``Travel``: going to places together, on ways that were compared before."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Literal
+
+import anyio
+
+from aerokit.arguments import checks_arguments
+from aerokit.errors import LocalProtocolError, OperationRejected
+from aerokit.fleets.apart import Deconfliction, Route, in_corridors, in_layers
+from aerokit.fleets.events import PathsDecided
+from aerokit.fleets.members import Member
+from aerokit.fleets.part import FleetPart
+from aerokit.fleets.results import FleetResult
+from aerokit.fleets.whereabouts import Around, altitude_amsl
+from aerokit.position import Position
+from aerokit.wording import shown
+
+__all__ = ["Travel", "WayApart"]
+
+WayApart = Literal["layers", "corridors", "refuse"]
+"""What is done about ways that cross: heights of their own, times of their own, or nothing is flown."""
+
+
+@checks_arguments
+class Travel(FleetPart):
+    """Places for each, and ways that do not meet."""
+
+    async def go_to(
+        self,
+        targets: Mapping[str, Position] | Callable[[Member], Position],
+        *,
+        speed_m_s: float | None = None,
+        timeout: float | None = None,
+        stagger_s: float | None = None,
+        apart: Deconfliction | None = None,
+    ) -> FleetResult:
+        """Fly each to a place of its own; as :meth:`aerokit.Vehicle.go_to`.
+
+        In a fleet with a ``min_distance_m`` the ways are compared first, and flown in layers if they cross.
+
+        Args:
+            targets: name → place; who is not named stays where it is. Or a function that gives the place of a member.
+            speed_m_s: ground speed; None leaves it.
+            timeout: seconds that each of them has for a leg; None: as long as it takes.
+            stagger_s: each begins so many seconds after the one before; None: all at once.
+            apart: what :meth:`plan_apart` has decided about these targets.
+
+        Raises:
+            LocalProtocolError: a name is nobody's. Nothing was sent.
+            ValueUnknownError: it is not known where one of them is. Nothing was sent.
+            OperationRejected: their ways come too near, and no heights keep them apart. Nothing was sent.
+        """
+        places = self._places(targets)
+        if apart is None and self._crew.min_distance_m is not None:
+            apart = self.plan_apart(places, speed_m_s=speed_m_s)
+        if apart is None or apart.decision == "clear":
+            names = tuple(self.members) if callable(targets) else tuple(places)
+            return await self._fly_to(places, speed_m_s, timeout, stagger_s, names=names)
+        if apart.decision == "refused":
+            raise OperationRejected(f"go_to: {apart.why}; nothing was sent")
+        if apart.decision == "corridors":
+            return await self._fly_to(places, speed_m_s, timeout, stagger_s, apart.delays_s)
+        return await self._fly_in_layers(places, speed_m_s, timeout, apart.heights_m)
+
+    def plan_apart(
+        self,
+        targets: Mapping[str, Position] | Callable[[Member], Position],
+        *,
+        min_distance_m: float | None = None,
+        by: WayApart = "layers",
+        speed_m_s: float | None = None,
+        highest_m: float | None = None,
+        slack_s: float = 3.0,
+    ) -> Deconfliction:
+        """Compare the straight ways to these places, and decide how they are flown. Nothing is sent.
+
+        Who is not named counts where it is. The event :class:`PathsDecided` tells what was decided.
+
+        Args:
+            targets: as for :meth:`go_to`.
+            min_distance_m: metres that have to be between any two; None: the fleet's own.
+            by: ``"layers"``: heights of their own; ``"corridors"``: times of their own, for which ``speed_m_s`` is
+                needed; ``"refuse"``: ways that cross are not flown.
+            speed_m_s: of all of them.
+            highest_m: no layer is higher, in metres above the sea; None: no limit.
+            slack_s: for corridors: by how many seconds one may be early or late compared with another.
+
+        Raises:
+            LocalProtocolError: a name is nobody's, or an argument is missing.
+            ValueUnknownError: it is not known where one of them is.
+        """
+        least_m = self._crew.min_distance_m if min_distance_m is None else min_distance_m
+        if least_m is None:
+            raise LocalProtocolError("min_distance_m is needed: this fleet has none")
+        routes, standing = self._routes(self._places(targets))
+        if by == "corridors":
+            if speed_m_s is None:
+                raise LocalProtocolError("by = 'corridors' needs speed_m_s: times come of ways and speeds")
+            decided = in_corridors(routes, standing, least_m, speed_m_s, slack_s=slack_s)
+        else:
+            decided = in_layers(
+                routes, standing, least_m, highest_m=float("inf") if highest_m is None else highest_m
+            )
+            if by == "refuse" and decided.decision == "layers":
+                decided = decided.replace(decision="refused", heights_m={})
+        self._crew.tell(PathsDecided(self._crew.now(), 0, "", decided))
+        return decided
+
+    # --------------------------------------------------------------------------------------- inside
+
+    def _places(self, targets: Mapping[str, Position] | Callable[[Member], Position]) -> dict[str, Position]:
+        for each in self:
+            each.look()
+        if callable(targets):
+            return {each.name: targets(each) for each in self if each.takes_orders}
+        for name in targets:
+            if name not in self.members:
+                raise LocalProtocolError(f"targets: {shown(name)} is not one of {', '.join(self.members)}")
+        return dict(targets)
+
+    def _routes(
+        self, places: Mapping[str, Position]
+    ) -> tuple[list[Route], dict[str, tuple[float, float, float]]]:
+        """Of those that move, and where all others of the fleet are, as far as that is known."""
+        members = self._crew.members
+        movers = [members[name] for name in places if members[name].takes_orders]
+        if not movers:
+            return [], {}
+        around = Around(movers[0].vehicle.position.value)
+        routes = [
+            Route(
+                each.name,
+                around.of_member(each),
+                around.place(places[each.name], altitude_amsl(each, places[each.name])),
+            )
+            for each in movers
+        ]
+        standing = {
+            each.name: around.place(here, here.altitude_amsl_m)
+            for each in members.values()
+            if each not in movers
+            and (here := each.vehicle.position.latest)
+            and here.altitude_amsl_m is not None
+        }
+        return routes, standing
+
+    async def _fly_to(
+        self,
+        places: Mapping[str, Position],
+        speed_m_s: float | None,
+        timeout: float | None,
+        stagger_s: float | None = None,
+        delays_s: Mapping[str, float] | None = None,
+        names: tuple[str, ...] = (),
+    ) -> FleetResult:
+        async def fly(member: Member) -> None:
+            if delays_s and delays_s.get(member.name):
+                await anyio.sleep(delays_s[member.name])
+            await member.vehicle.go_to(places[member.name], speed_m_s=speed_m_s, timeout=timeout)
+
+        return await self._run("go_to", fly, stagger_s=stagger_s, names=names or tuple(places))
+
+    async def _fly_in_layers(
+        self,
+        places: Mapping[str, Position],
+        speed_m_s: float | None,
+        timeout: float | None,
+        heights_m: Mapping[str, float],
+    ) -> FleetResult:
+        """Up, across, down: all of them are done with one before anybody begins the next."""
+        here = {name: self._crew.members[name].vehicle.position.value for name in heights_m}
+        stages = (
+            {name: _at(here[name], height) for name, height in heights_m.items()},
+            {name: _at(places[name], height) for name, height in heights_m.items()},
+            {name: places[name] for name in heights_m},
+        )
+        for stage in stages[:-1]:
+            result = await self._fly_to(stage, speed_m_s, timeout)
+            if not result.is_complete or result.left_out:
+                return result
+        return await self._fly_to(stages[-1], speed_m_s, timeout)
+
+
+def _at(place: Position, altitude_amsl_m: float) -> Position:
+    return Position(place.latitude_deg, place.longitude_deg, altitude_amsl_m=altitude_amsl_m)

@@ -1,0 +1,118 @@
+"""A fleet of simulated copters on one or several networks, on virtual time, with a tap on what is sent to each."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Sequence
+from contextlib import AsyncExitStack, asynccontextmanager
+from dataclasses import dataclass
+from typing import Any
+
+from flight_harness import Wire
+
+from aerokit import messages as m
+from aerokit.fleets.events import FleetEvent
+from aerokit.fleets.fleet import Fleet
+from aerokit.fleets.opening import fleet
+from aerokit.mavlink.enums import CopterMode, MavCmd
+from aerokit.runtime.subscription import Subscription
+from aerokit.sim import SimulatedCopter, simulated_link
+
+HOME = (47.3977, 8.5456, 488.0)
+
+
+@dataclass
+class Stage:
+    """Copters by the names of the members."""
+
+    fleet: Fleet
+    copters: dict[str, SimulatedCopter]
+    wires: dict[str, Wire]
+    told: Subscription[FleetEvent]
+
+    def mode_of(self, name: str) -> str:
+        return self.copters[name].mode.name
+
+    @property
+    def modes(self) -> dict[str, str]:
+        return {name: each.mode.name for name, each in self.copters.items()}
+
+    def orders_to(self, name: str) -> list[tuple[float, m.CommandLong | m.CommandInt]]:
+        """Commands that change what the member does, and when they were sent."""
+        network, _, number = name.partition("/")
+        return [
+            (at, each)
+            for at, each in self.wires[network].sent
+            if isinstance(each, (m.CommandLong, m.CommandInt))
+            and each.target_system == int(number)
+            and each.command in ORDERS
+        ]
+
+    def modes_ordered(self, name: str) -> list[str]:
+        return [
+            CopterMode(int(each.param2)).name
+            for _, each in self.orders_to(name)
+            if each.command == MavCmd.DO_SET_MODE
+        ]
+
+    def forget(self) -> None:
+        for wire in self.wires.values():
+            wire.forget()
+
+    def events(self, kind: type[FleetEvent] = FleetEvent) -> list[Any]:
+        """What was told until now."""
+        found = []
+        while (event := self.told.get_nowait()) is not None:
+            found.append(event)
+        return [each for each in found if isinstance(each, kind)]
+
+    async def take_off(self, altitude_m: float = 10.0) -> None:
+        """All of them are ready, armed and in the air; what was sent for it is forgotten."""
+        (await self.fleet.wait_ready()).raise_for_errors()
+        (await self.fleet.arm()).raise_for_errors()
+        (await self.fleet.take_off(altitude_m)).raise_for_errors()
+        self.events()
+        self.forget()
+
+    def pilot_takes(self, name: str, mode: int = CopterMode.LOITER) -> None:
+        """The mode switch is turned; the throttle stick is in the middle."""
+        copter = self.copters[name]
+        copter.rc[2] = 1500
+        assert copter.set_mode(mode)
+
+
+ORDERS = (
+    MavCmd.DO_SET_MODE,
+    MavCmd.NAV_TAKEOFF,
+    MavCmd.DO_REPOSITION,
+    MavCmd.COMPONENT_ARM_DISARM,
+    MavCmd.MISSION_START,
+    MavCmd.NAV_LAND,
+    MavCmd.NAV_RETURN_TO_LAUNCH,
+)
+
+
+@asynccontextmanager
+async def open_stage(
+    count: int = 3, *, networks: Sequence[str] = ("north",), spacing_m: float = 10.0, **options: Any
+) -> AsyncIterator[Stage]:
+    """``count`` copters with ids 1, 2, 3 … on each network, side by side to the east."""
+    copters: dict[str, SimulatedCopter] = {}
+    wires: dict[str, Wire] = {}
+    metre = 1 / 75_300  # of longitude, there
+    async with AsyncExitStack() as stack:
+        for row, network in enumerate(networks):
+            own = [
+                SimulatedCopter(
+                    system_id=number + 1,
+                    boot_time_s=0.0,
+                    home=(HOME[0] + row * 2e-4, HOME[1] + number * spacing_m * metre, HOME[2]),
+                    seed=10 * row + number,
+                )
+                for number in range(count)
+            ]
+            copters |= {f"{network}/{each.system_id}": each for each in own}
+            wires[network] = Wire(await stack.enter_async_context(simulated_link(own)))
+        options.setdefault("count", len(copters))
+        async with fleet(dict(wires), **options) as opened:
+            with opened.events(FleetEvent) as told:
+                yield Stage(opened, copters, wires, told)

@@ -1,0 +1,209 @@
+"""Ways are compared exactly, and what is decided keeps them apart: geometry, without vehicles."""
+
+from __future__ import annotations
+
+import math
+from itertools import accumulate, combinations, pairwise
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from aerokit.errors import LocalProtocolError
+from aerokit.fleets.apart import Route, conflicts_of, in_corridors, in_layers
+from aerokit.fleets.nearness import local_places, near_pairs
+from aerokit.fleets.paths import Path, PathPoint, Place, horizontal_distance, least_distance
+
+metres = st.floats(-50, 50).map(lambda value: round(value, 2))
+places = st.tuples(metres, metres, st.floats(0, 30).map(lambda value: round(value, 2)))
+
+
+@st.composite
+def paths(draw: st.DrawFn, name: str = "a") -> Path:
+    count = draw(st.integers(1, 4))
+    times = list(accumulate(draw(st.lists(st.floats(0.5, 20), min_size=count, max_size=count))))
+    return Path(name, [PathPoint(at, *draw(places)) for at in times])
+
+
+def place_at(path: Path, at_s: float) -> Place:
+    """Where it is then, worked out another way."""
+    points = list(path.points)
+    if at_s <= points[0].t_s:
+        return points[0].place
+    for one, other in pairwise(points):
+        if one.t_s <= at_s <= other.t_s and other.t_s > one.t_s:
+            share = (at_s - one.t_s) / (other.t_s - one.t_s)
+            return tuple(a + share * (b - a) for a, b in zip(one.place, other.place, strict=True))  # type: ignore[return-value]
+    return points[-1].place
+
+
+def fastest(path: Path) -> float:
+    legs = pairwise(path.points)
+    return max(
+        (math.dist(a.place, b.place) / (b.t_s - a.t_s) for a, b in legs if b.t_s - a.t_s > 1e-6), default=0.0
+    )
+
+
+@given(paths(), paths("b"))
+def test_the_least_distance_in_time_is_that_of_many_samples(one: Path, other: Path) -> None:
+    begin, end = min(one.begins_at_s, other.begins_at_s), max(one.ends_at_s, other.ends_at_s)
+    times = [begin + (end - begin) * number / 400 for number in range(401)]
+    sampled = min(math.dist(place_at(one, at), place_at(other, at)) for at in times)
+    found = least_distance(one, other, slack_s=0.0)
+    assert found.distance_m <= sampled + 1e-6
+    assert found.at_s == pytest.approx(found.other_at_s, abs=1e-6)
+    step = (end - begin) / 400
+    assert found.distance_m >= sampled - step * (fastest(one) + fastest(other)) - 1e-6
+
+
+@given(paths(), paths("b"), st.floats(0.5, 10))
+def test_slack_only_makes_it_nearer_and_no_times_are_the_nearest(
+    one: Path, other: Path, slack: float
+) -> None:
+    exact = least_distance(one, other, slack_s=0.0).distance_m
+    loose = least_distance(one, other, slack_s=slack).distance_m
+    never = least_distance(one, other).distance_m
+    assert never <= loose + 1e-6 <= exact + 2e-6
+    assert least_distance(other, one, slack_s=slack).distance_m == pytest.approx(loose, abs=1e-6)
+    near = least_distance(one, other, slack_s=slack)
+    assert abs(near.at_s - near.other_at_s) <= slack + 1e-6
+
+
+@given(paths(), paths("b"), st.floats(1, 20))
+def test_what_is_not_looked_at_closely_is_far(one: Path, other: Path, below: float) -> None:
+    exact, quick = least_distance(one, other), least_distance(one, other, below_m=below)
+    assert (quick.distance_m < below) == (exact.distance_m < below)
+    if exact.distance_m < below:
+        assert quick.distance_m == pytest.approx(exact.distance_m, abs=1e-9)
+
+
+def test_crossing_ways_meet_only_if_they_are_there_at_the_same_time() -> None:
+    one = Path.straight("a", (0, 0, 10), (100, 0, 10), 10)
+    at_once = Path.straight("b", (50, -50, 10), (50, 50, 10), 10)
+    later = Path.straight("b", (50, -50, 10), (50, 50, 10), 10, at_s=20)
+    assert least_distance(one, at_once, slack_s=0.0).distance_m == pytest.approx(0, abs=1e-9)
+    assert least_distance(one, later, slack_s=0.0).distance_m > 20
+    assert least_distance(one, later).distance_m == pytest.approx(0, abs=1e-9)
+    (conflict,) = conflicts_of([one, at_once], 5, slack_s=1)
+    assert (conflict.name, conflict.other) == ("a", "b")
+    assert conflict.at_s == pytest.approx(5, abs=1)
+    assert conflicts_of([one, later], 5, slack_s=3) == ()
+
+
+routes_of = st.lists(st.tuples(places, places), min_size=2, max_size=6).map(
+    lambda many: [Route(str(number), start, target) for number, (start, target) in enumerate(many)]
+)
+
+
+@given(routes_of, st.lists(places, max_size=2), st.floats(1, 8))
+def test_layers_keep_all_apart_whatever_the_speeds(
+    routes: list[Route], rest: list[Place], least: float
+) -> None:
+    standing = {f"rest {number}": place for number, place in enumerate(rest)}
+    decided = in_layers(routes, standing, least)
+    rests = [Path(name, [PathPoint(0, *place)]) for name, place in standing.items()]
+    if decided.decision == "clear":
+        ways = [[Path.straight(each.name, each.start, each.target, 1.0) for each in routes]]
+    elif decided.decision == "layers":
+        heights = decided.heights_m
+        stages: list[list[tuple[str, Place, Place]]] = [[], [], []]
+        for each in routes:
+            over_start = (*each.start[:2], heights[each.name])
+            over_target = (*each.target[:2], heights[each.name])
+            for stage, way in zip(
+                stages,
+                ((each.start, over_start), (over_start, over_target), (over_target, each.target)),
+                strict=True,
+            ):
+                stage.append((each.name, *way))
+        ways = [[Path.straight(name, one, other, 1.0) for name, one, other in stage] for stage in stages]
+    else:
+        assert decided.decision == "refused"
+        assert decided.why
+        return
+    for at_once in ways:
+        for one, other in combinations(at_once, 2):
+            assert least_distance(one, other).distance_m >= least - 1e-6
+        for one in at_once:
+            for other in rests:
+                assert least_distance(one, other).distance_m >= least - 1e-6
+
+
+@given(routes_of, st.floats(1, 8))
+def test_corridors_keep_all_apart_as_long_as_nobody_is_later_than_allowed(
+    routes: list[Route], least: float
+) -> None:
+    decided = in_corridors(routes, {}, least, 5.0, slack_s=2.0, longest_s=60.0)
+    if decided.decision == "corridors":
+        timed = [
+            Path.straight(each.name, each.start, each.target, 5.0, decided.delays_s[each.name])
+            for each in routes
+        ]
+        assert not conflicts_of(timed, least - 1e-6, slack_s=2.0)
+    assert decided.decision in ("clear", "corridors", "refused")
+
+
+def test_two_that_change_places_need_two_layers_and_no_corridor_helps() -> None:
+    swap = [Route("a", (0, 0, 10), (60, 0, 10)), Route("b", (60, 0, 10), (0, 0, 10))]
+    decided = in_layers(swap, {}, 5)
+    assert decided.decision == "layers"
+    assert sorted(decided.heights_m.values()) == [10, 15]
+    assert "a and b (0.0 m) come too near" in decided.why
+    assert in_layers(swap, {}, 5, highest_m=12).decision == "refused"
+    assert in_corridors(swap, {}, 5, 5.0, longest_s=60).decision == "refused"
+
+
+def test_one_after_the_other_through_a_crossing() -> None:
+    cross = [Route("a", (0, -50, 10), (0, 50, 10)), Route("b", (-50, 0, 10), (50, 0, 10))]
+    decided = in_corridors(cross, {}, 5, 10.0, slack_s=1.0)
+    assert decided.decision == "corridors"
+    assert decided.delays_s["a"] == 0
+    assert 1 <= decided.delays_s["b"] <= 5
+
+
+def test_who_rests_at_the_others_target_goes_first() -> None:
+    routes = [Route("a", (0, 0, 10), (50, 0, 10)), Route("b", (50, 0, 10), (100, 0, 10))]
+    decided = in_corridors(routes, {}, 5, 5.0, slack_s=1.0)
+    assert decided.decision == "corridors"
+    assert decided.delays_s["b"] == 0
+
+
+def test_nobody_flies_through_one_that_stands_there() -> None:
+    route = [Route("a", (0, 0, 10), (60, 0, 10))]
+    assert in_layers(route, {"b": (30, 0, 10)}, 5).heights_m == {"a": 15}
+    assert in_layers(route, {"b": (60, 1, 10)}, 5).decision == "refused"
+    assert in_layers(route, {"b": (30, 0, 30)}, 5).decision == "clear"
+    assert in_corridors(route, {"b": (30, 0, 10)}, 5, 5.0, longest_s=10).decision == "refused"
+
+
+@given(st.dictionaries(st.text("abcdef", min_size=1, max_size=3), places, max_size=20), st.floats(0.5, 40))
+def test_near_pairs_are_those_of_everybody_with_everybody(where: dict[str, Place], within: float) -> None:
+    expected = {
+        (one, other) for one, other in combinations(where, 2) if math.dist(where[one], where[other]) < within
+    }
+    assert {(one, other) for one, other, _ in near_pairs(where, within)} == expected
+
+
+def test_local_places_are_metres() -> None:
+    from aerokit import geo
+
+    there = geo.offset(47.0, 8.0, 300.0, -400.0)
+    local = local_places({"a": (47.0, 8.0, 1.0), "b": (*there, 11.0)})
+    assert local["b"] == pytest.approx((300.0, -400.0, 11.0), abs=2.0)
+
+
+def test_horizontal_distance_leaves_heights_out() -> None:
+    assert horizontal_distance(((0, 0, 0), (10, 0, 90)), ((5, -5, 40), (5, 5, 70))) == pytest.approx(0)
+
+
+def test_what_makes_no_sense_is_refused() -> None:
+    with pytest.raises(LocalProtocolError, match="min_distance_m"):
+        in_layers([], {}, 0)
+    with pytest.raises(LocalProtocolError, match="speed_m_s"):
+        Path.straight("a", (0, 0, 0), (1, 0, 0), 0)
+    with pytest.raises(LocalProtocolError, match="goes back in time"):
+        Path("a", [PathPoint(1, 0, 0, 0), PathPoint(0, 0, 0, 0)])
+    with pytest.raises(LocalProtocolError, match="has none"):
+        Path("a", [])
+    with pytest.raises(LocalProtocolError, match="finite"):
+        PathPoint(math.nan, 0, 0, 0)

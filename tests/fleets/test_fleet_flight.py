@@ -1,0 +1,329 @@
+"""Fleets fly, lose members and end by policy: on simulated copters, on virtual time."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Mapping
+from typing import Any
+
+import anyio
+import pytest
+from fleet_stage import open_stage
+from flight_harness import now
+
+from aerokit.errors import FleetError, LocalProtocolError, OperationTimeout
+from aerokit.fleets.events import (
+    MemberBack,
+    MemberFailed,
+    MemberLost,
+    MemberTakenBack,
+    MemberTakenOver,
+    PolicyCarriedOut,
+    PolicyOrdered,
+)
+from aerokit.fleets.members import Member, MemberState
+from aerokit.fleets.policy import Failure, PolicyName, PolicyOrder
+from aerokit.mavlink.enums import MavCmd
+from aerokit.position import Position
+
+pytestmark = pytest.mark.anyio
+
+
+def north(by_m: float) -> Any:
+    def target(member: Member) -> Position:
+        return member.vehicle.position.value.offset(north_m=by_m)
+
+    return target
+
+
+async def test_ten_take_off_lose_one_and_land_by_policy() -> None:
+    async with open_stage(10, on_error="land_others") as stage:
+        fleet = stage.fleet
+        (await fleet.wait_ready()).raise_for_errors()
+        (await fleet.arm()).raise_for_errors()
+        result = await fleet.take_off(10, stagger_s=0.5)
+        assert len(result) == 10
+        assert result.is_complete
+        await fleet.all_at_altitude(10)
+        stage.forget()
+        stage.copters["north/4"].faults.silent = True
+        result = await fleet.go_to(north(300))
+        assert list(result.failed) == ["north/4"]
+        assert len(result.stopped) == 9
+        others = [name for name in stage.copters if name != "north/4"]
+        assert all(
+            not stage.copters[name].is_armed or stage.copters[name].motion.is_on_ground for name in others
+        )
+        assert all(stage.modes_ordered(name) == ["LAND"] for name in others)  # once, and no hold before it
+        assert stage.modes_ordered("north/4") == []
+        (lost,) = [each for each in fleet if each.state is MemberState.LOST]
+        assert lost.name == "north/4"
+        told = stage.events()
+        assert [type(each) for each in told] == [MemberLost, MemberFailed, PolicyOrdered, PolicyCarriedOut]
+        assert told[2].orders == dict.fromkeys(others, "land")
+        with pytest.raises(FleetError, match="0 of 10 did it") as caught:
+            result.raise_for_errors()
+        assert set(caught.value.errors) == set(stage.copters)
+
+
+async def test_a_lost_one_comes_back_and_takes_part_again() -> None:
+    async with open_stage(2, on_error="go_on") as stage:
+        await stage.take_off()
+        stage.copters["north/2"].faults.silent = True
+        await anyio.sleep(6)
+        assert stage.fleet.members["north/2"].state is MemberState.LOST
+        result = await stage.fleet.hold()
+        assert list(result) == ["north/1"]
+        assert "no heartbeat" in result.left_out["north/2"]
+        stage.copters["north/2"].faults.silent = False
+        await anyio.sleep(2)
+        assert [type(each) for each in stage.events()] == [MemberLost, MemberBack]
+        assert list(await stage.fleet.land()) == ["north/1", "north/2"]
+
+
+@pytest.mark.parametrize(
+    ("policy", "mode"), [("hold_others", "BRAKE"), ("return_others", "RTL"), ("land_others", "LAND")]
+)
+async def test_the_others_get_the_order_of_the_policy_once(policy: str, mode: str) -> None:
+    async with open_stage(3, on_error=policy) as stage:
+        await stage.take_off()
+        stage.copters["north/1"].faults.refuse(MavCmd.DO_REPOSITION)
+        result = await stage.fleet.go_to(north(100))
+        await anyio.sleep(5)
+        assert list(result.failed) == ["north/1"]
+        assert stage.modes_ordered("north/2") == stage.modes_ordered("north/3") == [mode]
+        assert stage.modes_ordered("north/1") == []
+        assert f"it was told to {policy.partition('_')[0]}" in str(result.stopped["north/2"])
+
+
+async def test_who_has_done_it_already_is_told_too() -> None:
+    async with open_stage(2) as stage:
+        await stage.take_off()
+        near, far = (stage.fleet.vehicles[name].position.value for name in ("north/1", "north/2"))
+        targets = {"north/1": near.offset(north_m=3), "north/2": far.offset(north_m=300)}
+
+        async def fail() -> None:
+            await anyio.sleep(20)
+            stage.copters["north/2"].faults.silent = True
+
+        failing = asyncio.create_task(fail())
+        result = await stage.fleet.go_to(targets)
+        await failing
+        assert stage.mode_of("north/1") == "BRAKE"
+        assert list(result.stopped) == ["north/1"]
+
+
+async def test_go_on_leaves_the_others_alone() -> None:
+    async with open_stage(3, on_error="go_on") as stage:
+        await stage.take_off()
+        stage.copters["north/1"].faults.refuse(MavCmd.DO_REPOSITION)
+        result = await stage.fleet.go_to(north(30))
+        assert list(result.failed) == ["north/1"]
+        assert not result.stopped
+        assert result["north/2"] is None
+        assert not stage.events(PolicyOrdered)
+        assert stage.fleet.members["north/1"].state is MemberState.FAILED
+        stage.copters["north/1"].faults.commands.clear()
+        assert (await stage.fleet.go_to(north(5))).is_complete
+        assert stage.fleet.members["north/1"].state is MemberState.IN
+
+
+async def test_the_rule_of_the_group_of_who_failed_holds() -> None:
+    async with open_stage(
+        3, groups={"camera": ["north/1"], "show": ["north/[23]"]}, on_error_of={"camera": "go_on"}
+    ) as stage:
+        await stage.take_off()
+        stage.copters["north/1"].faults.refuse(MavCmd.DO_REPOSITION)
+        result = await stage.fleet.go_to(north(10))
+        assert (list(result.failed), list(result.stopped)) == (["north/1"], [])
+        stage.copters["north/1"].faults.commands.clear()
+        stage.copters["north/3"].faults.refuse(MavCmd.DO_REPOSITION)
+        result = await stage.fleet.go_to(north(100))
+        assert (list(result.failed), list(result.stopped)) == (["north/3"], ["north/1", "north/2"])
+        assert list(stage.fleet.group("show").members) == ["north/2", "north/3"]
+
+
+async def test_a_function_decides() -> None:
+    asked: list[Failure] = []
+
+    def decide(failure: Failure) -> Mapping[str, PolicyOrder]:
+        asked.append(failure)
+        return {"north/2": "land"}
+
+    async with open_stage(3, on_error=decide) as stage:
+        await stage.take_off()
+        stage.copters["north/1"].faults.refuse(MavCmd.DO_REPOSITION)
+        result = await stage.fleet.go_to(north(20))
+        assert [(each.member, each.action, each.others) for each in asked] == [
+            ("north/1", "go_to", ("north/2", "north/3"))
+        ]
+        assert stage.modes_ordered("north/2") == ["LAND"]
+        assert result["north/3"] is None
+        assert stage.copters["north/2"].motion.is_on_ground
+
+
+async def test_a_function_that_makes_no_sense_ends_in_holding() -> None:
+    def decide(failure: Failure) -> PolicyName:
+        return "explode"  # type: ignore[return-value]
+
+    async with open_stage(2, on_error=decide) as stage:
+        await stage.take_off()
+        stage.copters["north/1"].faults.refuse(MavCmd.DO_REPOSITION)
+        with pytest.raises(LocalProtocolError, match="the policy decided 'explode'"):
+            await stage.fleet.go_to(north(100))
+        assert stage.mode_of("north/2") == "BRAKE"
+
+
+async def test_cancelling_is_one_stop_for_all() -> None:
+    async with open_stage(5) as stage:
+        await stage.take_off()
+        started = now()
+        with anyio.move_on_after(3):
+            await stage.fleet.go_to(north(300))
+        assert now() - started == pytest.approx(3.0, abs=0.01)
+        await anyio.sleep(5)
+        times = {name: stage.orders_to(name)[-1][0] for name in stage.copters}
+        assert set(stage.modes.values()) == {"BRAKE"}
+        assert all(stage.modes_ordered(name) == ["BRAKE"] for name in stage.copters)
+        assert max(times.values()) - min(times.values()) < 0.001
+
+
+async def test_cancelling_stops_those_that_were_there_already_too() -> None:
+    async with open_stage(2) as stage:
+        await stage.take_off()
+        here = {name: each.position.value for name, each in stage.fleet.vehicles.items()}
+        with anyio.move_on_after(15):
+            await stage.fleet.go_to(
+                {"north/1": here["north/1"].offset(north_m=5), "north/2": here["north/2"].offset(north_m=300)}
+            )
+        await anyio.sleep(3)
+        assert stage.modes == {"north/1": "BRAKE", "north/2": "BRAKE"}
+
+
+async def test_cancelled_landing_goes_on() -> None:
+    async with open_stage(2) as stage:
+        await stage.take_off()
+        with anyio.move_on_after(2):
+            await stage.fleet.land()
+        await anyio.sleep(3)
+        assert set(stage.modes.values()) == {"LAND"}
+
+
+async def test_a_pilot_takes_one_out_of_the_fleet() -> None:
+    async with open_stage(3, on_error="go_on") as stage:
+        await stage.take_off()
+        stage.pilot_takes("north/2")
+        await anyio.sleep(2)
+        member = stage.fleet.members["north/2"]
+        assert (member.state, member.why) == (MemberState.TAKEN_OVER, "the mode changed to LOITER")
+        stage.forget()
+        for order in (stage.fleet.go_to(north(10)), stage.fleet.hold(), stage.fleet.set_mode("GUIDED")):
+            result = await order
+            assert result.left_out == {"north/2": "taken over: the mode changed to LOITER"}
+            assert result.is_complete
+        assert stage.orders_to("north/2") == []
+        stage.fleet.take_back("north/2")
+        assert [type(each) for each in stage.events()] == [MemberTakenOver, MemberTakenBack]
+        assert len(await stage.fleet.land()) == 3
+        assert stage.modes_ordered("north/2") == ["LAND"]
+
+
+async def test_a_pilot_who_takes_one_during_an_action_keeps_it() -> None:
+    async with open_stage(3) as stage:
+        await stage.take_off()
+
+        async def take() -> None:
+            await anyio.sleep(4)
+            stage.pilot_takes("north/2")
+
+        taking = asyncio.create_task(take())
+        result = await stage.fleet.go_to(north(300))
+        await taking
+        await anyio.sleep(5)
+        assert stage.modes == {"north/1": "BRAKE", "north/2": "LOITER", "north/3": "BRAKE"}
+        assert "LOITER" in str(result.failed["north/2"])
+        assert [each.command for _, each in stage.orders_to("north/2")] == [MavCmd.DO_REPOSITION]
+        stage.pilot_takes("north/2", 9)
+        (await stage.fleet.land()).raise_for_errors()
+
+
+async def test_who_is_under_a_failsafe_is_left_alone() -> None:
+    async with open_stage(3, on_error="land_others") as stage:
+        await stage.take_off()
+        await stage.fleet.vehicles["north/3"].parameters.set("BATT_FS_LOW_ACT", 2)  # RTL
+        await stage.fleet.vehicles["north/3"].parameters.set("BATT_LOW_MAH", 3000)
+        stage.copters["north/3"].battery.percent = 5.0
+        result = await stage.fleet.go_to(north(300))
+        assert list(result.failed) == ["north/3"]
+        assert stage.fleet.members["north/3"].state is MemberState.TAKEN_OVER
+        assert stage.modes_ordered("north/3") == []
+        assert stage.modes_ordered("north/1") == ["LAND"]
+
+
+async def test_one_that_does_not_arm_disarms_nobody_and_flies_nobody() -> None:
+    async with open_stage(3) as stage:
+        (await stage.fleet.wait_ready()).raise_for_errors()
+        stage.copters["north/2"].faults.refuse(MavCmd.COMPONENT_ARM_DISARM)
+        result = await stage.fleet.arm()
+        assert list(result.failed) == ["north/2"]
+        result = await stage.fleet.take_off(10)
+        assert list(result.failed) == ["north/2"]
+        await anyio.sleep(3)
+        assert all(each.motion.is_on_ground for each in stage.copters.values())
+
+
+async def test_a_barrier_waits_for_the_slowest_and_says_who_is_missing() -> None:
+    async with open_stage(3) as stage:
+        await stage.take_off()
+        began = now()
+
+        def is_time(member: Member) -> bool:
+            return now() - began > 3 * member.vehicle.system_id
+
+        await stage.fleet.barrier(is_time)
+        assert now() - began == pytest.approx(9.0, abs=0.5)
+        with pytest.raises(FleetError, match="all_at_altitude") as caught:
+            await stage.fleet.all_at_altitude(50, timeout=2)
+        (late,) = [each for each in caught.value.errors.values() if isinstance(each, OperationTimeout)]
+        assert "north/1, north/2, north/3" in str(late)
+
+
+async def test_several_networks_with_the_same_ids_are_one_fleet() -> None:
+    async with open_stage(2, networks=("north", "south")) as stage:
+        assert list(stage.fleet.members) == ["north/1", "north/2", "south/1", "south/2"]
+        await stage.take_off()
+        south = stage.fleet["south/*"]
+        assert list(south.vehicles) == ["south/1", "south/2"]
+        (await south.land()).raise_for_errors()
+        assert stage.modes["north/1"] == stage.modes["north/2"] == "GUIDED"
+        assert not stage.orders_to("north/1")
+        assert stage.copters["south/1"].motion.is_on_ground
+
+
+async def test_do_takes_a_method_or_a_function_with_its_own_deadline() -> None:
+    async with open_stage(2, on_error="go_on") as stage:
+        await stage.take_off()
+        assert (await stage.fleet.do("set_mode", "LOITER")).is_complete
+        assert stage.mode_of("north/1") == "LOITER"
+
+        async def name_of(member: Member) -> str:
+            await anyio.sleep(member.vehicle.system_id * 5)
+            return member.name
+
+        result = await stage.fleet.do(name_of, timeout=7)
+        assert result["north/1"] == "north/1"
+        assert isinstance(result["north/2"], OperationTimeout)
+        for wrong in ("explode", "_holding.hold", "position"):
+            with pytest.raises(LocalProtocolError, match="action"):
+                await stage.fleet.do(wrong)
+
+
+async def test_staggered_ones_begin_one_after_the_other() -> None:
+    async with open_stage(3) as stage:
+        (await stage.fleet.wait_ready()).raise_for_errors()
+        (await stage.fleet.arm()).raise_for_errors()
+        await stage.fleet.set_mode("GUIDED")
+        stage.forget()
+        await stage.fleet.take_off(5, stagger_s=2)
+        times = [stage.orders_to(name)[0][0] for name in stage.copters]
+        assert [later - times[0] for later in times] == pytest.approx([0.0, 2.0, 4.0], abs=0.3)

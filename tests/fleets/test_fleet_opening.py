@@ -1,0 +1,204 @@
+"""Who becomes a member, by which name; streams of all of them; what is refused; the blocking twin."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import anyio
+import pytest
+from fleet_stage import open_stage
+
+import aerokit
+from aerokit import events, sync
+from aerokit.errors import BusyError, ConnectFailed, LocalProtocolError, SubscriptionOverflow
+from aerokit.fleets.events import FleetEvent, MemberTakenOver, StateTold, Told
+from aerokit.fleets.members import MemberState
+from aerokit.fleets.policy import Failure, Rules
+from aerokit.fleets.results import FleetResult
+from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
+
+pytestmark = pytest.mark.anyio
+
+
+def copters(*ids: int) -> list[SimulatedCopter]:
+    return [SimulatedCopter(system_id=each, boot_time_s=0.0, seed=each) for each in ids]
+
+
+async def test_connections_vehicles_and_links_become_one_fleet() -> None:
+    async with (
+        simulated_link(copters(1, 2)) as north,
+        simulated_link(copters(1)) as south,
+        simulated_link(SimulatedPx4(system_id=9, boot_time_s=0.0)) as west,
+        aerokit.open_connection(north) as connection,
+        aerokit.connect(south) as vehicle,
+    ):
+        sources: dict[str, Any] = {"north": connection, "scout": vehicle, "west": west}
+        async with aerokit.fleet(sources, groups={"two": ["north/*"]}, roles={"eyes": ["scout"]}) as fleet:
+            assert list(fleet.members) == ["scout", "north/1", "north/2", "west/9"]
+            assert fleet.vehicles["scout"] is vehicle
+            assert [each.name for each in fleet.group("two")] == ["north/1", "north/2"]
+            assert [each.name for each in fleet.role("eyes")] == ["scout"]
+            assert "north/2" in fleet
+            assert len(fleet["*/[19]"]) == 2
+            for wrong in (lambda: fleet.group("three"), lambda: fleet.role("x"), lambda: fleet["east/*"]):
+                with pytest.raises(LocalProtocolError):
+                    wrong()
+        assert connection.is_open
+        assert not vehicle.is_silent
+
+
+async def test_networks_without_a_name_are_numbered_and_ids_may_be_named() -> None:
+    async with (
+        simulated_link(copters(1, 2, 3)) as one,
+        simulated_link(copters(2)) as two,
+        aerokit.fleet(one, two, system_ids={"1": [3, 1]}) as fleet,
+    ):
+        assert list(fleet.members) == ["1/1", "1/3", "2/2"]
+
+
+async def test_one_that_the_program_has_already_is_not_found_twice() -> None:
+    async with (
+        simulated_link(copters(1, 2)) as link,
+        aerokit.open_connection(link) as connection,
+        aerokit.connect(connection, system_id=1) as own,
+    ):
+        async with aerokit.fleet({"north": connection, "own": own}) as fleet:
+            assert list(fleet.members) == ["own", "north/2"]
+        with pytest.raises(BusyError):
+            async with aerokit.fleet(connection, system_ids=[1]):
+                raise AssertionError
+        with pytest.raises(LocalProtocolError, match="'a' and 'b' are the same vehicle"):
+            async with aerokit.fleet({"a": own, "b": own}):
+                raise AssertionError
+        with pytest.raises(LocalProtocolError, match="two vehicles are called 'north/2'"):
+            async with aerokit.fleet({"north/2": own, "north": connection}):
+                raise AssertionError
+
+
+async def test_who_is_missing_is_told() -> None:
+    async with simulated_link(copters(1, 2)) as link:
+        with pytest.raises(ConnectFailed, match=r"no 3 vehicles within 5 s; heard were north/1, north/2"):
+            async with aerokit.fleet({"north": link}, count=3, timeout=5):
+                raise AssertionError
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ({"on_error": "panic"}, "on_error = 'panic'"),
+        ({"on_error_of": {"a": "panic"}}, "on_error"),
+        ({"count": 0}, "count = 0"),
+        ({"min_distance_m": 0.0}, "min_distance_m"),
+        ({"too_close": "shout"}, "too_close"),
+        ({"system_ids": [0]}, "system_ids: 0"),
+        ({"system_ids": {"x": [1]}}, "'x' is no network"),
+        ({"groups": {"a": ["nobody"]}}, "'nobody' is no member"),
+        ({"groups": {"a": ["north/1"], "b": ["north/*"]}}, "two groups"),
+    ],
+)
+async def test_wrong_arguments_are_refused(options: dict[str, Any], match: str) -> None:
+    async with simulated_link(copters(1)) as link:
+        with pytest.raises(LocalProtocolError, match=match):
+            async with aerokit.fleet({"north": link}, **options):
+                raise AssertionError
+
+
+async def test_a_fleet_of_nobody_is_refused() -> None:
+    with pytest.raises(LocalProtocolError, match="needs an address"):
+        async with aerokit.fleet():
+            raise AssertionError
+
+
+async def test_one_stream_has_the_events_and_states_of_all() -> None:
+    async with open_stage(2, networks=("north", "south")) as stage:
+        (await stage.fleet.wait_ready()).raise_for_errors()
+        with (
+            stage.fleet.events(events.ModeChanged) as modes,
+            stage.fleet.events(MemberTakenOver) as taken,
+            stage.fleet.states("armed", "position", every_arrival=True) as states,
+            stage.fleet.events(capacity=2, overflow="error") as few,
+        ):
+            await stage.fleet.arm()
+            (await stage.fleet["south/2"].set_mode("GUIDED")).raise_for_errors()
+            told = await modes.get(timeout=5)
+            assert isinstance(told, Told)
+            assert (told.member, told.event.after) == ("south/2", "GUIDED")  # type: ignore[attr-defined]
+            seen: set[tuple[str, str]] = set()
+            with anyio.fail_after(5):
+                async for state in states:
+                    assert isinstance(state, StateTold)
+                    seen.add((state.member, state.state))
+                    if len(seen) == 8:
+                        break
+            assert taken.get_nowait() is None
+            with pytest.raises(SubscriptionOverflow):
+                async for _ in few:
+                    pass
+        for wrong in (lambda: stage.fleet.states(), lambda: stage.fleet.states("height")):
+            with pytest.raises(LocalProtocolError, match="is no state"):
+                wrong()
+        with pytest.raises(LocalProtocolError, match="a class of Event"):
+            stage.fleet.events(int)  # type: ignore[arg-type]
+
+
+async def test_who_is_let_go_gets_no_orders() -> None:
+    async with open_stage(2) as stage:
+        await stage.take_off()
+        stage.fleet.let_go("north/2", "it films")
+        result = await stage.fleet.hold()
+        assert result.left_out == {"north/2": "left: it films"}
+        assert stage.fleet.members["north/2"].state is MemberState.LEFT
+        assert not stage.orders_to("north/2")
+        stage.fleet.take_back("north/2")
+        assert (await stage.fleet.land()).is_complete
+
+
+async def test_all_are_let_go_at_once_and_nothing_is_left() -> None:
+    async with simulated_link(copters(1, 2, 3)) as link, aerokit.open_connection(link) as connection:
+        before = len(connection.bus._event_sinks), set(connection.attached)
+        async with aerokit.fleet(connection, count=3) as fleet:
+            with fleet.events(FleetEvent):
+                assert connection.attached == {1, 2, 3}
+        assert (len(connection.bus._event_sinks), connection.attached) == before
+        async with aerokit.connect(connection, system_id=2):
+            pass
+
+
+def test_results_say_what_became_of_whom() -> None:
+    error = ValueError("no")
+    result = FleetResult(
+        "land", {"a": None, "b": error}, failed={"b": error}, stopped={}, left_out={"c": "lost"}
+    )
+    assert repr(result) == "<FleetResult of land: 1 of 2 done; failed: b; left out: c>"
+    assert dict(result) == {"a": None, "b": error}
+    with pytest.raises(aerokit.errors.FleetError, match=r"land: 1 of 2 did it\n  - b: no"):
+        result.raise_for_errors()
+
+
+def test_rules_take_nothing_else() -> None:
+    failure = Failure("a", "", "go_to", ValueError(), ("b", "c"))
+    assert Rules("go_on", {}).decide(failure) == {}
+    assert Rules("return_others", {}).decide(failure) == {"b": "return", "c": "return"}
+    assert Rules(lambda _: None, {}).decide(failure) == {}
+    assert Rules(lambda _: "land_others", {}).decide(failure) == {"b": "land", "c": "land"}
+    for decided in ({"x": "land"}, {"b": "jump"}, "halt", 7):
+        with pytest.raises(LocalProtocolError, match="the policy decided"):
+            Rules(lambda _, it=decided: it, {}).decide(failure)  # type: ignore[misc]
+
+
+def test_the_blocking_twin_flies_a_fleet() -> None:
+    from aerokit.testing.served import hosted_flight
+
+    with hosted_flight("copter", boot_time_s=0.0) as served:
+        with sync.fleet({"north": served.address}, count=1) as fleet:
+            assert repr(fleet) == "<Fleet of 1: north/1>"
+            with fleet.events(events.ArmedChanged) as told:
+                fleet.wait_ready().raise_for_errors()
+                fleet.arm().raise_for_errors()
+                assert fleet.take_off(5).is_complete
+                assert told.get(timeout=5).member == "north/1"
+            assert isinstance(fleet.vehicles["north/1"], sync.Vehicle)
+            assert fleet.vehicles["north/1"].is_armed
+            assert fleet["north/*"].land()["north/1"] is None
+        with pytest.raises(LocalProtocolError):
+            sync.fleet({"north": served.address}, count=0)

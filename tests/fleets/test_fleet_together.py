@@ -1,0 +1,293 @@
+"""What a fleet does together: ways that cross, distances in flight, missions, formations, corrections."""
+
+from __future__ import annotations
+
+import math
+
+import anyio
+import pytest
+from fleet_stage import HOME, Stage, open_stage
+
+from aerokit import messages as m
+from aerokit.errors import (
+    FleetError,
+    LocalProtocolError,
+    OperationRejected,
+    SetpointStreamStopped,
+)
+from aerokit.fleets.corrections import fragments, rtcm_messages
+from aerokit.fleets.events import PathsDecided, TooClose
+from aerokit.fleets.formation import Formation, Offset, follow_velocity
+from aerokit.fleets.members import MemberState
+from aerokit.mavlink.enums import MavCmd
+from aerokit.missions import Mission, land, take_off, waypoint
+from aerokit.position import Position
+from aerokit.sim.track import least_distance_m, record_track
+
+pytestmark = pytest.mark.anyio
+
+
+def swapped(stage: Stage) -> dict[str, Position]:
+    here = {name: each.position.value for name, each in stage.fleet.vehicles.items()}
+    one, other = here
+    return {one: here[other], other: here[one]}
+
+
+async def test_two_that_change_places_fly_in_layers() -> None:
+    async with open_stage(2, spacing_m=40, min_distance_m=5.0) as stage:
+        await stage.take_off()
+        tracks = [record_track(each) for each in stage.copters.values()]
+        targets = swapped(stage)
+        (await stage.fleet.go_to(targets)).raise_for_errors()
+        assert least_distance_m(*tracks)[0] > 4.0
+        for name, target in targets.items():
+            assert stage.fleet.vehicles[name].distance_to(target) < 2
+        (told,) = stage.events(PathsDecided)
+        assert told.decided.decision == "layers"
+        assert "north/1 and north/2" in told.decided.why
+        assert not stage.events(TooClose)
+
+
+async def test_ways_that_cross_are_refused_and_nothing_is_sent() -> None:
+    async with open_stage(2, spacing_m=40, min_distance_m=5.0) as stage:
+        await stage.take_off()
+        plan = stage.fleet.plan_apart(swapped(stage), by="refuse")
+        assert plan.decision == "refused"
+        with pytest.raises(OperationRejected, match="nothing was sent"):
+            await stage.fleet.go_to(swapped(stage), apart=plan)
+        onto = {"north/1": stage.fleet.vehicles["north/2"].position.value}
+        with pytest.raises(OperationRejected, match="north/2"):
+            await stage.fleet.go_to(onto)
+        assert not stage.orders_to("north/1")
+        with pytest.raises(LocalProtocolError, match="speed_m_s"):
+            stage.fleet.plan_apart(onto, by="corridors")
+
+
+async def test_corridors_are_flown_one_after_the_other() -> None:
+    async with open_stage(2, spacing_m=30) as stage:
+        await stage.take_off()
+        one, other = (each.position.value for each in stage.fleet.vehicles.values())
+        targets = {
+            "north/1": one.offset(north_m=30, east_m=30),
+            "north/2": other.offset(north_m=30, east_m=-30),
+        }
+        plan = stage.fleet.plan_apart(targets, min_distance_m=8, by="corridors", speed_m_s=5, slack_s=2)
+        assert plan.decision == "corridors"
+        assert plan.delays_s["north/2"] >= 3
+        tracks = [record_track(each) for each in stage.copters.values()]
+        (await stage.fleet.go_to(targets, apart=plan, speed_m_s=5)).raise_for_errors()
+        assert least_distance_m(*tracks)[0] > 7
+
+
+async def test_two_that_come_too_near_hold_both_and_only_ours() -> None:
+    async with open_stage(3, spacing_m=20, min_distance_m=6.0) as stage:
+        await stage.take_off()
+        stage.pilot_takes("north/2")
+        stage.forget()
+        one = stage.fleet.vehicles["north/1"]
+        with pytest.raises(OperationRejected, match="another order"):
+            await one.go_to(stage.fleet.vehicles["north/3"].position.value)  # by itself: nobody has compared
+        await anyio.sleep(3)
+        first = stage.events(TooClose)
+        assert [(each.member, each.other, each.ordered) for each in first] == [
+            ("north/1", "north/2", ("north/1",))
+        ]
+        assert first[0].distance_m < 6
+        assert stage.modes == {"north/1": "BRAKE", "north/2": "LOITER", "north/3": "GUIDED"}
+        assert stage.orders_to("north/2") == []
+
+
+async def test_it_may_only_be_told() -> None:
+    async with open_stage(2, spacing_m=20, min_distance_m=6.0, too_close="tell") as stage:
+        await stage.take_off()
+        vehicle = stage.fleet.vehicles["north/1"]
+        await vehicle.go_to(stage.fleet.vehicles["north/2"].position.value.offset(east_m=-3))
+        await vehicle.go_to(vehicle.position.value.offset(east_m=-15))
+        await vehicle.go_to(vehicle.position.value.offset(east_m=15))
+        told = stage.events(TooClose)
+        assert [each.ordered for each in told] == [(), ()]  # once for each time
+        assert stage.mode_of("north/2") == "GUIDED"
+
+
+def mission_of(row: float) -> Mission:
+    spot = Position(*HOME[:2]).offset(north_m=10 + row, east_m=row)
+    return Mission(
+        [
+            take_off(altitude_relative_m=8),
+            waypoint(spot.latitude_deg, spot.longitude_deg, altitude_relative_m=8),
+            land(),
+        ]
+    )
+
+
+async def test_missions_are_distributed_and_started_together() -> None:
+    async with open_stage(3) as stage:
+        missions = {name: mission_of(10.0 * number) for number, name in enumerate(stage.copters)}
+        with pytest.raises(OperationRejected, match=r"upload\(\) comes first"):
+            await stage.fleet.start_missions()
+        (await stage.fleet.wait_ready()).raise_for_errors()
+        (await stage.fleet.upload(missions)).raise_for_errors()
+        with pytest.raises(OperationRejected, match="not armed: north/1, north/2, north/3"):
+            await stage.fleet.start_missions()
+        (await stage.fleet.arm()).raise_for_errors()
+        (await stage.fleet.start_missions()).raise_for_errors()
+        starts = [
+            at
+            for name in stage.copters
+            for at, each in stage.orders_to(name)
+            if each.command == MavCmd.MISSION_START
+        ]
+        assert len(starts) == 3
+        assert max(starts) - min(starts) < 0.5
+        (await stage.fleet.wait_missions_finished(timeout=200)).raise_for_errors()
+        assert all(each.motion.is_on_ground for each in stage.copters.values())
+        assert all(each.state is MemberState.IN for each in stage.fleet)
+
+
+async def test_nobody_starts_when_one_has_not_taken_its_mission() -> None:
+    async with open_stage(2, on_error="go_on") as stage:
+        missions = {name: mission_of(10.0 * number) for number, name in enumerate(stage.copters)}
+        (await stage.fleet.wait_ready()).raise_for_errors()
+        (await stage.fleet.upload(missions)).raise_for_errors()
+        (await stage.fleet.arm()).raise_for_errors()
+        stage.copters["north/2"].faults.silent = True
+        changed = {name: mission_of(5 + 10.0 * number) for number, name in enumerate(stage.copters)}
+        with pytest.raises(FleetError, match="north/2"):
+            await stage.fleet.upload(changed)
+        stage.copters["north/2"].faults.silent = False
+        with pytest.raises(OperationRejected, match=r"upload\(\) comes first"):
+            await stage.fleet.start_missions()
+        assert all(each.motion.is_on_ground for each in stage.copters.values())
+
+
+async def test_missions_whose_ways_meet_are_refused() -> None:
+    async with open_stage(2, min_distance_m=5.0) as stage:
+        (await stage.fleet.wait_ready()).raise_for_errors()
+        with pytest.raises(OperationRejected, match="come too near"):
+            await stage.fleet.upload({"north/1": mission_of(10), "north/2": mission_of(10)})
+        (told,) = stage.events(PathsDecided)
+        assert told.decided.conflicts[0].distance_m == pytest.approx(0, abs=0.1)
+
+
+async def test_a_formation_is_taken_and_kept_while_the_leader_moves() -> None:
+    async with open_stage(4) as stage:
+        await stage.take_off()
+        names = ["north/2", "north/3", "north/4"]
+        wedge = Formation.wedge(names, 8.0, frame="north")
+        (await stage.fleet.form(wedge, leader="north/1")).raise_for_errors()
+        leader = stage.fleet.vehicles["north/1"]
+        here = leader.position.value
+        for name in names:
+            offset = wedge.offsets[name]
+            place = here.offset(north_m=offset.north_m, east_m=offset.east_m)
+            assert stage.fleet.vehicles[name].distance_to(place) < 2.5
+        async with stage.fleet.following(wedge, leader="north/1") as following:
+            await leader.go_to(here.offset(north_m=80), speed_m_s=5)
+            await anyio.sleep(8)
+            assert following.is_running
+            assert all(following.error_m(name) < 1.5 for name in names)
+        assert {stage.mode_of(name) for name in names} == {"BRAKE"}
+        assert stage.mode_of("north/1") == "GUIDED"
+
+
+@pytest.mark.parametrize("policy", ["hold_others", "land_others"])
+async def test_when_the_leader_is_taken_over_the_followers_hold(policy: str) -> None:
+    async with open_stage(3, on_error=policy) as stage:
+        await stage.take_off()
+        line = Formation.line(["north/2", "north/3"], 8.0, frame="north")
+        with pytest.raises(SetpointStreamStopped, match="the leader north/1 is taken over"):
+            async with stage.fleet.following(line, leader="north/1") as following:
+                await anyio.sleep(5)
+                stage.pilot_takes("north/1")
+                assert "LOITER" in await following.wait_stopped()
+                await anyio.sleep(2)
+                assert not following.is_running
+        assert stage.modes == {"north/1": "LOITER", "north/2": "BRAKE", "north/3": "BRAKE"}
+
+
+async def test_when_the_leader_is_lost_the_followers_hold() -> None:
+    async with open_stage(2) as stage:
+        await stage.take_off()
+        line = Formation.line(["north/2"], 8.0, frame="north")
+        with pytest.raises(SetpointStreamStopped, match="following has stopped"):
+            async with stage.fleet.following(line, leader="north/1") as following:
+                stage.copters["north/1"].faults.silent = True
+                with anyio.fail_after(3):
+                    await following.wait_stopped()
+        await anyio.sleep(1)
+        assert stage.mode_of("north/2") == "BRAKE"
+
+
+async def test_a_follower_that_is_taken_over_leaves_it_to_the_policy() -> None:
+    async with open_stage(3, on_error="go_on") as stage:
+        await stage.take_off()
+        line = Formation.line(["north/2", "north/3"], 8.0, frame="north")
+        async with stage.fleet.following(line, leader="north/1") as following:
+            await anyio.sleep(3)
+            stage.pilot_takes("north/2")
+            await anyio.sleep(3)
+            assert following.is_running
+            assert following.error_m("north/3") < 20
+        assert stage.modes == {"north/1": "GUIDED", "north/2": "LOITER", "north/3": "BRAKE"}
+
+
+async def test_formations_that_make_no_sense_are_refused() -> None:
+    async with open_stage(2, min_distance_m=5.0) as stage:
+        wrong: list[tuple[Formation, str, str]] = [
+            (Formation({"north/9": Offset(10)}), "north/1", "north/9"),
+            (Formation({"north/1": Offset(10)}), "north/1", "is the leader"),
+            (Formation({"north/2": Offset(3)}), "north/1", "3.0 m apart"),
+        ]
+        for formation, leader, match in wrong:
+            with pytest.raises(LocalProtocolError, match=match):
+                stage.fleet.following(formation, leader=leader)
+
+
+def test_offsets_turn_with_the_heading() -> None:
+    ahead = Formation({"a": Offset(10, 2, 1)}, "heading")
+    east = ahead.offset_of("a", 90.0)
+    assert (east.north_m, east.east_m, east.up_m) == pytest.approx((-2, 10, 1))
+    with pytest.raises(LocalProtocolError, match="heading"):
+        ahead.offset_of("a", None)
+    assert follow_velocity((10, 0, 0), (1, 0, 0), gain=0.5, max_speed_m_s=100) == (6, 0, 0)
+    assert math.hypot(*follow_velocity((100, 100, 0), (0, 0, 0), gain=1, max_speed_m_s=7)) == pytest.approx(7)
+
+
+async def test_corrections_go_out_once_for_each_link() -> None:
+    async with open_stage(2, networks=("north", "south")) as stage:
+        stage.forget()
+        message = b"\xd3\x00\xc8" + bytes(range(200)) + b"crc"
+        assert stage.fleet.send_corrections(message) == 2
+        for wire in stage.wires.values():
+            sent = wire.all(m.GpsRtcmData)
+            assert b"".join(each.data[: each.len] for each in sent) == message
+            assert [each.flags & 7 for each in sent] == [0b001, 0b011]
+        with pytest.raises(LocalProtocolError, match="0 bytes"):
+            stage.fleet.send_corrections(b"")
+
+
+@pytest.mark.parametrize(
+    ("size", "lengths"),
+    [
+        (1, [1]),
+        (180, [180]),
+        (181, [180, 1]),
+        (360, [180, 180, 0]),
+        (719, [180, 180, 180, 179]),
+        (720, [180] * 4),
+    ],
+)
+def test_a_message_is_whole_when_four_are_there_or_one_is_not_full(size: int, lengths: list[int]) -> None:
+    pieces = fragments(bytes(size), 37)
+    assert [each.len for each in pieces] == lengths
+    assert {each.flags >> 3 for each in pieces} == {37 & 31}
+    assert [each.flags & 1 for each in pieces] == [int(len(lengths) > 1)] * len(lengths)
+    assert [each.flags >> 1 & 3 for each in pieces] == list(range(len(lengths)))
+
+
+def test_rtcm_messages_are_told_apart() -> None:
+    one, other = b"\xd3\x00\x02ab123", b"\xd3\x00\x00456"
+    assert list(rtcm_messages(one + other)) == [one, other]
+    assert list(rtcm_messages(b"no rtcm")) == [b"no rtcm"]
+    with pytest.raises(LocalProtocolError, match="721"):
+        fragments(bytes(721), 0)
