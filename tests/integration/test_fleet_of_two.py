@@ -26,8 +26,8 @@ pytest.importorskip("zenoh")
 pytestmark = pytest.mark.anyio
 
 ARDUCOPTER, PX4 = os.environ.get("AEROKIT_ARDUCOPTER"), os.environ.get("AEROKIT_PX4")
-DEFAULTS = Path(ARDUCOPTER or "/").resolve() / "../../../../Tools/autotest/default_params/copter.parm"
-ETC = Path(PX4 or "/").resolve() / "../../etc"
+BINARIES = [Path(each).resolve() for each in (ARDUCOPTER, PX4) if each]
+DEFAULTS = "Tools/autotest/default_params/copter.parm"
 SPEEDUP = 1.0 if ARDUCOPTER and PX4 else 8.0
 PX4_INSTANCE = 1  # its system id is one more
 
@@ -70,13 +70,14 @@ async def two_vehicles() -> AsyncIterator[list[str]]:
             ]
             stack.enter_context(
                 running(
-                    ARDUCOPTER, "--model", "+", "--speedup", "1", "--defaults", str(DEFAULTS), f"-I{INSTANCE}",
-                    "--home", "-35.363261,149.165230,584,353", "--serial0", f"udpclient:127.0.0.1:{port}",
+                    ARDUCOPTER, "--model", "+", "--speedup", "1", f"-I{INSTANCE}",
+                    "--defaults", str(BINARIES[0].parents[3] / DEFAULTS), "--home", "-35.363261,149.165230,584,353",
+                    "--serial0", f"udpclient:127.0.0.1:{port}",
                     folder=folders[0],
                 )
             )  # fmt: skip
             env = {"PX4_SIM_MODEL": "sihsim_quadx", "PATH": "/usr/bin:/bin"}
-            command = [PX4, "-d", "-i", str(PX4_INSTANCE), "-w", ".", str(ETC)]
+            command = [PX4, "-d", "-i", str(PX4_INSTANCE), "-w", ".", str(BINARIES[1].parents[1] / "etc")]
             stack.enter_context(running(*command, env=env, folder=folders[1]))
             yield [f"udpin:127.0.0.1:{port}", f"udpin:127.0.0.1:{14540 + PX4_INSTANCE}"]
             return
