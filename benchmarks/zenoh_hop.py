@@ -4,8 +4,8 @@
     python benchmarks/zenoh_hop.py --quick    # does it run? The figures mean little
 
 ``udp``: ``udpout:`` to ``udpin:``. ``zenoh``: a client connected to a vehicle side. ``zenoh_router``: both are clients
-of a router, a third process. Each frame goes out, is echoed, and is waited for: a PING of MAVLink, 50 times a second, and
-then 1000 in a burst, of which it is told how many came back. Processor time is that of the program that asks.
+of a router, a third process. Each frame goes out, is echoed, and is waited for: a PING of MAVLink, 50 times a second,
+and then 1000 in a burst, of which it is told how many came back. Processor time is that of the program that asks.
 """
 
 from __future__ import annotations
