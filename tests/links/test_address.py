@@ -23,6 +23,10 @@ def replay(path: str, speed: str | None = None) -> LinkAddress:
     return LinkAddress("replay", path=path, options=(("speed", speed),) if speed else ())
 
 
+def zenoh(path: str, kind: LinkKind = "zenoh", **options: str) -> LinkAddress:
+    return LinkAddress(kind, path=path, options=tuple(sorted(options.items())))
+
+
 ACCEPTED: list[tuple[str, LinkAddress]] = [
     ("127.0.0.1:14550", udpin("127.0.0.1", 14550)),
     (" localhost:14550\n", udpin("localhost", 14550)),
@@ -64,6 +68,18 @@ ACCEPTED: list[tuple[str, LinkAddress]] = [
     ("replay:flight.tlog?speed=1", replay("flight.tlog")),
     ("file:///logs/my%20flight.tlog", replay("/logs/my flight.tlog")),
     ("file:///C:/logs/flight.tlog", replay("C:/logs/flight.tlog")),
+    ("zenoh://north/alpha", zenoh("north/alpha")),
+    ("zenoh:North/Alpha-2.b/", zenoh("North/Alpha-2.b")),
+    (
+        "ZENOH://north/alpha?connect=tcp/10.0.0.5:7447,tls/Host:7448&Helm=TAKE&timeout=2.0",
+        zenoh("north/alpha", connect="tcp/10.0.0.5:7447,tls/Host:7448", helm="take", timeout="2"),
+    ),
+    (
+        "zenohin://n/a?listen=tcp/[::]:7447?iface=eth0&mode=peer&config=/Etc/my%20%26%25file?.json5",
+        zenoh(
+            "n/a", "zenohin", listen="tcp/[::]:7447?iface=eth0", mode="peer", config="/Etc/my &%file?.json5"
+        ),
+    ),
 ]
 
 
@@ -78,6 +94,16 @@ def test_accepted(text: str, address: LinkAddress) -> None:
     [
         ("", "it is empty"),
         (" \t", "it is empty"),
+        ("zenoh://north", "the name of the vehicle is missing, as in zenoh://fleet/alpha"),
+        ("zenoh:///alpha", "the fleet = '' is not allowed"),
+        ("zenohin://north/a/b", "the name = 'a/b' is not allowed"),
+        ("zenoh://north/*", "the name = '.' is not allowed"),
+        ("zenoh://north/alpha?client=a/b", "client = 'a/b' is not allowed"),
+        ("zenoh://north/alpha?helm=mine", "helm=mine is none of free, take, never"),
+        ("zenoh://north/alpha?mode=router", "mode=router is none of peer, client"),
+        ("zenoh://north/alpha?connect=", "connect= is empty"),
+        ("zenohin://north/alpha?helm=take", "'helm' is not an option of zenohin links"),
+        ("zenoh://north/alpha?timeout=0", "timeout=0 is not a number above 0"),
         ("udpin:a\0b:1", "NUL"),
         ("vehicle", "neither host:port nor the path"),
         ("14550", "neither host:port nor the path"),
@@ -137,14 +163,39 @@ hosts = (
     | st.ip_addresses().map(str)
     | st.just("fe80::1%eth0")
 )
+ascii_only = st.characters(max_codepoint=127)
+
+
+def is_tidy(text: str) -> bool:
+    return text == text.strip() != ""
+
+
 speeds = st.floats(min_value=0, exclude_min=True).map(lambda number: repr(number).removesuffix(".0"))
 bauds = st.none() | st.integers(1, 4_000_000)
 
 
 @st.composite
 def addresses(draw: st.DrawFn) -> LinkAddress:
-    kinds: list[LinkKind] = ["udpin", "udpout", "udpbcast", "tcp", "tcpin", "serial", "replay"]
+    kinds: list[LinkKind] = [
+        "udpin",
+        "udpout",
+        "udpbcast",
+        "tcp",
+        "tcpin",
+        "serial",
+        "replay",
+        "zenoh",
+        "zenohin",
+    ]
     kind = draw(st.sampled_from(kinds))
+    if kind in ("zenoh", "zenohin"):
+        path = draw(
+            st.from_regex(
+                r"[A-Za-z0-9][\w.-]{0,9}/[A-Za-z0-9][\w.-]{0,9}", fullmatch=True, alphabet=ascii_only
+            )
+        )
+        given = draw(st.dictionaries(st.sampled_from(["connect", "listen", "config"]), texts.filter(is_tidy)))
+        return zenoh(path, kind, **given)
     if kind == "serial":
         return serial(draw(texts.filter(lambda t: t.strip("/"))), draw(bauds), rtscts=draw(st.booleans()))
     if kind == "replay":
@@ -161,8 +212,8 @@ def test_the_canonical_string_parses_back_to_the_same(address: LinkAddress) -> N
 
 
 PIECES = (
-    "udp: udpin: tcp:// serial: file: replay: // / [ ] ::1 0.0.0.0 : , ? 14550 99999 speed= "
-    "rtscts=1 & .tlog COM3 % %3 %20 \\ baud= - ٣"
+    "udp: udpin: tcp:// zenoh: zenohin: north/alpha serial: file: replay: // / [ ] ::1 0.0.0.0 : , ? 14550 99999 "
+    "speed= rtscts=1 & .tlog COM3 % %3 %20 \\ baud= - ٣"
 )
 pieces = st.sampled_from([*PIECES.split(), " "])
 

@@ -12,6 +12,8 @@ from aerokit.links import (
     UdpBroadcast,
     UdpConnect,
     UdpListen,
+    ZenohConnect,
+    ZenohListen,
     create_link,
     parse_address,
 )
@@ -27,6 +29,8 @@ LINKS: list[tuple[str, type[Link], str]] = [
     ("/dev/ttyACM0,57600", SerialLink, "serial:///dev/ttyACM0:57600"),
     ("serial://COM3?rtscts=1", SerialLink, "serial://COM3:921600?rtscts=1"),
     ("flight.tlog", Replay, "replay:flight.tlog"),
+    ("zenoh://north/alpha?helm=never&client=me", ZenohConnect, "zenoh://north/alpha"),
+    ("zenohin:north/alpha?listen=tcp/127.0.0.1:0", ZenohListen, "zenohin://north/alpha"),
     ("replay:flight.tlog?speed=max", Replay, "replay:flight.tlog?speed=inf"),
 ]
 

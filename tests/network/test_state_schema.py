@@ -160,7 +160,8 @@ def test_what_changes_is_put_at_the_rate_and_what_does_not_every_two_seconds() -
 def test_arguments() -> None:
     async def main() -> None:
         async with simulated_link(SimulatedCopter()) as link, aerokit.connect(link) as vehicle:
-            for wrong in ({"rate_hz": 0.0}, {"rate_hz": 51.0}, {"states": ["nonsense"]}):
+            wrongs: list[dict[str, Any]] = [{"rate_hz": 0.0}, {"rate_hz": 51.0}, {"states": ["nonsense"]}]
+            for wrong in wrongs:
                 with pytest.raises(LocalProtocolError, match=r"not allowed|is no state"):
                     async with publishing(vehicle, Kept(), **wrong):
                         pass

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 __all__ = ["add_arguments", "run_sim"]
 
-CLIENTS_USE = {"tcpin": "tcp", "udpout": "udpin", "udpbcast": "udpin", "udpin": "udpout"}
+CLIENTS_USE = {"tcpin": "tcp", "udpout": "udpin", "udpbcast": "udpin", "udpin": "udpout", "zenohin": "zenoh"}
 """What a client writes where the simulator writes this."""
 
 

@@ -11,7 +11,15 @@ from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavCmd, MavFtpOpcode, MavMissionResult, MavResult, MavSeverity
 from aerokit.mavlink.framer import Framer
-from aerokit.mavlink.messages import CommandAck, MissionAck, Statustext
+from aerokit.mavlink.messages import (
+    INDEX,
+    CommandAck,
+    CommandInt,
+    CommandLong,
+    FileTransferProtocol,
+    MissionAck,
+    Statustext,
+)
 
 from .zenoh_keys import Told, Wish
 
@@ -29,11 +37,11 @@ TELL_EVERY_S = 0.5
 
 READ_MESSAGES = frozenset(
     (
-        "HEARTBEAT", "SYSTEM_TIME", "TIMESYNC", "PING", "STATUSTEXT", "COMMAND_ACK", "MESSAGE_INTERVAL", "LOGGING_ACK",
-        "PARAM_REQUEST_READ", "PARAM_REQUEST_LIST", "PARAM_EXT_REQUEST_READ", "PARAM_EXT_REQUEST_LIST",
-        "MISSION_REQUEST", "MISSION_REQUEST_INT", "MISSION_REQUEST_LIST", "MISSION_REQUEST_PARTIAL_LIST", "MISSION_ACK",
-        "FENCE_FETCH_POINT", "RALLY_FETCH_POINT", "REQUEST_DATA_STREAM", "REQUEST_EVENT",
-        "LOG_REQUEST_LIST", "LOG_REQUEST_DATA", "LOG_REQUEST_END", "DEVICE_OP_READ",
+        "Heartbeat", "SystemTime", "Timesync", "Ping", "Statustext", "CommandAck", "MessageInterval", "LoggingAck",
+        "ParamRequestRead", "ParamRequestList", "ParamExtRequestRead", "ParamExtRequestList", "MissionRequest",
+        "MissionRequestInt", "MissionRequestList", "MissionRequestPartialList", "MissionAck", "FenceFetchPoint",
+        "RallyFetchPoint", "RequestDataStream", "RequestEvent", "LogRequestList", "LogRequestData", "LogRequestEnd",
+        "DeviceOpRead",
     )
 )  # fmt: skip
 """What anybody may send: it asks, or says something of its sender, and changes nothing but streams."""
@@ -57,24 +65,25 @@ READ_FILES = frozenset(
 )  # fmt: skip
 """And these operations of MAVFTP."""
 
+_OPCODE_AT = 3  # https://mavlink.io/en/services/ftp.html#payload
 _SAYS = "network: "
 _LONGEST_TEXT = 50
 _MOST_KINDS = 64
+_READ_IDS = frozenset(message_id for message_id, row in INDEX.items() if row[0] in READ_MESSAGES)
 COMMANDS = ("COMMAND_LONG", "COMMAND_INT")
 _PLANS = ("MISSION_COUNT", "MISSION_CLEAR_ALL", "MISSION_WRITE_PARTIAL_LIST")
 
 
-def is_read(message: Message | None) -> bool:
-    """Whether anybody may send it; what is not known (None: not of our dialect) is an order."""
-    if message is None:
-        return False
-    fields: object = message
-    if message.NAME in COMMANDS:
-        return getattr(fields, "command", 0) in READ_COMMANDS
-    if message.NAME == "FILE_TRANSFER_PROTOCOL":
-        payload: bytes = getattr(fields, "payload", b"")
-        return len(payload) > 3 and payload[3] in READ_FILES
-    return message.NAME in READ_MESSAGES
+def is_read(frame: Frame) -> bool:
+    """Whether anybody may send it; what is not known is an order."""
+    if frame.message_id in _READ_IDS:  # without decoding it: most are
+        return True
+    if frame.message_id in (CommandLong.ID, CommandInt.ID):
+        return getattr(_decoded(frame), "command", 0) in READ_COMMANDS
+    if frame.message_id == FileTransferProtocol.ID:
+        payload: bytes = getattr(_decoded(frame), "payload", b"")
+        return len(payload) > _OPCODE_AT and payload[_OPCODE_AT] in READ_FILES
+    return False
 
 
 def refusals_in(answer: bytes) -> tuple[bytes, ...]:
@@ -146,13 +155,12 @@ class Gate:
         if self._framer.waiting:  # a datagram has whole frames: what is begun in one does not end in the next
             self._framer = _framer()
         for frame in frames:
-            message = _decoded(frame)
-            if is_read(message) or (wish != "never" and self._helm.may_order(self._client, now)):
+            if is_read(frame) or (wish != "never" and self._helm.may_order(self._client, now)):
                 passed.append(frame.raw)
                 continue
             holder = None if wish == "never" else self._helm.holder(now)
             reason = "this link never orders (helm=never)" if holder is None else f"{holder} has the helm"
-            tell += self._refuse(frame, message, reason, holder, now)
+            tell += self._refuse(frame, _decoded(frame), reason, holder, now)
         return b"".join(passed), tell
 
     def refuse_late(self, data: bytes, now: float) -> list[Told]:
@@ -162,11 +170,10 @@ class Gate:
         """
         tell: list[Told] = []
         for frame in _framer().receive(data, now):
-            message = _decoded(frame)
-            if is_read(message):
+            if is_read(frame):
                 self.refused += 1
             else:
-                tell += self._refuse(frame, message, "it came too late", None, now, is_late=True)
+                tell += self._refuse(frame, _decoded(frame), "it came too late", None, now, is_late=True)
         return tell
 
     def _refuse(

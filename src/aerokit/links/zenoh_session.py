@@ -15,9 +15,9 @@ from aerokit.snapshot import Snapshot
 __all__ = ["NetworkOptions", "attachment_of", "close_session", "open_session", "payload_of", "zenoh_module"]
 
 _TX = "transport/link/tx/queue"
+_NO_WAITING = (f"{_TX}/congestion_control/drop/wait_before_drop", 0)
+"""What is thrown away keeps nobody waiting; else a put may keep the loop for a millisecond, each time."""
 _SETTINGS = (
-    # A message that is thrown away costs nobody a wait; without this, a put may keep the loop for a millisecond.
-    (f"{_TX}/congestion_control/drop/wait_before_drop", 0),
     # Batches, of 64 KB at most: a burst of 1000 frames fits, a broken connection holds back no more than these.
     (f"{_TX}/size/data", 4),
     (f"{_TX}/size/real_time", 4),
@@ -122,7 +122,7 @@ def _config(zenoh: Any, address: str, options: NetworkOptions) -> Any:
             config.insert_json5(key, json.dumps(value))
     except zenoh.ZError as error:
         raise LocalProtocolError(f"{address}: {_reason(error)}") from error
-    for key, value in _SETTINGS if not options.config else ():
+    for key, value in (_NO_WAITING, *(_SETTINGS if not options.config else ())):
         with contextlib.suppress(zenoh.ZError):  # another version's
             config.insert_json5(key, json.dumps(value))
     return config

@@ -1,0 +1,163 @@
+"""What a hop over a zenoh network costs beside UDP: round trips of a frame between two processes on this machine.
+
+    python benchmarks/zenoh_hop.py            # a minute; writes bench-zenoh.json
+    python benchmarks/zenoh_hop.py --quick    # does it run? The figures mean little
+
+``udp``: ``udpout:`` to ``udpin:``. ``zenoh``: a client connected to a vehicle side. ``zenoh_router``: both are clients
+of a router, a third process. Each frame goes out, is echoed, and is waited for: a PING of MAVLink, 50 times a second,
+and then 1000 in a burst, of which it is told how many came back. Processor time is that of the program that asks.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import json
+import socket
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from aerokit.errors import LinkLost
+from aerokit.links import Peer, create_link
+from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.messages import Ping
+
+ECHO = """
+import asyncio, sys
+from aerokit.links import create_link
+
+class Echo:
+    def __init__(self, link): self.link = link
+    def bytes_received(self, data, peer): self.link.write(data, peer)
+    def link_lost(self, error): sys.exit(str(error))
+
+async def main():
+    link = create_link(sys.argv[1])
+    await link.open(Echo(link))
+    print("up", flush=True)
+    await asyncio.Event().wait()
+
+asyncio.run(main())
+"""
+ROUTER = """
+import json, sys, zenoh
+config = zenoh.Config()
+for key, value in (("mode", "router"), ("scouting/multicast/enabled", False), ("listen/endpoints", [sys.argv[1]])):
+    config.insert_json5(key, json.dumps(value))
+session = zenoh.open(config)
+print("up", flush=True)
+sys.stdin.read()
+"""
+
+
+class Ears:
+    """Counts what comes back, and wakes who waits for it."""
+
+    def __init__(self) -> None:
+        self.heard = 0
+        self.came = asyncio.Event()
+
+    def bytes_received(self, data: bytes, peer: Peer) -> None:
+        """See `Receiver`."""
+        self.heard += 1
+        self.came.set()
+
+    def link_lost(self, error: LinkLost) -> None:
+        """See `Receiver`."""
+        sys.exit(str(error))
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure, print, write."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--output", type=Path, default=Path("bench-zenoh.json"))
+    options = parser.parse_args(arguments)
+    count = 100 if options.quick else 1000
+    rows = {}
+    for name in ("udp", "zenoh", "zenoh_router"):
+        rows[name] = _measured(name, count)
+        shown = ", ".join(f"{what} {value:.0f}" for what, value in rows[name].items())
+        print(f"{name:14} {shown}")
+    options.output.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+    return 0
+
+
+def _measured(name: str, count: int) -> dict[str, float]:
+    port = _free_port()
+    endpoint = f"tcp/127.0.0.1:{port}"
+    with contextlib.ExitStack() as stack:
+        if name == "udp":
+            stack.enter_context(_process(ECHO, f"udpin:127.0.0.1:{port}"))
+            return asyncio.run(_ask(f"udpout:127.0.0.1:{port}", count))
+        if name == "zenoh_router":
+            stack.enter_context(_process(ROUTER, endpoint))
+        how = "connect" if name == "zenoh_router" else "listen"
+        stack.enter_context(_process(ECHO, f"zenohin://bench/echo?{how}={endpoint}"))
+        return asyncio.run(_ask(f"zenoh://bench/echo?connect={endpoint}", count))
+
+
+async def _ask(address: str, count: int) -> dict[str, float]:
+    link, ears, encoder = create_link(address), Ears(), FrameEncoder(255, 190)
+    await link.open(ears)
+    link.write(encoder.encode(Ping(0, 0, 0, 0)))  # what is imported for the first one
+    with contextlib.suppress(asyncio.TimeoutError):
+        await asyncio.wait_for(ears.came.wait(), 2)
+    round_trips: list[float] = []
+    processor = time.process_time()
+    for number in range(count):
+        frame = encoder.encode(Ping(0, number, 0, 0))
+        ears.came.clear()
+        began = time.perf_counter()
+        link.write(frame)
+        with contextlib.suppress(asyncio.TimeoutError):
+            await asyncio.wait_for(ears.came.wait(), 1)
+            round_trips.append(time.perf_counter() - began)
+        await asyncio.sleep(0.02)
+    processor = time.process_time() - processor
+    ears.heard = 0
+    for number in range(1000):
+        link.write(encoder.encode(Ping(0, number, 0, 0)))
+    await asyncio.sleep(1)
+    link.close()
+    await link.wait_closed()
+    percent = statistics.quantiles(round_trips, n=100)
+    return {
+        "round_trip_median_us": statistics.median(round_trips) * 1e6,
+        "round_trip_p99_us": percent[98] * 1e6,
+        "processor_us": processor / count * 1e6,
+        "lost": count - len(round_trips),
+        "of_1000_came_back": ears.heard,
+    }
+
+
+@contextlib.contextmanager
+def _process(program: str, argument: str) -> Iterator[None]:
+    with subprocess.Popen(
+        [sys.executable, "-c", program, argument], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as running:
+        try:
+            assert running.stdout is not None
+            if running.stdout.readline() != "up\n":
+                sys.exit(f"{argument} did not begin")
+            yield
+        finally:
+            running.kill()
+
+
+def _free_port() -> int:
+    with socket.socket() as sock:
+        sock.bind(("127.0.0.1", 0))
+        port: int = sock.getsockname()[1]
+        return port
+
+
+if __name__ == "__main__":
+    sys.exit(main())
