@@ -7,8 +7,9 @@
 A vehicle sends over UDP on 127.0.0.1 to a process of its own, ``aerokit hub udpin:… udpout:… …`` or ``mavproxy.py
 --master udpin:… --out udpout:… …``, which passes every frame on to 1, 4 or 16 others. ``out_N``: frames that came in,
 and went to all of them, in a second of its processor time, while a recorded ArduCopter is sent at 600 frames a second,
-in pieces of ten; both take turns, neither may lose any, and MAVProxy has no modules and logs to nowhere. ``latency_…``: time from
-sending to receiving at the first of four, of frames that come one by one, 100 a second: median and 99th percentile.
+in pieces of ten; both take turns, neither may lose any, and MAVProxy has no modules and logs to nowhere.
+``latency_…``: time from sending to receiving at the first of four, of frames that come one by one, 100 a second: median
+and 99th percentile.
 
 MAVProxy is that of ``$AEROKIT_MAVPROXY_PYTHON``'s environment, else of this one; without it there are no rows.
 """

@@ -8,7 +8,16 @@ from typing import Protocol, runtime_checkable
 
 from aerokit.errors import LinkLost
 
-__all__ = ["DrainListener", "Link", "Peer", "PeerKeeper", "PeerListener", "Receiver", "keeps_peers"]
+__all__ = [
+    "BurstListener",
+    "DrainListener",
+    "Link",
+    "Peer",
+    "PeerKeeper",
+    "PeerListener",
+    "Receiver",
+    "keeps_peers",
+]
 
 Peer = Hashable
 """Who sent the bytes, to be handed back to `Link.write`; None where there is only one. Opaque."""
@@ -48,6 +57,17 @@ class PeerKeeper(Receiver, Protocol):
 
     keeps_peers: bool
     """Whether it does: the link then writes to nobody else, and forgets nobody by itself."""
+
+
+@runtime_checkable
+class BurstListener(Receiver, Protocol):
+    """A receiver that gathers what comes in one go, and wants to be told that this is all for now.
+
+    Called by links whose `Link.tells_bursts` is True, after one or several ``bytes_received``.
+    """
+
+    def burst_ended(self) -> None:
+        """Nothing more comes before the loop has turned."""
 
 
 @runtime_checkable
@@ -98,6 +118,11 @@ class Link(ABC):
         Never blocks and never raises: what cannot be sent is dropped whole and counted in `dropped_writes`;
         before `open` and after the end it does nothing.
         """
+
+    @property
+    def tells_bursts(self) -> bool:
+        """Whether a `BurstListener` is told, now that the link is open."""
+        return False
 
     @property
     def unsent_bytes(self) -> int:
