@@ -470,6 +470,19 @@ async def test_a_patient_endpoint_may_come_later(monkeypatch: pytest.MonkeyPatch
             assert station.heard == ["HEARTBEAT"]
 
 
+@virtual
+async def test_a_patient_endpoint_that_is_removed_is_not_opened(monkeypatch: pytest.MonkeyPatch) -> None:
+    links = Phoenix(monkeypatch)
+    links.can_be_opened = False
+    async with Hub([Endpoint("tcp:127.0.0.1:5760", name="b", patient=True)]) as hub:
+        await anyio.sleep(1)
+        await hub.remove("b")
+        links.can_be_opened = True
+        await anyio.sleep(20)
+        assert links.far == []
+        assert hub.endpoints == ()
+
+
 class Broadcast(SlowLink):
     """One other side, which has an address all the same, as `UdpBroadcast` has."""
 

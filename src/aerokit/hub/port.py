@@ -40,8 +40,8 @@ class Port:
     """One peer of one endpoint: a framer for what comes, and a batch, or a queue, for what goes.
 
     While the link takes everything, frames are gathered in ``batch`` until the present turn of the loop is over. While
-    more than ``hold_above`` bytes (`NEVER`: it is not asked) have not left it, they wait in a queue that knows what they
-    are.
+    more than ``hold_above`` bytes (`NEVER`: it is not asked) have not left it, they wait in a queue that knows what
+    they are.
 
     ``tell(reason, held)`` is called for each frame that was dropped out of the queue.
     """
