@@ -85,7 +85,7 @@ def test_whatever_comes_bounds_hold_and_every_frame_is_accounted_for(
             now - each.since <= ORDERS_WAIT_S for each in frames._frames.values() if each.kind is Kind.ORDER
         )
     assert len(taken(frames)) + dropped == len(arrivals)
-    assert frames._bytes == frames._orders == 0
+    assert frames._bytes == frames._orders == frames._telemetry == 0
 
 
 @pytest.mark.parametrize(

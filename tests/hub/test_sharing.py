@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import random
+import socket
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Any
 
 import pytest
 from hub_stage import COPTER, STATION, Program, settle
+from served_copter import served_copter
 
 import aerokit
+import aerokit.sync
 from aerokit import Signing, SigningKey, Vehicle
 from aerokit.errors import ConnectionClosed, LinkOpenError, LocalProtocolError
 from aerokit.hub import Endpoint, Hub, HubEvent, shared
@@ -248,6 +251,38 @@ def test_it_ends_with_the_connection_and_the_connection_not_with_it() -> None:
                     await hub.share(connection, name="again")
 
     run_virtual(run())
+
+
+def test_the_blocking_twin_shares_too() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port = probe.getsockname()[1]
+    with (
+        served_copter(speedup=20) as address,
+        aerokit.sync.connect(address, share=[f"tcpin:127.0.0.1:{port}"]) as vehicle,
+        aerokit.sync.connect(f"tcp:127.0.0.1:{port}", source_system=250, rates={}) as station,
+    ):
+        assert station.system_id == vehicle.system_id
+        assert station.parameters.read("RTL_ALT").value > 0
+
+
+def test_what_is_sent_is_told_to_taps_and_a_mistake_there_harms_nobody(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    async def play(on: Stage) -> None:
+        told: list[bytes] = []
+        on.connection.tap_sent(lambda raw: 1 / 0)
+        detach = on.connection.tap_sent(told.append)
+        on.connection.send(ORDER)
+        on.connection.write_raw(on.station.encoder.encode(STATION))
+        detach()
+        detach()
+        on.connection.send(ORDER)
+        assert [raw[7] for raw in told] == [76]
+        await settle()
+        assert on.vehicle.heard.count("COMMAND_LONG") == 2
+
+    on_stage(play)
+    assert "ZeroDivisionError" in caplog.text
 
 
 def test_what_cannot_be_shared_is_said_at_once() -> None:

@@ -4,14 +4,14 @@ import asyncio
 import contextlib
 import errno
 import socket
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
-from link_harness import LOOPS, Recorder, each_loop, each_of, each_traffic
+from link_harness import LOOPS, Recorder, each_loop, each_of, each_traffic, eventually
 
 from aerokit.errors import BusyError, ConnectionClosed, LinkOpenError
-from aerokit.links import TcpConnect, TcpListen, UdpBroadcast, UdpConnect, UdpListen, udp
+from aerokit.links import ReconnectingLink, TcpConnect, TcpListen, UdpBroadcast, UdpConnect, UdpListen, udp
 
 HOSTS = pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
 
@@ -326,3 +326,35 @@ async def test_only_what_does_not_pass_ends_a_udp_link(error: Exception, told: l
     assert [str(each) for each in heard.losses] == [f"{link.address}: {each}" for each in told]
     link.close()
     await link.wait_closed()
+
+
+class Gatherer(Recorder):
+    """Is told when a burst is over."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.bursts: list[int] = []
+
+    def burst_ended(self) -> None:
+        self.bursts.append(len(self.pieces))
+
+
+@pytest.mark.parametrize("wrap", [lambda link: link, lambda link: ReconnectingLink(lambda: link)])
+@pytest.mark.anyio
+async def test_the_end_of_a_burst_is_told(wrap: Callable[[Any], Any]) -> None:
+    inner, gatherer = UdpListen("127.0.0.1", 0), Gatherer()
+    link = wrap(inner)
+    assert not link.tells_bursts
+    await link.open(gatherer)
+    sender = UdpConnect("127.0.0.1", inner.local_address[1])
+    await sender.open(Recorder())
+    for _ in range(3):
+        sender.write(b"datagram")
+    await eventually(lambda: len(gatherer.pieces) == 3)
+    assert link.tells_bursts
+    assert gatherer.bursts[-1] == 3
+    assert len(gatherer.bursts) <= 3
+    for each in (link, sender):
+        each.close()
+        await each.wait_closed()
+    assert not inner.tells_bursts

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from aerokit.hub.border import Border
 from aerokit.hub.filters import Filters
 from aerokit.hub.kinds import Kind, kind_of
-from aerokit.hub.port import Port, Totals
+from aerokit.hub.port import NEVER, Port, Totals
 from aerokit.hub.values import EndpointStatistics
 from aerokit.links import ReconnectingLink, create_link
 from aerokit.mavlink.framer import Framer
@@ -39,6 +39,8 @@ MOST_SENDERS = 2048
 HOLD_ABOVE = {"serial": 2048, "pty": 2048}
 """Bytes that may be on their way out of this machine while more is written: a third of a second of a slow radio."""
 HOLD_ABOVE_OTHERS = 16 * 1024
+NEVER_WAIT = ("udpin", "udpout", "udpbcast")
+"""Made of an address, these send or drop at once: there is no need to ask what has not left."""
 
 
 class Attachment:
@@ -61,7 +63,7 @@ class Attachment:
             self.link = address
         self.name: str = endpoint.name or self.link.address
         self.keeps_peers = True
-        self.is_open = False
+        self.is_open = self.tells_bursts = False
         self._is_on_link = self._is_single = False
         self._ports: dict[Peer, Port] = {}
         self._strangers: dict[Peer, Framer] = {}
@@ -132,6 +134,10 @@ class Attachment:
         except Exception as error:
             self._tell(self, "mistake", f"a mistake inside aerokit: {error!r}")
 
+    def burst_ended(self) -> None:
+        """What came can be written to the others."""
+        self._switch.flush()
+
     def peer_joined(self, peer: Peer) -> None:
         """A client is there, which may never say anything."""
         if peer not in self._ports:
@@ -169,6 +175,7 @@ class Attachment:
     def _come_up(self) -> None:
         self.is_open = True
         self._is_single = self.link.has_peer(None)
+        self.tells_bursts = self.link.tells_bursts
         if self._is_single and None not in self._ports:
             self._add_port(None, self._new_framer(), self._now())
 
@@ -212,7 +219,7 @@ class Attachment:
             framer,
             self.totals,
             dialect=self._dialect,
-            hold_above=HOLD_ABOVE.get(self.link.address.split(":")[0], HOLD_ABOVE_OTHERS),
+            hold_above=self._hold_above(),
             tell=self._dropped,
             border=self._border,
             is_mute=self.endpoint.read_only,
@@ -220,6 +227,12 @@ class Attachment:
         port.owner, port.heard_at = self, now
         self._switch.add(port)
         return port
+
+    def _hold_above(self) -> int:
+        kind = self.link.address.partition(":")[0]
+        if kind in NEVER_WAIT and isinstance(self.endpoint.address, str):
+            return NEVER
+        return HOLD_ABOVE.get(kind, HOLD_ABOVE_OTHERS)
 
     def _forget(self, peer: Peer) -> None:
         port = self._ports.pop(peer, None)

@@ -38,7 +38,7 @@ class HeldFrames:
         ] = {}  # telemetry by sender and message, others by numbers below 0; in order
         self._bytes = 0
         self._count = 0
-        self._orders = 0
+        self._orders = self._telemetry = 0  # how many of them: none need not be searched for
 
     def __len__(self) -> int:
         return len(self._frames)
@@ -56,15 +56,14 @@ class HeldFrames:
             self._count -= 1
             key = self._count
         while self._is_full(len(held.raw)):
-            oldest = next(
-                (each for each, frame in self._frames.items() if frame.kind is Kind.TELEMETRY), None
-            )
-            if oldest is None:
+            if not self._telemetry:
                 return [*dropped, ("queue_full", held)]
+            oldest = next(each for each, frame in self._frames.items() if frame.kind is Kind.TELEMETRY)
             dropped.append(("queue_full", self._take(oldest)))
         self._frames[key] = held
         self._bytes += len(held.raw)
         self._orders += held.kind is Kind.ORDER
+        self._telemetry += held.kind is Kind.TELEMETRY
         return dropped
 
     def expire(self, now: float) -> list[tuple[str, Held]]:
@@ -86,7 +85,7 @@ class HeldFrames:
         """Drop everything: the link has gone."""
         dropped = [("away", held) for held in self._frames.values()]
         self._frames.clear()
-        self._bytes = self._orders = 0
+        self._bytes = self._orders = self._telemetry = 0
         return dropped
 
     def _is_full(self, size: int) -> bool:
@@ -96,4 +95,5 @@ class HeldFrames:
         held = self._frames.pop(key)
         self._bytes -= len(held.raw)
         self._orders -= held.kind is Kind.ORDER
+        self._telemetry -= held.kind is Kind.TELEMETRY
         return held

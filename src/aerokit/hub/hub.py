@@ -219,6 +219,8 @@ class Hub:
         while self._attachments.get(attachment.name) is attachment:
             await anyio.sleep(delay_s)
             delay_s = min(2 * delay_s, LONGEST_DELAY_S)
+            if self._attachments.get(attachment.name) is not attachment:  # removed meanwhile
+                return
             try:
                 await attachment.open()
             except LinkError as error:

@@ -18,10 +18,11 @@ if TYPE_CHECKING:
     from aerokit.mavlink.dialect import Dialect
     from aerokit.mavlink.framer import Framer
 
-__all__ = ["JOINED_BYTES", "Port", "Totals"]
+__all__ = ["JOINED_BYTES", "NEVER", "Port", "Totals"]
 
 JOINED_BYTES = 1200
 """Frames that leave together are written together up to so many bytes, which is a datagram that nobody cuts up."""
+NEVER = 1 << 62
 MOST_RATES = 4096
 """So many (sender, message) are thinned out one by one."""
 
@@ -39,7 +40,8 @@ class Port:
     """One peer of one endpoint: a framer for what comes, and a batch, or a queue, for what goes.
 
     While the link takes everything, frames are gathered in ``batch`` until the present turn of the loop is over. While
-    more than ``hold_above`` bytes have not left it, they wait in a queue that knows what they are.
+    more than ``hold_above`` bytes (`NEVER`: it is not asked) have not left it, they wait in a queue that knows what
+    they are.
 
     ``tell(reason, held)`` is called for each frame that was dropped out of the queue.
     """
@@ -70,10 +72,15 @@ class Port:
         self.heard_at = 0.0
         self.owner: Attachment | None = None
         self._dialect = dialect
-        self._hold_above = hold_above
+        self._hold_above, self._may_hold = hold_above, hold_above < NEVER
         self._tell = tell
         self._held = HeldFrames()
         self._due: dict[int, float] = {}
+
+    @property
+    def tells_bursts(self) -> bool:
+        """Whether its link says when nothing more comes for now."""
+        return self.owner is not None and self.owner.tells_bursts
 
     @property
     def is_holding(self) -> bool:
@@ -87,7 +94,7 @@ class Port:
 
     def must_hold(self) -> bool:
         """Whether the next frame has to wait."""
-        return bool(self._held) or self._is_full()
+        return self._may_hold and (bool(self._held) or self._is_full())
 
     def hold(self, raw: bytes, plan: Plan[Port], now: float) -> None:
         """Have a frame wait for the link."""

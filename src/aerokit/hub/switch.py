@@ -31,8 +31,8 @@ MOST_GATHERED = 256
 class Switch:
     """Ports and the router between them, on one loop.
 
-    What comes in one turn of the loop is gathered for each port and written together at its end: a wake-up of the loop
-    later, and no timer.
+    What a link brings in one go is gathered for each port and written together: when the link says that this is all,
+    or else on the loop's next turn. There is no timer.
     """
 
     def __init__(
@@ -50,6 +50,7 @@ class Switch:
         self.recording: Recording | None = None
         """Gets every frame once."""
         self._dirty: list[Port] = []
+        self._is_scheduled = False
         self._holding: dict[Port, None] = {}
         self._timer: asyncio.TimerHandle | None = None
         self._pause_s = LOOK_EVERY_S
@@ -93,7 +94,6 @@ class Switch:
             port.totals.dropped["read_only"] += len(frames)
             return
         late, route, recording, border = framer.late, self.router.route, self.recording, port.border
-        is_written_soon = bool(self._dirty)
         size = len(data) - 3
         for frame in frames:
             is_late = bool(late) and frame in late
@@ -120,11 +120,15 @@ class Switch:
         if self._dirty:
             if len(frames) > MOST_GATHERED:
                 self.flush()
-            elif not is_written_soon:
+            elif not (self._is_scheduled or port.tells_bursts):
+                self._is_scheduled = True
                 self._loop.call_soon(self.flush)
 
     def flush(self) -> None:
         """Write what was gathered."""
+        self._is_scheduled = False
+        if not self._dirty:
+            return
         dirty, self._dirty = self._dirty, []
         unix_time = self.unix_time()
         for port in dirty:

@@ -16,7 +16,16 @@ if TYPE_CHECKING:
     from .create import create_link
     from .fault_model import FaultModel
     from .faulty import FaultyLink
-    from .link import DrainListener, HelmListener, Link, Peer, PeerKeeper, PeerListener, Receiver
+    from .link import (
+        BurstListener,
+        DrainListener,
+        HelmListener,
+        Link,
+        Peer,
+        PeerKeeper,
+        PeerListener,
+        Receiver,
+    )
     from .memory import MemoryLink, memory_link_pair
     from .pty import PtyLink
     from .reconnecting import Interruptible, ReconnectingLink
@@ -31,6 +40,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ACCEPTED_FORMS",
+    "BurstListener",
     "DrainListener",
     "FaultModel",
     "FaultyLink",
@@ -66,6 +76,7 @@ __all__ = [
 # Imported when first asked for: a program has one link, of one kind.
 _HOMES = {
     "ACCEPTED_FORMS": "aerokit.links.address",
+    "BurstListener": "aerokit.links.link",
     "DrainListener": "aerokit.links.link",
     "FaultModel": "aerokit.links.fault_model",
     "FaultyLink": "aerokit.links.faulty",

@@ -9,6 +9,7 @@ from typing import Protocol, runtime_checkable
 from aerokit.errors import LinkLost
 
 __all__ = [
+    "BurstListener",
     "DrainListener",
     "HelmListener",
     "Link",
@@ -71,6 +72,17 @@ class PeerKeeper(Receiver, Protocol):
 
 
 @runtime_checkable
+class BurstListener(Receiver, Protocol):
+    """A receiver that gathers what comes in one go, and wants to be told that this is all for now.
+
+    Called by links whose `Link.tells_bursts` is True, after one or several ``bytes_received``.
+    """
+
+    def burst_ended(self) -> None:
+        """Nothing more comes before the loop has turned."""
+
+
+@runtime_checkable
 class PeerListener(Receiver, Protocol):
     """A receiver that wants to be told of peers that come and go by themselves: the clients of a TCP server.
 
@@ -121,6 +133,11 @@ class Link(ABC):
         Never blocks and never raises: what cannot be sent is dropped whole and counted in `dropped_writes`;
         before `open` and after the end it does nothing.
         """
+
+    @property
+    def tells_bursts(self) -> bool:
+        """Whether a `BurstListener` is told, now that the link is open."""
+        return False
 
     @property
     def unsent_bytes(self) -> int:

@@ -17,7 +17,7 @@ from typing import Protocol, runtime_checkable
 
 from aerokit.errors import BusyError, ConnectionClosed, LinkLost, RecordingEnded
 
-from .link import DrainListener, HelmListener, Link, Peer, PeerListener, Receiver, keeps_peers
+from .link import BurstListener, DrainListener, HelmListener, Link, Peer, PeerListener, Receiver, keeps_peers
 
 __all__ = ["Interruptible", "ReconnectingLink"]
 
@@ -73,6 +73,11 @@ class ReconnectingLink(Link):
     def dropped_writes(self) -> int:  # type: ignore[override]
         """What all its links dropped, and what was written while there was none."""
         return self._dropped + self._link.dropped_writes
+
+    @property
+    def tells_bursts(self) -> bool:
+        """See `Link.tells_bursts`."""
+        return self._link.tells_bursts
 
     @property
     def unsent_bytes(self) -> int:
@@ -249,6 +254,8 @@ class _Ears:
     def __init__(self, owner: ReconnectingLink) -> None:
         self._owner = owner
         self.keeps_peers = owner._receiver is not None and keeps_peers(owner._receiver)
+        receiver = owner._receiver
+        self._burst_listener = receiver if isinstance(receiver, BurstListener) else None
         self.is_lost = False
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
@@ -266,6 +273,14 @@ class _Ears:
         receiver = self._owner._receiver
         if self is self._owner._ears and isinstance(receiver, HelmListener):
             receiver.order_refused(message, reason, helm, answers)
+
+    def burst_ended(self) -> None:
+        if (
+            self._burst_listener is not None
+            and self is self._owner._ears
+            and self._owner._receiver is not None
+        ):
+            self._burst_listener.burst_ended()
 
     def peer_joined(self, peer: Peer) -> None:
         if listener := self._peer_listener():

@@ -18,7 +18,7 @@ from typing import Any
 from .address import host_and_port
 from .allowed import AllowedPeers, Peers
 from .base import BaseLink
-from .link import Peer
+from .link import BurstListener, Peer
 from .sockets import Endpoint, bind_to, bound_socket, has_more, resolve
 
 __all__ = ["DATAGRAMS_PER_WAKE_UP", "MAX_PEERS", "UdpBroadcast", "UdpConnect", "UdpListen"]
@@ -58,6 +58,7 @@ class _UdpLink(BaseLink):
         self._transport: asyncio.DatagramTransport | None = None  # only on loops without add_reader
         self._transport_owns_socket = False
         self._has_more: Callable[[], object] = bool
+        self._burst_listener: BurstListener | None = None
 
     @property
     def local_address(self) -> tuple[str, int]:
@@ -73,6 +74,7 @@ class _UdpLink(BaseLink):
     async def _connect(self) -> None:
         self._loop = asyncio.get_running_loop()
         self._transport_owns_socket = False
+        self._burst_listener = self._receiver if isinstance(self._receiver, BurstListener) else None
         self._socket = sock = await self._make_socket()
         self._has_more = has_more(sock)
         _ask_for_buffers(sock)
@@ -112,8 +114,18 @@ class _UdpLink(BaseLink):
                 loop.remove_reader(sock)
             sock.close()
 
+    @property
+    def tells_bursts(self) -> bool:
+        """See `Link.tells_bursts`."""
+        return self._socket is not None and not self._transport_owns_socket
+
     def _drain(self) -> None:
         """Reads what is there, at most a burst of it; the loop comes back while there is more."""
+        self._read_burst()
+        if self._burst_listener is not None and self._receiver is not None:
+            self._burst_listener.burst_ended()
+
+    def _read_burst(self) -> None:
         for _ in range(DATAGRAMS_PER_WAKE_UP):
             if self._socket is None:  # closed by the receiver
                 return

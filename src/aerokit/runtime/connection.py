@@ -159,7 +159,10 @@ class Connection:
         data = self._encoder.encode(message, now)
         self._write(data, message, to)
         for tap in self._sent_taps:
-            tap(data)
+            try:
+                tap(data)
+            except Exception:
+                logger.exception("a tap (%r) raised; the frame was sent all the same", tap)
 
     @checked
     def write_raw(self, data: bytes) -> None:
@@ -293,7 +296,7 @@ class Connection:
     def tap_sent(self, sink: Callable[[bytes], object]) -> Detach:
         """Have every frame of our own that is sent given to ``sink(raw)``, signed if we sign; not those of `write_raw`.
 
-        ``sink`` must be quick and must neither await nor raise.
+        ``sink`` must be quick and must not await; what it raises is logged.
         """
         self._sent_taps = (*self._sent_taps, sink)
 
