@@ -140,7 +140,9 @@ class Member:
             self._minds_failsafe = True
         elif self._minds_failsafe:
             return f"it is under a failsafe (MAV_STATE {MavState(status).name})"
-        return "" if self._who_steers() == self._taken_back else vehicle.taken_over
+        has_ended_mission = "mission" in vars(vehicle) and vehicle.mission.explains_mode
+        is_forgiven = has_ended_mission or self._who_steers() == self._taken_back
+        return "" if is_forgiven else vehicle.taken_over
 
     def _who_steers(self) -> tuple[object, object]:
         return self.vehicle._helm.newest, self.vehicle.mode.latest
