@@ -96,7 +96,9 @@ class Member:
         self._detach = []
 
     def look(self) -> None:
-        """Find out whether somebody else has it by now."""
+        """Find out whether it is gone, or somebody else has it by now."""
+        if self._detach and not self.vehicle.connection.is_open:
+            self._lose(f"its link has gone, {self.vehicle.describe_link()}")
         if self.takes_orders and self._detach and (why := self._who_has_it()):
             self._change(MemberState.TAKEN_OVER, why)
             self._tell(MemberTakenOver(*self._when(), why))
