@@ -143,6 +143,13 @@ def bench_hub(session: nox.Session) -> None:
 
 
 @nox.session
+def bench_fleet(session: nox.Session) -> None:
+    """Fly 500 simulated vehicles of several processes as one fleet, in real time. Writes bench-fleet.json."""
+    session.install("-e", ".")
+    session.run("python", "benchmarks/fleet_scale.py", *session.posargs)
+
+
+@nox.session
 def fuzz(session: nox.Session) -> None:
     """Fuzz what takes bytes from outside, a quarter of an hour; `-- --runs 100000 address plan` for some of it, longer.
 

@@ -4,7 +4,8 @@
 
 Every vehicle sends what a client watches at 4 Hz, from a recorded flight, in real time; the frames are made beforehand
 and handed to the connections in this process, so that only clients and loop are measured. System ids end at 255: more
-vehicles are on several connections.
+vehicles are on several connections. ``fleet_…``: the same clients as one fleet, whose events are read; they are
+disarmed, so that the watch of distances has nobody to compare.
 """
 
 from __future__ import annotations
@@ -60,6 +61,7 @@ def rows(counts: Sequence[int] = COUNTS, turns: int = 16, rounds: int = 3) -> li
             unit="% of a core each", ratio=of_ten / each, aim=LINEAR if count >= 10 else 0.0,
         )  # fmt: skip
         table.append({**shown, "note": f"{each:.3f} % of a core each, {each * count:.1f} % together"})
+    table += _fleet_rows(counts, turns, rounds)
     mib = asyncio.run(_mebibytes_of_each(max(counts)))
     shown = row("client_memory", mib, MOST_MIB, "the most allowed", unit="MiB", ratio=MOST_MIB / mib, aim=1.0)
     return [
@@ -68,10 +70,35 @@ def rows(counts: Sequence[int] = COUNTS, turns: int = 16, rounds: int = 3) -> li
     ]
 
 
-async def _share_of_each(count: int, turns: int) -> float:
+def _fleet_rows(counts: Sequence[int], turns: int, rounds: int) -> list[Row]:
+    """For each count the share of a core that one member of a fleet takes, beside one of ten."""
+    found = {
+        count: statistics.median(
+            asyncio.run(_share_of_each(count, turns, is_fleet=True)) for _ in range(rounds)
+        )
+        for count in sorted({10, *counts})
+    }
+    table: list[Row] = []
+    for count in counts:
+        each, of_ten = 100 * found[count], 100 * found[10]
+        shown = row(
+            f"fleet_{count}", each, of_ten, "one of ten",
+            unit="% of a core each", ratio=of_ten / each, aim=LINEAR if count >= 10 else 0.0,
+        )  # fmt: skip
+        table.append(
+            {**shown, "note": f"as one fleet: {each:.3f} % of a core each, {each * count:.1f} % together"}
+        )
+    return table
+
+
+async def _share_of_each(count: int, turns: int, *, is_fleet: bool = False) -> float:
     """Share of a core that each vehicle takes."""
     async with AsyncExitStack() as stack:
         fleet = await _connected(stack, count, turns)
+        if is_fleet:
+            names = {f"member {number}": each for number, each in enumerate(fleet.vehicles)}
+            one = await stack.enter_async_context(aerokit.fleet(names, min_distance_m=5.0, too_close="tell"))
+            stack.enter_context(one.events(capacity=10_000))
         fleet.feed_turn()
         await asyncio.sleep(TURN_S)
         wall, used = time.perf_counter(), time.process_time()
@@ -99,7 +126,8 @@ class _Fleet:
     """Clients that are connected, and what their vehicles will send."""
 
     def __init__(self, vehicles: list[Vehicle], connections: list[Connection], turns: list[Turn]) -> None:
-        self._vehicles, self._connections, self._turns = vehicles, connections, turns
+        self.vehicles = vehicles
+        self._connections, self._turns = connections, turns
 
     def feed_turn(self) -> None:
         for connection, datagrams in zip(self._connections, self._turns.pop(0), strict=True):
@@ -111,7 +139,7 @@ class _Fleet:
         self._turns.clear()
 
     def check(self) -> None:
-        if not all(vehicle.attitude.is_known for vehicle in self._vehicles):
+        if not all(vehicle.attitude.is_known for vehicle in self.vehicles):
             raise AssertionError("not every client was told of its vehicle")
 
 

@@ -21,12 +21,13 @@ def test_every_row_has_a_figure_and_its_aim(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     rows = {row["name"]: row for row in json.loads(path.read_text())}
     assert list(rows) == [
-        "copter_hundred", "px4_hundred", "copter_flight", "px4_flight", "clients_1", "clients_3", "client_memory"
+        "copter_hundred", "px4_hundred", "copter_flight", "px4_flight", "clients_1", "clients_3",
+        "fleet_1", "fleet_3", "client_memory",
     ]  # fmt: skip
     for row in rows.values():
         assert row["aerokit"] > 0
         assert row["ratio"] > 0
-        assert row["aim"] == (0.0 if row["name"].startswith("clients_") else 1.0)
+        assert row["aim"] == (0.0 if row["name"].startswith(("clients_", "fleet_")) else 1.0)
         assert row["note"] in done.stdout
     assert rows["copter_hundred"]["vehicles"] <= rows["copter_hundred"]["aerokit"]
 

@@ -83,6 +83,8 @@ WRONG: dict[str, tuple[object, ...]] = {
     "str | Endpoint | Link": (*NOTHING, *STRANGE, *TEXT, *NUMBER),
     "Callable[[HubEvent], object]": (*NOTHING, *TEXT, *NUMBER, [print]),
     "str | Link": (*NOTHING, *STRANGE, *NUMBER, b"udpin:0.0.0.0:14550"),
+    "str | Link | Sequence[str | Link]": (*NOTHING, *STRANGE, *NUMBER, b"udpin:0.0.0.0:14550", [1, 2]),
+    "str | Link | Sequence[str | Link] | Connection": (*NOTHING, *STRANGE, *NUMBER, b"udpin:0.0.0.0:14550", [1, 2]),
     "str | Link | Connection": (*NOTHING, *STRANGE, *NUMBER, b"udpin:0.0.0.0:14550"),
 }
 """Type hint → values that it does not allow."""
@@ -114,7 +116,10 @@ RIGHT: dict[str, object] = {
     "str | int": "GUIDED",
     "str | os.PathLike[str]": "/nowhere/at/all",
     "CameraDefinition | str | os.PathLike[str]": "/nowhere/at/all",
+    "str | None": None,
     "str | Link": "udpin:127.0.0.1:0",
+    "str | Link | Sequence[str | Link]": "udpin:127.0.0.1:0",
+    "str | Link | Sequence[str | Link] | Connection": "udpin:127.0.0.1:0",
     "str | Link | Connection": "udpin:127.0.0.1:0",
     "Position": PLACE,
     "Position | None": PLACE,

@@ -6,7 +6,7 @@ import math
 from itertools import accumulate, combinations, pairwise
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aerokit.errors import LocalProtocolError
@@ -129,6 +129,7 @@ def test_layers_keep_all_apart_whatever_the_speeds(
                 assert least_distance(one, other).distance_m >= least - 1e-6
 
 
+@settings(max_examples=25)
 @given(routes_of, st.floats(1, 8))
 def test_corridors_keep_all_apart_as_long_as_nobody_is_later_than_allowed(
     routes: list[Route], least: float

@@ -125,7 +125,7 @@ async def test_go_on_leaves_the_others_alone() -> None:
         assert stage.fleet.members["north/1"].state is MemberState.FAILED
         stage.copters["north/1"].faults.commands.clear()
         assert (await stage.fleet.go_to(north(5))).is_complete
-        assert stage.fleet.members["north/1"].state is MemberState.IN
+        assert [each.state for each in stage.fleet] == [MemberState.IN] * 3
 
 
 async def test_the_rule_of_the_group_of_who_failed_holds() -> None:

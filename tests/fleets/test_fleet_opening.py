@@ -16,6 +16,7 @@ from aerokit.fleets.members import MemberState
 from aerokit.fleets.policy import Failure, Rules
 from aerokit.fleets.results import FleetResult
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
+from aerokit.sync.generator import FILES, generate
 
 pytestmark = pytest.mark.anyio
 
@@ -40,9 +41,12 @@ async def test_connections_vehicles_and_links_become_one_fleet() -> None:
             assert [each.name for each in fleet.role("eyes")] == ["scout"]
             assert "north/2" in fleet
             assert len(fleet["*/[19]"]) == 2
-            for wrong in (lambda: fleet.group("three"), lambda: fleet.role("x"), lambda: fleet["east/*"]):
-                with pytest.raises(LocalProtocolError):
-                    wrong()
+            with pytest.raises(LocalProtocolError, match="group = 'three'"):
+                fleet.group("three")
+            with pytest.raises(LocalProtocolError, match="role = 'x'"):
+                fleet.role("x")
+            with pytest.raises(LocalProtocolError, match=r"'east/\*' is no member"):
+                fleet["east/*"]
         assert connection.is_open
         assert not vehicle.is_silent
 
@@ -134,9 +138,9 @@ async def test_one_stream_has_the_events_and_states_of_all() -> None:
             with pytest.raises(SubscriptionOverflow):
                 async for _ in few:
                     pass
-        for wrong in (lambda: stage.fleet.states(), lambda: stage.fleet.states("height")):
+        for wrong in ((), ("height",)):
             with pytest.raises(LocalProtocolError, match="is no state"):
-                wrong()
+                stage.fleet.states(*wrong)
         with pytest.raises(LocalProtocolError, match="a class of Event"):
             stage.fleet.events(int)  # type: ignore[arg-type]
 
@@ -202,3 +206,7 @@ def test_the_blocking_twin_flies_a_fleet() -> None:
             assert fleet["north/*"].land()["north/1"] is None
         with pytest.raises(LocalProtocolError):
             sync.fleet({"north": served.address}, count=0)
+
+
+def test_the_twins_are_what_the_generator_writes() -> None:
+    assert FILES["fleet_twins"].read_text(encoding="utf-8") == generate("fleet_twins")

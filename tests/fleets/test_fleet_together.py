@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 
 import anyio
@@ -19,9 +20,12 @@ from aerokit.fleets.corrections import fragments, rtcm_messages
 from aerokit.fleets.events import PathsDecided, TooClose
 from aerokit.fleets.formation import Formation, Offset, follow_velocity
 from aerokit.fleets.members import MemberState
+from aerokit.fleets.opening import fleet
 from aerokit.mavlink.enums import MavCmd
-from aerokit.missions import Mission, land, take_off, waypoint
+from aerokit.missions import Mission, land, return_to_launch, take_off, waypoint
 from aerokit.position import Position
+from aerokit.sim import SimulatedPx4, simulated_link
+from aerokit.sim.px4.modes import POSITION
 from aerokit.sim.track import least_distance_m, record_track
 
 pytestmark = pytest.mark.anyio
@@ -291,3 +295,69 @@ def test_rtcm_messages_are_told_apart() -> None:
     assert list(rtcm_messages(b"no rtcm")) == [b"no rtcm"]
     with pytest.raises(LocalProtocolError, match="721"):
         fragments(bytes(721), 0)
+
+
+async def test_a_px4_whose_mission_ends_is_not_taken_over() -> None:
+    async with (
+        simulated_link([SimulatedPx4(system_id=each, boot_time_s=1.0, seed=each) for each in (1, 2)]) as link,
+        fleet({"south": link}, count=2) as both,
+    ):
+        (await both.wait_ready()).raise_for_errors()
+        missions = {}
+        for name, vehicle in both.vehicles.items():
+            here = vehicle.position.value
+            there = here.offset(north_m=20, east_m=10 * vehicle.system_id)
+            missions[name] = Mission(
+                [
+                    take_off(here.latitude_deg, here.longitude_deg, altitude_relative_m=10),
+                    waypoint(there.latitude_deg, there.longitude_deg, altitude_relative_m=10),
+                    *([return_to_launch()] if name == "south/1" else []),
+                ]
+            )
+        await both.upload(missions)
+        (await both.arm()).raise_for_errors()
+        (await both.start_missions()).raise_for_errors()
+        (await both.wait_missions_finished(timeout=300)).raise_for_errors()
+        await anyio.sleep(5)
+        assert [each.state for each in both] == [MemberState.IN] * 2
+        assert both.vehicles["south/2"].mode_name == "LOITER"
+        (
+            await both["south/2"].go_to(lambda each: each.vehicle.position.value.offset(north_m=10))
+        ).raise_for_errors()
+        (await both.land()).raise_for_errors()
+
+
+async def test_px4s_fly_as_a_fleet_and_a_pilot_is_noticed() -> None:
+    px4s = [SimulatedPx4(system_id=each, boot_time_s=1.0, seed=each) for each in (1, 2)]
+    async with simulated_link(px4s) as link, fleet({"south": link}, count=2, on_error="go_on") as both:
+        for order in (both.wait_ready(), both.arm(), both.take_off(10)):
+            (await order).raise_for_errors()
+        (await both.go_to(lambda each: each.vehicle.position.value.offset(north_m=20))).raise_for_errors()
+        line = Formation.line(["south/2"], 10.0, frame="north")
+        async with both.following(line, leader="south/1") as following:
+            await anyio.sleep(20)
+            assert following.error_m("south/2") < 1.5
+        assert [each.state for each in both] == [MemberState.IN] * 2
+        px4s[0].switch_to(POSITION)
+        await anyio.sleep(2)
+        (await both.land()).raise_for_errors()
+        assert both.members["south/1"].state is MemberState.TAKEN_OVER
+
+
+async def test_one_that_falls_out_between_two_layers_stops_the_others_there() -> None:
+    async with open_stage(3, spacing_m=40, min_distance_m=5.0, on_error="go_on") as stage:
+        await stage.take_off()
+        here = [each.position.value for each in stage.fleet.vehicles.values()]
+        targets = dict(zip(stage.copters, (here[1], here[0], here[2].offset(north_m=20)), strict=True))
+
+        async def take() -> None:
+            await anyio.sleep(1)
+            stage.pilot_takes("north/3")
+
+        taking = asyncio.create_task(take())
+        result = await stage.fleet.go_to(targets)
+        await taking
+        assert list(result.failed) == ["north/3"]
+        for name in ("north/1", "north/2"):  # up, and not across
+            assert stage.fleet.vehicles[name].distance_to(targets[name]) > 30
+            assert stage.mode_of(name) == "GUIDED"

@@ -31,6 +31,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     "serve": ("starlette", "uvicorn", "websockets"),
     "testing": ("pytest",),
     "video": ("av", "numpy"),
+    "zenoh": ("zenoh",),
 }
 """Extra → the modules that come with it; compared with pyproject.toml by a test."""
 USUAL_PORTS = (

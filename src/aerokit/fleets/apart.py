@@ -198,11 +198,12 @@ def _ends_too_near(routes: Sequence[Route], standing: Mapping[str, Place], min_d
     """Why nobody can go straight up or down; empty: they can."""
     for what in ("start", "target"):
         ends = {each.name: getattr(each, what) for each in routes}
-        others = {**ends, **standing}
+        # who stands well below an end is not in the way of one who goes up from it, or comes down to it
         for name, place in ends.items():
-            for other, other_place in others.items():
-                if other != name and math.dist(place[:2], other_place[:2]) < min_distance_m:
-                    distance = math.dist(place[:2], other_place[:2])
+            near = {other: there for other, there in standing.items() if there[2] > place[2] - min_distance_m}
+            for other, there in {**ends, **near}.items():
+                distance = math.dist(place[:2], there[:2])
+                if other != name and distance < min_distance_m:
                     return (
                         f"the {what} of {name} is {distance:.1f} m beside that of {other}, as seen from above"
                     )

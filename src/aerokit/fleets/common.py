@@ -68,6 +68,7 @@ class CommonAction:
         self._because: tuple[int, str] | None = None
         self._errors_of_orders: dict[str, str] = {}
         self._obeying = 0
+        self._is_deciding = False
         self._is_over = asyncio.Event()
         self._mistake: Exception | None = None
 
@@ -142,14 +143,21 @@ class CommonAction:
             return
         self._failed[member.name] = self._outcomes[member.name] = error
         member.note_failed(self.what, error)
-        if not self._is_safe and self._because is None and not self._crew.is_over:
+        if self._is_safe or self._because is not None or self._is_deciding or self._crew.is_over:
+            return
+        self._is_deciding = True  # who else has failed is only found out by looking at them
+        try:
             self._apply_policy(member, error)
+        finally:
+            self._is_deciding = False
 
     # ---------------------------------------------------------------------------------- the others
 
     def _apply_policy(self, failed: Member, error: Exception) -> None:
+        for each in self._members:
+            each.look()
         others = [each for each in self._members if each.name not in self._failed]
-        able = [each for each in others if self._may_be_ordered(each)]
+        able = [each for each in others if each.takes_orders]
         failure = Failure(failed.name, failed.group, self.what, error, tuple(each.name for each in able))
         orders: dict[str, PolicyOrder]
         try:
@@ -185,10 +193,6 @@ class CommonAction:
         asyncio.get_running_loop().call_soon(self._stop_all, [each for each in able if each.name in orders])
         if not self._orders:
             self._told_carried_out()
-
-    def _may_be_ordered(self, member: Member) -> bool:
-        member.look()
-        return member.takes_orders and member.name not in self._failed
 
     def _note_stopped(self, member: Member, failed: Member, order: PolicyOrder | None) -> None:
         told = f"; it was told to {order}" if order else ""

@@ -96,7 +96,9 @@ class Member:
         self._detach = []
 
     def look(self) -> None:
-        """Find out whether somebody else has it by now."""
+        """Find out whether it is gone, or somebody else has it by now."""
+        if self._detach and not self.vehicle.connection.is_open:
+            self._lose(f"its link has gone, {self.vehicle.describe_link()}")
         if self.takes_orders and self._detach and (why := self._who_has_it()):
             self._change(MemberState.TAKEN_OVER, why)
             self._tell(MemberTakenOver(*self._when(), why))
@@ -140,7 +142,9 @@ class Member:
             self._minds_failsafe = True
         elif self._minds_failsafe:
             return f"it is under a failsafe (MAV_STATE {MavState(status).name})"
-        return "" if self._who_steers() == self._taken_back else vehicle.taken_over
+        has_ended_mission = "mission" in vars(vehicle) and vehicle.mission.explains_mode
+        is_forgiven = has_ended_mission or self._who_steers() == self._taken_back
+        return "" if is_forgiven else vehicle.taken_over
 
     def _who_steers(self) -> tuple[object, object]:
         return self.vehicle._helm.newest, self.vehicle.mode.latest

@@ -51,7 +51,8 @@ class Travel(FleetPart):
         Raises:
             LocalProtocolError: a name is nobody's. Nothing was sent.
             ValueUnknownError: it is not known where one of them is. Nothing was sent.
-            OperationRejected: their ways come too near, and no heights keep them apart. Nothing was sent.
+            OperationRejected: their ways come too near, and no heights keep them apart: nothing was sent. Or one fell
+                out between two legs in layers: the others stay where they are.
         """
         places = self._places(targets)
         if apart is None and self._crew.min_distance_m is not None:
@@ -172,16 +173,23 @@ class Travel(FleetPart):
     ) -> FleetResult:
         """Up, across, down: all of them are done with one before anybody begins the next."""
         here = {name: self._crew.members[name].vehicle.position.value for name in heights_m}
-        stages = (
+        stages: tuple[dict[str, Position], ...] = (
             {name: _at(here[name], height) for name, height in heights_m.items()},
             {name: _at(places[name], height) for name, height in heights_m.items()},
             {name: places[name] for name in heights_m},
         )
-        for stage in stages[:-1]:
+        result: FleetResult | None = None
+        for stage in stages:
+            gone = [name for name in stage if not self.members[name].takes_orders]
+            if gone:  # it may stand in anybody's way
+                raise OperationRejected(
+                    f"go_to: {', '.join(gone)} fell out between two legs; the others stay in their layers"
+                )
             result = await self._fly_to(stage, speed_m_s, timeout)
-            if not result.is_complete or result.left_out:
-                return result
-        return await self._fly_to(stages[-1], speed_m_s, timeout)
+            if not result.is_complete:
+                break
+        assert result is not None
+        return result
 
 
 def _at(place: Position, altitude_amsl_m: float) -> Position:

@@ -108,7 +108,8 @@ class Selection(SelectionTwin["AsyncSelection"]):
         Raises:
             LocalProtocolError: a name is nobody's. Nothing was sent.
             ValueUnknownError: it is not known where one of them is. Nothing was sent.
-            OperationRejected: their ways come too near, and no heights keep them apart. Nothing was sent.
+            OperationRejected: their ways come too near, and no heights keep them apart: nothing was sent. Or one fell
+                out between two legs in layers: the others stay where they are.
         """
         return self._loop.run(
             self.aio.go_to,
@@ -517,7 +518,8 @@ class Fleet(FleetTwin):
         Raises:
             LocalProtocolError: a name is nobody's. Nothing was sent.
             ValueUnknownError: it is not known where one of them is. Nothing was sent.
-            OperationRejected: their ways come too near, and no heights keep them apart. Nothing was sent.
+            OperationRejected: their ways come too near, and no heights keep them apart: nothing was sent. Or one fell
+                out between two legs in layers: the others stay where they are.
         """
         return self._loop.run(
             self.aio.go_to,

@@ -1793,6 +1793,14 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         """
         self._loop.run(self.aio.wait_finished, timeout=timeout, max_silence_s=max_silence_s)
 
+    @property
+    def explains_mode(self) -> bool:
+        """Whether the vehicle is in a mode in which its mission ends by itself: holding, returning or landing.
+
+        That is so when the mission was ordered last, and is complete or at its last item; it is nobody else's doing.
+        """
+        return self.aio.explains_mode
+
 
 class FenceControl(TwinOf["AsyncFenceControl"]):
     """``await vehicle.fence.upload(Fence(polygons=[...]))``: where the vehicle may and may not be.

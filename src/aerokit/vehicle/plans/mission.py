@@ -180,6 +180,21 @@ class MissionControl(HeldPlan["Mission"]):
                 max_silence_s=max_silence_s,
             )
 
+    @property
+    def explains_mode(self) -> bool:
+        """Whether the vehicle is in a mode in which its mission ends by itself: holding, returning or landing.
+
+        That is so when the mission was ordered last, and is complete or at its last item; it is nobody else's doing.
+        """
+        talk = self._bridge.talk
+        if self._order is None or self._bridge.helm.newest is not self._order:
+            return False
+        ends_in = [
+            talk.autopilot.mode_for(purpose, is_vtol=talk.telemetry.is_vtol)
+            for purpose in ("hold", "return", "land")
+        ]
+        return (self._watch.is_complete or self._watch.is_at_last) and talk.telemetry.mode.latest in ends_in
+
     # ------------------------------------------------------------------------------------ inside
 
     def _plan_type(self) -> type[Mission]:

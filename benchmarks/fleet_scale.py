@@ -1,0 +1,144 @@
+"""Many simulated vehicles in real time, in several processes, and one fleet that flies them by UDP.
+
+    python benchmarks/fleet_scale.py                                  # 500 vehicles in 10 networks, 5 processes; 30 s
+    python benchmarks/fleet_scale.py --vehicles 20 --processes 2 --networks 2 --seconds 3   # does it run?
+
+Each process simulates its share of the networks: copters that hover, what a client watches at 4 Hz. The fleet takes
+all of them; measured are the processor time of everybody, how far each simulation was behind real time, and how old
+positions were when they were looked at. Writes bench-fleet.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from scale import RATES, _hovering
+
+import aerokit
+from aerokit.links import create_link
+from aerokit.sim import SimulatorServer
+
+FIRST_PORT = 14700
+LATE_S = 0.1
+"""A simulation that is farther behind than this does not keep up."""
+WARM_UP_S = 3.0
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure, print, write; or be one of the simulating processes."""
+    options = _parser().parse_args(arguments)
+    if options.serve:
+        print(json.dumps(asyncio.run(_serve(options.serve, options.vehicles, options.seconds))))
+        return 0
+    found = asyncio.run(_measure(options.vehicles, options.processes, options.networks, options.seconds))
+    for name, value in found.items():
+        print(f"{name}: {value}")
+    options.output.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
+    return 0
+
+
+# ----------------------------------------------------------------------------------- one simulator
+
+
+async def _serve(ports: Sequence[int], on_each: int, seconds: float) -> Mapping[str, float]:
+    """Vehicles on each of these ports; their processor time as a share, and how late their timers were."""
+    networks = [[_hovering("copter", number) for number in range(1, on_each + 1)] for _ in ports]
+    links = [create_link(f"udpout:127.0.0.1:{port}") for port in ports]
+    vehicles = [each for network in networks for each in network]
+    late: list[float] = []
+    async with SimulatorServer(vehicles, links, vehicles_on=networks) as server:
+        loop = asyncio.get_running_loop()
+        wall, used, simulated = time.perf_counter(), time.process_time(), server.now
+        end = loop.time() + seconds
+        while loop.time() < end:
+            due = loop.time() + 0.05
+            await asyncio.sleep(0.05)
+            late.append(loop.time() - due)
+        wall, used = time.perf_counter() - wall, time.process_time() - used
+        behind = wall - (min(vehicle.now for vehicle in vehicles) - simulated)
+    return {"share": used / wall, "latest_s": max(late), "behind_s": max(0.0, behind)}
+
+
+# ------------------------------------------------------------------------------------- the fleet
+
+
+async def _measure(count: int, processes: int, networks: int, seconds: float) -> dict[str, Any]:
+    """Start the simulators, make one fleet of their vehicles, and look for a while."""
+    on_each = count // networks
+    ports = [FIRST_PORT + number for number in range(networks)]
+    lasts = WARM_UP_S + seconds + 5.0 + 0.02 * count  # opening takes its time
+    children = [_started(ports[number::processes], on_each, lasts) for number in range(processes)]
+    try:
+        found = await _look(ports, on_each, seconds)
+        told = [json.loads(await asyncio.to_thread(_told, each)) for each in children]
+    finally:
+        for child in children:
+            child.kill()
+            child.wait()
+    return {
+        "vehicles": on_each * networks,
+        "processes": processes,
+        **found,
+        "simulators_share": [round(each["share"], 3) for each in told],
+        "simulators_behind_s": round(max(each["behind_s"] for each in told), 3),
+        "in_real_time": all(each["behind_s"] < LATE_S for each in told),
+    }
+
+
+def _started(ports: Sequence[int], on_each: int, seconds: float) -> subprocess.Popen[str]:
+    options = ["--vehicles", str(on_each), "--seconds", str(seconds), "--serve", *map(str, ports)]
+    return subprocess.Popen([sys.executable, __file__, *options], stdout=subprocess.PIPE, text=True)
+
+
+def _told(child: subprocess.Popen[str]) -> str:
+    return child.communicate()[0]
+
+
+async def _look(ports: Sequence[int], on_each: int, seconds: float) -> dict[str, Any]:
+    addresses = {f"network{port - FIRST_PORT}": f"udpin:127.0.0.1:{port}" for port in ports}
+    started = time.perf_counter()
+    async with aerokit.fleet(
+        addresses, count=on_each * len(ports), timeout=60, rates=RATES, min_distance_m=0.5, too_close="tell"
+    ) as fleet:
+        opened_s = time.perf_counter() - started
+        await asyncio.sleep(WARM_UP_S)
+        ages: list[float] = []
+        wall, used = time.perf_counter(), time.process_time()
+        for _ in range(max(1, round(2 * seconds))):
+            await asyncio.sleep(0.5)
+            ages += [vehicle.position.age for vehicle in fleet.vehicles.values()]
+        wall, used = time.perf_counter() - wall, time.process_time() - used
+        states = {member.state.value for member in fleet}
+    return {
+        "opened_in_s": round(opened_s, 2),
+        "client_share": round(used / wall, 3),
+        "position_age_median_s": round(statistics.median(ages), 3),
+        "position_age_worst_s": round(max(ages), 3),
+        "states": sorted(states),
+    }
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--vehicles", type=int, default=500, help="in all (500)")
+    parser.add_argument("--processes", type=int, default=5, help="that simulate (5)")
+    parser.add_argument("--networks", type=int, default=10, help="each with a UDP port of its own (10)")
+    parser.add_argument("--seconds", type=float, default=30.0, help="how long is looked (30)")
+    parser.add_argument("--serve", type=int, nargs="+", metavar="PORT", help=argparse.SUPPRESS)
+    parser.add_argument(
+        "--output", type=Path, default=Path("bench-fleet.json"), help="default: bench-fleet.json"
+    )
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())
