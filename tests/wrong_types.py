@@ -84,7 +84,13 @@ WRONG: dict[str, tuple[object, ...]] = {
     "Callable[[HubEvent], object]": (*NOTHING, *TEXT, *NUMBER, [print]),
     "str | Link": (*NOTHING, *STRANGE, *NUMBER, b"udpin:0.0.0.0:14550"),
     "str | Link | Sequence[str | Link]": (*NOTHING, *STRANGE, *NUMBER, b"udpin:0.0.0.0:14550", [1, 2]),
-    "str | Link | Sequence[str | Link] | Connection": (*NOTHING, *STRANGE, *NUMBER, b"udpin:0.0.0.0:14550", [1, 2]),
+    "str | Link | Sequence[str | Link] | Connection": (
+        *NOTHING,
+        *STRANGE,
+        *NUMBER,
+        b"udpin:0.0.0.0:14550",
+        [1, 2],
+    ),
     "str | Link | Connection": (*NOTHING, *STRANGE, *NUMBER, b"udpin:0.0.0.0:14550"),
 }
 """Type hint → values that it does not allow."""

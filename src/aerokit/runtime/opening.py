@@ -15,6 +15,7 @@ from aerokit.links.link import Link
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.enums import MavComponent
 from aerokit.runtime.connection import Connection
+from aerokit.wording import shown
 
 if TYPE_CHECKING:
     import os
@@ -131,6 +132,12 @@ def _link(
 
 
 def _several(addresses: Sequence[str | Link], baud: int, reconnect: bool, peers: Peers | None) -> Link:
+    if not isinstance(addresses, (list, tuple)) or not all(
+        isinstance(each, (str, Link)) for each in addresses
+    ):
+        raise LocalProtocolError(
+            f"address = {shown(addresses)} is not allowed: an address, a link, or a list of these"
+        )
     if len(addresses) < 2:
         if not addresses:
             raise LocalProtocolError("address = [] is not allowed: at least one")
