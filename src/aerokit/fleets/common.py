@@ -38,6 +38,8 @@ class CommonAction:
     ``holds_if_cancelled``: whether those that have done it already are told to hold, too, when it is cancelled.
     """
 
+    what: str
+
     def __init__(
         self,
         crew: Crew,

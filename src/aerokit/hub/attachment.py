@@ -49,6 +49,11 @@ class Attachment:
     ``now`` is the loop's clock, ``tell(attachment, kind, text)`` tells an event.
     """
 
+    filters: Filters
+    is_open: bool
+    tells_bursts: bool
+    totals: Totals
+
     def __init__(
         self, endpoint: Endpoint, switch: Switch, dialect: Dialect, now: Callable[[], float], tell: Tell
     ) -> None:

@@ -46,6 +46,10 @@ class Port:
     ``tell(reason, held)`` is called for each frame that was dropped out of the queue.
     """
 
+    heard_at: float
+    link: Link
+    peer: Peer
+
     def __init__(
         self,
         link: Link,

@@ -32,6 +32,11 @@ _RADIOS = (109, 166)
 class Plan(Generic[PortT]):
     """Where frames of one message, from one sender at one port to one target, go."""
 
+    key: int
+    message_id: int
+    reason: str
+    target: tuple[int, int]
+
     __slots__ = ("key", "message_id", "outs", "reason", "target", "thinned")
 
     def __init__(
@@ -59,6 +64,8 @@ class Plan(Generic[PortT]):
 
 class Node(Generic[PortT]):
     """A port as the router knows it."""
+
+    number: int
 
     __slots__ = ("number", "plans", "port")
 

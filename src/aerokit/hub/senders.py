@@ -28,6 +28,11 @@ _NO_AUTOPILOT = int(MavAutopilot.INVALID)
 class Sender:
     """One component, (system id, component id)."""
 
+    heard_at: float
+    is_autopilot: bool
+    is_vehicles: bool
+    number: int
+
     __slots__ = (
         *("component_id", "heard", "heard_at", "is_autopilot", "is_vehicles", "number", "system_id", "told"),
     )
@@ -83,6 +88,8 @@ class Sender:
 
 class Recent:
     """The frames of the last `DUPLICATE_WINDOW_S` to twice that, in two generations: nothing has to be searched."""
+
+    ends_at: float
 
     __slots__ = ("ends_at", "newer", "older")
 

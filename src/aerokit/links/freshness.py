@@ -29,6 +29,9 @@ _DRIFT = 0.001
 class Judge:
     """The vehicle side: makes beacons, and judges what bears their numbers."""
 
+    doubled: int
+    late: int
+
     def __init__(self, epoch: int) -> None:
         self.epoch: int = epoch
         self.late = 0
@@ -95,6 +98,10 @@ class Lateness:
 
 class Ears:
     """A client: which vehicle side it listens to, whether that one is there, and what to stamp."""
+
+    foreign: int
+    heard_at: float
+    late: int
 
     def __init__(self, nonce: int, wish: Wish = "free") -> None:
         self.epoch: int | None = None

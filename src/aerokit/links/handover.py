@@ -25,6 +25,8 @@ class Handover(Generic[ItemT]):
     At most ``most`` items wait; the oldest are dropped then, and counted. The loop is woken once for all that wait.
     """
 
+    dropped: int
+
     def __init__(self, take: Callable[[ItemT], object], most: int = MOST_WAITING) -> None:
         self.dropped = 0
         """Items that the loop was too slow for."""

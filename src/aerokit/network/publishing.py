@@ -45,6 +45,8 @@ class Publishing:
         states: names; none: all.
     """
 
+    published: int
+
     def __init__(self, vehicle: Vehicle, publisher: Publisher, states: frozenset[str] = frozenset()) -> None:
         self.published = 0
         """Messages so far."""

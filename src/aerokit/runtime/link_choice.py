@@ -117,6 +117,8 @@ class LinkChoice:
     only when it has shown to be the same vehicle, by its clock or by carrying the same frames.
     """
 
+    clock: VehicleClock
+
     def __init__(self, *, needs_proof: bool) -> None:
         self.needs_proof = needs_proof
         self.candidates: dict[int, Candidate] = {}

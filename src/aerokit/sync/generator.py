@@ -36,7 +36,7 @@ FILE = FILES["twins"]
 """The first of them."""
 OF_ONE = ("TwinOf", "BlockTwin", "SelectionTwin")
 """Bases that are told whose twin it is."""
-FUNCTIONS = {
+FUNCTIONS: dict[str, tuple[str, ...]] = {
     "twins": ("aerokit.runtime.opening.open_connection", "aerokit.vehicle.connect.connect"),
     "fleet_twins": ("aerokit.fleets.opening.fleet",),
 }
