@@ -327,3 +327,18 @@ async def test_staggered_ones_begin_one_after_the_other() -> None:
         await stage.fleet.take_off(5, stagger_s=2)
         times = [stage.orders_to(name)[0][0] for name in stage.copters]
         assert [later - times[0] for later in times] == pytest.approx([0.0, 2.0, 4.0], abs=0.3)
+
+
+async def test_what_cannot_be_ordered_stops_nobody() -> None:
+    async with open_stage(2) as stage:
+        await stage.take_off()
+        flying = asyncio.create_task(stage.fleet.go_to(north(20)))
+        await anyio.sleep(1)
+        for wrong in (
+            stage.fleet.take_off(-1),
+            stage.fleet.set_mode("NOPE"),
+            stage.fleet.go_to({}, speed_m_s=0),
+        ):
+            with pytest.raises(LocalProtocolError):
+                await wrong
+        assert (await flying).is_complete
