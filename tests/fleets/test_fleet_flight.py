@@ -342,3 +342,15 @@ async def test_what_cannot_be_ordered_stops_nobody() -> None:
             with pytest.raises(LocalProtocolError):
                 await wrong
         assert (await flying).is_complete
+
+
+async def test_nobody_is_stopped_from_landing_because_another_one_cannot() -> None:
+    async with open_stage(3) as stage:
+        await stage.take_off()
+        stage.copters["north/2"].faults.refuse(MavCmd.DO_SET_MODE)
+        result = await stage.fleet.land()
+        assert list(result.failed) == ["north/2"]
+        assert not result.stopped
+        assert stage.copters["north/1"].motion.is_on_ground
+        assert stage.copters["north/3"].motion.is_on_ground
+        assert not stage.events(PolicyOrdered)
