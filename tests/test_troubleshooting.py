@@ -40,6 +40,7 @@ PRINTS_NO_ERRORS = (
     "serve/",
     "testing/",
     "sync/twins",
+    "sync/fleet_twins",
 )
 SAYS_ENOUGH = 10
 """So many letters of a quoted text have to stand in one piece somewhere."""

@@ -13,6 +13,7 @@ from flight_harness import attached_sinks, now, waiting_on_cells
 from aerokit.errors import OperationRejected
 from aerokit.fleets.formation import Formation
 from aerokit.fleets.members import Member, MemberState
+from aerokit.sim import SimulatedCopter
 
 pytestmark = pytest.mark.anyio
 
@@ -36,17 +37,19 @@ async def test_leaving_the_block_while_another_task_flies_ends_in_holding() -> N
 
 async def test_an_exception_comes_out_as_it_is_and_all_hold_at_once() -> None:
     began = 0.0
+    copters: list[SimulatedCopter] = []
+    flying: list[asyncio.Task[Any]] = []
     with pytest.raises(KeyError, match="mine"):
         async with open_stage(4) as stage:
             await stage.take_off()
-            copters = stage.copters
-            flying = asyncio.create_task(stage.fleet.go_to(north(300)))
+            copters += stage.copters.values()
+            flying.append(asyncio.create_task(stage.fleet.go_to(north(300))))
             await anyio.sleep(3)
             began = now()
             raise KeyError("mine")
     assert now() - began < 2.5  # not one after another
-    await asyncio.wait([flying], timeout=1)
-    assert {each.mode.name for each in copters.values()} == {"BRAKE"}
+    await asyncio.wait(flying, timeout=1)
+    assert [each.mode.name for each in copters] == ["BRAKE"] * 4
 
 
 async def test_a_link_that_goes_makes_all_on_it_lost_and_the_others_hold() -> None:

@@ -327,3 +327,30 @@ async def test_staggered_ones_begin_one_after_the_other() -> None:
         await stage.fleet.take_off(5, stagger_s=2)
         times = [stage.orders_to(name)[0][0] for name in stage.copters]
         assert [later - times[0] for later in times] == pytest.approx([0.0, 2.0, 4.0], abs=0.3)
+
+
+async def test_what_cannot_be_ordered_stops_nobody() -> None:
+    async with open_stage(2) as stage:
+        await stage.take_off()
+        flying = asyncio.create_task(stage.fleet.go_to(north(20)))
+        await anyio.sleep(1)
+        for wrong in (
+            stage.fleet.take_off(-1),
+            stage.fleet.set_mode("NOPE"),
+            stage.fleet.go_to({}, speed_m_s=0),
+        ):
+            with pytest.raises(LocalProtocolError):
+                await wrong
+        assert (await flying).is_complete
+
+
+async def test_nobody_is_stopped_from_landing_because_another_one_cannot() -> None:
+    async with open_stage(3) as stage:
+        await stage.take_off()
+        stage.copters["north/2"].faults.refuse(MavCmd.DO_SET_MODE)
+        result = await stage.fleet.land()
+        assert list(result.failed) == ["north/2"]
+        assert not result.stopped
+        assert stage.copters["north/1"].motion.is_on_ground
+        assert stage.copters["north/3"].motion.is_on_ground
+        assert not stage.events(PolicyOrdered)

@@ -10,11 +10,19 @@ from fleet_stage import open_stage
 
 import aerokit
 from aerokit import events, sync
-from aerokit.errors import BusyError, ConnectFailed, LocalProtocolError, SubscriptionOverflow
+from aerokit.errors import (
+    BusyError,
+    ConnectFailed,
+    FleetError,
+    LocalProtocolError,
+    OperationRejected,
+    SubscriptionOverflow,
+)
 from aerokit.fleets.events import FleetEvent, MemberTakenOver, StateTold, Told
 from aerokit.fleets.members import MemberState
 from aerokit.fleets.policy import Failure, Rules
 from aerokit.fleets.results import FleetResult
+from aerokit.missions import Mission
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.sync.generator import FILES, generate
 
@@ -166,6 +174,56 @@ async def test_all_are_let_go_at_once_and_nothing_is_left() -> None:
         assert (len(connection.bus._event_sinks), connection.attached) == before
         async with aerokit.connect(connection, system_id=2):
             pass
+
+
+async def test_arguments_of_wrong_types_are_refused_and_nothing_is_sent() -> None:
+    async with open_stage(2) as stage:
+        fleet: Any = stage.fleet
+        (await stage.fleet.wait_ready()).raise_for_errors()
+        place = fleet.vehicles["north/1"].position.value
+        line = aerokit.Formation.line(["north/2"], 5.0)
+        stage.forget()
+        wrong: list[tuple[str, tuple[Any, ...], dict[str, Any]]] = [
+            ("take_off", ("ten",), {}),
+            ("take_off", (-1,), {}),
+            ("take_off", (10,), {"timeout": 0}),
+            ("take_off", (10,), {"stagger_s": -1}),
+            ("land", (), {"timeout": "1"}),
+            ("set_mode", (1.5,), {}),
+            ("do", (7,), {}),
+            ("do", (print, 1), {}),
+            ("go_to", ({"north/1": (47, 8)},), {}),
+            ("go_to", ({"north/9": place},), {}),
+            ("go_to", ({"north/1": place},), {"apart": "yes"}),
+            ("plan_apart", ({"north/1": place},), {"by": "luck"}),
+            ("plan_apart", ({"north/1": place},), {}),
+            ("barrier", (True,), {}),
+            ("all_at_altitude", (None,), {}),
+            ("upload", ({"north/1": 5},), {}),
+            ("upload", ({"north/9": Mission()},), {}),
+            ("upload", ({"north/1": Mission()},), {"at_once": 0}),
+            ("compare_missions", ({"north/1": Mission()},), {}),
+            ("form", (line,), {"leader": 1}),
+            ("form", ("line",), {"leader": "north/1"}),
+            ("following", (line,), {"leader": "north/1", "rate_hz": 1000}),
+            ("fly_show", ("show", place), {}),
+            ("send_corrections", ("text",), {}),
+            ("take_back", (1,), {}),
+            ("take_back", ("north/9",), {}),
+            ("let_go", ("north/9",), {}),
+            ("group", (None,), {}),
+            ("events", (), {"capacity": 0}),
+        ]
+        for name, arguments, options in wrong:
+            with pytest.raises((LocalProtocolError, FleetError)) as caught:
+                done = getattr(fleet, name)(*arguments, **options)
+                done = await done if hasattr(done, "__await__") else done
+                if isinstance(done, FleetResult):
+                    done.raise_for_errors()
+            errors = caught.value.errors.values() if isinstance(caught.value, FleetError) else ()
+            assert all(isinstance(each, (LocalProtocolError, OperationRejected)) for each in errors), name
+        assert not stage.orders_to("north/1")
+        assert not stage.orders_to("north/2")
 
 
 def test_results_say_what_became_of_whom() -> None:

@@ -11,6 +11,7 @@ from aerokit.errors import LocalProtocolError, OperationTimeout
 from aerokit.fleets.members import Member
 from aerokit.fleets.part import FleetPart
 from aerokit.fleets.results import FleetResult
+from aerokit.vehicle.checks import check_range
 from aerokit.vehicle.orders.progress import Arrivals
 from aerokit.wording import shown
 
@@ -92,10 +93,14 @@ class Actions(FleetPart):
         """Take off and climb to ``altitude_m`` above home; as :meth:`aerokit.Vehicle.take_off`.
 
         Args:
-            altitude_m: metres above the home of each.
+            altitude_m: metres above the home of each, above 0, at most 10,000.
             timeout: seconds that each of them has.
             stagger_s: each begins so many seconds after the one before; None: all at once.
+
+        Raises:
+            LocalProtocolError: the altitude is out of range. Nothing was sent.
         """
+        check_range("altitude_m", altitude_m, 0, 10_000, above=True)
         return await self._run(
             "take_off",
             lambda member: member.vehicle.take_off(altitude_m, timeout=timeout),
@@ -138,7 +143,13 @@ class Actions(FleetPart):
         Args:
             mode: a name as the autopilot's own documentation spells it, or its number.
             timeout: seconds that each of them has.
+
+        Raises:
+            LocalProtocolError: one of them has no such mode. Nothing was sent.
         """
+        for member in self:  # before anybody has changed it
+            if member.takes_orders:
+                member.vehicle.autopilot.find_mode(mode, member.vehicle.telemetry.mode_names)
         return await self._run("set_mode", lambda member: member.vehicle.set_mode(mode, timeout=timeout))
 
     # ------------------------------------------------------------------------------------- barriers

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import defaultdict
-from itertools import product
+from itertools import combinations, product
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -15,6 +14,8 @@ if TYPE_CHECKING:
 __all__ = ["local_places", "near_pairs"]
 
 METRES_PER_DEGREE = 111_319.5
+AHEAD = tuple(step for step in product((-1, 0, 1), repeat=3) if step > (0, 0, 0))
+"""Half of the neighbours of a cube: the others have it for a neighbour."""
 
 
 def near_pairs(places: Mapping[str, Place], within_m: float) -> list[tuple[str, str, float]]:
@@ -22,23 +23,23 @@ def near_pairs(places: Mapping[str, Place], within_m: float) -> list[tuple[str, 
 
     The air is divided into cubes of that size: only neighbouring ones are compared.
     """
-    cubes: defaultdict[tuple[int, ...], list[str]] = defaultdict(list)
-    for name, place in places.items():
-        cubes[tuple(math.floor(each / within_m) for each in place)].append(name)
+    cubes: dict[tuple[int, int, int], list[str]] = {}
+    for name, (north, east, up) in places.items():
+        cube = math.floor(north / within_m), math.floor(east / within_m), math.floor(up / within_m)
+        cubes.setdefault(cube, []).append(name)
     order = {name: number for number, name in enumerate(places)}
     found: list[tuple[str, str, float]] = []
-    for cube, names in cubes.items():
-        others = [
-            other
-            for step in product((-1, 0, 1), repeat=3)
-            for other in cubes.get(tuple(a + b for a, b in zip(cube, step, strict=True)), ())
-        ]
-        for name in names:
-            for other in others:
-                if order[name] < order[other]:
-                    distance = math.dist(places[name], places[other])
-                    if distance < within_m:
-                        found.append((name, other, distance))
+    for (x, y, z), names in cubes.items():
+        pairs = list(combinations(names, 2))
+        for dx, dy, dz in AHEAD:
+            others = cubes.get((x + dx, y + dy, z + dz))
+            if others is not None:
+                pairs += product(names, others)
+        for one, other in pairs:
+            distance = math.dist(places[one], places[other])
+            if distance < within_m:
+                first, second = (one, other) if order[one] < order[other] else (other, one)
+                found.append((first, second, distance))
     return sorted(found, key=lambda pair: (order[pair[0]], order[pair[1]]))
 
 

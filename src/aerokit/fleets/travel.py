@@ -16,6 +16,7 @@ from aerokit.fleets.part import FleetPart
 from aerokit.fleets.results import FleetResult
 from aerokit.fleets.whereabouts import Around, altitude_amsl
 from aerokit.position import Position
+from aerokit.vehicle.checks import check_range
 from aerokit.wording import shown
 
 __all__ = ["Travel", "WayApart"]
@@ -54,6 +55,8 @@ class Travel(FleetPart):
             OperationRejected: their ways come too near, and no heights keep them apart: nothing was sent. Or one fell
                 out between two legs in layers: the others stay where they are.
         """
+        if speed_m_s is not None:
+            check_range("speed_m_s", speed_m_s, 0, 1000, above=True)
         places = self._places(targets)
         if apart is None and self._crew.min_distance_m is not None:
             apart = self.plan_apart(places, speed_m_s=speed_m_s)

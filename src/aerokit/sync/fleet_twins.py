@@ -390,9 +390,12 @@ class Selection(SelectionTwin["AsyncSelection"]):
         """Take off and climb to ``altitude_m`` above home; as :meth:`aerokit.Vehicle.take_off`.
 
         Args:
-            altitude_m: metres above the home of each.
+            altitude_m: metres above the home of each, above 0, at most 10,000.
             timeout: seconds that each of them has.
             stagger_s: each begins so many seconds after the one before; None: all at once.
+
+        Raises:
+            LocalProtocolError: the altitude is out of range. Nothing was sent.
         """
         return self._loop.run(self.aio.take_off, altitude_m, timeout=timeout, stagger_s=stagger_s)
 
@@ -429,6 +432,9 @@ class Selection(SelectionTwin["AsyncSelection"]):
         Args:
             mode: a name as the autopilot's own documentation spells it, or its number.
             timeout: seconds that each of them has.
+
+        Raises:
+            LocalProtocolError: one of them has no such mode. Nothing was sent.
         """
         return self._loop.run(self.aio.set_mode, mode, timeout=timeout)
 
@@ -800,9 +806,12 @@ class Fleet(FleetTwin):
         """Take off and climb to ``altitude_m`` above home; as :meth:`aerokit.Vehicle.take_off`.
 
         Args:
-            altitude_m: metres above the home of each.
+            altitude_m: metres above the home of each, above 0, at most 10,000.
             timeout: seconds that each of them has.
             stagger_s: each begins so many seconds after the one before; None: all at once.
+
+        Raises:
+            LocalProtocolError: the altitude is out of range. Nothing was sent.
         """
         return self._loop.run(self.aio.take_off, altitude_m, timeout=timeout, stagger_s=stagger_s)
 
@@ -839,6 +848,9 @@ class Fleet(FleetTwin):
         Args:
             mode: a name as the autopilot's own documentation spells it, or its number.
             timeout: seconds that each of them has.
+
+        Raises:
+            LocalProtocolError: one of them has no such mode. Nothing was sent.
         """
         return self._loop.run(self.aio.set_mode, mode, timeout=timeout)
 
