@@ -11,7 +11,8 @@ in pieces of ten; both take turns, neither may lose any, and MAVProxy has no mod
 ``latency_…``: time from sending to receiving at the first of four, of frames that come one by one, 100 a second: median
 and 99th percentile.
 
-MAVProxy is that of ``$AEROKIT_MAVPROXY_PYTHON``'s environment, else of this one; without it there are no rows.
+MAVProxy is that of ``$AEROKIT_MAVPROXY_PYTHON``'s environment, else of this one; without it there are no rows. Where
+``$AEROKIT_MAVLINK_ROUTERD`` names a mavlink-routerd, which is C++, there is another row for it, without an aim.
 """
 
 from __future__ import annotations
@@ -45,6 +46,7 @@ OUTS = (1, 4, 16)
 NAMES = (*(f"out_{count}" for count in OUTS), "latency_median", "latency_p99")
 PYTHON = os.environ.get("AEROKIT_MAVPROXY_PYTHON", sys.executable)
 MAVPROXY = Path(PYTHON).parent / "mavproxy.py"
+ROUTERD = os.environ.get("AEROKIT_MAVLINK_ROUTERD", "")
 PIECE = 10
 SENT_HZ = 600
 WARM_UP = 600
@@ -90,15 +92,23 @@ def _throughput(count: int, quick: bool) -> list[Row]:
                 file=sys.stderr,
                 flush=True,
             )
-    if len(figures) < 2:
-        return []
-    own, peer = (statistics.median(each) for each in figures.values())
-    unit = "frames/CPU-s"
-    return [row(f"out_{count}", own, peer, "MAVProxy --out", unit=unit, ratio=own / peer, aim=10.0)]
+    medians = {name: statistics.median(each) for name, each in figures.items()}
+    own, rows = medians.pop("aerokit"), []
+    for name, peer in medians.items():
+        what, text, aim = _PEERS[name]
+        rows.append(
+            row(f"out_{count}{what}", own, peer, text, unit="frames/CPU-s", ratio=own / peer, aim=aim)
+        )
+    return rows
 
 
-def _present() -> tuple[str, ...]:
-    return ("aerokit", "mavproxy") if MAVPROXY.exists() else ("aerokit",)
+_PEERS = {"mavproxy": ("", "MAVProxy --out", 10.0), "routerd": ("_routerd", "mavlink-router", 0.0)}
+"""What is put behind a row's name, what the peer is called, and the aim."""
+
+
+def _present(*, with_routerd: bool = True) -> list[str]:
+    there = {"aerokit": True, "mavproxy": MAVPROXY.exists(), "routerd": with_routerd and bool(ROUTERD)}
+    return [name for name, is_there in there.items() if is_there]
 
 
 def _frames_per_second(
@@ -167,7 +177,7 @@ def _count(receivers: list[socket.socket], counts: list[int]) -> None:
 
 
 def _latencies(quick: bool) -> list[Row]:
-    series: dict[str, list[float]] = {name: [] for name in _present()}
+    series: dict[str, list[float]] = {name: [] for name in _present(with_routerd=False)}
     for _ in range(1 if quick else 5):
         for name, found in series.items():
             with _hub(name, 4) as (_, sender, receivers):
@@ -208,23 +218,8 @@ def _hub(
     with _bound() as probe:
         port = probe.getsockname()[1]
     outs = [f"127.0.0.1:{each.getsockname()[1]}" for each in receivers]
-    master = f"udpin:127.0.0.1:{port}"
     with tempfile.TemporaryDirectory() as folder:
-        if name == "aerokit":
-            command = [sys.executable, "-m", "aerokit", "hub", master, *(f"udpout:{out}" for out in outs)]
-        else:
-            command = [PYTHON, str(MAVPROXY), "--daemon", "--non-interactive", "--master", master]
-            command += [
-                "--state-basedir",
-                folder,
-                "--default-modules",
-                "",
-                "--streamrate",
-                "-1",
-                "--logfile",
-                os.devnull,
-            ]
-            command += [part for out in outs for part in ("--out", f"udpout:{out}")]
+        command = _command(name, port, outs, folder)
         process = subprocess.Popen(
             command,
             cwd=folder,
@@ -246,6 +241,26 @@ def _hub(
                 process.wait()
             for each in receivers:
                 each.close()
+
+
+def _command(name: str, port: int, outs: Sequence[str], folder: str) -> list[str]:
+    master = f"udpin:127.0.0.1:{port}"
+    if name == "aerokit":
+        return [sys.executable, "-m", "aerokit", "hub", master, *(f"udpout:{out}" for out in outs)]
+    if name == "routerd":
+        return [ROUTERD, "-t", "0", *(part for out in outs for part in ("-e", out)), f"127.0.0.1:{port}"]
+    quiet = [
+        "--default-modules",
+        "",
+        "--streamrate",
+        "-1",
+        "--logfile",
+        os.devnull,
+        "--state-basedir",
+        folder,
+    ]
+    command = [PYTHON, str(MAVPROXY), "--daemon", "--non-interactive", "--master", master, *quiet]
+    return [*command, *(part for out in outs for part in ("--out", f"udpout:{out}"))]
 
 
 def _wait_until_it_works(
