@@ -12,7 +12,8 @@ import aerokit
 from aerokit import events
 from aerokit import messages as m
 from aerokit.errors import AerokitError, LinkLost, LinkOpenError, LocalProtocolError
-from aerokit.links import FaultModel
+from aerokit.hub import shared
+from aerokit.links import FaultModel, memory_link_pair
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.missions import Mission, waypoint
 from aerokit.runtime.link_state import LinkState
@@ -333,3 +334,35 @@ async def test_a_link_that_was_not_there_is_used_when_it_comes() -> None:
         await anyio.sleep(3)
         assert [reason for _, reason in news.chosen] == ["silent"]
         await vehicle.arm()
+
+
+async def test_a_ground_station_shares_all_of_the_links() -> None:
+    """Its transfer goes on, too, when one of them dies; each order of its own arrives once."""
+    radios = Radios(2, models=[FaultModel(delay_s=0.02)] * 2)
+    told = Told(radios)
+    ours, theirs = memory_link_pair(latency_s=0.005)
+    async with (
+        over(radios, a_copter()) as connection,
+        aerokit.connect(connection) as flying,
+        shared(connection, [ours]),
+        aerokit.connect(theirs, source_system=254) as station,
+    ):
+        await flying.wait_ready()
+        await proven(connection, 1)
+        used = 0 if connection.links.value[0].used_for else 1  # type: ignore[union-attr]
+        told.messages.clear()
+        await station.arm()
+        arming = [index for index, each in told.of(m.CommandLong) if getattr(each, "command", 0) == 400]
+        assert arming == [used]
+        found: list[int] = []
+
+        async def download() -> None:
+            found.append(len(await station.parameters.download(method="list", refresh=True)))
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(download)
+            await anyio.sleep(0.5)
+            radios.cut(used)
+        assert found == [len(await flying.parameters.download(method="list", refresh=True))]
+        assert station.is_armed
+        await station.disarm()
