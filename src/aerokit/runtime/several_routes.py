@@ -99,8 +99,8 @@ class SeveralRoutes:
     # ------------------------------------------------------- as Routes, for the connection
 
     def note(self, frame: Frame, peer: Peer, counters: SourceStatistics | None) -> bool:
-        """A heartbeat came from this peer; False when there is no room to remember it."""
-        if not self._routes[_link(peer)].note(frame, peer, counters):
+        """A heartbeat came from this peer; False when there is no room to remember it, or it is nobody's (system 0)."""
+        if not frame.system_id or not self._routes[_link(peer)].note(frame, peer, counters):
             return False
         heartbeat = self._connection.bus.dialect.decode(frame)
         is_autopilot = getattr(heartbeat, "autopilot", MavAutopilot.INVALID) != MavAutopilot.INVALID
@@ -149,20 +149,18 @@ class SeveralRoutes:
     def peers_of(self, system_id: int, component_id: int, message: Message | None = None) -> Collection[Peer]:
         """Where to send what is for this component: over one link, the best one.
 
-        What is for everybody goes once to each system that is known, and to all links behind which none is;
-        heartbeats and the like go everywhere.
+        What is for everybody goes once to each system that is known, as far as the links allow it, and to all links
+        behind which none is; heartbeats and the like go everywhere.
         """
         if system_id != 0:
             choice = self._choices.get(system_id)
             if choice is None or choice.used is None:
                 return EVERY_PEER
             self._choose(system_id, choice, self._connection.now())
-            return self._routes[self._link_to(choice, (system_id, component_id))].peers_of(
-                system_id, component_id
-            )
+            return self._peers_on(self._link_to(choice, (system_id, component_id)), system_id, component_id)
         if message is not None and message.ID in FOR_ALL:
             return EVERY_PEER
-        return self._one_for_each_system()
+        return self._one_for_each_system(self._connection.now())
 
     # ---------------------------------------------------------------- what comes, and what of it is taken
 
@@ -283,13 +281,25 @@ class SeveralRoutes:
                     return link
         return choice.used.link
 
-    def _one_for_each_system(self) -> Collection[Peer]:
+    def _peers_on(self, link: int, system_id: int, component_id: int) -> Collection[Peer]:
+        """Those of this link only, also when it has forgotten who they are."""
+        peers = self._routes[link].peers_of(system_id, component_id)
+        return (LinkPeer(link, None),) if None in peers else peers
+
+    def _one_for_each_system(self, now: float) -> Collection[Peer]:
+        """Whoever is reached by what another one needs anyway is not written to a second time."""
         peers: set[Peer] = set()
         reached: set[int] = set()
+        ways: list[list[Collection[Peer]]] = []
         for system_id, choice in self._choices.items():
             reached.update(choice.candidates)
             if choice.used is not None:
-                peers.update(self._routes[choice.used.link].peers_of(system_id, 0))
+                others = (each for each in choice.candidates.values() if each is not choice.used)
+                usable = (each for each in others if choice.may_be_used(each) and each.is_alive(now))
+                ways.append([self._peers_on(each.link, system_id, 0) for each in (choice.used, *usable)])
+        for way in sorted(ways, key=len):
+            if not any(peers.issuperset(each) for each in way):
+                peers.update(way[0])
         peers.update(LinkPeer(link, None) for link in range(self._count) if link not in reached)
         return peers
 
