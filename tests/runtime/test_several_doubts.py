@@ -1,4 +1,4 @@
-"""Several links to one vehicle, and what may be wrong with them: nothing twice, nothing old, nothing to somebody else."""
+"""Several links to one vehicle, and what may be wrong: nothing comes twice or late, nothing goes to somebody else."""
 
 from __future__ import annotations
 
@@ -127,3 +127,52 @@ def test_a_link_that_comes_after_a_long_silence_is_believed_by_its_clock() -> No
         now += 0.5
     choice.choose(now)
     assert choice.used is choice.candidates[1]
+
+
+@pytest.mark.parametrize("late_s", [2.0, 4.0, 6.0])
+@pytest.mark.parametrize("dies", [False, True])
+async def test_what_came_long_ago_over_the_other_link_does_not_come_again(late_s: float, dies: bool) -> None:
+    """Both radios carry one stream of 100 frames a second; one of them begins to be late, and the other dies perhaps."""
+    radios = Radios(2)
+    await opened(radios)
+    async with open_connection(radios.together()) as connection:
+        came: list[int] = []
+        states: list[int] = []
+        connection.bus.attach(m.Attitude, lambda message: came.append(message.time_boot_ms))
+        connection.bus.attach(m.Heartbeat, lambda message: states.append(message.base_mode))
+        encoder = FrameEncoder(1, 1)
+        for step in range(1200):
+            if step == 400:
+                radios.links[1].incoming.model = FaultModel(delay_s=late_s)
+            if step == 500 and dies:
+                radios.cut(0)
+            frames = [encoder.encode(m.Attitude(10_000 + 10 * step, 0, 0, 0, 0, 0, 0))]
+            if step % 50 == 0:
+                armed = 128 if step < 450 else 0
+                frames.append(encoder.encode(m.Heartbeat(2, 3, 1 | armed, 0, 4)))
+            for data in frames:
+                for far in radios.far:
+                    far.write(data)
+            await anyio.sleep(0.01)
+        assert came == sorted(set(came))
+        assert sorted(states, reverse=True) == states, "armed was not told after disarmed"
+
+
+async def test_signed_copies_are_taken_whichever_comes_first() -> None:
+    """The quicker radio is not in use yet; nothing but heartbeats comes, which prove nothing."""
+    radios = Radios(2, models=[FaultModel(delay_s=0.05), GOOD])
+    await opened(radios)
+    key = SigningKey(bytes(range(32)))
+    async with open_connection(radios.together(), signing=Signing(key)) as connection:
+        refused = News(connection, events.FrameRefused)
+        states: list[int] = []
+        connection.bus.attach(m.Heartbeat, lambda message: states.append(message.custom_mode))
+        vehicle = FrameEncoder(1, 1)
+        vehicle.signing = Signing(key)
+        for step in range(10):
+            data = vehicle.encode(m.Heartbeat(2, 3, 81, step, 4), connection.unix_time())
+            for far in radios.far[: 1 if step == 0 else 2]:
+                far.write(data)
+            await anyio.sleep(1)
+        assert states == list(range(10))
+        assert refused.all == []

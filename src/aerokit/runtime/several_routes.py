@@ -89,7 +89,7 @@ class SeveralRoutes:
         self._counters: dict[
             tuple[int, int], dict[int, SourceStatistics]
         ] = {}  # of (system, link), by component
-        self._copies = Copies()
+        self.copies: Copies = Copies()
         self._questions = LinkQuestions(self._count, connection.send_to_peer)
         self._doubts_told: set[tuple[int, int]] = set()
         self._states = LinkStates(link, self._choices, connection.now, connection.bus.publish)
@@ -171,7 +171,7 @@ class SeveralRoutes:
         """
         if frame.system_id == self._we[0] and frame.component_id == self._we[1]:
             return True
-        if not self._copies.is_copy(frame, _link(peer)):
+        if not self.copies.is_copy(frame, _link(peer)):
             return False
         choice = self._choices.get(frame.system_id)
         # A heartbeat is like another one, also of another vehicle.
@@ -179,7 +179,7 @@ class SeveralRoutes:
             for link in {_link(peer), -1 if choice.used is None else choice.used.link}:
                 if (candidate := choice.candidates.get(link)) is not None:
                     candidate.note_copy(frame.received_at)
-        if not self._copies.was_taken:
+        if not self.copies.was_taken:
             return False
         self._stream(frame).heard_at[_link(peer)] = frame.received_at
         if frame.message_id == m.Heartbeat.ID and not self.is_elsewhere(frame, peer):
@@ -199,10 +199,12 @@ class SeveralRoutes:
         stream.heard_at[_link(peer)] = frame.received_at
         candidate = None if choice is None else choice.candidates.get(_link(peer))
         if choice is None or choice.used is None:
-            self._copies.take()
+            self.copies.take()
             return True  # of somebody who sends no heartbeats: a radio
         used = choice.used
         if frame.received_at <= choice.fresh_after and frame.message_id not in ANSWERS:
+            return False
+        if self.copies.is_late and not self._may_be_alike(frame, peer, choice):
             return False
         if _link(peer) != used.link:
             if candidate is None or not choice.may_be_used(candidate):
@@ -220,7 +222,7 @@ class SeveralRoutes:
             if is_shared and is_late and frame.message_id not in ANSWERS:
                 return False
         stream.newest = frame.sequence
-        self._copies.take()
+        self.copies.take()
         return True
 
     # ---------------------------------------------------------------------------- the links themselves
@@ -262,6 +264,13 @@ class SeveralRoutes:
         self._states.look(now)
 
     # ------------------------------------------------------------------------------------- inside
+
+    def _may_be_alike(self, frame: Frame, peer: Peer, choice: LinkChoice) -> bool:
+        """Whether it is another frame than the one with the same bytes: of streams apart, heartbeats are."""
+        candidate = choice.used
+        if candidate is None or candidate.link != _link(peer) or frame.message_id != m.Heartbeat.ID:
+            return False
+        return not choice.is_shared(candidate, frame.received_at)
 
     def _stream(self, frame: Frame) -> _Stream:
         key = frame.component_id << 8 | frame.system_id
