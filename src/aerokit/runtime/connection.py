@@ -428,7 +428,7 @@ class Connection:
                 if several is not None and several.is_copy(frame, peer):
                     continue
                 is_elsewhere = len(self._framers) > 1 and self._routes.is_elsewhere(frame, peer)
-                if not self._gate.is_open and not self._gate.admits(frame, may_hand_over=not is_elsewhere):
+                if not self._gate.is_open and not self._admits(frame, is_elsewhere):
                     continue
                 if self._recording is not None and several is None:
                     self._recording.write(frame.raw, self._clock())
@@ -574,6 +574,15 @@ class Connection:
         """Recordings and taps get everything, also what nobody wants and what the dialect does not know."""
         framer.keep_unknown = self._recording is not None or bool(self._taps)
         framer.wanted = None if framer.keep_unknown else self.bus.wanted
+
+    def _admits(self, frame: Frame, is_elsewhere: bool) -> bool:
+        """By its signature; once for all copies of a frame, of which the first need not be the one that is taken."""
+        if self._several is not None and self._several.copies.was_admitted:
+            return True
+        is_admitted = self._gate.admits(frame, may_hand_over=not is_elsewhere)
+        if is_admitted and self._several is not None:
+            self._several.copies.admit()
+        return is_admitted
 
     def _takes_place(self, framer: Framer, frame: Frame, peer: Peer) -> bool:
         is_signed = self.signing is not None and bool(frame.incompat_flags & SIGNED)  # checked by the gate

@@ -89,7 +89,7 @@ class SeveralRoutes:
         self._counters: dict[
             tuple[int, int], dict[int, SourceStatistics]
         ] = {}  # of (system, link), by component
-        self._copies = Copies()
+        self.copies: Copies = Copies()
         self._questions = LinkQuestions(self._count, connection.send_to_peer)
         self._doubts_told: set[tuple[int, int]] = set()
         self._states = LinkStates(link, self._choices, connection.now, connection.bus.publish)
@@ -99,8 +99,8 @@ class SeveralRoutes:
     # ------------------------------------------------------- as Routes, for the connection
 
     def note(self, frame: Frame, peer: Peer, counters: SourceStatistics | None) -> bool:
-        """A heartbeat came from this peer; False when there is no room to remember it."""
-        if not self._routes[_link(peer)].note(frame, peer, counters):
+        """A heartbeat came from this peer; False when there is no room to remember it, or it is nobody's (system 0)."""
+        if not frame.system_id or not self._routes[_link(peer)].note(frame, peer, counters):
             return False
         heartbeat = self._connection.bus.dialect.decode(frame)
         is_autopilot = getattr(heartbeat, "autopilot", MavAutopilot.INVALID) != MavAutopilot.INVALID
@@ -149,20 +149,18 @@ class SeveralRoutes:
     def peers_of(self, system_id: int, component_id: int, message: Message | None = None) -> Collection[Peer]:
         """Where to send what is for this component: over one link, the best one.
 
-        What is for everybody goes once to each system that is known, and to all links behind which none is;
-        heartbeats and the like go everywhere.
+        What is for everybody goes once to each system that is known, as far as the links allow it, and to all links
+        behind which none is; heartbeats and the like go everywhere.
         """
         if system_id != 0:
             choice = self._choices.get(system_id)
             if choice is None or choice.used is None:
                 return EVERY_PEER
             self._choose(system_id, choice, self._connection.now())
-            return self._routes[self._link_to(choice, (system_id, component_id))].peers_of(
-                system_id, component_id
-            )
+            return self._peers_on(self._link_to(choice, (system_id, component_id)), system_id, component_id)
         if message is not None and message.ID in FOR_ALL:
             return EVERY_PEER
-        return self._one_for_each_system()
+        return self._one_for_each_system(self._connection.now())
 
     # ---------------------------------------------------------------- what comes, and what of it is taken
 
@@ -173,7 +171,7 @@ class SeveralRoutes:
         """
         if frame.system_id == self._we[0] and frame.component_id == self._we[1]:
             return True
-        if not self._copies.is_copy(frame, _link(peer)):
+        if not self.copies.is_copy(frame, _link(peer)):
             return False
         choice = self._choices.get(frame.system_id)
         # A heartbeat is like another one, also of another vehicle.
@@ -181,7 +179,7 @@ class SeveralRoutes:
             for link in {_link(peer), -1 if choice.used is None else choice.used.link}:
                 if (candidate := choice.candidates.get(link)) is not None:
                     candidate.note_copy(frame.received_at)
-        if not self._copies.was_taken:
+        if not self.copies.was_taken:
             return False
         self._stream(frame).heard_at[_link(peer)] = frame.received_at
         if frame.message_id == m.Heartbeat.ID and not self.is_elsewhere(frame, peer):
@@ -201,10 +199,12 @@ class SeveralRoutes:
         stream.heard_at[_link(peer)] = frame.received_at
         candidate = None if choice is None else choice.candidates.get(_link(peer))
         if choice is None or choice.used is None:
-            self._copies.take()
+            self.copies.take()
             return True  # of somebody who sends no heartbeats: a radio
         used = choice.used
         if frame.received_at <= choice.fresh_after and frame.message_id not in ANSWERS:
+            return False
+        if self.copies.is_late and not self._may_be_alike(frame, peer, choice):
             return False
         if _link(peer) != used.link:
             if candidate is None or not choice.may_be_used(candidate):
@@ -222,7 +222,7 @@ class SeveralRoutes:
             if is_shared and is_late and frame.message_id not in ANSWERS:
                 return False
         stream.newest = frame.sequence
-        self._copies.take()
+        self.copies.take()
         return True
 
     # ---------------------------------------------------------------------------- the links themselves
@@ -265,6 +265,13 @@ class SeveralRoutes:
 
     # ------------------------------------------------------------------------------------- inside
 
+    def _may_be_alike(self, frame: Frame, peer: Peer, choice: LinkChoice) -> bool:
+        """Whether it is another frame than the one with the same bytes: of streams apart, heartbeats are."""
+        candidate = choice.used
+        if candidate is None or candidate.link != _link(peer) or frame.message_id != m.Heartbeat.ID:
+            return False
+        return not choice.is_shared(candidate, frame.received_at)
+
     def _stream(self, frame: Frame) -> _Stream:
         key = frame.component_id << 8 | frame.system_id
         stream = self._streams.get(key)
@@ -283,13 +290,25 @@ class SeveralRoutes:
                     return link
         return choice.used.link
 
-    def _one_for_each_system(self) -> Collection[Peer]:
+    def _peers_on(self, link: int, system_id: int, component_id: int) -> Collection[Peer]:
+        """Those of this link only, also when it has forgotten who they are."""
+        peers = self._routes[link].peers_of(system_id, component_id)
+        return (LinkPeer(link, None),) if None in peers else peers
+
+    def _one_for_each_system(self, now: float) -> Collection[Peer]:
+        """Whoever is reached by what another one needs anyway is not written to a second time."""
         peers: set[Peer] = set()
         reached: set[int] = set()
+        ways: list[list[Collection[Peer]]] = []
         for system_id, choice in self._choices.items():
             reached.update(choice.candidates)
             if choice.used is not None:
-                peers.update(self._routes[choice.used.link].peers_of(system_id, 0))
+                others = (each for each in choice.candidates.values() if each is not choice.used)
+                usable = (each for each in others if choice.may_be_used(each) and each.is_alive(now))
+                ways.append([self._peers_on(each.link, system_id, 0) for each in (choice.used, *usable)])
+        for way in sorted(ways, key=len):
+            if not any(peers.issuperset(each) for each in way):
+                peers.update(way[0])
         peers.update(LinkPeer(link, None) for link in range(self._count) if link not in reached)
         return peers
 

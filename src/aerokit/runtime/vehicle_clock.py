@@ -14,6 +14,10 @@ SAMPLES = 20
 TOLERANCE_S = 0.1
 DRIFT = 0.02
 """How wrong the speed may be: a simulation is not always as fast as it says."""
+MOST_DRIFT_S = 0.5
+"""And what comes of it at most: else anybody's clock would be right after a silence that was long enough."""
+REAL = 0.05
+"""So near to 1 the speed is 1: a real vehicle's. Over a long silence an error of measuring would become seconds."""
 SPAN_S = 1.0
 FASTEST = 200.0
 """No simulation is faster than this."""
@@ -42,7 +46,8 @@ class VehicleClock:
         if speed is None:
             return None
         last_at, last = self._samples[-1]
-        tolerance = (TOLERANCE_S + round_trip_s / 2 + DRIFT * abs(at - last_at)) * max(1.0, speed)
+        drift_s = min(DRIFT * abs(at - last_at), MOST_DRIFT_S)
+        tolerance = (TOLERANCE_S + round_trip_s / 2 + drift_s) * max(1.0, speed)
         return abs(last + speed * (at - last_at) - told_s) <= tolerance
 
     def _goes_on(self, at: float, told_s: float, round_trip_s: float) -> bool:
@@ -58,4 +63,7 @@ class VehicleClock:
         if not self._samples:
             return None
         (first_at, first), (last_at, last) = self._samples[0], self._samples[-1]
-        return (last - first) / (last_at - first_at) if last_at - first_at >= SPAN_S else None
+        if last_at - first_at < SPAN_S:
+            return None
+        speed = (last - first) / (last_at - first_at)
+        return 1.0 if abs(speed - 1) <= REAL else speed

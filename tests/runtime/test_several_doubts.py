@@ -1,0 +1,178 @@
+"""Several links to one vehicle, and what may be wrong: nothing comes twice or late, nothing goes to somebody else."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import anyio
+import pytest
+from several_harness import GOOD, News, Radios, Told, over
+
+import aerokit
+from aerokit import events
+from aerokit import messages as m
+from aerokit.errors import BusyError, LinkLost, LinkOpenError
+from aerokit.links import FaultModel, Link, MemoryLink, Peer, Receiver, SeveralLinks, memory_link_pair
+from aerokit.mavlink.checksum import x25
+from aerokit.mavlink.dialect import STANDARD
+from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.frame import Frame
+from aerokit.mavlink.signing import Signing, SigningKey
+from aerokit.runtime.connection import Connection
+from aerokit.runtime.link_choice import LinkChoice
+from aerokit.runtime.opening import open_connection
+from aerokit.sim import SimulatedCopter
+from aerokit.testing import VIRTUAL_BACKEND
+
+pytestmark = pytest.mark.anyio
+
+AUTOPILOT = m.Heartbeat(2, 3, 81, 0, 4)
+STATION = m.Heartbeat(6, 8, 0, 0, 4)
+
+
+@pytest.fixture
+def anyio_backend() -> tuple[str, dict[str, object]]:
+    return VIRTUAL_BACKEND
+
+
+class Deaf:
+    """Listens at the far end of a link, and does nothing."""
+
+    def bytes_received(self, data: bytes, peer: Peer) -> None:
+        pass
+
+    def link_lost(self, error: LinkLost) -> None:
+        pass
+
+
+def of_system_0(message: m.Heartbeat) -> bytes:
+    """A frame that no encoder of ours makes."""
+    frame = Frame.parse(FrameEncoder(1, 1).encode(message))
+    body = frame.body[:4] + b"\0" + frame.body[5:]
+    return b"\xfd" + body + x25(body + STANDARD.extras[frame.message_id]).to_bytes(2, "little")
+
+
+def orders(told: Told) -> list[int]:
+    """The radio that each order went over."""
+    return [index for index, _ in told.of(m.CommandLong)]
+
+
+def an_order_to_all() -> m.CommandLong:
+    return m.CommandLong(0, 0, 400, 0, 1.0, 0, 0, 0, 0, 0, 0)
+
+
+async def opened(radios: Radios) -> None:
+    for far in radios.far:
+        await far.open(Deaf())
+
+
+async def test_system_0_is_nobody_whom_orders_for_all_would_be_sent_to() -> None:
+    radios = Radios(2)
+    told = Told(radios)
+    await opened(radios)
+    async with open_connection(radios.together()) as connection:
+        radios.far[0].write(FrameEncoder(1, 1).encode(AUTOPILOT))
+        radios.far[0].write(of_system_0(AUTOPILOT))
+        await anyio.sleep(0.5)
+        connection.send(an_order_to_all())
+        assert sorted(orders(told)) == [0, 1]
+
+
+async def test_an_order_for_all_reaches_nobody_twice_where_one_link_reaches_everybody() -> None:
+    """A ground station was heard over the other radio first, and over the vehicle's as well."""
+    radios = Radios(2)
+    told = Told(radios)
+    await opened(radios)
+    async with open_connection(radios.together()) as connection:
+        radios.far[1].write(FrameEncoder(250, 190).encode(STATION))
+        await anyio.sleep(0.1)
+        for far in radios.far:
+            far.write(FrameEncoder(250, 190).encode(STATION))
+        radios.far[0].write(FrameEncoder(1, 1).encode(AUTOPILOT))
+        await anyio.sleep(0.1)
+        connection.send(an_order_to_all())
+        assert len(orders(told)) == 1
+
+
+def test_another_vehicle_is_not_believed_because_ours_was_silent_for_long() -> None:
+    """Two that were switched on ten seconds apart; ours is switched off."""
+    choice, now = LinkChoice(needs_proof=True), 0.0
+    while now < 30.0:
+        for link in (0, 1):
+            choice.heard(link, now, is_costly=False)
+        choice.choose(now)
+        choice.note_answer(0, now, 100.0 + now, 0.02, now)
+        choice.note_answer(1, now, 90.0 + now, 0.02, now)
+        now += 0.5
+    assert choice.candidates[1].is_doubted
+    while now < 3000.0:
+        choice.heard(1, now, is_costly=False)
+        choice.note_answer(1, now, 90.0 + now, 0.02, now)
+        choice.choose(now)
+        assert choice.used is choice.candidates[0]
+        now += 0.5
+
+
+def test_a_link_that_comes_after_a_long_silence_is_believed_by_its_clock() -> None:
+    choice, now = LinkChoice(needs_proof=True), 0.0
+    while now < 30.0:
+        choice.heard(0, now, is_costly=False)
+        choice.choose(now)
+        choice.note_answer(0, now, 100.0 + now, 0.02, now)
+        now += 0.5
+    now = 600.0
+    for _ in range(4):
+        choice.heard(1, now, is_costly=False)
+        choice.note_answer(1, now - 0.1, 100.03 + now - 0.1, 0.2, now)
+        now += 0.5
+    choice.choose(now)
+    assert choice.used is choice.candidates[1]
+
+
+@pytest.mark.parametrize("late_s", [2.0, 4.0, 6.0])
+@pytest.mark.parametrize("dies", [False, True])
+async def test_what_came_long_ago_over_the_other_link_does_not_come_again(late_s: float, dies: bool) -> None:
+    """Both radios carry one stream of 100 frames a second; one of them begins to be late, and the other dies perhaps."""
+    radios = Radios(2)
+    await opened(radios)
+    async with open_connection(radios.together()) as connection:
+        came: list[int] = []
+        states: list[int] = []
+        connection.bus.attach(m.Attitude, lambda message: came.append(message.time_boot_ms))
+        connection.bus.attach(m.Heartbeat, lambda message: states.append(message.base_mode))
+        encoder = FrameEncoder(1, 1)
+        for step in range(1200):
+            if step == 400:
+                radios.links[1].incoming.model = FaultModel(delay_s=late_s)
+            if step == 500 and dies:
+                radios.cut(0)
+            frames = [encoder.encode(m.Attitude(10_000 + 10 * step, 0, 0, 0, 0, 0, 0))]
+            if step % 50 == 0:
+                armed = 128 if step < 450 else 0
+                frames.append(encoder.encode(m.Heartbeat(2, 3, 1 | armed, 0, 4)))
+            for data in frames:
+                for far in radios.far:
+                    far.write(data)
+            await anyio.sleep(0.01)
+        assert came == sorted(set(came))
+        assert sorted(states, reverse=True) == states, "armed was not told after disarmed"
+
+
+async def test_signed_copies_are_taken_whichever_comes_first() -> None:
+    """The quicker radio is not in use yet; nothing but heartbeats comes, which prove nothing."""
+    radios = Radios(2, models=[FaultModel(delay_s=0.05), GOOD])
+    await opened(radios)
+    key = SigningKey(bytes(range(32)))
+    async with open_connection(radios.together(), signing=Signing(key)) as connection:
+        refused = News(connection, events.FrameRefused)
+        states: list[int] = []
+        connection.bus.attach(m.Heartbeat, lambda message: states.append(message.custom_mode))
+        vehicle = FrameEncoder(1, 1)
+        vehicle.signing = Signing(key)
+        for step in range(10):
+            data = vehicle.encode(m.Heartbeat(2, 3, 81, step, 4), connection.unix_time())
+            for far in radios.far[: 1 if step == 0 else 2]:
+                far.write(data)
+            await anyio.sleep(1)
+        assert states == list(range(10))
+        assert refused.all == []
