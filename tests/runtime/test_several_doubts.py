@@ -12,13 +12,12 @@ import aerokit
 from aerokit import events
 from aerokit import messages as m
 from aerokit.errors import BusyError, LinkLost, LinkOpenError
-from aerokit.links import FaultModel, Link, MemoryLink, Peer, Receiver, SeveralLinks, memory_link_pair
+from aerokit.links import FaultModel, Link, MemoryLink, Peer, SeveralLinks, memory_link_pair
 from aerokit.mavlink.checksum import x25
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.signing import Signing, SigningKey
-from aerokit.runtime.connection import Connection
 from aerokit.runtime.link_choice import LinkChoice
 from aerokit.runtime.link_state import LinkState
 from aerokit.runtime.opening import open_connection
@@ -133,7 +132,7 @@ def test_a_link_that_comes_after_a_long_silence_is_believed_by_its_clock() -> No
 @pytest.mark.parametrize("late_s", [2.0, 4.0, 6.0])
 @pytest.mark.parametrize("dies", [False, True])
 async def test_what_came_long_ago_over_the_other_link_does_not_come_again(late_s: float, dies: bool) -> None:
-    """Both radios carry one stream of 100 frames a second; one of them begins to be late, and the other dies perhaps."""
+    """Both radios carry 100 frames a second; one of them begins to be late, and the other dies perhaps."""
     radios = Radios(2)
     await opened(radios)
     async with open_connection(radios.together()) as connection:

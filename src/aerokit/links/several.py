@@ -139,8 +139,7 @@ class SeveralLinks(Link):
         for index, failure in enumerate(results):
             if failure is not None and not self._is_closed:
                 self._begin_opening(index)
-        if self._last_loss is not None and not any(self._is_there):
-            self._all_gone(self._last_loss)
+        self._look_whether_any_is_there()
 
     def write(self, data: bytes, peer: Peer = None) -> None:
         """See `Link.write`; None writes to every peer of every link."""
@@ -246,12 +245,13 @@ class SeveralLinks(Link):
         self._is_there[index] = False
         self._tell(index)
         self._last_loss = error
-        if not self._is_opening and not any(self._is_there) and self._lost_at is None:
-            self._all_gone(error)
+        self._look_whether_any_is_there()
 
-    def _all_gone(self, error: LinkLost) -> None:
-        receiver = self._receiver
-        if receiver is None:
+    def _look_whether_any_is_there(self) -> None:
+        receiver, error = self._receiver, self._last_loss
+        if error is None or receiver is None or self._is_opening:
+            return
+        if any(self._is_there) or self._lost_at is not None:
             return
         if self._stays and self._may_come_back:
             self._lost_at = asyncio.get_running_loop().time()
