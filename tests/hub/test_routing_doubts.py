@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from test_routing import CAMERA, COPTER, MOVES_AFTER_S, STATION, Stage, order
 
+from aerokit.mavlink.messages import ParamRequestList
+
 
 def a_camera_of_another_age() -> Stage:
     """Vehicle and camera are heard at ports a and b; of each, another one was the first."""
@@ -62,3 +64,13 @@ def test_a_port_that_comes_back_is_noticed() -> None:
     assert stage.hear("c", order(1, 0), 255, 190) == {"a", "b"}
     stage.hear("b", COPTER)
     assert stage.hear("c", order(1, 0), 255, 190) == {"a"}
+
+
+def test_an_order_for_everybody_reaches_a_vehicle_once() -> None:
+    stage = a_camera_of_another_age()
+    assert stage.hear("c", order(0, 0), 255, 190) == {"a", "d"}
+    assert stage.hear("c", ParamRequestList(0, 0), 255, 190) == {"a", "b", "d"}, "it orders nothing"
+    assert stage.hear("c", STATION, 255, 190) == {"a", "b", "d"}
+    stage.now += MOVES_AFTER_S + 1
+    stage.hear("b", COPTER)
+    assert stage.hear("c", order(0, 0), 255, 190) >= {"b"}, "it is reached there now"

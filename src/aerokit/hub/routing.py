@@ -72,7 +72,8 @@ class Node(Generic[PortT]):
 class Router(Generic[PortT]):
     """Learns behind which ports everybody is, and says where frames go.
 
-    - what is for everybody goes to all other ports;
+    - what is for everybody goes to all other ports; an order for everybody not to those by which it would reach
+      vehicles a second time;
     - what is for one component, or for all of one system, goes to the ports behind which it was heard, and nowhere
       while it was not; what is for an unknown component of a known system goes where the system is;
     - to a vehicle that is heard at several ports it goes by one of them, so that no order is given twice: the first
@@ -199,6 +200,8 @@ class Router(Generic[PortT]):
                 return Plan(name, message_id, where, reason="no_route")  # not kept: there are many nobodies
         else:
             found = dict.fromkeys(self._nodes)
+            if self._targets.is_order(message_id):
+                found = {number: None for number in found if not self._would_be_second(number)}
         found.pop(node.number, None)
         if message_id in _RADIOS:
             found = {number: None for number in found if not self._has_autopilot(number)}
@@ -233,6 +236,11 @@ class Router(Generic[PortT]):
                     if sender.is_autopilot or not any(each.is_heard_at(number) for each in autopilots)
                 )
         return found
+
+    def _would_be_second(self, number: int) -> bool:
+        """Whether the autopilots that are heard at a port are all reached by others."""
+        here = [each for each in self._senders.values() if each.is_autopilot and each.is_heard_at(number)]
+        return bool(here) and all(each.number != number for each in here)
 
     def _has_autopilot(self, number: int) -> bool:
         return any(each.is_autopilot and number in each.heard for each in self._senders.values())
