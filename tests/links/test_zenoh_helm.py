@@ -196,3 +196,15 @@ def test_a_client_without_the_helm_gets_only_reads_through(several: list[Message
 )
 def test_what_is_no_refusal_is_no_answer(answer: bytes) -> None:
     assert refusals_in(answer) == ()
+
+
+def test_of_two_programs_with_one_name_one_orders() -> None:
+    gate = Gate("ground-1", Helm())
+    assert gate.receive(send(ARM), "free", 0.0, 1) == (send(ARM), [])
+    passed, (told,) = gate.receive(send(ASK) + send(ARM), "free", 1.0, 2)
+    assert passed == send(ASK)
+    assert told.reason == "another program is called ground-1, too"
+    assert gate.receive(send(ARM), "take", 2.0, 2) == (send(ARM), [])
+    assert gate.receive(send(ARM), "free", 3.0, 1)[0] == b""
+    later = 2.0 + HELM_KEPT_S + 0.1
+    assert gate.receive(send(ARM), "free", later, 1) == (send(ARM), [])

@@ -81,3 +81,16 @@ def test_another_version_is_not_listened_to() -> None:
     assert Beacon.decode(beacon.encode().replace(b'"version":1', b'"version":2')) is None
     assert Stamp.decode(b"\x02" + Stamp(1, 1, 1, 1).encode()[1:]) is None
     assert read_sent_at(b"\x02" + sent_at(1, 1.0)[1:]) is None
+
+
+@pytest.mark.parametrize("clock", ["NaN", "Infinity", "-Infinity", "1" + 400 * "0"])
+def test_a_beacon_whose_clock_is_no_time_is_none(clock: str) -> None:
+    data = Beacon(1, 1, 1.5).encode()
+    assert Beacon.decode(data) is not None
+    assert Beacon.decode(data.replace(b"1.5", clock.encode())) is None
+
+
+def test_no_client_is_called_as_everybody_is() -> None:
+    with pytest.raises(LocalProtocolError, match="client = 'all' is not allowed"):
+        check_name("client", "all")
+    assert check_name("name", "all") == "all"

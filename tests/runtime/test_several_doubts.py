@@ -12,14 +12,14 @@ import aerokit
 from aerokit import events
 from aerokit import messages as m
 from aerokit.errors import BusyError, LinkLost, LinkOpenError
-from aerokit.links import FaultModel, Link, MemoryLink, Peer, Receiver, SeveralLinks, memory_link_pair
+from aerokit.links import FaultModel, Link, MemoryLink, Peer, SeveralLinks, memory_link_pair
 from aerokit.mavlink.checksum import x25
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.signing import Signing, SigningKey
-from aerokit.runtime.connection import Connection
 from aerokit.runtime.link_choice import LinkChoice
+from aerokit.runtime.link_state import LinkState
 from aerokit.runtime.opening import open_connection
 from aerokit.sim import SimulatedCopter
 from aerokit.testing import VIRTUAL_BACKEND
@@ -132,7 +132,7 @@ def test_a_link_that_comes_after_a_long_silence_is_believed_by_its_clock() -> No
 @pytest.mark.parametrize("late_s", [2.0, 4.0, 6.0])
 @pytest.mark.parametrize("dies", [False, True])
 async def test_what_came_long_ago_over_the_other_link_does_not_come_again(late_s: float, dies: bool) -> None:
-    """Both radios carry one stream of 100 frames a second; one of them begins to be late, and the other dies perhaps."""
+    """Both radios carry 100 frames a second; one of them begins to be late, and the other dies perhaps."""
     radios = Radios(2)
     await opened(radios)
     async with open_connection(radios.together()) as connection:
@@ -176,3 +176,106 @@ async def test_signed_copies_are_taken_whichever_comes_first() -> None:
             await anyio.sleep(1)
         assert states == list(range(10))
         assert refused.all == []
+
+
+async def test_a_link_that_is_in_use_elsewhere_stays_as_it_is() -> None:
+    near, far = memory_link_pair()
+    other, _ = memory_link_pair()
+    await far.open(Deaf())
+    async with open_connection(near) as connection:
+        with pytest.raises(BusyError):
+            async with open_connection([other, near]):
+                pass
+        far.write(FrameEncoder(1, 1).encode(AUTOPILOT))
+        await anyio.sleep(0.1)
+        assert (1, 1) in connection.heard
+
+
+class SlowLink(MemoryLink):
+    """Takes a second to open."""
+
+    async def _connect(self) -> None:
+        await anyio.sleep(1)
+        await super()._connect()
+
+
+async def test_a_link_that_goes_while_another_is_still_being_opened_does_not_end_the_connection() -> None:
+    near, far = memory_link_pair()
+    await far.open(Deaf())
+    async with anyio.create_task_group() as tasks:
+
+        async def close_soon() -> None:
+            await anyio.sleep(0.5)
+            far.close()
+
+        tasks.start_soon(close_soon)
+        async with open_connection([near, SlowLink("memory:slow")]) as connection:
+            await anyio.sleep(1)
+            assert connection.is_open
+            assert connection.links is not None
+            assert [each.state for each in connection.links.value] == [LinkState.LOST, LinkState.CONNECTED]
+
+
+async def test_links_that_all_go_while_they_are_opened_are_an_error() -> None:
+    near, far = memory_link_pair()
+    await far.open(Deaf())
+
+    class Refused(SlowLink):
+        async def _connect(self) -> None:
+            await super()._connect()
+            raise OSError(111, "refused")
+
+    async with anyio.create_task_group() as tasks:
+
+        async def close_soon() -> None:
+            await anyio.sleep(0.5)
+            far.close()
+
+        tasks.start_soon(close_soon)
+        with pytest.raises((LinkLost, LinkOpenError)):
+            async with open_connection([near, Refused("memory:refused")]) as connection:
+                connection.raise_if_ended()
+
+
+async def test_a_link_that_is_opened_late_ends_the_interruption() -> None:
+    near, far = memory_link_pair()
+    await far.open(Deaf())
+    tries = 0
+
+    class Third(MemoryLink):
+        """Opens at the third attempt."""
+
+        async def _connect(self) -> None:
+            nonlocal tries
+            tries += 1
+            if tries < 6:
+                raise OSError(111, "refused")
+            await super()._connect()
+
+    late = Third("memory:late")
+    both: list[Link] = [near, late]
+    together = SeveralLinks([partial(both.__getitem__, index) for index in range(2)], stays=True)
+    async with open_connection(together) as connection:
+        news = News(connection, events.LinkInterrupted, events.LinkRestored)
+        far.close()
+        await anyio.sleep(0.1)
+        assert [type(each) for each in news.all] == [events.LinkInterrupted]
+        await anyio.sleep(20)
+        assert [type(each) for each in news.all] == [events.LinkInterrupted, events.LinkRestored]
+        late._lose("gone")
+        assert not connection.is_open
+
+
+async def test_a_camera_that_is_heard_first_over_another_link_does_not_hide_the_vehicle() -> None:
+    radios = Radios(2)
+    camera = FrameEncoder(1, 100)
+    copter = SimulatedCopter(boot_time_s=5.0)
+    async with over(radios, copter, server={"vehicles_on": [[copter], []]}) as connection:
+        for _ in range(3):
+            radios.far[1].write(camera.encode(m.Heartbeat(30, 8, 0, 0, 4)))
+            await anyio.sleep(1)
+        async with aerokit.connect(connection, timeout=20) as vehicle:
+            assert vehicle.system_id == 1
+            told = connection.links
+            assert told is not None
+            assert told.value[0].used_for == (1,)

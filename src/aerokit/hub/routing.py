@@ -79,11 +79,13 @@ class Node(Generic[PortT]):
 class Router(Generic[PortT]):
     """Learns behind which ports everybody is, and says where frames go.
 
-    - what is for everybody goes to all other ports;
+    - what is for everybody goes to all other ports; an order for everybody not to those by which it would reach
+      vehicles a second time;
     - what is for one component, or for all of one system, goes to the ports behind which it was heard, and nowhere
       while it was not; what is for an unknown component of a known system goes where the system is;
     - to a vehicle that is heard at several ports it goes by one of them, so that no order is given twice: the first
-      one, until nothing has come from there for 3.5 s. Ground stations that share their ids all get it;
+      one, until nothing has come from there for 3.5 s; what is for all of a system goes to its autopilot in the same
+      way, and to its other components where that is not heard. Ground stations that share their ids all get it;
     - nothing goes back to where it came from, and nothing is passed on twice: copies that come by another way, within
       two seconds, end here, and teach nothing;
     - SETUP_SIGNING, which holds a key, goes nowhere; a telemetry radio's word on its own link does not go to vehicles.
@@ -205,6 +207,8 @@ class Router(Generic[PortT]):
                 return Plan(name, message_id, where, reason="no_route")  # not kept: there are many nobodies
         else:
             found = dict.fromkeys(self._nodes)
+            if self._targets.is_order(message_id):
+                found = {number: None for number in found if not self._would_be_second(number)}
         found.pop(node.number, None)
         if message_id in _RADIOS:
             found = {number: None for number in found if not self._has_autopilot(number)}
@@ -223,11 +227,27 @@ class Router(Generic[PortT]):
     def _ways_to(self, system_id: int, component_id: int) -> dict[int, None]:
         """Numbers of the ports by which a component, or all of a system, is reached."""
         exact = self._senders.get(system_id | component_id << 8) if component_id else None
+        if exact is not None:
+            return dict.fromkeys(exact.ways)
         known = [each for each in self._senders.values() if each.system_id == system_id]
+        autopilots = [each for each in known if each.is_autopilot]
         found: dict[int, None] = {}
-        for sender in known if exact is None else [exact]:
-            found.update(dict.fromkeys(sender.ways))
+        for sender in sorted(known, key=lambda each: not each.is_autopilot):
+            # Whoever is heard where the autopilot is reached is reached there, too; and where the autopilot is heard as
+            # well, it would be given the order a second time.
+            is_reached = sender.is_vehicles and any(sender.is_heard_at(number) for number in found)
+            if not is_reached:
+                found.update(
+                    (number, None)
+                    for number in sender.ways
+                    if sender.is_autopilot or not any(each.is_heard_at(number) for each in autopilots)
+                )
         return found
+
+    def _would_be_second(self, number: int) -> bool:
+        """Whether the autopilots that are heard at a port are all reached by others."""
+        here = [each for each in self._senders.values() if each.is_autopilot and each.is_heard_at(number)]
+        return bool(here) and all(each.number != number for each in here)
 
     def _has_autopilot(self, number: int) -> bool:
         return any(each.is_autopilot and number in each.heard for each in self._senders.values())

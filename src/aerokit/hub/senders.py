@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import MavAutopilot, MavType
@@ -57,9 +58,13 @@ class Sender:
         """Numbers of the ports that what is for it goes to."""
         return (self.number,) if self.is_vehicles else self.heard
 
+    def is_heard_at(self, number: int) -> bool:
+        """Whether it has lately been heard at a port, as of the time when it was heard at `number` last."""
+        return number == self.number or self.heard.get(number, -math.inf) >= self.heard_at - MOVES_AFTER_S
+
     def hear_elsewhere(self, number: int, now: float) -> bool:
         """Something came by another port than `number`; whether that changes where to send."""
-        is_new = number not in self.heard
+        is_new = now - self.heard.get(number, -math.inf) > MOVES_AFTER_S
         self.heard[number] = now
         if now - self.heard_at > MOVES_AFTER_S:
             self.heard[self.number] = self.heard_at

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from typing import TYPE_CHECKING
 
 from aerokit.errors import AerokitError, BusyError, LinkLost
@@ -10,6 +11,7 @@ from aerokit.hub.border import Border
 from aerokit.hub.targets import Targets
 from aerokit.links.link import Link, Peer
 from aerokit.mavlink.frame import MAGIC_V1, SIGNATURE_LENGTH, Frame
+from aerokit.runtime.events import HeardTwice
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -19,6 +21,8 @@ if TYPE_CHECKING:
     from aerokit.runtime.connection import Connection
 
 __all__ = ["SharedLink"]
+
+logger: logging.Logger = logging.getLogger("aerokit")
 
 
 class SharedLink(Link):
@@ -34,6 +38,7 @@ class SharedLink(Link):
         self._detachments: list[Callable[[], None]] = []
         self._border: Border | None = None
         self._lost: asyncio.Handle | None = None
+        self._is_double_told = False
         self.address: str = f"shared:{connection.link.address}"
         self.dropped_writes: int = 0
 
@@ -55,6 +60,8 @@ class SharedLink(Link):
             return
         for raw in _frames(data):
             frame = Frame.parse(raw)
+            if not self._is_double_told:
+                self._look_for_double(frame)
             if self._targets.of(frame)[0] == self._connection.source_system:
                 continue
             try:
@@ -83,6 +90,18 @@ class SharedLink(Link):
 
     async def wait_closed(self) -> None:
         """See `Link.wait_closed`."""
+
+    def _look_for_double(self, frame: Frame) -> None:
+        """Vehicles cannot tell a station that has our ids from us: what they answer to it would be taken for ours."""
+        ours = self._connection.source_system, self._connection.source_component
+        if (frame.system_id, frame.component_id) == ours:
+            self._is_double_told = True
+            logger.warning(
+                "a station shares the link of this program, and its ids %d/%d as well: each of them takes the vehicle's"
+                " answers to the other for its own; give the program others (source_system=, source_component=)",
+                *ours,
+            )
+            self._connection.bus.publish(HeardTwice(self._connection.now(), *ours))
 
     def _on_frame(self, frame: Frame, peer: Peer) -> None:
         border = self._present_border()

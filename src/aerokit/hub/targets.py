@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from aerokit.hub.kinds import Kind, kind_of
 from aerokit.hub.target_table import STANDARD_OFFSETS
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.frame import HEADER_LENGTH
@@ -48,6 +49,12 @@ class Targets:
     def is_unknown(self, message_id: int) -> bool:
         """Whether the dialect does not know a message, so that its checksum cannot have been checked."""
         return message_id not in self._dialect.rows
+
+    def is_order(self, message_id: int) -> bool:
+        """Whether it is an order to whomever it names."""
+        if self.places.get(message_id) is None:
+            return False
+        return kind_of(self._dialect[message_id].NAME, is_for_one=True) is Kind.ORDER
 
     def of(self, frame: Frame) -> tuple[int, int]:
         """System id and component id that a frame is for; 0 is everybody."""

@@ -146,24 +146,41 @@ class Gate:
         """Frames that did not pass."""
         self._client, self._helm = client, helm
         self._framer = _framer()
+        self._nonce: int | None = None  # of the program that orders under this name
+        self._nonce_at = 0.0
         self._told: dict[str, tuple[float, int]] = {}  # message → when it was told, and how many came since
 
-    def receive(self, data: bytes, wish: Wish, now: float) -> tuple[bytes, list[Told]]:
-        """Take a datagram that is from now; return what passes, and what the client is to be told."""
-        self._helm.hear(self._client, now)
+    def receive(self, data: bytes, wish: Wish, now: float, nonce: int = 0) -> tuple[bytes, list[Told]]:
+        """Take a datagram that is from now; return what passes, and what the client is to be told.
+
+        ``nonce`` tells programs apart that were given one name by mistake: the first of them is the client.
+        """
+        is_namesake = self._is_namesake(nonce, wish, now)
+        if not is_namesake:
+            self._helm.hear(self._client, now)
         passed: list[bytes] = []
         tell: list[Told] = []
         frames = self._framer.receive(data, now)
         if self._framer.waiting:  # a datagram has whole frames: what is begun in one does not end in the next
             self._framer = _framer()
         for frame in frames:
-            if is_read(frame) or (wish != "never" and self._helm.may_order(self._client, now)):
+            may_order = wish != "never" and not is_namesake
+            if is_read(frame) or (may_order and self._helm.may_order(self._client, now)):
                 passed.append(frame.raw)
                 continue
-            holder = None if wish == "never" else self._helm.holder(now)
+            holder = self._helm.holder(now) if may_order else None
             reason = "this link never orders (helm=never)" if holder is None else f"{holder} has the helm"
+            if is_namesake:
+                reason = f"another program is called {self._client}, too"
             tell += self._refuse(frame, _decoded(frame), reason, holder, now)
         return b"".join(passed), tell
+
+    def _is_namesake(self, nonce: int, wish: Wish, now: float) -> bool:
+        """Whether another program of this name was heard lately, and this one does not take the helm."""
+        if self._nonce not in (None, nonce) and wish != "take" and now - self._nonce_at <= HELM_KEPT_S:
+            return True
+        self._nonce, self._nonce_at = nonce, now
+        return False
 
     def refuse_late(self, data: bytes, now: float) -> list[Told]:
         """Take a datagram that is not from now: nothing of it passes; its orders are told.

@@ -78,6 +78,9 @@ class SeveralLinks(Link):
         self._is_there = [False] * len(self._links)
         self._kept: list[set[Peer]] = [set() for _ in self._links]
         self._openings: set[asyncio.Task[None]] = set()
+        self._strange: set[int] = set()  # in use elsewhere: not ours to close
+        self._is_opening = False
+        self._last_loss: LinkLost | None = None
         self._lost_at: float | None = None
         self._dropped = 0
 
@@ -121,17 +124,22 @@ class SeveralLinks(Link):
         if self._was_opened:
             raise BusyError(f"{self.address} is open; a link is opened once")
         self._was_opened, self._receiver = True, receiver
+        self._strange.clear()
+        self._is_opening, self._last_loss = True, None
         openings = [asyncio.ensure_future(self._open_one(index)) for index in range(len(self._links))]
         try:
-            failures = [each for each in await asyncio.gather(*openings) if each is not None]
-            if len(failures) == len(self._links):
-                raise LinkOpenError("none of the links can be opened: " + "; ".join(map(str, failures)))
+            results = await asyncio.gather(*openings)
+            if all(results):
+                raise LinkOpenError("none of the links can be opened: " + "; ".join(map(str, results)))
         except BaseException:
             await self._give_up_opening(openings)
             raise
-        for index, is_there in enumerate(self._is_there):
-            if not is_there and not self._is_closed:
+        finally:
+            self._is_opening = False
+        for index, failure in enumerate(results):
+            if failure is not None and not self._is_closed:
                 self._begin_opening(index)
+        self._look_whether_any_is_there()
 
     def write(self, data: bytes, peer: Peer = None) -> None:
         """See `Link.write`; None writes to every peer of every link."""
@@ -170,15 +178,19 @@ class SeveralLinks(Link):
             for task in self._openings:
                 with contextlib.suppress(RuntimeError):  # the loop is closed
                     task.cancel()
-            for link in self._links:
+            for link in self._own:
                 link.close()
 
     async def wait_closed(self) -> None:
         """See `Link.wait_closed`."""
         if self._openings:
             await asyncio.wait(tuple(self._openings))
-        for link in self._links:
+        for link in self._own:
             await link.wait_closed()
+
+    @property
+    def _own(self) -> list[Link]:
+        return [link for index, link in enumerate(self._links) if index not in self._strange]
 
     # ------------------------------------------------------------------------------- opening
 
@@ -188,9 +200,11 @@ class SeveralLinks(Link):
             await self._links[index].open(ears)
         except LinkOpenError as error:
             return error
-        if not ears.is_lost:
-            self._is_there[index] = True
-            self._tell(index)
+        except BusyError:
+            self._strange.add(index)
+            raise
+        if not ears.is_away:
+            self._back(index)
         return None
 
     async def _give_up_opening(self, openings: Collection[asyncio.Future[LinkOpenError | None]]) -> None:
@@ -198,9 +212,11 @@ class SeveralLinks(Link):
         for opening in openings:
             opening.cancel()
         await asyncio.wait(openings)
-        for index, link in enumerate(self._links):
+        for link in self._own:
             link.close()
-            self._links[index] = self._make_links[index]()
+        for index, make_link in enumerate(self._make_links):
+            if index not in self._strange:
+                self._links[index] = make_link()
         self._is_there = [False] * len(self._links)
         self._was_opened = False
 
@@ -228,8 +244,14 @@ class SeveralLinks(Link):
     def _gone(self, index: int, error: LinkLost) -> None:
         self._is_there[index] = False
         self._tell(index)
-        receiver = self._receiver
-        if receiver is None or any(self._is_there) or self._lost_at is not None:
+        self._last_loss = error
+        self._look_whether_any_is_there()
+
+    def _look_whether_any_is_there(self) -> None:
+        receiver, error = self._receiver, self._last_loss
+        if error is None or receiver is None or self._is_opening:
+            return
+        if any(self._is_there) or self._lost_at is not None:
             return
         if self._stays and self._may_come_back:
             self._lost_at = asyncio.get_running_loop().time()
@@ -278,7 +300,7 @@ class _Ears:
     def __init__(self, owner: SeveralLinks, index: int) -> None:
         self._owner, self._index = owner, index
         self.keeps_peers = owner._receiver is not None and keeps_peers(owner._receiver)
-        self.is_lost = False
+        self.is_away = False
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
         self._owner._heard(self._index, data, peer)
@@ -294,11 +316,13 @@ class _Ears:
             self._owner._receiver.order_refused(message, reason, helm, answers)
 
     def link_interrupted(self, error: LinkLost) -> None:
+        self.is_away = True
         self._owner._gone(self._index, error)
 
     def link_restored(self, away_s: float) -> None:
+        self.is_away = False
         self._owner._back(self._index)
 
     def link_lost(self, error: LinkLost) -> None:
-        self.is_lost = True
+        self.is_away = True
         self._owner._gone(self._index, error)

@@ -33,6 +33,8 @@ Wish = str
 
 WISHES: tuple[Wish, ...] = ("free", "take", "never")
 
+_EVERYBODY = "all"
+_LONGEST_CLOCK_S = 2.0**48
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,62}")
 _STAMP = struct.Struct(">BBIIII")  # version, wish, epoch, beacon, nonce, sequence
 _SENT = struct.Struct(">BIQ")  # version, epoch, milliseconds on the sender's clock
@@ -41,9 +43,15 @@ _SENT = struct.Struct(">BIQ")  # version, epoch, milliseconds on the sender's cl
 def check_name(what: str, name: str) -> str:
     """A name that may stand in a key: letters, digits, ``_``, ``.``, ``-``, at most 63, the first no sign.
 
+    A client must not be called "all".
+
     Raises:
         LocalProtocolError: it may not.
     """
+    if what == "client" and name == _EVERYBODY:
+        raise LocalProtocolError(
+            f"client = {name!r} is not allowed: it is the key of what is for all of them"
+        )
     if not _NAME.fullmatch(name):
         raise LocalProtocolError(
             f"{what} = {name!r} is not allowed: up to 63 letters, digits, '_', '.' and '-', a letter or digit first"
@@ -65,7 +73,7 @@ class Place(Snapshot):
     @property
     def everybody(self) -> str:
         """Frames of the vehicle side to all clients."""
-        return self.from_vehicle("all")
+        return self.from_vehicle(_EVERYBODY)
 
     @property
     def beacon(self) -> str:
@@ -121,6 +129,10 @@ class Beacon(Snapshot):
         epoch, number, helm = fields.get("epoch"), fields.get("number"), fields.get("helm")
         clock = fields.get("clock_s")
         if not (_is_u32(epoch) and _is_u32(number) and isinstance(clock, (int, float))):
+            return None
+        if (
+            not abs(clock) < _LONGEST_CLOCK_S
+        ):  # of infinity and of what is no number nothing could ever be late
             return None
         return cls(epoch, number, float(clock), helm if isinstance(helm, str) else None)  # type: ignore[arg-type]
 

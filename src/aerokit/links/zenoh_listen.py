@@ -181,7 +181,7 @@ class ZenohListen(BaseLink):
             return
         if stamp.wish == "take":
             self._helm.take(client, now)
-        passed, told = gate.receive(data, stamp.wish, now)
+        passed, told = gate.receive(data, stamp.wish, now, stamp.nonce)
         self._tell(client, told)
         if passed:
             self._deliver(passed, client)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import logging
 import math
 from contextlib import AsyncExitStack
 from typing import TYPE_CHECKING
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
     from aerokit.vehicle.vehicle import Vehicle
 
 __all__ = ["VERSION", "Publishing", "publishing"]
+
+logger: logging.Logger = logging.getLogger("aerokit")
 
 VERSION = 1
 """Of the messages: a change that a reader would misunderstand makes it 2."""
@@ -51,6 +54,7 @@ class Publishing:
         self.published = 0
         """Messages so far."""
         self._vehicle, self._publisher, self._states = vehicle, publisher, states
+        self._is_mistake_told = False
         self._told: dict[str, tuple[float, object]] = {}  # state → when it was put, and what
 
     def publish(self, now: float) -> None:
@@ -79,7 +83,15 @@ class Publishing:
             "age_s": round(age_s, 3),
             "unix_s": round(self._vehicle.connection.unix_time(), 3),
         }
-        self._publisher.put(f"{system_id}/{name}", _JSON.encode(message).encode())
+        try:
+            self._publisher.put(f"{system_id}/{name}", _JSON.encode(message).encode())
+        except (
+            Exception
+        ):  # else it would be taken for a mistake of ours, which closes the connection in mid-flight
+            if not self._is_mistake_told:
+                self._is_mistake_told = True
+                logger.exception("a publisher (%r) raised; it is asked on", self._publisher)
+            return
         self.published += 1
 
 

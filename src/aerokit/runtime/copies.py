@@ -39,8 +39,8 @@ class Copies:
         self._counts: dict[int, int] = {}  # of each sender: its frames that were no copies
         self._present: _Seen | None = None
         self.is_late: bool = False
-        """Whether the frame last asked about, which is no copy, was taken some seconds ago when it, or one like it, came
-        over another link."""
+        """Whether the frame last asked about, which is no copy, was taken seconds ago, when it came over another link;
+        or one with the same bytes."""
 
     def is_copy(self, frame: Frame, link: int) -> bool:
         """Whether exactly this frame came over another link within the last seconds, and not over this one."""

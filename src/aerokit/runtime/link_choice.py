@@ -140,6 +140,13 @@ class LinkChoice:
         candidate.heard_at = now
         return candidate
 
+    def begin_with(self, candidate: Candidate) -> None:
+        """The first autopilot of this system was heard there, which is who has to be the same behind other links."""
+        self.needs_proof = True
+        if candidate is not self.used:
+            self.used = None  # a camera's, for example
+            self.candidates = {candidate.link: candidate}
+
     def note_answer(self, link: int, at: float, told_s: float, round_trip_s: float, now: float) -> None:
         """The system has told its time over a link; ``at`` is when, by our clock."""
         candidate = self.candidates[link]

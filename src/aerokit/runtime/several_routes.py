@@ -107,9 +107,10 @@ class SeveralRoutes:
         choice = self._choices.get(frame.system_id)
         if choice is None:
             choice = self._choices[frame.system_id] = LinkChoice(needs_proof=is_autopilot)
-        choice.needs_proof |= is_autopilot
         is_costly = _link(peer) in self._link.costly
-        choice.heard(_link(peer), frame.received_at, is_costly=is_costly)
+        candidate = choice.heard(_link(peer), frame.received_at, is_costly=is_costly)
+        if is_autopilot and not choice.needs_proof:
+            choice.begin_with(candidate)
         if counters is not None:
             self._counters.setdefault((frame.system_id, _link(peer)), {})[frame.component_id] = counters
         if choice.used is None:

@@ -1,0 +1,76 @@
+"""Vehicles at several ports: what is for them goes by one of them, whoever else of the system is where."""
+
+from __future__ import annotations
+
+from test_routing import CAMERA, COPTER, MOVES_AFTER_S, STATION, Stage, order
+
+from aerokit.mavlink.messages import ParamRequestList
+
+
+def a_camera_of_another_age() -> Stage:
+    """Vehicle and camera are heard at ports a and b; of each, another one was the first."""
+    stage = Stage()
+    stage.hear("a", COPTER)
+    stage.hear("b", CAMERA, 1, 100)
+    for _ in range(2):  # the first is like the other port's: a copy
+        stage.hear("b", COPTER)
+        stage.hear("a", CAMERA, 1, 100)
+    stage.hear("c", STATION, 255, 190)
+    return stage
+
+
+def test_what_is_for_all_of_a_system_goes_to_its_autopilot_once() -> None:
+    stage = a_camera_of_another_age()
+    assert stage.hear("c", order(1, 0), 255, 190) == {"a"}
+    assert stage.hear("c", order(1, 1), 255, 190) == {"a"}
+    assert stage.hear("c", order(1, 100), 255, 190) == {"b"}
+    assert len(stage.hear("c", order(1, 77), 255, 190)) == 1, "of a component that is not known"
+
+
+def test_it_is_so_after_the_autopilot_has_moved() -> None:
+    stage = Stage()
+    for port in "ab":
+        stage.hear(port, COPTER)
+        stage.hear(port, CAMERA, 1, 100)
+    stage.hear("c", STATION, 255, 190)
+    stage.now += 1.0
+    stage.hear("a", CAMERA, 1, 100)
+    stage.now += MOVES_AFTER_S - 0.5
+    stage.hear("b", COPTER)
+    stage.hear("b", CAMERA, 1, 100)
+    assert stage.hear("c", order(1, 1), 255, 190) == {"b"}
+    assert stage.hear("c", order(1, 0), 255, 190) == {"b"}
+
+
+def test_a_camera_at_a_port_of_its_own_hears_what_is_for_all() -> None:
+    stage = Stage()
+    stage.hear("a", COPTER)
+    stage.hear("b", CAMERA, 1, 100)
+    stage.hear("c", STATION, 255, 190)
+    assert stage.hear("c", order(1, 0), 255, 190) == {"a", "b"}
+
+
+def test_a_port_that_comes_back_is_noticed() -> None:
+    """The vehicle was heard there long ago: until it is heard there again, the camera is reached there."""
+    stage = Stage()
+    stage.hear("b", COPTER)
+    stage.hear("a", COPTER)
+    stage.now += MOVES_AFTER_S + 1
+    stage.hear("a", COPTER)
+    stage.now += MOVES_AFTER_S + 1
+    stage.hear("a", COPTER)
+    stage.hear("b", CAMERA, 1, 100)
+    stage.hear("c", STATION, 255, 190)
+    assert stage.hear("c", order(1, 0), 255, 190) == {"a", "b"}
+    stage.hear("b", COPTER)
+    assert stage.hear("c", order(1, 0), 255, 190) == {"a"}
+
+
+def test_an_order_for_everybody_reaches_a_vehicle_once() -> None:
+    stage = a_camera_of_another_age()
+    assert stage.hear("c", order(0, 0), 255, 190) == {"a", "d"}
+    assert stage.hear("c", ParamRequestList(0, 0), 255, 190) == {"a", "b", "d"}, "it orders nothing"
+    assert stage.hear("c", STATION, 255, 190) == {"a", "b", "d"}
+    stage.now += MOVES_AFTER_S + 1
+    stage.hear("b", COPTER)
+    assert stage.hear("c", order(0, 0), 255, 190) >= {"b"}, "it is reached there now"

@@ -1,0 +1,38 @@
+"""A station that has the ids of the program whose link it shares: told, for answers cannot be told apart."""
+
+from __future__ import annotations
+
+import anyio
+import pytest
+from hub_stage import Program
+
+import aerokit
+from aerokit import events
+from aerokit.hub import shared
+from aerokit.links import memory_link_pair
+from aerokit.mavlink.messages import Heartbeat
+from aerokit.sim import SimulatedCopter, SimulatorServer
+from aerokit.testing import run_virtual
+
+
+@pytest.mark.parametrize("component", [190, 191])
+def test_a_station_with_our_ids_is_told_of_once(component: int) -> None:
+    near, far = memory_link_pair()
+
+    async def run() -> None:
+        async with (
+            SimulatorServer(SimulatedCopter(boot_time_s=0.0), far),
+            aerokit.open_connection(near) as connection,
+            Program(255, component) as station,
+            shared(connection, [station.endpoint("station")]),
+        ):
+            told: list[events.Event] = []
+            connection.bus.attach_event(events.HeardTwice, told.append)
+            for _ in range(3):
+                station.say(Heartbeat(6, 8, 1, 0, 4))
+                await anyio.sleep(1)
+            assert [(each.system_id, each.component_id) for each in told] == (  # type: ignore[attr-defined]
+                [(255, 190)] if component == 190 else []
+            )
+
+    run_virtual(run())
