@@ -18,7 +18,7 @@ from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.signing import Signing, SigningKey
-from aerokit.runtime.link_choice import LinkChoice
+from aerokit.runtime.link_choice import PATIENCE_S, STEADY_S, LinkChoice
 from aerokit.runtime.link_state import LinkState
 from aerokit.runtime.opening import open_connection
 from aerokit.sim import SimulatedCopter
@@ -279,3 +279,39 @@ async def test_a_camera_that_is_heard_first_over_another_link_does_not_hide_the_
             told = connection.links
             assert told is not None
             assert told.value[0].used_for == (1,)
+
+
+async def test_no_order_arrives_after_a_newer_one_because_a_better_link_was_taken() -> None:
+    """Over the radio in use an order takes a second and a half; a better one is taken while it is under way."""
+    copter = SimulatedCopter(boot_time_s=0.0)
+    radios = Radios(2, models=[FaultModel(delay_s=1.5), GOOD])
+    radios.cut(1)
+    async with over(radios, copter) as connection, aerokit.connect(connection) as vehicle:
+        await vehicle.wait_ready()
+        await anyio.sleep(20)
+        news = News(connection)
+        radios.mend(1)
+        choice = connection._routes._choices[1]  # type: ignore[union-attr]
+        with anyio.fail_after(60):
+            while choice._better is None or connection.now() - choice._better_since < 2.0:  # noqa: ASYNC110
+                await anyio.sleep(0.05)
+            connection.send(m.CommandLong(1, 1, 400, 0, 1.0, 0, 0, 0, 0, 0, 0))
+            while not news.chosen:  # noqa: ASYNC110
+                await anyio.sleep(0.05)
+        connection.send(m.CommandLong(1, 1, 400, 0, 0.0, 0, 0, 0, 0, 0, 0))
+        await anyio.sleep(5)
+        assert not copter.is_armed
+        assert news.chosen == [(radios.links[1].address, "better")]
+
+
+def test_orders_without_end_put_a_better_link_off_for_a_while_only() -> None:
+    choice, now, changed_at = LinkChoice(needs_proof=False), 0.0, None
+    while now < 40.0 and changed_at is None:
+        for link, round_trip_s in ((0, 1.0), (1, 0.02)):
+            choice.heard(link, now, is_costly=False).note_round_trip(round_trip_s, now)
+        choice.ordered(now)
+        if choice.choose(now) == "better":
+            changed_at = now
+        now += 0.05
+    assert changed_at is not None
+    assert STEADY_S + PATIENCE_S <= changed_at <= STEADY_S + PATIENCE_S + 0.2

@@ -52,6 +52,14 @@ ANSWERS = frozenset(
     )
 )  # fmt: skip
 """What is no state of the vehicle: it does not grow old on its way."""
+ORDERS = frozenset(
+    each.ID
+    for each in (
+        m.CommandLong, m.CommandInt, m.SetMode, m.MissionSetCurrent, m.MissionClearAll, m.ParamSet,
+        m.SetPositionTargetGlobalInt, m.SetPositionTargetLocalNed, m.SetAttitudeTarget,
+    )
+)  # fmt: skip
+"""What must not arrive after a newer one."""
 FOR_ALL = frozenset(each.ID for each in (m.Heartbeat, m.Timesync, m.Ping))
 """What everybody on every link is told: it orders nothing."""
 
@@ -157,7 +165,10 @@ class SeveralRoutes:
             choice = self._choices.get(system_id)
             if choice is None or choice.used is None:
                 return EVERY_PEER
-            self._choose(system_id, choice, self._connection.now())
+            now = self._connection.now()
+            self._choose(system_id, choice, now)
+            if message is None or message.ID in ORDERS:
+                choice.ordered(now)
             return self._peers_on(self._link_to(choice, (system_id, component_id)), system_id, component_id)
         if message is not None and message.ID in FOR_ALL:
             return EVERY_PEER
