@@ -306,6 +306,8 @@ async def test_no_order_arrives_after_a_newer_one_because_a_better_link_was_take
 
 def test_orders_without_end_put_a_better_link_off_for_a_while_only() -> None:
     choice, now, changed_at = LinkChoice(needs_proof=False), 0.0, None
+    choice.heard(0, now, is_costly=False)
+    choice.choose(now)
     while now < 40.0 and changed_at is None:
         for link, round_trip_s in ((0, 1.0), (1, 0.02)):
             choice.heard(link, now, is_costly=False).note_round_trip(round_trip_s, now)
