@@ -206,6 +206,7 @@ class LinkChoice:
         if former is not None:
             longer_s = ((to.round_trip_s or 0.0) - (former.round_trip_s or 0.0)) / 2
             self.fresh_after = former.heard_at + longer_s + JITTER_S
+            former.is_proven = True  # the one behind the other link is the same as was behind this one
         self.former, self.used, self.changed_at, self._better = former, to, now, None
         return reason
 
