@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from test_routing import CAMERA, COPTER, MOVES_AFTER_S, STATION, Stage, order
+from test_routing import CAMERA, COPTER, STATION, Stage, order
 
+from aerokit.hub.senders import MOVES_AFTER_S
 from aerokit.mavlink.messages import ParamRequestList
 
 

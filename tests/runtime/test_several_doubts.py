@@ -17,8 +17,10 @@ from aerokit.mavlink.checksum import x25
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.frame import Frame
+from aerokit.mavlink.message import Message
 from aerokit.mavlink.signing import Signing, SigningKey
-from aerokit.runtime.link_choice import LinkChoice
+from aerokit.runtime.connection import Connection
+from aerokit.runtime.link_choice import PATIENCE_S, STEADY_S, LinkChoice
 from aerokit.runtime.link_state import LinkState
 from aerokit.runtime.opening import open_connection
 from aerokit.sim import SimulatedCopter
@@ -279,3 +281,100 @@ async def test_a_camera_that_is_heard_first_over_another_link_does_not_hide_the_
             told = connection.links
             assert told is not None
             assert told.value[0].used_for == (1,)
+
+
+async def test_no_order_arrives_after_a_newer_one_because_a_better_link_was_taken() -> None:
+    """Over the radio in use an order takes a second and a half; a better one is taken while it is under way."""
+    copter = SimulatedCopter(boot_time_s=0.0)
+    radios = Radios(2, models=[FaultModel(delay_s=1.5), GOOD])
+    radios.cut(1)
+    async with over(radios, copter) as connection, aerokit.connect(connection) as vehicle:
+        await vehicle.wait_ready()
+        await anyio.sleep(20)
+        news = News(connection)
+        radios.mend(1)
+        assert connection._several is not None
+        choice = connection._several._choices[1]
+        with anyio.fail_after(60):
+            while choice._better is None or connection.now() - choice._better_since < 2.0:  # noqa: ASYNC110
+                await anyio.sleep(0.05)
+            connection.send(m.CommandLong(1, 1, 400, 0, 1.0, 0, 0, 0, 0, 0, 0))
+            while not news.chosen:  # noqa: ASYNC110
+                await anyio.sleep(0.05)
+        connection.send(m.CommandLong(1, 1, 400, 0, 0.0, 0, 0, 0, 0, 0, 0))
+        await anyio.sleep(5)
+        assert not copter.is_armed
+        assert news.chosen == [(radios.links[1].address, "better")]
+
+
+def test_orders_without_end_put_a_better_link_off_for_a_while_only() -> None:
+    choice, now, changed_at = LinkChoice(needs_proof=False), 0.0, None
+    choice.heard(0, now, is_costly=False)
+    choice.choose(now)
+    while now < 40.0 and changed_at is None:
+        for link, round_trip_s in ((0, 1.0), (1, 0.02)):
+            choice.heard(link, now, is_costly=False).note_round_trip(round_trip_s, now)
+        choice.ordered(now)
+        if choice.choose(now) == "better":
+            changed_at = now
+        now += 0.05
+    assert changed_at is not None
+    assert STEADY_S + PATIENCE_S <= changed_at <= STEADY_S + PATIENCE_S + 0.2
+
+
+class Ports:
+    """An autopilot with a port for each radio, each with numbers of its own."""
+
+    def __init__(self, radios: Radios) -> None:
+        self._far = radios.far
+        self._encoders = [FrameEncoder(1, 1) for _ in radios.far]
+
+    def say(self, message: Message, *ports: int) -> None:
+        for port in ports:
+            self._far[port].write(self._encoders[port].encode(message))
+
+
+async def changed_for_the_better(connection: Connection, ports: Ports, radios: Radios) -> LinkChoice:
+    """The second radio is the better one, and has just been taken."""
+    for step in range(200):
+        both = (0,) if step < 20 else (0, 1)
+        if step % 10 == 0:
+            ports.say(m.Heartbeat(2, 12, 81, 0, 4), *both)
+        await anyio.sleep(0.1)
+        assert connection._several is not None
+        choice = connection._several._choices.get(1)
+        if choice is not None and 1 in choice.candidates:
+            choice.candidates[1].is_proven = True
+            choice.candidates[0].note_round_trip(1.0, connection.now())
+            choice.candidates[1].note_round_trip(0.01, connection.now())
+        if choice is not None and choice.used is choice.candidates.get(1):
+            return choice
+    raise AssertionError("it was not taken")
+
+
+async def test_the_answer_to_what_was_ordered_before_a_change_is_taken_over_the_former_link_once() -> None:
+    """ArduPilot answers over the port that was asked, PX4 over all ports where it has seen us."""
+    radios = Radios(2, models=[FaultModel(delay_s=0.5), GOOD])
+    await opened(radios)
+    async with open_connection(radios.together()) as connection:
+        ports = Ports(radios)
+        await changed_for_the_better(connection, ports, radios)
+        answers: list[tuple[int, int]] = []
+        connection.bus.attach(m.CommandAck, lambda ack: answers.append((ack.command, ack.result)))
+        ports.say(m.CommandAck(176, 0), 0)
+        ports.say(m.CommandAck(400, 0), 0, 1)
+        await anyio.sleep(0.1)
+        ports.say(m.CommandAck(400, 4), 0, 1)
+        ports.say(m.CommandAck(400, 0), 0, 1)
+        await anyio.sleep(1)
+        assert answers == [(400, 0), (400, 4), (400, 0), (176, 0)]
+
+
+async def test_the_former_link_is_known_to_lead_to_the_vehicle() -> None:
+    radios = Radios(2, models=[FaultModel(delay_s=0.5), GOOD])
+    await opened(radios)
+    async with open_connection(radios.together()) as connection:
+        choice = await changed_for_the_better(connection, Ports(radios), radios)
+        radios.far[1].close()
+        await anyio.sleep(0.3)
+        assert choice.used is choice.candidates[0]

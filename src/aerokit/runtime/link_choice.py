@@ -13,7 +13,7 @@ from aerokit.runtime.vehicle_clock import VehicleClock
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-__all__ = ["PROOFS", "PROVEN_BY_COPIES", "SILENT_S", "Candidate", "LinkChoice"]
+__all__ = ["PATIENCE_S", "PROOFS", "PROVEN_BY_COPIES", "SILENT_S", "STEADY_S", "Candidate", "LinkChoice"]
 
 SILENT_S = 1.0
 """Of a link over which questions are answered twice a second."""
@@ -30,6 +30,8 @@ ALIKE = 0.5
 JITTER_S = 0.05
 STEADY_S = 3.0
 """And for so long."""
+PATIENCE_S = 10.0
+"""So long at most it is waited for a moment in which no order is under way: set-points may come without end."""
 
 
 class Candidate:
@@ -131,6 +133,7 @@ class LinkChoice:
         """What comes over the link in use before this time was sent before the last that came over the former one."""
         self._better: Candidate | None = None
         self._better_since = 0.0
+        self._ordered_at = -math.inf
 
     def heard(self, link: int, now: float, *, is_costly: bool) -> Candidate:
         """A heartbeat came over a link."""
@@ -186,15 +189,26 @@ class LinkChoice:
             self._better = None
         elif best is not self._better:
             self._better, self._better_since = best, now
-        elif now - self._better_since >= STEADY_S:
+        elif now - self._better_since >= STEADY_S and not self._must_wait(used, now):
             return self._change(best, "cheaper" if best.is_costly < used.is_costly else "better", now)
         return None
+
+    def ordered(self, now: float) -> None:
+        """An order is sent over the link in use now."""
+        self._ordered_at = now
+
+    def _must_wait(self, used: Candidate, now: float) -> bool:
+        """An order may be under way over the link in use: it would arrive after what is ordered over the other one."""
+        on_the_way_s = (used.round_trip_s or 0.0) + JITTER_S
+        waited_s = now - self._better_since - STEADY_S
+        return now - self._ordered_at <= on_the_way_s and waited_s <= PATIENCE_S
 
     def _change(self, to: Candidate, reason: str, now: float) -> str:
         former = self.used
         if former is not None:
             longer_s = ((to.round_trip_s or 0.0) - (former.round_trip_s or 0.0)) / 2
             self.fresh_after = former.heard_at + longer_s + JITTER_S
+            former.is_proven = True  # the one behind the other link is the same as was behind this one
         self.former, self.used, self.changed_at, self._better = former, to, now, None
         return reason
 

@@ -52,6 +52,16 @@ ANSWERS = frozenset(
     )
 )  # fmt: skip
 """What is no state of the vehicle: it does not grow old on its way."""
+ACKNOWLEDGEMENTS = frozenset(each.ID for each in (m.CommandAck, m.MissionAck, m.ParamExtAck))
+"""Of these PX4 sends one over each port where it has seen us: the second one would answer the next order."""
+ORDERS = frozenset(
+    each.ID
+    for each in (
+        m.CommandLong, m.CommandInt, m.SetMode, m.MissionSetCurrent, m.MissionClearAll, m.ParamSet,
+        m.SetPositionTargetGlobalInt, m.SetPositionTargetLocalNed, m.SetAttitudeTarget,
+    )
+)  # fmt: skip
+"""What must not arrive after a newer one."""
 FOR_ALL = frozenset(each.ID for each in (m.Heartbeat, m.Timesync, m.Ping))
 """What everybody on every link is told: it orders nothing."""
 
@@ -59,11 +69,19 @@ FOR_ALL = frozenset(each.ID for each in (m.Heartbeat, m.Timesync, m.Ping))
 class _Stream:
     """The frames of one component."""
 
-    __slots__ = ("heard_at", "newest")
+    __slots__ = ("acknowledgements", "heard_at", "newest")
 
     def __init__(self, links: int) -> None:
         self.heard_at = [-math.inf] * links
         self.newest = -1  # number of the newest frame that was taken; -1: none
+        # Which have come how often over each link since the change, as long as the former one is listened to.
+        self.acknowledgements: dict[bytes, list[int]] = {}
+
+    def has_come(self, payload: bytes, link: int) -> bool:
+        """Whether this acknowledgement came over another link as often as it has come over this one, by now."""
+        counts = self.acknowledgements.setdefault(payload, [0] * len(self.heard_at))
+        counts[link] += 1
+        return counts[link] <= max(count for other, count in enumerate(counts) if other != link)
 
 
 class SeveralRoutes:
@@ -157,7 +175,10 @@ class SeveralRoutes:
             choice = self._choices.get(system_id)
             if choice is None or choice.used is None:
                 return EVERY_PEER
-            self._choose(system_id, choice, self._connection.now())
+            now = self._connection.now()
+            self._choose(system_id, choice, now)
+            if message is None or message.ID in ORDERS:
+                choice.ordered(now)
             return self._peers_on(self._link_to(choice, (system_id, component_id)), system_id, component_id)
         if message is not None and message.ID in FOR_ALL:
             return EVERY_PEER
@@ -221,6 +242,11 @@ class SeveralRoutes:
             if lives_there and not is_late_answer and not is_shared:
                 return False
             if is_shared and is_late and frame.message_id not in ANSWERS:
+                return False
+        is_soon = frame.received_at - choice.changed_at <= ANSWERS_WITHIN_S
+        if is_soon and frame.message_id in ACKNOWLEDGEMENTS:
+            has_come = stream.has_come(frame.payload, _link(peer))
+            if has_come and _link(peer) != used.link:
                 return False
         stream.newest = frame.sequence
         self.copies.take()
