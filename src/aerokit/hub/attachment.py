@@ -212,7 +212,7 @@ class Attachment:
             framer,
             self.totals,
             dialect=self._dialect,
-            hold_above=HOLD_ABOVE.get(self.link.address.split(":")[0], HOLD_ABOVE_OTHERS),
+            hold_above=_hold_above(self.link.address),
             tell=self._dropped,
             border=self._border,
             is_mute=self.endpoint.read_only,
@@ -257,6 +257,12 @@ class Attachment:
 def check_filters(endpoint: Endpoint, dialect: Dialect) -> Filters:
     """What may go out there; LocalProtocolError when a name fits no message of the dialect."""
     return Filters(dialect, endpoint.only, endpoint.block, endpoint.rates)
+
+
+def _hold_above(address: str) -> int:
+    """Of a connection that is shared, and of several links, what the slowest of them stands."""
+    kinds = (each.split(":")[0] for each in address.removeprefix("shared:").split(" + "))
+    return min(HOLD_ABOVE.get(kind, HOLD_ABOVE_OTHERS) for kind in kinds)
 
 
 def _counted(framer: Framer) -> tuple[int, int, int, int]:
