@@ -17,9 +17,9 @@ __all__ = ["ANSWERS", "MOST_HZ", "Filters"]
 
 ANSWERS = frozenset(
     (
-        "COMMAND_ACK", "PARAM_VALUE", "PARAM_EXT_VALUE", "PARAM_EXT_ACK", "MISSION_ACK", "MISSION_COUNT", "MISSION_ITEM",
-        "MISSION_ITEM_INT", "MISSION_REQUEST", "MISSION_REQUEST_INT", "FILE_TRANSFER_PROTOCOL", "LOG_ENTRY", "LOG_DATA",
-        "AUTOPILOT_VERSION", "TIMESYNC", "PING", "STATUSTEXT",
+        "COMMAND_ACK", "PARAM_VALUE", "PARAM_EXT_VALUE", "PARAM_EXT_ACK", "MISSION_ACK", "MISSION_COUNT",
+        "MISSION_ITEM", "MISSION_ITEM_INT", "MISSION_REQUEST", "MISSION_REQUEST_INT", "FILE_TRANSFER_PROTOCOL",
+        "LOG_ENTRY", "LOG_DATA", "AUTOPILOT_VERSION", "TIMESYNC", "PING", "STATUSTEXT",
     )
 )  # fmt: skip
 """Answers and parts of transfers, of which some name no target: a rate for ``"*"`` does not mean them."""
