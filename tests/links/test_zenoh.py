@@ -416,7 +416,7 @@ def test_the_told_of_the_harness_is_a_listener() -> None:
 
 
 async def test_names_that_only_put_something_keep_nobody_away(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A client that listens is greeted by its token; whoever just puts on its key is forgotten when there is no room."""
+    """A client is greeted by its token; whoever just puts on its key is forgotten when there is no room."""
     link, now = ZenohListen("north", "alpha"), 100.0
     monkeypatch.setattr(link, "_now", lambda: now)
     for number in range(MAX_CLIENTS):
