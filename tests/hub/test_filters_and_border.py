@@ -114,3 +114,11 @@ def test_a_mistake_in_what_is_allowed_refuses() -> None:
 def test_unknown_messages_cannot_be_signed() -> None:
     unknown = bytes.fromhex("fd 04 00 00 07 01 01 22 c8 00") + b"mine" + b"\x12\x34"
     assert border()[0].signed(unknown, NOW) is None
+
+
+def test_a_rate_for_all_leaves_answers_as_they_are() -> None:
+    filters = Filters(STANDARD, rates={"*": 5, "LOG_DATA": 100})
+    assert filters.period(Attitude.ID) == pytest.approx(0.2)
+    for name in ("PARAM_VALUE", "COMMAND_ACK", "LOG_ENTRY", "STATUSTEXT"):
+        assert filters.period(next(each.ID for each in STANDARD if name == each.NAME)) == 0.0
+    assert filters.period(120) == pytest.approx(0.01)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from test_routing import CAMERA, COPTER, STATION, Stage, order
 
+from aerokit.hub.routing import MOST_SENDERS
 from aerokit.hub.senders import MOVES_AFTER_S
-from aerokit.mavlink.messages import ParamRequestList
+from aerokit.mavlink.messages import Attitude, Heartbeat, ParamRequestList
 
 
 def a_camera_of_another_age() -> Stage:
@@ -75,3 +76,13 @@ def test_an_order_for_everybody_reaches_a_vehicle_once() -> None:
     stage.now += MOVES_AFTER_S + 1
     stage.hear("b", COPTER)
     assert stage.hear("c", order(0, 0), 255, 190) >= {"b"}, "it is reached there now"
+
+
+def test_names_that_are_made_up_do_not_push_out_a_gimbal() -> None:
+    stage = Stage()
+    stage.hear("a", Heartbeat(26, 8, 0, 0, 3), 77, 154)
+    stage.hear("c", STATION, 255, 190)
+    stage.now += 0.1
+    for number in range(MOST_SENDERS + 100):
+        stage.hear("b", Attitude(0, 0, 0, 0, 0, 0, 0), 2 + number % 240, 1 + number // 240)
+    assert stage.hear("c", order(77, 154), 255, 190) == {"a"}

@@ -9,6 +9,7 @@ from hub_stage import Program
 import aerokit
 from aerokit import events
 from aerokit.hub import shared
+from aerokit.hub.attachment import _hold_above
 from aerokit.links import memory_link_pair
 from aerokit.mavlink.messages import Heartbeat
 from aerokit.sim import SimulatedCopter, SimulatorServer
@@ -36,3 +37,17 @@ def test_a_station_with_our_ids_is_told_of_once(component: int) -> None:
             )
 
     run_virtual(run())
+
+
+@pytest.mark.parametrize(
+    ("address", "most"),
+    [
+        ("serial:/dev/ttyUSB0:57600", 2048),
+        ("tcp:10.0.0.7:5760", 16384),
+        ("shared:serial:/dev/ttyUSB0:57600", 2048),
+        ("shared:udpin:0.0.0.0:14550 + serial:/dev/ttyUSB0:57600", 2048),
+        ("shared:udpin:0.0.0.0:14550", 16384),
+    ],
+)
+def test_as_much_waits_behind_a_shared_link_as_behind_the_link_itself(address: str, most: int) -> None:
+    assert _hold_above(address) == most

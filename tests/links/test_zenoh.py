@@ -15,6 +15,7 @@ from zenoh_network import VEHICLE_SIDE, HoldingProxy, eventually, free_port, pro
 from aerokit.errors import BusyError, ConnectionClosed, LinkOpenError, LocalProtocolError
 from aerokit.links import create_link, zenoh_session
 from aerokit.links.handover import Handover
+from aerokit.links.zenoh_listen import MAX_CLIENTS, SILENT_AFTER_S, ZenohListen
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import CommandLong, Heartbeat, ParamRequestList, SetPositionTargetLocalNed
@@ -412,3 +413,18 @@ def test_the_told_of_the_harness_is_a_listener() -> None:
     assert isinstance(Told, type)
     assert issubclass(Told, HelmListener)
     assert frame(Heartbeat(6, 8, 0, 0, 4, 3))
+
+
+async def test_names_that_only_put_something_keep_nobody_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A client is greeted by its token; whoever just puts on its key is forgotten when there is no room."""
+    link, now = ZenohListen("north", "alpha"), 100.0
+    monkeypatch.setattr(link, "_now", lambda: now)
+    for number in range(MAX_CLIENTS):
+        link._hear(f"noise-{number}", b"", b"")
+    assert len(link.peers) == MAX_CLIENTS
+    assert link._come("ground-1") is None
+    now += SILENT_AFTER_S + 1
+    link._hear("noise-7", b"", b"")
+    assert link._come("ground-1") is not None
+    assert len(link.peers) == MAX_CLIENTS
+    assert "noise-7" in link.peers

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 from functools import partial
 
 import anyio
@@ -378,3 +379,26 @@ async def test_the_former_link_is_known_to_lead_to_the_vehicle() -> None:
         radios.far[1].close()
         await anyio.sleep(0.3)
         assert choice.used is choice.candidates[0]
+
+
+async def test_a_peer_of_one_of_several_links_is_named_as_it_is_by_its_link() -> None:
+    """A program on board is started again, and has another port."""
+    here: socket.socket
+    async with open_connection(["udpin:127.0.0.1:0", "udpin:127.0.0.1:0"]) as connection:
+        news = News(connection, events.VehicleMoved)
+        link = connection.link
+        assert isinstance(link, SeveralLinks)
+        said: list[str] = []
+        for round_ in range(2):
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as here:
+                here.bind(("127.0.0.1", 0))
+                said.append(f"127.0.0.1:{here.getsockname()[1]}")
+                encoder = FrameEncoder(1, 1)
+                for _ in range(4):
+                    link._heard(1, encoder.encode(AUTOPILOT), here.getsockname())
+                    await anyio.sleep(0.1)
+            if round_ == 0:
+                await anyio.sleep(4)
+        moved = news.all[0]
+        assert isinstance(moved, events.VehicleMoved)
+        assert [moved.before, moved.after] == said

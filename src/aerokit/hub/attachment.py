@@ -237,7 +237,7 @@ class Attachment:
         kind = self.link.address.partition(":")[0]
         if kind in NEVER_WAIT and isinstance(self.endpoint.address, str):
             return NEVER
-        return HOLD_ABOVE.get(kind, HOLD_ABOVE_OTHERS)
+        return _hold_above(self.link.address)
 
     def _forget(self, peer: Peer) -> None:
         port = self._ports.pop(peer, None)
@@ -275,6 +275,12 @@ class Attachment:
 def check_filters(endpoint: Endpoint, dialect: Dialect) -> Filters:
     """What may go out there; LocalProtocolError when a name fits no message of the dialect."""
     return Filters(dialect, endpoint.only, endpoint.block, endpoint.rates)
+
+
+def _hold_above(address: str) -> int:
+    """Of a connection that is shared, and of several links, what the slowest of them stands."""
+    kinds = (each.split(":")[0] for each in address.removeprefix("shared:").split(" + "))
+    return min(HOLD_ABOVE.get(kind, HOLD_ABOVE_OTHERS) for kind in kinds)
 
 
 def _counted(framer: Framer) -> tuple[int, int, int, int]:

@@ -13,7 +13,16 @@ if TYPE_CHECKING:
 
     from aerokit.mavlink.dialect import Dialect
 
-__all__ = ["MOST_HZ", "Filters"]
+__all__ = ["ANSWERS", "MOST_HZ", "Filters"]
+
+ANSWERS = frozenset(
+    (
+        "COMMAND_ACK", "PARAM_VALUE", "PARAM_EXT_VALUE", "PARAM_EXT_ACK", "MISSION_ACK", "MISSION_COUNT",
+        "MISSION_ITEM", "MISSION_ITEM_INT", "MISSION_REQUEST", "MISSION_REQUEST_INT", "FILE_TRANSFER_PROTOCOL",
+        "LOG_ENTRY", "LOG_DATA", "AUTOPILOT_VERSION", "TIMESYNC", "PING", "STATUSTEXT",
+    )
+)  # fmt: skip
+"""Answers and parts of transfers, of which some name no target: a rate for ``"*"`` does not mean them."""
 
 MOST_HZ = 1000.0
 """The highest rate that can be asked for."""
@@ -22,7 +31,8 @@ MOST_HZ = 1000.0
 class Filters:
     """Names of messages as patterns: ``"GPS_*"``; only those of ``only``, if there are any, without those of ``block``.
 
-    ``rates`` are the highest ones, in Hz, for each sender; of several patterns that fit, the first counts.
+    ``rates`` are the highest ones, in Hz, for each sender; of several patterns that fit, the first counts. For
+    `ANSWERS` only their own names do.
 
     Raises:
         LocalProtocolError: a pattern fits no message of the dialect, or a rate is not in 0…1000.
@@ -58,7 +68,8 @@ class Filters:
             return None
         if any(fnmatchcase(name, each) for each in self._block):
             return None
-        hz = next((hz for each, hz in self._rates.items() if fnmatchcase(name, each)), None)
+        fitting = (hz for each, hz in self._rates.items() if fnmatchcase(name, each))
+        hz = self._rates.get(name) if name in ANSWERS else next(fitting, None)
         return 0.0 if hz is None else 1 / hz
 
     def _check(self, field: str, pattern: str) -> None:

@@ -21,7 +21,8 @@ __all__ = ["MOST_PLANS", "MOST_SENDERS", "Node", "Plan", "Router"]
 PortT = TypeVar("PortT")
 
 MOST_SENDERS = 1024
-"""So many (system id, component id) are remembered; one more takes the place of the one not heard for longest."""
+"""So many (system id, component id) are remembered; one more takes the place of the one not heard for longest, of those
+that have not said what they are if there are any: noise does not push out who is quiet for a second."""
 MOST_PLANS = 4096
 """So many plans are kept for each port."""
 
@@ -179,7 +180,8 @@ class Router(Generic[PortT]):
 
     def _add_sender(self, source: int, node: Node[PortT], now: float) -> Sender:
         if len(self._senders) >= MOST_SENDERS:
-            del self._senders[min(self._senders, key=lambda key: self._senders[key].heard_at)]
+            senders = self._senders
+            del senders[min(senders, key=lambda key: (senders[key].is_vehicles, senders[key].heard_at))]
         sender = self._senders[source] = Sender(source, node.number, now)
         self.forget_plans()
         return sender

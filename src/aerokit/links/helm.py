@@ -144,6 +144,8 @@ class Gate:
     def __init__(self, client: str, helm: Helm) -> None:
         self.refused = 0
         """Frames that did not pass."""
+        self.heard_at = 0.0
+        """When its owner heard something of the client."""
         self._client, self._helm = client, helm
         self._framer = _framer()
         self._nonce: int | None = None  # of the program that orders under this name

@@ -27,6 +27,12 @@ __all__ = ["MAX_CLIENTS", "ZenohListen"]
 MAX_CLIENTS = 64
 """Further clients are not listened to."""
 
+SILENT_AFTER_S = 30.0
+"""When there are so many, one that nothing has come of for so long makes room."""
+
+MOST_BYTES = 65535
+"""Nothing larger is listened to: a client sends single frames, or as many as are in a datagram."""
+
 _SOONEST_S = 0.02  # after the last beacon, whoever comes
 _RIVAL_WAIT_S = 2.5 * BEACON_EVERY_S
 
@@ -132,8 +138,9 @@ class ZenohListen(BaseLink):
         zenoh, session, place = self._zenoh, self._session, self._place
 
         def hear(sample: Any) -> None:
-            client = str(sample.key_expr).rpartition("/")[2]
-            handover.post(partial(self._hear, client, payload_of(sample), attachment_of(sample)))
+            client, payload = str(sample.key_expr).rpartition("/")[2], payload_of(sample)
+            if len(payload) <= MOST_BYTES:
+                handover.post(partial(self._hear, client, payload, attachment_of(sample)))
 
         def hear_client(sample: Any) -> None:
             client, is_put = str(sample.key_expr).rpartition("/")[2], sample.kind == zenoh.SampleKind.PUT
@@ -174,6 +181,7 @@ class ZenohListen(BaseLink):
         gate, now = self._come(client), self._now()
         if gate is None:
             return
+        gate.heard_at = now
         stamp, late = Stamp.decode(attachment), self._judge.late
         if not self._judge.accepts(client, stamp, now) or stamp is None:
             if self._judge.late > late:
@@ -188,10 +196,19 @@ class ZenohListen(BaseLink):
 
     def _come(self, client: str) -> Gate | None:
         gate = self._clients.get(client)
+        if gate is None and len(self._clients) >= MAX_CLIENTS:
+            self._forget_one_that_is_silent()
         if gate is None and len(self._clients) < MAX_CLIENTS:
             with contextlib.suppress(LocalProtocolError):  # not a name: somebody else's key
                 gate = self._clients[client] = Gate(check_name("client", client), self._helm)
+                gate.heard_at = self._now()
         return gate
+
+    def _forget_one_that_is_silent(self) -> None:
+        """Whoever has put something and is no client, or whose end was not noticed, keeps nobody else away."""
+        silent = min(self._clients, key=lambda each: self._clients[each].heard_at)
+        if self._now() - self._clients[silent].heard_at > SILENT_AFTER_S:
+            self._go(str(silent))
 
     def _greet(self, client: str) -> None:
         """It need not wait for the next beacon: it knows at once that we are there."""

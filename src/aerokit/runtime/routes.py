@@ -253,6 +253,7 @@ _SAME_PEER = _SamePeer()
 
 
 def _name(peer: Peer) -> str:
+    peer = getattr(peer, "peer", peer)  # of several links: the peer by its link's own reckoning
     if isinstance(peer, tuple) and len(peer) >= 2:
         host, port = peer[:2]
         return f"[{host}]:{port}" if ":" in str(host) else f"{host}:{port}"
