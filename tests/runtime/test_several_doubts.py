@@ -22,6 +22,7 @@ from aerokit.mavlink.message import Message
 from aerokit.mavlink.signing import Signing, SigningKey
 from aerokit.runtime.connection import Connection
 from aerokit.runtime.link_choice import PATIENCE_S, STEADY_S, LinkChoice
+from aerokit.runtime.link_questions import UNWANTED_HZ
 from aerokit.runtime.link_state import LinkState
 from aerokit.runtime.opening import open_connection
 from aerokit.sim import SimulatedCopter
@@ -402,3 +403,26 @@ async def test_a_peer_of_one_of_several_links_is_named_as_it_is_by_its_link() ->
         moved = news.all[0]
         assert isinstance(moved, events.VehicleMoved)
         assert [moved.before, moved.after] == said
+
+
+async def test_ids_that_somebody_makes_up_cost_little_and_not_for_long() -> None:
+    radios = Radios(2)
+    told = Told(radios)
+    await opened(radios)
+    async with open_connection(radios.together()) as connection:
+        for begin in (1, 101, 1, 101):
+            for system in range(1, 251):
+                for component in range(begin, begin + 4):
+                    radios.far[0].write(FrameEncoder(system, component).encode(AUTOPILOT))
+            await anyio.sleep(5)
+        asked = len(told.of(m.Timesync))
+        assert 200 < asked <= 25 * UNWANTED_HZ
+        await anyio.sleep(40)
+        told.messages.clear()
+        await anyio.sleep(10)
+        assert told.of(m.Timesync) == []
+        assert connection._several is not None
+        assert not any(connection._several._counters.values())
+        radios.far[0].write(FrameEncoder(7, 1).encode(AUTOPILOT))
+        await anyio.sleep(5)
+        assert len(told.of(m.Timesync)) >= 9

@@ -17,13 +17,16 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.runtime.link_choice import Candidate, LinkChoice
 
-__all__ = ["LinkQuestions"]
+__all__ = ["UNWANTED_HZ", "LinkQuestions"]
 
 ASK_S = 0.5
 ASK_COSTLY_S = 5.0
 EARLY_S = 0.05
 """It is looked ten times a second."""
 MOST_QUESTIONS = 256
+UNWANTED_HZ = 40.0
+"""So many questions a second go to systems without a vehicle object, all together: ids that somebody makes up must not
+fill a slow radio."""
 
 
 class LinkQuestions:
@@ -33,14 +36,26 @@ class LinkQuestions:
         self._count, self._send = links, send
         self._under_way: dict[int, tuple[int, int, float]] = {}  # ts1 → system, link, asked at
         self._asked_at: dict[tuple[int, int], float] = {}
+        self._left, self._left_at = UNWANTED_HZ, 0.0
 
-    def ask(self, system_id: int, choice: LinkChoice, candidate: Candidate, peer: Peer, now: float) -> None:
-        """Ask, if it is time to."""
+    def ask(
+        self,
+        system_id: int,
+        choice: LinkChoice,
+        candidate: Candidate,
+        peer: Peer,
+        now: float,
+        *,
+        is_wanted: bool,
+    ) -> None:
+        """Ask, if it is time to; ``is_wanted``: a vehicle object stands for the system."""
         is_idle = candidate.is_costly and candidate is not choice.used
         is_new = not candidate.is_proven and not candidate.is_doubted
         period = ASK_COSTLY_S if is_idle and not is_new else ASK_S
         key = system_id, candidate.link
         if now - self._asked_at.get(key, -math.inf) < period - EARLY_S:
+            return
+        if not is_wanted and not self._has_left(now):
             return
         self._asked_at[key] = now
         # Our time in nanoseconds, and in its last digits what nobody else asks.
@@ -51,6 +66,14 @@ class LinkQuestions:
             del self._under_way[next(iter(self._under_way))]
         self._under_way[number] = system_id, candidate.link, now
         self._send(m.Timesync(0, number, target_system=system_id, target_component=1), peer)
+
+    def _has_left(self, now: float) -> bool:
+        self._left = min(UNWANTED_HZ, self._left + UNWANTED_HZ * (now - self._left_at))
+        self._left_at = now
+        if self._left < 1:
+            return False
+        self._left -= 1
+        return True
 
     def is_ours(self, message: Message | None) -> bool:
         """Whether it answers one of our questions, over whatever link it came."""

@@ -42,6 +42,8 @@ ANSWERS_WITHIN_S = 3.0
 """After a change what was asked over the former link is still answered over it."""
 LIVES_S = 10.0
 """A component is taken for one behind a link for so long after something of it came there."""
+GONE_S = 30.0
+"""Who was not heard over a link for so long is neither asked nor counted there, until a heartbeat comes."""
 MOST_SOURCES = 1024
 
 ANSWERS = frozenset(
@@ -283,6 +285,9 @@ class SeveralRoutes:
         """Take stock: what has come over which link, who is to be asked, which link is to be used."""
         for system_id, choice in self._choices.items():
             for link, candidate in choice.candidates.items():
+                if now - candidate.heard_at > GONE_S:
+                    self._counters.pop((system_id, link), None)
+                    continue
                 counters = self._counters.get((system_id, link), {}).values()
                 received, lost = sum(each.received for each in counters), sum(each.lost for each in counters)
                 candidate.note_counts(received, lost, now)
@@ -367,7 +372,8 @@ class SeveralRoutes:
     def _ask(self, system_id: int, choice: LinkChoice, candidate: Candidate, now: float) -> None:
         if choice.needs_proof and candidate.is_there and not candidate.is_stalled:
             for peer in self._routes[candidate.link].peers_of(system_id, MavComponent.AUTOPILOT1):
-                self._questions.ask(system_id, choice, candidate, peer, now)
+                is_wanted = system_id in self._connection.attached
+                self._questions.ask(system_id, choice, candidate, peer, now, is_wanted=is_wanted)
 
     def _is_answer(self, frame: Frame, peer: Peer) -> bool:
         message = self._connection.bus.dialect.decode(frame)
