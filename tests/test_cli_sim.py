@@ -10,7 +10,9 @@ import pytest
 from recorded import SHORT
 
 from aerokit.cli import main
+from aerokit.cli.main import make_parser
 from aerokit.cli.places import EACH_ITS_OWN, each_with_its_own, place_of
+from aerokit.cli.sim import _client_address
 from aerokit.cli.vehicles import simulated_fleet
 from aerokit.sim import HOME, SimulatedCopter, SimulatedPx4
 from aerokit.sim.track import true_point
@@ -115,6 +117,27 @@ def test_sim_tells_the_name_of_the_other_end(tmp_path: Path, capsys: pytest.Capt
     assert main(["sim", f"pty:{port}", "--speedup", "100", "--duration", "1"]) == 0
     assert f"try: aerokit demo --connect {port}\n" in capsys.readouterr().out
     assert not os.path.lexists(port)
+
+
+@pytest.mark.parametrize(
+    ("options", "client"),
+    [
+        ("", "zenoh://f/a"),
+        ("?listen=tcp/0.0.0.0:7447", "'zenoh://f/a?connect=tcp/127.0.0.1:7447'"),
+        (
+            "?connect=tcp/10.0.0.5:7447&config=z.json5",
+            "'zenoh://f/a?connect=tcp/10.0.0.5:7447&config=z.json5'",
+        ),
+    ],
+)
+def test_the_address_for_clients_on_a_network_finds_it(options: str, client: str) -> None:
+    assert _client_address("zenohin://f/a", f"zenohin://f/a{options}") == client
+
+
+def test_numbers_below_0_are_no_options() -> None:
+    options = make_parser("sim").parse_args(["sim", "--home", "-35.36,149.16,-2.5", "--wind", "-3,-.5"])
+    assert options.home == (-35.36, 149.16, -2.5)
+    assert options.wind == (-3.0, -0.5)
 
 
 def test_a_recording_is_served(capsys: pytest.CaptureFixture[str]) -> None:

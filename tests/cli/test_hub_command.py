@@ -56,8 +56,12 @@ def test_signing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         (["a=nonsense:1:2"], "nonsense"),
         (["a=pty", "--rate", "ATTITUDE"], "is no rate"),
         (["a=pty", "--record", "x.bin"], "does not end in .tlog"),
-        (["a=pty", "--read-only", "b"], "there is no endpoint 'b': a"),
+        (["a=pty", "--read-only", "b"], "there is no endpoint 'b'; there are: a"),
+        (["radio=pty", "--read-only", "raido"], "there is no endpoint 'raido' (did you mean 'radio'?)"),
         (["a=pty", "--block", "DEBUG*@b"], "there is no endpoint 'b'"),
+        (["a=pty", "--only", "@a"], "names no message"),
+        (["a=pty", "--rate", ""], "names no message"),
+        (["a=pty", "--block", "DEBUG*@"], "names no endpoint behind the @"),
         (["a=tcpin:127.0.0.1:0", "--only", "NO_SUCH"], "fits no message"),
         (["a=tcpin:127.0.0.1:0", "a=tcpin:127.0.0.1:0"], "two endpoints are called 'a'"),
         ([], "required"),
@@ -108,12 +112,12 @@ def test_it_passes_frames_on_tells_and_records(tmp_path: Path, capsys: pytest.Ca
     assert asyncio.run(run()) == 0
     assert [raw[5] for _, raw in read_tlog(path)] == [1]
     assert main(["hub", "a=tcpin:127.0.0.1:0", "--record", str(path)]) != 0
-    assert "exists" in capsys.readouterr().err
+    assert "is there already; nothing was recorded" in capsys.readouterr().err
 
 
 def test_lines_for_people(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["hub", "a=tcpin:127.0.0.1:0", "--seconds", "0.1"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("a: tcpin:127.0.0.1:")
-    assert lines[1] == "1 endpoint, until Ctrl-C"
+    assert lines[1] == "1 endpoint, for 0.1 s"
     assert lines[-1] == "a: 0 frames in, 0 out, 0 lost; heard nobody"

@@ -102,6 +102,12 @@ def test_accepted(text: str, address: LinkAddress) -> None:
         ("zenoh://north/alpha?helm=mine", "helm=mine is none of free, take, never"),
         ("zenoh://north/alpha?mode=router", "mode=router is none of peer, client"),
         ("zenoh://north/alpha?connect=", "connect= is empty"),
+        (
+            "zenoh://north/alpha?connect=10.0.0.5:7447",
+            "connect=10.0.0.5:7447 is no endpoint of zenoh, as tcp/10",
+        ),
+        ("zenoh://north/alpha?connect=tcp/a:1,b:2", "connect=b:2 is no endpoint"),
+        ("zenohin://north/alpha?listen=http://0.0.0.0:7447", "listen=http://0.0.0.0:7447 is no endpoint"),
         ("zenohin://north/alpha?helm=take", "'helm' is not an option of zenohin links"),
         ("zenoh://north/alpha?timeout=0", "timeout=0 is not a number above 0"),
         ("udpin:a\0b:1", "NUL"),
@@ -195,6 +201,8 @@ def addresses(draw: st.DrawFn) -> LinkAddress:
             )
         )
         given = draw(st.dictionaries(st.sampled_from(["connect", "listen", "config"]), texts.filter(is_tidy)))
+        for key in given.keys() & {"connect", "listen"}:
+            given[key] = "tcp/x" + given[key].replace(",", ",tcp/x")
         return zenoh(path, kind, **given)
     if kind == "serial":
         return serial(draw(texts.filter(lambda t: t.strip("/"))), draw(bauds), rtscts=draw(st.booleans()))

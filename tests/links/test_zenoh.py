@@ -92,7 +92,7 @@ async def test_nobody_of_that_name() -> None:
 
 
 async def test_no_router() -> None:
-    with pytest.raises(LinkOpenError, match=r"cannot open zenoh://north/alpha: Unable to connect to any of"):
+    with pytest.raises(LinkOpenError, match=r"cannot open zenoh://north/alpha: nobody can be reached at tcp/127"):
         async with client(free_port()):
             pass
     with pytest.raises(LinkOpenError, match="cannot open zenohin://north/alpha"):
@@ -131,7 +131,7 @@ async def test_a_link_is_opened_once(tmp_path: Path) -> None:
         each.write(b"nothing happens")
     wrong = tmp_path / "zenoh.json5"
     wrong.write_text("{ mode: 7 }")
-    with pytest.raises(LocalProtocolError, match="zenoh://north/alpha"):
+    with pytest.raises(LocalProtocolError, match="zenoh://north/alpha: config="):
         await create_link(f"zenoh://north/alpha?config={wrong}").open(Recorder())
 
 

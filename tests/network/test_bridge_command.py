@@ -57,6 +57,17 @@ async def test_states_of_all_vehicles_on_a_link(capsys: pytest.CaptureFixture[st
     assert told[0]["network"] == network
 
 
+@pytest.mark.parametrize("network", ["tcp:127.0.0.1:5763", "zenoh://north", "north/box"])
+def test_a_network_is_wanted_before_anything_is_opened(
+    network: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        make_parser("bridge").parse_args(["bridge", "zenoh", "zenoh://north/box", network])
+    assert ended.value.code == 2
+    assert "argument NETWORK: " in (told := capsys.readouterr().err)
+    assert "zenoh://" in told
+
+
 def test_the_vehicles_address_may_be_left_out() -> None:
     options = make_parser("bridge").parse_args(["bridge", "zenoh", "zenoh://north/box"])
     assert (options.network, options.rate) == ("zenoh://north/box", 5.0)

@@ -15,6 +15,7 @@ from aerokit.cli.interrupt import on_interrupt
 from aerokit.cli.output import add_json, tell
 from aerokit.cli.signing import ENVIRONMENT, add_signing_key, signing_of
 from aerokit.cli.vehicle_command import ADDRESS_VARIABLE, default_address
+from aerokit.links.address import parse_address
 
 if TYPE_CHECKING:
     from aerokit.foxglove import FoxgloveBridge
@@ -48,7 +49,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help="show these MAVLink messages as they come, too: 'GPS_*' (repeatable)",
     )
-    _add_common(foxglove, 10.0)
+    _add_common(foxglove, 10.0, "topic")
     zenoh = actions.add_parser(
         "zenoh",
         help="put states on a zenoh network, as JSON",
@@ -59,11 +60,11 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     _add_place(zenoh)
     zenoh.add_argument(
         "network",
-        type=address,
+        type=_network,
         metavar="NETWORK",
         help="where the states go: zenoh://FLEET/NAME, zenoh://FLEET/NAME?connect=tcp/10.0.0.5:7447 …",
     )
-    _add_common(zenoh, 5.0)
+    _add_common(zenoh, 5.0, "state")
 
 
 def _add_place(action: argparse.ArgumentParser) -> None:
@@ -81,13 +82,13 @@ def _add_place(action: argparse.ArgumentParser) -> None:
     )
 
 
-def _add_common(action: argparse.ArgumentParser, rate_hz: float) -> None:
+def _add_common(action: argparse.ArgumentParser, rate_hz: float, what: str) -> None:
     action.add_argument(
         "--rate",
         type=number(0.1, 50 if rate_hz < 10 else 100),
         default=rate_hz,
         metavar="HZ",
-        help=f"of each topic or state at most ({rate_hz:g})",
+        help=f"so many times a second at most, each {what} ({rate_hz:g})",
     )
     action.add_argument(
         "--listen-only",
@@ -96,6 +97,13 @@ def _add_common(action: argparse.ArgumentParser, rate_hz: float) -> None:
     )
     add_signing_key(action, f"of vehicles that want signed messages (${ENVIRONMENT})")
     add_json(action)
+
+
+def _network(text: str) -> str:
+    """Looked at before a link is opened: the two addresses are easily given the other way round."""
+    if parse_address(address(text)).kind not in ("zenoh", "zenohin"):
+        raise argparse.ArgumentTypeError(f"{text!r} is not on a network, as zenoh://FLEET/NAME is")
+    return text
 
 
 def _port(text: str) -> int:

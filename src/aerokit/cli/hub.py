@@ -16,6 +16,7 @@ from aerokit.cli.interrupt import on_interrupt
 from aerokit.cli.output import add_json, tell
 from aerokit.cli.signing import ENVIRONMENT, add_signing_key, signing_of
 from aerokit.errors import LocalProtocolError
+from aerokit.wording import did_you_mean
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -44,8 +45,13 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     _add_names(command, "--patient", "begin without it when it cannot be opened, and go on trying")
     only = f"only these messages go out, at one endpoint or, without @NAME, at all: {_FILTER}"
     _add_filter(command, "--only", _messages, only)
-    _add_filter(command, "--block", _messages, "these messages do not go out")
-    _add_filter(command, "--rate", _rate, "at most so many a second, of each sender: 'ATTITUDE=5@NAME'")
+    _add_filter(command, "--block", _messages, f"these messages do not go out: {_FILTER}")
+    _add_filter(
+        command,
+        "--rate",
+        _rate,
+        "these go out so many times a second at most, of each sender: 'ATTITUDE=5@NAME'",
+    )
     _add_names(command, "--signed", "sign what goes out there, and let in only what is signed")
     add_signing_key(command, f"for --signed (${ENVIRONMENT})")
     command.add_argument(
@@ -55,7 +61,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         "--record",
         type=_log_file,
         metavar="FILE",
-        help="write every frame once: flight.tlog; none that is there",
+        help="write every frame once, to a new file: flight.tlog",
     )
     command.add_argument(
         "--every", type=number(0.1, 1e6), default=10.0, metavar="S", help="seconds between statistics (10)"
@@ -84,8 +90,13 @@ def _place(text: str) -> tuple[str, str]:
 
 def _messages(text: str) -> tuple[str, tuple[str, ...]]:
     """For which endpoint ("": all), and names of messages."""
-    names, _, endpoint = text.partition("@")
-    return endpoint, tuple(each.strip() for each in names.split(",") if each.strip())
+    names, at, endpoint = text.partition("@")
+    found = tuple(each.strip() for each in names.split(",") if each.strip())
+    if not found:
+        raise argparse.ArgumentTypeError(f"{text!r} names no message: {_FILTER}")
+    if at and not endpoint:
+        raise argparse.ArgumentTypeError(f"{text!r} names no endpoint behind the @: {_FILTER}")
+    return endpoint, found
 
 
 def _rate(text: str) -> tuple[str, dict[str, float]]:
@@ -109,8 +120,11 @@ def _log_file(text: str) -> str:
 
 def _make_anew(path: str) -> None:
     """Make the file now, so that nobody else's is replaced."""
-    with open(path, "xb"):
-        pass
+    try:
+        with open(path, "xb"):
+            pass
+    except FileExistsError as error:
+        raise FileExistsError(error.errno, "is there already; nothing was recorded", path) from None
 
 
 async def _hub(options: argparse.Namespace) -> int:
@@ -130,7 +144,7 @@ async def _hub(options: argparse.Namespace) -> int:
                 options,
                 "hub",
                 record,
-                f"{len(endpoints)} endpoint{'s' if len(endpoints) > 1 else ''}, until Ctrl-C",
+                f"{len(endpoints)} endpoint{'s' if len(endpoints) > 1 else ''}, {_how_long(options)}",
             )
             with anyio.move_on_after(options.seconds):
                 while not stop.is_set():
@@ -140,6 +154,10 @@ async def _hub(options: argparse.Namespace) -> int:
                         _tell_statistics(options, hub)
             _tell_statistics(options, hub)
     return INTERRUPTED if stop.is_set() and options.seconds is not None else DONE
+
+
+def _how_long(options: argparse.Namespace) -> str:
+    return "until Ctrl-C" if options.seconds is None else f"for {options.seconds:g} s"
 
 
 def _endpoints(options: argparse.Namespace) -> list[Endpoint]:
@@ -178,7 +196,9 @@ def _for(name: str, filters: Sequence[tuple[str, tuple[str, ...]]]) -> tuple[str
 
 def _check_known(name: str, names: list[str]) -> None:
     if name not in names:
-        raise LocalProtocolError(f"there is no endpoint {name!r}: {', '.join(names)}")
+        raise LocalProtocolError(
+            f"there is no endpoint {name!r}{did_you_mean(name, names)}; there are: {', '.join(names)}"
+        )
 
 
 def _tell_event(options: argparse.Namespace, event: HubEvent) -> None:

@@ -13,11 +13,17 @@ if TYPE_CHECKING:
 
 __all__ = ["Parser"]
 
+_BELOW_ZERO = re.compile(r"-\.?\d")
 _CHOICE = re.compile(r"invalid choice: '(.*)' \(choose from (.*)\)")
 
 
 class Parser(argparse.ArgumentParser):
     """Its subparsers are of this class, too, and each complains of its own arguments."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        # argparse takes "-35.36,149.16,584" for an option, and half of the world is south; a number alone it knows.
+        self._negative_number_matcher = _BELOW_ZERO
 
     def parse_known_args(  # type: ignore[override]  # typeshed has overloads for other namespaces
         self, args: Sequence[str] | None = None, namespace: Any = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import shlex
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +25,7 @@ from aerokit.cli.places import EACH_ITS_OWN, each_with_its_own, place_of
 from aerokit.cli.signing import add_signing_key
 from aerokit.cli.vehicles import simulated_fleet
 from aerokit.links import create_link
+from aerokit.links.address import parse_address
 from aerokit.sim import SimulatedVehicle, SimulatorServer, Wind
 from aerokit.sim.patience import wait_longer
 from aerokit.sim.place import HOME
@@ -92,7 +94,7 @@ def _add_conditions(command: argparse.ArgumentParser) -> None:
         "--wind",
         type=wind,
         metavar="NORTH,EAST[,GUSTS]",
-        help="where the air goes in m/s, and how much it changes (no wind); --wind=-3,0 for the first below 0",
+        help="where the air goes in m/s, and how much it changes: -3,0 (no wind)",
     )
     command.add_argument(
         "--battery", type=number(0, 100), metavar="PERCENT", help="charge at the start (100)"
@@ -191,7 +193,10 @@ def _tell(server: SimulatorServer, options: argparse.Namespace) -> None:
         text = f"{_systems(vehicles)} on {address}, {options.speedup:g} times real time"
         tell(options, "simulated", record, text)
     if not options.json:
-        print(f"try: aerokit demo --connect {_client_address(server.addresses[0])}", flush=True)
+        print(
+            f"try: aerokit demo --connect {_client_address(server.addresses[0], options.addresses[0])}",
+            flush=True,
+        )
 
 
 def _systems(vehicles: Sequence[SimulatedVehicle]) -> str:
@@ -199,11 +204,22 @@ def _systems(vehicles: Sequence[SimulatedVehicle]) -> str:
     return f"system {first}" if first == last else f"systems {first} to {last}"
 
 
-def _client_address(address: str) -> str:
+def _client_address(address: str, as_given: str) -> str:
     """How a client on this machine reaches it; serial ports have another end."""
     scheme, _, place = address.partition(":")
+    if scheme == "zenohin":
+        return shlex.quote(f"{CLIENTS_USE[scheme]}:{place}{_network_of_clients(as_given)}")
     if scheme == "pty":
         return place
     if scheme not in CLIENTS_USE:
         return "the other end of the serial line"
     return f"{CLIENTS_USE[scheme]}:{place.replace('0.0.0.0', '127.0.0.1')}"
+
+
+def _network_of_clients(address: str) -> str:
+    """What clients say behind their address: to connect where this one listens, or to where it is connected."""
+    where = parse_address(place_of(address, 0, 1))
+    endpoints, config = where.option("listen") or where.option("connect"), where.option("config")
+    options = [f"connect={endpoints.replace('0.0.0.0', '127.0.0.1')}"] if endpoints else []
+    options += [f"config={config}"] if config else []
+    return f"?{'&'.join(options)}" if options else ""

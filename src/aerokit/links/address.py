@@ -120,6 +120,7 @@ _ON_NETWORKS = ("zenoh", "zenohin")
 _CHOICES = {"mode": ("peer", "client"), "helm": ("free", "take", "never")}
 _AS_IT_IS = ("connect", "listen", "config", "client")  # names and paths: in upper and lower case
 _NOT_HERE = ("uds", "unix", "mcast", "ws", "wss", "wsserver", "csv")  # pymavlink knows these
+_ENDPOINT = re.compile(r"[a-z][a-z0-9_-]*/[^/].*", re.IGNORECASE | re.DOTALL)
 _SCHEME = re.compile(r"([a-z][a-z0-9_+.-]+):(.*)", re.IGNORECASE | re.DOTALL)  # one letter is a drive
 _URL = re.compile(r"([a-z][a-z0-9_+.-]*)://(.*)", re.IGNORECASE | re.DOTALL)
 _RECORDING = re.compile(r".*\.tlog(\?[^/\\]*)?", re.IGNORECASE | re.DOTALL)
@@ -226,6 +227,10 @@ class _Parser:
     def named(self, kind: LinkKind, text: str, options: dict[str, str]) -> LinkAddress:
         from .zenoh_keys import check_name  # few addresses need it
 
+        for key in ("connect", "listen"):
+            for endpoint in filter(None, options.get(key, "").split(",")):
+                if not _ENDPOINT.fullmatch(endpoint):
+                    self.fail(f"{key}={endpoint} is no endpoint of zenoh, as tcp/10.0.0.5:7447 is")
         fleet, slash, name = text.partition("/")
         if not slash:
             self.fail(f"the name of the vehicle is missing, as in {kind}://fleet/alpha")

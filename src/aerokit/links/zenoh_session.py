@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import re
 from collections.abc import Callable, Iterable
 from importlib import import_module
 from typing import Any
@@ -14,6 +15,8 @@ from aerokit.snapshot import Snapshot
 
 __all__ = ["NetworkOptions", "attachment_of", "close_session", "open_session", "payload_of", "zenoh_module"]
 
+_NOBODY_THERE = "Unable to connect to any of"
+_ENDPOINTS = re.compile(r"\w+\(([^()]+)\)")
 _TX = "transport/link/tx/queue"
 _NO_WAITING = (f"{_TX}/congestion_control/drop/wait_before_drop", 0)
 """What is thrown away keeps nobody waiting; else a put may keep the loop for a millisecond, each time."""
@@ -118,6 +121,9 @@ def _close_later(opening: asyncio.Future[Any]) -> None:
 def _config(zenoh: Any, address: str, options: NetworkOptions) -> Any:
     try:
         config = zenoh.Config.from_file(options.config) if options.config else zenoh.Config()
+    except zenoh.ZError as error:
+        raise LocalProtocolError(f"{address}: config={options.config}: {_reason(error)}") from error
+    try:
         for key, value in _settings(options):
             config.insert_json5(key, json.dumps(value))
     except zenoh.ZError as error:
@@ -145,7 +151,13 @@ def _settings(options: NetworkOptions) -> Iterable[tuple[str, object]]:
 
 def _reason(error: Exception) -> str:
     """Without the place in zenoh's source."""
-    return str(error).split(" at /", 1)[0].strip().rstrip("!.") or type(error).__name__
+    text = str(error).split(" at /", 1)[0].strip().rstrip("!.") or type(error).__name__
+    if text.startswith(_NOBODY_THERE):
+        where = ", ".join(_ENDPOINTS.findall(text)) or text
+        return (
+            f"nobody can be reached at {where} (is a router or peer running there, and is this its address?)"
+        )
+    return text.replace(": [", ": ")
 
 
 def _nothing() -> None:
