@@ -92,7 +92,9 @@ async def test_nobody_of_that_name() -> None:
 
 
 async def test_no_router() -> None:
-    with pytest.raises(LinkOpenError, match=r"cannot open zenoh://north/alpha: nobody can be reached at tcp/127"):
+    with pytest.raises(
+        LinkOpenError, match=r"cannot open zenoh://north/alpha: nobody can be reached at tcp/127"
+    ):
         async with client(free_port()):
             pass
     with pytest.raises(LinkOpenError, match="cannot open zenohin://north/alpha"):

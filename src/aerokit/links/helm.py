@@ -139,6 +139,8 @@ class Helm:
 class Gate:
     """What one client sends: whole frames that it may send pass, of the others it is told."""
 
+    heard_at: float
+
     refused: int
 
     def __init__(self, client: str, helm: Helm) -> None:

@@ -119,6 +119,8 @@ class LinkChoice:
     only when it has shown to be the same vehicle, by its clock or by carrying the same frames.
     """
 
+    needs_proof: bool
+
     clock: VehicleClock
 
     def __init__(self, *, needs_proof: bool) -> None:
