@@ -121,3 +121,10 @@ def test_lines_for_people(capsys: pytest.CaptureFixture[str]) -> None:
     assert lines[0].startswith("a: tcpin:127.0.0.1:")
     assert lines[1] == "1 endpoint, for 0.1 s"
     assert lines[-1] == "a: 0 frames in, 0 out, 0 lost; heard nobody"
+
+
+def test_nothing_recorded_leaves_no_file(tmp_path: Path) -> None:
+    path = tmp_path / "hub.tlog"
+    for _ in range(2):
+        assert main(["hub", "a=tcpin:127.0.0.1:0", "--seconds", "0.1", "--record", str(path)]) == 0
+        assert not path.exists()

@@ -13,6 +13,7 @@ from aerokit.cli.arguments import address, number, writable_file
 from aerokit.cli.completers import addresses, offer
 from aerokit.cli.exits import DONE, INTERRUPTED
 from aerokit.cli.interrupt import on_interrupt
+from aerokit.cli.new_file import make_new_recording, remove_if_empty
 from aerokit.cli.output import add_json, tell
 from aerokit.cli.signing import ENVIRONMENT, add_signing_key, signing_of
 from aerokit.errors import LocalProtocolError
@@ -118,15 +119,6 @@ def _log_file(text: str) -> str:
     return writable_file(text)
 
 
-def _make_anew(path: str) -> None:
-    """Make the file now, so that nobody else's is replaced."""
-    try:
-        with open(path, "xb"):
-            pass
-    except FileExistsError as error:
-        raise FileExistsError(error.errno, "is there already; nothing was recorded", path) from None
-
-
 async def _hub(options: argparse.Namespace) -> int:
     from aerokit.hub import Hub
 
@@ -137,7 +129,7 @@ async def _hub(options: argparse.Namespace) -> int:
     with on_interrupt(stop.set):
         async with hub:
             if options.record is not None:
-                _make_anew(options.record)
+                make_new_recording(options.record)
                 hub.record(options.record)
             record = {"endpoints": [each.address for each in hub.endpoints], "file": options.record}
             tell(
@@ -153,6 +145,8 @@ async def _hub(options: argparse.Namespace) -> int:
                     if not stop.is_set():
                         _tell_statistics(options, hub)
             _tell_statistics(options, hub)
+        if options.record is not None:
+            remove_if_empty(options.record)
     return INTERRUPTED if stop.is_set() and options.seconds is not None else DONE
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from aerokit.cli.arguments import writable_file
 from aerokit.cli.exits import DONE, FAILED, INTERRUPTED
 from aerokit.cli.link_command import add_link, add_seconds, await_end, opened
+from aerokit.cli.new_file import make_new_recording, remove_if_empty
 from aerokit.cli.output import tell
 from aerokit.errors import AerokitError
 
@@ -55,7 +56,7 @@ async def run_record(options: argparse.Namespace) -> int:
     def count(frame: Frame, peer: Peer) -> None:
         counts[frame.system_id, frame.message_id] += 1
 
-    _make_anew(options.file)
+    make_new_recording(options.file)
     error: AerokitError | None = None
     try:
         async with opened(options, reconnect=True) as connection:
@@ -70,7 +71,7 @@ async def run_record(options: argparse.Namespace) -> int:
                 error, is_interrupted = ended, False
             seconds = connection.now() - started
     except BaseException:
-        _remove_empty(options.file)
+        remove_if_empty(options.file)
         raise
     _tell_counts(options, counts, seconds)
     if error is not None:
@@ -78,21 +79,6 @@ async def run_record(options: argparse.Namespace) -> int:
     if not counts:
         return FAILED
     return INTERRUPTED if is_interrupted and options.seconds is not None else DONE
-
-
-def _make_anew(path: str) -> None:
-    """Make the file now, so that nobody else's is replaced."""
-    try:
-        with open(path, "xb"):
-            pass
-    except FileExistsError as error:
-        raise FileExistsError(error.errno, "is there already; nothing was recorded", path) from None
-
-
-def _remove_empty(path: str) -> None:
-    """It was made a moment ago, and nothing came of it."""
-    if not os.path.getsize(path):
-        os.unlink(path)
 
 
 async def _record(connection: Connection, options: argparse.Namespace) -> bool:
