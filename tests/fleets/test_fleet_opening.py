@@ -99,6 +99,7 @@ async def test_who_is_missing_is_told() -> None:
     [
         ({"on_error": "panic"}, "on_error = 'panic'"),
         ({"on_error_of": {"a": "panic"}}, "on_error"),
+        ({"on_error_of": {"typo": "land_others"}, "groups": {"two": ["1/*"]}}, "the groups are two"),
         ({"count": 0}, "count = 0"),
         ({"min_distance_m": 0.0}, "min_distance_m"),
         ({"too_close": "shout"}, "too_close"),

@@ -5,7 +5,8 @@ from __future__ import annotations
 from test_routing import CAMERA, COPTER, STATION, Stage, order
 
 from aerokit.hub.routing import MOST_SENDERS
-from aerokit.hub.senders import MOVES_AFTER_S
+from aerokit.hub.senders import MOVES_AFTER_S, REPEATED_WITHIN_S
+from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.messages import Attitude, Heartbeat, ParamRequestList
 
 
@@ -86,3 +87,38 @@ def test_names_that_are_made_up_do_not_push_out_a_gimbal() -> None:
     for number in range(MOST_SENDERS + 100):
         stage.hear("b", Attitude(0, 0, 0, 0, 0, 0, 0), 2 + number % 240, 1 + number // 240)
     assert stage.hear("c", order(77, 154), 255, 190) == {"a"}
+
+
+FIRST_ORDER = FrameEncoder(255, 190).encode(order(1))
+"""Of a program whose numbers begin at 0, as those of the one before did."""
+
+
+def test_the_first_order_of_a_program_at_a_new_port_is_no_copy() -> None:
+    """Scripts one after the other, that order the same: the vehicle must hear the last of them, too."""
+    stage = Stage()
+    stage.hear("a", COPTER)
+    assert stage.pass_on("c", FIRST_ORDER) == {"a"}
+    for name in ("e", "f"):  # a client of TCP, a new port of UDP
+        stage.now += 0.2
+        stage.nodes[name] = stage.router.add(name)
+        assert stage.pass_on(name, FIRST_ORDER) == {"a"}
+
+
+def test_nor_is_it_where_the_other_program_has_gone() -> None:
+    stage = Stage()
+    stage.hear("a", COPTER)
+    assert stage.pass_on("c", FIRST_ORDER) == {"a"}
+    assert stage.pass_on("d", FIRST_ORDER) == set(), "by another way that was there"
+    stage.router.remove(stage.nodes.pop("c"))
+    stage.now += 0.1
+    assert stage.pass_on("d", FIRST_ORDER) == {"a"}
+
+
+def test_nor_is_it_at_the_same_port_after_a_while() -> None:
+    stage = Stage()
+    stage.hear("a", COPTER)
+    assert stage.pass_on("c", FIRST_ORDER) == {"a"}
+    stage.now += REPEATED_WITHIN_S / 2
+    assert stage.pass_on("c", FIRST_ORDER, is_late=True) == set(), "doubled on its way"
+    stage.now += REPEATED_WITHIN_S
+    assert stage.pass_on("c", FIRST_ORDER, is_late=True) == {"a"}

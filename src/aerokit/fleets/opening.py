@@ -86,6 +86,11 @@ async def fleet(
         )
     if too_close not in ("hold", "tell"):
         raise LocalProtocolError(f"too_close = {too_close!r} is not allowed: 'hold' or 'tell'")
+    strange = [group for group in on_error_of or {} if group and group not in (groups or {})]
+    if strange:
+        raise LocalProtocolError(
+            f"on_error_of = {shown(strange[0])} is not allowed: the groups are {', '.join(groups or {}) or 'none'}"
+        )
     if count is not None and count < 1:
         raise LocalProtocolError(f"count = {count} is not allowed: 1 or more, or None")
     named = _named(sources)

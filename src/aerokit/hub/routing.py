@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Generic, TypeVar
 
-from aerokit.hub.senders import MOST_RECENT, Recent, Sender
+from aerokit.hub.senders import DUPLICATE_WINDOW_S, MOST_RECENT, REPEATED_WITHIN_S, Recent, Sender
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -152,9 +152,9 @@ class Router(Generic[PortT]):
             recent.begin_next(now)
         which = source << 24 | body[3] << 16 | frame.checksum
         before = recent.newer.get(which) or recent.older.get(which)
-        if before is not None and (is_late or before != number):
+        if before is not None and self._is_copy(before, number, now, is_late):
             return self._duplicate
-        recent.newer[which] = number
+        recent.newer[which] = number, self._count, now
         if sender.number == number:
             sender.heard_at = now
         elif sender.hear_elsewhere(number, now):
@@ -185,6 +185,17 @@ class Router(Generic[PortT]):
         sender = self._senders[source] = Sender(source, node.number, now)
         self.forget_plans()
         return sender
+
+    def _is_copy(self, before: tuple[int, int, float], number: int, now: float, is_late: bool) -> bool:
+        """Whether it is the frame that came before, and not the first one of a program that has been started again.
+
+        Such a program begins its numbers anew, and its first order may be the same as before: it must not be lost. It
+        comes from a port that was not there yet, or after the other one has gone, or from the same one after a while.
+        """
+        first, count, at = before
+        if first == number:
+            return is_late and now - at <= REPEATED_WITHIN_S
+        return first in self._nodes and number <= count and now - at <= DUPLICATE_WINDOW_S
 
     def _note_heartbeat(self, sender: Sender, node: Node[PortT], body: bytes) -> None:
         if sender.note_heartbeat(body):

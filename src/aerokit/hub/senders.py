@@ -10,10 +10,12 @@ from aerokit.mavlink.enums import MavAutopilot, MavType
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-__all__ = ["DUPLICATE_WINDOW_S", "MOST_RECENT", "MOVES_AFTER_S", "Recent", "Sender"]
+__all__ = ["DUPLICATE_WINDOW_S", "MOST_RECENT", "MOVES_AFTER_S", "REPEATED_WITHIN_S", "Recent", "Sender"]
 
 DUPLICATE_WINDOW_S = 2.0
 """A frame with the sender, number and checksum of one that came from elsewhere so short a time ago is the same one."""
+REPEATED_WITHIN_S = 0.5
+"""And one that comes again from the same place was doubled on its way only if it comes so soon."""
 MOST_RECENT = 1 << 15
 """Of more frames than that the window is shorter."""
 
@@ -99,9 +101,10 @@ class Recent:
     __slots__ = ("ends_at", "newer", "older")
 
     def __init__(self) -> None:
-        self.newer: dict[int, int] = {}
-        """Sender, sequence number and checksum as one number → the number of the port it came from."""
-        self.older: dict[int, int] = {}
+        self.newer: dict[int, tuple[int, int, float]] = {}
+        """Sender, sequence number and checksum as one number → the number of the port it came from, how many ports
+        there had been by then, and when."""
+        self.older: dict[int, tuple[int, int, float]] = {}
         self.ends_at = float("-inf")
         """When the next generation begins."""
 
