@@ -16,7 +16,7 @@ from aerokit.snapshot import Snapshot
 __all__ = ["NetworkOptions", "attachment_of", "close_session", "open_session", "payload_of", "zenoh_module"]
 
 _NOBODY_THERE = "Unable to connect to any of"
-_ENDPOINTS = re.compile(r"\w+\(([^()]+)\)")
+_ENDPOINTS = re.compile(r"[a-z]+/[^\s,()\[\]]+")  # "[Single(tcp/a:1)]", by 1.6 "[tcp/a:1]"
 _TX = "transport/link/tx/queue"
 _NO_WAITING = (f"{_TX}/congestion_control/drop/wait_before_drop", 0)
 """What is thrown away keeps nobody waiting; else a put may keep the loop for a millisecond, each time."""
