@@ -6,12 +6,8 @@ Sans-IO: what is heard, measured and asked comes in with its time.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 from aerokit.runtime.vehicle_clock import VehicleClock
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
 
 __all__ = ["PATIENCE_S", "PROOFS", "PROVEN_BY_COPIES", "SILENT_S", "STEADY_S", "Candidate", "LinkChoice"]
 
@@ -213,8 +209,3 @@ class LinkChoice:
             former.is_proven = True  # the one behind the other link is the same as was behind this one
         self.former, self.used, self.changed_at, self._better = former, to, now, None
         return reason
-
-    def forget(self, links: Iterable[int]) -> None:
-        """Nothing is behind these any more."""
-        for link in links:
-            self.candidates.pop(link, None)
