@@ -25,7 +25,7 @@ from aerokit.mavlink.enums import MavCmd
 from aerokit.missions import Mission, land, return_to_launch, take_off, waypoint
 from aerokit.position import Position
 from aerokit.sim import SimulatedPx4, simulated_link
-from aerokit.sim.px4.modes import POSITION
+from aerokit.sim.px4.modes import POSITION, custom_mode
 from aerokit.sim.track import least_distance_m, record_track
 
 pytestmark = pytest.mark.anyio
@@ -342,6 +342,28 @@ async def test_px4s_fly_as_a_fleet_and_a_pilot_is_noticed() -> None:
         await anyio.sleep(2)
         (await both.land()).raise_for_errors()
         assert both.members["south/1"].state is MemberState.TAKEN_OVER
+
+
+async def test_a_px4_that_has_landed_and_tells_its_next_mode_before_its_heartbeat_is_not_taken_over() -> None:
+    px4s = [SimulatedPx4(system_id=each, boot_time_s=1.0, seed=each) for each in (1, 2)]
+    async with simulated_link(px4s) as link, fleet({"south": link}, count=2) as both:
+        for order in (both.wait_ready(), both.arm(), both.take_off(6)):
+            (await order).raise_for_errors()
+        higher = both.vehicles["south/2"]
+        await higher.go_to(higher.position.value.offset(up_m=6))
+
+        async def tell() -> None:
+            while px4s[0].is_armed:  # noqa: ASYNC110
+                await anyio.sleep(0.01)
+            heard = both.vehicles["south/1"].armed.updated_at
+            px4s[0].send(m.CurrentMode(0, custom_mode(px4s[0].mode), custom_mode(px4s[0].mode)))
+            await both.vehicles["south/1"].mode.wait_until(lambda mode: mode.name == "LOITER")
+            assert both.vehicles["south/1"].armed.updated_at == heard, "no HEARTBEAT came meanwhile"
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(tell)
+            (await both.land()).raise_for_errors()
+        assert [each.state for each in both] == [MemberState.IN] * 2
 
 
 async def test_one_that_falls_out_between_two_layers_stops_the_others_there() -> None:

@@ -14,7 +14,7 @@ from aerokit import messages as m
 from aerokit.errors import CommandRejected, OperationRejected, OperationTimeout
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.runtime.cells import StateCell
-from aerokit.sim.px4.modes import POSITION
+from aerokit.sim.px4.modes import POSITION, custom_mode
 
 pytestmark = pytest.mark.anyio
 
@@ -187,6 +187,46 @@ async def test_land_and_return(flying: Px4Flight) -> None:
 async def test_land(flying: Px4Flight) -> None:
     await flying.vehicle.land()
     assert flying.px4.is_landed
+
+
+@pytest.mark.parametrize("is_taken", [False, True])
+async def test_a_mode_that_is_told_before_the_heartbeat_may_be_the_end_of_a_landing(
+    flying: Px4Flight, monkeypatch: pytest.MonkeyPatch, is_taken: bool
+) -> None:
+    """It leaves LAND when it disarms; CURRENT_MODE comes up to a second before the HEARTBEAT that says so."""
+    told: list[str] = []
+
+    def look() -> None:
+        told.append(flying.vehicle.taken_over)
+
+    monkeypatch.setattr(
+        flying.vehicle.telemetry, "landed_state", StateCell[int]("landed_state", now, "nothing")
+    )
+    async with anyio.create_task_group() as tasks:
+
+        async def current_mode() -> None:
+            await flying.vehicle.mode.wait_until(lambda mode: mode.name == "LAND")
+            if is_taken:
+                await anyio.sleep(2.0)
+                flying.px4.switch_to(POSITION)
+            else:
+                while flying.px4.is_armed:  # noqa: ASYNC110
+                    await anyio.sleep(0.01)
+            heard = flying.vehicle.armed.updated_at
+            flying.px4.send(m.CurrentMode(0, custom_mode(flying.px4.mode), custom_mode(flying.px4.mode)))
+            await flying.vehicle.mode.wait_until(lambda mode: mode.name != "LAND")
+            assert flying.vehicle.armed.updated_at == heard, "no HEARTBEAT came meanwhile"
+            look()
+            await flying.vehicle.armed.wait_until(lambda _: flying.vehicle.armed.updated_at > heard)
+            look()
+
+        tasks.start_soon(current_mode)
+        if is_taken:
+            with pytest.raises(OperationRejected, match="land: the mode changed to POSCTL"):
+                await flying.vehicle.land()
+        else:
+            await flying.vehicle.land()
+    assert told == (["", "the mode changed to POSCTL"] if is_taken else ["", "the mode changed to LOITER"])
 
 
 async def test_reboot() -> None:

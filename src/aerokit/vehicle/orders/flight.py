@@ -239,6 +239,8 @@ class FlightActions(Part):
         def trouble() -> str | None:
             if is_over() and is_deep() and self.connection.now() > accepted_at + MODE_GRACE_S:
                 return f"the mode changed to {self.telemetry.mode_name} at {self._where.altitude_relative():.1f} m"
+            if order.has_lost_mode and armed.updated_at < order.mode_lost_at:
+                return None  # the HEARTBEAT that comes next may tell that it has landed and disarmed
             return stays()
 
         depth = () if self.autopilot.landing_ends_in is None else ("position",)

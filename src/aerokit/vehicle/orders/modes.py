@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from aerokit.arguments import checks_arguments
+from aerokit.mavlink.enums import MavLandedState
 from aerokit.vehicle.orders.part import Part
 
 __all__ = ["ModeActions"]
@@ -58,4 +59,11 @@ class ModeActions(Part):
         A vehicle that only disarmed, as after a landing, was not taken over. The program's next action begins anew.
         """
         order = self._helm.newest
-        return order.taken_by if order is not None and order.has_lost_mode else ""
+        if order is None or not order.has_lost_mode:
+            return ""
+        may_have_landed = self.telemetry.landed_state.latest != MavLandedState.IN_AIR
+        if may_have_landed and self.telemetry.armed.updated_at < order.mode_lost_at:
+            return (
+                ""  # PX4 leaves LAND when it disarms: CURRENT_MODE tells that a moment before HEARTBEAT does
+            )
+        return order.taken_by

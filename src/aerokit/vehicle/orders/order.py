@@ -115,6 +115,8 @@ class Order:
         """What somebody else has done, as a clause; empty: nothing that was told."""
         self.has_lost_mode: bool = False
         """Whether that was another mode."""
+        self.mode_lost_at: float = -math.inf
+        """When that was told: by CURRENT_MODE sooner than by the HEARTBEAT that may say that it has disarmed, too."""
         self.is_given = False
         """Whether the vehicle may move by it, or moves by what the program had ordered before: given up, it is held."""
         late = {each.custom_mode for each in expected}
@@ -148,6 +150,8 @@ class Order:
         elif not self._is_mode_known or at < self._any_until:
             self._allowed.add(mode.custom_mode)
         elif mode.custom_mode not in self._allowed:
+            if not self.has_lost_mode:
+                self.mode_lost_at = at
             self.has_lost_mode = True
             self.taken_by = self.taken_by or f"the mode changed to {mode}"
         self._is_mode_known = True
