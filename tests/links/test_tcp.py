@@ -318,6 +318,23 @@ async def test_a_client_that_comes_while_the_link_closes_is_closed_too() -> None
 
 
 @each_loop
+@pytest.mark.parametrize("turns", [0, 1, 3, 4, 5, 6])  # at 2 asyncio itself drops it, and says so
+async def test_a_client_that_the_loop_has_just_accepted_is_closed_with_the_link(turns: int) -> None:
+    link = TcpListen("127.0.0.1", 0)
+    await link.open(Recorder())
+    before = len(asyncio.all_tasks())
+    with socket.create_connection(link.local_address) as client:
+        for _ in range(turns):
+            await asyncio.sleep(0)
+        link.close()
+        await link.wait_closed()
+        client.setblocking(False)
+        with contextlib.suppress(ConnectionResetError):  # nobody has accepted it yet
+            assert client.recv(1) == b""
+        assert len(asyncio.all_tasks()) == before
+
+
+@each_loop
 async def test_a_taken_port_is_an_error_with_a_hint() -> None:
     async with listening() as (listener, _):
         second = TcpListen(*listener.local_address)

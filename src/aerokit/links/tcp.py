@@ -33,6 +33,8 @@ SEND_BUFFER = 16 * 1024
 NOT_SENT_LOW_WATER = 1024
 """So much the system may take that it has never sent (TCP_NOTSENT_LOWAT, where there is one)."""
 
+TURNS_OF_AN_ACCEPT = 5
+"""Turns of the loop from a client that it has accepted to one that we know: before, nobody would close it."""
 MAX_CLIENTS = 64
 """Further clients of a listening link are turned away, or take the place of one that has said nothing yet."""
 
@@ -205,6 +207,8 @@ class TcpListen(_TcpLink):
 
     async def wait_closed(self) -> None:
         """See `Link.wait_closed`."""
+        for _ in range(TURNS_OF_AN_ACCEPT):
+            await asyncio.sleep(0)
         await super().wait_closed()
         if self._server is not None and self._receiver is None:
             with anyio.move_on_after(LINGER_S):
