@@ -306,8 +306,9 @@ class LinkChosen(Event):
     """Of several links, ``link`` (its address) is used for this system from now on: orders go over it.
 
     ``before`` is the one used until now (None: this is the first), ``reason`` says why: "first heard", "silent",
-    "stalled", "lost" (the former one), "better", or "cheaper" (the former one is a costly one). Message rates are asked
-    for again, for an autopilot keeps them for each link.
+    "stalled", "lost" (the former one), "better", "cheaper" (the former one is a costly one), or "another vehicle" (is
+    behind the former one: told late, by its AUTOPILOT_VERSION). Message rates are asked for again, for an autopilot
+    keeps them for each link.
     """
 
     link: str
