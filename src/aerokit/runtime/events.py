@@ -38,6 +38,7 @@ __all__ = [
     "ModeChanged",
     "MoveRefused",
     "OneLinkChanged",
+    "OneLinkNotOpened",
     "OrderRefused",
     "ParameterChanged",
     "SettingChanged",
@@ -322,6 +323,17 @@ class OneLinkChanged(Event):
     link: str
     before: LinkState
     after: LinkState
+
+
+class OneLinkNotOpened(Event):
+    """One of several links (its address) could not be opened at first, and why; it is tried again. Told once.
+
+    That is some tenths of a second after the connection was opened; ``connection.links`` has it as LOST all the time,
+    and ``OneLinkChanged`` tells when it is there.
+    """
+
+    link: str
+    error: AerokitError
 
 
 class LinkStateChanged(Event):

@@ -13,7 +13,7 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavAutopilot, MavComponent
 from aerokit.runtime.claims import boot_time_ms
 from aerokit.runtime.copies import Copies
-from aerokit.runtime.events import HeardTwice, LinkChosen
+from aerokit.runtime.events import HeardTwice, LinkChosen, OneLinkNotOpened
 from aerokit.runtime.hardware_id import HardwareId
 from aerokit.runtime.link_choice import LinkChoice
 from aerokit.runtime.link_questions import LinkQuestions
@@ -24,6 +24,7 @@ from aerokit.runtime.routes import EVERY_PEER, Routes
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
 
+    from aerokit.errors import LinkOpenError
     from aerokit.links.link import Peer
     from aerokit.links.several import SeveralLinks
     from aerokit.mavlink.frame import Frame
@@ -282,6 +283,11 @@ class SeveralRoutes:
             if (candidate := choice.candidates.get(link)) is not None:
                 candidate.is_stalled = is_stalled
                 self._choose(system_id, choice, now)
+
+    def link_not_opened(self, link: int, error: LinkOpenError) -> None:
+        """A link could not be opened, and is tried again."""
+        event = OneLinkNotOpened(self._connection.now(), 0, self._link.names[link], error)
+        self._connection.bus.publish(event)
 
     async def watch(self) -> None:
         """Count, ask and choose, as long as the connection is open."""
