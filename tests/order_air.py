@@ -40,6 +40,41 @@ class Crossing:
     at: float
     message: Message
     is_lost: bool = False
+    is_believed: bool = True
+    """Whether the program took it: over a link that is not in use it does not."""
+
+
+@dataclass(frozen=True)
+class Silence:
+    """One of two links falls silent, in seconds since the order was given: in both directions, or answers only."""
+
+    begin_s: float
+    end_s: float = float("inf")
+    is_one_way: bool = False
+
+
+class Diary:
+    """Everything that crossed, over whichever link."""
+
+    def __init__(self) -> None:
+        self.sent: list[Crossing] = []
+        self.heard: list[Crossing] = []
+        self._numbers = itertools.count()
+
+    def cross(self, into: list[Crossing], message: Message, is_lost: bool = False) -> Crossing:
+        """It crosses now."""
+        into.append(Crossing(next(self._numbers), _now(), message, is_lost))
+        return into[-1]
+
+    def begin(self) -> None:
+        """Forget all but the last HEARTBEAT."""
+        self.sent.clear()
+        self.heard[:] = self.heartbeats[-1:]
+
+    @property
+    def heartbeats(self) -> list[Crossing]:
+        """What the program has heard the vehicle tell of itself."""
+        return [each for each in self.heard if isinstance(each.message, Heartbeat) and each.is_believed]
 
 
 @dataclass
@@ -48,13 +83,12 @@ class Air(Link):
 
     link: Link
     weather: Weather = field(default_factory=Weather)
+    diary: Diary = field(default_factory=Diary)
+    silence: Silence | None = None
 
     def __post_init__(self) -> None:
         self.address = self.link.address
-        self.sent: list[Crossing] = []
-        self.heard: list[Crossing] = []
         self.began_at = float("inf")
-        self._numbers = itertools.count()
         self._ups: deque[Callable[[], object]] = deque()
         self._downs: deque[Callable[[], object]] = deque()
         self._up, self._down = Framer(), Framer()
@@ -63,13 +97,17 @@ class Air(Link):
     def begin(self) -> None:
         """The order is given now."""
         self.began_at = _now()
-        self.sent.clear()
-        self.heard = [each for each in self.heard if isinstance(each.message, Heartbeat)][-1:]
+        self.diary.begin()
+
+    @property
+    def sent(self) -> list[Crossing]:
+        """What the program has written."""
+        return self.diary.sent
 
     @property
     def heartbeats(self) -> list[Crossing]:
-        """What the program has heard the vehicle tell of itself."""
-        return [each for each in self.heard if isinstance(each.message, Heartbeat)]
+        """See `Diary.heartbeats`."""
+        return self.diary.heartbeats
 
     # ------------------------------------------------------------------------------------ link
 
@@ -80,8 +118,8 @@ class Air(Link):
     def write(self, data: bytes, peer: Peer = None) -> None:
         for frame in self._up.receive(data, _now()):
             message = STANDARD.decode(frame)
-            is_lost = self._is_out() or self._loses(message)
-            self.sent.append(Crossing(next(self._numbers), _now(), message, is_lost))
+            is_lost = self._is_out(is_up=True) or self._loses(message)
+            self.diary.cross(self.sent, message, is_lost)
             if not is_lost:
                 self._later(self._ups, self._delay(), functools.partial(self.link.write, frame.raw))
 
@@ -96,7 +134,7 @@ class Air(Link):
     def bytes_received(self, data: bytes, peer: Peer) -> None:
         for frame in self._down.receive(data, _now()):
             message = STANDARD.decode(frame)
-            is_lost = self._is_out() or self._loses(message)
+            is_lost = self._is_out(is_up=False) or self._loses(message)
             if is_lost or self._receiver is None:
                 continue
             arrive = functools.partial(self._arrive, frame.raw, message)
@@ -113,7 +151,7 @@ class Air(Link):
         """It always does."""
 
     def _arrive(self, raw: bytes, message: Message) -> None:
-        self.heard.append(Crossing(next(self._numbers), _now(), message))
+        self.diary.cross(self.diary.heard, message)
         if self._receiver is not None:
             self._receiver.bytes_received(raw, None)
 
@@ -123,8 +161,10 @@ class Air(Link):
         queue.append(act)
         asyncio.get_running_loop().call_later(delay_s, lambda: queue.popleft()())
 
-    def _is_out(self) -> bool:
-        since, outage = _now() - self.began_at, self.weather.outage
+    def _is_out(self, *, is_up: bool) -> bool:
+        since, outage, silence = _now() - self.began_at, self.weather.outage, self.silence
+        if silence is not None and silence.begin_s <= since < silence.end_s:
+            return not (is_up and silence.is_one_way)
         return outage is not None and outage[0] <= since < outage[1]
 
     def _loses(self, message: Message) -> bool:

@@ -8,7 +8,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import anyio
-from order_air import Air, Weather
+from order_air import Air, Silence, Weather
+from order_airs import Airs, TwoLinks, over_two
 from order_table import Row, upload
 
 import aerokit
@@ -24,6 +25,8 @@ from aerokit.testing import run_virtual
 Simulated = SimulatedCopter | SimulatedPx4
 
 RATES: dict[type[Message], float] = {GlobalPositionInt: 4.0}
+RIGHT_AFTER_S = 0.001
+"""What is sent with the call has left by then."""
 WATCH_S, WATCH_ARMING_S = 8.0, 18.0
 """So long after the order's end it is looked what becomes of it: an order to arm may come late."""
 
@@ -43,6 +46,8 @@ class Case:
     station_failsafe: bool = False
     """Whether it returns when it does not hear the ground station."""
     cancel_at: float | None = None
+    two: TwoLinks | None = None
+    """None: over one link."""
 
 
 @dataclass
@@ -51,7 +56,7 @@ class Flown:
 
     case: Case
     vehicle: Simulated
-    air: Air
+    air: Air | Airs
     given_at: float
     ended_at: float
     error: BaseException | None
@@ -95,6 +100,19 @@ def random_case(row: Row, autopilot: str, seed: int) -> Case:
         cancel_at=round(dice.uniform(0.05, 12.0), 2) if dice.random() < 0.25 else None,
         by_switch=dice.random() < 0.5,
     )
+
+
+def random_case_over_two(row: Row, autopilot: str, seed: int) -> Case:
+    """The same over two links: the one in use falls silent before, with or after the order; answers come over the other
+    one, or are lost on both. None of them delivers late: what a network keeps cannot be taken back.
+    """
+    case = random_case(row, autopilot, seed)
+    dice = random.Random(f"two links {row.name} {row.command} {autopilot} {seed}")
+    begin_s = dice.choice((0.0, RIGHT_AFTER_S, RIGHT_AFTER_S, round(dice.uniform(0.05, 4.0), 2)))
+    lasts_s = dice.choice((float("inf"), float("inf"), round(dice.uniform(0.5, 8.0), 2)))
+    silence = Silence(begin_s, begin_s + lasts_s, is_one_way=dice.random() < 0.5)
+    two = TwoLinks(silence, is_copied=dice.random() < 0.5)
+    return replace(case, weather=replace(case.weather, stall=None), two=two)
 
 
 def fly(case: Case) -> Flown:
@@ -171,35 +189,46 @@ def _set_up(case: Case) -> Simulated:
 
 
 async def _fly(case: Case) -> Flown:
-    vehicle, loop = _set_up(case), asyncio.get_running_loop()
+    vehicle = _set_up(case)
+    if case.two is not None:
+        async with (
+            over_two(vehicle, case.two) as (airs, connection),
+            aerokit.connect(connection, rates=RATES) as program,
+        ):
+            return await _give(case, vehicle, airs, program)
     async with simulated_link(vehicle) as link:
         air = Air(link)
         async with aerokit.connect(air, rates=RATES) as program:
-            await _go_to_place(case.row.place, vehicle, program)
-            air.weather = case.weather
-            air.begin()
-            given_at = loop.time()
-            acted: list[tuple[float, str]] = []
+            return await _give(case, vehicle, air, program)
 
-            def later(at: float | None, act: Callable[[], None]) -> None:
-                def happen() -> None:
-                    act()
-                    acted.append((loop.time(), mode_of(vehicle)))
 
-                if at is not None:
-                    loop.call_later(at, happen)
+async def _give(case: Case, vehicle: Simulated, air: Air | Airs, program: aerokit.Vehicle) -> Flown:
+    loop = asyncio.get_running_loop()
+    await _go_to_place(case.row.place, vehicle, program)
+    air.weather = case.weather
+    air.begin()
+    given_at = loop.time()
+    acted: list[tuple[float, str]] = []
 
-            later(case.pilot_at, lambda: _act(case, vehicle))
-            later(case.failsafe_at, lambda: _return(vehicle))
-            error: BaseException | None = None
-            with anyio.CancelScope(deadline=given_at + (case.cancel_at or 1e6)) as scope:
-                try:
-                    await case.row.give(program)
-                except AerokitError as caught:
-                    error = caught
-            if scope.cancelled_caught:
-                error = asyncio.CancelledError()
-            ended_at = loop.time()
-            told = (program.mode_name or "", program.is_armed)
-            await anyio.sleep(WATCH_ARMING_S if case.row.name == "arm" else WATCH_S)
-            return Flown(case, vehicle, air, given_at, ended_at, error, told, acted)
+    def later(at: float | None, act: Callable[[], None]) -> None:
+        def happen() -> None:
+            act()
+            acted.append((loop.time(), mode_of(vehicle)))
+
+        if at is not None:
+            loop.call_later(at, happen)
+
+    later(case.pilot_at, lambda: _act(case, vehicle))
+    later(case.failsafe_at, lambda: _return(vehicle))
+    error: BaseException | None = None
+    with anyio.CancelScope(deadline=given_at + (case.cancel_at or 1e6)) as scope:
+        try:
+            await case.row.give(program)
+        except AerokitError as caught:
+            error = caught
+    if scope.cancelled_caught:
+        error = asyncio.CancelledError()
+    ended_at = loop.time()
+    told = (program.mode_name or "", program.is_armed)
+    await anyio.sleep(WATCH_ARMING_S if case.row.name == "arm" else WATCH_S)
+    return Flown(case, vehicle, air, given_at, ended_at, error, told, acted)

@@ -10,23 +10,37 @@ import re
 from pathlib import Path
 
 import pytest
-from order_air import Weather
-from order_flights import Case, fly, mode_of, random_case
+from order_air import Silence, Weather
+from order_airs import TwoLinks
+from order_flights import RIGHT_AFTER_S, Case, Flown, fly, mode_of, random_case, random_case_over_two
 from order_judge import faults
 from order_table import ARM, REPOSITION, ROWS, SET_MODE, Row
 
-from aerokit.errors import CommandTimeout, OperationRejected
+from aerokit.errors import AerokitError, CommandTimeout, OperationRejected
 
 SEEDS = int(os.environ.get("AEROKIT_ORDER_SEEDS", "2"))
 BY_NAME = {row.name: row for row in ROWS}
 BOTH = ("ardupilot", "px4")
 
 
+EVERY_ROW = [
+    pytest.param(row, each, id=f"{row.name}-{row.command}-{each}") for row in ROWS for each in row.on
+]
+IS_SESSION = "AEROKIT_ORDER_SEEDS" in os.environ
+OVER_TWO, SEEDS_OVER_TWO = (EVERY_ROW, SEEDS) if IS_SESSION else (EVERY_ROW[::6], 1)
+"""Few of them in the tests, all of them in the session."""
+
+
+@pytest.mark.parametrize("seed", range(SEEDS_OVER_TWO))
+@pytest.mark.parametrize(("row", "autopilot"), OVER_TWO)
+def test_no_rule_is_broken_over_two_links(row: Row, autopilot: str, seed: int) -> None:
+    """The one in use falls silent before, with or after the order, which is not sent again late or blind."""
+    case = random_case_over_two(row, autopilot, seed)
+    assert faults(fly(case)) == [], case
+
+
 @pytest.mark.parametrize("seed", range(SEEDS))
-@pytest.mark.parametrize(
-    ("row", "autopilot"),
-    [pytest.param(row, each, id=f"{row.name}-{row.command}-{each}") for row in ROWS for each in row.on],
-)
+@pytest.mark.parametrize(("row", "autopilot"), EVERY_ROW)
 def test_no_rule_is_broken(row: Row, autopilot: str, seed: int) -> None:
     case = random_case(row, autopilot, seed)
     assert faults(fly(case)) == [], case
@@ -122,3 +136,46 @@ def test_a_pilot_who_goes_back_to_the_mode_from_before_keeps_the_vehicle() -> No
     flown = fly(Case(BY_NAME["go_to from another mode"], "px4", weather, pilot_at=1.51, cancel_at=0.98))
     assert faults(flown) == []
     assert mode_of(flown.vehicle) == "POSCTL"
+
+
+# ------------------------------------------------------------------------------- over two links
+
+
+def sent(flown: Flown, command: int) -> int:
+    """How often this command went out, over either link."""
+    return len([each for each in flown.air.sent if getattr(each.message, "command", 0) == command])
+
+
+def test_an_answer_that_comes_over_the_other_link_is_the_answer() -> None:
+    two = TwoLinks(Silence(RIGHT_AFTER_S), is_copied=True)
+    flown = fly(Case(BY_NAME["set_speed"], "ardupilot", Weather(), two=two))
+    assert flown.error is None
+    assert sent(flown, BY_NAME["set_speed"].command) == 1
+    assert flown.ended_at - flown.given_at < 0.5
+
+
+@pytest.mark.parametrize("autopilot", BOTH)
+def test_a_pilot_keeps_the_vehicle_when_the_answer_is_lost_on_both_links(autopilot: str) -> None:
+    """The mode is told over the next link only."""
+    two = TwoLinks(Silence(RIGHT_AFTER_S), is_copied=autopilot == "px4")
+    weather = Weather(command=REPOSITION, lost_acks=9)
+    flown = fly(Case(BY_NAME["go_to"], autopilot, weather, pilot_at=0.3, two=two))
+    assert isinstance(flown.error, OperationRejected)
+    assert sent(flown, REPOSITION) == 1
+    assert mode_of(flown.vehicle) == flown.acted[0][1]
+    assert faults(flown) == []
+
+
+def test_what_a_dying_link_has_lost_is_sent_again_once_the_next_one_has_told_that_nothing_changed() -> None:
+    flown = fly(Case(BY_NAME["land"], "ardupilot", Weather(), two=TwoLinks(Silence(0.0))))
+    assert flown.error is None
+    first, again = [each for each in flown.air.sent if getattr(each.message, "command", 0) == SET_MODE]
+    assert [first.is_lost, again.is_lost] == [True, False]
+    assert any(first.number < each.number < again.number for each in flown.air.heartbeats)
+
+
+def test_a_reboot_is_not_sent_again_over_the_next_link() -> None:
+    row = BY_NAME["reboot"]
+    flown = fly(Case(row, "ardupilot", Weather(), two=TwoLinks(Silence(0.0))))
+    assert isinstance(flown.error, AerokitError)
+    assert sent(flown, row.command) == 1

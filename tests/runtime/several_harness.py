@@ -7,8 +7,9 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from functools import partial
 from typing import Any
 
+from stream_splitter import Splitter
+
 from aerokit import events
-from aerokit.errors import LinkLost
 from aerokit.links import FaultModel, FaultyLink, Link, MemoryLink, Peer, SeveralLinks, memory_link_pair
 from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.message import Message
@@ -66,39 +67,6 @@ class Told:
     def of(self, *types: type[Message]) -> list[tuple[int, Message]]:
         """Those of these types, with the radio that each arrived by."""
         return [(index, message) for index, _, message in self.messages if isinstance(message, types)]
-
-
-class Splitter:
-    """One stream of the autopilot copied onto several radios, as a router on board does it."""
-
-    def __init__(self, far: Sequence[MemoryLink]) -> None:
-        self.port, self._inside = memory_link_pair()
-        self._far = far
-        self.keeps_peers = False
-
-    async def open(self, stack: AsyncExitStack) -> None:
-        """Begin to copy; everything is closed with the stack."""
-        splitter = self
-
-        class FromRadio:
-            def bytes_received(self, data: bytes, peer: Peer) -> None:
-                splitter._inside.write(data)
-
-            def link_lost(self, error: LinkLost) -> None:
-                pass
-
-        for link in (*self._far, self._inside):
-            stack.callback(link.close)
-        for link in self._far:
-            await link.open(FromRadio())
-        await self._inside.open(self)
-
-    def bytes_received(self, data: bytes, peer: Peer) -> None:
-        for link in self._far:
-            link.write(data)
-
-    def link_lost(self, error: LinkLost) -> None:
-        pass
 
 
 @asynccontextmanager

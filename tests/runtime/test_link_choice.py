@@ -11,7 +11,8 @@ from aerokit import messages as m
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.frame import Frame
 from aerokit.runtime.copies import Copies
-from aerokit.runtime.link_choice import PROOFS, SILENT_S, LinkChoice
+from aerokit.runtime.link_candidate import PROOFS, SILENT_S
+from aerokit.runtime.link_choice import LinkChoice
 from aerokit.runtime.vehicle_clock import VehicleClock
 
 STEPS = st.lists(

@@ -44,6 +44,9 @@ class OneOfSeveralListener(Receiver, Protocol):
     def one_link_stalled(self, link: int, is_stalled: bool) -> None:
         """What is written to a link does not leave, or leaves again."""
 
+    def one_link_not_opened(self, link: int, error: LinkOpenError) -> None:
+        """A link could not be opened at first, nor at the second attempt; it is tried again. Told once."""
+
 
 class SeveralLinks(Link):
     """Opens all of them; one that cannot be opened is tried again, as long as there is another one.
@@ -138,6 +141,7 @@ class SeveralLinks(Link):
             self._is_opening = False
         for index, failure in enumerate(results):
             if failure is not None and not self._is_closed:
+                logger.warning("one of several links cannot be opened, and is tried again: %s", failure)
                 self._begin_opening(index)
         self._look_whether_any_is_there()
 
@@ -226,7 +230,7 @@ class SeveralLinks(Link):
         task.add_done_callback(self._openings.discard)
 
     async def _open_late(self, index: int) -> None:
-        delay_s = FIRST_DELAY_S
+        delay_s, is_told = FIRST_DELAY_S, False
         while not self._is_closed:
             await asyncio.sleep(delay_s)
             delay_s = min(2 * delay_s, LONGEST_DELAY_S)
@@ -234,6 +238,10 @@ class SeveralLinks(Link):
             if error is None:
                 return
             logger.debug("not yet: %s", error)
+            # Not at the first attempt: whoever opens them could not listen yet.
+            if not is_told and isinstance(self._receiver, OneOfSeveralListener):
+                is_told = True
+                self._receiver.one_link_not_opened(index, error)
 
     # ------------------------------------------------------------------- what one of them says
 

@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     import os
     from collections.abc import AsyncGenerator, Callable, Iterator, Sequence
 
+    from aerokit.errors import LinkOpenError
     from aerokit.links.link import Peer
     from aerokit.mavlink.dialect import Dialect
     from aerokit.mavlink.framer import Framer
@@ -477,6 +478,11 @@ class Connection:
         """What is written to one of several links does not leave, or does again (called by the link)."""
         if self._several is not None:
             self._several.link_stalled(link, is_stalled)
+
+    def one_link_not_opened(self, link: int, error: LinkOpenError) -> None:
+        """One of several links could not be opened, and is tried again (called by the link)."""
+        if self._several is not None:
+            self._several.link_not_opened(link, error)
 
     def order_refused(self, message: str, reason: str, helm: str | None, answers: tuple[bytes, ...]) -> None:
         """The other side of a network let no order of ours through (called by the link)."""

@@ -38,6 +38,7 @@ __all__ = [
     "ModeChanged",
     "MoveRefused",
     "OneLinkChanged",
+    "OneLinkNotOpened",
     "OrderRefused",
     "ParameterChanged",
     "SettingChanged",
@@ -306,8 +307,9 @@ class LinkChosen(Event):
     """Of several links, ``link`` (its address) is used for this system from now on: orders go over it.
 
     ``before`` is the one used until now (None: this is the first), ``reason`` says why: "first heard", "silent",
-    "stalled", "lost" (the former one), "better", or "cheaper" (the former one is a costly one). Message rates are asked
-    for again, for an autopilot keeps them for each link.
+    "stalled", "lost" (the former one), "better", "cheaper" (the former one is a costly one), or "another vehicle" (is
+    behind the former one: told late, by its AUTOPILOT_VERSION). Message rates are asked for again, for an autopilot
+    keeps them for each link.
     """
 
     link: str
@@ -321,6 +323,17 @@ class OneLinkChanged(Event):
     link: str
     before: LinkState
     after: LinkState
+
+
+class OneLinkNotOpened(Event):
+    """One of several links (its address) could not be opened at first, and why; it is tried again. Told once.
+
+    That is some tenths of a second after the connection was opened; ``connection.links`` has it as LOST all the time,
+    and ``OneLinkChanged`` tells when it is there.
+    """
+
+    link: str
+    error: AerokitError
 
 
 class LinkStateChanged(Event):

@@ -1,6 +1,7 @@
-"""``LinkQuestions``: the time of each vehicle, asked over each link to it, and the answers.
+"""``LinkQuestions``: the time of each vehicle, asked over each link to it, and the answers; over a new link also which
+hardware it is.
 
-https://mavlink.io/en/services/timesync.html
+https://mavlink.io/en/services/timesync.html, https://mavlink.io/en/messages/common.html#AUTOPILOT_VERSION
 """
 
 from __future__ import annotations
@@ -9,13 +10,15 @@ import math
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import MavCmd, MavComponent
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from aerokit.links.link import Peer
     from aerokit.mavlink.message import Message
-    from aerokit.runtime.link_choice import Candidate, LinkChoice
+    from aerokit.runtime.link_candidate import Candidate
+    from aerokit.runtime.link_choice import LinkChoice
 
 __all__ = ["UNWANTED_HZ", "LinkQuestions"]
 
@@ -28,11 +31,13 @@ UNWANTED_HZ = 40.0
 """So many questions a second go to systems without a vehicle object, all together: ids that somebody makes up must not
 fill a slow radio."""
 
+_AUTOPILOT = int(MavComponent.AUTOPILOT1)
+
 
 class LinkQuestions:
     """Asks twice a second, over a costly link that is not in use once in five; ``send(message, peer)`` sends."""
 
-    def __init__(self, links: int, send: Callable[[m.Timesync, Peer], object]) -> None:
+    def __init__(self, links: int, send: Callable[[Message, Peer], object]) -> None:
         self._count, self._send = links, send
         self._under_way: dict[int, tuple[int, int, float]] = {}  # ts1 → system, link, asked at
         self._asked_at: dict[tuple[int, int], float] = {}
@@ -65,7 +70,13 @@ class LinkQuestions:
         if len(self._under_way) >= MOST_QUESTIONS:
             del self._under_way[next(iter(self._under_way))]
         self._under_way[number] = system_id, candidate.link, now
-        self._send(m.Timesync(0, number, target_system=system_id, target_component=1), peer)
+        self._send(m.Timesync(0, number, target_system=system_id, target_component=_AUTOPILOT), peer)
+        if choice.asks_hardware(candidate, is_wanted=is_wanted):
+            wanted = float(m.AutopilotVersion.ID)
+            question = m.CommandLong(
+                system_id, _AUTOPILOT, MavCmd.REQUEST_MESSAGE, 0, wanted, 0, 0, 0, 0, 0, 0
+            )
+            self._send(question, peer)
 
     def _has_left(self, now: float) -> bool:
         self._left = min(UNWANTED_HZ, self._left + UNWANTED_HZ * (now - self._left_at))

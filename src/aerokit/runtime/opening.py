@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     import os
     from collections.abc import AsyncIterator, Callable, Sequence
 
+    from aerokit.links import LinkAddress
     from aerokit.links.allowed import Peers
     from aerokit.mavlink.dialect import Dialect
     from aerokit.mavlink.signing import Signing
@@ -56,10 +57,10 @@ async def open_connection(
 
     Args:
         address: a connection string (``"udpin:0.0.0.0:14550"``, ``"/dev/ttyACM0,57600"``, …) or a link not yet open; or
-            several of them, that lead to the same vehicles (docs/how-to/several-links.md): each frame is taken once,
-            orders go over the best link, and over the next one when it falls silent. ``?costly=1`` behind an address
-            marks one that is used when the others fail. A link that is lost is opened again, as long as another one is
-            there.
+            several of them, none twice, that lead to the same vehicles (docs/how-to/several-links.md): each frame is
+            taken once, orders go over the best link, and over the next one when it falls silent. ``?costly=1`` behind
+            an address marks one that is used when the others fail. A link that is lost is opened again, as long as
+            another one is there.
         source_system: our own system id, 1–255; ground stations take 255.
         source_component: our own component id, 1–255. 0, which is nobody's, is allowed for programs that always were
             that (DroneKit).
@@ -144,6 +145,7 @@ def _several(addresses: Sequence[str | Link], baud: int, reconnect: bool, peers:
         return _link(addresses[0], baud, reconnect, peers)
     from aerokit.links import SeveralLinks, parse_address  # few programs have several
 
+    _refuse_twice(addresses, [each if isinstance(each, Link) else parse_address(each) for each in addresses])
     makers: list[Callable[[], Link]] = []
     costly: set[int] = set()
     for index, address in enumerate(addresses):
@@ -160,6 +162,30 @@ def _several(addresses: Sequence[str | Link], baud: int, reconnect: bool, peers:
         listened_to = peers if where.kind in ("udpin", "udpbcast", "tcpin") else None
         makers.append(partial(ReconnectingLink, partial(create_link, where, baud=baud, peers=listened_to)))
     return SeveralLinks(makers, costly=costly, stays=reconnect)
+
+
+def _refuse_twice(addresses: Sequence[str | Link], places: Sequence[Link | LinkAddress]) -> None:
+    """The same socket or port cannot be opened twice; that it cannot would be told as a link that is away."""
+    seen: set[object] = set()
+    for address, place in zip(addresses, places):  # noqa: B905 - as many
+        which = _which(place)
+        if which in seen:
+            raise LocalProtocolError(
+                f"address = {shown(addresses)} is not allowed: {shown(address)} is named twice; each link once"
+            )
+        if which is not None:
+            seen.add(which)
+
+
+def _which(place: Link | LinkAddress) -> object:
+    """What is opened there, whatever its options; None: another one each time."""
+    if isinstance(place, Link):
+        return id(place)
+    is_new = (place.kind in ("udpin", "tcpin") and not place.port) or (place.kind == "pty" and not place.path)
+    if is_new:
+        return None
+    ways = [each for each in place.options if each[0] in ("connect", "listen")]  # two ways to one name
+    return place.kind, place.host, place.port, place.device, place.path, tuple(ways)
 
 
 def _itself(link: Link) -> Link:

@@ -13,7 +13,8 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavAutopilot, MavComponent
 from aerokit.runtime.claims import boot_time_ms
 from aerokit.runtime.copies import Copies
-from aerokit.runtime.events import HeardTwice, LinkChosen
+from aerokit.runtime.events import HeardTwice, LinkChosen, OneLinkNotOpened
+from aerokit.runtime.hardware_id import HardwareId
 from aerokit.runtime.link_choice import LinkChoice
 from aerokit.runtime.link_questions import LinkQuestions
 from aerokit.runtime.link_state import LinkState
@@ -23,6 +24,7 @@ from aerokit.runtime.routes import EVERY_PEER, Routes
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
 
+    from aerokit.errors import LinkOpenError
     from aerokit.links.link import Peer
     from aerokit.links.several import SeveralLinks
     from aerokit.mavlink.frame import Frame
@@ -30,7 +32,7 @@ if TYPE_CHECKING:
     from aerokit.mavlink.statistics import SourceStatistics
     from aerokit.runtime.cells import StateCell
     from aerokit.runtime.connection import Connection
-    from aerokit.runtime.link_choice import Candidate
+    from aerokit.runtime.link_candidate import Candidate
     from aerokit.runtime.link_state import LinkStatus
 
 __all__ = ["SeveralRoutes"]
@@ -115,6 +117,7 @@ class SeveralRoutes:
         self._states = LinkStates(link, self._choices, connection.now, connection.bus.publish)
         self.status: StateCell[tuple[LinkStatus, ...]] = self._states.cell
         connection.bus.attach(m.Timesync, _ignore)
+        connection.bus.attach(m.AutopilotVersion, _ignore)
 
     # ------------------------------------------------------- as Routes, for the connection
 
@@ -179,6 +182,8 @@ class SeveralRoutes:
                 return EVERY_PEER
             now = self._connection.now()
             self._choose(system_id, choice, now)
+            if choice.used.is_other_hardware:
+                return ()  # the vehicle was lost unnoticed, and there is no other link to it
             if message is None or message.ID in ORDERS:
                 choice.ordered(now)
             return self._peers_on(self._link_to(choice, (system_id, component_id)), system_id, component_id)
@@ -206,6 +211,7 @@ class SeveralRoutes:
         if not self.copies.was_taken:
             return False
         self._stream(frame).heard_at[_link(peer)] = frame.received_at
+        self._note_hardware(frame, peer)
         if frame.message_id == m.Heartbeat.ID and not self.is_elsewhere(frame, peer):
             counters = self._counters.get((frame.system_id, _link(peer)), {}).get(frame.component_id)
             self.note(frame, peer, counters)
@@ -215,6 +221,7 @@ class SeveralRoutes:
         """Whether it is to be delivered; heartbeats of a link that is not in use are noted here."""
         if frame.message_id == m.Timesync.ID and self._is_answer(frame, peer):
             return False
+        self._note_hardware(frame, peer)
         choice = self._choices.get(frame.system_id)
         if frame.message_id == m.Heartbeat.ID:
             self.note(frame, peer, counters)
@@ -226,12 +233,14 @@ class SeveralRoutes:
             self.copies.take()
             return True  # of somebody who sends no heartbeats: a radio
         used = choice.used
+        if candidate is not None and not choice.may_be_used(candidate):
+            return False
         if frame.received_at <= choice.fresh_after and frame.message_id not in ANSWERS:
             return False
         if self.copies.is_late and not self._may_be_alike(frame, peer, choice):
             return False
         if _link(peer) != used.link:
-            if candidate is None or not choice.may_be_used(candidate):
+            if candidate is None:
                 return False
             lives_there = frame.received_at - stream.heard_at[used.link] <= LIVES_S
             is_shared = choice.is_shared(candidate, frame.received_at)
@@ -274,6 +283,11 @@ class SeveralRoutes:
             if (candidate := choice.candidates.get(link)) is not None:
                 candidate.is_stalled = is_stalled
                 self._choose(system_id, choice, now)
+
+    def link_not_opened(self, link: int, error: LinkOpenError) -> None:
+        """A link could not be opened, and is tried again."""
+        event = OneLinkNotOpened(self._connection.now(), 0, self._link.names[link], error)
+        self._connection.bus.publish(event)
 
     async def watch(self) -> None:
         """Count, ask and choose, as long as the connection is open."""
@@ -387,6 +401,16 @@ class SeveralRoutes:
             self._tell_doubt(frame, choice.candidates[link])
         return True
 
+    def _note_hardware(self, frame: Frame, peer: Peer) -> None:
+        choice, link = self._choices.get(frame.system_id), _link(peer)
+        if frame.message_id != m.AutopilotVersion.ID or frame.component_id != MavComponent.AUTOPILOT1:
+            return
+        message = self._connection.bus.dialect.decode(frame)
+        if isinstance(message, m.AutopilotVersion) and choice is not None and link in choice.candidates:
+            choice.note_hardware(link, HardwareId.of(message))
+            for candidate in choice.candidates.values():
+                self._tell_doubt(frame, candidate)
+
     def _tell_doubt(self, frame: Frame, candidate: Candidate) -> None:
         key = frame.system_id, candidate.link
         if not candidate.is_doubted:
@@ -394,9 +418,10 @@ class SeveralRoutes:
         elif key not in self._doubts_told:
             self._doubts_told.add(key)
             logger.warning(
-                "another vehicle speaks as system %d over %s: its clock is another one; it is not listened to",
+                "another vehicle speaks as system %d over %s: its %s is another one; it is not listened to",
                 frame.system_id,
                 self._link.names[candidate.link],
+                "hardware id (AUTOPILOT_VERSION)" if candidate.is_other_hardware else "clock",
             )
             self._connection.bus.publish(HeardTwice(frame.received_at, frame.system_id, frame.component_id))
 

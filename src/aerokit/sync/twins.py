@@ -3684,10 +3684,10 @@ def open_connection(
 
     Args:
         address: a connection string (``"udpin:0.0.0.0:14550"``, ``"/dev/ttyACM0,57600"``, …) or a link not yet open; or
-            several of them, that lead to the same vehicles (docs/how-to/several-links.md): each frame is taken once,
-            orders go over the best link, and over the next one when it falls silent. ``?costly=1`` behind an address
-            marks one that is used when the others fail. A link that is lost is opened again, as long as another one is
-            there.
+            several of them, none twice, that lead to the same vehicles (docs/how-to/several-links.md): each frame is
+            taken once, orders go over the best link, and over the next one when it falls silent. ``?costly=1`` behind
+            an address marks one that is used when the others fail. A link that is lost is opened again, as long as
+            another one is there.
         source_system: our own system id, 1–255; ground stations take 255.
         source_component: our own component id, 1–255. 0, which is nobody's, is allowed for programs that always were
             that (DroneKit).

@@ -1,0 +1,98 @@
+"""Several links, and how they are opened: none twice, and one that is not there is told."""
+
+from __future__ import annotations
+
+import logging
+from functools import partial
+
+import anyio
+import pytest
+from several_harness import News
+
+from aerokit import events
+from aerokit.errors import LinkOpenError, LocalProtocolError
+from aerokit.links import Link, MemoryLink, SeveralLinks, memory_link_pair
+from aerokit.runtime.link_state import LinkState
+from aerokit.runtime.opening import open_connection
+from aerokit.testing import VIRTUAL_BACKEND
+
+pytestmark = pytest.mark.anyio
+
+
+@pytest.fixture
+def anyio_backend() -> tuple[str, dict[str, object]]:
+    return VIRTUAL_BACKEND
+
+
+@pytest.mark.parametrize(
+    ("one", "again"),
+    [
+        ("udpin:127.0.0.1:14550", "udp://127.0.0.1:14550"),
+        ("tcp:127.0.0.1:1", "tcp:127.0.0.1:1?timeout=3"),
+        ("udpout:127.0.0.1:14550", "udpout:127.0.0.1:14550?costly=1"),
+        ("/dev/ttyUSB0,57600", "serial:///dev/ttyUSB0:115200"),
+        ("pty:/tmp/aerokit", "pty:/tmp/aerokit"),
+        ("zenoh://north/alpha", "zenoh://north/alpha"),
+    ],
+)
+async def test_an_address_that_is_named_twice_is_refused_before_anything_is_opened(
+    one: str, again: str
+) -> None:
+    near, far = memory_link_pair()
+    with pytest.raises(LocalProtocolError, match=r"address = .* is not allowed: .* is named twice") as caught:
+        async with open_connection([near, one, again]):
+            pass
+    assert repr(again) in str(caught.value)
+    async with open_connection(near):
+        far.close()
+
+
+async def test_a_link_that_is_named_twice_is_refused() -> None:
+    near, far = memory_link_pair()
+    with pytest.raises(LocalProtocolError, match="is named twice"):
+        async with open_connection([near, near]):
+            pass
+    async with open_connection(near):
+        far.close()
+
+
+async def test_what_is_another_one_each_time_may_be_named_twice() -> None:
+    async with open_connection(["udpin:127.0.0.1:0", "udpin:127.0.0.1:0", "tcpin:127.0.0.1:0"]) as connection:
+        assert isinstance(connection.link, SeveralLinks)
+        assert [connection.link.is_there(link) for link in range(3)] == [True, True, True]
+
+
+class NotYet(MemoryLink):
+    """Cannot be opened for the first few times."""
+
+    def __init__(self, failures: int) -> None:
+        super().__init__("memory:away")
+        self.failures = failures
+
+    async def _connect(self) -> None:
+        self.failures -= 1
+        if self.failures >= 0:
+            raise OSError(111, "refused")
+        await super()._connect()
+
+
+@pytest.mark.parametrize("failures", [1, 4])
+async def test_a_link_that_cannot_be_opened_at_first_is_told_once(
+    failures: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    near, _far = memory_link_pair()
+    both: list[Link] = [near, NotYet(failures)]
+    together = SeveralLinks([partial(both.__getitem__, index) for index in range(2)])
+    with caplog.at_level(logging.WARNING, "aerokit"):
+        async with open_connection(together) as connection:
+            news = News(connection, events.OneLinkNotOpened, events.OneLinkChanged)
+            await anyio.sleep(30)
+            told = [each for each in news.all if isinstance(each, events.OneLinkNotOpened)]
+            assert [each.link for each in told] == ["memory:away"] * (failures > 1)
+            assert all(isinstance(each.error, LinkOpenError) for each in told)
+            last = news.all[-1]
+            assert isinstance(last, events.OneLinkChanged)
+            assert (last.link, last.after) == ("memory:away", LinkState.CONNECTED)
+    warnings = [each.getMessage() for each in caplog.records if "memory:away" in each.getMessage()]
+    assert len(warnings) == 1
+    assert "refused" in warnings[0]
