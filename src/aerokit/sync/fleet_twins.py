@@ -49,8 +49,9 @@ __all__ = [
 class Following(BlockTwin["AsyncFollowing"]):
     """In its block the followers keep their places; leaving it, in any way, tells them to hold.
 
-    It stops by itself when the leader is lost or taken over, and as the fleet's policy says when a follower is; then
-    leaving the block raises :class:`SetpointStreamStopped`.
+    It stops by itself when the leader is lost or taken over, and as the fleet's policy says when a follower is. The
+    event :class:`FollowingStopped` tells it at once, and so does ``wait_stopped``; the block's program runs on, and
+    ``raise_if_stopped`` and leaving the block raise :class:`SetpointStreamStopped`.
     """
 
     @property
@@ -68,8 +69,16 @@ class Following(BlockTwin["AsyncFollowing"]):
         return self.aio.error_m(name)
 
     def wait_stopped(self) -> str:
-        """Wait until it stops by itself, and return why."""
+        """Wait until it stops by itself, and return why; empty once the block was left."""
         return self._loop.run(self.aio.wait_stopped)
+
+    def raise_if_stopped(self) -> None:
+        """For loops of the block's program: ``while True: following.raise_if_stopped(); …``.
+
+        Raises:
+            SetpointStreamStopped: it has stopped by itself; the text says why.
+        """
+        self._loop.call(self.aio.raise_if_stopped)
 
 
 class Selection(SelectionTwin["AsyncSelection"]):
