@@ -15,6 +15,7 @@ from aerokit.errors import (
     LocalProtocolError,
     OperationRejected,
     SetpointStreamStopped,
+    ValueUnknownError,
 )
 from aerokit.fleets.corrections import fragments, rtcm_messages
 from aerokit.fleets.events import FollowingStopped, PathsDecided, PolicyCarriedOut, TooClose
@@ -207,6 +208,28 @@ async def test_when_the_leader_is_taken_over_the_followers_hold(policy: str) -> 
                 await anyio.sleep(2)
                 assert not following.is_running
         assert stage.modes == {"north/1": "LOITER", "north/2": "BRAKE", "north/3": "BRAKE"}
+
+
+async def test_errors_of_form_call_it_form_and_name_who_is_not_where_one_knows() -> None:
+    async with open_stage(3, min_distance_m=5.0, on_error="go_on") as stage:
+        with pytest.raises(LocalProtocolError, match="there are no groups"):
+            stage.fleet.group("alpha")
+        await stage.take_off()
+        line = Formation.line(["north/2"], 8.0, frame="north")
+        (done := await stage.fleet.form(line, leader="north/1")).raise_for_errors()
+        assert done.action == "form"
+        onto = Formation({"north/2": Offset(0.0, 20.0)})
+        with pytest.raises(OperationRejected, match=r"^form: .*north/3.*nothing was sent"):
+            await stage.fleet.form(onto, leader="north/1")  # north/3 is there
+        stage.copters["north/1"].faults.silent = True
+        await anyio.sleep(2.5)
+        with pytest.raises(ValueUnknownError, match=r"^north/1: position is"):
+            await stage.fleet.form(line, leader="north/1")
+        here = stage.fleet.vehicles["north/2"].position.value
+        with pytest.raises(ValueUnknownError, match=r"^north/1: position is"):
+            await stage.fleet.go_to({"north/1": here.offset(up_m=20)})
+        with pytest.raises(ValueUnknownError, match=r"^north/1: position is"):
+            await stage.fleet.go_to(lambda each: each.vehicle.position.fresh(1).offset(north_m=1))
 
 
 async def test_when_the_leader_is_lost_the_followers_hold() -> None:

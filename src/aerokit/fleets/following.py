@@ -14,7 +14,7 @@ from aerokit.fleets.common import CommonAction
 from aerokit.fleets.events import FollowingStopped
 from aerokit.fleets.formation import follow_velocity
 from aerokit.fleets.nearness import local_places
-from aerokit.fleets.whereabouts import altitude_amsl
+from aerokit.fleets.whereabouts import altitude_amsl, position_of
 from aerokit.runtime.background import Background
 from aerokit.vehicle.orders.setpoints import VelocitySetpoint
 
@@ -141,7 +141,7 @@ class Following:
         if not self._ended.is_set():
             try:
                 self._look_at_leader()
-                self._leader.vehicle.position.fresh(OLD_LEADER_S)
+                position_of(self._leader, OLD_LEADER_S)
             except (OperationRejected, ValueUnknownError) as error:
                 following = self._action.under_way  # their streams tell them to hold as they are cancelled
                 left_alone = {
@@ -164,7 +164,7 @@ class Following:
     def _to_go(self, member: Member) -> tuple[float, float, float]:
         """Metres north, east and up to its place, as of now: what was told a moment ago has moved on since."""
         leader, vehicle = self._leader.vehicle, member.vehicle
-        there, here = leader.position.fresh(OLD_LEADER_S), vehicle.position.fresh(OLD_LEADER_S)
+        there, here = position_of(self._leader, OLD_LEADER_S), position_of(member, OLD_LEADER_S)
         places = local_places(
             {
                 "there": (there.latitude_deg, there.longitude_deg, altitude_amsl(self._leader, there)),

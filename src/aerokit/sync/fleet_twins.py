@@ -240,7 +240,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
         Raises:
             LocalProtocolError: a name is nobody's, or two places are too near to each other. Nothing was sent.
             OperationRejected: the leader does not take part, or the ways come too near. Nothing was sent.
-            ValueUnknownError: it is not known where the leader is.
+            ValueUnknownError: it is not known where the leader is, or one whose way is compared.
         """
         return self._loop.run(self.aio.form, formation, leader=leader, speed_m_s=speed_m_s, timeout=timeout)
 
@@ -656,7 +656,7 @@ class Fleet(FleetTwin):
         Raises:
             LocalProtocolError: a name is nobody's, or two places are too near to each other. Nothing was sent.
             OperationRejected: the leader does not take part, or the ways come too near. Nothing was sent.
-            ValueUnknownError: it is not known where the leader is.
+            ValueUnknownError: it is not known where the leader is, or one whose way is compared.
         """
         return self._loop.run(self.aio.form, formation, leader=leader, speed_m_s=speed_m_s, timeout=timeout)
 
@@ -1029,7 +1029,7 @@ def fleet(
         min_distance_m: metres between any two: ways are compared before they are flown, and in flight the event
             ``TooClose`` tells who is nearer to whom; None: nobody looks.
         too_close: what is done then: both ``"hold"``, as far as they take orders, or it is only told (``"tell"``).
-        timeout: seconds to wait for all of them.
+        timeout: seconds to wait for all of them; after five of them a warning of logger "aerokit" says who is missing.
         rates: message class → Hz, asked of each instead of the default rates; ``{}`` asks for nothing.
 
     Raises:
