@@ -38,7 +38,7 @@ logger: logging.Logger = logging.getLogger("aerokit")
 
 CLOSE_TIMEOUT_S = 2.0
 FLUSH_EVERY_S = 1.0
-_QUIET_KINDS = ("opened", "removed", "drained", "restored")
+_QUIET_KINDS = ("opened", "removed", "client_joined", "client_left", "drained", "restored")
 
 
 @checks_arguments
