@@ -5,7 +5,9 @@ from __future__ import annotations
 __all__ = ["FIRST_DELAY_S", "LONGEST_DELAY_S", "Delays"]
 
 FIRST_DELAY_S = 0.2
+"""Before the first further attempt."""
 LONGEST_DELAY_S = 5.0
+"""Before each of many."""
 
 
 class Delays:
