@@ -24,6 +24,7 @@ from aerokit import errors, events, messages
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.missions import Fence, FenceCircle, Mission, waypoint
 from aerokit.runtime.cells import StateCell
+from aerokit.runtime.link_state import LinkState
 from aerokit.runtime.opening import open_connection
 from aerokit.runtime.subscription import Subscription
 from aerokit.sim import SimulatedCopter, SimulatedGimbal
@@ -403,6 +404,18 @@ def test_missions_fences_and_rally_points(vehicle: aerokit.sync.Vehicle) -> None
 
 
 # ------------------------------------------------------------------------- several vehicles
+
+
+def test_how_each_of_several_links_does_is_in_a_cell() -> None:
+    with served_copter() as address:
+        with aerokit.sync.connect([address, "udpin:127.0.0.1:0"], rates={}) as vehicle:
+            links = vehicle.connection.links
+            assert isinstance(links, aerokit.sync.StateCell)
+            told = links.wait_until(lambda each: each[0].state is LinkState.CONNECTED, timeout=10)
+            assert [each.link.split(":")[0] for each in told] == ["tcp", "udpin"]
+            assert links.value[0].used_for == (1,)
+        with aerokit.sync.connect(address, rates={}) as vehicle:
+            assert vehicle.connection.links is None
 
 
 def test_two_vehicles_on_one_connection_share_its_thread() -> None:

@@ -104,7 +104,9 @@ def test_it_passes_frames_on_tells_and_records(tmp_path: Path, capsys: pytest.Ca
         while not any(each["type"] == "endpoint" and each["frames_in"] for each in told):
             await asyncio.sleep(0.01)
             told += records(capsys.readouterr().out)
-        assert [1, 1] in next(each for each in told if each["name"] == "a" and each["frames_in"])["systems"]
+        ends = [each for each in told if each["type"] == "endpoint" and each["name"] == "a"]
+        assert [1, 1] in next(each for each in ends if each["frames_in"])["systems"]
+        assert [each["kind"] for each in told if each["type"] == "hub_event"] == ["client_joined"]
         writer.close()
         ctrl_c()
         return int(await running)

@@ -204,7 +204,7 @@ def test_what_makes_no_sense_is_refused() -> None:
         Path.straight("a", (0, 0, 0), (1, 0, 0), 0)
     with pytest.raises(LocalProtocolError, match="goes back in time"):
         Path("a", [PathPoint(1, 0, 0, 0), PathPoint(0, 0, 0, 0)])
-    with pytest.raises(LocalProtocolError, match="has none"):
+    with pytest.raises(LocalProtocolError, match="has no points"):
         Path("a", [])
     with pytest.raises(LocalProtocolError, match="finite"):
         PathPoint(math.nan, 0, 0, 0)

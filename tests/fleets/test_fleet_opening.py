@@ -49,9 +49,11 @@ async def test_connections_vehicles_and_links_become_one_fleet() -> None:
             assert [each.name for each in fleet.role("eyes")] == ["scout"]
             assert "north/2" in fleet
             assert len(fleet["*/[19]"]) == 2
-            with pytest.raises(LocalProtocolError, match="group = 'three'"):
+            with pytest.raises(
+                LocalProtocolError, match="group = 'three' is not allowed: the groups are two"
+            ):
                 fleet.group("three")
-            with pytest.raises(LocalProtocolError, match="role = 'x'"):
+            with pytest.raises(LocalProtocolError, match="role = 'x' is not allowed: the roles are eyes"):
                 fleet.role("x")
             with pytest.raises(LocalProtocolError, match=r"'east/\*' is no member"):
                 fleet["east/*"]
@@ -89,9 +91,38 @@ async def test_one_that_the_program_has_already_is_not_found_twice() -> None:
 
 async def test_who_is_missing_is_told() -> None:
     async with simulated_link(copters(1, 2)) as link:
-        with pytest.raises(ConnectFailed, match=r"no 3 vehicles within 5 s; heard were north/1, north/2"):
-            async with aerokit.fleet({"north": link}, count=3, timeout=5):
+        with pytest.raises(ConnectFailed, match=r"within 4 s 2 of 3 vehicles were found: north/1, north/2$"):
+            async with aerokit.fleet({"north": link}, count=3, timeout=4):
                 raise AssertionError
+
+
+async def test_a_network_without_vehicles_is_named(caplog: pytest.LogCaptureFixture) -> None:
+    async with (
+        simulated_link(copters(1)) as north,
+        simulated_link(copters(2)) as south,
+        aerokit.open_connection(south) as quiet,
+        aerokit.connect(quiet) as own,
+    ):
+        text = "within 6 s no vehicle was heard on south; found were north/1\n  - network south: "
+        with pytest.raises(ConnectFailed, match=text):
+            async with aerokit.fleet({"north": north, "south": quiet}, timeout=6):
+                raise AssertionError
+        (told,) = [each.getMessage() for each in caplog.records]
+        assert told == (
+            "a fleet is waiting: after 5 s no vehicle was heard on south; found were north/1; it waits for 6 s"
+        )
+        with pytest.raises(ConnectFailed, match=r"within 1 s 1 of 2 vehicles were found, 1 of them given"):
+            async with aerokit.fleet({"scout": own, "south": quiet}, count=2, timeout=1):
+                raise AssertionError
+
+
+async def test_named_ones_that_are_not_heard_are_told_of_once(caplog: pytest.LogCaptureFixture) -> None:
+    async with simulated_link(copters(1, 2)) as link:
+        with pytest.raises(ConnectFailed, match="system 7"):
+            async with aerokit.fleet({"north": link}, system_ids=[1, 7], timeout=12):
+                raise AssertionError
+        (told,) = [each.getMessage() for each in caplog.records]
+        assert told == "a fleet is waiting: after 5 s nothing is heard of north/7; it waits for 12 s"
 
 
 @pytest.mark.parametrize(

@@ -15,9 +15,10 @@ from aerokit.errors import (
     LocalProtocolError,
     OperationRejected,
     SetpointStreamStopped,
+    ValueUnknownError,
 )
 from aerokit.fleets.corrections import fragments, rtcm_messages
-from aerokit.fleets.events import PathsDecided, TooClose
+from aerokit.fleets.events import FollowingStopped, PathsDecided, PolicyCarriedOut, TooClose
 from aerokit.fleets.formation import Formation, Offset, follow_velocity
 from aerokit.fleets.members import MemberState
 from aerokit.fleets.opening import fleet
@@ -209,6 +210,28 @@ async def test_when_the_leader_is_taken_over_the_followers_hold(policy: str) -> 
         assert stage.modes == {"north/1": "LOITER", "north/2": "BRAKE", "north/3": "BRAKE"}
 
 
+async def test_errors_of_form_call_it_form_and_name_who_is_not_where_one_knows() -> None:
+    async with open_stage(3, min_distance_m=5.0, on_error="go_on") as stage:
+        with pytest.raises(LocalProtocolError, match="there are no groups"):
+            stage.fleet.group("alpha")
+        await stage.take_off()
+        line = Formation.line(["north/2"], 8.0, frame="north")
+        (done := await stage.fleet.form(line, leader="north/1")).raise_for_errors()
+        assert done.action == "form"
+        onto = Formation({"north/2": Offset(0.0, 20.0)})
+        with pytest.raises(OperationRejected, match=r"^form: .*north/3.*nothing was sent"):
+            await stage.fleet.form(onto, leader="north/1")  # north/3 is there
+        stage.copters["north/1"].faults.silent = True
+        await anyio.sleep(2.5)
+        with pytest.raises(ValueUnknownError, match=r"^north/1: position is"):
+            await stage.fleet.form(line, leader="north/1")
+        here = stage.fleet.vehicles["north/2"].position.value
+        with pytest.raises(ValueUnknownError, match=r"^north/1: position is"):
+            await stage.fleet.go_to({"north/1": here.offset(up_m=20)})
+        with pytest.raises(ValueUnknownError, match=r"^north/1: position is"):
+            await stage.fleet.go_to(lambda each: each.vehicle.position.fresh(1).offset(north_m=1))
+
+
 async def test_when_the_leader_is_lost_the_followers_hold() -> None:
     async with open_stage(2) as stage:
         await stage.take_off()
@@ -219,6 +242,75 @@ async def test_when_the_leader_is_lost_the_followers_hold() -> None:
                 with anyio.fail_after(3):
                     await following.wait_stopped()
         await anyio.sleep(1)
+        assert stage.mode_of("north/2") == "BRAKE"
+
+
+async def test_the_program_in_the_block_is_told_at_once_that_nobody_follows_any_more() -> None:
+    async with open_stage(3, on_error="go_on") as stage:
+        await stage.take_off()
+        line = Formation.line(["north/2", "north/3"], 8.0, frame="north")
+        async with stage.fleet.following(line, leader="north/1") as following:
+            await anyio.sleep(3)
+            following.raise_if_stopped()
+            stage.pilot_takes("north/3")
+            await anyio.sleep(0.1)
+            stage.pilot_takes("north/1")
+            with (
+                pytest.raises(SetpointStreamStopped, match="the leader north/1 is taken over"),
+                anyio.fail_after(3),
+            ):
+                while True:
+                    following.raise_if_stopped()
+                    await anyio.sleep(0.1)
+        (told,) = stage.events(FollowingStopped)  # and leaving the block does not raise it again
+        assert told.member == "north/1"
+        assert "the leader north/1 is taken over: the mode changed to LOITER" in told.why
+        assert told.orders == {"north/2": "hold"}
+        assert told.left_alone == {"north/3": "taken over: the mode changed to LOITER"}
+        assert stage.modes == {"north/1": "LOITER", "north/2": "BRAKE", "north/3": "LOITER"}
+
+
+async def test_it_is_told_before_the_others_have_landed_by_policy() -> None:
+    async with open_stage(3, on_error="land_others") as stage:
+        await stage.take_off()
+        line = Formation.line(["north/2", "north/3"], 8.0, frame="north")
+        with pytest.raises(SetpointStreamStopped, match="north/3: "):
+            async with stage.fleet.following(line, leader="north/1") as following:
+                await anyio.sleep(3)
+                stage.pilot_takes("north/3")
+                with anyio.fail_after(3):
+                    assert "north/3" in await following.wait_stopped()
+        told = [each for each in stage.events() if isinstance(each, (FollowingStopped, PolicyCarriedOut))]
+        assert [type(each) for each in told] == [FollowingStopped]
+        assert told[0].orders == {"north/2": "land"}
+        assert list(told[0].left_alone) == ["north/3"]
+
+
+async def test_a_block_that_is_left_is_not_told_of() -> None:
+    async with open_stage(2) as stage:
+        await stage.take_off()
+        line = Formation.line(["north/2"], 8.0, frame="north")
+        async with stage.fleet.following(line, leader="north/1") as following:
+            await anyio.sleep(3)
+        following.raise_if_stopped()
+        assert stage.events(FollowingStopped) == []
+        assert await following.wait_stopped() == ""
+
+
+async def test_a_mistake_of_the_programs_policy_is_why_nobody_follows() -> None:
+    def wrong(_: object) -> None:
+        raise ZeroDivisionError("mine")
+
+    async with open_stage(3, on_error=wrong) as stage:
+        await stage.take_off()
+        line = Formation.line(["north/2", "north/3"], 8.0, frame="north")
+        with pytest.raises(SetpointStreamStopped, match="mine"):
+            async with stage.fleet.following(line, leader="north/1") as following:
+                await anyio.sleep(3)
+                stage.pilot_takes("north/3")
+                await following.wait_stopped()
+        (told,) = stage.events(FollowingStopped)
+        assert told.orders == {"north/2": "hold"}
         assert stage.mode_of("north/2") == "BRAKE"
 
 

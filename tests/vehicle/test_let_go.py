@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Awaitable, Callable
+
 import anyio
 import pytest
 from flight_harness import Wire, attached_sinks, in_the_air, open_flight
@@ -9,9 +11,10 @@ from flight_harness import Wire, attached_sinks, in_the_air, open_flight
 import aerokit
 from aerokit.errors import AerokitError, ConnectionClosed, OperationRejected, SetpointStreamStopped
 from aerokit.mavlink.enums import CopterMode
-from aerokit.mavlink.messages import Heartbeat
+from aerokit.mavlink.messages import Heartbeat, SetMode
 from aerokit.sim import SimulatedCopter, simulated_link
 from aerokit.vehicle.orders.setpoints import VelocitySetpoint
+from aerokit.vehicle.vehicles import vehicles_on
 
 pytestmark = pytest.mark.anyio
 
@@ -41,6 +44,68 @@ async def test_nothing_is_said_on_the_ground_or_when_it_was_meant(caplog: pytest
             raise ZeroDivisionError
     async with in_the_air():
         pass
+    assert "let go" not in caplog.text
+
+
+async def test_only_who_has_ordered_something_that_still_holds_is_warned(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    copter = SimulatedCopter(boot_time_s=0.0)
+    async with simulated_link(copter) as link, aerokit.open_connection(link) as connection:
+        async with aerokit.connect(connection) as vehicle:  # another program, as it were
+            await vehicle.wait_ready()
+            await vehicle.arm()
+            await vehicle.take_off(10.0)
+
+        async def left_after(*orders: Callable[[aerokit.Vehicle], Awaitable[object]]) -> str:
+            caplog.clear()
+            with pytest.raises(ZeroDivisionError):
+                async with aerokit.connect(connection) as vehicle:
+                    for each in orders:
+                        await each(vehicle)
+                    raise ZeroDivisionError
+            return caplog.text
+
+        async def pilot_takes(_: object) -> None:
+            copter.rc[2] = 1500
+            copter.set_mode(CopterMode.ALT_HOLD)
+            await anyio.sleep(3)
+
+        async def send_mode(vehicle: aerokit.Vehicle) -> None:
+            vehicle.send(SetMode(1, 1, CopterMode.GUIDED))
+            await anyio.sleep(3)
+
+        assert "let go" not in await left_after(lambda vehicle: vehicle.why_not_armable())
+        async with vehicles_on(connection) as vehicles:  # as `aerokit status` does it
+            await anyio.sleep(2)
+            assert list(vehicles) == [1]
+        assert "let go" not in caplog.text
+        assert "let go: in LOITER" in await left_after(lambda vehicle: vehicle.set_mode("LOITER"))
+        assert "let go" not in await left_after(lambda vehicle: vehicle.set_mode("GUIDED"), pilot_takes)
+        assert "let go: in GUIDED" in await left_after(send_mode)
+        assert "let go" not in await left_after(lambda vehicle: vehicle.set_speed(5.0))
+
+
+async def test_who_has_armed_it_is_warned_whoever_steers_it_since(caplog: pytest.LogCaptureFixture) -> None:
+    with pytest.raises(ZeroDivisionError):
+        async with in_the_air() as flight:
+            flight.pilot_takes_over()
+            await anyio.sleep(3)
+            assert flight.vehicle.taken_over
+            raise ZeroDivisionError
+    assert "vehicle 1 is let go: in LOITER, still armed, " in caplog.text
+
+
+async def test_what_was_ordered_before_it_disarmed_does_not_count(caplog: pytest.LogCaptureFixture) -> None:
+    with pytest.raises(ZeroDivisionError):
+        async with open_flight() as flight:
+            await flight.vehicle.wait_ready()
+            await flight.vehicle.arm()
+            await flight.vehicle.disarm()
+            flight.copter.set_mode(CopterMode.STABILIZE)
+            assert flight.copter.arming.arm(force=True)
+            await flight.vehicle.armed.wait_until(bool)
+            raise ZeroDivisionError
     assert "let go" not in caplog.text
 
 

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 __all__ = [
+    "add_baud",
     "add_vehicle_kind",
     "address",
     "address_or_form",
@@ -176,3 +177,10 @@ def add_vehicle_kind(command: argparse.ArgumentParser, kinds: str) -> None:
         "--vehicle", type=vehicle_kind, default="copter", metavar="KIND", help=f"simulated: {kinds}"
     )
     offer(kind, kind_names)
+
+
+def add_baud(
+    command: argparse._ActionsContainer, whose: str = "a serial port whose address says none"
+) -> None:
+    """Add ``--baud``."""
+    command.add_argument("--baud", type=int, default=57600, help=f"of {whose} (57600)")

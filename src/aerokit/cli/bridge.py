@@ -8,13 +8,12 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 from aerokit.cli.arguments import address, number
-from aerokit.cli.completers import addresses, offer
 from aerokit.cli.exits import DONE
 from aerokit.cli.extras import need
 from aerokit.cli.interrupt import on_interrupt
 from aerokit.cli.output import add_json, tell
 from aerokit.cli.signing import ENVIRONMENT, add_signing_key, signing_of
-from aerokit.cli.vehicle_command import ADDRESS_VARIABLE, default_address
+from aerokit.cli.vehicle_command import add_place
 from aerokit.links.address import parse_address
 
 if TYPE_CHECKING:
@@ -23,6 +22,8 @@ if TYPE_CHECKING:
     from aerokit.vehicle.vehicle import Vehicle
 
 __all__ = ["add_arguments"]
+
+WHERE = "where the vehicles are: "
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
@@ -35,7 +36,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         " texts, and each state as a topic. What a viewer does reaches no vehicle.",
     )
     foxglove.set_defaults(run=_foxglove)
-    _add_place(foxglove)
+    add_place(foxglove, what=WHERE)
     foxglove.add_argument(
         "--host", default="127.0.0.1", metavar="IP", help="listen here; 0.0.0.0: everywhere (127.0.0.1)"
     )
@@ -57,7 +58,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         " language, until Ctrl-C (docs/network.md). What anybody does there reaches no vehicle.",
     )
     zenoh.set_defaults(run=_zenoh)
-    _add_place(zenoh)
+    add_place(zenoh, what=WHERE)
     zenoh.add_argument(
         "network",
         type=_network,
@@ -65,21 +66,6 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         help="where the states go: zenoh://FLEET/NAME, zenoh://FLEET/NAME?connect=tcp/10.0.0.5:7447 …",
     )
     _add_common(zenoh, 5.0, "state")
-
-
-def _add_place(action: argparse.ArgumentParser) -> None:
-    place = action.add_argument(
-        "address",
-        nargs="?",
-        type=address,
-        default=default_address(),
-        metavar="ADDRESS",
-        help=f"where the vehicles are: udpin:0.0.0.0:14550, tcp:127.0.0.1:5760 … (${ADDRESS_VARIABLE})",
-    )
-    offer(place, addresses)
-    action.add_argument(
-        "--baud", type=int, default=57600, help="of a serial port whose address says none (57600)"
-    )
 
 
 def _add_common(action: argparse.ArgumentParser, rate_hz: float, what: str) -> None:

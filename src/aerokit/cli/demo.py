@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import AsyncExitStack, asynccontextmanager
 from typing import TYPE_CHECKING
 
-from aerokit.cli.arguments import add_vehicle_kind, address, number, system_id, writable_file
+from aerokit.cli.arguments import add_baud, add_vehicle_kind, address, number, system_id, writable_file
 from aerokit.cli.completers import addresses, offer
 from aerokit.cli.demo_lines import FlightReport
 from aerokit.cli.exits import DONE, FAILED, INTERRUPTED
@@ -61,9 +61,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         "--speedup", type=number(0.1, 100), default=5.0, metavar="X", help="of the simulated vehicle (5)"
     )
     command.add_argument("--system-id", type=system_id, metavar="ID", help="of the vehicle (the only one)")
-    command.add_argument(
-        "--baud", type=int, default=57600, help="of a serial port whose address says none (57600)"
-    )
+    add_baud(command)
     add_signing_key(command, f"of the vehicle of --connect (${ENVIRONMENT})")
     add_json(command)
 

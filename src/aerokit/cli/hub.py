@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import anyio
 
-from aerokit.cli.arguments import address, number, writable_file
+from aerokit.cli.arguments import add_baud, address, number, writable_file
 from aerokit.cli.completers import addresses, offer
 from aerokit.cli.exits import DONE, INTERRUPTED
 from aerokit.cli.interrupt import on_interrupt
@@ -55,9 +55,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     )
     _add_names(command, "--signed", "sign what goes out there, and let in only what is signed")
     add_signing_key(command, f"for --signed (${ENVIRONMENT})")
-    command.add_argument(
-        "--baud", type=int, default=57600, help="of serial ports whose address says none (57600)"
-    )
+    add_baud(command, "serial ports whose address says none")
     command.add_argument(
         "--record",
         type=_log_file,

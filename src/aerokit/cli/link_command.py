@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING
 
 import anyio
 
-from aerokit.cli.arguments import address, number
-from aerokit.cli.completers import addresses, offer
+from aerokit.cli.arguments import number
 from aerokit.cli.interrupt import on_interrupt
 from aerokit.cli.output import add_json
 from aerokit.cli.signing import ENVIRONMENT, add_signing_key, signing_of
-from aerokit.cli.vehicle_command import ADDRESS_VARIABLE, USUAL_ADDRESS, default_address
+from aerokit.cli.vehicle_command import add_place
 from aerokit.cli.waiting import waiting
 from aerokit.errors import ConnectFailed
 
@@ -29,19 +28,7 @@ __all__ = ["add_link", "add_seconds", "await_end", "await_vehicle", "opened"]
 
 def add_link(command: argparse.ArgumentParser, *, default: str | None = None) -> None:
     """Add the address, what belongs to it, and ``--json``; ``default`` says what happens without an address."""
-    place = command.add_argument(
-        "address",
-        nargs="?",
-        type=address,
-        default=default_address() if default is None else None,
-        metavar="ADDRESS",
-        help="udpin:0.0.0.0:14550, tcp:127.0.0.1:5760, /dev/ttyACM0,57600 … "
-        + (f"(${ADDRESS_VARIABLE}, else {USUAL_ADDRESS})" if default is None else f"({default})"),
-    )
-    offer(place, addresses)
-    command.add_argument(
-        "--baud", type=int, default=57600, help="of a serial port whose address says none (57600)"
-    )
+    add_place(command, default=default)
     add_signing_key(command, f"of vehicles that want signed messages (${ENVIRONMENT})")
     add_json(command)
 

@@ -8,14 +8,13 @@ import sys
 from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
 from typing import TYPE_CHECKING, Any
 
-from aerokit.cli.arguments import address, count
-from aerokit.cli.completers import addresses, offer
+from aerokit.cli.arguments import count
 from aerokit.cli.exits import DONE, FAILED
 from aerokit.cli.extras import need
 from aerokit.cli.interrupt import on_interrupt
 from aerokit.cli.output import add_json, tell
 from aerokit.cli.signing import ENVIRONMENT, add_signing_key, signing_of
-from aerokit.cli.vehicle_command import ADDRESS_VARIABLE, USUAL_ADDRESS, default_address
+from aerokit.cli.vehicle_command import add_place
 from aerokit.errors import LinkOpenError
 
 if TYPE_CHECKING:
@@ -32,16 +31,7 @@ LOOPBACK = "127.0.0.1"
 def add_arguments(command: argparse.ArgumentParser) -> None:
     """The arguments of the command."""
     command.set_defaults(run=_run)
-    place = command.add_argument(
-        "address",
-        nargs="?",
-        type=address,
-        default=default_address(),
-        metavar="ADDRESS",
-        help=f"of the vehicles: udpin:0.0.0.0:14550, tcp:127.0.0.1:5760, /dev/ttyACM0,57600 …"
-        f" (${ADDRESS_VARIABLE}, else {USUAL_ADDRESS})",
-    )
-    offer(place, addresses)
+    add_place(command, what="of the vehicles: ")
     command.add_argument(
         "--sim",
         nargs="?",
@@ -49,9 +39,6 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         const=1,
         metavar="N",
         help="N simulated copters (1) instead, to look at it",
-    )
-    command.add_argument(
-        "--baud", type=int, default=57600, help="of a serial port whose address says none (57600)"
     )
     add_signing_key(command, f"of vehicles that want signed messages (${ENVIRONMENT})")
     _add_web(command)

@@ -8,7 +8,7 @@ import sys
 from contextlib import AsyncExitStack, asynccontextmanager
 from typing import TYPE_CHECKING, Any
 
-from aerokit.cli.arguments import address, number, system_id
+from aerokit.cli.arguments import add_baud, address, number, system_id
 from aerokit.cli.completers import addresses, offer
 from aerokit.cli.output import add_json
 from aerokit.cli.signing import ENVIRONMENT, add_signing_key, signing_of
@@ -26,6 +26,7 @@ __all__ = [
     "ADDRESS_VARIABLE",
     "CONNECT_TIMEOUT_S",
     "add_action",
+    "add_place",
     "add_vehicle",
     "agreed",
     "connected",
@@ -43,6 +44,28 @@ CONNECT_TIMEOUT_S = 30.0
 def default_address() -> str:
     """Where the vehicle is when nobody says it: what the environment says, else the port of ground stations."""
     return os.environ.get(ADDRESS_VARIABLE, "").strip() or USUAL_ADDRESS
+
+
+def add_place(
+    command: argparse._ActionsContainer, name: str = "address", *, what: str = "", default: str | None = None
+) -> None:
+    """Add the address of vehicles, as an argument or an option, and ``--baud``.
+
+    ``what`` is said before the forms that an address has; ``default`` says what happens without one, if that is not
+    the usual address.
+    """
+    options: dict[str, Any] = {} if name.startswith("-") else {"nargs": "?"}
+    usual = f"${ADDRESS_VARIABLE}, else {USUAL_ADDRESS}"
+    place = command.add_argument(
+        name,
+        type=address,
+        default=default_address() if default is None else None,
+        metavar="ADDRESS",
+        help=f"{what}udpin:0.0.0.0:14550, tcp:127.0.0.1:5760, /dev/ttyACM0,57600 … ({default or usual})",
+        **options,
+    )
+    offer(place, addresses)
+    add_baud(command)
 
 
 def vehicle_arguments() -> argparse.ArgumentParser:
@@ -63,19 +86,8 @@ def vehicle_arguments() -> argparse.ArgumentParser:
 def add_vehicle(command: argparse.ArgumentParser) -> None:
     """Add the same to a command that has them itself."""
     group = command.add_argument_group("vehicle")
-    connect = group.add_argument(
-        "--connect",
-        type=address,
-        default=default_address(),
-        metavar="ADDRESS",
-        help=f"udpin:0.0.0.0:14550, tcp:127.0.0.1:5760, /dev/ttyACM0,57600 …"
-        f" (${ADDRESS_VARIABLE}, else {USUAL_ADDRESS})",
-    )
-    offer(connect, addresses)
+    add_place(group, "--connect")
     group.add_argument("--system-id", type=system_id, metavar="ID", help="of the vehicle (the only one)")
-    group.add_argument(
-        "--baud", type=int, default=57600, help="of a serial port whose address says none (57600)"
-    )
     group.add_argument(
         "--patience",
         type=number(0.1, 3600),

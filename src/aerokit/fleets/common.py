@@ -72,12 +72,13 @@ class CommonAction:
         self._obeying = 0
         self._is_deciding = False
         self._is_over = asyncio.Event()
-        self._mistake: Exception | None = None
+        self.mistake: Exception | None = None
+        """One of the program's function, or of its policy: ``run`` raises it at the end."""
 
     async def run(self) -> FleetResult:
         """Do it with all of them at once, and return when each has done it, failed, or was stopped."""
         if not self._members:
-            return self._result()
+            return self.so_far()
         tasks = Background(self._on_mistake)
         self._crew.under_way.append(self)
         try:
@@ -93,10 +94,24 @@ class CommonAction:
         finally:
             self._crew.under_way.remove(self)
             await tasks.aclose()
-        if self._mistake is not None:
+        if self.mistake is not None:
             self._hold_the_finished()
-            raise self._mistake
-        return self._result()
+            raise self.mistake
+        return self.so_far()
+
+    @property
+    def orders(self) -> dict[str, str]:
+        """What the policy has ordered, by member's name; empty: nobody has failed, or all go on."""
+        return dict(self._orders)
+
+    @property
+    def under_way(self) -> tuple[str, ...]:
+        """The names of those that are doing it just now."""
+        return tuple(
+            each.name
+            for each in self._members
+            if each.name in self._tasks and each.name not in (*self._failed, *self._stopped)
+        )
 
     def note_fallen_out(self, member: Member) -> None:
         """It is lost, or somebody else has it."""
@@ -165,7 +180,7 @@ class CommonAction:
         try:
             orders = self._crew.rules.decide(failure)
         except Exception as mistake:  # of the program's function: in doubt nobody flies on
-            self._mistake = self._mistake or mistake
+            self.mistake = self.mistake or mistake
             orders = dict.fromkeys(failure.others, "hold")
         if not orders:
             return
@@ -245,11 +260,13 @@ class CommonAction:
 
     def _on_mistake(self, error: Exception) -> None:
         """Something else than an error of ours: a mistake in the program's function."""
-        self._mistake = self._mistake or error
+        self.mistake = self.mistake or error
         self._is_over.set()
 
-    def _result(self) -> FleetResult:
-        in_order = {each.name: self._outcomes[each.name] for each in self._members}
+    def so_far(self) -> FleetResult:
+        """What became of those that have come to their ends."""
+        names = [each.name for each in self._members]
+        in_order = {name: self._outcomes[name] for name in names if name in self._outcomes}
         return FleetResult(
             self.what, in_order, failed=self._failed, stopped=self._stopped, left_out=self._left_out
         )

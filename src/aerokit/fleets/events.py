@@ -11,6 +11,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "FleetEvent",
+    "FollowingStopped",
     "MemberBack",
     "MemberFailed",
     "MemberLost",
@@ -93,6 +94,18 @@ class PolicyCarriedOut(FleetEvent):
     action: str
     orders: dict[str, str]
     errors: dict[str, str]
+
+
+class FollowingStopped(FleetEvent):
+    """The leader, ``member``, is not followed any more: ``why``, and what is ordered of the followers.
+
+    ``orders``: name → ``"hold"``, ``"land"`` or ``"return"``. ``left_alone`` are the others, and why nothing is ordered
+    of them. Leaving the block is no such event.
+    """
+
+    why: str
+    orders: dict[str, str]
+    left_alone: dict[str, str]
 
 
 class PathsDecided(FleetEvent):

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
+import logging
+from contextlib import contextmanager
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -13,14 +16,18 @@ from aerokit.runtime.diagnosis import no_vehicle_reason
 from aerokit.runtime.events import VehicleFound
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from aerokit.runtime.connection import Connection
 
-__all__ = ["find_systems"]
+__all__ = ["find_systems", "telling_who_is_missing"]
+
+logger: logging.Logger = logging.getLogger("aerokit")
 
 SETTLE_S = 2.5
 """Heartbeats come once a second: who is there has been heard twice by then."""
+TELL_AFTER_S = 5.0
+"""Who is not there by then is worth a line."""
 
 
 async def find_systems(
@@ -66,9 +73,10 @@ async def find_systems(
             for source, heartbeat in connection.heard.items():
                 hear(name, found_by(heartbeat, connection.now(), *source))
         with anyio.move_on_after(timeout):
-            while not is_enough():
-                news = anyio.Event()
-                await news.wait()
+            with telling_who_is_missing(timeout, lambda: _so_far(found, looked_for, count, given)):
+                while not is_enough():
+                    news = anyio.Event()
+                    await news.wait()
             if looked_for and count is None:
                 await anyio.sleep(SETTLE_S)
     finally:
@@ -87,12 +95,38 @@ def _missing(
     given: int,
     timeout: float,
 ) -> str:
-    there = ", ".join(f"{name}/{each}" for name, those in found.items() for each in those) or "none"
     why = "".join(
         f"\n  - network {name}: {no_vehicle_reason(networks[name], None)}"
         for name in looked_for
         if not found[name]
     )
-    wanted = f"{count} vehicles" if count is not None else "a vehicle on each network"
-    given_too = f" and the {given} given" if given else ""
-    return f"no {wanted} within {timeout:g} s; heard were {there}{given_too}{why}"
+    return f"within {timeout:g} s {_so_far(found, looked_for, count, given)}{why}"
+
+
+def _so_far(
+    found: Mapping[str, Mapping[int, None]], looked_for: list[str], count: int | None, given: int
+) -> str:
+    """Who is there of those that are waited for, as a clause."""
+    names = [f"{name}/{each}" for name, those in found.items() for each in those]
+    given_too = f", {given} of them given by the program" if given else ""
+    there = f": {', '.join(names)}" if names else ""
+    if count is not None:
+        return f"{given + len(names) or 'none'} of {count} vehicles were found{given_too}{there}"
+    silent = ", ".join(name for name in looked_for if not found[name])
+    return f"no vehicle was heard on {silent}{f'; found were {there[2:]}' if there else ''}"
+
+
+@contextmanager
+def telling_who_is_missing(timeout: float, describe: Callable[[], str]) -> Iterator[None]:
+    """Warn, once, if the block takes long: a fleet is not whole before all are there, and its program waits."""
+
+    def tell() -> None:
+        logger.warning(
+            "a fleet is waiting: after %g s %s; it waits for %g s", TELL_AFTER_S, describe(), timeout
+        )
+
+    timer = asyncio.get_running_loop().call_later(TELL_AFTER_S, tell)
+    try:
+        yield
+    finally:
+        timer.cancel()

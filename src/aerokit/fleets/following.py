@@ -11,13 +11,15 @@ import anyio
 from aerokit.arguments import checks_arguments
 from aerokit.errors import BusyError, OperationRejected, SetpointStreamStopped, ValueUnknownError
 from aerokit.fleets.common import CommonAction
+from aerokit.fleets.events import FollowingStopped
 from aerokit.fleets.formation import follow_velocity
 from aerokit.fleets.nearness import local_places
-from aerokit.fleets.whereabouts import altitude_amsl
+from aerokit.fleets.whereabouts import altitude_amsl, position_of
 from aerokit.runtime.background import Background
 from aerokit.vehicle.orders.setpoints import VelocitySetpoint
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from types import TracebackType
 
     from typing_extensions import Self
@@ -25,7 +27,6 @@ if TYPE_CHECKING:
     from aerokit.fleets.crew import Crew
     from aerokit.fleets.formation import Formation
     from aerokit.fleets.members import Member
-    from aerokit.fleets.results import FleetResult
 
 __all__ = ["Following"]
 
@@ -38,8 +39,9 @@ GAIN = 0.6
 class Following:
     """In its block the followers keep their places; leaving it, in any way, tells them to hold.
 
-    It stops by itself when the leader is lost or taken over, and as the fleet's policy says when a follower is; then
-    leaving the block raises :class:`SetpointStreamStopped`.
+    It stops by itself when the leader is lost or taken over, and as the fleet's policy says when a follower is. The
+    event :class:`FollowingStopped` tells it at once, and so does ``wait_stopped``; the block's program runs on, and
+    ``raise_if_stopped`` and leaving the block raise :class:`SetpointStreamStopped`.
     """
 
     def __init__(
@@ -55,9 +57,8 @@ class Following:
         self._period_s, self._rate_hz, self._max_speed_m_s = 1 / rate_hz, rate_hz, max_speed_m_s
         self._tasks = Background(self._on_mistake)
         self._ended = asyncio.Event()
-        self._was_entered = False
+        self._was_entered = self._was_told = False
         self._why = ""
-        self._result: FleetResult | None = None
 
     @property
     def is_running(self) -> bool:
@@ -78,15 +79,26 @@ class Following:
             return math.inf
 
     async def wait_stopped(self) -> str:
-        """Wait until it stops by itself, and return why."""
+        """Wait until it stops by itself, and return why; empty once the block was left."""
         await self._ended.wait()
         return self._why
+
+    def raise_if_stopped(self) -> None:
+        """For loops of the block's program: ``while True: following.raise_if_stopped(); …``.
+
+        Raises:
+            SetpointStreamStopped: it has stopped by itself; the text says why.
+        """
+        if self._why:
+            self._was_told = True
+            raise SetpointStreamStopped(f"following has stopped: {self._why}")
 
     async def __aenter__(self) -> Self:
         if self._was_entered:
             raise BusyError("following is entered once; make a new one")
         self._was_entered = True
         self._look_at_leader()
+        self._action = CommonAction(self._crew, "following", self._followers, self._fly)
         self._tasks.start(self._follow, "aerokit following")
         return self
 
@@ -96,37 +108,48 @@ class Following:
         exc: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        has_stopped = self._ended.is_set()
         self._ended.set()
         await self._tasks.aclose()
-        if has_stopped and exc is None:
-            raise SetpointStreamStopped(f"following has stopped: {self._why}")
+        if exc is None and not self._was_told:
+            self.raise_if_stopped()
 
     # --------------------------------------------------------------------------------------- inside
 
     async def _follow(self) -> None:
-        action = CommonAction(self._crew, "following", self._followers, self._fly)
-        result = await action.run()
-        failed = [f"{name}: {error}" for name, error in result.failed.items()]
-        self._why = "; ".join(failed or ["nobody follows"])
-        self._ended.set()
+        await self._action.run()
+        self._look_who_follows()
 
     async def _fly(self, member: Member) -> None:
-        async with member.vehicle.guided.velocity(rate_hz=self._rate_hz) as stream:
-            while not self._leader_is_gone():
-                stream.set(self._wanted(member))
-                await anyio.sleep(self._period_s)
-            await asyncio.Event().wait()  # it is being cancelled with all the others, and holds by that
+        try:
+            async with member.vehicle.guided.velocity(rate_hz=self._rate_hz) as stream:
+                while not self._leader_is_gone():
+                    stream.set(self._wanted(member))
+                    await anyio.sleep(self._period_s)
+                await asyncio.Event().wait()  # it is being cancelled with all the others, and holds by that
+        finally:  # told before the others have landed by policy, and after the action knows why
+            asyncio.get_running_loop().call_soon(self._look_who_follows)
+
+    def _look_who_follows(self) -> None:
+        if not self._action.under_way and self._action.mistake is None:
+            result = self._action.so_far()
+            failed = {name: str(error) for name, error in result.failed.items()}
+            why = "; ".join(f"{name}: {error}" for name, error in failed.items())
+            self._stop(why or "nobody follows", self._action.orders, {**result.left_out, **failed})
 
     def _leader_is_gone(self) -> bool:
         """Stop all of it if there is nobody to follow any more."""
         if not self._ended.is_set():
             try:
                 self._look_at_leader()
-                self._leader.vehicle.position.fresh(OLD_LEADER_S)
+                position_of(self._leader, OLD_LEADER_S)
             except (OperationRejected, ValueUnknownError) as error:
-                self._why = str(error)
-                self._ended.set()
+                following = self._action.under_way  # their streams tell them to hold as they are cancelled
+                left_alone = {
+                    each.name: f"{each.state.value}: {each.why}" if each.why else "it does not follow"
+                    for each in self._followers
+                    if each.name not in following
+                }
+                self._stop(str(error), dict.fromkeys(following, "hold"), left_alone)
                 self._tasks.cancel()
         return self._ended.is_set()
 
@@ -141,7 +164,7 @@ class Following:
     def _to_go(self, member: Member) -> tuple[float, float, float]:
         """Metres north, east and up to its place, as of now: what was told a moment ago has moved on since."""
         leader, vehicle = self._leader.vehicle, member.vehicle
-        there, here = leader.position.fresh(OLD_LEADER_S), vehicle.position.fresh(OLD_LEADER_S)
+        there, here = position_of(self._leader, OLD_LEADER_S), position_of(member, OLD_LEADER_S)
         places = local_places(
             {
                 "there": (there.latitude_deg, there.longitude_deg, altitude_amsl(self._leader, there)),
@@ -169,6 +192,18 @@ class Following:
                 f"the leader {self._leader.name} is {self._leader.state.value}: {self._leader.why}"
             )
 
-    def _on_mistake(self, error: Exception) -> None:
-        self._why = str(error)
+    def _stop(self, why: str, orders: Mapping[str, str], left_alone: Mapping[str, str]) -> None:
+        """It has stopped by itself."""
+        if self._ended.is_set():
+            return
+        self._why = why
         self._ended.set()
+        leader = self._leader
+        event = FollowingStopped(
+            self._crew.now(), leader.vehicle.system_id, leader.name, why, dict(orders), dict(left_alone)
+        )
+        self._crew.tell(event)
+
+    def _on_mistake(self, error: Exception) -> None:
+        holding = dict.fromkeys((each.name for each in self._followers if each.takes_orders), "hold")
+        self._stop(str(error) or type(error).__name__, self._action.orders or holding, {})

@@ -9,7 +9,7 @@ from aerokit.fleets.formation import Formation
 from aerokit.fleets.members import Member
 from aerokit.fleets.results import FleetResult
 from aerokit.fleets.travel import Travel
-from aerokit.fleets.whereabouts import OLD_S
+from aerokit.fleets.whereabouts import position_of
 from aerokit.position import Position
 from aerokit.vehicle.checks import check_range
 from aerokit.wording import shown
@@ -40,10 +40,10 @@ class Formations(Travel):
         Raises:
             LocalProtocolError: a name is nobody's, or two places are too near to each other. Nothing was sent.
             OperationRejected: the leader does not take part, or the ways come too near. Nothing was sent.
-            ValueUnknownError: it is not known where the leader is.
+            ValueUnknownError: it is not known where the leader is, or one whose way is compared.
         """
         member, followers = self._roles(formation, leader)
-        here, heading = member.vehicle.position.fresh(OLD_S), member.vehicle.heading_deg.latest
+        here, heading = position_of(member), member.vehicle.heading_deg.latest
         places: dict[str, Position] = {}
         for each in followers:
             offset = formation.offset_of(each.name, heading)
@@ -54,7 +54,9 @@ class Formations(Travel):
                 if there.altitude_amsl_m is None
                 else Position(there.latitude_deg, there.longitude_deg, altitude_amsl_m=there.altitude_amsl_m)
             )
-        return await self.go_to(places, speed_m_s=speed_m_s, timeout=timeout)
+        if speed_m_s is not None:
+            check_range("speed_m_s", speed_m_s, 0, 1000, above=True)
+        return await self._travel("form", places, speed_m_s, timeout)
 
     def following(
         self, formation: Formation, *, leader: str, rate_hz: float = 5.0, max_speed_m_s: float = 10.0

@@ -6,6 +6,7 @@ import asyncio
 from functools import partial
 from typing import TYPE_CHECKING
 
+from aerokit.fleets.finding import telling_who_is_missing
 from aerokit.runtime.background import Background, to_its_end
 from aerokit.vehicle.connect import connect
 
@@ -43,12 +44,20 @@ class Keepers:
         for number, (network, connection, system_id) in enumerate(systems):
             self._running += 1
             self._tasks.start(partial(self._keep, number, network, connection, system_id))
-        while len(self._open) < len(systems) and self._error is None:
-            self._news.clear()
-            await self._news.wait()
+        with telling_who_is_missing(self._timeout, lambda: f"nothing is heard of {self._missing(systems)}"):
+            while len(self._open) < len(systems) and self._error is None:
+                self._news.clear()
+                await self._news.wait()
         if self._error is not None:
             raise self._error
         return [self._open[number] for number in range(len(systems))]
+
+    def _missing(self, systems: Sequence[tuple[str, Connection, int]]) -> str:
+        return ", ".join(
+            f"{network}/{system_id}"
+            for number, (network, _, system_id) in enumerate(systems)
+            if number not in self._open
+        )
 
     async def leave(
         self,

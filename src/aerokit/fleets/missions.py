@@ -16,7 +16,7 @@ from aerokit.fleets.members import Member
 from aerokit.fleets.part import FleetPart
 from aerokit.fleets.paths import Path, PathPoint
 from aerokit.fleets.results import FleetResult
-from aerokit.fleets.whereabouts import Around, altitude_amsl
+from aerokit.fleets.whereabouts import Around, altitude_amsl, position_of
 from aerokit.missions.mission import Mission
 from aerokit.wording import shown
 
@@ -125,7 +125,7 @@ class Missions(FleetPart):
             raise LocalProtocolError("min_distance_m is needed: this fleet has none")
         members = self._named(missions)
         first = next(iter(members.values()), None)
-        around = None if first is None else Around(first.vehicle.position.value)
+        around = None if first is None else Around(position_of(first, math.inf))
         paths = (
             [] if around is None else [_path(around, members[name], each) for name, each in missions.items()]
         )

@@ -69,7 +69,7 @@ async def fleet(
         min_distance_m: metres between any two: ways are compared before they are flown, and in flight the event
             ``TooClose`` tells who is nearer to whom; None: nobody looks.
         too_close: what is done then: both ``"hold"``, as far as they take orders, or it is only told (``"tell"``).
-        timeout: seconds to wait for all of them.
+        timeout: seconds to wait for all of them; after five of them a warning of logger "aerokit" says who is missing.
         rates: message class → Hz, asked of each instead of the default rates; ``{}`` asks for nothing.
 
     Raises:
@@ -88,9 +88,8 @@ async def fleet(
         raise LocalProtocolError(f"too_close = {too_close!r} is not allowed: 'hold' or 'tell'")
     strange = [group for group in on_error_of or {} if group and group not in (groups or {})]
     if strange:
-        raise LocalProtocolError(
-            f"on_error_of = {shown(strange[0])} is not allowed: the groups are {', '.join(groups or {}) or 'none'}"
-        )
+        there = f"the groups are {', '.join(groups)}" if groups else "there are no groups"
+        raise LocalProtocolError(f"on_error_of = {shown(strange[0])} is not allowed: {there}")
     if count is not None and count < 1:
         raise LocalProtocolError(f"count = {count} is not allowed: 1 or more, or None")
     named = _named(sources)

@@ -82,7 +82,7 @@ class Path(Snapshot):
     def _check(self) -> None:
         object.__setattr__(self, "points", tuple(self.points))
         if not self.points:
-            raise LocalProtocolError(f"points: the path of {self.name} has none")
+            raise LocalProtocolError(f"points: the path of {self.name} has no points")
         for one, other in pairwise(self.points):
             if other.t_s < one.t_s:
                 raise LocalProtocolError(

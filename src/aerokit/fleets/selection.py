@@ -46,9 +46,8 @@ class Selection(Actions, Missions, Formations, Shows):
         found = tuple(each.name for each in self if getattr(each, what) == name)
         if not found:
             there = dict.fromkeys(getattr(each, what) for each in self if getattr(each, what))
-            raise LocalProtocolError(
-                f"{what} = {shown(name)} is not allowed: {', '.join(there) or 'there is none'}"
-            )
+            those = f"the {what}s are {', '.join(there)}" if there else f"there are no {what}s"
+            raise LocalProtocolError(f"{what} = {shown(name)} is not allowed: {those}")
         return Selection(self._crew, found)
 
     def __repr__(self) -> str:

@@ -134,10 +134,10 @@ class Show(Snapshot):
         try:
             found = json.loads(text)
         except (ValueError, RecursionError) as error:
-            raise LocalProtocolError(f"no JSON: {error}") from None
+            raise LocalProtocolError(f"not JSON: {error}") from None
         tracks = found.get("tracks") if isinstance(found, dict) else None
         if not isinstance(tracks, dict) or (found.get("format"), found.get("version")) != (FORMAT, VERSION):
-            raise LocalProtocolError(f"no {FORMAT!r} of version {VERSION}")
+            raise LocalProtocolError(f"not {FORMAT!r} of version {VERSION}")
         return cls.from_points(tracks)
 
     def to_csv(self) -> str:

@@ -142,9 +142,10 @@ class Shows(Travel):
         conflicts = () if least_m is None else show.conflicts(least_m, slack_s=SLACK_S)
         if conflicts:
             one = conflicts[0]
+            more = f", and so do {len(conflicts) - 1} more pairs" if len(conflicts) > 1 else ""
             raise OperationRejected(
-                f"fly_show: {one.name} and {one.other} come within {one.distance_m:.1f} m of each other, and"
-                f" {len(conflicts) - 1} more pairs too near; nothing was sent"
+                f"fly_show: {one.name} and {one.other} come within {one.distance_m:.1f} m of each other, nearer than"
+                f" {least_m:g} m{more}; nothing was sent"
             )
 
 

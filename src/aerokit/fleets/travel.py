@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from typing import Literal
 
 import anyio
 
 from aerokit.arguments import checks_arguments
-from aerokit.errors import LocalProtocolError, OperationRejected
+from aerokit.errors import LocalProtocolError, OperationRejected, ValueUnknownError
 from aerokit.fleets.apart import Deconfliction, Route, in_corridors, in_layers
 from aerokit.fleets.events import PathsDecided
 from aerokit.fleets.members import Member
 from aerokit.fleets.part import FleetPart
 from aerokit.fleets.results import FleetResult
-from aerokit.fleets.whereabouts import Around, altitude_amsl
+from aerokit.fleets.whereabouts import Around, altitude_amsl, position_of
 from aerokit.position import Position
 from aerokit.vehicle.checks import check_range
 from aerokit.wording import shown
@@ -58,16 +59,8 @@ class Travel(FleetPart):
         if speed_m_s is not None:
             check_range("speed_m_s", speed_m_s, 0, 1000, above=True)
         places = self._places(targets)
-        if apart is None and self._crew.min_distance_m is not None:
-            apart = self.plan_apart(places, speed_m_s=speed_m_s)
-        if apart is None or apart.decision == "clear":
-            names = tuple(self.members) if callable(targets) else tuple(places)
-            return await self._fly_to(places, speed_m_s, timeout, stagger_s, names=names)
-        if apart.decision == "refused":
-            raise OperationRejected(f"go_to: {apart.why}; nothing was sent")
-        if apart.decision == "corridors":
-            return await self._fly_to(places, speed_m_s, timeout, stagger_s, apart.delays_s)
-        return await self._fly_in_layers(places, speed_m_s, timeout, apart.heights_m)
+        names = tuple(self.members) if callable(targets) else tuple(places)
+        return await self._travel("go_to", places, speed_m_s, timeout, stagger_s, apart, names=names)
 
     def plan_apart(
         self,
@@ -115,11 +108,33 @@ class Travel(FleetPart):
 
     # --------------------------------------------------------------------------------------- inside
 
+    async def _travel(
+        self,
+        what: str,
+        places: Mapping[str, Position],
+        speed_m_s: float | None,
+        timeout: float | None,
+        stagger_s: float | None = None,
+        apart: Deconfliction | None = None,
+        *,
+        names: tuple[str, ...] = (),
+    ) -> FleetResult:
+        """On ways that are compared, if nothing is decided about them; ``what``: the action, as errors call it."""
+        if apart is None and self._crew.min_distance_m is not None:
+            apart = self.plan_apart(places, speed_m_s=speed_m_s)
+        if apart is None or apart.decision == "clear":
+            return await self._fly_to(what, places, speed_m_s, timeout, stagger_s, names=names)
+        if apart.decision == "refused":
+            raise OperationRejected(f"{what}: {apart.why}; nothing was sent")
+        if apart.decision == "corridors":
+            return await self._fly_to(what, places, speed_m_s, timeout, stagger_s, apart.delays_s)
+        return await self._fly_in_layers(what, places, speed_m_s, timeout, apart.heights_m)
+
     def _places(self, targets: Mapping[str, Position] | Callable[[Member], Position]) -> dict[str, Position]:
         for each in self:
             each.look()
         if callable(targets):
-            return {each.name: targets(each) for each in self if each.takes_orders}
+            return {each.name: _target_of(targets, each) for each in self if each.takes_orders}
         for name in targets:
             if name not in self.members:
                 raise LocalProtocolError(f"targets: {shown(name)} is not one of {', '.join(self.members)}")
@@ -133,7 +148,7 @@ class Travel(FleetPart):
         movers = [members[name] for name in places if members[name].takes_orders]
         if not movers:
             return [], {}
-        around = Around(movers[0].vehicle.position.value)
+        around = Around(position_of(movers[0]))
         routes = [
             Route(
                 each.name,
@@ -153,6 +168,7 @@ class Travel(FleetPart):
 
     async def _fly_to(
         self,
+        what: str,
         places: Mapping[str, Position],
         speed_m_s: float | None,
         timeout: float | None,
@@ -165,17 +181,18 @@ class Travel(FleetPart):
                 await anyio.sleep(delays_s[member.name])
             await member.vehicle.go_to(places[member.name], speed_m_s=speed_m_s, timeout=timeout)
 
-        return await self._run("go_to", fly, stagger_s=stagger_s, names=names or tuple(places))
+        return await self._run(what, fly, stagger_s=stagger_s, names=names or tuple(places))
 
     async def _fly_in_layers(
         self,
+        what: str,
         places: Mapping[str, Position],
         speed_m_s: float | None,
         timeout: float | None,
         heights_m: Mapping[str, float],
     ) -> FleetResult:
         """Up, across, down: all of them are done with one before anybody begins the next."""
-        here = {name: self._crew.members[name].vehicle.position.value for name in heights_m}
+        here = {name: position_of(self._crew.members[name], math.inf) for name in heights_m}
         stages: tuple[dict[str, Position], ...] = (
             {name: _at(here[name], height) for name, height in heights_m.items()},
             {name: _at(places[name], height) for name, height in heights_m.items()},
@@ -186,13 +203,20 @@ class Travel(FleetPart):
             gone = [name for name in stage if not self.members[name].takes_orders]
             if gone:  # it may stand in anybody's way
                 raise OperationRejected(
-                    f"go_to: {', '.join(gone)} fell out between two legs; the others stay in their layers"
+                    f"{what}: {', '.join(gone)} fell out between two legs; the others stay in their layers"
                 )
-            result = await self._fly_to(stage, speed_m_s, timeout)
+            result = await self._fly_to(what, stage, speed_m_s, timeout)
             if not result.is_complete:
                 break
         assert result is not None
         return result
+
+
+def _target_of(targets: Callable[[Member], Position], member: Member) -> Position:
+    try:
+        return targets(member)
+    except ValueUnknownError as error:  # such as where it is now
+        raise type(error)(f"{member.name}: {error}") from error
 
 
 def _at(place: Position, altitude_amsl_m: float) -> Position:

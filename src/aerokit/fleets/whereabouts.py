@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from aerokit.fleets.members import Member
     from aerokit.fleets.paths import Place
 
-__all__ = ["Around", "altitude_amsl", "is_flying"]
+__all__ = ["Around", "altitude_amsl", "is_flying", "position_of"]
 
 OLD_S = 2.0
 """What was told longer ago is not where it is now."""
@@ -25,6 +25,18 @@ def is_flying(member: Member) -> bool:
     return vehicle.is_armed and vehicle.landed_state.latest != MavLandedState.ON_GROUND
 
 
+def position_of(member: Member, within_s: float = OLD_S) -> Position:
+    """Where it is, told not longer ago than this.
+
+    Raises:
+        ValueUnknownError, StaleValueError: that is not known; the text names the member.
+    """
+    try:
+        return member.vehicle.position.fresh(within_s)
+    except ValueUnknownError as error:
+        raise type(error)(f"{member.name}: {error}") from None
+
+
 def altitude_amsl(member: Member, place: Position) -> float:
     """Metres above the sea of a place that is meant for this member; without an altitude, of where it is.
 
@@ -33,7 +45,7 @@ def altitude_amsl(member: Member, place: Position) -> float:
     """
     if place.altitude_amsl_m is not None:
         return place.altitude_amsl_m
-    here = member.vehicle.position.fresh(OLD_S)
+    here = position_of(member)
     if here.altitude_amsl_m is None:
         raise ValueUnknownError(f"{member.name} does not tell its altitude above the sea")
     if place.altitude_relative_m is None:
@@ -70,5 +82,5 @@ class Around:
         Raises:
             ValueUnknownError, StaleValueError: that is not known.
         """
-        here = member.vehicle.position.fresh(OLD_S)
+        here = position_of(member)
         return self.place(here, altitude_amsl(member, here))

@@ -147,10 +147,13 @@ class Attachment:
         """A client is there, which may never say anything."""
         if peer not in self._ports:
             self._add_port(peer, self._new_framer(), self._now())
+            self._tell(self, "client_joined", f"{_named(peer)} has connected")
 
     def peer_left(self, peer: Peer) -> None:
         """A client has gone."""
-        self._forget(peer)
+        if peer in self._ports:
+            self._forget(peer)
+            self._tell(self, "client_left", f"{_named(peer)} has gone")
 
     def link_interrupted(self, error: LinkLost) -> None:
         """The link has gone, and is being opened again."""
@@ -270,6 +273,12 @@ class Attachment:
         self._tell(
             self, "order_dropped", f"{known.NAME} for {target} was dropped after {waited:.1f} s: {why}"
         )
+
+
+def _named(peer: Peer) -> str:
+    """An IP address and a port as addresses have them, if it is that."""
+    host, port = peer[:2] if isinstance(peer, tuple) and len(peer) > 1 else (peer, "")
+    return f"client [{host}]:{port}" if ":" in str(host) else f"client {host}:{port}".rstrip(":")
 
 
 def check_filters(endpoint: Endpoint, dialect: Dialect) -> Filters:

@@ -14,6 +14,7 @@ from aerokit.hub.attachment import Attachment, check_filters
 from aerokit.hub.shared_link import SharedLink
 from aerokit.hub.switch import Switch
 from aerokit.hub.values import Endpoint, HubEvent
+from aerokit.links.delays import Delays
 from aerokit.links.link import Link
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.runtime.background import Background
@@ -36,10 +37,8 @@ __all__ = ["Hub"]
 logger: logging.Logger = logging.getLogger("aerokit")
 
 CLOSE_TIMEOUT_S = 2.0
-FIRST_DELAY_S = 0.2
-LONGEST_DELAY_S = 5.0
 FLUSH_EVERY_S = 1.0
-_QUIET_KINDS = ("opened", "removed", "drained", "restored")
+_QUIET_KINDS = ("opened", "removed", "client_joined", "client_left", "drained", "restored")
 
 
 @checks_arguments
@@ -215,10 +214,9 @@ class Hub:
         return attachment
 
     async def _open_later(self, attachment: Attachment) -> None:
-        delay_s = FIRST_DELAY_S
+        delays = Delays()
         while self._attachments.get(attachment.name) is attachment:
-            await anyio.sleep(delay_s)
-            delay_s = min(2 * delay_s, LONGEST_DELAY_S)
+            await anyio.sleep(delays.take())
             if self._attachments.get(attachment.name) is not attachment:  # removed meanwhile
                 return
             try:

@@ -113,7 +113,17 @@ class EndpointStatistics(Snapshot):
 
 
 HubEventKind = Literal[
-    "opened", "lost", "restored", "removed", "stalled", "drained", "order_dropped", "refused", "mistake"
+    "opened",
+    "lost",
+    "restored",
+    "removed",
+    "client_joined",
+    "client_left",
+    "stalled",
+    "drained",
+    "order_dropped",
+    "refused",
+    "mistake",
 ]
 
 
@@ -125,7 +135,8 @@ class HubEvent(Snapshot):
     endpoint: str
     """Its name."""
     kind: HubEventKind
-    """``opened``; ``lost`` and ``restored``: its link; ``removed``; ``stalled`` and ``drained``: what is written does
+    """``opened``; ``lost`` and ``restored``: its link; ``removed``; ``client_joined`` and ``client_left``: of a
+    server (``tcpin:``), where clients connect; ``stalled`` and ``drained``: what is written does
     not leave, and does again; ``order_dropped``: an order had waited too long, or met a full queue or a link that went;
     ``refused``: the first frame that a key did not fit, for each reason; ``mistake``: one inside aerokit."""
     text: str

@@ -17,6 +17,7 @@ from typing import Protocol, runtime_checkable
 
 from aerokit.errors import BusyError, ConnectionClosed, LinkLost, RecordingEnded
 
+from .delays import FIRST_DELAY_S, LONGEST_DELAY_S, Delays
 from .link import BurstListener, DrainListener, HelmListener, Link, Peer, PeerListener, Receiver, keeps_peers
 
 __all__ = ["Interruptible", "ReconnectingLink"]
@@ -50,12 +51,15 @@ class ReconnectingLink(Link):
     """
 
     def __init__(
-        self, make_link: Callable[[], Link], *, first_delay_s: float = 0.2, longest_delay_s: float = 5.0
+        self,
+        make_link: Callable[[], Link],
+        *,
+        first_delay_s: float = FIRST_DELAY_S,
+        longest_delay_s: float = LONGEST_DELAY_S,
     ) -> None:
         self._make_link = make_link
         self._link = make_link()
-        self._first_delay_s, self._longest_delay_s = first_delay_s, longest_delay_s
-        self._delay_s = first_delay_s
+        self._delays = Delays(first_delay_s, longest_delay_s)
         self._receiver: Receiver | None = None  # None: no callback is made
         self._ears: _Ears | None = None  # those of the present link; others are not listened to any more
         self._was_opened = self._is_closed = self._is_up = False
@@ -202,8 +206,7 @@ class ReconnectingLink(Link):
 
     async def _try_again(self) -> bool:
         await self._link.wait_closed()
-        await asyncio.sleep(self._delay_s)
-        self._delay_s = min(2 * self._delay_s, self._longest_delay_s)
+        await asyncio.sleep(self._delays.take())
         link = self._make_link()
         self._dropped += self._link.dropped_writes
         self._link = link
@@ -225,7 +228,7 @@ class ReconnectingLink(Link):
         if self._lost_at is None:
             return
         away_s, self._lost_at = asyncio.get_running_loop().time() - self._lost_at, None
-        self._delay_s = self._first_delay_s
+        self._delays.begin_anew()
         logger.info("%s is back after %.1f s", self.address, away_s)
         if isinstance(self._receiver, Interruptible):
             self._receiver.link_restored(away_s)

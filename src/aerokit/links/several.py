@@ -14,15 +14,13 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 from aerokit.errors import BusyError, ConnectionClosed, LinkLost, LinkOpenError, LocalProtocolError
 
+from .delays import Delays
 from .link import HelmListener, Link, Peer, Receiver, keeps_peers
 from .reconnecting import Interruptible
 
 __all__ = ["LinkPeer", "OneOfSeveralListener", "SeveralLinks"]
 
 logger: logging.Logger = logging.getLogger("aerokit")
-
-FIRST_DELAY_S = 0.2
-LONGEST_DELAY_S = 5.0
 
 
 class LinkPeer(NamedTuple):
@@ -230,10 +228,9 @@ class SeveralLinks(Link):
         task.add_done_callback(self._openings.discard)
 
     async def _open_late(self, index: int) -> None:
-        delay_s, is_told = FIRST_DELAY_S, False
+        delays, is_told = Delays(), False
         while not self._is_closed:
-            await asyncio.sleep(delay_s)
-            delay_s = min(2 * delay_s, LONGEST_DELAY_S)
+            await asyncio.sleep(delays.take())
             error = await self._open_one(index)
             if error is None:
                 return

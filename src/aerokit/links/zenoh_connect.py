@@ -15,13 +15,12 @@ import anyio
 
 from aerokit.errors import LinkOpenError, LocalProtocolError
 
-from .base import BaseLink
 from .freshness import Ears
 from .handover import Handover
 from .helm import refusals_in
 from .link import HelmListener, Peer
 from .zenoh_keys import WISHES, Beacon, Place, Told, Wish, check_name, read_sent_at
-from .zenoh_session import NetworkOptions, attachment_of, close_session, open_session, payload_of
+from .zenoh_session import NetworkLink, NetworkOptions, attachment_of, open_session, payload_of
 
 __all__ = ["LOST_AFTER_S", "OPEN_TIMEOUT_S", "ZenohConnect"]
 
@@ -34,7 +33,7 @@ LOST_AFTER_S = 15.0
 _LOOK_EVERY_S = 0.25
 
 
-class ZenohConnect(BaseLink):
+class ZenohConnect(NetworkLink):
     """``zenoh:`` is a client of one vehicle side (`ZenohListen`), which is found by its name.
 
     The vehicle side's end is a lost link, and so is its silence once the network has noticed it, or for `LOST_AFTER_S`.
@@ -74,12 +73,8 @@ class ZenohConnect(BaseLink):
         self._wants_helm = wish == "take"
         self._ears = Ears(random.getrandbits(32), "never" if wish == "never" else "free")
         self._alive: set[str] = set()  # keys of vehicle sides that the network knows
-        self._session: Any = None
         self._publisher: Any = None
-        self._declared: list[Any] = []  # they end when they are forgotten
-        self._handover: Handover[Callable[[], object]] | None = None
         self._first_beacon = asyncio.Event()
-        self._timer: asyncio.TimerHandle | None = None
 
     @property
     def helm(self) -> str | None:
@@ -142,16 +137,8 @@ class ZenohConnect(BaseLink):
             place.to_vehicle(client), congestion_control=zenoh.CongestionControl.DROP
         )
 
-    def _release(self) -> None:
-        if self._timer is not None:
-            self._timer.cancel()
-        if self._handover is not None:
-            self._handover.close()
-        session, self._session = self._session, None
-        self._timer = self._handover = self._publisher = None
-        self._declared = []
-        if session is not None:
-            close_session(session, self._released.set)
+    def _leave(self, session: Any) -> None:
+        self._publisher = None
 
     # ---------------------------------------------------------------------------------- what comes in
 

@@ -14,13 +14,12 @@ import anyio
 
 from aerokit.errors import LinkOpenError, LocalProtocolError
 
-from .base import BaseLink
 from .freshness import BEACON_EVERY_S, Judge
 from .handover import Handover
 from .helm import Gate, Helm
 from .link import Peer
 from .zenoh_keys import Beacon, Place, Stamp, Told, check_name, sent_at
-from .zenoh_session import NetworkOptions, attachment_of, close_session, open_session, payload_of
+from .zenoh_session import NetworkLink, NetworkOptions, attachment_of, open_session, payload_of
 
 __all__ = ["MAX_CLIENTS", "ZenohListen"]
 
@@ -39,7 +38,7 @@ _RIVAL_WAIT_S = 2.5 * BEACON_EVERY_S
 logger: logging.Logger = logging.getLogger("aerokit")
 
 
-class ZenohListen(BaseLink):
+class ZenohListen(NetworkLink):
     """``zenohin:`` serves the clients (`ZenohConnect`) of one name; each is a peer, by its name.
 
     Losing one of them, all of them, or the network itself does not lose the link. What comes of a client and is not
@@ -62,15 +61,11 @@ class ZenohListen(BaseLink):
         self._helm = Helm()
         self._clients: dict[Peer, Gate] = {}
         self._refused = 0  # of clients that have gone
-        self._session: Any = None
         self._zenoh: Any = None
         self._everybody: Any = None
-        self._declared: list[Any] = []  # they end when they are forgotten
-        self._handover: Handover[Callable[[], object]] | None = None
         self._has_others = self._is_serving = False
         self._rival = asyncio.Event()
         self._beaten_at = 0.0
-        self._timer: asyncio.TimerHandle | None = None
 
     @property
     def peers(self) -> tuple[Peer, ...]:
@@ -156,24 +151,15 @@ class ZenohListen(BaseLink):
             liveliness.declare_token(place.alive(self._judge.epoch)),
         ]
 
-    def _release(self) -> None:
-        if self._timer is not None:
-            self._timer.cancel()
-        if self._handover is not None:
-            self._handover.close()
-        session, self._session = self._session, None
-        self._timer = self._handover = self._everybody = None
-        self._declared = []
+    def _leave(self, session: Any) -> None:
+        self._everybody = None
         self._clients.clear()
-        if session is None:
-            return
-        if self._is_serving:
+        if session is not None and self._is_serving:
             self._is_serving = False
             goodbye = sent_at(self._judge.epoch, 0.0)
             drop = self._zenoh.CongestionControl.DROP
             with contextlib.suppress(Exception):
                 session.delete(self._place.beacon, congestion_control=drop, attachment=goodbye)
-        close_session(session, self._released.set)
 
     # ---------------------------------------------------------------------------------- what comes in
 

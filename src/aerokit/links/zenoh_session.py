@@ -13,7 +13,18 @@ from typing import Any
 from aerokit.errors import LinkOpenError, LocalProtocolError
 from aerokit.snapshot import Snapshot
 
-__all__ = ["NetworkOptions", "attachment_of", "close_session", "open_session", "payload_of", "zenoh_module"]
+from .base import BaseLink
+from .handover import Handover
+
+__all__ = [
+    "NetworkLink",
+    "NetworkOptions",
+    "attachment_of",
+    "close_session",
+    "open_session",
+    "payload_of",
+    "zenoh_module",
+]
 
 _NOBODY_THERE = "Unable to connect to any of"
 _ENDPOINTS = re.compile(r"[a-z]+/[^\s,()\[\]]+")  # "[Single(tcp/a:1)]", by 1.6 "[tcp/a:1]"
@@ -44,6 +55,33 @@ class NetworkOptions(Snapshot):
     def scouts(self) -> bool:
         """Whether it looks for others by multicast, unless the file says otherwise: when nobody is named."""
         return not (self.connect or self.listen)
+
+
+class NetworkLink(BaseLink):
+    """What both sides of a name have: a session, what is declared in it, and a timer."""
+
+    def __init__(self, address: str) -> None:
+        super().__init__(address)
+        self._session: Any = None
+        self._declared: list[Any] = []  # they end when they are forgotten
+        self._handover: Handover[Callable[[], object]] | None = None
+        self._timer: asyncio.TimerHandle | None = None
+
+    def _leave(self, session: Any) -> None:
+        """Forget what is made of the session, and say goodbye; None: there is no session any more."""
+        raise NotImplementedError
+
+    def _release(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+        if self._handover is not None:
+            self._handover.close()
+        session, self._session = self._session, None
+        self._timer = self._handover = None
+        self._declared = []
+        self._leave(session)
+        if session is not None:
+            close_session(session, self._released.set)
 
 
 def zenoh_module(address: str) -> Any:

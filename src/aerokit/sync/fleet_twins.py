@@ -49,8 +49,9 @@ __all__ = [
 class Following(BlockTwin["AsyncFollowing"]):
     """In its block the followers keep their places; leaving it, in any way, tells them to hold.
 
-    It stops by itself when the leader is lost or taken over, and as the fleet's policy says when a follower is; then
-    leaving the block raises :class:`SetpointStreamStopped`.
+    It stops by itself when the leader is lost or taken over, and as the fleet's policy says when a follower is. The
+    event :class:`FollowingStopped` tells it at once, and so does ``wait_stopped``; the block's program runs on, and
+    ``raise_if_stopped`` and leaving the block raise :class:`SetpointStreamStopped`.
     """
 
     @property
@@ -68,8 +69,16 @@ class Following(BlockTwin["AsyncFollowing"]):
         return self.aio.error_m(name)
 
     def wait_stopped(self) -> str:
-        """Wait until it stops by itself, and return why."""
+        """Wait until it stops by itself, and return why; empty once the block was left."""
         return self._loop.run(self.aio.wait_stopped)
+
+    def raise_if_stopped(self) -> None:
+        """For loops of the block's program: ``while True: following.raise_if_stopped(); …``.
+
+        Raises:
+            SetpointStreamStopped: it has stopped by itself; the text says why.
+        """
+        self._loop.call(self.aio.raise_if_stopped)
 
 
 class Selection(SelectionTwin["AsyncSelection"]):
@@ -231,7 +240,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
         Raises:
             LocalProtocolError: a name is nobody's, or two places are too near to each other. Nothing was sent.
             OperationRejected: the leader does not take part, or the ways come too near. Nothing was sent.
-            ValueUnknownError: it is not known where the leader is.
+            ValueUnknownError: it is not known where the leader is, or one whose way is compared.
         """
         return self._loop.run(self.aio.form, formation, leader=leader, speed_m_s=speed_m_s, timeout=timeout)
 
@@ -647,7 +656,7 @@ class Fleet(FleetTwin):
         Raises:
             LocalProtocolError: a name is nobody's, or two places are too near to each other. Nothing was sent.
             OperationRejected: the leader does not take part, or the ways come too near. Nothing was sent.
-            ValueUnknownError: it is not known where the leader is.
+            ValueUnknownError: it is not known where the leader is, or one whose way is compared.
         """
         return self._loop.run(self.aio.form, formation, leader=leader, speed_m_s=speed_m_s, timeout=timeout)
 
@@ -1020,7 +1029,7 @@ def fleet(
         min_distance_m: metres between any two: ways are compared before they are flown, and in flight the event
             ``TooClose`` tells who is nearer to whom; None: nobody looks.
         too_close: what is done then: both ``"hold"``, as far as they take orders, or it is only told (``"tell"``).
-        timeout: seconds to wait for all of them.
+        timeout: seconds to wait for all of them; after five of them a warning of logger "aerokit" says who is missing.
         rates: message class → Hz, asked of each instead of the default rates; ``{}`` asks for nothing.
 
     Raises:

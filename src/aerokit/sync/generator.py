@@ -23,7 +23,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from aerokit.sync.originals import TWINS, Member, Twin, decorators_of, function_node, imports_of, members_of
-from aerokit.sync.source_text import WIDTH, arguments_of, call, docstring, forwarded, function, outer
+from aerokit.sync.source_text import (
+    WIDTH,
+    arguments_of,
+    call,
+    docstring,
+    forwarded,
+    function,
+    optional,
+    outer,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -95,7 +104,9 @@ class Page:
 
     def returned(self, expression: str, returns: ast.expr | None) -> str:
         """The expression, wrapped where what it gives has a twin."""
-        name = outer(returns)
+        name, maybe = outer(returns), outer(optional(returns))
+        if maybe in self._twins:
+            return f"None if {expression} is None else {maybe}(self._loop, {expression})"
         return f"{name}(self._loop, {expression})" if name in self._twins else expression
 
     def member(self, twin: Twin, member: Member) -> str:

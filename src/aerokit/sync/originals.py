@@ -64,7 +64,7 @@ TWINS = (
     Twin(
         "aerokit.runtime.connection.Connection",
         "ConnectionTwin",
-        only=_names("send subscribe link_state signing unsent_bytes discard_unsent is_open now counts"),
+        only=_names("send subscribe link_state links signing unsent_bytes discard_unsent is_open now counts"),
         direct=_names("now"),
         called=_names("unsent_bytes"),
     ),

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-__all__ = ["WIDTH", "arguments_of", "call", "docstring", "forwarded", "function", "outer"]
+__all__ = ["WIDTH", "arguments_of", "call", "docstring", "forwarded", "function", "optional", "outer"]
 
 WIDTH = 100
 """Of a line."""
@@ -19,6 +19,14 @@ def outer(annotation: ast.expr | None) -> str:
     while isinstance(annotation, ast.Subscript):
         annotation = annotation.value
     return annotation.id if isinstance(annotation, ast.Name) else ""
+
+
+def optional(annotation: ast.expr | None) -> ast.expr | None:
+    """What is in front of ``| None``, if that is how the annotation ends."""
+    if isinstance(annotation, ast.BinOp) and isinstance(annotation.op, ast.BitOr):
+        last = annotation.right
+        return annotation.left if isinstance(last, ast.Constant) and last.value is None else None
+    return None
 
 
 def forwarded(node: ast.FunctionDef | ast.AsyncFunctionDef) -> list[str]:

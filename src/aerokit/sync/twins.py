@@ -71,7 +71,7 @@ if TYPE_CHECKING:
     from aerokit.protocols.transfer import OnProgress
     from aerokit.runtime.cells import Source
     from aerokit.runtime.events import Event, LinkReport
-    from aerokit.runtime.link_state import LinkState
+    from aerokit.runtime.link_state import LinkState, LinkStatus
     from aerokit.runtime.subscription import Overflow
     from aerokit.vehicle.camera.camera import Camera as AsyncCamera
     from aerokit.vehicle.camera.capture import Capture
@@ -339,6 +339,11 @@ class Connection(ConnectionTwin):
             ConnectionClosed, LinkLost: the connection has ended.
         """
         self._loop.call(self.aio.send, message, to=to)
+
+    @cached_property
+    def links(self) -> StateCell[tuple[LinkStatus, ...]] | None:
+        """How each of several links does; None where there is one link only. Told once a second, and at each change."""
+        return None if self.aio.links is None else StateCell(self._loop, self.aio.links)
 
     @property
     def unsent_bytes(self) -> int:

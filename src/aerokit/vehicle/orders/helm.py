@@ -53,6 +53,7 @@ class Helm:
         self._posted: list[Posted] = []
         self._numbers = itertools.count(1)
         self._newest_about: dict[Subject, int] = {}
+        self._ordered_since_disarmed: set[Subject] = set()
         self._modes_ordered: deque[tuple[float, int]] = deque(maxlen=16)
         self._on_new: list[Callable[[], None]] = []
         telemetry.mode.observe(self._on_mode, every_arrival=True)
@@ -87,6 +88,7 @@ class Helm:
         orders: tuple[Order | Posted, ...] = (*self._orders, *self._posted)
         for order in orders:
             order.note_reboot()
+        self._ordered_since_disarmed.clear()
 
     @contextmanager
     def aside(self) -> Iterator[Order]:
@@ -166,7 +168,9 @@ class Helm:
     def note_newer(self, subjects: Iterable[Subject]) -> int:
         """A newer order about these is given: what was posted about them before ends; the number of it."""
         number = next(self._numbers)
-        self._newest_about.update(dict.fromkeys(subjects, number))
+        about = dict.fromkeys(subjects, number)
+        self._newest_about.update(about)
+        self._ordered_since_disarmed.update(about)
         return number
 
     def _note_arming(self, armed: bool | None) -> None:
@@ -178,6 +182,16 @@ class Helm:
             each.note_newer(armed)
 
     # --------------------------------------------------------------------------------- doubts
+
+    @property
+    def is_obeyed(self) -> bool:
+        """Whether the vehicle may still do something that the program has ordered: it was armed by it and has not been
+        disarmed since, or it steers and nobody else has taken it from that.
+        """
+        order, about = self.newest, self._ordered_since_disarmed
+        # of an order without modes, such as a command of the program's own, it is not known what it brings about
+        is_taken = order is not None and order.modes and order.taken_by and not order.is_overruled
+        return "arm" in about if is_taken else bool(about)
 
     @property
     def is_known(self) -> bool:
@@ -234,7 +248,9 @@ class Helm:
         for each in self._followers():
             each.note_mode(mode, self._telemetry.mode.updated_at)
 
-    def _on_armed(self, _: bool | None, armed: bool) -> None:
+    def _on_armed(self, before: bool | None, armed: bool) -> None:
+        if before and not armed:
+            self._ordered_since_disarmed.clear()
         for each in self._followers():
             each.note_armed(armed, self._telemetry.armed.updated_at)
 

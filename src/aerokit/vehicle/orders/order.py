@@ -127,17 +127,18 @@ class Order:
         self._was_armed = armed_before
         self._is_newest = is_newest
         self._settles_at, self._any_until = settles_at, any_until
-        self._is_overruled = False
+        self.is_overruled = False
+        """Whether a newer order steers that is not one of an action."""
 
     @property
     def end(self) -> str:
         """Why it has nothing to say any more, as a clause; empty while it has."""
-        is_over = self._is_overruled or not self._is_newest(self)
+        is_over = self.is_overruled or not self._is_newest(self)
         return self.taken_by or ("another order was given" if is_over else "")
 
     def note_newer(self) -> None:
         """A newer order steers, which is none of these."""
-        self._is_overruled = True
+        self.is_overruled = True
 
     def is_own(self, mode: Mode) -> bool:
         """Whether this mode is one that the order may bring about."""
