@@ -14,7 +14,7 @@ from aerokit.errors import BusyError, LinkLost, LocalProtocolError
 from aerokit.links import Link, MemoryLink, Peer, create_link, memory_link_pair
 from aerokit.sim.channel import datagrams
 from aerokit.sim.hearing import SharedHearing
-from aerokit.sim.vehicle import SimulatedVehicle
+from aerokit.sim.vehicle import TICK_S, SimulatedVehicle
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -26,8 +26,8 @@ __all__ = ["SimulatorServer", "open_simulator", "simulated_link"]
 _SHORTEST_WAIT_S = 0.001
 """Of the loop's time, for many vehicles or when they run faster than it: several ticks are then done in one go."""
 _MANY = 10
-_WAIT_OF_MANY_S = 0.01
-"""Simulated, for as many and more when they do not run on virtual time: what falls into it goes out together."""
+_WAIT_OF_MANY_S = TICK_S
+"""Simulated, for more than `_MANY` unless they are on virtual time: what falls into it goes out together."""
 _INSTANT_S = 1e-8
 """What is due so soon on virtual time happens before anybody answers, as it does by a timer."""
 _TURNS = 1

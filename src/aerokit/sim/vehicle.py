@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from aerokit.sim.journal import Journal
 
-__all__ = ["Component", "ExtraComponent", "SimulatedVehicle", "sender_of"]
+__all__ = ["TICK_S", "Component", "ExtraComponent", "SimulatedVehicle", "sender_of"]
 
 TICK_S = 0.02
 """Motion, modes and failsafes run at 50 Hz while anything moves."""
@@ -122,10 +122,12 @@ class SimulatedVehicle:
         channel = self._channel if channel is None else channel
         if self.faults.frozen or self.faults.silent or not self._is_on:
             return
-        for message in channel.messages(data, now, peer):
+        messages = channel.messages(data, now, peer)
+        for message in messages:
             if sender_of(message) != (self.system_id, self.component_id):
                 self._handle(message, channel)
-        self.step(now)
+        if messages:
+            self.step(now)
 
     def step(self, now: float) -> None:
         """Let everything happen that is due up to ``now``."""
