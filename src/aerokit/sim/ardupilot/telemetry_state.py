@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 __all__ = ["STATE_BUILDERS", "heartbeat", "mission_current"]
 
 _UNKNOWN_CELL = 0xFFFF
+_RSSI = 255
 _MOTORS = {"copter": (0, 1, 2, 3), "plane": (2,)}
 """Outputs, from 0 on, of the motors that tell how they are."""
 _BOOT_MODE: dict[str, tuple[int, int]] = {
@@ -131,11 +132,13 @@ def mission_current(vehicle: ArduPilotVehicle, seq: int | None = None) -> m.Miss
 
 
 def _rc_channels(vehicle: ArduPilotVehicle) -> m.RcChannels:
-    return m.RcChannels(vehicle.time_boot_ms, len(vehicle.rc), *vehicle.rc.channels, 255)
+    fields = (*vehicle.rc.channels, _RSSI)
+    return m.RcChannels(vehicle.time_boot_ms, len(vehicle.rc), *fields)
 
 
 def _rc_channels_raw(vehicle: ArduPilotVehicle) -> m.RcChannelsRaw:
-    return m.RcChannelsRaw(vehicle.time_boot_ms, 0, *vehicle.rc, 255)
+    fields = (*vehicle.rc, _RSSI)
+    return m.RcChannelsRaw(vehicle.time_boot_ms, 0, *fields)
 
 
 def _vibration(vehicle: ArduPilotVehicle) -> m.Vibration:
