@@ -198,6 +198,27 @@ class TestOnSockets:
         ground.link.close()
         await ground.link.wait_closed()
 
+    async def test_many_share_datagrams(self) -> None:
+        ground = await opened(UdpListen("127.0.0.1", 0))
+        port = ground.link.local_address[1]  # type: ignore[attr-defined]
+        fleet = [SimulatedCopter(system_id=number, boot_time_s=0.0) for number in range(1, 13)]
+        framer, sent = Framer(), list[bytes]()
+        server = SimulatorServer(fleet, UdpConnect("127.0.0.1", port), speedup=5.0)
+        server.on_datagram = lambda _now, data, is_sent: sent.append(data) if is_sent else None
+        async with server:
+            await ground.wait_for(lambda x: isinstance(x, m.Heartbeat))
+            ground.command(7, MavCmd.DO_SET_MODE, 1, 4)
+            await ground.wait_for(lambda x: isinstance(x, m.CommandAck))
+        senders = [{frame.system_id for frame in framer.receive(data)} for data in sent]
+        assert max(map(len, senders)) > 1
+        assert set().union(*senders) == set(range(1, 13))
+        assert max(map(len, sent)) <= 1200
+        assert [copter.mode.number for copter in fleet] == [
+            4 if number == 7 else 0 for number in range(1, 13)
+        ]
+        ground.link.close()
+        await ground.link.wait_closed()
+
     async def test_an_address_in_use_leaves_nothing_behind(self) -> None:
         first = TcpListen("127.0.0.1", 0)
         async with SimulatorServer(SimulatedCopter(), first):

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 
 __all__ = ["FrameEncoder"]
 
-_HEADER_V2 = Struct("<BBBBBBBHB").pack
+_HEADER_V2 = Struct("<BBBBBBHB").pack  # without the magic byte
+_MAGIC_V1, _MAGIC_V2 = bytes((MAGIC_V1,)), bytes((MAGIC_V2,))
 _BYTES = tuple(bytes((number,)) for number in range(256))
 
 
@@ -64,19 +65,19 @@ class FrameEncoder:
         """
         signing = self.signing if self._version == 2 else None
         payload = message.encode()
+        number = message.ID
         if self._version == 2:
             payload = payload.rstrip(b"\0") or payload[:1]  # the standard never cuts the first byte
-            number, source, size = message.ID, (self.system_id, self.component_id), len(payload)
             flags = 0 if signing is None else SIGNED
-            head = _HEADER_V2(MAGIC_V2, size, flags, 0, self.sequence, *source, number & 0xFFFF, number >> 16)
-            frame = head + payload
+            source = self.system_id, self.component_id
+            body = _HEADER_V2(len(payload), flags, 0, self.sequence, *source, number & 0xFFFF, number >> 16)
+            body, magic = body + payload, _MAGIC_V2
         else:
-            if message.ID > 255:
-                raise LocalProtocolError(f"{message.NAME} has id {message.ID}, MAVLink 1 has none above 255")
+            if number > 255:
+                raise LocalProtocolError(f"{message.NAME} has id {number}, MAVLink 1 has none above 255")
             payload = payload[: message.BASE_LENGTH]
             source = self.system_id, self.component_id
-            frame = bytes((MAGIC_V1, len(payload), self.sequence, *source, message.ID)) + payload
+            body, magic = bytes((len(payload), self.sequence, *source, number)) + payload, _MAGIC_V1
         self.sequence = (self.sequence + 1) & 0xFF
-        crc = x25(frame[1:] + _BYTES[message.CRC_EXTRA])
-        frame += crc.to_bytes(2, "little")
+        frame = magic + body + x25(body + _BYTES[message.CRC_EXTRA]).to_bytes(2, "little")
         return frame if signing is None else frame + signing.sign(frame, now)

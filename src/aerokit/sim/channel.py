@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Hashable
+from collections.abc import Container, Hashable, Iterable
 from typing import TYPE_CHECKING
 
 from aerokit.errors import LocalProtocolError
 from aerokit.mavlink.encoder import FrameEncoder
-from aerokit.mavlink.framer import Framer
 from aerokit.sim.fitting import fitted
+from aerokit.sim.hearing import Hearing
 from aerokit.sim.streams import Streams
 
 if TYPE_CHECKING:
-    from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.message import Message
     from aerokit.mavlink.signing import Signing
 
-__all__ = ["Channel"]
+__all__ = ["Channel", "datagrams"]
 
 _DATAGRAM_SIZE = 1200
-
-
-MOST_PEERS = 256
 
 
 class Channel:
@@ -34,7 +30,8 @@ class Channel:
         self.streams: Streams = Streams()
         self._wanted = wanted
         self._own = (system_id, component_id)
-        self._framers: dict[Hashable, Framer] = {}
+        self.hearing: Hearing = Hearing(wanted)
+        """Reads what comes in; vehicles on one link may share it."""
         self._encoders: dict[tuple[int, int], FrameEncoder] = {}
         self._outbox: list[bytes] = []
         self.signing: Signing | None = None
@@ -46,16 +43,13 @@ class Channel:
         for encoder in self._encoders.values():
             encoder.signing = signing
 
-    def frames(self, data: bytes, now: float, peer: Hashable = None) -> list[Frame]:
+    def messages(self, data: bytes, now: float, peer: Hashable = None) -> list[Message]:
         """What the bytes of one peer hold that the vehicle understands."""
-        framer = self._framers.get(peer)
-        if framer is None:
-            if len(self._framers) >= MOST_PEERS:
-                del self._framers[next(iter(self._framers))]
-            framer = self._framers[peer] = Framer()
-            framer.wanted = self._wanted
-        frames = framer.receive(data, now)
-        return frames if self.signing is None else [each for each in frames if self.signing.accepts(each)]
+        signing, wanted = self.signing, self._wanted
+        heard = [each for each in self.hearing.messages(data, now, peer) if each.ID in wanted]
+        if signing is None:
+            return heard
+        return [each for each in heard if each.received_frame and signing.accepts(each.received_frame)]
 
     def encode(self, message: Message, sender: tuple[int, int] | None = None) -> bytes:
         """A frame with the sending component's next sequence number; empty when MAVLink 1 has none."""
@@ -90,25 +84,33 @@ class Channel:
         self._outbox.clear()
         return data
 
+    def take_pieces(self) -> list[bytes]:
+        """The same in frames, and what else belongs together."""
+        pieces, self._outbox = self._outbox, []
+        return pieces
+
     def take_datagrams(self) -> list[bytes]:
         """The same in pieces that fit into a datagram each."""
-        datagrams: list[bytes] = []
-        size = _DATAGRAM_SIZE
-        pieces: list[bytes] = []
-        for data in self._outbox:
-            if size + len(data) > _DATAGRAM_SIZE:
-                if pieces:
-                    datagrams.append(b"".join(pieces))
-                pieces, size = [], 0
-            pieces.append(data)
-            size += len(data)
-        if pieces:
-            datagrams.append(b"".join(pieces))
-        self._outbox.clear()
-        return datagrams
+        return datagrams(self.take_pieces())
 
     def reset(self) -> None:
         """Forget rates, half frames and sequence numbers, as a reboot does; what was said before is on its way."""
         self.streams = Streams()
-        self._framers.clear()
+        self.hearing = Hearing(self._wanted)
         self._encoders.clear()
+
+
+def datagrams(pieces: Iterable[bytes]) -> list[bytes]:
+    """As few as possible, each of whole pieces."""
+    found: list[bytes] = []
+    size = 0
+    together: list[bytes] = []
+    for data in pieces:
+        if together and size + len(data) > _DATAGRAM_SIZE:
+            found.append(b"".join(together))
+            together, size = [], 0
+        together.append(data)
+        size += len(data)
+    if together:
+        found.append(b"".join(together))
+    return found

@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit.errors import BusyError, LinkLost, LocalProtocolError
 from aerokit.links import Link, MemoryLink, Peer, create_link, memory_link_pair
-from aerokit.sim.vehicle import SimulatedVehicle
+from aerokit.sim.channel import datagrams
+from aerokit.sim.hearing import SharedHearing
+from aerokit.sim.vehicle import TICK_S, SimulatedVehicle
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -24,6 +26,8 @@ __all__ = ["SimulatorServer", "open_simulator", "simulated_link"]
 _SHORTEST_WAIT_S = 0.001
 """Of the loop's time, for many vehicles or when they run faster than it: several ticks are then done in one go."""
 _MANY = 10
+_WAIT_OF_MANY_S = TICK_S
+"""Simulated, for more than `_MANY` unless they are on virtual time: what falls into it goes out together."""
 _INSTANT_S = 1e-8
 """What is due so soon on virtual time happens before anybody answers, as it does by a timer."""
 _TURNS = 1
@@ -104,6 +108,8 @@ class SimulatorServer:
             raise BusyError("this SimulatorServer was started before")
         self._loop, self._owner = asyncio.get_running_loop(), asyncio.current_task()
         self._jump = getattr(self._loop, "jump", None)
+        if self._jump is None and len(self.vehicles) > _MANY:
+            self._shortest_wait_s = max(_SHORTEST_WAIT_S, _WAIT_OF_MANY_S / self._speedup)
         self._started_at = self._loop.time()
         try:
             async with AsyncExitStack() as opening:
@@ -243,6 +249,7 @@ class SimulatorServer:
             for vehicle, channel in zip(port.vehicles, port.channels, strict=True):
                 vehicle.receive(data, max(now, vehicle.now), peer, channel)
                 self._dues[self._numbers[id(vehicle)]] = vehicle.next_due
+            port.hearing.forget()
             self._flush()
             self._schedule()
         except Exception as error:
@@ -252,13 +259,11 @@ class SimulatorServer:
         """Send what is to be sent; whether there was something."""
         has_sent = False
         for port in self._ports:
-            for channel in port.channels:
-                if channel.has_output:
-                    has_sent = True
-                    for datagram in channel.take_datagrams():
-                        port.link.write(datagram)
-                        if self.on_datagram is not None:
-                            self.on_datagram(self.now, datagram, True)
+            for datagram in port.take_datagrams(together=self._jump is None):
+                has_sent = True
+                port.link.write(datagram)
+                if self.on_datagram is not None:
+                    self.on_datagram(self.now, datagram, True)
         return has_sent
 
     def _schedule(self) -> None:
@@ -304,6 +309,17 @@ class _Port:
         self.link = link
         self.vehicles: Sequence[SimulatedVehicle] = vehicles
         self.channels: Sequence[Channel] = channels
+        self.hearing: SharedHearing = SharedHearing()
+        if len(channels) > 1:
+            for channel in channels:
+                channel.hearing = self.hearing
+
+    def take_datagrams(self, *, together: bool) -> list[bytes]:
+        """What is to be sent; of many vehicles ``together``, whose frames then share datagrams as behind a router."""
+        speaking = [channel for channel in self.channels if channel.has_output]
+        if together and len(self.channels) > _MANY:
+            return datagrams(piece for channel in speaking for piece in channel.take_pieces())
+        return [datagram for channel in speaking for datagram in channel.take_datagrams()]
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
         """See `Receiver`."""

@@ -46,13 +46,12 @@ class Streams:
     def take_due(self, now: float) -> list[int]:
         """The message ids that are due, each scheduled anew."""
         ids: list[int] = []
-        heap = self._heap
+        heap, intervals = self._heap, self._intervals
         while self.next_due <= now:
             due, token, message_id = heap[0]
-            following = due + self._intervals[message_id][0]
-            if following <= now:
-                following = now + self._intervals[message_id][0]
-            heapreplace(heap, (following, token, message_id))
+            interval = intervals[message_id][0]
+            following = due + interval
+            heapreplace(heap, (following if following > now else now + interval, token, message_id))
             ids.append(message_id)
             self._look()
         return ids

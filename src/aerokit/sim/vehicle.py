@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from heapq import heappop, heappush
 from typing import TYPE_CHECKING, Any, Protocol
 
-from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.enums import MavAutopilot, MavModeFlag, MavSeverity, MavState, MavType
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import Heartbeat, Statustext
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
 
     from aerokit.sim.journal import Journal
 
-__all__ = ["Component", "ExtraComponent", "SimulatedVehicle", "sender_of"]
+__all__ = ["TICK_S", "Component", "ExtraComponent", "SimulatedVehicle", "sender_of"]
 
 TICK_S = 0.02
 """Motion, modes and failsafes run at 50 Hz while anything moves."""
@@ -123,11 +122,12 @@ class SimulatedVehicle:
         channel = self._channel if channel is None else channel
         if self.faults.frozen or self.faults.silent or not self._is_on:
             return
-        for frame in channel.frames(data, now, peer):
-            if frame.system_id == self.system_id and frame.component_id == self.component_id:
-                continue
-            self._handle(frame.message_id, frame, channel)
-        self.step(now)
+        messages = channel.messages(data, now, peer)
+        for message in messages:
+            if sender_of(message) != (self.system_id, self.component_id):
+                self._handle(message, channel)
+        if messages:
+            self.step(now)
 
     def step(self, now: float) -> None:
         """Let everything happen that is due up to ``now``."""
@@ -326,10 +326,9 @@ class SimulatedVehicle:
         """Send a text of severity INFO."""
         self.send_text(MavSeverity.INFO, text)
 
-    def _handle(self, message_id: int, frame: Any, channel: Channel) -> None:
-        handler = self.handlers.get(message_id)
-        message = STANDARD.decode(frame)
-        for overhear in self._overheard.get(message_id, ()):
+    def _handle(self, message: Message, channel: Channel) -> None:
+        handler = self.handlers.get(message.ID)
+        for overhear in self._overheard.get(message.ID, ()):
             overhear(message, channel)
         if handler is None or not self.is_for_me(message):
             return

@@ -38,9 +38,10 @@ class Radio:
         return len(self._sticks)
 
     def __getitem__(self, index: int) -> int:
-        value, since = self._overrides.get(index, (0, -math.inf))
-        if value and self._vehicle.now - since < self._override_time():
-            return value
+        if index in self._overrides:
+            value, since = self._overrides[index]
+            if value and self._vehicle.now - since < self._override_time():
+                return value
         if index == _THROTTLE and self._failure == _LOW_THROTTLE:
             return _LOW_THROTTLE_PWM
         return self._sticks[index] if index < len(self._sticks) else 0
@@ -54,6 +55,8 @@ class Radio:
     @property
     def channels(self) -> tuple[int, ...]:
         """All 18 that RC_CHANNELS has; those that nobody sends are 0."""
+        if not self._overrides and self._failure != _LOW_THROTTLE:
+            return (*self._sticks, *(0,) * (_CHANNELS - len(self._sticks)))
         return tuple(self[index] for index in range(_CHANNELS))
 
     @property
@@ -72,9 +75,7 @@ class Radio:
 
     @property
     def _failure(self) -> float:
-        parameters = self._vehicle.parameters
-        is_there = "SIM_RC_FAIL" in parameters
-        return parameters["SIM_RC_FAIL"] if is_there else 0.0
+        return self._vehicle.parameters.get("SIM_RC_FAIL", 0.0)
 
     def release_overrides(self) -> None:
         """Forget what was overridden, as a lost ground station makes the vehicle do."""

@@ -20,6 +20,7 @@ _STICK_RANGE = 500
 _SURFACE_RANGE = 400
 """A surface or thruster goes from 1100 to 1900."""
 _ROVER_DEADZONE = 30
+_OUTPUTS = 16
 _FULL_ROLL_RATE = 1.5
 _FULL_PITCH_RATE = 0.5
 _PITCH, _ROLL, _THROTTLE, _YAW, _FORWARD, _LATERAL = range(6)
@@ -69,10 +70,11 @@ def sub_outputs(sub: SimulatedSub) -> m.ServoOutputRaw:
 
 
 def _message(vehicle: ArduPilotVehicle, *pulses: int) -> m.ServoOutputRaw:
-    outputs = dict(enumerate(pulses, start=1)) | vehicle.accessories.servos
-    first = [outputs.get(number, 0) for number in range(1, 9)]
-    others = {f"servo{number}_raw": outputs.get(number, 0) for number in range(9, 17)}
-    return m.ServoOutputRaw(vehicle.time_boot_us & 0xFFFFFFFF, 0, *first, **others)
+    outputs = [*pulses, *(0,) * (_OUTPUTS - len(pulses))]
+    for number, pulse in vehicle.accessories.servos.items():
+        if 1 <= number <= _OUTPUTS:
+            outputs[number - 1] = pulse
+    return m.ServoOutputRaw(vehicle.time_boot_us & 0xFFFFFFFF, 0, *outputs)
 
 
 def _stick(pwm: int) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 __all__ = ["STATE_BUILDERS", "heartbeat", "mission_current"]
 
 _UNKNOWN_CELL = 0xFFFF
+_RSSI = 255
 _MOTORS = {"copter": (0, 1, 2, 3), "plane": (2,)}
 """Outputs, from 0 on, of the motors that tell how they are."""
 _BOOT_MODE: dict[str, tuple[int, int]] = {
@@ -131,16 +132,13 @@ def mission_current(vehicle: ArduPilotVehicle, seq: int | None = None) -> m.Miss
 
 
 def _rc_channels(vehicle: ArduPilotVehicle) -> m.RcChannels:
-    channels = _by_name(vehicle.rc.channels)
-    return m.RcChannels(time_boot_ms=vehicle.time_boot_ms, chancount=len(vehicle.rc), rssi=255, **channels)
+    fields = (*vehicle.rc.channels, _RSSI)
+    return m.RcChannels(vehicle.time_boot_ms, len(vehicle.rc), *fields)
 
 
 def _rc_channels_raw(vehicle: ArduPilotVehicle) -> m.RcChannelsRaw:
-    return m.RcChannelsRaw(time_boot_ms=vehicle.time_boot_ms, port=0, rssi=255, **_by_name(vehicle.rc))
-
-
-def _by_name(values: Iterable[int]) -> dict[str, int]:
-    return {f"chan{number}_raw": value for number, value in enumerate(values, start=1)}
+    fields = (*vehicle.rc, _RSSI)
+    return m.RcChannelsRaw(vehicle.time_boot_ms, 0, *fields)
 
 
 def _vibration(vehicle: ArduPilotVehicle) -> m.Vibration:
