@@ -18,7 +18,8 @@ from aerokit.parameters.parameter import MOST_PARAMETERS
 from aerokit.protocols.parameter_list import ParameterList
 from aerokit.protocols.round_trip import RoundTrip
 from aerokit.runtime.bus import Bus
-from aerokit.sim.channel import MOST_PEERS, Channel
+from aerokit.sim.channel import Channel
+from aerokit.sim.hearing import MOST_PEERS
 from aerokit.vehicle.state.status_text import MOST_OPEN, StatusTextAssembler
 from aerokit.vehicle.state.telemetry import MOST_MODE_NAMES
 
@@ -84,9 +85,10 @@ def test_texts_under_way() -> None:
 
 def test_peers_of_a_simulated_vehicle() -> None:
     channel = Channel(1, 1, (), version=2)
+    hearing = channel.hearing
     for port in range(2 * MOST_PEERS):
-        channel.frames(b"\xfd", 0.0, ("10.0.0.9", port))
-    assert len(channel._framers) == MOST_PEERS
+        channel.messages(b"\xfd", 0.0, ("10.0.0.9", port))
+    assert len(hearing._framers) == MOST_PEERS
 
 
 def test_plans_of_the_bus() -> None:
