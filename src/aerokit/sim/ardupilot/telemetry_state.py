@@ -132,13 +132,13 @@ def mission_current(vehicle: ArduPilotVehicle, seq: int | None = None) -> m.Miss
 
 
 def _rc_channels(vehicle: ArduPilotVehicle) -> m.RcChannels:
-    fields = (*vehicle.rc.channels, _RSSI)
-    return m.RcChannels(vehicle.time_boot_ms, len(vehicle.rc), *fields)
+    fields = [vehicle.time_boot_ms, len(vehicle.rc), *vehicle.rc.channels, _RSSI]
+    return m.RcChannels(*fields)
 
 
 def _rc_channels_raw(vehicle: ArduPilotVehicle) -> m.RcChannelsRaw:
-    fields = (*vehicle.rc, _RSSI)
-    return m.RcChannelsRaw(vehicle.time_boot_ms, 0, *fields)
+    fields = [vehicle.time_boot_ms, 0, *vehicle.rc, _RSSI]
+    return m.RcChannelsRaw(*fields)
 
 
 def _vibration(vehicle: ArduPilotVehicle) -> m.Vibration:

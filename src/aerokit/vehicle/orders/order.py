@@ -127,7 +127,7 @@ class Order:
         self._was_armed = armed_before
         self._is_newest = is_newest
         self._settles_at, self._any_until = settles_at, any_until
-        self.is_overruled = False
+        self.is_overruled: bool = False
         """Whether a newer order steers that is not one of an action."""
 
     @property
