@@ -88,7 +88,10 @@ async def test_it_shows_what_is_known_and_orders_only_after_a_yes_and_only_the_o
         await it.press("y")
         assert set(it.mode_orders()) == {2}
         assert [each.mode.value.name for each in it.app._watch.vehicles.values()] == ["STABILIZE", "LAND"]
-        await it.pilot.pause()
+        for _ in range(100):  # it is drawn when the screen finds time
+            if "land was ordered" in it.screen():
+                break
+            await it.pilot.pause(0.02)
         assert "land was ordered" in it.screen()
 
 
