@@ -97,12 +97,12 @@ def test_a_function_is_no_coroutine() -> None:
         run_virtual(test_a_function_is_no_coroutine)  # type: ignore[arg-type]
 
 
-def test_a_deadlock_is_an_error_that_names_the_waiting_task() -> None:
+def test_a_deadlock_is_an_error_that_names_the_waiting_task(monkeypatch: pytest.MonkeyPatch) -> None:
     async def wait_for_nobody() -> None:
         await asyncio.Event().wait()
 
-    # A thread that a test before has left might wake it: it is waited for, in real seconds.
-    with pytest.raises(DeadlockError, match=r"nothing left to wait for|nothing came from outside") as caught:
+    monkeypatch.setattr(threading, "active_count", lambda: 1)  # a test before may have left one of a package
+    with pytest.raises(DeadlockError, match="nothing left to wait for") as caught:
         run_virtual(wait_for_nobody())
     assert "locks.py" in str(caught.value)
     assert "Event.wait" in str(caught.value)

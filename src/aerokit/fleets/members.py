@@ -83,10 +83,8 @@ class Member:
             bus.attach_event(VehicleSilent, self._on_silent),
             bus.attach_event(VehicleBack, self._on_back),
             vehicle.mode.observe(later),
-            vehicle.armed.observe(
-                later, every_arrival=True
-            ),  # HEARTBEAT tells more than the CURRENT_MODE before it
-            vehicle.system_status.observe(later),
+            # Each HEARTBEAT, though nothing has changed: it tells more than the CURRENT_MODE before it.
+            vehicle.armed.observe(later, every_arrival=True),
             vehicle.connection.on_end(self._on_end),
         ]
         if vehicle.is_silent:

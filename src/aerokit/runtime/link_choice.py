@@ -168,9 +168,8 @@ class LinkChoice:
         if former is not None:
             longer_s = ((to.round_trip_s or 0.0) - (former.round_trip_s or 0.0)) / 2
             self.fresh_after = former.heard_at + longer_s + JITTER_S
-            former.is_proven = (
-                not former.is_other_hardware
-            )  # the one behind the other link is the same as was behind this one
+            # The one behind the other link is the same as was behind this one.
+            former.is_proven = not former.is_other_hardware
         self.former, self.used, self.changed_at, self._better = former, to, now, None
         self._adopt_hardware(to)
         return reason
