@@ -11,7 +11,7 @@ import pytest
 from served_copter import served
 
 import aerokit.sync
-from aerokit.errors import LocalProtocolError, ParameterRejected
+from aerokit.errors import LocalProtocolError, ParameterRejected, RollbackFailed
 from aerokit.events import SettingChanged
 from aerokit.sim import SimulatedCamera, SimulatedCopter
 from aerokit.sync.twins import Settings
@@ -78,6 +78,24 @@ def test_ctrl_c_while_values_are_put_back_waits_for_it(
         interrupt.start()
     radio.join()
     assert copter.parameters["RTL_ALT"] == 1500
+
+
+@pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="needs POSIX signals")
+def test_ctrl_c_does_not_hide_what_could_not_be_put_back(
+    vehicle: aerokit.sync.Vehicle, copter: SimulatedCopter
+) -> None:
+    main = threading.main_thread().ident
+    assert main is not None
+    interrupt = threading.Timer(0.1, signal.pthread_kill, (main, signal.SIGINT))
+    with (
+        pytest.raises(KeyboardInterrupt) as interrupted,
+        vehicle.parameters.temporarily({"RTL_ALT": 2000}, patience_s=1.0),
+    ):
+        copter.faults.silent = True
+        interrupt.start()
+    failed = interrupted.value.__cause__
+    assert isinstance(failed, RollbackFailed)
+    assert failed.not_restored == {"RTL_ALT": 1500}
 
 
 def test_settings_of_a_camera() -> None:

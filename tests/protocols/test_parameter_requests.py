@@ -390,3 +390,14 @@ def test_what_another_station_has_set_meanwhile_is_not_undone() -> None:
     answers = channel.run(writes(Parameter("PARAM_0000", 7, INT8), before={"PARAM_0000": 0}))
     assert value(answers["PARAM_0000"]) == 3
     assert channel.kinds()["PARAM_SET"] == 1
+
+
+def test_a_vehicle_that_has_become_faster_is_believed() -> None:
+    """It was busy when its round trip was measured, and the first writes were lost: each answer seems too early."""
+    vehicle = FakeVehicle(table_of(1))
+    channel = Channel(vehicle, delay_s=0.005)
+    channel.is_lost = lambda message: channel.now < 3.0
+    asked = Parameter("PARAM_0000", 5, INT8)
+    answer = channel.run(writes(asked, before={"PARAM_0000": 0}))["PARAM_0000"]
+    assert value(answer) == vehicle.parameters["PARAM_0000"].value == 5
+    assert channel.now < 5.0

@@ -20,6 +20,7 @@ from aerokit.mavlink.messages import (
 )
 from aerokit.parameters.parameter import MOST_PARAMETERS
 from aerokit.parameters.setting import Setting, setting_bytes, setting_value, settings_equal
+from aerokit.protocols.early_answers import EarlyAnswers
 from aerokit.protocols.request_window import RequestWindow
 from aerokit.protocols.transfer import PATIENCE_S, OnProgress, Transfer, ranges
 
@@ -44,8 +45,6 @@ PROBE, PROBE_INDEX = "", 0
 """The request for a setting that every component with settings has."""
 DOUBT = 1e-4
 """How probable it may be that a setting exists although the component, which answers otherwise, says nothing of it."""
-SOONEST = 0.5
-"""An answer takes at least this part of the fastest round trip so far."""
 VERDICT, VERDICT_OF_NO_CHANGE = 2, 8
 """So many answers with another value than asked for are a verdict; more when it is the value from before, which may
 also stand in a message that was under way, while PARAM_EXT_SET was lost."""
@@ -330,6 +329,7 @@ class SettingWrite(Transfer[Setting]):
         self._name, self._value, self._type, self._before = name, value, type, before
         self._told: list[Setting] = []
         """Answers with another value than asked for, all of one value."""
+        self._early = EarlyAnswers(self.round_trip)
         self._is_writing = False
         self._sent_at = 0.0
         self._attempts = 0
@@ -426,8 +426,4 @@ class SettingWrite(Transfer[Setting]):
 
     def _is_too_early(self, now: float) -> bool:
         """Whether this can be no answer to what was sent last: it is a late or repeated one to something before."""
-        elapsed_s = now - self._sent_at
-        is_early = elapsed_s < SOONEST * (self.round_trip.fastest_s or 0.0)
-        if is_early and self._attempts == 1:
-            self.round_trip.measured(elapsed_s)  # perhaps this component is so fast: believe it next time
-        return is_early
+        return self._early.is_one(self._name, self._sent_at, now, attempts=self._attempts)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from aerokit.errors import ParameterRejected, ParameterTimeout
 from aerokit.mavlink.messages import ParamError, ParamValue
 from aerokit.parameters import Parameter
+from aerokit.protocols.early_answers import EarlyAnswers
 from aerokit.protocols.request_window import RequestWindow
 from aerokit.protocols.transfer import PATIENCE_S, OnProgress, Transfer
 
@@ -24,9 +25,6 @@ __all__ = ["Answer", "ParameterRequests", "rejection"]
 Answer = Parameter | ParameterRejected | ParameterTimeout
 """What came of one request: what the vehicle says the parameter is, or why there is nothing to say."""
 
-SOONEST = 0.5
-"""An answer takes at least this part of the fastest round trip so far."""
-EARLY_ONES = 2
 ERRORS = {
     1: "the vehicle has no such parameter",
     2: "the vehicle does not accept this value",
@@ -75,6 +73,7 @@ class ParameterRequests(Transfer[dict[str, Answer]]):
         )
         self._answers: dict[str, Answer] = {}
         self._sent_at: dict[str, float] = {}
+        self._early = EarlyAnswers(self.round_trip)
 
     def start(self, now: float) -> None:
         """Ask for the first of them."""
@@ -131,11 +130,8 @@ class ParameterRequests(Transfer[dict[str, Answer]]):
 
     def _is_too_early(self, name: str, now: float) -> bool:
         """Whether this can be no answer to what was sent last: it is a late or repeated one to something before."""
-        elapsed_s = now - self._sent_at.get(name, now)
-        is_early = elapsed_s < SOONEST * (self.round_trip.fastest_s or 0.0)
-        if is_early and self._window.attempts(name) == 1:
-            self.round_trip.measured(elapsed_s)  # perhaps this vehicle is so fast: believe it next time
-        return is_early
+        sent_at = self._sent_at.get(name, now)
+        return self._early.is_one(name, sent_at, now, attempts=self._window.attempts(name))
 
     def _settle(self, name: str, answer: Answer, now: float) -> None:
         self._window.forget(name)

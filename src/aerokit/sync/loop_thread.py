@@ -89,7 +89,8 @@ class LoopThread:
     def run_to_its_end(self, function: Callable[P, Awaitable[T]], /, *args: P.args, **kwargs: P.kwargs) -> T:
         """As :meth:`run`, for what leaves something undone when it is cut short, and is bounded by itself.
 
-        Ctrl-C waits for it, and goes on as KeyboardInterrupt afterwards; a second one does not wait.
+        Ctrl-C waits for it, and goes on as KeyboardInterrupt afterwards, whose cause is what it has raised; a second one
+        does not wait.
         """
         return self._run(None, function, *args, **kwargs)
 
@@ -117,6 +118,8 @@ class LoopThread:
                 while call.was_started and not call.wait(WAKE_S if patience_s is None else patience_s):
                     if patience_s is not None or not self._thread.is_alive():
                         break
+                if patience_s is None and (failure := call.take_error()) is not None:
+                    raise error from failure
             raise
         return call.result()
 

@@ -58,12 +58,17 @@ class Reply(Generic[T]):
 
     def result(self) -> T:
         """The result, once it is done; raises the error, once; LookupError when there is neither."""
-        error, self._error = self._error, None  # kept, it would hold its traceback, and that would hold it
+        error = self.take_error()
         if error is not None:
             raise error
         if not self._values:
             raise LookupError("nothing was given")
         return self._values[0]
+
+    def take_error(self) -> BaseException | None:
+        """The error, once."""
+        error, self._error = self._error, None  # kept, it would hold its traceback, and that would hold it
+        return error
 
 
 def reply_of(future: concurrent.futures.Future[Any]) -> Reply[None]:
