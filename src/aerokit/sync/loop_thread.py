@@ -89,7 +89,7 @@ class LoopThread:
     def run_to_its_end(self, function: Callable[P, Awaitable[T]], /, *args: P.args, **kwargs: P.kwargs) -> T:
         """As :meth:`run`, for what leaves something undone when it is cut short, and is bounded by itself.
 
-        Ctrl-C waits for it, and goes on as KeyboardInterrupt afterwards, whose cause is what it has raised; a second one
+        Ctrl-C waits for it, and goes on as KeyboardInterrupt afterwards, its cause what it has raised; a second one
         does not wait.
         """
         return self._run(None, function, *args, **kwargs)
