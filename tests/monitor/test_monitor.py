@@ -43,6 +43,13 @@ class Stage:
         await anyio.sleep(0.5)
         self.app.look()
 
+    async def drawn(self, text: str) -> None:
+        """Wait until that can be drawn: a screen draws at its next frame, in the time of the test."""
+        for _ in range(100):
+            if text in self.screen():
+                break
+            await self.pilot.pause(0.02)
+
     def screen(self) -> str:
         """What stands on the terminal."""
         lines = self.app.screen._compositor.render_strips()
@@ -73,7 +80,9 @@ async def stage(count: int = 2) -> AsyncIterator[Stage]:
 
 async def test_it_shows_what_is_known_and_orders_only_after_a_yes_and_only_the_one_that_was_named() -> None:
     async with stage() as it:
+        await it.drawn("2 vehicles")
         assert "2 vehicles" in it.screen()
+        await it.drawn("STABILIZE  disarmed")
         assert "STABILIZE  disarmed" in it.screen()
         assert "HEARTBEAT" in str([name for name, _ in it.app._watch.rates(1)])
         for keys in (("l",), ("enter",), ("h",), ("n",), ("r",), ("escape",), ("r",), ("q",)):
@@ -88,10 +97,7 @@ async def test_it_shows_what_is_known_and_orders_only_after_a_yes_and_only_the_o
         await it.press("y")
         assert set(it.mode_orders()) == {2}
         assert [each.mode.value.name for each in it.app._watch.vehicles.values()] == ["STABILIZE", "LAND"]
-        for _ in range(100):  # it is drawn when the screen finds time
-            if "land was ordered" in it.screen():
-                break
-            await it.pilot.pause(0.02)
+        await it.drawn("land was ordered")
         assert "land was ordered" in it.screen()
 
 
@@ -110,13 +116,14 @@ async def test_a_refusal_is_shown_and_what_is_old_has_its_age() -> None:
         it.copters[0].faults.refuse(MavCmd.DO_SET_MODE, 2, "no")
         await it.press("h")
         await it.press("y")
-        await it.pilot.pause()
+        await it.drawn("hold failed")
         assert "hold failed" in it.screen()
         it.wire._link.close()  # it says nothing more
         await anyio.sleep(20)
         it.app.look()
-        await it.pilot.pause()
+        await it.drawn("old)")
         assert "old)" in it.screen()
+        await it.drawn("silent")
         assert "silent" in it.screen()
 
 
@@ -143,6 +150,7 @@ async def test_made_up_messages_fill_no_table(monkeypatch: pytest.MonkeyPatch) -
 
 async def test_of_nothing_heard_it_says_what_it_waits_for_and_nothing_is_zero() -> None:
     async with stage(0) as it:
+        await it.drawn("waiting for the heartbeat of a vehicle")
         assert "waiting for the heartbeat of a vehicle" in it.screen()
         await it.press("l")
         assert not isinstance(it.app.screen, Question)
