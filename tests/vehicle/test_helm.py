@@ -195,6 +195,23 @@ def test_after_an_order_of_the_programs_own_any_mode_may_come_for_three_seconds(
     assert order.end == end
 
 
+def test_the_mode_that_an_order_of_the_programs_own_names_is_not_a_pilots_doing() -> None:
+    stage = Stage()
+    own = stage.helm.order_of_the_programs_own(modes=[GUIDED])
+    stage.tell(GUIDED)
+    assert (own.end, stage.helm.is_obeyed) == ("", True)
+    stage.tell(RTL)  # within three seconds: nothing is sent again after a pilot's mode
+    assert (own.end, stage.helm.is_obeyed) == ("the mode changed to RTL", False)
+
+
+def test_an_order_of_the_programs_own_ends_at_any_mode_so_that_it_is_not_sent_again_over_a_pilot() -> None:
+    stage = Stage()
+    own = stage.helm.order_of_the_programs_own()
+    with stage.helm.sending(own) as sending:
+        stage.tell(RTL, after=0.5)
+        assert sending.end == "the mode changed to RTL"
+
+
 @pytest.mark.parametrize(
     ("error", "in_doubt", "settles_at"),
     [

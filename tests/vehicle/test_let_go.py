@@ -74,6 +74,8 @@ async def test_only_who_has_ordered_something_that_still_holds_is_warned(
         async def send_mode(vehicle: aerokit.Vehicle) -> None:
             vehicle.send(SetMode(1, 1, CopterMode.GUIDED))
             await anyio.sleep(3)
+            assert vehicle.mode_name == "GUIDED"
+            assert vehicle.taken_over == ""
 
         assert "let go" not in await left_after(lambda vehicle: vehicle.why_not_armable())
         async with vehicles_on(connection) as vehicles:  # as `aerokit status` does it
@@ -84,6 +86,7 @@ async def test_only_who_has_ordered_something_that_still_holds_is_warned(
         assert "let go" not in await left_after(lambda vehicle: vehicle.set_mode("GUIDED"), pilot_takes)
         assert "let go: in GUIDED" in await left_after(send_mode)
         assert "let go" not in await left_after(lambda vehicle: vehicle.set_speed(5.0))
+        assert "let go" not in await left_after(send_mode, pilot_takes)
 
 
 async def test_who_has_armed_it_is_warned_whoever_steers_it_since(caplog: pytest.LogCaptureFixture) -> None:

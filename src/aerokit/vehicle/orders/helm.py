@@ -77,9 +77,11 @@ class Helm:
         self._orders = [order]
         return order
 
-    def order_of_the_programs_own(self, subjects: Iterable[Subject] = ("mode", "motion")) -> Order:
-        """The program sends one by itself: which modes that brings about is not known."""
-        order = self.order(subjects=subjects)
+    def order_of_the_programs_own(
+        self, subjects: Iterable[Subject] = ("mode", "motion"), *, modes: Collection[Mode] = ()
+    ) -> Order:
+        """The program sends one by itself: which other modes that brings about is not known."""
+        order = self.order(*modes, subjects=subjects)
         self._any_mode_until = self._now() + MODE_GRACE_S
         return order
 

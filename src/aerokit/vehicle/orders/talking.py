@@ -136,7 +136,10 @@ class TalkActions(Part):
         target = getattr(message, "target_system", self.system_id)
         subjects = subjects_of(message) if target in (EVERYBODY, self.system_id) else ()
         if subjects and isinstance(message, (CommandInt, CommandLong, SetMode)):
-            self._helm.order_of_the_programs_own(subjects)
+            known = self.telemetry
+            asked = (message.custom_mode, message.base_mode) if isinstance(message, SetMode) else ()
+            modes = [known.autopilot.mode(*asked, known.mode_names)] if asked else ()
+            self._helm.order_of_the_programs_own(subjects, modes=modes)
         elif subjects:
             self._helm.note_newer(subjects)
 
