@@ -15,6 +15,7 @@ from functools import cached_property
 from typing import Any
 
 import pytest
+from ctrl_c import interrupt_soon
 from served_copter import served, served_copter
 
 import aerokit
@@ -333,14 +334,6 @@ def unused_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
-
-
-def interrupt_soon() -> threading.Timer:
-    main = threading.main_thread().ident
-    assert main is not None
-    timer = threading.Timer(0.1, signal.pthread_kill, (main, signal.SIGINT))
-    timer.start()
-    return timer
 
 
 @pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="needs POSIX signals")

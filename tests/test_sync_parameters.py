@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator
 
 import pytest
+from ctrl_c import interrupt_soon
 from served_copter import served
 
 import aerokit.sync
@@ -64,18 +65,14 @@ def test_ctrl_c_in_a_block_puts_back(vehicle: aerokit.sync.Vehicle, copter: Simu
 def test_ctrl_c_while_values_are_put_back_waits_for_it(
     vehicle: aerokit.sync.Vehicle, copter: SimulatedCopter
 ) -> None:
-    main = threading.main_thread().ident
-    assert main is not None
-
     def back() -> None:
         copter.faults.silent = False
 
     radio = threading.Timer(0.5, back)
-    interrupt = threading.Timer(0.1, signal.pthread_kill, (main, signal.SIGINT))
     with pytest.raises(KeyboardInterrupt), vehicle.parameters.temporarily({"RTL_ALT": 2000}):
         copter.faults.silent = True
         radio.start()
-        interrupt.start()
+        interrupt_soon()
     radio.join()
     assert copter.parameters["RTL_ALT"] == 1500
 
@@ -84,15 +81,12 @@ def test_ctrl_c_while_values_are_put_back_waits_for_it(
 def test_ctrl_c_does_not_hide_what_could_not_be_put_back(
     vehicle: aerokit.sync.Vehicle, copter: SimulatedCopter
 ) -> None:
-    main = threading.main_thread().ident
-    assert main is not None
-    interrupt = threading.Timer(0.1, signal.pthread_kill, (main, signal.SIGINT))
     with (
         pytest.raises(KeyboardInterrupt) as interrupted,
         vehicle.parameters.temporarily({"RTL_ALT": 2000}, patience_s=1.0),
     ):
         copter.faults.silent = True
-        interrupt.start()
+        interrupt_soon()
     failed = interrupted.value.__cause__
     assert isinstance(failed, RollbackFailed)
     assert failed.not_restored == {"RTL_ALT": 1500}

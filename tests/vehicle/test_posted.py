@@ -20,7 +20,7 @@ from aerokit.errors import (
     OperationRejected,
     OperationTimeout,
 )
-from aerokit.mavlink.enums import MavCmd, MavResult
+from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult
 from aerokit.runtime.cells import Source, StateCell
 from aerokit.vehicle.orders.helm import Helm
 from aerokit.vehicle.orders.order import Subject, subjects_of
@@ -248,6 +248,15 @@ async def test_what_is_sent_to_another_system_is_no_order_to_this_one(flying: Fl
             assert (each.NAME, order.end) == (each.NAME, "")
         vehicle.send(m.SetPositionTargetLocalNed(0, 0, 0, 1, 0x0DC7, *(0,) * 11))  # to everybody
         assert order.end == NEWER
+
+
+@pytest.mark.anyio
+async def test_a_set_mode_without_the_flag_for_custom_modes_names_none(flying: Flight) -> None:
+    vehicle = flying.vehicle
+    vehicle.send(m.SetMode(vehicle.system_id, 0, CopterMode.LOITER))
+    flying.copter.set_mode(CopterMode.LOITER)
+    await vehicle.mode.wait_until(lambda mode: mode.name == "LOITER", timeout=5)
+    assert vehicle.taken_over == "the mode changed to LOITER"
 
 
 @pytest.mark.anyio

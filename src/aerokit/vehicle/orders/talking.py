@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, TypeVar
 
 from aerokit.arguments import checks_arguments
+from aerokit.autopilots.modes import CUSTOM_MODE_ENABLED
 from aerokit.errors import LocalProtocolError
 from aerokit.mavlink.enums import MavFrame
 from aerokit.mavlink.message import Message
@@ -136,9 +137,10 @@ class TalkActions(Part):
         target = getattr(message, "target_system", self.system_id)
         subjects = subjects_of(message) if target in (EVERYBODY, self.system_id) else ()
         if subjects and isinstance(message, (CommandInt, CommandLong, SetMode)):
-            known = self.telemetry
-            asked = (message.custom_mode, message.base_mode) if isinstance(message, SetMode) else ()
-            modes = [known.autopilot.mode(*asked, known.mode_names)] if asked else ()
+            modes: list[Mode] = []
+            if isinstance(message, SetMode) and message.base_mode & CUSTOM_MODE_ENABLED:
+                known = self.telemetry
+                modes = [known.autopilot.mode(message.custom_mode, message.base_mode, known.mode_names)]
             self._helm.order_of_the_programs_own(subjects, modes=modes)
         elif subjects:
             self._helm.note_newer(subjects)
