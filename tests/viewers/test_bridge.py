@@ -7,6 +7,7 @@ import json
 import os
 import socket
 import struct
+import threading
 import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -18,6 +19,8 @@ import pytest
 from aerokit import messages as m
 from aerokit.errors import LinkOpenError, LocalProtocolError
 from aerokit.foxglove import FoxgloveBridge, foxglove_bridge
+from aerokit.foxglove import bridge as bridge_module
+from aerokit.links.sockets import is_free
 from aerokit.mavlink.message import Message
 from aerokit.runtime.connection import Connection
 from aerokit.runtime.opening import open_connection
@@ -199,6 +202,24 @@ async def test_nothing_is_listening_behind_the_block_and_the_port_can_be_used_ag
     assert _threads() <= threads, "other bridges need no more threads"
     assert _files() <= files + 2
     assert asyncio.all_tasks() == tasks
+
+
+async def test_behind_the_block_a_server_that_takes_its_time_has_closed_its_port(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class SlowServer:
+        def __init__(self, *_: object) -> None:
+            self.listening = socket.create_server(("127.0.0.1", 0))
+            self.port = self.listening.getsockname()[1]
+
+        def stop(self) -> None:
+            threading.Timer(0.2, self.listening.close).start()
+
+    monkeypatch.setattr(bridge_module, "_serve", SlowServer)
+    async with bridged() as (bridge, _):
+        assert not await is_free("127.0.0.1", bridge.port)
+    with pytest.raises(OSError, match=r"111|refused|Connect"):
+        await asyncio.open_connection("127.0.0.1", bridge.port)
 
 
 def _threads() -> int:

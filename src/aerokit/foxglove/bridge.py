@@ -8,11 +8,14 @@ from fnmatch import fnmatchcase
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+import anyio
+
 from aerokit.arguments import checked
 from aerokit.async_block import async_block
 from aerokit.errors import LinkOpenError, LocalProtocolError
 from aerokit.foxglove import topics
 from aerokit.foxglove.topics import Topic
+from aerokit.links.sockets import is_free
 from aerokit.runtime.background import Background
 from aerokit.vehicle.overview import overview
 from aerokit.vehicle.vehicles import vehicles_on
@@ -29,6 +32,8 @@ __all__ = ["FoxgloveBridge", "foxglove_bridge"]
 HIGHEST_RATE_HZ = 100.0
 WAITING_MESSAGES = 512
 """For one viewer; the SDK then drops the oldest, so a slow one sees the newest and keeps nobody waiting."""
+CLOSE_S = 2.0
+"""So long the end of a bridge waits at most until its port is closed."""
 _LINK_EVERY_S = 1.0
 
 
@@ -101,7 +106,7 @@ async def foxglove_bridge(
         for each in detach:
             each()
         shown.close()
-        server.stop()
+        await _stop(server, host)
 
 
 def _message_types(connection: Connection, patterns: Iterable[str]) -> list[type[Message]]:
@@ -126,6 +131,15 @@ def _serve(shown: _Shown, host: str, port: int) -> Any:
         )
     except RuntimeError as error:
         raise LinkOpenError(f"viewers cannot be served on {host} port {port}: {error}") from error
+
+
+async def _stop(server: Any, host: str) -> None:
+    """Have the server stop, and wait for it: its own thread closes the socket, a moment after ``stop`` has returned."""
+    port = server.port
+    server.stop()
+    with anyio.move_on_after(CLOSE_S, shield=True):
+        while not await is_free(host, port):  # noqa: ASYNC110 - the SDK tells nobody
+            await anyio.sleep(0.005)
 
 
 async def _repeat(action: Callable[[], None], every_s: float) -> None:

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
-__all__ = ["Endpoint", "bind_to", "bound_socket", "has_more", "resolve"]
+__all__ = ["Endpoint", "bind_to", "bound_socket", "has_more", "is_free", "resolve"]
 
 
 class Endpoint(NamedTuple):
@@ -45,6 +45,15 @@ async def bound_socket(host: str, port: int, kind: socket.SocketKind) -> socket.
         with contextlib.suppress(OSError):
             return bind_to(endpoint, kind)
     return bind_to(endpoints[-1], kind)
+
+
+async def is_free(host: str, port: int) -> bool:
+    """Whether nobody listens on that TCP port of this machine."""
+    try:
+        (await bound_socket(host, port, socket.SOCK_STREAM)).close()
+    except OSError:
+        return False
+    return True
 
 
 def bind_to(endpoint: Endpoint, kind: socket.SocketKind) -> socket.socket:
