@@ -323,9 +323,8 @@ class _Parser:
         self.fail(f"{scheme}: {known}{did_you_mean(scheme, _SCHEMES)}")
 
     def fail(self, reason: str) -> NoReturn:
-        raise LocalProtocolError(
-            f"{self.text!r} is not a link address: {reason}. Accepted:\n{ACCEPTED_FORMS}"
-        )
+        shown = re.sub(r"(//[^/@:]*):.*@", r"\1:…@", self.text)  # a broker's, with a password
+        raise LocalProtocolError(f"{shown!r} is not a link address: {reason}. Accepted:\n{ACCEPTED_FORMS}")
 
 
 def _is_ipv6(text: str) -> bool:

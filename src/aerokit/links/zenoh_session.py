@@ -7,7 +7,6 @@ import contextlib
 import json
 import re
 from collections.abc import Callable, Iterable
-from importlib import import_module
 from typing import Any
 
 from aerokit.errors import LinkOpenError, LocalProtocolError
@@ -15,6 +14,7 @@ from aerokit.snapshot import Snapshot
 
 from .base import BaseLink
 from .handover import Handover
+from .needed import needed
 
 __all__ = [
     "NetworkLink",
@@ -86,13 +86,7 @@ class NetworkLink(BaseLink):
 
 def zenoh_module(address: str) -> Any:
     """The module ``zenoh``; LinkOpenError with what to install when it is not there."""
-    try:
-        return import_module("zenoh")
-    except ModuleNotFoundError as error:
-        raise LinkOpenError(
-            f"cannot open {address}: this needs eclipse-zenoh, which is not installed:"
-            " pip install 'aerokit-mavlink[zenoh]'"
-        ) from error
+    return needed(address, "zenoh", "eclipse-zenoh", "zenoh")
 
 
 async def open_session(address: str, options: NetworkOptions, prepare: Callable[[Any, Any], object]) -> Any:

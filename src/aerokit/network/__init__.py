@@ -6,8 +6,18 @@ Frames, and with them the whole API, go over the addresses ``zenoh:`` and ``zeno
 from __future__ import annotations
 
 from aerokit.network.found import found
+from aerokit.network.mqtt_publisher import mqtt_publisher
+from aerokit.network.nats_publisher import nats_publisher
 from aerokit.network.publisher import Publisher
 from aerokit.network.publishing import Publishing, publishing
 from aerokit.network.zenoh_publisher import zenoh_publisher
 
-__all__ = ["Publisher", "Publishing", "found", "publishing", "zenoh_publisher"]
+__all__ = [
+    "Publisher",
+    "Publishing",
+    "found",
+    "mqtt_publisher",
+    "nats_publisher",
+    "publishing",
+    "zenoh_publisher",
+]

@@ -14,7 +14,7 @@ import anyio
 from aerokit.arguments import checked
 from aerokit.async_block import async_block
 from aerokit.errors import LocalProtocolError
-from aerokit.network.zenoh_publisher import zenoh_publisher
+from aerokit.network.publishers import publisher_for
 from aerokit.plain import plain
 from aerokit.runtime.background import Background
 from aerokit.vehicle.overview import overview
@@ -108,13 +108,14 @@ async def publishing(
 
     Args:
         vehicle: a vehicle that is connected.
-        to: ``"zenoh://fleet/alpha"``: on the keys ``aerokit/fleet/alpha/state/SYSTEM_ID/STATE``; or a `Publisher`.
+        to: ``"zenoh://fleet/alpha"``: on the keys ``aerokit/fleet/alpha/state/SYSTEM_ID/STATE``;
+            ``"mqtt://host/fleet/alpha"``, ``"nats://host/fleet/alpha"``: there, too; or a `Publisher`.
         rate_hz: of each state at most, above 0 to 50.
         states: names as in docs/states.md, and ``"link"``; none: all of them.
 
     Raises:
         LocalProtocolError: an argument is wrong, or there is no such state.
-        LinkOpenError: there is no network, or eclipse-zenoh is not installed.
+        LinkOpenError: there is no network or broker, or the package that it takes is not installed.
         ConnectionClosed, LinkLost: the vehicle's connection has ended.
     """
     if not 0 < rate_hz <= HIGHEST_RATE_HZ:
@@ -128,7 +129,7 @@ async def publishing(
     connection = vehicle.connection
     connection.raise_if_ended()
     async with AsyncExitStack() as stack:
-        publisher = await stack.enter_async_context(zenoh_publisher(to)) if isinstance(to, str) else to
+        publisher = await stack.enter_async_context(publisher_for(to)) if isinstance(to, str) else to
         under_way = Publishing(vehicle, publisher, wanted)
 
         async def go_on() -> None:

@@ -1,0 +1,125 @@
+"""Brokers of MQTT and NATS on this machine: nats-server, which is both, in a process of its own; and who listens."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from zenoh_network import eventually, free_port
+
+__all__ = ["PASSWORD", "USER", "Broker", "needs_a_broker"]
+
+PROGRAM = shutil.which("nats-server", path=str(Path(sys.executable).parent)) or shutil.which("nats-server")
+USER, PASSWORD = "alpha", "s3cret@/:"
+
+
+def needs_a_broker() -> None:
+    """Skip the tests of a module where the server, or a client, is not installed."""
+    pytest.importorskip("paho.mqtt.client")
+    pytest.importorskip("nats.aio.client")
+    if PROGRAM is None:
+        pytest.skip("nats-server is not installed", allow_module_level=True)
+
+
+class Broker:
+    """A server that can be killed and started again on the same ports."""
+
+    def __init__(self, folder: Path, *, with_password: bool = False) -> None:
+        self.ports = {"mqtt": free_port(), "nats": free_port()}
+        self._folder, self._starts = folder, 0
+        self._process: subprocess.Popen[bytes] | None = None
+        config: dict[str, Any] = {
+            "server_name": "test",
+            "listen": f"127.0.0.1:{self.ports['nats']}",
+            "mqtt": {"listen": f"127.0.0.1:{self.ports['mqtt']}"},
+            "jetstream": {"store_dir": str(folder / "store")},
+        }
+        if with_password:
+            config["authorization"] = {"user": USER, "password": PASSWORD}
+        self._config = folder / "nats.conf"
+        self._config.write_text(json.dumps(config), encoding="utf-8")
+
+    async def __aenter__(self) -> Broker:
+        await self.start()
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self.kill()
+
+    async def start(self) -> None:
+        """Until it is ready."""
+        assert PROGRAM is not None
+        assert self._process is None
+        self._starts += 1
+        log = self._folder / f"log-{self._starts}"
+        self._run(PROGRAM, log)
+        await eventually(lambda: log.exists() and "Server is ready" in log.read_text(encoding="utf-8"))
+
+    def _run(self, program: str, log: Path) -> None:
+        self._process = subprocess.Popen([program, "-c", str(self._config), "-l", str(log)])
+
+    def kill(self) -> None:
+        """At once, as if its machine had lost power."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+            self._process = None
+
+    @asynccontextmanager
+    async def heard(self, scheme: str, login: tuple[str, str] | None = None) -> AsyncIterator[list[Any]]:
+        """What arrives, as (topic, payload, whether it was retained)."""
+        listen = {"mqtt": self._heard_by_mqtt, "nats": self._heard_by_nats}[scheme]
+        async with listen(login) as heard:
+            yield heard
+
+    @asynccontextmanager
+    async def _heard_by_mqtt(self, login: tuple[str, str] | None) -> AsyncIterator[list[Any]]:
+        from paho.mqtt import client as mqtt
+
+        heard: list[Any] = []
+        subscribed: list[object] = []
+        client: Any = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2)  # type: ignore[attr-defined]
+        if login is not None:
+            client.username_pw_set(*login)
+        client.on_connect = lambda *_: client.subscribe("aerokit/#")
+        client.on_subscribe = lambda *_: subscribed.append(1)
+        client.on_message = lambda _c, _d, got: heard.append((got.topic, bytes(got.payload), got.retain))
+        client.connect("127.0.0.1", self.ports["mqtt"])
+        client.loop_start()
+        try:
+            await eventually(lambda: bool(subscribed))
+            yield heard
+        finally:
+            client.disconnect()
+            await asyncio.get_running_loop().run_in_executor(None, client.loop_stop)
+
+    @asynccontextmanager
+    async def _heard_by_nats(self, login: tuple[str, str] | None) -> AsyncIterator[list[Any]]:
+        import nats.aio.client
+
+        heard: list[Any] = []
+        client: Any = nats.aio.client.Client()
+
+        async def hear(got: Any) -> None:
+            heard.append((got.subject, bytes(got.data), False))
+
+        async def quiet(*_: object) -> None:
+            pass
+
+        who = {} if login is None else {"user": login[0], "password": login[1]}
+        port = self.ports["nats"]
+        await client.connect(f"nats://127.0.0.1:{port}", error_cb=quiet, allow_reconnect=False, **who)
+        try:
+            await client.subscribe("aerokit.>", cb=hear)
+            await client.flush()
+            yield heard
+        finally:
+            await client.close()
