@@ -52,18 +52,18 @@ class NatsLink(BrokerLink):
             allow_reconnect=False,  # it would keep what is published meanwhile for later
             max_reconnect_attempts=1,
             reconnect_time_wait=0,
-            connect_timeout=int(CONNECT_TIMEOUT_S),
+            connect_timeout=CONNECT_TIMEOUT_S,
             ping_interval=PING_EVERY_S,
             max_outstanding_pings=1,
             **({"token": where.user} if where.password is None else login),
         )
         try:
             await asyncio.wait_for(connecting, CONNECT_TIMEOUT_S)
-        except asyncio.TimeoutError:
-            text = f"no answer within {CONNECT_TIMEOUT_S:g} s (is it a server of NATS?)"
-            raise LinkOpenError(f"cannot open {self.address}: {text}") from None
         except Exception as error:  # of many kinds, and not all of them are nats.errors.Error
-            cause = self._error or error
+            cause = error if isinstance(error, asyncio.TimeoutError) else self._error or error
+            if isinstance(cause, asyncio.TimeoutError):
+                text = f"no answer within {CONNECT_TIMEOUT_S:g} s (is it a server of NATS?)"
+                raise LinkOpenError(f"cannot open {self.address}: {text}") from None
             if isinstance(cause, OSError):
                 raise self._refused(cause) from None
             raise LinkOpenError(f"cannot open {self.address}: {_reason(cause)}") from None
