@@ -1,4 +1,4 @@
-"""States over MQTT and NATS, by a real broker: where they arrive, and that nothing comes late."""
+"""States over MQTT, by a real broker: where they arrive, and that nothing comes late."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from aerokit.sim import SimulatedCopter, simulated_link
 
 needs_a_broker()
 pytestmark = pytest.mark.anyio
-SCHEMES = ("mqtt", "nats")
+SCHEMES = ("mqtt",)
 
 
 @pytest.fixture

@@ -26,6 +26,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     "convert": ("gpxpy", "mcap", "pyarrow", "pyulog", "simplekml"),
     "foxglove": ("foxglove",),
     "monitor": ("textual",),
+    "mqtt": ("paho",),
     "pictures": ("PIL",),
     "report": ("plotly", "pyulog"),
     "serve": ("starlette", "uvicorn", "websockets"),

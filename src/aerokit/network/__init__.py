@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from aerokit.network.found import found
 from aerokit.network.mqtt_publisher import mqtt_publisher
-from aerokit.network.nats_publisher import nats_publisher
 from aerokit.network.publisher import Publisher
 from aerokit.network.publishing import Publishing, publishing
 from aerokit.network.zenoh_publisher import zenoh_publisher
@@ -17,7 +16,6 @@ __all__ = [
     "Publishing",
     "found",
     "mqtt_publisher",
-    "nats_publisher",
     "publishing",
     "zenoh_publisher",
 ]

@@ -1,4 +1,4 @@
-"""``BrokerAddress``: a broker of MQTT or NATS, and who publishes there: ``"mqtt://10.0.0.5:1883/north/alpha"``."""
+"""``BrokerAddress``: a broker of MQTT, and who publishes there: ``"mqtt://10.0.0.5:1883/north/alpha"``."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from aerokit.snapshot import Snapshot
 
 __all__ = ["PORTS", "BrokerAddress", "parse_broker"]
 
-PORTS: dict[str, int] = {"mqtt": 1883, "mqtts": 8883, "nats": 4222}
+PORTS: dict[str, int] = {"mqtt": 1883, "mqtts": 8883}
 """Scheme → the port where such brokers listen."""
 
 
@@ -20,7 +20,7 @@ class BrokerAddress(Snapshot):
     """A broker, and who publishes there; what is printed of it has no user and no password."""
 
     scheme: str
-    """"mqtt", "mqtts" (by TLS) or "nats"."""
+    """"mqtt", or "mqtts" by TLS."""
     host: str
     port: int
     place: Place
@@ -68,7 +68,5 @@ def parse_broker(text: str, *schemes: str) -> BrokerAddress:
         place = Place(check_name("fleet", fleet), check_name("name", name))
     except LocalProtocolError:
         fail("fleet and name are up to 63 letters, digits, '_', '.' and '-', a letter or digit first")
-    if scheme == "nats" and "." in fleet + name:
-        fail("fleet and name must not have a '.', which parts the tokens of a subject of NATS")
     user, password = (None if each is None else unquote(each) for each in (parts.username, parts.password))
     return BrokerAddress(scheme, host, port or PORTS[scheme], place, user, password)

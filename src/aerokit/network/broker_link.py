@@ -1,4 +1,4 @@
-"""What MQTT and NATS have in common: a line to a broker that is opened again, and what waits to go there."""
+"""A line to a broker that is opened again, and what waits to go there."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``Publisher``: where typed state goes; zenoh, MQTT, NATS, or whatever else takes a name and bytes."""
+"""``Publisher``: where typed state goes; zenoh, MQTT, or whatever else takes a name and bytes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ __all__ = ["Publisher"]
 
 
 class Publisher(ABC):
-    """Puts bytes under a name on some network: zenoh, MQTT or NATS, or what a program brings a client of."""
+    """Puts bytes under a name on some network: zenoh, MQTT, or what a program brings a client of."""
 
     @abstractmethod
     def put(self, name: str, data: bytes) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from aerokit.network.mqtt_publisher import mqtt_publisher
-from aerokit.network.nats_publisher import nats_publisher
 from aerokit.network.zenoh_publisher import zenoh_publisher
 
 if TYPE_CHECKING:
@@ -19,7 +18,6 @@ __all__ = ["PUBLISHERS", "publisher_for"]
 PUBLISHERS: dict[str, Callable[[str], AbstractAsyncContextManager[Publisher]]] = {
     "mqtt": mqtt_publisher,
     "mqtts": mqtt_publisher,
-    "nats": nats_publisher,
     "zenoh": zenoh_publisher,
     "zenohin": zenoh_publisher,
 }

@@ -109,7 +109,7 @@ async def publishing(
     Args:
         vehicle: a vehicle that is connected.
         to: ``"zenoh://fleet/alpha"``: on the keys ``aerokit/fleet/alpha/state/SYSTEM_ID/STATE``;
-            ``"mqtt://host/fleet/alpha"``, ``"nats://host/fleet/alpha"``: there, too; or a `Publisher`.
+            ``"mqtt://host/fleet/alpha"``: on these topics; or a `Publisher`.
         rate_hz: of each state at most, above 0 to 50.
         states: names as in docs/states.md, and ``"link"``; none: all of them.
 
