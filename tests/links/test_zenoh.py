@@ -13,7 +13,7 @@ from zenoh_harness import Told, client, reconnecting, serving
 from zenoh_network import VEHICLE_SIDE, HoldingProxy, eventually, free_port, process, router
 
 from aerokit.errors import BusyError, ConnectionClosed, LinkOpenError, LocalProtocolError
-from aerokit.links import create_link, zenoh_session
+from aerokit.links import create_link, needed
 from aerokit.links.handover import Handover
 from aerokit.links.zenoh_listen import MAX_CLIENTS, SILENT_AFTER_S, ZenohListen
 from aerokit.mavlink.encoder import FrameEncoder
@@ -141,7 +141,7 @@ async def test_without_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(name: str) -> Any:
         raise ModuleNotFoundError(f"No module named {name!r}", name=name)
 
-    monkeypatch.setattr(zenoh_session, "import_module", fail)
+    monkeypatch.setattr(needed, "import_module", fail)
     for address in ("zenoh://north/alpha", "zenohin://north/alpha"):
         with pytest.raises(LinkOpenError, match=r"pip install 'aerokit-mavlink\[zenoh\]'"):
             await create_link(address).open(Recorder())

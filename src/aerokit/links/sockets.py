@@ -6,12 +6,13 @@ import asyncio
 import contextlib
 import select
 import socket
+import struct
 import sys
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
-__all__ = ["Endpoint", "bind_to", "bound_socket", "has_more", "is_free", "resolve"]
+__all__ = ["Endpoint", "bind_to", "bound_socket", "discard_unsent", "has_more", "is_free", "resolve"]
 
 
 class Endpoint(NamedTuple):
@@ -70,6 +71,12 @@ def bind_to(endpoint: Endpoint, kind: socket.SocketKind) -> socket.socket:
         sock.close()
         raise
     return sock
+
+
+def discard_unsent(sock: socket.socket) -> None:
+    """What the system still holds of it is thrown away when it is closed, and does not arrive late."""
+    with contextlib.suppress(OSError):
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
 
 
 def has_more(sock: socket.socket) -> Callable[[], object]:

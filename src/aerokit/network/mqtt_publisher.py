@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import socket
 import ssl
-import struct
 from typing import TYPE_CHECKING, Any
 
 from aerokit.arguments import checked
 from aerokit.async_block import async_block
 from aerokit.errors import LinkOpenError
 from aerokit.links.needed import needed
+from aerokit.links.sockets import discard_unsent
 from aerokit.network.broker_address import parse_broker
 from aerokit.network.broker_link import CONNECT_TIMEOUT_S, BrokerLink, publisher_over
 
@@ -89,7 +87,7 @@ class MqttLink(BrokerLink):
         if client is self._client is not None and client.want_write() and (sock := client.socket()):
             asyncio.get_running_loop().add_writer(sock, self._go_on, client, sock)
 
-    def _go_on(self, client: Any, sock: socket.socket) -> None:
+    def _go_on(self, client: Any, sock: Any) -> None:
         client.loop_write()
         if client is self._client and not client.want_write():
             asyncio.get_running_loop().remove_writer(sock)
@@ -113,12 +111,12 @@ class MqttLink(BrokerLink):
         if self._is_up:
             self._lose(f"the connection to the broker has ended ({reason})")
 
-    def _on_socket_close(self, client: Any, _data: Any, sock: socket.socket) -> None:
+    def _on_socket_close(self, client: Any, _data: Any, sock: Any) -> None:
         loop = asyncio.get_running_loop()
         loop.remove_reader(sock)
         loop.remove_writer(sock)
         if client is self._client:  # lost: what the system holds must not arrive when the network is back
-            _discard_unsent(sock)
+            discard_unsent(sock)
 
     def _answer(self, text: str) -> None:
         if self._answered is not None and not self._answered.done():
@@ -144,13 +142,8 @@ def _cut(client: Any) -> None:
         if client.on_socket_close is not None:
             client.on_socket_close(client, None, sock)
             client.on_socket_close = None
-        _discard_unsent(sock)
+        discard_unsent(sock)
         sock.close()
-
-
-def _discard_unsent(sock: socket.socket) -> None:
-    with contextlib.suppress(OSError):
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
 
 
 @checked
