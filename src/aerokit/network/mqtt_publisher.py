@@ -57,7 +57,7 @@ class MqttLink(BrokerLink):
         try:
             await asyncio.shield(opening)
         except asyncio.CancelledError:
-            opening.add_done_callback(lambda _: _cut(client))
+            opening.add_done_callback(lambda done: _give_up(done, client))
             raise
         except OSError as error:
             raise self._refused(error) from error
@@ -68,9 +68,12 @@ class MqttLink(BrokerLink):
         client.on_socket_close = self._on_socket_close
         loop.add_reader(sock, self._read, client, sock)
         self._look_after(client)
-        try:
-            refusal = await asyncio.wait_for(self._answered, CONNECT_TIMEOUT_S)
-        except asyncio.TimeoutError:
+        await asyncio.wait(
+            (self._answered,), timeout=CONNECT_TIMEOUT_S
+        )  # wait_for may swallow a cancellation
+        if self._answered.done():
+            refusal = self._answered.result()
+        else:
             refusal = f"no answer within {CONNECT_TIMEOUT_S:g} s (is it a broker of MQTT?)"
         if not refusal and client.socket() is None:
             refusal = "the broker closed the connection"
@@ -133,6 +136,12 @@ class MqttLink(BrokerLink):
                 client.disconnect()
             _cut(client)
         self._released.set()
+
+
+def _give_up(opening: asyncio.Future[None], client: Any) -> None:
+    """Nobody waits for it any more: a thread cannot be stopped; what it opened is closed."""
+    if not opening.cancelled() and opening.exception() is None:
+        _cut(client)
 
 
 def _cut(client: Any) -> None:
