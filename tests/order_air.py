@@ -12,6 +12,7 @@ from typing import Protocol
 
 from aerokit.links.link import Link, Peer, Receiver
 from aerokit.mavlink.dialect import STANDARD
+from aerokit.mavlink.enums import MavAutopilot
 from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.message import Message
@@ -102,7 +103,7 @@ class Diary:
     @property
     def heartbeats(self) -> list[Crossing]:
         """What the program has heard the vehicle tell of itself."""
-        return [each for each in self.heard if isinstance(each.message, Heartbeat) and each.is_believed]
+        return [each for each in self.heard if _is_autopilots(each.message) and each.is_believed]
 
 
 @dataclass
@@ -215,6 +216,10 @@ class Air(Link):
         if stall is not None and stall[0] <= since < stall[1]:
             return stall[1] - since + self.weather.latency_s
         return self.weather.latency_s
+
+
+def _is_autopilots(message: Message) -> bool:
+    return isinstance(message, Heartbeat) and message.autopilot != MavAutopilot.INVALID
 
 
 def _now() -> float:
