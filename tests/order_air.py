@@ -57,6 +57,7 @@ class Sky(Protocol):
     @property
     def weather(self) -> Weather:
         """What goes wrong."""
+        ...
 
     @weather.setter
     def weather(self, weather: Weather) -> None: ...
@@ -67,10 +68,12 @@ class Sky(Protocol):
     @property
     def sent(self) -> list[Crossing]:
         """What the program has written."""
+        ...
 
     @property
     def heartbeats(self) -> list[Crossing]:
         """What the program has heard the vehicle tell of itself."""
+        ...
 
 
 @dataclass(frozen=True)
