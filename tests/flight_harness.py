@@ -167,7 +167,7 @@ def attached_sinks(connection: Connection) -> int:
     """How many callbacks hang on a connection: sinks of messages and events, and what ends with it."""
     bus = connection.bus
     tables = (*bus._sinks.values(), *bus._event_sinks.values())
-    return sum(len(sinks) for sinks in tables) + len(connection._enders)
+    return sum(len(sinks) for sinks in tables) + len(connection._ending._enders)
 
 
 def waiting_on_cells(vehicle: aerokit.Vehicle) -> int:

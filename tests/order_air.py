@@ -8,9 +8,12 @@ import itertools
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Protocol
 
 from aerokit.links.link import Link, Peer, Receiver
 from aerokit.mavlink.dialect import STANDARD
+from aerokit.mavlink.enums import MavAutopilot
+from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import CommandAck, CommandInt, CommandLong, Heartbeat
@@ -42,6 +45,35 @@ class Crossing:
     is_lost: bool = False
     is_believed: bool = True
     """Whether the program took it: over a link that is not in use it does not."""
+    raw: bytes = b""
+    """The frame that it was."""
+    arrives_at: float = 0.0
+    """When it comes to the other end, if it is not lost."""
+
+
+class Sky(Protocol):
+    """All that is between a program and a vehicle, as the judge sees it: from the program's end."""
+
+    @property
+    def weather(self) -> Weather:
+        """What goes wrong."""
+        ...
+
+    @weather.setter
+    def weather(self, weather: Weather) -> None: ...
+
+    def begin(self) -> None:
+        """The order is given now."""
+
+    @property
+    def sent(self) -> list[Crossing]:
+        """What the program has written."""
+        ...
+
+    @property
+    def heartbeats(self) -> list[Crossing]:
+        """What the program has heard the vehicle tell of itself."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -74,7 +106,7 @@ class Diary:
     @property
     def heartbeats(self) -> list[Crossing]:
         """What the program has heard the vehicle tell of itself."""
-        return [each for each in self.heard if isinstance(each.message, Heartbeat) and each.is_believed]
+        return [each for each in self.heard if _is_autopilots(each.message) and each.is_believed]
 
 
 @dataclass
@@ -119,7 +151,7 @@ class Air(Link):
         for frame in self._up.receive(data, _now()):
             message = STANDARD.decode(frame)
             is_lost = self._is_out(is_up=True) or self._loses(message)
-            self.diary.cross(self.sent, message, is_lost)
+            self._note_sent(frame, self.diary.cross(self.sent, message, is_lost))
             if not is_lost:
                 self._later(self._ups, self._delay(), functools.partial(self.link.write, frame.raw))
 
@@ -150,8 +182,11 @@ class Air(Link):
     def link_drained(self) -> None:
         """It always does."""
 
+    def _note_sent(self, frame: Frame, crossing: Crossing) -> None:
+        crossing.raw, crossing.arrives_at = frame.raw, crossing.at + self._delay()
+
     def _arrive(self, raw: bytes, message: Message) -> None:
-        self.diary.cross(self.diary.heard, message)
+        self.diary.cross(self.diary.heard, message).raw = raw
         if self._receiver is not None:
             self._receiver.bytes_received(raw, None)
 
@@ -184,6 +219,10 @@ class Air(Link):
         if stall is not None and stall[0] <= since < stall[1]:
             return stall[1] - since + self.weather.latency_s
         return self.weather.latency_s
+
+
+def _is_autopilots(message: Message) -> bool:
+    return isinstance(message, Heartbeat) and message.autopilot != MavAutopilot.INVALID
 
 
 def _now() -> float:

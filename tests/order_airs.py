@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -29,17 +29,17 @@ class Airs:
     """As :class:`order_air.Air`, of two links; the weather is that of both."""
 
     def __init__(self, airs: list[Air], two: TwoLinks) -> None:
-        self._airs, self._two = airs, two
+        self.airs, self._two = airs, two
         self._diary = airs[0].diary
         self.connection: aerokit.Connection | None = None
 
     @property
     def weather(self) -> Weather:
-        return self._airs[0].weather
+        return self.airs[0].weather
 
     @weather.setter
     def weather(self, weather: Weather) -> None:
-        for air in self._airs:
+        for air in self.airs:
             air.weather = weather
 
     def begin(self) -> None:
@@ -47,8 +47,8 @@ class Airs:
         assert self.connection is not None
         assert self.connection.links is not None
         (used,) = [index for index, each in enumerate(self.connection.links.value) if each.used_for]
-        self._airs[used].silence = self._two.silence
-        for air in self._airs:
+        self.airs[used].silence = self._two.silence
+        for air in self.airs:
             air.begin()
 
     @property
@@ -78,8 +78,8 @@ async def over_two(
     vehicle: SimulatedVehicle, two: TwoLinks
 ) -> AsyncIterator[tuple[Airs, aerokit.Connection]]:
     """A connection over two links, to be flown with, and what crosses them."""
-    pairs, diary = [memory_link_pair() for _ in range(2)], _Unbelieved()
-    airs = Airs([Air(near, diary=diary) for near, _ in pairs], two)
+    pairs = [memory_link_pair() for _ in range(2)]
+    airs = unused_airs([near for near, _ in pairs], two)
     async with AsyncExitStack() as stack:
         ports: list[Link] = [far for _, far in pairs]
         if two.is_copied:
@@ -87,11 +87,23 @@ async def over_two(
             await splitter.open(stack)
             ports = [splitter.port]
         await stack.enter_async_context(SimulatorServer(vehicle, ports))
-        together = SeveralLinks([partial(_itself, air) for air in airs._airs])
-        connection = await stack.enter_async_context(open_connection(together))
+        yield airs, await stack.enter_async_context(joined(airs))
+
+
+@asynccontextmanager
+async def joined(airs: Airs) -> AsyncIterator[aerokit.Connection]:
+    """A connection over both."""
+    together = SeveralLinks([partial(_itself, air) for air in airs.airs])
+    async with open_connection(together) as connection:
         airs.connection = connection
         connection.bus.attach(Heartbeat, airs.believe)
-        yield airs, connection
+        yield connection
+
+
+def unused_airs(near: Sequence[Link], two: TwoLinks) -> Airs:
+    """Through the air over these links; nothing is open yet."""
+    diary = _Unbelieved()
+    return Airs([Air(each, diary=diary) for each in near], two)
 
 
 def _itself(link: Link) -> Link:

@@ -48,7 +48,7 @@ def _all(stage: Stage) -> Iterator[str]:
     yield from (
         f"sink of {key.__name__}" for key, sinks in connection.bus._event_sinks.items() for _ in sinks
     )
-    yield from _times("end of the connection", connection._enders)
+    yield from _times("end of the connection", connection._ending._enders)
     yield from _times("deadline", connection.deadlines._due)
     for cell in (*vehicle.telemetry.cells.values(), vehicle.link_quality):
         yield from _times(f"waiter on {cell.name}", cell._sinks)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 from test_routing import CAMERA, COPTER, STATION, Stage, order
 
 from aerokit.hub.routing import MOST_SENDERS
@@ -122,3 +123,15 @@ def test_nor_is_it_at_the_same_port_after_a_while() -> None:
     assert stage.pass_on("c", FIRST_ORDER, is_late=True) == set(), "doubled on its way"
     stage.now += REPEATED_WITHIN_S
     assert stage.pass_on("c", FIRST_ORDER, is_late=True) == {"a"}
+
+
+@pytest.mark.parametrize("component", [0, 1])
+def test_a_vehicle_on_two_links_does_not_get_its_own_order_by_the_other(component: int) -> None:
+    """PX4 says its failsafes as orders to all of its own system; a camera at a port of its own hears them."""
+    stage = Stage()
+    stage.hear("a", COPTER)
+    stage.hear("b", COPTER)  # like the other port's: a copy
+    stage.hear("b", COPTER)
+    stage.hear("c", CAMERA, 1, 100)
+    assert stage.hear("b", order(1, component)) == ({"c"} if component == 0 else set())
+    assert stage.hear("d", order(1, component), 255, 190) >= {"a"}

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import asyncio
-import random
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
 
 import anyio
-from order_air import Air, Silence, Weather
-from order_airs import Airs, TwoLinks, over_two
-from order_table import Row, upload
+from order_air import Air, Sky
+from order_airs import over_two
+from order_cases import Case
+from order_hub import through_hub
+from order_table import upload
 
 import aerokit
 from aerokit.errors import AerokitError
+from aerokit.links import Link
 from aerokit.mavlink.enums import CopterMode
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import GlobalPositionInt
@@ -25,29 +28,8 @@ from aerokit.testing import run_virtual
 Simulated = SimulatedCopter | SimulatedPx4
 
 RATES: dict[type[Message], float] = {GlobalPositionInt: 4.0}
-RIGHT_AFTER_S = 0.001
-"""What is sent with the call has left by then."""
 WATCH_S, WATCH_ARMING_S = 8.0, 18.0
 """So long after the order's end it is looked what becomes of it: an order to arm may come late."""
-
-
-@dataclass(frozen=True)
-class Case:
-    """What happens: all times are seconds since the order was given."""
-
-    row: Row
-    autopilot: str
-    weather: Weather
-    pilot_at: float | None = None
-    """When somebody else acts: turns the mode switch; on the ground, disarms, unless ``by_switch``."""
-    by_switch: bool = False
-    failsafe_at: float | None = None
-    """When the vehicle returns by itself."""
-    station_failsafe: bool = False
-    """Whether it returns when it does not hear the ground station."""
-    cancel_at: float | None = None
-    two: TwoLinks | None = None
-    """None: over one link."""
 
 
 @dataclass
@@ -56,7 +38,7 @@ class Flown:
 
     case: Case
     vehicle: Simulated
-    air: Air | Airs
+    air: Sky
     given_at: float
     ended_at: float
     error: BaseException | None
@@ -73,46 +55,6 @@ class Flown:
 def mode_of(vehicle: Simulated) -> str:
     """The mode that it is truly in, as programs spell it."""
     return true_point(vehicle).mode
-
-
-def random_case(row: Row, autopilot: str, seed: int) -> Case:
-    """Lost answers × lost copies × delays × pilot × failsafe × outage, by a seed."""
-    dice = random.Random(f"{row.name} {row.command} {autopilot} {seed}")
-    weather = Weather(
-        command=row.command,
-        lost_acks=dice.choice((0, 1, 1, 2, 9)),
-        lost_commands=dice.choice((0, 0, 1, 2)),
-        latency_s=dice.choice((0.01, 0.05, 0.2)),
-    )
-    if dice.random() < 0.35:
-        begin = round(dice.uniform(0.0, 5.0), 2)
-        weather.outage = (begin, begin + round(dice.uniform(1.0, 14.0), 2))
-    elif dice.random() < 0.15:
-        weather.stall = (0.0, round(dice.uniform(1.0, 8.0), 2))
-    happens = dice.random()
-    return Case(
-        row,
-        autopilot,
-        weather,
-        pilot_at=round(dice.uniform(0.05, 6.0), 2) if happens < 0.45 else None,
-        failsafe_at=round(dice.uniform(0.05, 6.0), 2) if 0.45 <= happens < 0.6 else None,
-        station_failsafe=dice.random() < 0.5,
-        cancel_at=round(dice.uniform(0.05, 12.0), 2) if dice.random() < 0.25 else None,
-        by_switch=dice.random() < 0.5,
-    )
-
-
-def random_case_over_two(row: Row, autopilot: str, seed: int) -> Case:
-    """The same over two links: the one in use falls silent before, with or after the order; answers come over the other
-    one, or are lost on both. None of them delivers late: what a network keeps cannot be taken back.
-    """
-    case = random_case(row, autopilot, seed)
-    dice = random.Random(f"two links {row.name} {row.command} {autopilot} {seed}")
-    begin_s = dice.choice((0.0, RIGHT_AFTER_S, RIGHT_AFTER_S, round(dice.uniform(0.05, 4.0), 2)))
-    lasts_s = dice.choice((float("inf"), float("inf"), round(dice.uniform(0.5, 8.0), 2)))
-    silence = Silence(begin_s, begin_s + lasts_s, is_one_way=dice.random() < 0.5)
-    two = TwoLinks(silence, is_copied=dice.random() < 0.5)
-    return replace(case, weather=replace(case.weather, stall=None), two=two)
 
 
 def fly(case: Case) -> Flown:
@@ -190,19 +132,29 @@ def _set_up(case: Case) -> Simulated:
 
 async def _fly(case: Case) -> Flown:
     vehicle = _set_up(case)
-    if case.two is not None:
-        async with (
-            over_two(vehicle, case.two) as (airs, connection),
-            aerokit.connect(connection, rates=RATES) as program,
-        ):
-            return await _give(case, vehicle, airs, program)
-    async with simulated_link(vehicle) as link:
-        air = Air(link)
-        async with aerokit.connect(air, rates=RATES) as program:
-            return await _give(case, vehicle, air, program)
+    async with (
+        _under(case, vehicle) as (sky, source),
+        aerokit.connect(source, rates=RATES) as program,
+    ):
+        return await _give(case, vehicle, sky, program)
 
 
-async def _give(case: Case, vehicle: Simulated, air: Air | Airs, program: aerokit.Vehicle) -> Flown:
+@asynccontextmanager
+async def _under(case: Case, vehicle: Simulated) -> AsyncIterator[tuple[Sky, Link | aerokit.Connection]]:
+    """What is between them, and what the program connects to."""
+    if case.hub is not None:
+        async with through_hub(vehicle, case.hub) as through:
+            yield through
+    elif case.two is not None:
+        async with over_two(vehicle, case.two) as over:
+            yield over
+    else:
+        async with simulated_link(vehicle) as link:
+            air = Air(link)
+            yield air, air
+
+
+async def _give(case: Case, vehicle: Simulated, air: Sky, program: aerokit.Vehicle) -> Flown:
     loop = asyncio.get_running_loop()
     await _go_to_place(case.row.place, vehicle, program)
     air.weather = case.weather

@@ -166,8 +166,7 @@ def _armed_late(flown: Flown) -> Iterator[str]:
 def _left_flying(flown: Flown) -> Iterator[str]:
     """What was given up, and nobody else has taken, holds; also when it was silent then."""
     row, given_up = flown.case.row, isinstance(flown.error, (asyncio.CancelledError, OperationTimeout))
-    outage = flown.case.weather.outage
-    is_heard = outage is None or flown.given_at + outage[1] < flown.ended_at + WATCH_S - HEARD_S
+    is_heard = flown.given_at + flown.case.quiet_until < flown.ended_at + WATCH_S - HEARD_S
     if (
         row.holds
         and given_up

@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 from order_air import Silence, Weather
 from order_airs import TwoLinks
-from order_flights import RIGHT_AFTER_S, Case, Flown, fly, mode_of, random_case, random_case_over_two
+from order_cases import RIGHT_AFTER_S, Case, random_case, random_case_over_two
+from order_flights import Flown, fly, mode_of
 from order_judge import faults
 from order_table import ARM, REPOSITION, ROWS, SET_MODE, Row
 

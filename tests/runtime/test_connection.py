@@ -366,19 +366,19 @@ async def test_cancelled_at_any_time_it_leaves_nothing_behind(seconds: float) ->
     if connection is not None:
         assert set(connection.bus.wanted) == {Heartbeat.ID}
         assert not connection.bus._event_sinks
-        assert connection._enders == []
+        assert connection._ending._enders == []
 
 
 async def test_looking_for_a_vehicle_leaves_no_ear_on_a_connection_that_stays() -> None:
     async with simulated_link(SimulatedCopter(boot_time_s=0)) as link, open_connection(link) as connection:
-        before = dict(connection.bus.wanted), list(connection._enders)
+        before = dict(connection.bus.wanted), list(connection._ending._enders)
         async with connect(connection):
             pass
-        assert (connection.bus.wanted, connection._enders) == before
+        assert (connection.bus.wanted, connection._ending._enders) == before
         with pytest.raises(ConnectFailed):
             async with connect(connection, system_id=9, timeout=2):
                 pytest.fail("nobody has this number")
-        assert (connection.bus.wanted, connection._enders) == before
+        assert (connection.bus.wanted, connection._ending._enders) == before
 
 
 async def test_a_connect_that_fails_leaves_nothing_behind() -> None:

@@ -86,7 +86,7 @@ class Pair:
 
     def attached(self) -> tuple[int, int, int]:
         sinks = sum(len(sinks) for sinks in self.connection.bus._sinks.values())
-        return sinks, len(self.connection._enders), len(self.connection.deadlines._due)
+        return sinks, len(self.connection._ending._enders), len(self.connection.deadlines._due)
 
     async def run(self, exchange: Exchange[int]) -> int:
         return await run_exchange(self.connection, SYSTEM, exchange)

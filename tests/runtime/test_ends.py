@@ -189,7 +189,7 @@ def break_encoder(vehicle: Vehicle, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def break_framer(vehicle: Vehicle, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(vehicle.connection._framers, None, object())
+    monkeypatch.setitem(vehicle.connection._intake.framers, None, object())
 
 
 def break_rates(vehicle: Vehicle, monkeypatch: pytest.MonkeyPatch) -> None:

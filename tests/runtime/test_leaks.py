@@ -215,7 +215,7 @@ def _attachments(connection: Connection) -> tuple[int, int, int, int]:
     bus = connection.bus
     sinks = sum(len(sinks) for sinks in bus._sinks.values())
     events = sum(len(sinks) for sinks in bus._event_sinks.values())
-    return sinks, events, len(connection._enders), len(connection._background)
+    return sinks, events, len(connection._ending._enders), len(connection._background)
 
 
 PROGRAM = """

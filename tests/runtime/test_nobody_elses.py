@@ -174,7 +174,7 @@ async def test_of_who_was_pushed_out_nothing_is_kept(link: KeptPeers) -> None:
     async with open_connection(link) as connection:
         for port in range(2 * MOST_STRANGERS):
             connection.bytes_received(b"\xfd", f"{port}@stranger")
-        assert len(connection._peers._limit._statistics) == MOST_STRANGERS
+        assert len(connection._intake._peers._limit._statistics) == MOST_STRANGERS
 
 
 async def test_a_frame_in_pieces_makes_a_peer_too(link: KeptPeers) -> None:

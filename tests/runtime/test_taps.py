@@ -74,8 +74,8 @@ async def test_a_tap_gets_everything_in_order_also_what_no_dialect_knows(
     detach()
     link.hear(encoder.encode(ATTITUDE), "one")
     assert len(heard) == 4
-    assert all(framer.wanted is connection.bus.wanted for framer in connection._framers.values())
-    assert not any(framer.keep_unknown for framer in connection._framers.values())
+    assert all(framer.wanted is connection.bus.wanted for framer in connection._intake.framers.values())
+    assert not any(framer.keep_unknown for framer in connection._intake.framers.values())
 
 
 async def test_those_who_subscribed_come_first(link: TwoPeers, connection: Connection) -> None:

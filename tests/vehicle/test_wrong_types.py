@@ -49,7 +49,7 @@ USED_BY_THE_LIBRARY = {
         "fail",
         "heard_at",
     }
-    | {"on_end", "record", "tap", "tap_sent", "send_to_peer", "order_refused"}
+    | {"on_end", "record", "tap", "tap_sent", "order_refused"}
     | {"one_link_changed", "one_link_not_opened", "one_link_stalled"},
 }
 """Nobody else calls them."""

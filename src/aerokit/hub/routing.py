@@ -215,7 +215,7 @@ class Router(Generic[PortT]):
         if message_id == _SETUP_SIGNING:
             return Plan(name, message_id, where, reason="secret")
         if where[0]:
-            found = self._ways_to(*where)
+            found = self._ways_to(*where, source, node.number)
             if not found:
                 return Plan(name, message_id, where, reason="no_route")  # not kept: there are many nobodies
         else:
@@ -237,11 +237,15 @@ class Router(Generic[PortT]):
         plan = node.plans[key] = Plan(name, message_id, where, tuple(outs), tuple(thinned))
         return plan
 
-    def _ways_to(self, system_id: int, component_id: int) -> dict[int, None]:
-        """Numbers of the ports by which a component, or all of a system, is reached."""
+    def _ways_to(self, system_id: int, component_id: int, source: int, here: int) -> dict[int, None]:
+        """Numbers of the ports by which a component, or all of a system, is reached; ``source`` speaks from ``here``.
+
+        Nothing is returned to who says it: a vehicle that is heard at two ports would get its own order by the other.
+        """
+        me = self._senders.get(source)
         exact = self._senders.get(system_id | component_id << 8) if component_id else None
         if exact is not None:
-            return dict.fromkeys(exact.ways)
+            return {here: None} if exact is me else dict.fromkeys(exact.ways)
         known = [each for each in self._senders.values() if each.system_id == system_id]
         autopilots = [each for each in known if each.is_autopilot]
         found: dict[int, None] = {}
@@ -252,7 +256,7 @@ class Router(Generic[PortT]):
             if not is_reached:
                 found.update(
                     (number, None)
-                    for number in sender.ways
+                    for number in ((here,) if sender is me else sender.ways)
                     if sender.is_autopilot or not any(each.is_heard_at(number) for each in autopilots)
                 )
         return found

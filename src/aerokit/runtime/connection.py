@@ -6,6 +6,7 @@ import asyncio
 import logging
 import math
 import time
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import anyio
@@ -16,15 +17,15 @@ from aerokit.links.link import Link
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavAutopilot, MavComponent, MavState, MavType
-from aerokit.mavlink.frame import SIGNED, Frame, is_whole_frame
+from aerokit.mavlink.frame import Frame, is_whole_frame
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import Heartbeat
 from aerokit.runtime.background import Background
-from aerokit.runtime.bus import Bus, once
+from aerokit.runtime.bus import Bus
 from aerokit.runtime.cells import StateCell
 from aerokit.runtime.components import found_by
 from aerokit.runtime.deadlines import Deadlines
-from aerokit.runtime.endings import raisable
+from aerokit.runtime.endings import Ending
 from aerokit.runtime.events import (
     Event,
     LinkClosed,
@@ -32,15 +33,12 @@ from aerokit.runtime.events import (
     LinkInterrupted,
     LinkRestored,
     LinkStalled,
-    LoopBlocked,
     OrderRefused,
     VehicleFound,
 )
+from aerokit.runtime.intake import Intake
 from aerokit.runtime.link_state import LinkState
 from aerokit.runtime.link_watch import LinkStateWatch
-from aerokit.runtime.loop_watch import LoopWatch
-from aerokit.runtime.peers import Peers
-from aerokit.runtime.recording import Recording
 from aerokit.runtime.routes import MOST_ROUTES, Routes
 from aerokit.runtime.signatures import SignatureGate, check_signing
 from aerokit.runtime.subscription import Overflow, Subscription
@@ -52,9 +50,8 @@ if TYPE_CHECKING:
     from aerokit.errors import LinkOpenError
     from aerokit.links.link import Peer
     from aerokit.mavlink.dialect import Dialect
-    from aerokit.mavlink.framer import Framer
     from aerokit.mavlink.signing import Signing
-    from aerokit.mavlink.statistics import FramerStatistics, SourceStatistics
+    from aerokit.mavlink.statistics import FramerStatistics
     from aerokit.runtime.bus import Detach, Sink
     from aerokit.runtime.link_state import LinkStatus
     from aerokit.runtime.several_routes import SeveralRoutes
@@ -102,8 +99,6 @@ class Connection:
         self.bus: Bus = Bus(dialect)
         self.source_system: int = source_system
         self.source_component: int = source_component
-        self.heard: dict[tuple[int, int], Heartbeat] = {}
-        """The last HEARTBEAT of every (system id, component id) on the link."""
         self.attached: set[int] = set()
         """System ids that have a vehicle object on this connection."""
         self.boot_clocks: dict[tuple[int, int], Callable[[float], float | None]] = {}
@@ -117,29 +112,35 @@ class Connection:
         self._encoder = FrameEncoder(source_system, source_component, version=mavlink_version)
         self._gate = SignatureGate(self._encoder, self.unix_time, self.bus.publish)
         self.signing = signing
-        self._several: SeveralRoutes | None = None
-        self._routes: Routes | SeveralRoutes
-        if link.is_several:
-            from aerokit.links.several import SeveralLinks  # few programs have several
-            from aerokit.runtime.several_routes import SeveralRoutes
-
-            assert isinstance(link, SeveralLinks)
-            self._routes = self._several = SeveralRoutes(link, self, may_move=may_move)
-        else:
-            self._routes = Routes(link, self.bus.publish, self.attached, self.boot_clocks, may_move=may_move)
-        self._peers = Peers(link, dialect, self._routes, self._let_through)
-        self._framers = self._peers.framers
+        make_routes = partial(
+            Routes, link, self.bus.publish, self.attached, self.boot_clocks, may_move=may_move
+        )
+        self._several = self._make_several(make_routes) if link.is_several else None
+        self._routes: Routes | SeveralRoutes = self._several or make_routes()
+        self._intake = Intake(link, self.bus, self._routes, self._several, self._gate, self._clock)
+        self._taps = self._intake.taps
+        self.heard: dict[tuple[int, int], Heartbeat] = self._intake.heard
+        """The last HEARTBEAT of every (system id, component id) on the link."""
         self.keeps_peers = True
-        self._recording: Recording | None = None
-        self._taps: tuple[Tap, ...] = ()
-        self._sent_taps: tuple[Callable[[bytes], object], ...] = ()
-        self._enders: list[Callable[[Exception], None]] = []
         self._background = Background(self.fail)
-        self._loop_watch = LoopWatch(self._on_blocked)
         self._is_on_link = True
         self._state_watch = LinkStateWatch(self.link_state, self.bus, system_id=0)
-        self._error: Exception | None = None
-        self.bus.attach(Heartbeat, _ignore)  # routes and diagnosis need every heartbeat
+        self._ending = Ending()
+
+    def _make_several(self, make_routes: Callable[[], Routes]) -> SeveralRoutes:
+        from aerokit.links.several import SeveralLinks  # few programs have several
+        from aerokit.runtime.several_routes import SeveralRoutes
+
+        assert isinstance(self.link, SeveralLinks)
+        return SeveralRoutes(
+            self.link,
+            make_routes,
+            self.bus,
+            we=(self.source_system, self.source_component),
+            attached=self.attached,
+            send=self._send_to_peer,
+            now=self.now,
+        )
 
     # ------------------------------------------------------------------------------- sending
 
@@ -159,11 +160,7 @@ class Connection:
         now = 0.0 if self._encoder.signing is None else self.unix_time()
         data = self._encoder.encode(message, now)
         self._write(data, message, to)
-        for tap in self._sent_taps:
-            try:
-                tap(data)
-            except Exception:
-                logger.exception("a tap (%r) raised; the frame was sent all the same", tap)
+        self._taps.give_sent(data)
 
     @checked
     def write_raw(self, data: bytes) -> None:
@@ -184,14 +181,6 @@ class Connection:
         frame = Frame.parse(bytes(data))
         known = self.bus.dialect.get(frame.message_id)
         self._write(frame.raw, None if known is None else self.bus.dialect.decode(frame), None)
-
-    def send_to_peer(self, message: Message, peer: Peer) -> None:
-        """Number, frame and write a message to one peer, whoever is behind it; for what is asked over each link."""
-        now = 0.0 if self._encoder.signing is None else self.unix_time()
-        data = self._encoder.encode(message, now)
-        self.link.write(data, peer)
-        if self._recording is not None:
-            self._recording.write(data, self._clock())
 
     @property
     def links(self) -> StateCell[tuple[LinkStatus, ...]] | None:
@@ -290,23 +279,14 @@ class Connection:
         in the name of a component of the first (:class:`HeardTwice`) does not. ``sink`` must be quick and must not
         await; what it raises is logged. While nobody taps, frames that nobody subscribed to are not even made.
         """
-        self._taps = (*self._taps, sink)
-        self._let_all_through()
-        return once(lambda: self._untap(sink))
+        return self._taps.add(sink)
 
     def tap_sent(self, sink: Callable[[bytes], object]) -> Detach:
         """Have every frame of our own that is sent given to ``sink(raw)``, signed if we sign; not those of `write_raw`.
 
         ``sink`` must be quick and must not await; what it raises is logged.
         """
-        self._sent_taps = (*self._sent_taps, sink)
-
-        def detach() -> None:
-            left = list(self._sent_taps)
-            left.remove(sink)
-            self._sent_taps = tuple(left)
-
-        return once(detach)
+        return self._taps.add_sent(sink)
 
     def check_types(self, types: tuple[type[Any], ...]) -> None:
         """Raise LocalProtocolError unless each of these can be subscribed to."""
@@ -320,28 +300,18 @@ class Connection:
 
     def on_end(self, ender: Callable[[Exception], None]) -> Detach:
         """Have ``ender(error)`` called when the connection ends; at once if it has ended already."""
-        if self._error is not None:
-            ender(self._error)
-            return _nothing
-        self._enders.append(ender)
-
-        def detach() -> None:
-            if ender in self._enders:
-                self._enders.remove(ender)
-
-        return detach
+        return self._ending.on_end(ender)
 
     # ---------------------------------------------------------------------------------- state
 
     @property
     def is_open(self) -> bool:
         """Whether messages can still be sent and received."""
-        return self._error is None
+        return self._ending.error is None
 
     def raise_if_ended(self) -> None:
         """Raise what ended the connection (ConnectionClosed, LinkLost), if it has ended."""
-        if self._error is not None:
-            raise raisable(self._error)
+        self._ending.raise_if_ended()
 
     def heard_at(self, system_id: int, component_id: int) -> float:
         """When the last HEARTBEAT of a component came, on :meth:`now`'s clock; −inf: none has."""
@@ -363,17 +333,11 @@ class Connection:
 
     def statistics(self) -> Iterator[FramerStatistics]:
         """The counters of every peer that is remembered."""
-        return (framer.statistics for framer in self._peers)
+        return self._intake.statistics()
 
     def counts(self, system_id: int) -> tuple[int, int]:
         """Frames of this system that were received, and frames that its sequence numbers say were lost."""
-        sources = [
-            source
-            for statistics in self.statistics()
-            for source in statistics.sources.values()
-            if source.system_id == system_id
-        ]
-        return sum(source.received for source in sources), sum(source.lost for source in sources)
+        return self._intake.counts(system_id)
 
     def close(self, error: Exception | None = None) -> None:
         """End it: what waits gets ``error``, the link closes, our tasks are cancelled. Never blocks; idempotent.
@@ -383,13 +347,11 @@ class Connection:
         self._end(error or ConnectionClosed("the connection was closed"))
         if self._is_on_link:
             self.link.close()
-        if self._recording is not None:
-            self._recording.close()
-            self._recording = None
+        self._taps.close()
 
     def fail(self, error: Exception) -> None:
         """Close it because of a mistake inside aerokit: whoever waits is told, and it never surfaces elsewhere."""
-        if self._error is not None and isinstance(error, AerokitError):
+        if not self.is_open and isinstance(error, AerokitError):
             return  # a task of ours was told of the end
         logger.error("a mistake inside aerokit closes the connection", exc_info=error)
         closed = ConnectionClosed(f"a mistake inside aerokit closed the connection: {error!r}")
@@ -405,48 +367,14 @@ class Connection:
             ConnectionClosed, LinkLost: the connection has ended.
         """
         self.raise_if_ended()
-        if self._recording is not None:
-            raise BusyError("this connection is being recorded already")
-        self._recording = Recording(path, self._clock())
-        self._let_all_through()
+        self._taps.record(path, self._clock())
 
     # -------------------------------------------------------------------- what the link calls
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
         """Take bytes off the link (called by the link); never raises."""
         try:
-            framer, several = self._framers.get(peer), self._several
-            now = self._clock()
-            if now > self._loop_watch.late_after:
-                now = self._loop_watch.arrival(now)
-            if framer is not None:
-                frames = framer.receive(data, now)
-            else:
-                framer, frames = self._peers.receive_from_stranger(peer, data, now)
-            for frame in frames:
-                if self._error is not None:  # a sink has closed it
-                    return
-                if several is not None and several.is_copy(frame, peer):
-                    continue
-                is_elsewhere = len(self._framers) > 1 and self._routes.is_elsewhere(frame, peer)
-                if not self._gate.is_open and not self._admits(frame, is_elsewhere):
-                    continue
-                if self._recording is not None and several is None:
-                    self._recording.write(frame.raw, self._clock())
-                if is_elsewhere and not self._takes_place(framer, frame, peer):
-                    continue
-                if (framer.late or framer.foreign) and self._is_stale(framer, frame):
-                    continue
-                if several is not None:
-                    if not several.takes(frame, peer, _counters(framer, frame)):
-                        continue
-                    if self._recording is not None:
-                        self._recording.write(frame.raw, self._clock())
-                if frame.message_id == Heartbeat.ID:
-                    self._note_heartbeat(framer, frame, peer)
-                self.bus.deliver(frame)
-                for tap in self._taps:
-                    self._give(tap, frame, peer)
+            self._intake.receive(data, peer)
         except Exception as error:
             self.fail(error)
 
@@ -457,7 +385,7 @@ class Connection:
 
     def link_restored(self, away_s: float) -> None:
         """The link is back (called by the link)."""
-        self._peers.begin_anew()
+        self._intake.begin_anew()
         self._state_watch.heard(self._clock())
         self.bus.publish(LinkRestored(self._clock(), 0, away_s))
 
@@ -510,13 +438,10 @@ class Connection:
 
     def _start(self) -> None:
         self._state_watch.heard(self._clock())
-        self._loop_watch.start()
+        self._intake.start()
         self._background.start(self._send_heartbeats, "aerokit heartbeat")
         if self._several is not None:
             self._background.start(self._several.watch, "aerokit links")
-
-    def _on_blocked(self, seconds: float) -> None:
-        self.bus.publish(LoopBlocked(self._clock(), 0, seconds))
 
     async def _send_heartbeats(self) -> None:
         heartbeat = Heartbeat(MavType.GCS, MavAutopilot.INVALID, 0, 0, MavState.ACTIVE, 3)
@@ -524,101 +449,41 @@ class Connection:
             self.send(heartbeat)
             self._gate.tell_keeping()
             self._state_watch.count(self._clock(), sum(each.frames for each in self.statistics()))
-            if self._recording is not None:
-                self._recording.flush()
+            self._taps.flush()
             await anyio.sleep(HEARTBEAT_PERIOD_S)
 
     def _end(self, error: Exception) -> None:
-        if self._error is not None:
+        if not self.is_open:
             return
-        self._error = error
+        self._ending.error = error
+        self._intake.close()
         self._state_watch.lost(self._clock(), is_told=isinstance(error, LinkLost))
         self.link_state.close(error)
         if self._several is not None:
             self._several.status.close(error)
         if isinstance(error, LinkLost):
             self.bus.publish(LinkClosed(self._clock(), 0, error))
-        enders, self._enders = self._enders, []
-        for ender in enders:
-            try:
-                ender(error)
-            except Exception:
-                logger.exception("a mistake at the end of a connection; the others are told all the same")
+        self._ending.tell(error)
         self.deadlines.close()
-        self._loop_watch.close()
         self._background.cancel()
 
     def _write(self, data: bytes, message: Message | None, to: int | None) -> None:
         system_id = getattr(message, "target_system", 0) if to is None else to
         for peer in self._routes.peers_of(system_id, getattr(message, "target_component", 0), message):
             self.link.write(data, peer)
-        if self._recording is not None:
-            self._recording.write(data, self._clock())
+        self._taps.keep(data, self._clock())
 
-    def _untap(self, sink: Tap) -> None:
-        left = list(self._taps)
-        left.remove(sink)
-        self._taps = tuple(left)
-        self._let_all_through()
-
-    def _give(self, tap: Tap, frame: Frame, peer: Peer) -> None:
-        try:
-            tap(frame, peer)
-        except Exception:
-            logger.exception("a tap (%r) raised; the frame was delivered to the others", tap)
+    def _send_to_peer(self, message: Message, peer: Peer) -> None:
+        """Number, frame and write a message to one peer, whoever is behind it; for what is asked over each link."""
+        now = 0.0 if self._encoder.signing is None else self.unix_time()
+        data = self._encoder.encode(message, now)
+        self.link.write(data, peer)
+        self._taps.keep(data, self._clock())
 
     def _attach(self, item: type[Any], sink: Sink, system_id: int) -> Detach:
         if issubclass(item, Message):
             return self.bus.attach(item, sink, system_id=system_id)
         return self.bus.attach_event(item, _only(system_id, sink) if system_id else sink)
-
-    def _let_all_through(self) -> None:
-        for framer in self._peers:
-            self._let_through(framer)
-
-    def _let_through(self, framer: Framer) -> None:
-        """Recordings and taps get everything, also what nobody wants and what the dialect does not know."""
-        framer.keep_unknown = self._recording is not None or bool(self._taps)
-        framer.wanted = None if framer.keep_unknown else self.bus.wanted
-
-    def _admits(self, frame: Frame, is_elsewhere: bool) -> bool:
-        """By its signature; once for all copies of a frame, of which the first need not be the one that is taken."""
-        if self._several is not None and self._several.copies.was_admitted:
-            return True
-        is_admitted = self._gate.admits(frame, may_hand_over=not is_elsewhere)
-        if is_admitted and self._several is not None:
-            self._several.copies.admit()
-        return is_admitted
-
-    def _takes_place(self, framer: Framer, frame: Frame, peer: Peer) -> bool:
-        is_signed = self.signing is not None and bool(frame.incompat_flags & SIGNED)  # checked by the gate
-        return self._routes.takes_place(frame, peer, _counters(framer, frame), is_signed)
-
-    def _is_stale(self, framer: Framer, frame: Frame) -> bool:
-        """Whether a frame out of order is not listened to: another sender's, or a heartbeat that was overtaken."""
-        is_foreign = frame in framer.foreign
-        if not is_foreign and frame not in framer.late:
-            return False
-        counters = _counters(framer, frame)
-        if counters is not None and counters.is_double(frame.received_at):
-            self._routes.hear_double(frame)
-            if is_foreign:
-                return True
-        return frame.message_id == Heartbeat.ID and (is_foreign or self._routes.is_overtaken(frame))
-
-    def _note_heartbeat(self, framer: Framer, frame: Frame, peer: Peer) -> None:
-        heartbeat = self.bus.dialect.decode(frame)
-        if frame.system_id == 0 or not isinstance(heartbeat, Heartbeat):
-            return
-        if self._routes.note(frame, peer, _counters(framer, frame)):
-            source = frame.system_id, frame.component_id
-            is_new = source not in self.heard
-            self.heard[source] = heartbeat
-            if is_new:
-                self.bus.publish(found_by(heartbeat, self._clock(), *source))
-            if len(self.heard) > MOST_ROUTES:
-                for source in [source for source in self.heard if not self._routes.is_known(source)]:
-                    del self.heard[source]
 
 
 def _only(system_id: int, sink: Sink) -> Sink:
@@ -631,18 +496,6 @@ def _only(system_id: int, sink: Sink) -> Sink:
     return filtered
 
 
-def _counters(framer: Framer, frame: Frame) -> SourceStatistics | None:
-    return framer.statistics.by_key.get(frame.component_id << 8 | frame.system_id)
-
-
 def _check_version(version: int) -> None:
     if version not in (1, 2):
         raise LocalProtocolError(f"mavlink_version = {version} is not allowed: 1 or 2")
-
-
-def _ignore(message: object) -> None:
-    pass
-
-
-def _nothing() -> None:
-    pass

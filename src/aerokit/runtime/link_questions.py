@@ -6,21 +6,28 @@ https://mavlink.io/en/services/timesync.html, https://mavlink.io/en/messages/com
 
 from __future__ import annotations
 
+import logging
 import math
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavComponent
+from aerokit.runtime.events import HeardTwice
+from aerokit.runtime.hardware_id import HardwareId
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping, Sequence
 
     from aerokit.links.link import Peer
+    from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.message import Message
+    from aerokit.runtime.bus import Bus
     from aerokit.runtime.link_candidate import Candidate
     from aerokit.runtime.link_choice import LinkChoice
 
 __all__ = ["UNWANTED_HZ", "LinkQuestions"]
+
+logger: logging.Logger = logging.getLogger("aerokit")
 
 ASK_S = 0.5
 ASK_COSTLY_S = 5.0
@@ -35,13 +42,25 @@ _AUTOPILOT = int(MavComponent.AUTOPILOT1)
 
 
 class LinkQuestions:
-    """Asks twice a second, over a costly link that is not in use once in five; ``send(message, peer)`` sends."""
+    """Asks twice a second, over a costly link that is not in use once in five; ``send(message, peer)`` sends.
 
-    def __init__(self, links: int, send: Callable[[Message, Peer], object]) -> None:
-        self._count, self._send = links, send
+    What is answered goes into the choices; that somebody else answers is told once, until it is so no more.
+    """
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        choices: Mapping[int, LinkChoice],
+        bus: Bus,
+        send: Callable[[Message, Peer], object],
+    ) -> None:
+        self._names, self._choices, self._bus, self._send = names, choices, bus, send
         self._under_way: dict[int, tuple[int, int, float]] = {}  # ts1 → system, link, asked at
         self._asked_at: dict[tuple[int, int], float] = {}
         self._left, self._left_at = UNWANTED_HZ, 0.0
+        self._doubts_told: set[tuple[int, int]] = set()
+        bus.attach(m.Timesync, _ignore)  # else frames of these would not even be made
+        bus.attach(m.AutopilotVersion, _ignore)
 
     def ask(
         self,
@@ -64,7 +83,7 @@ class LinkQuestions:
             return
         self._asked_at[key] = now
         # Our time in nanoseconds, and in its last digits what nobody else asks.
-        number = int(now * 1e9) // 1000 * 1000 + (system_id * self._count + candidate.link) % 1000
+        number = int(now * 1e9) // 1000 * 1000 + (system_id * len(self._names) + candidate.link) % 1000
         if number <= 0 or number in self._under_way:
             return
         if len(self._under_way) >= MOST_QUESTIONS:
@@ -78,6 +97,29 @@ class LinkQuestions:
             )
             self._send(question, peer)
 
+    def is_answer(self, frame: Frame, link: int) -> bool:
+        """Whether this TIMESYNC answers one of our questions, which is noted; over whatever link it came."""
+        message = self._bus.dialect.decode(frame)
+        if not isinstance(message, m.Timesync) or not message.tc1 or message.ts1 not in self._under_way:
+            return False
+        now = frame.received_at
+        round_trip_s = self._round_trip_of(message, frame.system_id, link, now)
+        choice = self._choices.get(frame.system_id)
+        if round_trip_s is not None and choice is not None and link in choice.candidates:
+            choice.note_answer(link, now - round_trip_s / 2, message.tc1 / 1e9, round_trip_s, now)
+            self._tell_doubt(frame, choice.candidates[link])
+        return True
+
+    def note_hardware(self, frame: Frame, link: int) -> None:
+        """Whatever came over a link: if it tells the hardware id, that is noted."""
+        if frame.message_id != m.AutopilotVersion.ID or frame.component_id != _AUTOPILOT:
+            return
+        choice, message = self._choices.get(frame.system_id), self._bus.dialect.decode(frame)
+        if isinstance(message, m.AutopilotVersion) and choice is not None and link in choice.candidates:
+            choice.note_hardware(link, HardwareId.of(message))
+            for candidate in choice.candidates.values():
+                self._tell_doubt(frame, candidate)
+
     def _has_left(self, now: float) -> bool:
         self._left = min(UNWANTED_HZ, self._left + UNWANTED_HZ * (now - self._left_at))
         self._left_at = now
@@ -86,12 +128,26 @@ class LinkQuestions:
         self._left -= 1
         return True
 
-    def is_ours(self, message: Message | None) -> bool:
-        """Whether it answers one of our questions, over whatever link it came."""
-        return isinstance(message, m.Timesync) and message.tc1 != 0 and message.ts1 in self._under_way
-
-    def round_trip_of(self, answer: m.Timesync, system_id: int, link: int, now: float) -> float | None:
+    def _round_trip_of(self, answer: m.Timesync, system_id: int, link: int, now: float) -> float | None:
         """Seconds since the question; None when it was asked of somebody else, or over another link."""
         if self._under_way.get(answer.ts1, (0, 0, 0.0))[:2] != (system_id, link):
             return None
         return max(0.0, now - self._under_way.pop(answer.ts1)[2])
+
+    def _tell_doubt(self, frame: Frame, candidate: Candidate) -> None:
+        key = frame.system_id, candidate.link
+        if not candidate.is_doubted:
+            self._doubts_told.discard(key)
+        elif key not in self._doubts_told:
+            self._doubts_told.add(key)
+            logger.warning(
+                "another vehicle speaks as system %d over %s: its %s is another one; it is not listened to",
+                frame.system_id,
+                self._names[candidate.link],
+                "hardware id (AUTOPILOT_VERSION)" if candidate.is_other_hardware else "clock",
+            )
+            self._bus.publish(HeardTwice(frame.received_at, frame.system_id, frame.component_id))
+
+
+def _ignore(message: object) -> None:
+    pass

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from aerokit.errors import BusyError, LocalProtocolError
+from aerokit.mavlink.frame import SIGNED
 from aerokit.runtime.events import FrameRefused
 
 if TYPE_CHECKING:
@@ -104,6 +105,10 @@ class SignatureGate:
             self._told.add(refusal)
             self._tell(frame, signing, refusal)
         return refusal is None
+
+    def has_checked(self, frame: Frame) -> bool:
+        """Whether a frame that was let in shows by its signature that it comes from somebody with our key."""
+        return self._encoder.signing is not None and bool(frame.incompat_flags & SIGNED)
 
     def _tell(self, frame: Frame, signing: Signing, refusal: Refusal) -> None:
         source = frame.system_id, frame.component_id

@@ -1,0 +1,177 @@
+"""``Intake``: from the bytes that a link brings to the frames that are let in, listened to and delivered."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from aerokit.mavlink.messages import Heartbeat
+from aerokit.runtime.components import found_by
+from aerokit.runtime.events import LoopBlocked
+from aerokit.runtime.loop_watch import LoopWatch
+from aerokit.runtime.peers import Peers
+from aerokit.runtime.routes import MOST_ROUTES
+from aerokit.runtime.taps import Taps
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from aerokit.links.link import Link, Peer
+    from aerokit.mavlink.frame import Frame
+    from aerokit.mavlink.framer import Framer
+    from aerokit.mavlink.statistics import FramerStatistics, SourceStatistics
+    from aerokit.runtime.bus import Bus
+    from aerokit.runtime.routes import Routes
+    from aerokit.runtime.several_routes import SeveralRoutes
+    from aerokit.runtime.signatures import SignatureGate
+
+__all__ = ["Intake"]
+
+
+class Intake:
+    """Frames are checked by one framer for each remote peer, by their signature and by who may speak in whose name.
+
+    What is left goes to ``bus``, and then to the taps. ``several`` are the routes, where they are those of several
+    links; ``clock`` is the loop's.
+    """
+
+    def __init__(
+        self,
+        link: Link,
+        bus: Bus,
+        routes: Routes | SeveralRoutes,
+        several: SeveralRoutes | None,
+        gate: SignatureGate,
+        clock: Callable[[], float],
+    ) -> None:
+        self._bus, self._gate, self._clock = bus, gate, clock
+        self._routes, self._several = routes, several
+        self._peers = Peers(link, bus.dialect, routes, self._let_through)
+        self.framers: dict[Peer, Framer] = self._peers.framers
+        """One for each peer."""
+        self.heard: dict[tuple[int, int], Heartbeat] = {}
+        """The last HEARTBEAT of every (system id, component id) on the link."""
+        self.taps: Taps = Taps(self._let_all_through)
+        self._loop_watch = LoopWatch(self._on_blocked)
+        self._is_closed = False
+        bus.attach(Heartbeat, _ignore)  # routes and diagnosis need every heartbeat
+
+    def start(self) -> None:
+        """The link is open: notice when the loop is kept from running."""
+        self._loop_watch.start()
+
+    def close(self) -> None:
+        """Nothing more is delivered."""
+        self._is_closed = True
+        self._loop_watch.close()
+
+    def begin_anew(self) -> None:
+        """The link has been opened again."""
+        self._peers.begin_anew()
+
+    def receive(self, data: bytes, peer: Peer) -> None:
+        """Take bytes off the link."""
+        framer, several, taps = self.framers.get(peer), self._several, self.taps
+        now = self._clock()
+        if now > self._loop_watch.late_after:
+            now = self._loop_watch.arrival(now)
+        if framer is not None:
+            frames = framer.receive(data, now)
+        else:
+            framer, frames = self._peers.receive_from_stranger(peer, data, now)
+        for frame in frames:
+            if self._is_closed:  # by a sink
+                return
+            if several is not None and several.is_copy(frame, peer):
+                continue
+            is_elsewhere = len(self.framers) > 1 and self._routes.is_elsewhere(frame, peer)
+            if not self._gate.is_open and not self._admits(frame, is_elsewhere):
+                continue
+            if taps.recording is not None and several is None:
+                taps.recording.write(frame.raw, self._clock())
+            if is_elsewhere and not self._takes_place(framer, frame, peer):
+                continue
+            if (framer.late or framer.foreign) and self._is_stale(framer, frame):
+                continue
+            if several is not None:
+                if not several.takes(frame, peer, _counters(framer, frame)):
+                    continue
+                taps.keep(frame.raw, self._clock())
+            if frame.message_id == Heartbeat.ID:
+                self._note_heartbeat(framer, frame, peer)
+            self._bus.deliver(frame)
+            if taps.received:
+                taps.give(frame, peer)
+
+    def statistics(self) -> Iterator[FramerStatistics]:
+        """The counters of every peer that is remembered."""
+        return (framer.statistics for framer in self._peers)
+
+    def counts(self, system_id: int) -> tuple[int, int]:
+        """Frames of this system that were received, and frames that its sequence numbers say were lost."""
+        sources = [
+            source
+            for statistics in self.statistics()
+            for source in statistics.sources.values()
+            if source.system_id == system_id
+        ]
+        return sum(source.received for source in sources), sum(source.lost for source in sources)
+
+    # ------------------------------------------------------------------------------- inside
+
+    def _on_blocked(self, seconds: float) -> None:
+        self._bus.publish(LoopBlocked(self._clock(), 0, seconds))
+
+    def _let_all_through(self) -> None:
+        for framer in self._peers:
+            self._let_through(framer)
+
+    def _let_through(self, framer: Framer) -> None:
+        """Recordings and taps get everything, also what nobody wants and what the dialect does not know."""
+        framer.keep_unknown = self.taps.want_all
+        framer.wanted = None if framer.keep_unknown else self._bus.wanted
+
+    def _admits(self, frame: Frame, is_elsewhere: bool) -> bool:
+        """By its signature; once for all copies of a frame, of which the first need not be the one that is taken."""
+        if self._several is not None and self._several.copies.was_admitted:
+            return True
+        is_admitted = self._gate.admits(frame, may_hand_over=not is_elsewhere)
+        if is_admitted and self._several is not None:
+            self._several.copies.admit()
+        return is_admitted
+
+    def _takes_place(self, framer: Framer, frame: Frame, peer: Peer) -> bool:
+        return self._routes.takes_place(frame, peer, _counters(framer, frame), self._gate.has_checked(frame))
+
+    def _is_stale(self, framer: Framer, frame: Frame) -> bool:
+        """Whether a frame out of order is not listened to: another sender's, or a heartbeat that was overtaken."""
+        is_foreign = frame in framer.foreign
+        if not is_foreign and frame not in framer.late:
+            return False
+        counters = _counters(framer, frame)
+        if counters is not None and counters.is_double(frame.received_at):
+            self._routes.hear_double(frame)
+            if is_foreign:
+                return True
+        return frame.message_id == Heartbeat.ID and (is_foreign or self._routes.is_overtaken(frame))
+
+    def _note_heartbeat(self, framer: Framer, frame: Frame, peer: Peer) -> None:
+        heartbeat = self._bus.dialect.decode(frame)
+        if frame.system_id == 0 or not isinstance(heartbeat, Heartbeat):
+            return
+        if self._routes.note(frame, peer, _counters(framer, frame)):
+            source = frame.system_id, frame.component_id
+            is_new = source not in self.heard
+            self.heard[source] = heartbeat
+            if is_new:
+                self._bus.publish(found_by(heartbeat, self._clock(), *source))
+            if len(self.heard) > MOST_ROUTES:
+                for source in [source for source in self.heard if not self._routes.is_known(source)]:
+                    del self.heard[source]
+
+
+def _counters(framer: Framer, frame: Frame) -> SourceStatistics | None:
+    return framer.statistics.by_key.get(frame.component_id << 8 | frame.system_id)
+
+
+def _ignore(message: object) -> None:
+    pass

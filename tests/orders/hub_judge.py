@@ -1,0 +1,56 @@
+"""What must never be at a hub: what it has passed on to the vehicle, held against what the program has sent."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from order_air import Crossing
+from order_flights import Flown
+from order_hub import HubSky
+
+from aerokit.hub.held import ORDERS_WAIT_S
+from aerokit.hub.kinds import Kind, kind_of
+from aerokit.hub.switch import LOOK_AT_LEAST_EVERY_S
+from aerokit.vehicle.orders.order import QUESTIONS
+
+LATE_S = ORDERS_WAIT_S + LOOK_AT_LEAST_EVERY_S + 0.001
+ROUNDING_S = 1e-6
+
+
+def hub_faults(flown: Flown) -> list[str]:
+    """Every order that the hub has made up, doubled, kept too long or sent in another order; in words."""
+    sky = flown.air
+    assert isinstance(sky, HubSky)
+    return list(_passed_on(sky))
+
+
+def orders_in(crossings: list[Crossing]) -> list[Crossing]:
+    """Those that change what a vehicle does or keeps."""
+    return [
+        each
+        for each in crossings
+        if kind_of(each.message.NAME, is_for_one=True) is Kind.ORDER
+        and getattr(each.message, "command", None) not in QUESTIONS
+    ]
+
+
+def _passed_on(sky: HubSky) -> Iterator[str]:
+    written: dict[bytes, list[Crossing]] = {}
+    for each in orders_in(sky.sent):
+        written.setdefault(each.raw, []).append(each)
+    newest = -1
+    for each in orders_in(sky.at_vehicle.sent):
+        what = f"{each.message.NAME} at {each.at:.2f}"
+        if each.raw not in written:
+            yield f"{what} is nobody's"
+            continue
+        before = [one for one in written[each.raw] if one.arrives_at <= each.at + ROUNDING_S]
+        if not before:
+            yield f"{what} was passed on once more"
+            continue
+        written[each.raw].remove(before[0])
+        if each.at - before[0].arrives_at > LATE_S:
+            yield f"{what} was kept for {each.at - before[0].arrives_at:.2f} s"
+        if before[0].number < newest:
+            yield f"{what} was passed on after a newer one"
+        newest = max(newest, before[0].number)
