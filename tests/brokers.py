@@ -1,4 +1,4 @@
-"""Brokers of MQTT and NATS on this machine: nats-server, which is both, in a process of its own; and who listens."""
+"""A broker of MQTT on this machine: nats-server, which is one, in a process of its own; and who listens."""
 
 from __future__ import annotations
 
@@ -24,7 +24,6 @@ USER, PASSWORD = "alpha", "s3cret@/:"
 def needs_a_broker() -> None:
     """Skip the tests of a module where the server, or a client, is not installed."""
     pytest.importorskip("paho.mqtt.client")
-    pytest.importorskip("nats.aio.client")
     if PROGRAM is None:
         pytest.skip("nats-server is not installed", allow_module_level=True)
 
@@ -74,14 +73,8 @@ class Broker:
             self._process = None
 
     @asynccontextmanager
-    async def heard(self, scheme: str, login: tuple[str, str] | None = None) -> AsyncIterator[list[Any]]:
+    async def heard(self, login: tuple[str, str] | None = None) -> AsyncIterator[list[Any]]:
         """What arrives, as (topic, payload, whether it was retained)."""
-        listen = {"mqtt": self._heard_by_mqtt, "nats": self._heard_by_nats}[scheme]
-        async with listen(login) as heard:
-            yield heard
-
-    @asynccontextmanager
-    async def _heard_by_mqtt(self, login: tuple[str, str] | None) -> AsyncIterator[list[Any]]:
         from paho.mqtt import client as mqtt
 
         heard: list[Any] = []
@@ -100,26 +93,3 @@ class Broker:
         finally:
             client.disconnect()
             await asyncio.get_running_loop().run_in_executor(None, client.loop_stop)
-
-    @asynccontextmanager
-    async def _heard_by_nats(self, login: tuple[str, str] | None) -> AsyncIterator[list[Any]]:
-        import nats.aio.client
-
-        heard: list[Any] = []
-        client: Any = nats.aio.client.Client()
-
-        async def hear(got: Any) -> None:
-            heard.append((got.subject, bytes(got.data), False))
-
-        async def quiet(*_: object) -> None:
-            pass
-
-        who = {} if login is None else {"user": login[0], "password": login[1]}
-        port = self.ports["nats"]
-        await client.connect(f"nats://127.0.0.1:{port}", error_cb=quiet, allow_reconnect=False, **who)
-        try:
-            await client.subscribe("aerokit.>", cb=hear)
-            await client.flush()
-            yield heard
-        finally:
-            await client.close()

@@ -26,7 +26,6 @@ from aerokit.sim import SimulatedCopter, simulated_link
 
 needs_a_broker()
 pytestmark = pytest.mark.anyio
-SCHEMES = ("mqtt",)
 
 
 @pytest.fixture
@@ -40,13 +39,12 @@ async def broker(tmp_path: Path) -> AsyncIterator[Broker]:
         yield running
 
 
-def topic(scheme: str, name: str) -> str:
-    text = f"aerokit/north/alpha/state/{name}"
-    return text if scheme == "mqtt" else text.replace("/", ".")
+def topic(name: str) -> str:
+    return f"aerokit/north/alpha/state/{name}"
 
 
-def address(scheme: str, port: int, login: str = "") -> str:
-    return f"{scheme}://{login}127.0.0.1:{port}/north/alpha"
+def address(port: int, login: str = "") -> str:
+    return f"mqtt://{login}127.0.0.1:{port}/north/alpha"
 
 
 def waiting(publisher: Any) -> dict[str, bytes]:
@@ -57,37 +55,33 @@ def waiting(publisher: Any) -> dict[str, bytes]:
     return found
 
 
-@pytest.mark.parametrize("scheme", SCHEMES)
-async def test_states_arrive_as_the_schema_says(scheme: str, broker: Broker) -> None:
+async def test_states_arrive_as_the_schema_says(broker: Broker) -> None:
     by_name = {each["properties"]["state"]["const"]: each for each in SCHEMA["oneOf"]}
     async with (
-        broker.heard(scheme) as heard,
+        broker.heard() as heard,
         simulated_link(SimulatedCopter()) as link,
         aerokit.connect(link) as vehicle,
-        publishing(vehicle, address(scheme, broker.ports[scheme]), rate_hz=20),
+        publishing(vehicle, address(broker.port), rate_hz=20),
     ):
-        wanted = {topic(scheme, f"1/{name}") for name in ("mode", "armed", "position", "link")}
+        wanted = {topic(f"1/{name}") for name in ("mode", "armed", "position", "link")}
         await eventually(lambda: wanted <= {each[0] for each in heard})
     states = [each for each in heard if "alive" not in each[0]]
     for where, data, is_retained in states:
         message = json.loads(data)
-        assert where == topic(scheme, f"1/{message['state']}")
+        assert where == topic(f"1/{message['state']}")
         assert faults(message, by_name[message["state"]]) == []
         assert not is_retained
 
 
-@pytest.mark.parametrize("scheme", SCHEMES)
-async def test_a_broker_killed_and_started_again(
-    scheme: str, broker: Broker, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_a_broker_killed_and_started_again(broker: Broker, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "aerokit")
 
     def told(text: str) -> bool:
         return any(text in each.getMessage() for each in caplog.records)
 
-    line = HoldingProxy(broker.ports[scheme])
-    async with line, publisher_for(address(scheme, line.port)) as publisher:
-        async with broker.heard(scheme) as heard:
+    line = HoldingProxy(broker.port)
+    async with line, publisher_for(address(line.port)) as publisher:
+        async with broker.heard() as heard:
             publisher.put("1/mode", b"first")
             await eventually(lambda: any(each[1] == b"first" for each in heard))
         broker.kill()
@@ -97,8 +91,8 @@ async def test_a_broker_killed_and_started_again(
             publisher.put(f"1/{number}", b"old")
         assert len(waiting(publisher)) == 0
         await broker.start()
-        async with broker.heard(scheme) as heard:  # nothing gets through before somebody listens
-            again = HoldingProxy(broker.ports[scheme])
+        async with broker.heard() as heard:  # nothing gets through before somebody listens
+            again = HoldingProxy(broker.port)
             again.port = line.port
             async with again:
 
@@ -112,19 +106,14 @@ async def test_a_broker_killed_and_started_again(
 
 
 @asynccontextmanager
-async def stalled(scheme: str) -> AsyncIterator[int]:
+async def stalled() -> AsyncIterator[int]:
     """The port of a broker that takes a client and then reads no more."""
     writers: list[asyncio.StreamWriter] = []
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         writers.append(writer)
-        if scheme == "nats":
-            writer.write(b'INFO {"max_payload": 1000000}\r\n')
-            await reader.readuntil(b"PING\r\n")
-            writer.write(b"PONG\r\n")
-        else:
-            await reader.read(1)
-            writer.write(b"\x20\x02\x00\x00")  # CONNACK
+        await reader.read(1)
+        writer.write(b"\x20\x02\x00\x00")  # CONNACK
 
     server = await asyncio.start_server(serve, "127.0.0.1", 0)
     async with server:
@@ -133,9 +122,8 @@ async def stalled(scheme: str) -> AsyncIterator[int]:
             writer.close()
 
 
-@pytest.mark.parametrize("scheme", SCHEMES)
-async def test_a_broker_that_takes_nothing_gets_the_latest_and_no_more(scheme: str) -> None:
-    async with stalled(scheme) as port, publisher_for(address(scheme, port)) as publisher:
+async def test_a_broker_that_takes_nothing_gets_the_latest_and_no_more() -> None:
+    async with stalled() as port, publisher_for(address(port)) as publisher:
         for number in range(2000):
             for name in "abc":
                 publisher.put(f"1/{name}", b"%4d" % number * 1000)  # 24 MB, more than the system takes
@@ -145,42 +133,39 @@ async def test_a_broker_that_takes_nothing_gets_the_latest_and_no_more(scheme: s
     await eventually(lambda: len(asyncio.all_tasks()) <= 2)
 
 
-@pytest.mark.parametrize("scheme", SCHEMES)
-async def test_no_broker(scheme: str) -> None:
+async def test_no_broker() -> None:
     port = free_port()
     with pytest.raises(LinkOpenError, match=f"127.0.0.1:{port}/north/alpha: Connect.*is the broker running"):
-        async with publisher_for(address(scheme, port, f"{USER}:geheim@")):
+        async with publisher_for(address(port, f"{USER}:geheim@")):
             pass
 
 
-@pytest.mark.parametrize("scheme", SCHEMES)
-async def test_somebody_who_says_nothing(scheme: str, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_somebody_who_says_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     before = asyncio.all_tasks()
-    monkeypatch.setattr(sys.modules[f"aerokit.network.{scheme}_publisher"], "CONNECT_TIMEOUT_S", 0.2)
+    monkeypatch.setattr(sys.modules["aerokit.network.mqtt_publisher"], "CONNECT_TIMEOUT_S", 0.2)
     silent = await asyncio.start_server(lambda _r, w: writers.append(w), "127.0.0.1", 0)
     writers: list[asyncio.StreamWriter] = []
     async with silent:
         port = silent.sockets[0].getsockname()[1]
         with pytest.raises(LinkOpenError, match=r"no answer within 0\.2 s"):
-            async with publisher_for(address(scheme, port)):
+            async with publisher_for(address(port)):
                 pass
         for writer in writers:
             writer.close()
     await eventually(lambda: asyncio.all_tasks() <= before)
 
 
-@pytest.mark.parametrize("scheme", SCHEMES)
-async def test_passwords(scheme: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+async def test_passwords(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.DEBUG)
     async with Broker(tmp_path, with_password=True) as broker:
-        port = broker.ports[scheme]
+        port = broker.port
         with pytest.raises(LinkOpenError, match=r"(?i)authoriz") as refused:
-            async with publisher_for(address(scheme, port, f"{USER}:geheim@")):
+            async with publisher_for(address(port, f"{USER}:geheim@")):
                 pass
         login = f"{USER}:{quote(PASSWORD, safe='')}@"
         async with (
-            broker.heard(scheme, (USER, PASSWORD)) as heard,
-            publisher_for(address(scheme, port, login)) as publisher,
+            broker.heard((USER, PASSWORD)) as heard,
+            publisher_for(address(port, login)) as publisher,
         ):
             publisher.put("1/mode", b"1")
             await eventually(lambda: any(each[1] == b"1" for each in heard))
@@ -193,10 +178,9 @@ async def test_passwords(scheme: str, tmp_path: Path, caplog: pytest.LogCaptureF
     assert not any(word in caplog.text for word in ("geheim", PASSWORD, quote(PASSWORD, safe="")))
 
 
-@pytest.mark.parametrize("scheme", SCHEMES)
-async def test_the_blocks_end_and_cancellation_leave_nothing(scheme: str, broker: Broker) -> None:
+async def test_the_blocks_end_and_cancellation_leave_nothing(broker: Broker) -> None:
     before = asyncio.all_tasks()
-    where = address(scheme, broker.ports[scheme])
+    where = address(broker.port)
     async with publisher_for(where) as publisher:
         publisher.put("1/mode", b"1")
     assert asyncio.all_tasks() <= before
@@ -226,13 +210,13 @@ async def test_the_blocks_end_and_cancellation_leave_nothing(scheme: str, broker
 
 async def test_who_is_there_by_mqtt(broker: Broker) -> None:
     alive = "aerokit/north/alpha/alive"
-    async with broker.heard("mqtt") as heard, HoldingProxy(broker.ports["mqtt"]) as line:
-        async with publisher_for(address("mqtt", line.port)):
+    async with broker.heard() as heard, HoldingProxy(broker.port) as line:
+        async with publisher_for(address(line.port)):
             await eventually(lambda: (alive, b"online", False) in heard)
-            async with broker.heard("mqtt") as later:  # whoever comes later is told, too
+            async with broker.heard() as later:  # whoever comes later is told, too
                 await eventually(lambda: (alive, b"online", True) in later)
         await eventually(lambda: heard[-1][:2] == (alive, b"offline"))
-        async with publisher_for(address("mqtt", line.port)):
+        async with publisher_for(address(line.port)):
             await eventually(lambda: heard[-1][:2] == (alive, b"online"))
             await line.__aexit__()  # no goodbye: the broker says it
             await eventually(lambda: heard[-1][:2] == (alive, b"offline"))
