@@ -29,16 +29,16 @@ def needs_a_broker() -> None:
 
 
 class Broker:
-    """A server that can be killed and started again on the same ports."""
+    """A server that can be killed and started again on the same port."""
 
     def __init__(self, folder: Path, *, with_password: bool = False) -> None:
-        self.ports = {"mqtt": free_port(), "nats": free_port()}
+        self.port = free_port()
         self._folder, self._starts = folder, 0
         self._process: subprocess.Popen[bytes] | None = None
         config: dict[str, Any] = {
             "server_name": "test",
-            "listen": f"127.0.0.1:{self.ports['nats']}",
-            "mqtt": {"listen": f"127.0.0.1:{self.ports['mqtt']}"},
+            "listen": f"127.0.0.1:{free_port()}",
+            "mqtt": {"listen": f"127.0.0.1:{self.port}"},
             "jetstream": {"store_dir": str(folder / "store")},
         }
         if with_password:
@@ -85,7 +85,7 @@ class Broker:
         client.on_connect = lambda *_: client.subscribe("aerokit/#")
         client.on_subscribe = lambda *_: subscribed.append(1)
         client.on_message = lambda _c, _d, got: heard.append((got.topic, bytes(got.payload), got.retain))
-        client.connect("127.0.0.1", self.ports["mqtt"])
+        client.connect("127.0.0.1", self.port)
         client.loop_start()
         try:
             await eventually(lambda: bool(subscribed))
