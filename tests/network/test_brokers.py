@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
+import os
+import signal
 import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -18,6 +20,7 @@ from test_state_schema import SCHEMA, faults
 from zenoh_network import HoldingProxy, eventually, free_port
 
 import aerokit
+from aerokit.cli.main import make_parser
 from aerokit.errors import LinkOpenError
 from aerokit.network import publishing
 from aerokit.network.broker_link import _OverLink
@@ -220,3 +223,37 @@ async def test_who_is_there_by_mqtt(broker: Broker) -> None:
             await eventually(lambda: heard[-1][:2] == (alive, b"online"))
             await line.__aexit__()  # no goodbye: the broker says it
             await eventually(lambda: heard[-1][:2] == (alive, b"offline"))
+
+
+async def test_the_command(broker: Broker, capsys: pytest.CaptureFixture[str]) -> None:
+    network = address(broker.port, f"{USER}:geheim@")
+    options = make_parser("bridge").parse_args(["bridge", "mqtt", network, "--json", "--rate", "20"])
+    async with broker.heard() as heard, simulated_link(SimulatedCopter()) as options.address:
+        command = asyncio.get_running_loop().create_task(options.run(options))
+        await eventually(lambda: topic("1/mode") in {each[0] for each in heard})
+        os.kill(os.getpid(), signal.SIGINT)
+        assert await command == 0
+    told = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [each["type"] for each in told] == ["publishing", "bridged_vehicle"]
+    assert told[0]["network"] == address(broker.port)
+
+
+@pytest.mark.parametrize(
+    "network",
+    [
+        "zenoh://north/alpha",
+        "mqtt://alpha:geheim@host",
+        "mqtt://alpha:geheim@host:x/north/alpha",
+        "tcp:127.0.0.1:5763",
+        "http://alpha:geheim@host/north/alpha",
+    ],
+)
+def test_a_broker_is_wanted_before_anything_is_opened(
+    network: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        make_parser("bridge").parse_args(["bridge", "mqtt", network])
+    assert ended.value.code == 2
+    assert "argument NETWORK: " in (told := capsys.readouterr().err)
+    assert "mqtt://" in told
+    assert "geheim" not in told

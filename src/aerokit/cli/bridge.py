@@ -1,4 +1,4 @@
-"""``aerokit bridge``: every vehicle on a link, live in the Foxglove viewer, or as JSON on a zenoh network."""
+"""``aerokit bridge``: every vehicle on a link, live in the Foxglove viewer, or as JSON on a network."""
 
 from __future__ import annotations
 
@@ -14,9 +14,12 @@ from aerokit.cli.interrupt import on_interrupt
 from aerokit.cli.output import add_json, tell
 from aerokit.cli.signing import ENVIRONMENT, add_signing_key, signing_of
 from aerokit.cli.vehicle_command import add_place
+from aerokit.errors import LocalProtocolError
 from aerokit.links.address import parse_address
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from aerokit.foxglove import FoxgloveBridge
     from aerokit.runtime.connection import Connection
     from aerokit.vehicle.vehicle import Vehicle
@@ -57,15 +60,21 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         description="Put each state of every vehicle on a link on a zenoh network, as JSON for programs in any"
         " language, until Ctrl-C (docs/network.md). What anybody does there reaches no vehicle.",
     )
-    zenoh.set_defaults(run=_zenoh)
-    add_place(zenoh, what=WHERE)
-    zenoh.add_argument(
-        "network",
-        type=_network,
-        metavar="NETWORK",
-        help="where the states go: zenoh://FLEET/NAME, zenoh://FLEET/NAME?connect=tcp/10.0.0.5:7447 …",
+    _add_publishing(zenoh, "zenoh://FLEET/NAME, zenoh://FLEET/NAME?connect=tcp/10.0.0.5:7447 …", _network)
+    mqtt = actions.add_parser(
+        "mqtt",
+        help="put states at a broker of MQTT, as JSON",
+        description="Put each state of every vehicle on a link at a broker of MQTT, as JSON for programs in any"
+        " language, until Ctrl-C (docs/network.md). What anybody does there reaches no vehicle.",
     )
-    _add_common(zenoh, 5.0, "state")
+    _add_publishing(mqtt, "mqtt://HOST/FLEET/NAME, mqtts://USER:PASSWORD@HOST/FLEET/NAME …", _broker)
+
+
+def _add_publishing(action: argparse.ArgumentParser, forms: str, network: Callable[[str], str]) -> None:
+    action.set_defaults(run=_publish)
+    add_place(action, what=WHERE)
+    action.add_argument("network", type=network, metavar="NETWORK", help=f"where the states go: {forms}")
+    _add_common(action, 5.0, "state")
 
 
 def _add_common(action: argparse.ArgumentParser, rate_hz: float, what: str) -> None:
@@ -89,6 +98,17 @@ def _network(text: str) -> str:
     """Looked at before a link is opened: the two addresses are easily given the other way round."""
     if parse_address(address(text)).kind not in ("zenoh", "zenohin"):
         raise argparse.ArgumentTypeError(f"{text!r} is not on a network, as zenoh://FLEET/NAME is")
+    return text
+
+
+def _broker(text: str) -> str:
+    """Looked at before a link is opened; an error does not show the password."""
+    from aerokit.network.broker_address import parse_broker
+
+    try:
+        parse_broker(text, "mqtt", "mqtts")
+    except LocalProtocolError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
     return text
 
 
@@ -128,9 +148,12 @@ async def _foxglove(options: argparse.Namespace) -> int:
     return DONE
 
 
-async def _zenoh(options: argparse.Namespace) -> int:
-    need("zenoh", "zenoh")
-    from aerokit.network import Publishing, zenoh_publisher
+async def _publish(options: argparse.Namespace) -> int:
+    is_broker = options.network.lower().startswith("mqtt")
+    need(*(("paho", "mqtt") if is_broker else ("zenoh", "zenoh")))
+    from aerokit.network import Publishing
+    from aerokit.network.broker_address import parse_broker
+    from aerokit.network.publishers import publisher_for
     from aerokit.runtime.opening import ONLOOKER, open_connection
     from aerokit.vehicle.vehicles import vehicles_on
 
@@ -141,15 +164,16 @@ async def _zenoh(options: argparse.Namespace) -> int:
             open_connection(
                 options.address, source_system=ONLOOKER, baud=options.baud, signing=signing
             ) as connection,
-            zenoh_publisher(options.network) as publisher,
+            publisher_for(options.network) as publisher,
             vehicles_on(
                 connection,
                 rates={} if options.listen_only else None,
                 on_found=lambda vehicle: _tell_vehicle(options, vehicle),
             ) as vehicles,
         ):
-            where = {"network": options.network, "address": options.address}
-            text = f"listening to {options.address}\nputting states on {options.network}\nuntil Ctrl-C"
+            network = str(parse_broker(options.network)) if is_broker else options.network  # no password
+            where = {"network": network, "address": options.address}
+            text = f"listening to {options.address}\nputting states on {network}\nuntil Ctrl-C"
             tell(options, "publishing", where, text)
             published: dict[int, Publishing] = {}
             while not stop.is_set():
