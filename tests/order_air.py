@@ -51,8 +51,22 @@ class Crossing:
     """When it comes to the other end, if it is not lost."""
 
 
-class Sky(Protocol):
-    """All that is between a program and a vehicle, as the judge sees it: from the program's end."""
+class Seen(Protocol):
+    """What crossed, as the judge sees it: from the program's end."""
+
+    @property
+    def sent(self) -> list[Crossing]:
+        """What the program has written."""
+        ...
+
+    @property
+    def heartbeats(self) -> list[Crossing]:
+        """What the program has heard the vehicle tell of itself."""
+        ...
+
+
+class Sky(Seen, Protocol):
+    """All that is between a program and a vehicle."""
 
     @property
     def weather(self) -> Weather:
@@ -64,16 +78,6 @@ class Sky(Protocol):
 
     def begin(self) -> None:
         """The order is given now."""
-
-    @property
-    def sent(self) -> list[Crossing]:
-        """What the program has written."""
-        ...
-
-    @property
-    def heartbeats(self) -> list[Crossing]:
-        """What the program has heard the vehicle tell of itself."""
-        ...
 
 
 @dataclass(frozen=True)

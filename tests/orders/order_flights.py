@@ -8,7 +8,7 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
 
 import anyio
-from order_air import Air, Sky
+from order_air import Air, Seen, Sky
 from order_airs import over_two
 from order_cases import Case
 from order_hub import through_hub
@@ -38,7 +38,7 @@ class Flown:
 
     case: Case
     vehicle: Simulated
-    air: Sky
+    air: Seen
     given_at: float
     ended_at: float
     error: BaseException | None
@@ -46,6 +46,8 @@ class Flown:
     """Mode and armed as the program knew them when the call ended."""
     acted: list[tuple[float, str]]
     """When somebody else acted, on the program's clock, and in which mode the vehicle was then."""
+    fresh_at: tuple[float, ...] = ()
+    """When a newer order was given for the program: by the policy of a fleet."""
 
     @property
     def is_armed_at_end(self) -> bool:
@@ -62,7 +64,7 @@ def fly(case: Case) -> Flown:
     return run_virtual(_fly(replace(case, weather=replace(case.weather))))
 
 
-async def _go_to_place(place: str, vehicle: Simulated, program: aerokit.Vehicle) -> None:
+async def go_to_place(place: str, vehicle: Simulated, program: aerokit.Vehicle) -> None:
     await program.wait_ready()
     if isinstance(vehicle, SimulatedCopter):
         vehicle.rc[2] = 1000 if place in ("ground", "armed") else 1500
@@ -96,14 +98,14 @@ def turn_switch(vehicle: Simulated) -> None:
         vehicle.switch_to(POSITION)
 
 
-def _return(vehicle: Simulated) -> None:
+def return_by_itself(vehicle: Simulated) -> None:
     if isinstance(vehicle, SimulatedCopter):
         vehicle.set_mode(CopterMode.RTL)
     else:
         vehicle.change_mode(RTL)
 
 
-def _act(case: Case, vehicle: Simulated) -> None:
+def act_on(case: Case, vehicle: Simulated) -> None:
     """Another station disarms what stands on the ground, or changes its mode; a pilot takes what flies."""
     if case.row.place == "ground":
         if case.by_switch:
@@ -116,7 +118,7 @@ def _act(case: Case, vehicle: Simulated) -> None:
         take_over(vehicle)
 
 
-def _set_up(case: Case) -> Simulated:
+def set_up(case: Case) -> Simulated:
     if case.autopilot == "px4":
         px4 = SimulatedPx4(boot_time_s=1.0)
         px4.parameters["NAV_DLL_ACT"] = 2.0 * case.station_failsafe
@@ -131,7 +133,7 @@ def _set_up(case: Case) -> Simulated:
 
 
 async def _fly(case: Case) -> Flown:
-    vehicle = _set_up(case)
+    vehicle = set_up(case)
     async with (
         _under(case, vehicle) as (sky, source),
         aerokit.connect(source, rates=RATES) as program,
@@ -156,7 +158,7 @@ async def _under(case: Case, vehicle: Simulated) -> AsyncIterator[tuple[Sky, Lin
 
 async def _give(case: Case, vehicle: Simulated, air: Sky, program: aerokit.Vehicle) -> Flown:
     loop = asyncio.get_running_loop()
-    await _go_to_place(case.row.place, vehicle, program)
+    await go_to_place(case.row.place, vehicle, program)
     air.weather = case.weather
     air.begin()
     given_at = loop.time()
@@ -170,8 +172,8 @@ async def _give(case: Case, vehicle: Simulated, air: Sky, program: aerokit.Vehic
         if at is not None:
             loop.call_later(at, happen)
 
-    later(case.pilot_at, lambda: _act(case, vehicle))
-    later(case.failsafe_at, lambda: _return(vehicle))
+    later(case.pilot_at, lambda: act_on(case, vehicle))
+    later(case.failsafe_at, lambda: return_by_itself(vehicle))
     error: BaseException | None = None
     with anyio.CancelScope(deadline=given_at + (case.cancel_at or 1e6)) as scope:
         try:

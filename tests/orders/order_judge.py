@@ -103,7 +103,8 @@ def _may_be_told(flown: Flown, message: Message, told: tuple[int, bool]) -> bool
 def _sent_blind(flown: Flown) -> Iterator[str]:
     """What is left of an order is not sent into a silence."""
     for each in _orders(flown):
-        is_late = each.at > flown.given_at + FIRST_S
+        given = (flown.given_at, *flown.fresh_at)
+        is_late = not any(0 <= each.at - at <= FIRST_S for at in given)
         if is_late and not any(each.at - KNOWN_S <= told.at <= each.at for told in flown.air.heartbeats):
             yield f"{_s(flown, each)} was sent blind"
 
