@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import anyio
 from order_air import Air, Crossing
 from order_cases import Case, random_case
-from order_flights import WATCH_S, Flown, Simulated, act_on, go_to_place, mode_of, return_by_itself, set_up
+from order_flights import WATCH_S, Flown, Simulated, go_to_place, set_up, somebody_acts
 from order_judge import faults
 from order_table import ROWS, Row
 
@@ -102,9 +102,8 @@ async def _fly(case: FleetCase) -> list[str]:
     for name, one in flown.items():
         one.fresh_at = tuple(each.at for each in ordered if f"{name}/1" in each.orders)
         if one.fresh_at and case.policy != "hold_others":
-            one.error = AerokitError(
-                "the policy had another order for it"
-            )  # which goes on, also when cancelled
+            # which goes on, also when cancelled
+            one.error = AerokitError("the policy had another order for it")
         found += [f"{name}: {fault}" for fault in faults(one)]
     return found
 
@@ -133,21 +132,11 @@ async def _give(
     place = next(iter(cases.values())).row.place
     await asyncio.gather(*(go_to_place(place, vehicles[name], programs[name]) for name in vehicles))
     given_at = loop.time()
-    acted: dict[str, list[tuple[float, str]]] = {name: [] for name in vehicles}
-
-    def later(name: str, at: float | None, act: Callable[[], None]) -> None:
-        def happen() -> None:
-            act()
-            acted[name].append((loop.time(), mode_of(vehicles[name])))
-
-        if at is not None:
-            loop.call_later(at, happen)
-
+    acted = {}
     for name, each in cases.items():
         airs[name].weather = each.weather
         airs[name].begin()
-        later(name, each.pilot_at, lambda name=name, each=each: act_on(each, vehicles[name]))  # type: ignore[misc]
-        later(name, each.failsafe_at, lambda name=name: return_by_itself(vehicles[name]))  # type: ignore[misc]
+        acted[name] = somebody_acts(each, vehicles[name])
     errors: dict[str, BaseException] = {}
     with anyio.CancelScope(deadline=given_at + (case.cancel_at or 1e6)) as scope:
         try:

@@ -98,14 +98,14 @@ def turn_switch(vehicle: Simulated) -> None:
         vehicle.switch_to(POSITION)
 
 
-def return_by_itself(vehicle: Simulated) -> None:
+def _return(vehicle: Simulated) -> None:
     if isinstance(vehicle, SimulatedCopter):
         vehicle.set_mode(CopterMode.RTL)
     else:
         vehicle.change_mode(RTL)
 
 
-def act_on(case: Case, vehicle: Simulated) -> None:
+def _act(case: Case, vehicle: Simulated) -> None:
     """Another station disarms what stands on the ground, or changes its mode; a pilot takes what flies."""
     if case.row.place == "ground":
         if case.by_switch:
@@ -116,6 +116,24 @@ def act_on(case: Case, vehicle: Simulated) -> None:
             vehicle.arming.disarm("another station")
     else:
         take_over(vehicle)
+
+
+def somebody_acts(case: Case, vehicle: Simulated) -> list[tuple[float, str]]:
+    """From now on, at the times of the case; what is returned fills: see :attr:`Flown.acted`."""
+    loop = asyncio.get_running_loop()
+    acted: list[tuple[float, str]] = []
+
+    def later(at: float | None, act: Callable[[], None]) -> None:
+        def happen() -> None:
+            act()
+            acted.append((loop.time(), mode_of(vehicle)))
+
+        if at is not None:
+            loop.call_later(at, happen)
+
+    later(case.pilot_at, lambda: _act(case, vehicle))
+    later(case.failsafe_at, lambda: _return(vehicle))
+    return acted
 
 
 def set_up(case: Case) -> Simulated:
@@ -162,18 +180,7 @@ async def _give(case: Case, vehicle: Simulated, air: Sky, program: aerokit.Vehic
     air.weather = case.weather
     air.begin()
     given_at = loop.time()
-    acted: list[tuple[float, str]] = []
-
-    def later(at: float | None, act: Callable[[], None]) -> None:
-        def happen() -> None:
-            act()
-            acted.append((loop.time(), mode_of(vehicle)))
-
-        if at is not None:
-            loop.call_later(at, happen)
-
-    later(case.pilot_at, lambda: act_on(case, vehicle))
-    later(case.failsafe_at, lambda: return_by_itself(vehicle))
+    acted = somebody_acts(case, vehicle)
     error: BaseException | None = None
     with anyio.CancelScope(deadline=given_at + (case.cancel_at or 1e6)) as scope:
         try:

@@ -18,8 +18,6 @@ from aerokit.errors import LocalProtocolError
 from aerokit.links.address import parse_address
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from aerokit.foxglove import FoxgloveBridge
     from aerokit.runtime.connection import Connection
     from aerokit.vehicle.vehicle import Vehicle
@@ -54,27 +52,34 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         help="show these MAVLink messages as they come, too: 'GPS_*' (repeatable)",
     )
     _add_common(foxglove, 10.0, "topic")
-    zenoh = actions.add_parser(
-        "zenoh",
-        help="put states on a zenoh network, as JSON",
-        description="Put each state of every vehicle on a link on a zenoh network, as JSON for programs in any"
-        " language, until Ctrl-C (docs/network.md). What anybody does there reaches no vehicle.",
-    )
-    _add_publishing(zenoh, "zenoh://FLEET/NAME, zenoh://FLEET/NAME?connect=tcp/10.0.0.5:7447 …", _network)
-    mqtt = actions.add_parser(
-        "mqtt",
-        help="put states at a broker of MQTT, as JSON",
-        description="Put each state of every vehicle on a link at a broker of MQTT, as JSON for programs in any"
-        " language, until Ctrl-C (docs/network.md). What anybody does there reaches no vehicle.",
-    )
-    _add_publishing(mqtt, "mqtt://HOST/FLEET/NAME, mqtts://USER:PASSWORD@HOST/FLEET/NAME …", _broker)
-
-
-def _add_publishing(action: argparse.ArgumentParser, forms: str, network: Callable[[str], str]) -> None:
-    action.set_defaults(run=_publish)
-    add_place(action, what=WHERE)
-    action.add_argument("network", type=network, metavar="NETWORK", help=f"where the states go: {forms}")
-    _add_common(action, 5.0, "state")
+    for name, where, forms, module, network, shown in (
+        (
+            "zenoh",
+            "on a zenoh network",
+            "zenoh://FLEET/NAME, zenoh://FLEET/NAME?connect=tcp/10.0.0.5:7447 …",
+            "zenoh",
+            _network,
+            str,
+        ),
+        (
+            "mqtt",
+            "at a broker of MQTT",
+            "mqtt://HOST/FLEET/NAME, mqtts://USER:PASSWORD@HOST/FLEET/NAME …",
+            "paho",
+            _broker,
+            _without_password,
+        ),
+    ):
+        action = actions.add_parser(
+            name,
+            help=f"put states {where}, as JSON",
+            description=f"Put each state of every vehicle on a link {where}, as JSON for programs in any"
+            " language, until Ctrl-C (docs/network.md). What anybody does there reaches no vehicle.",
+        )
+        action.set_defaults(run=_publish, needs=(module, name), shown=shown)
+        add_place(action, what=WHERE)
+        action.add_argument("network", type=network, metavar="NETWORK", help=f"where the states go: {forms}")
+        _add_common(action, 5.0, "state")
 
 
 def _add_common(action: argparse.ArgumentParser, rate_hz: float, what: str) -> None:
@@ -102,14 +107,18 @@ def _network(text: str) -> str:
 
 
 def _broker(text: str) -> str:
-    """Looked at before a link is opened; an error does not show the password."""
-    from aerokit.network.broker_address import parse_broker
-
+    """As :func:`_network`; an error does not show the password."""
     try:
-        parse_broker(text, "mqtt", "mqtts")
+        _without_password(text)
     except LocalProtocolError as error:
         raise argparse.ArgumentTypeError(str(error)) from error
     return text
+
+
+def _without_password(broker: str) -> str:
+    from aerokit.network.broker_address import parse_broker
+
+    return str(parse_broker(broker, "mqtt", "mqtts"))
 
 
 def _port(text: str) -> int:
@@ -149,16 +158,15 @@ async def _foxglove(options: argparse.Namespace) -> int:
 
 
 async def _publish(options: argparse.Namespace) -> int:
-    is_broker = options.network.lower().startswith("mqtt")
-    need(*(("paho", "mqtt") if is_broker else ("zenoh", "zenoh")))
+    need(*options.needs)
     from aerokit.network import Publishing
-    from aerokit.network.broker_address import parse_broker
     from aerokit.network.publishers import publisher_for
     from aerokit.runtime.opening import ONLOOKER, open_connection
     from aerokit.vehicle.vehicles import vehicles_on
 
     stop = asyncio.Event()
     signing = signing_of(options)
+    network = options.shown(options.network)
     with on_interrupt(stop.set):
         async with (
             open_connection(
@@ -171,7 +179,6 @@ async def _publish(options: argparse.Namespace) -> int:
                 on_found=lambda vehicle: _tell_vehicle(options, vehicle),
             ) as vehicles,
         ):
-            network = str(parse_broker(options.network)) if is_broker else options.network  # no password
             where = {"network": network, "address": options.address}
             text = f"listening to {options.address}\nputting states on {network}\nuntil Ctrl-C"
             tell(options, "publishing", where, text)

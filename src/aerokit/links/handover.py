@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
-__all__ = ["MOST_WAITING", "Handover"]
+__all__ = ["MOST_WAITING", "Handover", "opened_in_a_thread"]
 
 ItemT = TypeVar("ItemT")
 
@@ -73,3 +73,21 @@ class Handover(Generic[ItemT]):
                 self._loop.call_soon(self._drain)  # the others are handed over all the same
                 raise
         self._loop.call_soon(self._drain)
+
+
+async def opened_in_a_thread(work: Callable[[], ItemT], close: Callable[[ItemT], object]) -> ItemT:
+    """What ``work()`` opens, in a thread of the loop's; ``close`` it when nobody waits for it any more.
+
+    A thread cannot be stopped: when this is cancelled, what it opens is closed as soon as it is there.
+    """
+    opening = asyncio.get_running_loop().run_in_executor(None, work)
+
+    def close_later(opened: asyncio.Future[ItemT]) -> None:
+        if not opened.cancelled() and opened.exception() is None:
+            close(opened.result())
+
+    try:
+        return await asyncio.shield(opening)
+    except asyncio.CancelledError:
+        opening.add_done_callback(close_later)
+        raise

@@ -74,7 +74,7 @@ def bind_to(endpoint: Endpoint, kind: socket.SocketKind) -> socket.socket:
 
 
 def discard_unsent(sock: socket.socket) -> None:
-    """What the system still holds of it is thrown away when it is closed, and does not arrive late."""
+    """Without lingering the system forgets what it has not sent when it is closed, instead of sending it late."""
     with contextlib.suppress(OSError):
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
 

@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import errno
 import socket
-import struct
 from abc import abstractmethod
 from typing import Any
 
@@ -17,7 +16,7 @@ from .allowed import AllowedPeers, Peers
 from .base import BaseLink
 from .link import LINGER_S, Peer, PeerListener
 from .outbox import Outbox, unsent_in_kernel
-from .sockets import Endpoint, bound_socket, resolve
+from .sockets import Endpoint, bound_socket, discard_unsent, resolve
 
 __all__ = ["CONNECT_TIMEOUT_S", "MAX_CLIENTS", "MAX_PENDING_BYTES", "TcpConnect", "TcpListen"]
 
@@ -308,11 +307,10 @@ class _Stream(asyncio.Protocol):
                 self._linger = self._loop.call_later(LINGER_S, self._abort)
 
     def _abort(self) -> None:
-        """Without lingering the system forgets what it has not sent, instead of sending it when nobody waits for it."""
+        """What has not been sent is not sent any more, when nobody waits for it."""
         assert self._transport is not None
         sock = self._transport.get_extra_info("socket")
-        with contextlib.suppress(OSError):
-            sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        discard_unsent(sock)
         self._transport.abort()
 
     def connection_made(self, transport: Any) -> None:  # not every loop's is a Transport by its class

@@ -13,7 +13,7 @@ from aerokit.errors import LinkOpenError, LocalProtocolError
 from aerokit.snapshot import Snapshot
 
 from .base import BaseLink
-from .handover import Handover
+from .handover import Handover, opened_in_a_thread
 from .needed import needed
 
 __all__ = [
@@ -108,12 +108,8 @@ async def open_session(address: str, options: NetworkOptions, prepare: Callable[
             raise
         return session
 
-    opening = asyncio.get_running_loop().run_in_executor(None, work)
     try:
-        return await asyncio.shield(opening)
-    except asyncio.CancelledError:
-        opening.add_done_callback(_close_later)  # a thread cannot be stopped; what it opens is closed
-        raise
+        return await opened_in_a_thread(work, lambda session: close_session(session, _nothing))
     except zenoh.ZError as error:
         raise LinkOpenError(f"cannot open {address}: {_reason(error)}") from error
 
@@ -143,11 +139,6 @@ def attachment_of(sample: Any) -> bytes:
     """The bytes of its attachment; empty when it has none."""
     attachment = sample.attachment
     return b"" if attachment is None else bytes(attachment.to_bytes())
-
-
-def _close_later(opening: asyncio.Future[Any]) -> None:
-    if not opening.cancelled() and opening.exception() is None:
-        close_session(opening.result(), _nothing)
 
 
 def _config(zenoh: Any, address: str, options: NetworkOptions) -> Any:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from aerokit.arguments import checked
 from aerokit.async_block import async_block
 from aerokit.errors import LinkOpenError
+from aerokit.links.handover import opened_in_a_thread
 from aerokit.links.needed import needed
 from aerokit.links.sockets import discard_unsent
 from aerokit.network.broker_address import parse_broker
@@ -48,17 +49,14 @@ class MqttLink(BrokerLink):
             client.username_pw_set(where.user, where.password)
         self._answered = loop.create_future()
 
-        def work() -> None:  # looks the name up, connects, shakes hands: all of it blocks
+        def work() -> Any:  # looks the name up, connects, shakes hands: all of it blocks
             if where.scheme == "mqtts":
                 client.tls_set_context(ssl.create_default_context())
             client.connect(where.host, where.port, KEEPALIVE_S)
+            return client
 
-        opening = loop.run_in_executor(None, work)
         try:
-            await asyncio.shield(opening)
-        except asyncio.CancelledError:
-            opening.add_done_callback(lambda done: _give_up(done, client))
-            raise
+            await opened_in_a_thread(work, _cut)
         except OSError as error:
             raise self._refused(error) from error
         if (sock := client.socket()) is None:
@@ -68,9 +66,8 @@ class MqttLink(BrokerLink):
         client.on_socket_close = self._on_socket_close
         loop.add_reader(sock, self._read, client, sock)
         self._look_after(client)
-        await asyncio.wait(
-            (self._answered,), timeout=CONNECT_TIMEOUT_S
-        )  # wait_for may swallow a cancellation
+        # wait_for may swallow a cancellation
+        await asyncio.wait((self._answered,), timeout=CONNECT_TIMEOUT_S)
         if self._answered.done():
             refusal = self._answered.result()
         else:
@@ -136,12 +133,6 @@ class MqttLink(BrokerLink):
                 client.disconnect()
             _cut(client)
         self._released.set()
-
-
-def _give_up(opening: asyncio.Future[None], client: Any) -> None:
-    """Nobody waits for it any more: a thread cannot be stopped; what it opened is closed."""
-    if not opening.cancelled() and opening.exception() is None:
-        _cut(client)
 
 
 def _cut(client: Any) -> None:

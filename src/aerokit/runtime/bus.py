@@ -51,6 +51,11 @@ class Bus:
         """Have every ``message_type`` of ``system_id`` (0: of every system) delivered to ``sink``."""
         return self._attach((system_id, message_type.ID), (MESSAGE, sink))
 
+    def want(self, *message_types: type[Message]) -> None:
+        """Have frames of these made although nobody subscribes: who asks for this looks at them on their way here."""
+        for each in message_types:
+            self.attach(each, _ignore)
+
     def attach_frames(
         self, message_type: type[Message], sink: Sink, *, system_id: int = EVERY_SYSTEM
     ) -> Detach:
@@ -181,6 +186,10 @@ def once(action: Callable[[], None]) -> Detach:
             pending.pop()()
 
     return detach
+
+
+def _ignore(message: object) -> None:
+    pass
 
 
 def _report(sink: Callable[..., None]) -> None:

@@ -53,7 +53,7 @@ class Intake:
         self.taps: Taps = Taps(self._let_all_through)
         self._loop_watch = LoopWatch(self._on_blocked)
         self._is_closed = False
-        bus.attach(Heartbeat, _ignore)  # routes and diagnosis need every heartbeat
+        bus.want(Heartbeat)  # routes and diagnosis need every heartbeat
 
     def start(self) -> None:
         """The link is open: notice when the loop is kept from running."""
@@ -171,7 +171,3 @@ class Intake:
 
 def _counters(framer: Framer, frame: Frame) -> SourceStatistics | None:
     return framer.statistics.by_key.get(frame.component_id << 8 | frame.system_id)
-
-
-def _ignore(message: object) -> None:
-    pass

@@ -59,8 +59,7 @@ class LinkQuestions:
         self._asked_at: dict[tuple[int, int], float] = {}
         self._left, self._left_at = UNWANTED_HZ, 0.0
         self._doubts_told: set[tuple[int, int]] = set()
-        bus.attach(m.Timesync, _ignore)  # else frames of these would not even be made
-        bus.attach(m.AutopilotVersion, _ignore)
+        bus.want(m.Timesync, m.AutopilotVersion)
 
     def ask(
         self,
@@ -147,7 +146,3 @@ class LinkQuestions:
                 "hardware id (AUTOPILOT_VERSION)" if candidate.is_other_hardware else "clock",
             )
             self._bus.publish(HeardTwice(frame.received_at, frame.system_id, frame.component_id))
-
-
-def _ignore(message: object) -> None:
-    pass
