@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+import gc
+import random
 import socket
+from typing import Any
 
 import anyio
 import anyio.lowlevel
 import pytest
+from any_message import anything
 from flight_harness import Flight, block_loop
 
+import aerokit
 from aerokit import LinkState, open_connection
 from aerokit import messages as m
 from aerokit.errors import LinkLost, StaleValueError
 from aerokit.links import Peer
 from aerokit.links.base import BaseLink
 from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.runtime.cells import StateCell
 from aerokit.runtime.connection import Connection
 from aerokit.runtime.events import VehicleRebooted, VehicleSilent
 from aerokit.runtime.loop_watch import QUIET_TURNS
+from aerokit.vehicle.state.told import MESSAGE_IDS, message_type
 
 pytestmark = pytest.mark.anyio
 
@@ -151,3 +158,42 @@ async def test_nothing_is_watched_after_the_end() -> None:
         connection.link_lost(LinkLost("unplugged"))
         block_loop(5)
         await anyio.sleep(1)
+
+
+OURS = ("link_state", "link_quality", "links")
+"""Cells about what was read and when; their values come in no message."""
+
+
+def every_cell(vehicle: aerokit.Vehicle) -> list[StateCell[Any]]:
+    """All cells of a vehicle, its parts and its devices; `make_parts` has made them."""
+    gc.collect()
+    cells = [each for each in gc.get_objects() if isinstance(each, StateCell)]
+    return [each for each in cells if each.name not in OURS and each._closed_by is None]
+
+
+async def test_every_cell_after_a_pause_is_as_old_as_its_message(grounded: Flight) -> None:
+    """Each message that any cell comes from has waited in the socket while the loop was blocked."""
+    vehicle, wire, dice = grounded.vehicle, grounded.wire, random.Random(7)
+    component = vehicle.component(154)
+    for part in (vehicle.parameters, vehicle.mission.current, vehicle.gimbal, vehicle.camera):
+        assert part is not None
+    for kind in (m.Heartbeat, m.Attitude, m.Statustext):
+        vehicle.message(kind)
+        component.message(kind)
+    kinds = [message_type(name) for name in MESSAGE_IDS if not name.startswith(("Timesync", "ParamExt"))]
+    encoders = [FrameEncoder(vehicle.system_id, component_id) for component_id in (1, 154, 100)]
+    known = {kind: [anything(kind, dice) for _ in range(6)] for kind in kinds if kind is not m.Heartbeat}
+    known[m.Heartbeat] = [m.Heartbeat(2, 3, 81, 4, 3, 3), m.Heartbeat(26, 8, 0, 0, 4, 3)]
+    known[m.Heartbeat] += [m.Heartbeat(30, 8, 0, 0, 4, 3)]
+    frames = [
+        encoder.encode(message) for messages in known.values() for message in messages for encoder in encoders
+    ]
+    before = {cell: cell._arrivals for cell in every_cell(vehicle)}
+    block_loop(3.7)
+    for frame in frames:
+        wire.deliver(frame)
+    updated = [cell for cell in every_cell(vehicle) if cell.is_known and cell._arrivals > before.get(cell, 0)]
+    assert {cell.name: round(cell.age, 1) for cell in updated if cell.age < 3.5} == {}
+    names = {cell.name for cell in updated}
+    assert set(vehicle.telemetry.cells) - names <= {"version"}
+    assert {"cameras", "components", "mission.current", "gimbal.attitude", "HEARTBEAT"} <= names

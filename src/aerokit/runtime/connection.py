@@ -323,6 +323,18 @@ class Connection:
         """Seconds on the event loop's clock, the one that all ages and deadlines are measured on."""
         return self._clock()
 
+    @checked
+    def new_cell(self, name: str, waits_for: str) -> StateCell[Any]:
+        """Make a cell whose values are as old as the messages they came in; see :class:`StateCell`."""
+        return StateCell(name, self.now, waits_for, stamp=self.arrived_at)
+
+    def arrived_at(self) -> float:
+        """When the message that is delivered now arrived, on the clock of :meth:`now`; the time stamp of cells.
+
+        That is earlier than now if the event loop was kept from reading: the message may have waited in the socket.
+        """
+        return self._intake.arrived_at()
+
     def unix_time(self) -> float:
         """Seconds since 1970, as the system had them at the beginning, gone on by :meth:`now`: nobody sets it back."""
         return self._wall_at_0 + self._clock()

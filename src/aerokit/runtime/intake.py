@@ -102,6 +102,10 @@ class Intake:
             if taps.received:
                 taps.give(frame, peer)
 
+    def arrived_at(self) -> float:
+        """When what is delivered now arrived: now, or before a pause of the loop if it may have waited."""
+        return min(self._clock(), self._loop_watch.oldest_arrival)
+
     def statistics(self) -> Iterator[FramerStatistics]:
         """The counters of every peer that is remembered."""
         return (framer.statistics for framer in self._peers)

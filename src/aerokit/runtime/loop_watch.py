@@ -52,6 +52,11 @@ class LoopWatch:
             self._timer.cancel()
             self._timer = None
 
+    @property
+    def oldest_arrival(self) -> float:
+        """When what is read now may have arrived at the earliest; infinite while nothing can have waited."""
+        return math.inf if self._oldest is None else self._oldest
+
     def arrival(self, now: float) -> float:
         """When what is read came: now, or, if it may have waited, the earliest time at which it may have come."""
         if self._oldest is None and now <= self._due + LATE_AFTER_S:

@@ -28,8 +28,8 @@ class Cameras:
         self._bridge, self._talk, self._components = bridge, bridge.talk, components
         self._made: dict[int, Camera] = {}
         talk = bridge.talk
-        self.cell: StateCell[tuple[int, ...]] = StateCell(
-            "cameras", talk.connection.now, "HEARTBEAT or CAMERA_INFORMATION of a camera"
+        self.cell: StateCell[tuple[int, ...]] = talk.connection.new_cell(
+            "cameras", "HEARTBEAT or CAMERA_INFORMATION of a camera"
         )
         self._early: list[tuple[int, Any]] = []
         """Pictures of a camera behind the autopilot, while it is not known yet whether it is the first."""

@@ -232,7 +232,7 @@ class CameraLine(Ordering):
 
     def cell(self, name: str, waits_for: str) -> StateCell[Any]:
         """A state of the camera, which ends with the vehicle."""
-        cell: StateCell[Any] = StateCell(name, self._talk.connection.now, waits_for)
+        cell: StateCell[Any] = self._talk.connection.new_cell(name, waits_for)
         self._talk.keep(cell)
         return cell
 

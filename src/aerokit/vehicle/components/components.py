@@ -41,8 +41,8 @@ class Components:
         self._made: dict[int, Component] = {}
         self._heard: dict[tuple[int, int], ComponentStatus] = {}
         talk = bridge.talk
-        self.cell: StateCell[tuple[ComponentStatus, ...]] = StateCell(
-            "components", talk.connection.now, "HEARTBEAT"
+        self.cell: StateCell[tuple[ComponentStatus, ...]] = talk.connection.new_cell(
+            "components", "HEARTBEAT"
         )
         talk.keep(self.cell)
         bus = talk.connection.bus

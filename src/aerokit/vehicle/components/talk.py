@@ -39,8 +39,8 @@ class ComponentTalk:
         self.hearing: Hearing = Hearing(
             talk.connection, talk.system_id, component_id, self.rates, keep=talk.keep, at_close=talk.at_close
         )
-        version: StateCell[AutopilotVersion] = StateCell(
-            "version", talk.connection.now, f"AUTOPILOT_VERSION of component {component_id}"
+        version: StateCell[AutopilotVersion] = talk.connection.new_cell(
+            "version", f"AUTOPILOT_VERSION of component {component_id}"
         )
         talk.keep(version)
         self.transfers: Transfers = Transfers(

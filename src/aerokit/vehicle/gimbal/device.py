@@ -60,11 +60,11 @@ class Device:
         self.newest: Newest = Newest(bridge.helm)
         """Of the orders to it."""
         name = f"gimbal {self.device_id}" if component_id else "gimbal"
-        self.attitude: StateCell[GimbalAttitude] = StateCell(
-            f"{name}.attitude", bridge.talk.connection.now, ATTITUDE_COMES_IN
+        self.attitude: StateCell[GimbalAttitude] = bridge.talk.connection.new_cell(
+            f"{name}.attitude", ATTITUDE_COMES_IN
         )
-        self.controllers: StateCell[GimbalControllers] = StateCell(
-            f"{name}.controllers", bridge.talk.connection.now, "GIMBAL_MANAGER_STATUS"
+        self.controllers: StateCell[GimbalControllers] = bridge.talk.connection.new_cell(
+            f"{name}.controllers", "GIMBAL_MANAGER_STATUS"
         )
         self.is_told = False
         """Whether anything was heard of it; a program may name one that is not there."""

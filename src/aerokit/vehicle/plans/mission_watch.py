@@ -37,10 +37,10 @@ class MissionWatch:
         self._talk = talk
         self._offset = int(talk.autopilot.home_is_item_0)
         self._repeats = talk.autopilot.repeats_item_reached
-        now = talk.connection.now
-        self.current: StateCell[int | None] = StateCell("mission.current", now, "MISSION_CURRENT")
-        self.count: StateCell[int] = StateCell("mission.count", now, "MISSION_CURRENT with a number of items")
-        self.progress: StateCell[MissionProgress] = StateCell("mission.progress", now, "MISSION_CURRENT")
+        new_cell = talk.connection.new_cell
+        self.current: StateCell[int | None] = new_cell("mission.current", "MISSION_CURRENT")
+        self.count: StateCell[int] = new_cell("mission.count", "MISSION_CURRENT with a number of items")
+        self.progress: StateCell[MissionProgress] = new_cell("mission.progress", "MISSION_CURRENT")
         self.reached: int | None = None
         """The item that was reached last."""
         self.is_complete: bool = False

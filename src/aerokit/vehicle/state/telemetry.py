@@ -178,15 +178,22 @@ class Telemetry(States):
 
     def _entry(self, class_name: str, handler: Handler) -> Callable[[Any], None]:
         source = self._source(class_name)
-        system_id, component_id = self.system_id, self.component_id
 
         def take(message: Message) -> None:
             frame = message.received_frame
-            if frame is None or (frame.system_id == system_id and frame.component_id == component_id):
+            if frame is None or self.accepts(frame):
                 with self._lock:
-                    handler(message, source)
+                    self._handle(handler, message, source, frame)
 
         return take
+
+    def _handle(self, handler: Handler, message: Message, source: Source, frame: Frame | None) -> None:
+        """Every value is as old as the frame that it came in, whichever way it is decoded."""
+        before, self._arrived_at = self._arrived_at, None if frame is None else frame.received_at
+        try:
+            handler(message, source)
+        finally:
+            self._arrived_at = before
 
     def _handler(self, class_name: str) -> Handler:
         """What a message of this class does."""
@@ -237,11 +244,8 @@ class Telemetry(States):
         decode = kind.decode_body
 
         def apply(frame: Frame, message: Message | None) -> None:
-            before, self._arrived_at = self._arrived_at, frame.received_at
-            try:
-                handler(decode(frame.body, frame) if message is None else message, source)
-            finally:
-                self._arrived_at = before
+            decoded = decode(frame.body, frame) if message is None else message
+            self._handle(handler, decoded, source, frame)
 
         rows = SOURCES[class_name]
         cells = [self._cells[told.name] for told, _ in rows]
@@ -282,6 +286,7 @@ class Telemetry(States):
             self._mode_names[message.custom_mode] = name
 
     def _on_status_text(self, message: messages.Statustext, source: Source) -> None:
+        # When it was read: a text that explains a refusal must not seem older than the command that was refused.
         self._tell(self._texts.receive(message, self._clock()), source)
 
     def _tell(self, texts: Iterable[StatusText], source: Source) -> None:
