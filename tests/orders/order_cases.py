@@ -27,6 +27,8 @@ class Case:
     by_switch: bool = False
     failsafe_at: float | None = None
     """When the vehicle returns by itself."""
+    state_at: float | None = None
+    """When HEARTBEAT begins to tell a failsafe (MAV_STATE_CRITICAL) in the mode that there was."""
     station_failsafe: bool = False
     """Whether it returns when it does not hear the ground station."""
     cancel_at: float | None = None
@@ -57,10 +59,12 @@ def random_case(row: Row, autopilot: str, seed: int) -> Case:
     elif dice.random() < 0.15:
         weather.stall = (0.0, round(dice.uniform(1.0, 8.0), 2))
     happens = dice.random()
+    later = random.Random(f"a failsafe {row.name} {row.command} {autopilot} {seed}")
     return Case(
         row,
         autopilot,
         weather,
+        state_at=round(later.uniform(0.05, 6.0), 2) if happens >= 0.6 and later.random() < 0.5 else None,
         pilot_at=round(dice.uniform(0.05, 6.0), 2) if happens < 0.45 else None,
         failsafe_at=round(dice.uniform(0.05, 6.0), 2) if 0.45 <= happens < 0.6 else None,
         station_failsafe=dice.random() < 0.5,

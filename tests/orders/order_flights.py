@@ -105,6 +105,15 @@ def _return(vehicle: Simulated) -> None:
         vehicle.change_mode(RTL)
 
 
+def run_the_battery_down(vehicle: Simulated) -> None:
+    """What flies is under a failsafe from now on: ArduCopter only warns, PX4 holds first and returns 5 s later."""
+    vehicle.battery.percent = 6.0
+    if isinstance(vehicle, SimulatedPx4):
+        vehicle.parameters["COM_LOW_BAT_ACT"] = 3.0
+    else:
+        vehicle.parameters["BATT_LOW_MAH"] = vehicle.parameters["BATT_CAPACITY"]
+
+
 def _act(case: Case, vehicle: Simulated) -> None:
     """Another station disarms what stands on the ground, or changes its mode; a pilot takes what flies."""
     if case.row.place == "ground":
@@ -133,6 +142,7 @@ def somebody_acts(case: Case, vehicle: Simulated) -> list[tuple[float, str]]:
 
     later(case.pilot_at, lambda: _act(case, vehicle))
     later(case.failsafe_at, lambda: _return(vehicle))
+    later(case.state_at, lambda: run_the_battery_down(vehicle))
     return acted
 
 

@@ -21,7 +21,7 @@ from aerokit.mavlink.messages import (
     SetPositionTargetGlobalInt,
     SetPositionTargetLocalNed,
 )
-from aerokit.vehicle.orders.order import CHANGED_BY_COMMAND, QUESTIONS
+from aerokit.vehicle.orders.order import CHANGED_BY_COMMAND, FAILSAFE_STATES, QUESTIONS
 
 KNOWN_S = 2.6
 SETPOINTS = (SetPositionTargetLocalNed, SetPositionTargetGlobalInt, SetAttitudeTarget)
@@ -55,14 +55,19 @@ def _orders(flown: Flown) -> Iterator[Crossing]:
             yield each
 
 
-def _told(flown: Flown, since: int, until: int) -> list[tuple[int, bool]]:
+State = tuple[int, bool, bool]
+"""Mode, armed, and whether a failsafe is active."""
+
+
+def _told(flown: Flown, since: int, until: int) -> list[State]:
     """The states that HEARTBEAT told between these two crossings."""
     return [_state(each) for each in flown.air.heartbeats if since < each.number < until]
 
 
-def _state(heard: Crossing) -> tuple[int, bool]:
-    assert isinstance(heard.message, Heartbeat)
-    return heard.message.custom_mode, is_armed(heard.message.base_mode)
+def _state(heard: Crossing) -> State:
+    beat = heard.message
+    assert isinstance(beat, Heartbeat)
+    return beat.custom_mode, is_armed(beat.base_mode), beat.system_status in FAILSAFE_STATES
 
 
 def _key(message: Message) -> object:
@@ -88,16 +93,24 @@ def _sent_again(flown: Flown) -> Iterator[str]:
         last[key] = each.number
 
 
-def _may_be_told(flown: Flown, message: Message, told: tuple[int, bool]) -> bool:
+def _may_be_told(flown: Flown, message: Message, told: State) -> bool:
     """What was given up may come into force late: it is held again then. PX4 told to stop by DO_REPOSITION may be in
     its mode for holding all the time: that is not the effect.
     """
     if not isinstance(message, CommandLong):
         return False
     if message.command == REPOSITION:
-        return told == (PX4_LOITER, True)
+        return told == (PX4_LOITER, True, False)
     is_hold = message.command == SET_MODE and message.param2 == COPTER_BRAKE
-    return is_hold and flown.case.row.holds and told in {(COPTER_GUIDED, True), (COPTER_AUTO, True)}
+    return (
+        is_hold
+        and flown.case.row.holds
+        and told
+        in {
+            (COPTER_GUIDED, True, False),
+            (COPTER_AUTO, True, False),
+        }
+    )
 
 
 def _sent_blind(flown: Flown) -> Iterator[str]:
@@ -124,17 +137,22 @@ def _taken_back(flown: Flown) -> Iterator[str]:
 
 
 def _taken(flown: Flown) -> Crossing | None:
-    """The HEARTBEAT by which the program could know that somebody else steers."""
+    """The HEARTBEAT by which the program could know that somebody else steers, or that a failsafe is active."""
     own = set(flown.case.row.modes[flown.case.autopilot == "px4"])
     told = flown.air.heartbeats
     assert isinstance(told[0].message, Heartbeat)
     autopilot = autopilot_for(told[0].message)
     allowed: set[str] = set()
+    had_failsafe = False
     for each in told:
         assert isinstance(each.message, Heartbeat)
         name = autopilot.mode_of(each.message).name
+        has_failsafe = each.message.system_status in FAILSAFE_STATES
+        is_new, had_failsafe = has_failsafe and not had_failsafe, has_failsafe
         if each.at < flown.given_at:
             allowed = {name}
+        elif is_new:
+            return each
         elif name in own:
             allowed = set()
         elif name not in allowed:

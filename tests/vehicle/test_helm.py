@@ -11,7 +11,7 @@ import pytest
 
 from aerokit.autopilots import Mode
 from aerokit.errors import CommandRejected, CommandTimeout
-from aerokit.mavlink.enums import MavCmd
+from aerokit.mavlink.enums import MavCmd, MavState
 from aerokit.runtime.cells import Source, StateCell
 from aerokit.vehicle.orders.helm import KNOWN_S, MODE_GRACE_S, Helm
 from aerokit.vehicle.orders.order import CHANGED_BY_COMMAND, QUESTIONS, Order, Sending
@@ -30,15 +30,18 @@ class Stage:
         self.now, self.open = 0.0, ExitStack()
         self.mode = StateCell[Mode]("mode", lambda: self.now, "HEARTBEAT")
         self.armed = StateCell[bool]("armed", lambda: self.now, "HEARTBEAT")
-        self.helm = Helm(
-            lambda: self.now, cast("Telemetry", SimpleNamespace(mode=self.mode, armed=self.armed))
-        )
+        self.state = StateCell[int]("system_status", lambda: self.now, "HEARTBEAT")
+        cells = SimpleNamespace(mode=self.mode, armed=self.armed, system_status=self.state)
+        self.helm = Helm(lambda: self.now, cast("Telemetry", cells))
         if mode is not None and armed is not None:
             self.tell(mode, armed)
 
-    def tell(self, mode: Mode, armed: bool = True, *, after: float = 1.0) -> None:
+    def tell(
+        self, mode: Mode, armed: bool = True, *, after: float = 1.0, state: int = MavState.ACTIVE
+    ) -> None:
         self.now += after
         self.mode.set(mode, HEARTBEAT)
+        self.state.set(state, HEARTBEAT)
         self.armed.set(armed, HEARTBEAT)
 
 
@@ -312,5 +315,42 @@ def test_orders_know_what_moves_and_what_only_asks() -> None:
 
 
 def test_an_order_of_nothing_in_no_mode_stands() -> None:
-    order = Order(0.0, mode_before=None, modes=[], expected=[], armed_before=None, is_newest=lambda _: True)
+    order = Order(
+        0.0,
+        mode_before=None,
+        modes=[],
+        expected=[],
+        armed_before=None,
+        state_before=None,
+        is_newest=lambda _: True,
+    )
     assert order.end == ""
+
+
+# --------------------------------------------------------------------------------- failsafes
+
+
+@pytest.mark.parametrize("state", [MavState.CRITICAL, MavState.EMERGENCY, MavState.FLIGHT_TERMINATION])
+def test_order_failsafe_becomes_active_ends_it_for_good(state: int) -> None:
+    stage = Stage()
+    order = stage.helm.order(GUIDED)
+    with stage.helm.sending(order) as sending, stage.helm.aside() as aside:
+        stage.tell(GUIDED, state=state)
+        assert "failsafe" in order.end
+        assert sending.end == aside.end == order.end
+        assert not order.end_of_effect
+        stage.tell(GUIDED)
+        assert "failsafe" in order.end
+    assert not stage.helm.order(GUIDED).is_given
+
+
+def test_order_given_during_a_failsafe_stands_until_the_next_one() -> None:
+    stage = Stage()
+    stage.tell(LOITER, state=MavState.CRITICAL)
+    order = stage.helm.order(GUIDED)
+    stage.tell(GUIDED, state=MavState.CRITICAL)
+    assert not order.end
+    stage.tell(GUIDED)
+    assert not order.end
+    stage.tell(GUIDED, state=MavState.CRITICAL)
+    assert "failsafe" in order.end

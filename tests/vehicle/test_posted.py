@@ -20,7 +20,7 @@ from aerokit.errors import (
     OperationRejected,
     OperationTimeout,
 )
-from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult
+from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult, MavState
 from aerokit.runtime.cells import Source, StateCell
 from aerokit.vehicle.orders.helm import Helm
 from aerokit.vehicle.orders.order import Subject, subjects_of
@@ -47,13 +47,16 @@ class Stage:
         self.now, self._open = 0.0, ExitStack()
         self.mode = StateCell[Mode]("mode", lambda: self.now, "HEARTBEAT")
         self.armed = StateCell[bool]("armed", lambda: self.now, "HEARTBEAT")
-        told = cast("Telemetry", SimpleNamespace(mode=self.mode, armed=self.armed))
+        self.state = StateCell[int]("system_status", lambda: self.now, "HEARTBEAT")
+        cells = SimpleNamespace(mode=self.mode, armed=self.armed, system_status=self.state)
+        told = cast("Telemetry", cells)
         self.helm = Helm(lambda: self.now, told)
         self.tell(mode, armed)
 
-    def tell(self, mode: Mode, armed: bool = False) -> None:
+    def tell(self, mode: Mode, armed: bool = False, state: int = MavState.ACTIVE) -> None:
         self.now += 1.0
         self.mode.set(mode, HEARTBEAT)
+        self.state.set(state, HEARTBEAT)
         self.armed.set(armed, HEARTBEAT)
 
     def post(self, *subjects: Subject, mode: Mode | None = None, armed: bool | None = None) -> Posted:
@@ -62,6 +65,18 @@ class Stage:
 
 
 # ------------------------------------------------------------------------------------------ the rules
+
+
+def test_posted_order_failsafe_becomes_active_ends_it() -> None:
+    stage = Stage(armed=True)
+    mode, arm = stage.post("mode", mode=GUIDED), stage.post("arm", armed=True)
+    stage.tell(STABILIZE, armed=True, state=MavState.CRITICAL)
+    assert "failsafe" in mode.end
+    assert "failsafe" in arm.end
+    disarm = stage.post("arm", armed=False)
+    stage.tell(STABILIZE, armed=True)
+    stage.tell(STABILIZE, armed=True, state=MavState.CRITICAL)
+    assert not disarm.end
 
 
 def test_an_effect_is_a_change_to_it() -> None:

@@ -2798,14 +2798,14 @@ class Vehicle(VehicleTwin):
         return StateCell(self._loop, self.aio.mode)
 
     @cached_property
-    def armed(self) -> StateCell[bool]:
-        """Whether the motors are armed, by HEARTBEAT."""
-        return StateCell(self._loop, self.aio.armed)
-
-    @cached_property
     def system_status(self) -> StateCell[int]:
         """MAV_STATE by HEARTBEAT: 3 standby, 4 active, 5 critical, 6 emergency."""
         return StateCell(self._loop, self.aio.system_status)
+
+    @cached_property
+    def armed(self) -> StateCell[bool]:
+        """Whether the motors are armed, by HEARTBEAT."""
+        return StateCell(self._loop, self.aio.armed)
 
     @cached_property
     def vtol_state(self) -> StateCell[int]:
@@ -3245,7 +3245,8 @@ class Vehicle(VehicleTwin):
     def taken_over(self) -> str:
         """What somebody else has made of the program's last action, as a clause; empty: nothing that was told.
 
-        "the mode changed to LOITER": by a pilot, a failsafe or another program, which HEARTBEAT does not tell apart.
+        "the mode changed to LOITER": by a pilot, a failsafe or another program, which HEARTBEAT does not tell apart; or
+        "a failsafe became active (MAV_STATE_CRITICAL)", which may come some seconds before the mode changes.
         A vehicle that only disarmed, as after a landing, was not taken over. The program's next action begins anew.
         """
         return self.aio.taken_over

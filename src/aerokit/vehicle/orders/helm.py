@@ -57,6 +57,7 @@ class Helm:
         self._modes_ordered: deque[tuple[float, int]] = deque(maxlen=16)
         self._on_new: list[Callable[[], None]] = []
         telemetry.mode.observe(self._on_mode, every_arrival=True)
+        telemetry.system_status.observe(self._on_state, every_arrival=True)
         telemetry.armed.observe(self._on_armed, every_arrival=True)
 
     # ------------------------------------------------------------------------------- orders
@@ -159,6 +160,7 @@ class Helm:
             armed=armed,
             mode_now=self._telemetry.mode.latest,
             armed_now=self._telemetry.armed.latest,
+            state_now=self._telemetry.system_status.latest,
             moves=subjects[0] == "motion",
         )
         self._posted.append(posted)
@@ -232,6 +234,7 @@ class Helm:
             modes=modes,
             expected=(*expected, *self._posted_modes()),
             armed_before=self._telemetry.armed.latest,
+            state_before=self._telemetry.system_status.latest,
             is_newest=is_newest,
             settles_at=self.mode_settles_at,
             any_until=self._any_mode_until,
@@ -244,11 +247,21 @@ class Helm:
     def _steers(self) -> bool:
         """Whether the vehicle is in a mode of the newest order, and nobody has taken it from that."""
         order, mode = self.newest, self._telemetry.mode.latest
-        return order is not None and mode is not None and order.is_own(mode) and not order.taken_by
+        return (
+            order is not None
+            and mode is not None
+            and order.is_own(mode)
+            and not order.taken_by
+            and not order.failsafe
+        )
 
     def _on_mode(self, _: Mode | None, mode: Mode) -> None:
         for each in self._followers():
             each.note_mode(mode, self._telemetry.mode.updated_at)
+
+    def _on_state(self, _: int | None, state: int) -> None:
+        for each in self._followers():
+            each.note_state(state)
 
     def _on_armed(self, before: bool | None, armed: bool) -> None:
         if before and not armed:

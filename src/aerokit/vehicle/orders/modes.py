@@ -55,12 +55,13 @@ class ModeActions(Part):
     def taken_over(self) -> str:
         """What somebody else has made of the program's last action, as a clause; empty: nothing that was told.
 
-        "the mode changed to LOITER": by a pilot, a failsafe or another program, which HEARTBEAT does not tell apart.
+        "the mode changed to LOITER": by a pilot, a failsafe or another program, which HEARTBEAT does not tell apart; or
+        "a failsafe became active (MAV_STATE_CRITICAL)", which may come some seconds before the mode changes.
         A vehicle that only disarmed, as after a landing, was not taken over. The program's next action begins anew.
         """
         order = self._helm.newest
         if order is None or not order.has_lost_mode:
-            return ""
+            return "" if order is None else order.failsafe
         may_have_landed = self.telemetry.landed_state.latest != MavLandedState.IN_AIR
         if may_have_landed and self.telemetry.armed.updated_at < order.mode_lost_at:
             return (

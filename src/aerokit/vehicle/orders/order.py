@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any, Literal
 
-from aerokit.mavlink.enums import MavCmd
+from aerokit.mavlink.enums import MavCmd, MavState
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "CHANGED_BY_COMMAND",
+    "FAILSAFE_STATES",
     "QUESTIONS",
     "Order",
     "Sending",
@@ -58,6 +59,9 @@ CHANGED_BY_MESSAGE: Mapping[str, tuple[Subject, ...]] = {
     "SET_POSITION_TARGET_GLOBAL_INT": _MOTION,
     "MISSION_SET_CURRENT": _MOTION,
 }
+FAILSAFE_STATES = (MavState.CRITICAL, MavState.EMERGENCY, MavState.FLIGHT_TERMINATION)
+"""HEARTBEAT.system_status while a failsafe is active. PX4 tells it seconds before the failsafe changes the mode
+(COM_FAIL_ACT_T), and an order that arrives in that time cancels the failsafe."""
 GUIDED_ITEM = (2, 3)
 """MISSION_ITEM.current of one that is flown to at once."""
 QUESTIONS = frozenset(
@@ -88,6 +92,11 @@ def subjects_of(message: Message) -> tuple[Subject, ...]:
     return CHANGED_BY_MESSAGE.get(message.NAME, ())
 
 
+def failsafe_text(state: int) -> str:
+    """A clause for error texts."""
+    return f"a failsafe became active (MAV_STATE_{MavState(state).name})"
+
+
 class Order:
     """One order of the program, from when it is given until it is done, overruled or taken over.
 
@@ -105,6 +114,7 @@ class Order:
         modes: Collection[Mode],
         expected: Collection[Mode],
         armed_before: bool | None,
+        state_before: int | None,
         is_newest: Callable[[Order], bool],
         settles_at: float = -math.inf,
         any_until: float = -math.inf,
@@ -113,6 +123,8 @@ class Order:
         self.modes: tuple[Mode, ...] = tuple(modes)
         self.taken_by: str = ""
         """What somebody else has done, as a clause; empty: nothing that was told."""
+        self.failsafe: str = ""
+        """Which failsafe has become active since, as a clause; empty: none."""
         self.has_lost_mode: bool = False
         """Whether that was another mode."""
         self.mode_lost_at: float = -math.inf
@@ -125,6 +137,7 @@ class Order:
         self._own = {each.custom_mode for each in modes}
         self._is_mode_known = mode_before is not None
         self._was_armed = armed_before
+        self._had_failsafe = state_before in FAILSAFE_STATES
         self._is_newest = is_newest
         self._settles_at, self._any_until = settles_at, any_until
         self.is_overruled: bool = False
@@ -132,7 +145,15 @@ class Order:
 
     @property
     def end(self) -> str:
-        """Why it has nothing to say any more, as a clause; empty while it has."""
+        """Why nothing of it may be sent any more, as a clause; empty while it may."""
+        return self.taken_by or self.failsafe or self.end_of_effect
+
+    @property
+    def end_of_effect(self) -> str:
+        """Why the vehicle no longer does what was ordered, as a clause; empty while it may.
+
+        A failsafe alone is no reason: a vehicle that was told to land goes on landing.
+        """
         is_over = self.is_overruled or not self._is_newest(self)
         return self.taken_by or ("another order was given" if is_over else "")
 
@@ -156,6 +177,13 @@ class Order:
             self.has_lost_mode = True
             self.taken_by = self.taken_by or f"the mode changed to {mode}"
         self._is_mode_known = True
+
+    def note_state(self, state: int) -> None:
+        """Take MAV_STATE. A failsafe that was active when the order was given does not end it: the program knew it."""
+        is_active = state in FAILSAFE_STATES
+        if is_active and not self._had_failsafe:
+            self.failsafe = self.failsafe or failsafe_text(state)
+        self._had_failsafe = is_active
 
     def note_armed(self, armed: bool, at: float) -> None:
         """The vehicle tells whether it is armed."""
@@ -212,6 +240,9 @@ class Sending:
         """Another command is given: one to disarm ends one to arm, and the other way round."""
         if armed is not None and self._arms is not None and armed is not self._arms:
             self._is_overruled = True
+
+    def note_state(self, state: int) -> None:
+        """Take MAV_STATE, which is the order's to judge."""
 
     def note_mode(self, mode: Mode, at: float) -> None:
         """The vehicle tells its mode."""

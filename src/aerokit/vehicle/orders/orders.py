@@ -69,7 +69,7 @@ class Orders:
 
     def _unanswered(self, error: CommandTimeout, order: Order) -> Exception:
         """Who has taken the vehicle is the better answer; an order that cannot be taken back may still arrive."""
-        if order.taken_by:
+        if order.taken_by or order.failsafe:
             return OperationRejected(str(error), reasons=self._talk.texts_since(order.given_at))
         return error
 
@@ -145,15 +145,18 @@ class Orders:
             raise NotSupported(f"{action}: {self._talk.autopilot.firmware} has no mode for it")
         return mode
 
-    def stays_in(self, order: Order, *modes: Mode) -> Callable[[], str | None]:
-        """What can go wrong on the way: another order, it disarms, or its mode becomes another one than these."""
+    def stays_in(self, order: Order, *modes: Mode, ends_flight: bool = False) -> Callable[[], str | None]:
+        """What can go wrong on the way: another order, it disarms, or its mode becomes another one than these.
+
+        A failsafe goes wrong, too, unless the order ``ends_flight``: what lands or returns goes on under a failsafe.
+        """
         grace_until, settles_at = self._talk.connection.now() + MODE_GRACE_S, self._helm.mode_settles_at
         arrived = False
 
         def trouble() -> str | None:
             nonlocal arrived
-            if order.end:
-                return order.end
+            if end := order.end_of_effect if ends_flight else order.end:
+                return end
             if self._talk.telemetry.is_surely_disarmed:
                 return "the vehicle disarmed"
             if self._talk.connection.now() < settles_at:

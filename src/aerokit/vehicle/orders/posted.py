@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+from aerokit.vehicle.orders.order import FAILSAFE_STATES, failsafe_text
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
 
@@ -33,6 +35,7 @@ class Posted:
         armed: bool | None,
         mode_now: Mode | None,
         armed_now: bool | None,
+        state_now: int | None = None,
         moves: bool = False,
     ) -> None:
         self.has_worked: bool = False
@@ -47,6 +50,7 @@ class Posted:
         self._own_modes, self._moves = set(own_modes), moves
         self._mode_before = None if mode_now is None else mode_now.custom_mode
         self._armed_before = armed_now
+        self._had_failsafe = state_now in FAILSAFE_STATES
 
     @property
     def end(self) -> str:
@@ -57,6 +61,13 @@ class Posted:
     def lost(self) -> str:
         """Why nothing of it may be sent any more, as a clause: another order or somebody else has the vehicle."""
         return self._taken_by if self._is_newest() else "a newer order was given meanwhile"
+
+    def note_state(self, state: int) -> None:
+        """Take MAV_STATE. To disarm is meant whatever failsafe is active."""
+        is_active = state in FAILSAFE_STATES
+        if is_active and not self._had_failsafe and self.armed is not False:
+            self._taken_by = self._taken_by or failsafe_text(state)
+        self._had_failsafe = is_active
 
     def note_mode(self, mode: Mode, at: float) -> None:
         """The vehicle tells its mode."""

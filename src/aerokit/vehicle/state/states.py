@@ -52,11 +52,12 @@ class States:
     )
     """Flight mode by HEARTBEAT; ``vehicle.mode.value.name`` is its name."""
 
-    armed: Told[bool] = Told(By("Heartbeat", condition.armed), at_once=True)
-    """Whether the motors are armed, by HEARTBEAT."""
-
     system_status: Told[int] = Told(By("Heartbeat", condition.system_status), at_once=True)
     """MAV_STATE by HEARTBEAT: 3 standby, 4 active, 5 critical, 6 emergency."""
+
+    # After mode and system_status: whoever observes it has the whole HEARTBEAT.
+    armed: Told[bool] = Told(By("Heartbeat", condition.armed), at_once=True)
+    """Whether the motors are armed, by HEARTBEAT."""
 
     vtol_state: Told[int] = Told(By("ExtendedSysState", condition.vtol_state, hz=5.0), at_once=True)
     """MAV_VTOL_STATE: 1 to fixed wing, 2 to multicopter, 3 multicopter, 4 fixed wing (EXTENDED_SYS_STATE)."""
