@@ -111,7 +111,7 @@ async def test_what_it_does_not_know_is_refused(choice: Choice) -> None:
             with pytest.raises(CommandRejected):
                 await vehicle.command(command, UNKNOWN_MESSAGE, 100_000)
         with pytest.raises(CommandTimeout):
-            await vehicle.command(REQUEST_MESSAGE, 148, component_id=77, attempts=1)
+            await vehicle.command(REQUEST_MESSAGE, 148, component_id=77, retries=0)
         if choice.kind.takes_off:
             with pytest.raises(OperationRejected):
                 await vehicle.take_off(choice.kind.altitude_m)

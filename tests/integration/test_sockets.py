@@ -106,7 +106,7 @@ async def test_a_server_that_goes_is_told_at_once() -> None:
         address = simulator.addresses[0].replace("tcpin", "tcp")
         with anyio.fail_after(20), pytest.raises(LinkLost, match=r"other side closed|reset by peer"):
             async with connect(address) as vehicle:
-                pending = asyncio.ensure_future(vehicle.command(31_000, attempts=50))
+                pending = asyncio.ensure_future(vehicle.command(31_000, retries=49))
                 await asyncio.sleep(0)
                 await stack.aclose()
                 await pending

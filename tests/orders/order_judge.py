@@ -21,6 +21,7 @@ from aerokit.mavlink.messages import (
     SetPositionTargetGlobalInt,
     SetPositionTargetLocalNed,
 )
+from aerokit.vehicle.orders.late_arming import FIRST_HEARTBEAT_S
 from aerokit.vehicle.orders.order import CHANGED_BY_COMMAND, FAILSAFE_STATES, QUESTIONS
 
 KNOWN_S = 2.6
@@ -177,8 +178,13 @@ def _untrue(flown: Flown) -> Iterator[str]:
 
 
 def _armed_late(flown: Flown) -> Iterator[str]:
-    """An order to arm that was given up leaves nothing armed."""
-    if flown.case.row.name == "arm" and flown.error is not None and flown.is_armed_at_end:
+    """An order to arm that was given up leaves nothing armed that is known to have been armed by it."""
+    if flown.case.row.name != "arm" or flown.error is None or not flown.is_armed_at_end:
+        return
+    weather, until = flown.case.weather, flown.given_at + FIRST_HEARTBEAT_S
+    is_answered = not weather.lost_acks and weather.outage is None and not (flown.case.two or flown.case.hub)
+    is_told = any(_state(each)[1] for each in flown.air.heartbeats if flown.given_at < each.at <= until)
+    if is_answered or (is_told and not flown.acted):
         yield f"arm ended with {flown.error!r} and the vehicle is armed"
 
 

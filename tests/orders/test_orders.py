@@ -18,6 +18,8 @@ from order_judge import faults
 from order_table import ARM, REPOSITION, ROWS, SET_MODE, Row
 
 from aerokit.errors import AerokitError, CommandTimeout, OperationRejected
+from aerokit.mavlink.enums import MavCmd
+from aerokit.protocols.repeatable import SENT_ONCE
 
 SEEDS = int(os.environ.get("AEROKIT_ORDER_SEEDS", "2"))
 BY_NAME = {row.name: row for row in ROWS}
@@ -180,3 +182,10 @@ def test_a_reboot_is_not_sent_again_over_the_next_link() -> None:
     flown = fly(Case(row, "ardupilot", Weather(), two=TwoLinks(Silence(0.0))))
     assert isinstance(flown.error, AerokitError)
     assert sent(flown, row.command) == 1
+
+
+def test_each_command_that_is_sent_once_stands_in_the_documentation() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "reliability.md").read_text()
+    for command, (what, where) in SENT_ONCE.items():
+        condition = "" if where is None else f" (param{where[0] + 1} = {where[1]:g})"
+        assert f"| {MavCmd(command).name}{condition} | {what} |" in text

@@ -19,6 +19,7 @@ from aerokit.protocols.command import (
     command_name,
     result_name,
 )
+from aerokit.protocols.repeatable import ATTEMPTS, SENT_ONCE, attempts_of
 
 ARM = MavCmd.COMPONENT_ARM_DISARM
 ACCEPTED, DENIED, IN_PROGRESS = 0, 2, 5
@@ -31,8 +32,10 @@ class Told:
         self.end, self.told_at = end, told_at
 
 
-def order(standing: Told | None = None, *, component: int = 1, **options: Any) -> CommandExchange:
-    message = command_long(1, component, ARM, (1.0,))
+def order(
+    standing: Told | None = None, *, component: int = 1, arm: float = 0.0, **options: Any
+) -> CommandExchange:
+    message = command_long(1, component, ARM, (arm,))
     machine = CommandExchange(message, own_system=255, own_component=190, standing=standing, **options)
     machine.start(0.0)
     return machine
@@ -95,18 +98,47 @@ def test_into_a_silence_it_is_sent_once_and_ends_in_its_time() -> None:
     assert "sent once within 3.0 s; not sent again: the vehicle has not told since" in text_of(machine)
 
 
-def test_after_the_last_sending_it_is_waited_for_to_the_end_of_its_time() -> None:
+def test_last_sending_is_waited_for_while_the_order_stands() -> None:
     standing = Told(told_at=0.75)
     machine = order(standing, attempts=2)
     machine.expire(0.75)
     assert confirmations(machine) == [0, 1]
-    assert machine.deadline == 1.75
-    standing.told_at, standing.end = 1.75, "the pilot took over"
+    assert machine.deadline == 1.5
+    standing.told_at = 1.75
     machine.expire(1.75)
     assert not machine.done
-    machine.expire(2.0)
+    standing.end = "the pilot took over"
+    machine.expire(1.8)
     assert confirmations(machine) == []
-    assert text_of(machine).endswith("sent 2 times within 2.0 s")
+    assert text_of(machine).endswith("sent 2 times within 1.8 s; not sent again: the pilot took over")
+
+
+@pytest.mark.parametrize("command", SENT_ONCE)
+def test_order_that_would_be_done_twice_is_sent_once(command: int) -> None:
+    what, where = SENT_ONCE[command]
+    params = [0.0] * 7 if where is None else [1.0 - where[1]] * 7
+    if where is not None:
+        assert attempts_of(command, params) == ATTEMPTS
+        params[where[0]] = where[1]
+    standing, now = Told(), 0.0
+    message = command_long(1, 1, command, tuple(params))
+    machine = CommandExchange(message, own_system=255, own_component=190, standing=standing)
+    machine.start(now)
+    while not machine.done:
+        assert machine.deadline is not None
+        now = standing.told_at = machine.deadline
+        machine.expire(now)
+    assert now == 4.0
+    assert confirmations(machine) == [0]
+    assert text_of(machine).endswith(f"within 4.0 s; never sent again: a second one {what}")
+
+
+def test_order_sent_once_ends_as_soon_as_its_effect_was_told() -> None:
+    standing = Told()
+    machine = order(standing, arm=1.0)
+    standing.end = "its effect was told"
+    machine.expire(1.0)
+    assert machine.done
 
 
 def test_what_was_sent_already_is_not_sent_by_the_start() -> None:

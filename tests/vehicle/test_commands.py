@@ -20,7 +20,7 @@ from aerokit.errors import (
     OperationRejected,
     OperationTimeout,
 )
-from aerokit.mavlink.enums import MavCmd, MavResult
+from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult
 from aerokit.runtime.events import VehicleRebooted
 from aerokit.sim import BootTimeline, ExtraComponent, SimulatedCopter
 
@@ -87,8 +87,8 @@ async def test_nonsense_is_not_sent(grounded: Flight) -> None:
         await vehicle.command(BANNER, 0, math.inf)
     with pytest.raises(LocalProtocolError, match="x = "):
         await vehicle.command_int(MavCmd.DO_REPOSITION, frame=6, x=2**31)
-    with pytest.raises(LocalProtocolError, match="attempts"):
-        await vehicle.command(BANNER, attempts=0)
+    with pytest.raises(LocalProtocolError, match="retries"):
+        await vehicle.command(BANNER, retries=-1)
     assert not grounded.wire.commands(BANNER)
     assert not grounded.wire.commands(MavCmd.DO_REPOSITION)
 
@@ -99,7 +99,7 @@ async def test_nonsense_is_not_sent(grounded: Flight) -> None:
 async def test_retries_count_their_confirmation(grounded: Flight) -> None:
     grounded.copter.faults.ignore(BANNER, times=2)
     started = now()
-    await grounded.vehicle.command(BANNER)
+    await grounded.vehicle.command(BANNER, retries=3)
     assert [each.confirmation for each in grounded.wire.commands(BANNER)] == [0, 1, 2]  # type: ignore[union-attr]
     assert 1.5 <= now() - started <= 3.1  # each time right after a heartbeat
 
@@ -115,7 +115,7 @@ async def test_no_answer_at_all_says_what_was_seen_meanwhile(grounded: Flight) -
     grounded.copter.faults.ignore(BANNER)
     started = now()
     with pytest.raises(CommandTimeout) as caught:
-        await while_it_talks(grounded, grounded.vehicle.command(BANNER, attempts=3, attempt_timeout=1.0))
+        await while_it_talks(grounded, grounded.vehicle.command(BANNER, retries=2, attempt_timeout=1.0))
     assert now() - started == pytest.approx(3.0, abs=0.6)
     text = str(caught.value)
     assert "no COMMAND_ACK for MAV_CMD_DO_SEND_BANNER, sent 3 times within" in text
@@ -198,7 +198,7 @@ async def test_the_same_command_to_two_components_does_not_mix_its_answers() -> 
             tasks.start_soon(ask_the_autopilot)
             with pytest.raises(CommandTimeout):
                 await vehicle.command(
-                    MavCmd.REQUEST_MESSAGE, m.CameraInformation.ID, component_id=100, attempts=2
+                    MavCmd.REQUEST_MESSAGE, m.CameraInformation.ID, component_id=100, retries=1
                 )
 
 
@@ -340,3 +340,51 @@ async def test_the_link_goes_down_with_the_vehicle(grounded: Flight) -> None:
         tasks.start_soon(unplug)
         with pytest.raises(LinkLost):
             await grounded.vehicle.reboot()
+
+
+# ----------------------------------------------------------------------------- raw commands
+
+
+@pytest.mark.parametrize("is_int", [False, True])
+async def test_raw_command_answer_is_lost_is_sent_once(grounded: Flight, is_int: bool) -> None:
+    vehicle, command = grounded.vehicle, MavCmd.DO_GRIPPER
+    grounded.copter.faults.lose_ack(command)
+    with pytest.raises(CommandTimeout, match=r"sent once within 4\.0 s"):
+        await (vehicle.command_int(command, 1, frame=0) if is_int else vehicle.command(command, 1))
+    assert len(grounded.wire.commands(command)) == 1
+
+
+async def test_raw_question_answer_is_lost_is_asked_again(grounded: Flight) -> None:
+    grounded.copter.faults.ignore(MavCmd.REQUEST_MESSAGE, times=3)
+    grounded.wire.forget()
+    await grounded.vehicle.command(MavCmd.REQUEST_MESSAGE, m.HomePosition.ID)
+    assert len(grounded.wire.commands(MavCmd.REQUEST_MESSAGE)) == 4
+
+
+@pytest.mark.parametrize(
+    ("command", "params", "mode"),
+    [
+        (MavCmd.NAV_RETURN_TO_LAUNCH, (), "RTL"),
+        (MavCmd.NAV_LAND, (), "LAND"),
+        (MavCmd.NAV_LOITER_UNLIM, (), "LOITER"),
+        (MavCmd.DO_SET_MODE, (1, CopterMode.ALT_HOLD), "ALT_HOLD"),
+    ],
+)
+async def test_raw_command_own_mode_is_nobody_elses(
+    flying: Flight, command: int, params: tuple[float, ...], mode: str
+) -> None:
+    await flying.vehicle.command(command, *params)
+    await flying.vehicle.mode.wait_until(lambda told: told.name == mode, timeout=3)
+    await anyio.sleep(5.0)
+    assert flying.vehicle.taken_over == ""
+    flying.pilot_takes_over(CopterMode.STABILIZE)
+    await anyio.sleep(1.5)
+    assert "STABILIZE" in flying.vehicle.taken_over
+
+
+async def test_pilots_mode_after_a_raw_command_is_told_at_once(flying: Flight) -> None:
+    await flying.vehicle.command(MavCmd.NAV_RETURN_TO_LAUNCH)
+    await flying.vehicle.mode.wait_until(lambda told: told.name == "RTL", timeout=3)
+    flying.pilot_takes_over(CopterMode.STABILIZE)
+    await anyio.sleep(1.2)
+    assert "STABILIZE" in flying.vehicle.taken_over

@@ -40,9 +40,19 @@ async def test_a_lost_answer_is_made_up_for_by_what_is_told(grounded: Flight) ->
     assert len(grounded.wire.commands(ARM)) == 1  # HEARTBEAT has told that it was heard
 
 
-async def test_a_lost_order_is_given_again(grounded: Flight) -> None:
+async def test_arm_order_is_lost_ends_and_is_not_repeated(grounded: Flight) -> None:
     grounded.copter.faults.ignore(ARM, times=1)
+    with pytest.raises(CommandTimeout, match=r"never sent again: a second one arms a vehicle that a pilot"):
+        await grounded.vehicle.arm()
+    assert len(grounded.wire.commands(ARM)) == 1
+    await grounded.vehicle.arm()  # the program decides
+
+
+async def test_disarm_order_is_lost_is_repeated(grounded: Flight) -> None:
     await grounded.vehicle.arm()
+    grounded.wire.forget()
+    grounded.copter.faults.ignore(ARM, times=1)
+    await grounded.vehicle.disarm()
     first, second = grounded.wire.commands(ARM)
     assert (first.confirmation, second.confirmation) == (0, 1)  # type: ignore[union-attr]
 
@@ -107,7 +117,7 @@ async def test_a_silent_vehicle_is_a_timeout(grounded: Flight) -> None:
     grounded.copter.faults.silent = True
     with pytest.raises(
         CommandTimeout,
-        match=r"COMPONENT_ARM_DISARM, sent once within 4\.0 s; not sent again: .*; last heartbeat 4",
+        match=r"COMPONENT_ARM_DISARM, sent once within 4\.0 s; never sent again: .*; last heartbeat 4",
     ):
         await grounded.vehicle.arm()
 

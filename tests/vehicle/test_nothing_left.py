@@ -113,7 +113,7 @@ ACTIONS: list[Action] = [
     lambda flight: flight.vehicle.return_to_launch(timeout=20.0),
     lambda flight: flight.vehicle.why_not_armable(),
     lambda flight: flight.vehicle.reboot(timeout=10.0),
-    lambda flight: flight.vehicle.command(31_000, attempts=2),
+    lambda flight: flight.vehicle.command(31_000, retries=1),
     fly_by_velocity,
     fly_until_the_stream_stops,
     read_attitudes,

@@ -317,7 +317,7 @@ async def test_an_ack_of_another_system_is_not_taken() -> None:
 
                 tasks.start_soon(answer)
                 with pytest.raises(CommandTimeout):
-                    await vehicle.command(MavCmd.DO_SEND_BANNER, attempts=2)
+                    await vehicle.command(MavCmd.DO_SEND_BANNER, retries=1)
 
 
 async def test_each_autopilot_is_told_of_once_whether_it_is_connected_to_or_not() -> None:

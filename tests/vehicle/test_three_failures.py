@@ -175,7 +175,7 @@ PROGRAM = """
             print("connected", flush=True)
             for call in (
                 lambda: asyncio.wait_for(vehicle.arm(), 0.2),
-                lambda: vehicle.command(31000, attempts=1, attempt_timeout=0.2),
+                lambda: vehicle.command(31000, retries=0, attempt_timeout=0.2),
                 lambda: vehicle.position.wait_until(lambda _: True, timeout=0.2),
             ):
                 try:

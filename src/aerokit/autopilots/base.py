@@ -17,10 +17,12 @@ from aerokit.autopilots.health import (
 from aerokit.autopilots.modes import CUSTOM_MODE_ENABLED, NO_MODES, Mode, ModeTable, base_mode_name
 from aerokit.autopilots.version import AutopilotVersion, version_text
 from aerokit.mavlink import messages
-from aerokit.mavlink.enums import MavProtocolCapability
+from aerokit.mavlink.enums import MavCmd, MavProtocolCapability
 from aerokit.snapshot import Snapshot
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from aerokit.mavlink.message import Message
 
 __all__ = ["Autopilot", "GimbalRules", "ModeOrder", "Purpose", "Reposition", "SetpointRules", "TakeOff"]
@@ -31,6 +33,27 @@ _C_CAST = MavProtocolCapability.PARAM_ENCODE_C_CAST.value
 
 Purpose = Literal["hold", "land", "return", "setpoint", "take_off", "mission"]
 """What a program wants a mode for."""
+
+
+PURPOSES_OF_COMMANDS: Mapping[int, tuple[Purpose, ...]] = {
+    MavCmd.NAV_RETURN_TO_LAUNCH: ("return",),
+    MavCmd.NAV_LAND: ("land",),
+    MavCmd.NAV_VTOL_LAND: ("land",),
+    MavCmd.NAV_TAKEOFF: ("take_off", "hold", "setpoint"),
+    MavCmd.NAV_VTOL_TAKEOFF: ("take_off", "hold", "setpoint"),
+    MavCmd.MISSION_START: ("mission",),
+    MavCmd.DO_REPOSITION: ("setpoint", "hold"),
+    MavCmd.NAV_LOITER_UNLIM: ("hold",),
+    MavCmd.DO_PAUSE_CONTINUE: ("hold", "mission"),
+    MavCmd.OVERRIDE_GOTO: ("hold", "mission"),
+    MavCmd.DO_ORBIT: ("setpoint", "hold"),
+}
+"""MAV_CMD → what the modes are for that it brings about; an autopilot may take several for one."""
+NAMES_OF_COMMANDS: Mapping[int, tuple[str, ...]] = {
+    MavCmd.NAV_LOITER_UNLIM: ("LOITER",),
+    MavCmd.DO_ORBIT: ("ORBIT", "CIRCLE"),
+}
+"""MAV_CMD → names of further ones, where an autopilot has such a mode."""
 
 
 class TakeOff(Snapshot):
@@ -109,6 +132,11 @@ class ModeOrder(Snapshot):
     def legacy(self, target_system: int) -> messages.SetMode:
         """The same order as a SET_MODE message, which has no acknowledgement of its own."""
         return messages.SetMode(target_system, self.base_mode, self.custom_mode)
+
+
+def whole_numbers(params: Sequence[float]) -> list[int]:
+    """Parameters of a command that are numbers of modes; what is no number counts as 0."""
+    return [int(each) if math.isfinite(each) else 0 for each in params]
 
 
 class Autopilot:
@@ -238,6 +266,22 @@ class Autopilot:
     def mode_order(self, mode: Mode) -> ModeOrder:
         """How to ask for a mode."""
         return ModeOrder((CUSTOM_MODE_ENABLED, mode.custom_mode, 0), CUSTOM_MODE_ENABLED, mode.custom_mode)
+
+    def modes_of_command(
+        self, command: int, params: Sequence[float], extra: Mapping[int, str] = NO_MODES
+    ) -> tuple[Mode, ...]:
+        """The modes that a MAV_CMD may bring about when a program sends it; empty: not known, or none."""
+        if command == MavCmd.DO_SET_MODE:
+            return self._modes_of_order(params, extra)
+        purposes = PURPOSES_OF_COMMANDS.get(command, ())
+        names = {self._purpose_name(each, is_vtol) for each in purposes for is_vtol in (False, True)}
+        names |= {each for each in NAMES_OF_COMMANDS.get(command, ()) if each in self.modes.names}
+        return tuple(self.modes.find(name) for name in sorted(filter(None, names)))
+
+    def _modes_of_order(self, params: Sequence[float], extra: Mapping[int, str]) -> tuple[Mode, ...]:
+        """The mode of the parameters of DO_SET_MODE."""
+        base, custom = whole_numbers((*params, 0.0, 0.0)[:2])
+        return (self.mode(custom, base, extra),) if base & CUSTOM_MODE_ENABLED else ()
 
     def mode_to_arm_in(self) -> Mode | None:
         """Where to arm a vehicle that stands in a mode in which it does not arm; None: not known."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
 from aerokit.autopilots.base import (
@@ -14,6 +14,7 @@ from aerokit.autopilots.base import (
     Reposition,
     SetpointRules,
     TakeOff,
+    whole_numbers,
 )
 from aerokit.autopilots.health import ATTITUDE_AND_HEIGHT, POS_HORIZ_ABS, PREARM_CHECK, SENSORS, names_of
 from aerokit.autopilots.modes import CUSTOM_MODE_ENABLED, NO_MODES, Mode, ModeTable
@@ -150,6 +151,12 @@ class Px4(Autopilot):
         """DO_SET_MODE takes main and sub mode in param2 and param3."""
         main, sub = mode.custom_mode >> 16 & 0xFF, mode.custom_mode >> 24
         return ModeOrder((CUSTOM_MODE_ENABLED, main, sub), CUSTOM_MODE_ENABLED, mode.custom_mode)
+
+    def _modes_of_order(self, params: Sequence[float], extra: Mapping[int, str]) -> tuple[Mode, ...]:
+        base, main, sub = whole_numbers((*params, 0.0, 0.0, 0.0)[:3])
+        if not base & CUSTOM_MODE_ENABLED:
+            return ()
+        return (self.mode((main & 0xFF) << 16 | (sub & 0xFF) << 24, CUSTOM_MODE_ENABLED, extra),)
 
     def learn_mode_name(self, custom_mode: int, name: str) -> str | None:
         """Names of external modes; places without a registered mode say "(Mode not available)"."""

@@ -9,6 +9,7 @@ from aerokit.errors import CommandRejected, CommandTimeout, LocalProtocolError
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.mavlink.messages import CommandAck, CommandInt, CommandLong
 from aerokit.protocols.exchange import Exchange
+from aerokit.protocols.repeatable import ATTEMPTS, SENT_ONCE, attempts_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -27,6 +28,7 @@ __all__ = [
 
 BROADCAST = 0
 FLOAT32_MAX = 3.4028234663852886e38
+ATTEMPT_TIMEOUT_S = 1.0
 LOOK_S = 0.05
 """So often it is looked whether the vehicle has told what it does, once an order may be sent again."""
 SOONEST = 0.75
@@ -108,7 +110,8 @@ class CommandExchange(Exchange[CommandAck]):
 
     A question (no ``standing``) is sent again every ``attempt_timeout`` seconds. An order is sent again only right
     after the vehicle has told what it does, and only if that speaks neither of the order's effect nor of somebody
-    else's: so never into a silence.
+    else's: so never into a silence. ``attempts`` None: four, or one for an order that would be carried out twice
+    (``repeatable.SENT_ONCE``); ``attempt_timeout`` None: one second, or four for an order that is sent once.
 
     ``is_sent``: it has been sent once, just before :meth:`start`.
 
@@ -129,15 +132,22 @@ class CommandExchange(Exchange[CommandAck]):
         *,
         own_system: int,
         own_component: int,
-        attempts: int = 4,
-        attempt_timeout: float = 1.0,
+        attempts: int | None = None,
+        attempt_timeout: float | None = None,
         progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
         answers_before_ours: int = 0,
+        answers_within_s: float = 0.0,
         standing: Standing | None = None,
         is_sent: bool = False,
     ) -> None:
         super().__init__()
+        if attempts is None:
+            attempts = ATTEMPTS if standing is None else attempts_of(message.command, _params_of(message))
+        if attempt_timeout is None:
+            is_order_once = standing is not None and attempts == 1
+            attempt_timeout = ATTEMPT_TIMEOUT_S * (ATTEMPTS if is_order_once else 1)
+        attempt_timeout = max(attempt_timeout, answers_within_s) if attempt_timeout > 0 else attempt_timeout
         if attempts < 1:
             raise LocalProtocolError(f"attempts = {attempts} is not allowed: at least 1")
         for name, seconds in (("attempt_timeout", attempt_timeout), ("progress_timeout", progress_timeout)):
@@ -197,19 +207,24 @@ class CommandExchange(Exchange[CommandAck]):
     def _expire_order(self, standing: Standing, now: float) -> None:
         """Send it again if it still stands, as soon as the vehicle has told so; until its time is up."""
         until = self._started + self._attempts * self._attempt_timeout
-        if self._sent < self._attempts:
-            if standing.end:
-                self._fail(CommandTimeout(f"{self._timeout_text(now)}; not sent again: {standing.end}"))
-                return
-            if standing.told_at >= self._sent_at + SOONEST * self._attempt_timeout:
-                self._send(now)
-                return
+        if standing.end:
+            self._fail(CommandTimeout(f"{self._timeout_text(now)}; not sent again: {standing.end}"))
+            return
+        soonest = self._sent_at + SOONEST * self._attempt_timeout
+        if self._sent < self._attempts and standing.told_at >= soonest:
+            self._send(now)
+            return
         if now >= until:
-            is_silent = self._sent < self._attempts
-            why = "; not sent again: the vehicle has not told since what it does" if is_silent else ""
-            self._fail(CommandTimeout(self._timeout_text(now) + why))
+            self._fail(CommandTimeout(self._timeout_text(now) + self._why_not_again()))
         else:
             self.deadline = min(now + LOOK_S, until)
+
+    def _why_not_again(self) -> str:
+        if self._sent < self._attempts:
+            return "; not sent again: the vehicle has not told since what it does"
+        if self._attempts == 1 and attempts_of(self._message.command, _params_of(self._message)) == 1:
+            return f"; never sent again: a second one {SENT_ONCE[self._message.command][0]}"
+        return ""
 
     def _send(self, now: float) -> None:
         self._outbox.append(self._numbered(self._sent))
@@ -217,7 +232,7 @@ class CommandExchange(Exchange[CommandAck]):
         self._sent_at = now
         wait_s = self._attempt_timeout
         if self._standing is not None:
-            wait_s *= SOONEST if self._sent < self._attempts else 1
+            wait_s = min(SOONEST * wait_s, ATTEMPT_TIMEOUT_S)
         self.deadline = now + wait_s
 
     def _numbered(self, confirmation: int) -> Message:
@@ -251,6 +266,10 @@ class CommandExchange(Exchange[CommandAck]):
             return f"{name} was in progress, then nothing came for {self._progress_timeout:g} s"
         times = "once" if self._sent == 1 else f"{self._sent} times"
         return f"no COMMAND_ACK for {name}, sent {times} within {seconds:.1f} s"
+
+
+def _params_of(message: CommandLong | CommandInt) -> tuple[float, ...]:
+    return message.param1, message.param2, message.param3, message.param4
 
 
 def rejection(command: int, result: int) -> CommandRejected:

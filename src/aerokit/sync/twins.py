@@ -2705,8 +2705,8 @@ class Component(TwinOf["AsyncComponent"]):
         self,
         command: int,
         *params: float,
-        attempts: int = 4,
-        attempt_timeout: float = 1.0,
+        retries: int | None = None,
+        attempt_timeout: float | None = None,
         progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
     ) -> CommandAck:
@@ -2715,7 +2715,7 @@ class Component(TwinOf["AsyncComponent"]):
             self.aio.command,
             command,
             *params,
-            attempts=attempts,
+            retries=retries,
             attempt_timeout=attempt_timeout,
             progress_timeout=progress_timeout,
             on_progress=on_progress,
@@ -2987,8 +2987,8 @@ class Vehicle(VehicleTwin):
         command: int,
         *params: float,
         component_id: int | None = None,
-        attempts: int = 4,
-        attempt_timeout: float = 1.0,
+        retries: int | None = None,
+        attempt_timeout: float | None = None,
         progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
     ) -> CommandAck:
@@ -2998,10 +2998,12 @@ class Vehicle(VehicleTwin):
             command: the number, or a member of ``enums.MavCmd``.
             params: param1 to param7; missing ones are 0, NaN where the command says so.
             component_id: to another component than the autopilot; 0: to all, and the autopilot's answer counts.
-            attempts: how often it is sent at most; ``confirmation`` rises with each. What changes something is sent
-                again only right after a HEARTBEAT that tells of no other mode, and no newer order; see
-                docs/reliability.md.
-            attempt_timeout: seconds to wait for an ack after each, and at least two measured round trips.
+            retries: how often it is sent again while it is not answered, from 0; ``confirmation`` rises with each. An
+                order is sent again only right after a HEARTBEAT that tells of no other mode, no failsafe, and no newer
+                order (docs/reliability.md). None: 3 for a request that changes nothing but streams, 0 for all others,
+                because what they do would be done twice if only the answer was lost.
+            attempt_timeout: seconds to wait for an ack after each, above 0, and at least two measured round trips;
+                None: 1, or 4 if it is sent once.
             progress_timeout: seconds to wait after each IN_PROGRESS for the next answer; calibrations can take long.
             on_progress: called with 0–100, or None, for each IN_PROGRESS.
 
@@ -3017,7 +3019,7 @@ class Vehicle(VehicleTwin):
             command,
             *params,
             component_id=component_id,
-            attempts=attempts,
+            retries=retries,
             attempt_timeout=attempt_timeout,
             progress_timeout=progress_timeout,
             on_progress=on_progress,
@@ -3032,8 +3034,8 @@ class Vehicle(VehicleTwin):
         y: int = 0,
         z: float = 0.0,
         component_id: int | None = None,
-        attempts: int = 4,
-        attempt_timeout: float = 1.0,
+        retries: int | None = None,
+        attempt_timeout: float | None = None,
         progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
         or_long: bool = False,
@@ -3053,7 +3055,7 @@ class Vehicle(VehicleTwin):
             y=y,
             z=z,
             component_id=component_id,
-            attempts=attempts,
+            retries=retries,
             attempt_timeout=attempt_timeout,
             progress_timeout=progress_timeout,
             on_progress=on_progress,
@@ -3287,9 +3289,11 @@ class Vehicle(VehicleTwin):
         """Arm the motors and wait until HEARTBEAT says armed: **propellers may start to turn**.
 
         A vehicle that stands in a mode in which it does not arm (RTL or LAND after a flight, OFFBOARD) is put into
-        another one first. Cancelled, or ended by any error but a refusal, the order may still be carried out: for 15
-        seconds the vehicle is watched, and disarmed if it arms, as long as the connection is there; a warning of
-        logger "aerokit" says what came of it. Who arms it meanwhile by another way is not told apart.
+        another one first. The order is sent once: a HEARTBEAT that says disarmed does not tell whether a pilot has
+        disarmed it since. Cancelled, or ended by any error but a refusal, it may still be carried out: for 15 seconds
+        the vehicle is watched, and disarmed if this order arms it (the vehicle accepts it, or is armed at the next
+        HEARTBEAT and nobody else has taken it), as long as the connection is there. Logger "aerokit" warns of what
+        came of it, also of an arming that nothing shows to be this order's: that one is left alone.
 
         Args:
             mode: where to arm; None: the present mode, or one that ``take_off`` begins in if it cannot be armed there.
@@ -3301,7 +3305,7 @@ class Vehicle(VehicleTwin):
             LocalProtocolError: there is no such mode, or the vehicle does not arm in it. Nothing was sent.
             CommandRejected: the vehicle refused; ``reasons`` has its pre-arm texts, failing sensors and what the
                 estimator lacks. They are asked for again where the vehicle can run its checks on request.
-            CommandTimeout: there was no answer; the text says whether the order may still arrive.
+            CommandTimeout: there was no answer, and it did not arm; the text says whether the order may still arrive.
             OperationRejected: it is armed already, in another mode than ``mode``, and nothing was sent; or somebody
                 else has disarmed it, or changed its mode, meanwhile.
             HeartbeatTimeout: the vehicle has been silent for ``max_silence_s`` seconds.

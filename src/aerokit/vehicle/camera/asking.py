@@ -127,7 +127,7 @@ class Questions:
             first = params[0]
         with self._line.component.subscribe(message_type, capacity=100) as answers:
             with suppress(CommandTimeout):
-                await self._line.component.command(command, first, *others, attempts=2)
+                await self._line.component.command(command, first, *others, retries=1)
             with anyio.move_on_after(timeout):
                 async for answer in answers:
                     if where(answer):

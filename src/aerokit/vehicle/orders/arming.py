@@ -99,9 +99,11 @@ class ArmingActions(Part):
         """Arm the motors and wait until HEARTBEAT says armed: **propellers may start to turn**.
 
         A vehicle that stands in a mode in which it does not arm (RTL or LAND after a flight, OFFBOARD) is put into
-        another one first. Cancelled, or ended by any error but a refusal, the order may still be carried out: for 15
-        seconds the vehicle is watched, and disarmed if it arms, as long as the connection is there; a warning of
-        logger "aerokit" says what came of it. Who arms it meanwhile by another way is not told apart.
+        another one first. The order is sent once: a HEARTBEAT that says disarmed does not tell whether a pilot has
+        disarmed it since. Cancelled, or ended by any error but a refusal, it may still be carried out: for 15 seconds
+        the vehicle is watched, and disarmed if this order arms it (the vehicle accepts it, or is armed at the next
+        HEARTBEAT and nobody else has taken it), as long as the connection is there. Logger "aerokit" warns of what
+        came of it, also of an arming that nothing shows to be this order's: that one is left alone.
 
         Args:
             mode: where to arm; None: the present mode, or one that ``take_off`` begins in if it cannot be armed there.
@@ -113,7 +115,7 @@ class ArmingActions(Part):
             LocalProtocolError: there is no such mode, or the vehicle does not arm in it. Nothing was sent.
             CommandRejected: the vehicle refused; ``reasons`` has its pre-arm texts, failing sensors and what the
                 estimator lacks. They are asked for again where the vehicle can run its checks on request.
-            CommandTimeout: there was no answer; the text says whether the order may still arrive.
+            CommandTimeout: there was no answer, and it did not arm; the text says whether the order may still arrive.
             OperationRejected: it is armed already, in another mode than ``mode``, and nothing was sent; or somebody
                 else has disarmed it, or changed its mode, meanwhile.
             HeartbeatTimeout: the vehicle has been silent for ``max_silence_s`` seconds.
@@ -132,10 +134,10 @@ class ArmingActions(Part):
                 reasons = await self._health.arming_reasons(started)
                 raise self._talk.explained(error, started, reasons) from None
             except CommandTimeout as error:
-                self._late_arming.watch(was_armed)
+                self._late_arming.watch(order, was_armed)
                 raise CommandTimeout(f"{error}; {self._late_arming.text()}") from None
             except (anyio.get_cancelled_exc_class(), AerokitError):
-                self._late_arming.watch(was_armed)
+                self._late_arming.watch(order, was_armed)
                 raise
 
     async def disarm(

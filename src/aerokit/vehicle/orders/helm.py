@@ -81,10 +81,10 @@ class Helm:
     def order_of_the_programs_own(
         self, subjects: Iterable[Subject] = ("mode", "motion"), *, modes: Collection[Mode] = ()
     ) -> Order:
-        """The program sends one by itself: which other modes that brings about is not known."""
-        order = self.order(*modes, subjects=subjects)
-        self._any_mode_until = self._now() + MODE_GRACE_S
-        return order
+        """The program sends one by itself; without ``modes``, any mode that follows may be its effect."""
+        if not modes:
+            self._any_mode_until = self._now() + MODE_GRACE_S
+        return self.order(*modes, subjects=subjects)
 
     def note_reboot(self) -> None:
         """The vehicle has rebooted: all orders end."""

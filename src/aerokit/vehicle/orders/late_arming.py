@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import anyio
 
 from aerokit.errors import AerokitError
-from aerokit.mavlink.enums import MavCmd
+from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.vehicle.orders.leftover import Leftover
 
 if TYPE_CHECKING:
@@ -21,7 +21,11 @@ if TYPE_CHECKING:
 __all__ = ["LATE_S", "LateArming", "give_arm"]
 
 LATE_S = 15.0
-"""For so long after an order to arm was given up the vehicle is watched, and disarmed if it arms after all."""
+"""For so long after an order to arm was given up the vehicle is watched, and disarmed if that order arms it."""
+FIRST_HEARTBEAT_S = 1.5
+"""A vehicle that HEARTBEAT, at 1 Hz, calls armed so soon after the order was sent was armed by it."""
+ACK_S = 1.0
+"""How long after a HEARTBEAT that says armed the COMMAND_ACK of the order may come."""
 ARMING_AT_END_S = 1.5
 """How long the end of a block waits for it."""
 FORCE = 21196
@@ -31,6 +35,7 @@ logger: logging.Logger = logging.getLogger("aerokit")
 
 async def give_arm(talk: Talk, orders: Orders, order: Order, armed: bool, *, force: bool = False) -> None:
     """Order it to arm or disarm."""
+    talk.commands.forget_result(MavCmd.COMPONENT_ARM_DISARM)
     params = (float(armed), FORCE if force else 0)
     await orders.give(order, talk.commands.send_long, MavCmd.COMPONENT_ARM_DISARM, *params, armed=armed)
 
@@ -47,19 +52,19 @@ class LateArming:
         """What an error says of an order to arm that may still arrive."""
         unsent = self._talk.connection.unsent_bytes
         where = f"; {unsent} bytes have not left this computer yet" if unsent else ""
-        return f"the order may still be carried out{where}: if it arms within {LATE_S:g} s it is disarmed"
+        return f"the order may still be carried out{where}: if it arms the vehicle within {LATE_S:g} s, it is disarmed"
 
-    def watch(self, was_armed: bool) -> None:
+    def watch(self, order: Order, was_armed: bool) -> None:
         """The order to arm was given up; it may have been heard, or may still arrive."""
         self._talk.connection.discard_unsent()
-        self._leftover.start(partial(self._look, was_armed, self._helm.arming_orders))
+        self._leftover.start(partial(self._look, order, was_armed, self._helm.arming_orders))
 
-    async def _look(self, was_armed: bool, count: int) -> None:
+    async def _look(self, order: Order, was_armed: bool, count: int) -> None:
         with anyio.move_on_after(LATE_S):
-            await self._disarm_again(was_armed, count)
+            await self._disarm_again(order, was_armed, count)
 
-    async def _disarm_again(self, was_armed: bool, count: int) -> None:
-        """What was armed before the order is left alone, until it has been heard disarmed."""
+    async def _disarm_again(self, order: Order, was_armed: bool, count: int) -> None:
+        """What was armed before the order, or by somebody else, is left alone."""
         armed, since = self._talk.telemetry.armed, self._talk.connection.now()
         try:
             if was_armed:
@@ -70,6 +75,12 @@ class LateArming:
             return
         if self._helm.arming_orders != count:  # the program has ordered it by a command of its own
             return
+        if not await self._has_armed(order):
+            logger.warning(
+                "the vehicle armed after an order to arm was given up, and nothing shows that this order"
+                " did it: it is left armed"
+            )
+            return
         logger.warning("the vehicle armed although the order to arm was given up: it is disarmed again")
         with anyio.CancelScope(shield=True):
             try:
@@ -79,6 +90,22 @@ class LateArming:
                 logger.error(
                     "the vehicle armed after the order was given up, and could not be disarmed: %s", error
                 )
+
+    async def _has_armed(self, order: Order) -> bool:
+        """Whether it was this order that armed the vehicle, and not a pilot.
+
+        That is certain when the vehicle has accepted the order. Without an answer the time tells, unless somebody
+        else has taken the vehicle.
+        """
+        told_after = self._talk.telemetry.armed.updated_at - order.given_at
+        if not order.end and told_after <= FIRST_HEARTBEAT_S:
+            return True
+        if not self._is_accepted():
+            await anyio.sleep(ACK_S)
+        return self._is_accepted()
+
+    def _is_accepted(self) -> bool:
+        return self._talk.commands.last_result(MavCmd.COMPONENT_ARM_DISARM) == MavResult.ACCEPTED
 
     def stop(self) -> None:
         """Another order about arming is given."""

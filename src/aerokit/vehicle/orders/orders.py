@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit.errors import CommandRejected, CommandTimeout, NotSupported, OperationRejected
 from aerokit.mavlink.enums import MavCmd, MavResult
+from aerokit.protocols.repeatable import ATTEMPTS
+from aerokit.vehicle.checks import check_range
 from aerokit.vehicle.orders.helm import KNOWN_S, MODE_GRACE_S
 from aerokit.vehicle.orders.order import CHANGED_BY_COMMAND, QUESTIONS
 from aerokit.vehicle.orders.progress import await_progress
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterator
+    from collections.abc import Awaitable, Callable, Collection, Iterator
 
     from aerokit.autopilots import Mode, Purpose
     from aerokit.mavlink.messages import CommandAck
@@ -185,26 +187,35 @@ class Orders:
         send: Callable[..., Awaitable[CommandAck]],
         command: int,
         *params: float,
+        retries: int | None,
         **options: Any,
     ) -> CommandAck:
         """Any command that the program itself sends; ``send`` is one of the command sender's."""
         started = self._talk.connection.now()
+        if retries is None:
+            retries = ATTEMPTS - 1 if command in QUESTIONS else 0
+        check_range("retries", retries, 0, 1000)
+        options["attempts"] = 1 + retries
         try:
             if command in QUESTIONS:
                 return await send(command, *params, **options)
-            with self._own_order(command) as order:
-                armed = params[0] == 1 if command == MavCmd.COMPONENT_ARM_DISARM and params else None
-                with self._helm.sending(order, armed=armed) as sending:
-                    return await send(command, *params, standing=sending, **options)
+            names = self._talk.telemetry.mode_names
+            modes = self._talk.autopilot.modes_of_command(command, params, names)
+            armed = params[0] == 1 if command == MavCmd.COMPONENT_ARM_DISARM and params else None
+            with (
+                self._own_order(command, modes) as order,
+                self._helm.sending(order, modes=modes, armed=armed) as sending,
+            ):
+                return await send(command, *params, standing=sending, **options)
         except CommandRejected as error:
             await self._talk.settle()
             raise self._talk.explained(error, started) from None
 
     @contextmanager
-    def _own_order(self, command: int) -> Iterator[Order]:
+    def _own_order(self, command: int, modes: Collection[Mode]) -> Iterator[Order]:
         """A program that steers past the actions gives a new order, which ends theirs."""
         if command in CHANGED_BY_COMMAND:
-            yield self._helm.order_of_the_programs_own(CHANGED_BY_COMMAND[command])
+            yield self._helm.order_of_the_programs_own(CHANGED_BY_COMMAND[command], modes=modes)
         else:
             with self._helm.aside() as order:
                 yield order

@@ -44,8 +44,8 @@ class TalkActions(Part):
         command: int,
         *params: float,
         component_id: int | None = None,
-        attempts: int = 4,
-        attempt_timeout: float = 1.0,
+        retries: int | None = None,
+        attempt_timeout: float | None = None,
         progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
     ) -> CommandAck:
@@ -55,10 +55,12 @@ class TalkActions(Part):
             command: the number, or a member of ``enums.MavCmd``.
             params: param1 to param7; missing ones are 0, NaN where the command says so.
             component_id: to another component than the autopilot; 0: to all, and the autopilot's answer counts.
-            attempts: how often it is sent at most; ``confirmation`` rises with each. What changes something is sent
-                again only right after a HEARTBEAT that tells of no other mode, and no newer order; see
-                docs/reliability.md.
-            attempt_timeout: seconds to wait for an ack after each, and at least two measured round trips.
+            retries: how often it is sent again while it is not answered, from 0; ``confirmation`` rises with each. An
+                order is sent again only right after a HEARTBEAT that tells of no other mode, no failsafe, and no newer
+                order (docs/reliability.md). None: 3 for a request that changes nothing but streams, 0 for all others,
+                because what they do would be done twice if only the answer was lost.
+            attempt_timeout: seconds to wait for an ack after each, above 0, and at least two measured round trips;
+                None: 1, or 4 if it is sent once.
             progress_timeout: seconds to wait after each IN_PROGRESS for the next answer; calibrations can take long.
             on_progress: called with 0–100, or None, for each IN_PROGRESS.
 
@@ -74,7 +76,7 @@ class TalkActions(Part):
             command,
             *params,
             component_id=component_id,
-            attempts=attempts,
+            retries=retries,
             attempt_timeout=attempt_timeout,
             progress_timeout=progress_timeout,
             on_progress=on_progress,
@@ -89,8 +91,8 @@ class TalkActions(Part):
         y: int = 0,
         z: float = 0.0,
         component_id: int | None = None,
-        attempts: int = 4,
-        attempt_timeout: float = 1.0,
+        retries: int | None = None,
+        attempt_timeout: float | None = None,
         progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
         or_long: bool = False,
@@ -113,7 +115,7 @@ class TalkActions(Part):
             y=y,
             z=z,
             component_id=component_id,
-            attempts=attempts,
+            retries=retries,
             attempt_timeout=attempt_timeout,
             progress_timeout=progress_timeout,
             on_progress=on_progress,
@@ -137,10 +139,13 @@ class TalkActions(Part):
         target = getattr(message, "target_system", self.system_id)
         subjects = subjects_of(message) if target in (EVERYBODY, self.system_id) else ()
         if subjects and isinstance(message, (CommandInt, CommandLong, SetMode)):
-            modes: list[Mode] = []
-            if isinstance(message, SetMode) and message.base_mode & CUSTOM_MODE_ENABLED:
-                known = self.telemetry
-                modes = [known.autopilot.mode(message.custom_mode, message.base_mode, known.mode_names)]
+            names = self.telemetry.mode_names
+            modes: tuple[Mode, ...] = ()
+            if not isinstance(message, SetMode):
+                params = (message.param1, message.param2, message.param3, message.param4)
+                modes = self.autopilot.modes_of_command(message.command, params, names)
+            elif message.base_mode & CUSTOM_MODE_ENABLED:
+                modes = (self.autopilot.mode(message.custom_mode, message.base_mode, names),)
             self._helm.order_of_the_programs_own(subjects, modes=modes)
         elif subjects:
             self._helm.note_newer(subjects)
