@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import random
 from collections import Counter
 from collections.abc import Awaitable, Callable, Iterator
@@ -12,9 +13,9 @@ from dataclasses import dataclass, replace
 import anyio
 from order_air import Air, Crossing
 from order_cases import Case, random_case
-from order_flights import WATCH_S, Flown, Simulated, go_to_place, set_up, somebody_acts
-from order_judge import faults
-from order_table import ROWS, Row
+from order_flights import WATCH_S, Flown, Simulated, go_to_place, set_up, somebody_acts, take_over
+from order_judge import faults, orders_in
+from order_table import ARM, ROWS, SET_MODE, Row
 
 import aerokit
 from aerokit.errors import AerokitError
@@ -22,7 +23,10 @@ from aerokit.fleets.events import PolicyOrdered
 from aerokit.fleets.fleet import Fleet
 from aerokit.fleets.policy import PolicyName
 from aerokit.fleets.results import FleetResult
-from aerokit.sim import simulated_link
+from aerokit.mavlink import FrameEncoder
+from aerokit.mavlink.enums import CopterMode, MavCmd
+from aerokit.protocols.command import command_long
+from aerokit.sim import SimulatedPx4, simulated_link
 from aerokit.testing import run_virtual
 
 AUTOPILOTS = {"a": "ardupilot", "b": "px4", "c": "ardupilot"}
@@ -54,6 +58,8 @@ class FleetCase:
     policy: PolicyName
     members: dict[str, Case]
     cancel_at: float | None
+    of_others: str = ""
+    """The member that another station flies from the start; empty: none."""
 
 
 def random_fleet_case(action: str, policy: PolicyName, seed: int) -> FleetCase:
@@ -65,9 +71,9 @@ def random_fleet_case(action: str, policy: PolicyName, seed: int) -> FleetCase:
         if dice.random() < 0.4:  # somebody has to be well, or no policy is of use
             case = replace(case, pilot_at=None, failsafe_at=None, weather=replace(case.weather, outage=None))
         members[name] = replace(case, cancel_at=None)
-    return FleetCase(
-        action, policy, members, round(dice.uniform(0.05, 12.0), 2) if dice.random() < 0.2 else None
-    )
+    cancel_at = round(dice.uniform(0.05, 12.0), 2) if dice.random() < 0.2 else None
+    of_others = dice.choice(tuple(AUTOPILOTS)) if dice.random() < 0.4 else ""
+    return FleetCase(action, policy, members, cancel_at, of_others)
 
 
 def _row(action: str, autopilot: str) -> Row:
@@ -100,6 +106,9 @@ async def _fly(case: FleetCase) -> list[str]:
                 ordered.append(each)
     found = list(_of_the_policy(case, ordered))
     for name, one in flown.items():
+        if name == case.of_others:
+            found += [f"{name}: {each.message.NAME} was sent" for each in orders_in(one.air)]
+            continue
         one.fresh_at = tuple(each.at for each in ordered if f"{name}/1" in each.orders)
         if one.fresh_at and case.policy != "hold_others":
             # which goes on, also when cancelled
@@ -130,7 +139,11 @@ async def _give(
     loop = asyncio.get_running_loop()
     programs = {name: fleet.members[f"{name}/1"].vehicle for name in vehicles}
     place = next(iter(cases.values())).row.place
-    await asyncio.gather(*(go_to_place(place, vehicles[name], programs[name]) for name in vehicles))
+    others = case.of_others
+    if others:
+        await fly_by_another_station(vehicles[others], airs[others])
+    own = [name for name in vehicles if name != others]
+    await asyncio.gather(*(go_to_place(place, vehicles[name], programs[name]) for name in own))
     given_at = loop.time()
     acted = {}
     for name, each in cases.items():
@@ -162,6 +175,24 @@ async def _give(
         )
         for name in vehicles
     }
+
+
+async def fly_by_another_station(vehicle: Simulated, air: Air) -> None:
+    """It arms, takes off and goes on by hand; this program has ordered nothing."""
+    station, seconds = FrameEncoder(200, 190), 40.0  # it boots, and gets its position
+    is_px4 = isinstance(vehicle, SimulatedPx4)
+    if is_px4:
+        vehicle.parameters["MIS_TAKEOFF_ALT"] = 10.0
+    height_m = math.nan if is_px4 else 10.0
+    steps = [(ARM, (1.0,), 1.5), (MavCmd.NAV_TAKEOFF, (0.0,) * 6 + (height_m,), 12.0)]
+    for command, params, then_s in steps if is_px4 else [(SET_MODE, (1.0, CopterMode.GUIDED), 1.5), *steps]:
+        await anyio.sleep(seconds)
+        air.link.write(station.encode(command_long(vehicle.system_id, 1, command, params)))
+        seconds = then_s
+    await anyio.sleep(seconds)
+    take_over(vehicle)
+    await anyio.sleep(1.5)
+    assert vehicle.altitude_m > 1.0
 
 
 def _not_compared(acted: list[tuple[float, str]]) -> BaseException | None:

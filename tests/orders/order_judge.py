@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Iterator
 
-from order_air import Crossing
+from order_air import Crossing, Seen
 from order_flights import WATCH_S, Flown, mode_of
 from order_table import ARM, REPOSITION, SET_MODE
 
@@ -49,7 +49,12 @@ def faults(flown: Flown) -> list[str]:
 
 
 def _orders(flown: Flown) -> Iterator[Crossing]:
-    for each in flown.air.sent:
+    return orders_in(flown.air)
+
+
+def orders_in(air: Seen) -> Iterator[Crossing]:
+    """What was sent that changes something."""
+    for each in air.sent:
         command = getattr(each.message, "command", None)
         is_command = isinstance(each.message, (CommandLong, CommandInt)) and command not in QUESTIONS
         if is_command or isinstance(each.message, SetMode):

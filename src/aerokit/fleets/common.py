@@ -191,8 +191,9 @@ class CommonAction:
             order = orders.get(each.name)
             if order is None:
                 continue
-            if each.vehicle.is_surely_disarmed:
-                left_alone[each.name] = "it is disarmed"
+            if not each.is_flown_by_program:
+                is_disarmed = each.vehicle.is_surely_disarmed
+                left_alone[each.name] = "it is disarmed" if is_disarmed else "this program does not fly it"
             else:
                 self._orders[each.name] = order
             if each.name in self._orders or each.name not in self._outcomes:
@@ -248,8 +249,11 @@ class CommonAction:
     def _hold_the_finished(self) -> None:
         """Those that are under way hold by the cancellation of their own action."""
         for each in self._members:
-            is_flying = each.takes_orders and not each.vehicle.is_surely_disarmed
-            if is_flying and each.name in self._outcomes and each.name not in (*self._failed, *self._stopped):
+            if (
+                each.is_flown_by_program
+                and each.name in self._outcomes
+                and each.name not in (*self._failed, *self._stopped)
+            ):
                 self._crew.background.start(partial(_give_quietly, each), f"aerokit hold {each.name}")
 
     # ---------------------------------------------------------------------------------------- inside

@@ -60,7 +60,7 @@ class DistanceWatch:
     def _on_near(self, one: Member, other: Member, distance_m: float) -> None:
         for each in (one, other):
             each.look()
-        ordered = [each for each in (one, other) if self._holds and each.takes_orders]
+        ordered = [each for each in (one, other) if self._holds and each.is_flown_by_program]
         for each in ordered:
             self._crew.background.start(partial(self._hold, each), f"aerokit apart {each.name}")
         self._crew.tell(

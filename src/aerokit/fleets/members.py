@@ -69,6 +69,11 @@ class Member:
         """Whether it may be ordered something: it is heard, and nobody else flies it."""
         return self.state in (MemberState.IN, MemberState.FAILED)
 
+    @property
+    def is_flown_by_program(self) -> bool:
+        """Whether it flies by what this program has ordered: only then a policy, or a watch, may stop it."""
+        return self.takes_orders and self.vehicle.is_flown_by_program
+
     def __repr__(self) -> str:
         return f"<Member {self.name} {self.state.value}{f': {self.why}' if self.why else ''}>"
 
@@ -144,8 +149,10 @@ class Member:
         elif self._minds_failsafe:
             return f"it is under a failsafe (MAV_STATE {MavState(status).name})"
         has_ended_mission = "mission" in vars(vehicle) and vehicle.mission.explains_mode
-        is_forgiven = has_ended_mission or self._who_steers() == self._taken_back
-        return "" if is_forgiven else vehicle.taken_over
+        if has_ended_mission or self._who_steers() == self._taken_back:
+            return ""
+        is_others = vehicle.is_armed and not vehicle.is_flown_by_program
+        return vehicle.taken_over or ("somebody else has armed it" if is_others else "")
 
     def _who_steers(self) -> tuple[object, object]:
         return self.vehicle._helm.newest, self.vehicle.mode.latest

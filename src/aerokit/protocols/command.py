@@ -111,7 +111,7 @@ class CommandExchange(Exchange[CommandAck]):
     A question (no ``standing``) is sent again every ``attempt_timeout`` seconds. An order is sent again only right
     after the vehicle has told what it does, and only if that speaks neither of the order's effect nor of somebody
     else's: so never into a silence. ``attempts`` None: four, or one for an order that would be carried out twice
-    (``repeatable.SENT_ONCE``); ``attempt_timeout`` None: one second, or four for an order that is sent once.
+    (``repeatable.SENT_ONCE``); ``attempt_timeout`` None: one second, or four for such an order.
 
     ``is_sent``: it has been sent once, just before :meth:`start`.
 
@@ -142,10 +142,11 @@ class CommandExchange(Exchange[CommandAck]):
         is_sent: bool = False,
     ) -> None:
         super().__init__()
+        is_order_once = False
         if attempts is None:
             attempts = ATTEMPTS if standing is None else attempts_of(message.command, _params_of(message))
+            is_order_once = attempts == 1
         if attempt_timeout is None:
-            is_order_once = standing is not None and attempts == 1
             attempt_timeout = ATTEMPT_TIMEOUT_S * (ATTEMPTS if is_order_once else 1)
         attempt_timeout = max(attempt_timeout, answers_within_s) if attempt_timeout > 0 else attempt_timeout
         if attempts < 1:

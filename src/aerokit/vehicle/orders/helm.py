@@ -47,7 +47,9 @@ class Helm:
         """An order that changes the mode is out and its end is not known: the mode told may be about to change."""
         self.mode_settles_at: float = -math.inf
         """Until then HEARTBEAT may tell the mode of an order that was given up."""
-        self._any_mode_until = -math.inf
+        self._any_mode_until = self._own_arming_until = -math.inf
+        self._armed_at = -math.inf
+        self._armed_by_program: Order | None = None
         self._orders: list[Order] = []
         self._sendings: list[Sending] = []
         self._posted: list[Posted] = []
@@ -84,6 +86,8 @@ class Helm:
         """The program sends one by itself; without ``modes``, any mode that follows may be its effect."""
         if not modes:
             self._any_mode_until = self._now() + MODE_GRACE_S
+        if "arm" in subjects:
+            self._own_arming_until = self._now() + MODE_GRACE_S
         return self.order(*modes, subjects=subjects)
 
     def note_reboot(self) -> None:
@@ -92,6 +96,7 @@ class Helm:
         for order in orders:
             order.note_reboot()
         self._ordered_since_disarmed.clear()
+        self._armed_by_program, self._armed_at = None, math.inf
 
     @contextmanager
     def aside(self) -> Iterator[Order]:
@@ -133,6 +138,7 @@ class Helm:
             yield sending
         finally:
             self._sendings.remove(sending)
+            self._note_arming_ended(armed)
 
     # --------------------------------------------------------------------------------- posted
 
@@ -168,6 +174,7 @@ class Helm:
             yield posted
         finally:
             self._posted.remove(posted)
+            self._note_arming_ended(armed)
 
     def note_newer(self, subjects: Iterable[Subject]) -> int:
         """A newer order about these is given: what was posted about them before ends; the number of it."""
@@ -176,6 +183,11 @@ class Helm:
         self._newest_about.update(about)
         self._ordered_since_disarmed.update(about)
         return number
+
+    def _note_arming_ended(self, armed: bool | None) -> None:
+        """HEARTBEAT tells an accepted order's effect up to a second later."""
+        if armed:
+            self._own_arming_until = self._now() + MODE_GRACE_S
 
     def _note_arming(self, armed: bool | None) -> None:
         if armed is None:
@@ -186,6 +198,17 @@ class Helm:
             each.note_newer(armed)
 
     # --------------------------------------------------------------------------------- doubts
+
+    @property
+    def is_flown_by_program(self) -> bool:
+        """Whether the armed vehicle does what this program has ordered.
+
+        The program has armed it, or has given an order that steers since somebody else did, and nobody else has taken
+        it from that.
+        """
+        newest = self.newest
+        order = newest if newest is not None and newest.given_at >= self._armed_at else self._armed_by_program
+        return order is not None and not order.taken_by and not order.failsafe
 
     @property
     def is_obeyed(self) -> bool:
@@ -266,8 +289,22 @@ class Helm:
     def _on_armed(self, before: bool | None, armed: bool) -> None:
         if before and not armed:
             self._ordered_since_disarmed.clear()
+        if armed and not before:
+            self._note_armed_anew()
         for each in self._followers():
             each.note_armed(armed, self._telemetry.armed.updated_at)
 
+    def _note_armed_anew(self) -> None:
+        self._armed_at = self._telemetry.armed.updated_at
+        is_ordered = (
+            any(each.arms for each in self._sendings)
+            or any(each.armed for each in self._posted)
+            or self._now() < self._own_arming_until
+        )
+        newest = self.newest
+        modes = () if newest is None or newest.taken_by else newest.modes
+        self._armed_by_program = self._new(modes, lambda _: True) if is_ordered else None
+
     def _followers(self) -> tuple[Order | Sending | Posted, ...]:
-        return (*self._orders, *self._sendings, *self._posted)
+        own = () if self._armed_by_program is None else (self._armed_by_program,)
+        return (*own, *self._orders, *self._sendings, *self._posted)

@@ -52,6 +52,15 @@ class ModeActions(Part):
         return self._holding.is_told_to_hold
 
     @property
+    def is_flown_by_program(self) -> bool:
+        """Whether the vehicle is armed and does what this program has ordered.
+
+        The program has armed it, or has given an order that steers since somebody else did; and no pilot, failsafe or
+        other program has taken it from that. False for a vehicle that others fly and that this program only watches.
+        """
+        return self.telemetry.is_armed and self._helm.is_flown_by_program
+
+    @property
     def taken_over(self) -> str:
         """What somebody else has made of the program's last action, as a clause; empty: nothing that was told.
 

@@ -125,6 +125,8 @@ class Order:
         """What somebody else has done, as a clause; empty: nothing that was told."""
         self.failsafe: str = ""
         """Which failsafe has become active since, as a clause; empty: none."""
+        self.unexplained: str = ""
+        """A change of mode, as a clause: the effect of a command of the program, or a pilot's doing."""
         self.has_lost_mode: bool = False
         """Whether that was another mode."""
         self.mode_lost_at: float = -math.inf
@@ -170,6 +172,8 @@ class Order:
         if self.is_own(mode):
             self._allowed -= self._allowed if at >= self._settles_at else self._before
         elif not self._is_mode_known or at < self._any_until:
+            if self._is_mode_known and mode.custom_mode not in self._allowed:
+                self.unexplained = f"the mode changed to {mode}"
             self._allowed.add(mode.custom_mode)
         elif mode.custom_mode not in self._allowed:
             if not self.has_lost_mode:
@@ -220,7 +224,9 @@ class Sending:
         is_there = None if mode_now is None else mode_now.custom_mode
         self._modes = {each.custom_mode for each in modes} - {is_there}
         self._armed = None if armed is armed_now else armed
-        self._arms, self._is_overruled = armed, False
+        self.arms = armed
+        """Whether it arms, or disarms; None: neither."""
+        self._is_overruled = False
         self._is_done = is_done
 
     @property
@@ -234,11 +240,12 @@ class Sending:
         """Why it must not be sent again, as a clause; empty while it may."""
         if self.has_worked:
             return "its effect was told"
-        return self.order.end or ("another order was given" if self._is_overruled else "")
+        overruled = "another order was given" if self._is_overruled else ""
+        return self.order.end or overruled or self.order.unexplained
 
     def note_newer(self, armed: bool | None) -> None:
         """Another command is given: one to disarm ends one to arm, and the other way round."""
-        if armed is not None and self._arms is not None and armed is not self._arms:
+        if armed is not None and self.arms is not None and armed is not self.arms:
             self._is_overruled = True
 
     def note_state(self, state: int) -> None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit.errors import CommandRejected, CommandTimeout, NotSupported, OperationRejected
 from aerokit.mavlink.enums import MavCmd, MavResult
+from aerokit.protocols.command import ATTEMPT_TIMEOUT_S
 from aerokit.protocols.repeatable import ATTEMPTS
 from aerokit.vehicle.checks import check_range
 from aerokit.vehicle.orders.helm import KNOWN_S, MODE_GRACE_S
@@ -196,6 +197,8 @@ class Orders:
             retries = ATTEMPTS - 1 if command in QUESTIONS else 0
         check_range("retries", retries, 0, 1000)
         options["attempts"] = 1 + retries
+        if options["attempt_timeout"] is None and not retries:
+            options["attempt_timeout"] = ATTEMPTS * ATTEMPT_TIMEOUT_S
         try:
             if command in QUESTIONS:
                 return await send(command, *params, **options)
