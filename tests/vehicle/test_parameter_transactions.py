@@ -46,6 +46,41 @@ async def test_values_for_the_time_of_a_block() -> None:
         assert parameters.table["RTL_ALT"].value == 1500
 
 
+@pytest.mark.parametrize("heard", [True, False])
+async def test_value_changed_by_another_station_is_left(
+    heard: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Whether the program has heard of it, or the vehicle tells it only when it is asked."""
+    async with open_flight(copter()) as flight:
+        parameters = flight.vehicle.parameters
+        async with parameters.temporarily({"RTL_ALT": 2000, "LAND_SPEED": 60}):
+            flight.copter.parameters["RTL_ALT"] = 2500.0
+            if heard:
+                await parameters.get("RTL_ALT")
+        assert values(flight) == (2500.0, 50.0)
+        assert "RTL_ALT is not put back: another station has changed it from 2000 to 2500" in caplog.text
+        assert "LAND_SPEED" not in caplog.text
+
+
+async def test_value_that_the_program_changed_itself_is_put_back() -> None:
+    async with open_flight(copter()) as flight:
+        parameters = flight.vehicle.parameters
+        async with parameters.temporarily({"RTL_ALT": 2000}):
+            await parameters.set("RTL_ALT", 3000)
+        assert values(flight) == BEFORE
+
+
+async def test_transaction_that_fails_leaves_what_another_station_changed() -> None:
+    async with open_flight(copter()) as flight:
+        with pytest.raises(ZeroDivisionError):
+            async with flight.vehicle.parameters.transaction() as transaction:
+                await transaction.set("RTL_ALT", 2000)
+                await transaction.set("LAND_SPEED", 60)
+                flight.copter.parameters["RTL_ALT"] = 2500.0
+                _ = 1 / 0
+        assert values(flight) == (2500.0, 50.0)
+
+
 async def test_px4_too() -> None:
     px4 = SimulatedPx4(boot_time_s=0.0, parameter_count=100)
     async with open_px4(px4) as flight:

@@ -65,6 +65,8 @@ class ParameterAccess:
         self._answers: RoundTrip | None = None
         self._attending = 0
         self._written_at: dict[str, float] = {}
+        self.written: dict[str, int | float] = {}
+        """What the vehicle has confirmed of the last write of each, by this program."""
 
     @property
     def _answer_time(self) -> RoundTrip:
@@ -82,6 +84,7 @@ class ParameterAccess:
     def forget(self) -> None:
         """The vehicle has started anew, perhaps with another firmware."""
         self.store.forget()
+        self.written.clear()
         self._has_pack = None
 
     # ------------------------------------------------------------------------------- all of them
@@ -267,7 +270,8 @@ class ParameterAccess:
             before = {
                 each.name: each.value for each in map(self.store.get, _names(wanted)) if each is not None
             }
-            for name in before:
+            for name in _names(wanted):
+                self.written.pop(name, None)
                 self.store.trust(name)
             recent = self._recently_written() & set(_names(wanted))
             exchange = ParameterWrites(
@@ -286,6 +290,8 @@ class ParameterAccess:
                 answers = await transfers.run(exchange)
             for name, answer in answers.items():
                 self._written_at[name] = transfers.connection.now()
+                if isinstance(answer, Parameter):
+                    self.written[name] = answer.value
                 if isinstance(answer, Parameter) and name in before and answer.value != before[name]:
                     self.store.distrust(name, before[name])
             return answers
@@ -318,6 +324,7 @@ class ParameterAccess:
             if method == "ftp":
                 raise
         left = [each for each in wanted if not self._is_there(each, answers.get(each.name))]
+        self.written.update({each.name: each.value for each in wanted if each not in left})
         return {each.name: answers[each.name] for each in wanted if each not in left} | await self.write(
             left, patience_s, on_progress
         )

@@ -241,6 +241,7 @@ class Parameters:
         Also when the block raises or is cancelled: then the end of the block takes up to ``patience_s`` seconds. When
         one value cannot be set, those before are put back, and its error is raised. Blocks may be nested and may
         overlap, also about the same parameter: it gets the value from before the first of them when the last one ends.
+        A value that another station has changed meanwhile is left as it is, and a warning of logger "aerokit" names it.
 
         Raises:
             RollbackFailed: values could not be put back; ``not_restored`` has them.

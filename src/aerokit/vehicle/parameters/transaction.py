@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
     from aerokit.vehicle.parameters.writing import ParameterWriting
 
 __all__ = ["Holds", "Temporarily", "Transaction"]
+
+logger: logging.Logger = logging.getLogger("aerokit")
 
 LONGEST_PUTTING_BACK = 3
 """In patiences: the end of a block is bounded, however slowly the link goes."""
@@ -105,13 +108,29 @@ class _Block:
         reason = ""
         with anyio.move_on_after(LONGEST_PUTTING_BACK * self._patience_s):
             try:
-                answers = await self._access.write(wanted, self._patience_s)
+                changed = await self._changed_by_others(wanted)
+                wanted = [each for each in wanted if not isinstance(changed.get(each.name), Parameter)]
+                to_write = [each for each in wanted if each.name not in changed]
+                answers = await self._access.write(to_write, self._patience_s)
             except AerokitError as error:
                 reason = f" ({error})"
         left = {each.name: each.value for each in wanted if not _is_back(each, answers.get(each.name))}
         if left:
             names = ", ".join(f"{name} = {value!r}" for name, value in left.items())
             raise RollbackFailed(f"could not be put back{reason}: {names}", not_restored=left) from cause
+
+    async def _changed_by_others(self, wanted: list[Parameter]) -> dict[str, object]:
+        """What another station has changed since this program wrote it, which is logged; and what does not answer."""
+        written = self._access.written
+        own = [each.name for each in wanted if each.name in written]
+        changed: dict[str, object] = {}
+        for name, told in (await self._access.read(own, self._patience_s)).items():
+            if not isinstance(told, Parameter) or float(told.value) != float(written[name]):
+                changed[name] = told
+            if isinstance(told, Parameter) and name in changed:
+                text = "%s is not put back: another station has changed it from %r to %r"
+                logger.warning(text, name, written[name], told.value)
+        return changed
 
 
 class Temporarily(_Block):
@@ -159,8 +178,9 @@ class Transaction(_Block):
     :class:`aerokit.errors.RollbackFailed`, and stays as it is, also when the link comes back. The block's own exception
     comes out otherwise.
 
-    Other tasks are not kept from writing meanwhile: what a transaction puts back is what it found before its own first
-    write. Blocks about the same parameter may be nested and may overlap; an inner one that succeeds is undone
+    What another station has changed meanwhile is left as it is, and a warning of logger "aerokit" names it. Other
+    tasks of this program are not kept from writing meanwhile: what a transaction puts back is what it found before its
+    own first write. Blocks about the same parameter may be nested and may overlap; an inner one that succeeds is undone
     by an outer one that fails.
     """
 
