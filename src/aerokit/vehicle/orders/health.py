@@ -9,6 +9,7 @@ import anyio
 
 from aerokit.errors import CommandRejected, CommandTimeout
 from aerokit.mavlink.enums import MavCmd
+from aerokit.runtime.events import LinkRestored
 from aerokit.runtime.link_state import LinkState
 
 if TYPE_CHECKING:
@@ -28,6 +29,12 @@ class Health:
 
     def __init__(self, talk: Talk) -> None:
         self._talk, self._telemetry, self._autopilot = talk, talk.telemetry, talk.autopilot
+        self._restored_at = -math.inf
+        talk.at_close(talk.connection.bus.attach_event(LinkRestored, self._on_restored))
+
+    def _on_restored(self, event: LinkRestored) -> None:
+        """The vehicle may have rebooted meanwhile: only what it tells from now on counts."""
+        self._restored_at = event.at
 
     def missing_for_flight(self) -> list[str]:
         """What is still missing before the vehicle can fly, as far as it is known already; talks to nobody."""
@@ -45,11 +52,18 @@ class Health:
         is_lost = self._talk.watch.link_state.latest is LinkState.LOST
         why = f"the last one {self._talk.heartbeat_age:.1f} s ago{', the link is lost' if is_lost else ''}"
         heartbeats = [f"heartbeats ({why})"] if is_lost or self._talk.watch.is_silent else []
-        return heartbeats + [
+        cells = (telemetry.sensors, telemetry.estimator, telemetry.position)
+        old = [
             f"{cell.name} (no {cell.waits_for} for {cell.age:.0f} s)"
-            for cell in (telemetry.sensors, telemetry.estimator, telemetry.position)
+            for cell in cells
             if FRESH_S < cell.age < math.inf
         ]
+        before = [
+            f"{cell.name} (no {cell.waits_for} since the link was restored)"
+            for cell in cells
+            if cell.is_known and cell.updated_at < self._restored_at and cell.age <= FRESH_S
+        ]
+        return [*heartbeats, *old, *before]
 
     async def why_not_armable(self) -> list[str]:
         """Why arming would be refused now; the vehicle is asked to run its checks where it can do so on request."""
