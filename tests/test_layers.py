@@ -12,7 +12,7 @@ SOURCE = Path(__file__).parent.parent / "src" / "aerokit"
 
 FLOORS = [
     {"errors", "installed", "lazy", "async_block", "plain", "snapshot", "wording"},
-    {"arguments", "geo", "whole_file"},
+    {"read_only", "arguments", "geo", "whole_file"},
     {"position"},
     {"mavlink"},
     {"parameters", "missions", "links", "autopilots"},

@@ -252,7 +252,7 @@ async def test_values_from_before_the_link_was_restored_count_no_more(grounded: 
     assert vehicle.missing_for_flight()[1:] == [
         "sensors (no SYS_STATUS since the link was restored)",
         "estimator (no EKF_STATUS_REPORT since the link was restored)",
-        "position (no GLOBAL_POSITION_INT since the link was restored)",
+        "position (no GLOBAL_POSITION_INT with a fix since the link was restored)",
     ]
     await vehicle.wait_ready()
     await vehicle.arm()

@@ -7,7 +7,7 @@ import logging
 import math
 from collections import deque
 from collections.abc import AsyncIterator, Callable
-from typing import Generic, NoReturn, Protocol, TypeVar
+from typing import TYPE_CHECKING, Generic, NoReturn, Protocol, TypeVar
 
 from aerokit.arguments import checked
 from aerokit.errors import OperationTimeout, StaleValueError, ValueUnknownError
@@ -274,6 +274,14 @@ class StateCell(Generic[T]):
 
     def __repr__(self) -> str:
         return f"<StateCell {self._describe()}>"
+
+    if not TYPE_CHECKING:  # type checkers know what a cell has
+
+        def __getattr__(self, name: str) -> NoReturn:
+            """``vehicle.position.latitude_deg``: the attribute is one of the value."""
+            if not name.startswith("_") and hasattr(self.latest, name):
+                raise AttributeError(f"{self.name} is a StateCell: did you mean .value.{name}?")
+            raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
 
     def __bool__(self) -> NoReturn:
         """``if vehicle.armed:`` would be true for ever."""

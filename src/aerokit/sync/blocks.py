@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from aerokit.errors import ConnectionClosed
+from aerokit.read_only import ReadOnly
 from aerokit.sync.blocking_block import BlockingBlock
 from aerokit.sync.loop_thread import Held, LoopThread
 from aerokit.vehicle.connect import tell_how_it_is_left
@@ -62,7 +63,7 @@ BlockT = TypeVar("BlockT", bound="Temporarily | Transaction")
 TwinT = TypeVar("TwinT", bound="ConnectionTwin | VehicleTwin")
 
 
-class TwinOf(Generic[A]):
+class TwinOf(ReadOnly, Generic[A]):
     """A twin: the loop that it calls, and the asynchronous object that it stands for."""
 
     def __init__(self, loop: LoopThread, aio: A) -> None:
@@ -97,6 +98,13 @@ class CellTwin(TwinOf["StateCell[T]"], Generic[T]):
 
     def __bool__(self) -> bool:
         return bool(self.aio)  # which says what to write instead
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            if name == "aio":  # not made yet
+                raise AttributeError(name)
+            return getattr(self.aio, name)  # which says what was perhaps meant
 
 
 class ChangesTwin(TwinOf["Changes[T]"], Generic[T]):

@@ -1330,8 +1330,9 @@ class Transaction(TransactionTwin):
     :class:`aerokit.errors.RollbackFailed`, and stays as it is, also when the link comes back. The block's own exception
     comes out otherwise.
 
-    Other tasks are not kept from writing meanwhile: what a transaction puts back is what it found before its own first
-    write. Blocks about the same parameter may be nested and may overlap; an inner one that succeeds is undone
+    What another station has changed meanwhile is left as it is, and a warning of logger "aerokit" names it. Other
+    tasks of this program are not kept from writing meanwhile: what a transaction puts back is what it found before its
+    own first write. Blocks about the same parameter may be nested and may overlap; an inner one that succeeds is undone
     by an outer one that fails.
     """
 
@@ -1562,6 +1563,7 @@ class Parameters(TwinOf["AsyncParameters"]):
         Also when the block raises or is cancelled: then the end of the block takes up to ``patience_s`` seconds. When
         one value cannot be set, those before are put back, and its error is raised. Blocks may be nested and may
         overlap, also about the same parameter: it gets the value from before the first of them when the last one ends.
+        A value that another station has changed meanwhile is left as it is, and a warning of logger "aerokit" names it.
 
         Raises:
             RollbackFailed: values could not be put back; ``not_restored`` has them.

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from aerokit.arguments import checks_arguments
 from aerokit.mavlink.messages import ParamValue
+from aerokit.read_only import ReadOnly
 from aerokit.vehicle.orders.arming import ArmingActions
 from aerokit.vehicle.orders.flight import FlightActions
 from aerokit.vehicle.orders.looking import LookActions
@@ -48,7 +49,7 @@ TELL_OF_PICTURES = tuple(
 
 
 @checks_arguments
-class Vehicle(FlightActions, TravelActions, LookActions, ArmingActions, ModeActions, TalkActions):
+class Vehicle(ReadOnly, FlightActions, TravelActions, LookActions, ArmingActions, ModeActions, TalkActions):
     """One vehicle. Coroutines talk to it, properties never do; everything has a deadline and can be cancelled.
 
     Made by :func:`aerokit.connect`. State is in cells (``vehicle.position.value``, ``.age``, ``.fresh(within=1)``,

@@ -8,6 +8,7 @@ import anyio
 
 from aerokit.arguments import checks_arguments
 from aerokit.errors import OperationTimeout
+from aerokit.read_only import ReadOnly
 from aerokit.vehicle.camera.lens import LensCalls
 from aerokit.vehicle.camera.photos import PhotoCalls
 from aerokit.vehicle.camera.storing import StorageCalls
@@ -23,7 +24,7 @@ __all__ = ["Camera"]
 
 
 @checks_arguments
-class Camera(PhotoCalls, VideoCalls, LensCalls, TrackingCalls, StorageCalls):
+class Camera(ReadOnly, PhotoCalls, VideoCalls, LensCalls, TrackingCalls, StorageCalls):
     """One camera: pictures, video, lens, tracking, storage, streams (https://mavlink.io/en/services/camera.html).
 
     ``vehicle.camera`` is the first one that is heard, ``vehicle.camera_at(number)`` any: one with a component id of its

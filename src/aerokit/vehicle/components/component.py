@@ -13,6 +13,7 @@ from aerokit.errors import CommandRejected, CommandTimeout, OperationTimeout
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd
 from aerokit.mavlink.message import Message
+from aerokit.read_only import ReadOnly
 from aerokit.runtime.link_state import SILENT_AFTER_S
 from aerokit.runtime.subscription import Overflow, Subscription
 from aerokit.vehicle.components.status import ComponentInformation, information_of, kind_of
@@ -40,7 +41,7 @@ ASK_S, ASKED = 1.0, 3
 
 
 @checks_arguments
-class Component:
+class Component(ReadOnly):
     """One component of a vehicle: a camera, a gimbal, a companion computer, a receiver or another.
 
     Made by :meth:`aerokit.Vehicle.component`. Commands, messages with rates, parameters and files are those of this

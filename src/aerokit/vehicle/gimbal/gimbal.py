@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from aerokit.arguments import checks_arguments
 from aerokit.errors import CommandRejected, CommandTimeout
 from aerokit.mavlink.messages import GimbalDeviceInformation, GimbalManagerInformation
+from aerokit.read_only import ReadOnly
 from aerokit.vehicle.gimbal.control import GimbalControl
 from aerokit.vehicle.gimbal.places import PlaceActions
 from aerokit.vehicle.gimbal.pointing import PointActions
@@ -23,7 +24,7 @@ ANSWER_S = 2.0
 
 
 @checks_arguments
-class Gimbal(PointActions, PlaceActions):
+class Gimbal(ReadOnly, PointActions, PlaceActions):
     """One gimbal, by the gimbal protocol v2 (https://mavlink.io/en/services/gimbal_v2.html), or the mount of a vehicle
     that knows no better.
 

@@ -13,6 +13,7 @@ from aerokit.arguments import checks_arguments
 from aerokit.errors import NotSupported, ParameterRejected, ParameterTimeout
 from aerokit.parameters import Parameter, ParameterTable, check_name
 from aerokit.protocols.transfer import PATIENCE_S
+from aerokit.read_only import ReadOnly
 from aerokit.vehicle.parameters.access import CacheChoice, DownloadMethod, ParameterAccess, UploadMethod
 from aerokit.vehicle.parameters.names import Found, ParameterNames
 from aerokit.vehicle.parameters.results import Outcome, ParameterWrite
@@ -33,7 +34,7 @@ ParameterSource = ParameterTable | Mapping[str, float] | str | os.PathLike[str]
 
 
 @checks_arguments
-class Parameters:
+class Parameters(ReadOnly):
     """The parameters of one autopilot. Coroutines talk to it; ``table`` is what is known, and never does.
 
     Every PARAM_VALUE of the autopilot keeps the table up to date, also when somebody else has changed something, and

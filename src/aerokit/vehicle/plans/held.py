@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Generic, Literal, TypeVar
 
 from aerokit.arguments import checks_arguments
+from aerokit.read_only import ReadOnly
 from aerokit.vehicle.checks import check_kind
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ PlanMethod = Literal["auto", "ftp", "items"]
 
 
 @checks_arguments
-class HeldPlan(Generic[PlanT]):
+class HeldPlan(ReadOnly, Generic[PlanT]):
     """A mission, a fence or rally points that a vehicle holds.
 
     There is one transfer of them at a time with one vehicle; another one waits for its turn. Each can be cancelled at

@@ -1,0 +1,79 @@
+"""Assignments that look like orders are refused; an attribute of a value is not one of its cell."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any
+
+import pytest
+from flight_harness import Flight
+from served_copter import served_copter
+
+import aerokit.sync
+
+PARTS = ("gimbal", "camera", "mission", "fence", "rally", "parameters", "guided")
+CALLS = [
+    ("mode", "GUIDED", r"Vehicle\.mode = 'GUIDED' is not allowed: .*set_mode\('GUIDED'\)"),
+    ("armed", True, r"Vehicle\.armed = True is not allowed: .*arm\(\) or disarm\(\)"),
+    ("home", None, r"set_home\(place\)"),
+    ("heading_deg", 90, r"set_heading\(degrees\)"),
+    ("is_silent", True, r"Vehicle\.is_silent = True is not allowed: it is only read"),
+]
+
+
+@pytest.mark.anyio
+@pytest.mark.parametrize(("name", "value", "text"), CALLS)
+async def test_assignment_to_a_vehicle_names_the_call(
+    grounded: Flight, name: str, value: object, text: str
+) -> None:
+    cell = getattr(grounded.vehicle, name)
+    with pytest.raises(AttributeError, match=text) as caught:
+        setattr(grounded.vehicle, name, value)
+    assert ("await" in str(caught.value)) == ("write" in str(caught.value))
+    assert getattr(grounded.vehicle, name) is cell
+
+
+@pytest.mark.anyio
+async def test_no_public_attribute_of_a_vehicle_can_be_assigned(grounded: Flight) -> None:
+    objects = [grounded.vehicle, *(getattr(grounded.vehicle, part) for part in PARTS[:-1])]
+    assert [assigned for each in objects for assigned in assignable(each)] == []
+
+
+def test_no_public_attribute_of_a_blocking_vehicle_can_be_assigned() -> None:
+    with served_copter() as address, aerokit.sync.connect(address) as vehicle:
+        vehicle.wait_ready()
+        with pytest.raises(AttributeError, match=r"write ….set_mode\('GUIDED'\)"):
+            vehicle.mode = "GUIDED"  # type: ignore[misc, assignment]
+        with pytest.raises(
+            AttributeError, match=r"position is a StateCell: did you mean \.value\.latitude_deg\?"
+        ):
+            vehicle.position.latitude_deg  # type: ignore[attr-defined]  # noqa: B018
+        objects = [vehicle, *(getattr(vehicle, part) for part in PARTS)]
+        assert [assigned for each in objects for assigned in assignable(each)] == []
+
+
+def assignable(thing: Any) -> list[str]:
+    """The public names that take another value; it is put back."""
+    found = []
+    for name in {*dir(type(thing)), *vars(thing)}:
+        is_setter = isinstance(getattr(type(thing), name, None), property) and name in ("signing",)
+        if name.startswith("_") or is_setter:
+            continue
+        try:
+            setattr(thing, name, inspect.getattr_static(thing, name))
+        except AttributeError:
+            continue
+        found.append(f"{type(thing).__name__}.{name}")
+    return found
+
+
+@pytest.mark.anyio
+async def test_attribute_of_the_value_is_named_by_its_cell(grounded: Flight) -> None:
+    vehicle: Any = grounded.vehicle
+    with pytest.raises(
+        AttributeError, match=r"position is a StateCell: did you mean \.value\.latitude_deg\?"
+    ):
+        vehicle.position.latitude_deg  # noqa: B018
+    with pytest.raises(AttributeError, match=r"StateCell has no attribute 'latitude'"):
+        vehicle.position.latitude  # noqa: B018
+    assert not hasattr(vehicle.position, "__deepcopy__")
