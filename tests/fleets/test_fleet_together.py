@@ -476,3 +476,16 @@ async def test_one_that_falls_out_between_two_layers_stops_the_others_there() ->
         for name in ("north/1", "north/2"):  # up, and not across
             assert stage.fleet.vehicles[name].distance_to(targets[name]) > 30
             assert stage.mode_of(name) == "GUIDED"
+
+
+async def test_place_or_mission_too_far_away_is_refused_before_anybody_flies() -> None:
+    far = Position(-47.0, -81.0, altitude_relative_m=20.0)
+    async with open_stage(2) as stage:
+        await stage.take_off()
+        near = stage.fleet.vehicles["north/1"].position.value.offset(north_m=20.0)
+        with pytest.raises(LocalProtocolError, match=r"targets\['north/2'\] = .*max_distance_m"):
+            await stage.fleet.go_to({"north/1": near, "north/2": far})
+        mission = Mission([waypoint(-47.0, -81.0, altitude_relative_m=20.0)])
+        with pytest.raises(LocalProtocolError, match=r"missions\['north/2'\] = .*max_distance_m"):
+            await stage.fleet.upload({"north/2": mission})
+        assert stage.orders_to("north/1") == stage.orders_to("north/2") == []

@@ -18,6 +18,7 @@ from aerokit.fleets.paths import Path, PathPoint
 from aerokit.fleets.results import FleetResult
 from aerokit.fleets.whereabouts import Around, altitude_amsl, position_of
 from aerokit.missions.mission import Mission
+from aerokit.vehicle.orders.whereabouts import MAX_DISTANCE_M
 from aerokit.wording import shown
 
 __all__ = ["Missions"]
@@ -28,7 +29,12 @@ class Missions(FleetPart):
     """One mission for each."""
 
     async def upload(
-        self, missions: Mapping[str, Mission], *, at_once: int = 8, timeout: float | None = None
+        self,
+        missions: Mapping[str, Mission],
+        *,
+        at_once: int = 8,
+        max_distance_m: float = MAX_DISTANCE_M,
+        timeout: float | None = None,
     ) -> FleetResult:
         """Give each its mission, and read it back; as ``vehicle.mission.upload``.
 
@@ -38,6 +44,7 @@ class Missions(FleetPart):
         Args:
             missions: name → mission.
             at_once: so many transfers share a link at the same time, from 1.
+            max_distance_m: metres from where each is; a mission with a place farther away is refused.
             timeout: seconds that each of them has; None: as long as something comes.
 
         Raises:
@@ -50,16 +57,20 @@ class Missions(FleetPart):
         members = self._named(missions)
         for name, mission in missions.items():
             mission.check(home_is_item_0=members[name].vehicle.autopilot.home_is_item_0)
+            places = filter(None, (each.position for each in mission.to_items()))
+            members[name].vehicle._where.check_reach(f"missions[{name!r}]", places, max_distance_m)
         self._crew.missions.clear()
         if self._crew.min_distance_m is not None:
             decided = self.compare_missions(missions)
             if decided.decision == "refused":
                 raise OperationRejected(f"upload: {decided.why}; nothing was sent")
-        places = {name: anyio.Semaphore(at_once) for name in self._crew.networks}
+        turns = {name: anyio.Semaphore(at_once) for name in self._crew.networks}
 
         async def upload(member: Member) -> None:
-            async with places[member.network]:
-                await member.vehicle.mission.upload(missions[member.name], timeout=timeout)
+            async with turns[member.network]:
+                await member.vehicle.mission.upload(
+                    missions[member.name], timeout=timeout, max_distance_m=max_distance_m
+                )
 
         result = await self._run("upload", upload, names=tuple(missions))
         result.raise_for_errors()

@@ -18,6 +18,7 @@ from aerokit.fleets.results import FleetResult
 from aerokit.fleets.whereabouts import Around, altitude_amsl, position_of
 from aerokit.position import Position
 from aerokit.vehicle.checks import check_range
+from aerokit.vehicle.orders.whereabouts import MAX_DISTANCE_M
 from aerokit.wording import shown
 
 __all__ = ["Travel", "WayApart"]
@@ -35,6 +36,7 @@ class Travel(FleetPart):
         targets: Mapping[str, Position] | Callable[[Member], Position],
         *,
         speed_m_s: float | None = None,
+        max_distance_m: float = MAX_DISTANCE_M,
         timeout: float | None = None,
         stagger_s: float | None = None,
         apart: Deconfliction | None = None,
@@ -46,12 +48,13 @@ class Travel(FleetPart):
         Args:
             targets: name → place; who is not named stays where it is. Or a function that gives the place of a member.
             speed_m_s: ground speed; None leaves it.
+            max_distance_m: metres from where each is; a place farther away is refused.
             timeout: seconds that each of them has for a leg; None: as long as it takes.
             stagger_s: each begins so many seconds after the one before; None: all at once.
             apart: what :meth:`plan_apart` has decided about these targets.
 
         Raises:
-            LocalProtocolError: a name is nobody's. Nothing was sent.
+            LocalProtocolError: a name is nobody's, or a place is too far away. Nothing was sent.
             ValueUnknownError: it is not known where one of them is. Nothing was sent.
             OperationRejected: their ways come too near, and no heights keep them apart: nothing was sent. Or one fell
                 out between two legs in layers: the others stay where they are.
@@ -60,7 +63,11 @@ class Travel(FleetPart):
             check_range("speed_m_s", speed_m_s, 0, 1000, above=True)
         places = self._places(targets)
         names = tuple(self.members) if callable(targets) else tuple(places)
-        return await self._travel("go_to", places, speed_m_s, timeout, stagger_s, apart, names=names)
+        for name, place in places.items():
+            self.members[name].vehicle._where.check_reach(f"targets[{name!r}]", [place], max_distance_m)
+        return await self._travel(
+            "go_to", places, speed_m_s, timeout, stagger_s, apart, names=names, max_distance_m=max_distance_m
+        )
 
     def plan_apart(
         self,
@@ -118,17 +125,23 @@ class Travel(FleetPart):
         apart: Deconfliction | None = None,
         *,
         names: tuple[str, ...] = (),
+        max_distance_m: float = MAX_DISTANCE_M,
     ) -> FleetResult:
         """On ways that are compared, if nothing is decided about them; ``what``: the action, as errors call it."""
         if apart is None and self._crew.min_distance_m is not None:
             apart = self.plan_apart(places, speed_m_s=speed_m_s)
         if apart is None or apart.decision == "clear":
-            return await self._fly_to(what, places, speed_m_s, timeout, stagger_s, names=names)
+            return await self._fly_to(
+                what, places, speed_m_s, timeout, stagger_s, None, names, max_distance_m
+            )
         if apart.decision == "refused":
             raise OperationRejected(f"{what}: {apart.why}; nothing was sent")
         if apart.decision == "corridors":
-            return await self._fly_to(what, places, speed_m_s, timeout, stagger_s, apart.delays_s)
-        return await self._fly_in_layers(what, places, speed_m_s, timeout, apart.heights_m)
+            delays_s = apart.delays_s
+            return await self._fly_to(
+                what, places, speed_m_s, timeout, stagger_s, delays_s, (), max_distance_m
+            )
+        return await self._fly_in_layers(what, places, speed_m_s, timeout, apart.heights_m, max_distance_m)
 
     def _places(self, targets: Mapping[str, Position] | Callable[[Member], Position]) -> dict[str, Position]:
         for each in self:
@@ -175,11 +188,14 @@ class Travel(FleetPart):
         stagger_s: float | None = None,
         delays_s: Mapping[str, float] | None = None,
         names: tuple[str, ...] = (),
+        max_distance_m: float = MAX_DISTANCE_M,
     ) -> FleetResult:
         async def fly(member: Member) -> None:
             if delays_s and delays_s.get(member.name):
                 await anyio.sleep(delays_s[member.name])
-            await member.vehicle.go_to(places[member.name], speed_m_s=speed_m_s, timeout=timeout)
+            await member.vehicle.go_to(
+                places[member.name], speed_m_s=speed_m_s, timeout=timeout, max_distance_m=max_distance_m
+            )
 
         return await self._run(what, fly, stagger_s=stagger_s, names=names or tuple(places))
 
@@ -190,6 +206,7 @@ class Travel(FleetPart):
         speed_m_s: float | None,
         timeout: float | None,
         heights_m: Mapping[str, float],
+        max_distance_m: float,
     ) -> FleetResult:
         """Up, across, down: all of them are done with one before anybody begins the next."""
         here = {name: position_of(self._crew.members[name], math.inf) for name in heights_m}
@@ -205,7 +222,7 @@ class Travel(FleetPart):
                 raise OperationRejected(
                     f"{what}: {', '.join(gone)} fell out between two legs; the others stay in their layers"
                 )
-            result = await self._fly_to(what, stage, speed_m_s, timeout)
+            result = await self._fly_to(what, stage, speed_m_s, timeout, max_distance_m=max_distance_m)
             if not result.is_complete:
                 break
         assert result is not None

@@ -15,6 +15,7 @@ from aerokit.fleets.opening import fleet as fleet_async
 from aerokit.sync.blocks import BlockTwin
 from aerokit.sync.fleet_blocks import FleetTwin, SelectionTwin, opened_fleet
 from aerokit.sync.twins import Connection, Subscription, Vehicle
+from aerokit.vehicle.orders.whereabouts import MAX_DISTANCE_M
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable, Mapping
@@ -99,6 +100,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
         targets: Mapping[str, Position] | Callable[[Member], Position],
         *,
         speed_m_s: float | None = None,
+        max_distance_m: float = MAX_DISTANCE_M,
         timeout: float | None = None,
         stagger_s: float | None = None,
         apart: Deconfliction | None = None,
@@ -110,12 +112,13 @@ class Selection(SelectionTwin["AsyncSelection"]):
         Args:
             targets: name → place; who is not named stays where it is. Or a function that gives the place of a member.
             speed_m_s: ground speed; None leaves it.
+            max_distance_m: metres from where each is; a place farther away is refused.
             timeout: seconds that each of them has for a leg; None: as long as it takes.
             stagger_s: each begins so many seconds after the one before; None: all at once.
             apart: what :meth:`plan_apart` has decided about these targets.
 
         Raises:
-            LocalProtocolError: a name is nobody's. Nothing was sent.
+            LocalProtocolError: a name is nobody's, or a place is too far away. Nothing was sent.
             ValueUnknownError: it is not known where one of them is. Nothing was sent.
             OperationRejected: their ways come too near, and no heights keep them apart: nothing was sent. Or one fell
                 out between two legs in layers: the others stay where they are.
@@ -124,6 +127,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
             self.aio.go_to,
             targets,
             speed_m_s=speed_m_s,
+            max_distance_m=max_distance_m,
             timeout=timeout,
             stagger_s=stagger_s,
             apart=apart,
@@ -280,6 +284,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
         missions: Mapping[str, Mission],
         *,
         at_once: int = 8,
+        max_distance_m: float = MAX_DISTANCE_M,
         timeout: float | None = None,
     ) -> FleetResult:
         """Give each its mission, and read it back; as ``vehicle.mission.upload``.
@@ -290,6 +295,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
         Args:
             missions: name → mission.
             at_once: so many transfers share a link at the same time, from 1.
+            max_distance_m: metres from where each is; a mission with a place farther away is refused.
             timeout: seconds that each of them has; None: as long as something comes.
 
         Raises:
@@ -297,7 +303,13 @@ class Selection(SelectionTwin["AsyncSelection"]):
             OperationRejected: one of them does not take part now, or the ways come too near. Nothing was sent.
             FleetError: one of them did not take its mission: none of them will be started.
         """
-        return self._loop.run(self.aio.upload, missions, at_once=at_once, timeout=timeout)
+        return self._loop.run(
+            self.aio.upload,
+            missions,
+            at_once=at_once,
+            max_distance_m=max_distance_m,
+            timeout=timeout,
+        )
 
     def start_missions(self, *, timeout: float=10.0, stagger_s: float | None=None) -> FleetResult:
         """Start the missions that were uploaded together, all at once or nobody; as ``vehicle.mission.start``.
@@ -515,6 +527,7 @@ class Fleet(FleetTwin):
         targets: Mapping[str, Position] | Callable[[Member], Position],
         *,
         speed_m_s: float | None = None,
+        max_distance_m: float = MAX_DISTANCE_M,
         timeout: float | None = None,
         stagger_s: float | None = None,
         apart: Deconfliction | None = None,
@@ -526,12 +539,13 @@ class Fleet(FleetTwin):
         Args:
             targets: name → place; who is not named stays where it is. Or a function that gives the place of a member.
             speed_m_s: ground speed; None leaves it.
+            max_distance_m: metres from where each is; a place farther away is refused.
             timeout: seconds that each of them has for a leg; None: as long as it takes.
             stagger_s: each begins so many seconds after the one before; None: all at once.
             apart: what :meth:`plan_apart` has decided about these targets.
 
         Raises:
-            LocalProtocolError: a name is nobody's. Nothing was sent.
+            LocalProtocolError: a name is nobody's, or a place is too far away. Nothing was sent.
             ValueUnknownError: it is not known where one of them is. Nothing was sent.
             OperationRejected: their ways come too near, and no heights keep them apart: nothing was sent. Or one fell
                 out between two legs in layers: the others stay where they are.
@@ -540,6 +554,7 @@ class Fleet(FleetTwin):
             self.aio.go_to,
             targets,
             speed_m_s=speed_m_s,
+            max_distance_m=max_distance_m,
             timeout=timeout,
             stagger_s=stagger_s,
             apart=apart,
@@ -696,6 +711,7 @@ class Fleet(FleetTwin):
         missions: Mapping[str, Mission],
         *,
         at_once: int = 8,
+        max_distance_m: float = MAX_DISTANCE_M,
         timeout: float | None = None,
     ) -> FleetResult:
         """Give each its mission, and read it back; as ``vehicle.mission.upload``.
@@ -706,6 +722,7 @@ class Fleet(FleetTwin):
         Args:
             missions: name → mission.
             at_once: so many transfers share a link at the same time, from 1.
+            max_distance_m: metres from where each is; a mission with a place farther away is refused.
             timeout: seconds that each of them has; None: as long as something comes.
 
         Raises:
@@ -713,7 +730,13 @@ class Fleet(FleetTwin):
             OperationRejected: one of them does not take part now, or the ways come too near. Nothing was sent.
             FleetError: one of them did not take its mission: none of them will be started.
         """
-        return self._loop.run(self.aio.upload, missions, at_once=at_once, timeout=timeout)
+        return self._loop.run(
+            self.aio.upload,
+            missions,
+            at_once=at_once,
+            max_distance_m=max_distance_m,
+            timeout=timeout,
+        )
 
     def start_missions(self, *, timeout: float=10.0, stagger_s: float | None=None) -> FleetResult:
         """Start the missions that were uploaded together, all at once or nobody; as ``vehicle.mission.start``.

@@ -40,6 +40,7 @@ from aerokit.vehicle.orders.setpoints import (
     BodyVelocitySetpoint,
     VelocitySetpoint,
 )
+from aerokit.vehicle.orders.whereabouts import MAX_DISTANCE_M
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -1633,6 +1634,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         method: PlanMethod = 'auto',
         only_changes: bool = True,
         verify: bool = True,
+        max_distance_m: float = MAX_DISTANCE_M,
         patience_s: float = 10.0,
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
@@ -1647,6 +1649,8 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
                 vehicle, send nothing if it is the same, and only the items that differ if the vehicle takes them alone.
             verify: read it back and compare, or compare the checksum that PX4 tells when that is quicker. What was sent
                 as a file is always read back.
+            max_distance_m: metres from where the vehicle is, if it has told that; a plan with a place farther away is
+                refused.
             patience_s: give up after so many seconds without progress.
             timeout: seconds for all of it.
             on_progress: called with how far it is, in items, or in bytes of a file.
@@ -1656,7 +1660,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         holds a part of both: the error says so.
 
         Raises:
-            LocalProtocolError: the plan cannot be right; nothing was sent.
+            LocalProtocolError: the plan cannot be right, or has a place that is too far away; nothing was sent.
             MissionRejected: the vehicle refused; ``item``, ``result`` and ``reasons`` tell what and why.
             MissionTimeout: it fell silent; ``missing`` are the items it did not confirm.
             VerificationFailed: it confirmed, and holds something else.
@@ -1670,6 +1674,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
             method=method,
             only_changes=only_changes,
             verify=verify,
+            max_distance_m=max_distance_m,
             patience_s=patience_s,
             timeout=timeout,
             on_progress=on_progress,
@@ -1823,6 +1828,7 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
         method: PlanMethod = 'auto',
         only_changes: bool = True,
         verify: bool = True,
+        max_distance_m: float = MAX_DISTANCE_M,
         patience_s: float = 10.0,
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
@@ -1837,6 +1843,8 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
                 vehicle, send nothing if it is the same, and only the items that differ if the vehicle takes them alone.
             verify: read it back and compare, or compare the checksum that PX4 tells when that is quicker. What was sent
                 as a file is always read back.
+            max_distance_m: metres from where the vehicle is, if it has told that; a plan with a place farther away is
+                refused.
             patience_s: give up after so many seconds without progress.
             timeout: seconds for all of it.
             on_progress: called with how far it is, in items, or in bytes of a file.
@@ -1846,7 +1854,7 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
         holds a part of both: the error says so.
 
         Raises:
-            LocalProtocolError: the plan cannot be right; nothing was sent.
+            LocalProtocolError: the plan cannot be right, or has a place that is too far away; nothing was sent.
             MissionRejected: the vehicle refused; ``item``, ``result`` and ``reasons`` tell what and why.
             MissionTimeout: it fell silent; ``missing`` are the items it did not confirm.
             VerificationFailed: it confirmed, and holds something else.
@@ -1860,6 +1868,7 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
             method=method,
             only_changes=only_changes,
             verify=verify,
+            max_distance_m=max_distance_m,
             patience_s=patience_s,
             timeout=timeout,
             on_progress=on_progress,
@@ -1928,6 +1937,7 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
         method: PlanMethod = 'auto',
         only_changes: bool = True,
         verify: bool = True,
+        max_distance_m: float = MAX_DISTANCE_M,
         patience_s: float = 10.0,
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
@@ -1942,6 +1952,8 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
                 vehicle, send nothing if it is the same, and only the items that differ if the vehicle takes them alone.
             verify: read it back and compare, or compare the checksum that PX4 tells when that is quicker. What was sent
                 as a file is always read back.
+            max_distance_m: metres from where the vehicle is, if it has told that; a plan with a place farther away is
+                refused.
             patience_s: give up after so many seconds without progress.
             timeout: seconds for all of it.
             on_progress: called with how far it is, in items, or in bytes of a file.
@@ -1951,7 +1963,7 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
         holds a part of both: the error says so.
 
         Raises:
-            LocalProtocolError: the plan cannot be right; nothing was sent.
+            LocalProtocolError: the plan cannot be right, or has a place that is too far away; nothing was sent.
             MissionRejected: the vehicle refused; ``item``, ``result`` and ``reasons`` tell what and why.
             MissionTimeout: it fell silent; ``missing`` are the items it did not confirm.
             VerificationFailed: it confirmed, and holds something else.
@@ -1965,6 +1977,7 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
             method=method,
             only_changes=only_changes,
             verify=verify,
+            max_distance_m=max_distance_m,
             patience_s=patience_s,
             timeout=timeout,
             on_progress=on_progress,
@@ -3393,6 +3406,7 @@ class Vehicle(VehicleTwin):
         speed_m_s: float | None = None,
         heading_deg: float | None = None,
         tolerance_m: float | None = None,
+        max_distance_m: float = MAX_DISTANCE_M,
         timeout: float | None = None,
         max_silence_s: float | None = LONGEST_SILENCE_S,
     ) -> None:
@@ -3408,6 +3422,7 @@ class Vehicle(VehicleTwin):
             speed_m_s: ground speed from now on, above 0; None leaves it.
             heading_deg: where to look on arrival, 0–360 clockwise from north; None leaves it to the autopilot.
             tolerance_m: how near is there, in metres; None: what suits the type of vehicle.
+            max_distance_m: metres from where it is; a place farther away is refused.
             timeout: seconds; None: as long as it takes, provided that heartbeats come, the mode stays and it moves.
             max_silence_s: give up when no heartbeat has come for so many seconds; None: wait on, however long.
 
@@ -3415,7 +3430,8 @@ class Vehicle(VehicleTwin):
         SET_POSITION_TARGET_GLOBAL_INT to a vehicle that does not know it.
 
         Raises:
-            LocalProtocolError: the target is no place on earth, or another argument is out of range. Nothing was sent.
+            LocalProtocolError: the target is no place on earth or too far away, or another argument is out of range.
+                Nothing was sent.
             ValueUnknownError: position or home is not known and is needed here.
             CommandRejected: the vehicle refused (outside its fence, no position, …).
             OperationRejected: on the way the mode changed (a pilot, a failsafe) or the vehicle disarmed.
@@ -3429,6 +3445,7 @@ class Vehicle(VehicleTwin):
             speed_m_s=speed_m_s,
             heading_deg=heading_deg,
             tolerance_m=tolerance_m,
+            max_distance_m=max_distance_m,
             timeout=timeout,
             max_silence_s=max_silence_s,
         )

@@ -21,6 +21,7 @@ from aerokit.position import Position
 from aerokit.vehicle.checks import check_range
 from aerokit.vehicle.orders.part import Part
 from aerokit.vehicle.orders.progress import LONGEST_SILENCE_S, Stillness, await_progress
+from aerokit.vehicle.orders.whereabouts import MAX_DISTANCE_M
 
 if TYPE_CHECKING:
     from aerokit.autopilots import Mode
@@ -43,6 +44,7 @@ class TravelActions(Part):
         speed_m_s: float | None = None,
         heading_deg: float | None = None,
         tolerance_m: float | None = None,
+        max_distance_m: float = MAX_DISTANCE_M,
         timeout: float | None = None,
         max_silence_s: float | None = LONGEST_SILENCE_S,
     ) -> None:
@@ -58,6 +60,7 @@ class TravelActions(Part):
             speed_m_s: ground speed from now on, above 0; None leaves it.
             heading_deg: where to look on arrival, 0–360 clockwise from north; None leaves it to the autopilot.
             tolerance_m: how near is there, in metres; None: what suits the type of vehicle.
+            max_distance_m: metres from where it is; a place farther away is refused.
             timeout: seconds; None: as long as it takes, provided that heartbeats come, the mode stays and it moves.
             max_silence_s: give up when no heartbeat has come for so many seconds; None: wait on, however long.
 
@@ -65,7 +68,8 @@ class TravelActions(Part):
         SET_POSITION_TARGET_GLOBAL_INT to a vehicle that does not know it.
 
         Raises:
-            LocalProtocolError: the target is no place on earth, or another argument is out of range. Nothing was sent.
+            LocalProtocolError: the target is no place on earth or too far away, or another argument is out of range.
+                Nothing was sent.
             ValueUnknownError: position or home is not known and is needed here.
             CommandRejected: the vehicle refused (outside its fence, no position, …).
             OperationRejected: on the way the mode changed (a pilot, a failsafe) or the vehicle disarmed.
@@ -75,6 +79,7 @@ class TravelActions(Part):
         """
         latitude, longitude, altitude, is_relative = self._where.global_target(target)
         _check_travel(speed_m_s, heading_deg, tolerance_m, timeout)
+        self._where.check_reach("target", [target], max_distance_m)
         near_m = self.autopilot.arrival_radius_m if tolerance_m is None else tolerance_m
         self._check_can_turn(heading_deg)
         if not self.telemetry.is_armed:

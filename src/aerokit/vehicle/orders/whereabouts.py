@@ -13,9 +13,16 @@ from aerokit.vehicle.checks import check_range
 from aerokit.vehicle.orders.progress import OLD_POSITION_S
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from aerokit.vehicle.talk.talk import Talk
 
-__all__ = ["Whereabouts"]
+__all__ = ["MAX_DISTANCE_M", "Whereabouts"]
+
+METRES_PER_DEGREE = 112_000
+"""Of latitude, or of longitude at the equator, at most."""
+MAX_DISTANCE_M = 100_000.0
+"""Farther away, a place is taken for a mistake (coordinates exchanged, a sign lost) unless the call says so."""
 
 
 class Whereabouts:
@@ -36,6 +43,24 @@ class Whereabouts:
             here.latitude_deg, here.longitude_deg, target.latitude_deg, target.longitude_deg
         )
         return math.hypot(along, self._altitude_difference(here, target))
+
+    def check_reach(self, name: str, places: Iterable[Position], max_distance_m: float) -> None:
+        """Raise LocalProtocolError for a place that is farther away; none is while the position is unknown."""
+        check_range("max_distance_m", max_distance_m, 0, math.inf, above=True)
+        here = self._telemetry.position.latest
+        for place in places if here is not None else ():
+            degrees = abs(place.latitude_deg - here.latitude_deg) + abs(
+                place.longitude_deg - here.longitude_deg
+            )
+            if degrees * METRES_PER_DEGREE < max_distance_m:  # missions have thousands of places nearby
+                continue
+            distance_m = self.distance_to(place)
+            if distance_m > max_distance_m:
+                raise LocalProtocolError(
+                    f"{name} = {place.latitude_deg:.7f}, {place.longitude_deg:.7f} is not allowed: it is"
+                    f" {distance_m / 1000:,.0f} km away, more than max_distance_m = {max_distance_m:,.0f}; nothing was"
+                    " sent. Pass a greater max_distance_m if that is meant"
+                )
 
     def way_left(self, target: Position) -> float:
         """Along the ground for a vehicle that stays on it; the altitude it tells may count from anywhere."""

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Generic, Literal, TypeVar
 from aerokit.arguments import checks_arguments
 from aerokit.read_only import ReadOnly
 from aerokit.vehicle.checks import check_kind
+from aerokit.vehicle.orders.whereabouts import MAX_DISTANCE_M
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -40,6 +41,7 @@ class HeldPlan(ReadOnly, Generic[PlanT]):
         method: PlanMethod = "auto",
         only_changes: bool = True,
         verify: bool = True,
+        max_distance_m: float = MAX_DISTANCE_M,
         patience_s: float = 10.0,
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
@@ -54,6 +56,8 @@ class HeldPlan(ReadOnly, Generic[PlanT]):
                 vehicle, send nothing if it is the same, and only the items that differ if the vehicle takes them alone.
             verify: read it back and compare, or compare the checksum that PX4 tells when that is quicker. What was sent
                 as a file is always read back.
+            max_distance_m: metres from where the vehicle is, if it has told that; a plan with a place farther away is
+                refused.
             patience_s: give up after so many seconds without progress.
             timeout: seconds for all of it.
             on_progress: called with how far it is, in items, or in bytes of a file.
@@ -63,7 +67,7 @@ class HeldPlan(ReadOnly, Generic[PlanT]):
         holds a part of both: the error says so.
 
         Raises:
-            LocalProtocolError: the plan cannot be right; nothing was sent.
+            LocalProtocolError: the plan cannot be right, or has a place that is too far away; nothing was sent.
             MissionRejected: the vehicle refused; ``item``, ``result`` and ``reasons`` tell what and why.
             MissionTimeout: it fell silent; ``missing`` are the items it did not confirm.
             VerificationFailed: it confirmed, and holds something else.
@@ -72,6 +76,8 @@ class HeldPlan(ReadOnly, Generic[PlanT]):
             OperationTimeout: not done within ``timeout``.
         """
         plan = self._checked(plan)
+        places = [each.position for each in plan.to_items()]
+        self._context.bridge.where.check_reach("plan", filter(None, places), max_distance_m)
 
         async def work(transfer: PlanTransfer[PlanT]) -> None:
             await transfer.upload(plan, method, only_changes=only_changes, verify=verify)

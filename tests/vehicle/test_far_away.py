@@ -1,0 +1,62 @@
+"""Places that no such vehicle flies to: refused before anything is sent, unless the call says that they are meant."""
+
+from __future__ import annotations
+
+import anyio
+import pytest
+from flight_harness import Flight
+
+from aerokit import Position
+from aerokit.errors import LocalProtocolError
+from aerokit.missions import Mission, RallyPoints, rally_point, waypoint
+from aerokit.vehicle.orders.whereabouts import MAX_DISTANCE_M
+
+pytestmark = pytest.mark.anyio
+
+
+def exchanged(flight: Flight) -> Position:
+    """Longitude for latitude: half round the earth."""
+    here = flight.vehicle.position.value
+    return Position(-here.latitude_deg, here.longitude_deg - 90.0, altitude_relative_m=20.0)
+
+
+async def test_go_to_a_place_too_far_away_sends_nothing(flying: Flight) -> None:
+    target = exchanged(flying)
+    with pytest.raises(LocalProtocolError, match=r"target = .* km away, more than max_distance_m = 100,000"):
+        await flying.vehicle.go_to(target)
+    assert flying.wire.sent == [] or all(m.NAME == "HEARTBEAT" for _, m in flying.wire.sent)
+
+
+async def test_go_to_a_place_too_far_away_is_flown_if_that_is_meant(flying: Flight) -> None:
+    with anyio.move_on_after(3.0):
+        await flying.vehicle.go_to(exchanged(flying), max_distance_m=2.1e7)
+    assert flying.wire.commands(192)
+
+
+@pytest.mark.parametrize(
+    ("metres", "is_allowed"), [(MAX_DISTANCE_M - 500, True), (MAX_DISTANCE_M + 500, False)]
+)
+async def test_distance_is_compared_exactly(flying: Flight, metres: float, is_allowed: bool) -> None:
+    target = flying.vehicle.position.value.offset(north_m=0.6 * metres, east_m=0.8 * metres)
+    with anyio.move_on_after(1.0):
+        if is_allowed:
+            await flying.vehicle.go_to(target)
+        else:
+            with pytest.raises(LocalProtocolError):
+                await flying.vehicle.go_to(target)
+    assert bool(flying.wire.commands(192)) is is_allowed
+
+
+@pytest.mark.parametrize("kind", ["mission", "rally"])
+async def test_plan_with_a_place_too_far_away_is_not_uploaded(grounded: Flight, kind: str) -> None:
+    here, far = grounded.vehicle.position.value, exchanged(grounded)
+    if kind == "mission":
+        places = [here.offset(north_m=50.0), far]
+        items = [waypoint(each.latitude_deg, each.longitude_deg, altitude_relative_m=20) for each in places]
+        with pytest.raises(LocalProtocolError, match="more than max_distance_m"):
+            await grounded.vehicle.mission.upload(Mission(items))
+        await grounded.vehicle.mission.upload(Mission(items), max_distance_m=2.1e7)
+    else:
+        points = RallyPoints([rally_point(far.latitude_deg, far.longitude_deg, altitude_relative_m=20.0)])
+        with pytest.raises(LocalProtocolError, match="more than max_distance_m"):
+            await grounded.vehicle.rally.upload(points)
