@@ -26,6 +26,12 @@ from aerokit.runtime.routes import LIVE_FOR_S, MOVES_AFTER_S
 ATTITUDE = Attitude(0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
+@pytest.fixture
+def anyio_backend() -> str:
+    """Real sockets and the real clock."""
+    return "asyncio"
+
+
 # ---------------------------------------------------------------------- who speaks as the vehicle
 
 

@@ -32,8 +32,9 @@ async def test_a_flight() -> None:
         assert stage.flight.vehicle.position.value.distance_to(here) < 3
 
 
-async def test_who_gives_an_order_without_the_token_gives_none() -> None:
-    async with open_stage() as stage:
+@pytest.mark.parametrize("is_open", [False, True])
+async def test_who_gives_an_order_without_the_token_gives_none(is_open: bool) -> None:
+    async with open_stage(open_reading=is_open) as stage:
         stage.flight.wire.forget()
         wrong = [None, "Bearer ", f"Bearer {TOKEN}x", f"Basic {TOKEN}", "Bearer ä"]
         for authorization in wrong:
@@ -44,8 +45,13 @@ async def test_who_gives_an_order_without_the_token_gives_none() -> None:
                 answer = await stage.client.post(path, headers=headers)
                 assert answer.status_code == 401
                 assert answer.headers["content-type"] == "application/problem+json"
-        assert stage.flight.wire.commands(MavCmd.COMPONENT_ARM_DISARM) == []
-        assert stage.flight.wire.mode_orders() == []
+            answer = await stage.client.put(
+                "/api/vehicles/1/parameters/RTL_ALT", json={"value": 1}, headers=headers
+            )
+            assert answer.status_code == 401
+            refresh = await stage.client.get("/api/vehicles/1/mission?refresh=true", headers=headers)
+            assert refresh.status_code == 401, "it costs the vehicle's link something"
+        assert stage.flight.wire.sent == []
 
 
 @pytest.mark.parametrize(

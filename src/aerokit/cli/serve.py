@@ -140,7 +140,7 @@ async def _serve(uvicorn: Any, app: ServeApp, options: argparse.Namespace) -> in
         ws="websockets-sansio",
         ws_max_size=1024,
         ws_max_queue=4,
-        limit_concurrency=200,
+        http=need("aerokit.serve.connections", "serve").http_protocol(app.holds_token),
         timeout_keep_alive=20,
         timeout_graceful_shutdown=2,
     )

@@ -1,0 +1,178 @@
+"""Connections of `aerokit serve` on real sockets: strangers without the token keep no owner out."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
+
+import anyio
+import pytest
+import uvicorn
+from serve_stage import TOKEN
+
+import aerokit
+import aerokit.serve.connections as connections
+from aerokit.serve import make_app
+from aerokit.serve.connections import MAX_STRANGERS, http_protocol
+from aerokit.sim import SimulatedCopter, simulated_link
+
+pytestmark = pytest.mark.anyio
+
+
+@pytest.fixture
+def anyio_backend() -> str:
+    """Real sockets and the real clock."""
+    return "asyncio"
+
+
+Stream = tuple[asyncio.StreamReader, asyncio.StreamWriter]
+GIVEN = (200, 202)
+HALF = b"GET /api HTTP/1.1\r\nHost: 127"
+
+
+class Server:
+    """The application as `aerokit serve` serves it, and who connects to it."""
+
+    def __init__(self, server: uvicorn.Server) -> None:
+        self._server = server
+        self.port = server.servers[0].sockets[0].getsockname()[1]
+        self._streams: list[Stream] = []
+        self._keys = 0
+
+    async def connect(self, *, first: bytes = b"", host: str = "127.0.0.1") -> Stream:
+        stream = await asyncio.open_connection("127.0.0.1", self.port, local_addr=(host, 0))
+        self._streams.append(stream)
+        stream[1].write(first)
+        return stream
+
+    async def close(self) -> None:
+        for _, writer in self._streams:
+            writer.close()
+            with suppress(ConnectionError):
+                await writer.wait_closed()
+
+    async def flood(self, count: int, first: bytes = HALF, *, host: str = "127.0.0.1") -> None:
+        for _ in range(count):
+            await self.connect(first=first, host=host)
+
+    def open_connections(self) -> int:
+        return len(self._server.server_state.connections)
+
+    async def order(self, stream: Stream) -> int:
+        """Have the owner order `hold`; the status of the answer."""
+        self._keys += 1
+        head = (
+            f"POST /api/vehicles/1/hold?wait=false HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: Bearer {TOKEN}\r\n"
+            f"Idempotency-Key: key-{self._keys:08}\r\nContent-Type: application/json\r\nContent-Length: 2\r\n\r\n{{}}"
+        )
+        return await ask(stream, head.encode())
+
+
+def has_ended(stream: Stream) -> bool:
+    return stream[0].at_eof() or stream[0].exception() is not None
+
+
+async def end_of(stream: Stream) -> bytes:
+    """What comes until the server ends the connection."""
+    with anyio.fail_after(10), suppress(ConnectionResetError):
+        return await stream[0].read()
+    return b""
+
+
+async def ask(stream: Stream, request: bytes) -> int:
+    reader, writer = stream
+    writer.write(request)
+    with anyio.fail_after(10):
+        head = await reader.readuntil(b"\r\n\r\n")
+        length = next(line for line in head.lower().split(b"\r\n") if line.startswith(b"content-length:"))
+        await reader.readexactly(int(length.partition(b":")[2]))
+    return int(head.split()[1])
+
+
+@asynccontextmanager
+async def open_server() -> AsyncIterator[Server]:
+    async with (
+        simulated_link(SimulatedCopter(boot_time_s=0.0)) as link,
+        aerokit.connect(link) as vehicle,
+        make_app(vehicle, token=TOKEN, open_reading=True) as app,
+    ):
+        config = uvicorn.Config(
+            app,
+            port=0,
+            lifespan="off",
+            log_config=None,
+            ws="websockets-sansio",
+            http=http_protocol(app.holds_token),
+        )
+        server = uvicorn.Server(config)
+        serving = asyncio.ensure_future(server._serve())
+        with anyio.fail_after(10):
+            while not server.started:  # noqa: ASYNC110
+                await asyncio.sleep(0.01)
+        stage = Server(server)
+        try:
+            yield stage
+        finally:
+            await stage.close()
+            server.should_exit = True
+            await serving
+
+
+@pytest.mark.parametrize("first", [b"", HALF], ids=["silent", "half"])
+async def test_half_requests_of_strangers_keep_no_order_out(first: bytes) -> None:
+    async with open_server() as server:
+        owner = await server.connect()
+        assert await server.order(owner) in GIVEN
+        await server.flood(200, first)
+        assert await server.order(await server.connect()) in GIVEN
+        assert await server.order(owner) in GIVEN, "his own connection is not ended for strangers"
+        assert server.open_connections() <= MAX_STRANGERS + 2
+
+
+async def test_whole_requests_of_strangers_keep_no_order_out() -> None:
+    async with open_server() as server:
+        request = b"GET /api/vehicles HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
+        await server.flood(200, request)
+        assert await server.order(await server.connect()) in GIVEN
+        assert await ask(await server.connect(), request) == 200
+        assert server.open_connections() <= MAX_STRANGERS + 2
+
+
+async def test_strangers_of_one_address_end_no_connection_of_another_one() -> None:
+    async with open_server() as server:
+        page = await server.connect(host="127.0.0.2")
+        await server.flood(200)
+        assert await ask(page, b"GET /api HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n") == 200
+
+
+async def test_headers_that_do_not_come_end_the_connection(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connections, "REQUEST_TIMEOUT_S", 0.3)
+    whole = b"GET /api HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
+    async with open_server() as server:
+        silent, half, second = [await server.connect(first=first) for first in (b"", HALF, whole + HALF)]
+        idle = await server.connect()
+        assert await ask(idle, whole) == 200
+        assert await end_of(silent) == await end_of(half) == b""
+        assert await ask(idle, whole) == 200, "between requests it may wait"
+        idle[1].write(HALF)
+        assert await end_of(idle) == b""
+        assert not has_ended(second), "it has uvicorn's time for the next request"
+
+
+async def test_bytes_that_trickle_in_win_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connections, "REQUEST_TIMEOUT_S", 0.3)
+    async with open_server() as server:
+        stream = await server.connect(first=HALF)
+        with anyio.fail_after(10):
+            while not has_ended(stream):
+                stream[1].write(b"x")
+                await asyncio.sleep(0.02)
+
+
+@pytest.mark.parametrize("noise", [b"\x16\x03\x01 TLS\r\n\r\n", b"GET /" + b"x" * 100_000, b"\xfd" * 1000])
+async def test_a_request_that_is_no_http_is_refused(noise: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connections, "REQUEST_TIMEOUT_S", 0.3)
+    async with open_server() as server:
+        assert (await end_of(await server.connect(first=noise)))[9:12] in (b"400", b"")
+        assert await server.order(await server.connect()) in GIVEN
