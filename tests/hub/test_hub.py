@@ -672,9 +672,12 @@ async def test_arguments_of_wrong_types_are_refused() -> None:
 async def test_sixty_deaf_clients_cost_no_search_for_each_frame(monkeypatch: pytest.MonkeyPatch) -> None:
     """What a message is, is found out once for each, not for each frame that waits and is dropped."""
     matched: list[str] = []
-    monkeypatch.setattr(
-        kinds, "fnmatchcase", lambda name, pattern: matched.append(name) or fnmatchcase(name, pattern)
-    )
+
+    def match(name: str, pattern: str) -> bool:
+        matched.append(name)
+        return fnmatchcase(name, pattern)
+
+    monkeypatch.setattr(kinds, "fnmatchcase", match)
     kinds.kind_of.cache_clear()
     deaf, copter = [SlowLink(f"slow:{number}") for number in range(60)], Program(1, 1)
     async with copter, Hub([copter.endpoint("copter"), *(Endpoint(each) for each in deaf)]) as hub:

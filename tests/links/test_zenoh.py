@@ -444,3 +444,17 @@ async def test_a_datagram_that_comes_twice_reaches_the_vehicle_once(monkeypatch:
         link._hear("ground", orders[sequence - 1], Stamp(epoch, 1, 7, sequence).encode())
     assert taken == [orders[0], orders[2]]
     assert (link._judge.doubled, link.late_datagrams) == (3, 0)
+
+
+async def test_what_is_larger_than_a_datagram_is_not_listened_to() -> None:
+    """On either side: nobody who may publish on the network fills the other's memory or keeps its loop busy."""
+    port = free_port()
+    async with serving(port) as (vehicle, heard), client(port, "&client=ground") as (link, answered):
+        link.write(orders := frame(ParamRequestList(1, 1)))
+        await heard.until_data(orders)
+        for far in (vehicle, link):
+            far.write(orders * 10_000, "ground" if far is vehicle else None)
+        link.write(orders)
+        vehicle.write(b"small", "ground")
+        await heard.until_data(orders + orders)
+        await answered.until_data(b"small")
