@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections import Counter
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
 
@@ -19,7 +20,7 @@ from aerokit.links.tcp import MAX_CLIENTS
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.message import Message
-from aerokit.mavlink.messages import Attitude
+from aerokit.mavlink.messages import Attitude, ParamRequestList
 from aerokit.runtime.peers import MOST_PEERS, MOST_STRANGERS
 from aerokit.runtime.routes import LIVE_FOR_S, MOVES_AFTER_S
 
@@ -94,6 +95,37 @@ async def test_tcp_clients_that_say_nothing_push_out_nobody_who_has_spoken() -> 
         finally:
             for _, writer in silent:
                 writer.close()
+
+
+@pytest.mark.anyio
+async def test_clients_that_connect_and_go_leave_nothing() -> None:
+    async with udp_hub() as (hub, told, copter, station):
+        router, port = hub._switch.router, int(of(hub, "stations").address.rpartition(":")[2])  # type: ignore[union-attr]
+        for number in range(200):
+            _, writer = await asyncio.open_connection("127.0.0.1", port)
+            writer.write(FrameEncoder(1 + number % 250, 7).encode(STATION))
+            await writer.drain()
+            writer.close()
+        await until(lambda: sum(each.kind == "client_left" for each in told) == 200)
+        assert (len(router._nodes), len(router._senders)) == (2, 2)
+        assert len(list(hub._attachments["stations"]._peers)) == 1
+        station.say(ORDER)
+        await until(lambda: "COMMAND_LONG" in copter.heard)
+
+
+@virtual
+async def test_what_a_stranger_says_comes_back_to_nobody_and_goes_out_once() -> None:
+    """No amplification: a frame goes to each other place at most once, and the hub answers nothing."""
+    link, station = PeersLink(), Program(255, 190)
+    async with station, Hub([Endpoint(link, name="udp"), station.endpoint("station")]):
+        for number in range(10):
+            link.say(f"{number}@host", FrameEncoder(100 + number, 1), COPTER)
+        await settle()
+        link.sent.clear()
+        encoder = FrameEncoder(9, 9)
+        link.say("stranger@elsewhere", encoder, STATION, ParamRequestList(0, 0), ORDER)
+        await settle()
+        assert Counter(link.sent) == {(f"{number}@host", kind): 1 for number in range(10) for kind in (0, 21)}
 
 
 class PeersLink(SlowLink):

@@ -5,16 +5,20 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
+from typing import Any
 
 import anyio
 import pytest
 import uvicorn
+import websockets
 from serve_stage import TOKEN
+from websockets.typing import Subprotocol
 
 import aerokit
 import aerokit.serve.connections as connections
+from aerokit.cli.serve import config_of
 from aerokit.serve import make_app
-from aerokit.serve.connections import MAX_STRANGERS, http_protocol
+from aerokit.serve.connections import MAX_STRANGERS
 from aerokit.sim import SimulatedCopter, simulated_link
 
 pytestmark = pytest.mark.anyio
@@ -97,15 +101,7 @@ async def open_server() -> AsyncIterator[Server]:
         aerokit.connect(link) as vehicle,
         make_app(vehicle, token=TOKEN, open_reading=True) as app,
     ):
-        config = uvicorn.Config(
-            app,
-            port=0,
-            lifespan="off",
-            log_config=None,
-            ws="websockets-sansio",
-            http=http_protocol(app.holds_token),
-        )
-        server = uvicorn.Server(config)
+        server = uvicorn.Server(config_of(uvicorn, app, "127.0.0.1", 0))
         serving = asyncio.ensure_future(server._serve())
         with anyio.fail_after(10):
             while not server.started:  # noqa: ASYNC110
@@ -176,3 +172,84 @@ async def test_a_request_that_is_no_http_is_refused(noise: bytes, monkeypatch: p
     async with open_server() as server:
         assert (await end_of(await server.connect(first=noise)))[9:12] in (b"400", b"")
         assert await server.order(await server.connect()) in GIVEN
+
+
+# --------------------------------------------------------------------------------- the stream
+
+
+def stream(server: Server, token: str | None = TOKEN, **options: Any) -> Any:
+    protocols = [Subprotocol("aerokit.v1"), *([Subprotocol(f"bearer.{token}")] if token else [])]
+    return websockets.connect(f"ws://127.0.0.1:{server.port}/api/stream", subprotocols=protocols, **options)
+
+
+@pytest.mark.parametrize(
+    "said", ["x" * 2_000, "x" * 2_000_000, b"\0" * 2_000_000], ids=["text", "long text", "long bytes"]
+)
+async def test_a_socket_that_speaks_is_ended_before_its_message_is_read(said: str | bytes) -> None:
+    async with open_server() as server, stream(server) as socket:
+        with pytest.raises(websockets.ConnectionClosed), anyio.fail_after(10):
+            await socket.send(said)
+            while True:
+                await socket.recv()
+        assert await server.order(await server.connect()) in GIVEN
+
+
+async def test_a_page_of_another_site_gets_no_stream() -> None:
+    """Cross-site WebSocket hijacking, and a name that was pointed here (DNS rebinding)."""
+    async with open_server() as server:
+        for wrong in ({"origin": "http://evil.example"}, {"origin": f"http://127.0.0.1:{server.port + 1}"}):
+            with pytest.raises(websockets.InvalidStatus):
+                async with stream(server, None, **wrong):
+                    pass
+        async with stream(server, None, origin=f"http://127.0.0.1:{server.port}") as own:
+            assert await own.recv()
+
+
+async def test_streams_opened_and_dropped_leave_nothing() -> None:
+    async with open_server() as server:
+        for _ in range(100):
+            reader, writer = await server.connect(
+                first=b"GET /api/stream HTTP/1.1\r\nHost: 127.0.0.1\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
+                b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: MDEyMzQ1Njc4OWFiY2RlZg==\r\n\r\n"
+            )
+            with anyio.fail_after(10):
+                assert b" 101 " in await reader.readuntil(b"\r\n")
+            writer.transport.abort()
+        async with stream(server) as owner:
+            assert await owner.recv()
+        with anyio.fail_after(10):
+            while server.open_connections():  # noqa: ASYNC110
+                await asyncio.sleep(0.01)
+
+
+async def test_headers_that_nobody_asked_for_come_back_in_no_header() -> None:
+    async with open_server() as server:
+        evil = b"%0d%0aSet-Cookie:%20a=b"
+        for path in (
+            b"/" + evil,
+            b"/api/orders/" + evil,
+            b"/api?refresh=" + evil,
+            b"/api/vehicles/1/" + evil,
+        ):
+            reader, writer = await server.connect(
+                first=b"GET " + path + b" HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
+            )
+            with anyio.fail_after(10):
+                assert b"set-cookie" not in (await reader.readuntil(b"\r\n\r\n")).lower()
+            writer.close()
+
+
+async def test_a_request_hidden_in_another_one_is_refused() -> None:
+    """Two lengths, or a length and chunks: what a proxy takes for a body would be a request here."""
+    hidden = b"POST /api/vehicles/1/land HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
+    async with open_server() as server:
+        for lengths in (
+            b"Content-Length: 0\r\nContent-Length: 60",
+            b"Content-Length: 4\r\nTransfer-Encoding: chunked",
+        ):
+            request = (
+                b"POST /api/vehicles/1/hold HTTP/1.1\r\nHost: 127.0.0.1\r\n" + lengths + b"\r\n\r\n" + hidden
+            )
+            answer = await end_of(await server.connect(first=request))
+            assert answer.count(b"HTTP/1.1 ") == 1
+            assert answer[9:12] in (b"400", b"401")

@@ -166,6 +166,22 @@ async def test_nor_when_its_result_is_forgotten(monkeypatch: pytest.MonkeyPatch)
         assert not stage.flight.copter.is_armed
 
 
+async def test_a_flood_of_keys_fills_no_memory_and_every_one_is_used_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("aerokit.serve.orders.MOST_KEPT", 5)
+    monkeypatch.setattr("aerokit.serve.orders.MOST_KEYS", 20)
+    async with open_stage() as stage:
+        for number in range(40):
+            await stage.give("disarm", Idempotency_Key=f"flood-{number:04}")
+        orders = stage.app._orders
+        assert (len(orders._kept), len(orders._spent)) == (5, 20)
+        for number in (39, 20):
+            answer = await stage.give("arm", Idempotency_Key=f"flood-{number:04}")
+            assert answer.json()["error"] == "KeyUsed"
+        assert not stage.flight.copter.is_armed
+
+
 async def test_refusals_have_their_reasons() -> None:
     async with open_stage() as stage:
         stage.flight.copter.faults.refuse(

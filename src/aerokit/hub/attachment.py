@@ -208,6 +208,7 @@ class Attachment:
             is_mute=self.endpoint.read_only,
         )
         port.owner = self
+        self._guard.is_shared = len(self._ports) > 1
         self._switch.add(port)
         return port
 
@@ -227,6 +228,7 @@ class Attachment:
             self._gone = [a + b for a, b in zip(self._gone, _counted(framer), strict=True)]
         self._guard.forget(peer)
         port = self._ports.pop(peer, None)
+        self._guard.is_shared = len(self._ports) > 1
         if port is not None:
             self._switch.remove(port)
 

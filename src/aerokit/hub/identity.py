@@ -32,6 +32,8 @@ class IdentityGuard:
     """
 
     def __init__(self, link: Link, tell: Callable[[HubEventKind, Peer, str], object]) -> None:
+        self.is_shared = False
+        """Whether the endpoint has more than one peer; of one alone only heartbeats are of interest."""
         self._routes = Routes(link, self._publish)
         self._tell = tell
         self._heartbeat_at: dict[Peer, float] = {}
@@ -39,7 +41,7 @@ class IdentityGuard:
         self._speaker: Peer = None
 
     def admits(self, frame: Frame, framer: Framer, peer: Peer) -> bool:
-        """Whether this peer may say this frame. Call it with each good frame of the endpoint, in order."""
+        """Whether this peer may say this frame. Call it with each heartbeat, and with all frames if `is_shared`."""
         if self._routes.is_elsewhere(frame, peer):
             self._speaker = peer
             if not self._routes.takes_place(frame, peer, framer.counters_of(frame), is_signed=False):

@@ -99,7 +99,11 @@ class Switch:
                 if admitted is None:
                     continue
                 frame = admitted
-            if guard is not None and not guard.admits(frame, framer, peer):
+            if (
+                guard is not None
+                and (guard.is_shared or frame.message_id == 0)
+                and not guard.admits(frame, framer, peer)
+            ):
                 port.totals.dropped["foreign"] += 1
                 continue
             plan = route(node, frame, now, is_late)
