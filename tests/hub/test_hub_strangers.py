@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import random
 from collections import Counter
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
@@ -246,3 +247,44 @@ def test_a_sender_that_was_silent_makes_room_in_a_full_table() -> None:
     stage.now += LIVE_FOR_S + 1
     stage.hear("a", COPTER)
     assert stage.hear("c", order(1), 255, 190) == {"a"}
+
+
+# ------------------------------------------------------------------------------------ the rule
+
+
+@pytest.mark.parametrize("seed", range(6))
+@virtual
+async def test_whatever_strangers_do_orders_reach_the_vehicle_and_no_stranger(seed: int) -> None:
+    """Noise, made-up senders, the vehicle's own name, numbers that go on where it is, from any port and host."""
+    rng, link, station = random.Random(seed), PeersLink(), Program(255, 190)
+    copter, others = FrameEncoder(1, 1), dict[str, FrameEncoder]()
+
+    def stranger() -> None:
+        peer = f"{rng.randrange(400)}@{rng.choice(['drone', 'near', 'far'])}"
+        encoder = others.setdefault(f"{peer} {rng.random() < 0.5}", FrameEncoder(1, 1))
+        match rng.randrange(6):
+            case 0:
+                link.receiver.bytes_received(rng.randbytes(40), peer)
+            case 1:
+                link.say(peer, FrameEncoder(rng.randrange(2, 250), rng.randrange(1, 250)), COPTER)
+            case 2:
+                link.say(peer, FrameEncoder(255, 190), STATION)
+            case 3:
+                encoder.sequence = copter.sequence
+                link.say(peer, encoder, ATTITUDE)
+            case _:
+                link.say(peer, encoder, COPTER, ATTITUDE)
+
+    async with station, Hub([Endpoint(link, name="udp"), station.endpoint("station")]):
+        link.say("14550@drone", copter, COPTER)
+        station.say(STATION)
+        for step in range(60):
+            await asyncio.sleep(0.25)
+            link.say("14550@drone", copter, ATTITUDE, *([COPTER] if step % 4 == 0 else []))
+            for _ in range(rng.choice([1, 20, 100])):
+                stranger()
+            assert await ordered(link, station) == ["14550@drone"]
+            station.frames.clear()
+            link.say("14550@drone", copter, ORDER.__class__(255, 190, 400, 0, 1, 0, 0, 0, 0, 0, 0))
+            await settle()
+            assert station.heard.count("COMMAND_LONG") == 1, "what is for the station reaches it"
