@@ -178,3 +178,15 @@ def test_a_frame_that_came_once_before_elsewhere_is_no_loop() -> None:
         assert stage.pass_on("b", raw) == set("acd")
         stage.hear("b", COPTER)  # something new each time
         stage.now += LOOP_MEMORY_S
+
+
+def test_a_program_that_is_started_again_and_says_the_same_is_no_loop() -> None:
+    """A client of TCP each time, whose numbers begin at 0: its orders are new ones."""
+    stage = Stage()
+    stage.hear("a", COPTER)
+    encoder = FrameEncoder(255, 190)
+    raws = [encoder.encode(message) for message in [STATION, order(1)] * 20]
+    for name in ("e", "f", "g"):
+        stage.nodes[name] = stage.router.add(name)
+        assert [stage.reason for raw in raws if not stage.pass_on(name, raw)] == []
+        stage.now += 10

@@ -150,6 +150,7 @@ async def test_headers_that_do_not_come_end_the_connection(monkeypatch: pytest.M
         idle = await server.connect()
         assert await ask(idle, whole) == 200
         assert await end_of(silent) == await end_of(half) == b""
+        await asyncio.sleep(0.5)
         assert await ask(idle, whole) == 200, "between requests it may wait"
         idle[1].write(HALF)
         assert await end_of(idle) == b""
@@ -192,6 +193,17 @@ async def test_a_socket_that_speaks_is_ended_before_its_message_is_read(said: st
             while True:
                 await socket.recv()
         assert await server.order(await server.connect()) in GIVEN
+
+
+async def test_a_stream_lasts_longer_than_a_request_may_take(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connections, "REQUEST_TIMEOUT_S", 0.3)
+    async with open_server() as server, stream(server, None) as viewer:
+        until = asyncio.get_running_loop().time() + 1.0
+        with anyio.fail_after(10):
+            while asyncio.get_running_loop().time() < until:
+                assert await viewer.recv()
+        await server.flood(100)
+        assert await viewer.recv()
 
 
 async def test_a_page_of_another_site_gets_no_stream() -> None:
