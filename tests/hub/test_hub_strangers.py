@@ -167,11 +167,15 @@ async def test_a_vehicle_that_was_silent_is_followed_to_its_new_port() -> None:
         link.say("1@drone", first, COPTER)
         link.say("2@drone", second, COPTER, ATTITUDE)
         assert await ordered(link, station) == ["1@drone"]
+        assert station.heard == ["HEARTBEAT"], "nothing of the second one's"
         await asyncio.sleep(MOVES_AFTER_S + 0.1)
         link.say("2@drone", second, COPTER)
         assert await ordered(link, station) == ["2@drone"]
         assert [each.kind for each in told] == ["heard_twice", "moved"]
         assert "1/1" in told[1].text
+        link.say("1@drone", first, COPTER)
+        assert [each.kind for each in told] == ["heard_twice", "moved", "heard_twice"]
+        assert await ordered(link, station) == ["2@drone"]
 
 
 @virtual
