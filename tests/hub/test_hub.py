@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import AsyncExitStack, asynccontextmanager
+from fnmatch import fnmatchcase
 from functools import wraps
 from pathlib import Path
 from typing import Any
@@ -17,13 +18,14 @@ from wrong_types import misuses
 import aerokit
 from aerokit import Signing, SigningKey
 from aerokit.errors import BusyError, ConnectionClosed, LinkLost, LinkOpenError, LocalProtocolError
-from aerokit.hub import Endpoint, EndpointStatistics, Hub, HubEvent
+from aerokit.hub import Endpoint, EndpointStatistics, Hub, HubEvent, kinds
 from aerokit.links import Link, MemoryLink, Peer, memory_link_pair
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.messages import (
     Attitude,
     CommandLong,
     GlobalPositionInt,
+    Heartbeat,
     ParamRequestList,
     ParamValue,
     SetupSigning,
@@ -34,6 +36,7 @@ from aerokit.testing import run_virtual
 
 KEY = SigningKey.from_passphrase("border")
 ATTITUDE = Attitude(0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+CAMERA = Heartbeat(30, 8, 0, 0, 3)
 ORDER = CommandLong(1, 1, 400, 0, 1, 0, 0, 0, 0, 0, 0)
 UNKNOWN = bytes.fromhex("fd 04 00 00 07 01 01 22 c8 00") + b"mine" + b"\x12\x34"
 
@@ -499,7 +502,7 @@ async def test_a_link_with_one_other_side_that_has_a_name() -> None:
         link.receiver.bytes_received(b"noise", ("10.0.0.9", 1))
         assert not hasattr(link, "kept")
         link.receiver.bytes_received(Program(1, 1).encoder.encode(COPTER), ("10.0.0.7", 14550))
-        assert link.kept == [("10.0.0.7", 14550)]
+        assert link.kept[-1] == ("10.0.0.7", 14550)
         station.say(ORDER)
         await settle()
         assert link.names() == ["COMMAND_LONG"], "once, not to everybody and to it"
@@ -663,3 +666,47 @@ async def test_arguments_of_wrong_types_are_refused() -> None:
             assert error is not None, misuse
             assert misuse.parameter in str(error) or "address" in str(error)
         assert hub.endpoints == ()
+
+
+@virtual
+async def test_sixty_deaf_clients_cost_no_search_for_each_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a message is, is found out once for each, not for each frame that waits and is dropped."""
+    matched: list[str] = []
+
+    def match(name: str, pattern: str) -> bool:
+        matched.append(name)
+        return fnmatchcase(name, pattern)
+
+    monkeypatch.setattr(kinds, "fnmatchcase", match)
+    kinds.kind_of.cache_clear()
+    deaf, copter = [SlowLink(f"slow:{number}") for number in range(60)], Program(1, 1)
+    async with copter, Hub([copter.endpoint("copter"), *(Endpoint(each) for each in deaf)]) as hub:
+        for each in deaf:
+            each.unsent = 1 << 20
+        for number in range(200):
+            copter.say(Statustext(6, f"{number}"), ATTITUDE)
+        await settle()
+        assert sum(each.waiting for each in hub.endpoints) == 60 * 201
+        for each in deaf:
+            each.receiver.link_lost(LinkLost("gone"))
+        assert sum(each.dropped["away"] for each in hub.endpoints[1:]) == 60 * 201
+    assert len(matched) < 100
+
+
+@virtual
+async def test_an_order_for_everybody_reaches_each_vehicle_once() -> None:
+    """One vehicle has two radios, another one; a program and a camera hear it as well; it never comes back."""
+    first, second = Program(1, 1), Program(1, 1)
+    second.encoder.sequence = 100
+    other, camera, station, program = Program(2, 1), Program(1, 100), Program(255, 190), Program(250, 190)
+    everyone = first, second, other, camera, station, program
+    async with joined(*everyone):
+        for each, heartbeat in zip(everyone, [COPTER] * 3 + [CAMERA] + [STATION] * 2, strict=True):
+            each.say(heartbeat)
+        await settle()
+        for target in (0, 1), (0, 0):
+            station.say(CommandLong(*target, 400, 0, 1, 0, 0, 0, 0, 0, 0))
+            await settle()
+            assert [each.heard.count("COMMAND_LONG") for each in everyone] == [1, 0, 1, 1, 0, 1]
+            for each in everyone:
+                each.frames.clear()

@@ -242,7 +242,8 @@ def test_what_was_heard_is_not_remembered_without_bounds(stage: Stage) -> None:
 class Network:
     """Hubs joined by edges, several between two of them, too, and one program at each hub; frames take their time."""
 
-    def __init__(self, hubs: int, edges: list[tuple[int, int]], seed: int) -> None:
+    def __init__(self, hubs: int, edges: list[tuple[int, int]], seed: int, slowest_s: float = 0.2) -> None:
+        self.slowest_s = slowest_s
         self.random = random.Random(seed)
         self.now = 10.0
         self.heap: list[tuple[float, int, int, tuple[int, int], bytes]] = []
@@ -272,7 +273,9 @@ class Network:
 
     def _post(self, hub: int, port: tuple[int, int], raw: bytes) -> None:
         self.count += 1
-        heapq.heappush(self.heap, (self.now + self.random.uniform(0.001, 0.2), self.count, hub, port, raw))
+        heapq.heappush(
+            self.heap, (self.now + self.random.uniform(0.001, self.slowest_s), self.count, hub, port, raw)
+        )
 
     def run(self) -> None:
         while self.heap:
@@ -287,13 +290,13 @@ class Network:
 
 
 @st.composite
-def networks(draw: st.DrawFn) -> Network:
+def networks(draw: st.DrawFn, slowest_s: float = 0.2) -> Network:
     hubs = draw(st.integers(2, 6))
     tree = [(draw(st.integers(0, hub - 1)), hub) for hub in range(1, hubs)]
     pairs = st.tuples(st.integers(0, hubs - 1), st.integers(0, hubs - 1)).filter(
         lambda pair: pair[0] != pair[1]
     )
-    return Network(hubs, tree + draw(st.lists(pairs, max_size=6)), draw(st.integers(0, 2**32)))
+    return Network(hubs, tree + draw(st.lists(pairs, max_size=6)), draw(st.integers(0, 2**32)), slowest_s)
 
 
 @settings(max_examples=150, deadline=None)

@@ -15,6 +15,7 @@ from zenoh_network import VEHICLE_SIDE, HoldingProxy, eventually, free_port, pro
 from aerokit.errors import BusyError, ConnectionClosed, LinkOpenError, LocalProtocolError
 from aerokit.links import create_link, needed
 from aerokit.links.handover import Handover
+from aerokit.links.zenoh_keys import Stamp
 from aerokit.links.zenoh_listen import MAX_CLIENTS, SILENT_AFTER_S, ZenohListen
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.message import Message
@@ -430,3 +431,30 @@ async def test_names_that_only_put_something_keep_nobody_away(monkeypatch: pytes
     assert link._come("ground-1") is not None
     assert len(link.peers) == MAX_CLIENTS
     assert "noise-7" in link.peers
+
+
+async def test_a_datagram_that_comes_twice_reaches_the_vehicle_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Doubled on its way, or replayed by somebody on the network: an order is carried out once, and in order."""
+    link, taken = ZenohListen("north", "alpha"), list[bytes]()
+    monkeypatch.setattr(link, "_now", lambda: 100.0)
+    monkeypatch.setattr(link, "_deliver", lambda data, peer: taken.append(data))
+    epoch = link._judge.beacon(100.0).epoch
+    orders = [frame(ParamRequestList(1, 1)) for _ in range(3)]
+    for sequence in (1, 1, 3, 2, 3):
+        link._hear("ground", orders[sequence - 1], Stamp(epoch, 1, 7, sequence).encode())
+    assert taken == [orders[0], orders[2]]
+    assert (link._judge.doubled, link.late_datagrams) == (3, 0)
+
+
+async def test_what_is_larger_than_a_datagram_is_not_listened_to() -> None:
+    """On either side: nobody who may publish on the network fills the other's memory or keeps its loop busy."""
+    port = free_port()
+    async with serving(port) as (vehicle, heard), client(port, "&client=ground") as (link, answered):
+        link.write(orders := frame(ParamRequestList(1, 1)))
+        await heard.until_data(orders)
+        for far in (vehicle, link):
+            far.write(orders * 10_000, "ground" if far is vehicle else None)
+        link.write(orders)
+        vehicle.write(b"small", "ground")
+        await heard.until_data(orders + orders)
+        await answered.until_data(b"small")

@@ -32,8 +32,9 @@ async def test_a_flight() -> None:
         assert stage.flight.vehicle.position.value.distance_to(here) < 3
 
 
-async def test_who_gives_an_order_without_the_token_gives_none() -> None:
-    async with open_stage() as stage:
+@pytest.mark.parametrize("is_open", [False, True])
+async def test_who_gives_an_order_without_the_token_gives_none(is_open: bool) -> None:
+    async with open_stage(open_reading=is_open) as stage:
         stage.flight.wire.forget()
         wrong = [None, "Bearer ", f"Bearer {TOKEN}x", f"Basic {TOKEN}", "Bearer ä"]
         for authorization in wrong:
@@ -44,8 +45,13 @@ async def test_who_gives_an_order_without_the_token_gives_none() -> None:
                 answer = await stage.client.post(path, headers=headers)
                 assert answer.status_code == 401
                 assert answer.headers["content-type"] == "application/problem+json"
-        assert stage.flight.wire.commands(MavCmd.COMPONENT_ARM_DISARM) == []
-        assert stage.flight.wire.mode_orders() == []
+            answer = await stage.client.put(
+                "/api/vehicles/1/parameters/RTL_ALT", json={"value": 1}, headers=headers
+            )
+            assert answer.status_code == 401
+            refresh = await stage.client.get("/api/vehicles/1/mission?refresh=true", headers=headers)
+            assert refresh.status_code == 401, "it costs the vehicle's link something"
+        assert stage.flight.wire.sent == []
 
 
 @pytest.mark.parametrize(
@@ -157,6 +163,22 @@ async def test_nor_when_its_result_is_forgotten(monkeypatch: pytest.MonkeyPatch)
             await stage.give("mode", {"mode": "NONE"})
         again = await stage.give("arm", Idempotency_Key="the-same-key")
         assert (again.status_code, again.json()["error"]) == (409, "KeyUsed")
+        assert not stage.flight.copter.is_armed
+
+
+async def test_a_flood_of_keys_fills_no_memory_and_every_one_is_used_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("aerokit.serve.orders.MOST_KEPT", 5)
+    monkeypatch.setattr("aerokit.serve.orders.MOST_KEYS", 20)
+    async with open_stage() as stage:
+        for number in range(40):
+            await stage.give("disarm", Idempotency_Key=f"flood-{number:04}")
+        orders = stage.app._orders
+        assert (len(orders._kept), len(orders._spent)) == (5, 20)
+        for number in (39, 20):
+            answer = await stage.give("arm", Idempotency_Key=f"flood-{number:04}")
+            assert answer.json()["error"] == "KeyUsed"
         assert not stage.flight.copter.is_armed
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from contextlib import AsyncExitStack
 from pathlib import Path
 
 import anyio
@@ -17,7 +18,7 @@ from aerokit.errors import LocalProtocolError
 from aerokit.missions import Mission, return_to_launch, take_off
 from aerokit.serve import make_app
 from aerokit.serve.app import STATIC
-from aerokit.serve.stream import MOST_SOCKETS, MOST_WAITING
+from aerokit.serve.stream import MOST_SOCKETS, MOST_VIEWERS, MOST_WAITING
 from aerokit.sim import SimulatedCopter, simulated_link
 
 pytestmark = pytest.mark.anyio
@@ -223,6 +224,17 @@ async def test_there_are_only_so_many_sockets() -> None:
             await each.__aexit__()
         async with Socket(stage.app) as later:
             await later.next("websocket.accept")
+
+
+async def test_viewers_without_the_token_leave_places_for_the_owner() -> None:
+    async with open_stage(open_reading=True) as stage, AsyncExitStack() as stack:
+        for _ in range(MOST_VIEWERS):
+            viewer = await stack.enter_async_context(Socket(stage.app, token=None))
+            await viewer.next("websocket.accept")
+        async with Socket(stage.app, token=None) as one_more:
+            assert (await one_more.next("websocket.http.response.start"))["status"] == 503
+        async with Socket(stage.app) as owner:
+            await owner.next("websocket.accept")
 
 
 async def test_a_slow_client_gets_the_newest_state_and_one_that_stops_is_let_go() -> None:

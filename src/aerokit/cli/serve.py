@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from aerokit.runtime.connection import Connection
     from aerokit.serve import ServeApp
 
-__all__ = ["add_arguments"]
+__all__ = ["add_arguments", "config_of"]
 
 LOOPBACK = "127.0.0.1"
 
@@ -127,11 +127,12 @@ def _is_loopback(host: str) -> bool:
         return host == "localhost"
 
 
-async def _serve(uvicorn: Any, app: ServeApp, options: argparse.Namespace) -> int:
-    config = uvicorn.Config(
+def config_of(uvicorn: Any, app: ServeApp, host: str, port: int) -> Any:
+    """How uvicorn serves the application: bounded in what others may send and hold."""
+    return uvicorn.Config(
         app,
-        host=options.host,
-        port=options.port,
+        host=host,
+        port=port,
         lifespan="off",
         log_config=None,
         access_log=False,
@@ -140,11 +141,14 @@ async def _serve(uvicorn: Any, app: ServeApp, options: argparse.Namespace) -> in
         ws="websockets-sansio",
         ws_max_size=1024,
         ws_max_queue=4,
-        limit_concurrency=200,
+        http=need("aerokit.serve.connections", "serve").http_protocol(app.holds_token),
         timeout_keep_alive=20,
         timeout_graceful_shutdown=2,
     )
-    server = _server_class(uvicorn)(config)
+
+
+async def _serve(uvicorn: Any, app: ServeApp, options: argparse.Namespace) -> int:
+    server = _server_class(uvicorn)(config_of(uvicorn, app, options.host, options.port))
     server.told = lambda port: _tell(options, app, port)
 
     def stop() -> None:

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 from aerokit.hub.border import Border
 from aerokit.hub.filters import Filters
-from aerokit.hub.kinds import Kind, kind_of
+from aerokit.hub.identity import IdentityGuard
+from aerokit.hub.kinds import Kind
 from aerokit.hub.port import NEVER, Port, Totals
 from aerokit.hub.values import EndpointStatistics
 from aerokit.links import ReconnectingLink, create_link
-from aerokit.mavlink.framer import Framer
-from aerokit.mavlink.statistics import SourceLimit
+from aerokit.runtime.peers import MOST_PEERS, Peers
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -25,17 +25,12 @@ if TYPE_CHECKING:
     from aerokit.links.link import Link, Peer
     from aerokit.mavlink.dialect import Dialect
     from aerokit.mavlink.frame import Frame
+    from aerokit.mavlink.framer import Framer
 
     Tell = Callable[["Attachment", HubEventKind, str], object]
 
 __all__ = ["Attachment", "check_filters"]
 
-MOST_PEERS = 256
-"""So many of one endpoint are remembered; of datagrams the one not heard for longest is forgotten first."""
-MOST_STRANGERS = 32
-"""So many that have sent no good frame yet are listened to."""
-MOST_SENDERS = 2048
-"""So many (system id, component id) of one endpoint are counted apart."""
 HOLD_ABOVE = {"serial": 2048, "pty": 2048}
 """Bytes that may be on their way out of this machine while more is written: a third of a second of a slow radio."""
 HOLD_ABOVE_OTHERS = 16 * 1024
@@ -71,8 +66,11 @@ class Attachment:
         self.is_open = self.tells_bursts = False
         self._is_on_link = self._is_single = False
         self._ports: dict[Peer, Port] = {}
-        self._strangers: dict[Peer, Framer] = {}
-        self._limit = SourceLimit(MOST_SENDERS)
+        self._guard = IdentityGuard(self.link, self._tell_of_peer)
+        self._peers = Peers(
+            self.link, dialect, self._guard.least_wanted, _keep_unknown, forgotten=self._forget_port
+        )
+        self._is_crowded = False
         self.totals = Totals(Counter())
         self._gone = [0, 0, 0, 0]  # frames, bytes, lost frames, bad bytes of peers that are forgotten
         self._told_refusals: set[str] = set()
@@ -102,7 +100,7 @@ class Attachment:
         """What has come and gone until now."""
         router, ports = self._switch.router, tuple(self._ports.values())
         sums = list(self._gone)
-        for framer in (*(port.framer for port in ports), *self._strangers.values()):
+        for framer in self._peers:
             sums = [before + more for before, more in zip(sums, _counted(framer), strict=True)]
         heard = {source for port in ports if port.node is not None for source in router.heard_at(port.node)}
         dropped = {reason: count for reason, count in self.totals.dropped.items() if count}
@@ -129,13 +127,18 @@ class Attachment:
     def bytes_received(self, data: bytes, peer: Peer) -> None:
         """Take bytes off the link; never raises."""
         try:
-            now = self._now()
-            port = self._ports.get(peer)
-            if port is not None:
-                port.heard_at = now
-                self._switch.receive(port, data, now)
+            now, place = self._now(), None if self._is_single else peer
+            framer = self._peers.framers.get(place)
+            if framer is not None:
+                frames = framer.receive(data, now)
             else:
-                self._receive_from_stranger(data, peer, now)
+                framer, frames = self._peers.receive_from_stranger(place, data, now)
+                self._tell_crowded(framer, place)
+            if frames:
+                port = self._ports.get(place) or self._add_port(place)
+                self._switch.take(port, framer, frames, data, now)
+                if place != peer:  # of a broadcast: it is answered
+                    self.link.keep_peer(peer)
         except Exception as error:
             self._tell(self, "mistake", f"a mistake inside aerokit: {error!r}")
 
@@ -146,7 +149,7 @@ class Attachment:
     def peer_joined(self, peer: Peer) -> None:
         """A client is there, which may never say anything."""
         if peer not in self._ports:
-            self._add_port(peer, self._new_framer(), self._now())
+            self._add_port(peer)
             self._tell(self, "client_joined", f"{_named(peer)} has connected")
 
     def peer_left(self, peer: Peer) -> None:
@@ -185,54 +188,27 @@ class Attachment:
         self._is_single = self.link.has_peer(None)
         self.tells_bursts = self.link.tells_bursts
         if self._is_single and None not in self._ports:
-            self._add_port(None, self._new_framer(), self._now())
+            self._add_port(None)
 
     def _go_down(self) -> None:
         self.is_open = False
         for peer in tuple(self._ports):
             self._forget(peer)
-        self._strangers.clear()
 
-    def _receive_from_stranger(self, data: bytes, peer: Peer, now: float) -> None:
-        if peer is None or self._is_single:  # before `open` has returned; or a broadcast is answered
-            port = self._ports.get(None) or self._add_port(None, self._new_framer(), now)
-            before = port.framer.statistics.frames
-            self._switch.receive(port, data, now)
-            if peer is not None and port.framer.statistics.frames > before:
-                self.link.keep_peer(peer)
-            return
-        framer = self._strangers.get(peer)
-        if framer is None:
-            if len(self._strangers) >= MOST_STRANGERS:
-                self._strangers.pop(next(iter(self._strangers))).retire()
-            framer = self._strangers[peer] = self._new_framer()
-        frames = framer.receive(data, now)
-        if framer.statistics.frames:
-            del self._strangers[peer]
-            self.link.keep_peer(peer)
-            port = self._add_port(peer, framer, now)
-            self._switch.take(port, frames, data, now)
-
-    def _new_framer(self) -> Framer:
-        framer = Framer(self._dialect, self._limit)
-        framer.keep_unknown = True
-        return framer
-
-    def _add_port(self, peer: Peer, framer: Framer, now: float) -> Port:
-        if len(self._ports) >= MOST_PEERS:
-            self._forget(min(self._ports, key=lambda each: self._ports[each].heard_at))
+    def _add_port(self, peer: Peer) -> Port:
         port = self._ports[peer] = Port(
             self.link,
             peer,
-            framer,
             self.totals,
             dialect=self._dialect,
             hold_above=self._hold_above(),
             tell=self._dropped,
             border=self._border,
+            guard=None if self._is_single else self._guard,
             is_mute=self.endpoint.read_only,
         )
-        port.owner, port.heard_at = self, now
+        port.owner = self
+        self._guard.is_shared = len(self._ports) > 1
         self._switch.add(port)
         return port
 
@@ -243,12 +219,18 @@ class Attachment:
         return _hold_above(self.link.address)
 
     def _forget(self, peer: Peer) -> None:
+        self._forget_port(peer)
+        self._peers.forget(peer)
+
+    def _forget_port(self, peer: Peer) -> None:
+        framer = self._peers.framers.get(peer)
+        if framer is not None:
+            self._gone = [a + b for a, b in zip(self._gone, _counted(framer), strict=True)]
+        self._guard.forget(peer)
         port = self._ports.pop(peer, None)
+        self._guard.is_shared = len(self._ports) > 1
         if port is not None:
             self._switch.remove(port)
-            self._gone = [a + b for a, b in zip(self._gone, _counted(port.framer), strict=True)]
-            port.framer.retire()
-            self.link.forget_peer(peer)
 
     # ------------------------------------------------------------------------------- what is told
 
@@ -261,10 +243,22 @@ class Attachment:
                 self, "refused", f"a frame of {source} was refused: {why}; more such frames are only counted"
             )
 
+    def _tell_of_peer(self, kind: HubEventKind, peer: Peer, text: str) -> None:
+        self._tell(self, kind, f"{_named(peer)}: {text}")
+
+    def _tell_crowded(self, framer: Framer, peer: Peer) -> None:
+        """A newcomer that sent a good frame was turned away, because all places are taken by live peers."""
+        is_crowded = framer.statistics.frames > 0 and peer not in self._peers.framers
+        if is_crowded and not self._is_crowded:
+            self._tell_of_peer(
+                "turned_away", peer, f"all {MOST_PEERS} places are taken by peers that are heard"
+            )
+        self._is_crowded = is_crowded
+
     def _dropped(self, reason: str, held: Held) -> None:
-        known = self._dialect.get(held.message_id)
-        if known is None or kind_of(known.NAME, is_for_one=held.target[0] != 0) is not Kind.ORDER:
+        if held.kind is not Kind.ORDER:
             return
+        known = self._dialect[held.message_id]
         waited = self._now() - held.since
         why = {"late": "it had waited too long", "queue_full": "too much was waiting"}.get(
             reason, "the link went"
@@ -290,6 +284,10 @@ def _hold_above(address: str) -> int:
     """Of a connection that is shared, and of several links, what the slowest of them stands."""
     kinds = (each.split(":")[0] for each in address.removeprefix("shared:").split(" + "))
     return min(HOLD_ABOVE.get(kind, HOLD_ABOVE_OTHERS) for kind in kinds)
+
+
+def _keep_unknown(framer: Framer) -> None:
+    framer.keep_unknown = True
 
 
 def _counted(framer: Framer) -> tuple[int, int, int, int]:

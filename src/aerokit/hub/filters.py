@@ -47,6 +47,7 @@ class Filters:
     ) -> None:
         self._dialect = dialect
         self._only, self._block, self._rates = tuple(only), tuple(block), dict(rates or {})
+        self._periods: dict[int, float | None] = {}
         for field, patterns in (("only", self._only), ("block", self._block), ("rates", self._rates)):
             for pattern in patterns:
                 self._check(field, pattern)
@@ -60,10 +61,13 @@ class Filters:
         """None: the message does not go out; 0: it does; else once in so many seconds at most."""
         if not (self._only or self._block or self._rates):
             return 0.0
-        known = self._dialect.get(message_id)
-        if known is None:
+        if message_id not in self._dialect.rows:
             return None if self._only else 0.0
-        name = known.NAME
+        if message_id not in self._periods:
+            self._periods[message_id] = self._period(self._dialect[message_id].NAME)
+        return self._periods[message_id]
+
+    def _period(self, name: str) -> float | None:
         if self._only and not any(fnmatchcase(name, each) for each in self._only):
             return None
         if any(fnmatchcase(name, each) for each in self._block):

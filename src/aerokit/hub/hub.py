@@ -96,6 +96,7 @@ class Hub:
         if self._switch is not None:
             raise BusyError("a hub is entered once: make another one")
         self._switch = Switch(self._dialect, _gate, self._on_mistake)
+        self._switch.router.on_change = self._on_change
         self._background = Background(self._on_background_mistake)
         self._background.start(self._flush_recording, "aerokit hub")
         try:
@@ -266,6 +267,20 @@ class Hub:
                 listener(event)
             except Exception:
                 logger.exception("a listener (%r) raised; the others are told all the same", listener)
+
+    def _on_change(self, kind: HubEventKind, source: int, port: Port, before: Port | None) -> None:
+        if port.owner is None or (before is not None and before.owner is port.owner and kind == "moved"):
+            return  # its guard has told it
+        who = f"{source & 0xFF}/{source >> 8}"
+        other = "an endpoint that has gone" if before is None or before.owner is None else before.owner.name
+        text = {
+            "heard_twice": f"{who} is heard here and at {other}, where what is for it goes: two links to one vehicle,"
+            " or two vehicles with the same ids",
+            "moved": f"what is for {who} goes here now: it is not heard at {other} any more",
+            "loop": f"what {who} said at {other} comes back here: both lead to the same network in a circle; what comes"
+            " round is dropped",
+        }[kind]
+        self._tell(port.owner, kind, text)
 
     def _on_mistake(self, port: Port, error: Exception) -> None:
         if port.owner is not None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from enum import Enum
 from fnmatch import fnmatchcase
+from functools import cache
 
 __all__ = ["Kind", "kind_of"]
 
@@ -46,6 +47,7 @@ _ORDERS = (
 )  # fmt: skip
 
 
+@cache  # of each message of the dialects in use: a frame that has to wait costs no search
 def kind_of(name: str, *, is_for_one: bool) -> Kind:
     """What a message of the standard's ``name`` is; ``is_for_one``: this frame names a target, and is no telemetry."""
     if name not in _NO_ORDERS and any(fnmatchcase(name, pattern) for pattern in _ORDERS):

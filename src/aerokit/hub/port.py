@@ -13,10 +13,10 @@ if TYPE_CHECKING:
 
     from aerokit.hub.attachment import Attachment
     from aerokit.hub.border import Border
+    from aerokit.hub.identity import IdentityGuard
     from aerokit.hub.routing import Node, Plan
     from aerokit.links.link import Link, Peer
     from aerokit.mavlink.dialect import Dialect
-    from aerokit.mavlink.framer import Framer
 
 __all__ = ["JOINED_BYTES", "NEVER", "Port", "Totals"]
 
@@ -37,7 +37,7 @@ class Totals:
 
 
 class Port:
-    """One peer of one endpoint: a framer for what comes, and a batch, or a queue, for what goes.
+    """One peer of one endpoint, and a batch, or a queue, for what goes there.
 
     While the link takes everything, frames are gathered in ``batch`` until the present turn of the loop is over. While
     more than ``hold_above`` bytes (`NEVER`: it is not asked) have not left it, they wait in a queue that knows what
@@ -46,7 +46,6 @@ class Port:
     ``tell(reason, held)`` is called for each frame that was dropped out of the queue.
     """
 
-    heard_at: float
     link: Link
     peer: Peer
 
@@ -54,26 +53,24 @@ class Port:
         self,
         link: Link,
         peer: Peer,
-        framer: Framer,
         totals: Totals,
         *,
         dialect: Dialect,
         hold_above: int,
         tell: Callable[[str, Held], object],
         border: Border | None = None,
+        guard: IdentityGuard | None = None,
         is_mute: bool = False,
     ) -> None:
         self.link, self.peer = link, peer
-        self.framer = framer
         self.totals = totals
-        self.border = border
+        self.border, self.guard = border, guard
         self.is_mute = is_mute
         """Whether nothing that comes from here is passed on."""
         self.one_at_a_time = False
         """Whether each frame is written by itself: autopilots read datagrams into small buffers."""
         self.batch: list[bytes] = []
         self.node: Node[Port] | None = None
-        self.heard_at = 0.0
         self.owner: Attachment | None = None
         self._dialect = dialect
         self._hold_above, self._may_hold = hold_above, hold_above < NEVER

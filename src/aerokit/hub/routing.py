@@ -6,14 +6,25 @@ its target is kept, so that a frame costs a few look-ups; it is forgotten whenev
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Generic, TypeVar
 
-from aerokit.hub.senders import DUPLICATE_WINDOW_S, MOST_RECENT, REPEATED_WITHIN_S, Recent, Sender
+from aerokit.hub.senders import (
+    DUPLICATE_WINDOW_S,
+    LOOP_MEMORY_S,
+    LOOP_RUN,
+    MOST_RECENT,
+    REPEATED_WITHIN_S,
+    Recent,
+    Sender,
+)
+from aerokit.runtime.routes import LIVE_FOR_S, SWEEP_AFTER_S
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from aerokit.hub.targets import Targets
+    from aerokit.hub.values import HubEventKind
     from aerokit.mavlink.frame import Frame
 
 __all__ = ["MOST_PLANS", "MOST_SENDERS", "Node", "Plan", "Router"]
@@ -21,8 +32,8 @@ __all__ = ["MOST_PLANS", "MOST_SENDERS", "Node", "Plan", "Router"]
 PortT = TypeVar("PortT")
 
 MOST_SENDERS = 1024
-"""So many (system id, component id) are remembered; one more takes the place of the one not heard for longest, of those
-that have not said what they are if there are any: noise does not push out who is quiet for a second."""
+"""So many (system id, component id) are remembered. One more takes the place of one that has sent no heartbeat, or that
+was not heard for `LIVE_FOR_S`; if there is none, what is for it goes nowhere."""
 MOST_PLANS = 4096
 """So many plans are kept for each port."""
 
@@ -59,8 +70,8 @@ class Plan(Generic[PortT]):
         self.thinned: tuple[tuple[PortT, float], ...] = thinned
         """Where one goes in so many seconds at most."""
         self.reason = reason
-        """Why it goes nowhere: ``"duplicate"``, ``"no_route"``, ``"secret"``; "" where nobody else is there, or wants
-        it."""
+        """Why it goes nowhere: ``"duplicate"``, ``"loop"``, ``"no_route"``, ``"secret"``; "" where nobody else is there
+        or wants it."""
 
 
 class Node(Generic[PortT]):
@@ -68,13 +79,17 @@ class Node(Generic[PortT]):
 
     number: int
 
-    __slots__ = ("number", "plans", "port")
+    __slots__ = ("echoes", "loop_until", "number", "plans", "port")
 
     def __init__(self, port: PortT, number: int) -> None:
         self.port: PortT = port
         self.number = number
         """Above 0, and never given twice."""
         self.plans: dict[int, Plan[PortT]] = {}
+        self.echoes: dict[int, int] = {}
+        """Sender → how many more of its frames have come back here than new ones have come."""
+        self.loop_until = -math.inf
+        """Until then what comes back here is dropped."""
 
 
 class Router(Generic[PortT]):
@@ -88,7 +103,7 @@ class Router(Generic[PortT]):
       one, until nothing has come from there for 3.5 s; what is for all of a system goes to its autopilot in the same
       way, and to its other components where that is not heard. Ground stations that share their ids all get it;
     - nothing goes back to where it came from, and nothing is passed on twice: copies that come by another way, within
-      two seconds, end here, and teach nothing;
+      two seconds, end here, and teach nothing; nor does what comes back later, once it is clear that it goes round;
     - SETUP_SIGNING, which holds a key, goes nowhere; a telemetry radio's word on its own link does not go to vehicles.
 
     ``gate(port, message_id)`` says whether a port wants a message: None: no; 0: all of them; else one in so many
@@ -102,10 +117,16 @@ class Router(Generic[PortT]):
         self._senders: dict[int, Sender] = {}
         self._recent = Recent()
         self._count = 0
+        self._unproven: dict[int, None] = {}
+        self._swept_at = -math.inf
         self._duplicate: Plan[PortT] = Plan(0, -1, (0, 0), reason="duplicate")
+        self._loop: Plan[PortT] = Plan(0, -1, (0, 0), reason="loop")
         self._stranger: Plan[PortT] = Plan(0, -1, (0, 0), reason="unknown")
         self.on_vehicle: Callable[[PortT], object] | None = None
         """Called when an autopilot was heard at a port for the first time."""
+        self.on_change: Callable[[HubEventKind, int, PortT, PortT | None], object] | None = None
+        """Called with ``"heard_twice"``, ``"moved"`` or ``"loop"``, the sender, the port, and the port where it was
+        before (None: it has gone)."""
 
     def add(self, port: PortT) -> Node[PortT]:
         """A port has come."""
@@ -119,6 +140,7 @@ class Router(Generic[PortT]):
         if self._nodes.pop(node.number, None) is not None:
             for key in [key for key, sender in self._senders.items() if sender.leave(node.number)]:
                 del self._senders[key]
+                self._unproven.pop(key, None)
             self.forget_plans()
 
     def forget_plans(self) -> None:
@@ -152,13 +174,22 @@ class Router(Generic[PortT]):
             recent.begin_next(now)
         which = source << 24 | body[3] << 16 | frame.checksum
         before = recent.newer.get(which) or recent.older.get(which)
-        if before is not None and self._is_copy(before, number, now, is_late):
+        if before is None:
+            recent.newer[which] = number, self._count, now
+            if node.echoes:
+                self._note_fresh(node, source)
+        elif self._is_copy(before, number, now, is_late):
             return self._duplicate
-        recent.newer[which] = number, self._count, now
+        elif self._is_echo(before, number, now):
+            if self._is_loop(node, source, before[0], now):
+                return self._loop
+            recent.newer[which] = *before[:2], now
+        else:
+            recent.newer[which] = number, self._count, now
         if sender.number == number:
             sender.heard_at = now
-        elif sender.hear_elsewhere(number, now):
-            self.forget_plans()
+        else:
+            self._hear_elsewhere(sender, node, now)
         if not message_id:
             self._note_heartbeat(sender, node, body)
         try:
@@ -179,12 +210,29 @@ class Router(Generic[PortT]):
     # ------------------------------------------------------------------------------------ senders
 
     def _add_sender(self, source: int, node: Node[PortT], now: float) -> Sender:
-        if len(self._senders) >= MOST_SENDERS:
-            senders = self._senders
-            del senders[min(senders, key=lambda key: (senders[key].is_vehicles, senders[key].heard_at))]
-        sender = self._senders[source] = Sender(source, node.number, now)
-        self.forget_plans()
+        sender = Sender(source, node.number, now)
+        if len(self._senders) < MOST_SENDERS or self._make_room(now):
+            self._senders[source] = sender
+            self._unproven[source] = None
+            self.forget_plans()
         return sender
+
+    def _make_room(self, now: float) -> bool:
+        if self._unproven:
+            source = next(iter(self._unproven))
+            del self._unproven[source], self._senders[source]
+        elif now - self._swept_at >= SWEEP_AFTER_S:
+            self._swept_at = now
+            for source in [key for key, each in self._senders.items() if now - each.heard_at > LIVE_FOR_S]:
+                del self._senders[source]
+        return len(self._senders) < MOST_SENDERS
+
+    def _hear_elsewhere(self, sender: Sender, node: Node[PortT], now: float) -> None:
+        before = sender.number
+        if sender.hear_elsewhere(node.number, now):
+            self.forget_plans()
+        if sender.is_autopilot and sender.number != before:
+            self._tell("moved", sender.source, node, before)
 
     def _is_copy(self, before: tuple[int, int, float], number: int, now: float, is_late: bool) -> bool:
         """Whether it is the frame that came before, and not the first one of a program that has been started again.
@@ -197,7 +245,33 @@ class Router(Generic[PortT]):
             return is_late and now - at <= REPEATED_WITHIN_S
         return first in self._nodes and number <= count and now - at <= DUPLICATE_WINDOW_S
 
+    def _is_echo(self, before: tuple[int, int, float], number: int, now: float) -> bool:
+        """Whether the same frame came by another port long ago: by chance, or because it goes round."""
+        first, count, at = before
+        return first != number and number <= count and now - at <= LOOP_MEMORY_S
+
+    def _is_loop(self, node: Node[PortT], source: int, first: int, now: float) -> bool:
+        """Whether what this sender says comes back to a port often enough to be what this hub has passed on."""
+        run = node.echoes[source] = min(node.echoes.get(source, 0) + 1, LOOP_RUN)
+        if run < LOOP_RUN and now >= node.loop_until:
+            return False
+        if now >= node.loop_until:
+            self._tell("loop", source, node, first)
+        node.loop_until = now + LOOP_MEMORY_S
+        return True
+
+    def _note_fresh(self, node: Node[PortT], source: int) -> None:
+        run = node.echoes.pop(source, 0) - 1
+        if run > 0:
+            node.echoes[source] = run
+
+    def _tell(self, kind: HubEventKind, source: int, node: Node[PortT], before: int) -> None:
+        if self.on_change is not None:
+            other = self._nodes.get(before)
+            self.on_change(kind, source, node.port, None if other is None else other.port)
+
     def _note_heartbeat(self, sender: Sender, node: Node[PortT], body: bytes) -> None:
+        self._unproven.pop(sender.source, None)
         if sender.note_heartbeat(body):
             self.forget_plans()
         if sender.is_autopilot and node.number not in sender.told:
@@ -205,6 +279,8 @@ class Router(Generic[PortT]):
             self.forget_plans()
             if self.on_vehicle is not None:
                 self.on_vehicle(node.port)
+            if sender.number != node.number:
+                self._tell("heard_twice", sender.source, node, sender.number)
 
     # -------------------------------------------------------------------------------------- plans
 

@@ -10,14 +10,23 @@ from aerokit.mavlink.enums import MavAutopilot, MavType
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-__all__ = ["DUPLICATE_WINDOW_S", "MOST_RECENT", "MOVES_AFTER_S", "REPEATED_WITHIN_S", "Recent", "Sender"]
+__all__ = [
+    *("DUPLICATE_WINDOW_S", "LOOP_MEMORY_S", "LOOP_RUN", "MOST_RECENT", "MOVES_AFTER_S", "REPEATED_WITHIN_S"),
+    *("Recent", "Sender", "is_autopilot"),
+]
 
 DUPLICATE_WINDOW_S = 2.0
 """A frame with the sender, number and checksum of one that came from elsewhere so short a time ago is the same one."""
 REPEATED_WITHIN_S = 0.5
 """And one that comes again from the same place was doubled on its way only if it comes so soon."""
+LOOP_MEMORY_S = 60.0
+"""A frame that comes back by another port is recognised for this long. Below 256 s, in which the numbers of a sender of
+nothing but heartbeats come round."""
+LOOP_RUN = 8
+"""Frames of one sender that come back before a port is taken for the end of a loop: constant messages may be equal by
+chance, where a vehicle is heard over two radios."""
 MOST_RECENT = 1 << 15
-"""Of more frames than that the window is shorter."""
+"""Of more frames than that the memory is shorter."""
 
 MOVES_AFTER_S = 3.5
 """A vehicle that is heard at several ports is reached by another one when so long nothing came from the present one."""
@@ -28,6 +37,11 @@ _STATION = int(MavType.GCS)
 _NO_AUTOPILOT = int(MavAutopilot.INVALID)
 
 
+def is_autopilot(body: bytes) -> bool:
+    """Whether a HEARTBEAT is an autopilot's."""
+    return len(body) > _AUTOPILOT and body[_TYPE] != _STATION and body[_AUTOPILOT] != _NO_AUTOPILOT
+
+
 class Sender:
     """One component, (system id, component id)."""
 
@@ -35,12 +49,25 @@ class Sender:
     is_autopilot: bool
     is_vehicles: bool
     number: int
+    source: int
 
     __slots__ = (
-        *("component_id", "heard", "heard_at", "is_autopilot", "is_vehicles", "number", "system_id", "told"),
+        *(
+            "component_id",
+            "heard",
+            "heard_at",
+            "is_autopilot",
+            "is_vehicles",
+            "number",
+            "source",
+            "system_id",
+            "told",
+        ),
     )
 
     def __init__(self, source: int, number: int, now: float) -> None:
+        self.source = source
+        """System id + 256 · component id."""
         self.system_id: int = source & 0xFF
         self.component_id: int = source >> 8
         self.number = number
@@ -80,7 +107,7 @@ class Sender:
             return False
         before = self.is_vehicles, self.is_autopilot
         self.is_vehicles = body[_TYPE] != _STATION
-        self.is_autopilot = self.is_vehicles and body[_AUTOPILOT] != _NO_AUTOPILOT
+        self.is_autopilot = is_autopilot(body)
         return before != (self.is_vehicles, self.is_autopilot)
 
     def leave(self, number: int) -> bool:
@@ -94,7 +121,7 @@ class Sender:
 
 
 class Recent:
-    """The frames of the last `DUPLICATE_WINDOW_S` to twice that, in two generations: nothing has to be searched."""
+    """The frames of the last `LOOP_MEMORY_S` to twice that, in two generations: nothing has to be searched."""
 
     ends_at: float
 
@@ -110,6 +137,6 @@ class Recent:
 
     def begin_next(self, now: float) -> None:
         """Forget the older ones."""
-        is_over = now - self.ends_at >= DUPLICATE_WINDOW_S
+        is_over = now - self.ends_at >= LOOP_MEMORY_S
         self.older, self.newer = {} if is_over else self.newer, {}
-        self.ends_at = now + DUPLICATE_WINDOW_S
+        self.ends_at = now + LOOP_MEMORY_S

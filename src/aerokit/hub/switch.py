@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from aerokit.hub.routing import Plan
     from aerokit.mavlink.dialect import Dialect
     from aerokit.mavlink.frame import Frame
+    from aerokit.mavlink.framer import Framer
     from aerokit.runtime.recording import Recording
 
 __all__ = ["LOOK_EVERY_S", "Switch"]
@@ -79,18 +80,14 @@ class Switch:
         self._dirty.clear()
         self._holding.clear()
 
-    def receive(self, port: Port, data: bytes, now: float) -> None:
-        """Bytes came in at a port."""
-        framer = port.framer
-        frames = framer.receive(data, now)
-        if frames:
-            self.take(port, frames, data, now)
-
-    def take(self, port: Port, frames: list[Frame], data: bytes, now: float) -> None:
+    def take(self, port: Port, framer: Framer, frames: list[Frame], data: bytes, now: float) -> None:
         """Frames came in at a port, of ``data``, with which they may begin and end."""
         # This runs for every frame.
-        node, framer = port.node, port.framer
+        node, guard, peer = port.node, port.guard, port.peer
         if node is None or port.is_mute:
+            if guard is not None:
+                for frame in frames:
+                    guard.admits(frame, framer, peer)
             port.totals.dropped["read_only"] += len(frames)
             return
         late, route, recording, border = framer.late, self.router.route, self.recording, port.border
@@ -102,6 +99,13 @@ class Switch:
                 if admitted is None:
                     continue
                 frame = admitted
+            if (
+                guard is not None
+                and (guard.is_shared or frame.message_id == 0)
+                and not guard.admits(frame, framer, peer)
+            ):
+                port.totals.dropped["foreign"] += 1
+                continue
             plan = route(node, frame, now, is_late)
             # Most datagrams are one frame: there is no need to put it together again.
             body = frame.body

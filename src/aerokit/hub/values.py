@@ -104,10 +104,10 @@ class EndpointStatistics(Snapshot):
     waiting: int
     """Frames that wait because the link takes no more."""
     dropped: Mapping[str, int]
-    """Why → how many frames. On the way in: ``no_route`` (for somebody who was never heard), ``duplicate``,
-    ``read_only``, ``refused`` (signature), ``secret`` (SETUP_SIGNING), ``unknown`` (no message of the dialect, from
-    nobody known). On the way out: ``late`` (orders), ``queue_full``, ``superseded`` and ``thinned`` (telemetry),
-    ``away``, ``unsignable``, ``link``."""
+    """Why → how many frames. On the way in: ``no_route`` (for somebody who was never heard), ``duplicate``, ``loop``
+    (it went round), ``read_only``, ``refused`` (signature), ``foreign`` (another peer speaks as an autopilot that is
+    heard), ``secret`` (SETUP_SIGNING), ``unknown`` (no message of the dialect, from nobody known). On the way out:
+    ``late`` (orders), ``queue_full``, ``superseded``, ``thinned`` (telemetry), ``away``, ``unsignable``, ``link``."""
     systems: tuple[tuple[int, int], ...]
     """(system id, component id) of everybody who was heard here."""
 
@@ -123,6 +123,10 @@ HubEventKind = Literal[
     "drained",
     "order_dropped",
     "refused",
+    "heard_twice",
+    "moved",
+    "turned_away",
+    "loop",
     "mistake",
 ]
 
@@ -138,6 +142,8 @@ class HubEvent(Snapshot):
     """``opened``; ``lost`` and ``restored``: its link; ``removed``; ``client_joined`` and ``client_left``: of a
     server (``tcpin:``), where clients connect; ``stalled`` and ``drained``: what is written does
     not leave, and does again; ``order_dropped``: an order had waited too long, or met a full queue or a link that went;
-    ``refused``: the first frame that a key did not fit, for each reason; ``mistake``: one inside aerokit."""
+    ``refused``: the first frame that a key did not fit, for each reason; ``heard_twice``: an autopilot is heard from a
+    second peer or endpoint; ``moved``: it is reached there now; ``turned_away``: no place is left for a new peer;
+    ``loop``: what this hub has passed on comes back; ``mistake``: one inside aerokit."""
     text: str
     """In words."""

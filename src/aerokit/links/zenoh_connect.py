@@ -20,7 +20,7 @@ from .handover import Handover
 from .helm import refusals_in
 from .link import HelmListener, Peer
 from .zenoh_keys import WISHES, Beacon, Place, Told, Wish, check_name, read_sent_at
-from .zenoh_session import NetworkLink, NetworkOptions, attachment_of, open_session, payload_of
+from .zenoh_session import MOST_BYTES, NetworkLink, NetworkOptions, attachment_of, open_session, payload_of
 
 __all__ = ["LOST_AFTER_S", "OPEN_TIMEOUT_S", "ZenohConnect"]
 
@@ -113,8 +113,9 @@ class ZenohConnect(NetworkLink):
 
         def hear(take: Callable[[bytes, bytes, bool], object]) -> Callable[[Any], None]:
             def called(sample: Any) -> None:
-                is_put = sample.kind == zenoh.SampleKind.PUT
-                handover.post(partial(take, payload_of(sample), attachment_of(sample), is_put))
+                is_put, payload = sample.kind == zenoh.SampleKind.PUT, payload_of(sample)
+                if len(payload) <= MOST_BYTES:
+                    handover.post(partial(take, payload, attachment_of(sample), is_put))
 
             return called
 

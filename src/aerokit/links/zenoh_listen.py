@@ -19,7 +19,7 @@ from .handover import Handover
 from .helm import Gate, Helm
 from .link import Peer
 from .zenoh_keys import Beacon, Place, Stamp, Told, check_name, sent_at
-from .zenoh_session import NetworkLink, NetworkOptions, attachment_of, open_session, payload_of
+from .zenoh_session import MOST_BYTES, NetworkLink, NetworkOptions, attachment_of, open_session, payload_of
 
 __all__ = ["MAX_CLIENTS", "ZenohListen"]
 
@@ -28,9 +28,6 @@ MAX_CLIENTS = 64
 
 SILENT_AFTER_S = 30.0
 """When there are so many, one that nothing has come of for so long makes room."""
-
-MOST_BYTES = 65535
-"""Nothing larger is listened to: a client sends single frames, or as many as are in a datagram."""
 
 _SOONEST_S = 0.02  # after the last beacon, whoever comes
 _RIVAL_WAIT_S = 2.5 * BEACON_EVERY_S
@@ -123,7 +120,9 @@ class ZenohListen(NetworkLink):
         """On a thread: is the name taken? A token alone may be that of a program that was killed just now."""
 
         def hear_beacon(sample: Any) -> None:
-            handover.post(partial(self._hear_beacon, payload_of(sample)))
+            payload = payload_of(sample)
+            if len(payload) <= MOST_BYTES:
+                handover.post(partial(self._hear_beacon, payload))
 
         self._zenoh = zenoh
         self._declared = [session.declare_subscriber(self._place.beacon, hear_beacon)]

@@ -17,6 +17,7 @@ from .handover import Handover, opened_in_a_thread
 from .needed import needed
 
 __all__ = [
+    "MOST_BYTES",
     "NetworkLink",
     "NetworkOptions",
     "attachment_of",
@@ -25,6 +26,9 @@ __all__ = [
     "payload_of",
     "zenoh_module",
 ]
+
+MOST_BYTES = 65535
+"""Nothing larger is listened to: either side sends single frames, or as many as are in a datagram."""
 
 _NOBODY_THERE = "Unable to connect to any of"
 _ENDPOINTS = re.compile(r"[a-z]+/[^\s,()\[\]]+")  # "[Single(tcp/a:1)]", by 1.6 "[tcp/a:1]"

@@ -17,7 +17,7 @@ from struct import error as StructError  # noqa: N812
 from aerokit.mavlink.checksum import x25
 from aerokit.mavlink.dialect import STANDARD, Dialect
 from aerokit.mavlink.frame import MAGIC_V1, MAGIC_V2, SIGNATURE_LENGTH, SIGNED, Frame
-from aerokit.mavlink.statistics import OTHERS, FramerStatistics, SourceLimit
+from aerokit.mavlink.statistics import OTHERS, FramerStatistics, SourceLimit, SourceStatistics
 
 __all__ = ["MOST_SOURCES", "Framer"]
 
@@ -193,6 +193,10 @@ class Framer:
     def retire(self) -> None:
         """Give back the places of its senders in a `SourceLimit` that others share; it is not used any more."""
         self._limit.leave(self.statistics)
+
+    def counters_of(self, frame: Frame) -> SourceStatistics | None:
+        """The counters of a frame's sender; None if it is not counted apart."""
+        return self._sources.get(frame.component_id << 8 | frame.system_id)
 
     @property
     def waiting(self) -> int:

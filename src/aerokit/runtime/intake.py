@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from aerokit.links.link import Link, Peer
     from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.framer import Framer
-    from aerokit.mavlink.statistics import FramerStatistics, SourceStatistics
+    from aerokit.mavlink.statistics import FramerStatistics
     from aerokit.runtime.bus import Bus
     from aerokit.runtime.routes import Routes
     from aerokit.runtime.several_routes import SeveralRoutes
@@ -45,7 +45,7 @@ class Intake:
     ) -> None:
         self._bus, self._gate, self._clock = bus, gate, clock
         self._routes, self._several = routes, several
-        self._peers = Peers(link, bus.dialect, routes, self._let_through)
+        self._peers = Peers(link, bus.dialect, routes.least_wanted, self._let_through)
         self.framers: dict[Peer, Framer] = self._peers.framers
         """One for each peer."""
         self.heard: dict[tuple[int, int], Heartbeat] = {}
@@ -93,7 +93,7 @@ class Intake:
             if (framer.late or framer.foreign) and self._is_stale(framer, frame):
                 continue
             if several is not None:
-                if not several.takes(frame, peer, _counters(framer, frame)):
+                if not several.takes(frame, peer, framer.counters_of(frame)):
                     continue
                 taps.keep(frame.raw, self._clock())
             if frame.message_id == Heartbeat.ID:
@@ -144,14 +144,14 @@ class Intake:
         return is_admitted
 
     def _takes_place(self, framer: Framer, frame: Frame, peer: Peer) -> bool:
-        return self._routes.takes_place(frame, peer, _counters(framer, frame), self._gate.has_checked(frame))
+        return self._routes.takes_place(frame, peer, framer.counters_of(frame), self._gate.has_checked(frame))
 
     def _is_stale(self, framer: Framer, frame: Frame) -> bool:
         """Whether a frame out of order is not listened to: another sender's, or a heartbeat that was overtaken."""
         is_foreign = frame in framer.foreign
         if not is_foreign and frame not in framer.late:
             return False
-        counters = _counters(framer, frame)
+        counters = framer.counters_of(frame)
         if counters is not None and counters.is_double(frame.received_at):
             self._routes.hear_double(frame)
             if is_foreign:
@@ -162,7 +162,7 @@ class Intake:
         heartbeat = self._bus.dialect.decode(frame)
         if frame.system_id == 0 or not isinstance(heartbeat, Heartbeat):
             return
-        if self._routes.note(frame, peer, _counters(framer, frame)):
+        if self._routes.note(frame, peer, framer.counters_of(frame)):
             source = frame.system_id, frame.component_id
             is_new = source not in self.heard
             self.heard[source] = heartbeat
@@ -171,7 +171,3 @@ class Intake:
             if len(self.heard) > MOST_ROUTES:
                 for source in [source for source in self.heard if not self._routes.is_known(source)]:
                     del self.heard[source]
-
-
-def _counters(framer: Framer, frame: Frame) -> SourceStatistics | None:
-    return framer.statistics.by_key.get(frame.component_id << 8 | frame.system_id)

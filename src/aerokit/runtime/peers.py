@@ -8,13 +8,11 @@ from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.statistics import SourceLimit
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
 
     from aerokit.links.link import Link, Peer
     from aerokit.mavlink.dialect import Dialect
     from aerokit.mavlink.frame import Frame
-    from aerokit.runtime.routes import Routes
-    from aerokit.runtime.several_routes import SeveralRoutes
 
 __all__ = ["MOST_PEERS", "MOST_SENDERS", "MOST_STRANGERS", "Peers"]
 
@@ -30,17 +28,20 @@ class Peers:
     """Who sends a good frame becomes a peer, is written to, and is forgotten only for want of room.
 
     Then the first one makes room that no vehicle is behind; while there is none, nobody new is listened to.
-    ``prepare(framer)`` is called with each new framer.
+    ``least_wanted(peers, now)`` is which, as `Routes.least_wanted`; ``prepare(framer)`` is called with each new framer,
+    ``forgotten(peer)`` for each peer that makes room.
     """
 
     def __init__(
         self,
         link: Link,
         dialect: Dialect,
-        routes: Routes | SeveralRoutes,
+        least_wanted: Callable[[Iterable[Peer], float], Iterable[Peer]],
         prepare: Callable[[Framer], object],
+        forgotten: Callable[[Peer], object] | None = None,
     ) -> None:
-        self._link, self._dialect, self._routes, self._prepare = link, dialect, routes, prepare
+        self._link, self._dialect, self._prepare = link, dialect, prepare
+        self._least_wanted, self._forgotten = least_wanted, forgotten
         self.framers: dict[Peer, Framer] = {}
         """One for each peer."""
         self._strangers: dict[Peer, Framer] = {}
@@ -73,6 +74,14 @@ class Peers:
         for peer in self.framers:
             self._link.keep_peer(peer)
 
+    def forget(self, peer: Peer) -> Framer | None:
+        """A peer, or a stranger, has gone; its framer, if it had one."""
+        framer = self.framers.pop(peer, None) or self._strangers.pop(peer, None)
+        if framer is not None:
+            framer.retire()
+        self._link.forget_peer(peer)
+        return framer
+
     def _new_stranger(self, peer: Peer) -> Framer:
         if len(self._strangers) >= MOST_STRANGERS:
             self._strangers.pop(next(iter(self._strangers))).retire()
@@ -83,10 +92,9 @@ class Peers:
     def _has_room(self, now: float) -> bool:
         if len(self.framers) < MOST_PEERS:
             return True
-        unwanted = self._routes.least_wanted(self.framers, now)
-        if not unwanted:
-            return False
+        unwanted = list(self._least_wanted(self.framers, now))
         for peer in unwanted:
-            self.framers.pop(peer).retire()
-            self._link.forget_peer(peer)
-        return True
+            if self._forgotten is not None:
+                self._forgotten(peer)
+            self.forget(peer)
+        return bool(unwanted)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from starlette.applications import Starlette
+from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
 from starlette.routing import BaseRoute, Route, WebSocketRoute
@@ -43,6 +44,7 @@ class ServeApp:
     ) -> None:
         self.token = token
         """What orders, and reading where it is not open, have to be given."""
+        self._keys = keys
         self._watch, self._orders = watch, Orders(watch)
         api = Api(watch, self._orders, keys, settings)
         stream = Stream(watch, self._orders, keys)
@@ -63,6 +65,10 @@ class ServeApp:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one request, as ASGI has it."""
         await self._app(scope, receive, send)
+
+    def holds_token(self, headers: list[tuple[bytes, bytes]]) -> bool:
+        """Whether a request with these headers, as ASGI has them, holds the token."""
+        return self._keys.holds_token(Headers(raw=headers))
 
     async def aclose(self) -> None:
         """End it: orders that are under way are cancelled as actions of the library are, which ends in holding."""

@@ -44,6 +44,13 @@ class Keys:
         self._open_reading = open_reading
         self.read_only: bool = read_only
 
+    def holds_token(self, headers: Headers) -> bool:
+        """Whether the token is in these headers."""
+        given = _token_of(headers)
+        return given is not None and hmac.compare_digest(
+            given.encode("utf-8", "surrogateescape"), self._token
+        )
+
     def check(self, headers: Headers, *, is_order: bool = False, needs_token: bool = False) -> None:
         """Raise Problem, 401 or 403, unless this may be asked."""
         if is_order and self.read_only:
@@ -51,7 +58,7 @@ class Keys:
         given = _token_of(headers)
         if given is None and self._open_reading and not (is_order or needs_token):
             return
-        if given is None or not hmac.compare_digest(given.encode("utf-8", "surrogateescape"), self._token):
+        if not self.holds_token(headers):
             what = "the token is missing" if given is None else "the token is wrong"
             headers_back = {"WWW-Authenticate": 'Bearer realm="aerokit"'}
             raise Problem(401, "Unauthorized", f"{what}; nothing was sent", headers_back)

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 __all__ = ["Stream"]
 
 MOST_SOCKETS = 32
+MOST_VIEWERS = 16
+"""Of them, those without the token, where reading is open."""
 MOST_WAITING = 256
 """Events for one client that have not left; then the oldest go, and it is told how many."""
 SEND_TIMEOUT_S = 10.0
@@ -35,7 +37,7 @@ class Stream:
 
     def __init__(self, watch: Watch, orders: Orders, keys: Keys) -> None:
         self._watch, self._orders, self._keys = watch, orders, keys
-        self._open = 0
+        self._open = self._viewers = 0
 
     async def endpoint(self, socket: WebSocket) -> None:
         """Serve one client."""
@@ -44,18 +46,25 @@ class Stream:
         except Problem as problem:
             await _deny(socket, problem)
             return
+        is_viewer = not self._keys.holds_token(socket.headers)
         self._open += 1
+        self._viewers += is_viewer
         try:
             is_asked = PROTOCOL in socket.scope.get("subprotocols", ())
             await socket.accept(PROTOCOL if is_asked else None)
             await self._talk(socket, 1 / rate_hz)
         finally:
             self._open -= 1
+            self._viewers -= is_viewer
 
     def _admit(self, socket: WebSocket) -> float:
         self._keys.check(socket.headers)
         if self._open >= MOST_SOCKETS:
             raise Problem(503, "TooManySockets", f"{MOST_SOCKETS} clients are connected already")
+        if self._viewers >= MOST_VIEWERS and not self._keys.holds_token(socket.headers):
+            raise Problem(
+                503, "TooManySockets", f"{MOST_VIEWERS} clients without the token are connected already"
+            )
         text = socket.query_params.get("rate_hz", str(DEFAULT_RATE_HZ))
         try:
             rate_hz = float(text)

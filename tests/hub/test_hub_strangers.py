@@ -1,0 +1,294 @@
+"""Strangers at a hub: who speaks as the vehicle, who fills the places, who makes up senders. Real sockets, or none."""
+
+from __future__ import annotations
+
+import asyncio
+import random
+from collections import Counter
+from collections.abc import AsyncIterator
+from contextlib import AsyncExitStack, asynccontextmanager
+
+import pytest
+from hub_stage import COPTER, STATION, Program, SlowLink, settle, until
+from test_hub import virtual
+from test_hub_sockets import ORDER, of, to
+from test_routing import Stage, order
+
+from aerokit.hub import Endpoint, Hub, HubEvent
+from aerokit.hub.routing import MOST_SENDERS
+from aerokit.links import Peer
+from aerokit.links.tcp import MAX_CLIENTS
+from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.framer import Framer
+from aerokit.mavlink.message import Message
+from aerokit.mavlink.messages import Attitude, ParamRequestList
+from aerokit.runtime.peers import MOST_PEERS, MOST_STRANGERS
+from aerokit.runtime.routes import LIVE_FOR_S, MOVES_AFTER_S
+
+ATTITUDE = Attitude(0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+@pytest.fixture
+def anyio_backend() -> str:
+    """Real sockets and the real clock."""
+    return "asyncio"
+
+
+# ---------------------------------------------------------------------- who speaks as the vehicle
+
+
+@asynccontextmanager
+async def udp_hub() -> AsyncIterator[tuple[Hub, list[HubEvent], Program, Program]]:
+    """A hub on UDP and TCP, a copter on UDP that is heard, a station on TCP."""
+    told: list[HubEvent] = []
+    async with Hub(
+        [Endpoint("udpin:127.0.0.1:0", name="radio"), Endpoint("tcpin:127.0.0.1:0", name="stations")]
+    ) as hub:
+        hub.on_event(told.append)
+        async with (
+            Program(1, 1, to(of(hub, "radio"), "udpout")) as copter,
+            Program(255, 190, to(of(hub, "stations"), "tcp")) as station,
+        ):
+            copter.say(COPTER)
+            await until(lambda: of(hub, "radio").systems == ((1, 1),))
+            station.say(STATION)
+            await until(lambda: copter.frames)
+            yield hub, told, copter, station
+
+
+@pytest.mark.anyio
+async def test_udp_strangers_in_the_vehicles_name_get_no_order() -> None:
+    """Three hundred ports, as many as the hub has places and more; the vehicle keeps its own."""
+    async with udp_hub() as (hub, told, copter, station), AsyncExitStack() as stack:
+        strangers = [
+            await stack.enter_async_context(Program(1, 1, to(of(hub, "radio"), "udpout"))) for _ in range(300)
+        ]
+        for count in range(2):
+            for number, stranger in enumerate(strangers, 1):
+                stranger.say(COPTER)
+                if number % 50 == 0:  # a socket of this machine keeps some hundred datagrams at most
+                    said = 1 + count * 301 + number
+                    await until(lambda: of(hub, "radio").frames_in >= said)  # noqa: B023
+            copter.say(ATTITUDE)
+            station.say(ORDER)
+            await until(lambda: copter.heard.count("COMMAND_LONG") == count + 1)  # noqa: B023
+        assert not any("COMMAND_LONG" in stranger.heard for stranger in strangers)
+        assert [each.kind for each in told if each.kind == "heard_twice"] == ["heard_twice"], (
+            "told once, not 300 times"
+        )
+        assert of(hub, "radio").dropped["foreign"] == 600
+        assert of(hub, "radio").peers <= MOST_PEERS
+        assert station.heard.count("HEARTBEAT") <= 1, "and what they say goes nowhere"
+
+
+@pytest.mark.anyio
+async def test_tcp_clients_that_say_nothing_push_out_nobody_who_has_spoken() -> None:
+    async with udp_hub() as (hub, told, copter, station):
+        port = int(of(hub, "stations").address.rpartition(":")[2])
+        silent = [await asyncio.open_connection("127.0.0.1", port) for _ in range(MAX_CLIENTS + 5)]
+        try:
+            await until(lambda: sum(each.kind == "client_joined" for each in told) >= MAX_CLIENTS + 5)
+            assert of(hub, "stations").peers == MAX_CLIENTS
+            copter.say(ATTITUDE)
+            station.say(ORDER)
+            await until(lambda: "COMMAND_LONG" in copter.heard and "ATTITUDE" in station.heard)
+            assert not station.is_lost
+        finally:
+            for _, writer in silent:
+                writer.close()
+
+
+@pytest.mark.anyio
+async def test_clients_that_connect_and_go_leave_nothing() -> None:
+    async with udp_hub() as (hub, told, copter, station):
+        router, port = hub._switch.router, int(of(hub, "stations").address.rpartition(":")[2])  # type: ignore[union-attr]
+        for number in range(200):
+            _, writer = await asyncio.open_connection("127.0.0.1", port)
+            writer.write(FrameEncoder(1 + number % 250, 7).encode(STATION))
+            await writer.drain()
+            writer.close()
+        await until(lambda: sum(each.kind == "client_left" for each in told) == 200)
+        assert (len(router._nodes), len(router._senders)) == (2, 2)
+        assert len(list(hub._attachments["stations"]._peers)) == 1
+        station.say(ORDER)
+        await until(lambda: "COMMAND_LONG" in copter.heard)
+
+
+@virtual
+async def test_what_a_stranger_says_comes_back_to_nobody_and_goes_out_once() -> None:
+    """No amplification: a frame goes to each other place at most once, and the hub answers nothing."""
+    link, station = PeersLink(), Program(255, 190)
+    async with station, Hub([Endpoint(link, name="udp"), station.endpoint("station")]):
+        for number in range(10):
+            link.say(f"{number}@host", FrameEncoder(100 + number, 1), COPTER)
+        await settle()
+        link.sent.clear()
+        encoder = FrameEncoder(9, 9)
+        link.say("stranger@elsewhere", encoder, STATION, ParamRequestList(0, 0), ORDER)
+        await settle()
+        assert Counter(link.sent) == {(f"{number}@host", kind): 1 for number in range(10) for kind in (0, 21)}
+
+
+class PeersLink(SlowLink):
+    """A listening link in memory whose peers are called "port@host"."""
+
+    def __init__(self) -> None:
+        super().__init__("udpin:memory")
+        self.sent: list[tuple[Peer, int]] = []
+
+    def write(self, data: bytes, peer: Peer = None) -> None:
+        self.sent += [(peer, frame.message_id) for frame in Framer().receive(data)]
+
+    def has_peer(self, peer: Peer) -> bool:
+        return peer is not None
+
+    def host_of(self, peer: Peer) -> object:
+        return str(peer).rpartition("@")[2]
+
+    def say(self, peer: str, encoder: FrameEncoder, *messages: Message) -> None:
+        for message in messages:
+            self.receiver.bytes_received(encoder.encode(message), peer)
+
+
+async def ordered(link: PeersLink, station: Program) -> list[Peer]:
+    """Which peers an order to 1/1 goes to."""
+    link.sent.clear()
+    station.say(ORDER)
+    await settle()
+    return [peer for peer, message_id in link.sent if message_id == ORDER.ID]
+
+
+@virtual
+async def test_a_vehicle_that_was_silent_is_followed_to_its_new_port() -> None:
+    link, station, told = PeersLink(), Program(255, 190), list[HubEvent]()
+    async with station, Hub([Endpoint(link, name="udp"), station.endpoint("station")]) as hub:
+        hub.on_event(told.append)
+        first, second = FrameEncoder(1, 1), FrameEncoder(1, 1)
+        link.say("1@drone", first, COPTER)
+        link.say("2@drone", second, COPTER, ATTITUDE)
+        assert await ordered(link, station) == ["1@drone"]
+        assert station.heard == ["HEARTBEAT"], "nothing of the second one's"
+        await asyncio.sleep(MOVES_AFTER_S + 0.1)
+        link.say("2@drone", second, COPTER)
+        assert await ordered(link, station) == ["2@drone"]
+        assert [each.kind for each in told] == ["heard_twice", "moved"]
+        assert "1/1" in told[1].text
+        link.say("1@drone", first, COPTER)
+        assert [each.kind for each in told] == ["heard_twice", "moved", "heard_twice"]
+        assert await ordered(link, station) == ["2@drone"]
+
+
+@virtual
+async def test_places_taken_by_the_living_are_kept_and_a_newcomer_is_turned_away() -> None:
+    link, told = PeersLink(), list[HubEvent]()
+    async with Hub([Endpoint(link, name="udp")]) as hub:
+        hub.on_event(told.append)
+        for number in range(MOST_PEERS):
+            link.say(f"{number}@host", FrameEncoder(255, 190), STATION)
+        newcomer = FrameEncoder(1, 1)
+        for _ in range(3):
+            link.say("1@drone", newcomer, COPTER)
+        assert [each.kind for each in told] == ["turned_away"], "told once"
+        assert of(hub, "udp").peers == MOST_PEERS
+        assert (1, 1) not in of(hub, "udp").systems
+        await asyncio.sleep(LIVE_FOR_S + 1)
+        link.say("1@drone", newcomer, COPTER)
+        assert (1, 1) in of(hub, "udp").systems
+        assert of(hub, "udp").peers == MOST_PEERS
+
+
+@virtual
+async def test_who_sends_noise_has_no_place() -> None:
+    link = PeersLink()
+    async with Hub([Endpoint(link, name="udp")]) as hub:
+        link.say("1@drone", FrameEncoder(1, 1), COPTER)
+        for number in range(MOST_PEERS + 10):
+            link.receiver.bytes_received(b"\xfd\x00 noise", f"{number}@stranger")
+        assert of(hub, "udp").peers == 1
+        assert of(hub, "udp").systems == ((1, 1),)
+        assert len(list(hub._attachments["udp"]._peers)) == 1 + MOST_STRANGERS
+
+
+@virtual
+async def test_stations_that_share_ids_and_a_port_are_both_heard() -> None:
+    """Only an autopilot's place is kept for one peer: a hub passes on what two stations of the same ids say."""
+    link, copter = PeersLink(), Program(1, 1)
+    async with copter, Hub([Endpoint(link, name="udp"), copter.endpoint("copter")]):
+        copter.say(COPTER)
+        await settle()
+        encoders = FrameEncoder(255, 190), FrameEncoder(255, 190)
+        encoders[1].sequence = 100
+        for number, encoder in enumerate(encoders):
+            link.say(f"{number}@station", encoder, STATION, ORDER)
+        await settle()
+        assert copter.heard == ["HEARTBEAT", "COMMAND_LONG"] * 2
+
+
+# ---------------------------------------------------------------------------- made-up senders
+
+
+@pytest.mark.parametrize("message", [COPTER, STATION, ATTITUDE], ids=lambda message: type(message).__name__)
+def test_a_flood_of_senders_leaves_vehicle_and_station_their_routes(message: Message) -> None:
+    """Three thousand names in the second between two heartbeats."""
+    stage = Stage()
+    for _ in range(3):
+        stage.hear("a", COPTER)
+        stage.hear("c", STATION, 255, 190)
+        for number in range(3 * MOST_SENDERS):
+            stage.now += 1 / (3 * MOST_SENDERS)
+            stage.hear("b", message, 2 + number % 250, 1 + number // 250)
+        assert stage.hear("c", order(1), 255, 190) == {"a"}
+        assert stage.hear("a", order(255, 190)) == {"c"}
+    assert len(stage.router._senders) == MOST_SENDERS
+
+
+def test_a_sender_that_was_silent_makes_room_in_a_full_table() -> None:
+    stage = Stage()
+    for number in range(MOST_SENDERS):
+        stage.hear("b", COPTER, 2 + number % 250, 1 + number // 250)
+    assert stage.hear("a", COPTER) == set("bcd"), "passed on, but not remembered"
+    assert stage.hear("c", order(1), 255, 190) == set()
+    stage.now += LIVE_FOR_S + 1
+    stage.hear("a", COPTER)
+    assert stage.hear("c", order(1), 255, 190) == {"a"}
+
+
+# ------------------------------------------------------------------------------------ the rule
+
+
+@pytest.mark.parametrize("seed", range(6))
+@virtual
+async def test_whatever_strangers_do_orders_reach_the_vehicle_and_no_stranger(seed: int) -> None:
+    """Noise, made-up senders, the vehicle's own name, numbers that go on where it is, from any port and host."""
+    rng, link, station = random.Random(seed), PeersLink(), Program(255, 190)
+    copter, others = FrameEncoder(1, 1), dict[str, FrameEncoder]()
+
+    def stranger() -> None:
+        peer = f"{rng.randrange(400)}@{rng.choice(['drone', 'near', 'far'])}"
+        encoder = others.setdefault(f"{peer} {rng.random() < 0.5}", FrameEncoder(1, 1))
+        match rng.randrange(6):
+            case 0:
+                link.receiver.bytes_received(rng.randbytes(40), peer)
+            case 1:
+                link.say(peer, FrameEncoder(rng.randrange(2, 250), rng.randrange(1, 250)), COPTER)
+            case 2:
+                link.say(peer, FrameEncoder(255, 190), STATION)
+            case 3:
+                encoder.sequence = copter.sequence
+                link.say(peer, encoder, ATTITUDE)
+            case _:
+                link.say(peer, encoder, COPTER, ATTITUDE)
+
+    async with station, Hub([Endpoint(link, name="udp"), station.endpoint("station")]):
+        link.say("14550@drone", copter, COPTER)
+        station.say(STATION)
+        for step in range(60):
+            await asyncio.sleep(0.25)
+            link.say("14550@drone", copter, ATTITUDE, *([COPTER] if step % 4 == 0 else []))
+            for _ in range(rng.choice([1, 20, 100])):
+                stranger()
+            assert await ordered(link, station) == ["14550@drone"]
+            station.frames.clear()
+            link.say("14550@drone", copter, ORDER.__class__(255, 190, 400, 0, 1, 0, 0, 0, 0, 0, 0))
+            await settle()
+            assert station.heard.count("COMMAND_LONG") == 1, "what is for the station reaches it"
