@@ -151,8 +151,8 @@ class ChannelsOverride(_ChannelDict):
     **Nothing is repeated**: a vehicle takes a channel back on its own when it has heard nothing for a while
     (ArduPilot: RC_OVERRIDE_TIME, 3 s), which is what makes it safe that a program may hang. A program that keeps a
     stick pressed sets it again, several times a second. All channels are given back when the connection ends
-    (``connect(release_overrides=)``), unless the process is killed. ArduPilot listens only to the ground station it belongs to
-    (``connect(source_system=)`` and MAV_GCS_SYSID, 255).
+    (``connect(release_overrides=)``), unless the process is killed. ArduPilot listens only to the ground station it
+    belongs to (``connect(source_system=)`` and MAV_GCS_SYSID, 255).
     """
 
     def __init__(self, vehicle: VehicleCore) -> None:
