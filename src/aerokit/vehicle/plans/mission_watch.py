@@ -41,6 +41,7 @@ class MissionWatch:
         self.current: StateCell[int | None] = StateCell("mission.current", now, "MISSION_CURRENT")
         self.count: StateCell[int] = StateCell("mission.count", now, "MISSION_CURRENT with a number of items")
         self.progress: StateCell[MissionProgress] = StateCell("mission.progress", now, "MISSION_CURRENT")
+        talk.explain_timeouts(self.current, self.count, self.progress)
         self.reached: int | None = None
         """The item that was reached last."""
         self.is_complete: bool = False

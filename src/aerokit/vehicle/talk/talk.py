@@ -136,9 +136,15 @@ class Talk:
     def keep(self, cell: StateCell[Any]) -> None:
         """Have a cell end with the talk, and be forgotten when the vehicle has rebooted."""
         self._cells.append(cell)
+        self.explain_timeouts(cell)
         self.on_reboot.append(cell.forget)
         if self._ended_by is not None:
             cell.close(self._ended_by)
+
+    def explain_timeouts(self, *cells: StateCell[Any]) -> None:
+        """Have who waits for these in vain told of signatures that keep us and the vehicle apart."""
+        for cell in cells:
+            cell.explain_timeout = self._describe_signatures
 
     def send(self, message: Message) -> None:
         """Send one message as it is; ConnectionClosed after :meth:`close`."""
@@ -213,11 +219,14 @@ class Talk:
             if received + lost
             else "nothing heard"
         )
-        if signatures := self.connection.describe_signatures(self.system_id, self.component_id):
-            loss = f"{loss}, {signatures}"
+        signatures = self._describe_signatures()
+        why = f"{signatures}; " if signatures else ""
         texts = self.texts_since(self.connection.now() - 10.0)
         said = f", it said: {'; '.join(texts[-3:])}" if texts else ""
-        return f"last heartbeat {self.heartbeat_age:.1f} s ago, {loss}{said}"
+        return f"{why}last heartbeat {self.heartbeat_age:.1f} s ago, {loss}{said}"
+
+    def _describe_signatures(self) -> str:
+        return self.connection.describe_signatures(self.system_id)
 
     # -------------------------------------------------------------------------------- events
 
@@ -237,6 +246,7 @@ class Talk:
                 detach = bus.attach(message_type, handler, system_id=self.system_id)
             self._detach.append(detach)
         telemetry, publish = self.telemetry, self.publish
+        self.explain_timeouts(*telemetry.cells.values(), self.link_quality, self.watch.link_state)
         self._detach += [
             telemetry.mode.observe(lambda old, new: publish(ModeChanged, old and old.name, new.name)),
             telemetry.armed.observe(lambda _, new: publish(ArmedChanged, new)),
