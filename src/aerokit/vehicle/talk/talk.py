@@ -9,7 +9,7 @@ import anyio
 
 from aerokit.autopilots import autopilot_for
 from aerokit.errors import CommandRejected, ConnectionClosed
-from aerokit.mavlink.enums import MavResult
+from aerokit.mavlink.enums import MavResult, MavSeverity
 from aerokit.mavlink.messages import CommandAck
 from aerokit.runtime.background import Background
 from aerokit.runtime.cells import Source, StateCell
@@ -196,11 +196,28 @@ class Talk:
     def explained(
         self, error: CommandRejected, since: float, reasons: tuple[str, ...] = ()
     ) -> CommandRejected:
-        """The same refusal with what the vehicle has said since then, and these reasons."""
-        texts = tuple(text for text in self.texts_since(since) if text not in reasons)
+        """The same refusal with what the vehicle has said of it since then, and these reasons; each once.
+
+        What it says as mere information ("ArduPilot Ready") is no reason.
+        """
+        texts = [
+            each.text
+            for each in self.telemetry.texts_since(since)
+            if each.severity <= MavSeverity.WARNING or self.autopilot.is_refusal(each.text)
+        ]
         return CommandRejected(
-            str(error), command=error.command, result=error.result, reasons=(*texts, *reasons)
+            str(error).partition("\n")[0],
+            command=error.command,
+            result=error.result,
+            reasons=self.each_reason_once(*error.reasons, *texts, *reasons),
         )
+
+    def each_reason_once(self, *texts: str) -> tuple[str, ...]:
+        """ArduPilot says the same as "PreArm: …" and as "Arm: …"."""
+        reasons: dict[str, str] = {}
+        for text in texts:
+            reasons.setdefault(self.autopilot.arming_reason(text) or text, text)
+        return tuple(reasons.values())
 
     def texts_since(self, at: float) -> tuple[str, ...]:
         """What the vehicle said (STATUSTEXT) since this time on the loop's clock, oldest first."""
