@@ -327,9 +327,13 @@ class Connection:
         """Seconds since 1970, as the system had them at the beginning, gone on by :meth:`now`: nobody sets it back."""
         return self._wall_at_0 + self._clock()
 
-    def describe_signatures(self, system_id: int = 0) -> str:
-        """What signatures keep from us, or us from this system, for error texts; empty when nothing."""
-        return self._gate.describe([beat for source, beat in self.heard.items() if source[0] == system_id])
+    def describe_signatures(self, system_id: int = 0, component_id: int = 0) -> str:
+        """What signatures keep from us, or us from this component (0: all), for error texts; empty when nothing."""
+        return self._gate.describe(
+            heartbeat
+            for (system, component), heartbeat in self.heard.items()
+            if system == system_id and component_id in (0, component)
+        )
 
     def statistics(self) -> Iterator[FramerStatistics]:
         """The counters of every peer that is remembered."""
