@@ -8,7 +8,7 @@ from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from functools import wraps
 from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import LinkOpenError, LocalProtocolError
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -44,7 +44,13 @@ class _Block(AbstractAsyncContextManager[T]):
                 f"{self._name}(…) runs on asyncio, and no event loop of asyncio is running here: start the program by"
                 " asyncio.run(…), or, on trio, use aerokit.sync in a thread (trio.to_thread.run_sync)"
             ) from None
-        return await self._block.__aenter__()
+        try:
+            return await self._block.__aenter__()
+        except (
+            LinkOpenError,
+            LocalProtocolError,
+        ) as error:  # where in here it came from says nothing to a program
+            raise error.with_traceback(None) from error.__cause__
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None

@@ -213,7 +213,7 @@ def _open(
                 opened = open_connection(ip, baud=baud, reconnect=True, **ids)
                 return loop.hold_open(_releasing(opened, overrides))
             except LinkOpenError as error:
-                if attempt == ATTEMPTS - 1 or not isinstance(error.__cause__, ConnectionRefusedError):
+                if attempt == ATTEMPTS - 1 or not isinstance(error.__context__, ConnectionRefusedError):
                     _raise_classic(error)
                 time.sleep(BETWEEN_ATTEMPTS_S)
         raise AssertionError
@@ -247,7 +247,7 @@ def _check_address(ip: object) -> None:
 
 def _raise_classic(error: LinkOpenError) -> NoReturn:
     """As what the system called it: programs catch ConnectionRefusedError, socket.gaierror, SerialException."""
-    cause = error.__cause__
+    cause = error.__context__
     if isinstance(cause, OSError):
         if cause.errno is not None:
             raise type(cause)(cause.errno, str(error)) from error

@@ -36,7 +36,7 @@ class Recording:
         try:
             self._writer: TlogWriter | None = TlogWriter(path)
         except OSError as error:
-            raise LinkOpenError(f"cannot record to {self._path}: {error.strerror or error}") from error
+            raise LinkOpenError(f"cannot record to {self._path}: {error.strerror or error}") from None
 
     def write(self, raw: bytes, at: float) -> None:
         """Add one frame that was sent or received at this time; never raises."""
