@@ -107,7 +107,7 @@ class Intake:
             if several is not None:
                 if not several.takes(frame, peer, _counters(framer, frame)):
                     continue
-                taps.keep(frame.raw, self._clock())
+                taps.keep_received(frame.raw, self._clock())
             if frame.message_id == Heartbeat.ID:
                 self._note_heartbeat(framer, frame, peer)
             self._bus.deliver(frame)
