@@ -67,7 +67,7 @@ class StateCell(Generic[T]):
         "_source",
         "_stamp",
         "_updated_at",
-        "explain_timeout",
+        "_explain_timeout",
         "name",
         "waits_for",
     )
@@ -86,7 +86,7 @@ class StateCell(Generic[T]):
         self._stamp = clock if stamp is None else stamp  # the time that a value set now came at
         self.waits_for: str = waits_for
         """The messages that the value comes from."""
-        self.explain_timeout: Callable[[], str] = str
+        self._explain_timeout: Callable[[], str] = str
         """Says, for the text of a time-out, what keeps values from coming; empty when nothing is known."""
         self._known = False
         self._latest: T | None = None
@@ -426,7 +426,7 @@ class _Waiter(_Sink[T]):
             text += f"; it had to hold for {self._held_for:g} s"
         if self._seen_count > 1:
             text += f"; {self._seen_count} values seen, last " + ", ".join(map(repr, self._seen))
-        why = self._cell.explain_timeout()
+        why = self._cell._explain_timeout()
         return f"{text}; {why}" if why else text
 
 

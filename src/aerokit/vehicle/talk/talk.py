@@ -144,7 +144,7 @@ class Talk:
     def explain_timeouts(self, *cells: StateCell[Any]) -> None:
         """Have who waits for these in vain told of signatures that keep us and the vehicle apart."""
         for cell in cells:
-            cell.explain_timeout = self._describe_signatures
+            cell._explain_timeout = self._describe_signatures
 
     def send(self, message: Message) -> None:
         """Send one message as it is; ConnectionClosed after :meth:`close`."""

@@ -89,9 +89,9 @@ class Transfers:
                 self._explain(error)
                 raise
             if isinstance(result, dict):  # an answer for each name
-                for error in result.values():
-                    if isinstance(error, OperationTimeout):
-                        self._explain(error)
+                for answer in result.values():
+                    if isinstance(answer, OperationTimeout):
+                        self._explain(answer)
             return result
 
     def _explain(self, error: OperationTimeout) -> None:
