@@ -114,6 +114,17 @@ def test_an_address_that_is_taken(capsys: pytest.CaptureFixture[str]) -> None:
 # --------------------------------------------------------------------------------------- demo
 
 
+@pytest.mark.parametrize("address", ["tcp:127.0.0.1:1", "/dev/no-such-device,57600"])
+def test_demo_that_cannot_connect_leaves_the_last_recording(
+    address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    last = tmp_path / "demo.tlog"
+    last.write_bytes(b"the last flight")
+    assert main(["demo", "--connect", address]) != 0
+    assert last.read_bytes() == b"the last flight"
+
+
 @pytest.mark.parametrize(("vehicle", "firmware"), [("copter", "ArduCopter"), ("px4", "PX4")])
 def test_demo_on_its_own_vehicle(
     vehicle: str, firmware: str, capsys: pytest.CaptureFixture[str], tmp_path: Path

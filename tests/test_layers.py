@@ -11,8 +11,8 @@ import pytest
 SOURCE = Path(__file__).parent.parent / "src" / "aerokit"
 
 FLOORS = [
-    {"errors", "installed", "lazy", "async_block", "plain", "snapshot", "wording"},
-    {"read_only", "arguments", "geo", "whole_file"},
+    {"errors", "installed", "lazy", "plain", "snapshot", "wording"},
+    {"async_block", "read_only", "arguments", "geo", "whole_file"},
     {"position"},
     {"mavlink"},
     {"parameters", "missions", "links", "autopilots"},

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import threading
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -10,6 +12,7 @@ from served_copter import served_copter
 
 import aerokit
 import aerokit.sync
+from aerokit.errors import LocalProtocolError
 
 ASYNCHRONOUS: dict[str, Any] = {"connect": aerokit.connect, "open_connection": aerokit.open_connection}
 BLOCKING: dict[str, Any] = {
@@ -46,6 +49,23 @@ def test_the_asynchronous_one_is_not_for_with(name: str) -> None:
         f"{name}(…) is not for `with`: write `async with {name}(…) as …:` in an async function, or take aerokit.sync"
         " for a program without async"
     )
+
+
+@pytest.mark.parametrize("name", ASYNCHRONOUS)
+def test_the_asynchronous_one_without_asyncio_says_what_to_do(name: str) -> None:
+    """As trio runs a coroutine."""
+    opened: Any = ASYNCHRONOUS[name]("udpin:127.0.0.1:0")
+    with pytest.raises(
+        LocalProtocolError, match=rf"{name}\(…\) runs on asyncio, and .* use aerokit.sync"
+    ) as caught:
+        opened.__aenter__().send(None)
+    assert caught.value.__suppress_context__
+
+
+def test_classifiers_name_no_loop_but_asyncio() -> None:
+    project = (Path(__file__).parent.parent / "pyproject.toml").read_text(encoding="utf-8")
+    frameworks = set(re.findall(r'"Framework :: (\w+)"', project))
+    assert frameworks == {"AsyncIO", "Pytest"}
 
 
 @pytest.mark.parametrize("name", ASYNCHRONOUS)

@@ -16,7 +16,7 @@ from numbers import Integral, Real
 from types import UnionType
 from typing import Any, Literal, TypeVar, get_args, get_origin
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import LinkOpenError, LocalProtocolError
 from aerokit.wording import one, shown
 
 __all__ = ["checked", "checks_arguments"]
@@ -79,7 +79,10 @@ def checked(function: FunctionT, *, times_are_above_zero: bool = False) -> Funct
     @wraps(function)
     def calling(*args: Any, **kwargs: Any) -> Any:
         rules.check(args, kwargs)
-        return function(*args, **kwargs)
+        try:
+            return function(*args, **kwargs)
+        except LinkOpenError as error:  # where in here it came from says nothing to a program
+            raise error.with_traceback(None) from error.__cause__
 
     return calling  # type: ignore[return-value]  # the same
 

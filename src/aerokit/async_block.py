@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from functools import wraps
 from typing import TYPE_CHECKING, ParamSpec, TypeVar
+
+from aerokit.errors import LinkOpenError, LocalProtocolError
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -34,7 +37,20 @@ class _Block(AbstractAsyncContextManager[T]):
         self._name, self._block = name, block
 
     async def __aenter__(self) -> T:
-        return await self._block.__aenter__()
+        try:
+            asyncio.get_running_loop()
+        except RuntimeError:  # trio.run, for example
+            raise LocalProtocolError(
+                f"{self._name}(…) runs on asyncio, and no event loop of asyncio is running here: start the program by"
+                " asyncio.run(…), or, on trio, use aerokit.sync in a thread (trio.to_thread.run_sync)"
+            ) from None
+        try:
+            return await self._block.__aenter__()
+        except (
+            LinkOpenError,
+            LocalProtocolError,
+        ) as error:  # where in here it came from says nothing to a program
+            raise error.with_traceback(None) from error.__cause__
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None

@@ -13,10 +13,12 @@ from flight_harness import Wire
 
 from aerokit import messages as m
 from aerokit.cli import main
+from aerokit.cli.exits import TIMED_OUT
 from aerokit.links.memory import memory_link_pair
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavCmd
 from aerokit.mavlink.message import Message
+from aerokit.mavlink.signing import SigningKey
 from aerokit.mavlink.tlog import read_tlog
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.testing import run_virtual
@@ -63,6 +65,19 @@ def saying(sources: Iterable[tuple[int, int, Message]], *arguments: str, noise: 
 
 
 # -------------------------------------------------------------------------------------- status
+
+
+def test_status_of_a_vehicle_that_signs_names_the_missing_key_soon(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    copter = SimulatedCopter(boot_time_s=0.0, signing_key=SigningKey.from_passphrase("another one's"))
+    copter.signing.trusts_first_port = False  # no USB
+    copter.signing.load()
+    assert run_with(copter, ["status"], ["params", "get", "RTL_ALT"]) == [0, TIMED_OUT]
+    out, err = capsys.readouterr()
+    assert "its frames are signed and no key was given" in out.splitlines()[1]
+    assert "its frames are signed and no key was given" in err.splitlines()[0]
+    assert copter.now < 25.0, "seconds for both"
 
 
 @pytest.mark.parametrize("kind", [SimulatedCopter, SimulatedPx4])

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import pytest
 from dronekit_stage import Stage, on_stage
-from flight_controller import message_of
+from flight_controller import FlightController, message_of
 
 from aerokit import dronekit
 from aerokit.dronekit.channels import Channels
 
+SOURCES = Path(__file__).parent.parent.parent / "src"
 IGNORED, RELEASED = 0xFFFF, 0xFFFE
 VALUES = {f"chan{number}_raw": 1000 + number for number in range(1, 19)}
 FIRST_VALUES = {f"chan{number}_raw": 1000 + number for number in range(1, 9)}
@@ -280,3 +285,97 @@ def test_after_closing_nothing_can_be_overridden(stage: Stage, channels: Channel
     with pytest.raises(dronekit.APIException):
         channels.overrides["1"] = 1500
     assert channels.overrides == {}
+
+
+# ------------------------------------------------------------------------- the end of overrides
+
+OURS = {"1": 1500, "3": 1900, "10": 1700}
+
+
+def released(fc: FlightController, since: int) -> list[tuple[int, ...]]:
+    """The last RC_CHANNELS_OVERRIDE of a connection, and how often it came."""
+    fc.wait_for("RC_CHANNELS_OVERRIDE", lambda frame: frame.chan3_raw == 0, since=since)
+    return [
+        tuple(getattr(frame, f"chan{number}_raw") for number in range(1, 19))
+        for frame in fc.received("RC_CHANNELS_OVERRIDE", since=since)
+        if frame.chan3_raw == 0
+    ]
+
+
+GIVEN_BACK = (0, IGNORED, 0, *(IGNORED,) * 5, 0, RELEASED, *(0,) * 8)
+
+
+def test_overrides_end_with_the_connection(stage: Stage, channels: Channels) -> None:
+    channels.count = 18
+    channels.overrides = OURS
+    stage.reached()
+    since = stage.fc.mark()
+    stage.vehicle.close()
+    assert set(released(stage.fc, since)) == {GIVEN_BACK}
+
+
+def test_overrides_by_send_mavlink_end_with_the_connection(stage: Stage) -> None:
+    values = [1500, IGNORED, 1900, *(IGNORED,) * 5, IGNORED, 1700]
+    stage.vehicle.send_mavlink(stage.vehicle.message_factory.rc_channels_override_encode(0, 0, *values))
+    stage.reached()
+    since = stage.fc.mark()
+    stage.vehicle.close()
+    assert set(released(stage.fc, since)) == {GIVEN_BACK}
+
+
+@pytest.mark.parametrize("has_overridden", [False, True], ids=["never", "given back before"])
+def test_close_without_overrides_sends_no_release(
+    stage: Stage, channels: Channels, has_overridden: bool
+) -> None:
+    if has_overridden:
+        channels.count = 18
+        channels.overrides = OURS
+        channels.overrides.clear()
+    stage.reached()
+    since = stage.fc.mark()
+    stage.vehicle.close()
+    assert stage.fc.received("RC_CHANNELS_OVERRIDE", since=since) == []
+
+
+def test_release_overrides_false_leaves_them_to_the_vehicle() -> None:
+    with on_stage(dronekit, connect={"release_overrides": False}) as stage:
+        stage.vehicle.channels.overrides = {"3": 1900}
+        stage.reached()
+        since = stage.fc.mark()
+        stage.vehicle.close()
+        assert stage.fc.received("RC_CHANNELS_OVERRIDE", since=since) == []
+
+
+ENDS = {
+    "end of the program": "",
+    "exception": "raise ValueError",
+    "sys.exit": "import sys; sys.exit(3)",
+    "SIGINT": "import os, signal; os.kill(os.getpid(), signal.SIGINT)",
+    "SIGTERM turned into an exit": (
+        "import os, signal, sys; signal.signal(signal.SIGTERM, lambda *_: sys.exit(143));"
+        " os.kill(os.getpid(), signal.SIGTERM)"
+    ),
+    "dropped": "import gc; del vehicle; gc.collect(); time.sleep(0.5)",
+}
+
+
+@pytest.mark.parametrize("end", ENDS.values(), ids=ENDS)
+def test_overrides_end_with_the_program(end: str) -> None:
+    program = f"""
+import time
+from aerokit import dronekit
+
+vehicle = dronekit.connect({{address!r}}, rate=None)
+vehicle.channels.overrides = {{{{"1": 1500, "3": 1900}}}}
+time.sleep(0.1)
+{end}
+"""
+    with FlightController() as fc:
+        since = fc.mark()
+        subprocess.run(
+            [sys.executable, "-c", program.format(address=fc.address)],
+            env={**os.environ, "PYTHONPATH": str(SOURCES)},
+            timeout=60,
+            check=False,
+        )
+        assert set(released(fc, since)) == {(0, IGNORED, 0, *(IGNORED,) * 5, *(0,) * 10)}

@@ -10,6 +10,7 @@ from dronekit_stage import Stage, on_stage
 from flight_controller import FlightController
 
 from aerokit import dronekit
+from aerokit.dronekit import maintenance
 
 CALIBRATION, MAG_CALIBRATION, REBOOT, CAPABILITIES = 241, 42424, 246, 520
 FAILED, IN_PROGRESS = 4, 5
@@ -61,6 +62,27 @@ def test_a_long_calibration_is_sent_once(stage: Stage) -> None:
         stage.vehicle._handler.orders.wait(10.0)
     assert len(stage.fc.commands(CALIBRATION, since=since)) == 1
     assert not [line for line in lines if line.startswith("WARNING")]
+
+
+ONCE = [name for name in vars(maintenance.Maintenance) if name.startswith("send_calibrate_")] + ["reboot"]
+
+
+@pytest.mark.parametrize("name", ONCE)
+def test_calibration_or_reboot_with_a_lost_answer_is_sent_once(
+    stage: Stage, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for limit in ("CALIBRATION_S", "REBOOT_S"):
+        monkeypatch.setattr(
+            maintenance, limit, 0.4
+        )  # eight heartbeats, after each of which it could be sent again
+    stage.fc.results.update(dict.fromkeys((CALIBRATION, MAG_CALIBRATION, REBOOT)))
+    since = stage.fc.mark()
+    with stage.logged() as lines:
+        getattr(stage.vehicle, name)()
+        stage.vehicle._handler.orders.wait(10.0)
+    stage.settle()
+    assert len(stage.fc.commands(since=since)) == 1
+    assert [line for line in lines if line.startswith("WARNING") and "COMMAND_ACK" in line]
 
 
 def test_reboot(stage: Stage) -> None:

@@ -1,11 +1,15 @@
-"""Why a link could not be opened: the system's own error is the cause, for programs that look for its class."""
+"""Why a link could not be opened: the system's own error is the context, for programs that look for its class."""
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import importlib
 import os
+import re
 import socket
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,6 +22,7 @@ from aerokit.errors import LinkOpenError
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="other systems have other errors")
 
+SOURCES = Path(__file__).parents[2] / "src"
 SerialException: type[OSError] = importlib.import_module("serial").SerialException
 
 
@@ -58,7 +63,7 @@ CASES: list[tuple[str, type[BaseException], int | None]] = [
 @pytest.mark.anyio
 @pytest.mark.parametrize("reconnect", [False, True], ids=["once", "reconnect"])
 @pytest.mark.parametrize(("address", "kind", "number"), CASES, ids=[case[0] for case in CASES])
-async def test_the_cause_is_the_systems_own_error(
+async def test_the_context_is_the_systems_own_error(
     address: str,
     kind: type[BaseException],
     number: int | None,
@@ -75,9 +80,9 @@ async def test_the_cause_is_the_systems_own_error(
     with pytest.raises(LinkOpenError, match="cannot open ") as caught:
         async with open_connection(where, reconnect=reconnect):
             pytest.fail("not open")
-    cause = caught.value.__cause__
-    assert isinstance(cause, kind)
-    assert not isinstance(cause, LinkOpenError)
+    context = caught.value.__context__
+    assert isinstance(context, kind)
+    assert not isinstance(context, LinkOpenError)
     if number is not None:
         assert caught.value.errno == number
 
@@ -94,12 +99,48 @@ async def test_a_device_that_vanishes_while_it_is_opened(monkeypatch: pytest.Mon
         async with open_connection("/dev/ttyACM0"):
             pytest.fail("not open")
     assert caught.value.errno == errno.EIO
-    assert isinstance(caught.value.__cause__, SerialException)
-    assert isinstance(caught.value.__cause__.__cause__, termios.error)
+    assert isinstance(caught.value.__context__, SerialException)
+    assert isinstance(caught.value.__context__.__context__, termios.error)
+
+
+PROGRAMS = {
+    "sync": "import aerokit.sync\nwith aerokit.sync.connect({address!r}) as vehicle:\n    pass\n",
+    "sync connection": "import aerokit.sync\nopened = aerokit.sync.open_connection({address!r})\n",
+    "classic": "import aerokit.dronekit\nvehicle = aerokit.dronekit.connect({address!r})\n",
+    "async": """
+import asyncio, aerokit
+async def main():
+    async with aerokit.connect({address!r}) as vehicle:
+        pass
+asyncio.run(main())
+""",
+}
+FOREIGN = re.compile(rf'  File "{re.escape(os.path.dirname(asyncio.__file__))}.*\n.*\n( +\^+\n)?')
+
+
+@pytest.mark.parametrize("address", ["udpin:127.0.0.1:{udp}", "/dev/no-such-device", "no/such/file.tlog"])
+@pytest.mark.parametrize("program", PROGRAMS.values(), ids=PROGRAMS)
+def test_traceback_of_a_link_that_cannot_be_opened_is_short(
+    program: str, address: str, taken: dict[str, int], tmp_path: Path
+) -> None:
+    """Ten lines, beside those of asyncio itself."""
+    file = tmp_path / "program.py"
+    file.write_text(program.format(address=address.format(**taken)), encoding="utf-8")
+    ended = subprocess.run(
+        [sys.executable, file],
+        env={**os.environ, "PYTHONPATH": str(SOURCES)},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    shown = FOREIGN.sub("", ended.stderr)
+    assert "cannot open " in shown.splitlines()[-1]
+    assert len(shown.splitlines()) <= 10, ended.stderr
 
 
 def test_it_comes_through_the_blocking_twin(taken: dict[str, int]) -> None:
     for opened in (aerokit.sync.connect, aerokit.sync.open_connection):
         with pytest.raises(LinkOpenError) as caught:
             opened("tcp:127.0.0.1:{tcp}".format(**taken), reconnect=True)
-        assert isinstance(caught.value.__cause__, ConnectionRefusedError)
+        assert isinstance(caught.value.__context__, ConnectionRefusedError)

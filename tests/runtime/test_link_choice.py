@@ -11,13 +11,27 @@ from aerokit import messages as m
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.frame import Frame
 from aerokit.runtime.copies import Copies
+from aerokit.runtime.hardware_id import HardwareId
 from aerokit.runtime.link_candidate import PROOFS, SILENT_S
 from aerokit.runtime.link_choice import LinkChoice
 from aerokit.runtime.vehicle_clock import VehicleClock
 
+WHAT = (
+    "heard",
+    "counts",
+    "answer",
+    "there",
+    "gone",
+    "stalled",
+    "drained",
+    "look",
+    "hardware",
+    "pause",
+    "reboot",
+)
 STEPS = st.lists(
     st.tuples(
-        st.sampled_from(["heard", "counts", "answer", "there", "gone", "stalled", "drained", "look"]),
+        st.sampled_from(WHAT),
         st.integers(0, 2),
         st.floats(0.01, 1.5),
         st.floats(0.0, 0.5),
@@ -30,8 +44,11 @@ STEPS = st.lists(
 def test_nothing_goes_over_a_link_that_was_not_shown_to_lead_there(
     steps: list[tuple[str, int, float, float]],
 ) -> None:
-    """Link 2 leads to another vehicle: its clock is 300 s ahead."""
-    choice, now = LinkChoice(needs_proof=True), 1.0
+    """Link 2 leads to another vehicle: its clock is 300 s ahead, or more when ours has paused or rebooted.
+
+    Both are simulated on one machine, so that they tell the same hardware id.
+    """
+    choice, now, begin = LinkChoice(needs_proof=True), 1.0, -50.0
     choice.heard(0, now, is_costly=False)
     assert choice.choose(now) == "first heard"
     received = 0
@@ -46,7 +63,14 @@ def test_nothing_goes_over_a_link_that_was_not_shown_to_lead_there(
             received += 5
             candidate.note_counts(received, 1, now)
         elif what == "answer":
-            choice.note_answer(link, now - round_trip / 2, now + 50 + 300 * (link == 2), round_trip, now)
+            told = now + 350.0 if link == 2 else max(0.0, now - begin)
+            choice.note_answer(link, now - round_trip / 2, told, round_trip, now)
+        elif what == "hardware":
+            choice.note_hardware(link, HardwareId(b"A" * 18, 0))
+        elif what == "pause":
+            begin += later
+        elif what == "reboot":
+            begin = now
         elif what in ("there", "gone"):
             candidate.is_there = what == "there"
         elif what in ("stalled", "drained"):
@@ -94,6 +118,64 @@ def test_a_reboot_takes_the_proof_away_and_the_same_clock_gives_it_back() -> Non
     for step in range(PROOFS):
         choice.note_answer(1, 6.0 + step, 2.0 + step, 0.01, 6.0 + step)
     assert choice.candidates[1].is_proven
+
+
+def test_a_clock_that_paused_goes_on_and_keeps_its_speed() -> None:
+    clock = VehicleClock()
+    for step in range(10):
+        assert clock.note(step, 70.0 + step, 0.01)
+    assert clock.note(11.5, 79.0 + 1.0, 0.01), "it stood still for 1.5 s"
+    assert clock.agrees(12.5, 81.0, 0.01)
+    assert not clock.agrees(12.5, 82.5, 0.01)
+    assert not clock.note(13.0, 3.0, 0.01), "it has rebooted"
+    assert clock.agrees(14.0, 4.0, 0.01)
+
+
+@given(st.floats(0.2, 20.0), st.floats(0.2, 20.0))
+def test_a_clock_whose_speed_was_changed_is_measured_anew(before: float, after: float) -> None:
+    clock, told = VehicleClock(), 0.0
+    for step in range(40):
+        told += 0.5 * (before if step < 10 else after)
+        clock.note(step / 2, told, 0.01)
+    assert clock.agrees(21.0, told + 1.5 * after, 0.01)
+
+
+def test_hardware_alone_proves_who_was_proven_before_a_reboot_and_is_alone() -> None:
+    """The link in use dies with the reboot, and a pause makes the other one's clock useless."""
+    for was_proven in (True, False):
+        choice = LinkChoice(needs_proof=True)
+        for link in (0, 1):
+            choice.heard(link, 0.0, is_costly=False)
+        choice.choose(0.0)
+        for step in range(10):
+            for link in (0, 1) if was_proven else (0,):
+                choice.note_answer(link, step, step + 70.0, 0.01, step)
+        choice.note_hardware(0, HardwareId(b"A" * 18, 0))
+        choice.note_answer(0, 10.0, 1.0, 0.01, 10.0)
+        second = choice.candidates[1]
+        assert (second.is_proven, second.was_proven) == (False, was_proven)
+        for step in range(11, 20):
+            choice.note_hardware(1, HardwareId(b"A" * 18, 0))
+            choice.note_answer(1, step, step - 11.0, 0.01, step)
+        assert second.is_proven is was_proven
+        choice.note_hardware(1, HardwareId(b"B" * 18, 0))
+        assert not choice.may_be_used(second)
+
+
+def test_who_tells_another_hardware_after_a_reboot_is_not_believed_by_its_clock() -> None:
+    """Two vehicles that are switched off and on together; the link in use dies before ours has told its id again."""
+    choice = LinkChoice(needs_proof=True)
+    for link in (0, 1):
+        choice.heard(link, 0.0, is_costly=False)
+    choice.choose(0.0)
+    for step in range(10):
+        choice.note_answer(0, step, step + 70.0, 0.01, step)
+    choice.note_hardware(0, HardwareId(b"A" * 18, 0))
+    choice.note_answer(0, 10.0, 1.0, 0.01, 10.0)
+    for step in range(11, 20):
+        choice.note_hardware(1, HardwareId(b"B" * 18, 0))
+        choice.note_answer(1, step, step - 9.0, 0.01, step)
+    assert not choice.may_be_used(choice.candidates[1])
 
 
 def test_silence_counts_from_the_last_frame() -> None:

@@ -12,7 +12,7 @@ import pytest
 from pymavlink import mavutil
 
 from aerokit import Vehicle, connect, open_connection
-from aerokit.errors import BusyError, LinkLost, LinkOpenError, LocalProtocolError
+from aerokit.errors import BusyError, ConnectFailed, LinkLost, LinkOpenError, LocalProtocolError
 from aerokit.links import Peer, create_link, memory_link_pair
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.framer import Framer
@@ -66,6 +66,33 @@ async def test_a_recording_that_begins_later_has_frames_that_nobody_wants(tmp_pa
         connection.record(tmp_path / "late.tlog")
         connection.bytes_received(encoder.encode(ATTITUDE), None)
     assert senders(tmp_path / "late.tlog")[1] == 1
+
+
+async def test_a_recording_on_which_nobody_is_heard_leaves_the_older_one(tmp_path: Path) -> None:
+    path = tmp_path / "last.tlog"
+    await fly(path)
+    before = path.read_bytes()
+    near, _ = memory_link_pair()
+    with pytest.raises(ConnectFailed):
+        async with connect(near, record=path, timeout=3):
+            pytest.fail("nobody is there")
+    assert path.read_bytes() == before
+    with pytest.raises(LinkOpenError):
+        async with connect("/dev/no-such-device", record=path):
+            pytest.fail("it is not there")
+    assert path.read_bytes() == before
+
+
+async def test_a_recording_replaces_the_older_one_with_what_was_sent_before_anybody_was_heard(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "last.tlog"
+    await fly(path)
+    near, _ = memory_link_pair()
+    async with open_connection(near, record=path) as connection:
+        await anyio.sleep(2.5)
+        connection.bytes_received(FrameEncoder(7, 1).encode(ATTITUDE), None)
+    assert senders(path) == {255: 3, 7: 1}
 
 
 async def test_frames_nobody_wants_are_recorded_too(tmp_path: Path) -> None:

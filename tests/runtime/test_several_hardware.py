@@ -245,4 +245,8 @@ def test_ids_are_compared_by_the_field_that_both_tell() -> None:
     assert not of(b"", 7).contradicts(of(two, 7))
     assert not of(b"", 0).contradicts(of(two, 7))
     assert not of(one, 0).contradicts(of(b"", 7))
+    assert of(one, 7).confirms(of(one, 8)), "uid2 decides"
+    assert of(b"", 7).confirms(of(two, 7))
+    assert not of(one, 7).confirms(of(two, 7))
+    assert not of(b"", 0).confirms(of(b"", 0)), "nothing told is no evidence"
     assert [of(b"", 0).is_told, of(one, 0).is_told, of(b"", 1).is_told] == [False, True, True]

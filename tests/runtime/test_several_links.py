@@ -16,6 +16,7 @@ from aerokit.hub import shared
 from aerokit.links import FaultModel, memory_link_pair
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.missions import Mission, waypoint
+from aerokit.runtime.connection import Connection
 from aerokit.runtime.link_state import LinkState
 from aerokit.runtime.opening import open_connection
 from aerokit.sim import SimulatedCopter, SimulatedPx4, SimulatedVehicle, SimulatorServer
@@ -366,3 +367,53 @@ async def test_a_ground_station_shares_all_of_the_links() -> None:
         assert found == [len(await flying.parameters.download(method="list", refresh=True))]
         assert station.is_armed
         await station.disarm()
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.3, 0.6, 0.8, 1.0, 1.5])
+@pytest.mark.parametrize("is_silent", [False, True])
+async def test_link_that_dies_soon_after_the_vehicle_stood_still_is_left(
+    seconds: float, is_silent: bool
+) -> None:
+    """The vehicle's clock stands still for 1.5 s, as a simulation's does; then the link in use dies."""
+    radios, copter = Radios(2), SimulatedCopter()
+    async with over(radios, copter) as connection, aerokit.connect(connection) as flying:
+        news = News(connection)
+        await anyio.sleep(6)
+        await stand_still(copter, radios, is_silent=is_silent)
+        await anyio.sleep(seconds)
+        radios.cut(used_of(connection))
+        await anyio.sleep(4)
+        assert [reason for _, reason in news.chosen] == ["silent"]
+        assert flying.position.age < 1.0
+
+
+@pytest.mark.parametrize("seconds", [0.1, 0.6, 0.8, 1.0, 1.5, 3.0])
+@pytest.mark.parametrize("hiccups", [0, 1, 2])
+async def test_link_that_dies_soon_after_a_reboot_is_left(seconds: float, hiccups: int) -> None:
+    radios, copter = Radios(2), SimulatedCopter(boot_time_s=0.0)
+    copter.uid = b"A" * 18
+    async with over(radios, copter) as connection, aerokit.connect(connection):
+        news = News(connection)
+        await anyio.sleep(6)
+        copter.booted_at = copter.now
+        await anyio.sleep(seconds)
+        radios.cut(used_of(connection))
+        for _ in range(hiccups):
+            await stand_still(copter, radios, is_silent=False)
+        await anyio.sleep(6)
+        assert [reason for _, reason in news.chosen] == ["silent"]
+
+
+def used_of(connection: Connection) -> int:
+    assert connection.links is not None
+    return next(index for index, each in enumerate(connection.links.value) if each.used_for)
+
+
+async def stand_still(copter: SimulatedCopter, radios: Radios, *, is_silent: bool) -> None:
+    for each in radios.links if is_silent else ():
+        each.incoming.model = DEAD
+    for _ in range(15):
+        await anyio.sleep(0.1)
+        copter.booted_at += 0.1
+    for index in range(2 if is_silent else 0):
+        radios.mend(index)

@@ -91,7 +91,7 @@ async def test_a_whole_flight_signed() -> None:
 
 async def test_a_vehicle_with_a_key_does_not_hear_who_has_none() -> None:
     async with connected(radio_copter(signing_key=KEY)) as vehicle:
-        with pytest.raises(CommandTimeout, match="its frames are signed and ours are not"):
+        with pytest.raises(CommandTimeout, match="its frames are signed and no key was given"):
             await vehicle.command(512, 148)
         vehicle.connection.signing = lenient(WRONG)
         with pytest.raises(CommandTimeout):

@@ -8,7 +8,7 @@ from flight_harness import Flight, now, open_flight, open_px4
 
 from aerokit.errors import CommandRejected, CommandTimeout, LinkLost, OperationTimeout
 from aerokit.mavlink.encoder import FrameEncoder
-from aerokit.mavlink.enums import MavCmd, MavResult
+from aerokit.mavlink.enums import MavCmd, MavResult, MavSeverity
 from aerokit.mavlink.messages import Statustext
 from aerokit.sim import SimulatedCopter, SimulatedPx4
 
@@ -82,6 +82,28 @@ async def test_each_reason_is_told_once(grounded: Flight) -> None:
     with pytest.raises(CommandRejected) as caught:
         await grounded.vehicle.arm()
     assert len(set(caught.value.reasons)) == len(caught.value.reasons)
+
+
+async def test_what_is_said_meanwhile_and_is_no_reason_is_left_out(grounded: Flight) -> None:
+    copter, refuse = grounded.copter, grounded.copter.faults.prearm_failures
+    refuse.append("Compass not healthy")
+    say_more = copter.send_text
+
+    def say(severity: int, text: str) -> None:
+        for other in ("ArduPilot Ready", "Barometer 1 calibration complete"):
+            say_more(MavSeverity.INFO, other)
+        say_more(MavSeverity.CRITICAL, "PreArm: Compass not healthy")
+        say_more(MavSeverity.WARNING, "EKF3 IMU0 stopped aiding")
+        for _ in range(2):
+            say_more(severity, text)
+
+    copter.send_text = say  # type: ignore[method-assign]
+    with pytest.raises(CommandRejected) as caught:
+        await grounded.vehicle.arm()
+    assert caught.value.reasons[:2] == ("PreArm: Compass not healthy", "EKF3 IMU0 stopped aiding")
+    assert str(caught.value).count("Compass not healthy") == 1
+    assert "Ready" not in str(caught.value)
+    assert "Barometer" not in str(caught.value)
 
 
 async def test_too_early_names_the_estimator_and_the_failing_bits() -> None:

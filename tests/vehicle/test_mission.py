@@ -277,8 +277,9 @@ async def test_what_cannot_be_started(opened: Any) -> None:
 async def test_the_vehicles_reason_for_not_starting() -> None:
     async with armed(open_flight) as flight:
         await flight.vehicle.mission.clear()
-        with pytest.raises(LocalProtocolError, match="the mission is empty"):
+        with pytest.raises(LocalProtocolError, match="the vehicle's mission is empty: upload") as caught:
             await flight.vehicle.mission.start()
+        assert "item" not in str(caught.value)
         assert isinstance(flight, Flight)
         with pytest.raises(CommandRejected):
             await flight.vehicle.mission.resume()

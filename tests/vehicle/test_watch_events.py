@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import itertools
+import sys
+from types import SimpleNamespace
 from typing import Any
 
 import anyio
@@ -260,6 +263,43 @@ async def test_a_blocked_loop_is_an_event(grounded: Flight) -> None:
         event = await events.get(timeout=1.0)
         assert event.system_id == 0
         assert event.seconds == pytest.approx(1.5, abs=0.15)
+
+
+async def test_a_loop_blocked_for_long_is_a_warning(
+    grounded: Flight, caplog: pytest.LogCaptureFixture
+) -> None:
+    await anyio.sleep(1.0)
+    block_loop(0.5)
+    await anyio.sleep(1.0)
+    assert not caplog.records
+    block_loop(6.0)
+    await anyio.sleep(1.0)
+    (warning,) = caplog.records
+    assert (warning.name, warning.levelname) == ("aerokit", "WARNING")
+    assert warning.getMessage().startswith("the event loop was blocked for 6.")
+    assert "time.sleep" in warning.getMessage()
+
+
+class FakeShell:
+    """What IPython 9 has in its terminal."""
+
+    active_eventloop: str | None = None
+
+
+@pytest.mark.parametrize("gui", [None, "asyncio"])
+async def test_terminal_ipython_without_gui_asyncio_is_named(
+    gui: str | None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    shell, loop = FakeShell(), asyncio.get_running_loop()
+    shell.active_eventloop = gui
+    terminal = SimpleNamespace(TerminalInteractiveShell=SimpleNamespace(_instance=shell))
+    monkeypatch.setitem(sys.modules, "IPython.terminal.interactiveshell", terminal)
+    monkeypatch.setitem(sys.modules, "IPython.core.async_helpers", SimpleNamespace(_asyncio_event_loop=loop))
+    async with open_flight():
+        block_loop(3.0)
+        await anyio.sleep(1.0)
+    named = ["%gui asyncio" in each.getMessage() for each in caplog.records]
+    assert named == ([True, True] if gui is None else [False])
 
 
 async def test_a_blocked_loop_does_not_make_the_vehicle_silent(grounded: Flight) -> None:

@@ -24,14 +24,24 @@ def _signals() -> tuple[signal.Signals, ...]:
 
 
 @contextmanager
-def on_interrupt(callback: Callable[[], None]) -> Iterator[None]:
-    """While the block lasts, Ctrl-C, SIGTERM and SIGHUP call ``callback`` on the running loop and do nothing else."""
+def on_interrupt(
+    callback: Callable[[], None], at_once: Callable[[int], object] = lambda number: None
+) -> Iterator[None]:
+    """While the block lasts, Ctrl-C, SIGTERM and SIGHUP call ``callback`` on the running loop and do nothing else.
+
+    ``at_once(number)`` is called by the signal's handler before, also while something blocks the loop.
+    """
     loop = asyncio.get_running_loop()
     signals = _signals()
     before = [signal.getsignal(number) for number in signals]
+
+    def handle(number: int, _: object) -> None:
+        at_once(number)
+        loop.call_soon_threadsafe(callback)
+
     try:
         for number in signals:
-            signal.signal(number, lambda *_: loop.call_soon_threadsafe(callback))
+            signal.signal(number, handle)
     except ValueError:  # not on the main thread, where alone signals can be handled
         yield
         return

@@ -79,14 +79,17 @@ async def _what_is_missing(vehicle: Vehicle) -> list[str]:
     for state, message in ASKED_FOR:
         cell = getattr(vehicle, state)
         if not cell.is_known:
-            await _ask(vehicle, message, cell)
+            try:
+                await _ask(vehicle, message, cell)
+            except CommandTimeout as error:
+                return [str(error), *vehicle.missing_for_flight()]  # it answers nothing: to ask on takes long
     return list(dict.fromkeys([*await vehicle.why_not_armable(), *vehicle.missing_for_flight()]))
 
 
 async def _ask(vehicle: Vehicle, message: Any, cell: Any) -> None:
     try:
         await vehicle.command(MavCmd.REQUEST_MESSAGE, message.ID)
-    except (CommandRejected, CommandTimeout):
+    except CommandRejected:
         return
     with anyio.move_on_after(ANSWER_S):
         await cell.wait_until(lambda _: True)

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 __all__ = ["about_vehicle", "component_line", "link_line", "vehicle_lines"]
 
 UNKNOWN = "not told"
+NO_KEY = "; its frames are signed and no key was given (--signing-key FILE): it may not listen to us"
 FIXES = ("no receiver", "no fix", "2D", "3D", "DGPS", "RTK float", "RTK fixed", "static", "PPP")
 
 
@@ -45,8 +46,10 @@ def vehicle_lines(vehicle: Vehicle, missing: Sequence[str]) -> list[str]:
     landed = vehicle.landed_state.latest
     place = "" if landed is None else f", {_words(getattr(landed, 'name', str(landed)))}"
     kind = "" if heartbeat is None else f", {_words(_name(MavType, heartbeat.type))}"
+    is_locked = frame["signed"] and vehicle.connection.signing is None
     return [
-        f"system {vehicle.system_id}: {vehicle.autopilot.firmware} {version or 'of unknown version'}{kind}",
+        f"system {vehicle.system_id}: {vehicle.autopilot.firmware} {version or 'of unknown version'}{kind}"
+        f"{NO_KEY if is_locked else ''}",
         f"  mode     {vehicle.mode_name}, {armed}{place}",
         f"  GPS      {'; '.join(map(_gps, vehicle.gps.latest or ())) or UNKNOWN}",
         f"  battery  {'; '.join(map(_battery, vehicle.batteries.latest or ())) or UNKNOWN}",

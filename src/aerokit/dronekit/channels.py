@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from aerokit.dronekit.core import core_of
 from aerokit.dronekit.exceptions import APIException
+from aerokit.dronekit.override_release import RELEASE_UPPER
 from aerokit.dronekit.privates import Python2Mapping
 from aerokit.errors import LocalProtocolError
 from aerokit.mavlink.messages import RcChannels, RcChannelsOverride, RcChannelsRaw
@@ -22,8 +23,6 @@ __all__ = ["Channels", "ChannelsOverride"]
 FEWEST, MOST = 8, 18
 UNUSED = 0xFFFF
 """In RC_CHANNELS: there is no such channel. In an override: leave the channel as it is."""
-RELEASE_UPPER = 0xFFFE
-"""Gives a channel above 8 back to the radio; 0 leaves it alone."""
 NUMBERS = tuple(str(number) for number in range(1, MOST + 1))
 ALL_VALUES = attrgetter(*(f"chan{number}_raw" for number in NUMBERS))
 FIRST_VALUES = attrgetter(*(f"chan{number}_raw" for number in NUMBERS[:FEWEST]))
@@ -151,8 +150,9 @@ class ChannelsOverride(_ChannelDict):
 
     **Nothing is repeated**: a vehicle takes a channel back on its own when it has heard nothing for a while
     (ArduPilot: RC_OVERRIDE_TIME, 3 s), which is what makes it safe that a program may hang. A program that keeps a
-    stick pressed sets it again, several times a second. ArduPilot listens only to the ground station it belongs to
-    (``connect(source_system=)`` and MAV_GCS_SYSID, 255).
+    stick pressed sets it again, several times a second. All channels are given back when the connection ends
+    (``connect(release_overrides=)``), unless the process is killed. ArduPilot listens only to the ground station it
+    belongs to (``connect(source_system=)`` and MAV_GCS_SYSID, 255).
     """
 
     def __init__(self, vehicle: VehicleCore) -> None:

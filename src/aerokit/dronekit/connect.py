@@ -39,6 +39,7 @@ def connect(
     source_system: int = 255,
     source_component: int = 0,
     use_native: bool = False,
+    release_overrides: bool = True,
 ) -> VehicleT:
     """Connect to a vehicle and return it once it was heard.
 
@@ -59,6 +60,8 @@ def connect(
         source_system: our own system id, 1 to 255.
         source_component: our own component id, 0 to 255.
         use_native: accepted; means nothing.
+        release_overrides: give RC channels that are still overridden back to the radio when the connection ends. False
+            leaves them as DroneKit does, until the vehicle gives them up (ArduPilot: RC_OVERRIDE_TIME).
 
     Raises:
         OSError: the link cannot be opened (ConnectionRefusedError, socket.gaierror, serial.SerialException …).
@@ -78,6 +81,7 @@ def connect(
         )
     except (OSError, ValueError) as error:
         raise error.with_traceback(None) from None  # where in here it came from says nothing to a program
+    handler.overrides.is_wanted = release_overrides
     try:
         from aerokit.dronekit.vehicle import Vehicle  # the link hears meanwhile: this takes a while
 

@@ -19,6 +19,7 @@ from aerokit.errors import AerokitError, CommandRejected, ConnectionClosed
 from aerokit.runtime.components import is_autopilot
 
 if TYPE_CHECKING:
+    from aerokit.dronekit.override_release import OverrideRelease
     from aerokit.mavlink.message import Message
     from aerokit.runtime.connection import Connection
     from aerokit.sync.loop_thread import Held, LoopThread
@@ -40,7 +41,14 @@ Work = Callable[..., Awaitable[object]]
 class Line:
     """An open connection, its event loop on a thread, and the thread of the program's callbacks."""
 
-    def __init__(self, address: str, loop: LoopThread, held: Held[Connection], target_system: int) -> None:
+    def __init__(
+        self,
+        address: str,
+        loop: LoopThread,
+        held: Held[Connection],
+        target_system: int,
+        overrides: OverrideRelease,
+    ) -> None:
         self.target_system = target_system
         """System id of the vehicle, 0 before it was heard."""
         self.listener_thread: ListenerThread = ListenerThread()
@@ -52,6 +60,8 @@ class Line:
         """The asynchronous connection, for code that runs on its loop."""
         self.orders: Orders = Orders(loop)
         """What was ordered without waiting."""
+        self.overrides = overrides
+        """The RC channels that are given back when the connection ends."""
         self.knows_mavlink_2 = False
         """Whether the vehicle has said that it understands MAVLink 2, whichever version it speaks so far."""
         self.note_sent: Callable[[Message], None] = lambda message: None
@@ -80,6 +90,7 @@ class Line:
     def _send(self, message: Message, to: int | None) -> None:
         try:
             self.connection.send(message, to=to)
+            self.overrides.note_sent(message)
             self.note_sent(message)
         except AerokitError as error:
             logger.warning("%s was not sent: %s", message.NAME, error)

@@ -13,9 +13,9 @@ from aerokit.protocols.command import command_long
 
 __all__ = ["Maintenance"]
 
-CALIBRATION_ATTEMPTS, CALIBRATION_S = 2, 35.0
-"""ArduPilot answers when it is done, half a minute if it is not held still, and calibrates again for each resend."""
-REBOOT_ATTEMPTS, REBOOT_S = 2, 1.5
+CALIBRATION_S = 35.0
+"""ArduPilot answers when it is done, after half a minute if the vehicle is not held still."""
+REBOOT_S = 3.0
 TUNE_SIZES = (30, 200)
 
 
@@ -52,7 +52,7 @@ class Maintenance(VehicleCore):
             "calibration",
             command,
             *params,
-            attempts=CALIBRATION_ATTEMPTS,
+            attempts=1,  # it would calibrate again
             attempt_timeout=CALIBRATION_S,
             progress_timeout=CALIBRATION_S,
         )
@@ -72,9 +72,12 @@ class Maintenance(VehicleCore):
         self._dk.send(PlayTune(self._dk.target_system, 0, text[:first], text[first:]))
 
     def reboot(self) -> None:
-        """Reboot the autopilot. It is away for some seconds, and then boots anew. Refused while it is armed."""
+        """Reboot the autopilot. It is away for some seconds, and then boots anew. Refused while it is armed.
+
+        Sent once: a lost answer is a warning, and the vehicle may have rebooted.
+        """
         shutdown = MavCmd.PREFLIGHT_REBOOT_SHUTDOWN
-        self._dk.command("reboot", shutdown, 1, attempts=REBOOT_ATTEMPTS, attempt_timeout=REBOOT_S)
+        self._dk.command("reboot", shutdown, 1, attempts=1, attempt_timeout=REBOOT_S)
 
     def send_capabilities_request(self, vehicle: Any, name: str, m: Any) -> None:
         """Ask for AUTOPILOT_VERSION once. Has the arguments of a message listener, and uses none of them."""

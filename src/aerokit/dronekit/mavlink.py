@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 from aerokit.dronekit.exceptions import APIException
 from aerokit.dronekit.line import Line
 from aerokit.dronekit.observers import message_of
+from aerokit.dronekit.override_release import OverrideRelease
 from aerokit.errors import AerokitError, ConnectionClosed, LinkOpenError, LocalProtocolError
 from aerokit.links.address import ACCEPTED_FORMS, parse_address
 from aerokit.links.reconnecting import ReconnectingLink
@@ -23,6 +24,8 @@ from aerokit.runtime.opening import open_connection
 from aerokit.sync.loop_thread import LoopThread
 
 if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
     from aerokit.dronekit.master import Master
     from aerokit.links.link import Peer
     from aerokit.mavlink.frame import Frame
@@ -60,8 +63,9 @@ class MAVConnection(Line):
         source_component: int = 0,
         use_native: bool = False,
     ) -> None:
-        loop = LoopThread()
-        super().__init__(ip, loop, _open(loop, ip, baud, source_system, source_component), target_system)
+        loop, overrides = LoopThread(), OverrideRelease()
+        held = _open(loop, ip, baud, source_system, source_component, overrides)
+        super().__init__(ip, loop, held, target_system, overrides)
         self.loop_listeners: list[Callable[[MAVConnection], object]] = []
         """Functions that are called about 20 times a second; see :meth:`forward_loop`."""
         self.message_listeners: list[Callable[[MAVConnection, Any], object]] = []
@@ -193,7 +197,12 @@ def connections_made() -> Iterator[weakref.WeakSet[MAVConnection]]:
 
 
 def _open(
-    loop: LoopThread, ip: str, baud: int, source_system: int, source_component: int
+    loop: LoopThread,
+    ip: str,
+    baud: int,
+    source_system: int,
+    source_component: int,
+    overrides: OverrideRelease,
 ) -> Held[Connection]:
     """Open it; what refuses at first may be a simulator that the program has just started."""
     ids: dict[str, Any] = {"source_system": source_system, "source_component": source_component}
@@ -201,15 +210,28 @@ def _open(
         _check_address(ip)
         for attempt in range(ATTEMPTS):
             try:
-                return loop.hold_open(open_connection(ip, baud=baud, reconnect=True, **ids))
+                opened = open_connection(ip, baud=baud, reconnect=True, **ids)
+                return loop.hold_open(_releasing(opened, overrides))
             except LinkOpenError as error:
-                if attempt == ATTEMPTS - 1 or not isinstance(error.__cause__, ConnectionRefusedError):
+                if attempt == ATTEMPTS - 1 or not isinstance(error.__context__, ConnectionRefusedError):
                     _raise_classic(error)
                 time.sleep(BETWEEN_ATTEMPTS_S)
         raise AssertionError
     except BaseException:
         loop.close()
         raise
+
+
+@contextlib.asynccontextmanager
+async def _releasing(
+    opened: contextlib.AbstractAsyncContextManager[Connection], overrides: OverrideRelease
+) -> AsyncIterator[Connection]:
+    """However the connection ends, the last that is sent gives the RC channels back."""
+    async with opened as connection:
+        try:
+            yield connection
+        finally:
+            overrides.send(connection)
 
 
 def _check_address(ip: object) -> None:
@@ -225,7 +247,7 @@ def _check_address(ip: object) -> None:
 
 def _raise_classic(error: LinkOpenError) -> NoReturn:
     """As what the system called it: programs catch ConnectionRefusedError, socket.gaierror, SerialException."""
-    cause = error.__cause__
+    cause = error.__context__
     if isinstance(cause, OSError):
         if cause.errno is not None:
             raise type(cause)(cause.errno, str(error)) from error

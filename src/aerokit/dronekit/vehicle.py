@@ -229,8 +229,9 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
     def close(self) -> None:
         """End it: what was ordered a moment before gets the time to be answered, then link and threads end.
 
-        Idempotent; from any thread, callbacks included. Nothing is sent: a vehicle in the air goes on with what it
-        does. Calls that wait raise APIException.
+        Idempotent; from any thread, callbacks included. Overridden RC channels are given back to the radio
+        (``connect(release_overrides=)``); nothing else is sent: a vehicle in the air goes on with what it does. Calls
+        that wait raise APIException.
         """
         self._handler.close()
 

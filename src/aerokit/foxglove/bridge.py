@@ -130,7 +130,7 @@ def _serve(shown: _Shown, host: str, port: int) -> Any:
             message_backlog_size=WAITING_MESSAGES,
         )
     except RuntimeError as error:
-        raise LinkOpenError(f"viewers cannot be served on {host} port {port}: {error}") from error
+        raise LinkOpenError(f"viewers cannot be served on {host} port {port}: {error}") from None
 
 
 async def _stop(server: Any, host: str) -> None:

@@ -125,6 +125,8 @@ _SCHEME = re.compile(r"([a-z][a-z0-9_+.-]+):(.*)", re.IGNORECASE | re.DOTALL)  #
 _URL = re.compile(r"([a-z][a-z0-9_+.-]*)://(.*)", re.IGNORECASE | re.DOTALL)
 _RECORDING = re.compile(r".*\.tlog(\?[^/\\]*)?", re.IGNORECASE | re.DOTALL)
 _DATAFLASH = re.compile(r".*\.(bin|log|px4log|ulg)", re.IGNORECASE | re.DOTALL)
+_WITHOUT_COLON = re.compile(r"([^/\\:.~,][^/\\:]*)(//+|/(?=([^/\\]*:)?\d+$))")
+"""A path of no device: ``udp//:14550``, ``tcp/127.0.0.1:5760``, ``127.0.0.1/14550``."""
 _COM_PORT = re.compile(r"com\d+([,:].*)?", re.IGNORECASE)
 _COM_COLON_BAUD = re.compile(r"(com\d+):(.*)", re.IGNORECASE)
 _COLON_BAUD = re.compile(r"(.*):(\d+)", re.DOTALL | re.ASCII)
@@ -190,6 +192,8 @@ class _Parser:
             return self.replay(text[:end], self.options("replay", text[end + 1 :]))
         if _DATAFLASH.fullmatch(text):
             self.fail("this is a log of the autopilot's own format, not a recording of MAVLink (.tlog)")
+        if match := _WITHOUT_COLON.match(text):
+            self.fail_without_colon(match[1].lower(), match[0], text)
         if _COM_PORT.fullmatch(text) or "\\" in text or "/" in text:
             return self.serial(text, {}, decode=False)
         if ":" not in text:
@@ -315,6 +319,13 @@ class _Parser:
         if not (text.isascii() and text.isdigit() and len(text) <= 9):
             self.fail(f"{what} {text!r} is not a whole number")
         return int(text)
+
+    def fail_without_colon(self, scheme: str, begin: str, text: str) -> NoReturn:
+        if scheme not in _SCHEMES:
+            self.fail(
+                f"it is neither host:port nor the path of a serial port{did_you_mean(scheme, _SCHEMES)}"
+            )
+        self.fail(f"a colon is missing: write {scheme}://{text[len(begin) :]}")
 
     def fail_scheme(self, scheme: str) -> NoReturn:
         known = (

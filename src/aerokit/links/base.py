@@ -48,7 +48,7 @@ class BaseLink(Link):
         except BaseException as error:
             self._give_up_opening()
             if isinstance(error, OSError) and not isinstance(error, LinkError):
-                raise link_open_error(self.address, error) from error
+                raise link_open_error(self.address, error) from None
             raise
         if self._is_closed:
             self._release()

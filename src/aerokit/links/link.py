@@ -121,8 +121,8 @@ class Link(ABC):
     async def open(self, receiver: Receiver) -> None:
         """Opens the link; from now on the receiver is called.
 
-        Raises LinkOpenError with the address, the system's reason and a hint (its ``__cause__`` is the system's error:
-        ConnectionRefusedError, socket.gaierror, serial.SerialException, …), BusyError when it is open
+        Raises LinkOpenError with the address, the system's reason and a hint (its ``__context__`` is the system's
+        error: ConnectionRefusedError, socket.gaierror, serial.SerialException, …), BusyError when it is open
         already, and ConnectionClosed after `close`. A cancelled or failed `open` leaves nothing behind.
         """
 

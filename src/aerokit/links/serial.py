@@ -98,18 +98,20 @@ class SerialLink(BaseLink):
         )
 
     def _open_port(self) -> Any:
+        try:
+            return self._open_device()
+        except (OSError, ValueError, OverflowError) as error:
+            raise _open_error(self.address, error) from None
+
+    def _open_device(self) -> Any:
         serial = importlib.import_module("serial")
         try:
             return serial.Serial(
                 self._device, self._baud, rtscts=self._rtscts, exclusive=True, timeout=0, write_timeout=0
             )
-        except (OSError, ValueError, OverflowError) as error:
-            raise _open_error(self.address, error) from error
         except _TermiosError as error:
             # it vanished while it was being opened: pyserial lets this one through
-            failed = serial.SerialException(*error.args)
-            failed.__cause__ = error
-            raise _open_error(self.address, failed) from failed
+            raise serial.SerialException(*error.args) from error
 
     def _device_failed(self, error: OSError) -> None:
         """Reading or writing failed; said on a later turn, for it may be inside `write`."""

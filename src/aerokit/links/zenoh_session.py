@@ -115,7 +115,7 @@ async def open_session(address: str, options: NetworkOptions, prepare: Callable[
     try:
         return await opened_in_a_thread(work, lambda session: close_session(session, _nothing))
     except zenoh.ZError as error:
-        raise LinkOpenError(f"cannot open {address}: {_reason(error)}") from error
+        raise LinkOpenError(f"cannot open {address}: {_reason(error)}") from None
 
 
 def close_session(session: Any, closed: Callable[[], object]) -> None:

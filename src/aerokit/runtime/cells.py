@@ -59,6 +59,7 @@ class StateCell(Generic[T]):
         "_changes",
         "_clock",
         "_closed_by",
+        "_explain_timeout",
         "_feeds",
         "_is_followed",
         "_known",
@@ -85,6 +86,8 @@ class StateCell(Generic[T]):
         self._stamp = clock if stamp is None else stamp  # the time that a value set now came at
         self.waits_for: str = waits_for
         """The messages that the value comes from."""
+        self._explain_timeout: Callable[[], str] = str
+        """Says, for the text of a time-out, what keeps values from coming; empty when nothing is known."""
         self._known = False
         self._latest: T | None = None
         self._source: Source | None = None
@@ -431,7 +434,8 @@ class _Waiter(_Sink[T]):
             text += f"; it had to hold for {self._held_for:g} s"
         if self._seen_count > 1:
             text += f"; {self._seen_count} values seen, last " + ", ".join(map(repr, self._seen))
-        return text
+        why = self._cell._explain_timeout()
+        return f"{text}; {why}" if why else text
 
 
 class _Observer(_Sink[T]):

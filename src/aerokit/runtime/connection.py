@@ -340,8 +340,12 @@ class Connection:
         return self._wall_at_0 + self._clock()
 
     def describe_signatures(self, system_id: int = 0, component_id: int = 0) -> str:
-        """What signatures keep from us, or us from this component, for error texts; empty when nothing."""
-        return self._gate.describe(self.heard.get((system_id, component_id)))
+        """What signatures keep from us, or us from this component (0: all), for error texts; empty when nothing."""
+        return self._gate.describe(
+            heartbeat
+            for (system, component), heartbeat in self.heard.items()
+            if system == system_id and component_id in (0, component)
+        )
 
     def statistics(self) -> Iterator[FramerStatistics]:
         """The counters of every peer that is remembered."""
@@ -483,14 +487,14 @@ class Connection:
         system_id = getattr(message, "target_system", 0) if to is None else to
         for peer in self._routes.peers_of(system_id, getattr(message, "target_component", 0), message):
             self.link.write(data, peer)
-        self._taps.keep(data, self._clock())
+        self._taps.keep_sent(data, self._clock())
 
     def _send_to_peer(self, message: Message, peer: Peer) -> None:
         """Number, frame and write a message to one peer, whoever is behind it; for what is asked over each link."""
         now = 0.0 if self._encoder.signing is None else self.unix_time()
         data = self._encoder.encode(message, now)
         self.link.write(data, peer)
-        self._taps.keep(data, self._clock())
+        self._taps.keep_sent(data, self._clock())
 
     def _attach(self, item: type[Any], sink: Sink, system_id: int) -> Detach:
         if issubclass(item, Message):

@@ -39,3 +39,8 @@ class HardwareId(NamedTuple):
         if any(self.uid2) and any(other.uid2):
             return self.uid2 != other.uid2
         return bool(self.uid and other.uid) and self.uid != other.uid
+
+    def confirms(self, other: HardwareId) -> bool:
+        """Whether both tell the same one, by ``uid2`` or by ``uid``."""
+        is_same = (any(self.uid2) and self.uid2 == other.uid2) or (bool(self.uid) and self.uid == other.uid)
+        return is_same and not self.contradicts(other)

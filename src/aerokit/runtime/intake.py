@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink.messages import Heartbeat
@@ -11,6 +12,7 @@ from aerokit.runtime.loop_watch import LoopWatch
 from aerokit.runtime.peers import Peers
 from aerokit.runtime.routes import MOST_ROUTES
 from aerokit.runtime.taps import Taps
+from aerokit.runtime.terminal_ipython import TERMINAL_IPYTHON, stands_still_between_inputs
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -25,6 +27,14 @@ if TYPE_CHECKING:
     from aerokit.runtime.signatures import SignatureGate
 
 __all__ = ["Intake"]
+
+logger: logging.Logger = logging.getLogger("aerokit")
+
+WARN_AFTER_S = 1.0
+"""A heartbeat is missing then."""
+BLOCKING_CODE = (
+    "a coroutine did not await: use asyncio.sleep instead of time.sleep, and asyncio.to_thread for long work"
+)
 
 
 class Intake:
@@ -58,6 +68,8 @@ class Intake:
     def start(self) -> None:
         """The link is open: notice when the loop is kept from running."""
         self._loop_watch.start()
+        if stands_still_between_inputs():
+            logger.warning("nothing is received and no heartbeat sent between inputs: %s", TERMINAL_IPYTHON)
 
     def close(self) -> None:
         """Nothing more is delivered."""
@@ -95,7 +107,7 @@ class Intake:
             if several is not None:
                 if not several.takes(frame, peer, framer.counters_of(frame)):
                     continue
-                taps.keep(frame.raw, self._clock())
+                taps.keep_received(frame.raw, self._clock())
             if frame.message_id == Heartbeat.ID:
                 self._note_heartbeat(framer, frame, peer)
             self._bus.deliver(frame)
@@ -123,6 +135,12 @@ class Intake:
     # ------------------------------------------------------------------------------- inside
 
     def _on_blocked(self, seconds: float) -> None:
+        if seconds >= WARN_AFTER_S:
+            logger.warning(
+                "the event loop was blocked for %.1f s: nothing was received and no heartbeat sent meanwhile; %s",
+                seconds,
+                TERMINAL_IPYTHON if stands_still_between_inputs() else BLOCKING_CODE,
+            )
         self._bus.publish(LoopBlocked(self._clock(), 0, seconds))
 
     def _let_all_through(self) -> None:

@@ -42,6 +42,8 @@ class Candidate:
         self.round_trip_s: float | None = None
         """None: nothing was answered yet."""
         self.is_proven: bool = False
+        self.was_proven: bool = False
+        """Whether it was proven before the vehicle rebooted, and not doubted since."""
         self.is_doubted: bool = False
         """Whether somebody else speaks in this system's name there."""
         self.hardware: HardwareId | None = None
@@ -78,7 +80,7 @@ class Candidate:
         if self._agreed >= PROOFS and may_prove and not self.is_other_hardware:
             self.is_proven, self.is_doubted = True, False
         elif self._disagreed >= PROOFS:
-            self.is_proven, self.is_doubted = False, True
+            self._doubt()
 
     def note_copy(self, now: float) -> None:
         """The same frame came over it and over the link in use."""
@@ -89,6 +91,7 @@ class Candidate:
 
     def forget_proof(self) -> None:
         """The vehicle has rebooted: what was shown of its clock does not count any more."""
+        self.was_proven = self.was_proven or self.is_proven
         self.is_proven = self.is_other_hardware = False
         self.hardware = None
         self._asked_hardware = self._times_since = 0
@@ -113,7 +116,7 @@ class Candidate:
     def note_hardware(self, *, is_another: bool) -> None:
         """It and the vehicle have told their hardware ids."""
         if is_another:
-            self.is_proven, self.is_doubted = False, True
+            self._doubt()
         elif self.is_other_hardware:
             self.is_doubted = False
         self.is_other_hardware = is_another
@@ -122,6 +125,10 @@ class Candidate:
         """It has told its time, so that it could have told its hardware id."""
         if self._asked_hardware:
             self._times_since += 1
+
+    def _doubt(self) -> None:
+        self.is_proven = self.was_proven = False
+        self.is_doubted = True
 
     def is_alive(self, now: float) -> bool:
         """Whether something comes over it, and what is written leaves."""

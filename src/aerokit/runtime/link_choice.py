@@ -74,15 +74,21 @@ class LinkChoice:
     def note_answer(self, link: int, at: float, told_s: float, round_trip_s: float, now: float) -> None:
         """The system has told its time over a link; ``at`` is when, by our clock."""
         candidate = self.candidates[link]
+        is_stale = self.used is not None and self.used.answered_at < candidate.answered_at
         candidate.note_round_trip(round_trip_s, now)
         if candidate is self.used:
             if not self.clock.note(at, told_s, round_trip_s):
-                self.hardware = None  # somebody else may have been switched on in its place
+                self._hardware_link = (
+                    link  # another one may have been switched on in its place, and tells it there
+                )
                 for other in self.candidates.values():
                     other.forget_proof()
         else:
             candidate.note_time()
             agrees = self.clock.agrees(at, told_s, round_trip_s)
+            if agrees is False and is_stale:
+                # The link in use may be dead, and the vehicle may have stood still or rebooted since.
+                agrees = True if self._recognises(candidate, now) else None
             if agrees is not None:
                 candidate.note_clock(agrees, may_prove=not self._waits_for_hardware(candidate))
 
@@ -143,8 +149,17 @@ class LinkChoice:
         """
         if candidate is not self.used:
             return not candidate.is_proven and candidate.ask_hardware()
-        is_needed = self.hardware is None and len(self.candidates) > 1 and not is_wanted
-        return is_needed and candidate.ask_hardware()
+        return len(self.candidates) > 1 and not is_wanted and candidate.ask_hardware()
+
+    def _recognises(self, candidate: Candidate, now: float) -> bool:
+        """Whether its hardware id alone proves it: it was proven before the reboot, and is the only one alive."""
+        is_same = (
+            self.hardware is not None
+            and candidate.hardware is not None
+            and self.hardware.confirms(candidate.hardware)
+        )
+        alive = [each for each in self.candidates.values() if each.is_alive(now)]
+        return candidate.was_proven and is_same and alive == [candidate]
 
     def _waits_for_hardware(self, candidate: Candidate) -> bool:
         is_known = self.hardware is not None and candidate.hardware is not None

@@ -70,7 +70,7 @@ async def open_connection(
         signing: signs everything we send; what is not signed with its key is refused (docs/signing.md). None: what we
             send is not signed, and signatures are not checked.
         record: a ``.tlog`` file for everything received and sent, messages of unknown dialects too; an existing file
-            is replaced. A disk that is full ends the recording, not the connection.
+            is replaced when the first frame is received. A disk that is full ends the recording, not the connection.
         reconnect: whether a link that is lost, a device unplugged for example, is opened again until it is back,
             instead of ending the connection: ``LinkInterrupted``, ``LinkRestored``. Not for the first opening, and not
             at the end of a recording. Of several links: whether the connection outlives that all are away.

@@ -12,7 +12,7 @@ from aerokit.mavlink.frame import SIGNED
 from aerokit.runtime.events import FrameRefused
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
 
     from aerokit.mavlink.encoder import FrameEncoder
     from aerokit.mavlink.frame import Frame
@@ -128,15 +128,15 @@ class SignatureGate:
             logger.error("the time stamp of %r is not kept: %s", signing, error)
         self._keep_error = error
 
-    def describe(self, heartbeat: Heartbeat | None) -> str:
-        """What keeps us and the sender of this heartbeat apart, for error texts; empty when nothing does."""
+    def describe(self, heartbeats: Iterable[Heartbeat]) -> str:
+        """What keeps us and the senders of these heartbeats apart, for error texts; empty when nothing does."""
         signing = self._encoder.signing
         if signing is not None:
             refused = "; ".join(f"{n}: {why.value}" for why, n in signing.refused.items() if n)
             return f"frames were refused ({refused}) by {signing.key!r}" if refused else ""
-        frame = None if heartbeat is None else heartbeat.received_frame
-        is_signed = frame is not None and _has_key(frame)
-        return "its frames are signed and ours are not (signing=…)" if is_signed else ""
+        frames = (each.received_frame for each in heartbeats)
+        is_signed = any(frame is not None and _has_key(frame) for frame in frames)
+        return "its frames are signed and no key was given (signing=…)" if is_signed else ""
 
 
 def _has_key(frame: Frame) -> bool:

@@ -49,6 +49,8 @@ class Subscription(Generic[ItemT]):
             raise LocalProtocolError(
                 f"overflow = {overflow!r} is not allowed: 'drop_oldest', 'drop_newest' or 'error'"
             )
+        self._explain_timeout: Callable[[], str] = str
+        """Says, for the text of a time-out, what keeps items from coming; empty when nothing is known."""
         self.missed: int = 0
         """How many items were dropped because the reader was slow."""
         self._attach = attach
@@ -99,7 +101,10 @@ class Subscription(Generic[ItemT]):
                 return await self.__anext__()
             except StopAsyncIteration:
                 raise LocalProtocolError("this subscription is closed: read it inside its `with`") from None
-        raise OperationTimeout(f"nothing came on this subscription within {timeout:g} s")
+        why = self._explain_timeout()
+        raise OperationTimeout(
+            f"nothing came on this subscription within {timeout:g} s{f'; {why}' if why else ''}"
+        )
 
     def get_nowait(self) -> ItemT | None:
         """Return the next item if there is one."""

@@ -85,10 +85,15 @@ class Taps:
         self.recording = Recording(path, now)
         self._on_change()
 
-    def keep(self, raw: bytes, at: float) -> None:
-        """A frame goes into the recording, if there is one."""
+    def keep_received(self, raw: bytes, at: float) -> None:
+        """A frame that was received goes into the recording, if there is one."""
         if self.recording is not None:
             self.recording.write(raw, at)
+
+    def keep_sent(self, raw: bytes, at: float) -> None:
+        """A frame that was sent goes into the recording, if there is one."""
+        if self.recording is not None:
+            self.recording.write_sent(raw, at)
 
     def flush(self) -> None:
         """Hand what is recorded to the system."""

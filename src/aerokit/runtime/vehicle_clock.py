@@ -21,6 +21,10 @@ REAL = 0.05
 SPAN_S = 1.0
 FASTEST = 200.0
 """No simulation is faster than this."""
+MAX_PAUSE_S = 10.0
+"""A simulation that stood still for longer is taken for a vehicle that has rebooted."""
+SPEED_MAX_AGE_S = 5.0
+"""So long after a pause or a reboot the clock is taken to run as fast as before, until it was measured anew."""
 
 
 class VehicleClock:
@@ -28,11 +32,17 @@ class VehicleClock:
 
     def __init__(self) -> None:
         self._samples: deque[tuple[float, float]] = deque(maxlen=SAMPLES)
+        self._former_speed: tuple[float, float] | None = None  # and when it was measured
 
     def note(self, at: float, told_s: float, round_trip_s: float) -> bool:
-        """Told over the link in use; False when it does not go on: the vehicle has rebooted."""
+        """Told over the link in use; False when it does not go on: the vehicle has rebooted.
+
+        A clock that has stood still for a moment goes on, but later than expected.
+        """
         goes_on = not self._samples or self._goes_on(at, told_s, round_trip_s)
-        if not goes_on:
+        if not goes_on or self.agrees(at, told_s, round_trip_s) is False:
+            if (speed := self._measured_speed) is not None:
+                self._former_speed = speed, at
             self._samples.clear()
         self._samples.append((at, told_s))
         return goes_on
@@ -46,20 +56,33 @@ class VehicleClock:
         if speed is None:
             return None
         last_at, last = self._samples[-1]
-        drift_s = min(DRIFT * abs(at - last_at), MOST_DRIFT_S)
-        tolerance = (TOLERANCE_S + round_trip_s / 2 + drift_s) * max(1.0, speed)
+        tolerance = self._tolerance_s(at, round_trip_s, speed)
         return abs(last + speed * (at - last_at) - told_s) <= tolerance
 
     def _goes_on(self, at: float, told_s: float, round_trip_s: float) -> bool:
-        agrees = self.agrees(at, told_s, round_trip_s)
-        if agrees is not None:
-            return agrees
         last_at, last = self._samples[-1]
-        most = FASTEST * (at - last_at + TOLERANCE_S + round_trip_s)
-        return -TOLERANCE_S - round_trip_s <= told_s - last <= most
+        speed = self._measured_speed
+        if speed is None:
+            most = FASTEST * (at - last_at + TOLERANCE_S + round_trip_s)
+            return -TOLERANCE_S - round_trip_s <= told_s - last <= most
+        tolerance = self._tolerance_s(at, round_trip_s, speed)
+        expected = speed * (at - last_at)
+        least = max(0.0, expected - MAX_PAUSE_S * max(1.0, speed))
+        return least - tolerance <= told_s - last <= expected + tolerance
+
+    def _tolerance_s(self, at: float, round_trip_s: float, speed: float) -> float:
+        drift_s = min(DRIFT * abs(at - self._samples[-1][0]), MOST_DRIFT_S)
+        return (TOLERANCE_S + round_trip_s / 2 + drift_s) * max(1.0, speed)
 
     @property
     def _speed(self) -> float | None:
+        if (measured := self._measured_speed) is not None or self._former_speed is None:
+            return measured
+        speed, measured_at = self._former_speed
+        return speed if self._samples[-1][0] - measured_at <= SPEED_MAX_AGE_S else None
+
+    @property
+    def _measured_speed(self) -> float | None:
         if not self._samples:
             return None
         (first_at, first), (last_at, last) = self._samples[0], self._samples[-1]

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit.errors import AerokitError, LocalProtocolError
 from aerokit.sim.track import metres_from
+from aerokit.whole_file import write_whole
 
 if TYPE_CHECKING:
     from os import PathLike
@@ -49,7 +50,7 @@ def save_picture(tracks: Iterable[Track], path: str | PathLike[str]) -> None:
     check_picture(path)
     tracks = list(tracks)
     if Path(path).suffix.lower() == ".svg":
-        Path(path).write_text(draw_svg(tracks), encoding="utf-8")
+        write_whole(path, draw_svg(tracks))
     else:
         _save_png(_shapes(tracks), path)
 

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 import anyio
 
 from aerokit.arguments import checks_arguments
-from aerokit.errors import OperationTimeout
 from aerokit.read_only import ReadOnly
 from aerokit.vehicle.camera.lens import LensCalls
 from aerokit.vehicle.camera.photos import PhotoCalls
@@ -53,9 +52,7 @@ class Camera(ReadOnly, PhotoCalls, VideoCalls, LensCalls, TrackingCalls, Storage
         with anyio.move_on_after(timeout):
             found = await self._line.find()
         if found is None:
-            raise OperationTimeout(
-                f"{self._line.describe()} says nothing of itself; waited for {timeout:g} s at most"
-            )
+            raise self._line.timed_out(f"says nothing of itself; waited for {timeout:g} s at most")
         return found
 
     def __repr__(self) -> str:

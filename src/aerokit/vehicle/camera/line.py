@@ -128,6 +128,10 @@ class CameraLine(Ordering):
 
         self._talk.background.start(wait, "aerokit camera, a moment later")
 
+    def timed_out(self, what: str) -> OperationTimeout:
+        """The error that says what the camera did not do in time, and how well it is heard."""
+        return OperationTimeout(f"{self.describe()} {what}; {self._talk.describe_link()}")
+
     def describe(self) -> str:
         """For error texts."""
         information = self.information._latest
@@ -187,7 +191,7 @@ class CameraLine(Ordering):
             if not self.is_behind and not self.information.is_known:
                 raise
         if not self.information.is_known and not self.is_behind:
-            raise OperationTimeout(f"{self.describe()} did not say what it is; {self._talk.describe_link()}")
+            raise self.timed_out("did not say what it is")
 
     async def able(self, action: str, *capabilities: str) -> None:
         """Raise NotSupported unless the camera says that it has one of these, or says nothing about what it can."""

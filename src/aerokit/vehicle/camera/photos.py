@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import anyio
 
 from aerokit.arguments import checks_arguments
-from aerokit.errors import FileFormatError, LocalProtocolError, NotSupported, OperationTimeout
+from aerokit.errors import FileFormatError, LocalProtocolError, NotSupported
 from aerokit.vehicle.camera.album import LONGEST, Album
 from aerokit.vehicle.camera.capture import Capture
 from aerokit.vehicle.camera.part import CameraPart
@@ -97,7 +97,7 @@ class PhotoCalls(CameraPart):
             await self._line.find()
             status = await self._shutter.status()
             if status is None:
-                raise OperationTimeout(f"{self._line.describe()} does not say how many pictures it has taken")
+                raise self._line.timed_out("does not say how many pictures it has taken")
             count = status.image_count
             missing = 0
             for index in range(max(0, count - (1 if self._line.is_behind else LONGEST)), count):
@@ -110,7 +110,7 @@ class PhotoCalls(CameraPart):
             if count is None
             else f"did not tell of all of its {count} pictures"
         )
-        raise OperationTimeout(f"load_captures: {self._line.describe()} {told} within {timeout:g} s")
+        raise self._line.timed_out(f"{told} within {timeout:g} s")
 
     async def read_picture(self, capture: Capture) -> bytes:
         """The file of a picture, by MAVFTP: for a ``file_url`` that begins with ``mftp:`` or ``/``, at most 16 MB.

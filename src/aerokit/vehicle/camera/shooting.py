@@ -10,7 +10,6 @@ from aerokit.errors import (
     CommandRejected,
     CommandTimeout,
     OperationRejected,
-    OperationTimeout,
 )
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavResult
@@ -109,9 +108,8 @@ class Shutter:
                         continue
                     if missed is not None:
                         return self._done(missed)
-            raise error or OperationTimeout(
-                f"{self.line.describe()} accepted the order, and told of no picture within {timeout:g} s;"
-                " it may have taken one"
+            raise error or self.line.timed_out(
+                f"accepted the order, and told of no picture within {timeout:g} s; it may have taken one"
             )
 
     def _done(self, capture: Capture) -> Capture:
@@ -360,4 +358,4 @@ class PhotoInterval:
                 f"{self._line.describe()} has ended the series after {self._given + self._missed} pictures"
             )
         elif silent >= MOST_SILENT:
-            raise OperationTimeout(f"{self._line.describe()} takes pictures, and tells of none any more")
+            raise self._line.timed_out("takes pictures, and tells of none any more")

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 import anyio
 
 from aerokit.arguments import checks_arguments
-from aerokit.errors import OperationTimeout
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd
 from aerokit.vehicle.camera.decoding import known, mode_of, storage_of
@@ -81,10 +80,8 @@ class StorageCalls(CameraPart):
                 if told != mode:
                     await anyio.sleep(AGAIN_S)
             return
-        raise OperationTimeout(
-            f"{self._line.describe()} accepted {mode}, and {f'tells {told}' if told else 'tells no mode'}"
-            f" after {timeout:g} s"
-        )
+        tells = f"tells {told}" if told else "tells no mode"
+        raise self._line.timed_out(f"accepted {mode}, and {tells} after {timeout:g} s")
 
     async def load_storage(self) -> tuple[Storage, ...]:
         """Ask for the storage media (STORAGE_INFORMATION).
@@ -94,7 +91,7 @@ class StorageCalls(CameraPart):
         """
         await self._line.find()
         if await self._line.ask(m.StorageInformation, 0) is None:
-            raise OperationTimeout(f"{self._line.describe()} told of no storage")
+            raise self._line.timed_out("told of no storage")
         return self.storage.value
 
     async def format_storage(

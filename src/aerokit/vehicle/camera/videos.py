@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Literal
 import anyio
 
 from aerokit.arguments import checks_arguments
-from aerokit.errors import OperationTimeout
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import CameraSource, MavCmd
 from aerokit.vehicle.camera.decoding import status_of, stream_of, thermal_range_of, with_status
@@ -132,7 +131,7 @@ class VideoCalls(CameraPart):
                 await self.status.wait_until(lambda told: told.is_recording is wanted)
             return
         does = "does not record" if wanted else "goes on recording"
-        raise OperationTimeout(f"{self._line.describe()} accepted the order, and {does} after {timeout:g} s")
+        raise self._line.timed_out(f"accepted the order, and {does} after {timeout:g} s")
 
     # ----------------------------------------------------------------------------------------- streams
 
@@ -148,10 +147,10 @@ class VideoCalls(CameraPart):
         if first is None:
             first = await self._line.ask(m.VideoStreamInformation, 1)
         if first is None or not self._streams:
-            raise OperationTimeout(f"{self._line.describe()} told of no video stream")
+            raise self._line.timed_out("told of no video stream")
         for number in range(1, first.count + 1):
             if number not in self._streams and not await self._ask_stream(number):
-                raise OperationTimeout(f"{self._line.describe()} did not tell of its video stream {number}")
+                raise self._line.timed_out(f"did not tell of its video stream {number}")
         return self.streams.value
 
     async def _ask_stream(self, number: int) -> bool:

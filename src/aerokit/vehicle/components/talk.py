@@ -75,7 +75,9 @@ class ComponentTalk:
         if heard_at == -math.inf:
             return f"component {self.component_id} of system {self.system_id} was never heard"
         age = self.connection.now() - heard_at
-        return f"last heartbeat of component {self.component_id} {age:.1f} s ago"
+        signatures = self.connection.describe_signatures(self.system_id)
+        why = f"{signatures}; " if signatures else ""
+        return f"{why}last heartbeat of component {self.component_id} {age:.1f} s ago"
 
     def _close(self) -> None:
         self.transfers.is_closed = True

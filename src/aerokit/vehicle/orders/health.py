@@ -79,7 +79,7 @@ class Health:
                 await self._run_prearm_checks()
             await self._hear_of_health()
         found = (self.arming_texts(since), self.unarmable_mode(), self._out_of_date(), self._failing())
-        return tuple(dict.fromkeys(reason for reasons in found for reason in reasons))
+        return self._talk.each_reason_once(*(reason for reasons in found for reason in reasons))
 
     def unarmable_mode(self) -> list[str]:
         """That it does not arm in its present mode, if it does not."""

@@ -208,9 +208,10 @@ class MissionControl(HeldPlan["Mission"]):
     def _check_item(self, item: int) -> None:
         count = self._watch.count.latest
         last = LAST_ITEM if count is None else count - 1
+        if count == 0:
+            raise LocalProtocolError("the vehicle's mission is empty: upload() comes first; nothing was sent")
         if not isinstance(item, int) or isinstance(item, bool) or not 0 <= item <= last:
-            allowed = "the mission is empty" if count == 0 else f"0 to {last}"
-            raise LocalProtocolError(f"item = {item!r} is not allowed: {allowed}")
+            raise LocalProtocolError(f"item = {item!r} is not allowed: 0 to {last}")
 
     async def _set_current(self, item: int, timeout: float, order: Order, *, goes_on: bool = True) -> None:
         """``goes_on``: keep what it has counted of jumps. ArduPilot's item 0, home, stands for a fresh start."""

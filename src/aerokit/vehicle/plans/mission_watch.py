@@ -41,6 +41,7 @@ class MissionWatch:
         self.current: StateCell[int | None] = new_cell("mission.current", "MISSION_CURRENT")
         self.count: StateCell[int] = new_cell("mission.count", "MISSION_CURRENT with a number of items")
         self.progress: StateCell[MissionProgress] = new_cell("mission.progress", "MISSION_CURRENT")
+        talk.explain_timeouts(self.current, self.count, self.progress)
         self.reached: int | None = None
         """The item that was reached last."""
         self.is_complete: bool = False

@@ -70,6 +70,7 @@ class Hearing:
             return detach
 
         subscription: Subscription[ItemT] = Subscription(attach, capacity=capacity, overflow=overflow)
+        subscription._explain_timeout = lambda: self._connection.describe_signatures(self._system_id)
         return subscription
 
     def cell(self, message_type: type[MessageT], rate_hz: float | None) -> StateCell[MessageT]:

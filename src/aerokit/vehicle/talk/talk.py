@@ -9,7 +9,7 @@ import anyio
 
 from aerokit.autopilots import autopilot_for
 from aerokit.errors import CommandRejected, ConnectionClosed
-from aerokit.mavlink.enums import MavResult
+from aerokit.mavlink.enums import MavResult, MavSeverity
 from aerokit.mavlink.messages import CommandAck
 from aerokit.runtime.background import Background
 from aerokit.runtime.cells import Source, StateCell
@@ -136,9 +136,15 @@ class Talk:
     def keep(self, cell: StateCell[Any]) -> None:
         """Have a cell end with the talk, and be forgotten when the vehicle has rebooted."""
         self._cells.append(cell)
+        self.explain_timeouts(cell)
         self.on_reboot.append(cell.forget)
         if self._ended_by is not None:
             cell.close(self._ended_by)
+
+    def explain_timeouts(self, *cells: StateCell[Any]) -> None:
+        """Have who waits for these in vain told of signatures that keep us and the vehicle apart."""
+        for cell in cells:
+            cell._explain_timeout = self._describe_signatures
 
     def send(self, message: Message) -> None:
         """Send one message as it is; ConnectionClosed after :meth:`close`."""
@@ -190,11 +196,28 @@ class Talk:
     def explained(
         self, error: CommandRejected, since: float, reasons: tuple[str, ...] = ()
     ) -> CommandRejected:
-        """The same refusal with what the vehicle has said since then, and these reasons."""
-        texts = tuple(text for text in self.texts_since(since) if text not in reasons)
+        """The same refusal with what the vehicle has said of it since then, and these reasons; each once.
+
+        What it says as mere information ("ArduPilot Ready") is no reason.
+        """
+        texts = [
+            each.text
+            for each in self.telemetry.texts_since(since)
+            if each.severity <= MavSeverity.WARNING or self.autopilot.is_refusal(each.text)
+        ]
         return CommandRejected(
-            str(error), command=error.command, result=error.result, reasons=(*texts, *reasons)
+            str(error).partition("\n")[0],
+            command=error.command,
+            result=error.result,
+            reasons=self.each_reason_once(*error.reasons, *texts, *reasons),
         )
+
+    def each_reason_once(self, *texts: str) -> tuple[str, ...]:
+        """ArduPilot says the same as "PreArm: …" and as "Arm: …"."""
+        reasons: dict[str, str] = {}
+        for text in texts:
+            reasons.setdefault(self.autopilot.arming_reason(text) or text, text)
+        return tuple(reasons.values())
 
     def texts_since(self, at: float) -> tuple[str, ...]:
         """What the vehicle said (STATUSTEXT) since this time on the loop's clock, oldest first."""
@@ -213,11 +236,14 @@ class Talk:
             if received + lost
             else "nothing heard"
         )
-        if signatures := self.connection.describe_signatures(self.system_id, self.component_id):
-            loss = f"{loss}, {signatures}"
+        signatures = self._describe_signatures()
+        why = f"{signatures}; " if signatures else ""
         texts = self.texts_since(self.connection.now() - 10.0)
         said = f", it said: {'; '.join(texts[-3:])}" if texts else ""
-        return f"last heartbeat {self.heartbeat_age:.1f} s ago, {loss}{said}"
+        return f"{why}last heartbeat {self.heartbeat_age:.1f} s ago, {loss}{said}"
+
+    def _describe_signatures(self) -> str:
+        return self.connection.describe_signatures(self.system_id)
 
     # -------------------------------------------------------------------------------- events
 
@@ -237,6 +263,7 @@ class Talk:
                 detach = bus.attach(message_type, handler, system_id=self.system_id)
             self._detach.append(detach)
         telemetry, publish = self.telemetry, self.publish
+        self.explain_timeouts(*telemetry.cells.values(), self.link_quality, self.watch.link_state)
         self._detach += [
             telemetry.mode.observe(lambda old, new: publish(ModeChanged, old and old.name, new.name)),
             telemetry.armed.observe(lambda _, new: publish(ArmedChanged, new)),

@@ -84,10 +84,18 @@ class Transfers:
         with self.limit(timeout):
             self._measure_link()
             try:
-                return await run_exchange(self.connection, self.system_id, exchange)
+                result = await run_exchange(self.connection, self.system_id, exchange)
             except OperationTimeout as error:
-                error.args = (f"{error}; {self._describe()}",)
+                self._explain(error)
                 raise
+            if isinstance(result, dict):  # an answer for each name
+                for answer in result.values():
+                    if isinstance(answer, OperationTimeout):
+                        self._explain(answer)
+            return result
+
+    def _explain(self, error: OperationTimeout) -> None:
+        error.args = (f"{error}; {self._describe()}",)
 
     def _measure_link(self) -> None:
         seconds = self._round_trip_s() if self.round_trip.smoothed_s is None else None

@@ -1,0 +1,39 @@
+"""Files of users are replaced by whole ones only: each place that opens a file for writing is known here, with why."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+SOURCE = Path(__file__).parent.parent / "src" / "aerokit"
+WRITES = re.compile(
+    r"""open\([^)\n]*["'](?:w|x|a|r\+)[bt+]*["']|(?:write_text|write_bytes)\(|\.open\(["'](?:w|x|a)[bt+]*["']"""
+)
+KNOWN = {
+    "cli/camera.py": "beside what is there: nothing is replaced",
+    "cli/demo_lines.py": "os.devnull",
+    "cli/main.py": "os.devnull",
+    "cli/new_file.py": "a new file",
+    "convert/mcap.py": "converting.py moves it when it is whole",
+    "convert/tables.py": "converting.py moves it when it is whole",
+    "convert/tracks.py": "converting.py moves it when it is whole",
+    "cli/monitor.py": "os.devnull",
+    "mavlink/generator.py": "our own sources",
+    "mavlink/tlog.py": "recordings: runtime/recording.py replaces a file when the first frame is received",
+    "runtime/recording.py": "only to see whether it can be written",
+    "sync/generator.py": "our own sources",
+    "testing/failure.py": "of a failed test, under a name of its own",
+    "vehicle/camera/geotag.py": "moved when it is whole",
+    "vehicle/files/part_file.py": "a .part, which finish() moves",
+    "vehicle/parameters/cache.py": "moved when it is whole",
+    "whole_file.py": "write_whole",
+}
+
+
+def test_each_place_that_writes_files_is_known() -> None:
+    found = {
+        path.relative_to(SOURCE).as_posix()
+        for path in SOURCE.rglob("*.py")
+        if WRITES.search(path.read_text(encoding="utf-8"))
+    }
+    assert found == set(KNOWN)
