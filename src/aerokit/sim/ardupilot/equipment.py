@@ -31,7 +31,7 @@ _ANSWERS: tuple[tuple[int, int, tuple[Kind, ...]], ...] = (
     (_C.DO_GO_AROUND, _R.FAILED, ("plane",)),
     (_C.DO_SET_REVERSE, _R.ACCEPTED, ("rover",)),
     (_C.DO_PARACHUTE, _R.ACCEPTED, ("copter", "plane")),
-    (_C.DO_MOTOR_TEST, _R.ACCEPTED, ("copter", "rover")),
+    (_C.DO_MOTOR_TEST, _R.ACCEPTED, ("rover",)),
     (_C.DO_MOTOR_TEST, _R.FAILED, ("plane", "sub")),
     (_C.DO_GRIPPER, _R.FAILED, _ALL),
     (_C.DO_SPRAYER, _R.ACCEPTED, ("copter", "rover")),

@@ -286,6 +286,13 @@ class ArduPilotVehicle(SimulatedAutopilot):
         """Metres above home."""
         return self.navigation.altitude_above_home
 
+    def is_for_me(self, message: Message) -> bool:
+        """Also what is for a component of this system that is not there (MAVLink_routing.cpp)."""
+        system, component = getattr(message, "target_system", 0), getattr(message, "target_component", 0)
+        return system in (0, self.system_id) and all(
+            component != each.component_id for each in self.components
+        )
+
     # ------------------------------------------------------------------------------ boot and reboot
 
     def boot(self) -> None:
@@ -306,6 +313,7 @@ class ArduPilotVehicle(SimulatedAutopilot):
 
     def _become_ready(self) -> None:
         self.is_initialised = True
+        self.send(BUILDERS[self.KIND][m.SysStatus.ID](self))  # unasked: put off while the drivers started
         self.info("ArduPilot Ready")
         self.info("AHRS: DCM active")
         self.arming.start()
@@ -336,6 +344,8 @@ class ArduPilotVehicle(SimulatedAutopilot):
             self.motion.down = self.motion.ground_down
         self.motion.settle()
         self._reset()
+        for channel in self.channels:
+            channel.hangs_up = True
         self.reboot(_REBOOT_SILENCE_S)
 
     def send_text(self, severity: int, text: str) -> None:
