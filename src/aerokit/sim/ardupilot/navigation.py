@@ -29,7 +29,8 @@ _WITH_POSITION = int(
     | Ekf.PRED_POS_HORIZ_REL
     | Ekf.PRED_POS_HORIZ_ABS
 )
-_GIVE_UP_S = 10.0
+_DEAD_RECKONING = int(Ekf.ATTITUDE | Ekf.VELOCITY_VERT | Ekf.POS_VERT_ABS)
+_GIVE_UP_S, _STOP_AIDING_S = 7.0, 15.0
 _CHECK_S = 0.1
 
 Ned = tuple[float, float, float]
@@ -208,6 +209,8 @@ class Navigation:
         if lost and math.isnan(self._lost_at):
             self._lost_at, self.fix_type = now, GpsFixType.NO_FIX
         elif lost and self.has_position and now - self._lost_at >= _GIVE_UP_S:
+            self.flags = _DEAD_RECKONING | (Ekf.VELOCITY_HORIZ if self._vehicle.is_landed else 0)
+        elif lost and self.flags != _ATTITUDE_ONLY and now - self._lost_at >= _STOP_AIDING_S:
             self.flags = _ATTITUDE_ONLY
             self._say_cores("stopped aiding")
         elif not lost and self.fix_type < GpsFixType.TYPE_3D_FIX:

@@ -422,7 +422,10 @@ class ArduPilotVehicle(SimulatedAutopilot):
             return (north, east, (self.motion.ground_down if home is None else home[2]) - altitude)
         if frame in _TERRAIN:
             return (north, east, self.motion.ground_down - altitude)
-        return (north, east, self._frame.origin.altitude_m - altitude) if frame in _ABSOLUTE else None
+        if frame in _ABSOLUTE:
+            return (north, east, self._frame.origin.altitude_m - altitude)
+        self.info(f"Unknown mavlink coordinate frame {frame}")
+        return None
 
     def send_home(self, channel: Channel | None = None) -> None:
         """GPS_GLOBAL_ORIGIN and HOME_POSITION, as far as they are known."""

@@ -138,7 +138,8 @@ class SimulatedCopter(ArduPilotVehicle):
         is_on_ground = motion.is_on_ground
         if is_on_ground and not was_on_ground:
             self.info(f"SIM Hit ground at {motion.impact_speed_m_s:f} m/s")
-        if not is_on_ground or (self.motors.is_armed and self.mode.is_taking_off):
+        keeps_flying = self.mode.is_taking_off or not self.mode.notices_landing
+        if not is_on_ground or (self.motors.is_armed and keeps_flying):
             self._still_since = math.nan
         elif math.isnan(self._still_since):
             self._still_since = self.now
