@@ -42,6 +42,8 @@ QUIET_S, MOVING_S = 3.0, 45.0
 """The vehicle's: between two calls, and until it has come to rest."""
 FLIES_BY_ITSELF = ("AUTO", "RTL", "SMART_RTL", "LAND", "MISSION", "TAKEOFF")
 BY_ITSELF_S = 150.0
+CALM_S = 4
+"""The vehicle's, on end: it is noticed to have landed, and disarms, in that time."""
 ON_GROUND = 1
 C = MavCmd
 NAN = math.nan
@@ -229,7 +231,7 @@ class _Runner:
 
     async def _rest(self) -> None:
         vehicle, wait = self.vehicle, anyio.sleep
-        began, has_flown = anyio.current_time(), False
+        began, has_flown, calm = anyio.current_time(), False, 0
         await wait(QUIET_S * self._scale)
         while vehicle.is_armed:
             has_flown |= vehicle.landed_state.latest != ON_GROUND
@@ -238,7 +240,8 @@ class _Runner:
                 break
             climb, speed = vehicle.climb_m_s.latest or 0.0, vehicle.ground_speed_m_s.latest or 0.0
             changes = vehicle.landed_state.latest in (3, 4)
-            if abs(climb) < 0.15 and speed < 0.3 and not changes and not by_itself:
+            calm = calm + 1 if abs(climb) < 0.15 and speed < 0.3 and not changes and not by_itself else 0
+            if calm > CALM_S:
                 return
             await wait(self._scale)
         await wait(QUIET_S * self._scale)
@@ -329,6 +332,8 @@ async def run_choice(choice: Choice, seed: int, calls: int = CALLS) -> list[Step
     """On what the options say: a binary, or an address."""
     async with served(choice) as address, connect(address, timeout=60) as vehicle:
         await vehicle.wait_ready(timeout=choice.seconds(120))
+        if not choice.kind.is_ardupilot:  # it lengthens its other times for clients by itself
+            await vehicle.parameters.set("COM_DISARM_PRFLT", 10.0 * choice.speedup)
         return await run(vehicle, program(choice.kind.name, seed, calls), choice.speedup)
 
 

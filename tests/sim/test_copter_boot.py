@@ -104,12 +104,11 @@ def test_state_leaves_boot_after_it_is_ready() -> None:
     assert beats[-1] == (81, MavState.STANDBY)
 
 
-def test_nothing_but_heartbeats_texts_and_one_status_without_being_asked() -> None:
+def test_nothing_but_heartbeats_and_texts_without_being_asked() -> None:
     client = Client(SimulatedCopter(boot_time_s=1.0))
     client.run(12.0)
     kinds = {type(message) for _, message in client.heard}
-    assert kinds == {m.Heartbeat, m.Statustext, m.SysStatus, m.HomePosition, m.GpsGlobalOrigin, m.Timesync}
-    assert len(client.all(m.SysStatus)) == 1
+    assert kinds == {m.Heartbeat, m.Statustext, m.HomePosition, m.GpsGlobalOrigin, m.Timesync}
     assert len(client.all(m.Heartbeat)) == 12
 
 

@@ -122,6 +122,16 @@ def test_px4_storage_is_refused_while_armed(action: int) -> None:
     assert client.command(MavCmd.PREFLIGHT_STORAGE, action) == MavResult.TEMPORARILY_REJECTED
 
 
+@pytest.mark.parametrize(
+    ("function", "result"), [(1, 0), (12, 0), (13, 3), (33, 0), (41, 3), (1101, 0), (0, 3)]
+)
+def test_px4_actuator_test_is_denied_while_armed(function: int, result: int) -> None:
+    _, client = ready_px4()
+    assert client.command(MavCmd.ACTUATOR_TEST, 0, 1, 0, 0, function) == result
+    client.command(ARM, 1)
+    assert client.command(MavCmd.ACTUATOR_TEST, 0, 1, 0, 0, function) == MavResult.DENIED
+
+
 def test_px4_ping_is_answered_only_when_it_is_to_everybody() -> None:
     px4, client = ready_px4()
     for target in ((1, 1), (1, 0), (0, 1)):

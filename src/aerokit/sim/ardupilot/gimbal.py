@@ -96,7 +96,9 @@ class Gimbal:
         if self.mode == MavMountMode.RC_TARGETING:  # no stick turns it: all of them are in the middle
             return Target(self._middle("ROLL"), self._middle("PITCH"), 0.0, self.is_yaw_locked)
         if self.mode in _UNTURNED:
-            return Target(*(self.setting(f"MNT1_{MavMountMode(self.mode).name}_{axis}") for axis in "XYZ"))
+            place = MavMountMode(self.mode).name
+            roll, pitch, yaw = (self.setting(f"MNT1_{place}_{axis}") for axis in "XYZ")
+            return Target(roll, pitch, yaw)
         if self.mode == MavMountMode.GPS_POINT:
             return self._towards(self._region)
         if self.mode == MavMountMode.SYSID_TARGET:

@@ -313,7 +313,6 @@ class ArduPilotVehicle(SimulatedAutopilot):
 
     def _become_ready(self) -> None:
         self.is_initialised = True
-        self.send(BUILDERS[self.KIND][m.SysStatus.ID](self))  # unasked: put off while the drivers started
         self.info("ArduPilot Ready")
         self.info("AHRS: DCM active")
         self.arming.start()

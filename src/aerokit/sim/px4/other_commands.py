@@ -41,7 +41,6 @@ _SILENT = (
     _C.PREFLIGHT_SET_SENSOR_OFFSETS,
     _C.PREFLIGHT_UAVCAN,
     _C.OBLIQUE_SURVEY,
-    _C.ACTUATOR_TEST,
     _C.CONFIGURE_ACTUATOR,
     _C.INJECT_FAILURE,
     _C.START_RX_PAIR,
@@ -64,6 +63,7 @@ _GRIPS_FOR_S = 1.3
 _LOG_STOPS_AFTER_S = 2.0
 _UNKNOWN_PROGRESS = 255
 _STORAGE_ACTIONS = range(5)
+_ACTUATORS, _FIRST_OUTPUT_FUNCTION = (range(1, 13), range(33, 41)), 1000
 
 
 def other_commands(px4: SimulatedPx4) -> dict[int, CommandHandler]:
@@ -76,6 +76,7 @@ def other_commands(px4: SimulatedPx4) -> dict[int, CommandHandler]:
     handlers[_C.EXTERNAL_WIND_ESTIMATE] = lambda command: _answer_twice(px4, command)
     handlers[_C.FIXED_MAG_CAL_YAW] = lambda command: _calibrate_by_yaw(px4, command)
     handlers[_C.DO_GRIPPER] = lambda _: Progress((_UNKNOWN_PROGRESS,), _GRIPS_FOR_S)
+    handlers[_C.ACTUATOR_TEST] = lambda command: _test_actuator(px4, command)
     handlers[_C.PREFLIGHT_STORAGE] = lambda command: _store(px4, command)
     handlers[_C.LOGGING_STOP] = lambda _: Progress((), _LOG_STOPS_AFTER_S)
     return handlers
@@ -95,6 +96,15 @@ def _calibrate_by_yaw(px4: SimulatedPx4, command: Command) -> int:
     px4.info(f"Assuming vehicle is facing heading {command.param1:.1f} degrees")
     px4.info("Mag quick calibration finished")
     return MavResult.ACCEPTED
+
+
+def _test_actuator(px4: SimulatedPx4, command: Command) -> int:
+    """Nothing is seen of it; Param 5 is a motor, a servo, or from 1000 on any function of an output."""
+    if px4.is_armed:
+        return MavResult.DENIED
+    function = whole(command.x)
+    is_known = any(function in each for each in _ACTUATORS) or function >= _FIRST_OUTPUT_FUNCTION
+    return MavResult.ACCEPTED if is_known else MavResult.UNSUPPORTED
 
 
 def _store(px4: SimulatedPx4, command: Command) -> int | None:
