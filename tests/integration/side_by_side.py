@@ -300,6 +300,8 @@ class _Runner:
 
 async def run(vehicle: Vehicle, calls: list[Call], speedup: float) -> list[Step]:
     """Do the calls one after the other. A PX4 hears a station more often than in its 2.5 s, however fast it is."""
+    idle = ("DISARM_DELAY", 0.0) if vehicle.autopilot.runs_prearm_checks else ("COM_DISARM_PRFLT", -1.0)
+    await vehicle.parameters.set(*idle)  # off: a real vehicle takes longer to come to rest
     async with anyio.create_task_group() as tasks:
         tasks.start_soon(_beat, vehicle, 1.0 / speedup)
         runner = _Runner(vehicle, speedup)
@@ -332,8 +334,6 @@ async def run_choice(choice: Choice, seed: int, calls: int = CALLS) -> list[Step
     """On what the options say: a binary, or an address."""
     async with served(choice) as address, connect(address, timeout=60) as vehicle:
         await vehicle.wait_ready(timeout=choice.seconds(120))
-        if not choice.kind.is_ardupilot:  # it lengthens its other times for clients by itself
-            await vehicle.parameters.set("COM_DISARM_PRFLT", 10.0 * choice.speedup)
         return await run(vehicle, program(choice.kind.name, seed, calls), choice.speedup)
 
 

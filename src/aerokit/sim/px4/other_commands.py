@@ -98,13 +98,13 @@ def _calibrate_by_yaw(px4: SimulatedPx4, command: Command) -> int:
     return MavResult.ACCEPTED
 
 
-def _test_actuator(px4: SimulatedPx4, command: Command) -> int:
-    """Nothing is seen of it; Param 5 is a motor, a servo, or from 1000 on any function of an output."""
+def _test_actuator(px4: SimulatedPx4, command: Command) -> int | None:
+    """Nothing is seen of it; param 5 is a motor, a servo, or from 1000 on any function of an output."""
     if px4.is_armed:
         return MavResult.DENIED
     function = whole(command.x)
     is_known = any(function in each for each in _ACTUATORS) or function >= _FIRST_OUTPUT_FUNCTION
-    return MavResult.ACCEPTED if is_known else MavResult.UNSUPPORTED
+    return MavResult.ACCEPTED if is_known else None
 
 
 def _store(px4: SimulatedPx4, command: Command) -> int | None:
