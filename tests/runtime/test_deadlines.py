@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 
+import pytest
+
 from aerokit.runtime.deadlines import Deadlines
 from aerokit.testing import run_virtual
 
@@ -118,3 +120,22 @@ def test_requests_that_are_answered_cost_one_timer_and_closing_leaves_none() -> 
         assert alarms.rung == []
 
     run_virtual(program())
+
+
+def test_deadlines_that_are_past_on_uvloop_ring() -> None:
+    uvloop = pytest.importorskip("uvloop")
+    rung: list[str] = []
+
+    async def main() -> None:
+        deadlines, now = Deadlines(), asyncio.get_running_loop().time()
+        deadlines.set(lambda: rung.append("first"), now - 1.0)
+        deadlines.set(lambda: rung.append("second"), now - 2.0)
+        deadlines.set(lambda: rung.append("third"), now + 0.01)
+        last = asyncio.Event()
+        deadlines.set(last.set, now + 0.02)
+        await asyncio.wait_for(last.wait(), 5.0)
+
+    loop = uvloop.new_event_loop()
+    loop.run_until_complete(main())
+    loop.close()
+    assert sorted(rung) == ["first", "second", "third"]

@@ -11,7 +11,7 @@ from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import CopterMode, MavCmd, MavModeFlag
 from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.message import Message
-from aerokit.sim import SimulatedCopter, SimulatedVehicle
+from aerokit.sim import SimulatedCopter, SimulatedPx4, SimulatedVehicle
 
 M = TypeVar("M", bound=Message)
 STEP_S = 0.05
@@ -29,6 +29,7 @@ class Client:
         self.framer = Framer()
         self._encoder = FrameEncoder(system_id, component_id)
         vehicle.step(0.0)
+        self._ask_for_texts()
 
     def send(self, message: Message) -> None:
         self.vehicle.receive(self._encoder.encode(message), self.now)
@@ -55,7 +56,13 @@ class Client:
                 return message.result
         return None
 
+    def _ask_for_texts(self) -> None:
+        """PX4 tells texts where a ground station is heard; this client sends no heartbeats unless a test does."""
+        if isinstance(self.vehicle, SimulatedPx4):
+            self.vehicle.text_links.hear_station(self.vehicle.channels[0])
+
     def listen(self) -> None:
+        self._ask_for_texts()
         for frame in self.framer.receive(self.vehicle.take_outbox(), self.now):
             self.heard.append((self.now, STANDARD.decode(frame)))
 

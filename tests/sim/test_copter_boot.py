@@ -178,7 +178,9 @@ def test_losing_gps_is_noticed_at_once_by_the_receiver_and_later_by_the_estimato
     assert client.last(m.GpsRawInt).fix_type == GpsFixType.NO_FIX
     assert not client.last(m.SysStatus).onboard_control_sensors_health & MavSysStatusSensor.GPS
     assert client.last(m.EkfStatusReport).flags == 831
-    client.run(10.0)
+    client.run(7.0)
+    assert client.last(m.EkfStatusReport).flags == 39
+    client.run(8.0)
     assert client.last(m.EkfStatusReport).flags == 167
     copter.faults.gps_lost = False
     client.run(1.0)

@@ -180,7 +180,7 @@ def test_unknown_commands_are_unsupported() -> None:
     assert client.command(MavCmd.DO_SET_REVERSE) == MavResult.UNSUPPORTED
 
 
-def test_time_synchronisation_and_ping_are_answered() -> None:
+def test_time_synchronisation_is_answered_and_ping_is_not() -> None:
     copter, client = ready_copter()
     client.send(m.Timesync(0, 123_456_789))
     answer = client.last(m.Timesync)
@@ -189,8 +189,7 @@ def test_time_synchronisation_and_ping_are_answered() -> None:
     client.send(m.Timesync(5, 6))
     assert len(client.all(m.Timesync)) == 1, "an answer is not answered"
     client.send(m.Ping(99, 7, 0, 0))
-    ping = client.last(m.Ping)
-    assert (ping.time_usec, ping.seq, ping.target_system, ping.target_component) == (99, 7, 255, 190)
+    assert client.all(m.Ping) == []
 
 
 # -------------------------------------------------------------------------------------- parameters

@@ -213,11 +213,11 @@ def test_reposition_holds_at_an_amsl_altitude() -> None:
     px4, client = flying_px4()
     there = px4.frame.to_global(20.0, 10.0, 0.0)
     x, y = there.latitude_e7, there.longitude_e7
-    assert client.command_int(MavCmd.DO_REPOSITION, 6, -1, 1, 0, NAN, x=x, y=y, z=504.4) == MavResult.ACCEPTED
+    assert client.command_int(MavCmd.DO_REPOSITION, 5, -1, 1, 0, NAN, x=x, y=y, z=504.4) == MavResult.ACCEPTED
     client.run(20.0)
     assert (px4.motion.north, px4.motion.east) == pytest.approx((20.0, 10.0), abs=0.1)
     assert px4.altitude_m == pytest.approx(15.0, abs=0.1)
-    held = client.command_int(MavCmd.DO_REPOSITION, 6, -1, 1, 0, NAN, x=0x7FFFFFFF, y=0x7FFFFFFF, z=NAN)
+    held = client.command_int(MavCmd.DO_REPOSITION, 5, -1, 1, 0, NAN, x=0x7FFFFFFF, y=0x7FFFFFFF, z=NAN)
     assert held == MavResult.ACCEPTED
     client.run(5.0)
     assert (px4.motion.north, px4.motion.east) == pytest.approx((20.0, 10.0), abs=0.1)

@@ -63,7 +63,7 @@ def test_results(command: int, param1: float, result: int) -> None:
 
 @pytest.mark.parametrize(
     "command",
-    [MavCmd.DO_GIMBAL_MANAGER_PITCHYAW, MavCmd.SET_CAMERA_MODE, MavCmd.ACTUATOR_TEST, MavCmd.NAV_DELAY],
+    [MavCmd.DO_GIMBAL_MANAGER_PITCHYAW, MavCmd.SET_CAMERA_MODE, MavCmd.DO_WINCH, MavCmd.NAV_DELAY],
 )
 def test_nobody_answers_for_parts_that_do_not_run(command: int) -> None:
     _, client = ready()

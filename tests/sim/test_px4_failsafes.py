@@ -48,7 +48,7 @@ def set_mode(station: Station, sub: int) -> None:
 def fly_north(px4: SimulatedPx4, station: Station, metres: float, seconds: float) -> None:
     place = px4.frame.to_global(metres, 0.0, 0.0)
     station.command_int(
-        MavCmd.DO_REPOSITION, 0, -1, 1, 0, NAN, x=place.latitude_e7, y=place.longitude_e7, z=NAN
+        MavCmd.DO_REPOSITION, 5, -1, 1, 0, NAN, x=place.latitude_e7, y=place.longitude_e7, z=NAN
     )
     station.run(seconds)
 

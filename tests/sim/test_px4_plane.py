@@ -93,7 +93,7 @@ def test_it_is_sent_elsewhere_and_told_how_fast() -> None:
     plane, client = flying_plane()
     place = plane.frame.to_global(600.0, 300.0, 0.0)
     client.command_int(
-        MavCmd.DO_REPOSITION, 0, -1, 1, 0, NAN, x=place.latitude_e7, y=place.longitude_e7, z=584.09 + 80
+        MavCmd.DO_REPOSITION, 5, -1, 1, 0, NAN, x=place.latitude_e7, y=place.longitude_e7, z=584.09 + 80
     )
     client.run(90.0)
     assert away_m(plane, 600.0, 300.0) == pytest.approx(80.0, abs=8.0)

@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as peer
 
 from aerokit.mavlink import STANDARD, Frame, FrameEncoder, Framer
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavCmd, MavResult
+from aerokit.mavlink.enums import MavAutopilot, MavCmd, MavResult, MavType
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.signing import ONE_MINUTE, Signing, SigningKey
 from aerokit.sim import SimulatedCopter, SimulatedPx4
@@ -89,7 +89,9 @@ def copter_on_two_ports(**options: Any) -> tuple[SimulatedCopter, Station, Stati
 def px4_with_station(**options: Any) -> tuple[SimulatedPx4, Station]:
     px4 = SimulatedPx4(boot_time_s=0.0, **options)
     px4.step(5.0)
-    return px4, Station(px4, px4.channels[0])
+    station = Station(px4, px4.channels[0])
+    station.send(m.Heartbeat(MavType.GCS, MavAutopilot.INVALID, 0, 0, 4, 3))  # texts go to ground stations
+    return px4, station
 
 
 # -------------------------------------------------------------------------------------- ArduPilot

@@ -63,13 +63,15 @@ def test_a_disarmed_vehicle_sleeps_between_its_heartbeats() -> None:
 
 
 def test_only_hears_what_is_addressed_to_it() -> None:
-    _, client = ready_copter()
+    _, client = ready_copter(components=[ExtraComponent(154)])
     for target in ((2, 1), (1, 154), (2, 0)):
         client.send(m.CommandLong(*target, MavCmd.DO_SEND_BANNER, 0, 0, 0, 0, 0, 0, 0, 0))
     assert client.all(m.CommandAck) == []
-    for target in ((1, 1), (1, 0), (0, 0)):
+    for target in ((1, 1), (1, 0), (0, 0), (1, 99)):
         client.send(m.CommandLong(*target, MavCmd.DO_SEND_BANNER, 0, 0, 0, 0, 0, 0, 0, 0))
-    assert len(client.all(m.CommandAck)) == 3
+    assert len(client.all(m.CommandAck)) == 4, (
+        "ArduPilot takes what is for a component that is not there, too"
+    )
 
 
 def test_answers_go_to_who_asked() -> None:

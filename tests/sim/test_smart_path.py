@@ -68,8 +68,8 @@ def test_points_are_two_metres_apart_and_begin_where_it_was_armed() -> None:
 def test_without_a_position_the_path_is_given_up() -> None:
     rover, client = driving_rover()
     rover.faults.gps_lost = True
-    client.run(24.0)
-    assert rover.path.is_active, "ten seconds are estimated, fifteen forgiven"
+    client.run(21.0)
+    assert rover.path.is_active, "seven seconds are estimated, fifteen forgiven"
     client.run(3.0)
     assert "SmartRTL deactivated: bad position" in client.texts
     rover.faults.gps_lost = False

@@ -74,7 +74,7 @@ async def test_a_vehicle_waits_longer_for_its_clients() -> None:
     copter, px4 = SimulatedCopter(), SimulatedPx4()
     wait_longer([copter, px4], 10.0, leave=["GUID_TIMEOUT"])
     names = ("FS_GCS_TIMEOUT", "GUID_TIMEOUT", "DISARM_DELAY", "RC_OVERRIDE_TIME")
-    assert [copter.parameters[name] for name in names] == [50.0, 3.0, 0.0, 30.0]
+    assert [copter.parameters[name] for name in names] == [50.0, 3.0, 100.0, 30.0]
     assert [px4.parameters[name] for name in ("COM_DL_LOSS_T", "COM_OF_LOSS_T", "COM_RC_LOSS_T")] == [
         100.0,
         10.0,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -13,12 +14,18 @@ from flight_harness import Flight, Wire, in_the_air, open_flight
 import aerokit
 from aerokit import Position
 from aerokit import messages as m
-from aerokit.errors import CommandRejected, CommandTimeout, LocalProtocolError, OperationRejected
+from aerokit.errors import (
+    CommandRejected,
+    CommandTimeout,
+    LocalProtocolError,
+    OperationRejected,
+    OperationTimeout,
+)
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.mavlink.message import Message
 from aerokit.runtime.cells import Source
-from aerokit.sim import SimulatedCopter, SimulatedGimbal, SimulatedPx4, simulated_link
+from aerokit.sim import SimulatedCopter, SimulatedGimbal, SimulatedPx4, SimulatedVehicle, simulated_link
 from aerokit.sim.commands import CommandHandler
 
 pytestmark = pytest.mark.anyio
@@ -47,18 +54,43 @@ def params(message: Message) -> tuple[int, ...]:
 async def test_it_points_where_it_is_told_and_tells_so() -> None:
     async with in_the_air(copter=with_gimbal()) as flight:
         gimbal = flight.vehicle.gimbal
-        with flight.vehicle.rate(m.GimbalDeviceAttitudeStatus, 10.0):
-            await gimbal.point(-45.0, 90.0, wait=False)
-            told = await gimbal.attitude.wait_until(
-                lambda each: abs((each.pitch_deg or 0.0) + 45) < 1, timeout=5
-            )
-            assert told.yaw_deg == pytest.approx(90, abs=2)
-            assert gimbal.attitude.source == Source(1, 1, "GIMBAL_DEVICE_ATTITUDE_STATUS")
+        await gimbal.point(-45.0, 90.0, wait=False)
+        told = await gimbal.attitude.wait_until(lambda each: abs((each.pitch_deg or 0.0) + 45) < 1, timeout=5)
+        assert told.yaw_deg == pytest.approx(90, abs=2)
+        assert gimbal.attitude.source == Source(1, 1, "GIMBAL_DEVICE_ATTITUDE_STATUS")
         (command,) = flight.wire.commands(PITCHYAW)
         assert (command.target_component, command.param5) == (1, 28)  # type: ignore[union-attr]
         await gimbal.release()
         (released,) = flight.wire.commands(MOUNT)
         assert params(released)[-1] == 3
+
+
+@pytest.mark.parametrize(
+    "autopilot", [with_gimbal, partial(SimulatedPx4, boot_time_s=0.0, parameters={"MNT_MODE_IN": 4.0})]
+)
+async def test_attitude_that_is_waited_for_is_asked_for_until_nobody_waits(
+    autopilot: Callable[[], SimulatedVehicle],
+) -> None:
+    vehicle_there = autopilot()
+    async with simulated_link(vehicle_there) as link, aerokit.connect(link) as vehicle:
+        stream = m.GimbalDeviceAttitudeStatus.ID
+        before = vehicle_there.channels[0].streams.interval(stream)
+        await vehicle.gimbal.attitude.wait_until(lambda _: True, timeout=5)
+        async for _ in vehicle.gimbal.attitude.updates():
+            if vehicle_there.channels[0].streams.interval(stream) == pytest.approx(0.25):
+                break
+        with pytest.raises(OperationTimeout):
+            await vehicle.gimbals[1].attitude.wait_until(lambda _: False, timeout=3)
+        await anyio.sleep(2)
+        assert vehicle_there.channels[0].streams.interval(stream) in (0.25, before)
+
+
+async def test_attitude_that_nobody_waits_for_is_not_asked_for_any_more() -> None:
+    copter = with_gimbal()
+    async with simulated_link(copter) as link, aerokit.connect(link) as vehicle:
+        await vehicle.gimbal.attitude.wait_until(lambda _: True, timeout=5)
+        await anyio.sleep(2)
+        assert copter.channels[0].streams.interval(m.GimbalDeviceAttitudeStatus.ID) == 0.0
 
 
 async def test_roll_is_the_mounts_whose_yaw_is_the_vehicles() -> None:

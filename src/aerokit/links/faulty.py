@@ -264,6 +264,7 @@ class _Timetable:
         self._waiting: list[tuple[float, int, Callable[[], None]]] = []
         self._count = 0
         self._timer: asyncio.TimerHandle | None = None
+        self._timer_at = 0.0  # uvloop's handle of a time that is past does not tell it
 
     def __bool__(self) -> bool:
         return bool(self._waiting)
@@ -287,10 +288,10 @@ class _Timetable:
     def _schedule(self) -> None:
         due = self._waiting[0][0]
         if self._timer is not None:
-            if self._timer.when() <= due:
+            if self._timer_at <= due:
                 return
             self._timer.cancel()
-        self._timer = self.loop.call_at(due, self._run)
+        self._timer, self._timer_at = self.loop.call_at(due, self._run), due
 
     def _run(self) -> None:
         self._timer = None

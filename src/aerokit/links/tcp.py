@@ -204,6 +204,11 @@ class TcpListen(_TcpLink):
         """See `Link.has_peer`."""
         return peer in self._clients
 
+    def close_clients(self) -> None:
+        """Cut off all clients; they may come again."""
+        for stream in tuple(self._clients.values()):
+            stream.close()
+
     async def wait_closed(self) -> None:
         """See `Link.wait_closed`."""
         for _ in range(TURNS_OF_AN_ACCEPT):

@@ -301,6 +301,7 @@ _HINTS: dict[int, str] = {
     MavResult.UNSUPPORTED: " (this firmware does not know the command)",
     MavResult.COMMAND_LONG_ONLY: " (it has to be sent as COMMAND_LONG)",
     MavResult.COMMAND_INT_ONLY: " (it has to be sent as COMMAND_INT)",
+    MavResult.COMMAND_UNSUPPORTED_MAV_FRAME: " (not in this frame; PX4 1.17 takes MAV_FRAME_GLOBAL_INT, 5, alone)",
 }
 
 

@@ -22,6 +22,7 @@ class Deadlines:
         self._loop = asyncio.get_running_loop()
         self._due: dict[Alarm, float] = {}
         self._timer: asyncio.TimerHandle | None = None
+        self._timer_at = 0.0  # uvloop's handle of a time that is past does not tell it
 
     def set(self, alarm: Alarm, at: float) -> None:
         """Have ``alarm`` called at ``at`` (seconds, the loop's clock), and not at the time it was set to before."""
@@ -48,8 +49,8 @@ class Deadlines:
             self._come_by(min(self._due.values()))
 
     def _come_by(self, at: float) -> None:
-        if self._timer is not None and self._timer.when() <= at:
+        if self._timer is not None and self._timer_at <= at:
             return
         if self._timer is not None:
             self._timer.cancel()
-        self._timer = self._loop.call_at(at, self._ring, at)
+        self._timer, self._timer_at = self._loop.call_at(at, self._ring, at), at

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, ClassVar
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavProtocolCapability
 from aerokit.mavlink.signing import timestamp_at
-from aerokit.sim.commands import CommandHandler, CommandServer
-from aerokit.sim.vehicle import Component, SimulatedVehicle, sender_of
+from aerokit.sim.commands import Command, CommandHandler, CommandServer
+from aerokit.sim.vehicle import Component, SimulatedVehicle
 
 if TYPE_CHECKING:
     from aerokit.mavlink.signing import SigningKey
@@ -85,19 +85,18 @@ class SimulatedAutopilot(SimulatedVehicle):
         return major << 24 | minor << 16 | patch << 8 | _RELEASES.get(release, 0)
 
     def listen_to_clocks(self) -> None:
-        """Answer TIMESYNC, and PINGs to everybody."""
+        """Answer TIMESYNC."""
         self.on(m.Timesync, self._on_timesync)
-        self.on(m.Ping, self._on_ping)
 
     def serve_commands(self, handlers: Mapping[int, CommandHandler]) -> CommandServer:
         """Answer these MAV_CMDs, but for those that are to be unknown."""
         known = {number: each for number, each in handlers.items() if number not in self.unsupported_commands}
-        return CommandServer(self, known)
+        return CommandServer(self, known, self.refusal_of_command)
+
+    def refusal_of_command(self, command: Command) -> int | None:
+        """The MAV_RESULT of what this firmware refuses before it looks which command it is."""
+        return None
 
     def _on_timesync(self, request: m.Timesync, channel: Channel) -> None:
         if request.tc1 == 0:
             self.send(m.Timesync(int(self.uptime * 1e9), request.ts1), channel)
-
-    def _on_ping(self, ping: m.Ping, channel: Channel) -> None:
-        if ping.target_system == 0:
-            self.send(m.Ping(ping.time_usec, ping.seq, *sender_of(ping)), channel)

@@ -34,6 +34,8 @@ class Channel:
         """Reads what comes in; vehicles on one link may share it."""
         self._encoders: dict[tuple[int, int], FrameEncoder] = {}
         self._outbox: list[bytes] = []
+        self.hangs_up: bool = False
+        """Whether its clients are to be cut off, where it is a TCP port."""
         self.signing: Signing | None = None
         """What signs its frames and checks what it hears; see `sign_with`."""
 

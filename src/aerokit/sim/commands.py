@@ -98,12 +98,19 @@ class CommandServer:
     """Finds the handler of a command, lets faults meddle, and answers to who asked.
 
     A handler returns a MAV_RESULT, a `Progress`, or None when it answers by itself. What it sends itself goes
-    out before the acknowledgement. An unknown command is UNSUPPORTED.
+    out before the acknowledgement. An unknown command is UNSUPPORTED. ``refusal`` gives the MAV_RESULT of what is
+    refused whichever command it is.
     """
 
-    def __init__(self, vehicle: Commanded, handlers: dict[int, CommandHandler]) -> None:
+    def __init__(
+        self,
+        vehicle: Commanded,
+        handlers: dict[int, CommandHandler],
+        refusal: Callable[[Command], int | None] = lambda _: None,
+    ) -> None:
         self._vehicle = vehicle
         self._handlers = handlers
+        self._refusal = refusal
         vehicle.on(CommandLong, self._on_long)
         vehicle.on(CommandInt, self._on_int)
 
@@ -119,6 +126,9 @@ class CommandServer:
 
     def execute(self, command: Command) -> None:
         """Do it and answer."""
+        if (refused := self._refusal(command)) is not None:
+            self.answer(command, refused)
+            return
         fault = self._vehicle.faults.take(command.command)
         if fault is not None and fault.ignore:
             return

@@ -37,7 +37,7 @@ class CommandFault:
 class Faults:
     """Everything is off at first. Change attributes at any time; they act from the next message or step on.
 
-    - ``gps_lost``: no GPS fix any more; after ten seconds the estimator gives its position up
+    - ``gps_lost``: no GPS fix any more; after seven seconds the estimator gives its position up
     - ``rc_lost``: the pilot's transmitter is off; what follows is up to the failsafes of the kind
     - ``leak``: there is water in the hull of a submarine
     - ``heartbeats_stopped``: every stream goes on, heartbeats do not

@@ -11,11 +11,11 @@ __all__ = ["wait_longer"]
 
 _SECONDS = (
     "FS_GCS_TIMEOUT", "FS_LONG_TIMEOUT", "FS_PILOT_TIMEOUT", "GUID_TIMEOUT", "RC_OVERRIDE_TIME",
-    "COM_DISARM_PRFLT", "COM_DL_LOSS_T", "COM_OBC_LOSS_T", "COM_OF_LOSS_T", "COM_RC_LOSS_T",
+    "DISARM_DELAY", "COM_DISARM_PRFLT", "COM_DL_LOSS_T", "COM_OBC_LOSS_T", "COM_OF_LOSS_T", "COM_RC_LOSS_T",
 )  # fmt: skip
 """How long ArduPilot and PX4 wait for heartbeats, set-points, channel overrides or a take-off."""
-_OFF = ("DISARM_DELAY",)
-"""Too small a type for what it would have to be."""
+_INT8_MAX = 127.0
+"""The longest DISARM_DELAY that the firmware takes."""
 
 
 def wait_longer(vehicles: Iterable[SimulatedVehicle], speedup: float, *, leave: Collection[str] = ()) -> None:
@@ -23,7 +23,8 @@ def wait_longer(vehicles: Iterable[SimulatedVehicle], speedup: float, *, leave: 
 
     A client sends heartbeats and set-points by its own clock: ten times as fast, five seconds of the vehicle are half
     a second of the client. PX4's simulation lengthens COM_DL_LOSS_T and its like in the same way. ArduPilot's
-    DISARM_DELAY is switched off. ``leave`` are names of parameters that stay; nothing changes in real time or slower.
+    DISARM_DELAY becomes 127 s at most, as its type allows. ``leave`` are names of parameters that stay; nothing changes
+    in real time or slower.
     """
     if speedup <= 1.0:
         return
@@ -34,6 +35,7 @@ def wait_longer(vehicles: Iterable[SimulatedVehicle], speedup: float, *, leave: 
 
 
 def _lengthen(parameters: Parameters, speedup: float, leave: Collection[str]) -> None:
-    for name in (*_SECONDS, *_OFF):
+    for name in _SECONDS:
         if name in parameters and name not in leave:
-            parameters[name] = 0.0 if name in _OFF else parameters[name] * speedup
+            longer = parameters[name] * speedup
+            parameters[name] = min(longer, _INT8_MAX) if name == "DISARM_DELAY" else longer

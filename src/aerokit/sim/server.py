@@ -11,7 +11,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from aerokit.errors import BusyError, LinkLost, LocalProtocolError
-from aerokit.links import Link, MemoryLink, Peer, create_link, memory_link_pair
+from aerokit.links import Link, MemoryLink, Peer, TcpListen, create_link, memory_link_pair
 from aerokit.sim.channel import datagrams
 from aerokit.sim.hearing import SharedHearing
 from aerokit.sim.vehicle import TICK_S, SimulatedVehicle
@@ -264,6 +264,7 @@ class SimulatorServer:
                 port.link.write(datagram)
                 if self.on_datagram is not None:
                     self.on_datagram(self.now, datagram, True)
+            port.hang_up()
         return has_sent
 
     def _schedule(self) -> None:
@@ -320,6 +321,13 @@ class _Port:
         if together and len(self.channels) > _MANY:
             return datagrams(piece for channel in speaking for piece in channel.take_pieces())
         return [datagram for channel in speaking for datagram in channel.take_datagrams()]
+
+    def hang_up(self) -> None:
+        """Cut off the clients of a TCP port whose only vehicle reboots."""
+        if len(self.channels) == 1 and self.channels[0].hangs_up:
+            self.channels[0].hangs_up = False
+            if isinstance(self.link, TcpListen):
+                self.link.close_clients()
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
         """See `Receiver`."""

@@ -310,7 +310,7 @@ class SimulatedVehicle:
         text = text.encode("ascii", "replace").decode()
         if len(text) <= _TEXT_SIZE:
             self._note_text(severity, text)
-            self.send(Statustext(severity, text, 0, 0))
+            self.send_parts([Statustext(severity, text, 0, 0)])
             return
         self._text_id = self._text_id % 0xFFFF + 1
         self.send_chunks(severity, text, self._text_id)
@@ -318,9 +318,13 @@ class SimulatedVehicle:
     def send_chunks(self, severity: int, text: str, text_id: int) -> None:
         """Send STATUSTEXTs of one id; only a chunk that is not full ends the text."""
         self._note_text(severity, text)
-        for number in range(len(text) // _TEXT_SIZE + 1):
-            chunk = text[number * _TEXT_SIZE : (number + 1) * _TEXT_SIZE]
-            self.send(Statustext(severity, chunk, text_id, number))
+        chunks = [text[start : start + _TEXT_SIZE] for start in range(0, len(text) + 1, _TEXT_SIZE)]
+        self.send_parts([Statustext(severity, chunk, text_id, number) for number, chunk in enumerate(chunks)])
+
+    def send_parts(self, chunks: list[Statustext]) -> None:
+        """Send a text, in one part or several."""
+        for chunk in chunks:
+            self.send(chunk)
 
     def info(self, text: str) -> None:
         """Send a text of severity INFO."""

@@ -653,8 +653,8 @@ class Gimbal(TwinOf["AsyncGimbal"]):
 
     @cached_property
     def attitude(self) -> StateCell[GimbalAttitude]:
-        """Where it points, as it tells by itself: nothing is asked for (GIMBAL_DEVICE_ATTITUDE_STATUS of any component
-        of the vehicle, MOUNT_ORIENTATION, MOUNT_STATUS).
+        """Where it points (GIMBAL_DEVICE_ATTITUDE_STATUS of any component of the vehicle, MOUNT_ORIENTATION,
+        MOUNT_STATUS). The autopilot is asked for it while somebody waits, follows or observes; reading asks nothing.
         """
         return StateCell(self._loop, self.aio.attitude)
 

@@ -25,13 +25,12 @@ _NOTICE, _WARNING, _INFO = MavSeverity.NOTICE, MavSeverity.WARNING, MavSeverity.
 _SOURCE_SETS = (1.0, 2.0, 3.0)
 
 _ANSWERS: tuple[tuple[int, int, tuple[Kind, ...]], ...] = (
-    (_C.DO_FOLLOW, _R.DENIED, ("copter", "plane", "rover")),
     (_C.DO_RETURN_PATH_START, _R.FAILED, ("copter", "plane")),
     (_C.DO_LAND_START, _R.FAILED, ("copter", "plane")),
     (_C.DO_GO_AROUND, _R.FAILED, ("plane",)),
     (_C.DO_SET_REVERSE, _R.ACCEPTED, ("rover",)),
     (_C.DO_PARACHUTE, _R.ACCEPTED, ("copter", "plane")),
-    (_C.DO_MOTOR_TEST, _R.ACCEPTED, ("copter", "rover")),
+    (_C.DO_MOTOR_TEST, _R.ACCEPTED, ("rover",)),
     (_C.DO_MOTOR_TEST, _R.FAILED, ("plane", "sub")),
     (_C.DO_GRIPPER, _R.FAILED, _ALL),
     (_C.DO_SPRAYER, _R.ACCEPTED, ("copter", "rover")),
@@ -65,7 +64,6 @@ _TEXTS: dict[tuple[int, Kind], tuple[tuple[int, str], ...]] = {
         (_WARNING, "Mode change to AUTO RTL failed: No return path found"),
     ),
     (_C.DO_VTOL_TRANSITION, "plane"): ((_NOTICE, "VTOL not available"),),
-    (_C.DO_MOTOR_TEST, "copter"): ((_INFO, "starting motor test"),),
 }
 """What is said besides."""
 
@@ -78,6 +76,8 @@ def equipment_commands(vehicle: ArduPilotVehicle) -> dict[int, CommandHandler]:
         for command, result, kinds in _ANSWERS
         if kind in kinds
     }
+    if kind != "sub":
+        handlers[_C.DO_FOLLOW] = lambda c: _R.ACCEPTED if 0 < c.param1 <= 255 else _R.DENIED
     handlers |= {
         _C.DO_SET_SERVO: gear.accessory(Accessories.set_servo),
         _C.DO_REPEAT_SERVO: gear.accessory(Accessories.set_servo),

@@ -30,6 +30,7 @@ DEFAULTS = {
     "MNT1_PITCH_MAX": 20.0,
     "MNT1_YAW_MIN": -180.0,
     "MNT1_YAW_MAX": 180.0,
+    **dict.fromkeys((f"MNT1_{place}_{axis}" for place in ("RETRACT", "NEUTRAL") for axis in "XYZ"), 0.0),
 }
 """Of parameters that a small table may be without."""
 _UNTURNED = frozenset({MavMountMode.RETRACT, MavMountMode.NEUTRAL})
@@ -80,7 +81,7 @@ class Gimbal:
     def angles(self) -> tuple[float, float, float]:
         """Roll, pitch, yaw in degrees that the servos are to make, yaw from the nose."""
         if self.mode in _UNTURNED:
-            return (0.0, 0.0, 0.0)
+            return (self.target.roll, self.target.pitch, self.target.yaw)
         target, motion = self.target, self._vehicle.motion
         yaw = self._limited("YAW", self._from_nose(target))
         lean = (math.degrees(motion.roll), math.degrees(motion.pitch))
@@ -94,6 +95,10 @@ class Gimbal:
         """What it is to do now."""
         if self.mode == MavMountMode.RC_TARGETING:  # no stick turns it: all of them are in the middle
             return Target(self._middle("ROLL"), self._middle("PITCH"), 0.0, self.is_yaw_locked)
+        if self.mode in _UNTURNED:
+            place = MavMountMode(self.mode).name
+            roll, pitch, yaw = (self.setting(f"MNT1_{place}_{axis}") for axis in "XYZ")
+            return Target(roll, pitch, yaw)
         if self.mode == MavMountMode.GPS_POINT:
             return self._towards(self._region)
         if self.mode == MavMountMode.SYSID_TARGET:

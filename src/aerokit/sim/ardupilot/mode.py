@@ -26,6 +26,8 @@ class VehicleMode:
     """What is said when `enter` refuses."""
     returns_on_path: ClassVar[bool] = False
     """Whether it drives back on the path that is recorded otherwise."""
+    notices_landing: ClassVar[bool] = True
+    """Whether it leaves a vehicle on the ground still enough to be taken for landed."""
     is_landing: bool = False
     is_taking_off: bool = False
 

@@ -29,14 +29,15 @@ _WITH_POSITION = int(
     | Ekf.PRED_POS_HORIZ_REL
     | Ekf.PRED_POS_HORIZ_ABS
 )
-_GIVE_UP_S = 10.0
+_DEAD_RECKONING = int(Ekf.ATTITUDE | Ekf.VELOCITY_VERT | Ekf.POS_VERT_ABS)
+_GIVE_UP_S, _STOP_AIDING_S = 7.0, 15.0
 _CHECK_S = 0.1
 
 Ned = tuple[float, float, float]
 
 
 class Navigation:
-    """Grows with the boot, suffers under ``faults.gps_lost``.
+    """Grows with the boot, suffers under ``faults.gps_lost`` and SIM_GPS1_ENABLE 0.
 
     Positions are kept in the world's frame (`frame`, around the place where the vehicle was created);
     ``origin`` and
@@ -79,6 +80,11 @@ class Navigation:
     def has_position(self) -> bool:
         """Whether the estimator has a position that is good enough to fly by."""
         return self.flags is not None and self.flags & _POS_HORIZ_ABS != 0
+
+    @property
+    def gps_is_lost(self) -> bool:
+        """Whether its receiver tells nothing."""
+        return self._vehicle.faults.gps_lost or not self._vehicle.parameters["SIM_GPS1_ENABLE"]
 
     @property
     def has_attitude(self) -> bool:
@@ -161,7 +167,7 @@ class Navigation:
         self._vehicle.info("GPS 1: detected u-blox")
 
     def _get_fix(self) -> None:
-        if not self._vehicle.faults.gps_lost:
+        if not self.gps_is_lost:
             self.fix_type = GpsFixType.RTK_FIXED
             if not self._vehicle.timeline.estimator_leads_early:
                 self._set_first_home()
@@ -199,10 +205,12 @@ class Navigation:
     # ----------------------------------------------------------------------------------- losing GPS
 
     def _watch_gps(self) -> None:
-        now, lost = self._vehicle.now, self._vehicle.faults.gps_lost
+        now, lost = self._vehicle.now, self.gps_is_lost
         if lost and math.isnan(self._lost_at):
             self._lost_at, self.fix_type = now, GpsFixType.NO_FIX
         elif lost and self.has_position and now - self._lost_at >= _GIVE_UP_S:
+            self.flags = _DEAD_RECKONING | (Ekf.VELOCITY_HORIZ if self._vehicle.is_landed else 0)
+        elif lost and self.flags != _ATTITUDE_ONLY and now - self._lost_at >= _STOP_AIDING_S:
             self.flags = _ATTITUDE_ONLY
             self._say_cores("stopped aiding")
         elif not lost and self.fix_type < GpsFixType.TYPE_3D_FIX:

@@ -117,7 +117,7 @@ def sensor_status(vehicle: ArduPilotVehicle) -> tuple[int, int, int]:
     enabled, health = enabled | controls, health | controls
     if nav.is_gps_detected:
         present, enabled = present | _GPS, enabled | _GPS
-        health |= 0 if vehicle.faults.gps_lost else _GPS
+        health |= 0 if nav.gps_is_lost else _GPS
     if nav.is_healthy:
         enabled |= _AHRS
         health |= _AHRS if vehicle.timeline.estimator_leads_early or nav.has_position else 0

@@ -286,6 +286,13 @@ class ArduPilotVehicle(SimulatedAutopilot):
         """Metres above home."""
         return self.navigation.altitude_above_home
 
+    def is_for_me(self, message: Message) -> bool:
+        """Also what is for a component of this system that is not there (MAVLink_routing.cpp)."""
+        system, component = getattr(message, "target_system", 0), getattr(message, "target_component", 0)
+        return system in (0, self.system_id) and all(
+            component != each.component_id for each in self.components
+        )
+
     # ------------------------------------------------------------------------------ boot and reboot
 
     def boot(self) -> None:
@@ -336,6 +343,8 @@ class ArduPilotVehicle(SimulatedAutopilot):
             self.motion.down = self.motion.ground_down
         self.motion.settle()
         self._reset()
+        for channel in self.channels:
+            channel.hangs_up = True
         self.reboot(_REBOOT_SILENCE_S)
 
     def send_text(self, severity: int, text: str) -> None:
@@ -412,7 +421,10 @@ class ArduPilotVehicle(SimulatedAutopilot):
             return (north, east, (self.motion.ground_down if home is None else home[2]) - altitude)
         if frame in _TERRAIN:
             return (north, east, self.motion.ground_down - altitude)
-        return (north, east, self._frame.origin.altitude_m - altitude) if frame in _ABSOLUTE else None
+        if frame in _ABSOLUTE:
+            return (north, east, self._frame.origin.altitude_m - altitude)
+        self.info(f"Unknown mavlink coordinate frame {frame}")
+        return None
 
     def send_home(self, channel: Channel | None = None) -> None:
         """GPS_GLOBAL_ORIGIN and HOME_POSITION, as far as they are known."""

@@ -106,7 +106,7 @@ class _Setup:
         return MavResult.ACCEPTED
 
     def reboot(self, command: Command) -> int:
-        if self._vehicle.motors.is_armed and command.y != _FORCE_REBOOT:
+        if self._vehicle.is_armed and command.y != _FORCE_REBOOT:
             return MavResult.FAILED
         if command.param1 not in (1.0, 3.0):
             return MavResult.UNSUPPORTED

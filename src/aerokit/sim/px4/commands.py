@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from aerokit.mavlink.enums import MavCmd, MavModeFlag, MavResult, MavSeverity
+from aerokit.mavlink.enums import MavCmd, MavFrame, MavModeFlag, MavResult, MavSeverity
 from aerokit.sim.commands import Command, CommandHandler, Progress, whole
 from aerokit.sim.px4.gimbal import gimbal_commands
 from aerokit.sim.px4.message_requests import message_requests
@@ -29,10 +29,11 @@ from aerokit.sim.px4.other_commands import other_commands
 if TYPE_CHECKING:
     from aerokit.sim.px4.vehicle import SimulatedPx4
 
-__all__ = ["px4_commands", "set_mode"]
+__all__ = ["px4_commands", "refusal_by_place", "set_mode"]
 
 _FORCE = 21196.0
 _ALIASES: dict[Px4Mode, Px4Mode] = {(AUTO, 0): MISSION, ORBIT: POSITION}
+_INT32_MAX, _NAN_AS_INT = 0x7FFFFFFF, 0x7FF80000
 _AUTOTUNE_PERCENTS = (0, 20, 40, 60, 80, 95)
 
 
@@ -63,6 +64,17 @@ def px4_commands(px4: SimulatedPx4) -> dict[int, CommandHandler]:
         MavCmd.RUN_PREARM_CHECKS: flight.run_prearm_checks,
         MavCmd.PREFLIGHT_REBOOT_SHUTDOWN: flight.reboot,
     }
+
+
+def refusal_by_place(command: Command, *, checks_frame: bool) -> int | None:
+    """The MAV_RESULT of a place that is none; None when the command may be looked at."""
+    if command.is_long:
+        is_left_open = all(_INT32_MAX - 128 < each <= _INT32_MAX + 256 for each in (command.x, command.y))
+        return MavResult.DENIED if is_left_open else None
+    if command.x == command.y == _NAN_AS_INT:
+        return MavResult.DENIED
+    is_wrong = checks_frame and command.frame != MavFrame.GLOBAL_INT
+    return MavResult.COMMAND_UNSUPPORTED_MAV_FRAME if is_wrong else None
 
 
 def set_mode(px4: SimulatedPx4, base_mode: int, mode: Px4Mode) -> int:
@@ -171,7 +183,7 @@ class _Flight:
     def _destination(self, command: Command) -> tuple[float, float, float]:
         px4, motion = self._px4, self._px4.motion
         north, east, down = motion.north, motion.east, motion.down
-        keeps_place = 0x7FFFFFFF in (command.x, command.y) or not math.isfinite(command.x + command.y)
+        keeps_place = _INT32_MAX in (command.x, command.y) or not math.isfinite(command.x + command.y)
         if not keeps_place:
             north, east = px4.frame.to_local(*command.place())
         if math.isfinite(command.z):

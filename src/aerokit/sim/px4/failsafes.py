@@ -89,9 +89,10 @@ class Failsafes:
 
     # ----------------------------------------------------------------------------------------- links
 
-    def _on_heartbeat(self, beat: m.Heartbeat, _: Channel) -> None:
+    def _on_heartbeat(self, beat: m.Heartbeat, channel: Channel) -> None:
         if beat.type != MavType.GCS:
             return
+        self._px4.text_links.hear_station(channel)
         if not self.has_station and math.isfinite(self._station_at):
             self._px4.info("GCS connection regained")
         self.has_station, self._station_at = True, self._px4.now

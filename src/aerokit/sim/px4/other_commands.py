@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import MavCmd, MavResult, MavSeverity
-from aerokit.sim.commands import Progress
+from aerokit.sim.commands import Progress, whole
 
 if TYPE_CHECKING:
     from aerokit.sim.commands import Command, CommandHandler
@@ -27,7 +27,6 @@ _ACCEPTED = (
     _C.DO_SET_SAFETY_SWITCH_STATE,
     _C.EXTERNAL_POSITION_ESTIMATE,
     _C.LOGGING_START,
-    _C.PREFLIGHT_STORAGE,
 )
 """Taken, with nothing to be seen of it."""
 
@@ -42,7 +41,6 @@ _SILENT = (
     _C.PREFLIGHT_SET_SENSOR_OFFSETS,
     _C.PREFLIGHT_UAVCAN,
     _C.OBLIQUE_SURVEY,
-    _C.ACTUATOR_TEST,
     _C.CONFIGURE_ACTUATOR,
     _C.INJECT_FAILURE,
     _C.START_RX_PAIR,
@@ -54,6 +52,7 @@ _SILENT = (
     _C.DO_GIMBAL_MANAGER_CONFIGURE,
     _C.DO_TRIGGER_CONTROL,
     _C.DO_VTOL_TRANSITION,
+    _C.DO_WINCH,
     _C.PAYLOAD_PREPARE_DEPLOY,
     _C.PAYLOAD_CONTROL_DEPLOY,
 )
@@ -63,6 +62,8 @@ _NO_FIGURE_EIGHT = "Figure 8 command only available for fixed wing and vtol vehi
 _GRIPS_FOR_S = 1.3
 _LOG_STOPS_AFTER_S = 2.0
 _UNKNOWN_PROGRESS = 255
+_STORAGE_ACTIONS = range(5)
+_ACTUATORS, _FIRST_OUTPUT_FUNCTION = (range(1, 13), range(33, 41)), 1000
 
 
 def other_commands(px4: SimulatedPx4) -> dict[int, CommandHandler]:
@@ -75,6 +76,8 @@ def other_commands(px4: SimulatedPx4) -> dict[int, CommandHandler]:
     handlers[_C.EXTERNAL_WIND_ESTIMATE] = lambda command: _answer_twice(px4, command)
     handlers[_C.FIXED_MAG_CAL_YAW] = lambda command: _calibrate_by_yaw(px4, command)
     handlers[_C.DO_GRIPPER] = lambda _: Progress((_UNKNOWN_PROGRESS,), _GRIPS_FOR_S)
+    handlers[_C.ACTUATOR_TEST] = lambda command: _test_actuator(px4, command)
+    handlers[_C.PREFLIGHT_STORAGE] = lambda command: _store(px4, command)
     handlers[_C.LOGGING_STOP] = lambda _: Progress((), _LOG_STOPS_AFTER_S)
     return handlers
 
@@ -93,6 +96,22 @@ def _calibrate_by_yaw(px4: SimulatedPx4, command: Command) -> int:
     px4.info(f"Assuming vehicle is facing heading {command.param1:.1f} degrees")
     px4.info("Mag quick calibration finished")
     return MavResult.ACCEPTED
+
+
+def _test_actuator(px4: SimulatedPx4, command: Command) -> int | None:
+    """Nothing is seen of it; param 5 is a motor, a servo, or from 1000 on any function of an output."""
+    if px4.is_armed:
+        return MavResult.DENIED
+    function = whole(command.x)
+    is_known = any(function in each for each in _ACTUATORS) or function >= _FIRST_OUTPUT_FUNCTION
+    return MavResult.ACCEPTED if is_known else None
+
+
+def _store(px4: SimulatedPx4, command: Command) -> int | None:
+    """Nothing is seen of it; an action that it does not know is not answered."""
+    if px4.is_armed:
+        return MavResult.TEMPORARILY_REJECTED
+    return MavResult.ACCEPTED if whole(command.param1) in _STORAGE_ACTIONS else None
 
 
 def _answer_twice(px4: SimulatedPx4, command: Command) -> int:

@@ -18,7 +18,7 @@ from aerokit.sim.place import HOME
 from aerokit.sim.px4.arming import Arming
 from aerokit.sim.px4.calibration import Calibration
 from aerokit.sim.px4.camera_trigger import CameraTrigger
-from aerokit.sim.px4.commands import px4_commands, set_mode
+from aerokit.sim.px4.commands import px4_commands, refusal_by_place, set_mode
 from aerokit.sim.px4.events import Events
 from aerokit.sim.px4.failsafes import Failsafes
 from aerokit.sim.px4.flight import Flight
@@ -46,7 +46,7 @@ from aerokit.sim.px4.signing import Px4Signing
 from aerokit.sim.px4.sticks import Sticks
 from aerokit.sim.px4.storage import DEFAULT_LOGS, Storage
 from aerokit.sim.px4.telemetry import BUILDERS, global_origin
-from aerokit.sim.px4.texts import on_the_wire
+from aerokit.sim.px4.texts import TextLinks, on_the_wire
 from aerokit.sim.vehicle import Component, sender_of
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ class SimulatedPx4(SimulatedAutopilot):
     - ``home``: latitude, longitude (degrees), altitude AMSL (m); ``heading_deg``: where its nose points
     - ``boot_time_s``: seconds until it can be armed
     - ``version``: 1.16 accepts unknown modes and falls back to POSITION when offboard set-points stop, 1.17 refuses
-      them and returns
+      them and returns, and refuses a COMMAND_INT in another frame than GLOBAL_INT
     - ``fast_rate_hz``: rate of attitude, position and targets on links of mode "normal"
     - ``link_modes``: of the first link, the second …: "normal", "onboard", "config" or "minimal", as MAV_0_MODE says
     - ``parameters``: values other than the defaults; ``parameter_count``: fewer than all 910, for quick tests;
@@ -187,6 +187,7 @@ class SimulatedPx4(SimulatedAutopilot):
         self.flight: Flight = self._make_flight()
         self.mission: Mission = self._make_mission()
         self.failsafes: Failsafes = Failsafes(self)
+        self.text_links: TextLinks = TextLinks(self)
         self.missions.reset()
 
     def make_signing(self, key: SigningKey | None, timestamp: int) -> Px4Signing:
@@ -200,6 +201,7 @@ class SimulatedPx4(SimulatedAutopilot):
         """On its AUX outputs, if MNT_MODE_IN fits one."""
         self.commands: CommandServer = self.serve_commands(px4_commands(self))
         self.on(m.SetMode, self._on_set_mode)
+        self.on(m.Ping, self._on_ping)
         self.listen_to_clocks()
         self.missions.listen()
         self.failsafes.listen()
@@ -230,6 +232,10 @@ class SimulatedPx4(SimulatedAutopilot):
     def accepts_unknown_modes(self) -> bool:
         """v1.16 says ACCEPTED to a mode that it does not know."""
         return self.version.startswith("1.16")
+
+    def refusal_of_command(self, command: Command) -> int | None:
+        """Of frames; and of NaN sent as an integer, or "ignore" as a number (mavlink_receiver.cpp)."""
+        return refusal_by_place(command, checks_frame=not self.version.startswith("1.16"))
 
     def next_ping(self) -> int:
         """Sequence number of the next PING."""
@@ -283,6 +289,10 @@ class SimulatedPx4(SimulatedAutopilot):
         text = on_the_wire(text)
         number, self._next_text_id = self._next_text_id, (self._next_text_id + 1) & 0xFFFF
         self.call_later(0.0, lambda: self.send_chunks(severity, text, number))
+
+    def send_parts(self, chunks: list[m.Statustext]) -> None:
+        """See `TextLinks`."""
+        self.text_links.tell(chunks)
 
     # ------------------------------------------------------------------------------ arming and modes
 
@@ -414,6 +424,11 @@ class SimulatedPx4(SimulatedAutopilot):
             self.arming.disarm("auto preflight disarming")
 
     # -------------------------------------------------------------------------------- other messages
+
+    def _on_ping(self, ping: m.Ping, channel: Channel) -> None:
+        """Only one to everybody is a question."""
+        if ping.target_system == ping.target_component == 0:
+            self.send(m.Ping(ping.time_usec, ping.seq, *sender_of(ping)), channel)
 
     def _on_set_mode(self, request: m.SetMode, channel: Channel) -> None:
         main, sub = mode_from_custom(request.custom_mode)

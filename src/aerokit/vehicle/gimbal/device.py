@@ -6,23 +6,26 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import GimbalDeviceErrorFlags
+from aerokit.mavlink.messages import GimbalDeviceAttitudeStatus
 from aerokit.runtime.cells import Source, StateCell
 from aerokit.vehicle.gimbal.values import GimbalControllers, controllers_of
 from aerokit.vehicle.orders.newest import Newest
+from aerokit.vehicle.talk.rates import SUBSCRIPTION_HZ
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from aerokit.mavlink.message import Message
     from aerokit.mavlink.messages import (
-        GimbalDeviceAttitudeStatus,
         GimbalDeviceInformation,
         GimbalManagerInformation,
         GimbalManagerStatus,
     )
+    from aerokit.runtime.bus import Detach
     from aerokit.vehicle.gimbal.control import GimbalControl
     from aerokit.vehicle.orders.bridge import Bridge
     from aerokit.vehicle.state.gimbal import GimbalAttitude
+    from aerokit.vehicle.talk.talk import Talk
 
 __all__ = ["ATTITUDE_COMES_IN", "LAST_NUMBER", "Device"]
 
@@ -31,6 +34,30 @@ LAST_NUMBER = 6
 OVERTAKEN_MS = 5_000
 """Behind by more, its manager has rebooted."""
 ATTITUDE_COMES_IN = "GIMBAL_DEVICE_ATTITUDE_STATUS or MOUNT_ORIENTATION"
+
+
+class _AttitudeStream:
+    """Asks the autopilot for GIMBAL_DEVICE_ATTITUDE_STATUS while somebody waits for values that nobody else tells."""
+
+    pending = False
+
+    def __init__(self, cell: StateCell[GimbalAttitude], talk: Talk) -> None:
+        self._cell, self._talk = cell, talk
+        self._release: Detach | None = None
+
+    def catch_up(self) -> None:
+        """Values are worked out as they come."""
+
+    def watchers_changed(self) -> None:
+        """See `Feed`."""
+        if not self._cell._is_watched:
+            if self._release is not None:
+                self._release()
+            self._release = None
+            return
+        source, rates = self._cell.source, self._talk.rates
+        if self._release is None and (source is None or source.component_id == self._talk.component_id):
+            self._release = rates.want(GimbalDeviceAttitudeStatus, SUBSCRIPTION_HZ, is_optional=True)
 
 
 class Device:
@@ -63,6 +90,8 @@ class Device:
         self.attitude: StateCell[GimbalAttitude] = bridge.talk.connection.new_cell(
             f"{name}.attitude", ATTITUDE_COMES_IN
         )
+        if component_id in (0, bridge.talk.component_id):  # one with an id of its own tells it unasked
+            self.attitude._feed_from(_AttitudeStream(self.attitude, bridge.talk))
         self.controllers: StateCell[GimbalControllers] = bridge.talk.connection.new_cell(
             f"{name}.controllers", "GIMBAL_MANAGER_STATUS"
         )

@@ -25,8 +25,8 @@ class GimbalPart:
         self._bridge, self._talk = bridge, bridge.talk
         shown = self._orders.shown
         self.attitude: StateCell[GimbalAttitude] = shown.attitude
-        """Where it points, as it tells by itself: nothing is asked for (GIMBAL_DEVICE_ATTITUDE_STATUS of any component
-        of the vehicle, MOUNT_ORIENTATION, MOUNT_STATUS)."""
+        """Where it points (GIMBAL_DEVICE_ATTITUDE_STATUS of any component of the vehicle, MOUNT_ORIENTATION,
+        MOUNT_STATUS). The autopilot is asked for it while somebody waits, follows or observes; reading asks nothing."""
         self.controllers: StateCell[GimbalControllers] = shown.controllers
         """Who is in control of it, as its manager tells by itself (GIMBAL_MANAGER_STATUS)."""
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = ["CommandSender"]
 
-UNKNOWN = (MavResult.UNSUPPORTED, MavResult.COMMAND_LONG_ONLY)
+UNKNOWN = (MavResult.UNSUPPORTED, MavResult.COMMAND_LONG_ONLY, MavResult.COMMAND_UNSUPPORTED_MAV_FRAME)
 """What firmware says that does not know a command, or not in the form that it had."""
 ROUND_TRIPS = 2
 """Nothing is sent again before so many measured round trips: the answer is still under way."""
@@ -125,7 +125,7 @@ class CommandSender:
         """Send a command with a place above the sea: as COMMAND_INT, or COMMAND_LONG where that is not known."""
         try:
             return await self.send_int(
-                command, *params, frame=MavFrame.GLOBAL, x=x, y=y, z=z, standing=standing, **options
+                command, *params, frame=MavFrame.GLOBAL_INT, x=x, y=y, z=z, standing=standing, **options
             )
         except CommandRejected as error:
             is_known = error.result not in UNKNOWN

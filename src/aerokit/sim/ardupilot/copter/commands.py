@@ -40,6 +40,7 @@ def copter_commands(copter: SimulatedCopter) -> dict[int, CommandHandler]:
         MavCmd.DO_CHANGE_SPEED: flight.change_speed,
         MavCmd.CONDITION_YAW: flight.turn,
         MavCmd.DO_PAUSE_CONTINUE: flight.pause_or_continue,
+        MavCmd.DO_MOTOR_TEST: lambda command: copter.motor_test.command(command),
     }
 
 

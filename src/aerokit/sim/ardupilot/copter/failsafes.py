@@ -61,6 +61,7 @@ class CopterFailsafes(Failsafes):
         self._copter = copter
         self._radio_good_at = math.nan
         self._bad_since = math.nan
+        self._had_position = self._acted_on_estimator = False
         self._idle_since = math.nan
 
     def watch(self) -> None:
@@ -168,21 +169,31 @@ class CopterFailsafes(Failsafes):
         return action
 
     def _check_estimator(self) -> None:
+        """Only a position that was good before can be lost; a disarmed vehicle says so and does nothing."""
         copter = self._copter
-        good = copter.navigation.has_position
-        if self.estimator and good:
-            self.estimator = False
-            self.say("EKF Failsafe Cleared", MavSeverity.CRITICAL)
-        if good or not copter.is_armed or not copter.mode.needs_position:
-            self._bad_since = math.nan
+        if copter.navigation.has_position:
+            self._had_position, self._bad_since = True, math.nan
+            if self.estimator and self._acted_on_estimator:
+                self.say("EKF Failsafe Cleared", MavSeverity.CRITICAL)
+            self.estimator = self._acted_on_estimator = False
+        elif self._had_position and not self.estimator:
+            if math.isnan(self._bad_since):
+                self._bad_since = copter.now
+            elif copter.now - self._bad_since >= _ESTIMATOR_PATIENCE_S:
+                self._lose_estimator()
+
+    def _lose_estimator(self) -> None:
+        copter = self._copter
+        self.say("EKF variance", MavSeverity.CRITICAL)
+        self.estimator: bool = True
+        self._acted_on_estimator = copter.is_armed
+        if not copter.is_armed:
             return
-        if math.isnan(self._bad_since):
-            self._bad_since = copter.now
-            self.say("EKF variance", MavSeverity.CRITICAL)
-        if not self.estimator and copter.now - self._bad_since >= _ESTIMATOR_PATIENCE_S:
-            self.estimator: bool = True
-            copter.set_mode(CopterMode.LAND)
-            self.say(f"EKF Failsafe: changed to {copter.mode.name} Mode", MavSeverity.CRITICAL)
+        if not copter.mode.needs_position:
+            self.say("EKF Failsafe", MavSeverity.CRITICAL)
+            return
+        copter.set_mode(CopterMode.LAND)
+        self.say(f"EKF Failsafe: changed to {copter.mode.name} Mode", MavSeverity.CRITICAL)
 
     def _check_idling(self) -> None:
         """DISARM_DELAY: an armed vehicle that idles on the ground is disarmed."""

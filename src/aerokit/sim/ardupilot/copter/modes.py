@@ -177,8 +177,9 @@ class PosHold(Loiter):
 
 
 class Circle(Loiter):
-    """Holds like LOITER here instead of circling."""
+    """Holds like LOITER here instead of circling. On the ground it pulls at its circle, and notices no landing."""
 
+    notices_landing = False
     number: ClassVar[int] = CopterMode.CIRCLE
     name = "CIRCLE"
     can_arm = False

@@ -110,8 +110,11 @@ class Rtl(Mode):
     def update(self, dt: float) -> None:
         """One step of the present phase."""
         copter = self.copter
-        if copter.is_landed or self._phase == "land":
+        if self._phase == "land":
             descend(copter)
+            return
+        if copter.is_landed:  # it waits for DISARM_DELAY
+            copter.motors.wanted = False
             return
         copter.motors.wanted = True
         target = self.destination

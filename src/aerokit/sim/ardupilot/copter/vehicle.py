@@ -13,6 +13,7 @@ from aerokit.sim.ardupilot.copter.failsafes import CopterFailsafes
 from aerokit.sim.ardupilot.copter.fence import CopterFence
 from aerokit.sim.ardupilot.copter.guided import Guided
 from aerokit.sim.ardupilot.copter.modes import AltHold, Brake, Circle, Loiter, PosHold, Stabilize
+from aerokit.sim.ardupilot.copter.motor_test import MotorTest
 from aerokit.sim.ardupilot.copter.other_modes import (
     Acro,
     AutoRtl,
@@ -94,6 +95,7 @@ class SimulatedCopter(ArduPilotVehicle):
         self.yaw: AutoYaw = AutoYaw(self)
         self._still_since = math.nan
         self.path: SmartPath = SmartPath(self, only_armed=True)
+        self.motor_test: MotorTest = MotorTest(self)
 
     def _become_ready(self) -> None:
         super()._become_ready()
@@ -114,6 +116,11 @@ class SimulatedCopter(ArduPilotVehicle):
         return self.mode_of(Auto)
 
     @property
+    def is_armed(self) -> bool:
+        """Whether the motors are armed, for a test of them, too."""
+        return self.motors.is_armed or self.motor_test.is_running
+
+    @property
     def base_mode(self) -> int:
         """Guided in the modes that know where they are, in RTL when armed only."""
         base, name = _BASE, self.mode.name
@@ -121,7 +128,7 @@ class SimulatedCopter(ArduPilotVehicle):
             return base | _GUIDED
         if name in _GUIDED_MODES and (self.motors.is_armed or name != "RTL"):
             base |= _GUIDED
-        return base | _ARMED if self.motors.is_armed else base
+        return base | _ARMED if self.is_armed else base
 
     def move(self, dt: float) -> None:
         """Motion and land detector."""
@@ -131,7 +138,8 @@ class SimulatedCopter(ArduPilotVehicle):
         is_on_ground = motion.is_on_ground
         if is_on_ground and not was_on_ground:
             self.info(f"SIM Hit ground at {motion.impact_speed_m_s:f} m/s")
-        if not is_on_ground or (self.motors.is_armed and self.mode.is_taking_off):
+        keeps_flying = self.mode.is_taking_off or not self.mode.notices_landing
+        if not is_on_ground or (self.motors.is_armed and keeps_flying):
             self._still_since = math.nan
         elif math.isnan(self._still_since):
             self._still_since = self.now
