@@ -43,7 +43,7 @@ def test_no_public_attribute_of_a_blocking_vehicle_can_be_assigned() -> None:
     with served_copter() as address, aerokit.sync.connect(address) as vehicle:
         vehicle.wait_ready()
         with pytest.raises(AttributeError, match=r"write ….set_mode\('GUIDED'\)"):
-            vehicle.mode = "GUIDED"  # type: ignore[misc, assignment]
+            vehicle.mode = "GUIDED"  # type: ignore[assignment]
         with pytest.raises(
             AttributeError, match=r"position is a StateCell: did you mean \.value\.latitude_deg\?"
         ):

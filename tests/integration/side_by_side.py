@@ -257,11 +257,11 @@ class _Runner:
     # ------------------------------------------------------------------------------------- calls
 
     async def _command(self, command: int, *params: float) -> None:
-        await self.vehicle.command(int(command), *params, attempts=1, attempt_timeout=ANSWER_S)
+        await self.vehicle.command(int(command), *params, retries=0, attempt_timeout=ANSWER_S)
 
     async def _command_to(self, component_id: int, command: int) -> None:
         await self.vehicle.command(
-            int(command), 1, component_id=component_id, attempts=1, attempt_timeout=ANSWER_S
+            int(command), 1, component_id=component_id, retries=0, attempt_timeout=ANSWER_S
         )
 
     async def _command_int(self, command: int, frame: int, north: float, east: float, z: float) -> None:
@@ -269,7 +269,7 @@ class _Runner:
         x, y = round(there.latitude_deg * 1e7), round(there.longitude_deg * 1e7)
         params = (-1, 1, 0, NAN) if command == C.DO_REPOSITION else ()
         await self.vehicle.command_int(
-            int(command), *params, frame=frame, x=x, y=y, z=z, attempts=1, attempt_timeout=ANSWER_S
+            int(command), *params, frame=frame, x=x, y=y, z=z, retries=0, attempt_timeout=ANSWER_S
         )
 
     async def _set_mode(self, name: str) -> str | None:

@@ -52,7 +52,6 @@ class Maintenance(VehicleCore):
             "calibration",
             command,
             *params,
-            attempts=1,  # it would calibrate again
             attempt_timeout=CALIBRATION_S,
             progress_timeout=CALIBRATION_S,
         )
@@ -77,7 +76,7 @@ class Maintenance(VehicleCore):
         Sent once: a lost answer is a warning, and the vehicle may have rebooted.
         """
         shutdown = MavCmd.PREFLIGHT_REBOOT_SHUTDOWN
-        self._dk.command("reboot", shutdown, 1, attempts=1, attempt_timeout=REBOOT_S)
+        self._dk.command("reboot", shutdown, 1, attempt_timeout=REBOOT_S)
 
     def send_capabilities_request(self, vehicle: Any, name: str, m: Any) -> None:
         """Ask for AUTOPILOT_VERSION once. Has the arguments of a message listener, and uses none of them."""

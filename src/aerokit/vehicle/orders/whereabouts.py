@@ -48,7 +48,9 @@ class Whereabouts:
         """Raise LocalProtocolError for a place that is farther away; none is while the position is unknown."""
         check_range("max_distance_m", max_distance_m, 0, math.inf, above=True)
         here = self._telemetry.position.latest
-        for place in places if here is not None else ():
+        if here is None:
+            return
+        for place in places:
             degrees = abs(place.latitude_deg - here.latitude_deg) + abs(
                 place.longitude_deg - here.longitude_deg
             )
