@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from aerokit.runtime.connection import Connection
     from aerokit.runtime.link_state import LinkState
     from aerokit.runtime.opening import open_connection
+    from aerokit.runtime.own_heartbeat import OwnHeartbeat
     from aerokit.vehicle.connect import connect
     from aerokit.vehicle.orders.setpoints import (
         AccelerationSetpoint,
@@ -71,6 +72,7 @@ __all__ = [
     "Member",
     "MemberState",
     "Offset",
+    "OwnHeartbeat",
     "Position",
     "PositionSetpoint",
     "Show",
@@ -93,6 +95,7 @@ _HOMES = {
     "AttitudeSetpoint": "aerokit.vehicle.orders.setpoints",
     "BodyVelocitySetpoint": "aerokit.vehicle.orders.setpoints",
     "Connection": "aerokit.runtime.connection",
+    "OwnHeartbeat": "aerokit.runtime.own_heartbeat",
     "Deconfliction": "aerokit.fleets.apart",
     "Dialect": "aerokit.mavlink.dialect",
     "Endpoint": "aerokit.hub.values",

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any, cast
 
 from aerokit.dronekit.util import ErrprinterHandler
+from aerokit.runtime.own_heartbeat import OwnHeartbeat
 
 if TYPE_CHECKING:
     from typing_extensions import TypeVar
@@ -40,6 +41,7 @@ def connect(
     source_component: int = 0,
     use_native: bool = False,
     release_overrides: bool = True,
+    heartbeat: OwnHeartbeat | None = OwnHeartbeat(),  # noqa: B008 - it is immutable
 ) -> VehicleT:
     """Connect to a vehicle and return it once it was heard.
 
@@ -62,6 +64,9 @@ def connect(
         use_native: accepted; means nothing.
         release_overrides: give RC channels that are still overridden back to the radio when the connection ends. False
             leaves them as DroneKit does, until the vehicle gives them up (ArduPilot: RC_OVERRIDE_TIME).
+        heartbeat: what our own HEARTBEAT says, and how long it is sent without a sign of the program: reading an
+            attribute, an order, a wait, a listener that is called (60 seconds; :class:`aerokit.OwnHeartbeat`). None:
+            none is sent.
 
     Raises:
         OSError: the link cannot be opened (ConnectionRefusedError, socket.gaierror, serial.SerialException …).
@@ -78,6 +83,7 @@ def connect(
             source_system=source_system,
             source_component=source_component,
             use_native=use_native,
+            heartbeat=heartbeat,
         )
     except (OSError, ValueError) as error:
         raise error.with_traceback(None) from None  # where in here it came from says nothing to a program

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import logging
 import math
 import threading
@@ -282,8 +283,28 @@ class Core:
         self.handler.send(message)
 
 
+def _feeding(read: property) -> property:
+    """The same property, of which each reading shows that the program runs."""
+    getter = read.fget
+    assert getter is not None
+
+    @functools.wraps(getter)
+    def fed(vehicle: VehicleCore) -> Any:
+        vehicle._dk.handler.loop.feed()
+        return getter(vehicle)
+
+    return property(fed, read.fset, read.fdel, read.__doc__)
+
+
 class VehicleCore(HasObservers):
     """A vehicle and its core. ``_dk``: names that no subclass in the classic style takes for its own things."""
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        if cls.__module__.startswith("aerokit."):
+            for name, member in list(vars(cls).items()):
+                if isinstance(member, property) and not name.startswith("_"):
+                    setattr(cls, name, _feeding(member))
 
     def __init__(self, handler: MAVConnection) -> None:
         self._handler = handler

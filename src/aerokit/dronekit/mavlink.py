@@ -21,6 +21,7 @@ from aerokit.errors import AerokitError, ConnectionClosed, LinkOpenError, LocalP
 from aerokit.links.address import ACCEPTED_FORMS, parse_address
 from aerokit.links.reconnecting import ReconnectingLink
 from aerokit.runtime.opening import open_connection
+from aerokit.runtime.own_heartbeat import OwnHeartbeat
 from aerokit.sync.loop_thread import LoopThread
 
 if TYPE_CHECKING:
@@ -62,9 +63,10 @@ class MAVConnection(Line):
         source_system: int = 255,
         source_component: int = 0,
         use_native: bool = False,
+        heartbeat: OwnHeartbeat | None = OwnHeartbeat(),  # noqa: B008 - it is immutable
     ) -> None:
         loop, overrides = LoopThread(), OverrideRelease()
-        held = _open(loop, ip, baud, source_system, source_component, overrides)
+        held = _open(loop, ip, baud, source_system, source_component, overrides, heartbeat)
         super().__init__(ip, loop, held, target_system, overrides)
         self.loop_listeners: list[Callable[[MAVConnection], object]] = []
         """Functions that are called about 20 times a second; see :meth:`forward_loop`."""
@@ -203,6 +205,7 @@ def _open(
     source_system: int,
     source_component: int,
     overrides: OverrideRelease,
+    heartbeat: OwnHeartbeat | None,
 ) -> Held[Connection]:
     """Open it; what refuses at first may be a simulator that the program has just started."""
     ids: dict[str, Any] = {"source_system": source_system, "source_component": source_component}
@@ -210,8 +213,10 @@ def _open(
         _check_address(ip)
         for attempt in range(ATTEMPTS):
             try:
-                opened = open_connection(ip, baud=baud, reconnect=True, **ids)
-                return loop.hold_open(_releasing(opened, overrides))
+                opened = open_connection(ip, baud=baud, reconnect=True, heartbeat=heartbeat, **ids)
+                held = loop.hold_open(_releasing(opened, overrides))
+                held.value._prove_life_by(loop.proof)
+                return held
             except LinkOpenError as error:
                 if attempt == ATTEMPTS - 1 or not isinstance(error.__context__, ConnectionRefusedError):
                     _raise_classic(error)

@@ -16,7 +16,7 @@ from aerokit.errors import AerokitError, BusyError, ConnectionClosed, LinkLost, 
 from aerokit.links.link import Link
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
-from aerokit.mavlink.enums import MavAutopilot, MavComponent, MavState, MavType
+from aerokit.mavlink.enums import MavComponent
 from aerokit.mavlink.frame import Frame, is_whole_frame
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import Heartbeat
@@ -39,6 +39,7 @@ from aerokit.runtime.events import (
 from aerokit.runtime.intake import Intake
 from aerokit.runtime.link_state import LinkState
 from aerokit.runtime.link_watch import LinkStateWatch
+from aerokit.runtime.own_heartbeat import BLOCKING_FED_WITHIN_S, HeartbeatSwitch, OwnHeartbeat, ProofOfLife
 from aerokit.runtime.routes import MOST_ROUTES, Routes
 from aerokit.runtime.signatures import SignatureGate, check_signing
 from aerokit.runtime.subscription import Overflow, Subscription
@@ -85,6 +86,7 @@ class Connection:
         mavlink_version: int = 2,
         signing: Signing | None = None,
         may_move: bool = False,
+        heartbeat: OwnHeartbeat | None = OwnHeartbeat(),  # noqa: B008 - it is immutable
     ) -> None:
         if not 1 <= source_system <= 255:
             raise LocalProtocolError(f"source_system = {source_system} is not allowed: 1 to 255")
@@ -126,6 +128,9 @@ class Connection:
         self._is_on_link = True
         self._state_watch = LinkStateWatch(self.link_state, self.bus, system_id=0)
         self._ending = Ending()
+        self._heartbeat = (
+            None if heartbeat is None else HeartbeatSwitch(heartbeat, self._clock, self.bus.publish)
+        )
 
     def _make_several(self, make_routes: Callable[[], Routes]) -> SeveralRoutes:
         from aerokit.links.several import SeveralLinks  # few programs have several
@@ -181,6 +186,19 @@ class Connection:
         frame = Frame.parse(bytes(data))
         known = self.bus.dialect.get(frame.message_id)
         self._write(frame.raw, None if known is None else self.bus.dialect.decode(frame), None)
+
+    def feed(self) -> None:
+        """Show that the program runs: our heartbeat is sent for another ``fed_within_s`` seconds (`OwnHeartbeat`).
+
+        Any thread may call it.
+        """
+        if self._heartbeat is not None:
+            self._heartbeat.proof.feed()
+
+    def _prove_life_by(self, proof: ProofOfLife) -> None:
+        """The program calls from other threads than the loop's, which goes on when it hangs."""
+        if self._heartbeat is not None:
+            self._heartbeat.require(proof, BLOCKING_FED_WITHIN_S)
 
     @property
     def links(self) -> StateCell[tuple[LinkStatus, ...]] | None:
@@ -460,9 +478,9 @@ class Connection:
             self._background.start(self._several.watch, "aerokit links")
 
     async def _send_heartbeats(self) -> None:
-        heartbeat = Heartbeat(MavType.GCS, MavAutopilot.INVALID, 0, 0, MavState.ACTIVE, 3)
         while self.is_open:
-            self.send(heartbeat)
+            if self._heartbeat is not None and self._heartbeat.is_on():
+                self.send(self._heartbeat.message)
             self._gate.tell_keeping()
             self._state_watch.count(self._clock(), sum(each.frames for each in self.statistics()))
             self._taps.flush()

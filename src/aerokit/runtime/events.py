@@ -21,6 +21,8 @@ __all__ = [
     "FrameRefused",
     "GimbalControlLost",
     "HeardTwice",
+    "HeartbeatPaused",
+    "HeartbeatResumed",
     "ImageCaptured",
     "LandedStateChanged",
     "LinkChosen",
@@ -273,6 +275,18 @@ class LoopBlocked(Event):
     """The program kept the event loop from running for ``seconds``: nothing was received or sent meanwhile."""
 
     seconds: float
+
+
+class HeartbeatPaused(Event):
+    """The program has shown no sign of life for ``idle_s`` seconds: our own heartbeat is not sent."""
+
+    idle_s: float
+
+
+class HeartbeatResumed(Event):
+    """The program has shown one: our own heartbeat is sent again, after ``paused_s`` seconds."""
+
+    paused_s: float
 
 
 class LinkInterrupted(Event):

@@ -15,6 +15,7 @@ from aerokit.links.link import Link
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.enums import MavComponent
 from aerokit.runtime.connection import Connection
+from aerokit.runtime.own_heartbeat import OwnHeartbeat
 from aerokit.wording import shown
 
 if TYPE_CHECKING:
@@ -49,6 +50,7 @@ async def open_connection(
     reconnect: bool = False,
     peers: Peers | None = None,
     may_move: bool = False,
+    heartbeat: OwnHeartbeat | None = OwnHeartbeat(),  # noqa: B008 - it is immutable
 ) -> AsyncIterator[Connection]:
     """Open a link and be a MAVLink node on it for the time of the ``async with`` block.
 
@@ -79,6 +81,8 @@ async def open_connection(
         may_move: whether a vehicle that was silent may come back from another IP address without going on where it
             stopped, by sequence numbers and time since boot: rebooted, with a new address. Else it is not listened to
             there (``MoveRefused``), for it might be anybody.
+        heartbeat: what our own HEARTBEAT says, and on what condition it is sent; None: none is, and the vehicle
+            knows of no ground station: PX4 sends no texts then, and a ``udpout:`` link stays silent.
 
     Raises:
         LocalProtocolError: an argument is wrong; nothing was opened.
@@ -96,6 +100,7 @@ async def open_connection(
         mavlink_version=mavlink_version,
         signing=signing,
         may_move=may_move,
+        heartbeat=heartbeat,
     )
     try:
         if record is not None:

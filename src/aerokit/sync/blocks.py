@@ -67,9 +67,13 @@ class TwinOf(ReadOnly, Generic[A]):
     """A twin: the loop that it calls, and the asynchronous object that it stands for."""
 
     def __init__(self, loop: LoopThread, aio: A) -> None:
-        self._loop = loop
-        self.aio: A = aio
+        self._loop, self._aio = loop, aio
+
+    @property
+    def aio(self) -> A:
         """The asynchronous object, for code that runs on the loop."""
+        self._loop.feed()
+        return self._aio
 
     @contextmanager
     def _block(self, block: AbstractContextManager[T]) -> Iterator[T]:
@@ -102,7 +106,7 @@ class CellTwin(TwinOf["StateCell[T]"], Generic[T]):
     if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any:
-            if name == "aio":  # not made yet
+            if name == "_aio":  # not made yet
                 raise AttributeError(name)
             return getattr(self.aio, name)  # which says what was perhaps meant
 
@@ -337,6 +341,9 @@ def opened(
         if not is_connection:
             loop.close()
         raise
+    if not is_connection:
+        connection: Connection = getattr(held.value, "connection", held.value)
+        connection._prove_life_by(loop.proof)
     if issubclass(twin, VehicleTwin):
         return twin(loop, held, owns_loop=not is_connection)
     return twin(loop, held.value, held)

@@ -125,6 +125,8 @@ def opened_fleet(
         if not loops:
             loop.close()
         raise
+    for connection in held.value._crew.networks.values():
+        connection._prove_life_by(loop.proof)
     return twin(loop, held, owns_loop=not loops)
 
 

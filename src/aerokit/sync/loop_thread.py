@@ -9,6 +9,7 @@ import contextvars
 import functools
 import os
 import threading
+import time
 import weakref
 from contextlib import AbstractAsyncContextManager, AbstractContextManager
 from typing import TYPE_CHECKING, Any, Generic, ParamSpec, TypeVar
@@ -17,6 +18,7 @@ import anyio
 
 from aerokit.errors import AerokitError, BusyError, ConnectionClosed, LinkOpenError
 from aerokit.runtime.cancellation import Cancellation
+from aerokit.runtime.own_heartbeat import ProofOfLife
 from aerokit.sync.reply import Reply
 
 if TYPE_CHECKING:
@@ -47,6 +49,8 @@ class LoopThread:
     """
 
     def __init__(self) -> None:
+        self.proof: ProofOfLife = ProofOfLife(time.monotonic)
+        """Of the program that calls."""
         self._calls = _Calls()
         started: Reply[asyncio.AbstractEventLoop] = Reply()
         # In a context of its own: sniffio keeps there which library is running, and the caller's may be another one.
@@ -104,6 +108,8 @@ class LoopThread:
     ) -> T:
         """``patience_s``: how long to wait for the end of an interrupted call; None: as long as it takes."""
         call: _Call[T] | None = None
+        waits = object()
+        self.proof.waiting.add(waits)
         try:
             call = _Call(functools.partial(function, *args, **kwargs))
             self._start(call)
@@ -121,6 +127,9 @@ class LoopThread:
                 if patience_s is None and (failure := call.take_error()) is not None:
                     raise error from failure
             raise
+        finally:
+            self.proof.waiting.discard(waits)
+            self.proof.feed()
         return call.result()
 
     def call(self, function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:
@@ -155,6 +164,11 @@ class LoopThread:
         """As :meth:`enter`, for one that does not wait."""
         return self.enter(_Awaited(context))
 
+    def feed(self) -> None:
+        """The program has called, unless it is the loop's own thread that does."""
+        if not self.is_current:
+            self.proof.feed()
+
     def call_soon(self, function: Callable[P, object], /, *args: P.args, **kwargs: P.kwargs) -> None:
         """Have a function that does not wait called on the loop, after those asked for before; from any thread.
 
@@ -163,6 +177,7 @@ class LoopThread:
         Raises:
             ConnectionClosed: the loop was closed.
         """
+        self.feed()
         with self._lock:
             self._check()
             self._soon(functools.partial(function, *args, **kwargs))

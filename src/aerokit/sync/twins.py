@@ -16,6 +16,7 @@ from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.enums import MavComponent
 from aerokit.protocols.transfer import PATIENCE_S
 from aerokit.runtime.opening import open_connection as open_connection_async
+from aerokit.runtime.own_heartbeat import OwnHeartbeat
 from aerokit.sync.blocks import (
     BlockTwin,
     CellTwin,
@@ -3714,6 +3715,7 @@ def open_connection(
     reconnect: bool = False,
     peers: Peers | None = None,
     may_move: bool = False,
+    heartbeat: OwnHeartbeat | None = OwnHeartbeat(),
 ) -> Connection:
     """Open a link and be a MAVLink node on it ; use it in a ``with`` block, or close it.
 
@@ -3744,6 +3746,8 @@ def open_connection(
         may_move: whether a vehicle that was silent may come back from another IP address without going on where it
             stopped, by sequence numbers and time since boot: rebooted, with a new address. Else it is not listened to
             there (``MoveRefused``), for it might be anybody.
+        heartbeat: what our own HEARTBEAT says, and on what condition it is sent; None: none is, and the vehicle
+            knows of no ground station: PX4 sends no texts then, and a ``udpout:`` link stays silent.
 
     Raises:
         LocalProtocolError: an argument is wrong; nothing was opened.
@@ -3764,6 +3768,7 @@ def open_connection(
         reconnect=reconnect,
         peers=peers,
         may_move=may_move,
+        heartbeat=heartbeat,
     )
 
 
@@ -3784,6 +3789,7 @@ def connect(
     reconnect: bool = False,
     peers: Peers | None = None,
     may_move: bool = False,
+    heartbeat: OwnHeartbeat | None = OwnHeartbeat(),
     share: Iterable[str | Endpoint | Link] = (),
 ) -> Vehicle:
     """Connect to a vehicle ; use it in a ``with`` block, or close it.
@@ -3812,6 +3818,8 @@ def connect(
         may_move: whether the vehicle, once silent, may come back from another IP address without going on where it
             stopped, by sequence numbers and time since boot (rebooted, with a new address). Else it is not listened to
             there (``MoveRefused``), for it might be anybody.
+        heartbeat: what our own HEARTBEAT says, and on what condition it is sent; None: none is, and the vehicle
+            knows of no ground station: PX4 sends no texts then, and a ``udpout:`` link stays silent.
         share: where ground stations and other programs are, or come, that use the same link:
             ``["tcpin:127.0.0.1:5760"]`` (docs/hub.md). They should have other ids than this program. For an open
             connection: ``async with aerokit.hub.shared(connection, […])``.
@@ -3840,5 +3848,6 @@ def connect(
         reconnect=reconnect,
         peers=peers,
         may_move=may_move,
+        heartbeat=heartbeat,
         share=share,
     )

@@ -21,6 +21,7 @@ from aerokit.runtime.connection import Connection
 from aerokit.runtime.diagnosis import no_vehicle_reason
 from aerokit.runtime.endings import raisable
 from aerokit.runtime.opening import open_connection
+from aerokit.runtime.own_heartbeat import OwnHeartbeat
 from aerokit.runtime.routes import MOST_ROUTES
 from aerokit.vehicle.orders.bridge import Bridge
 from aerokit.vehicle.talk.rates import check_rate
@@ -67,6 +68,7 @@ async def connect(
     reconnect: bool = False,
     peers: Peers | None = None,
     may_move: bool = False,
+    heartbeat: OwnHeartbeat | None = OwnHeartbeat(),  # noqa: B008 - it is immutable
     share: Iterable[str | Endpoint | Link] = (),
 ) -> AsyncIterator[Vehicle]:
     """Connect to a vehicle for the time of the ``async with`` block.
@@ -95,6 +97,8 @@ async def connect(
         may_move: whether the vehicle, once silent, may come back from another IP address without going on where it
             stopped, by sequence numbers and time since boot (rebooted, with a new address). Else it is not listened to
             there (``MoveRefused``), for it might be anybody.
+        heartbeat: what our own HEARTBEAT says, and on what condition it is sent; None: none is, and the vehicle
+            knows of no ground station: PX4 sends no texts then, and a ``udpout:`` link stays silent.
         share: where ground stations and other programs are, or come, that use the same link:
             ``["tcpin:127.0.0.1:5760"]`` (docs/hub.md). They should have other ids than this program. For an open
             connection: ``async with aerokit.hub.shared(connection, […])``.
@@ -119,6 +123,10 @@ async def connect(
         if reconnect:
             raise LocalProtocolError(
                 "reconnect = True is not allowed here: the connection is open; say it to open_connection"
+            )
+        if heartbeat != OwnHeartbeat():
+            raise LocalProtocolError(
+                "heartbeat = … is not allowed here: the connection is open; say it to open_connection"
             )
         if peers is not None or may_move:
             raise LocalProtocolError(
@@ -145,6 +153,7 @@ async def connect(
             reconnect=reconnect,
             peers=peers,
             may_move=may_move,
+            heartbeat=heartbeat,
         ) as connection,
         _shared(connection, hub),
         _attached(connection, system_id, timeout, rates) as vehicle,
