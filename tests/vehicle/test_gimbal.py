@@ -239,7 +239,9 @@ async def test_home_of_px4_is_set_in_the_one_frame_that_it_takes() -> None:
         await vehicle.wait_ready()
         home = vehicle.home.value.position
         there = home.offset(north_m=50.0)
-        wanted = Position(there.latitude_deg, there.longitude_deg, altitude_amsl_m=home.altitude_amsl_m)
+        wanted = Position(
+            there.latitude_deg, there.longitude_deg, altitude_amsl_m=vehicle.home.value.altitude_amsl_m
+        )
         await vehicle.set_home(wanted)
         assert vehicle.home.value.position.distance_to(wanted) < 0.1
 
